@@ -1,0 +1,159 @@
+"""Pinhole cameras and rigid poses.
+
+Conventions: optical frames (x right, y down, z forward), poses are camera-to-world 4×4 matrices in metres,
+quaternions are wxyz. Pixel (0, 0) has its centre at (0.5, 0.5), so that scaling an image scales its intrinsics.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A posed pinhole camera.
+
+    Args:
+        K: Intrinsic matrix [3, 3], pixels.
+        width: Image width, pixels.
+        height: Image height, pixels.
+        pose: Camera-to-world transform [4, 4], metres, optical frame.
+
+    Raises:
+        ValueError: If K or the pose has a wrong shape, is not finite, or K has a focal length of zero or less.
+    """
+
+    K: np.ndarray
+    width: int
+    height: int
+    pose: np.ndarray = dataclasses.field(default_factory=lambda: np.eye(4))
+
+    def __post_init__(self):
+        K, pose = np.asarray(self.K, np.float64), np.asarray(self.pose, np.float64)
+        if K.shape != (3, 3) or not np.isfinite(K).all():
+            raise ValueError(f"camera matrix K must be a finite 3×3 matrix, got shape {K.shape}: {K.tolist()}")
+        if K[0, 0] <= 0 or K[1, 1] <= 0:
+            raise ValueError(f"focal lengths must be positive, got fx={K[0, 0]:g}, fy={K[1, 1]:g}; is the camera calibrated?")
+        if self.width <= 0 or self.height <= 0:
+            raise ValueError(f"image size must be positive, got {self.width}×{self.height}")
+        if pose.shape != (4, 4) or not np.isfinite(pose).all():
+            raise ValueError(f"camera pose must be a finite 4×4 matrix, got shape {pose.shape}: {pose.tolist()}")
+        object.__setattr__(self, "K", K)
+        object.__setattr__(self, "pose", pose)
+
+    @property
+    def viewmat(self) -> np.ndarray:
+        """World-to-camera transform [4, 4]."""
+        return invert_pose(self.pose)
+
+    @property
+    def position(self) -> np.ndarray:
+        """Optical centre in the world [3], metres."""
+        return self.pose[:3, 3]
+
+    def at(self, pose: np.ndarray) -> "Camera":
+        """The same camera at another camera-to-world pose."""
+        return dataclasses.replace(self, pose=pose)
+
+    def resized(self, width: int, height: int) -> "Camera":
+        """The camera that sees the same field of view in an image of width × height pixels."""
+        scale = np.diag([width / self.width, height / self.height, 1.0])
+        return dataclasses.replace(self, K=scale @ self.K, width=width, height=height)
+
+    def rays(self) -> np.ndarray:
+        """Directions through every pixel centre with unit z, camera frame [H, W, 3]."""
+        u, v = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
+        x = (u - self.K[0, 2]) / self.K[0, 0]
+        y = (v - self.K[1, 2]) / self.K[1, 1]
+        return np.stack([x, y, np.ones_like(x)], -1)
+
+    def backproject(self, depth: np.ndarray) -> np.ndarray:
+        """World points [H, W, 3] of a depth image (z along the optical axis, metres) [H, W]."""
+        points = self.rays() * depth[..., None]
+        return points @ self.pose[:3, :3].T + self.pose[:3, 3]
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pixel coordinates [N, 2] and depths [N] of world points [N, 3]; points behind have depth <= 0."""
+        local = (points - self.pose[:3, 3]) @ self.pose[:3, :3]
+        z = local[:, 2]
+        safe = np.where(np.abs(z) < 1e-12, 1e-12, z)
+        uv = local[:, :2] / safe[:, None] * [self.K[0, 0], self.K[1, 1]] + self.K[:2, 2]
+        return uv, z
+
+
+def invert_pose(pose: np.ndarray) -> np.ndarray:
+    """Inverse of a rigid transform [4, 4]."""
+    inverse = np.eye(4)
+    inverse[:3, :3] = pose[:3, :3].T
+    inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return inverse
+
+
+def quat_to_matrix(quat: np.ndarray) -> np.ndarray:
+    """Rotation matrices [..., 3, 3] of quaternions wxyz [..., 4], which need not be normalised."""
+    quat = np.asarray(quat, np.float64)
+    w, x, y, z = np.moveaxis(quat / np.linalg.norm(quat, axis=-1, keepdims=True), -1, 0)
+    return np.stack(
+        [
+            1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+        ],
+        -1,
+    ).reshape(quat.shape[:-1] + (3, 3))  # fmt: skip
+
+
+def matrix_to_quat(matrix: np.ndarray) -> np.ndarray:
+    """Quaternion wxyz [4] with w >= 0 of a rotation matrix [3, 3] (Bar-Itzhack: exact for rotations, nearest otherwise)."""
+    m = np.asarray(matrix, np.float64)
+    K = np.array(
+        [
+            [m[0, 0] - m[1, 1] - m[2, 2], 0, 0, 0],
+            [m[0, 1] + m[1, 0], m[1, 1] - m[0, 0] - m[2, 2], 0, 0],
+            [m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], m[2, 2] - m[0, 0] - m[1, 1], 0],
+            [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1], m.trace()],
+        ]
+    )
+    x, y, z, w = np.linalg.eigh(K / 3.0)[1][:, -1]  # eigh reads the lower triangle
+    quat = np.array([w, x, y, z])
+    return -quat if w < 0 else quat
+
+
+def make_pose(position: np.ndarray, quat: np.ndarray) -> np.ndarray:
+    """Rigid transform [4, 4] from a position [3] and a quaternion wxyz [4]."""
+    pose = np.eye(4)
+    pose[:3, :3] = quat_to_matrix(quat)
+    pose[:3, 3] = position
+    return pose
+
+
+def look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray = (0.0, -1.0, 0.0)) -> np.ndarray:
+    """Camera-to-world pose [4, 4] at a position [3] whose optical axis passes through a target [3]."""
+    z = np.asarray(target, np.float64) - position
+    z /= np.linalg.norm(z)
+    x = np.cross(-np.asarray(up, np.float64), z)
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([x, np.cross(z, x), z], 1)
+    pose[:3, 3] = position
+    return pose
+
+
+def slerp(q1: np.ndarray, q2: np.ndarray, alpha: float) -> np.ndarray:
+    """Spherical interpolation between unit quaternions wxyz [4] along the shorter arc."""
+    q1, q2 = np.asarray(q1, np.float64), np.asarray(q2, np.float64)
+    dot = float(q1 @ q2)
+    if dot < 0:
+        q2, dot = -q2, -dot
+    if dot > 1 - 1e-9:
+        mixed = (1 - alpha) * q1 + alpha * q2
+        return mixed / np.linalg.norm(mixed)
+    angle = np.arccos(dot)
+    return (np.sin((1 - alpha) * angle) * q1 + np.sin(alpha * angle) * q2) / np.sin(angle)
+
+
+def interpolate_pose(pose1: np.ndarray, pose2: np.ndarray, alpha: float) -> np.ndarray:
+    """Pose between two poses [4, 4]: slerp of rotations, lerp of translations (paper eq. 8)."""
+    quat = slerp(matrix_to_quat(pose1[:3, :3]), matrix_to_quat(pose2[:3, :3]), alpha)
+    return make_pose((1 - alpha) * pose1[:3, 3] + alpha * pose2[:3, 3], quat)

@@ -1,0 +1,95 @@
+"""Stage configurations: one frozen dataclass each is the single source of a stage's parameters.
+
+The command line, the ROS 2 parameters and `config/*.yaml` are all derived from (or tested against) these classes.
+A field is declared as ``name: Annotated[float, Range(lo, hi, unit)] = default`` with a one-line docstring under it.
+"""
+
+import ast
+import dataclasses
+import inspect
+import math
+import textwrap
+import typing
+from functools import cache
+from typing import Any, NamedTuple
+
+
+class Range(NamedTuple):
+    """Inclusive bounds of a numeric option and its unit, used inside ``Annotated``."""
+
+    minimum: float
+    maximum: float
+    unit: str = ""
+
+
+class Option(NamedTuple):
+    """Everything known about one field of a configuration."""
+
+    name: str
+    type: type  # bool, int, float or str
+    default: Any
+    description: str
+    range: Range | None
+    choices: tuple[str, ...] | None  # of a ``Literal`` field
+
+
+class ConfigError(ValueError):
+    """A configuration value that cannot be used; the message names the field, the value and what is allowed."""
+
+
+@cache
+def options(config_class: type) -> tuple[Option, ...]:
+    """All fields of a configuration dataclass, in order, with the docstring under each as its description."""
+    hints = typing.get_type_hints(config_class, include_extras=True)
+    body = ast.parse(textwrap.dedent(inspect.getsource(config_class))).body[0].body
+    docstrings = {
+        field.target.id: " ".join(doc.value.value.split())
+        for field, doc in zip(body, body[1:])
+        if isinstance(field, ast.AnnAssign) and isinstance(doc, ast.Expr) and isinstance(doc.value, ast.Constant)
+    }
+    found = []
+    for field in dataclasses.fields(config_class):
+        hint, bounds, choices = hints[field.name], None, None
+        if typing.get_origin(hint) is typing.Annotated:
+            hint, *extras = typing.get_args(hint)
+            bounds = next((extra for extra in extras if isinstance(extra, Range)), None)
+        if typing.get_origin(hint) is typing.Literal:
+            choices = typing.get_args(hint)
+            hint = type(choices[0])
+        found.append(Option(field.name, hint, field.default, docstrings.get(field.name, ""), bounds, choices))
+    return tuple(found)
+
+
+def validate(config: Any) -> None:
+    """Raise :class:`ConfigError` unless every field has its declared type and lies within its declared bounds."""
+    for option in options(type(config)):
+        value = getattr(config, option.name)
+        where = f"{type(config).__name__}.{option.name}"
+        if option.type is float and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+            object.__setattr__(config, option.name, value)
+        if not isinstance(value, option.type) or (option.type is int and isinstance(value, bool)):
+            raise ConfigError(f"{where} must be a {option.type.__name__}, got {value!r}")
+        if option.type is float and not math.isfinite(value):
+            raise ConfigError(f"{where} must be finite, got {value}")
+        if option.choices and value not in option.choices:
+            raise ConfigError(f"{where} must be one of {', '.join(map(str, option.choices))}, got {value!r}")
+        if option.range and not option.range.minimum <= value <= option.range.maximum:
+            low, high, unit = option.range
+            raise ConfigError(f"{where} must lie in [{low:g}, {high:g}] {unit}, got {value:g}".replace(" ,", ","))
+
+
+class StageConfig:
+    """Base of the stage configurations: validates on construction and converts from plain mappings."""
+
+    def __post_init__(self):
+        validate(self)
+
+    @classmethod
+    def from_mapping(cls, values: dict[str, Any]):
+        """Build from a mapping such as a YAML section; unknown names are an error that lists the known ones."""
+        known = [option.name for option in options(cls)]
+        unknown = [name for name in values if name not in known]
+        if unknown:
+            raise ConfigError(f"{cls.__name__} has no option {', '.join(unknown)}; it has {', '.join(known)}")
+        return cls(**values)

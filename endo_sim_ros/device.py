@@ -1,0 +1,40 @@
+"""Where to compute: one name for torch and Warp."""
+
+import functools
+import os
+
+import torch
+
+DEVICE_HELP = "Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."
+
+
+def pick_device(name: str = "auto") -> str:
+    """Resolve a device name to one that both torch and Warp understand, e.g. ``cpu`` or ``cuda:0``.
+
+    Raises:
+        ValueError: If the name is unknown or names a GPU that is not there.
+    """
+    if name == "auto":
+        return "cuda:0" if torch.cuda.is_available() else "cpu"
+    if name == "cpu":
+        return name
+    if name == "cuda" or name.startswith("cuda:") and name[5:].isdigit():
+        index = int(name[5:] or 0) if name != "cuda" else 0
+        if index >= torch.cuda.device_count():
+            raise ValueError(f"device {name!r} asked for, but {torch.cuda.device_count()} CUDA devices are visible; use cpu or auto")
+        return f"cuda:{index}"
+    raise ValueError(f"unknown device {name!r}; use auto, cpu, cuda or cuda:N")
+
+
+@functools.cache
+def init_warp() -> None:
+    """Start Warp quietly, once."""
+    import warp as wp
+
+    wp.config.quiet = True
+    wp.init()
+
+
+def cpu_threads() -> int:
+    """Number of worker threads for CPU kernels: the cores this process may use, or ENDO_SIM_THREADS."""
+    return int(os.environ.get("ENDO_SIM_THREADS", 0)) or len(os.sched_getaffinity(0))

@@ -1,0 +1,181 @@
+"""The Gaussian model (structure of arrays) and its PLY files in the INRIA layout."""
+
+import dataclasses
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from plyfile import PlyData, PlyElement, PlyParseError
+from torch import Tensor
+
+SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 sqrt(pi))
+
+
+class ModelError(ValueError):
+    """A Gaussian model or model file that cannot be used; the message says which field and why."""
+
+
+@dataclass(frozen=True)
+class GaussianModel:
+    """N anisotropic 3D Gaussians as 3D Gaussian Splatting stores them (before activation).
+
+    Args:
+        means: Centres [N, 3], metres, world.
+        quats: Rotations wxyz [N, 4], not necessarily normalised.
+        log_scales: Logarithm of the standard deviations along the rotated axes [N, 3], log metres.
+        logit_opacities: Logit of the opacity [N].
+        sh: Spherical harmonic colour coefficients [N, (degree + 1)², 3], degree 0 to 3.
+    """
+
+    means: Tensor
+    quats: Tensor
+    log_scales: Tensor
+    logit_opacities: Tensor
+    sh: Tensor
+
+    def __post_init__(self):
+        n = len(self.means)
+        shapes = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,)}
+        for name, shape in shapes.items():
+            if tuple(getattr(self, name).shape) != shape:
+                raise ModelError(f"Gaussian model: {name} has shape {tuple(getattr(self, name).shape)}, expected {shape}")
+        if self.sh.ndim != 3 or self.sh.shape[0] != n or self.sh.shape[1] not in (1, 4, 9, 16) or self.sh.shape[2] != 3:
+            raise ModelError(f"Gaussian model: sh has shape {tuple(self.sh.shape)}, expected [{n}, 1|4|9|16, 3]")
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def sh_degree(self) -> int:
+        return int(round(self.sh.shape[1] ** 0.5)) - 1
+
+    @property
+    def scales(self) -> Tensor:
+        """Standard deviations [N, 3], metres."""
+        return self.log_scales.exp()
+
+    @property
+    def opacities(self) -> Tensor:
+        """Opacities in (0, 1) [N]."""
+        return self.logit_opacities.sigmoid()
+
+    @property
+    def base_colors(self) -> Tensor:
+        """View-independent RGB [N, 3], clamped to [0, 1]."""
+        return (self.sh[:, 0] * SH_C0 + 0.5).clamp(0, 1)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The five arrays by field name."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+
+    def to(self, device: str | torch.device) -> "GaussianModel":
+        return GaussianModel(**{name: value.to(device) for name, value in self.tensors().items()})
+
+    def detach(self) -> "GaussianModel":
+        return GaussianModel(**{name: value.detach() for name, value in self.tensors().items()})
+
+    def select(self, index: Tensor) -> "GaussianModel":
+        """The Gaussians at an index or boolean mask."""
+        return GaussianModel(**{name: value[index] for name, value in self.tensors().items()})
+
+    @staticmethod
+    def from_points(points: Tensor, colors: Tensor, scales: Tensor, opacity: float = 0.5, sh_degree: int = 0) -> "GaussianModel":
+        """Isotropic Gaussians at points [N, 3] (m) with RGB colours [N, 3] in [0, 1] and standard deviations [N] (m)."""
+        n = len(points)
+        sh = points.new_zeros(n, (sh_degree + 1) ** 2, 3)
+        sh[:, 0] = (colors - 0.5) / SH_C0
+        quats = points.new_zeros(n, 4)
+        quats[:, 0] = 1
+        return GaussianModel(
+            points.clone(),
+            quats,
+            scales.clamp_min(1e-9).log()[:, None].repeat(1, 3),
+            torch.full_like(scales, opacity).logit(),
+            sh,
+        )
+
+
+def ply_fields(sh_degree: int) -> list[str]:
+    """Field names of the INRIA layout, in file order, without the unused normals."""
+    rest = 3 * ((sh_degree + 1) ** 2 - 1)
+    return (
+        ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2"]
+        + [f"f_rest_{i}" for i in range(rest)]
+        + ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    )
+
+
+def to_columns(model: GaussianModel) -> np.ndarray:
+    """The model as a float32 matrix [N, len(ply_fields(degree))] whose columns are `ply_fields`."""
+    t = {name: value.detach().cpu().float() for name, value in model.tensors().items()}
+    rest = t["sh"][:, 1:].transpose(1, 2).flatten(1)  # channel-major, as INRIA's files have it
+    columns = [t["means"], t["sh"][:, 0], rest, t["logit_opacities"][:, None], t["log_scales"], t["quats"]]
+    return torch.cat(columns, 1).numpy()
+
+
+def from_columns(columns: dict[str, np.ndarray], source: str) -> GaussianModel:
+    """The model of named columns [N] each; other columns are ignored.
+
+    Raises:
+        ModelError: If a field is missing, values are not finite, or the number of f_rest fields fits no SH degree.
+    """
+    rest_count = sum(name.startswith("f_rest_") for name in columns)
+    degrees = {3 * ((degree + 1) ** 2 - 1): degree for degree in range(4)}
+    if rest_count not in degrees:
+        raise ModelError(f"{source}: {rest_count} f_rest_* fields fit no SH degree; expected one of {sorted(degrees)}")
+    missing = [name for name in ply_fields(degrees[rest_count]) if name not in columns]
+    if missing:
+        raise ModelError(f"{source}: missing field {', '.join(missing[:4])}; a Gaussian model has INRIA's field names")
+
+    def stack(names):
+        return torch.from_numpy(np.stack([np.asarray(columns[name], np.float32) for name in names], 1))
+
+    dc, rest = stack([f"f_dc_{i}" for i in range(3)]), None
+    if rest_count:
+        rest = stack([f"f_rest_{i}" for i in range(rest_count)]).reshape(len(dc), 3, -1).transpose(1, 2)
+    model = GaussianModel(
+        stack("xyz"),
+        stack([f"rot_{i}" for i in range(4)]),
+        stack([f"scale_{i}" for i in range(3)]),
+        stack(["opacity"])[:, 0],
+        dc[:, None] if rest is None else torch.cat([dc[:, None], rest], 1),
+    )
+    for name, value in model.tensors().items():
+        # An opacity of exactly 0 or 1 has an infinite logit, which the sigmoid maps back.
+        bad = value.isnan() if name == "logit_opacities" else ~value.isfinite()
+        if bad.any():
+            index = int(bad.reshape(len(model), -1).any(1).nonzero()[0])
+            raise ModelError(f"{source}: {name} of Gaussian {index} is not finite; remove it or reconstruct again")
+    return model
+
+
+def save_ply(model: GaussianModel, path: str | Path) -> None:
+    """Write a binary PLY that SuperSplat, viser and other 3DGS viewers open. Written whole or not at all."""
+    path = Path(path)
+    columns, names = to_columns(model), ply_fields(model.sh_degree)
+    names = names[:3] + ["nx", "ny", "nz"] + names[3:]
+    columns = np.concatenate([columns[:, :3], np.zeros((len(model), 3), np.float32), columns[:, 3:]], 1)
+    vertices = np.rec.fromarrays(columns.T, names=names) if len(model) else np.empty(0, [(name, "f4") for name in names])
+    buffer = io.BytesIO()
+    PlyData([PlyElement.describe(np.asarray(vertices), "vertex")], byte_order="<").write(buffer)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".part")
+    partial.write_bytes(buffer.getvalue())
+    partial.replace(path)
+
+
+def load_ply(path: str | Path) -> GaussianModel:
+    """Read a 3DGS PLY of SH degree 0 to 3.
+
+    Raises:
+        ModelError: If the file is absent, not a PLY, truncated, or lacks a field; the message names the file.
+    """
+    try:
+        vertices = PlyData.read(str(path))["vertex"].data
+    except FileNotFoundError:
+        raise ModelError(f"{path}: no such file") from None
+    except (PlyParseError, KeyError, ValueError, UnicodeDecodeError) as error:
+        raise ModelError(f"{path}: not a readable PLY model ({error})") from error
+    return from_columns({name: vertices[name] for name in vertices.dtype.names}, str(path))

@@ -37,4 +37,5 @@ def init_warp() -> None:
 
 def cpu_threads() -> int:
     """Number of worker threads for CPU kernels: the cores this process may use, or ENDO_SIM_THREADS."""
-    return int(os.environ.get("ENDO_SIM_THREADS", 0)) or len(os.sched_getaffinity(0))
+    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return int(os.environ.get("ENDO_SIM_THREADS", "0")) or available

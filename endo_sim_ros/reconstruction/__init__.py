@@ -1,0 +1,7 @@
+"""From sparse posed views to a Gaussian model."""
+
+from endo_sim_ros.reconstruction.config import ReconstructionConfig
+from endo_sim_ros.reconstruction.keyframes import select_keyframes
+from endo_sim_ros.reconstruction.trainer import Progress, Trainer
+
+__all__ = ["Progress", "ReconstructionConfig", "Trainer", "select_keyframes"]

@@ -1,0 +1,263 @@
+"""Images and poses in, Gaussian model out."""
+
+import logging
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+from std_srvs.srv import Trigger
+
+from endo_sim_ros import messages
+from endo_sim_ros.cameras import Camera
+from endo_sim_ros.config import Range, StageConfig
+from endo_sim_ros.gaussians import GaussianModel, load_ply, save_ply
+from endo_sim_ros.messages import Topic
+from endo_sim_ros.nodes.base import OK, WARN, EndoNode, run
+from endo_sim_ros.reconstruction import Progress, ReconstructionConfig, Trainer, select_keyframes
+from endo_sim_ros.sequences.bag import LEFT_FRAME, feed
+from endo_sim_ros.sequences.frames import Frame, SequenceError
+from endo_sim_ros.sequences.synchronizer import Synchronizer
+
+_NEW_RECORDING = 1.0  # seconds that stamps must jump back to mean that another recording began
+
+
+@dataclass(frozen=True)
+class ReconstructionNodeConfig(StageConfig):
+    """Parameters of the node beside those of the reconstruction."""
+
+    world_frame: str = "world"
+    """Frame in which camera poses are given; poses in other frames are refused."""
+    sync_tolerance: Annotated[float, Range(0, 10, "s")] = 0.01
+    """Largest difference between the stamps of an image and its pose, depth, mask and right image."""
+    reliable: bool = True
+    """Ask for reliable delivery; set to false for cameras that publish best effort."""
+    start_after: Annotated[float, Range(0, 3600, "s")] = 1.5
+    """Reconstruct when no new view came for this long; 0 = only when the service ~/reconstruct is called."""
+    start_views: Annotated[int, Range(0, 100_000)] = 0
+    """Reconstruct as soon as this many views arrived (for a live camera, whose stream does not end); 0 = off."""
+    max_views: Annotated[int, Range(2, 100_000)] = 300
+    """Views kept in memory; above it every second one is dropped."""
+    image_timeout: Annotated[float, Range(0.1, 3600, "s")] = 10.0
+    """Warn when no view arrived for this long."""
+    publish_period: Annotated[float, Range(0.1, 3600, "s")] = 5.0
+    """Time between intermediate models during training."""
+    output_dir: str = "~/.ros/endo_sim_ros"
+    """Where each reconstruction's model.ply and checkpoint.pt are saved, in a folder named by the time."""
+    model_file: str = ""
+    """PLY model to publish at start, before any reconstruction."""
+
+
+class ReconstructionNode(EndoNode):
+    """Collects views, trains in a worker thread, publishes the model as it grows and saves it."""
+
+    def __init__(self):
+        super().__init__("reconstruction_node")
+        self._options = self.declare(ReconstructionNodeConfig)
+        self._config = self.declare(ReconstructionConfig)
+        logging.basicConfig(level=logging.INFO, format="%(name)s: %(message)s")
+        self._frames: list[Frame] = []
+        self._synchronizer = Synchronizer(self._options.sync_tolerance)
+        self._last_view = time.monotonic()
+        self._newest_stamp = 0
+        self._trained: tuple[int, int] | None = None  # first and last stamp of the recording reconstructed last
+        self._thread: threading.Thread | None = None
+        self._cancel = threading.Event()
+        self._lock = threading.Lock()
+        self._progress: Progress | None = None
+        self._outbox: tuple[GaussianModel, list[Camera]] | None = None  # newest model of the worker, to be published
+        self._published: GaussianModel | None = None
+        self._saved = ""
+        self._model_pub, self._cameras_pub, self._info_pub = (self.publisher(topic) for topic in messages.MODEL_TOPICS)
+        for topic in messages.RECORDING_TOPICS:
+            self.subscribe(topic, lambda message, topic=topic: self._on_recording(topic, message), 50, self._options.reliable)
+        self.create_service(Trigger, "~/reconstruct", self._on_reconstruct)
+        self.create_service(Trigger, "~/save", self._on_save)
+        self.create_timer(0.2, self._on_timer)
+        with self.guard("model_file"):
+            if self._options.model_file:
+                self._publish(load_ply(Path(self._options.model_file).expanduser()), [])
+
+    def config_changed(self, config: StageConfig) -> None:
+        if isinstance(config, ReconstructionNodeConfig):
+            self._options = config
+        else:
+            self._config = config  # used by the next reconstruction
+
+    # ------------------------------------------------------------------ views
+
+    def _on_recording(self, topic: Topic, message: Any) -> None:
+        stamp = messages.stamp_to_ns(message.header.stamp)
+        if topic in (messages.LEFT_IMAGE, messages.LEFT_COMPRESSED):
+            if 0 < stamp < self._newest_stamp - _NEW_RECORDING * 1e9:
+                self._end_of_recording()
+            self._newest_stamp = max(stamp, self._newest_stamp)
+        try:
+            frames = feed(self._synchronizer, topic, message, self._options.world_frame)
+        finally:
+            self._note_images(topic)
+        self._add_views(frames)
+
+    def _note_images(self, topic: Topic) -> None:
+        if topic in (messages.LEFT_IMAGE, messages.LEFT_COMPRESSED):
+            self._last_view = time.monotonic()
+
+    def _add_views(self, frames: list[Frame]) -> None:
+        self._frames.extend(frames)
+        if len(self._frames) > self._options.max_views:
+            self._frames = self._frames[::2]
+        if 0 < self._options.start_views <= len(self._frames):
+            self._start_if_new()
+
+    def _end_of_recording(self) -> None:
+        """Stamps jumped back: reconstruct what was collected and begin again with what comes."""
+        self._start_if_new()
+        self._synchronizer = Synchronizer(self._options.sync_tolerance)
+        self._frames, self._newest_stamp = [], 0
+
+    def _on_timer(self) -> None:
+        with self.guard("reconstruction"):
+            if 0 < self._options.start_after < time.monotonic() - self._last_view:
+                with self.guard("synchroniser"):
+                    self._add_views(self._synchronizer.flush())
+                self._start_if_new()
+            with self._lock:
+                outbox, self._outbox = self._outbox, None
+            if outbox:
+                self._publish(*outbox)
+
+    # --------------------------------------------------------------- training
+
+    def _start_if_new(self) -> None:
+        """Start training unless it runs already or these views were reconstructed before."""
+        if not self._frames or self._training:
+            return
+        span = (self._frames[0].stamp_ns, self._frames[-1].stamp_ns)
+        if span != self._trained:
+            self._start()
+
+    @property
+    def _training(self) -> bool:
+        return self._thread is not None and self._thread.is_alive()
+
+    def _start(self) -> None:
+        chosen = select_keyframes(self._frames, self._config.keyframes)
+        views = [self._frames[index] for index in chosen]
+        self._trained = (self._frames[0].stamp_ns, self._frames[-1].stamp_ns)
+        self._progress, self._saved = None, ""
+        self._cancel.clear()
+        self._thread = threading.Thread(target=self._train, args=(views, self._config), daemon=True)
+        self._thread.start()
+        self.get_logger().info(f"reconstructing from {len(views)} of {len(self._frames)} views")
+
+    def _train(self, views: list[Frame], config: ReconstructionConfig) -> None:
+        with self.guard("reconstruction"):
+            try:
+                trainer = Trainer(views, config)
+                self._offer(trainer)
+                published = time.monotonic()
+
+                def on_progress(progress: Progress) -> bool:
+                    nonlocal published
+                    self._progress = progress
+                    if time.monotonic() - published > self._options.publish_period:
+                        published = time.monotonic()
+                        self._offer(trainer)
+                    return not self._cancel.is_set()
+
+                trainer.run(on_progress, every=10)
+            except (MemoryError, torch.OutOfMemoryError) as error:
+                raise SequenceError(f"out of memory: lower max_gaussians, image_width or keyframes ({error})") from error
+            self._offer(trainer)
+            self._save(trainer.model, trainer)
+            self.get_logger().info(f"reconstruction finished: {len(trainer.model)} Gaussians, saved in {self._saved}")
+
+    def _offer(self, trainer: Trainer) -> None:
+        with self._lock:
+            self._outbox = (trainer.model.to("cpu"), trainer.cameras)
+
+    def _publish(self, model: GaussianModel, cameras: list[Camera]) -> None:
+        """Publish a model; equal stamps tie it to the cameras it was trained on."""
+        stamp, world = self.now_ns(), self._options.world_frame
+        if cameras:
+            first = cameras[0]
+            self._info_pub.publish(messages.encode_camera_info(first.K, first.width, first.height, stamp, LEFT_FRAME))
+        self._cameras_pub.publish(messages.encode_poses([camera.pose for camera in cameras], stamp, world))
+        self._model_pub.publish(messages.encode_gaussians(model, stamp, world))
+        self._published = model
+
+    def _save(self, model: GaussianModel, trainer: Trainer | None = None) -> None:
+        folder = Path(self._options.output_dir).expanduser() / time.strftime("%Y%m%d-%H%M%S")
+        try:
+            save_ply(model, folder / "model.ply")
+            if trainer is not None:
+                trainer.save_checkpoint(folder / "checkpoint.pt")
+        except OSError as error:
+            raise SequenceError(f"{folder}: the model cannot be saved ({error.strerror}); set output_dir") from error
+        self._saved = str(folder)
+
+    # --------------------------------------------------------------- services
+
+    def _on_reconstruct(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if self._training:
+            response.success, response.message = False, f"a reconstruction is running: {self.status()[1]}"
+            return response
+        with self.guard("synchroniser"):
+            self._add_views(self._synchronizer.flush())
+        if not self._frames:
+            response.success, response.message = False, f"no views yet: {self.status()[1]}"
+            return response
+        if not self._training:  # start_views may have started it
+            self._start()
+        response.success, response.message = True, f"reconstructing from {len(self._frames)} views"
+        return response
+
+    def _on_save(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success = False
+        if self._published is None:
+            response.message = "there is no model to save yet"
+            return response
+        try:
+            self._save(self._published)
+            response.success, response.message = True, self._saved
+        except SequenceError as error:
+            response.message = str(error)
+        return response
+
+    # ------------------------------------------------------------ diagnostics
+
+    def status(self):
+        dropped = {f"images {reason}": count for reason, count in self._synchronizer.dropped.items()}
+        values = {"views": len(self._frames), **dropped, "saved": self._saved}
+        if self._training:
+            progress = self._progress
+            if progress is None:
+                return OK, "preparing views", values
+            values |= {"iteration": progress.iteration, "iterations": progress.iterations}
+            values |= {"loss": f"{progress.loss:.4f}", "gaussians": progress.gaussians}
+            return OK, f"training, iteration {progress.iteration} of {progress.iterations}", values
+        if self._saved:
+            return OK, f"finished, model saved in {self._saved}", values
+        silent = time.monotonic() - self._last_view
+        if silent > self._options.image_timeout and not self._frames:
+            topic = self.resolve_topic_name(messages.LEFT_IMAGE.name)
+            reasons = [f"{count} {reason}" for reason, count in dropped.items() if count]
+            why = f"images arrived but none was usable ({', '.join(reasons)})" if reasons else f"no image on {topic}"
+            return WARN, f"{why} for {silent:.0f} s; play a bag or remap the topics", values
+        return OK, f"collecting views, {len(self._frames)} so far", values
+
+    def destroy_node(self) -> None:
+        self._cancel.set()
+        if self._thread is not None:
+            self._thread.join(timeout=10)
+        super().destroy_node()
+
+
+def main() -> int:
+    return run(ReconstructionNode)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,140 @@
+"""A tool that takes hold of the tissue in the middle of the picture, pulls, swings and lets go."""
+
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+
+from endo_sim_ros import messages
+from endo_sim_ros.cameras import Camera, invert_pose
+from endo_sim_ros.config import Range, StageConfig
+from endo_sim_ros.messages import ControlNodeCloud
+from endo_sim_ros.nodes.base import OK, WARN, EndoNode, run
+
+_FOLLOWED = 8  # nodes around the grasped point whose movement carries the tip
+
+
+@dataclass(frozen=True)
+class ScriptedToolConfig(StageConfig):
+    """Parameters of the scripted tool."""
+
+    arm: str = "PSM1"
+    """Name of the arm whose topics are published."""
+    world_frame: str = "world"
+    """Frame of the tool's pose."""
+    force: Annotated[float, Range(0, 100, "N")] = 0.6
+    """Largest force."""
+    u: Annotated[float, Range(0, 1)] = 0.5
+    """Where the tool takes hold, as a fraction of the image width."""
+    v: Annotated[float, Range(0, 1)] = 0.5
+    """Where the tool takes hold, as a fraction of the image height."""
+    rate: Annotated[float, Range(1, 1000, "Hz")] = 50.0
+    """Commands per second."""
+    pull: Annotated[float, Range(0, 600, "s")] = 2.0
+    """Time in which the force grows, towards the camera."""
+    swing: Annotated[float, Range(0, 600, "s")] = 4.0
+    """Time in which the force circles around that direction."""
+    release: Annotated[float, Range(0, 600, "s")] = 2.5
+    """Time watched after letting go."""
+
+
+class ScriptedToolNode(EndoNode):
+    """Publishes a tip pose and a wrench; begins when rendered depth and control nodes of the same scene exist."""
+
+    def __init__(self):
+        super().__init__("scripted_tool")
+        self._config = config = self.declare(ScriptedToolConfig)
+        self._pose_pub = self.publisher(messages.tool_pose(config.arm))
+        self._wrench_pub = self.publisher(messages.tool_wrench(config.arm))
+        self._camera_pose: np.ndarray | None = None
+        self._info: messages.CameraInfo | None = None
+        self._depth: np.ndarray | None = None
+        self._nodes: ControlNodeCloud | None = None
+        self._near: np.ndarray | None = None  # indices of the nodes that are followed
+        self._tip = self._towards_camera = self._across = np.zeros(3)
+        self._began: float | None = None
+        self._state = "waiting for the rendered depth"
+        self.subscribe(messages.CAMERA_POSE, self._on_camera, depth=1)
+        self.subscribe(messages.RENDERED_INFO, self._on_info, depth=1)
+        self.subscribe(messages.RENDERED_DEPTH, self._on_depth, depth=1)
+        self.subscribe(messages.CONTROL_NODES, self._on_nodes, depth=1)
+        self.create_timer(1 / config.rate, self._on_timer)
+
+    def _on_camera(self, message: Any) -> None:
+        self._camera_pose = messages.decode_pose(message, self._config.world_frame, messages.CAMERA_POSE.name)
+
+    def _on_info(self, message: Any) -> None:
+        self._info = messages.decode_camera_info(message, messages.RENDERED_INFO.name)
+
+    def _on_depth(self, message: Any) -> None:
+        self._depth = messages.decode_depth(message, messages.RENDERED_DEPTH.name)
+
+    def _on_nodes(self, message: Any) -> None:
+        self._nodes = messages.decode_control_nodes(message)
+
+    def _on_timer(self) -> None:
+        with self.guard("scripted tool"):
+            now = self.now_ns() * 1e-9
+            if self._began is None:
+                if not self._take_hold():
+                    return
+                self._began = now
+            self._publish(now - self._began)
+
+    def _take_hold(self) -> bool:
+        """Choose the tissue point under the configured pixel."""
+        if any(part is None for part in (self._camera_pose, self._info, self._depth, self._nodes)):
+            return False
+        height, width = self._depth.shape
+        camera = Camera(self._info.P[:, :3], width, height, self._camera_pose)
+        row, column = min(int(self._config.v * height), height - 1), min(int(self._config.u * width), width - 1)
+        seen = np.argwhere(self._depth > 0)
+        if not len(seen):
+            self._state = "no tissue in the picture"
+            return False
+        row, column = seen[((seen - [row, column]) ** 2).sum(1).argmin()]  # the nearest pixel with tissue
+        self._tip = camera.backproject(self._depth)[row, column]
+        self._near = np.argsort(np.linalg.norm(self._nodes.positions - self._tip, axis=1))[:_FOLLOWED]
+        self._towards_camera = camera.position - self._tip
+        self._towards_camera /= np.linalg.norm(self._towards_camera)
+        self._across = invert_pose(camera.pose)[0, :3]  # the image's x axis in the world
+        return True
+
+    def _publish(self, elapsed: float) -> None:
+        config, stamp = self._config, self.now_ns()
+        if self._nodes is not None and len(self._nodes.rest) > self._near.max():
+            moved = (self._nodes.positions - self._nodes.rest)[self._near].mean(0)
+        else:
+            moved = np.zeros(3)
+        pose = np.eye(4)
+        pose[:3, 3] = self._tip + moved
+        force = self._force(elapsed)
+        self._pose_pub.publish(messages.encode_pose(pose, stamp, config.world_frame))
+        self._wrench_pub.publish(messages.encode_wrench(force, np.zeros(3), stamp, config.world_frame))
+
+    def _force(self, elapsed: float) -> np.ndarray:
+        """Force on the tissue [3], N, world."""
+        config = self._config
+        if elapsed < config.pull:
+            self._state = "pulling"
+            return config.force * elapsed / config.pull * self._towards_camera
+        if elapsed < config.pull + config.swing:
+            self._state = "swinging"
+            angle = 2 * np.pi * (elapsed - config.pull) / config.swing
+            side = np.cross(self._towards_camera, self._across)
+            around = np.sin(angle) * self._across + 0.5 * (1 - np.cos(angle)) * side
+            direction = self._towards_camera + 0.8 * around
+            return config.force * direction / np.linalg.norm(direction)
+        self._state = "released" if elapsed < config.pull + config.swing + config.release else "finished"
+        return np.zeros(3)
+
+    def status(self):
+        return (WARN if self._began is None else OK), self._state, {"tip": np.round(self._tip, 4).tolist()}
+
+
+def main() -> int:
+    return run(ScriptedToolNode)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,46 @@
+"""Options of the reconstruction stage."""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from endo_sim_ros.config import Range, StageConfig
+
+
+@dataclass(frozen=True)
+class ReconstructionConfig(StageConfig):
+    """From sparse posed views to a Gaussian model."""
+
+    keyframes: Annotated[int, Range(1, 1000)] = 8
+    """Number of views to train on, spread over the camera path."""
+    image_width: Annotated[int, Range(16, 8192, "pixels")] = 640
+    """Views wider than this are shrunk to it before training."""
+    iterations: Annotated[int, Range(1, 1_000_000)] = 3000
+    """Optimisation steps (the paper uses 3000)."""
+    max_gaussians: Annotated[int, Range(1, 10_000_000)] = 60_000
+    """Largest number of Gaussians."""
+    sh_degree: Annotated[int, Range(0, 3)] = 0
+    """Degree of the spherical harmonics; 0 is the paper's frequency regularisation."""
+    depth: Literal["auto", "topic", "stereo", "none"] = "auto"
+    """Depth prior: the depth topic, matching with the right image, none, or the first of these that exists."""
+    depth_tolerance: Annotated[float, Range(0.001, 1)] = 0.05
+    """Relative depth difference at which two views contradict each other."""
+    lambda_ssim: Annotated[float, Range(0, 1)] = 0.2
+    """Share of 1 − SSIM in the photometric loss; the rest is L1."""
+    lambda_depth: Annotated[float, Range(0, 1000)] = 0.5
+    """Weight of the depth loss, in units of the scene's median depth (paper eq. 4)."""
+    lambda_dist: Annotated[float, Range(0, 1000)] = 1.0
+    """Weight of the distortion loss, in units of the scene's median depth (paper eq. 5)."""
+    lambda_tv: Annotated[float, Range(0, 1000)] = 0.5
+    """Weight of the total variation of the rendered depth, in units of the scene's median depth (paper eq. 6)."""
+    virtual_every: Annotated[int, Range(0, 1000)] = 1
+    """A virtual camera regularises every n-th iteration (paper eq. 8, 9); 0 = never."""
+    refine_every: Annotated[int, Range(1, 100_000)] = 100
+    """Iterations between relocations of dead Gaussians and growth."""
+    growth: Annotated[float, Range(0, 1)] = 0.05
+    """Share of new Gaussians added at each refinement until max_gaussians is reached."""
+    learning_rate: Annotated[float, Range(1e-3, 100)] = 1.0
+    """Factor on all learning rates."""
+    seed: Annotated[int, Range(0, 2**31 - 1)] = 0
+    """Seed of all random draws; the same seed gives the same model on a CPU, bit for bit."""
+    device: str = "auto"
+    """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""

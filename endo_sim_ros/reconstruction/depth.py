@@ -1,0 +1,97 @@
+"""Depth priors: one depth image per training view, in metres, from whatever the recording offers."""
+
+import dataclasses
+import logging
+
+import cv2
+import numpy as np
+
+from endo_sim_ros.reconstruction.config import ReconstructionConfig
+from endo_sim_ros.sequences.frames import Frame, SequenceError
+
+log = logging.getLogger(__name__)
+
+_NEAREST = 0.02  # metres; closer than an endoscope works
+_MIN_POINTS = 30  # points needed to trust an offset
+
+
+def with_depth_prior(frames: list[Frame], points: np.ndarray, config: ReconstructionConfig) -> list[Frame]:
+    """The frames with ``depth`` set to the configured prior, or None where there is none.
+
+    Args:
+        frames: Training views.
+        points: Triangulated scene points [N, 3] (m, world), used to find a constant disparity offset of stereo matching.
+        config: ``depth`` names the source; ``auto`` takes the depth topic, else stereo, else none.
+
+    Raises:
+        SequenceError: If the source asked for is not in the recording.
+    """
+    has_topic = any(frame.depth is not None for frame in frames)
+    has_stereo = any(frame.right is not None for frame in frames)
+    source = config.depth
+    if source == "auto":
+        source = "topic" if has_topic else "stereo" if has_stereo else "none"
+    if source == "topic" and not has_topic:
+        raise SequenceError("depth=topic, but no view has a depth image; publish endoscope/left/depth or use depth=auto")
+    if source == "stereo" and not has_stereo:
+        raise SequenceError("depth=stereo, but no view has a right image; publish endoscope/right/* or use depth=auto")
+    if source == "none":
+        return [dataclasses.replace(frame, depth=None) for frame in frames]
+    if source == "topic":
+        return frames
+    disparities = [None if frame.right is None else stereo_disparity(frame) for frame in frames]
+    offset = disparity_offset(frames, disparities, points)
+    return [dataclasses.replace(f, depth=None if d is None else _to_depth(f, d + offset)) for f, d in zip(frames, disparities)]
+
+
+def stereo_disparity(frame: Frame) -> np.ndarray:
+    """Disparity [H, W] float32 in pixels (0 = none) of a rectified pair by semi-global matching, checked both ways.
+
+    A difference of the principal points of the two eyes is removed, so that disparity = fx·B/z.
+    """
+    left, right = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (frame.image, frame.right))
+    fx = frame.camera.K[0, 0]
+    shift = 0.0 if frame.right_K is None else frame.camera.K[0, 2] - frame.right_K[0, 2]
+    levels = int(np.ceil((fx * frame.baseline / _NEAREST + abs(shift)) / 16)) * 16
+    levels = min(levels, max(frame.camera.width // 2 // 16, 1) * 16)
+    settings = dict(blockSize=5, P1=8 * 25, P2=32 * 25, uniquenessRatio=5, speckleWindowSize=100, speckleRange=2)
+    matcher = cv2.StereoSGBM_create(minDisparity=0, numDisparities=levels, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY, **settings)
+    disparity = matcher.compute(left, right).astype(np.float32) / 16
+    # The right image's own disparity, by matching the mirrored pair, must lead back to the same pixel.
+    mirrored = matcher.compute(np.ascontiguousarray(right[:, ::-1]), np.ascontiguousarray(left[:, ::-1]))[:, ::-1] / 16
+    columns = np.arange(frame.camera.width)[None] - disparity.round().astype(int)
+    back = np.take_along_axis(mirrored.astype(np.float32), columns.clip(0, frame.camera.width - 1), 1)
+    valid = (disparity > 0) & (columns >= 0) & (np.abs(back - disparity) <= 1)
+    return np.where(valid, np.maximum(disparity - np.float32(shift), 0), np.float32(0))
+
+
+def disparity_offset(frames: list[Frame], disparities: list[np.ndarray | None], points: np.ndarray) -> float:
+    """Constant to add to stereo disparities (pixels) so that they agree with points triangulated from the poses.
+
+    A wrong principal point of one eye shifts every disparity by the same amount. Zero when too few points are seen, or
+    when the offset is within the scatter that explains it by chance.
+    """
+    residuals = [np.empty(0)]
+    for frame, disparity in zip(frames, disparities):
+        if disparity is None or not len(points):
+            continue
+        uv, z = frame.camera.project(points)
+        u, v = np.floor(np.nan_to_num(uv, nan=-1.0)).astype(int).T
+        inside = (z > _NEAREST) & (u >= 0) & (v >= 0) & (u < frame.camera.width) & (v < frame.camera.height)
+        measured = disparity[v[inside], u[inside]]
+        expected = frame.camera.K[0, 0] * frame.baseline / z[inside]
+        residuals.append((expected - measured)[measured > 0])
+    residual = np.concatenate(residuals)
+    if len(residual) < _MIN_POINTS:
+        return 0.0
+    offset = float(np.median(residual))
+    spread = 1.4826 * float(np.median(np.abs(residual - offset)))
+    if abs(offset) < max(0.25, 3 * spread / np.sqrt(len(residual))):
+        return 0.0
+    log.info("stereo disparity shifted by %.2f pixels to agree with the poses (%d points, scatter %.2f)", offset, len(residual), spread)
+    return offset
+
+
+def _to_depth(frame: Frame, disparity: np.ndarray) -> np.ndarray:
+    valid = disparity > 0.5
+    return np.where(valid, frame.camera.K[0, 0] * frame.baseline / np.maximum(disparity, 0.5), 0).astype(np.float32)

@@ -1,0 +1,98 @@
+"""Loss terms of the reconstruction. Each returns an unreduced map or a scalar; the trainer weighs them.
+
+Images are [H, W, 3] in [0, 1], depths [H, W] in metres, masks [H, W] in {0, 1}.
+"""
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+_WINDOW, _SIGMA = 11, 1.5  # the SSIM window of the field
+_C1, _C2 = 0.01**2, 0.03**2
+
+
+def masked_mean(values: Tensor, mask: Tensor | None) -> Tensor:
+    """Mean of a map [H, W] or [H, W, C] over the pixels of a mask [H, W] (all without one); 0 for an empty mask."""
+    if mask is None:
+        return values.mean()
+    if values.shape[:2] != mask.shape:
+        raise ValueError(f"masked_mean: values {tuple(values.shape)} do not fit the mask {tuple(mask.shape)}")
+    channels = values[0, 0].numel()
+    weights = mask if values.ndim == 2 else mask[..., None]
+    return (values * weights).sum() / (mask.sum() * channels).clamp_min(1)
+
+
+def photometric(image: Tensor, target: Tensor, mask: Tensor | None, lambda_ssim: float) -> Tensor:
+    """(1 − λ)·L1 + λ·(1 − SSIM), the loss of vanilla 3DGS. Masked pixels are set equal in both images, so they add nothing."""
+    if image.shape != target.shape:
+        raise ValueError(f"photometric: image shape {tuple(image.shape)} != target shape {tuple(target.shape)}")
+    if mask is not None:
+        image, target = image * mask[..., None], target * mask[..., None]
+    l1 = masked_mean((image - target).abs(), mask)
+    if lambda_ssim == 0:
+        return l1
+    return (1 - lambda_ssim) * l1 + lambda_ssim * masked_mean(1 - ssim(image, target), mask)
+
+
+def depth_l1(depth: Tensor, prior: Tensor, mask: Tensor | None) -> Tensor:
+    """|D − D̂| where the prior has a measurement (> 0), metres (paper eq. 4)."""
+    valid = (prior > 0).to(depth.dtype)
+    return masked_mean((depth - prior).abs(), valid if mask is None else valid * mask)
+
+
+def total_variation(depth: Tensor, mask: Tensor | None) -> Tensor:
+    """Mean absolute difference of neighbouring depths, metres (paper eq. 6); pairs across a mask's edge do not count."""
+    dx, dy = (depth[:, 1:] - depth[:, :-1]).abs(), (depth[1:] - depth[:-1]).abs()
+    if mask is None:
+        return dx.mean() + dy.mean()
+    return masked_mean(dx, mask[:, 1:] * mask[:, :-1]) + masked_mean(dy, mask[1:] * mask[:-1])
+
+
+def ssim(image: Tensor, target: Tensor) -> Tensor:
+    """Structural similarity map [H, W, 3] (Wang et al. 2004; 11×11 window, σ 1.5, zero padding), differentiable in ``image``."""
+    return _Ssim.apply(image, target)
+
+
+def _gaussian() -> np.ndarray:
+    x = np.arange(_WINDOW) - _WINDOW // 2
+    weights = np.exp(-(x**2) / (2 * _SIGMA**2))
+    return weights / weights.sum()
+
+
+def _blur(image: Tensor) -> Tensor:
+    """Gaussian window over [H, W, C] with zero padding; symmetric, hence its own adjoint."""
+    if image.device.type == "cpu":  # OpenCV's separable filter is 10 times faster than a convolution here
+        kernel = _gaussian()
+        return torch.from_numpy(
+            cv2.sepFilter2D(image.numpy(), -1, kernel, kernel, borderType=cv2.BORDER_CONSTANT).reshape(image.shape)
+        )
+    kernel = torch.as_tensor(_gaussian(), dtype=image.dtype, device=image.device)
+    planes = image.permute(2, 0, 1)[:, None]
+    pad = _WINDOW // 2
+    planes = torch.nn.functional.conv2d(planes, kernel.view(1, 1, 1, -1), padding=(0, pad))
+    planes = torch.nn.functional.conv2d(planes, kernel.view(1, 1, -1, 1), padding=(pad, 0))
+    return planes[:, 0].permute(1, 2, 0)
+
+
+class _Ssim(torch.autograd.Function):
+    """SSIM = (2 μx μy + C1)(2 σxy + C2) / ((μx² + μy² + C1)(σx² + σy² + C2)) with its gradient in x by hand."""
+
+    @staticmethod
+    def forward(ctx, x: Tensor, y: Tensor) -> Tensor:
+        x, y = x.detach().contiguous(), y.detach().contiguous()
+        mu_x, mu_y = _blur(x), _blur(y)
+        var_x, var_y = _blur(x * x) - mu_x**2, _blur(y * y) - mu_y**2
+        cov = _blur(x * y) - mu_x * mu_y
+        ctx.save_for_backward(x, y, mu_x, mu_y, var_x, var_y, cov)
+        return (2 * mu_x * mu_y + _C1) * (2 * cov + _C2) / ((mu_x**2 + mu_y**2 + _C1) * (var_x + var_y + _C2))
+
+    @staticmethod
+    def backward(ctx, v: Tensor) -> tuple[Tensor, None]:
+        x, y, mu_x, mu_y, var_x, var_y, cov = ctx.saved_tensors
+        A, B = 2 * mu_x * mu_y + _C1, 2 * cov + _C2
+        C, D = mu_x**2 + mu_y**2 + _C1, var_x + var_y + _C2
+        s = A * B / (C * D)
+        v_var, v_cov = -v * s / D, v * 2 * A / (C * D)
+        v_mu = v * (2 * mu_y * B / (C * D) - 2 * mu_x * s / C) - 2 * mu_x * v_var - mu_y * v_cov
+        return _blur(v_mu.contiguous()) + 2 * x * _blur(v_var.contiguous()) + y * _blur(v_cov.contiguous()), None

@@ -1,0 +1,290 @@
+"""Optimises Gaussians against a few views (paper eq. 7) and virtual cameras between them (eq. 8, 9)."""
+
+import logging
+import math
+import pickle
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from endo_sim_ros.cameras import Camera, interpolate_pose
+from endo_sim_ros.device import pick_device
+from endo_sim_ros.gaussians import GaussianModel
+from endo_sim_ros.reconstruction import densification, losses
+from endo_sim_ros.reconstruction.config import ReconstructionConfig
+from endo_sim_ros.reconstruction.depth import with_depth_prior
+from endo_sim_ros.reconstruction.initialization import initial_model
+from endo_sim_ros.reconstruction.triangulation import triangulate
+from endo_sim_ros.sequences.frames import Frame, SequenceError
+from endo_sim_ros.splatting import RenderOutput, rasterize
+
+log = logging.getLogger(__name__)
+
+# Learning rates of 3DGS; that of the means is in units of the scene's depth and decays to a hundredth.
+_RATES = {"means": 1.6e-4, "quats": 1e-3, "log_scales": 5e-3, "logit_opacities": 5e-2, "sh": 2.5e-3}
+_NOISE = 5e5  # of 3DGS-MCMC, in units of the means' learning rate
+_LAST_REFINEMENT = 0.8  # share of the iterations after which the number of Gaussians stays fixed
+
+
+@dataclass(frozen=True)
+class _View:
+    """A training view on the compute device."""
+
+    camera: Camera
+    viewmat: Tensor  # [1, 4, 4]
+    K: Tensor  # [1, 3, 3]
+    image: Tensor  # [H, W, 3] in [0, 1]
+    depth: Tensor | None  # [H, W] m, 0 = none
+    mask: Tensor | None  # [H, W] 1 = tissue
+
+
+class Progress(NamedTuple):
+    """What a running reconstruction reports."""
+
+    iteration: int
+    iterations: int
+    loss: float
+    gaussians: int
+
+
+class Trainer:
+    """Trains a Gaussian model on posed views.
+
+    Args:
+        frames: Training views; every one is used (see `select_keyframes`).
+        config: Options.
+
+    Raises:
+        SequenceError: If there are no views, all pixels are masked, or the views give no scene points to start from.
+    """
+
+    def __init__(self, frames: list[Frame], config: ReconstructionConfig):
+        if not frames:
+            raise SequenceError("there are no views to reconstruct from; check the image, camera_info and pose topics")
+        if all(frame.mask is not None and not frame.mask.any() for frame in frames):
+            raise SequenceError("every pixel of every view is masked; a mask has 255 where there is tissue")
+        self.config = config
+        self.device = pick_device(config.device)
+        frames = [_shrink(frame, config.image_width) for frame in frames]
+        points, colors, _ = triangulate(frames)
+        frames = with_depth_prior(frames, points, config)
+        model = initial_model(frames, points, colors, config)
+        self._views = [self._to_device(frame) for frame in frames]
+        self._nearest = _nearest_views(frames)
+        self.scene_depth = self._median_depth(frames, model)
+        self.iteration = 0
+        self._generator = torch.Generator().manual_seed(config.seed)
+        self._order: list[int] = []
+        self._last_loss = torch.zeros(())
+        self._set_model(model.to(self.device))
+
+    # ------------------------------------------------------------------ state
+
+    @property
+    def model(self) -> GaussianModel:
+        """The current model, detached."""
+        return GaussianModel(**{name: tensor.detach().clone() for name, tensor in self._parameters.items()})
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """The training cameras at training size."""
+        return [view.camera for view in self._views]
+
+    @property
+    def progress(self) -> Progress:
+        return Progress(self.iteration, self.config.iterations, float(self._last_loss), len(self._parameters["means"]))
+
+    def save_checkpoint(self, path: str | Path) -> None:
+        """Write model, optimiser and random state; a training that loads them goes on as if never interrupted."""
+        path = Path(path)
+        state = {
+            "config": asdict(self.config),
+            "iteration": self.iteration,
+            "parameters": {name: tensor.detach() for name, tensor in self._parameters.items()},
+            "optimizer": self._optimizer.state_dict(),
+            "generator": self._generator.get_state(),
+            "order": self._order,
+        }
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_name(path.name + ".part")
+        torch.save(state, partial)
+        partial.replace(path)
+
+    def load_checkpoint(self, path: str | Path) -> None:
+        """Continue from a checkpoint of the same views and options.
+
+        Raises:
+            SequenceError: If the file is not a checkpoint.
+        """
+        try:
+            state = torch.load(path, map_location=self.device, weights_only=True)
+            self._set_model(GaussianModel(**state["parameters"]))
+            self._optimizer.load_state_dict(state["optimizer"])
+            self._generator.set_state(state["generator"].cpu())
+            self.iteration, self._order = state["iteration"], list(state["order"])
+        except (OSError, KeyError, TypeError, ValueError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
+            raise SequenceError(f"{path}: not a readable checkpoint ({error})") from error
+
+    # --------------------------------------------------------------- training
+
+    def run(self, on_progress: Callable[[Progress], bool | None] | None = None, every: int = 20) -> GaussianModel:
+        """Train to the end; ``on_progress`` is called every few iterations and may return False to stop early."""
+        while self.iteration < self.config.iterations:
+            self.step()
+            if on_progress and (self.iteration % every == 0 or self.iteration == self.config.iterations):
+                if on_progress(self.progress) is False:
+                    break
+        return self.model
+
+    def step(self) -> None:
+        """One iteration: a training view, a virtual view, one step of the optimiser."""
+        config = self.config
+        if not self._order:
+            self._order = torch.randperm(len(self._views), generator=self._generator).tolist()
+        index = self._order.pop()
+        loss = self._view_loss(self._views[index])
+        if config.virtual_every and self.iteration % config.virtual_every == 0 and len(self._views) > 1:
+            loss = loss + self._virtual_loss(index)
+        loss.backward()
+        self._last_loss = loss.detach()
+        decay = 0.01 ** (self.iteration / config.iterations)
+        self._optimizer.param_groups[0]["lr"] = _RATES["means"] * self.scene_depth * config.learning_rate * decay
+        self._optimizer.step()
+        self._optimizer.zero_grad(set_to_none=True)
+        self.iteration += 1
+        with torch.no_grad():
+            refining = self.iteration <= _LAST_REFINEMENT * config.iterations
+            if refining and self.iteration % config.refine_every == 0:
+                self._refine()
+            self._explore()
+
+    def _render(self, viewmat: Tensor, K: Tensor, camera: Camera, masks: Tensor | None = None) -> RenderOutput:
+        p = self._parameters
+        return rasterize(
+            p["means"], p["quats"], p["log_scales"].exp(), p["logit_opacities"].sigmoid(), p["sh"],
+            viewmat, K, camera.width, camera.height, masks=masks,
+        )  # fmt: skip
+
+    def _view_loss(self, view: _View) -> Tensor:
+        """Paper eq. 7: photometric, depth, distortion and total variation of one training view."""
+        config = self.config
+        masks = None if view.mask is None else view.mask[None] > 0
+        output = self._render(view.viewmat, view.K, view.camera, masks)
+        loss = losses.photometric(output.colors[0], view.image, view.mask, config.lambda_ssim)
+        if view.depth is not None and config.lambda_depth:
+            loss = loss + config.lambda_depth / self.scene_depth * losses.depth_l1(output.depths[0], view.depth, view.mask)
+        return loss + self._regularization(output, view.mask)
+
+    def _virtual_loss(self, index: int) -> Tensor:
+        """Paper eq. 9: distortion and total variation from a virtual camera between a view and its nearest view."""
+        first, second = self._views[index], self._views[self._nearest[index]]
+        alpha = torch.rand((), generator=self._generator).item()
+        camera = first.camera.at(interpolate_pose(first.camera.pose, second.camera.pose, alpha))
+        viewmat = torch.as_tensor(camera.viewmat, dtype=torch.float32, device=self.device)[None]
+        return self._regularization(self._render(viewmat, first.K, camera), None)
+
+    def _regularization(self, output: RenderOutput, mask: Tensor | None) -> Tensor:
+        config = self.config
+        distortion = losses.masked_mean(output.distortions[0], mask)
+        variation = losses.total_variation(output.depths[0], mask)
+        return (config.lambda_dist * distortion + config.lambda_tv * variation) / self.scene_depth
+
+    # --------------------------------------------------------------- Gaussians
+
+    def _set_model(self, model: GaussianModel) -> None:
+        """Start optimising a model with a fresh optimiser."""
+        self._parameters = {name: tensor.clone().requires_grad_() for name, tensor in model.tensors().items()}
+        groups = [
+            {"params": [self._parameters[name]], "lr": rate * self.config.learning_rate} for name, rate in _RATES.items()
+        ]
+        self._optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True)
+
+    def _refine(self) -> None:
+        """Relocate and add Gaussians, carrying the optimiser's state of those that stay."""
+        model, source, fresh = densification.refine(
+            self.model, self.config.growth, self.config.max_gaussians, self._generator
+        )
+        states = [self._optimizer.state[group["params"][0]] for group in self._optimizer.param_groups]
+        self._set_model(model)
+        for group, state in zip(self._optimizer.param_groups, states):
+            moved = {key: value[source] if value.ndim else value for key, value in state.items()}
+            for key in ("exp_avg", "exp_avg_sq"):
+                if key in moved:
+                    moved[key][fresh] = 0
+            self._optimizer.state[group["params"][0]] = moved
+
+    def _explore(self) -> None:
+        model = GaussianModel(**self._parameters)
+        faint = (model.opacities < 10 * densification.DEAD_OPACITY).nonzero()[:, 0]
+        if len(faint):
+            model = model.select(faint)
+            scale = _NOISE * self._optimizer.param_groups[0]["lr"]
+            noise = densification.exploration_noise(model, covariances(model), scale, self._generator)
+            self._parameters["means"][faint] += noise
+
+    # --------------------------------------------------------------- inputs
+
+    def _to_device(self, frame: Frame) -> _View:
+        tensor = lambda array: torch.as_tensor(array, dtype=torch.float32).to(self.device)  # noqa: E731
+        camera = frame.camera
+        return _View(
+            camera,
+            tensor(camera.viewmat)[None],
+            tensor(camera.K)[None],
+            tensor(frame.image) / 255,
+            None if frame.depth is None else tensor(frame.depth),
+            None if frame.mask is None or frame.mask.all() else tensor(frame.mask > 0),
+        )
+
+    def _median_depth(self, frames: list[Frame], model: GaussianModel) -> float:
+        points = model.means.numpy().astype(np.float64)
+        depths = np.concatenate([frame.camera.project(points)[1] for frame in frames])
+        depths = depths[depths > 0]
+        if not len(depths):
+            raise SequenceError("all scene points lie behind every camera; poses must be camera-to-world, optical frame")
+        return float(np.median(depths))
+
+
+def covariances(model: GaussianModel) -> Tensor:
+    """World covariances R S Sᵀ Rᵀ [N, 3, 3], m²."""
+    w, x, y, z = torch.nn.functional.normalize(model.quats, dim=1).unbind(1)
+    rotation = torch.stack(
+        [
+            1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+        ],
+        1,
+    ).view(-1, 3, 3)  # fmt: skip
+    half = rotation * model.scales[:, None]
+    return half @ half.transpose(1, 2)
+
+
+def _shrink(frame: Frame, width: int) -> Frame:
+    """The frame at the given width, if it is wider."""
+    camera = frame.camera
+    if camera.width <= width:
+        return frame
+    size = (width, max(round(camera.height * width / camera.width), 1))
+    small = camera.resized(*size)
+    area = lambda image: None if image is None else cv2.resize(image, size, interpolation=cv2.INTER_AREA)  # noqa: E731
+    nearest = lambda image: None if image is None else cv2.resize(image, size, interpolation=cv2.INTER_NEAREST)  # noqa: E731
+    right_K = None if frame.right_K is None else np.diag([size[0] / camera.width, size[1] / camera.height, 1]) @ frame.right_K
+    return Frame(
+        frame.stamp_ns, area(frame.image), small, area(frame.right), frame.baseline, right_K,
+        nearest(frame.depth), nearest(frame.mask),
+    )  # fmt: skip
+
+
+def _nearest_views(frames: list[Frame]) -> list[int]:
+    """Index of each view's nearest other view (by optical centre); its own for a single view."""
+    centres = np.array([frame.camera.position for frame in frames])
+    distance = np.linalg.norm(centres[:, None] - centres, axis=2)
+    np.fill_diagonal(distance, math.inf)
+    return distance.argmin(1).tolist()

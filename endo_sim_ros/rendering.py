@@ -1,0 +1,85 @@
+"""A Gaussian model that follows its control nodes, seen by a camera."""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from endo_sim_ros.cameras import Camera
+from endo_sim_ros.config import Range, StageConfig
+from endo_sim_ros.device import pick_device
+from endo_sim_ros.gaussians import SH_C0, GaussianModel
+from endo_sim_ros.physics.skinning import Skinning
+from endo_sim_ros.splatting import render, sh_basis
+
+_MIN_ALPHA = 0.5  # below it there is no surface whose depth could be told
+
+
+@dataclass(frozen=True)
+class RenderingConfig(StageConfig):
+    """From a Gaussian model and the state of its control nodes to camera images."""
+
+    image_width: Annotated[int, Range(0, 8192, "pixels")] = 0
+    """Width of the rendered image; 0 = that of the camera. The height follows."""
+    background: Annotated[float, Range(0, 1)] = 0.0
+    """Grey level where there is no tissue."""
+    skinning: Literal["compact", "softmax"] = "compact"
+    """Weights from nodes to Gaussians: compact (1 - (d/d5)²)² with F, or the paper's printed softmax(d) with R."""
+    neighbours: Annotated[int, Range(1, 32)] = 4
+    """Number of nodes that move one Gaussian."""
+    device: str = "auto"
+    """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""
+
+
+class DeformableRenderer:
+    """Renders one model, at rest or deformed by control nodes.
+
+    Args:
+        model: Gaussians at rest, world.
+        node_rest: Control nodes at rest [M, 3], metres, world; None renders the model at rest only.
+        config: Options.
+    """
+
+    def __init__(self, model: GaussianModel, node_rest: np.ndarray | None, config: RenderingConfig):
+        self.device = pick_device(config.device)
+        self.model = model.detach().to(self.device)
+        self.config = config
+        self._background = torch.full((3,), config.background, device=self.device)
+        self._skinning = None
+        if node_rest is not None:
+            self._skinning = Skinning(
+                self.model, node_rest, neighbours=config.neighbours, weighting=config.skinning, device=self.device
+            )
+
+    def camera(self, camera: Camera) -> Camera:
+        """The camera at the configured image width."""
+        width = self.config.image_width
+        return camera.resized(width, max(round(camera.height * width / camera.width), 1)) if width else camera
+
+    @torch.no_grad()
+    def render(
+        self, camera: Camera, positions: np.ndarray | None = None, F: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """RGB image [H, W, 3] uint8 and depth [H, W] float32 (m, 0 = no surface) for nodes at positions [M, 3] with F [M, 3, 3]."""
+        model, covars = self.model, None
+        if positions is not None:
+            means, covars = self._skinning.deform(positions, F)
+            sh = model.sh
+            if model.sh_degree:
+                sh = self._turned_colors(means, F, camera)
+            model = GaussianModel(means, model.quats, model.log_scales, model.logit_opacities, sh)
+        output = render(model, camera, background=self._background, covars=covars)
+        image = (output.colors[0].clamp(0, 1) * 255 + 0.5).to(torch.uint8)
+        alpha = output.alphas[0]
+        depth = torch.where(alpha > _MIN_ALPHA, output.depths[0] / alpha.clamp_min(1e-6), 0.0)
+        return image.cpu().numpy(), depth.cpu().numpy()
+
+    def _turned_colors(self, means: Tensor, F: np.ndarray, camera: Camera) -> Tensor:
+        """Degree 0 coefficients [N, 1, 3] of the colours seen by the camera: view directions turn back with the tissue."""
+        position = torch.as_tensor(camera.position, dtype=torch.float32, device=self.device)
+        directions = torch.nn.functional.normalize(means - position, dim=1)
+        at_rest = torch.einsum("nij,ni->nj", self._skinning.rotations(F), directions)
+        sh = self.model.sh
+        return (sh_basis(at_rest, sh.shape[1])[..., None] * sh).sum(1, keepdim=True) / SH_C0

@@ -1,0 +1,226 @@
+"""Recordings as rosbag2 files (mcap, zstd chunks); no ROS installation is needed to read or write them."""
+
+import contextlib
+import struct
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, ReaderError, StoragePlugin, Writer
+
+from endo_sim_ros import messages
+from endo_sim_ros.messages import Topic, bag_types
+from endo_sim_ros.sequences.frames import Frame, SequenceError
+from endo_sim_ros.sequences.synchronizer import Synchronizer
+
+LEFT_FRAME, RIGHT_FRAME, WORLD_FRAME = "endoscope_left", "endoscope_right", "world"
+
+
+class RawMessage(NamedTuple):
+    """A serialised message of a bag."""
+
+    topic: str  # absolute name
+    type: str
+    stamp_ns: int  # time of recording
+    data: bytes  # CDR
+
+
+class BagWriter:
+    """Writes messages of the contract, or raw ones of any type, into a new bag. Use as a context manager.
+
+    What was written is kept, and readable, also when the block ends with an error.
+
+    Raises:
+        SequenceError: If the path exists.
+    """
+
+    def __init__(self, path: str | Path):
+        if Path(path).exists():
+            raise SequenceError(f"{path} exists already; choose another name or remove it first")
+        self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
+        self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+        self._connections: dict[str, Any] = {}
+
+    def __enter__(self) -> "BagWriter":
+        self._writer.open()
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self._writer.close()
+
+    def write(self, topic: Topic, message: Any, stamp_ns: int) -> None:
+        """Append a message built from `messages.bag_types`."""
+        self.write_raw(topic, bag_types().typestore.serialize_cdr(message, topic.type), stamp_ns)
+
+    def write_raw(self, topic: Topic, data: bytes, stamp_ns: int) -> None:
+        """Append a serialised message."""
+        name = topic.name if topic.name.startswith("/") else f"/{topic.name}"
+        if name not in self._connections:
+            self._connections[name] = self._writer.add_connection(
+                name, topic.type, typestore=bag_types().typestore, offered_qos_profiles=[_qos(topic.qos == "latched")]
+            )
+        self._writer.write(self._connections[name], stamp_ns, data)
+
+
+def _qos(latched: bool) -> Qos:
+    forever = QosTime(2147483647, 4294967295)
+    return Qos(
+        QosHistory.KEEP_LAST,
+        1 if latched else 10,
+        QosReliability.RELIABLE,
+        QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE,
+        forever,
+        forever,
+        QosLiveliness.AUTOMATIC,
+        forever,
+        False,
+    )
+
+
+@contextlib.contextmanager
+def _readable(path: str | Path) -> Iterator[None]:
+    """Turn whatever a damaged bag raises into one sentence."""
+    try:
+        yield
+    except (SequenceError, GeneratorExit, KeyboardInterrupt):
+        raise
+    except FileNotFoundError:
+        raise SequenceError(f"{path}: no such bag; give a rosbag2 folder (with metadata.yaml) or an .mcap file") from None
+    except (ReaderError, AssertionError, OSError, KeyError, IndexError, TypeError, ValueError, EOFError, struct.error) as error:
+        raise SequenceError(f"{path}: the bag cannot be read ({type(error).__name__}: {error}); record or convert it again") from error
+
+
+class BagReader:
+    """Reads a rosbag2 folder or a single .mcap file. Use as a context manager.
+
+    Raises:
+        SequenceError: If there is no such bag or it is damaged.
+    """
+
+    def __init__(self, path: str | Path):
+        self.path = Path(path)
+        if not self.path.exists():
+            raise SequenceError(f"{path}: no such bag; give a rosbag2 folder (with metadata.yaml) or an .mcap file")
+        with _readable(path):
+            self._reader = Reader(self.path)
+
+    def __enter__(self) -> "BagReader":
+        with _readable(self.path):
+            self._reader.open()
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self._reader.close()
+
+    @property
+    def topics(self) -> dict[str, str]:
+        """Type of every topic by absolute name."""
+        return {connection.topic: connection.msgtype for connection in self._reader.connections}
+
+    @property
+    def latched(self) -> set[str]:
+        """Absolute names of the topics that were offered to late joiners."""
+        return {
+            connection.topic
+            for connection in self._reader.connections
+            if any(qos.durability == QosDurability.TRANSIENT_LOCAL for qos in connection.ext.offered_qos_profiles)
+        }
+
+    @property
+    def duration(self) -> float:
+        """Seconds between first and last message."""
+        return self._reader.duration * 1e-9
+
+    @property
+    def message_count(self) -> int:
+        return self._reader.message_count
+
+    def raw_messages(self, topics: Iterable[str] | None = None) -> Iterator[RawMessage]:
+        """Serialised messages in the order of recording, of all topics or of the absolute names given."""
+        wanted = None if topics is None else set(topics)
+        connections = [c for c in self._reader.connections if wanted is None or c.topic in wanted]
+        if not connections:
+            return
+        with _readable(self.path):
+            for connection, stamp_ns, data in self._reader.messages(connections):
+                yield RawMessage(connection.topic, connection.msgtype, stamp_ns, data)
+
+    def messages(self, topics: Iterable[Topic]) -> Iterator[tuple[Topic, int, Any]]:
+        """(topic, time of recording, message) of the given topics of the contract."""
+        wanted = {f"/{topic.name.lstrip('/')}": topic for topic in topics}
+        for raw in self.raw_messages(wanted):
+            topic = wanted[raw.topic]
+            if raw.type != topic.type:
+                raise SequenceError(f"{self.path}: {raw.topic} is a {raw.type}, expected a {topic.type}; remap or convert it")
+            with _readable(self.path):
+                message = bag_types().typestore.deserialize_cdr(raw.data, raw.type)
+            yield topic, raw.stamp_ns, message
+
+
+def write_bag(path: str | Path, frames: Iterable[Frame]) -> int:
+    """Write frames as a bag with the recording topics of the contract and return their number.
+
+    Raises:
+        SequenceError: If the path exists or there are no frames.
+    """
+    count, types = 0, bag_types()
+    with BagWriter(path) as bag:
+        for frame in frames:
+            stamp, camera = frame.stamp_ns, frame.camera
+            size = (camera.width, camera.height)
+            bag.write(messages.LEFT_INFO, messages.encode_camera_info(camera.K, *size, stamp, LEFT_FRAME, types=types), stamp)
+            bag.write(messages.CAMERA_POSE, messages.encode_pose(camera.pose, stamp, WORLD_FRAME, types), stamp)
+            bag.write(messages.LEFT_IMAGE, messages.encode_image(frame.image, stamp, LEFT_FRAME, types), stamp)
+            if frame.right is not None:
+                K = camera.K if frame.right_K is None else frame.right_K
+                info = messages.encode_camera_info(K, *size, stamp, RIGHT_FRAME, frame.baseline, types)
+                bag.write(messages.RIGHT_INFO, info, stamp)
+                bag.write(messages.RIGHT_IMAGE, messages.encode_image(frame.right, stamp, RIGHT_FRAME, types), stamp)
+            if frame.depth is not None:
+                bag.write(messages.DEPTH, messages.encode_image(frame.depth.astype("float32"), stamp, LEFT_FRAME, types), stamp)
+            if frame.mask is not None:
+                bag.write(messages.MASK, messages.encode_image(frame.mask, stamp, LEFT_FRAME, types), stamp)
+            count += 1
+    if not count:
+        raise SequenceError(f"{path}: the sequence has no frames; check its frame range and poses")
+    return count
+
+
+def read_bag(path: str | Path, tolerance: float = 0.01, world_frame: str = WORLD_FRAME) -> Iterator[Frame]:
+    """Frames of a bag with the recording topics of the contract, in order.
+
+    Raises:
+        SequenceError: If the bag is damaged or lacks images, camera_info or poses; the message lists what it has.
+    """
+    synchronizer = Synchronizer(tolerance)
+    with BagReader(path) as bag:
+        present = bag.topics
+        needed = ((messages.LEFT_IMAGE, messages.LEFT_COMPRESSED), (messages.LEFT_INFO,), (messages.CAMERA_POSE,))
+        for choices in needed:
+            if not any(f"/{topic.name}" in present for topic in choices):
+                raise SequenceError(
+                    f"{path}: no topic /{choices[0].name}; the bag has {', '.join(sorted(present)) or 'no topics'}"
+                )
+        for topic, _, message in bag.messages(messages.RECORDING_TOPICS):
+            try:
+                yield from feed(synchronizer, topic, message, world_frame)
+            except messages.MessageError as error:
+                raise SequenceError(f"{path}: {error}") from error
+    yield from synchronizer.flush()
+
+
+def feed(synchronizer: Synchronizer, topic: Topic, message: Any, world_frame: str) -> list[Frame]:
+    """Decode one message of a recording topic into the synchroniser and return the frames that became complete."""
+    stamp = messages.stamp_to_ns(message.header.stamp)
+    if topic in (messages.LEFT_INFO, messages.RIGHT_INFO):
+        synchronizer.add_info("left" if topic is messages.LEFT_INFO else "right", messages.decode_camera_info(message, topic.name))
+        return []
+    if topic is messages.CAMERA_POSE:
+        return synchronizer.add("pose", stamp, messages.decode_pose(message, world_frame, topic.name))
+    if topic is messages.DEPTH:
+        return synchronizer.add("depth", stamp, messages.decode_depth(message, topic.name))
+    if topic is messages.MASK:
+        return synchronizer.add("mask", stamp, messages.decode_mask(message, topic.name))
+    stream = "image" if topic in (messages.LEFT_IMAGE, messages.LEFT_COMPRESSED) else "right"
+    return synchronizer.add(stream, stamp, messages.decode_image(message, topic.name))

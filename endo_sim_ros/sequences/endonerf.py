@@ -1,0 +1,138 @@
+"""EndoNeRF: a fixed stereo endoscope over tissue that is pulled and cut, prepared in the LLFF layout.
+
+    pulling_soft_tissues/
+      images/%06d.png
+      poses_bounds.npy     17 floats per frame: 3×5 [down right back | position | height width focal], near, far
+      depth/               8 or 16 bit, optional
+      masks/               white = tool, optional
+"""
+
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from endo_sim_ros.cameras import Camera
+from endo_sim_ros.sequences.frames import Frame, SequenceError
+from endo_sim_ros.sequences.recordings import (
+    DEFAULT_FPS,
+    Recording,
+    check_folder,
+    intrinsic_matrix,
+    numbered_files,
+    read_depth,
+    read_gray,
+    read_image,
+    rigid,
+    select,
+    stamp_ns,
+    tissue_mask,
+    tool_is_white,
+)
+
+logger = logging.getLogger(__name__)
+
+POSES_FILE = "poses_bounds.npy"
+
+
+def read_endonerf(
+    path: Path | str,
+    *,
+    start: int | None = None,
+    stop: int | None = None,
+    step: int = 1,
+    depth_scale: float = 1e-3,
+    pose_scale: float | None = None,
+    mask_polarity: str = "tool",
+    fps: float | None = None,
+) -> Recording:
+    """Read an EndoNeRF scene.
+
+    Args:
+        path: The scene's folder.
+        start, stop: First frame number, and the one to stop before.
+        step: Take every step-th frame.
+        depth_scale: Metres per unit of the depth images; millimetres by default.
+        pose_scale: Metres per unit of the camera positions; None = as the depth images.
+        mask_polarity: What white means in the masks: `tool`, `tissue`, or `auto` to find out.
+        fps: Frames per second; None = 25.
+
+    Returns:
+        Frames of one eye; the images are rectified as published.
+
+    Raises:
+        SequenceError: If a file is missing or wrong.
+    """
+    root = check_folder(path)
+    images = numbered_files(root / "images")
+    if not images:
+        raise SequenceError(f"{root / 'images'}: holds no images named like 000000.png")
+    table = _read_table(root / POSES_FILE)
+    if len(table) != len(images):
+        raise SequenceError(
+            f"{root / POSES_FILE}: has {len(table)} poses, but {root / 'images'} has {len(images)} images; "
+            "each image needs one row"
+        )
+    rows = dict(zip(sorted(images), table, strict=True))
+    numbers = select(images, root, start, stop, step)
+    depths, masks = numbered_files(root / "depth"), numbered_files(root / "masks")
+    for name, files in (("depth", depths), ("masks", masks)):
+        lacking = [n for n in numbers if n not in files]
+        if files and lacking:
+            logger.warning("%s: %d of %d frames have no image there", root / name, len(lacking), len(numbers))
+    white_is_tool = False
+    if masks:
+        sample = (read_gray(masks[n]) for n in sorted(masks)[:: max(1, len(masks) // 20)])
+        white_is_tool = tool_is_white(sample, root / "masks", mask_polarity)
+    pose_scale = depth_scale if pose_scale is None else pose_scale
+
+    def frames() -> Iterator[Frame]:
+        for number in numbers:
+            image = read_image(images[number])
+            size = image.shape[1::-1]
+            source = f"{root / POSES_FILE}: row of frame {number}"
+            yield Frame(
+                stamp_ns=stamp_ns(number, fps or DEFAULT_FPS),
+                image=image,
+                camera=_camera(rows[number], size, pose_scale, source),
+                depth=_sized(read_depth(depths[number], depth_scale), size, depths[number]) if number in depths else None,
+                mask=tissue_mask(read_gray(masks[number]), white_is_tool=white_is_tool, size=size)
+                if number in masks
+                else None,
+            )
+
+    return Recording(frames, len(numbers))
+
+
+def _read_table(path: Path) -> np.ndarray:
+    """The rows [N, 17] of a poses_bounds file."""
+    if not path.is_file():
+        raise SequenceError(f"{path}: file is missing; it holds the camera of every image")
+    try:
+        table = np.load(path, allow_pickle=False)
+    except (ValueError, OSError, EOFError) as error:
+        raise SequenceError(f"{path}: not a readable NumPy array ({error})") from None
+    if table.ndim != 2 or table.shape[1] != 17 or not np.isfinite(table).all():
+        raise SequenceError(f"{path}: expected finite numbers of shape [frames, 17], got shape {list(table.shape)}")
+    return table.astype(np.float64)
+
+
+def _camera(row: np.ndarray, size: tuple[int, int], pose_scale: float, source: str) -> Camera:
+    """The camera of one LLFF row; the principal point is the image centre, as LLFF has none."""
+    block = row[:15].reshape(3, 5)
+    height, width, focal = block[:, 4]
+    if min(height, width, focal) <= 0:
+        raise SequenceError(f"{source}: height, width and focal must be positive, got {block[:, 4].tolist()}")
+    matrix = np.eye(4)
+    down, right, back = block[:, 0], block[:, 1], block[:, 2]
+    matrix[:3, :3] = np.stack([right, down, -back], 1)  # optical frame: x right, y down, z forward
+    matrix[:3, 3] = block[:, 3] * pose_scale
+    K = intrinsic_matrix(focal * size[0] / width, focal * size[1] / height, size[0] / 2, size[1] / 2)
+    return Camera(K, *size, rigid(matrix, source))
+
+
+def _sized(depth: np.ndarray, size: tuple[int, int], path: Path) -> np.ndarray:
+    if depth.shape[::-1] != size:
+        raise SequenceError(f"{path}: is {depth.shape[1]}×{depth.shape[0]}, but its image is {size[0]}×{size[1]}")
+    return depth

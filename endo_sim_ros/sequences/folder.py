@@ -1,0 +1,150 @@
+"""A plain folder of rectified images, the layout to bring other data in.
+
+    my_recording/
+      left/000001.png …       rectified images; the number in the name is the frame number
+      right/000001.png …      optional; rectified, same K
+      calibration.yaml        fx fy cx cy [pixels], baseline_m [with right/], optional fps, distortion (left only)
+      poses_left.txt          frame tx ty tz qx qy qz qw, camera-to-world, metres; without it poses are estimated
+      masks/000001.png …      optional; 255 = tissue, 0 = ignore
+      depth/000001.png …      optional; 16 bit, millimetres (see depth_scale), 0 = none
+"""
+
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from endo_sim_ros.cameras import Camera
+from endo_sim_ros.sequences.frames import Frame, SequenceError
+from endo_sim_ros.sequences.recordings import (
+    DEFAULT_FPS,
+    Recording,
+    check_folder,
+    intrinsic_matrix,
+    lit_area,
+    numbered_files,
+    read_calibration,
+    read_depth,
+    read_gray,
+    read_image,
+    read_poses,
+    select,
+    spread,
+    stamp_ns,
+    tissue_mask,
+    tool_is_white,
+)
+from endo_sim_ros.sequences.rectification import Rectification
+from endo_sim_ros.sequences.structure_from_motion import with_estimated_poses
+
+logger = logging.getLogger(__name__)
+
+CALIBRATION_FILE = "calibration.yaml"
+POSE_FILES = ("poses_left.txt", "poses.txt")
+
+
+def read_folder(
+    path: Path | str,
+    *,
+    start: int | None = None,
+    stop: int | None = None,
+    step: int = 1,
+    depth_scale: float = 1e-3,
+    mask_polarity: str = "tissue",
+    mask_border: bool = True,
+    fps: float | None = None,
+) -> Recording:
+    """Read a folder of images.
+
+    Args:
+        path: The folder that holds left/ and calibration.yaml.
+        start, stop: First frame number, and the one to stop before.
+        step: Take every step-th image.
+        depth_scale: Metres per unit of integer depth images; float images are metres.
+        mask_polarity: What white means in the masks: `tool`, `tissue`, or `auto` to find out.
+        mask_border: Ignore the black border that rectification or a round vignette leaves.
+        fps: Frames per second that frame numbers count in; None takes the calibration's, or 25.
+
+    Raises:
+        SequenceError: If a file is missing or wrong.
+    """
+    root = check_folder(path)
+    left, right = numbered_files(root / "left"), numbered_files(root / "right")
+    if not left:
+        raise SequenceError(f"{root / 'left'}: holds no images named like 000001.png")
+    calibration = read_calibration(root / CALIBRATION_FILE)
+    K = intrinsic_matrix(*(calibration[name] for name in ("fx", "fy", "cx", "cy")))
+    baseline = calibration.get("baseline_m")
+    if right and baseline is None:
+        raise SequenceError(f"{root / CALIBRATION_FILE}: baseline_m is missing, but there are right images")
+    if right and any(calibration["distortion"]):
+        raise SequenceError(f"{root / CALIBRATION_FILE}: stereo images must be rectified already; drop distortion or right/")
+    fps = fps or calibration.get("fps", DEFAULT_FPS)
+
+    numbers = select(left, root / "left", start, stop, step)
+    poses = None
+    pose_file = next((root / name for name in POSE_FILES if (root / name).is_file()), None)
+    if pose_file:
+        poses = read_poses(pose_file)
+        posed = [n for n in numbers if n in poses]
+        if not posed:
+            raise SequenceError(f"{pose_file}: holds no pose for any of the {len(numbers)} chosen images")
+        if len(posed) < len(numbers):
+            logger.info("%s: %d of %d images have no pose and are skipped", root, len(numbers) - len(posed), len(numbers))
+        numbers = posed
+    missing = [n for n in numbers if right and n not in right]
+    if missing:
+        raise SequenceError(f"{root / 'right'}: the right image of {left[missing[0]].name} is missing")
+
+    size = read_image(left[numbers[0]]).shape[1::-1]
+    stated = calibration.get("width", size[0]), calibration.get("height", size[1])
+    if stated != size:
+        raise SequenceError(
+            f"{root / CALIBRATION_FILE}: is for images of {stated[0]}×{stated[1]}, but {left[numbers[0]].name} is "
+            f"{size[0]}×{size[1]}; scale the intrinsics or the images"
+        )
+    rectification = Rectification.mono(K, calibration["distortion"], size)
+    masks, depths = numbered_files(root / "masks"), numbered_files(root / "depth")
+    white_is_tool = False
+    if masks:
+        sample = (read_gray(masks[n]) for n in spread(sorted(masks), 20))
+        white_is_tool = tool_is_white(sample, root / "masks", mask_polarity)
+
+    def image_of(file: Path) -> np.ndarray:
+        image = read_image(file)
+        if image.shape[1::-1] != size:
+            raise SequenceError(
+                f"{file}: is {image.shape[1]}×{image.shape[0]}, but the first image is {size[0]}×{size[1]}"
+            )
+        return image
+
+    def frames() -> Iterator[Frame]:
+        lit = lit_area(image_of(left[n]) for n in spread(numbers, 10)) if mask_border else np.full(size[::-1], 255, np.uint8)
+        for number in numbers:
+            mask, depth = lit, None
+            if number in masks:
+                tissue = tissue_mask(read_gray(masks[number]), white_is_tool=white_is_tool, size=size)
+                mask = cv2.bitwise_and(lit, tissue)
+            if number in depths:
+                z = read_depth(depths[number], depth_scale)
+                if z.shape[::-1] != size:
+                    raise SequenceError(f"{depths[number]}: is {z.shape[1]}×{z.shape[0]}, but its image is {size[0]}×{size[1]}")
+                depth = rectification.depth(np.dstack([np.zeros_like(z)] * 2 + [z]))
+            pose = np.eye(4) if poses is None else poses[number]
+            yield Frame(
+                stamp_ns=stamp_ns(number, fps),
+                image=rectification.left(image_of(left[number])),
+                camera=Camera(rectification.K, *size, pose),
+                right=image_of(right[number]) if right else None,
+                baseline=baseline if right else None,
+                depth=depth,
+                mask=rectification.mask(mask),
+            )
+
+    recording = Recording(frames, len(numbers))
+    if poses is not None:
+        return recording
+    logger.warning("%s: no %s, so poses come from structure from motion", root, " or ".join(POSE_FILES))
+    return with_estimated_poses(recording, len(numbers), root)

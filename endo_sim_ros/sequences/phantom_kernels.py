@@ -1,0 +1,230 @@
+"""Ray casting and shading of the phantom's height field, one thread per pixel.
+
+The surface is z = h(x, y): a grid of (n + 1)² vertices `cell` metres apart, bilinear in between, centred on the z axis
+and repeated as in a mirror beyond its border, without end. Grid coordinates are u = x / cell + n / 2, v alike.
+Maps with several levels of detail are stored flat, level after level; level l has (n >> l) + 1 vertices a side.
+
+Along a ray p(t) = o + t d (t is the depth, since camera-frame rays have unit z), z(t) - h(u(t), v(t)) is a quadratic in
+t within one cell, so hits are found exactly. Cells are skipped with a pyramid of their minimal heights
+(Tevs, Ihrke and Seidel, "Maximum mipmaps for fast, accurate, and scalable dynamic height field rendering", I3D 2008).
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False, "fast_math": False})
+
+TOP_LEVEL = wp.constant(6)  # the coarsest cells a ray skips at once are 2^6 cells wide
+FAR = wp.constant(1.0e9)
+
+
+@wp.struct
+class Surface:
+    """The height field and what it looks like; see the module's header for the layout."""
+
+    n: int  # cells a side, a power of two
+    cell: float  # width of a cell, metres
+    lowest: float  # bounds of the heights, metres
+    highest: float
+    heights: wp.array[float]  # [(n + 1)²] metres
+    nearest: wp.array[float]  # minimum of the heights over every cell, levels of (n >> l)² cells, flat
+    colours: wp.array[wp.vec4]  # linear albedo and wetness, levels of detail, flat
+    slopes: wp.array[wp.vec4]  # dh/dx, dh/dy, and the same of the wet film on top; levels of detail, flat
+
+
+@wp.struct
+class Light:
+    """A point light with inverse-square falloff, and how tissue answers it."""
+
+    position: wp.vec3  # world, metres
+    power: float  # radiance of a white surface facing the light is power / distance²
+    wrap: wp.vec3  # how far each colour scatters past the terminator, 0..1: red the farthest
+    sheen: float  # strength of the broad, satin reflection
+    glint: float  # strength of the mirror reflection of the wet film
+    sharpness: float  # its Blinn-Phong exponent
+
+
+@wp.func
+def mirrored(u: float, n: float):
+    """Grid coordinate folded back into [0, n], and the sign that a derivative along it takes."""
+    m = u - 2.0 * n * wp.floor(u / (2.0 * n))
+    sign = 1.0
+    if m > n:
+        m = 2.0 * n - m
+        sign = -1.0
+    return m, sign
+
+
+@wp.func
+def mirrored_cell(i: int, n: int):
+    m = i % (2 * n)
+    if m < 0:
+        m += 2 * n
+    if m >= n:
+        m = 2 * n - 1 - m
+    return m
+
+
+@wp.func
+def height_at(surface: Surface, u: float, v: float):
+    fu, _ = mirrored(u, float(surface.n))
+    fv, _ = mirrored(v, float(surface.n))
+    i = wp.min(int(fu), surface.n - 1)
+    j = wp.min(int(fv), surface.n - 1)
+    a = fu - float(i)
+    b = fv - float(j)
+    k = j * (surface.n + 1) + i
+    near = (1.0 - a) * surface.heights[k] + a * surface.heights[k + 1]
+    k += surface.n + 1
+    return (1.0 - b) * near + b * ((1.0 - a) * surface.heights[k] + a * surface.heights[k + 1])
+
+
+@wp.func
+def sample(texture: wp.array[wp.vec4], n: int, level: int, u: float, v: float):
+    """Bilinear value of one level of detail at folded grid coordinates of level 0."""
+    offset = int(0)
+    for coarser in range(level):
+        side = (n >> coarser) + 1
+        offset += side * side
+    side = n >> level
+    scale = 1.0 / float(1 << level)
+    i = wp.min(int(u * scale), side - 1)
+    j = wp.min(int(v * scale), side - 1)
+    a = u * scale - float(i)
+    b = v * scale - float(j)
+    k = offset + j * (side + 1) + i
+    near = (1.0 - a) * texture[k] + a * texture[k + 1]
+    k += side + 1
+    return (1.0 - b) * near + b * ((1.0 - a) * texture[k] + a * texture[k + 1])
+
+
+@wp.func
+def hit_in_cell(
+    surface: Surface, u: float, v: float, z: float, du: float, dv: float, dz: float, start: float, end: float
+):
+    """First depth in [start, end], both in one cell, at which the ray is on the surface; negative if there is none."""
+    half = 0.5 * (end - start)
+    f0 = z + start * dz - height_at(surface, u + start * du, v + start * dv)
+    f1 = z + (start + half) * dz - height_at(surface, u + (start + half) * du, v + (start + half) * dv)
+    f2 = z + end * dz - height_at(surface, u + end * du, v + end * dv)
+    if f0 >= 0.0:
+        return start
+    # f(s) = f0 + b s + a s² through the three values, s in [0, 2]; the form below is stable as a goes to 0
+    a = 0.5 * (f2 - 2.0 * f1 + f0)
+    b = f1 - f0 - a
+    discriminant = b * b - 4.0 * a * f0
+    if discriminant < 0.0:
+        return -1.0
+    denominator = b + wp.sqrt(discriminant)
+    if denominator <= 0.0:
+        return -1.0
+    s = -2.0 * f0 / denominator
+    if s > 2.0:
+        if f2 >= 0.0:
+            return end
+        return -1.0
+    return start + s * half
+
+
+@wp.func
+def cast(surface: Surface, origin: wp.vec3, ray: wp.vec3):
+    """Depth at which a ray first meets the surface, 0 if it never does."""
+    n = surface.n
+    u = origin[0] / surface.cell + 0.5 * float(n)
+    v = origin[1] / surface.cell + 0.5 * float(n)
+    du = ray[0] / surface.cell
+    dv = ray[1] / surface.cell
+    if ray[2] <= 1.0e-3:
+        return 0.0
+    t = wp.max((surface.lowest - origin[2]) / ray[2], 0.0)
+    last = (surface.highest - origin[2]) / ray[2] + 1.0e-6
+    nudge = 1.0e-3 / wp.max(wp.max(wp.abs(du), wp.abs(dv)), 1.0)  # past a cell's border, in depth
+    level = int(TOP_LEVEL)
+    for _ in range(4000):
+        if t > last:
+            break
+        size = float(1 << level)
+        i = wp.floor((u + t * du) / size)
+        j = wp.floor((v + t * dv) / size)
+        exit_u = FAR
+        exit_v = FAR
+        if du > 0.0:
+            exit_u = ((i + 1.0) * size - u) / du
+        if du < 0.0:
+            exit_u = (i * size - u) / du
+        if dv > 0.0:
+            exit_v = ((j + 1.0) * size - v) / dv
+        if dv < 0.0:
+            exit_v = (j * size - v) / dv
+        leave = wp.min(wp.max(wp.min(exit_u, exit_v), t), last)
+        offset = int(0)
+        for finer in range(level):
+            offset += (n >> finer) * (n >> finer)
+        side = n >> level
+        nearest = surface.nearest[offset + mirrored_cell(int(j), side) * side + mirrored_cell(int(i), side)]
+        reach = (nearest - origin[2]) / ray[2]  # the depth at which the ray gets down to the cell's nearest point
+        if reach > leave:
+            t = leave + nudge
+            level = wp.min(level + 1, TOP_LEVEL)
+        elif level > 0:
+            t = wp.max(t, reach)
+            level -= 1
+        else:
+            hit = hit_in_cell(surface, u, v, origin[2], du, dv, ray[2], t, leave)
+            if hit >= 0.0:
+                return hit
+            t = leave + nudge
+            level = 1
+    return 0.0
+
+
+@wp.func
+def shade(surface: Surface, light: Light, point: wp.vec3, eye: wp.vec3, footprint: float):
+    """Linear radiance towards the eye of a surface point, filtered over a footprint in metres."""
+    u, sign_u = mirrored(point[0] / surface.cell + 0.5 * float(surface.n), float(surface.n))
+    v, sign_v = mirrored(point[1] / surface.cell + 0.5 * float(surface.n), float(surface.n))
+    detail = wp.clamp(wp.log2(footprint / surface.cell), 0.0, 4.999)
+    level = int(detail)
+    blend = detail - float(level)
+    colour = sample(surface.colours, surface.n, level, u, v)
+    slope = sample(surface.slopes, surface.n, level, u, v)
+    if blend > 0.02:
+        colour += blend * (sample(surface.colours, surface.n, level + 1, u, v) - colour)
+        slope += blend * (sample(surface.slopes, surface.n, level + 1, u, v) - slope)
+    normal = wp.normalize(wp.vec3(sign_u * slope[0], sign_v * slope[1], -1.0))
+    film = wp.normalize(wp.vec3(sign_u * (slope[0] + slope[2]), sign_v * (slope[1] + slope[3]), -1.0))
+    to_eye = wp.normalize(eye - point)
+    to_light = light.position - point
+    irradiance = light.power / wp.dot(to_light, to_light)
+    to_light = wp.normalize(to_light)
+    halfway = wp.normalize(to_light + to_eye)
+    facing = wp.dot(normal, to_light)
+    diffuse = wp.vec3()
+    for c in range(3):
+        w = light.wrap[c]
+        lit = wp.max((facing + w) / (1.0 + w), 0.0)
+        diffuse[c] = colour[c] * lit * wp.sqrt(lit)
+    sheen = light.sheen * wp.pow(wp.max(wp.dot(normal, halfway), 0.0), 24.0)
+    glint = light.glint * wp.pow(wp.max(wp.dot(film, halfway), 0.0), light.sharpness)
+    reflection = colour[3] * (sheen + colour[3] * glint)
+    return irradiance * (diffuse + wp.vec3(reflection, reflection, reflection))
+
+
+@wp.kernel
+def render(
+    surface: Surface,
+    light: Light,
+    pose: wp.mat44,  # camera-to-world
+    focal: wp.vec2,  # pixels
+    centre: wp.vec2,
+    depth: wp.array2d[float],  # out, [H, W] metres, 0 = no surface
+    radiance: wp.array2d[wp.vec3],  # out, [H, W] linear
+):
+    y, x = wp.tid()
+    local = wp.vec3((float(x) + 0.5 - centre[0]) / focal[0], (float(y) + 0.5 - centre[1]) / focal[1], 1.0)
+    ray = wp.transform_vector(pose, local)
+    origin = wp.transform_point(pose, wp.vec3(0.0, 0.0, 0.0))
+    t = cast(surface, origin, ray)
+    depth[y, x] = t
+    radiance[y, x] = wp.vec3()
+    if t > 0.0:
+        radiance[y, x] = shade(surface, light, origin + t * ray, origin, t / focal[0])

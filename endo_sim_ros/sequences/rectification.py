@@ -1,0 +1,178 @@
+"""Undistortion and stereo rectification.
+
+Calibrations on the way in follow OpenCV (pixel (0, 0) has its centre at (0, 0)); the rectified K on the way out
+follows `endo_sim_ros.cameras` (centre at (0.5, 0.5)).
+"""
+
+import dataclasses
+import logging
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from endo_sim_ros.sequences.frames import SequenceError
+from endo_sim_ros.sequences.recordings import clean_depth
+
+logger = logging.getLogger(__name__)
+
+HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+
+
+@dataclass(frozen=True)
+class StereoCalibration:
+    """Two cameras as a stereo calibration gives them, OpenCV conventions.
+
+    Args:
+        source: The calibration file, for messages.
+        size: Image width and height, pixels.
+        K_left, K_right: Intrinsic matrices [3, 3], pixels.
+        D_left, D_right: Distortion coefficients [4, 5 or 8].
+        R, T: Rotation [3, 3] and translation [3], metres, from the left to the right camera: x_right = R x_left + T.
+    """
+
+    source: str
+    size: tuple[int, int]
+    K_left: np.ndarray
+    D_left: np.ndarray
+    K_right: np.ndarray
+    D_right: np.ndarray
+    R: np.ndarray
+    T: np.ndarray
+
+    def __post_init__(self):
+        shapes = {"K_left": (3, 3), "K_right": (3, 3), "R": (3, 3), "T": (3,), "D_left": None, "D_right": None}
+        for name, shape in shapes.items():
+            value = np.asarray(getattr(self, name), np.float64)
+            value = value.ravel() if len(shape or (1,)) == 1 else value
+            if not np.isfinite(value).all() or (shape and value.shape != shape):
+                raise SequenceError(f"{self.source}: {name} must be finite with shape {shape}, got {value.tolist()}")
+            object.__setattr__(self, name, value)
+        for name in ("K_left", "K_right"):
+            K = getattr(self, name)
+            if K[0, 0] <= 0 or K[1, 1] <= 0:
+                raise SequenceError(f"{self.source}: {name} must have positive focal lengths, got {K.tolist()}")
+        if np.abs(self.R @ self.R.T - np.eye(3)).max() > 0.01 or np.linalg.det(self.R) < 0:
+            raise SequenceError(f"{self.source}: R is not a rotation: {self.R.tolist()}")
+        if not np.abs(self.T[0]) > 1e-5:
+            raise SequenceError(f"{self.source}: T has no horizontal part ({self.T.tolist()} m), so there is no baseline")
+        if not 0.5e-3 < np.abs(self.T[0]) < 0.05:
+            logger.warning("%s: a baseline of %.3g m is unusual for an endoscope; T is read as millimetres",
+                           self.source, abs(self.T[0]))  # fmt: skip
+        if self.T[0] > 0:
+            # Some tools write the pose of the right camera instead of the change of coordinates.
+            logger.warning("%s: T points to the right eye, so R and T are read as its pose in the left frame", self.source)
+            object.__setattr__(self, "T", -self.R.T @ self.T)
+            object.__setattr__(self, "R", self.R.T.copy())
+
+    def resized(self, width: int, height: int) -> "StereoCalibration":
+        """The calibration for images of another size with the same field of view."""
+        if (width, height) == self.size:
+            return self
+        sx, sy = width / self.size[0], height / self.size[1]
+        if abs(sx / sy - 1) > 0.01:
+            raise SequenceError(
+                f"{self.source}: is for images of {self.size[0]}×{self.size[1]}, but the images are {width}×{height}; "
+                "use the calibration that belongs to this recording"
+            )
+        logger.info("%s: intrinsics scaled from %d×%d to %d×%d", self.source, *self.size, width, height)
+        scale = np.diag([sx, sy, 1.0])
+        left, right = (scale @ (K + HALF_PIXEL) - HALF_PIXEL for K in (self.K_left, self.K_right))
+        return dataclasses.replace(self, size=(width, height), K_left=left, K_right=right)
+
+
+class Rectification:
+    """Maps raw images, masks, depth and poses into the rectified left camera (and its twin on the right).
+
+    Attributes:
+        K: Intrinsics of both rectified cameras [3, 3], pixels, this package's pixel convention.
+        baseline: Distance to the right camera along +x, metres; None for one eye.
+        rotation: Rotation [3, 3] from the raw to the rectified left camera frame.
+        valid: Mask [H, W], uint8: 255 where the raw left image has the pixel, 0 on the black border.
+    """
+
+    def __init__(self, size, K, rotation, left_maps, right_maps=None, baseline=None):
+        self.size = size
+        self.K = K
+        self.rotation = rotation
+        self.baseline = baseline
+        self._left_maps = left_maps
+        self._right_maps = right_maps
+        if left_maps is None:
+            self.valid = np.full(size[::-1], 255, np.uint8)
+        else:
+            u, v = left_maps
+            inside = (u >= 0) & (u <= size[0] - 1) & (v >= 0) & (v <= size[1] - 1)
+            self.valid = np.where(inside, np.uint8(255), np.uint8(0))
+
+    @classmethod
+    def stereo(cls, calibration: StereoCalibration) -> "Rectification":
+        """Rows aligned, one K and no disparity at infinity for both eyes, no larger border than needed (alpha 0)."""
+        c, size = calibration, calibration.size
+        R_left, R_right, P_left, P_right, *_ = cv2.stereoRectify(
+            c.K_left, c.D_left, c.K_right, c.D_right, size, c.R, c.T, flags=cv2.CALIB_ZERO_DISPARITY, alpha=0
+        )
+        baseline = -P_right[0, 3] / P_right[0, 0]
+        if not np.isfinite(P_left).all() or not baseline > 0:
+            raise SequenceError(f"{c.source}: the two cameras cannot be rectified; check R and T")
+        left = cv2.initUndistortRectifyMap(c.K_left, c.D_left, R_left, P_left, size, cv2.CV_32FC1)
+        right = cv2.initUndistortRectifyMap(c.K_right, c.D_right, R_right, P_right, size, cv2.CV_32FC1)
+        return cls(size, P_left[:, :3] + HALF_PIXEL, R_left, left, right, float(baseline))
+
+    @classmethod
+    def mono(cls, K: np.ndarray, distortion: np.ndarray, size: tuple[int, int]) -> "Rectification":
+        """Undistortion of one eye.
+
+        Args:
+            K: Intrinsics [3, 3] of the raw image, this package's pixel convention (as COLMAP's).
+            distortion: Coefficients k1 [k2 [p1 p2 [k3]]] as OpenCV orders them; empty or zeros for none.
+            size: Image width and height, pixels.
+        """
+        coefficients = np.zeros(max(5, len(distortion)))
+        coefficients[: len(distortion)] = distortion
+        if not coefficients.any():
+            return cls(size, np.array(K, np.float64), np.eye(3), None)
+        K_cv = K - HALF_PIXEL
+        K_new, _ = cv2.getOptimalNewCameraMatrix(K_cv, coefficients, size, 0)
+        zoom = max(K_new[0, 0] / K_cv[0, 0], K_new[1, 1] / K_cv[1, 1])  # one zoom for both axes: pixels stay as they are
+        K_new[0, 0], K_new[1, 1] = zoom * K_cv[0, 0], zoom * K_cv[1, 1]
+        maps = cv2.initUndistortRectifyMap(K_cv, coefficients, np.eye(3), K_new, size, cv2.CV_32FC1)
+        return cls(size, K_new + HALF_PIXEL, np.eye(3), maps)
+
+    def left(self, image: np.ndarray) -> np.ndarray:
+        """Rectified left image [H, W, 3]."""
+        return self._remap(image, self._left_maps, cv2.INTER_LINEAR)
+
+    def right(self, image: np.ndarray) -> np.ndarray:
+        """Rectified right image [H, W, 3]."""
+        return self._remap(image, self._right_maps, cv2.INTER_LINEAR)
+
+    def mask(self, mask: np.ndarray | None) -> np.ndarray:
+        """Rectified mask [H, W] of a raw one (255 = tissue), with the black border ignored; None masks nothing else."""
+        if mask is None:
+            return self.valid
+        return cv2.bitwise_and(self._remap(mask, self._left_maps, cv2.INTER_NEAREST), self.valid)
+
+    def depth(self, points: np.ndarray) -> np.ndarray:
+        """Rectified depth [H, W] of a raw map of points [H, W, 3], metres, in the raw left camera frame.
+
+        Rectification turns the camera, so the depth of a point changes; it is not the raw depth moved about.
+        Points that are not finite, or lie at or behind the camera, have no depth.
+        """
+        with np.errstate(invalid="ignore"):
+            measured = np.isfinite(points).all(-1) & (points[..., 2] > 0)
+            z = np.where(measured, points @ self.rotation[2], 0)
+        return self._remap(clean_depth(z), self._left_maps, cv2.INTER_NEAREST)
+
+    def pose(self, pose: np.ndarray) -> np.ndarray:
+        """Camera-to-world pose [4, 4] of the rectified left camera from that of the raw one."""
+        turned = pose.copy()
+        turned[:3, :3] = pose[:3, :3] @ self.rotation.T
+        return turned
+
+    def _remap(self, image: np.ndarray, maps, interpolation: int) -> np.ndarray:
+        if image.shape[1::-1] != tuple(self.size):
+            raise SequenceError(
+                f"image is {image.shape[1]}×{image.shape[0]}, but its calibration is for {self.size[0]}×{self.size[1]}"
+            )
+        return image if maps is None else cv2.remap(image, *maps, interpolation)

@@ -1,0 +1,274 @@
+"""Camera poses from the images alone, by COLMAP's incremental structure from motion."""
+
+import contextlib
+import dataclasses
+import itertools
+import logging
+import tempfile
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2  # before pycolmap, whose own image library would otherwise break cv2.imwrite
+import numpy as np
+
+from endo_sim_ros.cameras import invert_pose
+from endo_sim_ros.sequences.frames import Frame, SequenceError
+from endo_sim_ros.sequences.recordings import Recording
+
+logger = logging.getLogger(__name__)
+
+GUESSED_MEDIAN_DEPTH = 0.1  # m, a usual working distance of a laparoscope
+EXHAUSTIVE_LIMIT = 60  # images; beyond, each is matched with its neighbours in time only
+LONG_RUN = 300  # images, from which on a run takes tens of minutes
+
+
+@dataclass(frozen=True)
+class StructureFromMotion:
+    """What was recovered.
+
+    Args:
+        poses: Camera-to-world poses [4, 4] of the left images that could be placed, by position in the input; the world
+            is the first one's camera frame.
+        K: Intrinsics [3, 3], pixels; as given, or estimated.
+        distortion: Coefficients (k1,) in OpenCV's sense, empty when K was given.
+        points: Sparse points [N, 3], world.
+        reprojection_error: Mean over all observations, pixels.
+        metric: False when the scale is a guess.
+    """
+
+    poses: dict[int, np.ndarray]
+    K: np.ndarray
+    distortion: tuple[float, ...]
+    points: np.ndarray
+    reprojection_error: float
+    metric: bool
+
+
+def estimate_poses(
+    images: Iterable[np.ndarray],
+    K: np.ndarray | None = None,
+    *,
+    masks: Iterable[np.ndarray | None] | None = None,
+    right_images: Iterable[np.ndarray] | None = None,
+    baseline: float | None = None,
+    scale: float | None = None,
+    matching: str = "auto",
+    seed: int = 0,
+    threads: int = -1,
+) -> StructureFromMotion:
+    """Estimate where the camera was for every image.
+
+    Args:
+        images: RGB images [H, W, 3] of one size, in order of time; read once, so a generator will do.
+        K: Intrinsics [3, 3] of undistorted images, held fixed. None estimates one focal length and one radial
+            distortion for all images (the camera may then converge to a wrong focal length, which no error reveals:
+            pass K wherever it is known).
+        masks: For each image [H, W], uint8, 0 = take no features here; or None.
+        right_images: Rectified right images with the same K, for a stereo camera; needs baseline.
+        baseline: Distance from left to right camera, metres; makes the result metric.
+        scale: Metres per unit of the reconstruction, as a last resort where no baseline is known.
+        matching: `exhaustive` (all pairs), `sequential` (neighbours in time), or `auto` by the number of images.
+        seed: For random sampling.
+        threads: -1 uses all cores; 1 makes a run repeatable to the last bit.
+
+    Returns:
+        The recovered poses; images that could not be placed are missing from them and logged.
+
+    Raises:
+        SequenceError: If no reconstruction comes out.
+    """
+    if (right_images is None) != (baseline is None):
+        raise ValueError("estimate_poses: right_images and baseline must be given together")
+    if matching not in ("auto", "exhaustive", "sequential"):
+        raise ValueError(f"estimate_poses: matching must be auto, exhaustive or sequential, got {matching!r}")
+    with tempfile.TemporaryDirectory(prefix="endo_sfm_") as folder:
+        root = Path(folder)
+        count, size = _write_images(root, images, masks, right_images)
+        if count < 2:
+            raise SequenceError(f"structure from motion needs at least 2 images, got {count}; select more frames")
+        if count > LONG_RUN:
+            logger.warning("structure from motion on %d images takes long; a larger step would do as well", count)
+        if matching == "auto":
+            matching = "exhaustive" if count <= EXHAUSTIVE_LIMIT else "sequential"
+        reconstruction = _run_colmap(root, K, size, matching=matching, seed=seed, threads=threads)
+    return _result(reconstruction, count, K, baseline=baseline, scale=scale)
+
+
+def with_estimated_poses(
+    frames: Iterable[Frame], count: int, source: Path, *, scale: float | None = None, threads: int = -1
+) -> Recording:
+    """Frames of a calibrated camera with unknown poses, posed by structure from motion on first iteration.
+
+    Args:
+        frames: The frames, re-iterable, with any pose; stereo frames make the result metric.
+        count: Their number.
+        source: The recording, for messages.
+        scale: Metres per unit of the reconstruction, where frames have no right image.
+        threads: As for `estimate_poses`.
+    """
+    poses: dict[int, np.ndarray] = {}
+
+    def posed() -> Iterator[Frame]:
+        if not poses:
+            logger.info("%s: has no poses; running structure from motion on %d frames", source, count)
+            first = next(iter(frames))
+            stereo = first.right is not None and scale is None
+            try:
+                result = estimate_poses(
+                    (frame.image for frame in frames),
+                    first.camera.K,
+                    masks=(frame.mask for frame in frames),
+                    right_images=(frame.right for frame in frames) if stereo else None,
+                    baseline=first.baseline if stereo else None,
+                    scale=scale,
+                    threads=threads,
+                )
+            except SequenceError as error:
+                raise SequenceError(f"{source}: {error}") from None
+            poses.update(result.poses)
+        for position, frame in enumerate(frames):
+            if position in poses:
+                yield dataclasses.replace(frame, camera=frame.camera.at(poses[position]))
+
+    return Recording(posed, count)
+
+
+def _write_images(root: Path, images, masks, right_images) -> tuple[int, tuple[int, int]]:
+    """Lay the images out as COLMAP reads them: `left/000000.png`, its mask `masks/left/000000.png.png`."""
+    for folder in ("images/left", "images/right", "masks/left", "masks/right"):
+        (root / folder).mkdir(parents=True)
+    count, size, masked = 0, None, False
+    absent = itertools.repeat(None)
+    for image, mask, right in zip(images, masks or absent, right_images or absent, strict=False):
+        size = size or image.shape[1::-1]
+        if image.shape[1::-1] != size:
+            raise SequenceError(f"image {count} is {image.shape[1]}×{image.shape[0]}, but the first one is {size[0]}×{size[1]}")
+        name = f"{count:06d}.png"
+        cv2.imwrite(str(root / "images/left" / name), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+        if right is not None:
+            cv2.imwrite(str(root / "images/right" / name), cv2.cvtColor(right, cv2.COLOR_RGB2BGR))
+        if mask is not None:
+            # The border of the left mask serves the right eye too; its tools are shifted, which matching survives.
+            masked = True
+            for eye in ("left", "right") if right is not None else ("left",):
+                cv2.imwrite(str(root / f"masks/{eye}" / f"{name}.png"), mask)
+        count += 1
+    if not masked:
+        for eye in ("left", "right"):
+            (root / "masks" / eye).rmdir()
+        (root / "masks").rmdir()
+    return count, size or (0, 0)
+
+
+def _run_colmap(root: Path, K: np.ndarray | None, size: tuple[int, int], *, matching: str, seed: int, threads: int):
+    """COLMAP's largest model of the images under root."""
+    import pycolmap  # noqa: PLC0415  (a heavy import that only this function needs)
+
+    with _quiet(pycolmap):
+        pycolmap.set_random_seed(seed)
+        database = root / "database.db"
+        reader = pycolmap.ImageReaderOptions()
+        if K is not None:
+            reader.camera_model = "PINHOLE"
+            reader.camera_params = ",".join(repr(float(v)) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+        else:
+            reader.camera_model = "SIMPLE_RADIAL"
+        if (root / "masks").is_dir():
+            reader.mask_path = root / "masks"
+        extraction = pycolmap.FeatureExtractionOptions(num_threads=threads)
+        pycolmap.extract_features(
+            database, root / "images", camera_mode=pycolmap.CameraMode.SINGLE,
+            reader_options=reader, extraction_options=extraction, device=pycolmap.Device.cpu,
+        )  # fmt: skip
+        verification = pycolmap.TwoViewGeometryOptions()
+        verification.ransac.random_seed = seed
+        verification.detect_watermark = False  # a fixed vignette or overlay is masked, and watermarks are not pairs
+        match = pycolmap.match_exhaustive if matching == "exhaustive" else pycolmap.match_sequential
+        match(
+            database, pycolmap.FeatureMatchingOptions(num_threads=threads),
+            verification_options=verification, device=pycolmap.Device.cpu,
+        )  # fmt: skip
+        options = pycolmap.IncrementalPipelineOptions(num_threads=threads, random_seed=seed, min_model_size=2)
+        options.extract_colors = False
+        options.mapper.random_seed = options.triangulation.random_seed = seed
+        options.mapper.num_threads = threads
+        if K is not None:
+            options.ba_refine_focal_length = options.ba_refine_extra_params = False
+            options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+        models = pycolmap.incremental_mapping(database, root / "images", root, options)
+    if not models:
+        raise SequenceError(
+            "structure from motion found no pair of images with enough matches and parallax; "
+            f"select frames in which the camera moves and the tissue is in focus ({size[0]}×{size[1]} images)"
+        )
+    if len(models) > 1:
+        logger.warning("structure from motion fell apart into %d pieces; only the largest is used", len(models))
+    return max(models.values(), key=lambda model: model.num_reg_images())
+
+
+@contextlib.contextmanager
+def _quiet(pycolmap):
+    """Keeps COLMAP's progress off the terminal; its errors still show."""
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = level
+
+
+def _result(model, count: int, K: np.ndarray | None, *, baseline: float | None, scale: float | None):
+    """Scale a COLMAP model to metres and put the world into its first camera."""
+    eyes: dict[str, dict[int, np.ndarray]] = {"left": {}, "right": {}}
+    depths = []
+    points = {key: point.xyz for key, point in model.points3D.items()}
+    for image in model.images.values():
+        if not image.has_pose:
+            continue
+        view = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
+        eye, number = image.name.split("/")
+        eyes[eye][int(number.split(".")[0])] = invert_pose(view)
+        seen = [points[p.point3D_id] for p in image.points2D if p.has_point3D()]
+        depths.extend((np.reshape(seen, (-1, 3)) @ view[2, :3] + view[2, 3]).tolist())
+    left = dict(sorted(eyes["left"].items()))
+    if len(left) < 2 or not depths:
+        raise SequenceError("structure from motion placed fewer than 2 images; select frames with more overlap")
+    if len(left) < count:
+        lost = [n for n in range(count) if n not in left]
+        shown = ", ".join(map(str, lost[:10])) + (", …" if len(lost) > 10 else "")
+        logger.warning("structure from motion could not place %d of %d images: %s", len(lost), count, shown)
+
+    metric = True
+    pairs = [np.linalg.norm(eyes["right"][n][:3, 3] - left[n][:3, 3]) for n in left if n in eyes["right"]]
+    if baseline is not None and pairs:
+        spread = np.std(pairs) / np.median(pairs)
+        factor = baseline / np.median(pairs)
+        logger.info("scale from %d stereo pairs, whose baselines vary by %.1f %%", len(pairs), 100 * spread)
+    elif scale is not None:
+        factor = scale
+    else:
+        metric = False
+        factor = GUESSED_MEDIAN_DEPTH / np.median(depths)
+        logger.warning(
+            "THE SCALE IS A GUESS: one eye cannot tell size, so the median depth is set to %g m; "
+            "pass scale, or a stereo recording, where sizes and forces matter", GUESSED_MEDIAN_DEPTH,
+        )  # fmt: skip
+
+    to_first = invert_pose(next(iter(left.values())))
+    poses = {}
+    for number, pose in left.items():
+        poses[number] = to_first @ pose
+        poses[number][:3, 3] *= factor
+    xyz = np.reshape(list(points.values()), (-1, 3)) @ to_first[:3, :3].T + to_first[:3, 3]
+
+    distortion: tuple[float, ...] = ()
+    if K is None:
+        f, cx, cy, k1 = next(iter(model.cameras.values())).params
+        K, distortion = np.array([[f, 0, cx], [0, f, cy], [0, 0, 1]]), (float(k1),)
+        logger.warning("estimated a focal length of %.1f px and k1 %.3f, which may be wrong; pass the calibration if known", f, k1)
+    error = float(model.compute_mean_reprojection_error())
+    logger.info("structure from motion placed %d of %d images, %d points, %.2f px", len(left), count, len(xyz), error)
+    return StructureFromMotion(poses, np.asarray(K, np.float64), distortion, xyz * factor, error, metric)
+
+

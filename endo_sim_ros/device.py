@@ -28,10 +28,10 @@ def pick_device(name: str = "auto") -> str:
 
 @functools.cache
 def init_warp() -> None:
-    """Start Warp quietly, once."""
+    """Start Warp, once, without its banner and its remark that a machine has no GPU."""
     import warp as wp
 
-    wp.config.quiet = True
+    wp.config.log_level = wp.LOG_ERROR
     wp.init()
 
 

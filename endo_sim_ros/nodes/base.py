@@ -122,7 +122,10 @@ class EndoNode(Node):
         return OK, "running", {}
 
     def publish_diagnostics(self) -> None:
-        level, text, values = self.status()
+        try:
+            level, text, values = self.status()
+        except Exception as error:  # a fault in describing the state must not end the node
+            level, text, values = ERROR, f"status: unexpected {type(error).__name__}: {error}", {}
         if time.monotonic() < self._error_until:
             level, text = ERROR, self._error_text
         values = values | {"errors": self.error_count}

@@ -231,7 +231,7 @@ class PhysicsNode(EndoNode):
         values = {
             "nodes": len(simulation.nodes.rest),
             "steps": self._steps,
-            "substeps": simulation.solver.substeps,
+            "substeps": simulation.solver.substepping.count,
             "milliseconds per step": f"{1e3 * self._seconds_per_step:.1f}",
             "real-time factor": f"{self._real_time_factor:.2f}",
             "simulated time": f"{simulation.time:.2f}",

@@ -1,10 +1,10 @@
 """EndoNeRF: a fixed stereo endoscope over tissue that is pulled and cut, prepared in the LLFF layout.
 
-    pulling_soft_tissues/
-      images/%06d.png
-      poses_bounds.npy     17 floats per frame: 3×5 [down right back | position | height width focal], near, far
-      depth/               8 or 16 bit, optional
-      masks/               white = tool, optional
+pulling_soft_tissues/
+  images/%06d.png
+  poses_bounds.npy     17 floats per frame: 3×5 [down right back | position | height width focal], near, far
+  depth/               8 or 16 bit, optional
+  masks/               white = tool, optional
 """
 
 import logging
@@ -19,6 +19,7 @@ from endo_sim_ros.sequences.recordings import (
     DEFAULT_FPS,
     Recording,
     check_folder,
+    check_size,
     intrinsic_matrix,
     numbered_files,
     read_depth,
@@ -26,6 +27,7 @@ from endo_sim_ros.sequences.recordings import (
     read_image,
     rigid,
     select,
+    spread,
     stamp_ns,
     tissue_mask,
     tool_is_white,
@@ -83,9 +85,19 @@ def read_endonerf(
             logger.warning("%s: %d of %d frames have no image there", root / name, len(lacking), len(numbers))
     white_is_tool = False
     if masks:
-        sample = (read_gray(masks[n]) for n in sorted(masks)[:: max(1, len(masks) // 20)])
+        sample = (read_gray(masks[n]) for n in spread(sorted(masks), 20))
         white_is_tool = tool_is_white(sample, root / "masks", mask_polarity)
     pose_scale = depth_scale if pose_scale is None else pose_scale
+
+    def depth_of(number: int, size: tuple[int, int]) -> np.ndarray | None:
+        if number not in depths:
+            return None
+        return check_size(read_depth(depths[number], depth_scale), size, depths[number])
+
+    def mask_of(number: int, size: tuple[int, int]) -> np.ndarray | None:
+        if number not in masks:
+            return None
+        return tissue_mask(read_gray(masks[number]), white_is_tool=white_is_tool, size=size)
 
     def frames() -> Iterator[Frame]:
         for number in numbers:
@@ -96,10 +108,8 @@ def read_endonerf(
                 stamp_ns=stamp_ns(number, fps or DEFAULT_FPS),
                 image=image,
                 camera=_camera(rows[number], size, pose_scale, source),
-                depth=_sized(read_depth(depths[number], depth_scale), size, depths[number]) if number in depths else None,
-                mask=tissue_mask(read_gray(masks[number]), white_is_tool=white_is_tool, size=size)
-                if number in masks
-                else None,
+                depth=depth_of(number, size),
+                mask=mask_of(number, size),
             )
 
     return Recording(frames, len(numbers))
@@ -130,9 +140,3 @@ def _camera(row: np.ndarray, size: tuple[int, int], pose_scale: float, source: s
     matrix[:3, 3] = block[:, 3] * pose_scale
     K = intrinsic_matrix(focal * size[0] / width, focal * size[1] / height, size[0] / 2, size[1] / 2)
     return Camera(K, *size, rigid(matrix, source))
-
-
-def _sized(depth: np.ndarray, size: tuple[int, int], path: Path) -> np.ndarray:
-    if depth.shape[::-1] != size:
-        raise SequenceError(f"{path}: is {depth.shape[1]}×{depth.shape[0]}, but its image is {size[0]}×{size[1]}")
-    return depth

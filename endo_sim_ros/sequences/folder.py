@@ -1,12 +1,12 @@
 """A plain folder of rectified images, the layout to bring other data in.
 
-    my_recording/
-      left/000001.png …       rectified images; the number in the name is the frame number
-      right/000001.png …      optional; rectified, same K
-      calibration.yaml        fx fy cx cy [pixels], baseline_m [with right/], optional fps, distortion (left only)
-      poses_left.txt          frame tx ty tz qx qy qz qw, camera-to-world, metres; without it poses are estimated
-      masks/000001.png …      optional; 255 = tissue, 0 = ignore
-      depth/000001.png …      optional; 16 bit, millimetres (see depth_scale), 0 = none
+my_recording/
+  left/000001.png …       rectified images; the number in the name is the frame number
+  right/000001.png …      optional; rectified, same K
+  calibration.yaml        fx fy cx cy [pixels], baseline_m [with right/], optional fps, distortion (left only)
+  poses_left.txt          frame tx ty tz qx qy qz qw, camera-to-world, metres; without it poses are estimated
+  masks/000001.png …      optional; 255 = tissue, 0 = ignore
+  depth/000001.png …      optional; 16 bit, millimetres (see depth_scale), 0 = none
 """
 
 import logging
@@ -21,8 +21,11 @@ from endo_sim_ros.sequences.frames import Frame, SequenceError
 from endo_sim_ros.sequences.recordings import (
     DEFAULT_FPS,
     Recording,
+    check_calibrated_size,
     check_folder,
+    check_size,
     intrinsic_matrix,
+    keep_posed,
     lit_area,
     numbered_files,
     read_calibration,
@@ -80,7 +83,9 @@ def read_folder(
     if right and baseline is None:
         raise SequenceError(f"{root / CALIBRATION_FILE}: baseline_m is missing, but there are right images")
     if right and any(calibration["distortion"]):
-        raise SequenceError(f"{root / CALIBRATION_FILE}: stereo images must be rectified already; drop distortion or right/")
+        raise SequenceError(
+            f"{root / CALIBRATION_FILE}: stereo images must be rectified already; drop distortion or right/"
+        )
     fps = fps or calibration.get("fps", DEFAULT_FPS)
 
     numbers = select(left, root / "left", start, stop, step)
@@ -88,23 +93,13 @@ def read_folder(
     pose_file = next((root / name for name in POSE_FILES if (root / name).is_file()), None)
     if pose_file:
         poses = read_poses(pose_file)
-        posed = [n for n in numbers if n in poses]
-        if not posed:
-            raise SequenceError(f"{pose_file}: holds no pose for any of the {len(numbers)} chosen images")
-        if len(posed) < len(numbers):
-            logger.info("%s: %d of %d images have no pose and are skipped", root, len(numbers) - len(posed), len(numbers))
-        numbers = posed
+        numbers = keep_posed(numbers, poses, pose_file)
     missing = [n for n in numbers if right and n not in right]
     if missing:
         raise SequenceError(f"{root / 'right'}: the right image of {left[missing[0]].name} is missing")
 
     size = read_image(left[numbers[0]]).shape[1::-1]
-    stated = calibration.get("width", size[0]), calibration.get("height", size[1])
-    if stated != size:
-        raise SequenceError(
-            f"{root / CALIBRATION_FILE}: is for images of {stated[0]}×{stated[1]}, but {left[numbers[0]].name} is "
-            f"{size[0]}×{size[1]}; scale the intrinsics or the images"
-        )
+    check_calibrated_size(calibration, size, root / CALIBRATION_FILE)
     rectification = Rectification.mono(K, calibration["distortion"], size)
     masks, depths = numbered_files(root / "masks"), numbered_files(root / "depth")
     white_is_tool = False
@@ -113,15 +108,12 @@ def read_folder(
         white_is_tool = tool_is_white(sample, root / "masks", mask_polarity)
 
     def image_of(file: Path) -> np.ndarray:
-        image = read_image(file)
-        if image.shape[1::-1] != size:
-            raise SequenceError(
-                f"{file}: is {image.shape[1]}×{image.shape[0]}, but the first image is {size[0]}×{size[1]}"
-            )
-        return image
+        return check_size(read_image(file), size, file)
 
     def frames() -> Iterator[Frame]:
-        lit = lit_area(image_of(left[n]) for n in spread(numbers, 10)) if mask_border else np.full(size[::-1], 255, np.uint8)
+        lit = np.full(size[::-1], 255, np.uint8)
+        if mask_border:
+            lit = lit_area(image_of(left[n]) for n in spread(numbers, 10))
         for number in numbers:
             mask, depth = lit, None
             if number in masks:
@@ -129,8 +121,7 @@ def read_folder(
                 mask = cv2.bitwise_and(lit, tissue)
             if number in depths:
                 z = read_depth(depths[number], depth_scale)
-                if z.shape[::-1] != size:
-                    raise SequenceError(f"{depths[number]}: is {z.shape[1]}×{z.shape[0]}, but its image is {size[0]}×{size[1]}")
+                check_size(z, size, depths[number])
                 depth = rectification.depth(np.dstack([np.zeros_like(z)] * 2 + [z]))
             pose = np.eye(4) if poses is None else poses[number]
             yield Frame(

@@ -3,7 +3,7 @@
 import logging
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -62,6 +62,18 @@ def select(numbers: Iterable[int], source: Path, start: int | None, stop: int | 
     return inside[::step]
 
 
+def keep_posed(numbers: list[int], poses: Container[int], pose_file: Path) -> list[int]:
+    """The frame numbers that have a pose; the others are counted in the log."""
+    posed = [n for n in numbers if n in poses]
+    if not posed:
+        raise SequenceError(f"{pose_file}: holds no pose for any of the {len(numbers)} chosen frames")
+    if len(posed) < len(numbers):
+        logger.info(
+            "%s: %d of %d frames have no pose and are skipped", pose_file, len(numbers) - len(posed), len(numbers)
+        )
+    return posed
+
+
 # ------------------------------------------------------------------------------------------------ images and video
 
 
@@ -81,6 +93,13 @@ def read_depth(path: Path, depth_scale: float) -> np.ndarray:
     raw = raw[..., 0] if raw.ndim == 3 else raw
     depth = raw.astype(np.float32) * (depth_scale if np.issubdtype(raw.dtype, np.integer) else 1.0)
     return clean_depth(depth)
+
+
+def check_size(image: np.ndarray, size: tuple[int, int], path: Path) -> np.ndarray:
+    """The image, if it has the recording's size (width, height)."""
+    if image.shape[1::-1] != tuple(size):
+        raise SequenceError(f"{path}: is {image.shape[1]}×{image.shape[0]}, but the recording is {size[0]}×{size[1]}")
+    return image
 
 
 def clean_depth(depth: np.ndarray) -> np.ndarray:
@@ -259,6 +278,16 @@ def read_calibration(path: Path) -> dict:
     except (TypeError, ValueError):
         raise SequenceError(f"{path}: distortion must be a list of numbers, got {fields['distortion']!r}") from None
     return fields
+
+
+def check_calibrated_size(calibration: dict, size: tuple[int, int], path: Path):
+    """Refuses a calibration file that states another image size than (width, height)."""
+    stated = calibration.get("width", size[0]), calibration.get("height", size[1])
+    if stated != size:
+        raise SequenceError(
+            f"{path}: width and height are {stated[0]}×{stated[1]}, but the images are {size[0]}×{size[1]}; "
+            "scale fx, fy, cx, cy or the images"
+        )
 
 
 def intrinsic_matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:

@@ -55,13 +55,17 @@ class StereoCalibration:
         if np.abs(self.R @ self.R.T - np.eye(3)).max() > 0.01 or np.linalg.det(self.R) < 0:
             raise SequenceError(f"{self.source}: R is not a rotation: {self.R.tolist()}")
         if not np.abs(self.T[0]) > 1e-5:
-            raise SequenceError(f"{self.source}: T has no horizontal part ({self.T.tolist()} m), so there is no baseline")
+            raise SequenceError(
+                f"{self.source}: T has no horizontal part ({self.T.tolist()} m), so there is no baseline"
+            )
         if not 0.5e-3 < np.abs(self.T[0]) < 0.05:
             logger.warning("%s: a baseline of %.3g m is unusual for an endoscope; T is read as millimetres",
                            self.source, abs(self.T[0]))  # fmt: skip
         if self.T[0] > 0:
             # Some tools write the pose of the right camera instead of the change of coordinates.
-            logger.warning("%s: T points to the right eye, so R and T are read as its pose in the left frame", self.source)
+            logger.warning(
+                "%s: T points to the right eye, so R and T are read as its pose in the left frame", self.source
+            )
             object.__setattr__(self, "T", -self.R.T @ self.T)
             object.__setattr__(self, "R", self.R.T.copy())
 
@@ -110,7 +114,7 @@ class Rectification:
         """Rows aligned, one K and no disparity at infinity for both eyes, no larger border than needed (alpha 0)."""
         c, size = calibration, calibration.size
         R_left, R_right, P_left, P_right, *_ = cv2.stereoRectify(
-            c.K_left, c.D_left, c.K_right, c.D_right, size, c.R, c.T, flags=cv2.CALIB_ZERO_DISPARITY, alpha=0
+            c.K_left, c.D_left, c.K_right, c.D_right, size, c.R, c.T[:, None], flags=cv2.CALIB_ZERO_DISPARITY, alpha=0
         )
         baseline = -P_right[0, 3] / P_right[0, 0]
         if not np.isfinite(P_left).all() or not baseline > 0:
@@ -134,7 +138,9 @@ class Rectification:
             return cls(size, np.array(K, np.float64), np.eye(3), None)
         K_cv = K - HALF_PIXEL
         K_new, _ = cv2.getOptimalNewCameraMatrix(K_cv, coefficients, size, 0)
-        zoom = max(K_new[0, 0] / K_cv[0, 0], K_new[1, 1] / K_cv[1, 1])  # one zoom for both axes: pixels stay as they are
+        zoom = max(
+            K_new[0, 0] / K_cv[0, 0], K_new[1, 1] / K_cv[1, 1]
+        )  # one zoom for both axes: pixels stay as they are
         K_new[0, 0], K_new[1, 1] = zoom * K_cv[0, 0], zoom * K_cv[1, 1]
         maps = cv2.initUndistortRectifyMap(K_cv, coefficients, np.eye(3), K_new, size, cv2.CV_32FC1)
         return cls(size, K_new + HALF_PIXEL, np.eye(3), maps)

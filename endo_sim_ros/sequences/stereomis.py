@@ -1,11 +1,11 @@
 """StereoMIS: da Vinci recordings with kinematic camera poses.
 
-    P1/
-      *.mp4                     left eye stacked on top of right; or video_frames/%06dl.png, %06dr.png
-      StereoCalibration.ini     both cameras, OpenCV; T in millimetres
-      groundtruth.txt           frame tx ty tz qx qy qz qw, camera-to-world, metres; not every frame
-      masks/%06dl.png           instruments; not every frame, sometimes at half resolution
-      train_split.csv, test_split.csv      start,end of the usable ranges, both inclusive
+P1/
+  *.mp4                     left eye stacked on top of right; or video_frames/%06dl.png, %06dr.png
+  StereoCalibration.ini     both cameras, OpenCV; T in millimetres
+  groundtruth.txt           frame tx ty tz qx qy qz qw, camera-to-world, metres; not every frame
+  masks/%06dl.png           instruments; not every frame, sometimes at half resolution
+  train_split.csv, test_split.csv      start,end of the usable ranges, both inclusive
 """
 
 import configparser
@@ -23,7 +23,9 @@ from endo_sim_ros.sequences.recordings import (
     Recording,
     Video,
     check_folder,
+    check_size,
     find_video,
+    keep_posed,
     numbered_files,
     read_gray,
     read_image,
@@ -84,12 +86,7 @@ def read_stereomis(
     poses = None
     if (root / "groundtruth.txt").is_file():
         poses = read_poses(root / "groundtruth.txt")
-        posed = [n for n in numbers if n in poses]
-        if not posed:
-            raise SequenceError(f"{root / 'groundtruth.txt'}: holds no pose for any of the {len(numbers)} chosen frames")
-        if len(posed) < len(numbers):
-            logger.info("%s: %d of %d frames have no pose and are skipped", root, len(numbers) - len(posed), len(numbers))
-        numbers = posed
+        numbers = keep_posed(numbers, poses, root / "groundtruth.txt")
     else:
         logger.warning("%s: no groundtruth.txt, so poses come from structure from motion", root)
 
@@ -101,7 +98,7 @@ def read_stereomis(
         white_is_tool = tool_is_white(sample, root / "masks", mask_polarity)
         bare = sum(n not in mask_of for n in numbers)
         if bare:
-            logger.warning("%s: %d of %d frames have no mask nearby; tools stay visible in them", root, bare, len(numbers))
+            logger.warning("%s: %d of %d frames have no mask; tools stay visible in them", root, bare, len(numbers))
 
     def frames() -> Iterator[Frame]:
         for number, left, right in images.read(numbers):
@@ -149,9 +146,10 @@ def read_stereo_ini(path: Path) -> StereoCalibration:
     size = int(number("StereoLeft", "res_x")), int(number("StereoLeft", "res_y"))
     if min(size) < 1:
         raise SequenceError(f"{path}: [StereoLeft] res_x and res_y must be positive, got {size[0]}×{size[1]}")
+    left, right = camera("StereoLeft"), camera("StereoRight")
     rotation = np.reshape([number("StereoRight", f"R_{i}") for i in range(9)], (3, 3))
     translation = 1e-3 * np.array([number("StereoRight", f"T_{i}") for i in range(3)])  # the file has millimetres
-    return StereoCalibration(str(path), size, *camera("StereoLeft"), *camera("StereoRight"), rotation, translation)
+    return StereoCalibration(str(path), size, *left, *right, rotation, translation)
 
 
 class _StackedVideo:
@@ -160,7 +158,7 @@ class _StackedVideo:
     def __init__(self, root: Path):
         path = find_video(root)
         if path is None:
-            raise SequenceError(f"{root}: holds neither a video (*.mp4) nor a folder video_frames; copy one of them here")
+            raise SequenceError(f"{root}: holds neither a video (*.mp4) nor a folder video_frames; copy one of them in")
         self._video = Video(path)
         self.fps = self._video.fps
         self.numbers = list(range(self._video.frame_count))
@@ -190,14 +188,10 @@ class _ExtractedFrames:
 
     def read(self, numbers) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
         for number in numbers:
-            pair = [read_image(files[number]) for files in (self._left, self._right)]
-            for image, files in zip(pair, (self._left, self._right), strict=True):
-                if image.shape[1::-1] != self.size:
-                    raise SequenceError(
-                        f"{files[number]}: is {image.shape[1]}×{image.shape[0]}, "
-                        f"but the first image is {self.size[0]}×{self.size[1]}"
-                    )
-            yield number, *pair
+            left, right = (
+                check_size(read_image(files[number]), self.size, files[number]) for files in (self._left, self._right)
+            )
+            yield number, left, right
 
 
 def _read_split(root: Path, split: str) -> list[tuple[int, int]]:

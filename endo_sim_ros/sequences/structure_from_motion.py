@@ -20,6 +20,7 @@ logger = logging.getLogger(__name__)
 
 GUESSED_MEDIAN_DEPTH = 0.1  # m, a usual working distance of a laparoscope
 EXHAUSTIVE_LIMIT = 60  # images; beyond, each is matched with its neighbours in time only
+PEAK_THRESHOLD = 0.002  # of SIFT; tissue has little contrast, and the usual 0.0067 finds a third of the features
 LONG_RUN = 300  # images, from which on a run takes tens of minutes
 
 
@@ -80,6 +81,8 @@ def estimate_poses(
     """
     if (right_images is None) != (baseline is None):
         raise ValueError("estimate_poses: right_images and baseline must be given together")
+    if right_images is not None and K is None:
+        raise ValueError("estimate_poses: stereo images need K, because they are rectified with it")
     if matching not in ("auto", "exhaustive", "sequential"):
         raise ValueError(f"estimate_poses: matching must be auto, exhaustive or sequential, got {matching!r}")
     with tempfile.TemporaryDirectory(prefix="endo_sfm_") as folder:
@@ -91,7 +94,7 @@ def estimate_poses(
             logger.warning("structure from motion on %d images takes long; a larger step would do as well", count)
         if matching == "auto":
             matching = "exhaustive" if count <= EXHAUSTIVE_LIMIT else "sequential"
-        reconstruction = _run_colmap(root, K, size, matching=matching, seed=seed, threads=threads)
+        reconstruction = _run_colmap(root, K, size, baseline=baseline, matching=matching, seed=seed, threads=threads)
     return _result(reconstruction, count, K, baseline=baseline, scale=scale)
 
 
@@ -143,7 +146,9 @@ def _write_images(root: Path, images, masks, right_images) -> tuple[int, tuple[i
     for image, mask, right in zip(images, masks or absent, right_images or absent, strict=False):
         size = size or image.shape[1::-1]
         if image.shape[1::-1] != size:
-            raise SequenceError(f"image {count} is {image.shape[1]}×{image.shape[0]}, but the first one is {size[0]}×{size[1]}")
+            raise SequenceError(
+                f"image {count} is {image.shape[1]}×{image.shape[0]}, but the first one is {size[0]}×{size[1]}"
+            )
         name = f"{count:06d}.png"
         cv2.imwrite(str(root / "images/left" / name), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
         if right is not None:
@@ -161,8 +166,10 @@ def _write_images(root: Path, images, masks, right_images) -> tuple[int, tuple[i
     return count, size or (0, 0)
 
 
-def _run_colmap(root: Path, K: np.ndarray | None, size: tuple[int, int], *, matching: str, seed: int, threads: int):
-    """COLMAP's largest model of the images under root."""
+def _run_colmap(
+    root: Path, K: np.ndarray | None, size: tuple[int, int], *, baseline, matching: str, seed: int, threads: int
+):
+    """COLMAP's largest model of the images under root; with a baseline, left and right move as one rig."""
     import pycolmap  # noqa: PLC0415  (a heavy import that only this function needs)
 
     with _quiet(pycolmap):
@@ -177,10 +184,13 @@ def _run_colmap(root: Path, K: np.ndarray | None, size: tuple[int, int], *, matc
         if (root / "masks").is_dir():
             reader.mask_path = root / "masks"
         extraction = pycolmap.FeatureExtractionOptions(num_threads=threads)
+        extraction.sift.peak_threshold = PEAK_THRESHOLD
         pycolmap.extract_features(
-            database, root / "images", camera_mode=pycolmap.CameraMode.SINGLE,
+            database, root / "images", camera_mode=pycolmap.CameraMode.PER_FOLDER,
             reader_options=reader, extraction_options=extraction, device=pycolmap.Device.cpu,
         )  # fmt: skip
+        if baseline is not None:
+            _tie_eyes(pycolmap, database, baseline)
         verification = pycolmap.TwoViewGeometryOptions()
         verification.ransac.random_seed = seed
         verification.detect_watermark = False  # a fixed vignette or overlay is masked, and watermarks are not pairs
@@ -205,6 +215,22 @@ def _run_colmap(root: Path, K: np.ndarray | None, size: tuple[int, int], *, matc
     if len(models) > 1:
         logger.warning("structure from motion fell apart into %d pieces; only the largest is used", len(models))
     return max(models.values(), key=lambda model: model.num_reg_images())
+
+
+def _tie_eyes(pycolmap, database: Path, baseline: float):
+    """Make each stereo pair one rigid body, which starts rectified and is refined as one for all pairs.
+
+    Pairs placed one by one would drift, because the parallax between the eyes is only a degree or two.
+    """
+    right_from_left = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([-baseline, 0.0, 0.0]))
+    rig = pycolmap.RigConfig(
+        cameras=[
+            pycolmap.RigConfigCamera(ref_sensor=True, image_prefix="left/"),
+            pycolmap.RigConfigCamera(ref_sensor=False, image_prefix="right/", cam_from_rig=right_from_left),
+        ]
+    )
+    with pycolmap.Database.open(database) as opened:
+        pycolmap.apply_rig_config([rig], opened)
 
 
 @contextlib.contextmanager
@@ -242,9 +268,8 @@ def _result(model, count: int, K: np.ndarray | None, *, baseline: float | None, 
     metric = True
     pairs = [np.linalg.norm(eyes["right"][n][:3, 3] - left[n][:3, 3]) for n in left if n in eyes["right"]]
     if baseline is not None and pairs:
-        spread = np.std(pairs) / np.median(pairs)
         factor = baseline / np.median(pairs)
-        logger.info("scale from %d stereo pairs, whose baselines vary by %.1f %%", len(pairs), 100 * spread)
+        logger.info("scale from the baseline of %d stereo pairs", len(pairs))
     elif scale is not None:
         factor = scale
     else:
@@ -266,9 +291,9 @@ def _result(model, count: int, K: np.ndarray | None, *, baseline: float | None, 
     if K is None:
         f, cx, cy, k1 = next(iter(model.cameras.values())).params
         K, distortion = np.array([[f, 0, cx], [0, f, cy], [0, 0, 1]]), (float(k1),)
-        logger.warning("estimated a focal length of %.1f px and k1 %.3f, which may be wrong; pass the calibration if known", f, k1)
+        logger.warning(
+            "estimated a focal length of %.1f px and k1 %.3f, which may be wrong; pass the calibration if known", f, k1
+        )
     error = float(model.compute_mean_reprojection_error())
     logger.info("structure from motion placed %d of %d images, %d points, %.2f px", len(left), count, len(xyz), error)
     return StructureFromMotion(poses, np.asarray(K, np.float64), distortion, xyz * factor, error, metric)
-
-

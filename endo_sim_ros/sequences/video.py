@@ -1,10 +1,10 @@
 """A plain video of one eye, with or without a calibration and poses.
 
-    endo.mp4, or a folder with
-      endo.mp4
-      calibration.yaml    optional: fx fy cx cy [pixels], distortion
-      poses.txt           optional: frame tx ty tz qx qy qz qw, camera-to-world
-      mask.png            optional, one for all frames; or masks/%06d.png; 255 = tissue
+endo.mp4, or a folder with
+  endo.mp4
+  calibration.yaml    optional: fx fy cx cy [pixels], distortion
+  poses.txt           optional: frame tx ty tz qx qy qz qw, camera-to-world
+  mask.png            optional, one for all frames; or masks/%06d.png; 255 = tissue
 """
 
 import logging
@@ -19,8 +19,10 @@ from endo_sim_ros.sequences.frames import Frame, SequenceError
 from endo_sim_ros.sequences.recordings import (
     Recording,
     Video,
+    check_calibrated_size,
     find_video,
     intrinsic_matrix,
+    keep_posed,
     lit_area,
     numbered_files,
     read_calibration,
@@ -87,15 +89,136 @@ def read_video(
         SequenceError: If a file is missing or wrong, or poses are given without intrinsics.
     """
     path = Path(path)
-    root = path if path.is_dir() else path.parent
     if path.is_dir():
-        path = find_video(path)
+        folder, path = path, find_video(path)
         if path is None:
-            raise SequenceError(f"{root}: holds no video; pass a video file or a folder with one")
-    beside = root if root == Path(root) and find_sidecars(root, path) else None
+            raise SequenceError(f"{folder}: holds no video; pass a video file or a folder with one")
+        poses = poses or _existing(folder / "poses.txt")
+        calibration = calibration or (_existing(folder / "calibration.yaml") if fx is None else None)
+        mask = mask or _existing(folder / "mask.png") or _existing(folder / "masks")
     video = Video(path)
-    return video, beside
+    size = video.width, video.height
+    fps = fps or video.fps
+    K, distortion = _intrinsics(path, calibration, (fx, fy, cx, cy), distortion, size)
+    numbers = select(range(video.frame_count), path, start, stop, step)
+    masks = _Masks(mask, mask_polarity, size)
+
+    known = None
+    if poses is not None and str(poses) != STRUCTURE_FROM_MOTION:
+        if K is None:
+            raise SequenceError(
+                f"{path}: poses are given ({poses}), but no intrinsics; pass fx (and fy, cx, cy, distortion) or a "
+                f"calibration file, or poses={STRUCTURE_FROM_MOTION!r} to estimate both"
+            )
+        factor = 1.0 if scale is None else scale
+        known = {n: _scaled(pose, factor) for n, pose in read_poses(Path(poses)).items()}
+        numbers = keep_posed(numbers, known, Path(poses))
+    else:
+        if sfm_step < 1:
+            raise SequenceError(f"{path}: sfm_step must be 1 or more, got {sfm_step}")
+        numbers = numbers[::sfm_step]
+        logger.info("%s: poses of every %d-th frame come from structure from motion", path, step * sfm_step)
+
+    cache: dict[str, object] = {}  # what takes a pass over the video is found once, on first iteration
+
+    def frames() -> Iterator[Frame]:
+        if not cache:
+            sample = spread(numbers, 10)
+            whole = np.full(size[::-1], 255, np.uint8)
+            lit = lit_area(image for _, image in video.frames(sample)) if mask_border else whole
+            rectification = None if K is None else Rectification.mono(K, distortion, size)
+            placed = known
+            if placed is None:
+                placed, rectification = _estimate(
+                    video,
+                    numbers,
+                    rectification,
+                    lambda n: cv2.bitwise_and(lit, masks.of(n)),
+                    scale=scale,
+                    threads=threads,
+                )
+            cache.update(lit=lit, rectification=rectification, poses=placed)
+        lit, rectification, placed = cache["lit"], cache["rectification"], cache["poses"]
+        for number, image in video.frames([n for n in numbers if n in placed]):
+            yield Frame(
+                stamp_ns=stamp_ns(number, fps),
+                image=rectification.left(image),
+                camera=Camera(rectification.K, *size, placed[number]),
+                mask=rectification.mask(cv2.bitwise_and(lit, masks.of(number))),
+            )
+
+    return Recording(frames, len(numbers))
 
 
-def find_sidecars(root: Path, path: Path) -> bool:
-    return True
+def _estimate(video: Video, numbers: list[int], rectification, mask_of, *, scale, threads):
+    """Poses by frame number and the rectification, which is estimated too where it is None."""
+    undistort = rectification or Rectification.mono(np.eye(3), (), (video.width, video.height))
+    try:
+        result = estimate_poses(
+            (undistort.left(image) for _, image in video.frames(numbers)),
+            None if rectification is None else rectification.K,
+            masks=(undistort.mask(mask_of(number)) for number in numbers),
+            scale=scale,
+            threads=threads,
+        )
+    except SequenceError as error:
+        raise SequenceError(f"{video.path}: {error}") from None
+    if rectification is None:
+        rectification = Rectification.mono(result.K, result.distortion, (video.width, video.height))
+    return {numbers[position]: pose for position, pose in result.poses.items()}, rectification
+
+
+def _intrinsics(path: Path, calibration, values, distortion, size):
+    """K [3, 3] and distortion from a file or from arguments; K is None when neither is given."""
+    fx, fy, cx, cy = values
+    if calibration is not None:
+        if fx is not None:
+            raise SequenceError(f"{path}: pass either a calibration file or fx, not both")
+        fields = read_calibration(Path(calibration))
+        check_calibrated_size(fields, size, Path(calibration))
+        return intrinsic_matrix(*(fields[name] for name in ("fx", "fy", "cx", "cy"))), fields["distortion"]
+    if fx is None:
+        if any(value is not None for value in values) or len(distortion):
+            raise SequenceError(f"{path}: fy, cx, cy and distortion need fx as well")
+        return None, ()
+    fy, cx, cy = fx if fy is None else fy, size[0] / 2 if cx is None else cx, size[1] / 2 if cy is None else cy
+    if not (np.isfinite([fx, fy, cx, cy, *distortion]).all() and fx > 0 and fy > 0):
+        raise SequenceError(f"{path}: fx and fy must be positive, got fx={fx}, fy={fy}, cx={cx}, cy={cy}")
+    return intrinsic_matrix(fx, fy, cx, cy), distortion
+
+
+class _Masks:
+    """One mask for all frames, one per frame, or none."""
+
+    def __init__(self, source: Path | str | None, polarity: str, size: tuple[int, int]):
+        self._size = size
+        self._files: dict[int, Path] = {}
+        self._constant = np.full(size[::-1], 255, np.uint8)
+        if source is None:
+            return
+        source = Path(source)
+        if source.is_dir():
+            self._files = numbered_files(source)
+            if not self._files:
+                raise SequenceError(f"{source}: holds no masks named like 000000.png")
+            sample = [read_gray(self._files[n]) for n in spread(sorted(self._files), 20)]
+            self._white_is_tool = tool_is_white(sample, source, polarity)
+        else:
+            image = read_gray(source)
+            self._constant = tissue_mask(image, white_is_tool=tool_is_white([image], source, polarity), size=size)
+
+    def of(self, number: int) -> np.ndarray:
+        """Mask [H, W] of a frame, 255 = tissue; all tissue where a folder has none."""
+        if number not in self._files:
+            return self._constant
+        return tissue_mask(read_gray(self._files[number]), white_is_tool=self._white_is_tool, size=self._size)
+
+
+def _scaled(pose: np.ndarray, factor: float) -> np.ndarray:
+    scaled = pose.copy()
+    scaled[:3, 3] *= factor
+    return scaled
+
+
+def _existing(path: Path) -> Path | None:
+    return path if path.exists() else None

@@ -1,0 +1,177 @@
+"""The command line: `endo-sim COMMAND --help`."""
+
+import logging
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from rich.progress import track
+
+from endo_sim_ros.config import ConfigError
+from endo_sim_ros.gaussians import ModelError
+from endo_sim_ros.messages import MessageError
+from endo_sim_ros.reconstruction.config import ReconstructionConfig
+from endo_sim_ros.sequences.frames import Frame, SequenceError
+from endo_sim_ros.sequences.phantom import PhantomConfig
+
+Positional = tyro.conf.Positional
+
+
+@dataclass(frozen=True)
+class Convert:
+    """Turn a recording (StereoMIS, SCARED, EndoNeRF, folder of images, video) into a rosbag2."""
+
+    source: Positional[Path]
+    """Folder or file of the recording."""
+    bag: Positional[Path]
+    """Folder of the new bag; it must not exist."""
+    kind: Literal["auto", "stereomis", "scared", "endonerf", "folder", "video"] = "auto"
+    """Layout; auto recognises it."""
+    start: int | None = None
+    """First frame number."""
+    stop: int | None = None
+    """Frame number to stop before."""
+    step: int = 1
+    """Take every n-th frame."""
+    fps: float | None = None
+    """Frame rate, Hz; default: that of the recording."""
+    split: Literal["train", "test"] | None = None
+    """StereoMIS: only the frame ranges of this split."""
+    poses: Path | None = None
+    """Video: file of camera poses (frame tx ty tz qx qy qz qw, camera-to-world); without one they are estimated."""
+    calibration: tuple[float, float, float, float] | None = None
+    """Video: fx fy cx cy in pixels."""
+    distortion: tuple[float, ...] = ()
+    """Video: OpenCV distortion coefficients k1 k2 p1 p2 [k3]."""
+    mask: Path | None = None
+    """Video: image of one mask for all frames, white = tissue."""
+    scale: float | None = None
+    """Metres per unit of the poses, for poses of unknown scale."""
+    width: int | None = None
+    """Shrink frames to this width, pixels."""
+
+    def run(self) -> None:
+        from endo_sim_ros.sequences.bag import write_bag
+        from endo_sim_ros.sequences.readers import open_sequence
+
+        given = {name: getattr(self, name) for name in ("start", "stop", "fps", "split", "poses", "calibration", "mask", "scale")}
+        options = {name: value for name, value in given.items() if value is not None} | {"step": self.step}
+        if self.distortion:
+            options["distortion"] = self.distortion
+        frames = open_sequence(self.source, self.kind, **options)
+        count = write_bag(self.bag, _tracked(frames, f"converting {self.source.name}"))
+        print(f"{self.bag}: {count} frames")
+
+
+@dataclass(frozen=True)
+class Phantom:
+    """Write a bag of a synthetic patient with exact poses, depth, stereo pair and mask."""
+
+    bag: Positional[Path]
+    """Folder of the new bag; it must not exist."""
+    config: Annotated[PhantomConfig, tyro.conf.arg(name="")] = field(default_factory=PhantomConfig)
+
+    def run(self) -> None:
+        from endo_sim_ros.sequences.bag import write_bag
+        from endo_sim_ros.sequences.phantom import phantom_sequence
+
+        frames = _Sized(phantom_sequence(self.config), self.config.frames)
+        print(f"{self.bag}: {write_bag(self.bag, _tracked(frames, 'rendering the patient'))} frames")
+
+
+@dataclass(frozen=True)
+class Reconstruct:
+    """Reconstruct a Gaussian model from a bag without ROS, and measure it on the views that were held out."""
+
+    bag: Positional[Path]
+    """Bag with images, camera_info and poses."""
+    out: Positional[Path]
+    """Folder for model.ply, checkpoint.pt and held_out.png."""
+    config: Annotated[ReconstructionConfig, tyro.conf.arg(name="")] = field(default_factory=ReconstructionConfig)
+
+    def run(self) -> None:
+        from endo_sim_ros.evaluation.held_out import reconstruct_and_measure
+
+        reconstruct_and_measure(self.bag, self.out, self.config)
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Run the whole graph: replay, reconstruct, touch and render, each node its own process."""
+
+    bag: Path | None = None
+    """Bag to use; default: a synthetic patient."""
+    out: Path = Path("out")
+    """Folder for the results."""
+    seed: int = 0
+    """Synthetic patient: other seeds give other organs."""
+    frames: int = 60
+    """Synthetic patient: number of frames."""
+    width: int = 320
+    """Width of training and rendered images, pixels."""
+    iterations: int = 1500
+    """Training iterations."""
+    force: float = 0.6
+    """Largest force of the scripted tool, N."""
+    timeout: float = 900.0
+    """Give up after this long, seconds."""
+
+    def run(self) -> None:
+        from endo_sim_ros.nodes.demo import run_demo
+
+        run_demo(self.bag, self.out, self.seed, self.frames, self.width, self.iterations, self.force, self.timeout)
+
+
+@dataclass(frozen=True)
+class Config:
+    """Print the parameters of all nodes with their defaults as a ROS parameter file."""
+
+    def run(self) -> None:
+        from endo_sim_ros.nodes.parameter_file import parameter_file
+
+        print(parameter_file(), end="")
+
+
+COMMANDS = {"demo": Demo, "convert": Convert, "phantom": Phantom, "reconstruct": Reconstruct, "config": Config}
+
+
+class _Sized:
+    """An iterator whose length is known, for progress bars."""
+
+    def __init__(self, items: Iterable[Frame], count: int):
+        self._items, self._count = items, count
+
+    def __iter__(self) -> Iterator[Frame]:
+        return iter(self._items)
+
+    def __len__(self) -> int:
+        return self._count
+
+
+def _tracked(frames: Iterable[Frame], text: str) -> Iterable[Frame]:
+    return track(frames, description=text, total=len(frames) if hasattr(frames, "__len__") else None)
+
+
+def main() -> int:
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    command = tyro.extras.subcommand_cli_from_dict(
+        COMMANDS, prog="endo-sim", description="Endoscope recordings become tissue that a robot can touch."
+    )
+    start = time.monotonic()
+    try:
+        command.run()
+    except KeyboardInterrupt:
+        return 130
+    except (SequenceError, MessageError, ModelError, ConfigError, RuntimeError, ValueError, OSError) as error:
+        print(f"endo-sim: {error}", file=sys.stderr)
+        return 1
+    logging.getLogger(__name__).info("done in %.0f s", time.monotonic() - start)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

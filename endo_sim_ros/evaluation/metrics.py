@@ -1,0 +1,38 @@
+"""Image and depth quality as the field measures it."""
+
+import cv2
+import numpy as np
+
+
+def psnr(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """Peak signal-to-noise ratio, dB, of images [H, W, 3] uint8 over the pixels where the mask [H, W] is not 0."""
+    error = (image.astype(np.float64) - reference) ** 2
+    mse = error.mean() if mask is None else error[mask > 0].mean()
+    return float(10 * np.log10(255.0**2 / max(mse, 1e-12)))
+
+
+def gain_fitted(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
+    """The image times the one gain per channel that fits the reference best, undoing a difference in exposure."""
+    a, b = image.astype(np.float64), reference.astype(np.float64)
+    if mask is not None:
+        a, b = a[mask > 0], b[mask > 0]
+    a, b = a.reshape(-1, 3), b.reshape(-1, 3)
+    gain = (a * b).sum(0) / np.maximum((a * a).sum(0), 1e-12)
+    return np.clip(image * gain, 0, 255)
+
+
+def ssim(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """Mean structural similarity (11×11 Gaussian window, σ 1.5, no padding) of images [H, W, 3] uint8."""
+    x, y = image.astype(np.float64) / 255, reference.astype(np.float64) / 255
+    blur = lambda a: cv2.GaussianBlur(a, (11, 11), 1.5)[5:-5, 5:-5]  # noqa: E731
+    mu_x, mu_y = blur(x), blur(y)
+    var_x, var_y, cov = blur(x * x) - mu_x**2, blur(y * y) - mu_y**2, blur(x * y) - mu_x * mu_y
+    c1, c2 = 0.01**2, 0.03**2
+    values = (2 * mu_x * mu_y + c1) * (2 * cov + c2) / ((mu_x**2 + mu_y**2 + c1) * (var_x + var_y + c2))
+    return float(values.mean() if mask is None else values[mask[5:-5, 5:-5] > 0].mean())
+
+
+def depth_rmse(depth: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """Root mean square depth error, metres, of [H, W] where both have a value (> 0)."""
+    valid = (depth > 0) & (reference > 0) & (True if mask is None else mask > 0)
+    return float(np.sqrt(((depth - reference)[valid].astype(np.float64) ** 2).mean())) if valid.any() else float("nan")

@@ -1,0 +1,81 @@
+"""Parameters of the tissue simulation."""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from endo_sim_ros.config import Range, StageConfig
+
+
+@dataclass(frozen=True)
+class PhysicsConfig(StageConfig):
+    """How the tissue is built from the Gaussians, what it is made of and how it is stepped."""
+
+    node_count: Annotated[int, Range(8, 200_000)] = 2000
+    """Number of all simulated nodes: the skin gets node_count / (layers + 1) of them, each layer as many."""
+    thickness: Annotated[float, Range(1e-4, 1.0, "m")] = 0.02
+    """Depth of the tissue behind the reconstructed skin; the layers divide it evenly."""
+    layers: Annotated[int, Range(0, 32)] = 4
+    """Number of layers extruded behind the skin; 0 simulates the skin alone, as the paper prints it."""
+    pin_back: bool = True
+    """Hold the deepest layer in place."""
+    pin_rim: bool = True
+    """Hold the nodes at the border of the skin, as seen from the viewpoint, and the layers behind them."""
+    min_opacity: Annotated[float, Range(0.0, 1.0)] = 0.1
+    """Gaussians fainter than this do not become nodes."""
+    material: Literal["fixed_corotated", "neo_hookean"] = "fixed_corotated"
+    """Constitutive law."""
+    young_modulus: Annotated[float, Range(1.0, 1e9, "Pa")] = 10e3
+    """Stiffness of the tissue."""
+    poisson_ratio: Annotated[float, Range(0.0, 0.49)] = 0.3
+    """Compressibility. Wet tissue is nearer 0.49, but there the sound speed multiplies the substeps by four and
+    the coarse grid locks; 0.3 keeps the paper's substep stable."""
+    density: Annotated[float, Range(1.0, 1e5, "kg/m³")] = 1000.0
+    """Mass density of the tissue."""
+    substeps: Annotated[int, Range(1, 100_000)] = 80
+    """Substeps in one step."""
+    substep_dt: Annotated[float, Range(1e-7, 0.1, "s")] = 0.0005
+    """Duration of one substep; one step lasts substeps × substep_dt."""
+    adapt_substeps: bool = True
+    """Take more and shorter substeps where the material needs them; off, such a material is refused."""
+    damping: Annotated[float, Range(0.0, 1e5, "1/s")] = 50.0
+    """Rate c at which velocities decay, exp(-c t)."""
+    gravity_x: Annotated[float, Range(-100.0, 100.0, "m/s²")] = 0.0
+    """Gravity along world x. Zero by default: the reconstruction already hangs under gravity."""
+    gravity_y: Annotated[float, Range(-100.0, 100.0, "m/s²")] = 0.0
+    """Gravity along world y."""
+    gravity_z: Annotated[float, Range(-100.0, 100.0, "m/s²")] = 0.0
+    """Gravity along world z."""
+    kinematics: Literal["rest", "current"] = "rest"
+    """Where the transfer weights are taken: at the rest positions (total Lagrangian: never fractures numerically) or
+    at the current positions (updated Lagrangian, as PhysGaussian and the paper have it)."""
+    grid_ratio: Annotated[float, Range(1.0, 4.0)] = 1.75
+    """Grid cell size over node spacing. Near 1 a cell holds one node and has motions that no node resists (with current
+    kinematics it fractures); above 2 dents are blurred."""
+    travel: Annotated[float, Range(1e-3, 10.0, "m")] = 0.05
+    """Farthest a node may move from rest; a step that takes one farther is undone and counted as a fault."""
+    force_radius: Annotated[float, Range(1e-4, 1.0, "m")] = 0.01
+    """A tool acts on the skin nodes within this distance of its tip."""
+    skinning: Literal["compact", "softmax"] = "compact"
+    """Weights from nodes to Gaussians: compact (1 - (d/d5)²)² with F, or the paper's softmax(d) with R."""
+    neighbours: Annotated[int, Range(1, 32)] = 4
+    """Number of nodes that move one Gaussian."""
+    dense: bool = False
+    """Simulate every Gaussian as a material point (PhysGaussian's way) instead of sparse nodes;
+    layers are then ignored."""
+    device: str = "auto"
+    """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""
+
+    @classmethod
+    def baseline(cls, **overrides) -> "PhysicsConfig":
+        """PhysGaussian's way through the same solver: every Gaussian a material point, skin only, current weights."""
+        return cls(**{"dense": True, "layers": 0, "kinematics": "current", "grid_ratio": 1.0, **overrides})
+
+    @property
+    def step_duration(self) -> float:
+        """Simulated time of one step, seconds."""
+        return self.substeps * self.substep_dt
+
+    @property
+    def gravity(self) -> tuple[float, float, float]:
+        """Gravity, world, m/s²."""
+        return self.gravity_x, self.gravity_y, self.gravity_z

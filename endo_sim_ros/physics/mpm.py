@@ -1,0 +1,201 @@
+"""The material point solver: owns the grid and the state of the moving nodes, and takes steps."""
+
+import logging
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import warp as wp
+
+from endo_sim_ros.device import init_warp, pick_device
+from endo_sim_ros.physics.config import PhysicsConfig
+from endo_sim_ros.physics.control_nodes import ControlNodes
+from endo_sim_ros.physics.materials import energy_density, lame_parameters, sound_speed
+from endo_sim_ros.physics.mpm_kernels import Grid, Nodes, check_nodes, make_advance_kernel, update_grid
+
+log = logging.getLogger(__name__)
+
+CFL_LIMIT = 0.7  # c Δt / h; measured: 0.7 runs, 0.9 blows up
+PIN_STIFFNESS = 50.0  # of a pinned node's spring, over that of a cube of tissue of its volume
+MARGIN_CELLS = 2.0  # between the nodes and the edge of the grid; a spline reaches 1.5
+MAX_GRID_NODES = 64_000_000  # 28 bytes each
+
+
+class StabilityError(ValueError):
+    """A material that the chosen substep cannot follow; the message names the numbers and the substep that could."""
+
+
+@dataclass(frozen=True)
+class Substepping:
+    """How one step is divided."""
+
+    count: int
+    dt: float  # s
+    cfl: float  # c Δt / h
+    note: str  # one sentence when the count differs from the configured one, else empty
+
+
+def plan_substeps(config: PhysicsConfig, cell_size: float) -> Substepping:
+    """Check the Courant number c Δt/h and, where allowed, raise the substep count to what is stable.
+
+    Args:
+        config: Material and substeps asked for.
+        cell_size: Grid cell size h, metres.
+
+    Raises:
+        StabilityError: If the substeps are too long and ``adapt_substeps`` is off.
+    """
+    speed = sound_speed(config.young_modulus, config.poisson_ratio, config.density)
+    cfl = speed * config.substep_dt / cell_size
+    if cfl <= CFL_LIMIT:
+        return Substepping(config.substeps, config.substep_dt, cfl, "")
+    count = math.ceil(config.substeps * cfl / CFL_LIMIT)
+    dt = config.step_duration / count
+    why = (
+        f"young_modulus {config.young_modulus:g} Pa, poisson_ratio {config.poisson_ratio:g} and density"
+        f" {config.density:g} kg/m³ on a grid of {cell_size:.3g} m give a Courant number of {cfl:.2f} with"
+        f" {config.substeps} substeps of {config.substep_dt:g} s (limit {CFL_LIMIT})"
+    )
+    if not config.adapt_substeps:
+        raise StabilityError(f"{why}; use {count} substeps of {dt:.3g} s or a softer material")
+    return Substepping(count, dt, speed * dt / cell_size, f"{why}: taking {count} substeps of {dt:.3g} s instead")
+
+
+class MpmSolver:
+    """MLS-MPM over control nodes on one device.
+
+    The state lives in a local frame (world axes, origin at the grid's corner) as displacement from rest, so that a
+    scene metres from the world's origin is as accurate as one at it and an undisturbed rest state is an exact fixed
+    point. On CPU the solver is serial and bit-for-bit repeatable.
+
+    Args:
+        nodes: The nodes at rest.
+        config: Material, substeps, grid and device.
+
+    Raises:
+        StabilityError: If the substeps are too long for the material and may not be adapted.
+        ValueError: If the grid would be absurdly large.
+    """
+
+    def __init__(self, nodes: ControlNodes, config: PhysicsConfig):
+        init_warp()
+        self.device = pick_device(config.device)
+        self.config = config
+        self.mu, self.lam = lame_parameters(config.young_modulus, config.poisson_ratio)
+        self.cell_size = config.grid_ratio * nodes.spacing
+        self.substepping = plan_substeps(config, self.cell_size)
+        if self.substepping.note:
+            log.warning("%s", self.substepping.note)
+
+        h = self.cell_size
+        margin = MARGIN_CELLS * h + (config.travel if config.kinematics == "current" else 0.0)
+        rest = nodes.rest.astype(np.float64)
+        self.origin = rest.min(0) - margin  # [3] world, m
+        shape = np.ceil((rest.max(0) + margin - self.origin) / h).astype(int) + 1
+        if shape.prod() > MAX_GRID_NODES:
+            raise ValueError(
+                f"the simulation grid would have {shape[0]}×{shape[1]}×{shape[2]} nodes of {h:.3g} m; remove outlying"
+                " Gaussians, lower node_count or raise grid_ratio"
+            )
+        self.grid_shape = tuple(int(n) for n in shape)
+        self._grid = Grid()
+        self._grid.h, self._grid.inverse_h = h, 1 / h
+        self._grid.nx, self._grid.ny, self._grid.nz = self.grid_shape
+
+        def array(values, dtype):
+            return wp.array(values, dtype=dtype, device=self.device)
+
+        # A pinned node's springs are stiffer than the tissue beside it, so that it gives way a few per cent at most.
+        stiffness = PIN_STIFFNESS * (self.lam + 2 * self.mu) * np.cbrt(nodes.volumes) * nodes.pinned
+        count = len(nodes)
+        self._nodes = Nodes()
+        self._nodes.X = array((rest - self.origin).astype(np.float32), wp.vec3)
+        self._nodes.mass = array((nodes.volumes * config.density).astype(np.float32), float)
+        self._nodes.volume = array(nodes.volumes.astype(np.float32), float)
+        self._nodes.spring = array(stiffness.astype(np.float32), float)
+        self._nodes.force = wp.zeros(count, wp.vec3, device=self.device)
+        self._nodes.u = wp.zeros(count, wp.vec3, device=self.device)
+        self._nodes.v = wp.zeros(count, wp.vec3, device=self.device)
+        self._nodes.C = wp.zeros(count, wp.mat33, device=self.device)
+        self._nodes.F = wp.empty(count, wp.mat33, device=self.device)
+        self._state = (self._nodes.u, self._nodes.v, self._nodes.C, self._nodes.F)
+        self._backup = tuple(wp.empty_like(array) for array in self._state)
+        self._grid_mv = wp.zeros(self.grid_shape, wp.vec4, device=self.device)
+        self._grid_v = wp.zeros(self.grid_shape, wp.vec3, device=self.device)
+        self._fault = wp.zeros(1, int, device=self.device)
+        self._graph = None
+        self.reset()
+
+    def reset(self) -> None:
+        """Back to rest, no force."""
+        for array in (self._nodes.force, self._nodes.u, self._nodes.v, self._nodes.C):
+            array.zero_()
+        self._nodes.F.fill_(wp.mat33(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))
+
+    def set_forces(self, forces: np.ndarray) -> None:
+        """Forces on the nodes [M, 3], N, world; kept until set again."""
+        self._nodes.force.assign(np.ascontiguousarray(forces, np.float32))
+
+    def step(self) -> int:
+        """Take one step; returns how many nodes ended it non-finite or out of bounds (0 = a good step)."""
+        if self._graph is None:
+            self._graph = self._capture()
+        wp.capture_launch(self._graph)
+        return int(self._fault.numpy()[0])
+
+    def _capture(self):
+        """The whole step as one graph; forces are read from their device array at every launch."""
+        advance = make_advance_kernel(self.config.material, self.config.kinematics)
+        for kernel in (advance, check_nodes):
+            wp.load_module(kernel.module, device=self.device)
+        with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
+            self._record(advance)
+        return capture.graph
+
+    def _record(self, advance) -> None:
+        dt, count = self.substepping.dt, self.substepping.count
+        gravity = wp.vec3(*self.config.gravity)
+        decay = math.exp(-self.config.damping * dt)
+        constants = [self._nodes, self._grid, dt, gravity, self.mu, self.lam]
+        grid_mv, grid_v = self._grid_mv.flatten(), self._grid_v.flatten()
+        for array, backup in zip(self._state, self._backup):
+            wp.copy(backup, array)
+        self._fault.zero_()
+        grid_mv.zero_()
+        for substep in range(count + 1):
+            gather, scatter = int(substep > 0), int(substep < count)
+            if gather:
+                wp.launch(update_grid, len(grid_mv), [decay, grid_mv, grid_v], device=self.device)
+            inputs = [*constants, gather, scatter, self._grid_v, self._grid_mv]
+            wp.launch(advance, len(self._nodes.X), inputs, device=self.device)
+        inputs = [self._nodes.u, self._nodes.F, self.config.travel, self._fault]
+        wp.launch(check_nodes, len(self._nodes.X), inputs, device=self.device)
+
+    def restore(self) -> None:
+        """Return to the state before the last step, at rest there."""
+        for array, backup in zip(self._state, self._backup):
+            wp.copy(array, backup)
+        self._nodes.v.zero_()
+        self._nodes.C.zero_()
+
+    def displacements(self) -> np.ndarray:
+        """Displacements [M, 3], m, world axes. Those of pinned nodes are how far their springs give way."""
+        return self._nodes.u.numpy().copy()
+
+    def deformation_gradients(self) -> np.ndarray:
+        """F of all nodes [M, 3, 3]."""
+        return self._nodes.F.numpy().copy()
+
+    def momentum(self) -> np.ndarray:
+        """Total linear momentum of the nodes [3], kg·m/s."""
+        return (self._nodes.mass.numpy().astype(np.float64)[:, None] * self._nodes.v.numpy()).sum(0)
+
+    def energy(self) -> tuple[float, float]:
+        """Kinetic energy (with the affine motion that APIC carries) and elastic energy, J."""
+        mass, volume = self._nodes.mass.numpy().astype(np.float64), self._nodes.volume.numpy().astype(np.float64)
+        v, C = self._nodes.v.numpy().astype(np.float64), self._nodes.C.numpy().astype(np.float64)
+        kinetic = 0.5 * (mass * ((v**2).sum(1) + self.cell_size**2 / 4 * (C**2).sum((1, 2)))).sum()
+        F = torch.from_numpy(self._nodes.F.numpy()).double()
+        density = energy_density(self.config.material, F, self.mu, self.lam).numpy()
+        return float(kinetic), float((volume * density).sum())

@@ -1,0 +1,182 @@
+"""The tissue that tools push and pull: control nodes, the solver, wrenches and faults."""
+
+import logging
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from endo_sim_ros.gaussians import GaussianModel
+from endo_sim_ros.physics.config import PhysicsConfig
+from endo_sim_ros.physics.control_nodes import ControlNodes, build_control_nodes
+from endo_sim_ros.physics.mpm import MpmSolver
+from endo_sim_ros.physics.wrench import fall_off, minimum_norm_forces
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class NodeState:
+    """What the renderer needs to know, at one time; all float32, world frame."""
+
+    rest: np.ndarray  # [M, 3] m
+    positions: np.ndarray  # [M, 3] m
+    F: np.ndarray  # deformation gradients [M, 3, 3]
+    time: float  # s since the start or the last reset
+
+
+@dataclass
+class _Tool:
+    tip: np.ndarray  # [3] m, world
+    force: np.ndarray  # [3] N
+    torque: np.ndarray  # [3] N·m
+    nodes: np.ndarray = field(default_factory=lambda: np.empty(0, int))  # attached, indices
+    weights: np.ndarray = field(default_factory=lambda: np.empty(0))
+    applied: tuple[np.ndarray, np.ndarray] = (np.zeros(3), np.zeros(3))  # force N and torque N·m that arrived
+
+
+class TissueSimulation:
+    """Soft tissue behind a reconstructed skin, stepped in fixed steps of ``step_duration``.
+
+    A tool takes hold of the tissue when its wrench becomes non-zero: the moving skin nodes then within
+    ``force_radius`` of its tip (in their current positions) are its nodes until the wrench is zero again, so that
+    grabbed tissue follows without jitter. A tool that reaches no node applies nothing and tries again every step.
+
+    Args:
+        model: The reconstructed Gaussians, world.
+        viewpoint: Camera position [3] or positions [V, 3], metres, world; the tissue extends away from it.
+        config: Parameters.
+
+    Raises:
+        ValueError: If no tissue can be built from the model, or (:class:`StabilityError`) the substeps are too long.
+    """
+
+    def __init__(self, model: GaussianModel, viewpoint: np.ndarray, config: PhysicsConfig):
+        self._start(build_control_nodes(model, viewpoint, config), config)
+
+    @classmethod
+    def from_nodes(cls, nodes: ControlNodes, config: PhysicsConfig) -> "TissueSimulation":
+        """Simulate given nodes, such as a test specimen."""
+        simulation = cls.__new__(cls)
+        simulation._start(nodes, config)
+        return simulation
+
+    def _start(self, nodes: ControlNodes, config: PhysicsConfig) -> None:
+        self.nodes = nodes
+        self.config = config
+        self.solver = MpmSolver(nodes, config)
+        self.substepping = self.solver.substepping
+        self.step_duration = config.step_duration
+        self.time = 0.0
+        self.faults = 0  # steps undone because a node ran away
+        self.last_fault = ""
+        self._tools: dict[str, _Tool] = {}
+        self._touchable = np.flatnonzero(nodes.is_skin & ~nodes.pinned)
+        self._loaded = False
+
+    def set_wrench(
+        self, tool: str, tip: np.ndarray, force: np.ndarray, torque: np.ndarray | tuple[float, ...] = (0.0, 0.0, 0.0)
+    ) -> bool:
+        """The wrench that a tool exerts on the tissue at its tip, until changed; zero lets go.
+
+        Args:
+            tool: Name of the tool.
+            tip: Tip position [3], metres, world. It may move while the tool holds on.
+            force: Force [3], N, world.
+            torque: Torque about the tip [3], N·m, world.
+
+        Returns:
+            Whether the wrench arrives: False when it is not zero but no moving skin node is in reach.
+
+        Raises:
+            ValueError: If an input has a wrong shape or is not finite; the tool then keeps its previous wrench.
+        """
+        tip, force, torque = (
+            _vector(name, value, tool) for name, value in (("tip", tip), ("force", force), ("torque", torque))
+        )
+        if not (force.any() or torque.any()):
+            self._tools.pop(tool, None)
+            return True
+        held = self._tools.setdefault(tool, _Tool(tip, force, torque))
+        held.tip, held.force, held.torque = tip, force, torque
+        positions = self._positions()
+        self._attach(held, positions)
+        self._distribute(held, positions)
+        return len(held.nodes) > 0
+
+    def reaction(self, tool: str) -> tuple[np.ndarray, np.ndarray]:
+        """Force [3] N and torque about the tip [3] N·m that the tissue exerts back on a tool, world: minus what was
+        applied; zero for a tool that is out of reach, has let go or is unknown."""
+        held = self._tools.get(tool)
+        force, torque = held.applied if held else (np.zeros(3), np.zeros(3))
+        return 0.0 - force, 0.0 - torque
+
+    def in_reach(self, tool: str) -> bool:
+        """Whether the tool holds on to tissue."""
+        return tool in self._tools and len(self._tools[tool].nodes) > 0
+
+    def step(self) -> None:
+        """Advance by ``step_duration``. A step that ends badly is undone, counted in ``faults`` and described in
+        ``last_fault``; the tissue is then at rest where it was before."""
+        if self._tools or self._loaded:
+            positions = self._positions()
+            forces = np.zeros_like(positions)
+            for held in self._tools.values():
+                self._attach(held, positions)
+                np.add.at(forces, held.nodes, self._distribute(held, positions))
+            self.solver.set_forces(forces)
+            self._loaded = bool(self._tools)
+        bad = self.solver.step()
+        self.time += self.step_duration
+        if bad:
+            self.solver.restore()
+            self.faults += 1
+            self.last_fault = (
+                f"step to {self.time:.3f} s undone: {bad} of {len(self.nodes)} nodes ended non-finite, torn or"
+                f" over {self.config.travel:g} m from rest ({self._describe_tools()}); use less force or more travel"
+            )
+            log.warning("%s", self.last_fault)
+
+    def reset(self) -> None:
+        """Back to the rest state at time zero; tools let go."""
+        self.solver.reset()
+        self._tools.clear()
+        self._loaded = False
+        self.time = 0.0
+
+    def state(self) -> NodeState:
+        """Positions and deformation gradients of all nodes now."""
+        moving = ~self.nodes.pinned[:, None]
+        positions = self.nodes.rest + self.solver.displacements() * moving
+        F = np.where(moving[..., None], self.solver.deformation_gradients(), np.eye(3, dtype=np.float32))
+        return NodeState(self.nodes.rest, positions, F, self.time)
+
+    def _positions(self) -> np.ndarray:
+        return self.nodes.rest.astype(np.float64) + self.solver.displacements()
+
+    def _attach(self, held: _Tool, positions: np.ndarray) -> None:
+        if len(held.nodes) == 0:
+            distances = np.linalg.norm(positions[self._touchable] - held.tip, axis=1)
+            near = distances <= self.config.force_radius
+            held.nodes = self._touchable[near]
+            held.weights = fall_off(distances[near], self.config.force_radius)
+
+    def _distribute(self, held: _Tool, positions: np.ndarray) -> np.ndarray:
+        """Forces on the tool's nodes [K, 3]; remembers what they add up to."""
+        if len(held.nodes) == 0:
+            held.applied = (np.zeros(3), np.zeros(3))
+            return np.zeros((0, 3))
+        offsets = positions[held.nodes] - held.tip
+        forces = minimum_norm_forces(offsets, held.weights, held.force, held.torque)
+        held.applied = (forces.sum(0), np.cross(offsets, forces).sum(0))
+        return forces
+
+    def _describe_tools(self) -> str:
+        parts = [f"{name} {np.linalg.norm(held.force):.3g} N" for name, held in self._tools.items()]
+        return ", ".join(parts) or "no tool"
+
+
+def _vector(name: str, value: np.ndarray, tool: str) -> np.ndarray:
+    vector = np.asarray(value, np.float64)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise ValueError(f"{name} of tool {tool!r} must be three finite numbers, got {vector.tolist()}")
+    return vector

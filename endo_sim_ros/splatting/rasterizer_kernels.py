@@ -1,0 +1,742 @@
+"""Kernels of the rasteriser: projection, tile lists, and one-thread-per-pixel compositing.
+
+Notation. A splat is one Gaussian n seen by one camera c; splats are numbered c·N + n. With mean position p in the
+camera frame, J the Jacobian of the pinhole projection (x/z and y/z clamped to 1.3 fields of view), R the camera
+rotation and Σ the world covariance, its footprint in the image is a 2D Gaussian (EWA splatting, Zwicker et al. 2001;
+3DGS, eq. 5)
+
+    mean = (fx x/z + cx, fy y/z + cy),   cov = J R Σ Rᵀ Jᵀ + eps2d I,   conic = cov⁻¹ = [[A, B], [B, C]]
+    σ(d) = ½ (A dx² + C dy²) + B dx dy,   α = min(0.999, opacity · exp(−σ)), nothing below 1/255.
+
+Compositing, front to back, with w_i = α_i T_i and T_{i+1} = T_i (1 − α_i), until T would drop below 1e-4:
+
+    colour = Σ w_i c_i + T background,   depth = Σ w_i z_i,   alpha = Σ w_i,
+    distortion L = Σ_ij w_i w_j |z_i − z_j| = Σ_i 2 w_i (z_i W_i − D_i),   W_i = Σ_{j<i} w_j,   D_i = Σ_{j<i} w_j z_j.
+
+Backward, in one front-to-back pass (v_x is the gradient of the loss with respect to x): with
+
+    ∂L/∂w_i = 2 [z_i (W_i + W_{i+1} − W) + D − D_i − D_{i+1}],     ∂L/∂z_i = 2 w_i (W_i + W_{i+1} − W),
+    g_i = v_colour·c_i + v_depth z_i + v_alpha + v_L ∂L/∂w_i,       v_α_i = T_i g_i − (S − Σ_{j≤i} w_j g_j) / (1 − α_i),
+    S = Σ_i w_i g_i = v_colour·colour + v_depth D + v_alpha W + 2 v_L L   (colour without background here).
+
+Depths are taken relative to the first splat of a tile: L does not change, and float32 keeps the small differences.
+
+Memory layout. `splats` is one float32 row of 16 per splat, one cache line; its columns are the constants below. A splat
+touches the tiles whose pixel centres its ellipse α ≥ 1/255 meets. Those (splat, tile) pairs are *intersections*,
+numbered in depth order of their splats, so that the intersections of a splat are consecutive; `slots` lists them by
+tile, and within a tile by depth. The backward pass writes one gradient row of 12 per intersection; `project_backward`
+adds up the consecutive rows of a splat. No two CPU threads write to the same place, so results repeat bit for bit.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+TILE = 16  # pixels, width and height of a tile
+SPLAT_SIZE = 16  # floats per splat
+RECORD_SIZE = 12  # floats per gradient record
+
+# Columns of a splat.
+X, Y = wp.constant(0), wp.constant(1)  # mean, pixels
+A, B, C = wp.constant(2), wp.constant(3), wp.constant(4)  # conic, 1/pixel²
+OPACITY = wp.constant(5)
+Z = wp.constant(6)  # depth, metres
+RED = wp.constant(7)  # and green, blue
+EXTENT_X, EXTENT_Y = wp.constant(10), wp.constant(11)  # half size of the ellipse's bounding box, pixels
+HALF_WIDTH = wp.constant(12)  # half width of the ellipse along the row through its centre, pixels
+# A gradient record has the gradients of columns 0 to 9 in the same order.
+
+ALPHA_MIN = wp.constant(1.0 / 255.0)
+ALPHA_MAX = wp.constant(0.999)
+TRANSMITTANCE_MIN = wp.constant(1e-4)
+# Slack that keeps the tile test on the safe side of float32 rounding.
+LOG_ALPHA_SLACK = wp.constant(0.01)
+PIXEL_SLACK = wp.constant(0.01)
+
+TILE_SIZE = wp.constant(TILE)
+TILE_LAST = wp.constant(float(TILE - 1))
+
+mat23 = wp.types.matrix(shape=(2, 3), dtype=wp.float32)
+vec10 = wp.types.vector(length=10, dtype=wp.float32)
+vec16 = wp.types.vector(length=16, dtype=wp.float32)
+
+
+# ---------------------------------------------------------------- one Gaussian
+
+
+@wp.func
+def unit_quat(quat: wp.vec4) -> wp.vec4:
+    """Normalised quaternion; the zero quaternion stands for no rotation."""
+    norm = wp.length(quat)
+    if norm < 1.0e-12:
+        return wp.vec4(1.0, 0.0, 0.0, 0.0)
+    return quat / norm
+
+
+@wp.func
+def quat_to_matrix(q: wp.vec4) -> wp.mat33:
+    """Rotation matrix of a unit quaternion wxyz."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    return wp.mat33(
+        1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y),
+        2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x),
+        2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y),
+    )  # fmt: skip
+
+
+@wp.func
+def quat_gradient(quat: wp.vec4, v: wp.mat33) -> wp.vec4:
+    """Gradient of a quaternion (not necessarily normalised) from that of its rotation matrix."""
+    norm = wp.length(quat)
+    if norm < 1.0e-12:
+        return wp.vec4(0.0, 0.0, 0.0, 0.0)
+    q = quat / norm
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    v_q = 2.0 * wp.vec4(
+        x * (v[2, 1] - v[1, 2]) + y * (v[0, 2] - v[2, 0]) + z * (v[1, 0] - v[0, 1]),
+        w * (v[2, 1] - v[1, 2]) + y * (v[1, 0] + v[0, 1]) + z * (v[2, 0] + v[0, 2]) - 2.0 * x * (v[1, 1] + v[2, 2]),
+        w * (v[0, 2] - v[2, 0]) + x * (v[1, 0] + v[0, 1]) + z * (v[2, 1] + v[1, 2]) - 2.0 * y * (v[0, 0] + v[2, 2]),
+        w * (v[1, 0] - v[0, 1]) + x * (v[2, 0] + v[0, 2]) + y * (v[2, 1] + v[1, 2]) - 2.0 * z * (v[0, 0] + v[1, 1]),
+    )
+    return (v_q - q * wp.dot(q, v_q)) / norm
+
+
+@wp.func
+def scaled_rotation(quat: wp.vec4, scale: wp.vec3) -> wp.mat33:
+    """M = R diag(scale), so that the covariance is M Mᵀ."""
+    return quat_to_matrix(unit_quat(quat)) * wp.diag(scale)
+
+
+@wp.func
+def world_covariance(
+    n: int, quats: wp.array[wp.vec4], scales: wp.array[wp.vec3], covars: wp.array[wp.mat33], has_covars: int
+) -> wp.mat33:
+    """Covariance of Gaussian n, m²: the symmetric part of the one given, or R S Sᵀ Rᵀ."""
+    if has_covars != 0:
+        return 0.5 * (covars[n] + wp.transpose(covars[n]))
+    m = scaled_rotation(quats[n], scales[n])
+    return m * wp.transpose(m)
+
+
+@wp.func
+def sh_basis(count: int, d: wp.vec3) -> vec16:
+    """The first 1, 4, 9 or 16 real spherical harmonics in a unit direction, ordered and signed as in 3DGS files."""
+    x, y, z = d[0], d[1], d[2]
+    b = vec16()
+    b[0] = 0.28209479177387814
+    if count > 1:
+        b[1] = -0.4886025119029199 * y
+        b[2] = 0.4886025119029199 * z
+        b[3] = -0.4886025119029199 * x
+    if count > 4:
+        b[4] = 1.0925484305920792 * x * y
+        b[5] = -1.0925484305920792 * y * z
+        b[6] = 0.31539156525252005 * (2.0 * z * z - x * x - y * y)
+        b[7] = -1.0925484305920792 * x * z
+        b[8] = 0.5462742152960396 * (x * x - y * y)
+    if count > 9:
+        b[9] = -0.5900435899266435 * y * (3.0 * x * x - y * y)
+        b[10] = 2.890611442640554 * x * y * z
+        b[11] = -0.4570457994644658 * y * (4.0 * z * z - x * x - y * y)
+        b[12] = 0.3731763325901154 * z * (2.0 * z * z - 3.0 * x * x - 3.0 * y * y)
+        b[13] = -0.4570457994644658 * x * (4.0 * z * z - x * x - y * y)
+        b[14] = 1.445305721320277 * z * (x * x - y * y)
+        b[15] = -0.5900435899266435 * x * (x * x - 3.0 * y * y)
+    return b
+
+
+@wp.func
+def sh_direction_gradient(count: int, d: wp.vec3, v: vec16) -> wp.vec3:
+    """Gradient of the direction from those of the basis values."""
+    x, y, z = d[0], d[1], d[2]
+    g = wp.vec3()
+    if count > 1:
+        g += 0.4886025119029199 * wp.vec3(-v[3], -v[1], v[2])
+    if count > 4:
+        g += 1.0925484305920792 * wp.vec3(v[4] * y - v[7] * z, v[4] * x - v[5] * z, -v[5] * y - v[7] * x)
+        g += 0.31539156525252005 * v[6] * wp.vec3(-2.0 * x, -2.0 * y, 4.0 * z)
+        g += 0.5462742152960396 * v[8] * wp.vec3(2.0 * x, -2.0 * y, 0.0)
+    if count > 9:
+        xx, yy, zz = x * x, y * y, z * z
+        g += -0.5900435899266435 * v[9] * wp.vec3(6.0 * x * y, 3.0 * (xx - yy), 0.0)
+        g += 2.890611442640554 * v[10] * wp.vec3(y * z, x * z, x * y)
+        g += -0.4570457994644658 * v[11] * wp.vec3(-2.0 * x * y, 4.0 * zz - xx - 3.0 * yy, 8.0 * y * z)
+        g += 0.3731763325901154 * v[12] * wp.vec3(-6.0 * x * z, -6.0 * y * z, 6.0 * zz - 3.0 * xx - 3.0 * yy)
+        g += -0.4570457994644658 * v[13] * wp.vec3(4.0 * zz - 3.0 * xx - yy, -2.0 * x * y, 8.0 * x * z)
+        g += 1.445305721320277 * v[14] * wp.vec3(2.0 * x * z, -2.0 * y * z, xx - yy)
+        g += -0.5900435899266435 * v[15] * wp.vec3(3.0 * (xx - yy), -6.0 * x * y, 0.0)
+    return g
+
+
+@wp.func
+def sh_color(n: int, count: int, basis: vec16, sh: wp.array2d[wp.vec3]) -> wp.vec3:
+    """Colour of Gaussian n before it is clamped at zero."""
+    color = wp.vec3(0.5, 0.5, 0.5)
+    for k in range(count):
+        color += basis[k] * sh[n, k]
+    return color
+
+
+@wp.func
+def camera_rotation(viewmat: wp.mat44) -> wp.mat33:
+    return wp.mat33(
+        viewmat[0, 0], viewmat[0, 1], viewmat[0, 2],
+        viewmat[1, 0], viewmat[1, 1], viewmat[1, 2],
+        viewmat[2, 0], viewmat[2, 1], viewmat[2, 2],
+    )  # fmt: skip
+
+
+@wp.func
+def camera_translation(viewmat: wp.mat44) -> wp.vec3:
+    return wp.vec3(viewmat[0, 3], viewmat[1, 3], viewmat[2, 3])
+
+
+@wp.func
+def clamped_slopes(p: wp.vec3, K: wp.mat33, width: int, height: int) -> wp.vec2:
+    """x/z and y/z, limited to the image plus 0.3 half fields of view, where the linearised projection still holds."""
+    margin_x = 0.15 * float(width) / K[0, 0]
+    margin_y = 0.15 * float(height) / K[1, 1]
+    return wp.vec2(
+        wp.clamp(p[0] / p[2], -K[0, 2] / K[0, 0] - margin_x, (float(width) - K[0, 2]) / K[0, 0] + margin_x),
+        wp.clamp(p[1] / p[2], -K[1, 2] / K[1, 1] - margin_y, (float(height) - K[1, 2]) / K[1, 1] + margin_y),
+    )
+
+
+@wp.func
+def projection_jacobian(slopes: wp.vec2, z: float, K: wp.mat33) -> mat23:
+    """∂(pixel)/∂(camera coordinates), pixel/m."""
+    fx, fy = K[0, 0] / z, K[1, 1] / z
+    return mat23(fx, 0.0, -fx * slopes[0], 0.0, fy, -fy * slopes[1])
+
+
+@wp.func
+def image_covariance(to_image: mat23, covariance: wp.mat33, eps2d: float) -> wp.vec3:
+    """xx, xy and yy of the blurred covariance in the image, pixel²."""
+    cov = to_image * covariance * wp.transpose(to_image)
+    return wp.vec3(cov[0, 0] + eps2d, cov[0, 1], cov[1, 1] + eps2d)
+
+
+# ---------------------------------------------------------------- tiles
+
+
+@wp.func
+def tile_rows(y: float, extent_y: float, tiles_y: int) -> wp.vec2i:
+    """Rows [first, end) of tiles that have a pixel centre within extent_y of y."""
+    size = float(TILE_SIZE)
+    first = wp.ceil((y - extent_y - PIXEL_SLACK - TILE_LAST - 0.5) / size)
+    last = wp.floor((y + extent_y + PIXEL_SLACK - 0.5) / size)
+    end = float(tiles_y)
+    return wp.vec2i(int(wp.clamp(first, 0.0, end)), int(wp.clamp(last + 1.0, 0.0, end)))
+
+
+@wp.func
+def tile_columns(
+    row: int, x: float, y: float, a: float, b: float, c: float, extent: wp.vec2, half_width: float, tiles_x: int
+) -> wp.vec2i:
+    """Columns [first, end) of tiles in one row that have a pixel centre in the x-range of ellipse ∩ row.
+
+    Ellipse and row are convex, so the tiles met are exactly a range. At height dy the ellipse spans
+    −(B/A) dy ± half_width √(1 − dy²/extent_y²); it is widest to the right at dy = −(B/C) extent_x.
+    """
+    size = float(TILE_SIZE)
+    low = wp.max(float(row * TILE_SIZE) + 0.5 - y - PIXEL_SLACK, -extent[1])
+    high = wp.min(float(row * TILE_SIZE) + 0.5 + TILE_LAST - y + PIXEL_SLACK, extent[1])
+    widest = -b / c * extent[0]
+    dy_right = wp.clamp(widest, low, high)
+    dy_left = wp.clamp(-widest, low, high)
+    t_right, t_left = dy_right / extent[1], dy_left / extent[1]
+    right = x - b / a * dy_right + half_width * wp.sqrt(wp.max(1.0 - t_right * t_right, 0.0)) + PIXEL_SLACK
+    left = x - b / a * dy_left - half_width * wp.sqrt(wp.max(1.0 - t_left * t_left, 0.0)) - PIXEL_SLACK
+    first = wp.ceil((left - TILE_LAST - 0.5) / size)
+    last = wp.floor((right - 0.5) / size)
+    end = float(tiles_x)
+    return wp.vec2i(int(wp.clamp(first, 0.0, end)), int(wp.clamp(last + 1.0, 0.0, end)))
+
+
+@wp.kernel
+def project(
+    offset: int,
+    means: wp.array[wp.vec3],
+    quats: wp.array[wp.vec4],
+    scales: wp.array[wp.vec3],
+    covars: wp.array[wp.mat33],
+    has_covars: int,
+    opacities: wp.array[float],
+    sh: wp.array2d[wp.vec3],
+    viewmats: wp.array[wp.mat44],
+    Ks: wp.array[wp.mat33],
+    width: int,
+    height: int,
+    near: float,
+    eps2d: float,
+    tile_mask: wp.array[wp.uint8],  # [C · tiles], 0 = nobody looks at this tile
+    splats: wp.array2d[float],  # out
+    radii: wp.array[int],  # out, pixels, 0 = not in the image
+    depth_keys: wp.array[int],  # out, order as depths do
+    counts: wp.array[int],  # out, intersections of each splat
+):
+    splat = offset + wp.tid()
+    gaussian_count = means.shape[0]
+    camera = splat // gaussian_count
+    n = splat - camera * gaussian_count
+    radii[splat] = 0
+    depth_keys[splat] = 0
+    counts[splat] = 0
+
+    viewmat, K = viewmats[camera], Ks[camera]
+    rotation, translation = camera_rotation(viewmat), camera_translation(viewmat)
+    p = rotation * means[n] + translation
+    opacity = opacities[n]
+    # Written so that NaN fails the test too.
+    if not (p[2] >= near and opacity >= ALPHA_MIN):
+        return
+    to_image = projection_jacobian(clamped_slopes(p, K, width, height), p[2], K) * rotation
+    cov = image_covariance(to_image, world_covariance(n, quats, scales, covars, has_covars), eps2d)
+    det = cov[0] * cov[2] - cov[1] * cov[1]
+    if not (det > 0.0 and cov[0] > 0.0):
+        return
+    x, y = K[0, 0] * p[0] / p[2] + K[0, 2], K[1, 1] * p[1] / p[2] + K[1, 2]
+    a, b, c = cov[2] / det, -cov[1] / det, cov[0] / det
+    level = 2.0 * (wp.log(255.0 * opacity) + LOG_ALPHA_SLACK)
+    extent = wp.vec2(wp.sqrt(level * cov[0]), wp.sqrt(level * cov[2]))
+    half_width = wp.sqrt(level / a)
+
+    basis = vec16()
+    if sh.shape[1] == 1:
+        basis[0] = 0.28209479177387814
+    else:
+        basis = sh_basis(sh.shape[1], wp.normalize(means[n] + wp.transpose(rotation) * translation))
+    color = sh_color(n, sh.shape[1], basis, sh)
+    finite = wp.isfinite(x + y + a + b + c + extent[0] + extent[1] + half_width + opacity)
+    if not (finite and wp.isfinite(color[0] + color[1] + color[2])):
+        return
+    if x + extent[0] < 0.0 or x - extent[0] > float(width) or y + extent[1] < 0.0 or y - extent[1] > float(height):
+        return
+    color = wp.max(color, wp.vec3())
+
+    splats[splat, X] = x
+    splats[splat, Y] = y
+    splats[splat, A] = a
+    splats[splat, B] = b
+    splats[splat, C] = c
+    splats[splat, OPACITY] = opacity
+    splats[splat, Z] = p[2]
+    splats[splat, RED] = color[0]
+    splats[splat, RED + 1] = color[1]
+    splats[splat, RED + 2] = color[2]
+    splats[splat, EXTENT_X] = extent[0]
+    splats[splat, EXTENT_Y] = extent[1]
+    splats[splat, HALF_WIDTH] = half_width
+    radii[splat] = int(wp.min(wp.ceil(wp.max(extent[0], extent[1])), 1.0e6))
+    depth_keys[splat] = wp.cast(p[2], wp.int32)  # the bits of positive floats order as the floats do
+
+    tiles_x = (width + TILE_SIZE - 1) // TILE_SIZE
+    tiles_y = (height + TILE_SIZE - 1) // TILE_SIZE
+    rows = tile_rows(y, extent[1], tiles_y)
+    count = int(0)
+    for row in range(rows[0], rows[1]):
+        columns = tile_columns(row, x, y, a, b, c, extent, half_width, tiles_x)
+        for column in range(columns[0], columns[1]):
+            count += int(tile_mask[(camera * tiles_y + row) * tiles_x + column])
+    counts[splat] = count
+
+
+@wp.kernel
+def emit_intersections(
+    offset: int,
+    order: wp.array[int],  # [C·N] splats by depth
+    ends: wp.array[int],  # [C·N] running sum of counts in that order
+    counts: wp.array[int],
+    gaussian_count: int,
+    splats: wp.array2d[float],
+    tile_mask: wp.array[wp.uint8],
+    tiles_x: int,
+    tiles_y: int,
+    firsts: wp.array[int],  # out, first intersection of each splat
+    tiles: wp.array[int],  # out, tile of each intersection (the first half is used)
+    slots: wp.array[int],  # out, number of each intersection (the first half is used)
+    owners: wp.array[int],  # out, splat of each intersection
+):
+    rank = offset + wp.tid()
+    splat = order[rank]
+    if counts[splat] == 0:
+        return
+    end = ends[rank]
+    i = end - counts[splat]
+    firsts[splat] = i
+    camera = splat // gaussian_count
+    x, y = splats[splat, X], splats[splat, Y]
+    a, b, c = splats[splat, A], splats[splat, B], splats[splat, C]
+    extent = wp.vec2(splats[splat, EXTENT_X], splats[splat, EXTENT_Y])
+    rows = tile_rows(y, extent[1], tiles_y)
+    for row in range(rows[0], rows[1]):
+        columns = tile_columns(row, x, y, a, b, c, extent, splats[splat, HALF_WIDTH], tiles_x)
+        for column in range(columns[0], columns[1]):
+            tile = (camera * tiles_y + row) * tiles_x + column
+            if tile_mask[tile] != wp.uint8(0) and i < end:
+                tiles[i] = tile
+                slots[i] = i
+                owners[i] = splat
+                i += 1
+    # Compilers may round differently in the two kernels: an intersection that was counted but not met here
+    # goes to the tile after the last one, which nobody draws.
+    while i < end:
+        tiles[i] = tile_mask.shape[0]
+        slots[i] = i
+        owners[i] = splat
+        i += 1
+
+
+@wp.kernel
+def find_tile_starts(offset: int, tiles: wp.array[int], count: int, starts: wp.array[int]):
+    """starts[t] = first slot whose tile is t or later; launched over count + 1 slots of the sorted tiles."""
+    slot = offset + wp.tid()
+    low, high = int(0), starts.shape[0]
+    if slot > 0:
+        low = tiles[slot - 1] + 1
+    if slot < count:
+        high = tiles[slot] + 1
+    for tile in range(low, wp.min(high, starts.shape[0])):
+        starts[tile] = slot
+
+
+@wp.kernel
+def project_backward(
+    offset: int,
+    means: wp.array[wp.vec3],
+    quats: wp.array[wp.vec4],
+    scales: wp.array[wp.vec3],
+    covars: wp.array[wp.mat33],
+    has_covars: int,
+    sh: wp.array2d[wp.vec3],
+    viewmats: wp.array[wp.mat44],
+    Ks: wp.array[wp.mat33],
+    width: int,
+    height: int,
+    eps2d: float,
+    counts: wp.array[int],
+    firsts: wp.array[int],
+    records: wp.array2d[float],
+    wants_pose: int,
+    v_means: wp.array[wp.vec3],  # out, as all below
+    v_quats: wp.array[wp.vec4],
+    v_scales: wp.array[wp.vec3],
+    v_covars: wp.array[wp.mat33],
+    v_opacities: wp.array[float],
+    v_sh: wp.array2d[wp.vec3],
+    v_viewmats: wp.array2d[wp.mat44],  # [C, N], each Gaussian's share, filled when wants_pose
+):
+    """Gradients of Gaussian n over all cameras: adds up the records of its splats and goes back through `project`."""
+    n = offset + wp.tid()
+    gaussian_count = means.shape[0]
+    sh_count = sh.shape[1]
+    v_mean = wp.vec3()
+    v_covariance = wp.mat33()
+    v_opacity = float(0.0)
+    drawn = int(0)
+    for k in range(sh_count):
+        v_sh[n, k] = wp.vec3()
+
+    for camera in range(viewmats.shape[0]):
+        splat = camera * gaussian_count + n
+        if wants_pose != 0:
+            v_viewmats[camera, n] = wp.mat44()
+        if counts[splat] > 0:
+            drawn = 1
+            v = vec10()
+            for i in range(firsts[splat], firsts[splat] + counts[splat]):
+                for k in range(10):
+                    v[k] += records[i, k]
+
+            viewmat, K = viewmats[camera], Ks[camera]
+            rotation, translation = camera_rotation(viewmat), camera_translation(viewmat)
+            mean = means[n]
+            p = rotation * mean + translation
+            z = p[2]
+            slopes = clamped_slopes(p, K, width, height)
+            to_image = projection_jacobian(slopes, z, K) * rotation
+            covariance = world_covariance(n, quats, scales, covars, has_covars)
+            cov = image_covariance(to_image, covariance, eps2d)
+            det = cov[0] * cov[2] - cov[1] * cov[1]
+            conic = wp.mat22(cov[2] / det, -cov[1] / det, -cov[1] / det, cov[0] / det)
+
+            # conic = cov⁻¹ and cov = T Σ Tᵀ with T = J R.
+            v_conic = wp.mat22(v[A], 0.5 * v[B], 0.5 * v[B], v[C])
+            v_cov = -1.0 * (conic * v_conic * conic)
+            v_covariance += wp.transpose(to_image) * v_cov * to_image
+            v_to_image = 2.0 * (v_cov * to_image * covariance)
+            v_jacobian = v_to_image * wp.transpose(rotation)
+            v_rotation = wp.transpose(projection_jacobian(slopes, z, K)) * v_to_image
+
+            # J depends on z and on the slopes, which depend on p unless clamped.
+            fx, fy = K[0, 0] / z, K[1, 1] / z
+            v_slope_x, v_slope_y = -fx * v_jacobian[0, 2], -fy * v_jacobian[1, 2]
+            v_p = wp.vec3(fx * v[X], fy * v[Y], v[Z] - (fx * v[X] * p[0] + fy * v[Y] * p[1]) / z)
+            v_p[2] -= fx / z * (v_jacobian[0, 0] - slopes[0] * v_jacobian[0, 2])
+            v_p[2] -= fy / z * (v_jacobian[1, 1] - slopes[1] * v_jacobian[1, 2])
+            if slopes[0] == p[0] / z:
+                v_p += wp.vec3(v_slope_x / z, 0.0, -v_slope_x * slopes[0] / z)
+            if slopes[1] == p[1] / z:
+                v_p += wp.vec3(0.0, v_slope_y / z, -v_slope_y * slopes[1] / z)
+            v_opacity += v[OPACITY]
+
+            # Colour: c = max(Σ basis_k sh_k + 0.5, 0).
+            basis = vec16()
+            to_gaussian = mean + wp.transpose(rotation) * translation
+            distance = wp.length(to_gaussian)
+            direction = wp.normalize(to_gaussian)
+            if sh_count == 1:
+                basis[0] = 0.28209479177387814
+            else:
+                basis = sh_basis(sh_count, direction)
+            color = sh_color(n, sh_count, basis, sh)
+            v_color = wp.vec3(v[RED], v[RED + 1], v[RED + 2])
+            for k in range(3):
+                if color[k] <= 0.0:
+                    v_color[k] = 0.0
+            v_basis = vec16()
+            for k in range(sh_count):
+                v_sh[n, k] = v_sh[n, k] + basis[k] * v_color
+                v_basis[k] = wp.dot(sh[n, k], v_color)
+            v_position = wp.vec3()
+            if sh_count > 1 and distance > 0.0:
+                v_direction = sh_direction_gradient(sh_count, direction, v_basis)
+                v_position = (v_direction - direction * wp.dot(direction, v_direction)) / distance
+            v_mean += wp.transpose(rotation) * v_p + v_position
+
+            if wants_pose != 0:
+                # The direction is mean + Rᵀ t.
+                v_rotation += wp.outer(v_p, mean) + wp.outer(translation, v_position)
+                v_t = v_p + rotation * v_position
+                v_viewmats[camera, n] = wp.mat44(
+                    v_rotation[0, 0], v_rotation[0, 1], v_rotation[0, 2], v_t[0],
+                    v_rotation[1, 0], v_rotation[1, 1], v_rotation[1, 2], v_t[1],
+                    v_rotation[2, 0], v_rotation[2, 1], v_rotation[2, 2], v_t[2],
+                    0.0, 0.0, 0.0, 0.0,
+                )  # fmt: skip
+
+    v_means[n] = v_mean
+    v_opacities[n] = v_opacity
+    if has_covars != 0:
+        v_covars[n] = v_covariance
+    elif drawn == 0:  # perhaps because its numbers are not finite
+        v_scales[n] = wp.vec3()
+        v_quats[n] = wp.vec4()
+    else:
+        # Σ = M Mᵀ, M = R diag(scale).
+        r = quat_to_matrix(unit_quat(quats[n]))
+        scale = scales[n]
+        v_m = 2.0 * (v_covariance * r * wp.diag(scale))
+        rv = wp.transpose(r) * v_m
+        v_scales[n] = wp.vec3(rv[0, 0], rv[1, 1], rv[2, 2])
+        v_quats[n] = quat_gradient(quats[n], v_m * wp.diag(scale))
+
+
+# ---------------------------------------------------------------- one thread per pixel (GPU)
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __any_sync(0xffffffffu, condition != 0);
+#else
+    return condition;
+#endif
+""")
+def warp_any(condition: int) -> int:
+    """Whether the condition holds in any thread of the warp, which must be here together; a CPU warp is one thread."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    for (int step = 16; step > 0; step /= 2)
+        value += __shfl_xor_sync(0xffffffffu, value, step);
+#endif
+    return value;
+""")
+def warp_sum(value: float) -> float:
+    """Sum over the threads of the warp, which must be here together; a CPU warp is one thread."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return lane % 32 == 0;
+#else
+    return 1;
+#endif
+""")
+def leads_warp(lane: int) -> int:
+    """Whether this thread writes for its warp; a CPU warp is one thread."""
+    ...
+
+
+@wp.func
+def pixel_in_tile(lane: int) -> wp.vec2i:
+    """Position of a thread's pixel in its tile. A warp covers 8×4 pixels, so that its threads agree more often."""
+    warp = lane // 32
+    return wp.vec2i((warp % 2) * 8 + lane % 8, (warp // 2) * 4 + (lane % 32) // 8)
+
+
+@wp.func
+def splat_exponential(splats: wp.array2d[float], splat: int, dx: float, dy: float) -> float:
+    """exp(−σ) at an offset from the mean, pixels."""
+    a, b, c = splats[splat, A], splats[splat, B], splats[splat, C]
+    return wp.exp(-(0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy))
+
+
+@wp.kernel
+def render_pixels(
+    offset: int,
+    splats: wp.array2d[float],
+    owners: wp.array[int],
+    slots: wp.array[int],
+    starts: wp.array[int],
+    background: wp.array[wp.vec3],  # [1]
+    width: int,
+    height: int,
+    colors: wp.array[wp.vec3],  # out [C·H·W], as all below
+    depths: wp.array[float],
+    alphas: wp.array[float],
+    distortions: wp.array[float],
+):
+    """Composite one pixel. Launched over tiles × 256 threads."""
+    thread = offset + wp.tid()
+    tile = thread // (TILE_SIZE * TILE_SIZE)
+    tiles_x = (width + TILE_SIZE - 1) // TILE_SIZE
+    tiles_y = (height + TILE_SIZE - 1) // TILE_SIZE
+    in_tile = pixel_in_tile(thread % (TILE_SIZE * TILE_SIZE))
+    column = (tile % tiles_x) * TILE_SIZE + in_tile[0]
+    row = (tile // tiles_x % tiles_y) * TILE_SIZE + in_tile[1]
+    if column >= width or row >= height:
+        return
+    px, py = float(column) + 0.5, float(row) + 0.5
+    start, end = starts[tile], starts[tile + 1]
+    reference = float(0.0)
+    if start < end:
+        reference = splats[owners[slots[start]], Z]
+
+    color = wp.vec3()
+    depth, distortion = float(0.0), float(0.0)
+    transmittance = float(1.0)
+    for slot in range(start, end):
+        splat = owners[slots[slot]]
+        exponential = splat_exponential(splats, splat, px - splats[splat, X], py - splats[splat, Y])
+        alpha = wp.min(ALPHA_MAX, splats[splat, OPACITY] * exponential)
+        if alpha >= ALPHA_MIN:
+            following = transmittance * (1.0 - alpha)
+            if following < TRANSMITTANCE_MIN:
+                break
+            weight = alpha * transmittance
+            z = splats[splat, Z] - reference
+            color += weight * wp.vec3(splats[splat, RED], splats[splat, RED + 1], splats[splat, RED + 2])
+            distortion += 2.0 * weight * (z * (1.0 - transmittance) - depth)
+            depth += weight * z
+            transmittance = following
+
+    pixel = (tile // (tiles_x * tiles_y) * height + row) * width + column
+    colors[pixel] = color + transmittance * background[0]
+    depths[pixel] = depth + reference * (1.0 - transmittance)
+    alphas[pixel] = 1.0 - transmittance
+    distortions[pixel] = distortion
+
+
+@wp.kernel
+def render_pixels_backward(
+    offset: int,
+    splats: wp.array2d[float],
+    owners: wp.array[int],
+    slots: wp.array[int],
+    starts: wp.array[int],
+    background: wp.array[wp.vec3],  # [1]
+    width: int,
+    height: int,
+    colors: wp.array[wp.vec3],
+    depths: wp.array[float],
+    alphas: wp.array[float],
+    distortions: wp.array[float],
+    v_colors: wp.array[wp.vec3],
+    v_depths: wp.array[float],
+    v_alphas: wp.array[float],
+    v_distortions: wp.array[float],
+    records: wp.array2d[float],  # out, zeroed before: each warp adds its share
+):
+    """Gradients of one pixel. All threads of a warp walk the same splats, also those whose pixel is finished."""
+    thread = offset + wp.tid()
+    tile = thread // (TILE_SIZE * TILE_SIZE)
+    lane = thread % (TILE_SIZE * TILE_SIZE)
+    tiles_x = (width + TILE_SIZE - 1) // TILE_SIZE
+    tiles_y = (height + TILE_SIZE - 1) // TILE_SIZE
+    in_tile = pixel_in_tile(lane)
+    column = (tile % tiles_x) * TILE_SIZE + in_tile[0]
+    row = (tile // tiles_x % tiles_y) * TILE_SIZE + in_tile[1]
+    px, py = float(column) + 0.5, float(row) + 0.5
+    start, end = starts[tile], starts[tile + 1]
+    reference = float(0.0)
+    if start < end:
+        reference = splats[owners[slots[start]], Z]
+
+    live = int(0)
+    v_color = wp.vec3()
+    v_depth, v_alpha, v_distortion = float(0.0), float(0.0), float(0.0)
+    total_weight, total_depth, remaining = float(0.0), float(0.0), float(0.0)
+    if column < width and row < height:
+        live = 1
+        pixel = (tile // (tiles_x * tiles_y) * height + row) * width + column
+        v_color = v_colors[pixel]
+        v_depth = v_depths[pixel]
+        v_distortion = v_distortions[pixel]
+        total_weight = alphas[pixel]
+        total_depth = depths[pixel] - reference * total_weight
+        # The background is seen through the transmittance 1 − alpha, and depths count from the reference.
+        v_alpha = v_alphas[pixel] - wp.dot(v_color, background[0]) + v_depth * reference
+        foreground = colors[pixel] - (1.0 - total_weight) * background[0]
+        remaining = wp.dot(v_color, foreground) + v_depth * total_depth + v_alpha * total_weight
+        remaining += 2.0 * v_distortion * distortions[pixel]
+
+    transmittance, depth = float(1.0), float(0.0)
+    for slot in range(start, end):
+        if warp_any(live) == 0:
+            break
+        intersection = slots[slot]
+        splat = owners[intersection]
+        dx, dy = splats[splat, X] - px, splats[splat, Y] - py
+        opacity = splats[splat, OPACITY]
+        exponential = splat_exponential(splats, splat, dx, dy)
+        alpha = wp.min(ALPHA_MAX, opacity * exponential)
+        following = transmittance * (1.0 - alpha)
+        draws = int(0)
+        if live != 0 and alpha >= ALPHA_MIN:
+            if following < TRANSMITTANCE_MIN:
+                live = 0
+            else:
+                draws = 1
+        if warp_any(draws) != 0:
+            v = vec10()
+            if draws != 0:
+                weight = alpha * transmittance
+                z = splats[splat, Z] - reference
+                color = wp.vec3(splats[splat, RED], splats[splat, RED + 1], splats[splat, RED + 2])
+                spread = 2.0 - transmittance - following - total_weight  # W_i + W_{i+1} − W
+                v_weight = wp.dot(v_color, color) + v_depth * z + v_alpha
+                v_weight += 2.0 * v_distortion * (z * spread + total_depth - 2.0 * depth - weight * z)
+                depth += weight * z
+                remaining -= weight * v_weight
+                v_splat_alpha = transmittance * v_weight - remaining / (1.0 - alpha)
+                transmittance = following
+                v[Z] = weight * (v_depth + 2.0 * v_distortion * spread)
+                v[RED] = weight * v_color[0]
+                v[RED + 1] = weight * v_color[1]
+                v[RED + 2] = weight * v_color[2]
+                if opacity * exponential <= ALPHA_MAX:
+                    v_sigma = -alpha * v_splat_alpha
+                    v[OPACITY] = exponential * v_splat_alpha
+                    v[X] = v_sigma * (splats[splat, A] * dx + splats[splat, B] * dy)
+                    v[Y] = v_sigma * (splats[splat, B] * dx + splats[splat, C] * dy)
+                    v[A] = 0.5 * v_sigma * dx * dx
+                    v[B] = v_sigma * dx * dy
+                    v[C] = 0.5 * v_sigma * dy * dy
+            for k in range(10):
+                total = warp_sum(v[k])
+                if leads_warp(lane) != 0:
+                    wp.atomic_add(records, intersection, k, total)

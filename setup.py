@@ -1,0 +1,53 @@
+"""Installs by `pip install .` and by `colcon build`; `ros2 run endo_sim_ros <node>` works after both."""
+
+import os
+import re
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+NAME = "endo_sim_ros"
+HERE = Path(__file__).parent
+VERSION = re.search(r"<version>(.+)</version>", (HERE / "package.xml").read_text()).group(1)
+
+# A sourced ROS 2 brings its own rclpy and messages; a second copy from PyPI would shadow them.
+ROS = [] if os.environ.get("AMENT_PREFIX_PATH") else ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"]
+
+setup(
+    name=NAME,
+    version=VERSION,
+    description="Endoscope recordings become tissue that a robot can touch: Gaussian splatting and MPM as ROS 2 nodes",
+    long_description=(HERE / "README.md").read_text(),
+    long_description_content_type="text/markdown",
+    license="Apache-2.0",
+    python_requires=">=3.10",
+    packages=find_packages(include=[NAME, f"{NAME}.*"]),
+    install_requires=[
+        *ROS,
+        "imageio-ffmpeg",
+        "mcap",
+        "numpy",
+        "opencv-python-headless",
+        "plyfile",
+        "pycolmap",
+        "pyyaml",
+        "rich",
+        "rosbags>=0.11",
+        "scipy",
+        "tifffile",
+        "torch>=2.4",
+        "tyro",
+        "warp-lang>=1.19",
+    ],
+    extras_require={"test": ["hypothesis", "pytest", "pytest-timeout", "torchmetrics"]},
+    entry_points={"console_scripts": ["endo-sim = endo_sim_ros.cli:main"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml", "msg_conventions.md"]),
+        (f"share/{NAME}/config", sorted(map(str, Path("config").glob("*.yaml")))),
+        (f"share/{NAME}/launch", sorted(map(str, Path("launch").glob("*.py")))),
+        # `ros2 run` looks for executables here; console scripts would land in bin/ under pip.
+        (f"lib/{NAME}", sorted(map(str, Path("scripts").glob("*_node")))),
+    ],
+    zip_safe=False,
+)

@@ -1,0 +1,636 @@
+"""Physics: nodes, materials, the solver against theory, tools, faults and skinning."""
+
+import dataclasses
+import logging
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from endo_sim_ros.config import ConfigError, options
+from endo_sim_ros.gaussians import GaussianModel
+from endo_sim_ros.physics import (
+    ControlNodes,
+    MpmSolver,
+    PhysicsConfig,
+    Skinning,
+    StabilityError,
+    TissueSimulation,
+    build_control_nodes,
+    lame_parameters,
+    minimum_norm_forces,
+    plan_substeps,
+    sample_farthest,
+    sound_speed,
+)
+from endo_sim_ros.physics.materials import MATERIALS, energy_density, kirchhoff_stress, rotation_of
+
+EYE = np.zeros(3)  # the camera of the test scene, looking along +z
+TIP = np.array([0.0, 0.0, 0.12])  # on the sheet, in front of the camera
+
+
+def curved_sheet(count: int = 3000, seed: int = 0, offset: tuple = (0.0, 0.0, 0.0)) -> GaussianModel:
+    """A 10 × 8 cm curved sheet 12 cm in front of the origin. Coordinates are multiples of 2⁻²⁰ m, so that moving the
+    scene by whole metres rounds nothing."""
+    rng = np.random.default_rng(seed)
+    xy = rng.uniform([-0.05, -0.04], [0.05, 0.04], (count, 2))
+    points = np.c_[xy, 0.12 + 0.5 * (xy**2).sum(1) + 0.003 * np.sin(60 * xy[:, 0])]
+    points = np.round(points * 2**20) / 2**20 + offset
+    colors = torch.from_numpy(rng.uniform(size=(count, 3))).float()
+    return GaussianModel.from_points(torch.from_numpy(points).float(), colors, torch.full((count,), 0.001))
+
+
+def simulate(model=None, viewpoint=EYE, **overrides) -> TissueSimulation:
+    model = curved_sheet() if model is None else model
+    return TissueSimulation(model, viewpoint, PhysicsConfig(device="cpu", **{"node_count": 1000, **overrides}))
+
+
+def steps(simulation: TissueSimulation, count: int) -> None:
+    for _ in range(count):
+        simulation.step()
+
+
+def depth_of_dent(simulation: TissueSimulation) -> float:
+    state = simulation.state()
+    return float(np.linalg.norm(state.positions - state.rest, axis=1).max())
+
+
+def specimen(shape: tuple, spacing: float, pinned, is_skin) -> ControlNodes:
+    """A block of nodes whose volumes add up to the block's; `pinned` and `is_skin` map positions [M, 3] to bool [M]."""
+    axes = [np.arange(n) * spacing for n in shape]
+    rest = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    on_face = (rest < spacing / 2) | (rest > rest.max(0) - spacing / 2)
+    volumes = np.where(on_face, spacing / 2, spacing).prod(1)
+    return ControlNodes(rest.astype(np.float32), pinned(rest), volumes.astype(np.float32), is_skin(rest), spacing)
+
+
+# Configuration
+
+
+def test_every_option_has_a_description_and_every_material_is_a_choice():
+    assert all(option.description for option in options(PhysicsConfig))
+    material = next(option for option in options(PhysicsConfig) if option.name == "material")
+    assert set(material.choices) == set(MATERIALS)
+    assert PhysicsConfig().step_duration == pytest.approx(0.04)
+    with pytest.raises(ConfigError, match="poisson_ratio"):
+        PhysicsConfig(poisson_ratio=0.5)
+
+
+# Control nodes
+
+
+def test_farthest_points_agree_with_brute_force():
+    points = np.random.default_rng(1).normal(size=(1500, 3))
+    chosen = [7]
+    nearest = np.full(len(points), np.inf)
+    for _ in range(59):
+        nearest = np.minimum(nearest, ((points - points[chosen[-1]]) ** 2).sum(1))
+        chosen.append(int(nearest.argmax()))
+    assert sample_farthest(points, 60, start=7).tolist() == chosen
+
+
+def test_farthest_points_of_duplicates_take_the_lowest_index():
+    points = np.repeat(np.eye(3), 4, axis=0)
+    assert sample_farthest(points, 3).tolist() == [0, 4, 8]
+
+
+def test_more_samples_than_points_is_refused():
+    with pytest.raises(ValueError, match="cannot pick 5 of 4 points"):
+        sample_farthest(np.zeros((4, 3)), 5)
+
+
+def test_tissue_has_the_volume_and_depth_asked_for():
+    nodes = build_control_nodes(curved_sheet(), EYE, PhysicsConfig(node_count=2000, layers=4, thickness=0.02))
+    assert len(nodes) == 2000 and nodes.is_skin.sum() == 400
+    skin, back = nodes.rest[:400], nodes.rest[-400:]
+    depth = np.linalg.norm(back, axis=1) - np.linalg.norm(skin, axis=1)
+    np.testing.assert_allclose(depth, 0.02, atol=1e-6)
+    np.testing.assert_allclose(np.cross(skin, back), 0, atol=1e-8)  # along the viewing rays
+    assert nodes.pinned[-400:].all()
+    # 10 × 8 cm seen from 12 cm, 2 cm deep: a little more than 160 cm³, as the frustum widens.
+    assert 1.0 * 160e-6 < nodes.volumes.sum() < 1.4 * 160e-6
+
+
+def test_rim_is_the_border_and_only_the_border():
+    nodes = build_control_nodes(curved_sheet(), EYE, PhysicsConfig(node_count=2000, pin_back=False))
+    x, y = np.abs(nodes.rest[nodes.is_skin][:, :2]).T
+    rim = nodes.pinned[nodes.is_skin]
+    assert rim[(x > 0.0495) | (y > 0.0395)].all()
+    assert not rim[(x < 0.044) & (y < 0.034)].any()
+
+
+def test_faint_and_floating_gaussians_do_not_become_nodes():
+    model = curved_sheet()
+    logits = model.logit_opacities.clone()
+    logits[:500] = -4.0
+    means = model.means.clone()
+    means[500] = torch.tensor([0.0, 0.0, 0.05])
+    nodes = build_control_nodes(dataclasses.replace(model, means=means, logit_opacities=logits), EYE, PhysicsConfig())
+    skin = {tuple(point) for point in nodes.rest[nodes.is_skin].tolist()}
+    assert not skin & {tuple(point) for point in means[:501].tolist()}
+
+
+def test_coinciding_gaussians_become_one_node():
+    model = curved_sheet(300)
+    twice = model.select(torch.arange(300).repeat(10))
+    nodes = build_control_nodes(twice, EYE, PhysicsConfig(node_count=5000))
+    assert nodes.is_skin.sum() == 300
+    assert nodes.volumes.sum() < 1.4 * 160e-6
+
+
+def test_several_viewpoints_mean_their_centre():
+    config = PhysicsConfig(node_count=500)
+    one = build_control_nodes(curved_sheet(), EYE, config)
+    two = build_control_nodes(curved_sheet(), np.array([[0.01, 0, 0], [-0.01, 0, 0]]), config)
+    np.testing.assert_array_equal(one.rest, two.rest)
+
+
+@pytest.mark.parametrize("viewpoint", [[0.0, np.nan, 0.0], [[np.inf, 0.0, 0.0]]])
+def test_a_viewpoint_that_is_not_finite_is_refused(viewpoint):
+    with pytest.raises(ValueError, match="viewpoint must be a finite"):
+        build_control_nodes(curved_sheet(), np.array(viewpoint), PhysicsConfig())
+
+
+def test_a_model_without_opaque_gaussians_is_refused():
+    model = dataclasses.replace(curved_sheet(), logit_opacities=torch.full((3000,), -9.0))
+    with pytest.raises(ValueError, match="only 0 of 3000 Gaussians are as opaque"):
+        build_control_nodes(model, EYE, PhysicsConfig())
+
+
+# Materials
+
+
+@wp.kernel(enable_backward=False)
+def _rotations(F: wp.array[wp.mat33], R: wp.array[wp.mat33]):
+    i = wp.tid()
+    R[i] = rotation_of(F[i])
+
+
+def _stress_kernel(material):
+    stress = MATERIALS[material][0]
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def evaluate(F: wp.array[wp.mat33], mu: float, lam: float, P: wp.array[wp.mat33], tau: wp.array[wp.mat33]):
+        i = wp.tid()
+        P[i] = stress(F[i], mu, lam)
+        tau[i] = kirchhoff_stress(P[i], F[i])
+
+    return evaluate
+
+
+def stresses(material: str, F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """P and τ [N, 3, 3] of F [N, 3, 3] for μ = 2 and λ = 3."""
+    F = wp.array(F.astype(np.float32), dtype=wp.mat33, device="cpu")
+    P, tau = wp.empty_like(F), wp.empty_like(F)
+    wp.launch(_stress_kernel(material), len(F), [F, 2.0, 3.0, P, tau], device="cpu")
+    return P.numpy(), tau.numpy()
+
+
+def random_rotations(count: int, seed: int = 0) -> np.ndarray:
+    Q, R = np.linalg.qr(np.random.default_rng(seed).normal(size=(count, 3, 3)))
+    Q *= np.sign(np.diagonal(R, axis1=1, axis2=2))[:, None, :]
+    Q[np.linalg.det(Q) < 0, :, 0] *= -1
+    return Q
+
+
+@pytest.mark.parametrize("material", MATERIALS)
+def test_stress_is_the_gradient_of_the_energy(material):
+    rng = np.random.default_rng(2)
+    F = random_rotations(64) @ (np.eye(3) + 0.25 * rng.uniform(-1, 1, (64, 3, 3)))
+    F = F[np.linalg.det(F) > 0.2]
+    leaf = torch.from_numpy(F).requires_grad_()
+    energy_density(material, leaf, 2.0, 3.0).sum().backward()
+    P, tau = stresses(material, F)
+    np.testing.assert_allclose(P, leaf.grad.numpy(), atol=3e-5)
+    np.testing.assert_allclose(tau, leaf.grad.numpy() @ F.transpose(0, 2, 1), atol=3e-5)
+    assert np.abs(P).max() > 0.5
+
+
+@pytest.mark.parametrize("material", MATERIALS)
+def test_rigid_rotation_gives_no_stress_and_rest_gives_exactly_none(material):
+    P, _ = stresses(material, random_rotations(64))
+    np.testing.assert_allclose(P, 0, atol=5e-6)
+    assert not np.any(stresses(material, np.eye(3)[None])[0])
+
+
+@pytest.mark.parametrize("material", MATERIALS)
+def test_inverted_and_collapsed_matter_has_finite_stress(material):
+    F = np.stack([np.diag([1.0, 1.0, -0.5]), np.zeros((3, 3)), np.diag([1.0, 1.0, 0.0]), -np.eye(3)])
+    assert np.isfinite(stresses(material, F)[0]).all()
+
+
+def test_polar_rotation_is_proper_and_nearest():
+    rng = np.random.default_rng(3)
+    F = rng.normal(size=(200, 3, 3))
+    U, _, Vt = np.linalg.svd(F)
+    U[np.linalg.det(U @ Vt) < 0, :, 2] *= -1
+    R = wp.empty(200, dtype=wp.mat33, device="cpu")
+    wp.launch(_rotations, 200, [wp.array(F.astype(np.float32), dtype=wp.mat33, device="cpu"), R], device="cpu")
+    near_tie = np.abs(np.linalg.svd(F)[1][:, 2]) < 0.05  # the rotation is ill-conditioned there
+    np.testing.assert_allclose(R.numpy()[~near_tie], (U @ Vt)[~near_tie], atol=2e-3)
+    np.testing.assert_allclose(np.linalg.det(R.numpy()), 1, atol=1e-4)
+
+
+def test_small_strains_obey_hooke():
+    strain = np.diag([1e-3, -2e-4, -2e-4])
+    for material in MATERIALS:
+        P, _ = stresses(material, (np.eye(3) + strain)[None])
+        np.testing.assert_allclose(P[0], 4.0 * strain + 3.0 * np.trace(strain) * np.eye(3), atol=2e-5)
+
+
+def test_sound_speed_of_the_default_tissue():
+    mu, lam = lame_parameters(10e3, 0.3)
+    assert (mu, lam) == pytest.approx((3846.15, 5769.23), rel=1e-5)
+    assert sound_speed(10e3, 0.3, 1000) == pytest.approx(3.669, rel=1e-3)
+
+
+# The solver
+
+
+@pytest.mark.parametrize("kinematics", ["rest", "current"])
+@pytest.mark.parametrize("material", MATERIALS)
+def test_rest_state_stays_bit_identical_without_force(kinematics, material):
+    simulation = simulate(kinematics=kinematics, material=material)
+    steps(simulation, 3)
+    state = simulation.state()
+    np.testing.assert_array_equal(state.positions, state.rest)
+    np.testing.assert_array_equal(state.F, np.tile(np.eye(3, dtype=np.float32), (len(state.F), 1, 1)))
+    assert state.time == pytest.approx(0.12) and state.positions.dtype == np.float32
+
+
+@pytest.mark.parametrize("kinematics", ["rest", "current"])
+def test_free_tissue_takes_up_the_impulse(kinematics):
+    simulation = simulate(kinematics=kinematics, layers=2, pin_back=False, pin_rim=False, damping=0.0)
+    force = np.array([0.02, -0.03, 0.05])
+    simulation.set_wrench("probe", TIP, force)
+    steps(simulation, 4)
+    np.testing.assert_allclose(simulation.solver.momentum(), force * simulation.time, rtol=2e-3, atol=1e-6)
+
+
+def test_damping_decays_momentum_exponentially():
+    simulation = simulate(layers=2, pin_back=False, pin_rim=False, damping=20.0)
+    simulation.set_wrench("probe", TIP, [0, 0, 0.05])
+    steps(simulation, 2)
+    before = simulation.solver.momentum()
+    simulation.set_wrench("probe", TIP, [0, 0, 0])
+    steps(simulation, 2)
+    np.testing.assert_allclose(simulation.solver.momentum(), before * np.exp(-20 * 0.08), rtol=5e-3, atol=1e-7)
+
+
+@pytest.mark.parametrize("kinematics", ["rest", "current"])
+def test_undriven_energy_decays(kinematics):
+    simulation = simulate(kinematics=kinematics, damping=0.0)
+    simulation.set_wrench("probe", TIP, [0.0, 0.0, 0.1])
+    steps(simulation, 4)
+    simulation.set_wrench("probe", TIP, [0.0, 0.0, 0.0])
+    energies = []
+    for _ in range(10):
+        energies.append(sum(simulation.solver.energy()))
+        simulation.step()
+    assert energies[0] > 1e-6
+    assert all(later <= 1.001 * earlier for earlier, later in zip(energies, energies[1:]))
+
+
+def test_released_tissue_returns_to_rest():
+    simulation = simulate()
+    simulation.set_wrench("probe", TIP, [0.0, 0.0, 0.3])
+    steps(simulation, 8)
+    deep = depth_of_dent(simulation)
+    simulation.set_wrench("probe", TIP, [0.0, 0.0, 0.0])
+    steps(simulation, 40)
+    assert depth_of_dent(simulation) < 0.05 * deep
+
+
+@pytest.mark.parametrize("kinematics, ratio", [("rest", 1.75), ("rest", 2.0), ("current", 2.0)])
+def test_column_under_its_own_weight_shortens_as_theory_says(kinematics, ratio):
+    height, spacing = 0.02, 0.005
+    nodes = specimen((13, 13, 5), spacing, lambda x: x[:, 2] > height - 1e-6, lambda x: x[:, 2] < 1e-6)
+    config = PhysicsConfig(device="cpu", gravity_z=9.81, poisson_ratio=0.0, kinematics=kinematics, grid_ratio=ratio)
+    simulation = TissueSimulation.from_nodes(nodes, config)
+    steps(simulation, 25)
+    state = simulation.state()
+    sag = (state.positions - state.rest)[nodes.is_skin, 2].mean()
+    assert sag == pytest.approx(1000 * 9.81 * height**2 / (2 * 10e3), rel=0.06)
+
+
+@pytest.mark.parametrize("spacing, tolerance", [(0.005, 0.15), (0.0025, 0.06)])
+def test_cantilever_bends_as_timoshenko_says_and_better_when_finer(spacing, tolerance):
+    length, side, young, force = 0.08, 0.02, 20e3, 0.008
+    counts = [round(edge / spacing) + 1 for edge in (length, side, side)]
+    nodes = specimen(counts, spacing, lambda x: x[:, 0] < 1e-6, lambda x: x[:, 0] > length - 1e-6)
+    config = PhysicsConfig(device="cpu", young_modulus=young, poisson_ratio=0.0, damping=25.0, force_radius=0.05)
+    simulation = TissueSimulation.from_nodes(nodes, config)
+    simulation.set_wrench("load", [length, side / 2, side / 2], [0.0, 0.0, force])
+    steps(simulation, 30)
+    state = simulation.state()
+    bent = (state.positions - state.rest)[nodes.is_skin, 2].mean()
+    theory = force * length**3 / (3 * young * side**4 / 12) + force * length / (5 / 6 * young / 2 * side**2)
+    assert bent == pytest.approx(theory, rel=tolerance)
+
+
+def test_dent_grows_with_force_and_shrinks_with_stiffness():
+    dents = []
+    for force, young in ((0.05, 10e3), (0.2, 10e3), (0.2, 20e3)):
+        simulation = simulate(young_modulus=young)
+        assert simulation.set_wrench("probe", TIP, [0.0, 0.0, force])
+        steps(simulation, 10)
+        dents.append(depth_of_dent(simulation))
+    assert dents[1] > 3 * dents[0]
+    assert dents[2] == pytest.approx(dents[1] / 2, rel=0.15)
+
+
+def test_pinned_nodes_do_not_move_and_tissue_beside_them_hardly_does():
+    simulation = simulate(node_count=2000)
+    simulation.set_wrench("probe", TIP, [0.0, 0.0, 0.3])
+    steps(simulation, 8)
+    state, pinned = simulation.state(), simulation.nodes.pinned
+    np.testing.assert_array_equal(state.positions[pinned], state.rest[pinned])
+    assert np.abs(simulation.solver.displacements()[pinned]).max() < 0.02 * depth_of_dent(simulation)
+
+
+@pytest.mark.parametrize("kinematics", ["rest", "current"])
+def test_same_inputs_give_the_same_bits_twice(kinematics):
+    def run():
+        simulation = simulate(kinematics=kinematics)
+        simulation.set_wrench("probe", TIP, [0.1, 0.0, 0.2], [0.0, 0.0, 1e-4])
+        steps(simulation, 4)
+        return simulation
+
+    first, second = run(), run()
+    np.testing.assert_array_equal(first.state().positions, second.state().positions)
+    np.testing.assert_array_equal(first.state().F, second.state().F)
+    first.reset()
+    first.set_wrench("probe", TIP, [0.1, 0.0, 0.2], [0.0, 0.0, 1e-4])
+    steps(first, 4)
+    np.testing.assert_array_equal(first.state().positions, second.state().positions)
+
+
+def test_moving_the_scene_by_metres_changes_nothing():
+    dents = []
+    for offset in ((0.0, 0.0, 0.0), (2.0, -4.0, 3.0)):
+        simulation = simulate(curved_sheet(offset=offset), np.array(offset))
+        simulation.set_wrench("probe", TIP + offset, [0.0, 0.0, 0.2])
+        steps(simulation, 5)
+        state = simulation.state()
+        dents.append(state.positions.astype(np.float64) - state.rest)
+    np.testing.assert_allclose(dents[1], dents[0], atol=2e-6)
+    assert np.abs(dents[0]).max() > 5e-4
+
+
+def test_printed_skin_only_method_and_dense_baseline_run():
+    printed = simulate(layers=0, kinematics="current", skinning="softmax")
+    dense = TissueSimulation(curved_sheet(), EYE, PhysicsConfig.baseline(device="cpu"))
+    assert len(printed.nodes) == 1000 and len(dense.nodes) == 3000
+    for simulation in (printed, dense):
+        assert simulation.set_wrench("probe", TIP, [0.0, 0.0, 0.002])
+        steps(simulation, 3)
+        assert 1e-5 < depth_of_dent(simulation) < 0.02
+        assert simulation.faults == 0
+
+
+# Stability and faults
+
+
+def test_stiff_material_gets_more_substeps_of_the_same_total(caplog):
+    config = PhysicsConfig(young_modulus=1e6, poisson_ratio=0.45)
+    with caplog.at_level(logging.WARNING):
+        plan = plan_substeps(config, 0.00875)
+    assert plan.count > 80 and plan.cfl <= 0.7
+    assert plan.count * plan.dt == pytest.approx(config.step_duration)
+    for value in ("1e+06 Pa", "0.45", "1000 kg/m³", "0.00875 m", f"{plan.count} substeps"):
+        assert value in plan.note
+    assert plan_substeps(PhysicsConfig(), 0.00875).note == ""
+
+
+def test_stiff_material_is_refused_with_the_numbers_when_substeps_may_not_adapt():
+    numbers = r"young_modulus 1e\+06 Pa.*0\.3.*1000 kg.*0\.00875 m.*use \d+ substeps of"
+    with pytest.raises(StabilityError, match=numbers):
+        plan_substeps(PhysicsConfig(young_modulus=1e6, adapt_substeps=False), 0.00875)
+
+
+@pytest.mark.parametrize("kinematics", ["rest", "current"])
+def test_absurd_force_is_caught_and_the_last_good_state_restored(kinematics, caplog):
+    simulation = simulate(kinematics=kinematics)
+    simulation.set_wrench("probe", TIP, [0.0, 0.0, 0.1])
+    steps(simulation, 3)
+    good = simulation.state()
+    simulation.set_wrench("probe", TIP, [0.0, 0.0, -1e7])
+    with caplog.at_level(logging.WARNING):
+        simulation.step()
+    bad = simulation.state()
+    assert simulation.faults == 1 and "undone" in simulation.last_fault and "1e+07 N" in simulation.last_fault
+    assert simulation.last_fault in caplog.text
+    np.testing.assert_array_equal(bad.positions, good.positions)
+    np.testing.assert_array_equal(bad.F, good.F)
+    assert not np.any(simulation.solver.momentum())
+    simulation.set_wrench("probe", TIP, [0.0, 0.0, 0.1])
+    steps(simulation, 2)
+    assert simulation.faults == 1 and np.isfinite(simulation.state().positions).all()
+
+
+def test_a_grid_beyond_memory_is_refused():
+    ends = np.array([[0, 0, 0], [100, 100, 100]], np.float32)
+    nodes = ControlNodes(ends, np.zeros(2, bool), np.full(2, 1e-9, np.float32), np.ones(2, bool), 1e-3)
+    with pytest.raises(ValueError, match="simulation grid would have"):
+        MpmSolver(nodes, PhysicsConfig(device="cpu"))
+
+
+# Tools
+
+
+def test_minimum_norm_forces_add_up_and_are_smallest():
+    rng = np.random.default_rng(4)
+    for count in (3, 5, 40):
+        r, w = rng.normal(size=(count, 3)) * 0.01, rng.uniform(0.1, 1, count)
+        F, tau = rng.normal(size=3), rng.normal(size=3) * 0.01
+        f = minimum_norm_forces(r, w, F, tau)
+        np.testing.assert_allclose(f.sum(0), F, atol=1e-12)
+        np.testing.assert_allclose(np.cross(r, f).sum(0), tau, atol=1e-12)
+        # The pseudo-inverse solves the same problem in scaled unknowns f/√w.
+        A = np.concatenate([np.concatenate([np.eye(3), _cross_matrix(ri)]) * np.sqrt(wi) for ri, wi in zip(r, w)], 1)
+        g = np.linalg.pinv(A) @ np.concatenate([F, tau])
+        np.testing.assert_allclose(f, g.reshape(-1, 3) * np.sqrt(w)[:, None], atol=1e-9)
+
+
+def _cross_matrix(r: np.ndarray) -> np.ndarray:
+    return np.array([[0, -r[2], r[1]], [r[2], 0, -r[0]], [-r[1], r[0], 0]])
+
+
+def test_too_few_nodes_for_a_torque_still_take_the_force():
+    for r in (np.array([[0.001, 0.002, 0.0]]), np.array([[0.0, 0.0, 0.0], [0.01, 0.0, 0.0]])):
+        f = minimum_norm_forces(r, np.ones(len(r)), np.array([0.0, 0.0, 1.0]), np.array([1e-3, 0.0, 0.0]))
+        assert np.isfinite(f).all()
+        np.testing.assert_allclose(f.sum(0), [0, 0, 1], atol=1e-12)
+
+
+def test_reaction_is_minus_the_wrench_while_it_arrives():
+    simulation = simulate()
+    force, torque = np.array([0.02, 0.01, 0.1]), np.array([1e-4, 0.0, 5e-5])
+    simulation.set_wrench("probe", TIP, force, torque)
+    for _ in range(3):
+        simulation.step()
+        reaction = simulation.reaction("probe")
+        np.testing.assert_allclose(reaction[0], -force, atol=1e-12)
+        np.testing.assert_allclose(reaction[1], -torque, atol=1e-12)
+    assert not np.any(simulation.reaction("nobody"))
+    simulation.set_wrench("probe", TIP, np.zeros(3))
+    assert not np.any(simulation.reaction("probe"))
+
+
+def test_tool_out_of_reach_applies_nothing_until_it_reaches():
+    simulation = simulate()
+    assert not simulation.set_wrench("probe", EYE, [0.0, 0.0, 1.0])
+    simulation.step()
+    state = simulation.state()
+    np.testing.assert_array_equal(state.positions, state.rest)
+    assert not simulation.in_reach("probe") and not np.any(simulation.reaction("probe"))
+    assert simulation.set_wrench("probe", TIP, [0.0, 0.0, 0.1])
+    simulation.step()
+    assert depth_of_dent(simulation) > 1e-4
+
+
+def test_grabbed_tissue_stays_grabbed_while_it_follows():
+    simulation = simulate(force_radius=0.006)
+    simulation.set_wrench("jaw", TIP, [0.0, 0.0, -0.8])
+    steps(simulation, 12)
+    assert depth_of_dent(simulation) > simulation.config.force_radius / 2
+    tip = TIP - [0, 0, 0.004]
+    simulation.set_wrench("jaw", tip, [0.0, 0.0, -0.8])
+    simulation.step()
+    np.testing.assert_allclose(simulation.reaction("jaw")[0], [0, 0, 0.8], atol=1e-12)
+
+
+def test_two_tools_act_at_once():
+    simulation = simulate()
+    left, right = TIP - [0.025, 0, 0], TIP + [0.025, 0, 0]
+    simulation.set_wrench("left", left, [0.0, 0.0, 0.1])
+    simulation.set_wrench("right", right, [0.0, 0.0, -0.1])
+    steps(simulation, 5)
+    state = simulation.state()
+    moved = (state.positions - state.rest)[simulation.nodes.is_skin, 2]
+    x = state.rest[simulation.nodes.is_skin, 0]
+    assert moved[x < 0].max() > 3e-4 and moved[x > 0].min() < -3e-4
+
+
+@pytest.mark.parametrize("name, position", [("tip", 1), ("force", 2), ("torque", 3)])
+@pytest.mark.parametrize("value", [[0.0, np.nan, 0.0], [np.inf, 0.0, 0.0], [0.0, 0.0]])
+def test_bad_wrench_is_refused_by_name_and_changes_nothing(name, position, value):
+    simulation = simulate(node_count=200)
+    arguments = ["probe", TIP, np.zeros(3), np.zeros(3)]
+    arguments[position] = value
+    with pytest.raises(ValueError, match=f"{name} of tool 'probe' must be three finite numbers"):
+        simulation.set_wrench(*arguments)
+    simulation.step()
+    np.testing.assert_array_equal(simulation.state().positions, simulation.nodes.rest)
+
+
+# Skinning
+
+
+def affine_field(rest: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    A = np.array([[1.1, 0.2, 0.0], [-0.1, 0.9, 0.1], [0.05, 0.0, 1.2]])
+    return A, rest @ A.T + [0.01, 0.02, -0.03], np.tile(A, (len(rest), 1, 1))
+
+
+@pytest.mark.parametrize("weighting", ["compact", "softmax"])
+def test_undeformed_nodes_leave_gaussians_untouched(weighting):
+    model = curved_sheet()
+    nodes = build_control_nodes(model, EYE, PhysicsConfig(node_count=1000))
+    skinning = Skinning(model, nodes.rest, weighting=weighting, device="cpu")
+    means, covars = skinning.deform(nodes.rest, np.tile(np.eye(3), (len(nodes), 1, 1)))
+    assert torch.equal(means, model.means)
+    torch.testing.assert_close(covars, skinning.covars, rtol=1e-6, atol=0.0)
+
+
+def test_affine_fields_are_exact():
+    model = curved_sheet()
+    nodes = build_control_nodes(model, EYE, PhysicsConfig(node_count=1000))
+    A, positions, F = affine_field(nodes.rest)
+    skinning = Skinning(model, nodes.rest, device="cpu")
+    means, covars = skinning.deform(positions, F)
+    np.testing.assert_allclose(means, affine_field(model.means.numpy())[1], atol=1e-7)
+    np.testing.assert_allclose(covars, A @ skinning.covars.numpy() @ A.T, rtol=1e-4, atol=1e-12)
+
+
+@pytest.mark.parametrize("weighting", ["compact", "softmax"])
+def test_rigid_motion_is_exact_and_gives_its_rotation(weighting):
+    model = curved_sheet(500)
+    rest = model.means[::5].numpy()
+    R = random_rotations(1)[0]
+    skinning = Skinning(model, rest, weighting=weighting, device="cpu")
+    F = np.tile(R, (len(rest), 1, 1))
+    means, _ = skinning.deform(rest @ R.T + 0.01, F)
+    np.testing.assert_allclose(means, model.means.numpy() @ R.T + 0.01, atol=2e-7)
+    np.testing.assert_allclose(skinning.rotations(F), np.tile(R, (500, 1, 1)), atol=1e-5)
+
+
+def test_a_dent_is_smoother_with_compact_weights_than_with_the_printed_softmax():
+    rng = np.random.default_rng(5)
+    xy = rng.uniform(-0.02, 0.02, (4000, 2))
+    points = np.c_[xy, np.zeros(4000)]
+    rest = points[sample_farthest(points, 220)]  # 2.7 mm apart
+
+    def dent(p):  # 5 mm deep, Gaussian, and its gradient
+        depth = 0.005 * np.exp(-(p[:, :2] ** 2).sum(1) / (2 * 0.006**2))
+        F = np.tile(np.eye(3), (len(p), 1, 1))
+        F[:, 2, :2] = -depth[:, None] * p[:, :2] / 0.006**2
+        return p + np.c_[np.zeros((len(p), 2)), depth], F
+
+    model = GaussianModel.from_points(torch.from_numpy(points).float(), torch.rand(4000, 3), torch.full((4000,), 0.001))
+    inside = np.abs(xy).max(1) < 0.015
+    line = np.c_[np.linspace(-0.015, 0.015, 6001), np.zeros((6001, 2))]  # 5 µm apart: jumps show, slopes do not
+    along = GaussianModel.from_points(torch.from_numpy(line).float(), torch.rand(6001, 3), torch.full((6001,), 0.001))
+    rms, jump = {}, {}
+    for weighting in ("compact", "softmax"):
+        means, _ = Skinning(model, rest, weighting=weighting, device="cpu").deform(*dent(rest))
+        error = np.linalg.norm(means.numpy() - dent(points)[0], axis=1)[inside]
+        rms[weighting] = np.sqrt((error**2).mean())
+        means, _ = Skinning(along, rest, weighting=weighting, device="cpu").deform(*dent(rest))
+        jump[weighting] = np.abs(np.diff(means[:, 2].numpy() - dent(line)[0][:, 2])).max()
+    assert rms["compact"] < 0.05e-3 and rms["compact"] < 0.6 * rms["softmax"]
+    assert jump["compact"] < 0.01e-3 and jump["compact"] < 0.1 * jump["softmax"]
+
+
+def test_wild_nodes_give_bounded_gaussians():
+    model = curved_sheet(300)
+    rest = model.means[::5].numpy()
+    for F in (np.diag([9.0, 1.0, 1.0]), np.diag([1.0, 1.0, -1.0]), np.zeros((3, 3)), np.diag([1.0, 1.0, 1e-6])):
+        skinning = Skinning(model, rest, device="cpu")
+        _, covars = skinning.deform(rest, np.tile(F, (len(rest), 1, 1)))
+        stretch = torch.linalg.eigvalsh(covars).sqrt() / 0.001
+        assert 0.199 < stretch.min() and stretch.max() < 4.01
+
+
+def test_few_nodes_and_no_gaussians_are_fine():
+    model = curved_sheet(50)
+    for count in (1, 2, 3):
+        rest = model.means[:count].numpy()
+        means, _ = Skinning(model, rest, device="cpu").deform(rest + 1, np.tile(np.eye(3), (count, 1, 1)))
+        np.testing.assert_allclose(means, model.means + 1, atol=1e-6)
+    empty = model.select(torch.zeros(50, dtype=torch.bool))
+    assert Skinning(empty, rest, device="cpu").deform(rest, np.zeros((3, 3, 3)))[0].shape == (0, 3)
+
+
+def test_wrong_node_shapes_are_refused():
+    model = curved_sheet(50)
+    rest = model.means[:10].numpy()
+    skinning = Skinning(model, rest, device="cpu")
+    with pytest.raises(ValueError, match=r"F has shape \(9, 3, 3\), expected \(10, 3, 3\)"):
+        skinning.deform(rest, np.zeros((9, 3, 3)))
+    with pytest.raises(ValueError, match=r"node_rest has shape \(0, 3\)"):
+        Skinning(model, np.zeros((0, 3)), device="cpu")
+
+
+def test_simulated_dent_reaches_the_gaussians():
+    model = curved_sheet()
+    simulation = simulate(model)
+    simulation.set_wrench("probe", TIP, [0.0, 0.0, 0.2])
+    steps(simulation, 8)
+    state = simulation.state()
+    means, covars = Skinning(model, state.rest, device="cpu").deform(state.positions, state.F)
+    moved = (means - model.means)[:, 2].numpy()
+    distance = np.linalg.norm(model.means[:, :2].numpy(), axis=1)
+    assert moved[distance < 0.004].mean() > 3 * moved[(distance > 0.012) & (distance < 0.016)].mean() > 0
+    assert np.abs(moved[distance > 0.035]).max() < 0.05 * moved.max()
+    assert torch.linalg.eigvalsh(covars).min() > 0

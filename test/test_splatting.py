@@ -1,0 +1,391 @@
+"""The rasteriser against its float64 reference, and what must hold at the edges."""
+
+import numpy as np
+import pytest
+import torch
+
+from endo_sim_ros.cameras import Camera, look_at
+from endo_sim_ros.gaussians import GaussianModel
+from endo_sim_ros.splatting import RenderOutput, _rasterize, rasterize, rasterizer, render
+
+DEVICES = ["cpu"] + (["cuda"] if torch.cuda.is_available() else [])
+WIDTH, HEIGHT = 70, 45  # no multiple of the tile
+BACKGROUND = torch.tensor([0.2, 0.4, 0.1], dtype=torch.float64)
+
+
+def make_gaussians(count=60, sh_count=1, seed=0):
+    """Random means, quats, scales, opacities and sh in float64; some lie behind the cameras, some outside the image."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    means = normal(count, 3) * torch.tensor([0.04, 0.04, 0.05]) + torch.tensor([0.0, 0.0, 0.12])
+    opacities = torch.rand(count, generator=generator, dtype=torch.float64)
+    scales = (0.5 * normal(count, 3)).exp() * 0.006
+    return [means, normal(count, 4), scales, opacities, 0.3 * normal(count, sh_count, 3)]
+
+
+def make_cameras(count=2, width=WIDTH, height=HEIGHT):
+    """View matrices and intrinsics in float64, around a point 12 cm in front of the origin."""
+    target = np.array([0.0, 0.0, 0.12])
+    poses = [look_at(np.array([0.03 * i, 0.01 * i, -0.02 * i]), target) for i in range(count)]
+    viewmats = torch.stack([torch.from_numpy(np.linalg.inv(pose)) for pose in poses])
+    K = torch.tensor([[0.8 * width, 0, 0.45 * width], [0, 0.75 * width, 0.55 * height], [0, 0, 1]], dtype=torch.float64)
+    return viewmats, K.repeat(count, 1, 1)
+
+
+def random_like(images, seed=1):
+    generator = torch.Generator().manual_seed(seed)
+    return [torch.randn(image.shape, generator=generator, dtype=torch.float64) for image in images]
+
+
+def covariances(quats, scales):
+    """World covariances [N, 3, 3]."""
+    rotations = rasterizer._quat_to_matrix(quats)
+    return rotations @ torch.diag_embed(scales**2) @ rotations.mT
+
+
+def run(
+    function, gaussians, cameras, size=(WIDTH, HEIGHT), device="cpu", dtype=torch.float64, cotangents=None, **options
+):
+    """The output of a rasteriser and the gradients of gaussians, view matrices and background for random cotangents."""
+    viewmats, Ks = cameras
+    leaves = [x.detach().to(device, dtype).requires_grad_() for x in (*gaussians, viewmats, BACKGROUND)]
+    *gaussians, viewmats, background = leaves
+    if len(gaussians) == 4:  # means, covars, opacities, sh
+        options["covars"] = gaussians[1]
+        gaussians = [gaussians[0], None, None, *gaussians[2:]]
+    output = function(*gaussians, viewmats, Ks.to(device, dtype), *size, background=background, **options)
+    cotangents = random_like(output[:4]) if cotangents is None else cotangents
+    torch.autograd.backward(output[:4], [x.to(device, dtype) for x in cotangents])
+    return output, [leaf.grad for leaf in leaves]
+
+
+def assert_close(name, actual, expected, tolerance):
+    """Both finite, and equal within a tolerance relative to the largest expected value."""
+    actual, expected = actual.detach().cpu().double(), expected.detach().double()
+    assert actual.isfinite().all() and expected.isfinite().all(), f"{name} is not finite"
+    error = float((actual - expected).abs().max() / expected.abs().max())
+    assert error < tolerance, f"{name}: relative error {error:.1e}"
+
+
+GAUSSIAN_NAMES = ["means", "quats", "scales", "opacities", "sh", "viewmats", "background"]
+IMAGE_TOLERANCE = 1e-5
+GRADIENT_TOLERANCES = {"means": 5e-5, "quats": 5e-5, "scales": 5e-5, "covars": 5e-5, "opacities": 5e-5} | {
+    name: 1e-4 for name in ("sh", "viewmats", "background")
+}
+
+
+def assert_matches_reference(gaussians, cameras, device="cpu", names=GAUSSIAN_NAMES, **options):
+    expected, expected_gradients = run(_rasterize, gaussians, cameras, **options)
+    output, gradients = run(rasterize, gaussians, cameras, device=device, dtype=torch.float32, **options)
+    for name, actual, image in zip(RenderOutput._fields, output, expected):
+        if name != "radii":
+            assert image.abs().max() > 0, f"{name} is empty, nothing is tested"
+            assert_close(name, actual, image, IMAGE_TOLERANCE)
+    assert torch.equal(output.radii.cpu() > 0, expected.radii > 0)
+    assert (output.radii.cpu() - expected.radii).abs().max() <= 1
+    for name, actual, gradient in zip(names, gradients, expected_gradients):
+        assert gradient.abs().max() > 1e-6, f"the gradient of {name} vanishes, nothing is tested"
+        assert_close(f"gradient of {name}", actual, gradient, GRADIENT_TOLERANCES[name])
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_torch_thread():
+    """The reference works on small tensors, for which threads that wait for each other on busy cores only cost time."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(params=["vectors", "pixels"])
+def compositor(request, monkeypatch):
+    """Both ways to composite; the kernels made for GPUs run on the CPU too, in one thread."""
+    if request.param == "pixels":
+        monkeypatch.setattr(rasterizer, "_uses_vectors", lambda device: False)
+        monkeypatch.setattr(rasterizer, "cpu_threads", lambda: 1)
+
+
+@pytest.mark.parametrize("sh_count", [1, 4, 9, 16])
+@pytest.mark.parametrize("device", DEVICES)
+def test_images_and_all_gradients_match_the_reference(device, sh_count, compositor):
+    assert_matches_reference(make_gaussians(sh_count=sh_count, seed=sh_count), make_cameras(), device)
+
+
+@pytest.mark.parametrize("seed", range(20, 26))
+def test_random_scenes_match_the_reference(seed):
+    generator = np.random.default_rng(seed)
+    size = tuple(int(x) for x in generator.integers(1, 60, 2))
+    gaussians = make_gaussians(int(generator.integers(5, 120)), 4, seed)
+    gaussians[2] = gaussians[2] * float(generator.uniform(0.3, 3.0))
+    assert_matches_reference(gaussians, make_cameras(1, *size), size=size)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_opaque_stacks_that_end_pixels_early_match_the_reference(device, compositor):
+    gaussians = make_gaussians(150, seed=3)
+    gaussians[2] = gaussians[2] * 3
+    gaussians[3] = 0.9 + 0.1 * gaussians[3]
+    expected, _ = run(_rasterize, gaussians, make_cameras())
+    assert expected.alphas.max() > 1 - 1e-3
+    assert_matches_reference(gaussians, make_cameras(), device)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_covariances_match_the_reference_and_give_the_picture_of_quats_and_scales(device):
+    means, quats, scales, opacities, sh = make_gaussians(seed=5)
+    by_covariance = [means, covariances(quats, scales), opacities, sh]
+    names = ["means", "covars", "opacities", "sh", "viewmats", "background"]
+    assert_matches_reference(by_covariance, make_cameras(), device, names)
+    output, _ = run(rasterize, by_covariance, make_cameras(), dtype=torch.float32, device=device)
+    same, _ = run(rasterize, [means, quats, scales, opacities, sh], make_cameras(), dtype=torch.float32, device=device)
+    for name, actual, image in zip(RenderOutput._fields[:4], output, same):
+        assert_close(name, actual, image.detach().cpu(), IMAGE_TOLERANCE)
+
+
+def test_each_output_alone_has_the_gradient_of_the_reference():
+    gaussians, cameras = make_gaussians(seed=6), make_cameras()
+    images = run(_rasterize, gaussians, cameras)[0][:4]
+    for alone in range(4):
+        cotangents = [x if i == alone else torch.zeros_like(x) for i, x in enumerate(random_like(images))]
+        _, expected = run(_rasterize, gaussians, cameras, cotangents=cotangents)
+        _, gradients = run(rasterize, gaussians, cameras, cotangents=cotangents, dtype=torch.float32)
+        for name, actual, gradient in zip(GAUSSIAN_NAMES[:4], gradients, expected):
+            assert gradient.abs().max() > 0
+            assert_close(f"{name} for {RenderOutput._fields[alone]}", actual, gradient, 2e-4)
+
+
+def test_camera_gradient_matches_finite_differences_of_the_reference():
+    gaussians, (viewmats, Ks) = make_gaussians(40, 4, seed=7), make_cameras(1)
+    cotangents = random_like(_rasterize(*gaussians, viewmats, Ks, WIDTH, HEIGHT)[:4])
+    _, gradients = run(rasterize, gaussians, (viewmats, Ks), dtype=torch.float32, cotangents=cotangents)
+
+    def loss(pose):
+        output = _rasterize(*gaussians, pose, Ks, WIDTH, HEIGHT, background=BACKGROUND)
+        return float(sum((image * cotangent).sum() for image, cotangent in zip(output, cotangents)))
+
+    step = 1e-7
+    differences = torch.zeros(1, 4, 4, dtype=torch.float64)
+    for row in range(3):
+        for column in range(4):
+            change = torch.zeros(1, 4, 4, dtype=torch.float64)
+            change[0, row, column] = step
+            differences[0, row, column] = (loss(viewmats + change) - loss(viewmats - change)) / (2 * step)
+    assert_close("gradient of viewmats", gradients[5], differences, 1e-3)
+
+
+def test_float64_inputs_get_float64_gradients():
+    _, gradients = run(rasterize, make_gaussians(), make_cameras())
+    assert all(gradient.dtype == torch.float64 for gradient in gradients)
+
+
+def test_distortion_is_the_double_sum_of_its_definition():
+    z, opacity = torch.tensor([0.10, 0.11, 0.13]), torch.tensor([0.3, 0.6, 0.5])
+    means = torch.stack([torch.zeros(3), torch.zeros(3), z], 1)
+    K = torch.tensor([[[50.0, 0, 0.5], [0, 50.0, 0.5], [0, 0, 1]]])
+    quats, scales = torch.tensor([[1.0, 0, 0, 0]]).repeat(3, 1), torch.full((3, 3), 0.01)
+    output = rasterize(means, quats, scales, opacity, torch.zeros(3, 1, 3), torch.eye(4)[None], K, 1, 1)
+    weights = opacity * torch.tensor([1.0, 0.7, 0.7 * 0.4])
+    expected = (weights[:, None] * weights * (z[:, None] - z).abs()).sum()
+    assert torch.allclose(output.distortions.squeeze(), expected, rtol=1e-5)
+    assert torch.allclose(output.depths.squeeze(), (weights * z).sum(), rtol=1e-5)
+    assert torch.allclose(output.alphas.squeeze(), weights.sum(), rtol=1e-5)
+    assert torch.allclose(output.colors.squeeze(), 0.5 * weights.sum().expand(3), rtol=1e-5)
+
+
+# ---------------------------------------------------------------- edges
+
+
+def assert_only_background(gaussians, size=(WIDTH, HEIGHT)):
+    output, gradients = run(rasterize, gaussians, make_cameras(2, *size), size=size, dtype=torch.float32)
+    assert torch.equal(output.colors, BACKGROUND.float().expand_as(output.colors))
+    assert not any(image.any() for image in output[1:])
+    assert all(not gradient.any() for gradient in gradients[:-1])
+    cotangent = random_like(output[:1])[0].sum((0, 1, 2))
+    assert_close("gradient of the background", gradients[-1], cotangent, 1e-5)
+
+
+def test_no_gaussians_render_the_background(compositor):
+    assert_only_background(make_gaussians(0))
+
+
+def test_gaussians_behind_the_camera_render_the_background(compositor):
+    gaussians = make_gaussians()
+    gaussians[0][:, 2] = -0.1 - gaussians[0][:, 2].abs()
+    assert_only_background(gaussians)
+
+
+def test_gaussians_beside_the_image_render_the_background():
+    gaussians = make_gaussians()
+    gaussians[0][:, 0] += 5
+    assert_only_background(gaussians)
+
+
+def test_transparent_gaussians_render_the_background():
+    gaussians = make_gaussians()
+    gaussians[3][:] = 0.5 / 255
+    assert_only_background(gaussians)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (16, 16), (17, 1), (1, 33), (48, 31)])
+def test_any_image_size_matches_the_reference(size, compositor):
+    gaussians = make_gaussians(30, seed=8)
+    gaussians[2] = gaussians[2] * 4
+    assert_matches_reference(gaussians, make_cameras(2, *size), size=size)
+
+
+def test_a_gaussian_that_covers_all_tiles_matches_the_reference():
+    gaussians = make_gaussians(4, seed=9)
+    gaussians[0] = gaussians[0] * 0.1 + torch.tensor([0, 0, 0.1])
+    gaussians[2] = gaussians[2] * 40
+    assert_matches_reference(gaussians, make_cameras())
+
+
+def test_needle_gaussians_lose_no_tile(compositor):
+    gaussians = make_gaussians(80, seed=10)
+    gaussians[2] = gaussians[2] * torch.tensor([12.0, 0.02, 0.02])
+    expected, _ = run(_rasterize, gaussians, make_cameras())
+    output, _ = run(rasterize, gaussians, make_cameras(), dtype=torch.float32)
+    for image, other in zip(output[:4], expected):
+        errors = (image.double() - other).abs() / other.abs().max()
+        # In float32 a needle's conic is good to 1e-4, so that some pixels fall on the other side of alpha = 1/255.
+        assert errors.max() < 2 / 255
+        assert (errors > 5e-4).double().mean() < 2e-3
+
+
+def test_zero_quaternion_means_no_rotation_and_has_no_gradient():
+    gaussians = make_gaussians()
+    gaussians[1][3] = 0
+    identity = [x.clone() for x in gaussians]
+    identity[1][3] = torch.tensor([1.0, 0, 0, 0])
+    output, gradients = run(rasterize, gaussians, make_cameras(), dtype=torch.float32)
+    expected, _ = run(rasterize, identity, make_cameras(), dtype=torch.float32)
+    assert torch.equal(output.colors, expected.colors)
+    assert not gradients[1][3].any() and gradients[1].any()
+    assert all(gradient.isfinite().all() for gradient in gradients)
+
+
+def test_a_flat_gaussian_is_drawn_as_wide_as_the_blur():
+    gaussians = make_gaussians()
+    gaussians[2][:] = 0
+    assert_matches_reference(gaussians, make_cameras(), names=["means"])
+
+
+@pytest.mark.parametrize("argument,value", [(1, torch.nan), (2, torch.inf), (3, torch.nan), (4, torch.nan), (2, 1e30)])
+def test_a_gaussian_that_is_not_finite_is_not_drawn_and_does_no_harm(argument, value):
+    good = make_gaussians()
+    broken = [torch.cat([x[:1], x]) for x in good]
+    broken[argument][0] = value
+    output, gradients = run(rasterize, broken, make_cameras(), dtype=torch.float32)
+    expected, expected_gradients = run(rasterize, good, make_cameras(), dtype=torch.float32)
+    assert torch.equal(output.colors, expected.colors)
+    assert not output.radii[:, 0].any()
+    for gradient, expected_gradient in zip(gradients[:5], expected_gradients):
+        assert not gradient[0].any()
+        assert torch.equal(gradient[1:], expected_gradient)
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_a_mean_that_is_not_finite_is_named(value):
+    gaussians = [x.float() for x in make_gaussians()]
+    gaussians[0][7, 1] = value
+    viewmats, Ks = make_cameras()
+    with pytest.raises(ValueError, match=r"rasterize: means\[7\] is not finite"):
+        rasterize(*gaussians, viewmats, Ks, WIDTH, HEIGHT)
+
+
+@pytest.mark.parametrize("function", [rasterize, _rasterize])
+def test_wrong_shapes_are_named_with_both_shapes(function):
+    gaussians = make_gaussians(6)
+    viewmats, Ks = make_cameras()
+    names = ["means", "quats", "scales", "opacities", "sh", "viewmats", "Ks"]
+    for index, name in enumerate(names):
+        arguments = [*gaussians, viewmats, Ks]
+        arguments[index] = arguments[index][..., :-1]
+        if name in ("means", "opacities"):
+            arguments[index] = arguments[index][None]
+        with pytest.raises(ValueError, match=rf"{function.__name__}: {name} shape \(.*\) != expected shape \(.*\)"):
+            function(*arguments, WIDTH, HEIGHT)
+    for option, shape in {"background": (4,), "masks": (2, HEIGHT, WIDTH + 1)}.items():
+        with pytest.raises(ValueError, match=f"{option} shape"):
+            function(*gaussians, viewmats, Ks, WIDTH, HEIGHT, **{option: torch.zeros(shape)})
+    with pytest.raises(ValueError, match="either covars or both"):
+        function(gaussians[0], None, *gaussians[2:], viewmats, Ks, WIDTH, HEIGHT)
+    with pytest.raises(ValueError, match="covars replaces"):
+        function(*gaussians, viewmats, Ks, WIDTH, HEIGHT, covars=torch.eye(3).repeat(6, 1, 1))
+    with pytest.raises(ValueError, match="image size"):
+        function(*gaussians, viewmats, Ks, 0, HEIGHT)
+
+
+# ---------------------------------------------------------------- promises
+
+
+def test_results_repeat_bit_for_bit_with_any_number_of_threads(monkeypatch):
+    gaussians, cameras = make_gaussians(3000, 4, seed=11), make_cameras(2, 150, 90)
+    results = []
+    for threads in (1, 2, 2, 5):
+        monkeypatch.setattr(rasterizer, "cpu_threads", lambda: threads)
+        results.append(run(rasterize, gaussians, cameras, size=(150, 90), dtype=torch.float32))
+    for output, gradients in results[1:]:
+        for first, other in zip((*results[0][0], *results[0][1]), (*output, *gradients)):
+            assert torch.equal(first, other)
+
+
+def test_a_mask_that_skips_tiles_does_not_change_the_other_pixels(compositor):
+    gaussians, cameras = make_gaussians(seed=12), make_cameras()
+    mask = torch.zeros(2, HEIGHT, WIDTH, dtype=torch.bool)
+    mask[0, 20:30, 30:50] = True
+    mask[1, 44, 69] = True
+    cotangents = random_like(run(_rasterize, gaussians, cameras)[0][:4])
+    cotangents = [x * (mask[..., None] if x.ndim == 4 else mask) for x in cotangents]
+    whole, whole_gradients = run(rasterize, gaussians, cameras, dtype=torch.float32, cotangents=cotangents)
+    output, gradients = run(rasterize, gaussians, cameras, dtype=torch.float32, cotangents=cotangents, masks=mask)
+    for image, expected in zip(output[:4], whole):
+        assert torch.equal(image[mask], expected[mask])
+    assert torch.equal(output.colors[0, 0, 0], BACKGROUND.float()) and not torch.equal(output.colors, whole.colors)
+    for name, gradient, expected in zip(GAUSSIAN_NAMES, gradients, whole_gradients):
+        assert_close(name, gradient, expected, 1e-5)
+
+
+def test_hidden_gaussians_do_not_change_the_picture():
+    gaussians, cameras = make_gaussians(seed=13), make_cameras()
+    hidden = [torch.cat([x, y]) for x, y in zip(gaussians, make_gaussians(50, seed=14))]
+    hidden[0][60:, 2] = -1
+    expected, _ = run(rasterize, gaussians, cameras, dtype=torch.float32)
+    output, _ = run(rasterize, hidden, cameras, dtype=torch.float32)
+    assert all(torch.equal(image, other) for image, other in zip(output[:4], expected))
+    assert not output.radii[:, 60:].any()
+
+
+def test_render_shows_a_model_through_a_camera():
+    model = GaussianModel.from_points(
+        torch.tensor([[0.0, 0, 0.1]]), torch.tensor([[0.9, 0.2, 0.1]]), torch.tensor([0.02]), opacity=0.99
+    )
+    camera = Camera(np.array([[40.0, 0, 16.5], [0, 40, 12.5], [0, 0, 1]]), 33, 25)
+    output = render(model, camera, background=torch.ones(3))
+    assert output.colors.shape == (1, 25, 33, 3) and output.radii.shape == (1, 1)
+    assert torch.allclose(output.colors[0, 12, 16], torch.tensor([0.9, 0.2, 0.1]) * 0.99 + 0.01, atol=1e-4)
+    assert torch.allclose(output.depths[0, 12, 16], torch.tensor(0.099), atol=1e-6)
+    covars = covariances(model.quats, model.scales)
+    deformed = render(model, camera, covars=covars, background=torch.ones(3))
+    assert torch.allclose(deformed.colors, output.colors, atol=1e-5)
+
+
+def test_gradient_descent_recovers_a_moved_gaussian():
+    viewmats, Ks = (x.float() for x in make_cameras(1))
+    quats, scales = torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.015)
+    opacities, sh = torch.tensor([0.9]), torch.ones(1, 1, 3)
+
+    def draw(mean):
+        return rasterize(mean[None], quats, scales, opacities, sh, viewmats, Ks, WIDTH, HEIGHT).colors
+
+    target = draw(torch.tensor([0.01, -0.005, 0.12]))
+    mean = torch.tensor([0.0, 0.0, 0.13], requires_grad=True)
+    optimizer = torch.optim.Adam([mean], lr=1e-3)
+    for _ in range(60):
+        optimizer.zero_grad()
+        (draw(mean) - target).square().mean().backward()
+        optimizer.step()
+    assert torch.allclose(mean, torch.tensor([0.01, -0.005, 0.12]), atol=2e-3)

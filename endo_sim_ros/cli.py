@@ -115,7 +115,7 @@ class Demo:
     """Width of training and rendered images, pixels."""
     iterations: int = 1500
     """Training iterations."""
-    force: float = 0.6
+    force: float = 2.5
     """Largest force of the scripted tool, N."""
     timeout: float = 900.0
     """Give up after this long, seconds."""

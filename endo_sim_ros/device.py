@@ -1,7 +1,9 @@
 """Where to compute: one name for torch and Warp."""
 
+import contextlib
 import functools
 import os
+import sys
 
 import torch
 
@@ -32,7 +34,22 @@ def init_warp() -> None:
     import warp as wp
 
     wp.config.log_level = wp.LOG_ERROR
-    wp.init()
+    with contextlib.nullcontext() if torch.cuda.is_available() else _silent_stderr():
+        wp.init()
+
+
+@contextlib.contextmanager
+def _silent_stderr():
+    """Discard what native code writes to the error stream."""
+    sys.stderr.flush()
+    saved, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    try:
+        yield
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
+        os.close(nowhere)
 
 
 def cpu_threads() -> int:

@@ -66,6 +66,21 @@ class GaussianModel:
         """View-independent RGB [N, 3], clamped to [0, 1]."""
         return (self.sh[:, 0] * SH_C0 + 0.5).clamp(0, 1)
 
+    @property
+    def covariances(self) -> Tensor:
+        """World covariances R diag(s²) Rᵀ [N, 3, 3], m²."""
+        w, x, y, z = torch.nn.functional.normalize(self.quats, dim=1).unbind(1)
+        R = torch.stack(
+            [
+                1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+                2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+                2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+            ],
+            1,
+        ).view(-1, 3, 3)  # fmt: skip
+        half = R * self.scales[:, None]
+        return half @ half.transpose(1, 2)
+
     def tensors(self) -> dict[str, Tensor]:
         """The five arrays by field name."""
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}

@@ -51,6 +51,7 @@ TRAINING_CAMERA_INFO = Topic("training_camera_info", "sensor_msgs/msg/CameraInfo
 CONTROL_NODES = Topic("control_nodes", "sensor_msgs/msg/PointCloud2")
 RENDERED_IMAGE = Topic("rendered/image_raw", "sensor_msgs/msg/Image")
 RENDERED_INFO = Topic("rendered/camera_info", "sensor_msgs/msg/CameraInfo")
+RENDERED_POSE = Topic("rendered/camera_pose", "geometry_msgs/msg/PoseStamped")
 RENDERED_DEPTH = Topic("rendered/depth/image", "sensor_msgs/msg/Image")
 DIAGNOSTICS = Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
 
@@ -75,7 +76,7 @@ RECORDING_TOPICS = (
     LEFT_IMAGE, LEFT_COMPRESSED, LEFT_INFO, RIGHT_IMAGE, RIGHT_COMPRESSED, RIGHT_INFO, DEPTH, MASK, CAMERA_POSE,
 )  # fmt: skip
 MODEL_TOPICS = (GAUSSIANS, TRAINING_CAMERAS, TRAINING_CAMERA_INFO)
-RENDERED_TOPICS = (RENDERED_IMAGE, RENDERED_INFO, RENDERED_DEPTH)
+RENDERED_TOPICS = (RENDERED_INFO, RENDERED_POSE, RENDERED_DEPTH, RENDERED_IMAGE)
 
 
 def all_topics(arms: tuple[str, ...] = ("PSM1",)) -> tuple[Topic, ...]:

@@ -379,7 +379,7 @@ def test_moving_the_scene_by_metres_changes_nothing():
 
 
 def test_printed_skin_only_method_and_dense_baseline_run():
-    printed = simulate(layers=0, kinematics="current", skinning="softmax")
+    printed = simulate(layers=0, kinematics="current")
     dense = TissueSimulation(curved_sheet(), EYE, PhysicsConfig.baseline(device="cpu"))
     assert len(printed.nodes) == 1000 and len(dense.nodes) == 3000
     for simulation in (printed, dense):
@@ -387,6 +387,92 @@ def test_printed_skin_only_method_and_dense_baseline_run():
         steps(simulation, 3)
         assert 1e-5 < depth_of_dent(simulation) < 0.02
         assert simulation.faults == 0
+
+
+# Grasping
+
+
+def pose_at(position) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, 3] = position
+    return pose
+
+
+def test_closed_jaw_holds_tissue_that_follows_and_pulls_back():
+    simulation = simulate()
+    assert simulation.set_grasp("PSM1", pose_at(TIP), True)
+    held = simulation._grips["PSM1"].nodes
+    for i in range(1, 11):
+        simulation.set_grasp("PSM1", pose_at(TIP - [0, 0, 0.001 * i]), True)
+        simulation.step()
+    moved = (simulation.state().positions - simulation.nodes.rest)[held]
+    np.testing.assert_allclose(moved, np.tile([0, 0, -0.01], (len(held), 1)), atol=1e-3)
+    force, _ = simulation.reaction("PSM1")
+    assert force[2] > 0.05 and np.linalg.norm(force[:2]) < 0.3 * force[2]  # the tissue pulls the jaw back, away from the camera
+    assert simulation.in_reach("PSM1") and simulation.faults == 0
+
+
+def test_reaction_of_a_grasp_grows_with_stiffness():
+    pulls = []
+    for modulus in (5e3, 10e3):
+        simulation = simulate(young_modulus=modulus)
+        simulation.set_grasp("PSM1", pose_at(TIP), True)
+        simulation.set_grasp("PSM1", pose_at(TIP - [0, 0, 0.002]), True)
+        steps(simulation, 10)
+        pulls.append(simulation.reaction("PSM1")[0][2])
+    assert pulls[1] / pulls[0] == pytest.approx(2, rel=0.1)
+
+
+def test_turning_the_jaw_turns_the_tissue_and_is_resisted():
+    simulation = simulate()
+    simulation.set_grasp("PSM1", pose_at(TIP), True)
+    held = simulation._grips["PSM1"].nodes
+    pose = pose_at(TIP)
+    angle = 0.2
+    pose[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    simulation.set_grasp("PSM1", pose, True)
+    steps(simulation, 5)
+    state, rest = simulation.state(), simulation.nodes.rest
+    expected = (rest[held] - TIP) @ pose[:3, :3].T + TIP
+    np.testing.assert_allclose(state.positions[held], expected, atol=4e-4)
+    assert simulation.reaction("PSM1")[1][2] < -1e-4
+
+
+def test_opening_the_jaw_releases_the_tissue():
+    simulation = simulate()
+    simulation.set_grasp("PSM1", pose_at(TIP), True)
+    simulation.set_grasp("PSM1", pose_at(TIP - [0, 0, 0.008]), True)
+    steps(simulation, 5)
+    pulled = depth_of_dent(simulation)
+    assert simulation.set_grasp("PSM1", pose_at(TIP - [0, 0, 0.008]), False)
+    steps(simulation, 100)
+    assert pulled > 0.007 and depth_of_dent(simulation) < 0.1 * pulled
+    assert not simulation.reaction("PSM1")[0].any() and not simulation.in_reach("PSM1")
+
+
+def test_jaw_closed_in_the_air_holds_nothing_and_tissue_pulled_too_far_slips():
+    simulation = simulate()
+    assert not simulation.set_grasp("PSM1", pose_at(TIP - [0, 0, 0.05]), True)
+    assert simulation.set_grasp("PSM1", pose_at(TIP), True)
+    simulation.set_grasp("PSM1", pose_at(TIP - [0, 0, 0.06]), True)
+    simulation.step()
+    assert simulation.slips == 1 and not simulation.in_reach("PSM1") and simulation.faults == 0
+    with pytest.raises(ValueError, match="pose of tool 'PSM1' must be a finite"):
+        simulation.set_grasp("PSM1", np.full((4, 4), np.nan), True)
+
+
+def test_tissue_that_came_to_rest_is_not_stepped_until_a_tool_acts():
+    simulation = simulate()
+    calls, step = [], simulation.solver.step
+    simulation.solver.step = lambda: calls.append(1) or step()
+    steps(simulation, 3)
+    assert not calls and simulation.time == pytest.approx(3 * simulation.step_duration)
+    simulation.set_wrench("PSM1", TIP, [0, 0, 0.1])
+    simulation.step()
+    simulation.set_wrench("PSM1", TIP, [0, 0, 0])
+    steps(simulation, 200)
+    assert 4 < len(calls) < 100
+    assert depth_of_dent(simulation) < 2e-5
 
 
 # Stability and faults

@@ -4,6 +4,7 @@ import io
 import itertools
 import json
 import logging
+import shutil
 import tarfile
 from pathlib import Path
 
@@ -12,10 +13,10 @@ import numpy as np
 import pytest
 import tifffile
 
-from endo_sim_ros.cameras import Camera, make_pose, matrix_to_quat
+from endo_sim_ros.cameras import Camera, matrix_to_quat
 from endo_sim_ros.sequences.endonerf import read_endonerf
 from endo_sim_ros.sequences.folder import read_folder
-from endo_sim_ros.sequences.frames import SequenceError
+from endo_sim_ros.sequences.frames import Frame, SequenceError
 from endo_sim_ros.sequences.readers import READERS, open_sequence
 from endo_sim_ros.sequences.recordings import Video, lit_area, numbered_files, read_poses, tool_is_white
 from endo_sim_ros.sequences.rectification import Rectification, StereoCalibration
@@ -83,7 +84,11 @@ def plane_colours(frame) -> tuple[np.ndarray, np.ndarray]:
 def assert_frame_agrees(frame, tolerance=4.0, margin=4):
     """The image shows what K and pose say; the right image shows it shifted by fx·baseline/depth on the same row."""
     expected, depth = plane_colours(frame)
-    used = cv2.erode(frame.mask, np.ones((2 * margin + 1,) * 2)) > 0 if frame.mask is not None else np.ones(depth.shape, bool)
+    used = (
+        cv2.erode(frame.mask, np.ones((2 * margin + 1,) * 2)) > 0
+        if frame.mask is not None
+        else np.ones(depth.shape, bool)
+    )
     used[:margin] = used[-margin:] = False
     assert used.mean() > 0.3
     error = np.abs(frame.image.astype(float) - expected).max(-1)[used]
@@ -126,7 +131,9 @@ def write_poses(path: Path, poses: dict[int, np.ndarray], heading="# frame tx ty
 
 
 def trajectory(count: int) -> dict[int, np.ndarray]:
-    return {n: pose_of((0.001 * n, -0.0005 * n, 0.0004 * n), x=0.004 * n, y=-0.006 * n, z=0.003 * n) for n in range(count)}
+    return {
+        n: pose_of((0.001 * n, -0.0005 * n, 0.0004 * n), x=0.004 * n, y=-0.006 * n, z=0.003 * n) for n in range(count)
+    }
 
 
 # ---------------------------------------------------------------------------------------------------- rectification
@@ -141,8 +148,6 @@ def test_rectified_eyes_share_rows_and_their_disparity_gives_depth(distortion):
     pose = pose_of((0.004, -0.002, 0.01), x=0.1, y=-0.15, z=0.2)
     left, points = see_plane(K_LEFT, distortion, pose)
     right, _ = see_plane(K_RIGHT, distortion, right_pose(pose, R, T))
-
-    from endo_sim_ros.sequences.frames import Frame
 
     frame = Frame(
         stamp_ns=1,
@@ -171,7 +176,14 @@ def test_pixels_outside_the_raw_image_are_masked():
     pincushion = np.array([0.3, 0, 0, 0, 0])
     rectification = Rectification.stereo(
         StereoCalibration(
-            "c", (WIDTH, HEIGHT), K_LEFT, pincushion, K_RIGHT, pincushion, rotation(0.2, 0, 0.1), np.array([-BASELINE, 0, 0])
+            "c",
+            (WIDTH, HEIGHT),
+            K_LEFT,
+            pincushion,
+            K_RIGHT,
+            pincushion,
+            rotation(0.2, 0, 0.1),
+            np.array([-BASELINE, 0, 0]),
         )
     )
     white = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
@@ -183,8 +195,6 @@ def test_mono_undistortion_shows_what_its_pinhole_says():
     rectification = Rectification.mono(K_LEFT + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], BARREL, (WIDTH, HEIGHT))
     pose = pose_of((0.002, 0.001, 0), y=0.1)
     image, points = see_plane(K_LEFT, BARREL, pose)
-    from endo_sim_ros.sequences.frames import Frame
-
     camera = Camera(rectification.K, WIDTH, HEIGHT, rectification.pose(pose))
     frame = Frame(1, rectification.left(image), camera, depth=rectification.depth(points), mask=rectification.valid)
     assert_frame_agrees(frame)
@@ -244,8 +254,6 @@ def stereomis_source(tmp_path_factory):
 @pytest.fixture
 def stereomis(stereomis_source, tmp_path):
     """A copy that a test may damage."""
-    import shutil
-
     return Path(shutil.copytree(stereomis_source, tmp_path / "P1"))
 
 
@@ -266,7 +274,9 @@ def test_stereomis_counts_frames_without_pose_in_the_log(stereomis_source, caplo
     assert "white is taken for tools" in caplog.text
 
 
-@pytest.mark.parametrize(("split", "numbers"), [("train", [0, 1, 4, 5]), ("test", [6, 7]), (None, [0, 1, 2, 4, 5, 6, 7])])
+@pytest.mark.parametrize(
+    ("split", "numbers"), [("train", [0, 1, 4, 5]), ("test", [6, 7]), (None, [0, 1, 2, 4, 5, 6, 7])]
+)
 def test_stereomis_splits_are_inclusive_ranges(stereomis_source, split, numbers):
     frames = read_stereomis(stereomis_source, split=split)
     assert [(f.stamp_ns - 1_000_000_000) // 50_000_000 for f in frames] == numbers
@@ -333,7 +343,11 @@ def test_reading_is_lazy_and_repeatable(stereomis):
     ("name", "text", "message"),
     [
         ("StereoCalibration.ini", None, "StereoCalibration.ini: file is missing"),
-        ("StereoCalibration.ini", "[StereoLeft]\nres_x=1\nres_y=1\nfc_x=5", r"StereoCalibration.ini: \[StereoLeft\] fc_y"),
+        (
+            "StereoCalibration.ini",
+            "[StereoLeft]\nres_x=1\nres_y=1\nfc_x=5",
+            r"StereoCalibration.ini: \[StereoLeft\] fc_y",
+        ),
         ("StereoCalibration.ini", "no ini at all", "StereoCalibration.ini: not a readable ini"),
         ("groundtruth.txt", "0 0 0 0 0 0 1", "groundtruth.txt: line 1 has 7 numbers, expected 8"),
         ("groundtruth.txt", "0 0 0 0 0 0 0 0", "groundtruth.txt: line 1 is not a pose"),
@@ -476,7 +490,10 @@ def damage_json(root: Path, data: bytes):
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda r: (r / "endoscope_calibration.yaml").write_text("%YAML:1.0\n---\nM1: 3\n"), "endoscope_calibration.yaml: "),
+        (
+            lambda r: (r / "endoscope_calibration.yaml").write_text("%YAML:1.0\n---\nM1: 3\n"),
+            "endoscope_calibration.yaml: ",
+        ),
         (lambda r: (r / "endoscope_calibration.yaml").write_text("nonsense"), "endoscope_calibration.yaml: "),
         (lambda r: (r / "data/frame_data.tar.gz").write_bytes(b"no archive"), "frame_data.tar.gz: not a readable"),
         (lambda r: damage_json(r, b"{"), "frame_data000000.json is not valid JSON"),
@@ -485,7 +502,10 @@ def damage_json(root: Path, data: bytes):
         (lambda r: damage_json(r, b" " * (2 << 20)), "far more than a camera needs"),
         (lambda r: (r / "data/scene_points.tar.gz").write_bytes(b"no archive"), "scene_points.tar.gz: not a readable"),
         (lambda r: (r / "left_depth_map.tiff").write_bytes(b"no tiff"), "left_depth_map.tiff: not a readable TIFF"),
-        (lambda r: tifffile.imwrite(r / "left_depth_map.tiff", np.zeros((8, 8, 3), np.float32), photometric="rgb"), "expected points of shape"),
+        (
+            lambda r: tifffile.imwrite(r / "left_depth_map.tiff", np.zeros((8, 8, 3), np.float32), photometric="rgb"),
+            "expected points of shape",
+        ),
         (lambda r: (r / "data/rgb.mp4").write_bytes(b"no video"), "rgb.mp4: not a readable video"),
     ],
 )
@@ -571,7 +591,10 @@ def test_endonerf_scales_can_be_stated(endonerf):
         (lambda r: np.save(r / "poses_bounds.npy", np.array([{}])), "poses_bounds.npy: not a readable NumPy array"),
         (lambda r: np.save(r / "poses_bounds.npy", np.ones((4, 15))), r"shape \[frames, 17\], got shape \[4, 15\]"),
         (lambda r: np.save(r / "poses_bounds.npy", np.ones((3, 17))), "has 3 poses, but .* has 4 images"),
-        (lambda r: np.save(r / "poses_bounds.npy", np.ones((4, 17))), "row of frame 0: its 3×3 block is not a rotation"),
+        (
+            lambda r: np.save(r / "poses_bounds.npy", np.ones((4, 17))),
+            "row of frame 0: its 3×3 block is not a rotation",
+        ),
         (lambda r: (r / "images/000002.png").write_bytes(b"x"), "000002.png: not a readable image"),
         (lambda r: write_rgb(r / "depth/000001.png", np.ones((8, 8), np.uint16)), "depth/000001.png: is 8×8"),
     ],
@@ -619,8 +642,6 @@ def test_image_folder_frames(folder):
 
 
 def test_image_folder_with_left_images_only(folder):
-    import shutil
-
     shutil.rmtree(folder / "right")
     shutil.rmtree(folder / "depth")
     (folder / "calibration.yaml").write_text(CALIBRATION)
@@ -807,7 +828,9 @@ def relief_images(poses, K_cv, size=(320, 240)):
         yield np.repeat(grey[..., None], 3, -1).round().astype(np.uint8)
 
 
-ORBIT = [pose_of((0.05 * np.sin(a), 0.01 * np.cos(3 * a), 0.1 - 0.1 * np.cos(a)), y=-a) for a in np.linspace(-0.35, 0.35, 6)]
+ORBIT = [
+    pose_of((0.05 * np.sin(a), 0.01 * np.cos(3 * a), 0.1 - 0.1 * np.cos(a)), y=-a) for a in np.linspace(-0.35, 0.35, 6)
+]
 K_RELIEF = np.array([[300.0, 0, 159.5], [0, 300.0, 119.5], [0, 0, 1]])
 
 
@@ -854,23 +877,37 @@ def test_structure_from_motion_that_fails_says_why(tmp_path):
         estimate_poses([np.zeros((120, 160, 3), np.uint8)])
 
 
-@pytest.mark.skipif(not (SHARED / "gallbladder/endo.mp4").is_file(), reason="the gallbladder video is not at ../shared/data")
+@pytest.mark.skipif(
+    not (SHARED / "gallbladder/endo.mp4").is_file(), reason="the gallbladder video is not at ../shared/data"
+)
 def test_structure_from_motion_on_a_real_video(tmp_path):
     reference = read_poses(SHARED / "gallbladder/poses.txt")
     video = Video(SHARED / "gallbladder/endo.mp4")
     numbers = list(range(0, 96, 12))
-    images = [cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for _, image in video.frames(numbers)]
+    images = [
+        cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for _, image in video.frames(numbers)
+    ]
     lit = lit_area(images)
     K, distortion = np.array([[453.7, 0, 320], [0, 453.7, 180], [0, 0, 1]]), [-0.083]
     rectification = Rectification.mono(K, distortion, (640, 360))
     masks = [rectification.mask(lit)] * len(images)
     result = estimate_poses((rectification.left(i) for i in images), rectification.K, masks=masks, scale=0.01)
     assert len(result.poses) >= len(numbers) - 1
+    assert result.reprojection_error < 2.0
     placed = sorted(result.poses)
     estimated = np.array([result.poses[n][:3, 3] for n in placed])
-    assert similarity_error(estimated, np.array([reference[numbers[n]][:3, 3] for n in placed])) < 0.1
+    # Loose: the tissue moves and the camera hardly does, so a few frames of one eye leave the relief open.
+    assert similarity_error(estimated, np.array([reference[numbers[n]][:3, 3] for n in placed])) < 0.25
 
 
-def test_make_pose_agrees_with_the_test_helper():
-    pose = pose_of((1, 2, 3), x=0.4, y=0.1)
-    np.testing.assert_allclose(make_pose(pose[:3, 3], matrix_to_quat(pose[:3, :3])), pose, atol=1e-12)
+@pytest.mark.skipif(not (SHARED / "hamlyn06/left").is_dir(), reason="the hamlyn06 recording is not at ../shared/data")
+def test_structure_from_motion_on_real_stereo_is_metric(tmp_path):
+    source = SHARED / "hamlyn06"
+    for name in ("left", "right", "calibration.yaml"):
+        (tmp_path / name).symlink_to(source / name)
+    reference = [frame.camera.position for frame in read_folder(source, stop=400, step=2)]
+    estimated = [frame.camera.position for frame in read_folder(tmp_path, stop=400, step=2)]
+    assert len(estimated) == len(reference) == 4
+    assert similarity_error(np.array(estimated), np.array(reference)) < 0.02
+    travel = [np.linalg.norm(np.diff(positions, axis=0), axis=1).sum() for positions in (estimated, reference)]
+    assert travel[0] == pytest.approx(travel[1], rel=0.08)  # the reference's own scale is good to 3 %

@@ -33,7 +33,7 @@ class TouchReport:
         self._times: list[float] = []
         self._rendered: list[tuple[np.ndarray, Camera, np.ndarray, np.ndarray]] = []  # image, camera, tip, force
         self._rest: tuple[np.ndarray, np.ndarray] | None = None  # image and depth before the tool
-        pose, image, K, depth, tool, force = None, None, None, None, np.zeros(3), None
+        pose, K, seen_from, depth, tool, force = None, None, None, None, np.zeros(3), None
         with BagReader(recording) as bag:
             for topic, stamp_ns, message in bag.messages(wanted):
                 if topic == messages.CAMERA_POSE:
@@ -46,15 +46,17 @@ class TouchReport:
                     force = messages.decode_wrench(message, topic.name)[0]
                 elif topic == messages.RENDERED_INFO:
                     K = messages.decode_camera_info(message).P[:, :3]
+                elif topic == messages.RENDERED_POSE:
+                    seen_from = messages.decode_pose(message, "world", topic.name)
                 elif topic == messages.RENDERED_DEPTH and force is None:
                     depth = messages.decode_depth(message)
                 elif topic == messages.RENDERED_IMAGE:
                     image = messages.decode_image(message)
                     if force is None:
                         self._rest = (image.copy(), depth)
-                    elif pose is not None and K is not None:
+                    elif seen_from is not None and K is not None:
                         self._times.append(stamp_ns * 1e-9)
-                        self._rendered.append((image.copy(), Camera(K, image.shape[1], image.shape[0], pose), tool, force))
+                        self._rendered.append((image.copy(), Camera(K, image.shape[1], image.shape[0], seen_from), tool, force))
         if not self._rendered or not self._inputs or self._rest is None or self._rest[1] is None:
             raise SequenceError(f"{recording}: no images were rendered while the tool acted; see the logs beside it")
         largest = max(np.linalg.norm(force) for *_, force in self._rendered)

@@ -136,7 +136,7 @@ def _touch_over_dds(
             virtual_every=2,
         )  # fmt: skip
         graph.start("physics_node", arms=_ARM)
-        graph.start("rendering_node", image_width=width)
+        graph.start("rendering_node", image_width=width, idle_rate=1.0)
         wait("starting", lambda s: {"recorder", "reconstruction_node", "physics_node", "rendering_node"} <= set(s), text_of("recorder"))
         player = graph.start("bag_player_node", bag=bag)
         wait("replaying", lambda _: player.exit_status == 0, text_of("bag_player"))

@@ -27,6 +27,10 @@ class PhysicsNodeConfig(StageConfig):
     """Frame of tool poses, the model and the control nodes."""
     command_timeout: Annotated[float, Range(0, 3600, "s")] = 0.5
     """A wrench that is not repeated for this long is dropped; 0 = held until changed."""
+    jaw_closed: Annotated[float, Range(-3.2, 3.2, "rad")] = 0.1
+    """A jaw at or below this angle holds the tissue at its tip."""
+    jaw_open: Annotated[float, Range(-3.2, 3.2, "rad")] = 0.2
+    """A jaw at or above this angle lets go; between the two it stays as it is."""
 
 
 @dataclass
@@ -38,6 +42,7 @@ class _Arm:
     torque: np.ndarray | None = None  # [3] N·m about the tip, world
     heard: float = 0.0  # time of the last wrench, monotonic seconds
     acting: bool = False
+    closed: bool = False  # the jaw
 
 
 class PhysicsNode(EndoNode):
@@ -65,6 +70,7 @@ class PhysicsNode(EndoNode):
         for name in self._arms:
             self.subscribe(messages.tool_pose(name), partial(self._on_tool_pose, name))
             self.subscribe(messages.tool_wrench(name), partial(self._on_wrench, name))
+            self.subscribe(messages.tool_jaw(name), partial(self._on_jaw, name))
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(Trigger, "~/step", self._on_step)
         self.create_service(SetBool, "~/pause", self._on_pause)
@@ -140,9 +146,23 @@ class PhysicsNode(EndoNode):
             force, torque = arm.pose[:3, :3] @ force, arm.pose[:3, :3] @ torque
         arm.force, arm.torque, arm.heard = force, torque, time.monotonic()
 
+    def _on_jaw(self, name: str, message: Any) -> None:
+        angle, arm = messages.decode_jaw(message, messages.tool_jaw(name).name), self._arms[name]
+        if arm.pose is None:
+            raise MessageError(f"{name}: a jaw command came before any pose on {messages.tool_pose(name).name}; publish the tip's pose")
+        if angle <= self._options.jaw_closed:
+            arm.closed = True
+        elif angle >= self._options.jaw_open:
+            arm.closed = False
+
     def _apply_tools(self, simulation: TissueSimulation) -> None:
         for name, arm in self._arms.items():
-            if arm.pose is None or arm.force is None:
+            if arm.pose is None:
+                continue
+            if not simulation.set_grasp(name, arm.pose, arm.closed):
+                self.report_error(f"{name}: the jaw closed on nothing at {np.round(arm.pose[:3, 3], 4).tolist()}; {self._reach(simulation)}")
+                arm.closed = False
+            if arm.force is None:
                 continue
             timeout = self._options.command_timeout
             stale = 0 < timeout < time.monotonic() - arm.heard
@@ -152,10 +172,13 @@ class PhysicsNode(EndoNode):
                 reached = simulation.set_wrench(name, arm.pose[:3, 3], force, torque)
                 if wanted and not reached:
                     self.report_error(
-                        f"{name}: no tissue within force_radius = {simulation.config.force_radius:g} m of the tip at "
-                        f"{np.round(arm.pose[:3, 3], 4).tolist()}; the wrench has no effect"
+                        f"{name}: the wrench at {np.round(arm.pose[:3, 3], 4).tolist()} has no effect; {self._reach(simulation)}"
                     )
             arm.acting = wanted
+
+    @staticmethod
+    def _reach(simulation: TissueSimulation) -> str:
+        return f"no movable tissue lies within force_radius = {simulation.config.force_radius:g} m of the tip"
 
     # ------------------------------------------------------------------ steps
 
@@ -168,9 +191,15 @@ class PhysicsNode(EndoNode):
                 self._publish(self._simulation)
 
     def _step(self, simulation: TissueSimulation) -> None:
-        start, faults = time.monotonic(), simulation.faults
+        start, faults, slips = time.monotonic(), simulation.faults, simulation.slips
         self._apply_tools(simulation)
         simulation.step()
+        if simulation.slips > slips:
+            self.report_error(
+                f"tissue slipped out of a jaw that pulled it almost {simulation.config.travel:g} m; open it, come nearer, or raise travel"
+            )
+            for name, arm in self._arms.items():
+                arm.closed = arm.closed and simulation.in_reach(name)
         self._steps += 1
         if simulation.faults > faults:
             self.report_error(simulation.last_fault)
@@ -198,7 +227,7 @@ class PhysicsNode(EndoNode):
         if self._simulation is not None:
             self._simulation.reset()
             for arm in self._arms.values():
-                arm.force, arm.acting = None, False
+                arm.force, arm.acting, arm.closed = None, False, False
             self._publish(self._simulation)
         return response
 
@@ -236,6 +265,7 @@ class PhysicsNode(EndoNode):
             "real-time factor": f"{self._real_time_factor:.2f}",
             "simulated time": f"{simulation.time:.2f}",
             "faults": simulation.faults,
+            "slips": simulation.slips,
         }
         return OK, "paused" if self._paused else "running", values
 

@@ -23,6 +23,8 @@ class RenderingNodeConfig(StageConfig):
 
     rate: Annotated[float, Range(0.1, 240, "Hz")] = 25.0
     """Images published per second; input that arrives faster is dropped, the newest is kept."""
+    idle_rate: Annotated[float, Range(0.1, 240, "Hz")] = 5.0
+    """Images published per second while nothing in the picture changes."""
     world_frame: str = "world"
     """Frame of the model, the control nodes and camera poses."""
     camera_frame: str = LEFT_FRAME
@@ -48,10 +50,11 @@ class RenderingNode(EndoNode):
         self._training_pose: np.ndarray | None = None
         self._info: CameraInfo | None = None
         self._training_info: CameraInfo | None = None
-        self._dirty, self._images = True, 0
+        self._dirty, self._images, self._last_image = True, 0, 0.0
         self._output: tuple[np.ndarray, np.ndarray, Camera] | None = None
         self._seconds_per_image = 0.0
-        self._image_pub, self._info_pub, self._depth_pub = (self.publisher(topic) for topic in messages.RENDERED_TOPICS)
+        publishers = (self.publisher(topic) for topic in messages.RENDERED_TOPICS)
+        self._info_pub, self._pose_pub, self._depth_pub, self._image_pub = publishers
         self.subscribe(messages.GAUSSIANS, self._on_model)
         self.subscribe(messages.TRAINING_CAMERAS, self._on_training_cameras)
         self.subscribe(messages.TRAINING_CAMERA_INFO, self._on_training_info)
@@ -115,11 +118,14 @@ class RenderingNode(EndoNode):
             camera = self._camera()
             if self._renderer is None or camera is None:
                 return
+            now = time.monotonic()
             if self._dirty or self._output is None:
                 self._dirty = False
-                start = time.monotonic()
                 self._output = self._render(self._renderer, self._renderer.camera(camera))
-                self._seconds_per_image += 0.1 * (time.monotonic() - start - self._seconds_per_image)
+                self._seconds_per_image += 0.1 * (time.monotonic() - now - self._seconds_per_image)
+            elif now - self._last_image < 1 / self._options.idle_rate - 0.5 / self._options.rate:
+                return
+            self._last_image = now
             self._publish(*self._output)
 
     def _wanted(self) -> tuple[int, bytes]:
@@ -147,9 +153,10 @@ class RenderingNode(EndoNode):
 
     def _publish(self, image: np.ndarray, depth: np.ndarray, camera: Camera) -> None:
         stamp, frame = self.now_ns(), self._options.camera_frame
-        self._image_pub.publish(messages.encode_image(image, stamp, frame))
         self._info_pub.publish(messages.encode_camera_info(camera.K, camera.width, camera.height, stamp, frame))
+        self._pose_pub.publish(messages.encode_pose(camera.pose, stamp, self._options.world_frame))
         self._depth_pub.publish(messages.encode_image(depth, stamp, frame))
+        self._image_pub.publish(messages.encode_image(image, stamp, frame))
         self._images += 1
 
     # ------------------------------------------------------------ diagnostics

@@ -22,7 +22,7 @@ class ScriptedToolConfig(StageConfig):
     """Name of the arm whose topics are published."""
     world_frame: str = "world"
     """Frame of the tool's pose."""
-    force: Annotated[float, Range(0, 100, "N")] = 0.6
+    force: Annotated[float, Range(0, 100, "N")] = 2.5
     """Largest force."""
     u: Annotated[float, Range(0, 1)] = 0.5
     """Where the tool takes hold, as a fraction of the image width."""
@@ -31,7 +31,7 @@ class ScriptedToolConfig(StageConfig):
     rate: Annotated[float, Range(1, 1000, "Hz")] = 50.0
     """Commands per second."""
     pull: Annotated[float, Range(0, 600, "s")] = 2.0
-    """Time in which the force grows, towards the camera."""
+    """Time in which the force grows, aslant towards the camera."""
     swing: Annotated[float, Range(0, 600, "s")] = 4.0
     """Time in which the force circles around that direction."""
     release: Annotated[float, Range(0, 600, "s")] = 2.5
@@ -54,14 +54,14 @@ class ScriptedToolNode(EndoNode):
         self._tip = self._towards_camera = self._across = np.zeros(3)
         self._began: float | None = None
         self._state = "waiting for the rendered depth"
-        self.subscribe(messages.CAMERA_POSE, self._on_camera, depth=1)
+        self.subscribe(messages.RENDERED_POSE, self._on_camera, depth=1)
         self.subscribe(messages.RENDERED_INFO, self._on_info, depth=1)
         self.subscribe(messages.RENDERED_DEPTH, self._on_depth, depth=1)
         self.subscribe(messages.CONTROL_NODES, self._on_nodes, depth=1)
         self.create_timer(1 / config.rate, self._on_timer)
 
     def _on_camera(self, message: Any) -> None:
-        self._camera_pose = messages.decode_pose(message, self._config.world_frame, messages.CAMERA_POSE.name)
+        self._camera_pose = messages.decode_pose(message, self._config.world_frame, messages.RENDERED_POSE.name)
 
     def _on_info(self, message: Any) -> None:
         self._info = messages.decode_camera_info(message, messages.RENDERED_INFO.name)
@@ -117,16 +117,19 @@ class ScriptedToolNode(EndoNode):
         config = self._config
         if elapsed < config.pull:
             self._state = "pulling"
-            return config.force * elapsed / config.pull * self._towards_camera
+            return config.force * elapsed / config.pull * self._direction(0.0)
         if elapsed < config.pull + config.swing:
             self._state = "swinging"
             angle = 2 * np.pi * (elapsed - config.pull) / config.swing
-            side = np.cross(self._towards_camera, self._across)
-            around = np.sin(angle) * self._across + 0.5 * (1 - np.cos(angle)) * side
-            direction = self._towards_camera + 0.8 * around
-            return config.force * direction / np.linalg.norm(direction)
+            return config.force * self._direction(angle)
         self._state = "released" if elapsed < config.pull + config.swing + config.release else "finished"
         return np.zeros(3)
+
+    def _direction(self, angle: float) -> np.ndarray:
+        """Unit vector [3], world: aslant towards the camera, circling from the picture's top."""
+        up = np.cross(self._towards_camera, self._across)
+        direction = self._towards_camera + np.cos(angle) * up + np.sin(angle) * self._across
+        return direction / np.linalg.norm(direction)
 
     def status(self):
         return (WARN if self._began is None else OK), self._state, {"tip": np.round(self._tip, 4).tolist()}

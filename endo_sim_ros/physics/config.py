@@ -54,11 +54,7 @@ class PhysicsConfig(StageConfig):
     travel: Annotated[float, Range(1e-3, 10.0, "m")] = 0.05
     """Farthest a node may move from rest; a step that takes one farther is undone and counted as a fault."""
     force_radius: Annotated[float, Range(1e-4, 1.0, "m")] = 0.01
-    """A tool acts on the skin nodes within this distance of its tip."""
-    skinning: Literal["compact", "softmax"] = "compact"
-    """Weights from nodes to Gaussians: compact (1 - (d/d5)²)² with F, or the paper's softmax(d) with R."""
-    neighbours: Annotated[int, Range(1, 32)] = 4
-    """Number of nodes that move one Gaussian."""
+    """A tool pulls, and a closing jaw holds, the skin nodes within this distance of its tip."""
     dense: bool = False
     """Simulate every Gaussian as a material point (PhysGaussian's way) instead of sparse nodes;
     layers are then ignored."""

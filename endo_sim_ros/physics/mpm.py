@@ -107,13 +107,16 @@ class MpmSolver:
             return wp.array(values, dtype=dtype, device=self.device)
 
         # A pinned node's springs are stiffer than the tissue beside it, so that it gives way a few per cent at most.
-        stiffness = PIN_STIFFNESS * (self.lam + 2 * self.mu) * np.cbrt(nodes.volumes) * nodes.pinned
+        self._hold_stiffness = PIN_STIFFNESS * (self.lam + 2 * self.mu) * np.cbrt(nodes.volumes)
+        self._pin_stiffness = self._hold_stiffness * nodes.pinned
         count = len(nodes)
         self._nodes = Nodes()
         self._nodes.X = array((rest - self.origin).astype(np.float32), wp.vec3)
         self._nodes.mass = array((nodes.volumes * config.density).astype(np.float32), float)
         self._nodes.volume = array(nodes.volumes.astype(np.float32), float)
-        self._nodes.spring = array(stiffness.astype(np.float32), float)
+        self._nodes.spring = wp.zeros(count, float, device=self.device)
+        self._nodes.target = wp.zeros(count, wp.vec3, device=self.device)
+        self._nodes.target_v = wp.zeros(count, wp.vec3, device=self.device)
         self._nodes.force = wp.zeros(count, wp.vec3, device=self.device)
         self._nodes.u = wp.zeros(count, wp.vec3, device=self.device)
         self._nodes.v = wp.zeros(count, wp.vec3, device=self.device)
@@ -124,11 +127,13 @@ class MpmSolver:
         self._grid_mv = wp.zeros(self.grid_shape, wp.vec4, device=self.device)
         self._grid_v = wp.zeros(self.grid_shape, wp.vec3, device=self.device)
         self._fault = wp.zeros(1, int, device=self.device)
+        self._speed_sq = wp.zeros(1, float, device=self.device)
         self._graph = None
         self.reset()
 
     def reset(self) -> None:
-        """Back to rest, no force."""
+        """Back to rest, no force, nothing held but the pinned nodes."""
+        self.hold(np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3)))
         for array in (self._nodes.force, self._nodes.u, self._nodes.v, self._nodes.C):
             array.zero_()
         self._nodes.F.fill_(wp.mat33(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))
@@ -136,6 +141,27 @@ class MpmSolver:
     def set_forces(self, forces: np.ndarray) -> None:
         """Forces on the nodes [M, 3], N, world; kept until set again."""
         self._nodes.force.assign(np.ascontiguousarray(forces, np.float32))
+
+    def hold(self, nodes: np.ndarray, start: np.ndarray, end: np.ndarray) -> None:
+        """Springs pull these nodes [K] along: displacements [K, 3] m at the start and at the end of the next step.
+
+        Pinned nodes stay held; all others are free. Kept until called again.
+        """
+        spring = self._pin_stiffness.copy()
+        spring[nodes] = self._hold_stiffness[nodes]
+        targets = np.zeros((2, len(spring), 3))
+        targets[:, nodes] = start, (end - start) / self.config.step_duration
+        for array, values in zip((self._nodes.spring, self._nodes.target, self._nodes.target_v), (spring, *targets)):
+            array.assign(np.ascontiguousarray(values, np.float32))
+
+    def holding_forces(self, nodes: np.ndarray, end: np.ndarray) -> np.ndarray:
+        """Forces [K, 3] N that the springs exert on these nodes [K] at the end of the step, for the ``end`` given to `hold`."""
+        return self._hold_stiffness[nodes, None] * (end - self._nodes.u.numpy()[nodes])
+
+    @property
+    def speed(self) -> float:
+        """Speed of the fastest node at the end of the last step, m/s."""
+        return math.sqrt(max(float(self._speed_sq.numpy()[0]), 0.0))
 
     def step(self) -> int:
         """Take one step; returns how many nodes ended it non-finite or out of bounds (0 = a good step)."""
@@ -162,14 +188,15 @@ class MpmSolver:
         for array, backup in zip(self._state, self._backup):
             wp.copy(backup, array)
         self._fault.zero_()
+        self._speed_sq.zero_()
         grid_mv.zero_()
         for substep in range(count + 1):
             gather, scatter = int(substep > 0), int(substep < count)
             if gather:
                 wp.launch(update_grid, len(grid_mv), [decay, grid_mv, grid_v], device=self.device)
-            inputs = [*constants, gather, scatter, self._grid_v, self._grid_mv]
+            inputs = [*constants, (substep + 1) * dt, gather, scatter, self._grid_v, self._grid_mv]
             wp.launch(advance, len(self._nodes.X), inputs, device=self.device)
-        inputs = [self._nodes.u, self._nodes.F, self.config.travel, self._fault]
+        inputs = [self._nodes.u, self._nodes.v, self._nodes.F, self.config.travel, self._fault, self._speed_sq]
         wp.launch(check_nodes, len(self._nodes.X), inputs, device=self.device)
 
     def restore(self) -> None:

@@ -2,7 +2,7 @@
 
 For node p with weights w at grid nodes i (a distance d = X_i − X_p away), cell size h:
 
-    P2G   (mv)_i += w [m (v + Δt g) + Δt (f − k u) + (m C − Δt 4/h² V S) d],   m_i += w (m + Δt² k)
+    P2G   (mv)_i += w [m (v + Δt g) + Δt (f − k (u − u*)) + (m C − Δt 4/h² V S) d],   m_i += w (m + Δt² k)
     grid  v_i = (mv)_i / m_i · exp(−c Δt)
     G2P   v = Σ w v_i,   C = 4/h² Σ w v_i dᵀ,   u += Δt v
 
@@ -13,8 +13,8 @@ tissue cannot lose contact with itself.
 The state is a displacement u from rest in the solver's local frame, all float32. G2P of one substep and P2G of the
 next share a kernel, so that one substep is two launches.
 
-Pinned nodes are held to their rest positions by springs k, zero for all others; Δt² k is the springs' implicit part,
-lumped, which makes them stable at any stiffness. (Holding grid nodes instead puts the wall up to half a cell off, and
+Pinned nodes are held by springs k to the displacement u* = 0, grasped ones to a u* that moves evenly through the step;
+k is zero for all others. Δt² k is the springs' implicit part, lumped, which makes them stable at any stiffness. (Holding grid nodes instead puts the wall up to half a cell off, and
 kinematic nodes without stress leave the tissue next to the wall hanging on nothing.)
 """
 
@@ -45,7 +45,9 @@ class Nodes:
     X: wp.array[wp.vec3]  # rest position, local, m
     mass: wp.array[float]  # kg
     volume: wp.array[float]  # at rest, m³
-    spring: wp.array[float]  # N/m, of pinned nodes; zero where free
+    spring: wp.array[float]  # N/m, of pinned and grasped nodes; zero where free
+    target: wp.array[wp.vec3]  # displacement u* at the start of the step that the spring pulls to, m
+    target_v: wp.array[wp.vec3]  # its velocity during the step, m/s
     force: wp.array[wp.vec3]  # N
     u: wp.array[wp.vec3]  # displacement, m
     v: wp.array[wp.vec3]  # velocity, m/s
@@ -80,6 +82,7 @@ def make_advance_kernel(material: str, kinematics: str):
         gravity: wp.vec3,
         mu: float,
         lam: float,
+        time: float,  # since the start of the step
         gather: int,
         scatter: int,
         grid_v: wp.array3d[wp.vec3],
@@ -138,7 +141,8 @@ def make_advance_kernel(material: str, kinematics: str):
                 S = kirchhoff_stress(S, F)
             A = (mass * grid.h) * C - (dt * 4.0 * grid.inverse_h * nodes.volume[p]) * S  # per cell of distance
             spring = nodes.spring[p]
-            q = mass * (v + dt * gravity) + dt * (nodes.force[p] - spring * u) - A * f
+            stretch = u - nodes.target[p] - time * nodes.target_v[p]
+            q = mass * (v + dt * gravity) + dt * (nodes.force[p] - spring * stretch) - A * f
             ax = wp.vec4(A[0, 0], A[1, 0], A[2, 0], 0.0)
             ay = wp.vec4(A[0, 1], A[1, 1], A[2, 1], 0.0)
             az = wp.vec4(A[0, 2], A[1, 2], A[2, 2], 0.0)
@@ -167,8 +171,16 @@ def update_grid(decay: float, grid_mv: wp.array[wp.vec4], grid_v: wp.array[wp.ve
 
 
 @wp.kernel
-def check_nodes(u: wp.array[wp.vec3], F: wp.array[wp.mat33], travel: float, fault: wp.array[int]):
-    """Count nodes that are not finite or out of bounds; the comparisons are false for NaN."""
+def check_nodes(
+    u: wp.array[wp.vec3],
+    v: wp.array[wp.vec3],
+    F: wp.array[wp.mat33],
+    travel: float,
+    fault: wp.array[int],
+    speed_sq: wp.array[float],
+):
+    """Count nodes that are not finite or out of bounds (the comparisons are false for NaN) and find the largest v²."""
     p = wp.tid()
     if not (wp.length_sq(u[p]) <= travel * travel and wp.ddot(F[p], F[p]) < 1.0e4):
         wp.atomic_add(fault, 0, 1)
+    wp.atomic_max(speed_sq, 0, wp.length_sq(v[p]))

@@ -15,21 +15,6 @@ from endo_sim_ros.physics.skinning_kernels import blend_rotations, node_rotation
 STRETCH_RANGE = (0.2, 4.0)  # of a Gaussian; beyond it the picture shows needles or holes, not tissue
 
 
-def covariances(quats: Tensor, scales: Tensor) -> Tensor:
-    """Covariances R diag(s²) Rᵀ [N, 3, 3], m², of quaternions wxyz [N, 4] and standard deviations [N, 3], m."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
-    R = torch.stack(
-        [
-            1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-        ],
-        -1,
-    ).reshape(-1, 3, 3)  # fmt: skip
-    half = R * scales[:, None, :]
-    return half @ half.transpose(1, 2)
-
-
 def bind_weights(
     means: np.ndarray, node_rest: np.ndarray, neighbours: int, weighting: str
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -84,7 +69,7 @@ class Skinning:
         index, weights = bind_weights(means, rest, neighbours, weighting)
         model = model.detach().to(self.device)
         self.means = model.means.float().contiguous()  # [N, 3] m, at rest
-        self.covars = covariances(model.quats.float(), model.scales.float()).contiguous()  # [N, 3, 3] m², at rest
+        self.covars = model.covariances.float().contiguous()  # [N, 3, 3] m², at rest
         self.neighbours = torch.from_numpy(index).to(self.device)  # [N, K]
         self.weights = torch.from_numpy(weights).to(self.device)  # [N, K]
         self.node_rest = torch.from_numpy(rest).float().to(self.device).contiguous()  # [M, 3] m

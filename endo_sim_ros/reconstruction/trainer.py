@@ -225,7 +225,7 @@ class Trainer:
         if len(faint):
             model = model.select(faint)
             scale = _NOISE * self._optimizer.param_groups[0]["lr"]
-            noise = densification.exploration_noise(model, covariances(model), scale, self._generator)
+            noise = densification.exploration_noise(model, scale, self._generator)
             self._parameters["means"][faint] += noise
 
     # --------------------------------------------------------------- inputs
@@ -249,21 +249,6 @@ class Trainer:
         if not len(depths):
             raise SequenceError("all scene points lie behind every camera; poses must be camera-to-world, optical frame")
         return float(np.median(depths))
-
-
-def covariances(model: GaussianModel) -> Tensor:
-    """World covariances R S Sᵀ Rᵀ [N, 3, 3], m²."""
-    w, x, y, z = torch.nn.functional.normalize(model.quats, dim=1).unbind(1)
-    rotation = torch.stack(
-        [
-            1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-        ],
-        1,
-    ).view(-1, 3, 3)  # fmt: skip
-    half = rotation * model.scales[:, None]
-    return half @ half.transpose(1, 2)
 
 
 def _shrink(frame: Frame, width: int) -> Frame:

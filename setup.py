@@ -24,8 +24,7 @@ setup(
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
     install_requires=[
         *ROS,
-        "imageio-ffmpeg",
-        "mcap",
+        "av",
         "numpy",
         "opencv-python-headless",
         "plyfile",
@@ -39,7 +38,7 @@ setup(
         "tyro",
         "warp-lang>=1.19",
     ],
-    extras_require={"test": ["hypothesis", "pytest", "pytest-timeout", "torchmetrics"]},
+    extras_require={"test": ["mcap", "mcap-ros2-support", "pytest", "torchmetrics"]},
     entry_points={"console_scripts": ["endo-sim = endo_sim_ros.cli:main"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),

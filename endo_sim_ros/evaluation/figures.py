@@ -1,10 +1,11 @@
 """Pictures for people: force arrows, coloured depth, labelled sheets and videos."""
 
 from collections.abc import Iterable
+from fractions import Fraction
 from pathlib import Path
 
+import av
 import cv2
-import imageio_ffmpeg
 import numpy as np
 
 from endo_sim_ros.cameras import Camera
@@ -69,19 +70,15 @@ def write_png(path: str | Path, image: np.ndarray) -> None:
 
 def write_video(path: str | Path, images: Iterable[np.ndarray], fps: float) -> int:
     """Write RGB images [H, W, 3] uint8 of one size as H.264 that browsers play, and return their number."""
-    writer, count = None, 0
-    try:
+    count = 0
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000), options={"crf": "18"})
+        stream.pix_fmt = "yuv420p"
         for image in images:
             image = np.ascontiguousarray(image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2])  # H.264 wants even sizes
-            if writer is None:
-                size = (image.shape[1], image.shape[0])
-                writer = imageio_ffmpeg.write_frames(
-                    str(path), size, fps=fps, codec="libx264", quality=8, macro_block_size=2, ffmpeg_log_level="error"
-                )
-                writer.send(None)
-            writer.send(image)
+            if not count:
+                stream.height, stream.width = image.shape[:2]
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
             count += 1
-    finally:
-        if writer is not None:
-            writer.close()
+        container.mux(stream.encode())
     return count

@@ -1,22 +1,34 @@
 """What all nodes share: parameters from configurations, diagnostics, guarded callbacks, start and stop."""
 
+import os
+import re
+import signal
 import sys
+import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
 import rclpy
 import torch
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.clock import Clock, ClockType
+from rclpy.exceptions import InvalidParameterTypeException, NameValidationException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from endo_sim_ros import messages
 from endo_sim_ros.config import ConfigError, StageConfig, options
-from endo_sim_ros.messages import ERROR, OK, WARN, Topic
+from endo_sim_ros.device import pick_device
+from endo_sim_ros.gaussians import ModelError
+from endo_sim_ros.messages import ERROR, OK, WARN, MessageError, Topic
+from endo_sim_ros.sequences.frames import SequenceError
 
-_ERROR_SHOWN = 5.0  # seconds that an error stays on /diagnostics
+_ERROR_SHOWN = 5.0  # seconds that an error stays on /diagnostics, and that its repetitions are not logged
+_MOST_LOGGED = 10  # different errors logged in that time: one whose text differs at 500 Hz must not flood the log
+_END_WITHIN = 3.0  # seconds that worker threads have to end before the process ends without them
 STREAM_DEPTH = 20
 
 Config = TypeVar("Config", bound=StageConfig)
@@ -25,6 +37,8 @@ Config = TypeVar("Config", bound=StageConfig)
 class EndoNode(Node):
     """A node whose callbacks may fail without taking it down: what went wrong is one sentence on /diagnostics."""
 
+    read_at_start: frozenset[str] = frozenset()  # parameters that act at start only; all others act when they are set
+
     def __init__(self, name: str):
         super().__init__(name)
         torch.set_num_threads(1)  # the kernels bring their own threads
@@ -32,7 +46,11 @@ class EndoNode(Node):
         self._diagnostics = self.publisher(messages.DIAGNOSTICS)
         self._error_text, self._error_until, self.error_count = "", 0.0, 0
         self._logged: dict[str, float] = {}
-        self.create_timer(1.0, self.publish_diagnostics)
+        self.every(1.0, self.publish_diagnostics)
+
+    def every(self, seconds: float, callback: Callable[[], None]) -> Any:
+        """A timer of wall time, which also runs while a simulated clock stands still."""
+        return self.create_timer(seconds, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     # ------------------------------------------------------------- parameters
 
@@ -55,32 +73,40 @@ class EndoNode(Node):
                 descriptor.integer_range = [bounds]
             try:
                 values[option.name] = self.declare_parameter(option.name, option.default, descriptor).value
+            except InvalidParameterTypeException as error:
+                hint = ", with a decimal point" if option.type is float else ""
+                raise ConfigError(f"parameter {option.name} must be a {option.type.__name__}{hint}: {error}") from error
             except Exception as error:  # rclpy has one exception type for each way a value can be wrong
                 raise ConfigError(f"parameter {option.name}: {error} ({option.description})") from error
-        self._configs[config_class] = config_class.from_mapping(values)
+        self._configs[config_class] = _checked(config_class, values)
         if len(self._configs) == 1:
             self.add_on_set_parameters_callback(self._on_set_parameters)
         return self._configs[config_class]
 
     def config_changed(self, config: StageConfig) -> None:
-        """Called with a whole, valid configuration after one of its parameters was set; override to use it."""
+        """Called with a whole, valid configuration after one of its parameters was set; override to use it.
+
+        Raises:
+            ValueError: If the values cannot be used after all; the parameters then keep their old ones.
+        """
 
     def _on_set_parameters(self, parameters: list) -> SetParametersResult:
         new = {parameter.name: parameter.value for parameter in parameters}
-        changed = []
-        for config_class, config in self._configs.items():
-            mine = {name: value for name, value in new.items() if hasattr(config, name)}
-            try:
-                if mine:
-                    changed.append(config_class.from_mapping(vars(config) | mine))
-            except ConfigError as error:
-                return SetParametersResult(successful=False, reason=str(error))
-        for config in changed:
-            try:
+        try:
+            changed = []
+            for config_class, config in self._configs.items():
+                candidate = _checked(config_class, vars(config) | {key: new[key] for key in vars(config) if key in new})
+                names = {key for key, value in vars(config).items() if getattr(candidate, key) != value}
+                if names & self.read_at_start:
+                    fixed = ", ".join(sorted(names & self.read_at_start))
+                    raise ConfigError(f"{fixed}: read at start only; restart the node with the new value")
+                if names:
+                    changed.append(candidate)
+            for config in changed:
                 self.config_changed(config)
-            except ValueError as error:
-                return SetParametersResult(successful=False, reason=str(error))
-            self._configs[type(config)] = config
+                self._configs[type(config)] = config
+        except ValueError as error:
+            return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     # ----------------------------------------------------------------- topics
@@ -107,13 +133,13 @@ class EndoNode(Node):
         return _Guard(self, where)
 
     def report_error(self, text: str) -> None:
-        """Publish an error now and show it on /diagnostics for a while; repeated ones are logged every few seconds."""
+        """Show an error on /diagnostics for a while, beginning now; repetitions are only counted."""
+        now = time.monotonic()
         self.error_count += 1
-        self._error_text, self._error_until = text, time.monotonic() + _ERROR_SHOWN
-        if time.monotonic() - self._logged.get(text, -1e9) > _ERROR_SHOWN:
-            if len(self._logged) > 100:
-                self._logged.clear()
-            self._logged[text] = time.monotonic()
+        self._error_text, self._error_until = text, now + _ERROR_SHOWN
+        self._logged = {old: when for old, when in self._logged.items() if now - when < _ERROR_SHOWN}
+        if text not in self._logged and len(self._logged) < _MOST_LOGGED:
+            self._logged[text] = now
             self.get_logger().error(text)
             self.publish_diagnostics()
 
@@ -125,12 +151,20 @@ class EndoNode(Node):
         try:
             level, text, values = self.status()
         except Exception as error:  # a fault in describing the state must not end the node
-            level, text, values = ERROR, f"status: unexpected {type(error).__name__}: {error}", {}
+            level, text, values = ERROR, sentence("status", error), {}
+        now = self.now_ns()
+        if now == 0:
+            level, text = WARN, "use_sim_time is set but no time came on /clock"
         if time.monotonic() < self._error_until:
             level, text = ERROR, self._error_text
         values = values | {"errors": self.error_count}
         name = self.get_fully_qualified_name().lstrip("/")
-        self._diagnostics.publish(messages.encode_diagnostics(name, level, text, values, self.now_ns()))
+        status = messages.encode_diagnostics(name, level, text, values, now)
+        try:
+            self._diagnostics.publish(status)
+        except Exception:
+            if self.context.ok():  # otherwise a worker came to its end after the node
+                raise
 
 
 class _Guard:
@@ -143,9 +177,74 @@ class _Guard:
     def __exit__(self, kind: type | None, error: BaseException | None, _: Any) -> bool:
         if error is None or not isinstance(error, Exception) or isinstance(error, ExternalShutdownException):
             return False
-        expected = isinstance(error, ValueError)  # the errors of this package are sentences for the user
-        self._node.report_error(str(error) if expected else f"{self._where}: unexpected {type(error).__name__}: {error}")
+        if self._node.context.ok():  # what fails because the node is being shut down is no error
+            self._node.report_error(sentence(self._where, error))
         return True
+
+
+class Background:
+    """Builds what is wanted in a thread of its own, one thing at a time; only the newest wish counts.
+
+    A wish is known by its key: anything that compares equal only for equal wishes.
+    """
+
+    def __init__(self):
+        self._executor = ThreadPoolExecutor(1)
+        self._key: Any = None
+        self._future: Future | None = None
+
+    @property
+    def busy(self) -> bool:
+        return self._future is not None
+
+    def want(self, key: Any, build: Callable[[], Any]) -> None:
+        """Begin to build, unless that was the last wish already; call again and again while busy."""
+        if self._future is None and key != self._key:
+            self._key, self._future = key, self._executor.submit(build)
+
+    def take(self) -> tuple[Any, Any] | None:
+        """Key and result once when a wish has been fulfilled, else None. Raises what the building raised."""
+        if self._future is None or not self._future.done():
+            return None
+        future, self._future = self._future, None
+        return self._key, future.result()
+
+    def stop(self) -> None:
+        """Begin nothing more."""
+        self._executor.shutdown(wait=False, cancel_futures=True)
+
+
+def sentence(where: str, error: Exception) -> str:
+    """What to tell the user about an error."""
+    if isinstance(error, (MessageError, SequenceError, ModelError, ConfigError)):
+        return str(error)  # written for the user, with the place in it
+    if isinstance(error, ValueError):
+        return f"{where}: {error}"
+    return f"{where}: unexpected {type(error).__name__}: {error}"
+
+
+def arm_names(text: str) -> tuple[str, ...]:
+    """The names in the parameter `arms`, each once.
+
+    Raises:
+        ConfigError: If one cannot be part of a topic's name.
+    """
+    names = tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+    for name in names:
+        if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*", name):
+            raise ConfigError(f"arms: {name!r} cannot name topics; use letters, digits and _, and commas between arms")
+    return names
+
+
+def _checked(config_class: type[Config], values: dict[str, Any]) -> Config:
+    """A configuration whose device exists."""
+    config = config_class.from_mapping(values)
+    if hasattr(config, "device"):
+        try:
+            pick_device(config.device)
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
+    return config
 
 
 def quality(topic: Topic, depth: int = STREAM_DEPTH, reliable: bool = True) -> QoSProfile:
@@ -159,24 +258,37 @@ def quality(topic: Topic, depth: int = STREAM_DEPTH, reliable: bool = True) -> Q
 
 
 def run(node_class: Callable[[], EndoNode]) -> int:
-    """Start ROS, spin a node until it is told to stop, and return the exit status."""
-    rclpy.init(args=sys.argv)
-    node = None
+    """Start ROS, spin a node until it is told to stop, and return the exit status: 2 if it could not start."""
+    node, status = None, 0
     try:
+        rclpy.init(args=sys.argv)
         node = node_class()
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
-    except ConfigError as error:
-        print(f"{node_class.__name__}: {error}", file=sys.stderr)
-        return 2
+    except Exception as error:
+        if node is None and not isinstance(error, (ConfigError, NameValidationException)) and rclpy.ok():
+            raise
+        if isinstance(error, (ConfigError, NameValidationException)) or not _interrupted():
+            print(f"{node_class.__name__}: {error}", file=sys.stderr)
+            status = 2
     finally:
+        rclpy.try_shutdown()
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # an impatient second one must not cut short what follows
         if node is not None:
             node.destroy_node()
-        rclpy.try_shutdown()
-    return 0
+    deadline = time.monotonic() + _END_WITHIN
+    workers = [thread for thread in threading.enumerate() if thread is not threading.main_thread()]
+    for thread in workers:
+        thread.join(max(0.0, deadline - time.monotonic()))
+    if any(thread.is_alive() for thread in workers):
+        # Compiled code cannot be interrupted: it would delay the end of the process, or crash in it.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+    return status
 
 
-__all__ = ["ERROR", "OK", "WARN", "EndoNode", "run"]
+__all__ = ["ERROR", "OK", "WARN", "Background", "EndoNode", "arm_names", "run", "sentence"]

@@ -20,14 +20,14 @@ def relocated(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor
     Args:
         opacities: [N] in (0, 1). scales: [N, 3] m. copies: [N] int, at least 1.
     """
-    copies = copies.clamp(1, _MAX_COPIES)
-    new_opacities = 1 - (1 - opacities) ** (1.0 / copies)
-    denominator = torch.zeros_like(opacities)
-    for i in range(1, int(copies.max()) + 1):
-        for k in range(i):
-            term = math.comb(i - 1, k) * (-1) ** k / math.sqrt(k + 1)
-            denominator += (i <= copies) * term * new_opacities ** (k + 1)
-    return new_opacities, scales * (opacities / denominator)[:, None]
+    o, n = opacities.double(), copies.clamp(1, _MAX_COPIES).double()
+    o = 1 - (1 - o) ** (1 / n)
+    # Σ_j C(n, j) (-1)^(j-1) o^j / √j, their double sum over i and k with Σ_i C(i-1, k) = C(n, k+1).
+    total, term = torch.zeros_like(o), -torch.ones_like(o)
+    for j in range(1, int(n.max()) + 1 if len(n) else 1):
+        term = -term * o * (n - j + 1) / j  # C(n, j) is 0 for j > n
+        total += term / math.sqrt(j)
+    return o.to(opacities), scales * (opacities / total)[:, None].to(scales)
 
 
 def refine(
@@ -53,10 +53,10 @@ def refine(
         source[torch.cat([dead, torch.arange(n, n + born, device=device)])] = drawn
         copies = torch.bincount(drawn, minlength=n) + 1
         touched = copies > 1
-        opacity, scale = relocated(opacities, model.scales, copies)
+        opacity, scale = relocated(opacities[touched], model.scales[touched], copies[touched])
         logit, log_scale = model.logit_opacities.clone(), model.log_scales.clone()
-        logit[touched] = opacity[touched].clamp(DEAD_OPACITY, 1 - 1e-6).logit()
-        log_scale[touched] = scale[touched].log()
+        logit[touched] = opacity.clamp(DEAD_OPACITY, 1 - 1e-6).logit()
+        log_scale[touched] = scale.log()
         model = GaussianModel(model.means, model.quats, log_scale, logit, model.sh)
         fresh = touched[source]
     elif count:

@@ -18,8 +18,10 @@ _MIN_POINTS = 30  # points needed to trust an offset
 def with_depth_prior(frames: list[Frame], points: np.ndarray, config: ReconstructionConfig) -> list[Frame]:
     """The frames with ``depth`` set to the configured prior, or None where there is none.
 
+    The prior is 0 where it has no finite positive measurement and where the mask says that there is no tissue.
+
     Args:
-        frames: Training views.
+        frames: Training views, best at full size: disparities are as precise as the pixels are fine.
         points: Triangulated scene points [N, 3] (m, world), used to find a constant disparity offset of stereo matching.
         config: ``depth`` names the source; ``auto`` takes the depth topic, else stereo, else none.
 
@@ -38,10 +40,17 @@ def with_depth_prior(frames: list[Frame], points: np.ndarray, config: Reconstruc
     if source == "none":
         return [dataclasses.replace(frame, depth=None) for frame in frames]
     if source == "topic":
-        return frames
+        return [_with_depth(frame, frame.depth) for frame in frames]
     disparities = [None if frame.right is None else stereo_disparity(frame) for frame in frames]
     offset = disparity_offset(frames, disparities, points)
-    return [dataclasses.replace(f, depth=None if d is None else _to_depth(f, d + offset)) for f, d in zip(frames, disparities)]
+    return [_with_depth(f, None if d is None else _to_depth(f, d, offset)) for f, d in zip(frames, disparities)]
+
+
+def _with_depth(frame: Frame, depth: np.ndarray | None) -> Frame:
+    if depth is None:
+        return dataclasses.replace(frame, depth=None)
+    valid = np.isfinite(depth) & (depth > 0) & (True if frame.mask is None else frame.mask > 0)
+    return dataclasses.replace(frame, depth=np.where(valid, depth, 0).astype(np.float32))
 
 
 def stereo_disparity(frame: Frame) -> np.ndarray:
@@ -49,18 +58,21 @@ def stereo_disparity(frame: Frame) -> np.ndarray:
 
     A difference of the principal points of the two eyes is removed, so that disparity = fx·B/z.
     """
-    left, right = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (frame.image, frame.right))
-    fx = frame.camera.K[0, 0]
+    fx, width = frame.camera.K[0, 0], frame.camera.width
     shift = 0.0 if frame.right_K is None else frame.camera.K[0, 2] - frame.right_K[0, 2]
     levels = int(np.ceil((fx * frame.baseline / _NEAREST + abs(shift)) / 16)) * 16
-    levels = min(levels, max(frame.camera.width // 2 // 16, 1) * 16)
+    levels = min(levels, max(width // 2 // 16, 1) * 16)
     settings = dict(blockSize=5, P1=8 * 25, P2=32 * 25, uniquenessRatio=5, speckleWindowSize=100, speckleRange=2)
     matcher = cv2.StereoSGBM_create(minDisparity=0, numDisparities=levels, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY, **settings)
-    disparity = matcher.compute(left, right).astype(np.float32) / 16
+    # The matcher skips as many columns on the left as it has levels: let those be padding.
+    pad = lambda image: cv2.copyMakeBorder(image, 0, 0, levels, 0, cv2.BORDER_REPLICATE)  # noqa: E731
+    match = lambda a, b: matcher.compute(pad(a), pad(b))[:, levels:].astype(np.float32) / 16  # noqa: E731
+    left, right = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (frame.image, frame.right))
+    disparity = match(left, right)
     # The right image's own disparity, by matching the mirrored pair, must lead back to the same pixel.
-    mirrored = matcher.compute(np.ascontiguousarray(right[:, ::-1]), np.ascontiguousarray(left[:, ::-1]))[:, ::-1] / 16
-    columns = np.arange(frame.camera.width)[None] - disparity.round().astype(int)
-    back = np.take_along_axis(mirrored.astype(np.float32), columns.clip(0, frame.camera.width - 1), 1)
+    back = match(np.ascontiguousarray(right[:, ::-1]), np.ascontiguousarray(left[:, ::-1]))[:, ::-1]
+    columns = np.arange(width) - disparity.round().astype(int)
+    back = np.take_along_axis(back, columns.clip(0, width - 1), 1)
     valid = (disparity > 0) & (columns >= 0) & (np.abs(back - disparity) <= 1)
     return np.where(valid, np.maximum(disparity - np.float32(shift), 0), np.float32(0))
 
@@ -92,6 +104,6 @@ def disparity_offset(frames: list[Frame], disparities: list[np.ndarray | None], 
     return offset
 
 
-def _to_depth(frame: Frame, disparity: np.ndarray) -> np.ndarray:
-    valid = disparity > 0.5
-    return np.where(valid, frame.camera.K[0, 0] * frame.baseline / np.maximum(disparity, 0.5), 0).astype(np.float32)
+def _to_depth(frame: Frame, disparity: np.ndarray, offset: float) -> np.ndarray:
+    corrected = np.where(disparity > 0, disparity + offset, 0)
+    return np.where(corrected > 0.5, frame.camera.K[0, 0] * frame.baseline / np.maximum(corrected, 0.5), 0)

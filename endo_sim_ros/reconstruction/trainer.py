@@ -1,10 +1,11 @@
 """Optimises Gaussians against a few views (paper eq. 7) and virtual cameras between them (eq. 8, 9)."""
 
+import dataclasses
 import logging
 import math
 import pickle
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -71,9 +72,8 @@ class Trainer:
             raise SequenceError("every pixel of every view is masked; a mask has 255 where there is tissue")
         self.config = config
         self.device = pick_device(config.device)
-        frames = [_shrink(frame, config.image_width) for frame in frames]
         points, colors, _ = triangulate(frames)
-        frames = with_depth_prior(frames, points, config)
+        frames = [shrink(frame, config.image_width) for frame in with_depth_prior(frames, points, config)]
         model = initial_model(frames, points, colors, config)
         self._views = [self._to_device(frame) for frame in frames]
         self._nearest = _nearest_views(frames)
@@ -104,7 +104,7 @@ class Trainer:
         """Write model, optimiser and random state; a training that loads them goes on as if never interrupted."""
         path = Path(path)
         state = {
-            "config": asdict(self.config),
+            "config": dataclasses.asdict(self.config),
             "iteration": self.iteration,
             "parameters": {name: tensor.detach() for name, tensor in self._parameters.items()},
             "optimizer": self._optimizer.state_dict(),
@@ -251,20 +251,27 @@ class Trainer:
         return float(np.median(depths))
 
 
-def _shrink(frame: Frame, width: int) -> Frame:
-    """The frame at the given width, if it is wider."""
+def shrink(frame: Frame, width: int) -> Frame:
+    """The frame at the given width (pixels), if it is wider; the intrinsics follow.
+
+    Colours are averaged; depth is that at the pixel's centre; a pixel is tissue if all that it averages is.
+    """
     camera = frame.camera
     if camera.width <= width:
         return frame
     size = (width, max(round(camera.height * width / camera.width), 1))
-    small = camera.resized(*size)
-    area = lambda image: None if image is None else cv2.resize(image, size, interpolation=cv2.INTER_AREA)  # noqa: E731
-    nearest = lambda image: None if image is None else cv2.resize(image, size, interpolation=cv2.INTER_NEAREST)  # noqa: E731
-    right_K = None if frame.right_K is None else np.diag([size[0] / camera.width, size[1] / camera.height, 1]) @ frame.right_K
-    return Frame(
-        frame.stamp_ns, area(frame.image), small, area(frame.right), frame.baseline, right_K,
-        nearest(frame.depth), nearest(frame.mask),
-    )  # fmt: skip
+    average = lambda image: cv2.resize(image, size, interpolation=cv2.INTER_AREA)  # noqa: E731
+    scale = np.diag([size[0] / camera.width, size[1] / camera.height, 1])
+    return dataclasses.replace(
+        frame,
+        image=average(frame.image),
+        camera=camera.resized(*size),
+        right=None if frame.right is None else average(frame.right),
+        right_K=None if frame.right_K is None else scale @ frame.right_K,
+        # Plain INTER_NEAREST takes the corner instead of the centre.
+        depth=None if frame.depth is None else cv2.resize(frame.depth, size, interpolation=cv2.INTER_NEAREST_EXACT),
+        mask=None if frame.mask is None else np.where(average(np.float32(frame.mask > 0)) > 0.999, 255, 0).astype(np.uint8),
+    )
 
 
 def _nearest_views(frames: list[Frame]) -> list[int]:

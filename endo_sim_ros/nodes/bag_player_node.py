@@ -3,13 +3,14 @@
 import threading
 import time
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated
 
 import rclpy
 
 from endo_sim_ros.config import Range, StageConfig
-from endo_sim_ros.messages import MessageError, Topic
-from endo_sim_ros.nodes.base import ERROR, OK, EndoNode, run
+from endo_sim_ros.messages import DIAGNOSTICS, MessageError, Topic
+from endo_sim_ros.nodes.base import ERROR, OK, EndoNode, run, sentence
 from endo_sim_ros.sequences.bag import BagReader
 from endo_sim_ros.sequences.frames import SequenceError
 
@@ -31,47 +32,69 @@ class BagPlayerConfig(StageConfig):
 class BagPlayerNode(EndoNode):
     """Publishes the raw messages of a bag in real time, then exits."""
 
+    read_at_start = frozenset({"bag", "wait_for_subscribers"})
+
     def __init__(self):
         super().__init__("bag_player")
         self._config = self.declare(BagPlayerConfig)
         self._sent, self._total, self._state = 0, 0, "starting"
         self._failed = False
+        self._stop = threading.Event()
         self._thread = threading.Thread(target=self._play, daemon=True)
         self._thread.start()
+
+    def config_changed(self, config: BagPlayerConfig) -> None:
+        self._config = config
 
     def status(self):
         values = {"bag": self._config.bag, "messages": self._sent, "of": self._total}
         return (ERROR if self._failed else OK), self._state, values
 
+    def destroy_node(self) -> None:
+        self._stop.set()
+        self._thread.join()
+        super().destroy_node()
+
     def _play(self) -> None:
         try:
             self._open_and_publish()
-        except (SequenceError, MessageError) as error:
+        except Exception as error:
+            if self._stopped:
+                return
             # Stay alive and keep saying so: a launch file should show the reason, not a missing node.
-            self._failed, self._state = True, str(error)
-            self.report_error(str(error))
+            self._failed, self._state = True, sentence(self._config.bag, error)
+            self.report_error(self._state)
+            return
+        if self._stopped:
             return
         self._state = "finished"
         self.publish_diagnostics()
         self.get_logger().info(f"finished: {self._sent} messages")
-        time.sleep(0.5)  # lets reliable delivery complete
-        rclpy.try_shutdown()
+        self._stop.wait(0.5)  # lets reliable delivery complete
+        rclpy.try_shutdown(context=self.context)
+
+    @property
+    def _stopped(self) -> bool:
+        return self._stop.is_set() or not self.context.ok()
 
     def _open_and_publish(self) -> None:
         if not self._config.bag:
             raise SequenceError("no bag given; start with --ros-args -p bag:=PATH")
-        with BagReader(self._config.bag) as bag:
+        with BagReader(Path(self._config.bag).expanduser()) as bag:
             publishers = {}
             for name, kind in bag.topics.items():
+                topic = Topic(name.lstrip("/"), kind, "latched" if name in bag.latched else "stream")
+                if name == DIAGNOSTICS.name:
+                    continue  # the states of nodes that ran then would be taken for those of nodes that run now
                 try:
-                    publishers[name] = self.publisher(Topic(name.lstrip("/"), kind, "latched" if name in bag.latched else "stream"))
+                    publishers[name] = self.publisher(topic)
                 except MessageError as error:
                     self.get_logger().warning(f"{name} is not replayed: {error}")
             if not publishers:
                 raise SequenceError(f"{self._config.bag}: the bag has no topic that can be replayed")
             self._await_subscribers(publishers)
             self._state = "playing"
-            while rclpy.ok():
+            while not self._stopped:
                 self._total += bag.message_count
                 self._publish(bag, publishers)
                 if not self._config.loop:
@@ -80,19 +103,20 @@ class BagPlayerNode(EndoNode):
     def _await_subscribers(self, publishers: dict) -> None:
         self._state = "waiting for subscribers"
         deadline = time.monotonic() + self._config.wait_for_subscribers
-        while rclpy.ok() and time.monotonic() < deadline:
+        while not self._stopped and time.monotonic() < deadline:
             if any(publisher.get_subscription_count() for publisher in publishers.values()):
-                time.sleep(0.5)  # the other topics of the same listener are found a little later
+                self._stop.wait(0.5)  # the other topics of the same listener are found a little later
                 return
-            time.sleep(0.05)
+            self._stop.wait(0.05)
 
     def _publish(self, bag: BagReader, publishers: dict) -> None:
-        start_wall, start_bag = time.monotonic(), None
+        due, last = time.monotonic(), None
         for raw in bag.raw_messages(publishers):
-            start_bag = raw.stamp_ns if start_bag is None else start_bag
-            due = start_wall + (raw.stamp_ns - start_bag) * 1e-9 / self._config.rate
-            time.sleep(max(0.0, due - time.monotonic()))
-            if not rclpy.ok():
+            if last is not None:
+                due += (raw.stamp_ns - last) * 1e-9 / self._config.rate
+            last = raw.stamp_ns
+            self._stop.wait(max(0.0, due - time.monotonic()))
+            if self._stopped:
                 return
             publishers[raw.topic].publish(bytes(raw.data))
             self._sent += 1

@@ -66,7 +66,9 @@ class EndoNode(Node):
             if option.choices:
                 descriptor.additional_constraints = "one of " + ", ".join(option.choices)
             if option.range and option.type is float:
-                bounds = FloatingPointRange(from_value=float(option.range.minimum), to_value=float(option.range.maximum))
+                bounds = FloatingPointRange(
+                    from_value=float(option.range.minimum), to_value=float(option.range.maximum)
+                )
                 descriptor.floating_point_range = [bounds]
             elif option.range:
                 bounds = IntegerRange(from_value=int(option.range.minimum), to_value=int(option.range.maximum), step=1)
@@ -105,8 +107,8 @@ class EndoNode(Node):
             for config in changed:
                 self.config_changed(config)
                 self._configs[type(config)] = config
-        except ValueError as error:
-            return SetParametersResult(successful=False, reason=str(error))
+        except Exception as error:
+            return SetParametersResult(successful=False, reason=sentence("parameters", error))
         return SetParametersResult(successful=True)
 
     # ----------------------------------------------------------------- topics
@@ -114,7 +116,9 @@ class EndoNode(Node):
     def publisher(self, topic: Topic) -> Any:
         return self.create_publisher(messages.ros_class(topic.type), topic.name, quality(topic))
 
-    def subscribe(self, topic: Topic, callback: Callable[[Any], None], depth: int = STREAM_DEPTH, reliable: bool = True) -> None:
+    def subscribe(
+        self, topic: Topic, callback: Callable[[Any], None], depth: int = STREAM_DEPTH, reliable: bool = True
+    ) -> None:
         """Subscribe with a callback whose errors are reported instead of raised."""
 
         def guarded(message: Any) -> None:
@@ -122,6 +126,19 @@ class EndoNode(Node):
                 callback(message)
 
         self.create_subscription(messages.ros_class(topic.type), topic.name, guarded, quality(topic, depth, reliable))
+
+    def service(self, kind: type, name: str, callback: Callable[[Any], tuple[bool, str]]) -> None:
+        """Offer a service whose callback takes the request and returns (success, message)."""
+
+        def answer(request: Any, response: Any) -> Any:
+            try:
+                response.success, response.message = callback(request)
+            except Exception as error:
+                response.success, response.message = False, sentence(name, error)
+                self.report_error(response.message)
+            return response
+
+        self.create_service(kind, name, answer)
 
     def now_ns(self) -> int:
         return self.get_clock().now().nanoseconds
@@ -218,7 +235,7 @@ def sentence(where: str, error: Exception) -> str:
     """What to tell the user about an error."""
     if isinstance(error, (MessageError, SequenceError, ModelError, ConfigError)):
         return str(error)  # written for the user, with the place in it
-    if isinstance(error, ValueError):
+    if isinstance(error, (ValueError, OSError)):
         return f"{where}: {error}"
     return f"{where}: unexpected {type(error).__name__}: {error}"
 
@@ -259,21 +276,25 @@ def quality(topic: Topic, depth: int = STREAM_DEPTH, reliable: bool = True) -> Q
 
 def run(node_class: Callable[[], EndoNode]) -> int:
     """Start ROS, spin a node until it is told to stop, and return the exit status: 2 if it could not start."""
-    node, status = None, 0
     try:
         rclpy.init(args=sys.argv)
+    except RuntimeError as error:  # arguments that ROS does not understand
+        print(f"{node_class.__name__}: {_one_line(error)}", file=sys.stderr)
+        return 2
+    node, status = None, 0
+    try:
         node = node_class()
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
-    except Exception as error:
-        if node is None and not isinstance(error, (ConfigError, NameValidationException)) and rclpy.ok():
+    except (ConfigError, NameValidationException) as error:
+        print(f"{node_class.__name__}: {_one_line(error)}", file=sys.stderr)
+        status = 2
+    except Exception:
+        if rclpy.ok():  # otherwise an interrupt came while the node was starting, and made that fail
             raise
-        if isinstance(error, (ConfigError, NameValidationException)) or not _interrupted():
-            print(f"{node_class.__name__}: {error}", file=sys.stderr)
-            status = 2
     finally:
         rclpy.try_shutdown()
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # an impatient second one must not cut short what follows
@@ -289,6 +310,10 @@ def run(node_class: Callable[[], EndoNode]) -> int:
         sys.stderr.flush()
         os._exit(status)
     return status
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
 
 
 __all__ = ["ERROR", "OK", "WARN", "Background", "EndoNode", "arm_names", "run", "sentence"]

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import rclpy
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
@@ -56,7 +56,8 @@ def run_demo(
     recording = out / "recording"
     for old in (recording, out / "models"):
         shutil.rmtree(old, ignore_errors=True)
-    columns = (SpinnerColumn(), TextColumn("{task.description:<14}"), BarColumn(), TextColumn("{task.fields[note]}"), TimeElapsedColumn())
+    texts = TextColumn("{task.description:<14}"), BarColumn(), TextColumn("{task.fields[note]}")
+    columns = (SpinnerColumn(), *texts, TimeElapsedColumn())
     with Progress(*columns, console=console) as progress, NodeGroup(out / "logs") as graph:
         if bag is None:
             bag = _phantom_bag(out / f"phantom_{seed}", seed, frames, width, progress)
@@ -76,7 +77,7 @@ def run_demo(
         (out / "model.ply", "the Gaussian model"),
         (recording, "every topic, as a rosbag2 (mcap)"),
     ):
-        console.print(f"[bold]{path!s:<24}[/] {what}", highlight=False)
+        console.print(f"[bold]{path!s:<24}[/] {what}", highlight=False, soft_wrap=True)
 
 
 def _phantom_bag(path: Path, seed: int, frames: int, width: int, progress: Progress) -> Path:
@@ -96,7 +97,15 @@ def _phantom_bag(path: Path, seed: int, frames: int, width: int, progress: Progr
 
 
 def _touch_over_dds(
-    graph: NodeGroup, progress: Progress, bag: Path, recording: Path, out: Path, width: int, iterations: int, force: float, timeout: float
+    graph: NodeGroup,
+    progress: Progress,
+    bag: Path,
+    recording: Path,
+    out: Path,
+    width: int,
+    iterations: int,
+    force: float,
+    timeout: float,
 ) -> None:
     """Run the nodes until the tool has let go."""
     os.environ.update(graph.environment)  # this process joins the same graph
@@ -114,7 +123,8 @@ def _touch_over_dds(
             for node in graph.dead():
                 raise DemoError(f"{node.name} ended with status {node.exit_status}; its log is {node.log}")
             if time.monotonic() > deadline:
-                raise DemoError(f"{stage} did not finish within {timeout:.0f} s (last: {text}); logs are in {out / 'logs'}")
+                late = f"{stage} did not finish within {timeout:.0f} s (last: {text})"
+                raise DemoError(f"{late}; logs are in {out / 'logs'}")
         progress.update(task, completed=1, total=1)
 
     def text_of(name: str) -> Callable[[dict], tuple[str, float, float]]:
@@ -122,7 +132,8 @@ def _touch_over_dds(
             level, text, values = statuses.get(name, (0, "starting", {}))
             if level == ERROR:
                 raise DemoError(f"{name}: {text}")
-            return text, float(values.get("iteration", values.get("messages", 0))), float(values.get("iterations", values.get("of", 0)))
+            completed = values.get("iteration", values.get("messages", 0))
+            return text, float(completed), float(values.get("iterations", values.get("of", 0)))
 
         return note
 
@@ -132,20 +143,27 @@ def _touch_over_dds(
     try:
         graph.start("recorder_node", bag=recording, arms=_ARM)
         graph.start(
-            "reconstruction_node", output_dir=out / "models", image_width=width, iterations=iterations, max_gaussians=30_000,
+            "reconstruction_node",
+            output_dir=out / "models",
+            image_width=width,
+            iterations=iterations,
+            max_gaussians=30_000,
             virtual_every=2,
-        )  # fmt: skip
+        )
         graph.start("physics_node", arms=_ARM)
         graph.start("rendering_node", image_width=width, idle_rate=1.0)
-        wait("starting", lambda s: {"recorder", "reconstruction_node", "physics_node", "rendering_node"} <= set(s), text_of("recorder"))
+        names = {"recorder", "reconstruction_node", "physics_node", "rendering_node"}
+        wait("starting", names.issubset, text_of("recorder"))
         player = graph.start("bag_player_node", bag=bag)
         wait("replaying", lambda _: player.exit_status == 0, text_of("bag_player"))
         wait("reconstructing", says("reconstruction_node", "finished"), text_of("reconstruction_node"))
         final = lambda s: s.get("rendering_node", (0, "", {}))[2].get("following control nodes") == "True"  # noqa: E731
         settled = itertools.count()  # the final model reaches physics and rendering a moment after it is finished
         wait("binding", lambda s: final(s) and next(settled) > 20, text_of("physics_node"))
-        graph.start("scripted_tool_node", arm=_ARM, force=force)
+        graph.start("scripted_tool_node", arm=_ARM, force=force, listeners=2)  # physics and the recorder
         wait("touching", says("scripted_tool", "finished"), text_of("scripted_tool"))
+    except ExternalShutdownException:  # ROS heard the signal to stop before Python did
+        raise KeyboardInterrupt from None
     finally:
         executor.shutdown()
         watcher.destroy_node()

@@ -12,10 +12,15 @@ _STOP_AFTER = 15.0  # seconds that a node has to end after an interrupt
 
 
 def graph_environment() -> dict[str, str]:
-    """Environment for a graph on one machine: nothing leaves it, and large messages travel fast. What is set already wins."""
+    """Environment for a graph on one machine: nothing leaves it, and large messages travel fast.
+
+    What is set already wins.
+    """
     environment = dict(os.environ)
     environment.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    environment.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))  # a graph of our own beside others on this machine
+    environment.setdefault(
+        "ROS_DOMAIN_ID", str(1 + os.getpid() % 100)
+    )  # a graph of our own beside others on this machine
     try:
         limit = int(Path("/proc/sys/net/core/rmem_max").read_text())
     except (OSError, ValueError):

@@ -1,7 +1,6 @@
 """Gaussian model and tool wrenches in, control nodes and reactions out."""
 
 import time
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any
@@ -13,8 +12,10 @@ from endo_sim_ros import messages
 from endo_sim_ros.config import Range, StageConfig
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.messages import ControlNodeCloud, MessageError
-from endo_sim_ros.nodes.base import OK, WARN, EndoNode, run
+from endo_sim_ros.nodes.base import ERROR, OK, WARN, Background, EndoNode, arm_names, run, sentence
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
+
+_CAMERAS_LATE = 1.0  # seconds after a model in which its training cameras may still be on their way
 
 
 @dataclass(frozen=True)
@@ -48,20 +49,24 @@ class _Arm:
 class PhysicsNode(EndoNode):
     """Samples control nodes from the latest model and steps them at the rate of the simulation."""
 
+    read_at_start = frozenset({"arms"})
+
     def __init__(self):
         super().__init__("physics_node")
         self._options = self.declare(PhysicsNodeConfig)
         self._config = self.declare(PhysicsConfig)
         self._simulation: TissueSimulation | None = None
-        self._model_stamp = 0  # of the simulated model
-        self._arrived: tuple[int, GaussianModel] | None = None  # newest model, and its stamp
-        self._views: tuple[int, np.ndarray] | None = None  # camera positions of the newest model, and its stamp
+        self._simulated_stamp = 0  # stamp of the simulated model
+        self._model: GaussianModel | None = None  # the newest; its stamp, number, and time of arrival:
+        self._model_stamp, self._model_number, self._model_came = 0, 0, 0.0
+        self._views: np.ndarray | None = None  # positions [V, 3] of the newest training cameras; their stamp:
+        self._views_stamp = 0
         self._camera_position: np.ndarray | None = None
-        self._building: Future | None = None
-        self._worker = ThreadPoolExecutor(1)
+        self._background = Background()
+        self._failure = ""  # why the newest model is not simulated
         self._paused, self._steps, self._seconds_per_step, self._last_step = False, 0, 0.0, None
         self._real_time_factor = 1.0
-        self._arms = {name.strip(): _Arm() for name in self._options.arms.split(",") if name.strip()}
+        self._arms = {name: _Arm() for name in arm_names(self._options.arms)}
         self._nodes_pub = self.publisher(messages.CONTROL_NODES)
         self._reaction_pubs = {name: self.publisher(messages.tool_reaction(name)) for name in self._arms}
         self.subscribe(messages.GAUSSIANS, self._on_model)
@@ -71,65 +76,64 @@ class PhysicsNode(EndoNode):
             self.subscribe(messages.tool_pose(name), partial(self._on_tool_pose, name))
             self.subscribe(messages.tool_wrench(name), partial(self._on_wrench, name))
             self.subscribe(messages.tool_jaw(name), partial(self._on_jaw, name))
-        self.create_service(Trigger, "~/reset", self._on_reset)
-        self.create_service(Trigger, "~/step", self._on_step)
-        self.create_service(SetBool, "~/pause", self._on_pause)
+        self.service(Trigger, "~/reset", self._on_reset)
+        self.service(Trigger, "~/step", self._on_step)
+        self.service(SetBool, "~/pause", self._on_pause)
         self._timer = self.create_timer(self._config.step_duration, self._on_timer)
 
     def config_changed(self, config: StageConfig) -> None:
         if isinstance(config, PhysicsConfig):
-            self._config = config
+            self._config = config  # the timer builds a simulation for it
             self._timer.timer_period_ns = int(config.step_duration * 1e9)
-            self._rebuild()
         else:
-            raise ValueError("this parameter is read at start only; restart the node with the new value")
+            self._options = config
 
     # ------------------------------------------------------------------ model
 
     def _on_model(self, message: Any) -> None:
-        model = messages.decode_gaussians(message)
         messages.check_frame(message, (self._options.world_frame,), messages.GAUSSIANS.name)
-        self._arrived = (messages.stamp_to_ns(message.header.stamp), model)
-        self._rebuild()
+        self._model = messages.decode_gaussians(message)
+        self._model_stamp = messages.stamp_to_ns(message.header.stamp)
+        self._model_number, self._model_came = self._model_number + 1, time.monotonic()
 
     def _on_training_cameras(self, message: Any) -> None:
-        poses = messages.decode_poses(message)
-        self._views = (messages.stamp_to_ns(message.header.stamp), poses[:, :3, 3])
-        self._rebuild()
+        messages.check_frame(message, (self._options.world_frame,), messages.TRAINING_CAMERAS.name)
+        self._views = messages.decode_poses(message)[:, :3, 3]
+        self._views_stamp = messages.stamp_to_ns(message.header.stamp)
 
     def _on_camera(self, message: Any) -> None:
         pose = messages.decode_pose(message, self._options.world_frame, messages.CAMERA_POSE.name)
-        first = self._camera_position is None
         self._camera_position = pose[:3, 3]
-        if first:
-            self._rebuild()
 
-    def _viewpoint(self) -> np.ndarray | None:
-        """Where the tissue was seen from: the model's own cameras, else wherever the camera is now."""
-        if self._arrived and self._views and self._views[0] == self._arrived[0] and len(self._views[1]):
-            return self._views[1]
-        if self._views and self._arrived and self._views[0] != self._arrived[0]:
-            return None  # the cameras of this model are still on their way
-        return self._camera_position
+    def _viewpoint(self) -> tuple[str, np.ndarray | None]:
+        """Where the tissue was seen from, and whose place that is: the model's own cameras, else wherever the camera is
+        now, else the cameras of an earlier model."""
+        views = self._views if self._views is not None and len(self._views) else None
+        if self._views is not None and self._views_stamp == self._model_stamp:
+            if views is not None:
+                return "own cameras", views
+        elif time.monotonic() - self._model_came < _CAMERAS_LATE:
+            return "", None
+        return ("camera", self._camera_position) if self._camera_position is not None else ("earlier cameras", views)
 
-    def _rebuild(self) -> None:
+    def _build(self) -> None:
         """Build a simulation of the newest model in the background; the old one goes on meanwhile."""
-        if self._building is None and self._arrived is not None and (viewpoint := self._viewpoint()) is not None:
-            stamp, model = self._arrived
-            self._arrived_built = self._arrived, self._config
-            self._building = self._worker.submit(lambda: (stamp, TissueSimulation(model, viewpoint, self._config)))
-
-    def _take_built(self) -> None:
-        if self._building is None or not self._building.done():
-            return
-        future, self._building = self._building, None
-        if (self._arrived, self._config) != self._arrived_built:
-            self._rebuild()  # a newer model or configuration came meanwhile
-        with self.guard("physics"):
-            self._model_stamp, self._simulation = future.result()
-            self._last_step = None
-            for arm in self._arms.values():
-                arm.acting = False
+        try:
+            built = self._background.take()
+            if built is not None:
+                self._simulated_stamp, self._simulation = built[1]
+                self._last_step, self._failure = None, ""
+                for arm in self._arms.values():
+                    arm.acting = False
+        except Exception as error:
+            self._failure = sentence("physics", error)
+            self.report_error(self._failure)
+        origin, viewpoint = self._viewpoint()
+        if self._model is not None and viewpoint is not None:
+            model, stamp, config = self._model, self._model_stamp, self._config
+            self._background.want(
+                (self._model_number, origin, config), lambda: (stamp, TissueSimulation(model, viewpoint, config))
+            )
 
     # ------------------------------------------------------------------ tools
 
@@ -141,7 +145,9 @@ class PhysicsNode(EndoNode):
         force, torque = messages.decode_wrench(message, topic)
         frame = messages.check_frame(message, ("", name, self._options.world_frame), topic)
         if arm.pose is None:
-            raise MessageError(f"{topic}: a wrench came before any pose on {messages.tool_pose(name).name}; publish the tip's pose")
+            raise MessageError(
+                f"{topic}: a wrench came before any pose on {messages.tool_pose(name).name}; publish the tip's pose"
+            )
         if frame != self._options.world_frame:  # in the axes of the tool
             force, torque = arm.pose[:3, :3] @ force, arm.pose[:3, :3] @ torque
         arm.force, arm.torque, arm.heard = force, torque, time.monotonic()
@@ -149,7 +155,9 @@ class PhysicsNode(EndoNode):
     def _on_jaw(self, name: str, message: Any) -> None:
         angle, arm = messages.decode_jaw(message, messages.tool_jaw(name).name), self._arms[name]
         if arm.pose is None:
-            raise MessageError(f"{name}: a jaw command came before any pose on {messages.tool_pose(name).name}; publish the tip's pose")
+            raise MessageError(
+                f"{name}: a jaw command came before any pose on {messages.tool_pose(name).name}; publish the tip's pose"
+            )
         if angle <= self._options.jaw_closed:
             arm.closed = True
         elif angle >= self._options.jaw_open:
@@ -159,8 +167,9 @@ class PhysicsNode(EndoNode):
         for name, arm in self._arms.items():
             if arm.pose is None:
                 continue
+            where = f"at {np.round(arm.pose[:3, 3], 4).tolist()}"
             if not simulation.set_grasp(name, arm.pose, arm.closed):
-                self.report_error(f"{name}: the jaw closed on nothing at {np.round(arm.pose[:3, 3], 4).tolist()}; {self._reach(simulation)}")
+                self.report_error(f"{name}: the jaw closed on nothing {where}; {self._reach(simulation)}")
                 arm.closed = False
             if arm.force is None:
                 continue
@@ -171,9 +180,7 @@ class PhysicsNode(EndoNode):
             if wanted or arm.acting:
                 reached = simulation.set_wrench(name, arm.pose[:3, 3], force, torque)
                 if wanted and not reached:
-                    self.report_error(
-                        f"{name}: the wrench at {np.round(arm.pose[:3, 3], 4).tolist()} has no effect; {self._reach(simulation)}"
-                    )
+                    self.report_error(f"{name}: the wrench {where} has no effect; {self._reach(simulation)}")
             arm.acting = wanted
 
     @staticmethod
@@ -184,7 +191,7 @@ class PhysicsNode(EndoNode):
 
     def _on_timer(self) -> None:
         with self.guard("physics"):
-            self._take_built()
+            self._build()
             if self._simulation is not None:
                 if not self._paused:
                     self._step(self._simulation)
@@ -195,8 +202,9 @@ class PhysicsNode(EndoNode):
         self._apply_tools(simulation)
         simulation.step()
         if simulation.slips > slips:
+            travel = f"{simulation.config.travel:g} m"
             self.report_error(
-                f"tissue slipped out of a jaw that pulled it almost {simulation.config.travel:g} m; open it, come nearer, or raise travel"
+                f"tissue slipped out of a jaw that pulled it almost {travel}; open it, come nearer, or raise travel"
             )
             for name, arm in self._arms.items():
                 arm.closed = arm.closed and simulation.in_reach(name)
@@ -211,7 +219,7 @@ class PhysicsNode(EndoNode):
 
     def _publish(self, simulation: TissueSimulation) -> None:
         stamp, state = self.now_ns(), simulation.state()
-        cloud = ControlNodeCloud(state.rest, state.positions, state.F, self._model_stamp)
+        cloud = ControlNodeCloud(state.rest, state.positions, state.F, self._simulated_stamp)
         self._nodes_pub.publish(messages.encode_control_nodes(cloud, stamp, self._options.world_frame))
         for name, arm in self._arms.items():
             if arm.pose is not None:
@@ -221,42 +229,44 @@ class PhysicsNode(EndoNode):
 
     # --------------------------------------------------------------- services
 
-    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success = self._simulation is not None
-        response.message = "at rest" if response.success else "there is no model yet"
-        if self._simulation is not None:
-            self._simulation.reset()
-            for arm in self._arms.values():
-                arm.force, arm.acting, arm.closed = None, False, False
-            self._publish(self._simulation)
-        return response
+    def _on_reset(self, _: Trigger.Request) -> tuple[bool, str]:
+        if self._simulation is None:
+            return False, "there is no model yet"
+        self._simulation.reset()
+        for arm in self._arms.values():
+            arm.force, arm.acting, arm.closed = None, False, False
+        self._publish(self._simulation)
+        return True, "at rest"
 
-    def _on_step(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if self._simulation is None or not self._paused:
-            response.success = False
-            response.message = "there is no model yet" if self._simulation is None else "running; call ~/pause with true first"
-            return response
-        with self.guard("~/step"):
-            self._step(self._simulation)
-            self._publish(self._simulation)
-            response.success, response.message = True, f"time {self._simulation.time:.4f} s"
-        return response
+    def _on_step(self, _: Trigger.Request) -> tuple[bool, str]:
+        if self._simulation is None:
+            return False, "there is no model yet"
+        if not self._paused:
+            return False, "running; call ~/pause with true first"
+        self._step(self._simulation)
+        self._publish(self._simulation)
+        return True, f"time {self._simulation.time:.4f} s"
 
-    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+    def _on_pause(self, request: SetBool.Request) -> tuple[bool, str]:
         self._paused, self._last_step = request.data, None
-        response.success, response.message = True, "paused" if request.data else "running"
-        return response
+        return True, "paused" if request.data else "running"
 
     # ------------------------------------------------------------ diagnostics
 
     def status(self):
         simulation = self._simulation
         if simulation is None:
-            if self._arrived is None:
+            if self._model is None:
                 return WARN, "waiting for a model on gaussians", {}
-            if self._building is not None:
+            if self._background.busy:
                 return OK, "building control nodes", {}
-            return WARN, "waiting for training_cameras or ECM/measured_cp to know from which side the tissue is seen", {}
+            if self._failure:
+                return ERROR, self._failure, {}
+            return (
+                WARN,
+                "waiting for training_cameras or ECM/measured_cp to know from which side the tissue is seen",
+                {},
+            )
         values = {
             "nodes": len(simulation.nodes.rest),
             "steps": self._steps,
@@ -267,10 +277,12 @@ class PhysicsNode(EndoNode):
             "faults": simulation.faults,
             "slips": simulation.slips,
         }
+        if self._failure:
+            return ERROR, f"{self._failure}; the model before goes on", values
         return OK, "paused" if self._paused else "running", values
 
     def destroy_node(self) -> None:
-        self._worker.shutdown(wait=False, cancel_futures=True)
+        self._background.stop()
         super().destroy_node()
 
 

@@ -4,6 +4,7 @@ import logging
 import threading
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,13 +16,15 @@ from endo_sim_ros.cameras import Camera
 from endo_sim_ros.config import Range, StageConfig
 from endo_sim_ros.gaussians import GaussianModel, load_ply, save_ply
 from endo_sim_ros.messages import Topic
-from endo_sim_ros.nodes.base import OK, WARN, EndoNode, run
+from endo_sim_ros.nodes.base import ERROR, OK, WARN, EndoNode, run, sentence
 from endo_sim_ros.reconstruction import Progress, ReconstructionConfig, Trainer, select_keyframes
 from endo_sim_ros.sequences.bag import LEFT_FRAME, feed
 from endo_sim_ros.sequences.frames import Frame, SequenceError
 from endo_sim_ros.sequences.synchronizer import Synchronizer
 
-_NEW_RECORDING = 1.0  # seconds that stamps must jump back to mean that another recording began
+_LEFT_IMAGES = (messages.LEFT_IMAGE, messages.LEFT_COMPRESSED)
+# Seconds by which stamps must jump to mean that another recording began; after a pause any step back means it.
+_JUMP_BACK, _JUMP_AHEAD, _PAUSE = 1.0, 60.0, 1.0
 
 
 @dataclass(frozen=True)
@@ -37,7 +40,7 @@ class ReconstructionNodeConfig(StageConfig):
     start_after: Annotated[float, Range(0, 3600, "s")] = 1.5
     """Reconstruct when no new view came for this long; 0 = only when the service ~/reconstruct is called."""
     start_views: Annotated[int, Range(0, 100_000)] = 0
-    """Reconstruct as soon as this many views arrived (for a live camera, whose stream does not end); 0 = off."""
+    """Reconstruct once as soon as this many views arrived (for a live camera, whose stream does not end); 0 = off."""
     max_views: Annotated[int, Range(2, 100_000)] = 300
     """Views kept in memory; above it every second one is dropped."""
     image_timeout: Annotated[float, Range(0.1, 3600, "s")] = 10.0
@@ -47,11 +50,13 @@ class ReconstructionNodeConfig(StageConfig):
     output_dir: str = "~/.ros/endo_sim_ros"
     """Where each reconstruction's model.ply and checkpoint.pt are saved, in a folder named by the time."""
     model_file: str = ""
-    """PLY model to publish at start, before any reconstruction."""
+    """PLY model to publish at start, before any reconstruction, or when this is set."""
 
 
 class ReconstructionNode(EndoNode):
     """Collects views, trains in a worker thread, publishes the model as it grows and saves it."""
+
+    read_at_start = frozenset({"reliable"})
 
     def __init__(self):
         super().__init__("reconstruction_node")
@@ -60,8 +65,8 @@ class ReconstructionNode(EndoNode):
         logging.basicConfig(level=logging.INFO, format="%(name)s: %(message)s")
         self._frames: list[Frame] = []
         self._synchronizer = Synchronizer(self._options.sync_tolerance)
-        self._last_view = time.monotonic()
-        self._newest_stamp = 0
+        self._last_image = self._last_view = time.monotonic()  # when they arrived
+        self._newest_stamp = 0  # of the images of this recording
         self._trained: tuple[int, int] | None = None  # first and last stamp of the recording reconstructed last
         self._thread: threading.Thread | None = None
         self._cancel = threading.Event()
@@ -69,19 +74,22 @@ class ReconstructionNode(EndoNode):
         self._progress: Progress | None = None
         self._outbox: tuple[GaussianModel, list[Camera]] | None = None  # newest model of the worker, to be published
         self._published: GaussianModel | None = None
-        self._saved = ""
+        self._model_stamp = 0
+        self._saved, self._failure = "", ""  # how the last reconstruction ended
         self._model_pub, self._cameras_pub, self._info_pub = (self.publisher(topic) for topic in messages.MODEL_TOPICS)
         for topic in messages.RECORDING_TOPICS:
-            self.subscribe(topic, lambda message, topic=topic: self._on_recording(topic, message), 50, self._options.reliable)
-        self.create_service(Trigger, "~/reconstruct", self._on_reconstruct)
-        self.create_service(Trigger, "~/save", self._on_save)
-        self.create_timer(0.2, self._on_timer)
+            self.subscribe(topic, partial(self._on_recording, topic), 50, self._options.reliable)
+        self.service(Trigger, "~/reconstruct", self._on_reconstruct)
+        self.service(Trigger, "~/save", self._on_save)
+        self.every(0.2, self._on_timer)
         with self.guard("model_file"):
-            if self._options.model_file:
-                self._publish(load_ply(Path(self._options.model_file).expanduser()), [])
+            self._publish_file(self._options.model_file)
 
     def config_changed(self, config: StageConfig) -> None:
         if isinstance(config, ReconstructionNodeConfig):
+            if config.model_file != self._options.model_file:
+                self._publish_file(config.model_file)
+            self._synchronizer.tolerance_ns = int(config.sync_tolerance * 1e9)
             self._options = config
         else:
             self._config = config  # used by the next reconstruction
@@ -89,39 +97,50 @@ class ReconstructionNode(EndoNode):
     # ------------------------------------------------------------------ views
 
     def _on_recording(self, topic: Topic, message: Any) -> None:
-        stamp = messages.stamp_to_ns(message.header.stamp)
-        if topic in (messages.LEFT_IMAGE, messages.LEFT_COMPRESSED):
-            if 0 < stamp < self._newest_stamp - _NEW_RECORDING * 1e9:
-                self._end_of_recording()
-            self._newest_stamp = max(stamp, self._newest_stamp)
-        try:
-            frames = feed(self._synchronizer, topic, message, self._options.world_frame)
-        finally:
-            self._note_images(topic)
-        self._add_views(frames)
+        if topic in _LEFT_IMAGES:
+            self._note_image(messages.stamp_to_ns(message.header.stamp))
+        self._add_views(feed(self._synchronizer, topic, message, self._options.world_frame))
 
-    def _note_images(self, topic: Topic) -> None:
-        if topic in (messages.LEFT_IMAGE, messages.LEFT_COMPRESSED):
-            self._last_view = time.monotonic()
+    def _note_image(self, stamp: int) -> None:
+        """Keep track of where one recording ends and the next begins."""
+        paused = time.monotonic() - self._last_image > _PAUSE
+        self._last_image = time.monotonic()
+        if stamp <= 0:
+            return  # will be refused
+        step = (stamp - self._newest_stamp) * 1e-9
+        if self._newest_stamp and (step < -_JUMP_BACK or step > _JUMP_AHEAD or paused and step <= 0):
+            self._end_recording()
+            if paused:
+                self._trained = None  # the same recording replayed on purpose, not looped, is reconstructed again
+        self._newest_stamp = max(stamp, self._newest_stamp)
 
-    def _add_views(self, frames: list[Frame]) -> None:
-        self._frames.extend(frames)
-        if len(self._frames) > self._options.max_views:
-            self._frames = self._frames[::2]
-        if 0 < self._options.start_views <= len(self._frames):
-            self._start_if_new()
-
-    def _end_of_recording(self) -> None:
-        """Stamps jumped back: reconstruct what was collected and begin again with what comes."""
+    def _end_recording(self) -> None:
+        """Reconstruct what was collected and begin again with what comes."""
+        self._flush()
         self._start_if_new()
         self._synchronizer = Synchronizer(self._options.sync_tolerance)
         self._frames, self._newest_stamp = [], 0
 
+    def _flush(self) -> None:
+        """Take over all views that still wait for other streams."""
+        while self._synchronizer.pending:
+            with self.guard("synchroniser"):  # an image that cannot be used raises, and is gone
+                self._add_views(self._synchronizer.flush())
+
+    def _add_views(self, frames: list[Frame]) -> None:
+        if frames:
+            self._frames.extend(frames)
+            self._last_view = time.monotonic()
+        if len(self._frames) > self._options.max_views:
+            self._frames = self._frames[::2]
+        if 0 < self._options.start_views <= len(self._frames):
+            if self._trained is None or self._trained[0] != self._frames[0].stamp_ns:  # once in a recording
+                self._start_if_new()
+
     def _on_timer(self) -> None:
         with self.guard("reconstruction"):
-            if 0 < self._options.start_after < time.monotonic() - self._last_view:
-                with self.guard("synchroniser"):
-                    self._add_views(self._synchronizer.flush())
+            if 0 < self._options.start_after < time.monotonic() - self._last_image:
+                self._flush()
                 self._start_if_new()
             with self._lock:
                 outbox, self._outbox = self._outbox, None
@@ -146,33 +165,36 @@ class ReconstructionNode(EndoNode):
         chosen = select_keyframes(self._frames, self._config.keyframes)
         views = [self._frames[index] for index in chosen]
         self._trained = (self._frames[0].stamp_ns, self._frames[-1].stamp_ns)
-        self._progress, self._saved = None, ""
+        self._progress, self._saved, self._failure = None, "", ""
         self._cancel.clear()
         self._thread = threading.Thread(target=self._train, args=(views, self._config), daemon=True)
         self._thread.start()
         self.get_logger().info(f"reconstructing from {len(views)} of {len(self._frames)} views")
 
     def _train(self, views: list[Frame], config: ReconstructionConfig) -> None:
-        with self.guard("reconstruction"):
-            try:
-                trainer = Trainer(views, config)
-                self._offer(trainer)
-                published = time.monotonic()
-
-                def on_progress(progress: Progress) -> bool:
-                    nonlocal published
-                    self._progress = progress
-                    if time.monotonic() - published > self._options.publish_period:
-                        published = time.monotonic()
-                        self._offer(trainer)
-                    return not self._cancel.is_set()
-
-                trainer.run(on_progress, every=10)
-            except (MemoryError, torch.OutOfMemoryError) as error:
-                raise SequenceError(f"out of memory: lower max_gaussians, image_width or keyframes ({error})") from error
+        try:
+            trainer = Trainer(views, config)
             self._offer(trainer)
-            self._save(trainer.model, trainer)
-            self.get_logger().info(f"reconstruction finished: {len(trainer.model)} Gaussians, saved in {self._saved}")
+            published = time.monotonic()
+
+            def on_progress(progress: Progress) -> bool:
+                nonlocal published
+                self._progress = progress
+                if time.monotonic() - published > self._options.publish_period:
+                    published = time.monotonic()
+                    self._offer(trainer)
+                return not self._cancel.is_set()
+
+            trainer.run(on_progress, every=5)
+            self._offer(trainer)
+            self._save(trainer.model, trainer)  # also what an interrupted training has reached
+            done = f"{len(trainer.model)} Gaussians after {trainer.iteration} iterations"
+            self.get_logger().info(f"reconstruction finished: {done}, saved in {self._saved}")
+        except Exception as error:
+            self._failure = sentence("reconstruction", error)
+            if isinstance(error, (MemoryError, torch.OutOfMemoryError)):
+                self._failure = f"out of memory: lower max_gaussians, image_width or keyframes ({error})"
+            self.report_error(self._failure)
 
     def _offer(self, trainer: Trainer) -> None:
         with self._lock:
@@ -180,7 +202,9 @@ class ReconstructionNode(EndoNode):
 
     def _publish(self, model: GaussianModel, cameras: list[Camera]) -> None:
         """Publish a model; equal stamps tie it to the cameras it was trained on."""
-        stamp, world = self.now_ns(), self._options.world_frame
+        world = self._options.world_frame
+        # A stamp identifies one model, also while a simulated clock stands still or jumps back.
+        self._model_stamp = stamp = max(self.now_ns(), self._model_stamp + 1)
         if cameras:
             first = cameras[0]
             self._info_pub.publish(messages.encode_camera_info(first.K, first.width, first.height, stamp, LEFT_FRAME))
@@ -188,49 +212,45 @@ class ReconstructionNode(EndoNode):
         self._model_pub.publish(messages.encode_gaussians(model, stamp, world))
         self._published = model
 
+    def _publish_file(self, path: str) -> None:
+        if path:
+            self._publish(load_ply(Path(path).expanduser()), [])
+
     def _save(self, model: GaussianModel, trainer: Trainer | None = None) -> None:
         folder = Path(self._options.output_dir).expanduser() / time.strftime("%Y%m%d-%H%M%S")
         try:
             save_ply(model, folder / "model.ply")
             if trainer is not None:
                 trainer.save_checkpoint(folder / "checkpoint.pt")
-        except OSError as error:
-            raise SequenceError(f"{folder}: the model cannot be saved ({error.strerror}); set output_dir") from error
+        except (OSError, RuntimeError) as error:  # torch turns a full disk into a RuntimeError
+            reason = getattr(error, "strerror", None) or str(error)
+            raise SequenceError(f"{folder}: the model cannot be saved ({reason}); set output_dir") from error
         self._saved = str(folder)
 
     # --------------------------------------------------------------- services
 
-    def _on_reconstruct(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_reconstruct(self, _: Trigger.Request) -> tuple[bool, str]:
         if self._training:
-            response.success, response.message = False, f"a reconstruction is running: {self.status()[1]}"
-            return response
-        with self.guard("synchroniser"):
-            self._add_views(self._synchronizer.flush())
+            return False, f"a reconstruction is running: {self.status()[1]}"
+        self._flush()
         if not self._frames:
-            response.success, response.message = False, f"no views yet: {self.status()[1]}"
-            return response
+            return False, f"no views yet: {self.status()[1]}"
         if not self._training:  # start_views may have started it
             self._start()
-        response.success, response.message = True, f"reconstructing from {len(self._frames)} views"
-        return response
+        return True, f"reconstructing from {len(self._frames)} views"
 
-    def _on_save(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success = False
+    def _on_save(self, _: Trigger.Request) -> tuple[bool, str]:
         if self._published is None:
-            response.message = "there is no model to save yet"
-            return response
-        try:
-            self._save(self._published)
-            response.success, response.message = True, self._saved
-        except SequenceError as error:
-            response.message = str(error)
-        return response
+            return False, "there is no model to save yet"
+        self._save(self._published)
+        return True, self._saved
 
     # ------------------------------------------------------------ diagnostics
 
     def status(self):
-        dropped = {f"images {reason}": count for reason, count in self._synchronizer.dropped.items()}
-        values = {"views": len(self._frames), **dropped, "saved": self._saved}
+        dropped = self._synchronizer.dropped
+        counts = {f"images {reason}": count for reason, count in dropped.items()}
+        values = {"views": len(self._frames), **counts, "saved": self._saved}
         if self._training:
             progress = self._progress
             if progress is None:
@@ -238,20 +258,23 @@ class ReconstructionNode(EndoNode):
             values |= {"iteration": progress.iteration, "iterations": progress.iterations}
             values |= {"loss": f"{progress.loss:.4f}", "gaussians": progress.gaussians}
             return OK, f"training, iteration {progress.iteration} of {progress.iterations}", values
+        if self._failure:
+            return ERROR, self._failure, values
         if self._saved:
             return OK, f"finished, model saved in {self._saved}", values
         silent = time.monotonic() - self._last_view
-        if silent > self._options.image_timeout and not self._frames:
+        if silent > self._options.image_timeout:
             topic = self.resolve_topic_name(messages.LEFT_IMAGE.name)
             reasons = [f"{count} {reason}" for reason, count in dropped.items() if count]
-            why = f"images arrived but none was usable ({', '.join(reasons)})" if reasons else f"no image on {topic}"
-            return WARN, f"{why} for {silent:.0f} s; play a bag or remap the topics", values
+            unusable = reasons and time.monotonic() - self._last_image < silent
+            why = f"images arrive but none is usable ({', '.join(reasons)})" if unusable else f"no image on {topic}"
+            return WARN, f"{why} for {silent:.0f} s; play a bag, start the camera or remap the topics", values
         return OK, f"collecting views, {len(self._frames)} so far", values
 
     def destroy_node(self) -> None:
         self._cancel.set()
         if self._thread is not None:
-            self._thread.join(timeout=10)
+            self._thread.join(timeout=2.0)
         super().destroy_node()
 
 

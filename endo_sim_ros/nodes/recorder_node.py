@@ -8,10 +8,10 @@ from pathlib import Path
 from endo_sim_ros import messages
 from endo_sim_ros.config import StageConfig
 from endo_sim_ros.messages import Topic
-from endo_sim_ros.nodes.base import ERROR, OK, EndoNode, quality, run
+from endo_sim_ros.nodes.base import ERROR, OK, EndoNode, arm_names, quality, run, sentence
 from endo_sim_ros.sequences.bag import BagWriter
 
-_MAX_WAITING = 2000  # messages that may wait for the disk before new ones are dropped, and counted
+_MAX_WAITING = 256_000_000  # bytes that may wait for the disk before new messages are dropped, and counted
 
 
 @dataclass(frozen=True)
@@ -27,15 +27,18 @@ class RecorderConfig(StageConfig):
 class RecorderNode(EndoNode):
     """Writes every topic of the contract as it comes, without decoding it."""
 
+    read_at_start = frozenset({"bag", "arms"})
+
     def __init__(self):
         super().__init__("recorder")
         self._config = self.declare(RecorderConfig)
+        topics = messages.all_topics(arm_names(self._config.arms))
         self._written, self._dropped, self._failure = 0, 0, ""
-        self._queue: queue.Queue = queue.Queue(_MAX_WAITING)
+        self._queue: queue.SimpleQueue = queue.SimpleQueue()
+        self._waiting, self._lock = 0, threading.Lock()  # bytes in the queue
         self._thread = threading.Thread(target=self._write)
         self._thread.start()
-        arms = tuple(name.strip() for name in self._config.arms.split(",") if name.strip())
-        for topic in messages.all_topics(arms):
+        for topic in topics:
             kind = messages.ros_class(topic.type)
             self.create_subscription(kind, topic.name, self._recorder(topic), quality(topic, 100), raw=True)
 
@@ -43,10 +46,12 @@ class RecorderNode(EndoNode):
         absolute = topic._replace(name=self.resolve_topic_name(topic.name))
 
         def record(data: bytes) -> None:
-            try:
-                self._queue.put_nowait((absolute, data, self.now_ns()))
-            except queue.Full:
+            if self._failure or self._waiting > _MAX_WAITING:
                 self._dropped += 1
+                return
+            with self._lock:
+                self._waiting += len(data)
+            self._queue.put((absolute, data, self.now_ns()))
 
         return record
 
@@ -57,8 +62,11 @@ class RecorderNode(EndoNode):
                 while (item := self._queue.get()) is not None:
                     bag.write_raw(*item)
                     self._written += 1
-        except (OSError, ValueError) as error:
-            self._failure = f"recording stopped: {error}"
+                    with self._lock:
+                        self._waiting -= len(item[1])
+        except Exception as error:  # a full disk, above all
+            self._failure = f"recording stopped: {sentence(self._config.bag, error)}"
+            self._queue = queue.SimpleQueue()  # let go of what can no longer be written
             self.report_error(self._failure)
 
     def status(self):
@@ -66,9 +74,8 @@ class RecorderNode(EndoNode):
         return (ERROR, self._failure, values) if self._failure else (OK, "recording", values)
 
     def destroy_node(self) -> None:
-        if self._thread.is_alive():
-            self._queue.put(None)
-            self._thread.join(timeout=30)
+        self._queue.put(None)
+        self._thread.join()  # what was heard before the end is kept, even if the disk takes its time
         super().destroy_node()
 
 

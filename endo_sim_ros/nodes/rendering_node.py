@@ -1,7 +1,6 @@
 """Gaussian model, control nodes and a camera pose in, images out."""
 
 import time
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -11,10 +10,30 @@ from endo_sim_ros import messages
 from endo_sim_ros.cameras import Camera
 from endo_sim_ros.config import Range, StageConfig
 from endo_sim_ros.gaussians import GaussianModel
-from endo_sim_ros.messages import CameraInfo, ControlNodeCloud
-from endo_sim_ros.nodes.base import OK, WARN, EndoNode, run
+from endo_sim_ros.messages import CameraInfo, ControlNodeCloud, MessageError
+from endo_sim_ros.nodes.base import ERROR, OK, WARN, Background, EndoNode, run, sentence
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.bag import LEFT_FRAME
+
+_MAX_SIDE = 8192  # pixels; a damaged camera_info must not make the node ask for all memory
+
+
+@dataclass(frozen=True)
+class _Bound:
+    """A renderer and what it is for."""
+
+    renderer: DeformableRenderer
+    model_stamp: int
+    node_rest: np.ndarray | None  # [M, 3] m, None without control nodes
+
+    def follows(self, nodes: ControlNodeCloud | None) -> bool:
+        """Whether it can show the state of these nodes."""
+        return (
+            nodes is not None
+            and self.node_rest is not None
+            and nodes.model_stamp_ns == self.model_stamp
+            and np.array_equal(nodes.rest, self.node_rest)
+        )
 
 
 @dataclass(frozen=True)
@@ -38,14 +57,12 @@ class RenderingNode(EndoNode):
         super().__init__("rendering_node")
         self._options = self.declare(RenderingNodeConfig)
         self._config = self.declare(RenderingConfig)
-        self._model: GaussianModel | None = None
-        self._model_stamp = 0
+        self._model: GaussianModel | None = None  # the newest; its stamp, and number in the order of arrival:
+        self._model_stamp, self._model_number = 0, 0
         self._nodes: ControlNodeCloud | None = None
-        self._renderer: DeformableRenderer | None = None
-        self._renderer_key: tuple[int, bytes] | None = None  # model stamp and rest positions that the renderer is for
-        self._tried_key: tuple[int, bytes] | None = None  # the same of the last one begun, which may have failed
-        self._building: Future | None = None
-        self._worker = ThreadPoolExecutor(1)
+        self._bound: _Bound | None = None
+        self._background = Background()
+        self._failure = ""  # why the newest model is not shown
         self._pose: np.ndarray | None = None
         self._training_pose: np.ndarray | None = None
         self._info: CameraInfo | None = None
@@ -61,14 +78,14 @@ class RenderingNode(EndoNode):
         self.subscribe(messages.CONTROL_NODES, self._on_nodes, depth=1)
         self.subscribe(messages.CAMERA_POSE, self._on_camera, depth=1)
         self.subscribe(messages.LEFT_INFO, self._on_info, depth=1)
-        self._timer = self.create_timer(1.0 / self._options.rate, self._on_timer)
+        self._timer = self.every(1.0 / self._options.rate, self._on_timer)
 
     def config_changed(self, config: StageConfig) -> None:
         if isinstance(config, RenderingNodeConfig):
             self._options = config
             self._timer.timer_period_ns = int(1e9 / config.rate)
         else:
-            self._config, self._tried_key = config, None
+            self._config = config  # the timer binds the model anew
 
     # ------------------------------------------------------------------ input
 
@@ -76,19 +93,27 @@ class RenderingNode(EndoNode):
         messages.check_frame(message, (self._options.world_frame,), messages.GAUSSIANS.name)
         self._model = messages.decode_gaussians(message)
         self._model_stamp = messages.stamp_to_ns(message.header.stamp)
+        self._model_number += 1
 
     def _on_training_cameras(self, message: Any) -> None:
+        messages.check_frame(message, (self._options.world_frame,), messages.TRAINING_CAMERAS.name)
         poses = messages.decode_poses(message)
         self._training_pose = poses[len(poses) // 2] if len(poses) else None
         self._dirty = True
 
     def _on_training_info(self, message: Any) -> None:
-        self._training_info, self._dirty = messages.decode_camera_info(message, messages.TRAINING_CAMERA_INFO.name), True
+        self._training_info = _decode_info(message, messages.TRAINING_CAMERA_INFO.name)
+        self._dirty = True
 
     def _on_nodes(self, message: Any) -> None:
         messages.check_frame(message, (self._options.world_frame,), messages.CONTROL_NODES.name)
         nodes, old = messages.decode_control_nodes(message), self._nodes
-        same = old is not None and old.model_stamp_ns == nodes.model_stamp_ns and np.array_equal(old.positions, nodes.positions)
+        same = (
+            old is not None
+            and old.model_stamp_ns == nodes.model_stamp_ns
+            and np.array_equal(old.positions, nodes.positions)
+            and np.array_equal(old.F, nodes.F)
+        )
         self._nodes = nodes
         self._dirty |= not same
 
@@ -98,8 +123,10 @@ class RenderingNode(EndoNode):
         self._pose = pose
 
     def _on_info(self, message: Any) -> None:
-        info = messages.decode_camera_info(message)
-        same = self._info is not None and np.array_equal(info.P, self._info.P) and info.width == self._info.width
+        info, old = _decode_info(message, messages.LEFT_INFO.name), self._info
+        same = (
+            old is not None and np.array_equal(info.P, old.P) and (info.width, info.height) == (old.width, old.height)
+        )
         self._info, self._dirty = info, self._dirty or not same
 
     def _camera(self) -> Camera | None:
@@ -116,40 +143,38 @@ class RenderingNode(EndoNode):
         with self.guard("rendering"):
             self._build()
             camera = self._camera()
-            if self._renderer is None or camera is None:
+            if self._bound is None or camera is None:
                 return
             now = time.monotonic()
             if self._dirty or self._output is None:
                 self._dirty = False
-                self._output = self._render(self._renderer, self._renderer.camera(camera))
+                self._output = self._render(self._bound, self._bound.renderer.camera(camera))
                 self._seconds_per_image += 0.1 * (time.monotonic() - now - self._seconds_per_image)
             elif now - self._last_image < 1 / self._options.idle_rate - 0.5 / self._options.rate:
                 return
             self._last_image = now
             self._publish(*self._output)
 
-    def _wanted(self) -> tuple[int, bytes]:
-        """What the renderer should be for: the newest model, with its node set once that arrived."""
-        nodes = self._nodes
-        matching = nodes is not None and nodes.model_stamp_ns == self._model_stamp
-        return self._model_stamp, nodes.rest.tobytes() if matching else b""
-
     def _build(self) -> None:
-        """Bind Gaussians to nodes in the background; the previous picture stays meanwhile."""
-        if self._building is not None and self._building.done():
-            future, self._building = self._building, None
-            self._renderer = future.result()
-            self._renderer_key, self._dirty = self._tried_key, True
-        if self._building is None and self._model is not None and self._wanted() != self._tried_key:
-            self._tried_key = key = self._wanted()
-            model, config = self._model, self._config
-            rest = self._nodes.rest if key[1] else None
-            self._building = self._worker.submit(lambda: DeformableRenderer(model, rest, config))
+        """Bind the newest model to its control nodes in the background; the picture before stays meanwhile."""
+        try:
+            built = self._background.take()
+            if built is not None:
+                self._bound, self._dirty, self._failure = built[1], True, ""
+        except Exception as error:
+            self._failure = sentence("rendering", error)
+            self.report_error(self._failure)
+        if self._model is not None:
+            model, stamp, config = self._model, self._model_stamp, self._config
+            matching = self._nodes is not None and self._nodes.model_stamp_ns == stamp
+            rest = self._nodes.rest if matching else None  # without nodes the model is shown at rest
+            key = (self._model_number, rest.tobytes() if matching else b"", config)
+            self._background.want(key, lambda: _Bound(DeformableRenderer(model, rest, config), stamp, rest))
 
-    def _render(self, renderer: DeformableRenderer, camera: Camera) -> tuple[np.ndarray, np.ndarray, Camera]:
-        if self._renderer_key[1] and self._renderer_key == self._wanted():
-            return *renderer.render(camera, self._nodes.positions, self._nodes.F), camera
-        return *renderer.render(camera), camera
+    def _render(self, bound: _Bound, camera: Camera) -> tuple[np.ndarray, np.ndarray, Camera]:
+        if bound.follows(self._nodes):
+            return *bound.renderer.render(camera, self._nodes.positions, self._nodes.F), camera
+        return *bound.renderer.render(camera), camera
 
     def _publish(self, image: np.ndarray, depth: np.ndarray, camera: Camera) -> None:
         stamp, frame = self.now_ns(), self._options.camera_frame
@@ -170,13 +195,24 @@ class RenderingNode(EndoNode):
             "gaussians": len(self._model),
             "images": self._images,
             "milliseconds per image": f"{1e3 * self._seconds_per_image:.1f}",
-            "following control nodes": self._renderer_key is not None and self._renderer_key == self._wanted() and bool(self._renderer_key[1]),
+            "following control nodes": self._bound is not None and self._bound.follows(self._nodes),
         }
+        if self._failure:
+            return ERROR, self._failure, values
         return OK, "rendering", values
 
     def destroy_node(self) -> None:
-        self._worker.shutdown(wait=False, cancel_futures=True)
+        self._background.stop()
         super().destroy_node()
+
+
+def _decode_info(message: Any, topic: str) -> CameraInfo:
+    info = messages.decode_camera_info(message, topic)
+    if max(info.width, info.height) > _MAX_SIDE:
+        raise MessageError(
+            f"{topic}: images of {info.width}×{info.height} are too large to render; the limit is {_MAX_SIDE} a side"
+        )
+    return info
 
 
 def main() -> int:

@@ -7,9 +7,9 @@ import numpy as np
 
 from endo_sim_ros import messages
 from endo_sim_ros.cameras import Camera, invert_pose
-from endo_sim_ros.config import Range, StageConfig
+from endo_sim_ros.config import ConfigError, Range, StageConfig
 from endo_sim_ros.messages import ControlNodeCloud
-from endo_sim_ros.nodes.base import OK, WARN, EndoNode, run
+from endo_sim_ros.nodes.base import OK, WARN, EndoNode, arm_names, run
 
 _FOLLOWED = 8  # nodes around the grasped point whose movement carries the tip
 
@@ -28,6 +28,8 @@ class ScriptedToolConfig(StageConfig):
     """Where the tool takes hold, as a fraction of the image width."""
     v: Annotated[float, Range(0, 1)] = 0.5
     """Where the tool takes hold, as a fraction of the image height."""
+    listeners: Annotated[int, Range(0, 100)] = 1
+    """Subscribers of the wrench to wait for, so that none misses the beginning."""
     rate: Annotated[float, Range(1, 1000, "Hz")] = 50.0
     """Commands per second."""
     pull: Annotated[float, Range(0, 600, "s")] = 2.0
@@ -41,16 +43,22 @@ class ScriptedToolConfig(StageConfig):
 class ScriptedToolNode(EndoNode):
     """Publishes a tip pose and a wrench; begins when rendered depth and control nodes of the same scene exist."""
 
+    read_at_start = frozenset({"arm", "rate"})
+
     def __init__(self):
         super().__init__("scripted_tool")
         self._config = config = self.declare(ScriptedToolConfig)
-        self._pose_pub = self.publisher(messages.tool_pose(config.arm))
-        self._wrench_pub = self.publisher(messages.tool_wrench(config.arm))
+        names = arm_names(config.arm)
+        if len(names) != 1:
+            raise ConfigError(f"arm: expected one name, got {config.arm!r}")
+        self._pose_pub = self.publisher(messages.tool_pose(names[0]))
+        self._wrench_pub = self.publisher(messages.tool_wrench(names[0]))
         self._camera_pose: np.ndarray | None = None
         self._info: messages.CameraInfo | None = None
         self._depth: np.ndarray | None = None
         self._nodes: ControlNodeCloud | None = None
-        self._near: np.ndarray | None = None  # indices of the nodes that are followed
+        self._near = np.zeros(0, int)  # indices of the nodes that are followed; the stamp of their model:
+        self._near_stamp = 0
         self._tip = self._towards_camera = self._across = np.zeros(3)
         self._began: float | None = None
         self._state = "waiting for the rendered depth"
@@ -59,6 +67,9 @@ class ScriptedToolNode(EndoNode):
         self.subscribe(messages.RENDERED_DEPTH, self._on_depth, depth=1)
         self.subscribe(messages.CONTROL_NODES, self._on_nodes, depth=1)
         self.create_timer(1 / config.rate, self._on_timer)
+
+    def config_changed(self, config: ScriptedToolConfig) -> None:
+        self._config = config
 
     def _on_camera(self, message: Any) -> None:
         self._camera_pose = messages.decode_pose(message, self._config.world_frame, messages.RENDERED_POSE.name)
@@ -85,6 +96,9 @@ class ScriptedToolNode(EndoNode):
         """Choose the tissue point under the configured pixel."""
         if any(part is None for part in (self._camera_pose, self._info, self._depth, self._nodes)):
             return False
+        if self._wrench_pub.get_subscription_count() < self._config.listeners:
+            self._state = "waiting for somebody to feel the tool"
+            return False
         height, width = self._depth.shape
         camera = Camera(self._info.P[:, :3], width, height, self._camera_pose)
         row, column = min(int(self._config.v * height), height - 1), min(int(self._config.u * width), width - 1)
@@ -94,18 +108,22 @@ class ScriptedToolNode(EndoNode):
             return False
         row, column = seen[((seen - [row, column]) ** 2).sum(1).argmin()]  # the nearest pixel with tissue
         self._tip = camera.backproject(self._depth)[row, column]
-        self._near = np.argsort(np.linalg.norm(self._nodes.positions - self._tip, axis=1))[:_FOLLOWED]
+        self._follow(self._nodes.positions)
         self._towards_camera = camera.position - self._tip
         self._towards_camera /= np.linalg.norm(self._towards_camera)
         self._across = invert_pose(camera.pose)[0, :3]  # the image's x axis in the world
         return True
 
+    def _follow(self, positions: np.ndarray) -> None:
+        """Choose the nodes at the grasped point."""
+        self._near = np.argsort(np.linalg.norm(positions - self._tip, axis=1))[:_FOLLOWED]
+        self._near_stamp = self._nodes.model_stamp_ns
+
     def _publish(self, elapsed: float) -> None:
         config, stamp = self._config, self.now_ns()
-        if self._nodes is not None and len(self._nodes.rest) > self._near.max():
-            moved = (self._nodes.positions - self._nodes.rest)[self._near].mean(0)
-        else:
-            moved = np.zeros(3)
+        if self._nodes.model_stamp_ns != self._near_stamp:  # a new model has nodes of its own
+            self._follow(self._nodes.rest)
+        moved = (self._nodes.positions - self._nodes.rest)[self._near].mean(0)
         pose = np.eye(4)
         pose[:3, 3] = self._tip + moved
         force = self._force(elapsed)

@@ -1,5 +1,7 @@
 """The Gaussians that training starts from: depth back-projected from every view, checked between views."""
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
@@ -10,6 +12,14 @@ from endo_sim_ros.sequences.frames import Frame, SequenceError
 
 _OPACITY = 0.5
 _MIN_POINTS = 10
+
+
+class _Points(NamedTuple):
+    """Surface points with what a Gaussian needs."""
+
+    positions: np.ndarray  # [N, 3] m, world
+    colors: np.ndarray  # [N, 3] RGB in [0, 1]
+    spacing: np.ndarray  # [N] m, distance to the neighbours
 
 
 def initial_model(
@@ -24,70 +34,102 @@ def initial_model(
     Raises:
         SequenceError: If neither depth nor points give the scene a shape.
     """
-    dense = [_consistent_points(frames, index, config.depth_tolerance) for index in range(len(frames))]
-    dense_points = np.concatenate([p for p, _ in dense])
-    dense_colors = np.concatenate([c for _, c in dense])
-    if len(dense_points):
-        # Keep triangulated points only where the dense cloud leaves a hole.
-        spacing = _median_spacing(dense_points)
-        far = cKDTree(dense_points).query(points)[0] > 5 * spacing if len(points) else np.zeros(0, bool)
-        points, colors = points[far], colors[far]
-    points, colors = np.concatenate([dense_points, points]), np.concatenate([dense_colors, colors])
-    if len(points) < _MIN_POINTS:
+    chosen = _surface_pixels(frames, config.depth_tolerance)
+    stride = _stride(chosen, config.max_gaussians)
+    taken = [pixels & _lattice(pixels.shape, stride) for pixels in chosen]
+    parts = [_back_project(frames, i, pixels, stride, config.depth_tolerance) for i, pixels in enumerate(taken)]
+    parts.append(_in_holes(parts, points, colors))
+    positions, colors, spacing = (np.concatenate(arrays) for arrays in zip(*parts))
+    if len(positions) < _MIN_POINTS:
         raise SequenceError(
-            f"only {len(points)} scene points could be found in {len(frames)} views; give depth or a right image, "
+            f"only {len(positions)} scene points could be found in {len(frames)} views; give depth or a right image, "
             "views that overlap from different positions, or check the poses"
         )
-    points, colors = _thin(points, colors, config.max_gaussians)
-    spacing = cKDTree(points).query(points, k=min(4, len(points)))[0][:, 1:].mean(1)
-    spacing = np.minimum(spacing, 4 * np.median(spacing))  # a lone point must not cover the scene
-    tensor = lambda array: torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))  # noqa: E731
-    return GaussianModel.from_points(tensor(points), tensor(colors), tensor(spacing), _OPACITY, config.sh_degree)
+    arrays = (array[: config.max_gaussians] for array in (positions, colors, spacing))
+    tensors = [torch.from_numpy(array.astype(np.float32)) for array in arrays]
+    return GaussianModel.from_points(*tensors, _OPACITY, config.sh_degree)
 
 
-def _consistent_points(frames: list[Frame], index: int, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Back-projected pixels of one view that no other view contradicts.
+def _surface_pixels(frames: list[Frame], tolerance: float) -> list[np.ndarray]:
+    """Which pixels [H, W] of each view to back-project, so that every piece of surface is there once.
 
-    A view contradicts a point that floats in front of the surface it sees by more than the relative tolerance.
+    The view that sees a piece from nearest provides it. A pixel whose point floats in front of the surface that another
+    view sees, by more than the relative tolerance, is contradicted and left out.
     """
+    chosen = [np.zeros((frame.camera.height, frame.camera.width), bool) for frame in frames]
+    with_depth = [i for i, frame in enumerate(frames) if frame.depth is not None and (frame.depth > 0).any()]
+    fineness = {i: np.median(frames[i].depth[frames[i].depth > 0]) / frames[i].camera.K[0, 0] for i in with_depth}
+    done = []
+    for i in sorted(with_depth, key=fineness.get):
+        frame = frames[i]
+        pixels = (frame.depth > 0) & (True if frame.mask is None else frame.mask > 0)
+        points = frame.camera.backproject(frame.depth)[pixels]
+        keep = np.ones(len(points), bool)
+        for j in with_depth:
+            if j == i:
+                continue
+            z, surface, _ = _seen(frames[j], points)
+            keep &= ~((surface > 0) & (z < surface * (1 - tolerance)))
+            if j in done:
+                keep &= ~((surface > 0) & (z < surface * (1 + tolerance)))
+        chosen[i][pixels] = keep
+        done.append(i)
+    return chosen
+
+
+def _seen(frame: Frame, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of world points [N, 3] in a view: depth [N] (m), depth of the surface that it sees there (m, 0 = none), its RGB [N, 3]."""
+    uv, z = frame.camera.project(points)
+    u, v = np.floor(uv).T
+    inside = (z > 0) & (u >= 0) & (v >= 0) & (u < frame.camera.width) & (v < frame.camera.height)
+    surface, colors = np.zeros(len(points)), np.zeros((len(points), 3))
+    rows, columns = v[inside].astype(int), u[inside].astype(int)
+    surface[inside], colors[inside] = frame.depth[rows, columns], frame.image[rows, columns] / 255.0
+    return z, surface, colors
+
+
+def _stride(chosen: list[np.ndarray], limit: int) -> float:
+    """Smallest distance (pixels, at least 1) of a lattice that takes no more than ``limit`` of the chosen pixels."""
+    total = sum(int(pixels.sum()) for pixels in chosen)
+    stride = max((total / limit) ** 0.5, 1.0)
+    while sum(int((pixels & _lattice(pixels.shape, stride)).sum()) for pixels in chosen) > limit:
+        stride *= 1.01
+    return stride
+
+
+def _lattice(shape: tuple[int, int], stride: float) -> np.ndarray:
+    """A regular choice of pixels [H, W], one in every ``stride``² (not necessarily a whole number)."""
+    rows, columns = (np.diff(np.floor(np.arange(-1, n) / stride)) > 0 for n in shape)
+    return rows[:, None] & columns
+
+
+def _back_project(frames: list[Frame], index: int, pixels: np.ndarray, stride: float, tolerance: float) -> _Points:
+    """Points of the given pixels [H, W] of one view, with the mean colour of the views that see them.
+
+    The light moves with the endoscope: colours of one view alone would show where the next view's piece begins.
+    """
+    if not pixels.any():
+        return _Points(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
     frame = frames[index]
-    if frame.depth is None:
-        return np.empty((0, 3)), np.empty((0, 3))
-    valid = (frame.depth > 0) & (True if frame.mask is None else frame.mask > 0)
-    points, colors = frame.camera.backproject(frame.depth)[valid], frame.image[valid] / 255.0
-    keep = np.ones(len(points), bool)
-    for other in frames[:index] + frames[index + 1 :]:
-        if other.depth is None:
+    points, colors = frame.camera.backproject(frame.depth)[pixels], frame.image[pixels] / 255.0
+    count = np.ones((len(points), 1))
+    for j, other in enumerate(frames):
+        if j == index or other.depth is None:
             continue
-        uv, z = other.camera.project(points)
-        u, v = np.floor(uv).astype(int).T
-        seen = (z > 0) & (u >= 0) & (v >= 0) & (u < other.camera.width) & (v < other.camera.height)
-        surface = np.zeros(len(points))
-        surface[seen] = other.depth[v[seen], u[seen]]
-        keep &= ~((surface > 0) & (z < surface * (1 - tolerance)))
-    return points[keep], colors[keep]
+        z, surface, seen = _seen(other, points)
+        agrees = ((surface > 0) & (np.abs(z - surface) < tolerance * surface))[:, None]
+        colors, count = colors + agrees * seen, count + agrees
+    return _Points(points, colors / count, stride * frame.depth[pixels].astype(np.float64) / frame.camera.K[0, 0])
 
 
-def _median_spacing(points: np.ndarray) -> float:
-    sample = points[:: max(len(points) // 2000, 1)]
-    return float(np.median(cKDTree(points).query(sample, k=2)[0][:, 1]))
-
-
-def _thin(points: np.ndarray, colors: np.ndarray, limit: int) -> tuple[np.ndarray, np.ndarray]:
-    """Average points and colours in cubes, as small as the limit on their number allows."""
-    low, size = 0.0, float(np.ptp(points, axis=0).max()) or 1.0
-    origin = points.min(0)
-    for _ in range(20):  # bisection on the cube's size
-        middle = 0.5 * (low + size)
-        cells = np.unique(_cell_keys(points, origin, middle))
-        low, size = (low, middle) if len(cells) <= limit else (middle, size)
-    _, inverse, counts = np.unique(_cell_keys(points, origin, size), return_inverse=True, return_counts=True)
-    average = lambda values: np.stack(  # noqa: E731
-        [np.bincount(inverse, values[:, axis]) / counts for axis in range(3)], 1
-    )
-    return average(points), average(colors)
-
-
-def _cell_keys(points: np.ndarray, origin: np.ndarray, size: float) -> np.ndarray:
-    cells = np.minimum((points - origin) / size, 2**20).astype(np.int64)
-    return cells[:, 0] << 42 | cells[:, 1] << 21 | cells[:, 2]
+def _in_holes(parts: list[_Points], points: np.ndarray, colors: np.ndarray) -> _Points:
+    """The triangulated points that lie where the back-projected surface has a hole, or all if there is none."""
+    surface = np.concatenate([part.positions for part in parts])
+    if len(surface) and len(points):
+        distance, nearest = cKDTree(surface).query(points)
+        far = distance > 5 * np.concatenate([part.spacing for part in parts])[nearest]
+        points, colors = points[far], colors[far]
+    if len(points) < 2:
+        return _Points(points, colors, np.full(len(points), 1e-3))
+    spacing = cKDTree(points).query(points, k=min(4, len(points)))[0][:, 1:].mean(1)
+    return _Points(points, colors, np.minimum(spacing, 4 * np.median(spacing)))  # a lone point must not cover the scene

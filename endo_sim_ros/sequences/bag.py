@@ -1,13 +1,13 @@
 """Recordings as rosbag2 files (mcap, zstd chunks); no ROS installation is needed to read or write them."""
 
 import contextlib
-import struct
+import shutil
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, ReaderError, StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer, WriterError
 
 from endo_sim_ros import messages
 from endo_sim_ros.messages import Topic, bag_types
@@ -32,18 +32,24 @@ class BagWriter:
     What was written is kept, and readable, also when the block ends with an error.
 
     Raises:
-        SequenceError: If the path exists.
+        SequenceError: If the path exists or cannot be made.
+        OSError: If the disk is full.
     """
 
     def __init__(self, path: str | Path):
-        if Path(path).exists():
+        self.path = Path(path)
+        if self.path.exists():
             raise SequenceError(f"{path} exists already; choose another name or remove it first")
         self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
         self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
         self._connections: dict[str, Any] = {}
 
     def __enter__(self) -> "BagWriter":
-        self._writer.open()
+        try:
+            self._writer.open()
+        except (OSError, WriterError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise SequenceError(f"{self.path}: the bag cannot be made ({reason}); choose another place") from error
         return self
 
     def __exit__(self, *_: Any) -> None:
@@ -83,12 +89,19 @@ def _readable(path: str | Path) -> Iterator[None]:
     """Turn whatever a damaged bag raises into one sentence."""
     try:
         yield
-    except (SequenceError, GeneratorExit, KeyboardInterrupt):
+    except SequenceError:
         raise
     except FileNotFoundError:
-        raise SequenceError(f"{path}: no such bag; give a rosbag2 folder (with metadata.yaml) or an .mcap file") from None
-    except (ReaderError, AssertionError, OSError, KeyError, IndexError, TypeError, ValueError, EOFError, struct.error) as error:
-        raise SequenceError(f"{path}: the bag cannot be read ({type(error).__name__}: {error}); record or convert it again") from error
+        raise SequenceError(_no_bag(path)) from None
+    except Exception as error:  # random bytes find every one that parsers and decompressors know
+        reason = " ".join(str(error).split())
+        raise SequenceError(
+            f"{path}: the bag cannot be read ({type(error).__name__}: {reason}); record or convert it again"
+        ) from error
+
+
+def _no_bag(path: str | Path) -> str:
+    return f"{path}: no such bag; give a rosbag2 folder (with metadata.yaml) or an .mcap file"
 
 
 class BagReader:
@@ -101,7 +114,7 @@ class BagReader:
     def __init__(self, path: str | Path):
         self.path = Path(path)
         if not self.path.exists():
-            raise SequenceError(f"{path}: no such bag; give a rosbag2 folder (with metadata.yaml) or an .mcap file")
+            raise SequenceError(_no_bag(path))
         with _readable(path):
             self._reader = Reader(self.path)
 
@@ -152,7 +165,9 @@ class BagReader:
         for raw in self.raw_messages(wanted):
             topic = wanted[raw.topic]
             if raw.type != topic.type:
-                raise SequenceError(f"{self.path}: {raw.topic} is a {raw.type}, expected a {topic.type}; remap or convert it")
+                raise SequenceError(
+                    f"{self.path}: {raw.topic} is a {raw.type}, expected a {topic.type}; remap or convert it"
+                )
             with _readable(self.path):
                 message = bag_types().typestore.deserialize_cdr(raw.data, raw.type)
             yield topic, raw.stamp_ns, message
@@ -169,7 +184,9 @@ def write_bag(path: str | Path, frames: Iterable[Frame]) -> int:
         for frame in frames:
             stamp, camera = frame.stamp_ns, frame.camera
             size = (camera.width, camera.height)
-            bag.write(messages.LEFT_INFO, messages.encode_camera_info(camera.K, *size, stamp, LEFT_FRAME, types=types), stamp)
+            bag.write(
+                messages.LEFT_INFO, messages.encode_camera_info(camera.K, *size, stamp, LEFT_FRAME, types=types), stamp
+            )
             bag.write(messages.CAMERA_POSE, messages.encode_pose(camera.pose, stamp, WORLD_FRAME, types), stamp)
             bag.write(messages.LEFT_IMAGE, messages.encode_image(frame.image, stamp, LEFT_FRAME, types), stamp)
             if frame.right is not None:
@@ -178,11 +195,16 @@ def write_bag(path: str | Path, frames: Iterable[Frame]) -> int:
                 bag.write(messages.RIGHT_INFO, info, stamp)
                 bag.write(messages.RIGHT_IMAGE, messages.encode_image(frame.right, stamp, RIGHT_FRAME, types), stamp)
             if frame.depth is not None:
-                bag.write(messages.DEPTH, messages.encode_image(frame.depth.astype("float32"), stamp, LEFT_FRAME, types), stamp)
+                bag.write(
+                    messages.DEPTH,
+                    messages.encode_image(frame.depth.astype("float32"), stamp, LEFT_FRAME, types),
+                    stamp,
+                )
             if frame.mask is not None:
                 bag.write(messages.MASK, messages.encode_image(frame.mask, stamp, LEFT_FRAME, types), stamp)
             count += 1
     if not count:
+        shutil.rmtree(path)  # an empty bag would only be in the way of the next attempt
         raise SequenceError(f"{path}: the sequence has no frames; check its frame range and poses")
     return count
 
@@ -191,9 +213,10 @@ def read_bag(path: str | Path, tolerance: float = 0.01, world_frame: str = WORLD
     """Frames of a bag with the recording topics of the contract, in order.
 
     Raises:
-        SequenceError: If the bag is damaged or lacks images, camera_info or poses; the message lists what it has.
+        SequenceError: If the bag is damaged, lacks images, camera_info or poses (the message lists what it has), holds
+            a message that cannot be used, or gives no frame at all.
     """
-    synchronizer = Synchronizer(tolerance)
+    synchronizer, count = Synchronizer(tolerance), 0
     with BagReader(path) as bag:
         present = bag.topics
         needed = ((messages.LEFT_IMAGE, messages.LEFT_COMPRESSED), (messages.LEFT_INFO,), (messages.CAMERA_POSE,))
@@ -203,24 +226,41 @@ def read_bag(path: str | Path, tolerance: float = 0.01, world_frame: str = WORLD
                     f"{path}: no topic /{choices[0].name}; the bag has {', '.join(sorted(present)) or 'no topics'}"
                 )
         for topic, _, message in bag.messages(messages.RECORDING_TOPICS):
-            try:
-                yield from feed(synchronizer, topic, message, world_frame)
-            except messages.MessageError as error:
-                raise SequenceError(f"{path}: {error}") from error
-    yield from synchronizer.flush()
+            with _located(path):
+                frames = feed(synchronizer, topic, message, world_frame)
+            count += len(frames)
+            yield from frames
+    with _located(path):
+        frames = synchronizer.flush()
+    if not count + len(frames):
+        reasons = ", ".join(f"{number} {reason}" for reason, number in synchronizer.dropped.items() if number)
+        raise SequenceError(
+            f"{path}: no view in the bag ({reasons or 'no images'}); are image and pose stamps within {tolerance} s?"
+        )
+    yield from frames
+
+
+@contextlib.contextmanager
+def _located(path: str | Path) -> Iterator[None]:
+    """Put the name of the bag before what is wrong with a message in it."""
+    try:
+        yield
+    except (messages.MessageError, SequenceError) as error:
+        raise SequenceError(f"{path}: {error}") from error
 
 
 def feed(synchronizer: Synchronizer, topic: Topic, message: Any, world_frame: str) -> list[Frame]:
     """Decode one message of a recording topic into the synchroniser and return the frames that became complete."""
     stamp = messages.stamp_to_ns(message.header.stamp)
     if topic in (messages.LEFT_INFO, messages.RIGHT_INFO):
-        synchronizer.add_info("left" if topic is messages.LEFT_INFO else "right", messages.decode_camera_info(message, topic.name))
+        info = messages.decode_camera_info(message, topic.name)
+        synchronizer.add_info("left" if topic == messages.LEFT_INFO else "right", info)
         return []
-    if topic is messages.CAMERA_POSE:
+    if topic == messages.CAMERA_POSE:
         return synchronizer.add("pose", stamp, messages.decode_pose(message, world_frame, topic.name))
-    if topic is messages.DEPTH:
+    if topic == messages.DEPTH:
         return synchronizer.add("depth", stamp, messages.decode_depth(message, topic.name))
-    if topic is messages.MASK:
+    if topic == messages.MASK:
         return synchronizer.add("mask", stamp, messages.decode_mask(message, topic.name))
     stream = "image" if topic in (messages.LEFT_IMAGE, messages.LEFT_COMPRESSED) else "right"
     return synchronizer.add(stream, stamp, messages.decode_image(message, topic.name))

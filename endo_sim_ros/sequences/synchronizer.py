@@ -1,5 +1,6 @@
 """From separate streams (image, camera_info, pose, depth, …) to whole frames."""
 
+import bisect
 from typing import Any
 
 import numpy as np
@@ -10,14 +11,48 @@ from endo_sim_ros.sequences.frames import Frame, SequenceError
 
 STREAMS = ("image", "pose", "right", "depth", "mask")
 LAG = 2  # images to wait for streams that are just starting
-MAX_PENDING = 40  # images kept while an optional stream is silent
+MAX_PENDING = 40  # images kept while another stream is silent
+MAX_POSES, MAX_OTHERS = 10_000, 128  # messages of another stream kept while no image comes
+
+
+class _Stream:
+    """The messages of one stream that wait for their image, by stamp; beyond the limit the oldest go."""
+
+    def __init__(self, limit: int):
+        self.stamps: list[int] = []  # increasing
+        self.latest: int | None = None  # stamp that arrived last
+        self._values: dict[int, Any] = {}
+        self._limit = limit
+
+    def add(self, stamp: int, value: Any) -> None:
+        if stamp not in self._values:
+            bisect.insort(self.stamps, stamp)
+        self._values[stamp], self.latest = value, stamp
+        if len(self.stamps) > self._limit:
+            self.drop_before(self.stamps[1])
+
+    def pop(self, stamp: int) -> Any:
+        self.stamps.remove(stamp)
+        return self._values.pop(stamp)
+
+    def drop_before(self, stamp: int) -> None:
+        count = bisect.bisect_left(self.stamps, stamp)
+        for old in self.stamps[:count]:
+            del self._values[old]
+        del self.stamps[:count]
+
+    def nearest(self, stamp: int) -> tuple[int, Any] | None:
+        """Distance in stamps, and message, of the one nearest to a stamp."""
+        index = bisect.bisect_left(self.stamps, stamp)
+        near = min(self.stamps[max(index - 1, 0) : index + 1], key=lambda other: abs(other - stamp), default=None)
+        return None if near is None else (abs(near - stamp), self._values[near])
 
 
 class Synchronizer:
     """Matches the messages of a recording by stamp, exactly or to the nearest within a tolerance.
 
-    An image needs a pose; right image, depth and mask join where their streams exist. An image waits until each stream
-    that has spoken so far has either matched it or moved past it.
+    An image needs a camera_info and a pose; right image, depth and mask join where their streams exist. An image waits
+    until each stream that it needs or that has spoken so far has either matched it or moved past it.
 
     Args:
         tolerance: Largest difference between matched stamps, seconds.
@@ -26,10 +61,15 @@ class Synchronizer:
     def __init__(self, tolerance: float = 0.01):
         self.tolerance_ns = int(tolerance * 1e9)
         self._infos: dict[str, CameraInfo] = {}
-        self._waiting: dict[str, dict[int, Any]] = {name: {} for name in STREAMS}
-        self._newest: dict[str, int] = {}
+        self._streams = {name: _Stream(MAX_POSES if name == "pose" else MAX_OTHERS) for name in STREAMS}
         self._emitted = 0  # stamp of the last image that left
+        self._complete: list[Frame] = []
         self.dropped = {"without pose": 0, "without camera_info": 0, "out of order": 0, "invalid": 0}
+
+    @property
+    def pending(self) -> int:
+        """Number of images that wait, or that are complete and wait to be fetched."""
+        return len(self._streams["image"].stamps) + len(self._complete)
 
     def add_info(self, eye: str, info: CameraInfo) -> None:
         """Set the camera information of the ``left`` or ``right`` eye; the latest one counts."""
@@ -39,53 +79,59 @@ class Synchronizer:
         """Add one decoded message of a stream and return the frames that became complete, in order.
 
         Raises:
-            SequenceError: If a stamp is zero or an image cannot become a frame; that image is dropped, the rest goes on.
+            SequenceError: If a stamp is zero or an image cannot become a frame. That message is dropped; frames that
+                were complete before it come with the next call.
         """
         if stamp_ns <= 0:
             raise SequenceError(f"{stream}: a stamp of zero marks an invalid message; set header.stamp")
         if stream == "image" and stamp_ns <= self._emitted:
             self.dropped["out of order"] += 1
             return []
-        self._waiting[stream][stamp_ns] = value
-        self._newest[stream] = max(stamp_ns, self._newest.get(stream, 0))
+        self._streams[stream].add(stamp_ns, value)
         return self._collect(final=False)
 
     def flush(self) -> list[Frame]:
-        """The frames still waiting; call at the end of a recording."""
+        """The frames still waiting; call at the end of a recording, while `pending` where bad images may be among them.
+
+        Raises:
+            SequenceError: As `add`.
+        """
         return self._collect(final=True)
 
     def _collect(self, final: bool) -> list[Frame]:
-        frames = []
-        images = self._waiting["image"]
-        for stamp in sorted(images):
-            newer = sum(other > stamp for other in images)
-            if not final and newer < MAX_PENDING and (newer < LAG or not self._settled(stamp)):
-                break
-            image = images.pop(stamp)
-            self._emitted = stamp
-            frame = self._build(stamp, image)
+        images = self._streams["image"]
+        while images.stamps and (final or self._may_leave(images.stamps[0], len(images.stamps) - 1)):
+            self._emitted = images.stamps[0]
+            frame = self._build(self._emitted, images.pop(self._emitted))
             if frame is not None:
-                frames.append(frame)
-        return frames
+                self._complete.append(frame)
+        complete, self._complete = self._complete, []
+        return complete
+
+    def _may_leave(self, stamp: int, newer: int) -> bool:
+        """Whether an image need wait no longer, given the number of newer ones."""
+        return newer >= MAX_PENDING or newer >= LAG and "left" in self._infos and self._settled(stamp)
 
     def _settled(self, stamp: int) -> bool:
-        """Whether every stream that has spoken has matched this stamp or moved past it."""
-        return all(
-            self._match(name, stamp) is not None or self._newest[name] > stamp + self.tolerance_ns
-            for name in STREAMS[1:]
-            if name in self._newest
-        )
+        """Whether every stream that is needed or has spoken has matched this stamp or moved past it."""
+        for name in STREAMS[1:]:
+            latest = self._streams[name].latest
+            if latest is None:
+                if name == "pose":
+                    return False
+            elif latest <= stamp + self.tolerance_ns and self._match(name, stamp) is None:
+                return False
+        return True
 
-    def _match(self, stream: str, stamp: int) -> int | None:
-        """Stamp of the nearest waiting message within the tolerance."""
-        nearest = min(self._waiting[stream], key=lambda other: abs(other - stamp), default=None)
-        return nearest if nearest is not None and abs(nearest - stamp) <= self.tolerance_ns else None
+    def _match(self, stream: str, stamp: int) -> Any | None:
+        """The nearest waiting message within the tolerance."""
+        nearest = self._streams[stream].nearest(stamp)
+        return nearest[1] if nearest is not None and nearest[0] <= self.tolerance_ns else None
 
     def _build(self, stamp: int, image: np.ndarray) -> Frame | None:
-        parts = {name: self._waiting[name][key] for name in STREAMS[1:] if (key := self._match(name, stamp)) is not None}
+        parts = {name: part for name in STREAMS[1:] if (part := self._match(name, stamp)) is not None}
         for name in STREAMS[1:]:  # what lies further back can match no later image
-            for old in [key for key in self._waiting[name] if key < stamp - self.tolerance_ns]:
-                del self._waiting[name][old]
+            self._streams[name].drop_before(stamp - self.tolerance_ns)
         info = self._infos.get("left")
         missing = "camera_info" if info is None else "pose" if "pose" not in parts else None
         if missing:
@@ -98,7 +144,9 @@ class Synchronizer:
             raise SequenceError(str(error)) from error
 
 
-def _frame(stamp: int, image: np.ndarray, info: CameraInfo, right_info: CameraInfo | None, parts: dict[str, Any]) -> Frame:
+def _frame(
+    stamp: int, image: np.ndarray, info: CameraInfo, right_info: CameraInfo | None, parts: dict[str, Any]
+) -> Frame:
     for name, array in (("image", image), ("depth", parts.get("depth")), ("mask", parts.get("mask"))):
         if array is not None and array.shape[:2] != (info.height, info.width):
             raise SequenceError(
@@ -106,8 +154,12 @@ def _frame(stamp: int, image: np.ndarray, info: CameraInfo, right_info: CameraIn
                 f"{info.width}×{info.height}; publish both at the same size"
             )
     right = parts.get("right") if right_info is not None and right_info.baseline > 0 else None
-    if right is not None and right.shape != image.shape:
-        raise SequenceError(f"endoscope/right: the image is {right.shape[1]}×{right.shape[0]}, the left {image.shape[1]}×{image.shape[0]}")
+    if right is not None and not right.shape[:2] == image.shape[:2] == (right_info.height, right_info.width):
+        raise SequenceError(
+            f"endoscope/right: the image is {right.shape[1]}×{right.shape[0]}, its camera_info says "
+            f"{right_info.width}×{right_info.height} and the left image is {image.shape[1]}×{image.shape[0]}; "
+            "publish all at the same size"
+        )
     return Frame(
         stamp_ns=stamp,
         image=info.rectify(image),

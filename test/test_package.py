@@ -1,0 +1,128 @@
+"""The package as users install it: what lies where, and that it starts."""
+
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+NODES = ("reconstruction_node", "physics_node", "rendering_node", "bag_player_node")
+
+
+@pytest.fixture(scope="module")
+def prefix(tmp_path_factory) -> Path:
+    """The package alone, installed by pip into an empty prefix."""
+    target = tmp_path_factory.mktemp("prefix")
+    command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--prefix", str(target), "."]
+    source = tmp_path_factory.mktemp("source")
+    listing = subprocess.run(["git", "ls-files", "-co", "--exclude-standard"], cwd=ROOT, capture_output=True, text=True)
+    if listing.returncode:
+        pytest.skip("needs git to copy the source tree")
+    for name in listing.stdout.splitlines():
+        if (ROOT / name).is_file():
+            (source / name).parent.mkdir(parents=True, exist_ok=True)
+            (source / name).write_bytes((ROOT / name).read_bytes())
+            (source / name).chmod((ROOT / name).stat().st_mode)
+    done = subprocess.run(command, cwd=source, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return target
+
+
+def test_nodes_are_executables_where_ros2_run_looks(prefix):
+    for node in NODES:
+        path = prefix / "lib" / "endo_sim_ros" / node
+        assert path.is_file() and os.access(path, os.X_OK), node
+
+
+def test_ament_index_finds_the_package(prefix):
+    from ament_index_python.packages import get_package_prefix, get_package_share_directory
+
+    before = os.environ.get("AMENT_PREFIX_PATH")
+    os.environ["AMENT_PREFIX_PATH"] = str(prefix)
+    try:
+        assert Path(get_package_prefix("endo_sim_ros")) == prefix
+        share = Path(get_package_share_directory("endo_sim_ros"))
+    finally:
+        if before is None:
+            del os.environ["AMENT_PREFIX_PATH"]
+        else:
+            os.environ["AMENT_PREFIX_PATH"] = before
+    for name in ("package.xml", "msg_conventions.md", "config/endo_sim.yaml", "launch/endo_sim.launch.py"):
+        assert (share / name).is_file(), name
+
+
+@pytest.mark.parametrize("node", NODES)
+def test_installed_executable_starts_its_node(prefix, node):
+    """A parameter out of range makes it end at once, with the reason: proof that the node itself ran."""
+    site = next(prefix.glob("lib/python*/site-packages"))
+    paths = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    name = "rate" if node in ("bag_player_node", "rendering_node") else "iterations" if node[0] == "r" else "density"
+    value = "0" if name == "iterations" else "-1.0"
+    done = subprocess.run(
+        [str(prefix / "lib" / "endo_sim_ros" / node), "--ros-args", "-p", f"{name}:={value}"],
+        env={**os.environ, "PATH": paths, "PYTHONPATH": str(site)}, cwd="/", capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 2, done.stderr
+    assert name in done.stderr and "Traceback" not in done.stderr
+
+
+def test_command_line_is_installed(prefix):
+    assert os.access(prefix / "bin" / "endo-sim", os.X_OK)
+
+
+def test_package_xml_names_what_the_code_imports():
+    package = ElementTree.parse(ROOT / "package.xml").getroot()
+    assert package.get("format") == "3"
+    assert package.findtext("export/build_type") == "ament_python"
+    declared = {element.text for element in package.findall("exec_depend")}
+    imported = set()
+    for path in (ROOT / "endo_sim_ros").rglob("*.py"):
+        for line in path.read_text().splitlines():
+            words = line.split()
+            if len(words) > 1 and words[0] in ("import", "from"):
+                imported.add(words[1].split(".")[0])
+    from endo_sim_ros.messages import _PACKAGES
+
+    ros = {name for name in imported if name == "rclpy" or name.endswith(("_msgs", "_srvs", "_interfaces"))} | set(_PACKAGES)
+    assert ros <= declared, ros - declared
+
+
+def test_only_nodes_and_messages_know_ros():
+    for path in (ROOT / "endo_sim_ros").rglob("*.py"):
+        if "nodes" in path.parts or path.name == "messages.py":
+            continue
+        for line in path.read_text().splitlines():
+            assert not line.strip().startswith(("import rclpy", "from rclpy", "from sensor_msgs", "from geometry_msgs")), path
+
+
+def test_library_works_without_ros():
+    """Everything but the nodes imports with the ROS packages hidden."""
+    code = """
+import sys
+class Hide:
+    def find_spec(self, name, path=None, target=None):
+        if name.split('.')[0] in ('rclpy', 'sensor_msgs', 'geometry_msgs', 'std_msgs', 'diagnostic_msgs', 'builtin_interfaces'):
+            raise ImportError(name)
+sys.meta_path.insert(0, Hide())
+import endo_sim_ros.cli, endo_sim_ros.rendering, endo_sim_ros.physics, endo_sim_ros.evaluation.held_out
+import endo_sim_ros.sequences.readers, endo_sim_ros.sequences.bag
+from endo_sim_ros import messages
+messages.encode_pose(__import__('numpy').eye(4), 1, 'world', messages.bag_types())
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+
+
+def test_launch_file_is_valid():
+    path = ROOT / "launch" / "endo_sim.launch.py"
+    compile(path.read_text(), str(path), "exec")
+    if importlib.util.find_spec("launch_ros") is None:
+        pytest.skip("launch_ros is not installed; the launch file was compiled only")
+    spec = importlib.util.spec_from_file_location("endo_sim_launch", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    assert len(module.generate_launch_description().entities) == 6

@@ -173,16 +173,16 @@ def _tracked(frames: Iterable[Frame], text: str) -> Iterable[Frame]:
 
 def main() -> int:
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    command = tyro.extras.subcommand_cli_from_dict(
-        COMMANDS, prog="endo-sim", description="Endoscope recordings become tissue that a robot can touch."
-    )
     start = time.monotonic()
     try:
+        command = tyro.extras.subcommand_cli_from_dict(
+            COMMANDS, prog="endo-sim", description="Endoscope recordings become tissue that a robot can touch."
+        )
         command.run()
     except KeyboardInterrupt:
         return 130
     except (SequenceError, MessageError, ModelError, ConfigError, RuntimeError, ValueError, OSError) as error:
-        print(f"endo-sim: {error}", file=sys.stderr)
+        print(f"endo-sim: {str(error) or type(error).__name__}", file=sys.stderr)
         return 1
     logging.getLogger(__name__).info("done in %.0f s", time.monotonic() - start)
     return 0

@@ -14,6 +14,9 @@ from endo_sim_ros.nodes.base import ERROR, OK, EndoNode, run, sentence
 from endo_sim_ros.sequences.bag import BagReader
 from endo_sim_ros.sequences.frames import SequenceError
 
+_DEPTH = 100  # messages kept for a subscriber whose connection is still being made
+_SETTLED = 1.0  # seconds without a new subscriber after which everybody is taken to be there
+
 
 @dataclass(frozen=True)
 class BagPlayerConfig(StageConfig):
@@ -87,7 +90,7 @@ class BagPlayerNode(EndoNode):
                 if name == DIAGNOSTICS.name:
                     continue  # the states of nodes that ran then would be taken for those of nodes that run now
                 try:
-                    publishers[name] = self.publisher(topic)
+                    publishers[name] = self.publisher(topic, depth=_DEPTH)
                 except MessageError as error:
                     self.get_logger().warning(f"{name} is not replayed: {error}")
             if not publishers:
@@ -101,11 +104,16 @@ class BagPlayerNode(EndoNode):
                     return
 
     def _await_subscribers(self, publishers: dict) -> None:
+        """Wait for somebody to listen, and then until nobody new has come for a while: discovery takes its time, and
+        the topics of one listener are found one after another."""
         self._state = "waiting for subscribers"
         deadline = time.monotonic() + self._config.wait_for_subscribers
+        counts, since = None, 0.0
         while not self._stopped and time.monotonic() < deadline:
-            if any(publisher.get_subscription_count() for publisher in publishers.values()):
-                self._stop.wait(0.5)  # the other topics of the same listener are found a little later
+            found = [publisher.get_subscription_count() for publisher in publishers.values()]
+            if found != counts:
+                counts, since = found, time.monotonic()
+            elif any(found) and time.monotonic() - since > _SETTLED:
                 return
             self._stop.wait(0.05)
 

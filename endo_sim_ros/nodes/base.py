@@ -113,8 +113,8 @@ class EndoNode(Node):
 
     # ----------------------------------------------------------------- topics
 
-    def publisher(self, topic: Topic) -> Any:
-        return self.create_publisher(messages.ros_class(topic.type), topic.name, quality(topic))
+    def publisher(self, topic: Topic, depth: int = STREAM_DEPTH) -> Any:
+        return self.create_publisher(messages.ros_class(topic.type), topic.name, quality(topic, depth))
 
     def subscribe(
         self, topic: Topic, callback: Callable[[Any], None], depth: int = STREAM_DEPTH, reliable: bool = True

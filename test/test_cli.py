@@ -1,0 +1,98 @@
+"""The commands as a user types them."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+from endo_sim_ros.gaussians import load_ply
+from endo_sim_ros.sequences.bag import read_bag
+
+ROOT = Path(__file__).parents[1]
+
+
+def endo_sim(*arguments, timeout: float = 120) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-m", "endo_sim_ros.cli", *map(str, arguments)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=timeout)
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("bags") / "patient"
+    done = endo_sim("phantom", path, "--frames", 10, "--width", 128, "--height", 96)
+    assert done.returncode == 0, done.stderr
+    assert "10 frames" in done.stdout
+    return path
+
+
+def test_bag_is_read_by_the_authors_of_the_format(bag):
+    """The mcap library and its ROS 2 decoder see the same bytes as our reader."""
+    frame = next(iter(read_bag(bag)))
+    found = {}
+    with next(bag.glob("*.mcap")).open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        assert {chunk.compression for chunk in reader.get_summary().chunk_indexes} == {"zstd"}
+        for _, channel, _, message in reader.iter_decoded_messages():
+            found.setdefault(channel.topic, message)
+    image = found["/endoscope/left/image_raw"]
+    pixels = np.frombuffer(image.data, np.uint8).reshape(image.height, image.width, 3)
+    np.testing.assert_array_equal(pixels, frame.image)
+    assert found["/endoscope/right/camera_info"].p[3] == pytest.approx(-frame.camera.K[0, 0] * frame.baseline)
+    position = found["/ECM/measured_cp"].pose.position
+    np.testing.assert_allclose([position.x, position.y, position.z], frame.camera.position)
+
+
+def test_reconstruct_writes_a_model_and_measures_held_out_views(bag, tmp_path):
+    out = tmp_path / "result"
+    done = endo_sim("reconstruct", bag, out, "--iterations", 80, "--max-gaussians", 4000, "--keyframes", 4, "--device", "cpu")
+    assert done.returncode == 0, done.stderr
+    psnr = float(next(line for line in done.stderr.splitlines() if line.startswith("PSNR [dB]")).split()[-1])
+    assert 18 < psnr < 45
+    assert 1000 < len(load_ply(out / "model.ply")) <= 4000
+    assert (out / "checkpoint.pt").is_file()
+    assert cv2.imread(str(out / "held_out.png")).std() > 10
+
+
+@pytest.mark.parametrize(
+    "arguments, sentence",
+    [
+        (("convert", "no/such/thing", "out"), "no/such/thing: no such file or folder"),
+        (("convert", "docs", "out"), "no known layout recognised"),
+        (("reconstruct", "no_bag", "out"), "no_bag: no such bag"),
+        (("phantom", "README.md"), "README.md exists already"),
+        (("phantom", "out", "--frames", "0"), r"PhantomConfig.frames must lie in \[1, 100000\], got 0"),
+        (("demo", "--bag", "no_bag"), "no_bag: no such bag"),
+    ],
+)
+def test_mistakes_are_one_sentence(arguments, sentence, tmp_path):
+    extra = ("--out", tmp_path) if arguments[0] == "demo" else ()
+    done = endo_sim(*arguments, *extra)
+    assert done.returncode != 0
+    assert "Traceback" not in done.stderr
+    text = " ".join((done.stderr + done.stdout).replace("│", " ").split())
+    assert re.search(sentence, text), text
+    assert not (ROOT / "out" / "metadata.yaml").exists()
+
+
+def test_demo_runs_the_whole_graph_and_leaves_its_results(tmp_path):
+    options = {"--frames": 14, "--width": 128, "--iterations": 60, "--timeout": 240, "--force": 1.0}
+    done = endo_sim("demo", "--out", tmp_path, *(word for pair in options.items() for word in pair), timeout=280)
+    assert done.returncode == 0, done.stderr + done.stdout
+    video = cv2.VideoCapture(str(tmp_path / "touch.mp4"))
+    assert video.get(cv2.CAP_PROP_FRAME_COUNT) > 100 and video.get(cv2.CAP_PROP_FPS) == 25
+    frames = [video.read()[1].astype(int) for _ in range(100)]
+    assert np.abs(frames[0] - frames[60]).mean() > 1  # the tissue moved
+    sheet = cv2.imread(str(tmp_path / "contact_sheet.png"))
+    assert sheet.shape[1] == 3 * 128 and sheet.std() > 10
+    assert len(load_ply(tmp_path / "model.ply")) > 1000
+    with next((tmp_path / "recording").glob("*.mcap")).open("rb") as file:
+        summary = make_reader(file).get_summary()
+        counts = {summary.channels[i].topic: n for i, n in summary.statistics.channel_message_counts.items()}
+    for topic in ("gaussians", "control_nodes", "PSM1/body/servo_cf", "PSM1/body/measured_cf", "rendered/image_raw", "diagnostics"):
+        assert counts[f"/{topic}"] > 0, topic

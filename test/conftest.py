@@ -1,10 +1,42 @@
 """Every test process has a graph of its own, on this machine only, and quiet kernels."""
 
 import os
+import time
 
+# Set before anything starts ROS; processes that a test starts inherit it.
 os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+os.environ.setdefault("FASTDDS_BUILTIN_TRANSPORTS", "DEFAULT")  # finds late joiners soonest; test messages are small
 
+import pytest  # noqa: E402
 import torch  # noqa: E402
 
 torch.set_num_threads(1)
+
+
+def wait_until(condition, seconds, what, step=lambda: time.sleep(0.02)):
+    """Repeat a step until a condition is true and return its value; fail with `what` was awaited after some seconds."""
+    deadline = time.monotonic() + seconds
+    while not (value := condition()):
+        if time.monotonic() > deadline:
+            pytest.fail(f"waited {seconds} s in vain for {what() if callable(what) else what}")
+        step()
+    return value
+
+
+@pytest.fixture(scope="session")
+def small_frames():
+    """Twelve small views of a synthetic patient with stereo, depth and mask."""
+    from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
+
+    return list(phantom_sequence(PhantomConfig(frames=12, width=96, height=80, border=0.05)))
+
+
+@pytest.fixture(scope="session")
+def small_bag(small_frames, tmp_path_factory):
+    """The same as a bag."""
+    from endo_sim_ros.sequences.bag import write_bag
+
+    path = tmp_path_factory.mktemp("bags") / "small"
+    write_bag(path, small_frames)
+    return path

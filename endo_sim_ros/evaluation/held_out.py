@@ -3,13 +3,12 @@
 import logging
 from pathlib import Path
 
-import cv2
 import numpy as np
 from rich.progress import Progress as ProgressBar
 
 from endo_sim_ros.evaluation import figures, metrics
 from endo_sim_ros.gaussians import GaussianModel, save_ply
-from endo_sim_ros.reconstruction import Progress, ReconstructionConfig, Trainer, select_keyframes
+from endo_sim_ros.reconstruction import Progress, ReconstructionConfig, Trainer, select_keyframes, shrink
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.bag import read_bag
 from endo_sim_ros.sequences.frames import Frame
@@ -35,9 +34,10 @@ def reconstruct_and_measure(bag: Path, out: Path, config: ReconstructionConfig) 
         model = trainer.run(on_progress)
     save_ply(model, out / "model.ply")
     trainer.save_checkpoint(out / "checkpoint.pt")
-    held_out = [frame for index, frame in enumerate(frames) if index not in chosen]
+    held_out = [shrink(frame, config.image_width) for index, frame in enumerate(frames) if index not in chosen]
+    held_out = [frame for frame in held_out if frame.mask is None or frame.mask.any()]
     if not held_out:
-        log.info("every view was trained on; lower keyframes to hold some out")
+        log.info("no view was held out that shows tissue; lower keyframes")
         return {}
     figures_of, pictures = _measure(model, held_out, config)
     figures.write_png(out / "held_out.png", figures.sheet(pictures, columns=4))
@@ -51,23 +51,15 @@ def _measure(model: GaussianModel, frames: list[Frame], config: ReconstructionCo
     rows, pictures = [], []
     shown = {int(i) for i in np.linspace(0, len(frames) - 1, min(_STRIPS, len(frames)))}
     for index, frame in enumerate(frames):
-        camera = frame.camera
-        if camera.width > config.image_width:
-            camera = camera.resized(config.image_width, round(camera.height * config.image_width / camera.width))
-        size = (camera.width, camera.height)
-        image, depth = renderer.render(camera)
-        reference = cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
-        mask = None if frame.mask is None else cv2.resize(frame.mask, size, interpolation=cv2.INTER_NEAREST)
-        if mask is not None and not mask.any():
-            continue
+        mask, reference = frame.mask, frame.image
+        image, depth = renderer.render(frame.camera)
         row = {
             "PSNR [dB]": metrics.psnr(image, reference, mask),
             "PSNR, gain fitted [dB]": metrics.psnr(metrics.gain_fitted(image, reference, mask), reference, mask),
             "SSIM": metrics.ssim(image, reference, mask),
         }
         if frame.depth is not None:
-            true_depth = cv2.resize(frame.depth, size, interpolation=cv2.INTER_NEAREST)
-            row["depth RMSE [mm]"] = 1e3 * metrics.depth_rmse(depth, true_depth, mask)
+            row["depth RMSE [mm]"] = 1e3 * metrics.depth_rmse(depth, frame.depth, mask)
         rows.append(row)
         if index in shown:
             difference = np.abs(image.astype(int) - reference).clip(0, 85).astype(np.uint8) * 3
@@ -77,5 +69,6 @@ def _measure(model: GaussianModel, frames: list[Frame], config: ReconstructionCo
                 ("difference × 3", difference),
                 ("rendered depth", figures.color_depth(depth)),
             ]
-    means = {name: float(np.mean([row[name] for row in rows if name in row])) for name in rows[0]}
+    names = dict.fromkeys(name for row in rows for name in row)  # each once, in order
+    means = {name: float(np.nanmean([row.get(name, np.nan) for row in rows])) for name in names}
     return means | {"held-out views": float(len(rows))}, pictures

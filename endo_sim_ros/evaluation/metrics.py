@@ -22,14 +22,21 @@ def gain_fitted(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | Non
 
 
 def ssim(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Mean structural similarity (11×11 Gaussian window, σ 1.5, no padding) of images [H, W, 3] uint8."""
+    """Mean structural similarity (11×11 Gaussian window, σ 1.5, mirrored borders) of images [H, W, 3] uint8.
+
+    Pixels where the mask [H, W] is 0 are black in both images and not in the mean; NaN if that leaves none.
+    """
     x, y = image.astype(np.float64) / 255, reference.astype(np.float64) / 255
-    blur = lambda a: cv2.GaussianBlur(a, (11, 11), 1.5)[5:-5, 5:-5]  # noqa: E731
+    if mask is not None:
+        x, y = x * (mask > 0)[..., None], y * (mask > 0)[..., None]
+    blur = lambda a: cv2.GaussianBlur(a, (11, 11), 1.5, borderType=cv2.BORDER_REFLECT_101)
     mu_x, mu_y = blur(x), blur(y)
     var_x, var_y, cov = blur(x * x) - mu_x**2, blur(y * y) - mu_y**2, blur(x * y) - mu_x * mu_y
     c1, c2 = 0.01**2, 0.03**2
     values = (2 * mu_x * mu_y + c1) * (2 * cov + c2) / ((mu_x**2 + mu_y**2 + c1) * (var_x + var_y + c2))
-    return float(values.mean() if mask is None else values[mask[5:-5, 5:-5] > 0].mean())
+    if mask is not None:
+        values = values[mask > 0]
+    return float(values.mean()) if values.size else float("nan")
 
 
 def depth_rmse(depth: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:

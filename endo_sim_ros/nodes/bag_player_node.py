@@ -15,7 +15,7 @@ from endo_sim_ros.sequences.bag import BagReader
 from endo_sim_ros.sequences.frames import SequenceError
 
 _DEPTH = 100  # messages kept for a subscriber whose connection is still being made
-_SETTLED = 1.0  # seconds without a new subscriber after which everybody is taken to be there
+_SETTLED = 3.5  # seconds without a new subscriber after which all are there: processes announce themselves every 3
 
 
 @dataclass(frozen=True)

@@ -300,15 +300,10 @@ def run(node_class: Callable[[], EndoNode]) -> int:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # an impatient second one must not cut short what follows
         if node is not None:
             node.destroy_node()
-    deadline = time.monotonic() + _END_WITHIN
-    workers = [thread for thread in threading.enumerate() if thread is not threading.main_thread()]
-    for thread in workers:
-        thread.join(max(0.0, deadline - time.monotonic()))
-    if any(thread.is_alive() for thread in workers):
-        # Compiled code cannot be interrupted: it would delay the end of the process, or crash in it.
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(status)
+    # Python waits for worker threads, and compiled code in them cannot be interrupted: give it a few seconds.
+    watchdog = threading.Timer(_END_WITHIN, os._exit, [status])
+    watchdog.daemon = True
+    watchdog.start()
     return status
 
 

@@ -36,11 +36,18 @@ def graph_environment() -> dict[str, str]:
 class NodeProcess:
     """One node in its own process, with its output in a log file."""
 
-    def __init__(self, name: str, parameters: dict[str, Any], environment: dict[str, str], log: Path):
+    def __init__(
+        self,
+        name: str,
+        parameters: dict[str, Any],
+        environment: dict[str, str],
+        log: Path,
+        ros_arguments: tuple[str, ...] = (),
+    ):
         self.name, self.log = name, log
         arguments = [sys.executable, "-m", f"endo_sim_ros.nodes.{name}"]
-        if parameters:
-            arguments.append("--ros-args")
+        if parameters or ros_arguments:
+            arguments += ["--ros-args", *ros_arguments]
         for key, value in parameters.items():
             text = str(value).lower() if isinstance(value, bool) else str(value)
             arguments += ["-p", f"{key}:={text}"]
@@ -55,9 +62,12 @@ class NodeProcess:
         """None while the node runs."""
         return self._process.poll()
 
-    def interrupt(self) -> None:
+    def send_signal(self, number: int) -> None:
         if self.exit_status is None:
-            self._process.send_signal(signal.SIGINT)
+            self._process.send_signal(number)
+
+    def interrupt(self) -> None:
+        self.send_signal(signal.SIGINT)
 
     def wait(self, seconds: float = _STOP_AFTER) -> int:
         """Exit status; a node that does not end in time is killed."""
@@ -82,8 +92,10 @@ class NodeGroup:
     def __exit__(self, *_: Any) -> None:
         self.stop()
 
-    def start(self, name: str, **parameters: Any) -> NodeProcess:
-        node = NodeProcess(name, parameters, self.environment, self._log_folder / f"{name}.log")
+    def start(self, name: str, *ros_arguments: str, **parameters: Any) -> NodeProcess:
+        """Start a node, or another one in its place, with parameters and arguments such as ``-r __ns:=/left``."""
+        log = self._log_folder / f"{name}.log"
+        node = NodeProcess(name, parameters, self.environment, log, ros_arguments)
         self.nodes[name] = node
         return node
 

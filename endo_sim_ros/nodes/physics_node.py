@@ -59,8 +59,9 @@ class PhysicsNode(EndoNode):
         self._simulated_stamp = 0  # stamp of the simulated model
         self._model: GaussianModel | None = None  # the newest; its stamp, number, and time of arrival:
         self._model_stamp, self._model_number, self._model_came = 0, 0, 0.0
-        self._views: np.ndarray | None = None  # positions [V, 3] of the newest training cameras; their stamp:
-        self._views_stamp = 0
+        self._views: np.ndarray | None = None  # positions [V, 3] of the newest training cameras that were any
+        self._views_stamp: int | None = None  # stamp of the newest training_cameras, and whether there were any:
+        self._views_given = False
         self._camera_position: np.ndarray | None = None
         self._background = Background()
         self._failure = ""  # why the newest model is not simulated
@@ -98,8 +99,10 @@ class PhysicsNode(EndoNode):
 
     def _on_training_cameras(self, message: Any) -> None:
         messages.check_frame(message, (self._options.world_frame,), messages.TRAINING_CAMERAS.name)
-        self._views = messages.decode_poses(message)[:, :3, 3]
-        self._views_stamp = messages.stamp_to_ns(message.header.stamp)
+        poses = messages.decode_poses(message)
+        self._views_stamp, self._views_given = messages.stamp_to_ns(message.header.stamp), len(poses) > 0
+        if self._views_given:
+            self._views = poses[:, :3, 3]
 
     def _on_camera(self, message: Any) -> None:
         pose = messages.decode_pose(message, self._options.world_frame, messages.CAMERA_POSE.name)
@@ -108,13 +111,13 @@ class PhysicsNode(EndoNode):
     def _viewpoint(self) -> tuple[str, np.ndarray | None]:
         """Where the tissue was seen from, and whose place that is: the model's own cameras, else wherever the camera is
         now, else the cameras of an earlier model."""
-        views = self._views if self._views is not None and len(self._views) else None
-        if self._views is not None and self._views_stamp == self._model_stamp:
-            if views is not None:
-                return "own cameras", views
-        elif time.monotonic() - self._model_came < _CAMERAS_LATE:
+        if self._views_stamp == self._model_stamp and self._views_given:
+            return "own cameras", self._views
+        if self._views_stamp != self._model_stamp and time.monotonic() - self._model_came < _CAMERAS_LATE:
             return "", None
-        return ("camera", self._camera_position) if self._camera_position is not None else ("earlier cameras", views)
+        if self._camera_position is not None:
+            return "camera", self._camera_position
+        return "earlier cameras", self._views
 
     def _build(self) -> None:
         """Build a simulation of the newest model in the background; the old one goes on meanwhile."""

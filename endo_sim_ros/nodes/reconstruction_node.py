@@ -167,7 +167,7 @@ class ReconstructionNode(EndoNode):
         self._trained = (self._frames[0].stamp_ns, self._frames[-1].stamp_ns)
         self._progress, self._saved, self._failure = None, "", ""
         self._cancel.clear()
-        self._thread = threading.Thread(target=self._train, args=(views, self._config), daemon=True)
+        self._thread = threading.Thread(target=self._train, args=(views, self._config))
         self._thread.start()
         self.get_logger().info(f"reconstructing from {len(views)} of {len(self._frames)} views")
 

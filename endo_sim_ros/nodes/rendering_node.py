@@ -98,8 +98,8 @@ class RenderingNode(EndoNode):
     def _on_training_cameras(self, message: Any) -> None:
         messages.check_frame(message, (self._options.world_frame,), messages.TRAINING_CAMERAS.name)
         poses = messages.decode_poses(message)
-        self._training_pose = poses[len(poses) // 2] if len(poses) else None
-        self._dirty = True
+        if len(poses):  # a model from a file has none; then those before are better than nothing
+            self._training_pose, self._dirty = poses[len(poses) // 2], True
 
     def _on_training_info(self, message: Any) -> None:
         self._training_info = _decode_info(message, messages.TRAINING_CAMERA_INFO.name)

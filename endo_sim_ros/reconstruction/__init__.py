@@ -2,6 +2,6 @@
 
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.keyframes import select_keyframes
-from endo_sim_ros.reconstruction.trainer import Progress, Trainer
+from endo_sim_ros.reconstruction.trainer import Progress, Trainer, shrink
 
-__all__ = ["Progress", "ReconstructionConfig", "Trainer", "select_keyframes"]
+__all__ = ["Progress", "ReconstructionConfig", "Trainer", "select_keyframes", "shrink"]

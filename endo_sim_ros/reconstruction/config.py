@@ -20,15 +20,16 @@ class ReconstructionConfig(StageConfig):
     """Largest number of Gaussians."""
     sh_degree: Annotated[int, Range(0, 3)] = 0
     """Degree of the spherical harmonics; 0 is the paper's frequency regularisation."""
-    depth: Literal["auto", "topic", "stereo", "none"] = "auto"
-    """Depth prior: the depth topic, matching with the right image, none, or the first of these that exists."""
+    depth: Literal["auto", "topic", "stereo", "points", "none"] = "auto"
+    """Depth prior: the depth topic, matching with the right image, interpolation between triangulated points, none, or
+    the first of these that exists."""
     depth_tolerance: Annotated[float, Range(0.001, 1)] = 0.05
     """Relative depth difference at which two views contradict each other."""
     lambda_ssim: Annotated[float, Range(0, 1)] = 0.2
     """Share of 1 − SSIM in the photometric loss; the rest is L1."""
-    lambda_depth: Annotated[float, Range(0, 1000)] = 0.5
+    lambda_depth: Annotated[float, Range(0, 1000)] = 1.0
     """Weight of the depth loss, in units of the scene's median depth (paper eq. 4)."""
-    lambda_dist: Annotated[float, Range(0, 1000)] = 1.0
+    lambda_dist: Annotated[float, Range(0, 1000)] = 0.1
     """Weight of the distortion loss, in units of the scene's median depth (paper eq. 5)."""
     lambda_tv: Annotated[float, Range(0, 1000)] = 0.5
     """Weight of the total variation of the rendered depth, in units of the scene's median depth (paper eq. 6)."""

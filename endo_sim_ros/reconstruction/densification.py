@@ -1,6 +1,7 @@
 """Where Gaussians are needed: a capped Markov chain Monte Carlo strategy (Kheradmand et al. 2024, 3DGS-MCMC).
 
-Dead Gaussians move to live ones, and new ones are born there, such that the rendered image stays the same; noise explores.
+Dead Gaussians move to live ones, and new ones are born there, such that the rendered image stays the same; noise
+explores.
 """
 
 import math

@@ -5,6 +5,8 @@ import logging
 
 import cv2
 import numpy as np
+from scipy.interpolate import LinearNDInterpolator
+from scipy.spatial import Delaunay, cKDTree
 
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.sequences.frames import Frame, SequenceError
@@ -12,7 +14,9 @@ from endo_sim_ros.sequences.frames import Frame, SequenceError
 log = logging.getLogger(__name__)
 
 _NEAREST = 0.02  # metres; closer than an endoscope works
-_MIN_POINTS = 30  # points needed to trust an offset
+_MIN_POINTS = 30  # points needed to trust an offset or an interpolation
+_NEIGHBOURS = 8  # points around a point that it is compared with
+_DISAGREEMENT = 0.1  # largest relative difference from them
 
 
 def with_depth_prior(frames: list[Frame], points: np.ndarray, config: ReconstructionConfig) -> list[Frame]:
@@ -22,8 +26,9 @@ def with_depth_prior(frames: list[Frame], points: np.ndarray, config: Reconstruc
 
     Args:
         frames: Training views, best at full size: disparities are as precise as the pixels are fine.
-        points: Triangulated scene points [N, 3] (m, world), used to find a constant disparity offset of stereo matching.
-        config: ``depth`` names the source; ``auto`` takes the depth topic, else stereo, else none.
+        points: Triangulated scene points [N, 3] (m, world), to interpolate between, or to find a constant disparity
+            offset of stereo matching.
+        config: ``depth`` names the source; ``auto`` takes the depth topic, else stereo, else the points.
 
     Raises:
         SequenceError: If the source asked for is not in the recording.
@@ -32,18 +37,42 @@ def with_depth_prior(frames: list[Frame], points: np.ndarray, config: Reconstruc
     has_stereo = any(frame.right is not None for frame in frames)
     source = config.depth
     if source == "auto":
-        source = "topic" if has_topic else "stereo" if has_stereo else "none"
+        source = "topic" if has_topic else "stereo" if has_stereo else "points"
     if source == "topic" and not has_topic:
-        raise SequenceError("depth=topic, but no view has a depth image; publish endoscope/left/depth or use depth=auto")
+        raise SequenceError("depth=topic, but no view has a depth image; publish endoscope/left/depth or use auto")
     if source == "stereo" and not has_stereo:
         raise SequenceError("depth=stereo, but no view has a right image; publish endoscope/right/* or use depth=auto")
     if source == "none":
         return [dataclasses.replace(frame, depth=None) for frame in frames]
+    if source == "points":
+        return [_with_depth(frame, interpolated_depth(frame, points)) for frame in frames]
     if source == "topic":
         return [_with_depth(frame, frame.depth) for frame in frames]
     disparities = [None if frame.right is None else stereo_disparity(frame) for frame in frames]
     offset = disparity_offset(frames, disparities, points)
     return [_with_depth(f, None if d is None else _to_depth(f, d, offset)) for f, d in zip(frames, disparities)]
+
+
+def interpolated_depth(frame: Frame, points: np.ndarray) -> np.ndarray | None:
+    """Depth [H, W] (m, 0 outside their hull) interpolated between the triangulated points seen in a view; None if few.
+
+    Linear in inverse depth, which keeps planes flat. A point that disagrees with its neighbours in the image is a wrong
+    match or hidden from this view, and left out.
+    """
+    uv, z = frame.camera.project(points)
+    inside = (z > _NEAREST) & (uv >= 0).all(1) & (uv < [frame.camera.width, frame.camera.height]).all(1)
+    uv, inverse = np.unique(uv[inside], axis=0, return_index=True)
+    inverse = 1 / z[inside][inverse]
+    if len(uv) < _MIN_POINTS:
+        return None
+    neighbours = cKDTree(uv).query(uv, k=_NEIGHBOURS + 1)[1][:, 1:]
+    agrees = np.abs(inverse / np.median(inverse[neighbours], axis=1) - 1) < _DISAGREEMENT
+    uv, inverse = uv[agrees], inverse[agrees]
+    if len(uv) < _MIN_POINTS or np.linalg.matrix_rank(uv - uv.mean(0), tol=1.0) < 2:
+        return None
+    v, u = np.mgrid[: frame.camera.height, : frame.camera.width] + 0.5
+    values = LinearNDInterpolator(Delaunay(uv), inverse, fill_value=np.inf)(u, v)
+    return (1 / values).astype(np.float32)
 
 
 def _with_depth(frame: Frame, depth: np.ndarray | None) -> Frame:
@@ -62,11 +91,13 @@ def stereo_disparity(frame: Frame) -> np.ndarray:
     shift = 0.0 if frame.right_K is None else frame.camera.K[0, 2] - frame.right_K[0, 2]
     levels = int(np.ceil((fx * frame.baseline / _NEAREST + abs(shift)) / 16)) * 16
     levels = min(levels, max(width // 2 // 16, 1) * 16)
-    settings = dict(blockSize=5, P1=8 * 25, P2=32 * 25, uniquenessRatio=5, speckleWindowSize=100, speckleRange=2)
-    matcher = cv2.StereoSGBM_create(minDisparity=0, numDisparities=levels, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY, **settings)
+    matcher = cv2.StereoSGBM_create(
+        minDisparity=0, numDisparities=levels, blockSize=5, P1=8 * 25, P2=32 * 25, uniquenessRatio=5,
+        speckleWindowSize=100, speckleRange=2, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+    )  # fmt: skip
     # The matcher skips as many columns on the left as it has levels: let those be padding.
-    pad = lambda image: cv2.copyMakeBorder(image, 0, 0, levels, 0, cv2.BORDER_REPLICATE)  # noqa: E731
-    match = lambda a, b: matcher.compute(pad(a), pad(b))[:, levels:].astype(np.float32) / 16  # noqa: E731
+    pad = lambda image: cv2.copyMakeBorder(image, 0, 0, levels, 0, cv2.BORDER_REPLICATE)
+    match = lambda a, b: matcher.compute(pad(a), pad(b))[:, levels:].astype(np.float32) / 16
     left, right = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (frame.image, frame.right))
     disparity = match(left, right)
     # The right image's own disparity, by matching the mirrored pair, must lead back to the same pixel.
@@ -100,7 +131,8 @@ def disparity_offset(frames: list[Frame], disparities: list[np.ndarray | None], 
     spread = 1.4826 * float(np.median(np.abs(residual - offset)))
     if abs(offset) < max(0.25, 3 * spread / np.sqrt(len(residual))):
         return 0.0
-    log.info("stereo disparity shifted by %.2f pixels to agree with the poses (%d points, scatter %.2f)", offset, len(residual), spread)
+    text = "stereo disparity shifted by %.2f pixels to agree with the poses (%d points, scatter %.2f)"
+    log.info(text, offset, len(residual), spread)
     return offset
 
 

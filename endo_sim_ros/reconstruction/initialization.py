@@ -78,7 +78,7 @@ def _surface_pixels(frames: list[Frame], tolerance: float) -> list[np.ndarray]:
 
 
 def _seen(frame: Frame, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of world points [N, 3] in a view: depth [N] (m), depth of the surface that it sees there (m, 0 = none), its RGB [N, 3]."""
+    """Depth [N] (m) of points [N, 3] in a view; depth (0 = none) and RGB [N, 3] of the surface that it sees there."""
     uv, z = frame.camera.project(points)
     u, v = np.floor(uv).T
     inside = (z > 0) & (u >= 0) & (v >= 0) & (u < frame.camera.width) & (v < frame.camera.height)

@@ -24,7 +24,7 @@ def masked_mean(values: Tensor, mask: Tensor | None) -> Tensor:
 
 
 def photometric(image: Tensor, target: Tensor, mask: Tensor | None, lambda_ssim: float) -> Tensor:
-    """(1 − λ)·L1 + λ·(1 − SSIM), the loss of vanilla 3DGS. Masked pixels are set equal in both images, so they add nothing."""
+    """(1 − λ)·L1 + λ·(1 − SSIM), the loss of vanilla 3DGS. Masked pixels, equal in both, add nothing."""
     if image.shape != target.shape:
         raise ValueError(f"photometric: image shape {tuple(image.shape)} != target shape {tuple(target.shape)}")
     if mask is not None:
@@ -42,7 +42,7 @@ def depth_l1(depth: Tensor, prior: Tensor, mask: Tensor | None) -> Tensor:
 
 
 def total_variation(depth: Tensor, mask: Tensor | None) -> Tensor:
-    """Mean absolute difference of neighbouring depths, metres (paper eq. 6); pairs across a mask's edge do not count."""
+    """Mean absolute difference of neighbour depths, metres (paper eq. 6); pairs across a mask's edge do not count."""
     dx, dy = (depth[:, 1:] - depth[:, :-1]).abs(), (depth[1:] - depth[:-1]).abs()
     if mask is None:
         return dx.mean() + dy.mean()
@@ -50,7 +50,7 @@ def total_variation(depth: Tensor, mask: Tensor | None) -> Tensor:
 
 
 def ssim(image: Tensor, target: Tensor) -> Tensor:
-    """Structural similarity map [H, W, 3] (Wang et al. 2004; 11×11 window, σ 1.5, zero padding), differentiable in ``image``."""
+    """Structural similarity map [H, W, 3] (Wang et al. 2004; 11×11, σ 1.5, zeros around); gradient in ``image``."""
     return _Ssim.apply(image, target)
 
 

@@ -7,7 +7,7 @@ import pickle
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -27,9 +27,12 @@ from endo_sim_ros.splatting import RenderOutput, rasterize
 
 log = logging.getLogger(__name__)
 
-# Learning rates of 3DGS; that of the means is in units of the scene's depth and decays to a hundredth.
-_RATES = {"means": 1.6e-4, "quats": 1e-3, "log_scales": 5e-3, "logit_opacities": 5e-2, "sh": 2.5e-3}
-_NOISE = 5e5  # of 3DGS-MCMC, in units of the means' learning rate
+# Learning rates of 3DGS, those of sizes and colours raised for a tenth of its iterations. That of the means is in units
+# of the scene's depth and decays to a hundredth.
+_RATES = {
+    "means": 1.6e-4, "quats": 1e-3, "log_scales": 2e-2, "logit_opacities": 5e-2, "sh_base": 1e-2, "sh_rest": 1.25e-4,
+}  # fmt: skip
+_NOISE = 5e5  # of 3DGS-MCMC, in units of the means' learning rate, for a scene of depth 1
 _LAST_REFINEMENT = 0.8  # share of the iterations after which the number of Gaussians stays fixed
 
 
@@ -77,7 +80,8 @@ class Trainer:
         model = initial_model(frames, points, colors, config)
         self._views = [self._to_device(frame) for frame in frames]
         self._nearest = _nearest_views(frames)
-        self.scene_depth = self._median_depth(frames, model)
+        self.scene_depth = _median_depth(frames, model)
+        self._stamps = [frame.stamp_ns for frame in frames]
         self.iteration = 0
         self._generator = torch.Generator().manual_seed(config.seed)
         self._order: list[int] = []
@@ -89,7 +93,7 @@ class Trainer:
     @property
     def model(self) -> GaussianModel:
         """The current model, detached."""
-        return GaussianModel(**{name: tensor.detach().clone() for name, tensor in self._parameters.items()})
+        return GaussianModel(**{name: tensor.detach().clone() for name, tensor in self._current().tensors().items()})
 
     @property
     def cameras(self) -> list[Camera]:
@@ -105,8 +109,9 @@ class Trainer:
         path = Path(path)
         state = {
             "config": dataclasses.asdict(self.config),
+            "stamps": self._stamps,
             "iteration": self.iteration,
-            "parameters": {name: tensor.detach() for name, tensor in self._parameters.items()},
+            "model": self.model.tensors(),
             "optimizer": self._optimizer.state_dict(),
             "generator": self._generator.get_state(),
             "order": self._order,
@@ -120,14 +125,21 @@ class Trainer:
         """Continue from a checkpoint of the same views and options.
 
         Raises:
-            SequenceError: If the file is not a checkpoint.
+            SequenceError: If the file is not a checkpoint, or one of other views or options.
         """
         try:
             state = torch.load(path, map_location=self.device, weights_only=True)
-            self._set_model(GaussianModel(**state["parameters"]))
+            mine = dataclasses.asdict(self.config)
+            differing = [name for name in mine if name != "device" and mine[name] != state["config"].get(name)]
+            if differing or state["stamps"] != self._stamps:
+                what = f"other options ({', '.join(differing)})" if differing else "other views"
+                raise SequenceError(f"{path}: the checkpoint was made with {what}; use the same or start anew")
+            self._set_model(GaussianModel(**state["model"]))
             self._optimizer.load_state_dict(state["optimizer"])
             self._generator.set_state(state["generator"].cpu())
             self.iteration, self._order = state["iteration"], list(state["order"])
+        except SequenceError:
+            raise
         except (OSError, KeyError, TypeError, ValueError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
             raise SequenceError(f"{path}: not a readable checkpoint ({error})") from error
 
@@ -137,9 +149,9 @@ class Trainer:
         """Train to the end; ``on_progress`` is called every few iterations and may return False to stop early."""
         while self.iteration < self.config.iterations:
             self.step()
-            if on_progress and (self.iteration % every == 0 or self.iteration == self.config.iterations):
-                if on_progress(self.progress) is False:
-                    break
+            due = self.iteration % every == 0 or self.iteration == self.config.iterations
+            if on_progress and due and on_progress(self.progress) is False:
+                break
         return self.model
 
     def step(self) -> None:
@@ -165,9 +177,9 @@ class Trainer:
             self._explore()
 
     def _render(self, viewmat: Tensor, K: Tensor, camera: Camera, masks: Tensor | None = None) -> RenderOutput:
-        p = self._parameters
+        model = self._current()
         return rasterize(
-            p["means"], p["quats"], p["log_scales"].exp(), p["logit_opacities"].sigmoid(), p["sh"],
+            model.means, model.quats, model.scales, model.opacities, model.sh,
             viewmat, K, camera.width, camera.height, masks=masks,
         )  # fmt: skip
 
@@ -178,7 +190,8 @@ class Trainer:
         output = self._render(view.viewmat, view.K, view.camera, masks)
         loss = losses.photometric(output.colors[0], view.image, view.mask, config.lambda_ssim)
         if view.depth is not None and config.lambda_depth:
-            loss = loss + config.lambda_depth / self.scene_depth * losses.depth_l1(output.depths[0], view.depth, view.mask)
+            error = losses.depth_l1(output.depths[0], view.depth, view.mask)
+            loss = loss + config.lambda_depth / self.scene_depth * error
         return loss + self._regularization(output, view.mask)
 
     def _virtual_loss(self, index: int) -> Tensor:
@@ -199,11 +212,17 @@ class Trainer:
 
     def _set_model(self, model: GaussianModel) -> None:
         """Start optimising a model with a fresh optimiser."""
-        self._parameters = {name: tensor.clone().requires_grad_() for name, tensor in model.tensors().items()}
-        groups = [
-            {"params": [self._parameters[name]], "lr": rate * self.config.learning_rate} for name, rate in _RATES.items()
-        ]
+        tensors = model.tensors() | {"sh_base": model.sh[:, :1], "sh_rest": model.sh[:, 1:]}
+        self._parameters = {name: tensors[name].clone().requires_grad_() for name in _RATES if tensors[name].numel()}
+        factor = self.config.learning_rate
+        groups = [{"params": [tensor], "lr": factor * _RATES[name]} for name, tensor in self._parameters.items()]
         self._optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True)
+
+    def _current(self) -> GaussianModel:
+        """The model made of the parameters, through which gradients flow."""
+        p = self._parameters
+        sh = torch.cat([p["sh_base"], p["sh_rest"]], 1) if "sh_rest" in p else p["sh_base"]
+        return GaussianModel(p["means"], p["quats"], p["log_scales"], p["logit_opacities"], sh)
 
     def _refine(self) -> None:
         """Relocate and add Gaussians, carrying the optimiser's state of those that stay."""
@@ -220,18 +239,20 @@ class Trainer:
             self._optimizer.state[group["params"][0]] = moved
 
     def _explore(self) -> None:
-        model = GaussianModel(**self._parameters)
+        """Move faint Gaussians about at random."""
+        model = self._current()
         faint = (model.opacities < 10 * densification.DEAD_OPACITY).nonzero()[:, 0]
         if len(faint):
             model = model.select(faint)
-            scale = _NOISE * self._optimizer.param_groups[0]["lr"]
+            # Variances are in m²: divided by the squared depth of the scene, steps are those of a scene of depth 1.
+            scale = _NOISE * self._optimizer.param_groups[0]["lr"] / self.scene_depth**2
             noise = densification.exploration_noise(model, scale, self._generator)
             self._parameters["means"][faint] += noise
 
     # --------------------------------------------------------------- inputs
 
     def _to_device(self, frame: Frame) -> _View:
-        tensor = lambda array: torch.as_tensor(array, dtype=torch.float32).to(self.device)  # noqa: E731
+        tensor = lambda array: torch.tensor(array, dtype=torch.float32, device=self.device)
         camera = frame.camera
         return _View(
             camera,
@@ -242,13 +263,12 @@ class Trainer:
             None if frame.mask is None or frame.mask.all() else tensor(frame.mask > 0),
         )
 
-    def _median_depth(self, frames: list[Frame], model: GaussianModel) -> float:
-        points = model.means.numpy().astype(np.float64)
-        depths = np.concatenate([frame.camera.project(points)[1] for frame in frames])
-        depths = depths[depths > 0]
-        if not len(depths):
-            raise SequenceError("all scene points lie behind every camera; poses must be camera-to-world, optical frame")
-        return float(np.median(depths))
+
+def _median_depth(frames: list[Frame], model: GaussianModel) -> float:
+    """Median depth of the Gaussians in front of the views, metres."""
+    points = model.means.numpy().astype(np.float64)
+    depths = np.concatenate([frame.camera.project(points)[1] for frame in frames])
+    return float(np.median(depths[depths > 0]))
 
 
 def shrink(frame: Frame, width: int) -> Frame:
@@ -260,7 +280,7 @@ def shrink(frame: Frame, width: int) -> Frame:
     if camera.width <= width:
         return frame
     size = (width, max(round(camera.height * width / camera.width), 1))
-    average = lambda image: cv2.resize(image, size, interpolation=cv2.INTER_AREA)  # noqa: E731
+    average = lambda image: cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     scale = np.diag([size[0] / camera.width, size[1] / camera.height, 1])
     return dataclasses.replace(
         frame,
@@ -270,7 +290,7 @@ def shrink(frame: Frame, width: int) -> Frame:
         right_K=None if frame.right_K is None else scale @ frame.right_K,
         # Plain INTER_NEAREST takes the corner instead of the centre.
         depth=None if frame.depth is None else cv2.resize(frame.depth, size, interpolation=cv2.INTER_NEAREST_EXACT),
-        mask=None if frame.mask is None else np.where(average(np.float32(frame.mask > 0)) > 0.999, 255, 0).astype(np.uint8),
+        mask=None if frame.mask is None else np.uint8(255) * (average(np.float32(frame.mask > 0)) > 0.999),
     )
 
 

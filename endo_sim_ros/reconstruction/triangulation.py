@@ -1,7 +1,5 @@
 """Sparse scene points from matched features of posed views."""
 
-import itertools
-
 import cv2
 import numpy as np
 
@@ -43,8 +41,7 @@ def _pairs(frames: list[Frame]) -> list[tuple[int, int]]:
     centres = np.array([frame.camera.position for frame in frames])
     distance = np.linalg.norm(centres[:, None] - centres, axis=2)
     nearest = np.argsort(distance, axis=1, kind="stable")[:, : _NEIGHBOURS + 1]
-    pairs = itertools.chain.from_iterable(((min(i, j), max(i, j)) for j in row if j != i) for i, row in enumerate(nearest))
-    return sorted({(int(i), int(j)) for i, j in pairs})
+    return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(nearest) for j in row if j != i})
 
 
 def _intersect(first: Frame, second: Frame, uv1: np.ndarray, uv2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,65 @@
+"""Image and depth measures against torchmetrics and by hand."""
+
+import numpy as np
+import pytest
+import torch
+from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
+
+from endo_sim_ros.evaluation import metrics
+
+
+@pytest.fixture
+def pair():
+    """Two alike RGB images [41, 57, 3] uint8."""
+    rng = np.random.default_rng(0)
+    x, y = np.meshgrid(np.linspace(0, 6, 57), np.linspace(0, 5, 41))
+    clean = 120 + 80 * np.stack([np.sin(x + y), np.cos(2 * x), np.sin(x * y)], -1)
+    return tuple((clean + rng.normal(0, 12, clean.shape)).clip(0, 255).astype(np.uint8) for _ in range(2))
+
+
+def planes(image):
+    return torch.from_numpy(image).permute(2, 0, 1)[None].double() / 255
+
+
+def test_psnr_is_that_of_torchmetrics(pair):
+    expected = peak_signal_noise_ratio(planes(pair[0]), planes(pair[1]), data_range=1.0)
+    assert metrics.psnr(*pair) == pytest.approx(float(expected), abs=1e-4)
+
+
+def test_ssim_is_that_of_torchmetrics(pair):
+    expected = structural_similarity_index_measure(planes(pair[0]), planes(pair[1]), data_range=1.0, sigma=1.5)
+    assert metrics.ssim(*pair) == pytest.approx(float(expected), abs=1e-4)
+
+
+def test_equal_images_score_best(pair):
+    assert metrics.psnr(pair[0], pair[0]) > 100
+    assert metrics.ssim(pair[0], pair[0]) == pytest.approx(1)
+
+
+def test_masked_pixels_do_not_count(pair):
+    image, reference = (x.copy() for x in pair)
+    mask = np.full(image.shape[:2], 255, np.uint8)
+    mask[:, 20:] = 0
+    before = metrics.psnr(image, reference, mask), metrics.ssim(image, reference, mask)
+    image[:, 20:] = 0  # also within the window of pixels that count
+    assert metrics.psnr(image, reference, mask) == before[0]
+    assert metrics.ssim(image, reference, mask) == pytest.approx(before[1], abs=1e-12)
+    inside = metrics.psnr(image[:, :20], reference[:, :20])
+    assert metrics.psnr(image, reference, mask) == pytest.approx(inside)
+
+
+def test_ssim_of_an_empty_mask_is_nan(pair):
+    assert np.isnan(metrics.ssim(*pair, np.zeros(pair[0].shape[:2], np.uint8)))
+
+
+def test_gain_fit_undoes_an_exposure_per_channel(pair):
+    reference = pair[0].astype(np.float64)
+    darker = reference * [0.5, 0.8, 0.9]
+    np.testing.assert_allclose(metrics.gain_fitted(darker, reference), reference, atol=1e-9)
+
+
+def test_depth_rmse_counts_pixels_that_have_both_depths():
+    depth, reference = np.full((2, 2), 0.1, np.float32), np.float32([[0.103, 0.0], [0.096, 0.2]])
+    mask = np.uint8([[255, 255], [255, 0]])
+    assert metrics.depth_rmse(depth, reference, mask) == pytest.approx(np.sqrt((0.003**2 + 0.004**2) / 2), rel=1e-5)
+    assert np.isnan(metrics.depth_rmse(depth, np.zeros_like(depth)))

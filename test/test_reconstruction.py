@@ -1,0 +1,584 @@
+"""From sparse views to a model: every part by itself, then short trainings on the phantom."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torchmetrics.functional.image import structural_similarity_index_measure
+
+from endo_sim_ros.cameras import Camera, look_at
+from endo_sim_ros.evaluation import metrics
+from endo_sim_ros.evaluation.held_out import reconstruct_and_measure
+from endo_sim_ros.gaussians import GaussianModel
+from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer, densification, losses, select_keyframes, shrink
+from endo_sim_ros.reconstruction.depth import disparity_offset, interpolated_depth, stereo_disparity, with_depth_prior
+from endo_sim_ros.reconstruction.initialization import initial_model
+from endo_sim_ros.reconstruction.triangulation import triangulate
+from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
+from endo_sim_ros.sequences.bag import write_bag
+from endo_sim_ros.sequences.frames import Frame, SequenceError
+from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
+from endo_sim_ros.splatting import render
+
+NO_POINTS = (np.empty((0, 3)), np.empty((0, 3)))
+
+
+def film(width, height, count):
+    return tuple(phantom_sequence(PhantomConfig(width=width, height=height, frames=count)))
+
+
+@pytest.fixture(scope="module")
+def small():
+    """Nine frames of the phantom, 160×128, with exact depth and stereo."""
+    return film(160, 128, 9)
+
+
+@pytest.fixture(scope="module")
+def large():
+    """Four frames of the phantom, 640×512, for matching."""
+    return film(640, 512, 4)
+
+
+def options(**changes):
+    short = {"iterations": 12, "max_gaussians": 2000, "refine_every": 5, "device": "cpu"}
+    return ReconstructionConfig(**(short | changes))
+
+
+def bare(frame, **changes):
+    """The frame without any depth."""
+    nothing = {"depth": None, "right": None, "baseline": None, "right_K": None}
+    return dataclasses.replace(frame, **(nothing | changes))
+
+
+def equal(first: GaussianModel, second: GaussianModel) -> bool:
+    return all(torch.equal(a, b) for a, b in zip(first.tensors().values(), second.tensors().values()))
+
+
+def held_out(model, frames):
+    """Mean PSNR (dB) and depth error (m) over frames."""
+    renderer = DeformableRenderer(model, None, RenderingConfig(device="cpu"))
+    rows = []
+    for frame in frames:
+        image, depth = renderer.render(frame.camera)
+        rows.append([metrics.psnr(image, frame.image), metrics.depth_rmse(depth, frame.depth)])
+    return np.mean(rows, 0)
+
+
+# ----------------------------------------------------------------------------------------------- losses
+
+
+def reference_ssim(x, y):
+    """The SSIM map [H, W, 3] in plain torch, zero padding."""
+    t = torch.arange(11, dtype=x.dtype) - 5
+    g = torch.exp(-(t**2) / 4.5)
+    window = torch.outer(g, g)[None, None] / g.sum() ** 2
+    blur = lambda a: torch.nn.functional.conv2d(a.permute(2, 0, 1)[:, None], window, padding=5)[:, 0].permute(1, 2, 0)
+    mx, my = blur(x), blur(y)
+    vx, vy, cov = blur(x * x) - mx**2, blur(y * y) - my**2, blur(x * y) - mx * my
+    c1, c2 = 1e-4, 9e-4
+    return (2 * mx * my + c1) * (2 * cov + c2) / ((mx**2 + my**2 + c1) * (vx + vy + c2))
+
+
+@pytest.fixture
+def images():
+    generator = torch.Generator().manual_seed(0)
+    return tuple(torch.rand(37, 29, 3, generator=generator, dtype=torch.float64) for _ in range(3))
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-10), (torch.float32, 2e-4)])
+def test_ssim_and_its_gradient_are_those_of_the_reference(images, dtype, tolerance):
+    x, y, v = images
+    y = 0.7 * x + 0.3 * y
+    ours, exact = x.clone().to(dtype).requires_grad_(), x.clone().requires_grad_()
+    value, expected = losses.ssim(ours, y.to(dtype)), reference_ssim(exact, y)
+    torch.testing.assert_close(value.double(), expected, atol=tolerance, rtol=0)
+    value.backward(v.to(dtype))
+    expected.backward(v)
+    assert exact.grad.abs().max() > 0.1
+    torch.testing.assert_close(ours.grad.double(), exact.grad, atol=10 * tolerance, rtol=0)
+
+
+def test_ssim_is_that_of_torchmetrics_away_from_the_border(images):
+    x, y = (image.permute(2, 0, 1)[None] for image in images[:2])
+    _, full = structural_similarity_index_measure(x, y, data_range=1.0, return_full_image=True)
+    ours = losses.ssim(*images[:2])
+    torch.testing.assert_close(ours[5:-5, 5:-5], full[0].permute(1, 2, 0)[5:-5, 5:-5], atol=1e-6, rtol=0)
+
+
+def test_photometric_loss_of_constant_images_by_hand():
+    image, target = torch.full((20, 20, 3), 0.5), torch.full((20, 20, 3), 0.3)
+    assert float(losses.photometric(image, target, None, 0.0)) == pytest.approx(0.2)
+    expected = 0.8 * 0.2 + 0.2 * float(1 - losses.ssim(image, target).mean())
+    assert float(losses.photometric(image, target, None, 0.2)) == pytest.approx(expected, rel=1e-5)
+
+
+def test_masked_pixels_have_no_part_in_the_photometric_loss(images):
+    image, target = images[0].float().requires_grad_(), images[1].float()
+    mask = torch.zeros(37, 29)
+    mask[:, :15] = 1
+    loss = losses.photometric(image, target, mask, 0.2)
+    loss.backward()
+    assert image.grad[:, 15:].abs().max() == 0
+    assert image.grad[:, :15].abs().max() > 0
+    other = torch.where(mask[..., None] > 0, images[0].float(), 9.0)
+    assert float(losses.photometric(other, target, mask, 0.2)) == float(loss.detach())
+
+
+def test_masked_mean_counts_channels_and_survives_an_empty_mask():
+    values = torch.tensor([[[1.0, 3.0], [9.0, 9.0]]])  # [1, 2, 2]
+    assert float(losses.masked_mean(values, torch.tensor([[1.0, 0.0]]))) == 2
+    assert float(losses.masked_mean(values, torch.zeros(1, 2))) == 0
+    with pytest.raises(ValueError, match="do not fit the mask"):
+        losses.masked_mean(values, torch.ones(2, 2))
+
+
+def test_depth_loss_by_hand():
+    depth, prior = torch.tensor([[0.10, 0.20, 0.30]]), torch.tensor([[0.13, 0.0, 0.29]])
+    assert float(losses.depth_l1(depth, prior, None)) == pytest.approx(0.02)
+    assert float(losses.depth_l1(depth, prior, torch.tensor([[1.0, 1.0, 0.0]]))) == pytest.approx(0.03)
+
+
+def test_total_variation_by_hand():
+    depth = torch.tensor([[1.0, 2.0, 4.0], [1.0, 1.0, 1.0]])
+    # Differences along rows: 1, 2, 0, 0; along columns: 0, 1, 3.
+    assert float(losses.total_variation(depth, None)) == pytest.approx(3 / 4 + 4 / 3)
+    mask = torch.tensor([[1.0, 1.0, 0.0], [1.0, 1.0, 1.0]])
+    assert float(losses.total_variation(depth, mask)) == pytest.approx(1 / 3 + 1 / 2)
+
+
+# -------------------------------------------------------------------------------------------- keyframes
+
+
+def blank(pose, size=(32, 24), **changes):
+    width, height = size
+    K = np.array([[30.0, 0, width / 2], [0, 30.0, height / 2], [0, 0, 1]])
+    image = np.full((height, width, 3), 90, np.uint8)
+    return Frame(1, image, Camera(K, width, height, pose), **changes)
+
+
+def at(x):
+    pose = np.eye(4)
+    pose[0, 3] = x
+    return pose
+
+
+def test_keyframes_hold_the_ends_and_spread():
+    frames = [blank(at(x)) for x in (0, 0.001, 0.002, 0.05, 0.051, 0.1)]
+    assert select_keyframes(frames, 2) == [0, 5]
+    assert select_keyframes(frames, 3) == [0, 3, 5]
+    assert select_keyframes(frames, 1) == [0]
+    assert select_keyframes(frames, 99) == list(range(6))
+    assert select_keyframes([], 3) == []
+
+
+def test_keyframes_spread_over_rotations_too():
+    frames = [blank(look_at(np.zeros(3), np.array([x, 0.0, 0.1]))) for x in (0, 0.001, 0.05, 0.1)]
+    assert select_keyframes(frames, 3) == [0, 2, 3]
+
+
+def test_keyframes_of_identical_poses_are_different_frames():
+    assert len(set(select_keyframes([blank(np.eye(4))] * 5, 3))) == 3
+
+
+# --------------------------------------------------------------------------------- shrinking of frames
+
+
+def test_shrinking_keeps_pixels_and_intrinsics_together():
+    """A ramp of depth and colour stays, to half a pixel of the larger image, what the shrunken camera expects."""
+    height, width = 90, 120
+    v, u = np.mgrid[:height, :width] + 0.5
+    image = np.stack([u, v, u], -1).astype(np.uint8)
+    frame = blank(np.eye(4), (width, height), depth=(u + 1000 * v).astype(np.float32))
+    frame = shrink(dataclasses.replace(frame, image=image, right=image, right_K=frame.camera.K), 40)
+    camera = frame.camera
+    assert (camera.width, camera.height, *frame.image.shape) == (40, 30, 30, 40, 3)
+    np.testing.assert_allclose(frame.right_K, camera.K)
+    assert camera.K[0, 0] == 10
+    assert camera.K[0, 2] == 20
+    rows, columns = np.mgrid[:30, :40]
+    np.testing.assert_allclose(frame.depth, (columns + 0.5) * 3 + 1000 * (rows + 0.5) * 3)  # centre of 3 × 3 pixels
+    np.testing.assert_allclose(frame.image[..., 0], columns * 3 + 1)
+
+
+def test_a_shrunken_pixel_is_tissue_only_if_all_of_it_is():
+    mask = np.full((24, 32), 255, np.uint8)
+    mask[:, :3] = 0
+    small = shrink(blank(np.eye(4), mask=mask), 16)
+    assert (small.mask[:, :2] == 0).all()
+    assert (small.mask[:, 2:] == 255).all()
+
+
+def test_narrow_frames_are_left_alone():
+    frame = blank(np.eye(4))
+    assert shrink(frame, 32) is frame
+
+
+# ---------------------------------------------------------------------------------------- triangulation
+
+
+def test_triangulated_points_lie_on_the_surface(large):
+    points, colors, views = triangulate(list(large))
+    assert len(points) > 300
+    assert colors.shape == points.shape
+    assert 0 <= colors.min() <= colors.max() <= 1
+    errors = []
+    for point, (i, _) in zip(points, views):
+        uv, z = large[i].camera.project(point[None])
+        u, v = np.floor(uv[0]).astype(int)
+        errors.append(abs(z[0] - large[i].depth[v, u]) / z[0])
+    assert np.median(errors) < 0.01
+
+
+def test_views_from_one_place_give_no_points(large):
+    first = large[0]
+    assert len(triangulate([first, first])[0]) == 0
+    turned = first.camera.pose.copy()
+    turned[:3, :3] = turned[:3, :3] @ cv2.Rodrigues(np.array([0.0, 0.05, 0.0]))[0]
+    H = first.camera.K @ turned[:3, :3].T @ first.camera.pose[:3, :3] @ np.linalg.inv(first.camera.K)
+    image = cv2.warpPerspective(first.image, H, (640, 512))
+    rotated = bare(first, image=image, camera=first.camera.at(turned))
+    assert len(triangulate([first, rotated])[0]) == 0
+
+
+# ------------------------------------------------------------------------------------------- depth prior
+
+
+def test_stereo_depth_is_near_the_exact_depth(large):
+    prior = with_depth_prior(list(large[:2]), NO_POINTS[0], options(depth="stereo"))
+    for frame, exact in zip(prior, large):
+        valid = frame.depth > 0
+        assert valid.mean() > 0.7
+        assert np.median(np.abs(frame.depth - exact.depth)[valid]) < 0.002
+        assert valid[:, :100].mean() > 0.3  # the columns that a matcher by itself would skip
+
+
+def test_a_wrong_principal_point_of_the_right_eye_is_found(large):
+    points, _, _ = triangulate(list(large))
+    right = [np.ascontiguousarray(np.roll(frame.right, -3, axis=1)) for frame in large]  # as if cx were 3 pixels less
+    wrong = [dataclasses.replace(frame, right=image) for frame, image in zip(large, right)]
+    offset = disparity_offset(wrong, [stereo_disparity(frame) for frame in wrong], points)
+    assert offset == pytest.approx(-3, abs=0.25)
+    K = large[0].camera.K - np.array([[0, 0, 3.0], [0, 0, 0], [0, 0, 0]])
+    known = [dataclasses.replace(frame, right_K=K) for frame in wrong]
+    assert disparity_offset(known, [stereo_disparity(frame) for frame in known], points) == pytest.approx(0, abs=0.25)
+
+
+def test_no_offset_without_points(large):
+    assert disparity_offset(list(large[:1]), [np.ones((512, 640), np.float32)], np.empty((0, 3))) == 0
+
+
+def test_depth_between_points_is_interpolated_without_the_wrong_ones(large):
+    points, _, _ = triangulate(list(large))
+    frame = large[0]
+    wrong = points[::20] * 0.7
+    depth = interpolated_depth(frame, np.concatenate([points, wrong]))
+    valid = depth > 0
+    assert valid.mean() > 0.4
+    assert np.median(np.abs(depth / frame.depth - 1)[valid]) < 0.02
+    assert interpolated_depth(frame, points[:10]) is None
+    straight = frame.camera.at(np.eye(4))
+    line = np.stack([np.linspace(-0.02, 0.02, 50), np.zeros(50), np.full(50, 0.1)], 1)
+    assert interpolated_depth(dataclasses.replace(frame, camera=straight), line) is None
+
+
+def test_depth_prior_is_clean(small):
+    depth = small[0].depth.copy()
+    depth[0, :4] = [np.nan, np.inf, -1, 0]
+    mask = np.full_like(small[0].mask, 255)
+    mask[1] = 0
+    (frame,) = with_depth_prior([dataclasses.replace(small[0], depth=depth, mask=mask)], NO_POINTS[0], options())
+    assert (frame.depth[0, :4] == 0).all()
+    assert (frame.depth[1] == 0).all()
+    assert np.isfinite(frame.depth).all()
+    assert (frame.depth[2:] == depth[2:]).all()
+
+
+def test_depth_sources_are_chosen_or_refused(small):
+    frame = small[0]
+    assert with_depth_prior([frame], NO_POINTS[0], options(depth="none"))[0].depth is None
+    with pytest.raises(SequenceError, match="depth=topic"):
+        with_depth_prior([bare(frame)], NO_POINTS[0], options(depth="topic"))
+    with pytest.raises(SequenceError, match="depth=stereo"):
+        with_depth_prior([bare(frame)], NO_POINTS[0], options(depth="stereo"))
+
+
+# ----------------------------------------------------------------------------------------- initial model
+
+
+def test_initial_model_lies_on_the_surface_within_the_limit(small):
+    model = initial_model(list(small[::4]), *NO_POINTS, options(max_gaussians=3000))
+    assert 2000 < len(model) <= 3000
+    errors = []
+    for frame in small[::4]:
+        uv, z = frame.camera.project(model.means.numpy().astype(np.float64))
+        u, v = np.floor(uv).astype(int).T
+        inside = (u >= 0) & (v >= 0) & (u < 160) & (v < 128) & (z > 0)
+        # Never in front of what a view sees by more than the tolerance.
+        assert (z[inside] > frame.depth[v[inside], u[inside]] * 0.949).all()
+        errors.append(np.abs(z[inside] / frame.depth[v[inside], u[inside]] - 1))
+    assert np.median(np.concatenate(errors)) < 0.01
+
+
+def test_depth_floating_in_front_of_another_view_is_left_out(small):
+    first, second = small[0], small[4]
+    depth = first.depth.copy()
+    depth[50:70, 60:90] *= 0.6  # a floating patch
+    model = initial_model([dataclasses.replace(first, depth=depth), second], *NO_POINTS, options(max_gaussians=50_000))
+    uv, z = second.camera.project(model.means.numpy().astype(np.float64))
+    u, v = np.floor(uv).astype(int).T
+    inside = (u >= 0) & (v >= 0) & (u < 160) & (v < 128)
+    assert (z[inside] > 0.94 * second.depth[v[inside], u[inside]]).all()
+    alone = initial_model([dataclasses.replace(first, depth=depth)], *NO_POINTS, options(max_gaussians=50_000))
+    assert float(alone.means[:, 2].min()) < 0.7 * first.depth.min() + first.camera.position[2]
+
+
+def test_masked_pixels_give_no_gaussians(small):
+    mask = np.zeros_like(small[0].mask)
+    mask[:, :80] = 255
+    model = initial_model([dataclasses.replace(small[0], mask=mask)], *NO_POINTS, options())
+    uv, _ = small[0].camera.project(model.means.numpy().astype(np.float64))
+    assert uv[:, 0].max() < 80
+
+
+# ----------------------------------------------------------------------------------------- densification
+
+
+def cloud(count=300, seed=0):
+    """Small Gaussians in front of a camera at the origin."""
+    generator = torch.Generator().manual_seed(seed)
+    means = torch.rand(count, 3, generator=generator) * 0.06 + torch.tensor([-0.03, -0.03, 0.1])
+    scales = torch.rand(count, generator=generator) * 1e-3 + 5e-4
+    model = GaussianModel.from_points(means, torch.rand(count, 3, generator=generator), scales, 0.3)
+    opacities = torch.rand(count, generator=generator) * 0.4 + 0.1
+    return dataclasses.replace(model, logit_opacities=opacities.logit())
+
+
+def test_copies_share_opacity_and_size():
+    opacities, scales = torch.tensor([0.3, 0.99, 0.5]), torch.ones(3, 3)
+    shared, smaller = densification.relocated(opacities, scales, torch.tensor([2, 50, 1]))
+    torch.testing.assert_close(1 - (1 - shared) ** torch.tensor([2, 50, 1]), opacities)
+    # Two copies by hand: 0.3 / (2 o − o² / √2) with o = 1 − √0.7.
+    o = 1 - 0.7**0.5
+    assert float(smaller[0, 0]) == pytest.approx(0.3 / (2 * o - o**2 / 2**0.5), rel=1e-6)
+    assert float(smaller[2, 0]) == pytest.approx(1)
+    assert torch.isfinite(smaller).all()
+
+
+def test_refinement_preserves_the_picture_moves_the_dead_and_respects_the_limit():
+    model = cloud()
+    logits = model.logit_opacities.clone()
+    logits[::6] = -7  # dead
+    model = dataclasses.replace(model, logit_opacities=logits)
+    camera = Camera(np.array([[80.0, 0, 40], [0, 80, 40], [0, 0, 1]]), 80, 80)
+    before = render(model, camera)
+    new, source, fresh = densification.refine(model, 0.05, 310, torch.Generator().manual_seed(0))
+    after = render(new, camera)
+    assert len(new) == len(source) == len(fresh) == 310
+    assert (new.opacities > densification.DEAD_OPACITY).all()
+    assert not (source[:300:6] == torch.arange(0, 300, 6)).any()
+    assert fresh[:300:6].all()
+    assert fresh[300:].all()
+    torch.testing.assert_close(new.means, model.means[source])
+    untouched = ~fresh[:300]
+    torch.testing.assert_close(new.log_scales[:300][untouched], model.log_scales[untouched])
+    assert float((after.colors - before.colors).abs().mean()) < 0.02 * float(before.colors.mean())
+
+
+def test_refinement_without_any_living_gaussian_changes_nothing():
+    model = dataclasses.replace(cloud(20), logit_opacities=torch.full((20,), -9.0))
+    new, source, fresh = densification.refine(model, 0.5, 100, torch.Generator())
+    assert equal(new, model)
+    assert len(source) == len(fresh) == 20
+    assert not fresh.any()
+
+
+def test_noise_moves_only_the_faint():
+    model = cloud(50)
+    model.logit_opacities[:25] = -7
+    noise = densification.exploration_noise(model, 1.0, torch.Generator().manual_seed(0))
+    assert noise[:25].abs().min() > 0
+    assert noise[25:].abs().max() < 1e-3 * noise[:25].abs().median()
+
+
+def test_optimiser_state_follows_its_gaussians(small):
+    trainer = Trainer([small[0], small[8]], options(refine_every=1000, max_gaussians=1500))
+    for _ in range(3):
+        trainer.step()
+    with torch.no_grad():
+        trainer._parameters["logit_opacities"][:7] = -8
+    state = lambda: trainer._optimizer.state[trainer._parameters["means"]]
+    moments, means = state()["exp_avg"].clone(), trainer.model.means
+    trainer._refine()
+    kept = (trainer.model.means[: len(means)] == means).all(1) & (state()["exp_avg"][: len(means)] != 0).any(1)
+    assert kept.sum() > 0.5 * len(means)
+    assert not kept[:7].any()
+    torch.testing.assert_close(state()["exp_avg"][: len(means)][kept], moments[kept])
+    assert float(state()["step"]) == 3
+    trainer.step()
+
+
+# ---------------------------------------------------------------------------------------------- training
+
+
+def test_virtual_camera_lies_between_two_views(small, monkeypatch):
+    trainer = Trainer([small[0], small[4]], options())
+    first, second = (small[i].camera.position for i in (0, 4))
+    seen = []
+    draw = trainer._render
+
+    def spy(viewmat, K, camera, masks=None):
+        seen.append(camera.position)
+        return draw(viewmat, K, camera, masks)
+
+    monkeypatch.setattr(trainer, "_render", spy)
+    for _ in range(3):
+        trainer.step()
+    virtual = seen[1::2]
+    assert len(virtual) == 3
+    for position in virtual:
+        alpha = np.dot(position - first, second - first) / np.dot(second - first, second - first)
+        assert 0 < alpha < 1
+        np.testing.assert_allclose(position, (1 - alpha) * first + alpha * second, atol=1e-12)
+
+
+def test_training_improves_views_it_has_not_seen(small):
+    training, rest = [small[i] for i in (0, 2, 4, 6)], [small[i] for i in (1, 3, 5)]
+    noisy = [
+        dataclasses.replace(f, depth=f.depth * np.float32(1.03 if i % 2 else 0.97)) for i, f in enumerate(training)
+    ]
+    trainer = Trainer(noisy, options(iterations=150, max_gaussians=8000, refine_every=50))
+    psnr, error = held_out(trainer.model, rest)
+    reports = []
+    model = trainer.run(lambda progress: reports.append(progress), every=50)
+    trained_psnr, trained_error = held_out(model, rest)
+    assert trained_psnr > psnr + 3
+    assert trained_error < 0.9 * error
+    assert [report.iteration for report in reports] == [50, 100, 150]
+    assert reports[-1].gaussians == len(model) <= 8000
+
+
+def test_progress_can_stop_the_training(small):
+    trainer = Trainer([small[0]], options())
+    trainer.run(lambda progress: False, every=2)
+    assert trainer.iteration == 2
+
+
+def test_same_seed_gives_the_same_bits_whatever_the_threads(small, monkeypatch):
+    models = []
+    for threads in ("1", "2", "3"):
+        monkeypatch.setenv("ENDO_SIM_THREADS", threads)
+        torch.set_num_threads(int(threads))
+        try:
+            models.append(Trainer(list(small[::4]), options(max_gaussians=15_000)).run())
+        finally:
+            torch.set_num_threads(1)
+    assert equal(models[0], models[1])
+    assert equal(models[0], models[2])
+    other = Trainer(list(small[::4]), options(max_gaussians=15_000, seed=1)).run()
+    assert not equal(models[0], other)
+
+
+def test_a_checkpoint_goes_on_as_if_never_interrupted(small, tmp_path):
+    views = list(small[::4])
+    whole = Trainer(views, options()).run()
+    first = Trainer(views, options())
+    for _ in range(7):
+        first.step()
+    first.save_checkpoint(tmp_path / "a" / "checkpoint.pt")
+    second = Trainer(views, options())
+    second.load_checkpoint(tmp_path / "a" / "checkpoint.pt")
+    assert second.iteration == 7
+    assert equal(second.run(), whole)
+
+
+def test_checkpoints_that_do_not_fit_are_refused(small, tmp_path):
+    path = tmp_path / "checkpoint.pt"
+    trainer = Trainer([small[0]], options())
+    trainer.save_checkpoint(path)
+    with pytest.raises(SequenceError, match=r"other options \(seed\)"):
+        Trainer([small[0]], options(seed=3)).load_checkpoint(path)
+    with pytest.raises(SequenceError, match="other views"):
+        Trainer([small[1]], options()).load_checkpoint(path)
+    path.write_bytes(b"not a checkpoint")
+    with pytest.raises(SequenceError, match="not a readable checkpoint"):
+        trainer.load_checkpoint(path)
+    with pytest.raises(SequenceError, match="not a readable checkpoint"):
+        trainer.load_checkpoint(tmp_path / "absent.pt")
+
+
+def test_higher_harmonics_are_trained(small):
+    model = Trainer([small[0], small[8]], options(sh_degree=3)).run()
+    assert model.sh_degree == 3
+    assert model.sh[:, 1:].abs().max() > 0
+
+
+def test_reconstruction_of_a_bag_is_measured(tmp_path, small):
+    write_bag(tmp_path / "bag", small)
+    found = reconstruct_and_measure(tmp_path / "bag", tmp_path / "out", options(keyframes=4, image_width=80))
+    assert found["held-out views"] == 5
+    assert found["PSNR [dB]"] > 15
+    assert found["depth RMSE [mm]"] < 10
+    for name in ("model.ply", "checkpoint.pt", "held_out.png"):
+        assert (tmp_path / "out" / name).stat().st_size > 0
+
+
+# -------------------------------------------------------------------------------------------- bad inputs
+
+
+def finite(model):
+    return all(bool(tensor.isfinite().all()) for tensor in model.tensors().values())
+
+
+def test_no_views_is_one_clear_error():
+    with pytest.raises(SequenceError, match="no views"):
+        Trainer([], options())
+
+
+def test_one_view_is_enough_with_depth(small):
+    assert finite(Trainer([small[0]], options()).run())
+
+
+def test_identical_views_train(small):
+    assert finite(Trainer([small[0]] * 3, options()).run())
+
+
+def test_masking_everything_is_an_error(small):
+    hidden = dataclasses.replace(small[0], mask=np.zeros_like(small[0].mask))
+    with pytest.raises(SequenceError, match="masked"):
+        Trainer([hidden], options())
+    assert finite(Trainer([small[4], hidden], options()).run())  # one of them is no obstacle
+
+
+def test_depth_with_holes_trains(small):
+    depth = small[0].depth.copy()
+    depth[:, :60], depth[:40] = np.nan, 0
+    empty = dataclasses.replace(small[4], depth=np.zeros_like(depth))
+    assert finite(Trainer([dataclasses.replace(small[0], depth=depth), empty], options()).run())
+
+
+def test_nothing_to_see_is_an_error(small):
+    flat = np.full_like(small[0].image, 128)
+    with pytest.raises(SequenceError, match="only 0 scene points"):
+        Trainer([bare(small[0], image=flat), bare(small[4], image=flat)], options())
+    with pytest.raises(SequenceError, match="only 0 scene points"):
+        Trainer([dataclasses.replace(bare(small[0]), depth=np.zeros_like(small[0].depth))], options())
+
+
+def test_views_that_face_away_from_each_other_train(small):
+    away = small[4].camera.pose @ np.diag([-1.0, 1, -1, 1])
+    other = dataclasses.replace(small[4], camera=small[4].camera.at(away))
+    assert finite(Trainer([small[0], other], options()).run())
+
+
+def test_points_alone_are_enough(large):
+    model = Trainer([bare(frame) for frame in large[:3]], options(image_width=160)).run()
+    assert finite(model)
+    assert len(model) > 100
+
+
+def test_odd_sizes_train():
+    frames = film(161, 97, 3)
+    model = Trainer(list(frames[::2]), options(image_width=75)).run()
+    assert finite(model)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 import rclpy
+from rclpy.duration import Duration
 
 from endo_sim_ros.config import Range, StageConfig
 from endo_sim_ros.messages import DIAGNOSTICS, MessageError, Topic
@@ -14,7 +15,7 @@ from endo_sim_ros.nodes.base import ERROR, OK, EndoNode, run, sentence
 from endo_sim_ros.sequences.bag import BagReader
 from endo_sim_ros.sequences.frames import SequenceError
 
-_DEPTH = 100  # messages kept for a subscriber whose connection is still being made
+_DELIVERED_WITHIN = 10.0  # seconds that subscribers have, at the end, to ask again for what they missed
 _SETTLED = 3.5  # seconds without a new subscriber after which all are there: processes announce themselves every 3
 
 
@@ -73,7 +74,6 @@ class BagPlayerNode(EndoNode):
         self._state = "finished"
         self.publish_diagnostics()
         self.get_logger().info(f"finished: {self._sent} messages")
-        self._stop.wait(0.5)  # lets reliable delivery complete
         rclpy.try_shutdown(context=self.context)
 
     @property
@@ -90,7 +90,7 @@ class BagPlayerNode(EndoNode):
                 if name == DIAGNOSTICS.name:
                     continue  # the states of nodes that ran then would be taken for those of nodes that run now
                 try:
-                    publishers[name] = self.publisher(topic, depth=_DEPTH)
+                    publishers[name] = self.publisher(topic)
                 except MessageError as error:
                     self.get_logger().warning(f"{name} is not replayed: {error}")
             if not publishers:
@@ -101,6 +101,7 @@ class BagPlayerNode(EndoNode):
                 self._total += bag.message_count
                 self._publish(bag, publishers)
                 if not self._config.loop:
+                    self._await_delivery(publishers)
                     return
 
     def _await_subscribers(self, publishers: dict) -> None:
@@ -116,6 +117,15 @@ class BagPlayerNode(EndoNode):
             elif any(found) and time.monotonic() - since > _SETTLED:
                 return
             self._stop.wait(0.05)
+
+    def _await_delivery(self, publishers: dict) -> None:
+        """A lost message is repeated when its subscriber asks, which it can only while the publisher exists."""
+        self._state = "waiting until everything is received"
+        deadline = time.monotonic() + _DELIVERED_WITHIN
+        for publisher in publishers.values():
+            while not self._stopped and time.monotonic() < deadline:
+                if publisher.wait_for_all_acked(Duration(seconds=0.2)):
+                    break
 
     def _publish(self, bag: BagReader, publishers: dict) -> None:
         due, last = time.monotonic(), None

@@ -17,6 +17,7 @@ demo: setup
 	$(VENV)/bin/endo-sim demo --out $(OUT) $(if $(BAG),--bag $(BAG))
 
 test: setup
+	$(VENV)/bin/ruff check
 	$(VENV)/bin/python -m pytest test
 
 setup: $(VENV)/.installed

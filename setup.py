@@ -38,7 +38,7 @@ setup(
         "tyro",
         "warp-lang>=1.19",
     ],
-    extras_require={"test": ["mcap", "mcap-ros2-support", "pytest", "torchmetrics"]},
+    extras_require={"test": ["mcap", "mcap-ros2-support", "pytest", "ruff", "torchmetrics"]},
     entry_points={"console_scripts": ["endo-sim = endo_sim_ros.cli:main"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
@@ -48,5 +48,6 @@ setup(
         # `ros2 run` looks for executables here; console scripts would land in bin/ under pip.
         (f"lib/{NAME}", sorted(map(str, Path("scripts").glob("*_node")))),
     ],
+    package_data={f"{NAME}.nodes": ["fastdds.xml"]},
     zip_safe=False,
 )

@@ -11,6 +11,9 @@ os.environ.setdefault("FASTDDS_BUILTIN_TRANSPORTS", "DEFAULT")  # finds late joi
 import pytest  # noqa: E402
 import torch  # noqa: E402
 
+from endo_sim_ros.nodes.transport import prepare_transport  # noqa: E402
+
+prepare_transport()
 torch.set_num_threads(1)
 
 

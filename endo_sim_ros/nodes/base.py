@@ -24,6 +24,7 @@ from endo_sim_ros.config import ConfigError, StageConfig, options
 from endo_sim_ros.device import pick_device
 from endo_sim_ros.gaussians import ModelError
 from endo_sim_ros.messages import ERROR, OK, WARN, MessageError, Topic
+from endo_sim_ros.nodes.transport import prepare_transport
 from endo_sim_ros.sequences.frames import SequenceError
 
 _ERROR_SHOWN = 5.0  # seconds that an error stays on /diagnostics, and that its repetitions are not logged
@@ -276,6 +277,7 @@ def quality(topic: Topic, depth: int = STREAM_DEPTH, reliable: bool = True) -> Q
 
 def run(node_class: Callable[[], EndoNode]) -> int:
     """Start ROS, spin a node until it is told to stop, and return the exit status: 2 if it could not start."""
+    prepare_transport()
     try:
         rclpy.init(args=sys.argv)
     except RuntimeError as error:  # arguments that ROS does not understand

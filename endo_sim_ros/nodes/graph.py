@@ -1,6 +1,5 @@
 """Starts the nodes of the graph as processes of their own."""
 
-import os
 import signal
 import subprocess
 import sys
@@ -8,29 +7,9 @@ import time
 from pathlib import Path
 from typing import Any
 
+from endo_sim_ros.nodes.transport import graph_environment
+
 _STOP_AFTER = 15.0  # seconds that a node has to end after an interrupt
-
-
-def graph_environment() -> dict[str, str]:
-    """Environment for a graph on one machine: nothing leaves it, and large messages travel fast.
-
-    What is set already wins.
-    """
-    environment = dict(os.environ)
-    environment.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    environment.setdefault(
-        "ROS_DOMAIN_ID", str(1 + os.getpid() % 100)
-    )  # a graph of our own beside others on this machine
-    try:
-        limit = int(Path("/proc/sys/net/core/rmem_max").read_text())
-    except (OSError, ValueError):
-        return environment
-    if limit >= 4_000_000:  # with sockets larger than the limit Fast DDS receives nothing
-        environment.setdefault(
-            "FASTDDS_BUILTIN_TRANSPORTS",
-            "LARGE_DATA?max_msg_size=1MB&sockets_size=4MB&non_blocking=true&tcp_negotiation_timeout=50",
-        )
-    return environment
 
 
 class NodeProcess:

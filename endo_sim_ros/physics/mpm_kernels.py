@@ -14,8 +14,9 @@ The state is a displacement u from rest in the solver's local frame, all float32
 next share a kernel, so that one substep is two launches.
 
 Pinned nodes are held by springs k to the displacement u* = 0, grasped ones to a u* that moves evenly through the step;
-k is zero for all others. Δt² k is the springs' implicit part, lumped, which makes them stable at any stiffness. (Holding grid nodes instead puts the wall up to half a cell off, and
-kinematic nodes without stress leave the tissue next to the wall hanging on nothing.)
+k is zero for all others. Δt² k is the springs' implicit part, lumped, which makes them stable at any stiffness. (Holding
+grid nodes instead puts the wall up to half a cell off, and kinematic nodes without stress leave the tissue next to the
+wall hanging on nothing.)
 """
 
 import functools

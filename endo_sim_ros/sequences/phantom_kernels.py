@@ -81,7 +81,7 @@ def height_at(surface: Surface, u: float, v: float):
 @wp.func
 def sample(texture: wp.array[wp.vec4], n: int, level: int, u: float, v: float):
     """Bilinear value of one level of detail at folded grid coordinates of level 0."""
-    offset = 0
+    offset = int(0)
     for coarser in range(level):
         side = (n >> coarser) + 1
         offset += side * side
@@ -156,7 +156,7 @@ def cast(surface: Surface, origin: wp.vec3, ray: wp.vec3):
         if dv < 0.0:
             exit_v = (j * size - v) / dv
         leave = wp.min(wp.max(wp.min(exit_u, exit_v), t), last)
-        offset = 0
+        offset = int(0)
         for finer in range(level):
             offset += (n >> finer) * (n >> finer)
         side = n >> level

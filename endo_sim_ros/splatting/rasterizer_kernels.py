@@ -333,7 +333,7 @@ def project(
     tiles_x = (width + TILE_SIZE - 1) // TILE_SIZE
     tiles_y = (height + TILE_SIZE - 1) // TILE_SIZE
     rows = tile_rows(y, extent[1], tiles_y)
-    count = 0
+    count = int(0)
     for row in range(rows[0], rows[1]):
         columns = tile_columns(row, x, y, a, b, c, extent, half_width, tiles_x)
         for column in range(columns[0], columns[1]):
@@ -391,7 +391,7 @@ def emit_intersections(
 def find_tile_starts(offset: int, tiles: wp.array[int], count: int, starts: wp.array[int]):
     """starts[t] = first slot whose tile is t or later; launched over count + 1 slots of the sorted tiles."""
     slot = offset + wp.tid()
-    low, high = 0, starts.shape[0]
+    low, high = int(0), starts.shape[0]
     if slot > 0:
         low = tiles[slot - 1] + 1
     if slot < count:
@@ -432,8 +432,8 @@ def project_backward(
     sh_count = sh.shape[1]
     v_mean = wp.vec3()
     v_covariance = wp.mat33()
-    v_opacity = 0.0
-    drawn = 0
+    v_opacity = float(0.0)
+    drawn = int(0)
     for k in range(sh_count):
         v_sh[n, k] = wp.vec3()
 
@@ -612,13 +612,13 @@ def render_pixels(
         return
     px, py = float(column) + 0.5, float(row) + 0.5
     start, end = starts[tile], starts[tile + 1]
-    reference = 0.0
+    reference = float(0.0)
     if start < end:
         reference = splats[owners[slots[start]], Z]
 
     color = wp.vec3()
-    depth, distortion = 0.0, 0.0
-    transmittance = 1.0
+    depth, distortion = float(0.0), float(0.0)
+    transmittance = float(1.0)
     for slot in range(start, end):
         splat = owners[slots[slot]]
         exponential = splat_exponential(splats, splat, px - splats[splat, X], py - splats[splat, Y])
@@ -672,14 +672,14 @@ def render_pixels_backward(
     row = (tile // tiles_x % tiles_y) * TILE_SIZE + in_tile[1]
     px, py = float(column) + 0.5, float(row) + 0.5
     start, end = starts[tile], starts[tile + 1]
-    reference = 0.0
+    reference = float(0.0)
     if start < end:
         reference = splats[owners[slots[start]], Z]
 
-    live = 0
+    live = int(0)
     v_color = wp.vec3()
-    v_depth, v_alpha, v_distortion = 0.0, 0.0, 0.0
-    total_weight, total_depth, remaining = 0.0, 0.0, 0.0
+    v_depth, v_alpha, v_distortion = float(0.0), float(0.0), float(0.0)
+    total_weight, total_depth, remaining = float(0.0), float(0.0), float(0.0)
     if column < width and row < height:
         live = 1
         pixel = (tile // (tiles_x * tiles_y) * height + row) * width + column
@@ -694,7 +694,7 @@ def render_pixels_backward(
         remaining = wp.dot(v_color, foreground) + v_depth * total_depth + v_alpha * total_weight
         remaining += 2.0 * v_distortion * distortions[pixel]
 
-    transmittance, depth = 1.0, 0.0
+    transmittance, depth = float(1.0), float(0.0)
     for slot in range(start, end):
         if warp_any(live) == 0:
             break
@@ -705,7 +705,7 @@ def render_pixels_backward(
         exponential = splat_exponential(splats, splat, dx, dy)
         alpha = wp.min(ALPHA_MAX, opacity * exponential)
         following = transmittance * (1.0 - alpha)
-        draws = 0
+        draws = int(0)
         if live != 0 and alpha >= ALPHA_MIN:
             if following < TRANSMITTANCE_MIN:
                 live = 0

@@ -10,11 +10,11 @@ from endo_sim_ros.config import Range, StageConfig
 class PhysicsConfig(StageConfig):
     """How the tissue is built from the Gaussians, what it is made of and how it is stepped."""
 
-    node_count: Annotated[int, Range(8, 200_000)] = 2000
+    node_count: Annotated[int, Range(8, 200_000)] = 4000
     """Number of all simulated nodes: the skin gets node_count / (layers + 1) of them, each layer as many."""
     thickness: Annotated[float, Range(1e-4, 1.0, "m")] = 0.02
     """Depth of the tissue behind the reconstructed skin; the layers divide it evenly."""
-    layers: Annotated[int, Range(0, 32)] = 4
+    layers: Annotated[int, Range(0, 32)] = 3
     """Number of layers extruded behind the skin; 0 simulates the skin alone, as the paper prints it."""
     pin_back: bool = True
     """Hold the deepest layer in place."""
@@ -32,11 +32,12 @@ class PhysicsConfig(StageConfig):
     density: Annotated[float, Range(1.0, 1e5, "kg/m³")] = 1000.0
     """Mass density of the tissue."""
     substeps: Annotated[int, Range(1, 100_000)] = 80
-    """Substeps in one step."""
+    """Substeps in one step, as the paper has them; see adapt_substeps."""
     substep_dt: Annotated[float, Range(1e-7, 0.1, "s")] = 0.0005
     """Duration of one substep; one step lasts substeps × substep_dt."""
     adapt_substeps: bool = True
-    """Take more and shorter substeps where the material needs them; off, such a material is refused."""
+    """Divide the step into as few substeps as the material and the grid safely allow; off, the configured ones are taken,
+    as the paper does, or refused where they would blow up."""
     damping: Annotated[float, Range(0.0, 1e5, "1/s")] = 50.0
     """Rate c at which velocities decay, exp(-c t)."""
     gravity_x: Annotated[float, Range(-100.0, 100.0, "m/s²")] = 0.0
@@ -48,7 +49,7 @@ class PhysicsConfig(StageConfig):
     kinematics: Literal["rest", "current"] = "rest"
     """Where the transfer weights are taken: at the rest positions (total Lagrangian: never fractures numerically) or
     at the current positions (updated Lagrangian, as PhysGaussian and the paper have it)."""
-    grid_ratio: Annotated[float, Range(1.0, 4.0)] = 1.75
+    grid_ratio: Annotated[float, Range(1.0, 4.0)] = 1.5
     """Grid cell size over node spacing. Near 1 a cell holds one node and has motions that no node resists (with current
     kinematics it fractures); above 2 dents are blurred."""
     travel: Annotated[float, Range(1e-3, 10.0, "m")] = 0.05

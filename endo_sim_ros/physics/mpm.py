@@ -1,6 +1,5 @@
 """The material point solver: owns the grid and the state of the moving nodes, and takes steps."""
 
-import logging
 import math
 from dataclasses import dataclass
 
@@ -14,9 +13,8 @@ from endo_sim_ros.physics.control_nodes import ControlNodes
 from endo_sim_ros.physics.materials import energy_density, lame_parameters, sound_speed
 from endo_sim_ros.physics.mpm_kernels import Grid, Nodes, check_nodes, make_advance_kernel, update_grid
 
-log = logging.getLogger(__name__)
-
 CFL_LIMIT = 0.7  # c Δt / h; measured: 0.7 runs, 0.9 blows up
+CFL_CHOSEN = 0.5  # leaves room for tissue that stiffens where it is compressed
 PIN_STIFFNESS = 50.0  # of a pinned node's spring, over that of a cube of tissue of its volume
 MARGIN_CELLS = 2.0  # between the nodes and the edge of the grid; a spline reaches 1.5
 MAX_GRID_NODES = 64_000_000  # 28 bytes each
@@ -33,33 +31,33 @@ class Substepping:
     count: int
     dt: float  # s
     cfl: float  # c Δt / h
-    note: str  # one sentence when the count differs from the configured one, else empty
 
 
 def plan_substeps(config: PhysicsConfig, cell_size: float) -> Substepping:
-    """Check the Courant number c Δt/h and, where allowed, raise the substep count to what is stable.
+    """Divide a step so that the Courant number c Δt/h is stable: as few substeps as are safe, or those configured.
 
     Args:
-        config: Material and substeps asked for.
+        config: Material and substeps asked for; with ``adapt_substeps`` these give the duration of the step only.
         cell_size: Grid cell size h, metres.
 
     Raises:
         StabilityError: If the substeps are too long and ``adapt_substeps`` is off.
     """
     speed = sound_speed(config.young_modulus, config.poisson_ratio, config.density)
-    cfl = speed * config.substep_dt / cell_size
-    if cfl <= CFL_LIMIT:
-        return Substepping(config.substeps, config.substep_dt, cfl, "")
-    count = math.ceil(config.substeps * cfl / CFL_LIMIT)
+    count = config.substeps
+    if config.adapt_substeps:
+        count = math.ceil(config.step_duration * speed / (CFL_CHOSEN * cell_size))
     dt = config.step_duration / count
-    why = (
-        f"young_modulus {config.young_modulus:g} Pa, poisson_ratio {config.poisson_ratio:g} and density"
-        f" {config.density:g} kg/m³ on a grid of {cell_size:.3g} m give a Courant number of {cfl:.2f} with"
-        f" {config.substeps} substeps of {config.substep_dt:g} s (limit {CFL_LIMIT})"
-    )
-    if not config.adapt_substeps:
-        raise StabilityError(f"{why}; use {count} substeps of {dt:.3g} s or a softer material")
-    return Substepping(count, dt, speed * dt / cell_size, f"{why}: taking {count} substeps of {dt:.3g} s instead")
+    cfl = speed * dt / cell_size
+    if cfl > CFL_LIMIT:
+        fitting = math.ceil(count * cfl / CFL_LIMIT)
+        raise StabilityError(
+            f"young_modulus {config.young_modulus:g} Pa, poisson_ratio {config.poisson_ratio:g} and density"
+            f" {config.density:g} kg/m³ on a grid of {cell_size:.3g} m give a Courant number of {cfl:.2f} with {count}"
+            f" substeps of {dt:g} s (limit {CFL_LIMIT}); use {fitting} substeps of {config.step_duration / fitting:.3g} s,"
+            " adapt_substeps, or a softer material"
+        )
+    return Substepping(count, dt, cfl)
 
 
 class MpmSolver:
@@ -85,8 +83,6 @@ class MpmSolver:
         self.mu, self.lam = lame_parameters(config.young_modulus, config.poisson_ratio)
         self.cell_size = config.grid_ratio * nodes.spacing
         self.substepping = plan_substeps(config, self.cell_size)
-        if self.substepping.note:
-            log.warning("%s", self.substepping.note)
 
         h = self.cell_size
         margin = MARGIN_CELLS * h + (config.travel if config.kinematics == "current" else 0.0)

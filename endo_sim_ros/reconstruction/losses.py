@@ -49,6 +49,16 @@ def total_variation(depth: Tensor, mask: Tensor | None) -> Tensor:
     return masked_mean(dx, mask[:, 1:] * mask[:, :-1]) + masked_mean(dy, mask[1:] * mask[:-1])
 
 
+def elongation(log_scales: Tensor) -> Tensor:
+    """How far the longest axis of each Gaussian exceeds three times the middle one, log ratio [N]; discs and spheres have 0.
+
+    A needle along the line of sight cannot be seen until shear lays it across the picture (after PhysGaussian's
+    anisotropy regulariser, Xie et al. 2024, which also forbids discs).
+    """
+    ordered = log_scales.sort(dim=1).values
+    return torch.relu(ordered[:, 2] - ordered[:, 1] - np.log(3.0))
+
+
 def ssim(image: Tensor, target: Tensor) -> Tensor:
     """Structural similarity map [H, W, 3] (Wang et al. 2004; 11×11, σ 1.5, zeros around); gradient in ``image``."""
     return _Ssim.apply(image, target)

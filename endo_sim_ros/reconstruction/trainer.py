@@ -163,6 +163,8 @@ class Trainer:
         loss = self._view_loss(self._views[index])
         if config.virtual_every and self.iteration % config.virtual_every == 0 and len(self._views) > 1:
             loss = loss + self._virtual_loss(index)
+        if config.lambda_elongation:
+            loss = loss + config.lambda_elongation * losses.elongation(self._parameters["log_scales"]).mean()
         loss.backward()
         self._last_loss = loss.detach()
         decay = 0.01 ** (self.iteration / config.iterations)

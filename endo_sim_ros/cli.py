@@ -126,11 +126,11 @@ class Demo:
     """Synthetic patient: other seeds give other organs."""
     frames: int = 60
     """Synthetic patient: number of frames."""
-    width: int = 320
+    width: int = 480
     """Width of training and rendered images, pixels."""
     iterations: int = 1500
     """Training iterations."""
-    force: float = 2.5
+    force: float = 2.0
     """Largest force of the scripted tool, N."""
     timeout: float = 900.0
     """Give up after this long, seconds."""

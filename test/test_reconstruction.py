@@ -582,3 +582,19 @@ def test_odd_sizes_train():
     frames = film(161, 97, 3)
     model = Trainer(list(frames[::2]), options(image_width=75)).run()
     assert finite(model)
+
+
+def test_depth_extent_sees_needles_along_the_line_of_sight_only():
+    eye, angle = torch.tensor([0.0, 0.0, -0.1]), np.pi / 4
+    turned = [np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0]  # the z axis turns towards x
+    quats = torch.tensor([[1.0, 0, 0, 0], [1, 0, 0, 0], [2, 0, 0, 0], turned])
+    scales = torch.tensor([[1.0, 1, 1], [4, 4, 1], [1, 1, 6], [1, 1, 6]]) * 1e-3
+    model = GaussianModel(torch.zeros(4, 3), quats, scales.log(), torch.zeros(4), torch.zeros(4, 1, 3))
+    model.log_scales.requires_grad_()
+    extent = losses.depth_extent(model, eye)
+    # A sphere and a disc across the view are fine; a needle along it is 6 times as deep as wide, a turned one less.
+    deep, wide = (1 + 36) / 2, (1 + (1 + 36) / 2) / 2
+    expected = [0, 0, np.log(6 / 1.5), 0.5 * np.log(deep / wide) - np.log(1.5)]
+    np.testing.assert_allclose(extent.detach(), np.maximum(expected, 0), atol=1e-5)
+    extent[2].backward()
+    assert model.log_scales.grad[2, 2] > 0 > model.log_scales.grad[2, 0] and not model.log_scales.grad[:2].any()

@@ -22,7 +22,7 @@ class ScriptedToolConfig(StageConfig):
     """Name of the arm whose topics are published."""
     world_frame: str = "world"
     """Frame of the tool's pose."""
-    force: Annotated[float, Range(0, 100, "N")] = 2.5
+    force: Annotated[float, Range(0, 100, "N")] = 2.0
     """Largest force."""
     u: Annotated[float, Range(0, 1)] = 0.5
     """Where the tool takes hold, as a fraction of the image width."""

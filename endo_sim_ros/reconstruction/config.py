@@ -33,8 +33,8 @@ class ReconstructionConfig(StageConfig):
     """Weight of the distortion loss, in units of the scene's median depth (paper eq. 5)."""
     lambda_tv: Annotated[float, Range(0, 1000)] = 0.5
     """Weight of the total variation of the rendered depth, in units of the scene's median depth (paper eq. 6)."""
-    lambda_elongation: Annotated[float, Range(0, 1000)] = 0.02
-    """Weight of the elongation of needle-shaped Gaussians, which turn into streaks when the tissue is sheared."""
+    lambda_flat: Annotated[float, Range(0, 1000)] = 0.01
+    """Weight of Gaussians being deeper than 1.5 times their width, which turns into streaks when the tissue is sheared."""
     virtual_every: Annotated[int, Range(0, 1000)] = 1
     """A virtual camera regularises every n-th iteration (paper eq. 8, 9); 0 = never."""
     refine_every: Annotated[int, Range(1, 100_000)] = 100

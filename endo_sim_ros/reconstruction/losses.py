@@ -3,10 +3,14 @@
 Images are [H, W, 3] in [0, 1], depths [H, W] in metres, masks [H, W] in {0, 1}.
 """
 
+import math
+
 import cv2
 import numpy as np
 import torch
 from torch import Tensor
+
+from endo_sim_ros.gaussians import GaussianModel
 
 _WINDOW, _SIGMA = 11, 1.5  # the SSIM window of the field
 _C1, _C2 = 0.01**2, 0.03**2
@@ -49,14 +53,21 @@ def total_variation(depth: Tensor, mask: Tensor | None) -> Tensor:
     return masked_mean(dx, mask[:, 1:] * mask[:, :-1]) + masked_mean(dy, mask[1:] * mask[:-1])
 
 
-def elongation(log_scales: Tensor) -> Tensor:
-    """How far the longest axis of each Gaussian exceeds three times the middle one, log ratio [N]; discs and spheres have 0.
+def depth_extent(model: GaussianModel, eye: Tensor) -> Tensor:
+    """How far each Gaussian is deeper than 1.5 times its width seen from a point ``eye`` [3] (m, world), log ratio [N].
 
-    A needle along the line of sight cannot be seen until shear lays it across the picture (after PhysGaussian's
-    anisotropy regulariser, Xie et al. 2024, which also forbids discs).
+    Depth along the line of sight cannot be seen in the training views, but it becomes a streak across the picture as soon
+    as the tissue is sheared. (PhysGaussian's anisotropy regulariser, Xie et al. 2024, serves the same end but also
+    forbids the discs that a surface is best made of.)
     """
-    ordered = log_scales.sort(dim=1).values
-    return torch.relu(ordered[:, 2] - ordered[:, 1] - np.log(3.0))
+    line = torch.nn.functional.normalize(model.means.detach() - eye, dim=1)
+    w, v = model.quats[:, :1], -model.quats[:, 1:]  # the inverse rotation takes the line of sight to the Gaussian's axes
+    cross = torch.linalg.cross(v, line)
+    local = line + 2 / (w * w + (v * v).sum(1, keepdim=True)).clamp_min(1e-12) * (w * cross + torch.linalg.cross(v, cross))
+    variances = (2 * model.log_scales).exp()
+    deep = (local * local * variances).sum(1)
+    wide = (variances.sum(1) - deep) / 2
+    return torch.relu(0.5 * (deep / wide.clamp_min(1e-20)).log() - math.log(1.5))
 
 
 def ssim(image: Tensor, target: Tensor) -> Tensor:

@@ -79,6 +79,8 @@ class Trainer:
         frames = [shrink(frame, config.image_width) for frame in with_depth_prior(frames, points, config)]
         model = initial_model(frames, points, colors, config)
         self._views = [self._to_device(frame) for frame in frames]
+        eye = np.mean([view.camera.position for view in self._views], 0)
+        self._eye = torch.as_tensor(eye, dtype=torch.float32, device=self.device)
         self._nearest = _nearest_views(frames)
         self.scene_depth = _median_depth(frames, model)
         self._stamps = [frame.stamp_ns for frame in frames]
@@ -163,8 +165,8 @@ class Trainer:
         loss = self._view_loss(self._views[index])
         if config.virtual_every and self.iteration % config.virtual_every == 0 and len(self._views) > 1:
             loss = loss + self._virtual_loss(index)
-        if config.lambda_elongation:
-            loss = loss + config.lambda_elongation * losses.elongation(self._parameters["log_scales"]).mean()
+        if config.lambda_flat:
+            loss = loss + config.lambda_flat * losses.depth_extent(self._current(), self._eye).mean()
         loss.backward()
         self._last_loss = loss.detach()
         decay = 0.01 ** (self.iteration / config.iterations)

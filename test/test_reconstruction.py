@@ -587,7 +587,7 @@ def test_odd_sizes_train():
 def test_depth_extent_sees_needles_along_the_line_of_sight_only():
     eye, angle = torch.tensor([0.0, 0.0, -0.1]), np.pi / 4
     turned = [np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0]  # the z axis turns towards x
-    quats = torch.tensor([[1.0, 0, 0, 0], [1, 0, 0, 0], [2, 0, 0, 0], turned])
+    quats = torch.tensor([[1.0, 0, 0, 0], [1, 0, 0, 0], [2, 0, 0, 0], turned], dtype=torch.float32)
     scales = torch.tensor([[1.0, 1, 1], [4, 4, 1], [1, 1, 6], [1, 1, 6]]) * 1e-3
     model = GaussianModel(torch.zeros(4, 3), quats, scales.log(), torch.zeros(4), torch.zeros(4, 1, 3))
     model.log_scales.requires_grad_()

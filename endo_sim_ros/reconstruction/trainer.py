@@ -33,6 +33,7 @@ _RATES = {
     "means": 1.6e-4, "quats": 1e-3, "log_scales": 2e-2, "logit_opacities": 5e-2, "sh_base": 1e-2, "sh_rest": 1.25e-4,
 }  # fmt: skip
 _NOISE = 5e5  # of 3DGS-MCMC, in units of the means' learning rate, for a scene of depth 1
+_LARGEST = 0.1  # standard deviation of a Gaussian, in units of the scene's depth
 _LAST_REFINEMENT = 0.8  # share of the iterations after which the number of Gaussians stays fixed
 
 
@@ -175,6 +176,8 @@ class Trainer:
         self._optimizer.zero_grad(set_to_none=True)
         self.iteration += 1
         with torch.no_grad():
+            # Nothing holds the size of Gaussians where every view is masked; one that grew would smear the deformed scene.
+            self._parameters["log_scales"].clamp_(max=math.log(_LARGEST * self.scene_depth))
             refining = self.iteration <= _LAST_REFINEMENT * config.iterations
             if refining and self.iteration % config.refine_every == 0:
                 self._refine()

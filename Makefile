@@ -23,6 +23,7 @@ test: setup
 setup: $(VENV)/.installed
 
 $(VENV)/.installed: setup.py setup.cfg package.xml
+	@echo "setting up $(VENV), about a minute ..."
 	$(PYTHON) -m venv $(VENV)
 	$(VENV)/bin/python -m pip install --quiet --upgrade pip
 	$(VENV)/bin/python -m pip install --quiet --retries 0 $(TORCH_INDEX) '$(TORCH)'

@@ -5,7 +5,9 @@ quaternions are wxyz. Pixel (0, 0) has its centre at (0.5, 0.5), so that scaling
 """
 
 import dataclasses
+import json
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -157,3 +159,22 @@ def interpolate_pose(pose1: np.ndarray, pose2: np.ndarray, alpha: float) -> np.n
     """Pose between two poses [4, 4]: slerp of rotations, lerp of translations (paper eq. 8)."""
     quat = slerp(matrix_to_quat(pose1[:3, :3]), matrix_to_quat(pose2[:3, :3]), alpha)
     return make_pose((1 - alpha) * pose1[:3, 3] + alpha * pose2[:3, 3], quat)
+
+
+def save_cameras(cameras: list[Camera], path: str | Path) -> None:
+    """Write cameras as JSON: a list of K, width, height and camera-to-world pose."""
+    entries = [{"K": c.K.tolist(), "width": c.width, "height": c.height, "pose": c.pose.tolist()} for c in cameras]
+    Path(path).write_text(json.dumps(entries, indent=1))
+
+
+def load_cameras(path: str | Path) -> list[Camera]:
+    """Read what `save_cameras` wrote.
+
+    Raises:
+        ValueError: If the file holds something else; the message names it.
+    """
+    try:
+        entries = json.loads(Path(path).read_text())
+        return [Camera(np.array(e["K"]), int(e["width"]), int(e["height"]), np.array(e["pose"])) for e in entries]
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: not a readable list of cameras ({error})") from error

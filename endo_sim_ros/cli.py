@@ -1,6 +1,7 @@
 """The command line: `endo-sim COMMAND --help`."""
 
 import logging
+import shutil
 import sys
 import time
 from collections.abc import Iterable, Iterator
@@ -49,7 +50,7 @@ class Convert:
     """SCARED: direction of the poses; auto finds it by comparing images."""
     poses: Path | None = None
     """Video: file of camera poses (frame tx ty tz qx qy qz qw, camera-to-world). Without one poses.txt beside the video
-    is taken, and without that they are estimated by structure from motion."""
+    is taken, and without that, or with "sfm", they are estimated by structure from motion."""
     scale: float | None = None
     """Video: metres per unit of the poses."""
     sfm_step: int | None = None
@@ -75,10 +76,16 @@ class Convert:
 
         if self.bag.exists():  # before any work
             raise SequenceError(f"{self.bag} exists already; choose another name or remove it first")
+        if self.fps is not None and not self.fps > 0:
+            raise SequenceError(f"--fps must be positive, got {self.fps:g}")
         fixed = ("source", "bag", "kind")
         options = {name: value for name, value in vars(self).items() if name not in fixed and value is not None}
         frames = open_sequence(self.source, self.kind, **options)
-        count = write_bag(self.bag, _tracked(frames, f"converting {self.source.name}"))
+        try:
+            count = write_bag(self.bag, _tracked(frames, f"converting {self.source.name}"))
+        except BaseException:  # half a conversion would only be in the way of the next try
+            shutil.rmtree(self.bag, ignore_errors=True)
+            raise
         print(f"{self.bag}: {count} frames")
 
 

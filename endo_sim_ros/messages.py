@@ -176,6 +176,7 @@ def _header(types: Any, stamp_ns: int, frame_id: str) -> Any:
 def check_frame(message: Any, allowed: tuple[str, ...], topic: str) -> str:
     """The header's frame, which must be one of the allowed ones."""
     frame = message.header.frame_id.lstrip("/")
+    allowed = tuple(name.lstrip("/") for name in allowed)
     if frame not in allowed:
         names = " or ".join(repr(name) for name in allowed)
         raise MessageError(
@@ -286,6 +287,11 @@ class CameraInfo:
         """Whether images of this camera are rectified already."""
         return not self.D.any() and np.allclose(self.R, np.eye(3)) and np.allclose(self.K, self.P[:, :3])
 
+    def same_as(self, other: "CameraInfo") -> bool:
+        """Whether another one says the same."""
+        mine, others = (self.width, self.height), (other.width, other.height)
+        return mine == others and all(np.array_equal(getattr(self, n), getattr(other, n)) for n in ("K", "D", "R", "P"))
+
     @property
     def baseline(self) -> float:
         """Distance to the left eye along +x, metres (0 for a left or single eye)."""
@@ -295,9 +301,20 @@ class CameraInfo:
         """Rectified image; labels and depths are resampled with ``nearest``."""
         if self.rectified:
             return image
+        return cv2.remap(image, *self._maps, cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR)
+
+    @functools.cached_property
+    def _maps(self) -> tuple[np.ndarray, np.ndarray]:
         size = (self.width, self.height)
-        maps = cv2.initUndistortRectifyMap(self.K, self.D, self.R, self.P[:, :3], size, cv2.CV_32FC1)
-        return cv2.remap(image, *maps, cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR)
+        return cv2.initUndistortRectifyMap(self.K, self.D, self.R, self.P[:, :3], size, cv2.CV_32FC1)
+
+    @functools.cached_property
+    def seen(self) -> np.ndarray:
+        """Mask [H, W] uint8 of the rectified image: 255 where the raw image reaches, 0 in the border beyond it."""
+        return self.rectify(np.full((self.height, self.width), 255, np.uint8), nearest=True)
+
+
+_DISTORTION_MODELS = ("", "plumb_bob", "rational_polynomial")
 
 
 def decode_camera_info(message: Any, topic: str = LEFT_INFO.name) -> CameraInfo:
@@ -312,10 +329,20 @@ def decode_camera_info(message: Any, topic: str = LEFT_INFO.name) -> CameraInfo:
         raise MessageError(f"{topic}: K has focal lengths {K[0, 0]:g} and {K[1, 1]:g}; the camera is not calibrated")
     if message.width == 0 or message.height == 0:
         raise MessageError(f"{topic}: the image size is {message.width}×{message.height}")
+    if message.distortion_model not in _DISTORTION_MODELS and D.any():
+        raise MessageError(
+            f"{topic}: distortion_model {message.distortion_model!r} is not supported; publish rectified images (D = 0)"
+        )
+    if D.size not in (0, 4, 5, 8, 12, 14) or np.abs(D).max(initial=0) > 1e3:
+        raise MessageError(f"{topic}: D = {D.tolist()} is not a set of OpenCV distortion coefficients; calibrate the camera")
     if not R.any():
         R = np.eye(3)
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-2:
+        raise MessageError(f"{topic}: R is not a rotation; calibrate the camera, or set it to one for a single eye")
     if P[0, 0] <= 0 or P[1, 1] <= 0:
         P = np.hstack([K, np.zeros((3, 1))])
+    if not np.allclose(P[2], [0, 0, 1, 0]):
+        raise MessageError(f"{topic}: the last row of P is {P[2].tolist()}, not 0 0 1 0; calibrate the camera")
     return CameraInfo(K, D, R, P, message.width, message.height)
 
 

@@ -7,10 +7,12 @@ from endo_sim_ros.cameras import (
     Camera,
     interpolate_pose,
     invert_pose,
+    load_cameras,
     look_at,
     make_pose,
     matrix_to_quat,
     quat_to_matrix,
+    save_cameras,
     slerp,
 )
 
@@ -96,3 +98,15 @@ def test_look_at_points_the_optical_axis_with_the_picture_upright():
 def test_unusable_cameras_are_refused(change, sentence):
     with pytest.raises(ValueError, match=sentence):
         Camera(**{"K": K, "width": 640, "height": 480, "pose": np.eye(4), **change})
+
+
+def test_cameras_survive_a_file(tmp_path):
+    cameras = [Camera(K, 640, 512, random_pose()), Camera(K, 64, 48)]
+    save_cameras(cameras, tmp_path / "cameras.json")
+    for sent, received in zip(cameras, load_cameras(tmp_path / "cameras.json"), strict=True):
+        np.testing.assert_array_equal(received.pose, sent.pose)
+        np.testing.assert_array_equal(received.K, sent.K)
+        assert (received.width, received.height) == (sent.width, sent.height)
+    (tmp_path / "cameras.json").write_text('{"K": 1}')
+    with pytest.raises(ValueError, match="cameras.json: not a readable list of cameras"):
+        load_cameras(tmp_path / "cameras.json")

@@ -131,6 +131,11 @@ def test_raw_images_are_rectified_by_their_camera_info():
     moved = np.array(cv2.minMaxLoc(cv2.GaussianBlur(info.rectify(dot), (7, 7), 0))[3], float)
     expected = cv2.undistortPoints(np.array([[[501.0, 101.0]]]), K, D, R=R, P=K)[0, 0]
     assert np.linalg.norm(moved - expected) < 1.5
+    message.d = [0.3, 0.0, 0.0, 0.0, 0.0]
+    info = messages.decode_camera_info(message)
+    lit = info.rectify(np.full((512, 640), 200, np.uint8), nearest=True)
+    np.testing.assert_array_equal(info.seen > 0, lit > 0)  # the border beyond the raw image is known
+    assert not info.seen.all() and info.seen.mean() > 128
     assert np.linalg.norm(expected - [501, 101]) > 5
 
 
@@ -255,6 +260,20 @@ def test_bad_camera_info_is_refused():
         messages.decode_camera_info(message)
     message = messages.encode_camera_info(K * np.nan, 640, 512, STAMP, "cam")
     with pytest.raises(MessageError, match="camera_info: K is not finite"):
+        messages.decode_camera_info(message)
+    for field, value, sentence in (
+        ("d", [0.1, 0.2, 0.3], "not a set of OpenCV distortion coefficients"),
+        ("d", [1e300, 0, 0, 0, 0], "not a set of OpenCV distortion coefficients"),
+        ("r", np.ones(9), "R is not a rotation"),
+        ("p", np.array([500.0, 0, 320, 0, 0, 500, 256, 0, 0, 0, 0, 0]), "last row of P"),
+    ):
+        message = messages.encode_camera_info(K, 640, 512, STAMP, "cam")
+        setattr(message, field, value)
+        with pytest.raises(MessageError, match=f"camera_info: .*{sentence}"):
+            messages.decode_camera_info(message)
+    message = messages.encode_camera_info(K, 640, 512, STAMP, "cam")
+    message.d, message.distortion_model = [0.1, 0.0, 0.0, 0.0], "equidistant"
+    with pytest.raises(MessageError, match="distortion_model 'equidistant' is not supported"):
         messages.decode_camera_info(message)
 
 

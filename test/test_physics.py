@@ -1,7 +1,6 @@
 """Physics: nodes, materials, the solver against theory, tools, faults and skinning."""
 
 import dataclasses
-import logging
 
 import numpy as np
 import pytest
@@ -505,17 +504,15 @@ def test_stiff_material_is_refused_with_the_numbers_when_substeps_may_not_adapt(
 
 
 @pytest.mark.parametrize("kinematics", ["rest", "current"])
-def test_absurd_force_is_caught_and_the_last_good_state_restored(kinematics, caplog):
+def test_absurd_force_is_caught_and_the_last_good_state_restored(kinematics):
     simulation = simulate(kinematics=kinematics)
     simulation.set_wrench("probe", TIP, [0.0, 0.0, 0.1])
     steps(simulation, 3)
     good = simulation.state()
     simulation.set_wrench("probe", TIP, [0.0, 0.0, -1e7])
-    with caplog.at_level(logging.WARNING):
-        simulation.step()
+    simulation.step()
     bad = simulation.state()
     assert simulation.faults == 1 and "undone" in simulation.last_fault and "1e+07 N" in simulation.last_fault
-    assert simulation.last_fault in caplog.text
     np.testing.assert_array_equal(bad.positions, good.positions)
     np.testing.assert_array_equal(bad.F, good.F)
     assert not np.any(simulation.solver.momentum())

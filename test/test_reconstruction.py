@@ -598,3 +598,10 @@ def test_depth_extent_sees_needles_along_the_line_of_sight_only():
     np.testing.assert_allclose(extent.detach(), np.maximum(expected, 0), atol=1e-5)
     extent[2].backward()
     assert model.log_scales.grad[2, 2] > 0 > model.log_scales.grad[2, 0] and not model.log_scales.grad[:2].any()
+
+
+def test_no_gaussian_outgrows_the_scene():
+    frames = list(phantom_sequence(PhantomConfig(frames=4, width=96, height=80, border=0.1)))
+    trainer = Trainer(frames, ReconstructionConfig(iterations=60, max_gaussians=1000, device="cpu", learning_rate=5.0))
+    trainer.run()
+    assert trainer.model.scales.max() <= 0.04 * trainer.scene_depth * 1.001

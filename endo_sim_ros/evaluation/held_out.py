@@ -20,6 +20,7 @@ _STRIPS = 3  # held-out views shown in the picture
 
 def reconstruct_and_measure(bag: Path, out: Path, config: ReconstructionConfig) -> dict[str, float]:
     """Reconstruct a bag, save the model, and return mean figures over the views that were not trained on."""
+    out.mkdir(parents=True, exist_ok=True)  # before the long work
     frames = list(read_bag(bag))
     chosen = select_keyframes(frames, config.keyframes)
     log.info("%d views, training on %d", len(frames), len(chosen))

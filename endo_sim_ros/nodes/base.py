@@ -170,16 +170,15 @@ class EndoNode(Node):
             level, text, values = self.status()
         except Exception as error:  # a fault in describing the state must not end the node
             level, text, values = ERROR, sentence("status", error), {}
-        now = self.now_ns()
-        if now == 0:
-            level, text = WARN, "use_sim_time is set but no time came on /clock"
         if time.monotonic() < self._error_until:
             level, text = ERROR, self._error_text
         values = values | {"errors": self.error_count}
-        name = self.get_fully_qualified_name().lstrip("/")
-        status = messages.encode_diagnostics(name, level, text, values, now)
         try:
-            self._diagnostics.publish(status)
+            now = self.now_ns()
+            if now == 0 and level != ERROR:
+                level, text = WARN, "use_sim_time is set but no time came on /clock"
+            name = self.get_fully_qualified_name().lstrip("/")
+            self._diagnostics.publish(messages.encode_diagnostics(name, level, text, values, now))
         except Exception:
             if self.context.ok():  # otherwise a worker came to its end after the node
                 raise

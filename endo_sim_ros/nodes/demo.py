@@ -11,6 +11,7 @@ import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
 from endo_sim_ros.evaluation import figures
@@ -38,6 +39,20 @@ class _Watcher(EndoNode):
         self.statuses: dict[str, tuple[int, str, dict[str, str]]] = {}
         self.subscribe(messages.DIAGNOSTICS, self._on_diagnostics)
 
+    def request(self, service: str, executor: SingleThreadedExecutor) -> None:
+        """Call a Trigger service.
+
+        Raises:
+            DemoError: If it does not answer, or refuses.
+        """
+        client = self.create_client(Trigger, service)
+        if not client.wait_for_service(timeout_sec=20.0):
+            raise DemoError(f"the service {service} is not there; see the log of its node")
+        future = client.call_async(Trigger.Request())
+        executor.spin_until_future_complete(future, timeout_sec=60.0)
+        if not future.done() or not future.result().success:
+            raise DemoError(f"{service}: {future.result().message if future.done() else 'no answer'}")
+
     def _on_diagnostics(self, message) -> None:
         for name, level, text, values in messages.decode_diagnostics(message):
             self.statuses[name] = (level, text, values)
@@ -62,8 +77,8 @@ def run_demo(
         if bag is None:
             bag = _phantom_bag(out / f"phantom_{seed}", seed, frames, width, progress)
         else:
-            with BagReader(bag):  # a bad bag is reported before anything starts
-                pass
+            with BagReader(bag) as reader:  # a bag that cannot do is reported before anything starts
+                reader.require_recording()
         _touch_over_dds(graph, progress, bag, recording, out, width, iterations, force, timeout)
     with console.status("writing the video and the contact sheet"):
         report = TouchReport(recording, _ARM)
@@ -144,6 +159,7 @@ def _touch_over_dds(
         graph.start("recorder_node", bag=recording, arms=_ARM)
         graph.start(
             "reconstruction_node",
+            start_after=0.0,  # asked to, below
             output_dir=out / "models",
             image_width=width,
             iterations=iterations,
@@ -156,6 +172,7 @@ def _touch_over_dds(
         wait("starting", names.issubset, text_of("recorder"))
         player = graph.start("bag_player_node", bag=bag)
         wait("replaying", lambda _: player.exit_status == 0, text_of("bag_player"))
+        watcher.request("reconstruction_node/reconstruct", executor)
         wait("reconstructing", says("reconstruction_node", "finished"), text_of("reconstruction_node"))
         final = lambda s: s.get("rendering_node", (0, "", {}))[2].get("following control nodes") == "True"  # noqa: E731
         settled = itertools.count()  # the final model reaches physics and rendering a moment after it is finished

@@ -12,7 +12,7 @@ import torch
 from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
-from endo_sim_ros.cameras import Camera
+from endo_sim_ros.cameras import Camera, load_cameras, save_cameras
 from endo_sim_ros.config import Range, StageConfig
 from endo_sim_ros.gaussians import GaussianModel, load_ply, save_ply
 from endo_sim_ros.messages import Topic
@@ -26,6 +26,8 @@ _LEFT_IMAGES = (messages.LEFT_IMAGE, messages.LEFT_COMPRESSED)
 # Seconds by which stamps must jump to mean that another recording began; after a pause any step back means it.
 _JUMP_BACK, _JUMP_AHEAD, _PAUSE = 1.0, 60.0, 1.0
 
+_LATEST, _CAMERAS = "latest", "cameras.json"
+
 
 @dataclass(frozen=True)
 class ReconstructionNodeConfig(StageConfig):
@@ -38,19 +40,21 @@ class ReconstructionNodeConfig(StageConfig):
     reliable: bool = True
     """Ask for reliable delivery; set to false for cameras that publish best effort."""
     start_after: Annotated[float, Range(0, 3600, "s")] = 1.5
-    """Reconstruct when no new view came for this long; 0 = only when the service ~/reconstruct is called."""
+    """Reconstruct when no image came for this long, or for three times the longest gap between images so far; 0 = only
+    when the service ~/reconstruct is called."""
     start_views: Annotated[int, Range(0, 100_000)] = 0
     """Reconstruct once as soon as this many views arrived (for a live camera, whose stream does not end); 0 = off."""
     max_views: Annotated[int, Range(2, 100_000)] = 300
     """Views kept in memory; above it every second one is dropped."""
     image_timeout: Annotated[float, Range(0.1, 3600, "s")] = 10.0
-    """Warn when no view arrived for this long."""
+    """Warn when no view arrived for this long; also the longest wait for a slow recording to go on."""
     publish_period: Annotated[float, Range(0.1, 3600, "s")] = 5.0
     """Time between intermediate models during training."""
     output_dir: str = "~/.ros/endo_sim_ros"
     """Where each reconstruction's model.ply and checkpoint.pt are saved, in a folder named by the time."""
     model_file: str = ""
-    """PLY model to publish at start, before any reconstruction, or when this is set."""
+    """PLY model to publish at start, before any reconstruction, or when this is set; latest = the newest in output_dir.
+    Cameras saved beside it (cameras.json) are published with it."""
 
 
 class ReconstructionNode(EndoNode):
@@ -67,6 +71,7 @@ class ReconstructionNode(EndoNode):
         self._synchronizer = Synchronizer(self._options.sync_tolerance)
         self._last_image = self._last_view = time.monotonic()  # when they arrived
         self._newest_stamp = 0  # of the images of this recording
+        self._longest_gap: float | None = None  # between arriving images of this recording, seconds
         self._trained: tuple[int, int] | None = None  # first and last stamp of the recording reconstructed last
         self._thread: threading.Thread | None = None
         self._cancel = threading.Event()
@@ -75,7 +80,8 @@ class ReconstructionNode(EndoNode):
         self._outbox: tuple[GaussianModel, list[Camera]] | None = None  # newest model of the worker, to be published
         self._published: GaussianModel | None = None
         self._model_stamp = 0
-        self._saved, self._failure = "", ""  # how the last reconstruction ended
+        self._saved, self._failure, self._finished = "", "", False  # how the last reconstruction ended
+        self._cameras: list[Camera] = []  # of the newest published model
         self._model_pub, self._cameras_pub, self._info_pub = (self.publisher(topic) for topic in messages.MODEL_TOPICS)
         for topic in messages.RECORDING_TOPICS:
             self.subscribe(topic, partial(self._on_recording, topic), 50, self._options.reliable)
@@ -103,7 +109,8 @@ class ReconstructionNode(EndoNode):
 
     def _note_image(self, stamp: int) -> None:
         """Keep track of where one recording ends and the next begins."""
-        paused = time.monotonic() - self._last_image > _PAUSE
+        gap = time.monotonic() - self._last_image
+        paused = gap > _PAUSE
         self._last_image = time.monotonic()
         if stamp <= 0:
             return  # will be refused
@@ -112,14 +119,22 @@ class ReconstructionNode(EndoNode):
             self._end_recording()
             if paused:
                 self._trained = None  # the same recording replayed on purpose, not looped, is reconstructed again
+        elif self._newest_stamp:
+            self._longest_gap = max(gap, self._longest_gap or 0.0)
         self._newest_stamp = max(stamp, self._newest_stamp)
+
+    def _silence(self) -> float:
+        """Seconds without an image that mean the end of the recording, which may be a slow one."""
+        options = self._options
+        gap = options.image_timeout if self._longest_gap is None else 3 * self._longest_gap
+        return max(options.start_after, min(gap, options.image_timeout))
 
     def _end_recording(self) -> None:
         """Reconstruct what was collected and begin again with what comes."""
         self._flush()
         self._start_if_new()
         self._synchronizer = Synchronizer(self._options.sync_tolerance)
-        self._frames, self._newest_stamp = [], 0
+        self._frames, self._newest_stamp, self._longest_gap = [], 0, None
 
     def _flush(self) -> None:
         """Take over all views that still wait for other streams."""
@@ -139,7 +154,7 @@ class ReconstructionNode(EndoNode):
 
     def _on_timer(self) -> None:
         with self.guard("reconstruction"):
-            if 0 < self._options.start_after < time.monotonic() - self._last_image:
+            if self._options.start_after > 0 and time.monotonic() - self._last_image > self._silence():
                 self._flush()
                 self._start_if_new()
             with self._lock:
@@ -165,7 +180,7 @@ class ReconstructionNode(EndoNode):
         chosen = select_keyframes(self._frames, self._config.keyframes)
         views = [self._frames[index] for index in chosen]
         self._trained = (self._frames[0].stamp_ns, self._frames[-1].stamp_ns)
-        self._progress, self._saved, self._failure = None, "", ""
+        self._progress, self._saved, self._failure, self._finished = None, "", "", False
         self._cancel.clear()
         self._thread = threading.Thread(target=self._train, args=(views, self._config))
         self._thread.start()
@@ -187,7 +202,8 @@ class ReconstructionNode(EndoNode):
 
             trainer.run(on_progress, every=5)
             self._offer(trainer)
-            self._save(trainer.model, trainer)  # also what an interrupted training has reached
+            self._save(trainer.model, trainer.cameras, trainer)  # also what an interrupted training has reached
+            self._finished = True
             done = f"{len(trainer.model)} Gaussians after {trainer.iteration} iterations"
             self.get_logger().info(f"reconstruction finished: {done}, saved in {self._saved}")
         except Exception as error:
@@ -210,16 +226,27 @@ class ReconstructionNode(EndoNode):
             self._info_pub.publish(messages.encode_camera_info(first.K, first.width, first.height, stamp, LEFT_FRAME))
         self._cameras_pub.publish(messages.encode_poses([camera.pose for camera in cameras], stamp, world))
         self._model_pub.publish(messages.encode_gaussians(model, stamp, world))
-        self._published = model
+        self._published, self._cameras = model, cameras
 
-    def _publish_file(self, path: str) -> None:
-        if path:
-            self._publish(load_ply(Path(path).expanduser()), [])
+    def _publish_file(self, name: str) -> None:
+        if not name:
+            return
+        path = Path(name).expanduser()
+        if name == _LATEST:
+            folder = Path(self._options.output_dir).expanduser()
+            path = max(folder.glob("*/model.ply"), default=None)
+            if path is None:
+                raise SequenceError(f"{folder}: there is no model saved yet; model_file=latest has nothing to publish")
+        cameras = path.with_name(_CAMERAS)
+        self._publish(load_ply(path), load_cameras(cameras) if cameras.exists() else [])
 
-    def _save(self, model: GaussianModel, trainer: Trainer | None = None) -> None:
-        folder = Path(self._options.output_dir).expanduser() / time.strftime("%Y%m%d-%H%M%S")
+    def _save(self, model: GaussianModel, cameras: list[Camera], trainer: Trainer | None = None) -> None:
+        parent = Path(self._options.output_dir).expanduser()
+        name = time.strftime("%Y%m%d-%H%M%S")
+        folder = next(path for n in range(1000) if not (path := parent / (f"{name}-{n}" if n else name)).exists())
         try:
             save_ply(model, folder / "model.ply")
+            save_cameras(cameras, folder / _CAMERAS)
             if trainer is not None:
                 trainer.save_checkpoint(folder / "checkpoint.pt")
         except (OSError, RuntimeError) as error:  # torch turns a full disk into a RuntimeError
@@ -242,7 +269,7 @@ class ReconstructionNode(EndoNode):
     def _on_save(self, _: Trigger.Request) -> tuple[bool, str]:
         if self._published is None:
             return False, "there is no model to save yet"
-        self._save(self._published)
+        self._save(self._published, self._cameras)
         return True, self._saved
 
     # ------------------------------------------------------------ diagnostics
@@ -260,7 +287,7 @@ class ReconstructionNode(EndoNode):
             return OK, f"training, iteration {progress.iteration} of {progress.iterations}", values
         if self._failure:
             return ERROR, self._failure, values
-        if self._saved:
+        if self._finished:
             return OK, f"finished, model saved in {self._saved}", values
         silent = time.monotonic() - self._last_view
         if silent > self._options.image_timeout:

@@ -148,7 +148,10 @@ class RenderingNode(EndoNode):
             now = time.monotonic()
             if self._dirty or self._output is None:
                 self._dirty = False
-                self._output = self._render(self._bound, self._bound.renderer.camera(camera))
+                camera = self._bound.renderer.camera(camera)
+                if max(camera.width, camera.height) > _MAX_SIDE:
+                    raise MessageError(f"images of {camera.width}×{camera.height} are too large; set image_width")
+                self._output = self._render(self._bound, camera)
                 self._seconds_per_image += 0.1 * (time.monotonic() - now - self._seconds_per_image)
             elif now - self._last_image < 1 / self._options.idle_rate - 0.5 / self._options.rate:
                 return

@@ -1,6 +1,5 @@
 """The tissue that tools push and pull: control nodes, the solver, wrenches and faults."""
 
-import logging
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,8 +9,6 @@ from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes, build_control_nodes
 from endo_sim_ros.physics.mpm import MpmSolver
 from endo_sim_ros.physics.wrench import fall_off, minimum_norm_forces
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -185,10 +182,9 @@ class TissueSimulation:
             self.solver.restore()
             self.faults += 1
             self.last_fault = (
-                f"step to {self.time:.3f} s undone: {bad} of {len(self.nodes)} nodes ended non-finite, torn or"
+                f"a step was undone: {bad} of {len(self.nodes)} nodes ended non-finite, torn or"
                 f" over {self.config.travel:g} m from rest ({self._describe_tools()}); use less force or more travel"
             )
-            log.warning("%s", self.last_fault)
             for grip in self._grips.values():  # pull on from where the tissue is
                 grip.displacements = self.solver.displacements()[grip.nodes].astype(np.float64)
         for grip in self._grips.values():

@@ -140,6 +140,15 @@ class BagReader:
             if any(qos.durability == QosDurability.TRANSIENT_LOCAL for qos in connection.ext.offered_qos_profiles)
         }
 
+    def require_recording(self) -> None:
+        """Raise SequenceError, listing what is there, unless the bag has images, camera_info and poses."""
+        present = self.topics
+        needed = ((messages.LEFT_IMAGE, messages.LEFT_COMPRESSED), (messages.LEFT_INFO,), (messages.CAMERA_POSE,))
+        for choices in needed:
+            if not any(f"/{topic.name}" in present for topic in choices):
+                there = ", ".join(sorted(present)) or "no topics"
+                raise SequenceError(f"{self.path}: no topic /{choices[0].name}; the bag has {there}")
+
     @property
     def duration(self) -> float:
         """Seconds between first and last message."""
@@ -218,13 +227,7 @@ def read_bag(path: str | Path, tolerance: float = 0.01, world_frame: str = WORLD
     """
     synchronizer, count = Synchronizer(tolerance), 0
     with BagReader(path) as bag:
-        present = bag.topics
-        needed = ((messages.LEFT_IMAGE, messages.LEFT_COMPRESSED), (messages.LEFT_INFO,), (messages.CAMERA_POSE,))
-        for choices in needed:
-            if not any(f"/{topic.name}" in present for topic in choices):
-                raise SequenceError(
-                    f"{path}: no topic /{choices[0].name}; the bag has {', '.join(sorted(present)) or 'no topics'}"
-                )
+        bag.require_recording()
         for topic, _, message in bag.messages(messages.RECORDING_TOPICS):
             with _located(path):
                 frames = feed(synchronizer, topic, message, world_frame)

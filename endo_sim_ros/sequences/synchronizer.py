@@ -3,6 +3,7 @@
 import bisect
 from typing import Any
 
+import cv2
 import numpy as np
 
 from endo_sim_ros.cameras import Camera
@@ -64,7 +65,7 @@ class Synchronizer:
         self._streams = {name: _Stream(MAX_POSES if name == "pose" else MAX_OTHERS) for name in STREAMS}
         self._emitted = 0  # stamp of the last image that left
         self._complete: list[Frame] = []
-        self.dropped = {"without pose": 0, "without camera_info": 0, "out of order": 0, "invalid": 0}
+        self.dropped = {"without pose": 0, "without camera_info": 0, "out of order": 0, "invalid": 0, "without right eye": 0}
 
     @property
     def pending(self) -> int:
@@ -73,7 +74,9 @@ class Synchronizer:
 
     def add_info(self, eye: str, info: CameraInfo) -> None:
         """Set the camera information of the ``left`` or ``right`` eye; the latest one counts."""
-        self._infos[eye] = info
+        old = self._infos.get(eye)
+        if old is None or not old.same_as(info):  # an equal one keeps its rectification maps
+            self._infos[eye] = info
 
     def add(self, stream: str, stamp_ns: int, value: Any) -> list[Frame]:
         """Add one decoded message of a stream and return the frames that became complete, in order.
@@ -137,9 +140,13 @@ class Synchronizer:
         if missing:
             self.dropped[f"without {missing}"] += 1
             return None
+        right_info = self._infos.get("right")
+        if "right" in parts and (right_info is None or right_info.baseline <= 0):  # P[0, 3] must be −fx·B
+            self.dropped["without right eye"] += 1
+            del parts["right"]
         try:
-            return _frame(stamp, image, info, self._infos.get("right"), parts)
-        except ValueError as error:
+            return _frame(stamp, image, info, right_info, parts)
+        except (ValueError, cv2.error) as error:
             self.dropped["invalid"] += 1
             raise SequenceError(str(error)) from error
 
@@ -153,13 +160,16 @@ def _frame(
                 f"endoscope/left: the {name} is {array.shape[1]}×{array.shape[0]} but camera_info says "
                 f"{info.width}×{info.height}; publish both at the same size"
             )
-    right = parts.get("right") if right_info is not None and right_info.baseline > 0 else None
+    right = parts.get("right")
     if right is not None and not right.shape[:2] == image.shape[:2] == (right_info.height, right_info.width):
         raise SequenceError(
             f"endoscope/right: the image is {right.shape[1]}×{right.shape[0]}, its camera_info says "
             f"{right_info.width}×{right_info.height} and the left image is {image.shape[1]}×{image.shape[0]}; "
             "publish all at the same size"
         )
+    mask = None if "mask" not in parts else info.rectify(parts["mask"], nearest=True)
+    if not info.rectified:
+        mask = info.seen if mask is None else np.minimum(mask, info.seen)
     return Frame(
         stamp_ns=stamp,
         image=info.rectify(image),
@@ -168,5 +178,5 @@ def _frame(
         baseline=None if right is None else right_info.baseline,
         right_K=None if right is None or np.allclose(right_info.P[:, :3], info.P[:, :3]) else right_info.P[:, :3],
         depth=None if "depth" not in parts else info.rectify(parts["depth"], nearest=True),
-        mask=None if "mask" not in parts else info.rectify(parts["mask"], nearest=True),
+        mask=mask,
     )

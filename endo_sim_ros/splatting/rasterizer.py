@@ -115,8 +115,8 @@ def render(
         near: Nearest distance drawn, metres.
         eps2d: Added to the variances in the image, pixel².
     """
-    viewmat = torch.as_tensor(camera.viewmat, dtype=torch.float32, device=model.means.device)
-    K = torch.as_tensor(camera.K, dtype=torch.float32, device=model.means.device)
+    viewmat = torch.tensor(camera.viewmat, dtype=torch.float32, device=model.means.device)
+    K = torch.tensor(camera.K, dtype=torch.float32, device=model.means.device)
     return rasterize(
         model.means,
         None if covars is not None else model.quats,

@@ -336,6 +336,17 @@ def test_camera_info_of_another_size_in_mid_stream_is_followed(bench, reconstruc
     assert {frame.camera.width for frame in reconstruction._frames} == {96, 192}
 
 
+def test_a_slow_recording_is_not_taken_for_one_that_ended(bench, reconstruction, small_frames):
+    """Images every half second, with a silence of 0.2 s set to mean the end."""
+    assert bench.set("reconstruction_node", start_after=0.2, image_timeout=4.0)[0]
+    for count in range(1, 4):
+        send_frames(bench, small_frames[count - 1 : count])
+        bench.until(lambda: time.monotonic() - reconstruction._last_image > 0.5, "half a second")
+        assert reconstruction._trained is None
+    bench.status("reconstruction_node", "finished, model saved in")
+    assert len(reconstruction._frames) == 3
+
+
 def test_recording_is_reconstructed_published_latched_and_saved(bench, reconstruction, small_frames, tmp_path):
     assert bench.set("reconstruction_node", publish_period=0.1, output_dir=str(tmp_path), keyframes=3)[0]
     models = bench.hear(messages.GAUSSIANS)
@@ -362,6 +373,13 @@ def test_recording_is_reconstructed_published_latched_and_saved(bench, reconstru
     assert len(models) == count
     answer = bench.call(Trigger, "/reconstruction_node/save")
     assert answer.success and answer.message.startswith(str(tmp_path))
+    # The newest model comes back by name, with the cameras that were saved beside it.
+    assert bench.set("reconstruction_node", model_file="latest")[0]
+    bench.until(lambda: len(models) > count, "the saved model")
+    bench.until(lambda: cameras[-1].header.stamp == models[-1].header.stamp, "its cameras")
+    torch.testing.assert_close(messages.decode_gaussians(models[-1]).means, final.means)
+    assert len(cameras[-1].poses) == 3
+    count = len(models)
     # A second recording with the very same stamps, after a pause, is another recording.
     bench.until(lambda: time.monotonic() - reconstruction._last_image > 1.1)
     send_frames(bench, small_frames)

@@ -15,6 +15,7 @@ from endo_sim_ros.messages import ControlNodeCloud, MessageError
 from endo_sim_ros.nodes.base import ERROR, OK, WARN, Background, EndoNode, arm_names, run, sentence
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
 
+_SLOW = 0.5  # real-time factor below which the node warns
 _CAMERAS_LATE = 1.0  # seconds after a model in which its training cameras may still be on their way
 
 
@@ -282,7 +283,11 @@ class PhysicsNode(EndoNode):
         }
         if self._failure:
             return ERROR, f"{self._failure}; the model before goes on", values
-        return OK, "paused" if self._paused else "running", values
+        if self._paused:
+            return OK, "paused", values
+        if self._real_time_factor < _SLOW:
+            return WARN, "slower than real time; lower node_count or young_modulus, or use a GPU", values
+        return OK, "running", values
 
     def destroy_node(self) -> None:
         self._background.stop()

@@ -33,7 +33,7 @@ def with_depth_prior(frames: list[Frame], points: np.ndarray, config: Reconstruc
     Raises:
         SequenceError: If the source asked for is not in the recording.
     """
-    has_topic = any(frame.depth is not None for frame in frames)
+    has_topic = any(frame.depth is not None and (frame.depth > 0).any() for frame in frames)
     has_stereo = any(frame.right is not None for frame in frames)
     source = config.depth
     if source == "auto":

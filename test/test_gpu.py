@@ -93,7 +93,7 @@ def test_skinning_agrees():
 
 
 def test_training_reaches_the_same_quality():
-    frames = list(phantom_sequence(PhantomConfig(frames=5, width=160, height=128)))
+    frames = list(phantom_sequence(PhantomConfig(frames=5, width=160, height=128, travel=0.01)))
     quality = {}
     for device in ("cpu", "cuda"):
         config = ReconstructionConfig(iterations=150, max_gaussians=8000, image_width=160, device=device)

@@ -17,7 +17,7 @@ NODES = ("reconstruction_node", "physics_node", "rendering_node", "bag_player_no
 def prefix(tmp_path_factory) -> Path:
     """The package alone, installed by pip into an empty prefix."""
     target = tmp_path_factory.mktemp("prefix")
-    command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--prefix", str(target), "."]
+    command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--ignore-installed", "--prefix", str(target), "."]
     source = tmp_path_factory.mktemp("source")
     listing = subprocess.run(["git", "ls-files", "-co", "--exclude-standard"], cwd=ROOT, capture_output=True, text=True)
     if listing.returncode:

@@ -33,7 +33,7 @@ _RATES = {
     "means": 1.6e-4, "quats": 1e-3, "log_scales": 2e-2, "logit_opacities": 5e-2, "sh_base": 1e-2, "sh_rest": 1.25e-4,
 }  # fmt: skip
 _NOISE = 5e5  # of 3DGS-MCMC, in units of the means' learning rate, for a scene of depth 1
-_LARGEST = 0.04  # standard deviation of a Gaussian, in units of the scene's depth
+_LARGEST = 0.06  # standard deviation of a Gaussian, in units of the scene's depth
 _LAST_REFINEMENT = 0.8  # share of the iterations after which the number of Gaussians stays fixed
 
 

@@ -7,8 +7,6 @@ import sys
 
 import torch
 
-DEVICE_HELP = "Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."
-
 
 def pick_device(name: str = "auto") -> str:
     """Resolve a device name to one that both torch and Warp understand, e.g. ``cpu`` or ``cuda:0``.

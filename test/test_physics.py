@@ -593,6 +593,19 @@ def test_grabbed_tissue_stays_grabbed_while_it_follows():
     np.testing.assert_allclose(simulation.reaction("jaw")[0], [0, 0, 0.8], atol=1e-12)
 
 
+def test_a_tip_that_stays_behind_does_not_wring_the_tissue():
+    simulation = simulate(force_radius=0.008)
+    simulation.set_wrench("jaw", TIP, [2.0, 0.0, -1.0])
+    simulation.step()
+    at_first = np.linalg.norm(simulation.solver._nodes.force.numpy(), axis=1).max()
+    steps(simulation, 100)
+    assert depth_of_dent(simulation) > simulation.config.force_radius
+    in_the_end = np.linalg.norm(simulation.solver._nodes.force.numpy(), axis=1).max()
+    np.testing.assert_allclose(in_the_end, at_first, rtol=0.2)  # about the tip itself they would have doubled
+    np.testing.assert_allclose(simulation.reaction("jaw")[0], [-2.0, 0.0, 1.0], atol=1e-12)
+    np.testing.assert_allclose(simulation.reaction("jaw")[1], 0.0, atol=1e-12)
+
+
 def test_two_tools_act_at_once():
     simulation = simulate()
     left, right = TIP - [0.025, 0, 0], TIP + [0.025, 0, 0]

@@ -28,6 +28,7 @@ class _Tool:
     torque: np.ndarray  # [3] N·m
     nodes: np.ndarray = field(default_factory=lambda: np.empty(0, int))  # attached, indices
     weights: np.ndarray = field(default_factory=lambda: np.empty(0))
+    contact: np.ndarray = field(default_factory=lambda: np.zeros(3))  # tip relative to the nodes' centroid, kept, m
     applied: tuple[np.ndarray, np.ndarray] = (np.zeros(3), np.zeros(3))  # force N and torque N·m that arrived
 
 
@@ -55,7 +56,8 @@ class TissueSimulation:
 
     A tool takes hold of the tissue when its wrench becomes non-zero: the moving skin nodes then within
     ``force_radius`` of its tip (in their current positions) are its nodes until the wrench is zero again, so that
-    grabbed tissue follows without jitter. A tool that reaches no node applies nothing and tries again every step.
+    grabbed tissue follows without jitter. The wrench acts at the point of the tissue that was at the tip then, and moves
+    with it: about a tip that stays behind, a mere force would be an ever greater couple on the few nodes. A tool that reaches no node applies nothing and tries again every step.
     A jaw that closes holds the nodes in the same reach, which then follow the pose of its tip until it opens.
     Tissue that nothing acts on and that has come to rest costs no time.
 
@@ -101,9 +103,9 @@ class TissueSimulation:
 
         Args:
             tool: Name of the tool.
-            tip: Tip position [3], metres, world. It may move while the tool holds on.
+            tip: Tip position [3], metres, world; what counts is where it is when the tool takes hold.
             force: Force [3], N, world.
-            torque: Torque about the tip [3], N·m, world.
+            torque: Torque about the point held [3], N·m, world.
 
         Returns:
             Whether the wrench arrives: False when it is not zero but no moving skin node is in reach.
@@ -155,8 +157,8 @@ class TissueSimulation:
         return True
 
     def reaction(self, tool: str) -> tuple[np.ndarray, np.ndarray]:
-        """Force [3] N and torque about the tip [3] N·m that the tissue exerts back on a tool, world: minus what its
-        wrench and its jaw apply; zero for a tool that is out of reach, has let go or is unknown."""
+        """Force [3] N and torque [3] N·m that the tissue exerts back on a tool, world: minus what its wrench applies
+        (torque about the point held) and its jaw (about the tip); zero for a tool that is out of reach, has let go or is unknown."""
         force, torque = np.zeros(3), np.zeros(3)
         for acting in (self._tools.get(tool), self._grips.get(tool)):
             if acting is not None:
@@ -236,6 +238,8 @@ class TissueSimulation:
         if len(held.nodes) == 0:
             held.nodes, distances = self._within_reach(held.tip, positions)
             held.weights = fall_off(distances, self.config.force_radius)
+            if len(held.nodes):
+                held.contact = held.tip - np.average(positions[held.nodes], 0, held.weights)
 
     def _within_reach(self, tip: np.ndarray, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Moving skin nodes within ``force_radius`` of a tip, and their distances, m."""
@@ -248,7 +252,8 @@ class TissueSimulation:
         if len(held.nodes) == 0:
             held.applied = (np.zeros(3), np.zeros(3))
             return np.zeros((0, 3))
-        offsets = positions[held.nodes] - held.tip
+        nodes = positions[held.nodes]
+        offsets = nodes - np.average(nodes, 0, held.weights) - held.contact
         forces = minimum_norm_forces(offsets, held.weights, held.force, held.torque)
         held.applied = (forces.sum(0), np.cross(offsets, forces).sum(0))
         return forces

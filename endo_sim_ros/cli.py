@@ -158,7 +158,48 @@ class Config:
         print(parameter_file(), end="")
 
 
-COMMANDS = {"demo": Demo, "convert": Convert, "phantom": Phantom, "reconstruct": Reconstruct, "config": Config}
+@dataclass(frozen=True)
+class BenchRaster:
+    """The rasteriser: forward, forward and backward, memory, and how time grows."""
+
+    json: Path | None = None
+    """File for the results as a list of rows."""
+    device: str = "auto"
+    """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""
+
+    def run(self) -> None:
+        from endo_sim_ros.evaluation.raster_bench import bench_raster
+
+        bench_raster(self.device, self.json)
+
+
+@dataclass(frozen=True)
+class BenchGraph:
+    """The node graph over DDS, each node its own process: latency from wrench to image, rates and losses."""
+
+    json: Path | None = None
+    """File for the results as a list of rows."""
+
+    def run(self) -> None:
+        from endo_sim_ros.nodes.graph_bench import bench_graph
+
+        bench_graph(self.json)
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Measure speed on this machine, beside peers where they are installed; medians and ratios."""
+
+    what: tyro.conf.OmitArgPrefixes[
+        Annotated[BenchRaster, tyro.conf.subcommand("raster", prefix_name=False)]
+        | Annotated[BenchGraph, tyro.conf.subcommand("graph", prefix_name=False)]
+    ]
+
+    def run(self) -> None:
+        self.what.run()
+
+
+COMMANDS = {"demo": Demo, "convert": Convert, "phantom": Phantom, "reconstruct": Reconstruct, "config": Config, "bench": Bench}
 
 
 class _Sized:

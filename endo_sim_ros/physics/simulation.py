@@ -56,9 +56,10 @@ class TissueSimulation:
 
     A tool takes hold of the tissue when its wrench becomes non-zero: the moving skin nodes then within
     ``force_radius`` of its tip (in their current positions) are its nodes until the wrench is zero again, so that
-    grabbed tissue follows without jitter. The wrench acts at the point of the tissue that was at the tip then, and moves
-    with it: about a tip that stays behind, a mere force would be an ever greater couple on the few nodes. A tool that reaches no node applies nothing and tries again every step.
-    A jaw that closes holds the nodes in the same reach, which then follow the pose of its tip until it opens.
+    grabbed tissue follows without jitter. The wrench acts at the point of the tissue that was at the tip then, and
+    moves with it: about a tip that stays behind, a mere force would be an ever greater couple on the few nodes. A
+    tool that reaches no node applies nothing and tries again every step. A jaw that closes holds the nodes in the
+    same reach, which then follow the pose of its tip until it opens.
     Tissue that nothing acts on and that has come to rest costs no time.
 
     Args:

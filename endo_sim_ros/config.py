@@ -26,7 +26,7 @@ class Option(NamedTuple):
     """Everything known about one field of a configuration."""
 
     name: str
-    type: type  # bool, int, float or str
+    type: type  # bool, int, float, str, or tuple of strings
     default: Any
     description: str
     range: Range | None
@@ -56,6 +56,7 @@ def options(config_class: type) -> tuple[Option, ...]:
         if typing.get_origin(hint) is typing.Literal:
             choices = typing.get_args(hint)
             hint = type(choices[0])
+        hint = typing.get_origin(hint) or hint
         found.append(Option(field.name, hint, field.default, docstrings.get(field.name, ""), bounds, choices))
     return tuple(found)
 
@@ -68,6 +69,11 @@ def validate(config: Any) -> None:
         if option.type is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
             object.__setattr__(config, option.name, value)
+        if option.type is tuple and isinstance(value, (list, tuple)):
+            value = tuple(value)
+            object.__setattr__(config, option.name, value)
+            if not all(isinstance(item, str) for item in value):
+                raise ConfigError(f"{where} must be a list of names, got {value!r}")
         if not isinstance(value, option.type) or (option.type is int and isinstance(value, bool)):
             raise ConfigError(f"{where} must be a {option.type.__name__}, got {value!r}")
         if option.type is float and not math.isfinite(value):

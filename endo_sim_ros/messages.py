@@ -53,11 +53,17 @@ RENDERED_IMAGE = Topic("rendered/image_raw", "sensor_msgs/msg/Image")
 RENDERED_INFO = Topic("rendered/camera_info", "sensor_msgs/msg/CameraInfo")
 RENDERED_POSE = Topic("rendered/camera_pose", "geometry_msgs/msg/PoseStamped")
 RENDERED_DEPTH = Topic("rendered/depth/image", "sensor_msgs/msg/Image")
+TOOL_MARKERS = Topic("tool_markers", "visualization_msgs/msg/MarkerArray")
 DIAGNOSTICS = Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
+CLOCK = Topic("/clock", "rosgraph_msgs/msg/Clock")
 
 
 def tool_pose(arm: str) -> Topic:
     return Topic(f"{arm}/measured_cp", "geometry_msgs/msg/PoseStamped")
+
+
+def tool_pose_command(arm: str) -> Topic:
+    return Topic(f"{arm}/servo_cp", "geometry_msgs/msg/PoseStamped")
 
 
 def tool_wrench(arm: str) -> Topic:
@@ -68,6 +74,10 @@ def tool_jaw(arm: str) -> Topic:
     return Topic(f"{arm}/jaw/servo_jp", "sensor_msgs/msg/JointState")
 
 
+def tool_jaw_state(arm: str) -> Topic:
+    return Topic(f"{arm}/jaw/measured_js", "sensor_msgs/msg/JointState")
+
+
 def tool_reaction(arm: str) -> Topic:
     return Topic(f"{arm}/body/measured_cf", "geometry_msgs/msg/WrenchStamped")
 
@@ -76,13 +86,14 @@ RECORDING_TOPICS = (
     LEFT_IMAGE, LEFT_COMPRESSED, LEFT_INFO, RIGHT_IMAGE, RIGHT_COMPRESSED, RIGHT_INFO, DEPTH, MASK, CAMERA_POSE,
 )  # fmt: skip
 MODEL_TOPICS = (GAUSSIANS, TRAINING_CAMERAS, TRAINING_CAMERA_INFO)
+TOOL_TOPICS = (tool_pose, tool_pose_command, tool_wrench, tool_jaw, tool_jaw_state, tool_reaction)  # of one arm
 RENDERED_TOPICS = (RENDERED_INFO, RENDERED_POSE, RENDERED_DEPTH, RENDERED_IMAGE)
 
 
 def all_topics(arms: tuple[str, ...] = ("PSM1",)) -> tuple[Topic, ...]:
     """Every topic of the contract for the given arms."""
-    tools = tuple(make(arm) for arm in arms for make in (tool_pose, tool_wrench, tool_jaw, tool_reaction))
-    return RECORDING_TOPICS + MODEL_TOPICS + (CONTROL_NODES,) + RENDERED_TOPICS + tools + (DIAGNOSTICS,)
+    tools = tuple(make(arm) for arm in arms for make in TOOL_TOPICS)
+    return RECORDING_TOPICS + MODEL_TOPICS + (CONTROL_NODES,) + RENDERED_TOPICS + tools + (TOOL_MARKERS, DIAGNOSTICS, CLOCK)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -90,12 +101,14 @@ def all_topics(arms: tuple[str, ...] = ("PSM1",)) -> tuple[Topic, ...]:
 # ---------------------------------------------------------------------------------------------------------------------
 
 _PACKAGES = {
-    "builtin_interfaces": ("Time",),
-    "std_msgs": ("Header",),
+    "builtin_interfaces": ("Time", "Duration"),
+    "rosgraph_msgs": ("Clock",),
+    "std_msgs": ("Header", "ColorRGBA"),
     "geometry_msgs": (
         "Point", "Quaternion", "Pose", "PoseStamped", "PoseArray", "Vector3", "Wrench", "WrenchStamped",
     ),
-    "sensor_msgs": ("Image", "CameraInfo", "RegionOfInterest", "PointCloud2", "PointField", "JointState"),
+    "sensor_msgs": ("Image", "CompressedImage", "CameraInfo", "RegionOfInterest", "PointCloud2", "PointField", "JointState"),
+    "visualization_msgs": ("Marker", "MarkerArray", "UVCoordinate", "MeshFile"),
     "diagnostic_msgs": ("DiagnosticArray", "DiagnosticStatus", "KeyValue"),
 }  # fmt: skip
 _FULL_NAMES = {name: f"{package}/msg/{name}" for package, names in _PACKAGES.items() for name in names}
@@ -450,6 +463,78 @@ def encode_jaw(angle: float, stamp_ns: int, types: Any = None) -> Any:
         velocity=empty,
         effort=empty,
     )
+
+
+@dataclass(frozen=True)
+class ToolDisplay:
+    """What is shown of one tool; world axes."""
+
+    arm: str
+    tip: np.ndarray  # [3] m
+    force: np.ndarray  # [3] N, on the tissue
+    reaction: np.ndarray  # [3] N, on the tool
+    held: np.ndarray  # [K, 3] m, nodes that the tool holds
+
+
+METRES_PER_NEWTON = 0.01  # length of the arrows
+_MARKER_RADIUS = 0.0015  # m
+_SPHERE, _ARROW, _POINTS = 2, 0, 8  # Marker.type
+_ADD, _DELETE = 0, 2  # Marker.action
+
+
+def encode_tool_markers(tools: list[ToolDisplay], stamp_ns: int, frame_id: str, types: Any = None) -> Any:
+    """MarkerArray for RViz and Foxglove: of each tool the tip, the force on the tissue, the reaction and the held nodes.
+
+    The namespace of a marker is its arm; ids 0 to 3 are in that order. Arrows are 1 cm per newton. What there is nothing
+    of is deleted.
+    """
+    types = types or ros_types()
+    point = lambda p: types.Point(x=float(p[0]), y=float(p[1]), z=float(p[2]))  # noqa: E731
+    markers = []
+
+    def add(tool: ToolDisplay, kind: int, points: list, size: tuple, color: tuple, there: bool) -> None:
+        position = tool.tip if kind == _SPHERE else np.zeros(3)
+        orientation = types.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
+        marker = types.Marker(
+            header=_header(types, stamp_ns, frame_id),
+            ns=tool.arm,
+            id=len(markers) % 4,
+            type=kind,
+            action=_ADD if there else _DELETE,
+            pose=types.Pose(position=point(position), orientation=orientation),
+            scale=types.Vector3(**dict(zip("xyz", size))),
+            color=types.ColorRGBA(**dict(zip("rgba", color))),
+            lifetime=types.Duration(sec=0, nanosec=0),
+            frame_locked=False,
+            points=[point(p) for p in points],
+            colors=[],
+            texture_resource="",
+            texture=types.CompressedImage(
+                header=_header(types, 0, ""), format="", data=types.sequence(np.zeros(0, np.uint8))
+            ),
+            uv_coordinates=[],
+            text="",
+            mesh_resource="",
+            mesh_file=types.MeshFile(filename="", data=types.sequence(np.zeros(0, np.uint8))),
+            mesh_use_embedded_materials=False,
+        )
+        markers.append(marker)
+
+    r = _MARKER_RADIUS
+    for tool in tools:
+        add(tool, _SPHERE, [], (2 * r, 2 * r, 2 * r), (0.9, 0.9, 0.9, 1.0), True)
+        for vector, color in ((tool.force, (1.0, 0.55, 0.1, 1.0)), (tool.reaction, (0.2, 0.6, 1.0, 1.0))):
+            end = tool.tip + METRES_PER_NEWTON * vector
+            add(tool, _ARROW, [tool.tip, end], (r / 2, r, 2 * r), color, bool(np.any(vector)))
+        add(tool, _POINTS, list(tool.held), (r, r, 0.0), (0.3, 1.0, 0.4, 1.0), len(tool.held) > 0)
+    return types.MarkerArray(markers=markers)
+
+
+def encode_clock(stamp_ns: int, types: Any = None) -> Any:
+    """Clock message."""
+    types = types or ros_types()
+    sec, nanosec = divmod(int(stamp_ns), 1_000_000_000)
+    return types.Clock(clock=types.Time(sec=sec, nanosec=nanosec))
 
 
 # ---------------------------------------------------------------------------------------------------------------------

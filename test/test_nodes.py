@@ -34,7 +34,7 @@ K = np.array([[90.0, 0, 48], [0, 90.0, 40], [0, 0, 1]])
 WIDTH, HEIGHT = 96, 80
 SMALL = {
     "reconstruction_node": {"iterations": 30, "max_gaussians": 1500, "image_width": WIDTH, "start_after": 0.0},
-    "physics_node": {"node_count": 300, "arms": "PSM1,PSM2", "substeps": 40, "force_radius": 0.02},
+    "physics_node": {"node_count": 300, "arms": "[PSM1, PSM2]", "substeps": 40, "force_radius": 0.02},
     "rendering_node": {"rate": 20.0},
 }
 
@@ -90,6 +90,11 @@ class Bench:
 
     def until(self, condition, what="a condition", seconds=20.0):
         return wait_until(condition, seconds, what, lambda: self.executor.spin_once(timeout_sec=0.02))
+
+    def spin(self, seconds):
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline:
+            self.executor.spin_once(timeout_sec=0.02)
 
     def status(self, name, text, level=None, since=0):
         """Wait until a node says something that contains a text; returns (level, text, values)."""
@@ -670,11 +675,11 @@ def test_parameters_act_or_are_refused_with_the_reason(bench, physics):
         ("young_modulus", float("nan"), "out of range"),
         ("material", "jelly", "must be one of fixed_corotated, neo_hookean, got 'jelly'"),
         ("device", "tpu", "unknown device 'tpu'"),
-        ("arms", "PSM3", "arms: read at start only; restart the node"),
+        ("arms", ["PSM3"], "arms: read at start only; restart the node"),
     ):
         successful, text = bench.set("physics_node", **{name: value})
         assert not successful and reason in text, (name, value, text)
-    assert bench.set("physics_node", arms="PSM1,PSM2")[0]  # as it is already
+    assert bench.set("physics_node", arms=["PSM1", "PSM2"])[0]  # as it is already
     assert bench.set("physics_node", young_modulus=5000.0)[0]
     bench.until(lambda: physics._simulation.config.young_modulus == 5000.0, "softer tissue")
     assert bench.set("physics_node", adapt_substeps=False, substep_dt=0.05)[0]  # far too long for the material
@@ -904,7 +909,7 @@ def test_wrong_parameters_at_start_end_the_node_with_one_line(graph):
     wrong = {
         "physics_node": (("-p", "young_modulus:=5000"), "young_modulus must be a float, with a decimal point"),
         "rendering_node": (("-p", "device:=tpu"), "unknown device 'tpu'"),
-        "recorder_node": (("-p", "arms:='PSM 1'"), "'PSM 1' cannot name topics"),
+        "recorder_node": (("-p", "arms:=['PSM 1']"), "'PSM 1' cannot name topics"),
         "bag_player_node": (("-p", "nonsense"), "nonsense"),
     }
     nodes = {graph.start(name, *arguments): sentence for name, (arguments, sentence) in wrong.items()}

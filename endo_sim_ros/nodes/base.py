@@ -6,7 +6,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
@@ -75,10 +75,12 @@ class EndoNode(Node):
                 bounds = IntegerRange(from_value=int(option.range.minimum), to_value=int(option.range.maximum), step=1)
                 descriptor.integer_range = [bounds]
             try:
-                values[option.name] = self.declare_parameter(option.name, option.default, descriptor).value
+                default = list(option.default) if option.type is tuple else option.default
+                values[option.name] = self.declare_parameter(option.name, default, descriptor).value
             except InvalidParameterTypeException as error:
-                hint = ", with a decimal point" if option.type is float else ""
-                raise ConfigError(f"parameter {option.name} must be a {option.type.__name__}{hint}: {error}") from error
+                kind = {float: "float, with a decimal point", tuple: "list such as [PSM1, PSM2]"}
+                kind = kind.get(option.type, option.type.__name__)
+                raise ConfigError(f"parameter {option.name} must be a {kind}: {error}") from error
             except Exception as error:  # rclpy has one exception type for each way a value can be wrong
                 raise ConfigError(f"parameter {option.name}: {error} ({option.description})") from error
         self._configs[config_class] = _checked(config_class, values)
@@ -240,16 +242,16 @@ def sentence(where: str, error: Exception) -> str:
     return f"{where}: unexpected {type(error).__name__}: {error}"
 
 
-def arm_names(text: str) -> tuple[str, ...]:
+def arm_names(names: Iterable[str]) -> tuple[str, ...]:
     """The names in the parameter `arms`, each once.
 
     Raises:
         ConfigError: If one cannot be part of a topic's name.
     """
-    names = tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+    names = tuple(dict.fromkeys(name.strip() for name in names))
     for name in names:
         if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*", name):
-            raise ConfigError(f"arms: {name!r} cannot name topics; use letters, digits and _, and commas between arms")
+            raise ConfigError(f"arms: {name!r} cannot name topics; use letters, digits and _")
     return names
 
 

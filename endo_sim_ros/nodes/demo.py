@@ -156,7 +156,7 @@ def _touch_over_dds(
         return lambda statuses: name in statuses and statuses[name][1].startswith(begin)
 
     try:
-        graph.start("recorder_node", bag=recording, arms=_ARM)
+        graph.start("recorder_node", bag=recording, arms=[_ARM])
         graph.start(
             "reconstruction_node",
             start_after=0.0,  # asked to, below
@@ -166,7 +166,7 @@ def _touch_over_dds(
             max_gaussians=30_000,
             virtual_every=2,
         )
-        graph.start("physics_node", arms=_ARM)
+        graph.start("physics_node", arms=[_ARM])
         graph.start("rendering_node", image_width=width, idle_rate=1.0)
         names = {"recorder", "reconstruction_node", "physics_node", "rendering_node"}
         wait("starting", names.issubset, text_of("recorder"))

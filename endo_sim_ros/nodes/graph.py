@@ -28,8 +28,7 @@ class NodeProcess:
         if parameters or ros_arguments:
             arguments += ["--ros-args", *ros_arguments]
         for key, value in parameters.items():
-            text = str(value).lower() if isinstance(value, bool) else str(value)
-            arguments += ["-p", f"{key}:={text}"]
+            arguments += ["-p", f"{key}:={_yaml(value)}"]
         log.parent.mkdir(parents=True, exist_ok=True)
         with log.open("wb") as output:
             self._process = subprocess.Popen(
@@ -55,6 +54,12 @@ class NodeProcess:
         except subprocess.TimeoutExpired:
             self._process.kill()
             return self._process.wait()
+
+
+def _yaml(value: Any) -> str:
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(_yaml, value))}]"
+    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 class NodeGroup:

@@ -42,7 +42,9 @@ def parameter_file(nodes: tuple[str, ...] = tuple(NODE_CONFIGS)) -> str:
     return "\n".join(lines)
 
 
-def _yaml(value: bool | int | float | str) -> str:
+def _yaml(value: bool | int | float | str | tuple[str, ...]) -> str:
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_yaml, value))}]"
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, float):

@@ -1,30 +1,46 @@
 """Gaussian model and tool wrenches in, control nodes and reactions out."""
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from std_srvs.srv import SetBool, Trigger
 
 from endo_sim_ros import messages
-from endo_sim_ros.config import Range, StageConfig
+from endo_sim_ros.config import ConfigError, Range, StageConfig
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.messages import ControlNodeCloud, MessageError
 from endo_sim_ros.nodes.base import ERROR, OK, WARN, Background, EndoNode, arm_names, run, sentence
+from endo_sim_ros.nodes.pacing import CommandQueue, Pacer
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
 
 _SLOW = 0.5  # real-time factor below which the node warns
 _CAMERAS_LATE = 1.0  # seconds after a model in which its training cameras may still be on their way
+_POLLS = 8  # times per step that the timer asks whether a step is due
+_WINDOW = 1.0  # seconds over which the real-time factor is measured
+_INPUTS = ("pose", "wrench", "jaw")  # parts of a command in lockstep
 
 
 @dataclass(frozen=True)
 class PhysicsNodeConfig(StageConfig):
     """Parameters of the node beside those of the physics."""
 
-    arms: str = "PSM1"
-    """Names of the tool arms, separated by commas; each has its topics under its name."""
+    mode: Literal["realtime", "lockstep"] = "realtime"
+    """realtime: steps follow the clock (the wall's, or /clock with use_sim_time) and meet the commands that come; what
+    cannot be kept up with is skipped. lockstep: each command takes one step, and state, reaction and /clock bear its stamp."""
+    lockstep_inputs: tuple[str, ...] = ("pose", "wrench")
+    """lockstep: what a command consists of (pose, wrench, jaw); a step is taken when all of it, for all arms and with the
+    same stamp, has come. What is not named here acts when it comes."""
+    step_count: Annotated[int, Range(1, 1_000_000)] = 1
+    """Steps that one call of ~/step takes."""
+    arms: tuple[str, ...] = ("PSM1",)
+    """Names of the tool arms; each has its topics under its name."""
+    arm_source: Literal["measured", "commanded"] = "measured"
+    """measured: tips follow measured_cp, as robots and their simulators publish it. commanded: there is no other robot;
+    tips follow servo_cp at once, and this node publishes measured_cp and jaw/measured_js as an arm would."""
     world_frame: str = "world"
     """Frame of tool poses, the model and the control nodes."""
     command_timeout: Annotated[float, Range(0, 3600, "s")] = 0.5
@@ -44,13 +60,14 @@ class _Arm:
     torque: np.ndarray | None = None  # [3] N·m about the tip, world
     heard: float = 0.0  # time of the last wrench, monotonic seconds
     acting: bool = False
+    angle: float = 0.0  # of the jaw, rad
     closed: bool = False  # the jaw
 
 
 class PhysicsNode(EndoNode):
     """Samples control nodes from the latest model and steps them at the rate of the simulation."""
 
-    read_at_start = frozenset({"arms"})
+    read_at_start = frozenset({"arms", "arm_source", "mode", "lockstep_inputs"})
 
     def __init__(self):
         super().__init__("physics_node")
@@ -66,27 +83,44 @@ class PhysicsNode(EndoNode):
         self._camera_position: np.ndarray | None = None
         self._background = Background()
         self._failure = ""  # why the newest model is not simulated
-        self._paused, self._steps, self._seconds_per_step, self._last_step = False, 0, 0.0, None
+        self._paused, self._steps, self._seconds_per_step = False, 0, 0.0
+        self._window: tuple[float, float] | None = None  # clock and simulated time where the real-time factor begins
         self._real_time_factor = 1.0
+        self._pacer = Pacer()
         self._arms = {name: _Arm() for name in arm_names(self._options.arms)}
+        self._lockstep = self._options.mode == "lockstep"
+        unknown = set(self._options.lockstep_inputs) - set(_INPUTS)
+        if unknown or not self._options.lockstep_inputs:
+            given = list(self._options.lockstep_inputs)
+            raise ConfigError(f"lockstep_inputs: {given} must be some of {', '.join(_INPUTS)}")
+        self._commands = CommandQueue(frozenset((n, kind) for n in self._arms for kind in self._options.lockstep_inputs))
         self._nodes_pub = self.publisher(messages.CONTROL_NODES)
+        self._markers_pub = self.publisher(messages.TOOL_MARKERS)
         self._reaction_pubs = {name: self.publisher(messages.tool_reaction(name)) for name in self._arms}
+        commanded = self._options.arm_source == "commanded"
+        self._arm_pubs = {
+            name: (self.publisher(messages.tool_pose(name)), self.publisher(messages.tool_jaw_state(name)))
+            for name in self._arms
+            if commanded
+        }
+        self._pose_topic = messages.tool_pose_command if commanded else messages.tool_pose
+        self._clock_pub = self.publisher(messages.CLOCK) if self._lockstep else None
         self.subscribe(messages.GAUSSIANS, self._on_model)
         self.subscribe(messages.TRAINING_CAMERAS, self._on_training_cameras)
         self.subscribe(messages.CAMERA_POSE, self._on_camera)
         for name in self._arms:
-            self.subscribe(messages.tool_pose(name), partial(self._on_tool_pose, name))
+            self.subscribe(self._pose_topic(name), partial(self._on_tool_pose, name))
             self.subscribe(messages.tool_wrench(name), partial(self._on_wrench, name))
             self.subscribe(messages.tool_jaw(name), partial(self._on_jaw, name))
         self.service(Trigger, "~/reset", self._on_reset)
         self.service(Trigger, "~/step", self._on_step)
         self.service(SetBool, "~/pause", self._on_pause)
-        self._timer = self.create_timer(self._config.step_duration, self._on_timer)
+        self._timer = self.every(self._config.step_duration / _POLLS, self._on_timer)
 
     def config_changed(self, config: StageConfig) -> None:
         if isinstance(config, PhysicsConfig):
             self._config = config  # the timer builds a simulation for it
-            self._timer.timer_period_ns = int(config.step_duration * 1e9)
+            self._timer.timer_period_ns = int(config.step_duration / _POLLS * 1e9)
         else:
             self._options = config
 
@@ -126,9 +160,12 @@ class PhysicsNode(EndoNode):
             built = self._background.take()
             if built is not None:
                 self._simulated_stamp, self._simulation = built[1]
-                self._last_step, self._failure = None, ""
+                self._failure = ""
+                self._start_timing()
                 for arm in self._arms.values():
                     arm.acting = False
+                if self._lockstep:  # the first observation, before any command
+                    self._publish(self._simulation, self._simulated_stamp)
         except Exception as error:
             self._failure = sentence("physics", error)
             self.report_error(self._failure)
@@ -141,31 +178,73 @@ class PhysicsNode(EndoNode):
 
     # ------------------------------------------------------------------ tools
 
+    def _receive(self, name: str, kind: str, message: Any, topic: str, act: Callable[[], None]) -> None:
+        """Let a command act now or, in lockstep, in the step that its stamp names."""
+        if not self._lockstep or kind not in self._options.lockstep_inputs:
+            act()
+            return
+        stamp = messages.stamp_to_ns(message.header.stamp)
+        if stamp <= 0:
+            raise MessageError(f"{topic}: a stamp of zero; in lockstep all parts of a command bear its stamp")
+        try:
+            self._commands.put(stamp, (name, kind), act)
+        except ValueError as error:
+            raise MessageError(f"{topic}: {error}") from error
+        self._run_commands()
+
     def _on_tool_pose(self, name: str, message: Any) -> None:
-        self._arms[name].pose = messages.decode_pose(message, self._options.world_frame, messages.tool_pose(name).name)
+        arm, topic = self._arms[name], self._pose_topic(name).name
+        pose = messages.decode_pose(message, self._options.world_frame, topic)
+        self._receive(name, "pose", message, topic, lambda: setattr(arm, "pose", pose))
 
     def _on_wrench(self, name: str, message: Any) -> None:
         topic, arm = messages.tool_wrench(name).name, self._arms[name]
         force, torque = messages.decode_wrench(message, topic)
         frame = messages.check_frame(message, ("", name, self._options.world_frame), topic)
-        if arm.pose is None:
-            raise MessageError(
-                f"{topic}: a wrench came before any pose on {messages.tool_pose(name).name}; publish the tip's pose"
-            )
-        if frame != self._options.world_frame:  # in the axes of the tool
-            force, torque = arm.pose[:3, :3] @ force, arm.pose[:3, :3] @ torque
-        arm.force, arm.torque, arm.heard = force, torque, time.monotonic()
+
+        def act() -> None:
+            self._require_pose(name, topic, "wrench")
+            R = np.eye(3) if frame == self._options.world_frame else arm.pose[:3, :3]  # else in the axes of the tool
+            arm.force, arm.torque, arm.heard = R @ force, R @ torque, time.monotonic()
+
+        self._receive(name, "wrench", message, topic, act)
+        if not self._lockstep:
+            self._pacer.note_input(self._seconds())
+            self._step_if_due()
 
     def _on_jaw(self, name: str, message: Any) -> None:
-        angle, arm = messages.decode_jaw(message, messages.tool_jaw(name).name), self._arms[name]
-        if arm.pose is None:
-            raise MessageError(
-                f"{name}: a jaw command came before any pose on {messages.tool_pose(name).name}; publish the tip's pose"
-            )
-        if angle <= self._options.jaw_closed:
-            arm.closed = True
-        elif angle >= self._options.jaw_open:
-            arm.closed = False
+        topic, arm = messages.tool_jaw(name).name, self._arms[name]
+        angle = messages.decode_jaw(message, topic)
+
+        def act() -> None:
+            self._require_pose(name, topic, "jaw command")
+            arm.angle = angle
+            if angle <= self._options.jaw_closed:
+                arm.closed = True
+            elif angle >= self._options.jaw_open:
+                arm.closed = False
+
+        self._receive(name, "jaw", message, topic, act)
+
+    def _require_pose(self, name: str, topic: str, what: str) -> None:
+        if self._arms[name].pose is None:
+            pose_topic = self._pose_topic(name).name
+            raise MessageError(f"{topic}: a {what} came before any pose on {pose_topic}; publish the tip's pose")
+
+    def _run_commands(self) -> None:
+        """Lockstep: one step for each complete command."""
+
+        def give_up(stamp: int, missing: set) -> None:
+            parts = ", ".join(sorted(f"{name}'s {kind}" for name, kind in missing))
+            self.report_error(f"the command of {stamp * 1e-9:.6f} s is given up: a later one is complete but its {parts} never came")
+
+        while self._simulation is not None and (command := self._commands.take(give_up)):
+            stamp, parts = command
+            for part in sorted(parts, key=lambda part: (_INPUTS.index(part[1]), part[0])):  # poses before what needs them
+                with self.guard("command"):
+                    parts[part]()
+            self._step(self._simulation)
+            self._publish(self._simulation, stamp)
 
     def _apply_tools(self, simulation: TissueSimulation) -> None:
         for name, arm in self._arms.items():
@@ -178,7 +257,7 @@ class PhysicsNode(EndoNode):
             if arm.force is None:
                 continue
             timeout = self._options.command_timeout
-            stale = 0 < timeout < time.monotonic() - arm.heard
+            stale = not self._lockstep and 0 < timeout < time.monotonic() - arm.heard
             force, torque = (np.zeros(3), np.zeros(3)) if stale else (arm.force, arm.torque)
             wanted = bool(force.any() or torque.any())
             if wanted or arm.acting:
@@ -193,13 +272,41 @@ class PhysicsNode(EndoNode):
 
     # ------------------------------------------------------------------ steps
 
+    def _seconds(self) -> float:
+        """The clock that steps follow in real time: the wall's, or /clock."""
+        return self.now_ns() * 1e-9
+
     def _on_timer(self) -> None:
         with self.guard("physics"):
             self._build()
-            if self._simulation is not None:
-                if not self._paused:
-                    self._step(self._simulation)
-                self._publish(self._simulation)
+            if self._lockstep:
+                self._run_commands()  # those that came before the model
+            else:
+                self._step_if_due()
+
+    def _step_if_due(self) -> None:
+        """Real time: take the next step if it is time for it."""
+        simulation, now = self._simulation, self._seconds()
+        if simulation is None or not self._pacer.is_due(now, simulation.step_duration):
+            return
+        if not self._paused:
+            self._step(simulation)
+            self._measure(now, simulation)
+        self._publish(simulation, self.now_ns())
+
+    def _start_timing(self) -> None:
+        """Time before this was not meant to be simulated."""
+        self._pacer.restart()
+        self._window, self._real_time_factor = None, 1.0
+
+    def _measure(self, now: float, simulation: TissueSimulation) -> None:
+        """Real-time factor: simulated over elapsed time."""
+        if self._window is None or now < self._window[0] or simulation.time < self._window[1]:
+            self._window = now, simulation.time
+        elapsed = now - self._window[0]
+        if elapsed > _WINDOW:
+            self._real_time_factor = (simulation.time - self._window[1]) / elapsed
+            self._window = now, simulation.time
 
     def _step(self, simulation: TissueSimulation) -> None:
         start, faults, slips = time.monotonic(), simulation.faults, simulation.slips
@@ -216,20 +323,29 @@ class PhysicsNode(EndoNode):
         if simulation.faults > faults:
             self.report_error(simulation.last_fault)
         self._seconds_per_step += 0.1 * (time.monotonic() - start - self._seconds_per_step)
-        if self._last_step is not None:
-            factor = simulation.step_duration / max(start - self._last_step, 1e-6)
-            self._real_time_factor += 0.1 * (factor - self._real_time_factor)
-        self._last_step = start
 
-    def _publish(self, simulation: TissueSimulation) -> None:
-        stamp, state = self.now_ns(), simulation.state()
+    def _publish(self, simulation: TissueSimulation, stamp: int) -> None:
+        """The state, the reactions and what belongs to them, all with one stamp."""
+        world, state = self._options.world_frame, simulation.state()
+        if self._clock_pub is not None:
+            self._clock_pub.publish(messages.encode_clock(stamp))
         cloud = ControlNodeCloud(state.rest, state.positions, state.F, self._simulated_stamp)
-        self._nodes_pub.publish(messages.encode_control_nodes(cloud, stamp, self._options.world_frame))
+        self._nodes_pub.publish(messages.encode_control_nodes(cloud, stamp, world))
+        shown = []
         for name, arm in self._arms.items():
-            if arm.pose is not None:
-                axes = arm.pose[:3, :3].T  # the reaction is given in the axes of the tool
-                force, torque = (axes @ vector for vector in simulation.reaction(name))
-                self._reaction_pubs[name].publish(messages.encode_wrench(force, torque, stamp, name))
+            if arm.pose is None:
+                continue
+            reaction, torque = simulation.reaction(name)
+            axes = arm.pose[:3, :3].T  # the reaction is given in the axes of the tool
+            self._reaction_pubs[name].publish(messages.encode_wrench(axes @ reaction, axes @ torque, stamp, name))
+            if name in self._arm_pubs:
+                pose_pub, jaw_pub = self._arm_pubs[name]
+                pose_pub.publish(messages.encode_pose(arm.pose, stamp, world))
+                jaw_pub.publish(messages.encode_jaw(arm.angle, stamp))
+            force = arm.force if arm.acting and arm.force is not None else np.zeros(3)
+            shown.append(messages.ToolDisplay(name, arm.pose[:3, 3], force, reaction, simulation.held(name)))
+        if shown and self._markers_pub.get_subscription_count():
+            self._markers_pub.publish(messages.encode_tool_markers(shown, stamp, world))
 
     # --------------------------------------------------------------- services
 
@@ -237,22 +353,31 @@ class PhysicsNode(EndoNode):
         if self._simulation is None:
             return False, "there is no model yet"
         self._simulation.reset()
+        self._commands.clear()
+        self._start_timing()
         for arm in self._arms.values():
             arm.force, arm.acting, arm.closed = None, False, False
-        self._publish(self._simulation)
+        self._publish(self._simulation, self._simulated_stamp if self._lockstep else self.now_ns())
         return True, "at rest"
 
     def _on_step(self, _: Trigger.Request) -> tuple[bool, str]:
-        if self._simulation is None:
+        simulation = self._simulation
+        if simulation is None:
             return False, "there is no model yet"
-        if not self._paused:
-            return False, "running; call ~/pause with true first"
-        self._step(self._simulation)
-        self._publish(self._simulation)
-        return True, f"time {self._simulation.time:.4f} s"
+        if not (self._paused or self._lockstep):
+            return False, "running; call ~/pause with true first, or use mode lockstep"
+        for _ in range(self._options.step_count):
+            self._step(simulation)
+            if self._lockstep:
+                self._commands.last_stamp += round(simulation.step_duration * 1e9)
+            self._publish(simulation, self._commands.last_stamp if self._lockstep else self.now_ns())
+        return True, f"time {simulation.time:.4f} s"
 
     def _on_pause(self, request: SetBool.Request) -> tuple[bool, str]:
-        self._paused, self._last_step = request.data, None
+        if self._lockstep:
+            return False, "in lockstep time passes only with commands; there is nothing to pause"
+        self._paused = request.data
+        self._start_timing()
         return True, "paused" if request.data else "running"
 
     # ------------------------------------------------------------ diagnostics
@@ -277,6 +402,7 @@ class PhysicsNode(EndoNode):
             "substeps": simulation.solver.substepping.count,
             "milliseconds per step": f"{1e3 * self._seconds_per_step:.1f}",
             "real-time factor": f"{self._real_time_factor:.2f}",
+            "skipped steps": self._pacer.skipped,
             "simulated time": f"{simulation.time:.2f}",
             "faults": simulation.faults,
             "slips": simulation.slips,
@@ -285,6 +411,12 @@ class PhysicsNode(EndoNode):
             return ERROR, f"{self._failure}; the model before goes on", values
         if self._paused:
             return OK, "paused", values
+        if self._lockstep:
+            waiting = self._commands.missing()
+            if waiting is None:
+                return OK, f"in lockstep, {self._steps} steps taken, waiting for a command", values
+            parts = ", ".join(sorted(f"{name}'s {kind}" for name, kind in waiting[1]))
+            return OK, f"in lockstep, waiting for {parts} of the command of {waiting[0] * 1e-9:.6f} s", values
         if self._real_time_factor < _SLOW:
             return WARN, "slower than real time; lower node_count or young_modulus, or use a GPU", values
         return OK, "running", values

@@ -6,7 +6,7 @@ import time
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import torch
 from std_srvs.srv import Trigger
@@ -33,6 +33,9 @@ _LATEST, _CAMERAS = "latest", "cameras.json"
 class ReconstructionNodeConfig(StageConfig):
     """Parameters of the node beside those of the reconstruction."""
 
+    mode: Literal["realtime", "lockstep"] = "realtime"
+    """realtime: intermediate models are published while they train, stamped by the clock. lockstep: the final model only,
+    stamped by the newest image (models read from files: from one nanosecond on), so that one bag gives the same bytes in every run."""
     world_frame: str = "world"
     """Frame in which camera poses are given; poses in other frames are refused."""
     sync_tolerance: Annotated[float, Range(0, 10, "s")] = 0.01
@@ -73,6 +76,7 @@ class ReconstructionNode(EndoNode):
         self._newest_stamp = 0  # of the images of this recording
         self._longest_gap: float | None = None  # between arriving images of this recording, seconds
         self._trained: tuple[int, int] | None = None  # first and last stamp of the recording reconstructed last
+        self._recording_stamp = 0  # last stamp of the recording reconstructed last
         self._thread: threading.Thread | None = None
         self._cancel = threading.Event()
         self._lock = threading.Lock()
@@ -180,6 +184,7 @@ class ReconstructionNode(EndoNode):
         chosen = select_keyframes(self._frames, self._config.keyframes)
         views = [self._frames[index] for index in chosen]
         self._trained = (self._frames[0].stamp_ns, self._frames[-1].stamp_ns)
+        self._recording_stamp = self._trained[1]
         self._progress, self._saved, self._failure, self._finished = None, "", "", False
         self._cancel.clear()
         self._thread = threading.Thread(target=self._train, args=(views, self._config))
@@ -188,14 +193,15 @@ class ReconstructionNode(EndoNode):
 
     def _train(self, views: list[Frame], config: ReconstructionConfig) -> None:
         try:
-            trainer = Trainer(views, config)
-            self._offer(trainer)
+            trainer, lockstep = Trainer(views, config), self._options.mode == "lockstep"
+            if not lockstep:
+                self._offer(trainer)
             published = time.monotonic()
 
             def on_progress(progress: Progress) -> bool:
                 nonlocal published
                 self._progress = progress
-                if time.monotonic() - published > self._options.publish_period:
+                if not lockstep and time.monotonic() - published > self._options.publish_period:
                     published = time.monotonic()
                     self._offer(trainer)
                 return not self._cancel.is_set()
@@ -220,7 +226,8 @@ class ReconstructionNode(EndoNode):
         """Publish a model; equal stamps tie it to the cameras it was trained on."""
         world = self._options.world_frame
         # A stamp identifies one model, also while a simulated clock stands still or jumps back.
-        self._model_stamp = stamp = max(self.now_ns(), self._model_stamp + 1)
+        now = self._recording_stamp if self._options.mode == "lockstep" else self.now_ns()
+        self._model_stamp = stamp = max(now, self._model_stamp + 1)
         if cameras:
             first = cameras[0]
             self._info_pub.publish(messages.encode_camera_info(first.K, first.width, first.height, stamp, LEFT_FRAME))

@@ -1,17 +1,29 @@
 """Records topics into a rosbag2 (mcap) where `ros2 bag record` is not installed."""
 
+import json
 import queue
+import signal
 import threading
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rich.live import Live
+from rich.text import Text
+
 from endo_sim_ros import messages
-from endo_sim_ros.config import StageConfig
+from endo_sim_ros.config import ConfigError, StageConfig
 from endo_sim_ros.messages import Topic
 from endo_sim_ros.nodes.base import ERROR, OK, EndoNode, arm_names, quality, run, sentence
-from endo_sim_ros.sequences.bag import BagWriter
+from endo_sim_ros.nodes.transport import prepare_transport
+from endo_sim_ros.sequences.bag import BagWriter, canonical_cdr
+from endo_sim_ros.sequences.frames import SequenceError
 
 _MAX_WAITING = 256_000_000  # bytes that may wait for the disk before new messages are dropped, and counted
+_FLUSH_EVERY = 1.0  # seconds; what was heard longer ago outlives a killed recorder
+_ALL = "all"
 
 
 @dataclass(frozen=True)
@@ -20,20 +32,27 @@ class RecorderConfig(StageConfig):
 
     bag: str = "recording"
     """Folder of the new bag; it must not exist."""
-    arms: str = "PSM1"
-    """Names of the tool arms, separated by commas."""
+    arms: tuple[str, ...] = ("PSM1",)
+    """Names of the tool arms."""
+    topics: tuple[str, ...] = (_ALL,)
+    """Names of the topics to record, of those of the contract; all records every one."""
+    canonical: bool = True
+    """Writes zeros into the gaps between the fields of a message, where senders leave anything: equal messages then have
+    equal bytes."""
 
 
 class RecorderNode(EndoNode):
-    """Writes every topic of the contract as it comes, without decoding it."""
+    """Writes every topic of the contract, or those that were chosen, as it comes."""
 
-    read_at_start = frozenset({"bag", "arms"})
+    read_at_start = frozenset({"bag", "arms", "topics", "canonical"})
 
     def __init__(self):
         super().__init__("recorder")
         self._config = self.declare(RecorderConfig)
-        topics = messages.all_topics(arm_names(self._config.arms))
-        self._written, self._dropped, self._failure = 0, 0, ""
+        topics = _chosen(self._config.topics, arm_names(self._config.arms))
+        self.failure = ""  # why nothing is recorded any more
+        self._written, self._bytes, self._dropped = 0, 0, 0
+        self._heard: set[str] = set()  # topics
         self._queue: queue.SimpleQueue = queue.SimpleQueue()
         self._waiting, self._lock = 0, threading.Lock()  # bytes in the queue
         self._thread = threading.Thread(target=self._write)
@@ -46,7 +65,7 @@ class RecorderNode(EndoNode):
         absolute = topic._replace(name=self.resolve_topic_name(topic.name))
 
         def record(data: bytes) -> None:
-            if self._failure or self._waiting > _MAX_WAITING:
+            if self.failure or self._waiting > _MAX_WAITING:
                 self._dropped += 1
                 return
             with self._lock:
@@ -59,24 +78,100 @@ class RecorderNode(EndoNode):
         """Runs in its own thread so that a slow disk delays no subscription; what was written stays readable."""
         try:
             with BagWriter(Path(self._config.bag).expanduser()) as bag:
-                while (item := self._queue.get()) is not None:
-                    bag.write_raw(*item)
-                    self._written += 1
-                    with self._lock:
-                        self._waiting -= len(item[1])
+                flushed = time.monotonic()
+                while (item := self._next()) is not None:
+                    if item:
+                        topic, data, stamp_ns = item
+                        bag.write_raw(topic, canonical_cdr(data, topic.type) if self._config.canonical else data, stamp_ns)
+                        self._written += 1
+                        self._bytes += len(data)
+                        self._heard.add(topic.name)
+                        with self._lock:
+                            self._waiting -= len(data)
+                    if time.monotonic() - flushed > _FLUSH_EVERY:
+                        bag.flush()
+                        flushed = time.monotonic()
         except Exception as error:  # a full disk, above all
-            self._failure = f"recording stopped: {sentence(self._config.bag, error)}"
+            kept = "; what was written before can be read" if isinstance(error, OSError) else ""
+            self.failure = f"recording stopped: {sentence(self._config.bag, error)}{kept}"
             self._queue = queue.SimpleQueue()  # let go of what can no longer be written
-            self.report_error(self._failure)
+            self.report_error(self.failure)
+
+    def _next(self) -> tuple | None:
+        """What to write next, nothing in a quiet second, None at the end."""
+        try:
+            return self._queue.get(timeout=_FLUSH_EVERY)
+        except queue.Empty:
+            return ()
+
+    @property
+    def summary(self) -> str:
+        """What was recorded so far, in one line."""
+        dropped = f", {self._dropped} dropped" if self._dropped else ""
+        written = f"{self._written} messages of {len(self._heard)} topics"
+        return f"{self._config.bag}: {written}, {self._bytes / 1e6:.1f} MB{dropped}"
 
     def status(self):
         values = {"bag": self._config.bag, "messages": self._written, "dropped": self._dropped}
-        return (ERROR, self._failure, values) if self._failure else (OK, "recording", values)
+        return (ERROR, self.failure, values) if self.failure else (OK, "recording", values)
 
     def destroy_node(self) -> None:
         self._queue.put(None)
         self._thread.join()  # what was heard before the end is kept, even if the disk takes its time
         super().destroy_node()
+
+
+def _chosen(names: tuple[str, ...], arms: tuple[str, ...]) -> list[Topic]:
+    """The topics of the contract with these names.
+
+    Raises:
+        ConfigError: If there is no such topic.
+    """
+    known = {topic.name.lstrip("/"): topic for topic in messages.all_topics(arms)}
+    if _ALL in names:
+        return list(known.values())
+    wanted = dict.fromkeys(name.strip().lstrip("/") for name in names)
+    unknown = [name for name in wanted if name not in known]
+    if unknown or not wanted:
+        what = ", ".join(map(repr, unknown)) or "topic of no name"
+        raise ConfigError(f"topics: the contract has no {what} for the arms {', '.join(arms)}; see msg_conventions.md")
+    return [known[name] for name in wanted]
+
+
+def record(bag: Path, arms: tuple[str, ...], topics: tuple[str, ...]) -> None:
+    """Record a running graph until interrupted, with a live line of counts.
+
+    Raises:
+        SequenceError: If the bag cannot be made, or the disk is full; what was written is kept.
+        ConfigError: If a topic or arm cannot be recorded.
+    """
+    if bag.exists():
+        raise SequenceError(f"{bag} exists already; choose another name or remove it first")
+    prepare_transport()
+    values = {"bag": str(bag), "arms": list(arms), "topics": list(topics)}
+    parameters = [word for name, value in values.items() for word in ("-p", f"recorder:{name}:={json.dumps(value)}")]
+    rclpy.init(args=["--ros-args", *parameters])
+    node = None
+    try:
+        node, executor, shown = RecorderNode(), SingleThreadedExecutor(), 0.0
+        executor.add_node(node)
+        with Live(Text(), transient=True) as live:
+            while not node.failure:
+                executor.spin_once(timeout_sec=0.1)
+                if time.monotonic() - shown > 0.25:
+                    shown = time.monotonic()
+                    live.update(Text(f"{node.summary}; Ctrl-C ends it"))
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        rclpy.try_shutdown()
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # an impatient second one must not cut short what follows
+        if node is not None:
+            node.destroy_node()
+    if node is not None and node.failure:
+        raise SequenceError(node.failure)
+    if node is not None:
+        print(node.summary)
 
 
 def main() -> int:

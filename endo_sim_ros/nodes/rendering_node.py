@@ -1,8 +1,9 @@
 """Gaussian model, control nodes and a camera pose in, images out."""
 
 import time
-from dataclasses import dataclass
-from typing import Annotated, Any
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -11,11 +12,14 @@ from endo_sim_ros.cameras import Camera
 from endo_sim_ros.config import Range, StageConfig
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.messages import CameraInfo, ControlNodeCloud, MessageError
-from endo_sim_ros.nodes.base import ERROR, OK, WARN, Background, EndoNode, run, sentence
+from endo_sim_ros.nodes.base import ERROR, OK, STREAM_DEPTH, WARN, Background, EndoNode, run, sentence
+from endo_sim_ros.nodes.pacing import Pacer
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.bag import LEFT_FRAME
 
 _MAX_SIDE = 8192  # pixels; a damaged camera_info must not make the node ask for all memory
+_POLLS = 8  # times per image that the timer asks whether one is due
+_MOST_WAITING = 1000  # states that wait in lockstep, before the oldest is given up
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,11 @@ class _Bound:
 class RenderingNodeConfig(StageConfig):
     """Parameters of the node beside those of the rendering."""
 
+    mode: Literal["realtime", "lockstep"] = "realtime"
+    """realtime: the newest state is shown as soon as it comes, at most at the rate. lockstep: each state on control_nodes
+    gives one image with its stamp, and none is left out."""
+    lockstep_camera: bool = False
+    """lockstep: wait for the camera pose with the stamp of the state; otherwise the newest pose is used."""
     rate: Annotated[float, Range(0.1, 240, "Hz")] = 25.0
     """Images published per second; input that arrives faster is dropped, the newest is kept."""
     idle_rate: Annotated[float, Range(0.1, 240, "Hz")] = 5.0
@@ -51,7 +60,9 @@ class RenderingNodeConfig(StageConfig):
 
 
 class RenderingNode(EndoNode):
-    """Keeps the newest model, node state and camera, and renders them at its own rate."""
+    """Keeps the newest model, node state and camera, and renders them at its own rate, or state by state in lockstep."""
+
+    read_at_start = frozenset({"mode", "lockstep_camera"})
 
     def __init__(self):
         super().__init__("rendering_node")
@@ -67,6 +78,10 @@ class RenderingNode(EndoNode):
         self._training_pose: np.ndarray | None = None
         self._info: CameraInfo | None = None
         self._training_info: CameraInfo | None = None
+        self._lockstep = self._options.mode == "lockstep"
+        self._states: deque[tuple[int, ControlNodeCloud]] = deque()  # lockstep: stamps and states still to be shown
+        self._poses: dict[int, np.ndarray] = {}  # lockstep_camera: poses that wait for their state, by stamp
+        self._pacer = Pacer()
         self._dirty, self._images, self._last_image = True, 0, 0.0
         self._output: tuple[np.ndarray, np.ndarray, Camera] | None = None
         self._seconds_per_image = 0.0
@@ -75,15 +90,16 @@ class RenderingNode(EndoNode):
         self.subscribe(messages.GAUSSIANS, self._on_model)
         self.subscribe(messages.TRAINING_CAMERAS, self._on_training_cameras)
         self.subscribe(messages.TRAINING_CAMERA_INFO, self._on_training_info)
-        self.subscribe(messages.CONTROL_NODES, self._on_nodes, depth=1)
-        self.subscribe(messages.CAMERA_POSE, self._on_camera, depth=1)
+        depth = STREAM_DEPTH if self._lockstep else 1
+        self.subscribe(messages.CONTROL_NODES, self._on_nodes, depth)
+        self.subscribe(messages.CAMERA_POSE, self._on_camera, depth)
         self.subscribe(messages.LEFT_INFO, self._on_info, depth=1)
-        self._timer = self.every(1.0 / self._options.rate, self._on_timer)
+        self._timer = self.every(1.0 / self._options.rate / _POLLS, self._on_timer)
 
     def config_changed(self, config: StageConfig) -> None:
         if isinstance(config, RenderingNodeConfig):
             self._options = config
-            self._timer.timer_period_ns = int(1e9 / config.rate)
+            self._timer.timer_period_ns = int(1e9 / config.rate / _POLLS)
         else:
             self._config = config  # the timer binds the model anew
 
@@ -99,11 +115,12 @@ class RenderingNode(EndoNode):
         messages.check_frame(message, (self._options.world_frame,), messages.TRAINING_CAMERAS.name)
         poses = messages.decode_poses(message)
         if len(poses):  # a model from a file has none; then those before are better than nothing
-            self._training_pose, self._dirty = poses[len(poses) // 2], True
+            self._training_pose = poses[len(poses) // 2]
+            self._change()
 
     def _on_training_info(self, message: Any) -> None:
         self._training_info = _decode_info(message, messages.TRAINING_CAMERA_INFO.name)
-        self._dirty = True
+        self._change()
 
     def _on_nodes(self, message: Any) -> None:
         messages.check_frame(message, (self._options.world_frame,), messages.CONTROL_NODES.name)
@@ -115,19 +132,42 @@ class RenderingNode(EndoNode):
             and np.array_equal(old.F, nodes.F)
         )
         self._nodes = nodes
-        self._dirty |= not same
+        if self._lockstep:
+            self._states.append((messages.stamp_to_ns(message.header.stamp), nodes))
+            if len(self._states) > _MOST_WAITING:
+                self._states.popleft()
+                raise MessageError(f"{messages.CONTROL_NODES.name}: over {_MOST_WAITING} states wait to be shown; one is left out")
+            self._show_states()
+        elif not same:
+            self._change()
+            self._show_if_due()
+
+    def _change(self) -> None:
+        """What is shown is out of date."""
+        if not self._dirty:
+            self._dirty = True
+            self._pacer.note_input(time.monotonic())
 
     def _on_camera(self, message: Any) -> None:
         pose = messages.decode_pose(message, self._options.world_frame, messages.CAMERA_POSE.name)
-        self._dirty |= self._pose is None or not np.array_equal(pose, self._pose)
+        same = self._pose is not None and np.array_equal(pose, self._pose)
         self._pose = pose
+        if self._lockstep and self._options.lockstep_camera:
+            self._poses[messages.stamp_to_ns(message.header.stamp)] = pose
+            while len(self._poses) > _MOST_WAITING:
+                del self._poses[next(iter(self._poses))]
+            self._show_states()
+        elif not same:
+            self._change()
 
     def _on_info(self, message: Any) -> None:
         info, old = _decode_info(message, messages.LEFT_INFO.name), self._info
         same = (
             old is not None and np.array_equal(info.P, old.P) and (info.width, info.height) == (old.width, old.height)
         )
-        self._info, self._dirty = info, self._dirty or not same
+        self._info = info
+        if not same:
+            self._change()
 
     def _camera(self) -> Camera | None:
         """The camera asked for; until there is one, a training camera."""
@@ -142,28 +182,51 @@ class RenderingNode(EndoNode):
     def _on_timer(self) -> None:
         with self.guard("rendering"):
             self._build()
+            if self._lockstep:
+                self._show_states()
+            else:
+                self._show_if_due()
+
+    def _show_if_due(self) -> None:
+        """Real time: show the newest state, or what was shown once more, if it is time for it."""
+        camera, now = self._camera(), time.monotonic()
+        if self._bound is None or camera is None:
+            return
+        if self._dirty or self._output is None:
+            if not self._pacer.is_due(now, 1 / self._options.rate):
+                return
+            self._dirty = False
+            self._output = self._render(self._bound, self._nodes, camera)
+        elif now - self._last_image < 1 / self._options.idle_rate - 0.5 / self._options.rate:
+            return
+        self._last_image = now
+        self._publish(*self._output, self.now_ns())
+
+    def _show_states(self) -> None:
+        """Lockstep: one image for each state, in order, as soon as its model and its camera are there."""
+        while self._states and self._bound is not None:
+            stamp, nodes = self._states[0]
+            if nodes.model_stamp_ns < self._bound.model_stamp:  # of a model that is gone
+                self._states.popleft()
+                continue
             camera = self._camera()
-            if self._bound is None or camera is None:
+            if self._options.lockstep_camera:
+                pose = self._poses.get(stamp)
+                camera = camera and pose is not None and replace(camera, pose=pose)
+            if not self._bound.follows(nodes) or not camera:
                 return
-            now = time.monotonic()
-            if self._dirty or self._output is None:
-                self._dirty = False
-                camera = self._bound.renderer.camera(camera)
-                if max(camera.width, camera.height) > _MAX_SIDE:
-                    raise MessageError(f"images of {camera.width}×{camera.height} are too large; set image_width")
-                self._output = self._render(self._bound, camera)
-                self._seconds_per_image += 0.1 * (time.monotonic() - now - self._seconds_per_image)
-            elif now - self._last_image < 1 / self._options.idle_rate - 0.5 / self._options.rate:
-                return
-            self._last_image = now
-            self._publish(*self._output)
+            self._states.popleft()
+            for old in [other for other in self._poses if other <= stamp]:
+                del self._poses[old]
+            self._publish(*self._render(self._bound, nodes, camera), stamp)
 
     def _build(self) -> None:
         """Bind the newest model to its control nodes in the background; the picture before stays meanwhile."""
         try:
             built = self._background.take()
             if built is not None:
-                self._bound, self._dirty, self._failure = built[1], True, ""
+                self._bound, self._failure = built[1], ""
+                self._change()
         except Exception as error:
             self._failure = sentence("rendering", error)
             self.report_error(self._failure)
@@ -174,13 +237,19 @@ class RenderingNode(EndoNode):
             key = (self._model_number, rest.tobytes() if matching else b"", config)
             self._background.want(key, lambda: _Bound(DeformableRenderer(model, rest, config), stamp, rest))
 
-    def _render(self, bound: _Bound, camera: Camera) -> tuple[np.ndarray, np.ndarray, Camera]:
-        if bound.follows(self._nodes):
-            return *bound.renderer.render(camera, self._nodes.positions, self._nodes.F), camera
-        return *bound.renderer.render(camera), camera
+    def _render(
+        self, bound: _Bound, nodes: ControlNodeCloud | None, camera: Camera
+    ) -> tuple[np.ndarray, np.ndarray, Camera]:
+        start, camera = time.monotonic(), bound.renderer.camera(camera)
+        if max(camera.width, camera.height) > _MAX_SIDE:
+            raise MessageError(f"images of {camera.width}×{camera.height} are too large; set image_width")
+        state = (nodes.positions, nodes.F) if bound.follows(nodes) else ()
+        image, depth = bound.renderer.render(camera, *state)
+        self._seconds_per_image += 0.1 * (time.monotonic() - start - self._seconds_per_image)
+        return image, depth, camera
 
-    def _publish(self, image: np.ndarray, depth: np.ndarray, camera: Camera) -> None:
-        stamp, frame = self.now_ns(), self._options.camera_frame
+    def _publish(self, image: np.ndarray, depth: np.ndarray, camera: Camera, stamp: int) -> None:
+        frame = self._options.camera_frame
         self._info_pub.publish(messages.encode_camera_info(camera.K, camera.width, camera.height, stamp, frame))
         self._pose_pub.publish(messages.encode_pose(camera.pose, stamp, self._options.world_frame))
         self._depth_pub.publish(messages.encode_image(depth, stamp, frame))
@@ -202,6 +271,9 @@ class RenderingNode(EndoNode):
         }
         if self._failure:
             return ERROR, self._failure, values
+        if self._lockstep:
+            waiting = f", {len(self._states)} states wait" if self._states else ""
+            return OK, f"in lockstep, {self._images} images rendered{waiting}", values
         return OK, "rendering", values
 
     def destroy_node(self) -> None:

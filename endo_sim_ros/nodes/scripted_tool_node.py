@@ -7,7 +7,7 @@ import numpy as np
 
 from endo_sim_ros import messages
 from endo_sim_ros.cameras import Camera, invert_pose
-from endo_sim_ros.config import ConfigError, Range, StageConfig
+from endo_sim_ros.config import Range, StageConfig
 from endo_sim_ros.messages import ControlNodeCloud
 from endo_sim_ros.nodes.base import OK, WARN, EndoNode, arm_names, run
 
@@ -48,11 +48,9 @@ class ScriptedToolNode(EndoNode):
     def __init__(self):
         super().__init__("scripted_tool")
         self._config = config = self.declare(ScriptedToolConfig)
-        names = arm_names(config.arm)
-        if len(names) != 1:
-            raise ConfigError(f"arm: expected one name, got {config.arm!r}")
-        self._pose_pub = self.publisher(messages.tool_pose(names[0]))
-        self._wrench_pub = self.publisher(messages.tool_wrench(names[0]))
+        (arm,) = arm_names([config.arm])
+        self._pose_pub = self.publisher(messages.tool_pose(arm))
+        self._wrench_pub = self.publisher(messages.tool_wrench(arm))
         self._camera_pose: np.ndarray | None = None
         self._info: messages.CameraInfo | None = None
         self._depth: np.ndarray | None = None

@@ -166,6 +166,12 @@ class TissueSimulation:
                 force, torque = force - acting.applied[0], torque - acting.applied[1]
         return force, torque
 
+    def held(self, tool: str) -> np.ndarray:
+        """Positions now of the nodes that a tool holds on to [K, 3], m, world; none when it is in the air."""
+        acting = (self._tools.get(tool), self._grips.get(tool))
+        nodes = np.concatenate([np.zeros(0, int)] + [each.nodes for each in acting if each is not None])
+        return self.nodes.rest[nodes] + self.solver.displacements()[nodes]
+
     def in_reach(self, tool: str) -> bool:
         """Whether the tool holds on to tissue."""
         return tool in self._grips or tool in self._tools and len(self._tools[tool].nodes) > 0

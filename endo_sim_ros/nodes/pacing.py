@@ -1,0 +1,109 @@
+"""When periodic work is due: at the pace of a clock, or at the pace of commands."""
+
+from collections.abc import Callable, Hashable
+from typing import Any
+
+_MOST_WAITING = 1000  # commands; beyond it the oldest is given up, so that nothing grows without bound
+
+
+class Pacer:
+    """Once a period on average, at the moment that serves best: work runs as soon as fresh input is there, up to half a
+    period early or, while input streams in, late. What is missed by more than a period is skipped, never made up for.
+    To meet a new stream of inputs, the rhythm may come forward by half a period, once."""
+
+    def __init__(self):
+        self._due: float | None = None
+        self._inputs = (float("-inf"), float("-inf"))  # times of the last two
+        self._waiting: float | None = None  # since when fresh input waits
+        self._may_shift = 0.6  # periods
+        self.skipped = 0
+
+    def note_input(self, now: float) -> None:
+        """Input arrived that the next piece of work should use."""
+        self._inputs = self._inputs[1], now
+        if self._waiting is None:
+            self._waiting = now
+
+    def is_due(self, now: float, period: float) -> bool:
+        """Whether the work should run at this time, seconds of any clock; if so it is taken to run now."""
+        if self._due is None or now < self._due - 3 * period:  # the first time, or the clock went back
+            self._due, self._waiting = now, None
+        streaming = now - self._inputs[0] < 3 * period
+        if now - self._inputs[1] > 25 * period:  # whatever comes next is another stream
+            self._may_shift = 0.6
+        early = -0.5 if self._waiting is not None else 0.5 if streaming else 0.0
+        if now < self._due + early * period - 1e-9:
+            return False
+        missed = max(int((now - self._due) / period), 0)
+        self.skipped += missed
+        self._due += (missed + 1) * period
+        if streaming and self._waiting is not None and (waited := (now - self._waiting) / period) > 0.1:
+            shift = min(waited + 0.1, self._may_shift)
+            self._may_shift -= shift
+            self._due -= shift * period
+        self._waiting = None
+        return True
+
+    def restart(self) -> None:
+        """Forget the rhythm: the time since the last piece of work was not meant to be filled."""
+        self._due = None
+
+
+class CommandQueue:
+    """Commands made of parts that come on topics of their own, tied together by their stamp.
+
+    Each topic keeps its order, but one may overtake another; a command is complete when all its parts are there. When a
+    later one is complete an earlier incomplete one can never be, so it is given up.
+
+    Args:
+        needed: The parts of a command.
+    """
+
+    def __init__(self, needed: frozenset[Hashable]):
+        self.needed = needed
+        self.last_stamp = 0  # ns, of the last command taken
+        self._waiting: dict[int, dict[Hashable, Any]] = {}
+
+    def put(self, stamp_ns: int, part: Hashable, value: Any) -> None:
+        """Add one part of the command with this stamp.
+
+        Raises:
+            ValueError: If that command cannot be taken any more, or too many wait.
+        """
+        if stamp_ns <= self.last_stamp:
+            raise ValueError(
+                f"a command of time {stamp_ns * 1e-9:.6f} s is not after the last step, {self.last_stamp * 1e-9:.6f} s;"
+                " stamps must grow from one command to the next (~/reset begins anew)"
+            )
+        self._waiting.setdefault(stamp_ns, {})[part] = value
+        if len(self._waiting) > _MOST_WAITING:
+            first = min(self._waiting)
+            del self._waiting[first]
+            raise ValueError(f"over {_MOST_WAITING} commands wait; the oldest, of {first * 1e-9:.6f} s, is dropped")
+
+    def take(self, on_incomplete: Callable[[int, set], None]) -> tuple[int, dict[Hashable, Any]] | None:
+        """The earliest complete command, as its stamp in ns and its parts, or None.
+
+        Args:
+            on_incomplete: Told the stamp and the missing parts of each command that is given up.
+        """
+        complete = [stamp for stamp, parts in self._waiting.items() if parts.keys() >= self.needed]
+        if not complete:
+            return None
+        stamp = min(complete)
+        for earlier in sorted(other for other in self._waiting if other < stamp):
+            on_incomplete(earlier, set(self.needed - self._waiting.pop(earlier).keys()))
+        self.last_stamp = stamp
+        return stamp, self._waiting.pop(stamp)
+
+    def missing(self) -> tuple[int, set] | None:
+        """Stamp and missing parts of the earliest command that waits."""
+        if not self._waiting:
+            return None
+        stamp = min(self._waiting)
+        return stamp, set(self.needed - self._waiting[stamp].keys())
+
+    def clear(self) -> None:
+        """Forget what waits and what was; stamps may begin anew."""
+        self._waiting.clear()
+        self.last_stamp = 0

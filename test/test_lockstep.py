@@ -1,0 +1,196 @@
+"""Lockstep: one command, one step, one state, one image, all with the command's stamp; run after run the same bytes."""
+
+from collections import defaultdict
+
+import numpy as np
+import pytest
+import rclpy
+from conftest import wait_until
+from std_srvs.srv import SetBool, Trigger
+from test_nodes import Bench, send_camera, send_model, sheet
+
+from endo_sim_ros import messages
+from endo_sim_ros.gaussians import save_ply
+from endo_sim_ros.messages import ERROR, OK
+from endo_sim_ros.nodes.graph import NodeGroup
+from endo_sim_ros.nodes.physics_node import PhysicsNode
+from endo_sim_ros.nodes.rendering_node import RenderingNode
+from endo_sim_ros.sequences.bag import BagReader
+
+MODEL_STAMP, STEP = 5_000_000_000, 20_000_000  # ns
+PARAMETERS = {
+    "physics_node": {"node_count": 300, "substeps": 40, "force_radius": 0.02, "mode": "lockstep", "device": "cpu"},
+    "rendering_node": {"mode": "lockstep", "device": "cpu"},
+}
+IMAGES = messages.RENDERED_IMAGE
+POSE, WRENCH = messages.tool_pose_command("PSM1"), messages.tool_wrench("PSM1")
+STATES = (messages.CONTROL_NODES, messages.tool_reaction("PSM1"), messages.CLOCK, *messages.RENDERED_TOPICS)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def ros():
+    arguments = ["--ros-args", "-p", "physics_node:arm_source:=commanded"]
+    for node, values in PARAMETERS.items():
+        for name, value in values.items():
+            arguments += ["-p", f"{node}:{name}:={value}"]
+    rclpy.init(args=arguments)
+    yield
+    rclpy.try_shutdown()
+
+
+@pytest.fixture
+def bench():
+    bench = Bench()
+    for topic in (*STATES, messages.tool_pose("PSM1"), messages.tool_jaw_state("PSM1"), messages.TOOL_MARKERS):
+        bench.hear(topic)
+    yield bench
+    bench.close()
+
+
+@pytest.fixture
+def graph(bench):
+    """Physics and rendering in this process, with a model and a camera."""
+    bench.add(PhysicsNode)
+    bench.add(RenderingNode)
+    send_camera(bench)
+    send_model(bench, sheet(tilt=0.3), MODEL_STAMP)
+    await_images(bench, 1)  # the first observation
+    return bench
+
+
+def stamps(bench, topic):
+    found = bench.heard[topic.name]
+    return [messages.stamp_to_ns(m.clock if topic is messages.CLOCK else m.header.stamp) for m in found]
+
+
+def await_images(bench, count):
+    bench.until(lambda: len(bench.heard[IMAGES.name]) >= count, lambda: f"{count} images: {bench.statuses}", 40)
+
+
+def command(bench, stamp, force=(0.0, 0.0, -1.0), parts=(POSE, WRENCH)):
+    pose = np.eye(4)
+    pose[:3, 3] = 0, 0, 0.1
+    made = {
+        POSE: messages.encode_pose(pose, stamp, "world"),
+        WRENCH: messages.encode_wrench(np.array(force), np.zeros(3), stamp, "world"),
+    }
+    for part in parts:
+        bench.publish(part, made[part])
+
+
+def test_each_command_is_one_step_and_one_image_with_its_stamp(graph):
+    assert stamps(graph, IMAGES) == [MODEL_STAMP]
+    sent = [MODEL_STAMP + k * STEP for k in range(1, 21)]
+    for k, stamp in enumerate(sent):  # all at once: none may be lost, whatever the order of the parts
+        command(graph, stamp, parts=(POSE, WRENCH) if k % 2 else (WRENCH, POSE))
+    await_images(graph, 21)
+    graph.until(lambda: len(graph.heard["PSM1/body/measured_cf"]) == 20)
+    for topic in STATES:
+        expected = sent if topic.name == "PSM1/body/measured_cf" else [MODEL_STAMP, *sent]
+        assert stamps(graph, topic) == expected, topic.name
+    images = [messages.decode_image(image).astype(int) for image in graph.heard[IMAGES.name]]
+    assert np.abs(images[-1] - images[0]).max() > 8  # each shows its own state
+    force, _ = messages.decode_wrench(graph.heard["PSM1/body/measured_cf"][-1], "")
+    np.testing.assert_allclose(force, [0, 0, 1], atol=1e-9)
+    answer = graph.call(Trigger, "/physics_node/step")
+    assert answer.success and answer.message == f"time {21 * STEP * 1e-9:.4f} s"
+
+
+def test_step_takes_as_many_steps_as_asked_for_and_pause_is_refused(graph):
+    command(graph, MODEL_STAMP + STEP)
+    assert graph.set("physics_node", step_count=3)[0]
+    assert graph.call(Trigger, "/physics_node/step").success
+    await_images(graph, 5)
+    assert stamps(graph, IMAGES) == [MODEL_STAMP + k * STEP for k in range(5)]
+    answer = graph.call(SetBool, "/physics_node/pause", data=True)
+    assert not answer.success and "nothing to pause" in answer.message
+    assert not graph.set("physics_node", mode="realtime")[0]
+
+
+def test_reset_gives_the_first_observation_and_time_begins_anew(graph):
+    for k in range(1, 4):
+        command(graph, MODEL_STAMP + k * STEP)
+    await_images(graph, 4)
+    assert graph.call(Trigger, "/physics_node/reset").success
+    await_images(graph, 5)
+    command(graph, 7)  # nanoseconds: earlier than before
+    await_images(graph, 6)
+    assert stamps(graph, IMAGES)[-2:] == [MODEL_STAMP, 7]
+    first, again = (messages.decode_image(graph.heard[IMAGES.name][k]) for k in (0, 4))
+    np.testing.assert_array_equal(first, again)
+
+
+def test_mistakes_in_stamps_are_told_and_the_next_command_acts(graph):
+    command(graph, 100)
+    await_images(graph, 2)
+    command(graph, 100)
+    graph.refused("physics_node", "is not after the last step", "stamps must grow", "PSM1")
+    command(graph, 0)
+    graph.refused("physics_node", "a stamp of zero; in lockstep", "PSM1")
+    command(graph, 200, parts=(POSE,))
+    graph.status("physics_node", "waiting for PSM1's wrench of the command of", OK)
+    command(graph, 300)
+    graph.status("physics_node", "is given up", ERROR)
+    await_images(graph, 3)
+    assert stamps(graph, IMAGES)[-2:] == [100, 300]
+
+
+def test_a_commanded_arm_answers_like_a_robot_and_shows_its_markers(graph):
+    graph.publish(messages.tool_jaw("PSM1"), messages.encode_jaw(0.5, 1))
+    command(graph, 100)
+    graph.publish(messages.tool_jaw("PSM1"), messages.encode_jaw(0.7, 1))  # not part of a command: acts at once
+    graph.until(lambda: graph.nodes[1]._arms["PSM1"].angle == 0.7)
+    command(graph, 200)
+    graph.until(lambda: len(graph.heard["PSM1/jaw/measured_js"]) == 2)
+    pose = messages.decode_pose(graph.heard["PSM1/measured_cp"][-1], "world", "")
+    np.testing.assert_allclose(pose[:3, 3], [0, 0, 0.1])
+    assert messages.decode_jaw(graph.heard["PSM1/jaw/measured_js"][-1], "") == 0.7
+    assert stamps(graph, messages.tool_pose("PSM1")) == [100, 200]
+    tip, force, reaction, held = graph.heard["tool_markers"][-1].markers
+    assert (tip.ns, tip.header.frame_id, tip.action) == ("PSM1", "world", tip.ADD)
+    arrow = np.array([[p.x, p.y, p.z] for p in force.points])
+    np.testing.assert_allclose(arrow[1] - arrow[0], [0, 0, -0.01])
+    assert reaction.points[1].z > tip.pose.position.z and len(held.points) > 2
+
+
+def record(tmp_path, name, model):
+    """A scripted episode with the graph in processes of its own; all output as bytes, by topic."""
+    bench, bag = Bench(), tmp_path / name
+    bench.hear(IMAGES)
+    try:
+        with NodeGroup(tmp_path / "logs") as group:
+            group.environment |= {"ENDO_SIM_THREADS": "2" if name == "second" else "1"}
+            group.start("recorder_node", bag=bag)
+            group.start("physics_node", **PARAMETERS["physics_node"])
+            group.start("rendering_node", **PARAMETERS["rendering_node"])
+            bench.status("recorder", "recording", OK)
+            for node in ("physics_node", "rendering_node"):
+                bench.status(node, "waiting for a model")
+            wait_until(lambda: len(bench.user.get_publishers_info_by_topic(IMAGES.name)), 20, "the renderer")
+            send_camera(bench)
+            group.start("reconstruction_node", mode="lockstep", model_file=model, output_dir=tmp_path)
+            await_images(bench, 1)
+            for k in range(1, 9):
+                poses = messages.tool_pose("PSM1")
+                pose = np.eye(4)
+                pose[:3, 3] = 0, 0, 0.1
+                bench.publish(poses, messages.encode_pose(pose, k * STEP, "world"))
+                command(bench, k * STEP, (0.3, 0.1 * k, -1.0), (WRENCH,))
+                await_images(bench, k + 1)
+            bench.spin(0.5)
+    finally:
+        bench.close()
+    with BagReader(bag) as reader:
+        found = defaultdict(list)
+        for raw in reader.raw_messages(list(reader.topics)):
+            found[raw.topic].append(bytes(raw.data))
+    return found
+
+
+def test_the_same_commands_give_the_same_bytes_in_every_run(tmp_path):
+    save_ply(sheet(tilt=0.3), tmp_path / "model.ply")
+    first, second = (record(tmp_path, name, tmp_path / "model.ply") for name in ("first", "second"))
+    for topic in ("gaussians", "control_nodes", "PSM1/body/measured_cf", "clock", "rendered/image_raw", "rendered/depth/image"):
+        count = 1 if topic == "gaussians" else 8 if topic.startswith("PSM1") else 9
+        assert len(first[f"/{topic}"]) == count, topic
+        assert first[f"/{topic}"] == second[f"/{topic}"], topic

@@ -38,12 +38,16 @@ setup(
         "tyro",
         "warp-lang>=1.19",
     ],
-    extras_require={"test": ["mcap", "mcap-ros2-support", "pytest", "ruff", "torchmetrics"]},
+    extras_require={
+        "lerobot": ["pyarrow"],  # `endo-sim export`
+        "test": ["hypothesis", "mcap", "mcap-ros2-support", "pyarrow", "pytest", "ruff", "torchmetrics"],
+    },
     entry_points={"console_scripts": ["endo-sim = endo_sim_ros.cli:main"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml", "msg_conventions.md"]),
-        (f"share/{NAME}/config", sorted(map(str, Path("config").glob("*.yaml")))),
+        (f"share/{NAME}/config", sorted(map(str, Path("config").glob("*.*")))),
+        (f"share/{NAME}/config/sros2", sorted(map(str, Path("config/sros2").glob("*.xml")))),
         (f"share/{NAME}/launch", sorted(map(str, Path("launch").glob("*.py")))),
         # `ros2 run` looks for executables here; console scripts would land in bin/ under pip.
         (f"lib/{NAME}", sorted(map(str, Path("scripts").glob("*_node")))),

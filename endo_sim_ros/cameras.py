@@ -11,6 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
+_MOST_BYTES = 64_000_000  # of a file of cameras; one takes 600
+_LONGEST_SIDE = 65_535  # pixels
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -34,13 +37,13 @@ class Camera:
     def __post_init__(self):
         K, pose = np.asarray(self.K, np.float64), np.asarray(self.pose, np.float64)
         if K.shape != (3, 3) or not np.isfinite(K).all():
-            raise ValueError(f"camera matrix K must be a finite 3×3 matrix, got shape {K.shape}: {K.tolist()}")
+            raise ValueError(f"camera matrix K must be a finite 3×3 matrix, got {K.tolist() if K.shape == (3, 3) else K.shape}")
         if K[0, 0] <= 0 or K[1, 1] <= 0:
             raise ValueError(f"focal lengths must be positive, got fx={K[0, 0]:g}, fy={K[1, 1]:g}; is the camera calibrated?")
         if self.width <= 0 or self.height <= 0:
             raise ValueError(f"image size must be positive, got {self.width}×{self.height}")
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
-            raise ValueError(f"camera pose must be a finite 4×4 matrix, got shape {pose.shape}: {pose.tolist()}")
+            raise ValueError(f"camera pose must be a finite 4×4 matrix, got {pose.tolist() if pose.shape == (4, 4) else pose.shape}")
         object.__setattr__(self, "K", K)
         object.__setattr__(self, "pose", pose)
 
@@ -173,8 +176,18 @@ def load_cameras(path: str | Path) -> list[Camera]:
     Raises:
         ValueError: If the file holds something else; the message names it.
     """
+    path = Path(path)
     try:
-        entries = json.loads(Path(path).read_text())
-        return [Camera(np.array(e["K"]), int(e["width"]), int(e["height"]), np.array(e["pose"])) for e in entries]
-    except (OSError, KeyError, TypeError, ValueError) as error:
+        if path.stat().st_size > _MOST_BYTES:
+            raise ValueError(f"it has {path.stat().st_size} bytes, far more than cameras need")
+        entries = json.loads(path.read_text())
+        if not isinstance(entries, list):
+            raise ValueError(f"expected a list, got {type(entries).__name__}")
+        cameras = [Camera(np.array(e["K"]), int(e["width"]), int(e["height"]), np.array(e["pose"])) for e in entries]
+        for camera in cameras:
+            R = camera.pose[:3, :3]
+            if max(camera.width, camera.height) > _LONGEST_SIDE or not np.allclose(R @ R.T, np.eye(3), atol=1e-3):
+                raise ValueError(f"no camera has {camera.width}×{camera.height} pixels and the rotation {R.round(3).tolist()}")
+        return cameras
+    except (OSError, KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise ValueError(f"{path}: not a readable list of cameras ({error})") from error

@@ -149,6 +149,82 @@ class Demo:
 
 
 @dataclass(frozen=True)
+class Record:
+    """Record a running graph into a rosbag2, for replay or `export`, until interrupted."""
+
+    out: Positional[Path]
+    """Folder of the new bag; it must not exist."""
+    arms: tuple[str, ...] = ("PSM1",)
+    """Names of the tool arms."""
+    topics: tuple[str, ...] = ("all",)
+    """Names of the topics to record, such as rendered/image_raw; all records every topic of msg_conventions.md."""
+
+    def run(self) -> None:
+        from endo_sim_ros.nodes.recorder_node import record
+
+        record(self.out, self.arms, self.topics)
+
+
+@dataclass(frozen=True)
+class Export:
+    """Turn recordings of the graph into a dataset to learn from; each is one episode."""
+
+    paths: Annotated[Positional[tuple[Path, ...]], tyro.conf.arg(metavar="BAG [BAG ...] OUT")]
+    """Recordings with rendered images, control nodes, and poses and reactions of tools; then the folder of the new dataset."""
+    format: Literal["lerobot"] = "lerobot"
+    """lerobot: a LeRobotDataset v3.0."""
+    fps: int | None = None
+    """Frames per second; default: those of the steps of a recording in lockstep, else 25."""
+    arm: tuple[str, ...] = ()
+    """Names of the tool arms; default: all in the recording."""
+    task: str = "manipulate the tissue"
+    """What was done, in words."""
+    sampling: Literal["auto", "rate", "lockstep"] = "auto"
+    """rate: the last message of each topic, at a fixed rate; lockstep: messages with equal stamps; auto: lockstep where there
+    are such messages and no other fps is asked for."""
+    images: Literal["video", "png"] = "video"
+    """video: small (H.264); png: exact."""
+    world_frame: str = "world"
+    """Frame of the poses in the recording."""
+
+    def run(self) -> None:
+        from endo_sim_ros.learning.lerobot import export_lerobot
+
+        if len(self.paths) < 2:
+            raise SequenceError("give one recording or more, then the folder of the dataset")
+        *bags, out = self.paths
+        episodes, frames = export_lerobot(
+            bags, out, self.task, self.fps, self.arm, self.sampling, self.images, self.world_frame
+        )
+        print(f"{out}: {episodes} episode{'s' * (episodes != 1)}, {frames} frames")
+
+
+@dataclass(frozen=True)
+class Up:
+    """Start the graph, each node its own process, and show what each says, until Ctrl-C; `ros2 launch` without ROS installed."""
+
+    bag: Path | None = None
+    """Recording to replay; default: none, for a live endoscope."""
+    params_file: Path | None = None
+    """ROS parameter file for the nodes; `endo-sim config` prints one with all defaults."""
+    namespace: str = ""
+    """Namespace of all nodes and topics."""
+    arms: tuple[str, ...] = ()
+    """Names of the tool arms; default: as in the parameter file, else PSM1."""
+    model: str = ""
+    """PLY model to start with; latest = the newest one that was saved."""
+    logs: Path = Path("~/.ros/endo_sim_ros/logs")
+    """Folder for what each node prints."""
+    respawn: bool = True
+    """Start a node that crashes again, once."""
+
+    def run(self) -> None:
+        from endo_sim_ros.nodes.up import run_up
+
+        run_up(self.bag, self.params_file, self.namespace, self.arms, self.model, self.logs, self.respawn)
+
+
+@dataclass(frozen=True)
 class Config:
     """Print the parameters of all nodes with their defaults as a ROS parameter file."""
 
@@ -179,11 +255,44 @@ class BenchGraph:
 
     json: Path | None = None
     """File for the results as a list of rows."""
+    gaussians: int = 30_000
+    """Size of the model."""
+    width: int = 640
+    """Width of the images, pixels."""
+    height: int = 512
+    """Height of the images, pixels."""
+    rate: float = 25.0
+    """Commands and images per second, Hz."""
+    changes: int = 60
+    """Changes of the wrench in real time whose way to the image is timed."""
+    commands: int = 200
+    """Commands in lockstep."""
+    device: str = "auto"
+    """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""
 
     def run(self) -> None:
         from endo_sim_ros.nodes.graph_bench import bench_graph
 
-        bench_graph(self.json)
+        bench_graph(self.json, self.gaussians, self.width, self.height, self.rate, self.changes, self.commands, self.device)
+
+
+@dataclass(frozen=True)
+class BenchSoak:
+    """The node graph under random traffic, half of it spoilt: who dies, whose memory grows, does it still work."""
+
+    json: Path | None = None
+    """File for the results as a list of rows."""
+    minutes: float = 10.0
+    """Duration of the traffic."""
+    rate: float = 500.0
+    """Messages per second on all topics together."""
+    seed: int = 0
+    """Other seeds give other traffic."""
+
+    def run(self) -> None:
+        from endo_sim_ros.nodes.soak import soak
+
+        soak(self.json, self.minutes, self.rate, self.seed)
 
 
 @dataclass(frozen=True)
@@ -193,13 +302,24 @@ class Bench:
     what: tyro.conf.OmitArgPrefixes[
         Annotated[BenchRaster, tyro.conf.subcommand("raster", prefix_name=False)]
         | Annotated[BenchGraph, tyro.conf.subcommand("graph", prefix_name=False)]
+        | Annotated[BenchSoak, tyro.conf.subcommand("soak", prefix_name=False)]
     ]
 
     def run(self) -> None:
         self.what.run()
 
 
-COMMANDS = {"demo": Demo, "convert": Convert, "phantom": Phantom, "reconstruct": Reconstruct, "config": Config, "bench": Bench}
+COMMANDS = {
+    "demo": Demo,
+    "up": Up,
+    "convert": Convert,
+    "phantom": Phantom,
+    "reconstruct": Reconstruct,
+    "record": Record,
+    "export": Export,
+    "config": Config,
+    "bench": Bench,
+}
 
 
 class _Sized:

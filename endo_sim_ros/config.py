@@ -41,12 +41,14 @@ class ConfigError(ValueError):
 def options(config_class: type) -> tuple[Option, ...]:
     """All fields of a configuration dataclass, in order, with the docstring under each as its description."""
     hints = typing.get_type_hints(config_class, include_extras=True)
-    body = ast.parse(textwrap.dedent(inspect.getsource(config_class))).body[0].body
-    docstrings = {
-        field.target.id: " ".join(doc.value.value.split())
-        for field, doc in zip(body, body[1:])
-        if isinstance(field, ast.AnnAssign) and isinstance(doc, ast.Expr) and isinstance(doc.value, ast.Constant)
-    }
+    docstrings = {}
+    for each in filter(dataclasses.is_dataclass, reversed(config_class.__mro__)):
+        body = ast.parse(textwrap.dedent(inspect.getsource(each))).body[0].body
+        docstrings |= {
+            field.target.id: " ".join(doc.value.value.split())
+            for field, doc in zip(body, body[1:])
+            if isinstance(field, ast.AnnAssign) and isinstance(doc, ast.Expr) and isinstance(doc.value, ast.Constant)
+        }
     found = []
     for field in dataclasses.fields(config_class):
         hint, bounds, choices = hints[field.name], None, None

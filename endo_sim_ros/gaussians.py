@@ -1,16 +1,22 @@
 """The Gaussian model (structure of arrays) and its PLY files in the INRIA layout."""
 
 import dataclasses
-import io
+import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import torch
-from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 sqrt(pi))
+_LONGEST_HEADER = 65536  # bytes of a PLY file; that of a model of degree 3 has 1500
+_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
+_TYPES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8",
+    "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
+}  # fmt: skip
 
 
 class ModelError(ValueError):
@@ -172,25 +178,67 @@ def save_ply(model: GaussianModel, path: str | Path) -> None:
     columns, names = to_columns(model), ply_fields(model.sh_degree)
     names = names[:3] + ["nx", "ny", "nz"] + names[3:]
     columns = np.concatenate([columns[:, :3], np.zeros((len(model), 3), np.float32), columns[:, 3:]], 1)
-    vertices = np.rec.fromarrays(columns.T, names=names) if len(model) else np.empty(0, [(name, "f4") for name in names])
-    buffer = io.BytesIO()
-    PlyData([PlyElement.describe(np.asarray(vertices), "vertex")], byte_order="<").write(buffer)
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(model)}"]
+    lines += [*(f"property float {name}" for name in names), "end_header", ""]
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".part")
-    partial.write_bytes(buffer.getvalue())
+    partial.write_bytes("\n".join(lines).encode() + columns.astype("<f4").tobytes())
     partial.replace(path)
 
 
 def load_ply(path: str | Path) -> GaussianModel:
-    """Read a 3DGS PLY of SH degree 0 to 3.
+    """Read a 3DGS PLY of SH degree 0 to 3, binary or ASCII.
 
     Raises:
         ModelError: If the file is absent, not a PLY, truncated, or lacks a field; the message names the file.
     """
+    path = Path(path)
+    if not path.is_file():
+        raise ModelError(f"{path}: no such file")
     try:
-        vertices = PlyData.read(str(path))["vertex"].data
-    except FileNotFoundError:
-        raise ModelError(f"{path}: no such file") from None
-    except (PlyParseError, KeyError, ValueError, UnicodeDecodeError) as error:
+        with path.open("rb") as file:
+            vertices = _read_vertices(file, path.stat().st_size)
+    except (OSError, ValueError) as error:
         raise ModelError(f"{path}: not a readable PLY model ({error})") from error
     return from_columns({name: vertices[name] for name in vertices.dtype.names}, str(path))
+
+
+def _read_vertices(file: BinaryIO, size: int) -> np.ndarray:
+    """The element `vertex` of a PLY file of a size in bytes, as a structured array.
+
+    What the header claims is held against the size of the file before any memory is asked for.
+    """
+    head = file.read(_LONGEST_HEADER)
+    end = re.search(rb"\nend_header[ \t\r]*\n", head)
+    if not head.startswith(b"ply") or end is None:
+        raise ValueError(f"no PLY header within {_LONGEST_HEADER} bytes")
+    order, name, count, fields = "", "", 0, []
+    for line in head[: end.start()].decode("ascii", "replace").splitlines()[1:]:
+        match line.split():
+            case ["format", layout, "1.0"] if layout in _ORDERS:
+                order = _ORDERS[layout]
+            case ["element", _, _] if name == "vertex":
+                break  # what follows the vertices does not matter
+            case ["element", name, number]:
+                count = int(number)
+            case ["property", kind, field] if kind in _TYPES:
+                fields.append((field, order + _TYPES[kind]))
+            case [] | ["comment" | "obj_info", *_]:
+                pass
+            case _:
+                raise ValueError(f"its header has {line[:60]!r}, which no Gaussian model has")
+    if name != "vertex" or not fields or not order:
+        raise ValueError("its header has no format, or its data does not begin with vertices")
+    dtype, room, text = np.dtype(fields), size - end.end(), order == "="
+    least = 2 * len(fields) if text else dtype.itemsize  # bytes of a row; as text a digit and a blank, the last one optional
+    if not 0 <= count <= (room + text) // least:
+        raise ValueError(f"its header claims {count} vertices of {least} bytes or more, {room} bytes follow")
+    if not count:
+        return np.empty(0, dtype)
+    if not text:
+        return np.memmap(file, dtype, "r", end.end(), (count,))
+    file.seek(end.end())
+    vertices = np.loadtxt(file, dtype, comments=None, max_rows=count, ndmin=1)
+    if len(vertices) < count:
+        raise ValueError(f"its header claims {count} vertices, {len(vertices)} follow")
+    return vertices

@@ -8,6 +8,7 @@ filled through ``array.array`` and read through ``np.frombuffer``.
 import array
 import functools
 import importlib
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -186,14 +187,15 @@ def _header(types: Any, stamp_ns: int, frame_id: str) -> Any:
     return types.Header(stamp=types.Time(sec=sec, nanosec=nanosec), frame_id=frame_id)
 
 
-def check_frame(message: Any, allowed: tuple[str, ...], topic: str) -> str:
+def check_frame(message: Any, allowed: Iterable[str], topic: str) -> str:
     """The header's frame, which must be one of the allowed ones."""
     frame = message.header.frame_id.lstrip("/")
-    allowed = tuple(name.lstrip("/") for name in allowed)
+    allowed = [name.lstrip("/") for name in allowed]
     if frame not in allowed:
         names = " or ".join(repr(name) for name in allowed)
         raise MessageError(
-            f"{topic}: unknown frame {frame!r}; this graph knows {names} (set the parameter world_frame, or republish in that frame)"
+            f"{topic}: unknown frame {frame!r}; this graph knows {names} (set the parameter world_frame, name it in the"
+            " parameter frames, or republish in that frame)"
         )
     return frame
 
@@ -393,10 +395,37 @@ def _decode_pose(pose: Any, topic: str) -> np.ndarray:
     return make_pose(position, quat)
 
 
-def decode_pose(message: Any, world_frame: str, topic: str) -> np.ndarray:
-    """Pose [4, 4] in the world of a PoseStamped; the quaternion must have unit length within 1 %."""
-    check_frame(message, (world_frame,), topic)
-    return _decode_pose(message.pose, topic)
+def decode_pose(message: Any, frames: str | Mapping[str, np.ndarray], topic: str) -> np.ndarray:
+    """Pose [4, 4] in the world of a PoseStamped; the quaternion must have unit length within 1 %.
+
+    Args:
+        message: The message.
+        frames: Name of the world frame, or the poses [4, 4] of known frames in the world, by name.
+        topic: For errors.
+    """
+    frame = check_frame(message, (frames,) if isinstance(frames, str) else frames, topic)
+    pose = _decode_pose(message.pose, topic)
+    return pose if isinstance(frames, str) else frames[frame] @ pose
+
+
+def parse_frames(world_frame: str, frames: Iterable[str]) -> dict[str, np.ndarray]:
+    """Poses [4, 4] in the world of the frames given as ``name x y z qx qy qz qw``, and of the world itself.
+
+    Raises:
+        ValueError: If one is not a name and a pose in metres with a unit quaternion.
+    """
+    poses = {world_frame.lstrip("/"): np.eye(4)}
+    for text in filter(None, frames):
+        name, *numbers = text.split() or [""]
+        try:
+            x, y, z, qx, qy, qz, qw = map(float, numbers)
+        except ValueError:
+            raise ValueError(f"frames: {text!r} is not a name and seven numbers, as in 'PSM1_base 0.1 0 0 0 0 0 1'") from None
+        position, quat = np.array([x, y, z]), np.array([qw, qx, qy, qz])
+        if not np.isfinite(position).all() or not abs(np.linalg.norm(quat) - 1) < 0.01:
+            raise ValueError(f"frames: {text!r} has no finite position and unit quaternion (x y z qx qy qz qw)")
+        poses[name.lstrip("/")] = make_pose(position, quat)
+    return poses
 
 
 def _encode_pose(types: Any, pose: np.ndarray) -> Any:

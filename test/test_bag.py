@@ -1,6 +1,8 @@
 """Recordings as bags: what goes in comes out, and damage is told in one sentence."""
 
+import contextlib
 import dataclasses
+import resource
 import shutil
 
 import numpy as np
@@ -10,7 +12,7 @@ import torch
 from endo_sim_ros import messages
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.messages import Topic, bag_types
-from endo_sim_ros.sequences.bag import LEFT_FRAME, BagReader, BagWriter, read_bag, write_bag
+from endo_sim_ros.sequences.bag import LEFT_FRAME, BagReader, BagWriter, canonical_cdr, read_bag, write_bag
 from endo_sim_ros.sequences.frames import SequenceError
 
 STAMP = 1_000_000_000
@@ -98,6 +100,144 @@ def test_a_sequence_without_frames_leaves_nothing_behind(tmp_path):
 def test_a_place_that_cannot_be_written_is_named(small_frames):
     with pytest.raises(SequenceError, match="/proc/nowhere/bag: the bag cannot be made"):
         write_bag("/proc/nowhere/bag", small_frames)
+
+
+# -------------------------------------------------------------------------------------------- cut short
+
+NOISE = Topic("noise", messages.LEFT_IMAGE.type)
+
+
+def noise(number, size=100_000):
+    """An image message that does not compress."""
+    pixels = np.random.default_rng(number).integers(0, 256, (size // 300, 100, 3), np.uint8)
+    return messages.encode_image(pixels, STAMP + number, LEFT_FRAME, bag_types())
+
+
+def stamps_of(path):
+    with BagReader(path) as bag:
+        found = [(stamp, messages.stamp_to_ns(message.header.stamp)) for _, stamp, message in bag.messages([NOISE])]
+        assert bag.message_count == len(found)
+    return found
+
+
+def written(path, count, flush_every=7):
+    """A bag as a killed process leaves it: its writer never came to an end."""
+    source = path.with_name(f"{path.name}_open")
+    with BagWriter(source) as bag:
+        for number in range(count):
+            bag.write(NOISE, noise(number), STAMP + number)
+            if number % flush_every == flush_every - 1:
+                bag.flush()
+        shutil.copytree(source, path)
+    return path
+
+
+def test_what_was_flushed_is_read_without_the_end_of_the_file(tmp_path):
+    path = written(tmp_path / "bag", 40)  # the last flush came after 35; a chunk of a megabyte is never full between them
+    assert not (path / "metadata.yaml").exists()
+    for place in (path, path / "bag_open.mcap"):
+        assert stamps_of(place) == [(STAMP + number, STAMP + number) for number in range(35)]
+    with BagReader(path) as bag:
+        assert bag.topics == {"/noise": NOISE.type} and bag.duration == pytest.approx(34e-9, abs=2e-9)
+        assert bag.latched == set() and list(bag.raw_messages(["/nothing"])) == []
+
+
+def test_full_chunks_need_no_flush(tmp_path):
+    assert len(stamps_of(written(tmp_path / "bag", 40, flush_every=1000))) >= 30
+
+
+@pytest.mark.parametrize("share", [0.05, 0.25, 0.5, 0.77, 0.999])
+def test_half_a_chunk_at_the_end_is_passed_over(tmp_path, share):
+    file = written(tmp_path / "bag", 40) / "bag_open.mcap"
+    data = file.read_bytes()
+    file.write_bytes(data[: int(share * len(data))])
+    if share < 0.1:
+        with pytest.raises(SequenceError, match="bag: the bag cannot be read .*nothing was written before"):
+            stamps_of(tmp_path / "bag")
+    else:
+        assert len(stamps_of(tmp_path / "bag")) == 7 * int(5 * share)  # five chunks of seven
+    file.write_bytes(data + bytes(5000))  # what a file system may leave after a power cut
+    assert len(stamps_of(tmp_path / "bag")) == 35
+
+
+def test_messages_out_of_order_are_put_in_order(tmp_path):
+    with BagWriter(tmp_path / "open") as bag:
+        for number in (3, 1, 2, 0):
+            bag.write(NOISE, noise(number), STAMP + number)
+            bag.flush()
+        shutil.copytree(tmp_path / "open", tmp_path / "bag")
+    assert [stamp - STAMP for stamp, _ in stamps_of(tmp_path / "bag")] == [0, 1, 2, 3]
+
+
+@contextlib.contextmanager
+def largest_file(size):
+    """No file of this process grows beyond a size: what a full disk does to a writer."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@pytest.mark.parametrize("flush_every", [1, 1000])
+def test_a_full_disk_leaves_what_fitted(tmp_path, flush_every):
+    count = 0
+    with pytest.raises(OSError, match="File too large"), largest_file(3_500_000), BagWriter(tmp_path / "bag") as bag:
+        while True:
+            bag.write(NOISE, noise(count), STAMP + count)
+            count += 1
+            if count % flush_every == 0:
+                bag.flush()
+    found = stamps_of(tmp_path / "bag")
+    assert found == [(STAMP + number, STAMP + number) for number in range(len(found))]
+    assert len(found) > (30 if flush_every == 1 else 20)
+
+
+def test_a_disk_without_room_for_the_index_keeps_all_messages(tmp_path):
+    with contextlib.ExitStack() as stack, pytest.raises(OSError, match="File too large"), BagWriter(tmp_path / "bag") as bag:
+        for number in range(25):
+            bag.write(NOISE, noise(number), STAMP + number)
+        bag.flush()
+        stack.enter_context(largest_file(next((tmp_path / "bag").glob("*.mcap")).stat().st_size + 100))
+    assert len(stamps_of(tmp_path / "bag")) == 25 and not (tmp_path / "bag" / "metadata.yaml").exists()
+
+
+def test_a_bag_that_failed_takes_no_more_messages(tmp_path):
+    with largest_file(300_000), contextlib.suppress(OSError), BagWriter(tmp_path / "bag") as bag:
+        bag.write(NOISE, noise(0), STAMP)
+        bag.flush()
+        with pytest.raises(OSError):
+            bag.write(NOISE, noise(1, 3_000_000), STAMP)
+        with pytest.raises(SequenceError, match="bag: the bag takes no more messages"):
+            bag.write(NOISE, noise(2), STAMP)
+    assert len(stamps_of(tmp_path / "bag")) == 1
+
+
+# -------------------------------------------------------------------------------------------- canonical bytes
+
+
+def test_gaps_between_fields_become_zeros_and_nothing_else_changes():
+    message = messages.encode_image(np.arange(30, dtype=np.uint8).reshape(2, 5, 3), STAMP, "abc", bag_types())
+    clean = bytes(bag_types().typestore.serialize_cdr(message, messages.LEFT_IMAGE.type))
+    dirty, gaps = bytearray(clean), 0
+    for place in range(4, len(clean)):  # a byte that no field holds
+        trial = bytearray(clean)
+        trial[place] ^= 0x55
+        try:
+            again = bag_types().typestore.deserialize_cdr(bytes(trial), messages.LEFT_IMAGE.type)
+            changed = bytes(bag_types().typestore.serialize_cdr(again, messages.LEFT_IMAGE.type)) != clean
+        except Exception:
+            changed = True
+        if not changed:
+            dirty[place], gaps = 0x55, gaps + 1
+    assert gaps and bytes(dirty) != clean
+    assert canonical_cdr(bytes(dirty), messages.LEFT_IMAGE.type) == clean == canonical_cdr(clean, messages.LEFT_IMAGE.type)
+
+
+@pytest.mark.parametrize("data, kind", [(b"anything", "foreign_msgs/msg/Thing"), (b"\0\1\0\0\7", "sensor_msgs/msg/Image"), (b"", "x")])
+def test_bytes_that_cannot_be_understood_stay_as_they_are(data, kind):
+    assert canonical_cdr(data, kind) is data
 
 
 # ---------------------------------------------------------------------------------------------------- damage

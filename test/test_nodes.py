@@ -666,6 +666,47 @@ def test_models_with_equal_or_zero_stamps_replace_each_other_too(bench, physics)
         bench.until(lambda: abs(depth() - z) < 0.005, f"a picture of the model at {z}")
 
 
+def test_poses_in_the_frame_of_a_robots_base_are_turned_into_the_world(bench, physics):
+    send_model(bench)
+    await_nodes(bench, 5 * S)
+    for wrong in (["base 0 0 0.1"], ["base 0 0 0.1 0 0 0 2"], ["base 0 0 nan 0 0 0 1"]):
+        successful, reason = bench.set("physics_node", frames=wrong)
+        assert not successful and "frames: 'base" in reason
+    half = 0.5**0.5
+    assert bench.set("physics_node", frames=[f"base 0 0 0.1 0 {half} 0 {half}"])[0]  # its z axis is the world's x axis
+    bench.publish(messages.tool_pose("PSM1"), messages.encode_pose(np.eye(4), S, "base"))
+    send_wrench(bench, (0, 0, 1.0), frame="base")
+    bench.until(lambda: moved(bench) > 5e-4, "tissue to move")
+    state = nodes_of(bench)
+    shift = state.positions - state.rest
+    assert shift[np.linalg.norm(shift, axis=1).argmax()].argmax() == 0  # along the world's x
+    bench.publish(messages.tool_pose("PSM1"), messages.encode_pose(np.eye(4), S, "elsewhere"))
+    bench.refused("physics_node", "unknown frame 'elsewhere'; this graph knows 'world' or 'base'")
+
+
+def test_physics_follows_a_simulated_clock(bench):
+    clock = messages.encode_clock
+    bench.hear(messages.CONTROL_NODES)
+    node = bench.add(PhysicsNode)
+    assert bench.set("physics_node", use_sim_time=True)[0]
+    bench.publish(messages.CLOCK, clock(100 * S))
+    send_model(bench)
+    bench.until(lambda: node._simulation is not None, "the simulation")
+    for k in range(100):  # a second of simulated time, however long it takes
+        bench.publish(messages.CLOCK, clock(100 * S + k * S // 100))
+        bench.spin(0.01)
+    bench.spin(0.2)
+    assert len(bench.heard["control_nodes"]) == pytest.approx(1 / node._simulation.step_duration, abs=2)
+    assert node._simulation.time == pytest.approx(1.0, abs=2 * node._simulation.step_duration)
+    assert messages.stamp_to_ns(bench.heard["control_nodes"][-1].header.stamp) <= 101 * S
+    bench.publish(messages.CLOCK, clock(5 * S))  # another bag: the clock begins anew, and so does the rhythm
+    count = len(bench.heard["control_nodes"])
+    for k in range(20):
+        bench.publish(messages.CLOCK, clock(5 * S + k * S // 100))
+        bench.spin(0.01)
+    assert len(bench.heard["control_nodes"]) >= count + 5
+
+
 def test_parameters_act_or_are_refused_with_the_reason(bench, physics):
     send_model(bench)
     await_nodes(bench, 5 * S)

@@ -4,10 +4,14 @@ import importlib.util
 import os
 import subprocess
 import sys
+import types
 from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+
+from endo_sim_ros.config import options
+from endo_sim_ros.nodes.parameter_file import NODE_CONFIGS
 
 ROOT = Path(__file__).parents[1]
 NODES = ("reconstruction_node", "physics_node", "rendering_node", "bag_player_node")
@@ -51,7 +55,10 @@ def test_ament_index_finds_the_package(prefix):
             del os.environ["AMENT_PREFIX_PATH"]
         else:
             os.environ["AMENT_PREFIX_PATH"] = before
-    for name in ("package.xml", "msg_conventions.md", "config/endo_sim.yaml", "launch/endo_sim.launch.py"):
+    for name in (
+        "package.xml", "msg_conventions.md", "config/endo_sim.yaml", "config/endo_sim.rviz", "config/endo_sim.foxglove.json",
+        "config/sros2/endo_sim.policy.xml", "launch/endo_sim.launch.py", "launch/replay.launch.py",
+    ):  # fmt: skip
         assert (share / name).is_file(), name
 
 
@@ -117,12 +124,73 @@ messages.encode_pose(__import__('numpy').eye(4), 1, 'world', messages.bag_types(
     assert done.returncode == 0, done.stderr
 
 
-def test_launch_file_is_valid():
-    path = ROOT / "launch" / "endo_sim.launch.py"
-    compile(path.read_text(), str(path), "exec")
+class _Recorded:
+    """Stands for any action of launch: keeps what it was made with."""
+
+    def __init__(self, *args, **kwargs):
+        self.args, self.kwargs = args, kwargs
+
+
+def _load_launch_file(name: str, monkeypatch) -> tuple[types.ModuleType, list]:
+    """A launch file and its entities. Where launch is not installed its actions only record what they are made with."""
     if importlib.util.find_spec("launch_ros") is None:
-        pytest.skip("launch_ros is not installed; the launch file was compiled only")
-    spec = importlib.util.spec_from_file_location("endo_sim_launch", path)
+        actions = ("DeclareLaunchArgument", "IncludeLaunchDescription", "OpaqueFunction", "Node")
+        fake = {action: type(action, (_Recorded,), {}) for action in actions}
+        for module in ("launch", "launch.actions", "launch_ros", "launch_ros.actions"):
+            monkeypatch.setitem(sys.modules, module, types.SimpleNamespace(**fake))
+        sys.modules["launch"].LaunchContext = object
+        sys.modules["launch"].LaunchDescription = lambda entities: types.SimpleNamespace(entities=entities)
+    spec = importlib.util.spec_from_file_location("launch_file", ROOT / "launch" / name)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    assert len(module.generate_launch_description().entities) == 6
+    return module, module.generate_launch_description().entities
+
+
+@pytest.mark.parametrize("name", ["endo_sim.launch.py", "replay.launch.py"])
+def test_launch_file_is_valid(name, monkeypatch):
+    _, entities = _load_launch_file(name, monkeypatch)
+    declared = [entity for entity in entities if type(entity).__name__ == "DeclareLaunchArgument"]
+    assert declared
+    for argument in declared:
+        text = argument.kwargs["description"] if isinstance(argument, _Recorded) else argument.description
+        assert text.endswith("."), text
+
+
+@pytest.mark.skipif(importlib.util.find_spec("launch_ros") is not None, reason="looks into stand-ins of launch")
+def test_launch_file_starts_the_graph_with_what_is_given(monkeypatch):
+    module, entities = _load_launch_file("endo_sim.launch.py", monkeypatch)
+    defaults = {entity.args[0]: entity.kwargs["default_value"] for entity in entities[:-1]}
+    assert Path(defaults["params"]).is_file()
+    start = lambda **given: [  # noqa: E731
+        action.kwargs for action in entities[-1].kwargs["function"](types.SimpleNamespace(launch_configurations=defaults | given))
+    ]
+    graph = ["reconstruction_node", "physics_node", "rendering_node"]
+    assert [node["executable"] for node in start()] == graph
+    assert [node["parameters"] for node in start()] == [[defaults["params"], {}]] * 3
+    nodes = start(bag="b", rate="2.0", loop="true", model="latest", arms="PSM1, PSM2", namespace="left", enclaves="/e", rviz="true")
+    names = [node["executable"] for node in nodes]
+    assert names == ["rviz2", *graph, "bag_player_node"], "RViz first: nothing is left behind where it is not installed"
+    assert {node["namespace"] for node in nodes} == {"left"}
+    assert Path(nodes[0]["arguments"][1]).is_file()
+    names, nodes = names[1:], nodes[1:]
+    given = [node["parameters"][1] for node in nodes]
+    assert given == [{"model_file": "latest"}, {"arms": ["PSM1", "PSM2"]}, {}, {"bag": "b", "rate": 2.0, "loop": True}]
+    assert [node["ros_arguments"] for node in nodes] == [["--enclave", f"/e/{name}"] for name in names]
+    with pytest.raises(FileNotFoundError, match="params"):
+        start(params="/does/not/exist.yaml")
+    for name in names:
+        assert (ROOT / "scripts" / name).is_file()
+    for node, parameters in zip(names, given):  # as the nodes declare them
+        configs = NODE_CONFIGS[node.replace("player_node", "player")]
+        known = {option.name: option.type for config in configs for option in options(config)}
+        for key, value in parameters.items():
+            assert known[key] in (type(value), tuple), key
+
+
+def test_replay_launch_file_hands_everything_to_the_graph(monkeypatch):
+    _, entities = _load_launch_file("replay.launch.py", monkeypatch)
+    bag, graph = entities
+    assert type(bag).__name__ == "DeclareLaunchArgument" and type(graph).__name__ == "IncludeLaunchDescription"
+    if isinstance(bag, _Recorded):
+        assert bag.args == ("bag",) and "default_value" not in bag.kwargs, "it is asked for"
+        assert graph.args == (str(ROOT / "launch" / "endo_sim.launch.py"),)

@@ -1,6 +1,7 @@
 """Physics: nodes, materials, the solver against theory, tools, faults and skinning."""
 
 import dataclasses
+import threading
 
 import numpy as np
 import pytest
@@ -521,8 +522,16 @@ def test_absurd_force_is_caught_and_the_last_good_state_restored(kinematics):
     assert simulation.faults == 1 and np.isfinite(simulation.state().positions).all()
 
 
-def test_a_grid_beyond_memory_is_refused():
-    ends = np.array([[0, 0, 0], [100, 100, 100]], np.float32)
+@pytest.mark.parametrize("spacing", [1e-42, 1e-9, 1e6])
+def test_tissue_of_an_absurd_size_is_refused(spacing):
+    nodes = specimen((3, 3, 3), spacing, lambda X: np.zeros(len(X), bool), lambda X: np.ones(len(X), bool))
+    with pytest.raises(ValueError, match="grid cells would be .* m wide.*metres"):
+        MpmSolver(nodes, PhysicsConfig(device="cpu"))
+
+
+@pytest.mark.parametrize("size", [100, 1e15, 2.0**61, 1e30])  # in integers the larger ones would wrap around
+def test_a_grid_beyond_memory_is_refused(size):
+    ends = np.array([[0, 0, 0], [size, size, size]], np.float32)
     nodes = ControlNodes(ends, np.zeros(2, bool), np.full(2, 1e-9, np.float32), np.ones(2, bool), 1e-3)
     with pytest.raises(ValueError, match="simulation grid would have"):
         MpmSolver(nodes, PhysicsConfig(device="cpu"))
@@ -604,6 +613,31 @@ def test_a_tip_that_stays_behind_does_not_wring_the_tissue():
     np.testing.assert_allclose(in_the_end, at_first, rtol=0.2)  # about the tip itself they would have doubled
     np.testing.assert_allclose(simulation.reaction("jaw")[0], [-2.0, 0.0, 1.0], atol=1e-12)
     np.testing.assert_allclose(simulation.reaction("jaw")[1], 0.0, atol=1e-12)
+
+
+def test_tissue_can_be_built_in_one_thread_while_other_tissue_begins_to_move_in_another():
+    points = np.random.default_rng(0).normal(size=(2000, 3))
+    expected, wrong, done = sample_farthest(points, 40), [], threading.Event()
+
+    def sample():
+        while not done.is_set():
+            try:
+                np.testing.assert_array_equal(sample_farthest(points, 40), expected)
+            except BaseException as error:
+                wrong.append(error)
+                return
+
+    thread = threading.Thread(target=sample)
+    thread.start()
+    try:
+        for _ in range(20):
+            simulation = simulate(node_count=60, layers=1)
+            simulation.set_wrench("probe", TIP, [0.0, 0.0, 0.01])
+            simulation.step()  # the first one prepares the launches
+    finally:
+        done.set()
+        thread.join()
+    assert not wrong
 
 
 def test_two_tools_act_at_once():

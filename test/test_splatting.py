@@ -1,8 +1,12 @@
 """The rasteriser against its float64 reference, and what must hold at the edges."""
 
+import contextlib
+
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from endo_sim_ros.cameras import Camera, look_at
 from endo_sim_ros.gaussians import GaussianModel
@@ -81,7 +85,7 @@ def assert_matches_reference(gaussians, cameras, device="cpu", names=GAUSSIAN_NA
     expected, expected_gradients = run(_rasterize, gaussians, cameras, **options)
     output, gradients = run(rasterize, gaussians, cameras, device=device, dtype=torch.float32, **options)
     for name, actual, image in zip(RenderOutput._fields, output, expected):
-        if name != "radii":
+        if name not in ("radii", "medians"):
             assert image.abs().max() > 0, f"{name} is empty, nothing is tested"
             assert_close(name, actual, image, IMAGE_TOLERANCE)
     assert torch.equal(output.radii.cpu() > 0, expected.radii > 0)
@@ -101,11 +105,10 @@ def one_torch_thread():
 
 
 @pytest.fixture(params=["vectors", "pixels"])
-def compositor(request, monkeypatch):
-    """Both ways to composite; the kernels made for GPUs run on the CPU too, in one thread."""
-    if request.param == "pixels":
-        monkeypatch.setattr(rasterizer, "_uses_vectors", lambda device: False)
-        monkeypatch.setattr(rasterizer, "cpu_threads", lambda: 1)
+def compositor(request):
+    """Both ways to composite; the kernels made for GPUs run on the CPU too."""
+    with rasterizer.scalar_kernels() if request.param == "pixels" else contextlib.nullcontext():
+        yield
 
 
 @pytest.mark.parametrize("sh_count", [1, 4, 9, 16])
@@ -176,6 +179,110 @@ def test_camera_gradient_matches_finite_differences_of_the_reference():
     assert_close("gradient of viewmats", gradients[5], differences, 1e-3)
 
 
+def test_gradients_match_finite_differences_where_nothing_is_cut_off(monkeypatch):
+    gaussians, cameras = make_gaussians(8, 4, seed=16), make_cameras(1, 20, 14)
+    gaussians[0] *= torch.tensor([0.2, 0.2, 1.0])
+    gaussians[0][:, 2] += 0.1
+    gaussians[2] = 0.1 + 2 * gaussians[2]
+    gaussians[3] = 0.2 + 0.3 * gaussians[3]
+    gaussians[4] = 0.3 * gaussians[4]  # no colour is clamped at zero
+    images, gradients = run(rasterize, gaussians, cameras, size=(20, 14), dtype=torch.float32)
+    cotangents = random_like(images[:4])
+
+    def loss(leaves):
+        *gaussians, viewmats, background = leaves
+        output = _rasterize(*gaussians, viewmats, cameras[1], 20, 14, background=background)
+        return float(sum((image * cotangent).sum() for image, cotangent in zip(output, cotangents)))
+
+    leaves = [*gaussians, cameras[0], BACKGROUND]
+    expected = loss(leaves)
+    monkeypatch.setattr(rasterizer, "ALPHA_MIN", 1e-9)
+    monkeypatch.setattr(rasterizer, "TRANSMITTANCE_MIN", 0.0)
+    assert loss(leaves) == expected, "a cut-off has an effect"
+    generator = torch.Generator().manual_seed(0)
+    for index, name in enumerate(GAUSSIAN_NAMES):
+        for _ in range(4):
+            direction = torch.randn(leaves[index].shape, generator=generator, dtype=torch.float64)
+            if name == "viewmats":
+                direction[:, 3] = 0
+            step = 1e-6 * leaves[index].abs().max() * direction
+            ahead, behind = ([x + sign * step if i == index else x for i, x in enumerate(leaves)] for sign in (1, -1))
+            difference = (loss(ahead) - loss(behind)) / 2
+            change = float((gradients[index].double() * step).sum())
+            scale = float(gradients[index].double().norm() * step.norm())
+            assert abs(change - difference) < 1e-4 * scale, f"{name}: {change / difference - 1:.1e}"
+
+
+def with_absolute_gradients(function, gaussians, cameras, device="cpu", dtype=torch.float64, **options):
+    """Absolute gradients of the means in the image, and all other gradients."""
+    absgrad = torch.full((len(cameras[0]), len(gaussians[0]), 2), 7.0, dtype=dtype, device=device, requires_grad=True)
+    _, gradients = run(function, gaussians, cameras, device=device, dtype=dtype, absgrad=absgrad, **options)
+    return absgrad.grad, gradients
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_absolute_gradients_match_the_reference_and_change_nothing_else(device, compositor):
+    gaussians, cameras = make_gaussians(seed=17), make_cameras()
+    gaussians[0][:5, 2] = -1
+    expected, _ = with_absolute_gradients(_rasterize, gaussians, cameras)
+    actual, gradients = with_absolute_gradients(rasterize, gaussians, cameras, device, torch.float32)
+    assert_close("absolute gradients", actual, expected, 5e-5)
+    assert (actual >= 0).all() and not actual[:, :5].any()
+    _, plain = run(rasterize, gaussians, cameras, device=device, dtype=torch.float32)
+    if device == "cpu":
+        assert all(torch.equal(first, other) for first, other in zip(gradients, plain))
+
+
+def test_absolute_gradients_do_not_cancel():
+    means, K = torch.tensor([[0.0, 0.0, 0.1]]), torch.tensor([[[100.0, 0, 8.5], [0, 100, 8.5], [0, 0, 1]]])
+    gaussian = [means.requires_grad_(), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.003), torch.tensor([0.5])]
+    absgrad = torch.zeros(1, 1, 2, requires_grad=True)
+    rasterize(*gaussian, torch.zeros(1, 1, 3), torch.eye(4)[None], K, 17, 17, absgrad=absgrad).alphas.sum().backward()
+    # By symmetry the left and right halves of the splat pull the same way apart.
+    assert absgrad.grad.min() > 0.1 and torch.allclose(absgrad.grad[..., 0], absgrad.grad[..., 1], rtol=1e-4)
+    assert (means.grad[0, :2] * 0.1 / 100).abs().max() < 1e-4 * absgrad.grad.min()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_median_depth_and_its_gradient_match_the_reference(device, compositor):
+    gaussians, (viewmats, Ks) = make_gaussians(150, seed=18), make_cameras()
+    gaussians = [x.float().double() for x in gaussians]
+    results = []
+    for function, where, dtype in ((_rasterize, "cpu", torch.float64), (rasterize, device, torch.float32)):
+        leaves = [x.detach().to(where, dtype, copy=True).requires_grad_() for x in (*gaussians, viewmats)]
+        medians = function(*leaves, Ks.to(where, dtype), WIDTH, HEIGHT, median=True).medians
+        (medians * random_like([medians])[0].to(where, dtype)).sum().backward()
+        results.append((medians.detach().cpu(), leaves[0].grad.cpu(), leaves[5].grad.cpu()))
+    expected, actual = results
+    assert (expected[0] > 0).any() and not expected[0].all()
+    for name, x, y in zip(("medians", "gradient of means", "gradient of viewmats"), actual, expected):
+        assert_close(name, x, y, 1e-5)
+
+
+def test_median_depth_is_where_half_of_the_light_is_blocked(compositor):
+    z, opacity = torch.tensor([0.13, 0.10, 0.11]), torch.tensor([0.5, 0.3, 0.6])
+    means = torch.stack([torch.zeros(3), torch.zeros(3), z], 1).requires_grad_()
+    K = torch.tensor([[[50.0, 0, 0.5], [0, 50.0, 0.5], [0, 0, 1]]])
+    quats, scales = torch.tensor([[1.0, 0, 0, 0]]).repeat(3, 1), torch.full((3, 3), 0.01)
+    arguments = [means, quats, scales, opacity, torch.zeros(3, 1, 3), torch.eye(4)[None], K, 1, 1]
+    output = rasterize(*arguments, median=True)
+    output.medians.sum().backward()
+    assert torch.allclose(output.medians, torch.tensor(0.11))
+    assert torch.equal(means.grad, torch.tensor([[0.0, 0, 0], [0, 0, 0], [0, 0, 1]]))
+    faint = rasterize(*arguments[:3], 0.2 * opacity, *arguments[4:], median=True)
+    assert not faint.medians.any() and rasterize(*arguments).medians is None
+
+
+def test_expected_depth_lies_on_the_surface_also_where_it_is_thin():
+    gaussians = [x.float() for x in make_gaussians(seed=19)]
+    gaussians[0][:, 2] = 0.12
+    viewmats, Ks = (x.float() for x in make_cameras(1))
+    output = rasterize(*gaussians, torch.eye(4)[None], Ks, WIDTH, HEIGHT)
+    drawn = output.alphas > 0
+    assert drawn.any() and not drawn.all()
+    assert torch.allclose(output.expected_depths, torch.where(drawn, 0.12, 0.0), atol=1e-6)
+
+
 def test_float64_inputs_get_float64_gradients():
     _, gradients = run(rasterize, make_gaussians(), make_cameras())
     assert all(gradient.dtype == torch.float64 for gradient in gradients)
@@ -201,7 +308,7 @@ def test_distortion_is_the_double_sum_of_its_definition():
 def assert_only_background(gaussians, size=(WIDTH, HEIGHT)):
     output, gradients = run(rasterize, gaussians, make_cameras(2, *size), size=size, dtype=torch.float32)
     assert torch.equal(output.colors, BACKGROUND.float().expand_as(output.colors))
-    assert not any(image.any() for image in output[1:])
+    assert not any(image.any() for image in output[1:5])
     assert all(not gradient.any() for gradient in gradients[:-1])
     cotangent = random_like(output[:1])[0].sum((0, 1, 2))
     assert_close("gradient of the background", gradients[-1], cotangent, 1e-5)
@@ -209,6 +316,32 @@ def assert_only_background(gaussians, size=(WIDTH, HEIGHT)):
 
 def test_no_gaussians_render_the_background(compositor):
     assert_only_background(make_gaussians(0))
+
+
+@pytest.mark.parametrize("opacity", [0.3, 1.0])
+def test_one_gaussian_matches_the_reference(opacity, compositor):
+    gaussians = make_gaussians(1, 4, seed=15)
+    gaussians[0][:] = torch.tensor([0.01, 0.02, 0.12])
+    gaussians[3][:] = opacity
+    # It meets nothing, so its distortion is zero.
+    expected, expected_gradients = run(_rasterize, gaussians, make_cameras())
+    output, gradients = run(rasterize, gaussians, make_cameras(), dtype=torch.float32)
+    for name, actual, image in zip(RenderOutput._fields[:3], output, expected):
+        assert_close(name, actual, image, IMAGE_TOLERANCE)
+    assert output.distortions.abs().max() < 1e-9
+    for name, actual, gradient in zip(GAUSSIAN_NAMES, gradients, expected_gradients):
+        assert_close(f"gradient of {name}", actual, gradient, GRADIENT_TOLERANCES[name])
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_opacities_of_exactly_zero_and_one_match_the_reference(device, compositor):
+    gaussians = make_gaussians(80, seed=21)
+    gaussians[3] = (gaussians[3] > 0.5).double()
+    output, gradients = run(rasterize, gaussians, make_cameras(), device=device, dtype=torch.float32)
+    invisible = (gaussians[3] == 0).to(device)
+    assert not output.radii[:, invisible].any()
+    assert not any(gradient[invisible].any() for gradient in gradients[:5])
+    assert_matches_reference(gaussians, make_cameras(), device)
 
 
 def test_gaussians_behind_the_camera_render_the_background(compositor):
@@ -241,6 +374,35 @@ def test_a_gaussian_that_covers_all_tiles_matches_the_reference():
     gaussians[0] = gaussians[0] * 0.1 + torch.tensor([0, 0, 0.1])
     gaussians[2] = gaussians[2] * 40
     assert_matches_reference(gaussians, make_cameras())
+
+
+@pytest.mark.parametrize("scale", [[0.0, 1.0, 1.0], [0.0, 0.0, 1.0], [1e-12, 1.0, 1.0], [-1.0, 1.0, 1.0]])
+def test_degenerate_scales_match_the_reference(scale, compositor):
+    gaussians = make_gaussians(seed=22)
+    gaussians[2] = gaussians[2] * torch.tensor(scale)
+    assert_matches_reference(gaussians, make_cameras(), names=["means", "quats"])
+
+
+def test_a_million_gaussians_are_all_seen():
+    count, size = 1_000_000, (160, 128)
+    gaussians = [x.float() for x in make_gaussians(count, seed=23)]
+    gaussians[2] *= 0.02
+    gaussians[3] *= 0.02
+    cameras = make_cameras(1, *size)
+    whole, gradients = run(rasterize, gaussians, cameras, size=size, dtype=torch.float32)
+    assert all(x.isfinite().all() for x in (*whole[:4], *gradients))
+    assert (whole.radii > 0).sum() > 0.5 * count
+    # Compositing is associative: front half, then back half.
+    viewmat = cameras[0][0].float()
+    front = (gaussians[0] @ viewmat[:3, :3].T + viewmat[:3, 3])[:, 2] < 0.12
+    halves = [run(rasterize, [x[side] for x in gaussians], cameras, size=size, dtype=torch.float32)[0] for side in (front, ~front)]
+    seen_through = 1 - halves[0].alphas
+    alphas = halves[0].alphas + seen_through * halves[1].alphas
+    unfinished = alphas < 0.99
+    assert 0.5 < alphas[unfinished].max() and unfinished.float().mean() > 0.2
+    assert (whole.alphas - alphas)[unfinished].abs().max() < 1e-4
+    depths = halves[0].depths + seen_through * halves[1].depths
+    assert (whole.depths - depths)[unfinished].abs().max() < 1e-5
 
 
 def test_needle_gaussians_lose_no_tile(compositor):
@@ -308,7 +470,7 @@ def test_wrong_shapes_are_named_with_both_shapes(function):
             arguments[index] = arguments[index][None]
         with pytest.raises(ValueError, match=rf"{function.__name__}: {name} shape \(.*\) != expected shape \(.*\)"):
             function(*arguments, WIDTH, HEIGHT)
-    for option, shape in {"background": (4,), "masks": (2, HEIGHT, WIDTH + 1)}.items():
+    for option, shape in {"background": (4,), "masks": (2, HEIGHT, WIDTH + 1), "absgrad": (2, 5, 2)}.items():
         with pytest.raises(ValueError, match=f"{option} shape"):
             function(*gaussians, viewmats, Ks, WIDTH, HEIGHT, **{option: torch.zeros(shape)})
     with pytest.raises(ValueError, match="either covars or both"):
@@ -319,6 +481,61 @@ def test_wrong_shapes_are_named_with_both_shapes(function):
         function(*gaussians, viewmats, Ks, 0, HEIGHT)
 
 
+# ---------------------------------------------------------------- fuzzing
+
+scenes = st.fixed_dictionaries(
+    {
+        "seed": st.integers(0, 2**31),
+        "count": st.integers(0, 40),
+        "cameras": st.integers(1, 3),
+        "sh_count": st.sampled_from([1, 4, 9, 16]),
+        "size": st.tuples(st.integers(1, 50), st.integers(1, 50)),
+        "log_scale": st.floats(-6, 3),
+        "stretch": st.sampled_from([(1, 1, 1), (1, 1, 0), (1, 0, 0), (0, 0, 0), (5, 1, 0.2)]),
+        "opacities": st.sampled_from(["random", "zero", "one", "faint", "both"]),
+        "nearness": st.floats(0.0, 0.3),
+        "zero_quats": st.booleans(),
+        "covars": st.booleans(),
+        "median": st.booleans(),
+    }
+)
+
+
+@settings(max_examples=80, deadline=None, derandomize=True, database=None)
+@given(scenes)
+def test_any_scene_matches_the_reference(scene):
+    """Images everywhere but at pixels on a threshold; gradients where there is no such pixel."""
+    gaussians = make_gaussians(scene["count"], scene["sh_count"], scene["seed"])
+    means, quats, scales, opacities, sh = gaussians
+    means[:, 2] -= scene["nearness"]
+    if scene["zero_quats"]:
+        quats[::3] = 0
+    scales = scales * np.exp(scene["log_scale"]) * torch.tensor(scene["stretch"], dtype=torch.float64)
+    edge = {"zero": opacities * 0, "one": opacities * 0 + 1, "faint": opacities / 100, "both": opacities.round()}
+    opacities = edge.get(scene["opacities"], opacities)
+    shape = covariances(quats, scales) if scene["covars"] else None
+    gaussians = [means, quats, scales, opacities, sh] if shape is None else [means, shape, opacities, sh]
+    gaussians = [x.float().double() for x in gaussians]
+    cameras, options = make_cameras(scene["cameras"], *scene["size"]), {"size": scene["size"], "median": scene["median"]}
+    cameras = [x.float().double() for x in cameras]
+    expected, expected_gradients = run(_rasterize, gaussians, cameras, **options)
+    output, gradients = run(rasterize, gaussians, cameras, dtype=torch.float32, **options)
+    assert all(gradient.isfinite().all() for gradient in gradients)
+    assert (output.alphas >= 0).all() and (output.alphas <= 1).all() and (output.distortions > -1e-5).all()
+    assert_close("gradient of background", gradients[-1], expected_gradients[-1] + 1e-9, 2e-2)
+    apart = torch.zeros_like(expected.alphas, dtype=torch.bool)
+    for name, image, other in zip(RenderOutput._fields[:4], output, expected):
+        error = (image.double() - other).abs() / other.abs().max().clamp_min(1e-3)
+        error = error.amax(-1) if error.ndim == 4 else error
+        # The light of a splat that is or is not cut off: one 255th of itself, or the last 1e-4 of the transmittance.
+        assert error.max() < 3e-2, name
+        apart |= error > 3e-5
+    assert apart.sum() <= max(2, 0.01 * apart.numel())
+    if not apart.any():
+        for actual, gradient in zip(gradients[:-1], expected_gradients):
+            assert (actual.double() - gradient).abs().max() <= 5e-4 * gradient.abs().max() + 1e-6 if gradient.numel() else True
+
+
 # ---------------------------------------------------------------- promises
 
 
@@ -327,10 +544,12 @@ def test_results_repeat_bit_for_bit_with_any_number_of_threads(monkeypatch):
     results = []
     for threads in (1, 2, 2, 5):
         monkeypatch.setattr(rasterizer, "cpu_threads", lambda: threads)
-        results.append(run(rasterize, gaussians, cameras, size=(150, 90), dtype=torch.float32))
-    for output, gradients in results[1:]:
-        for first, other in zip((*results[0][0], *results[0][1]), (*output, *gradients)):
-            assert torch.equal(first, other)
+        absgrad = torch.zeros(2, 3000, 2, requires_grad=True)
+        options = {"size": (150, 90), "absgrad": absgrad, "median": True}
+        output, gradients = run(rasterize, gaussians, cameras, dtype=torch.float32, **options)
+        results.append([*output, *gradients, absgrad.grad])
+    for result in results[1:]:
+        assert all(torch.equal(first, other) for first, other in zip(results[0], result, strict=True))
 
 
 def test_a_mask_that_skips_tiles_does_not_change_the_other_pixels(compositor):

@@ -1,5 +1,6 @@
 """What all nodes share: parameters from configurations, diagnostics, guarded callbacks, start and stop."""
 
+import functools
 import os
 import re
 import signal
@@ -8,8 +9,10 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
+import numpy as np
 import rclpy
 import torch
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
@@ -33,6 +36,32 @@ _END_WITHIN = 3.0  # seconds that worker threads have to end before the process 
 STREAM_DEPTH = 20
 
 Config = TypeVar("Config", bound=StageConfig)
+
+
+@dataclass(frozen=True)
+class WorldConfig(StageConfig):
+    """Where poses are given."""
+
+    world_frame: str = "world"
+    """Frame of camera poses, tool poses, the model and the control nodes."""
+    frames: tuple[str, ...] = ("",)  # ROS has no typed empty list
+    """Other frames in which camera and tool poses may come, such as the bases of robot arms: each the name and the pose
+    in the world, 'PSM1_base x y z qx qy qz qw', metres."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        try:
+            messages.parse_frames(self.world_frame, self.frames)
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
+
+    @property
+    def frame_poses(self) -> dict[str, np.ndarray]:
+        """Poses [4, 4] of all known frames in the world, by name."""
+        return _frame_poses(self.world_frame, self.frames)
+
+
+_frame_poses = functools.cache(messages.parse_frames)
 
 
 class EndoNode(Node):

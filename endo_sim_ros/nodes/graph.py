@@ -40,6 +40,10 @@ class NodeProcess:
         """None while the node runs."""
         return self._process.poll()
 
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
     def send_signal(self, number: int) -> None:
         if self.exit_status is None:
             self._process.send_signal(number)

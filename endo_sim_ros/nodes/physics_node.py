@@ -13,7 +13,7 @@ from endo_sim_ros import messages
 from endo_sim_ros.config import ConfigError, Range, StageConfig
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.messages import ControlNodeCloud, MessageError
-from endo_sim_ros.nodes.base import ERROR, OK, WARN, Background, EndoNode, arm_names, run, sentence
+from endo_sim_ros.nodes.base import ERROR, OK, WARN, Background, EndoNode, WorldConfig, arm_names, run, sentence
 from endo_sim_ros.nodes.pacing import CommandQueue, Pacer
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
 
@@ -25,7 +25,7 @@ _INPUTS = ("pose", "wrench", "jaw")  # parts of a command in lockstep
 
 
 @dataclass(frozen=True)
-class PhysicsNodeConfig(StageConfig):
+class PhysicsNodeConfig(WorldConfig):
     """Parameters of the node beside those of the physics."""
 
     mode: Literal["realtime", "lockstep"] = "realtime"
@@ -41,8 +41,6 @@ class PhysicsNodeConfig(StageConfig):
     arm_source: Literal["measured", "commanded"] = "measured"
     """measured: tips follow measured_cp, as robots and their simulators publish it. commanded: there is no other robot;
     tips follow servo_cp at once, and this node publishes measured_cp and jaw/measured_js as an arm would."""
-    world_frame: str = "world"
-    """Frame of tool poses, the model and the control nodes."""
     command_timeout: Annotated[float, Range(0, 3600, "s")] = 0.5
     """A wrench that is not repeated for this long is dropped; 0 = held until changed."""
     jaw_closed: Annotated[float, Range(-3.2, 3.2, "rad")] = 0.1
@@ -140,7 +138,7 @@ class PhysicsNode(EndoNode):
             self._views = poses[:, :3, 3]
 
     def _on_camera(self, message: Any) -> None:
-        pose = messages.decode_pose(message, self._options.world_frame, messages.CAMERA_POSE.name)
+        pose = messages.decode_pose(message, self._options.frame_poses, messages.CAMERA_POSE.name)
         self._camera_position = pose[:3, 3]
 
     def _viewpoint(self) -> tuple[str, np.ndarray | None]:
@@ -194,17 +192,18 @@ class PhysicsNode(EndoNode):
 
     def _on_tool_pose(self, name: str, message: Any) -> None:
         arm, topic = self._arms[name], self._pose_topic(name).name
-        pose = messages.decode_pose(message, self._options.world_frame, topic)
+        pose = messages.decode_pose(message, self._options.frame_poses, topic)
         self._receive(name, "pose", message, topic, lambda: setattr(arm, "pose", pose))
 
     def _on_wrench(self, name: str, message: Any) -> None:
         topic, arm = messages.tool_wrench(name).name, self._arms[name]
         force, torque = messages.decode_wrench(message, topic)
-        frame = messages.check_frame(message, ("", name, self._options.world_frame), topic)
+        frames = self._options.frame_poses
+        frame = messages.check_frame(message, ("", name, *frames), topic)
 
         def act() -> None:
             self._require_pose(name, topic, "wrench")
-            R = np.eye(3) if frame == self._options.world_frame else arm.pose[:3, :3]  # else in the axes of the tool
+            R = frames.get(frame, arm.pose)[:3, :3]  # any other is the tool's own
             arm.force, arm.torque, arm.heard = R @ force, R @ torque, time.monotonic()
 
         self._receive(name, "wrench", message, topic, act)

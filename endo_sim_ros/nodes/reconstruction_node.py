@@ -16,7 +16,7 @@ from endo_sim_ros.cameras import Camera, load_cameras, save_cameras
 from endo_sim_ros.config import Range, StageConfig
 from endo_sim_ros.gaussians import GaussianModel, load_ply, save_ply
 from endo_sim_ros.messages import Topic
-from endo_sim_ros.nodes.base import ERROR, OK, WARN, EndoNode, run, sentence
+from endo_sim_ros.nodes.base import ERROR, OK, WARN, EndoNode, WorldConfig, run, sentence
 from endo_sim_ros.reconstruction import Progress, ReconstructionConfig, Trainer, select_keyframes
 from endo_sim_ros.sequences.bag import LEFT_FRAME, feed
 from endo_sim_ros.sequences.frames import Frame, SequenceError
@@ -30,14 +30,12 @@ _LATEST, _CAMERAS = "latest", "cameras.json"
 
 
 @dataclass(frozen=True)
-class ReconstructionNodeConfig(StageConfig):
+class ReconstructionNodeConfig(WorldConfig):
     """Parameters of the node beside those of the reconstruction."""
 
     mode: Literal["realtime", "lockstep"] = "realtime"
     """realtime: intermediate models are published while they train, stamped by the clock. lockstep: the final model only,
     stamped by the newest image (models read from files: from one nanosecond on), so that one bag gives the same bytes in every run."""
-    world_frame: str = "world"
-    """Frame in which camera poses are given; poses in other frames are refused."""
     sync_tolerance: Annotated[float, Range(0, 10, "s")] = 0.01
     """Largest difference between the stamps of an image and its pose, depth, mask and right image."""
     reliable: bool = True
@@ -109,7 +107,7 @@ class ReconstructionNode(EndoNode):
     def _on_recording(self, topic: Topic, message: Any) -> None:
         if topic in _LEFT_IMAGES:
             self._note_image(messages.stamp_to_ns(message.header.stamp))
-        self._add_views(feed(self._synchronizer, topic, message, self._options.world_frame))
+        self._add_views(feed(self._synchronizer, topic, message, self._options.frame_poses))
 
     def _note_image(self, stamp: int) -> None:
         """Keep track of where one recording ends and the next begins."""

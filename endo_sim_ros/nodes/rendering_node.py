@@ -12,7 +12,7 @@ from endo_sim_ros.cameras import Camera
 from endo_sim_ros.config import Range, StageConfig
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.messages import CameraInfo, ControlNodeCloud, MessageError
-from endo_sim_ros.nodes.base import ERROR, OK, STREAM_DEPTH, WARN, Background, EndoNode, run, sentence
+from endo_sim_ros.nodes.base import ERROR, OK, STREAM_DEPTH, WARN, Background, EndoNode, WorldConfig, run, sentence
 from endo_sim_ros.nodes.pacing import Pacer
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.bag import LEFT_FRAME
@@ -41,7 +41,7 @@ class _Bound:
 
 
 @dataclass(frozen=True)
-class RenderingNodeConfig(StageConfig):
+class RenderingNodeConfig(WorldConfig):
     """Parameters of the node beside those of the rendering."""
 
     mode: Literal["realtime", "lockstep"] = "realtime"
@@ -53,8 +53,6 @@ class RenderingNodeConfig(StageConfig):
     """Images published per second; input that arrives faster is dropped, the newest is kept."""
     idle_rate: Annotated[float, Range(0.1, 240, "Hz")] = 5.0
     """Images published per second while nothing in the picture changes."""
-    world_frame: str = "world"
-    """Frame of the model, the control nodes and camera poses."""
     camera_frame: str = LEFT_FRAME
     """Frame written into the headers of rendered images."""
 
@@ -149,7 +147,7 @@ class RenderingNode(EndoNode):
             self._pacer.note_input(time.monotonic())
 
     def _on_camera(self, message: Any) -> None:
-        pose = messages.decode_pose(message, self._options.world_frame, messages.CAMERA_POSE.name)
+        pose = messages.decode_pose(message, self._options.frame_poses, messages.CAMERA_POSE.name)
         same = self._pose is not None and np.array_equal(pose, self._pose)
         self._pose = pose
         if self._lockstep and self._options.lockstep_camera:
@@ -252,8 +250,9 @@ class RenderingNode(EndoNode):
         frame = self._options.camera_frame
         self._info_pub.publish(messages.encode_camera_info(camera.K, camera.width, camera.height, stamp, frame))
         self._pose_pub.publish(messages.encode_pose(camera.pose, stamp, self._options.world_frame))
-        self._depth_pub.publish(messages.encode_image(depth, stamp, frame))
         self._image_pub.publish(messages.encode_image(image, stamp, frame))
+        if self._depth_pub.get_subscription_count():  # a megabyte that would only delay the next image
+            self._depth_pub.publish(messages.encode_image(depth, stamp, frame))
         self._images += 1
 
     # ------------------------------------------------------------ diagnostics

@@ -1,7 +1,10 @@
 """The material point solver: owns the grid and the state of the moving nodes, and takes steps."""
 
 import math
+import threading
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -17,7 +20,12 @@ CFL_LIMIT = 0.7  # c Δt / h; measured: 0.7 runs, 0.9 blows up
 CFL_CHOSEN = 0.5  # leaves room for tissue that stiffens where it is compressed
 PIN_STIFFNESS = 50.0  # of a pinned node's spring, over that of a cube of tissue of its volume
 MARGIN_CELLS = 2.0  # between the nodes and the edge of the grid; a spline reaches 1.5
+MIN_CELL, MAX_CELL = 1e-6, 1e3  # m; beyond these float32 no longer holds masses and stiffnesses
 MAX_GRID_NODES = 64_000_000  # 28 bytes each
+
+
+# Held while a graph is captured on a GPU: what another thread launches there meanwhile would become part of it.
+capturing = threading.Lock()
 
 
 class StabilityError(ValueError):
@@ -85,16 +93,21 @@ class MpmSolver:
         self.substepping = plan_substeps(config, self.cell_size)
 
         h = self.cell_size
+        if not MIN_CELL <= h <= MAX_CELL:
+            raise ValueError(
+                f"the grid cells would be {h:.3g} m wide, which is no tissue; is the model in metres, and is it the"
+                " viewpoint's own?"
+            )
         margin = MARGIN_CELLS * h + (config.travel if config.kinematics == "current" else 0.0)
         rest = nodes.rest.astype(np.float64)
         self.origin = rest.min(0) - margin  # [3] world, m
-        shape = np.ceil((rest.max(0) + margin - self.origin) / h).astype(int) + 1
-        if shape.prod() > MAX_GRID_NODES:
+        cells = np.ceil((rest.max(0) + margin - self.origin) / h) + 1
+        if not cells.prod() <= MAX_GRID_NODES:  # as floats: a product of integers could wrap around to a small one
             raise ValueError(
-                f"the simulation grid would have {shape[0]}×{shape[1]}×{shape[2]} nodes of {h:.3g} m; remove outlying"
-                " Gaussians, lower node_count or raise grid_ratio"
+                f"the simulation grid would have {cells[0]:.0f}×{cells[1]:.0f}×{cells[2]:.0f} nodes of {h:.3g} m; remove"
+                " outlying Gaussians, lower node_count or raise grid_ratio"
             )
-        self.grid_shape = tuple(int(n) for n in shape)
+        self.grid_shape = tuple(int(n) for n in cells)
         self._grid = Grid()
         self._grid.h, self._grid.inverse_h = h, 1 / h
         self._grid.nx, self._grid.ny, self._grid.nz = self.grid_shape
@@ -124,7 +137,8 @@ class MpmSolver:
         self._grid_v = wp.zeros(self.grid_shape, wp.vec3, device=self.device)
         self._fault = wp.zeros(1, int, device=self.device)
         self._speed_sq = wp.zeros(1, float, device=self.device)
-        self._graph = None
+        self._flat_mv, self._flat_v = self._grid_mv.flatten(), self._grid_v.flatten()
+        self._advance: Callable[[], None] | None = None
         self.reset()
 
     def reset(self) -> None:
@@ -161,39 +175,42 @@ class MpmSolver:
 
     def step(self) -> int:
         """Take one step; returns how many nodes ended it non-finite or out of bounds (0 = a good step)."""
-        if self._graph is None:
-            self._graph = self._capture()
-        wp.capture_launch(self._graph)
+        if self._advance is None:
+            self._advance = self._prepare()
+        self._advance()
         return int(self._fault.numpy()[0])
 
-    def _capture(self):
-        """The whole step as one graph; forces are read from their device array at every launch."""
+    def _prepare(self) -> Callable[[], None]:
+        """The whole step as one call; forces are read from their device array every time."""
         advance = make_advance_kernel(self.config.material, self.config.kinematics)
-        for kernel in (advance, check_nodes):
+        for kernel in (advance, update_grid, check_nodes):
             wp.load_module(kernel.module, device=self.device)
-        with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
-            self._record(advance)
-        return capture.graph
+        if self.device == "cpu":
+            # No graph: a capture on the CPU takes in, and does not run, what other threads of the process launch meanwhile.
+            actions = self._actions(advance, lambda *arguments: wp.launch(*arguments, device="cpu", record_cmd=True).launch)
+            return lambda: [action() for action in actions]
+        with capturing, wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
+            for action in self._actions(advance, lambda *arguments: partial(wp.launch, *arguments, device=self.device)):
+                action()
+        return partial(wp.capture_launch, capture.graph)
 
-    def _record(self, advance) -> None:
+    def _actions(self, advance: wp.Kernel, launch: Callable[..., Callable[[], None]]) -> list[Callable[[], None]]:
+        """What one step does, in order; ``launch`` turns kernel, size and inputs into an action."""
         dt, count = self.substepping.dt, self.substepping.count
         gravity = wp.vec3(*self.config.gravity)
         decay = math.exp(-self.config.damping * dt)
         constants = [self._nodes, self._grid, dt, gravity, self.mu, self.lam]
-        grid_mv, grid_v = self._grid_mv.flatten(), self._grid_v.flatten()
-        for array, backup in zip(self._state, self._backup):
-            wp.copy(backup, array)
-        self._fault.zero_()
-        self._speed_sq.zero_()
-        grid_mv.zero_()
+        actions = [partial(wp.copy, backup, array) for array, backup in zip(self._state, self._backup)]
+        actions += [array.zero_ for array in (self._fault, self._speed_sq, self._grid_mv)]
+        update = launch(update_grid, len(self._flat_mv), [decay, self._flat_mv, self._flat_v])
         for substep in range(count + 1):
             gather, scatter = int(substep > 0), int(substep < count)
             if gather:
-                wp.launch(update_grid, len(grid_mv), [decay, grid_mv, grid_v], device=self.device)
+                actions.append(update)
             inputs = [*constants, (substep + 1) * dt, gather, scatter, self._grid_v, self._grid_mv]
-            wp.launch(advance, len(self._nodes.X), inputs, device=self.device)
+            actions.append(launch(advance, len(self._nodes.X), inputs))
         inputs = [self._nodes.u, self._nodes.v, self._nodes.F, self.config.travel, self._fault, self._speed_sq]
-        wp.launch(check_nodes, len(self._nodes.X), inputs, device=self.device)
+        return [*actions, launch(check_nodes, len(self._nodes.X), inputs)]
 
     def restore(self) -> None:
         """Return to the state before the last step, at rest there."""

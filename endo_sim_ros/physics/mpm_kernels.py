@@ -65,8 +65,14 @@ def spline(x: float) -> wp.vec3:
 
 @wp.func
 def first_cell(x: float, n: int) -> int:
-    """First of the three grid nodes along one axis; clamped, so that a runaway node stays inside the grid."""
-    return wp.clamp(int(wp.floor(x - 0.5)), 0, n - 3)
+    """First of the three grid nodes along one axis; clamped, so that a runaway node stays inside the grid.
+
+    Before the conversion: what an integer cannot hold, and NaN, would become any integer, past a later clamp.
+    """
+    first = wp.floor(x - 0.5)
+    if first > 0.0:  # not NaN
+        return int(wp.min(first, float(n - 3)))
+    return 0
 
 
 @functools.cache

@@ -7,7 +7,7 @@ import numpy as np
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes, build_control_nodes
-from endo_sim_ros.physics.mpm import MpmSolver
+from endo_sim_ros.physics.mpm import MpmSolver, capturing
 from endo_sim_ros.physics.wrench import fall_off, minimum_norm_forces
 
 
@@ -84,7 +84,8 @@ class TissueSimulation:
     def _start(self, nodes: ControlNodes, config: PhysicsConfig) -> None:
         self.nodes = nodes
         self.config = config
-        self.solver = MpmSolver(nodes, config)
+        with capturing:
+            self.solver = MpmSolver(nodes, config)
         self.substepping = self.solver.substepping
         self.step_duration = config.step_duration
         self.time = 0.0

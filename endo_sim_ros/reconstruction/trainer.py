@@ -4,6 +4,7 @@ import dataclasses
 import logging
 import math
 import pickle
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -131,22 +132,26 @@ class Trainer:
             SequenceError: If the file is not a checkpoint, or one of other views or options.
         """
         try:
-            state = torch.load(path, map_location=self.device, weights_only=True)
+            state = _read_checkpoint(Path(path), self.device)
             mine = dataclasses.asdict(self.config)
             differing = [name for name in mine if name != "device" and mine[name] != state["config"].get(name)]
             if differing or state["stamps"] != self._stamps:
                 what = f"other options ({', '.join(differing)})" if differing else "other views"
                 raise SequenceError(f"{path}: the checkpoint was made with {what}; use the same or start anew")
-            self._set_model(GaussianModel(**state["model"]))
-            self._optimizer.load_state_dict(state["optimizer"])
-            self._generator.set_state(state["generator"].cpu())
-            self.iteration, self._order = state["iteration"], list(state["order"])
+            iteration, order = int(state["iteration"]), [int(view) for view in state["order"]]
+            if iteration < 0 or not set(order) <= set(range(len(self._views))):
+                raise ValueError("it names views or an iteration that there cannot be")
+            generator = torch.Generator()
+            generator.set_state(state["generator"].cpu())
+            self._set_model(GaussianModel(**state["model"]))  # what is refused was so before: a training goes on as it was
+            self._optimizer.load_state_dict(self._optimizer.state_dict() | {"state": state["optimizer"]["state"]})
+            self._generator = generator
+            self.iteration, self._order = iteration, order
         except SequenceError:
             raise
-        except (
-            OSError, KeyError, IndexError, AttributeError, TypeError, ValueError, RuntimeError, EOFError, pickle.UnpicklingError,
-        ) as error:  # fmt: skip
-            raise SequenceError(f"{path}: not a readable checkpoint ({error})") from error
+        except Exception as error:  # a damaged file can make the unpickler raise anything
+            reason = next(iter(str(error).splitlines()), type(error).__name__)
+            raise SequenceError(f"{path}: not a readable checkpoint ({reason})") from error
 
     # --------------------------------------------------------------- training
 
@@ -221,8 +226,7 @@ class Trainer:
 
     def _set_model(self, model: GaussianModel) -> None:
         """Start optimising a model with a fresh optimiser."""
-        tensors = model.tensors() | {"sh_base": model.sh[:, :1], "sh_rest": model.sh[:, 1:]}
-        self._parameters = {name: tensors[name].clone().requires_grad_() for name in _RATES if tensors[name].numel()}
+        self._parameters = {name: tensor.clone().requires_grad_() for name, tensor in _parameters(model).items()}
         factor = self.config.learning_rate
         groups = [{"params": [tensor], "lr": factor * _RATES[name]} for name, tensor in self._parameters.items()]
         self._optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True)
@@ -271,6 +275,41 @@ class Trainer:
             None if frame.depth is None else tensor(frame.depth),
             None if frame.mask is None or frame.mask.all() else tensor(frame.mask > 0),
         )
+
+
+def _parameters(model: GaussianModel) -> dict[str, Tensor]:
+    """The tensors of a model that are optimised, by name."""
+    tensors = model.tensors() | {"sh_base": model.sh[:, :1], "sh_rest": model.sh[:, 1:]}
+    return {name: tensors[name] for name in _RATES if tensors[name].numel()}
+
+
+def _read_checkpoint(path: Path, device: torch.device) -> dict:
+    """The contents of a checkpoint. No code in it runs, and its tensors are no larger than the file.
+
+    Raises:
+        ValueError: If the file claims more than it holds, or the state of the optimiser does not fit the model.
+    """
+    size = path.stat().st_size
+    with zipfile.ZipFile(path) as archive:
+        if sum(entry.file_size for entry in archive.infolist()) > size:
+            raise ValueError("it claims more than it holds")
+        if archive.testzip() is not None:
+            raise ValueError("it is damaged")
+    try:
+        state = torch.load(path, map_location=device, weights_only=True)
+    except pickle.UnpicklingError:  # whose text advises to load it all the same
+        raise ValueError("it holds other objects than tensors and numbers") from None
+    moments = state["optimizer"]["state"]  # of each parameter, by its number; empty before the first step
+    tensors = [*state["model"].values(), *(value for values in moments.values() for value in values.values())]
+    if sum(tensor.numel() * tensor.element_size() for tensor in tensors) > size:  # views of less
+        raise ValueError("it claims more than it holds")
+    if any(tensor.dtype != torch.float32 or tensor.is_meta or not tensor.isfinite().all() for tensor in tensors):
+        raise ValueError("its tensors are not of finite float32 numbers")
+    shapes = [tensor.shape for tensor in _parameters(GaussianModel(**state["model"])).values()]  # none without Gaussians
+    found = {number: {name: value.shape for name, value in values.items()} for number, values in moments.items()}
+    if not shapes or found and found != {n: {"step": (), "exp_avg": shape, "exp_avg_sq": shape} for n, shape in enumerate(shapes)}:
+        raise ValueError("the state of the optimiser does not fit the model")
+    return state
 
 
 def _median_depth(frames: list[Frame], model: GaussianModel) -> float:

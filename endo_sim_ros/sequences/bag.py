@@ -1,13 +1,17 @@
 """Recordings as rosbag2 files (mcap, zstd chunks); no ROS installation is needed to read or write them."""
 
 import contextlib
+import os
 import shutil
-from collections.abc import Iterable, Iterator
+import struct
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer, WriterError
+from rosbags.rosbag2.storage_mcap import ChunkInfo, McapReader
 
 from endo_sim_ros import messages
 from endo_sim_ros.messages import Topic, bag_types
@@ -29,11 +33,12 @@ class RawMessage(NamedTuple):
 class BagWriter:
     """Writes messages of the contract, or raw ones of any type, into a new bag. Use as a context manager.
 
-    What was written is kept, and readable, also when the block ends with an error.
+    What was written is kept, and readable, also when the block ends with an error. When the process is killed that is
+    what was written before the last `flush`, or in whole chunks of a megabyte; when the disk is full, what fitted.
 
     Raises:
         SequenceError: If the path exists or cannot be made.
-        OSError: If the disk is full.
+        OSError: If the disk is full; nothing can be written then.
     """
 
     def __init__(self, path: str | Path):
@@ -43,6 +48,7 @@ class BagWriter:
         self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
         self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
         self._connections: dict[str, Any] = {}
+        self._end, self._failed = 0, False  # bytes of the file that are whole records, and whether more may follow
 
     def __enter__(self) -> "BagWriter":
         try:
@@ -53,7 +59,36 @@ class BagWriter:
         return self
 
     def __exit__(self, *_: Any) -> None:
-        self._writer.close()
+        file = self._writer.storage.path
+        try:
+            if not self._failed:
+                self.flush()  # on its own: where there is no room for the index there may be for messages
+                with self._storing():
+                    self._writer.close()
+        finally:
+            if self._failed:  # half a record would be in the way; BagReader does without the index
+                with contextlib.suppress(OSError):
+                    self._writer.abort()
+                os.truncate(file, self._end)
+
+    @contextlib.contextmanager
+    def _storing(self) -> Iterator[None]:
+        if self._failed:
+            raise SequenceError(f"{self.path}: the bag takes no more messages since one could not be written")
+        try:
+            yield
+        except OSError:
+            self._failed = True
+            raise
+
+    def flush(self) -> None:
+        """Hand over what was written to the operating system, so that it outlives this process."""
+        storage = self._writer.storage
+        with self._storing():
+            if storage.chunk.bio.tell():
+                storage.close_chunk()
+            storage.bio.flush()
+            self._end = storage.bio.tell()
 
     def write(self, topic: Topic, message: Any, stamp_ns: int) -> None:
         """Append a message built from `messages.bag_types`."""
@@ -66,7 +101,22 @@ class BagWriter:
             self._connections[name] = self._writer.add_connection(
                 name, topic.type, typestore=bag_types().typestore, offered_qos_profiles=[_qos(topic.qos == "latched")]
             )
-        self._writer.write(self._connections[name], stamp_ns, data)
+        with self._storing():
+            self._writer.write(self._connections[name], stamp_ns, data)
+        if not self._writer.storage.chunk.bio.tell():  # a chunk was full and went to the file
+            self.flush()
+
+
+def canonical_cdr(data: bytes, message_type: str) -> bytes:
+    """The same message, with zeros between its fields; as it is where its type is not known or its bytes are damaged.
+
+    Senders may leave anything in these gaps, so that the bytes of equal messages differ.
+    """
+    typestore = bag_types().typestore
+    try:
+        return bytes(typestore.serialize_cdr(typestore.deserialize_cdr(data, message_type), message_type))
+    except Exception:  # parsers know many
+        return data
 
 
 def _qos(latched: bool) -> Qos:
@@ -104,8 +154,67 @@ def _no_bag(path: str | Path) -> str:
     return f"{path}: no such bag; give a rosbag2 folder (with metadata.yaml) or an .mcap file"
 
 
+_MAGIC = b"\x89MCAP0\r\n"
+_CHUNK, _DATA_END = 0x06, 0x0F  # records of an mcap file
+
+
+class _UnfinishedMcap(McapReader):
+    """A file whose recorder was killed, or had no room: its whole chunks, without the index that would be at the end."""
+
+    def _open(self) -> None:
+        size = os.fstat(self.bio.fileno()).st_size
+        if self.bio.read(len(_MAGIC)) != _MAGIC:
+            raise ValueError("not an mcap file")
+        self.data_start = position = len(_MAGIC)
+        chunks = []
+        while position + 9 <= size:
+            self.bio.seek(position)
+            kind, length = struct.unpack("<BQ", self.bio.read(9))
+            if kind in (0, _DATA_END) or position + 9 + length > size:
+                break
+            if kind == _CHUNK:
+                start, end, raw_size, _, letters = struct.unpack("<QQQII", self.bio.read(32))
+                compression = self.bio.read(letters).decode()
+                (packed_size,) = struct.unpack("<Q", self.bio.read(8))
+                chunks.append(ChunkInfo(start, end, position, 9 + length, {}, 0, compression, packed_size, raw_size, {}))
+            position += 9 + length
+        if not chunks:
+            raise ValueError("nothing was written before the recording ended")
+        self.data_end = position
+        self.meta_scan()  # topics and counts
+        for chunk in chunks:
+            chunk.channel_count.update(dict.fromkeys(self.channels, 1))  # any topic may be in any chunk
+        self.chunks = chunks
+        found = self.statistics
+        self.connections = [c._replace(msgcount=found.channel_message_counts.get(c.id, 0)) for c in self.connections]
+        self.metadata = self.metadata._replace(
+            start_time=found.start_time,
+            end_time=found.end_time + 1,
+            duration=found.end_time - found.start_time + 1,
+            message_count=found.message_count,
+        )
+
+
+def _open_reader(path: Path) -> Reader:
+    """Reader of a bag; without metadata.yaml, which is written last, that of its only file."""
+    folder = path if path.is_dir() else path.parent
+    files = list(folder.glob("*.mcap")) if path.is_dir() else [path]
+    if (folder / "metadata.yaml").exists() or len(files) != 1:
+        return Reader(path)
+    (file,) = files
+    reader = Reader(file)
+    with file.open("rb") as data:
+        whole = file.stat().st_size > len(_MAGIC) and data.seek(-len(_MAGIC), os.SEEK_END) and data.read() == _MAGIC
+    if file.suffix == ".mcap" and not whole:
+        reader.storage = _UnfinishedMcap(file)
+    return reader
+
+
 class BagReader:
     """Reads a rosbag2 folder or a single .mcap file. Use as a context manager.
+
+    A recording that was cut short, by a killed process or a full disk, is read as far as it was written. (Where there is
+    a metadata.yaml, which a recorder writes last, a file that ends early is damaged instead.)
 
     Raises:
         SequenceError: If there is no such bag or it is damaged.
@@ -116,7 +225,7 @@ class BagReader:
         if not self.path.exists():
             raise SequenceError(_no_bag(path))
         with _readable(path):
-            self._reader = Reader(self.path)
+            self._reader = _open_reader(self.path)
 
     def __enter__(self) -> "BagReader":
         with _readable(self.path):
@@ -252,7 +361,9 @@ def _located(path: str | Path) -> Iterator[None]:
         raise SequenceError(f"{path}: {error}") from error
 
 
-def feed(synchronizer: Synchronizer, topic: Topic, message: Any, world_frame: str) -> list[Frame]:
+def feed(
+    synchronizer: Synchronizer, topic: Topic, message: Any, frames: str | Mapping[str, np.ndarray]
+) -> list[Frame]:
     """Decode one message of a recording topic into the synchroniser and return the frames that became complete."""
     stamp = messages.stamp_to_ns(message.header.stamp)
     if topic in (messages.LEFT_INFO, messages.RIGHT_INFO):
@@ -260,7 +371,7 @@ def feed(synchronizer: Synchronizer, topic: Topic, message: Any, world_frame: st
         synchronizer.add_info("left" if topic == messages.LEFT_INFO else "right", info)
         return []
     if topic == messages.CAMERA_POSE:
-        return synchronizer.add("pose", stamp, messages.decode_pose(message, world_frame, topic.name))
+        return synchronizer.add("pose", stamp, messages.decode_pose(message, frames, topic.name))
     if topic == messages.DEPTH:
         return synchronizer.add("depth", stamp, messages.decode_depth(message, topic.name))
     if topic == messages.MASK:

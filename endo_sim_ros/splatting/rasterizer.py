@@ -4,6 +4,7 @@
 """
 
 import contextlib
+import contextvars
 import functools
 import os
 from concurrent.futures import ThreadPoolExecutor
@@ -22,6 +23,7 @@ from endo_sim_ros.splatting import rasterizer_simd_kernels as simd_kernels
 ALPHA_MIN = 1 / 255  # fainter contributions are skipped
 ALPHA_MAX = 0.999
 TRANSMITTANCE_MIN = 1e-4  # a pixel is finished before its transmittance drops below this
+MEDIAN = 0.5  # transmittance at the median depth
 
 
 class RenderOutput(NamedTuple):
@@ -32,6 +34,12 @@ class RenderOutput(NamedTuple):
     alphas: Tensor  # [C, H, W] Σ w_i
     distortions: Tensor  # [C, H, W] Σ_ij w_i w_j |z_i − z_j|, metres
     radii: Tensor  # [C, N] int32, half size of the footprint's bounding box, pixels; 0 = not in the image; no gradient
+    medians: Tensor | None = None  # [C, H, W] z where half of the light is blocked, metres; 0 = never; None = not asked for
+
+    @property
+    def expected_depths(self) -> Tensor:
+        """Mean depth of what is seen, Σ w_i z_i / Σ w_i [C, H, W], metres; 0 where nothing is drawn."""
+        return self.depths / self.alphas.clamp_min(ALPHA_MIN / 2)  # alpha is 0 or at least ALPHA_MIN
 
 
 def rasterize(
@@ -48,6 +56,8 @@ def rasterize(
     covars: Tensor | None = None,
     background: Tensor | None = None,
     masks: Tensor | None = None,
+    absgrad: Tensor | None = None,
+    median: bool = False,
     near: float = 1e-3,
     eps2d: float = 0.3,
 ) -> RenderOutput:
@@ -69,6 +79,10 @@ def rasterize(
         covars: World covariances [N, 3, 3], m², used instead of quats and scales, e.g. of deformed Gaussians.
         background: Colour behind everything [3]; black by default.
         masks: True where the image matters [C, H, W]. Tiles of 16×16 pixels without any True show background only.
+        absgrad: Receives the statistics of AbsGS densification: its values are not used, its gradient is
+            Σ_pixels |∂L/∂mean2d| per image coordinate [C, N, 2], 1/pixel (Ye et al. 2024). Costs time only where it
+            requires a gradient.
+        median: Whether to compute median depths. Their gradient is that of the depth of the Gaussian at the median.
         near: Gaussians nearer than this are not drawn, metres.
         eps2d: Added to the variances in the image, pixel²: no splat is thinner than about a pixel.
 
@@ -79,19 +93,20 @@ def rasterize(
         ValueError: If shapes disagree, or a mean is not finite (CPU tensors only: on CUDA that test would stall the
             device). Any other Gaussian whose projection is not finite is not drawn and gets zero gradients.
     """
-    options = {"covars": covars, "background": background, "masks": masks}
+    options = {"covars": covars, "background": background, "masks": masks, "absgrad": absgrad}
     _check_inputs("rasterize", means, quats, scales, opacities, sh, viewmats, Ks, width, height, **options)
     if means.device.type == "cpu" and not means.isfinite().all():
         index = int((~means.detach().isfinite()).any(1).nonzero()[0])
         raise ValueError(f"rasterize: means[{index}] is not finite: {means[index].tolist()}")
     _load_kernels(str(means.device))
-    settings = _Settings(int(width), int(height), float(near), float(eps2d))
+    settings = _Settings(int(width), int(height), float(near), float(eps2d), bool(median), _uses_vectors(means.device))
     if background is None:
         background = _black(means.device)
-    arguments = [means, quats, scales, covars, opacities, sh, viewmats, background]
+    arguments = [means, quats, scales, covars, opacities, sh, viewmats, background, absgrad]
     arguments = [None if x is None else x.to(means.device, torch.float32).contiguous() for x in arguments]
     Ks = Ks.to(means.device, torch.float32).contiguous()
-    return RenderOutput(*_Rasterize.apply(settings, Ks, masks, *arguments))
+    *images, owners = _Rasterize.apply(settings, Ks, masks, *arguments)
+    return RenderOutput(*images, _depths_of(owners, arguments[0], arguments[6]) if median else None)
 
 
 def render(
@@ -101,6 +116,7 @@ def render(
     covars: Tensor | None = None,
     background: Tensor | None = None,
     mask: Tensor | None = None,
+    median: bool = False,
     near: float = 1e-3,
     eps2d: float = 0.3,
 ) -> RenderOutput:
@@ -112,6 +128,7 @@ def render(
         covars: World covariances [N, 3, 3], m², instead of the model's own.
         background: Colour behind everything [3]; black by default.
         mask: True where the image matters [H, W]; whole tiles without any True are skipped.
+        median: Whether to compute median depths.
         near: Nearest distance drawn, metres.
         eps2d: Added to the variances in the image, pixel².
     """
@@ -130,13 +147,14 @@ def render(
         covars=covars,
         background=background,
         masks=None if mask is None else mask[None],
+        median=median,
         near=near,
         eps2d=eps2d,
     )
 
 
 def _check_inputs(
-    name, means, quats, scales, opacities, sh, viewmats, Ks, width, height, *, covars, background, masks
+    name, means, quats, scales, opacities, sh, viewmats, Ks, width, height, *, covars, background, masks, absgrad
 ) -> None:
     """Raise ValueError, naming the argument and both shapes, unless all shapes agree."""
     if means.ndim != 2 or means.shape[1] != 3:
@@ -161,10 +179,22 @@ def _check_inputs(
         "Ks": (Ks, (c, 3, 3)),
         "background": (background, (3,)),
         "masks": (masks, (c, height, width)),
+        "absgrad": (absgrad, (c, n, 2)),
     }
     for argument, (tensor, shape) in expected.items():
         if tensor is not None and tuple(tensor.shape) != shape:
             raise ValueError(f"{name}: {argument} shape {tuple(tensor.shape)} != expected shape {shape}")
+
+
+def _depths_of(owners: Tensor, means: Tensor, viewmats: Tensor) -> Tensor:
+    """Depth z [C, H, W] in its camera of the splat c·N + n named at each pixel; 0 for none, −1; differentiable."""
+    if not len(means):
+        return means.new_zeros(owners.shape)
+    # Nobody is drawn at a mean that is not finite, but zero times such a mean would spoil the cameras' gradients.
+    axes, means = viewmats[:, None, 2], means.nan_to_num(0, 0, 0)
+    z = (axes[..., :3] * means).sum(-1) + axes[..., 3]  # [C, N]
+    z = z.flatten().gather(0, owners.clamp_min(0).flatten().long()).view(owners.shape)
+    return torch.where(owners >= 0, z, 0)
 
 
 # ---------------------------------------------------------------- running the kernels
@@ -177,6 +207,8 @@ class _Settings(NamedTuple):
     height: int
     near: float
     eps2d: float
+    median: bool
+    vectors: bool  # whether to composite with the kernels made for CPUs, rather than one thread per pixel
 
     @property
     def tiles_x(self) -> int:
@@ -230,15 +262,18 @@ def _array(tensor: Tensor | None, dtype=None):
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
 
 
-def _launch(kernel, count: int, arguments: list, device: torch.device) -> None:
-    """Launch a kernel whose first argument is an offset, over count items: at once on CUDA, in shares on the CPU."""
+def _launch(kernel, count: int, arguments: list, device: torch.device, width: int = 1) -> None:
+    """Launch a kernel whose first argument is an offset, over count items of some threads each.
+
+    At once on CUDA, in shares of whole items on the CPU.
+    """
     if count == 0:
         return
     if device.type != "cpu":
-        wp.launch(kernel, dim=count, inputs=[0, *arguments], device=str(device))
+        wp.launch(kernel, dim=count * width, inputs=[0, *arguments], device=str(device))
         return
-    threads = cpu_threads() if count >= 1024 else 1
-    bounds = [count * i // threads for i in range(threads + 1)]
+    threads = cpu_threads() if count * width >= 1024 else 1
+    bounds = [width * (count * i // threads) for i in range(threads + 1)]
 
     def share(first, end):
         wp.launch(kernel, dim=end - first, inputs=[first, *arguments], device="cpu")
@@ -304,34 +339,61 @@ def _intersect(splats, depth_keys, counts, tile_mask, gaussian_count, settings) 
     return _Intersections(owners, slots, starts, counts, firsts)
 
 
+_scalar = contextvars.ContextVar("scalar", default=False)
+
+
+@contextlib.contextmanager
+def scalar_kernels():
+    """Within it, `rasterize` runs the kernels made for GPUs on the CPU too, pixel by pixel: to compare with."""
+    token = _scalar.set(True)
+    try:
+        yield
+    finally:
+        _scalar.reset(token)
+
+
 def _uses_vectors(device: torch.device) -> bool:
-    """Whether to composite with the kernels made for CPUs, rather than one thread per pixel."""
-    return device.type == "cpu"
+    return device.type == "cpu" and not _scalar.get()
 
 
-def _composite(intersections, splats, background, settings, tile_count, images, v_images=(), records=None) -> None:
-    """Fill images (colours, depths, alphas, distortions) or, when their gradients are given, the gradient records."""
-    device, backward = splats.device, records is not None
-    lists = [intersections.owners, intersections.slots, intersections.starts]
-    if _uses_vectors(device):
-        kernel = simd_kernels.render_tiles_backward if backward else simd_kernels.render_tiles
-        arguments = [_array(x) for x in (splats.view(-1), *lists, background)]
-        arguments += [settings.width, settings.height, *(_array(x.view(-1)) for x in (*images, *v_images))]
-        _launch_tiles(kernel, tile_count, arguments + ([_array(records.view(-1))] if backward else []))
+def _composite(intersections, splats, background, settings, tile_count, images, owners) -> None:
+    """Fill images (colours, depths, alphas, distortions) and, if wanted, the owners of median depths."""
+    arguments = [*_image_arguments(intersections, splats, background, settings, images), int(settings.median), _array(owners)]
+    if settings.vectors:
+        _launch_tiles(simd_kernels.render_tiles, tile_count, arguments)
     else:
-        kernel = kernels.render_pixels_backward if backward else kernels.render_pixels
-        arguments = [*(_array(x) for x in (splats, *lists)), _array(background[None], wp.vec3)]
-        arguments += [settings.width, settings.height]
-        for x in (*images, *v_images):
-            arguments.append(_array(x.view(-1, 3), wp.vec3) if x.ndim == 4 else _array(x.view(-1)))
-        _launch(kernel, tile_count * kernels.TILE**2, arguments + ([_array(records)] if backward else []), device)
+        _launch(kernels.render_pixels, tile_count, arguments, splats.device, kernels.TILE**2)
+
+
+def _composite_backward(intersections, splats, background, settings, tile_count, images, v_images, absolute) -> Tensor:
+    """The gradient records, from the gradients of the images."""
+    # One kernel writes every record, the other adds to them.
+    size = (len(intersections.owners), kernels.RECORD_SIZE)
+    records = (torch.empty if settings.vectors else torch.zeros)(size, device=splats.device)
+    arguments = _image_arguments(intersections, splats, background, settings, (*images, *v_images)) + [int(absolute)]
+    if settings.vectors:
+        _launch_tiles(simd_kernels.render_tiles_backward, tile_count, [*arguments, _array(records.view(-1))])
+    else:
+        # No two threads of a CPU share a tile, and with it a record.
+        _launch(kernels.render_pixels_backward, tile_count, [*arguments, _array(records)], splats.device, kernels.TILE**2)
+    return records
+
+
+def _image_arguments(intersections, splats, background, settings, images) -> list:
+    """The arguments with which all compositing kernels begin."""
+    lists = [_array(x) for x in (intersections.owners, intersections.slots, intersections.starts)]
+    if settings.vectors:
+        arrays = [_array(x.view(-1)) for x in images]
+        return [_array(splats.view(-1)), *lists, _array(background), settings.width, settings.height, *arrays]
+    arrays = [_array(x.view(-1, 3), wp.vec3) if x.ndim == 4 else _array(x.view(-1)) for x in images]
+    return [_array(splats), *lists, _array(background[None], wp.vec3), settings.width, settings.height, *arrays]
 
 
 class _Rasterize(torch.autograd.Function):
     """Takes settings, Ks and masks, then the differentiable tensors; float32, contiguous, on one device."""
 
     @staticmethod
-    def forward(ctx, settings, Ks, masks, means, quats, scales, covars, opacities, sh, viewmats, background):
+    def forward(ctx, settings, Ks, masks, means, quats, scales, covars, opacities, sh, viewmats, background, absgrad):
         device, n, camera_count = means.device, len(means), len(viewmats)
         splat_count = camera_count * n
         splats = torch.empty(splat_count, kernels.SPLAT_SIZE, device=device)
@@ -340,6 +402,7 @@ class _Rasterize(torch.autograd.Function):
         depth_keys = torch.empty(2 * splat_count, dtype=torch.int32, device=device)
         size = (camera_count, settings.height, settings.width)
         images = [torch.empty(*size, 3, device=device)] + [torch.empty(size, device=device) for _ in range(3)]
+        owners = torch.empty(size if settings.median else 0, dtype=torch.int32, device=device)
         tile_mask = _tile_mask(masks, settings, camera_count, device)
         with _on_stream(device):
             arguments = _gaussian_arguments(means, quats, scales, covars) + [_array(opacities)]
@@ -347,12 +410,12 @@ class _Rasterize(torch.autograd.Function):
             outputs = (tile_mask, splats, radii.view(-1), depth_keys, counts)
             _launch(kernels.project, splat_count, arguments + [_array(x) for x in outputs], device)
             intersections = _intersect(splats, depth_keys, counts, tile_mask, n, settings)
-            _composite(intersections, splats, background, settings, len(tile_mask), images)
+            _composite(intersections, splats, background, settings, len(tile_mask), images, owners.view(-1))
         ctx.settings, ctx.intersections, ctx.tile_count = settings, intersections, len(tile_mask)
         ctx.splats, ctx.Ks = splats, Ks
         ctx.save_for_backward(means, quats, scales, covars, opacities, sh, viewmats, background, *images)
-        ctx.mark_non_differentiable(radii)
-        return *images, radii
+        ctx.mark_non_differentiable(radii, owners)
+        return *images, radii, owners
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -360,22 +423,22 @@ class _Rasterize(torch.autograd.Function):
         means, quats, scales, covars, opacities, sh, viewmats, background, *images = ctx.saved_tensors
         settings, intersections, device = ctx.settings, ctx.intersections, means.device
         v_images = [v.float().contiguous() for v in v_outputs[:4]]
-        wants_pose, wants_background = ctx.needs_input_grad[9:11]
+        wants_pose, wants_background, wants_absolute = ctx.needs_input_grad[9:12]
 
-        # The CPU writes every record, a GPU adds to them.
-        allocate = torch.empty if _uses_vectors(device) else torch.zeros
-        records = allocate(len(intersections.owners), kernels.RECORD_SIZE, device=device)
         v_means, v_opacities, v_sh = (torch.empty_like(x) for x in (means, opacities, sh))
         v_quats, v_scales, v_covars = (None if x is None else torch.empty_like(x) for x in (quats, scales, covars))
         shares = torch.empty(len(viewmats), len(means), 4, 4, device=device) if wants_pose else None
+        v_absgrad = torch.empty(len(viewmats), len(means), 2, device=device) if wants_absolute else None
         with _on_stream(device):
-            _composite(intersections, ctx.splats, background, settings, ctx.tile_count, images, v_images, records)
+            lists_and_images = (intersections, ctx.splats, background, settings, ctx.tile_count, images)
+            records = _composite_backward(*lists_and_images, v_images, wants_absolute)
             arguments = _gaussian_arguments(means, quats, scales, covars)
             arguments += _camera_arguments(sh, viewmats, ctx.Ks, settings) + [settings.eps2d]
-            arguments += [_array(x) for x in (intersections.counts, intersections.firsts, records)] + [int(wants_pose)]
+            arguments += [_array(x) for x in (intersections.counts, intersections.firsts, records)]
+            arguments += [int(wants_pose), int(wants_absolute)]
             arguments += [_array(v_means, wp.vec3), _array(v_quats, wp.vec4), _array(v_scales, wp.vec3)]
             arguments += [_array(v_covars, wp.mat33), _array(v_opacities), _array(v_sh, wp.vec3)]
-            arguments += [_array(shares, wp.mat44)]
+            arguments += [_array(shares, wp.mat44), _array(v_absgrad, wp.vec2)]
             _launch(kernels.project_backward, len(means), arguments, device)
 
         v_viewmats = v_background = None
@@ -383,7 +446,8 @@ class _Rasterize(torch.autograd.Function):
             v_viewmats = _repeatable_sum(shares, 1)
         if wants_background:
             v_background = _repeatable_sum((v_images[0] * (1 - images[2])[..., None]).view(-1, 3), 0)
-        return None, None, None, v_means, v_quats, v_scales, v_covars, v_opacities, v_sh, v_viewmats, v_background
+        v_gaussians = (v_means, v_quats, v_scales, v_covars, v_opacities, v_sh)
+        return None, None, None, *v_gaussians, v_viewmats, v_background, v_absgrad
 
 
 def _gaussian_arguments(means, quats, scales, covars) -> list:
@@ -420,6 +484,8 @@ def _rasterize(
     covars: Tensor | None = None,
     background: Tensor | None = None,
     masks: Tensor | None = None,
+    absgrad: Tensor | None = None,
+    median: bool = False,
     near: float = 1e-3,
     eps2d: float = 0.3,
 ) -> RenderOutput:
@@ -427,7 +493,7 @@ def _rasterize(
 
     Same arguments, errors and result as `rasterize`; masks are checked, but nothing is skipped.
     """
-    options = {"covars": covars, "background": background, "masks": masks}
+    options = {"covars": covars, "background": background, "masks": masks, "absgrad": absgrad}
     _check_inputs("_rasterize", means, quats, scales, opacities, sh, viewmats, Ks, width, height, **options)
     if covars is None:
         rotations = _quat_to_matrix(quats)
@@ -435,11 +501,16 @@ def _rasterize(
     covars = (covars + covars.mT) / 2
     if background is None:
         background = means.new_zeros(3)
+    if absgrad is None:
+        absgrad = means.new_zeros(len(viewmats), len(means), 2)
     cameras = [
-        _render_reference(means, covars, opacities, sh, viewmat, K, width, height, background, near, eps2d)
-        for viewmat, K in zip(viewmats, Ks)
+        _render_reference(means, covars, opacities, sh, viewmat, K, width, height, background, absgrad[c], near, eps2d)
+        for c, (viewmat, K) in enumerate(zip(viewmats, Ks))
     ]
-    return RenderOutput(*(torch.stack(images) for images in zip(*cameras)))
+    *images, owners = (torch.stack(images) for images in zip(*cameras))
+    first = len(means) * torch.arange(len(viewmats), device=means.device)[:, None, None]
+    owners = torch.where(owners >= 0, owners + first, -1)
+    return RenderOutput(*images, _depths_of(owners, means, viewmats) if median else None)
 
 
 def _quat_to_matrix(quats: Tensor) -> Tensor:
@@ -481,8 +552,20 @@ def sh_basis(directions: Tensor, count: int) -> Tensor:
     return torch.stack(basis[:count], 1)
 
 
-def _render_reference(means, covars, opacities, sh, viewmat, K, width, height, background, near, eps2d):
-    """One camera of `_rasterize`."""
+class _SumOfAbsolutes(torch.autograd.Function):
+    """The first argument [N, H, W]; the gradient of the second [N] is the sum of its gradient's absolute values."""
+
+    @staticmethod
+    def forward(ctx, x, probe):
+        return x.clone()
+
+    @staticmethod
+    def backward(ctx, v):
+        return v, v.abs().sum((1, 2))
+
+
+def _render_reference(means, covars, opacities, sh, viewmat, K, width, height, background, absgrad, near, eps2d):
+    """One camera of `_rasterize`: its images, radii and, per pixel, the Gaussian at the median depth or −1."""
     rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     points = means @ rotation.T + translation
@@ -515,8 +598,9 @@ def _render_reference(means, covars, opacities, sh, viewmat, K, width, height, b
 
     rows = torch.arange(height, dtype=means.dtype, device=means.device) + 0.5
     columns = torch.arange(width, dtype=means.dtype, device=means.device) + 0.5
-    dx = (columns - center_x[:, None])[:, None, :]  # [N, 1, W]
-    dy = (rows - center_y[:, None])[:, :, None]  # [N, H, 1]
+    shape = (len(index), height, width)
+    dx = _SumOfAbsolutes.apply((columns - center_x[:, None])[:, None, :].expand(shape), absgrad[index, 0])
+    dy = _SumOfAbsolutes.apply((rows - center_y[:, None])[:, :, None].expand(shape), absgrad[index, 1])
     a, b, c = (x[:, None, None] for x in (yy / det, -xy / det, xx / det))
     sigma = (a * dx**2 + c * dy**2) / 2 + b * dx * dy
     alpha = (opacities[:, None, None] * (-sigma).exp()).clamp_max(ALPHA_MAX)
@@ -537,4 +621,6 @@ def _render_reference(means, covars, opacities, sh, viewmat, K, width, height, b
         alphas,
         (2 * weights * (z * before_weight - before_depth)).sum(0),
     )
-    return *images, radii
+    crosses = (before > MEDIAN) & (after <= MEDIAN)  # once, as transmittance only falls
+    owners = torch.where(crosses, index[:, None, None] + 1, 0).sum(0) - 1
+    return *images, radii, owners

@@ -6,12 +6,14 @@ rotation and Σ the world covariance, its footprint in the image is a 2D Gaussia
 3DGS, eq. 5)
 
     mean = (fx x/z + cx, fy y/z + cy),   cov = J R Σ Rᵀ Jᵀ + eps2d I,   conic = cov⁻¹ = [[A, B], [B, C]]
-    σ(d) = ½ (A dx² + C dy²) + B dx dy,   α = min(0.999, opacity · exp(−σ)), nothing below 1/255.
+    σ(d) = ½ (A dx² + C dy²) + B dx dy = ½ A ((dx + B/A dy)² + det(cov)/cov_yy² dy²),
+    α = min(0.999, opacity · exp(−σ)), nothing below 1/255.
 
 Compositing, front to back, with w_i = α_i T_i and T_{i+1} = T_i (1 − α_i), until T would drop below 1e-4:
 
     colour = Σ w_i c_i + T background,   depth = Σ w_i z_i,   alpha = Σ w_i,
-    distortion L = Σ_ij w_i w_j |z_i − z_j| = Σ_i 2 w_i (z_i W_i − D_i),   W_i = Σ_{j<i} w_j,   D_i = Σ_{j<i} w_j z_j.
+    distortion L = Σ_ij w_i w_j |z_i − z_j| = Σ_i 2 w_i (z_i W_i − D_i),   W_i = Σ_{j<i} w_j,   D_i = Σ_{j<i} w_j z_j,
+    median depth = z_i of the splat i with T_i > ½ ≥ T_{i+1}, if there is one: the kernels name it, torch does the rest.
 
 Backward, in one front-to-back pass (v_x is the gradient of the loss with respect to x): with
 
@@ -25,7 +27,8 @@ Memory layout. `splats` is one float32 row of 16 per splat, one cache line; its 
 touches the tiles whose pixel centres its ellipse α ≥ 1/255 meets. Those (splat, tile) pairs are *intersections*,
 numbered in depth order of their splats, so that the intersections of a splat are consecutive; `slots` lists them by
 tile, and within a tile by depth. The backward pass writes one gradient row of 12 per intersection; `project_backward`
-adds up the consecutive rows of a splat. No two CPU threads write to the same place, so results repeat bit for bit.
+adds up the consecutive rows of a splat. The absolute gradients of the mean, Σ_pixels |∂L/∂mean|, take the same way.
+No two CPU threads write to the same place, so results repeat bit for bit.
 """
 
 import warp as wp
@@ -43,17 +46,22 @@ OPACITY = wp.constant(5)
 Z = wp.constant(6)  # depth, metres
 RED = wp.constant(7)  # and green, blue
 EXTENT_X, EXTENT_Y = wp.constant(10), wp.constant(11)  # half size of the ellipse's bounding box, pixels
-HALF_WIDTH = wp.constant(12)  # half width of the ellipse along the row through its centre, pixels
-# A gradient record has the gradients of columns 0 to 9 in the same order.
+ASPECT_X, ASPECT_Y = wp.constant(12), wp.constant(13)  # half width on the row through the centre / EXTENT_Y, and vice versa
+SHEAR_X, SHEAR_Y = wp.constant(14), wp.constant(15)  # B/A and B/C
+# A gradient record has the gradients of columns 0 to 9 in the same order, then, if wanted, the sums over pixels of the
+# absolute gradients of columns 0 and 1.
+ABSOLUTE = wp.constant(10)
 
 ALPHA_MIN = wp.constant(1.0 / 255.0)
 ALPHA_MAX = wp.constant(0.999)
 TRANSMITTANCE_MIN = wp.constant(1e-4)
+MEDIAN = wp.constant(0.5)
 # Slack that keeps the tile test on the safe side of float32 rounding.
 LOG_ALPHA_SLACK = wp.constant(0.01)
 PIXEL_SLACK = wp.constant(0.01)
 
 TILE_SIZE = wp.constant(TILE)
+LOOK_AHEAD = wp.constant(8)
 TILE_LAST = wp.constant(float(TILE - 1))
 
 mat23 = wp.types.matrix(shape=(2, 3), dtype=wp.float32)
@@ -210,10 +218,27 @@ def projection_jacobian(slopes: wp.vec2, z: float, K: wp.mat33) -> mat23:
 
 
 @wp.func
-def image_covariance(to_image: mat23, covariance: wp.mat33, eps2d: float) -> wp.vec3:
-    """xx, xy and yy of the blurred covariance in the image, pixel²."""
-    cov = to_image * covariance * wp.transpose(to_image)
-    return wp.vec3(cov[0, 0] + eps2d, cov[0, 1], cov[1, 1] + eps2d)
+def image_covariance(
+    n: int,
+    to_image: mat23,
+    quats: wp.array[wp.vec4],
+    scales: wp.array[wp.vec3],
+    covars: wp.array[wp.mat33],
+    has_covars: int,
+    eps2d: float,
+) -> wp.vec4:
+    """xx, xy and yy of the blurred covariance of Gaussian n in the image, pixel², and their determinant.
+
+    Of M Mᵀ + εI, with M's rows r and s, the determinant is |r × s|² + ε (|r|² + |s|²) + ε²: nothing cancels.
+    """
+    if has_covars != 0:
+        cov = to_image * world_covariance(n, quats, scales, covars, has_covars) * wp.transpose(to_image)
+        xx, yy = cov[0, 0] + eps2d, cov[1, 1] + eps2d
+        return wp.vec4(xx, cov[0, 1], yy, xx * yy - cov[0, 1] * cov[0, 1])
+    m = to_image * scaled_rotation(quats[n], scales[n])
+    r, s = wp.vec3(m[0, 0], m[0, 1], m[0, 2]), wp.vec3(m[1, 0], m[1, 1], m[1, 2])
+    rr, ss, normal = wp.dot(r, r), wp.dot(s, s), wp.cross(r, s)
+    return wp.vec4(rr + eps2d, wp.dot(r, s), ss + eps2d, wp.dot(normal, normal) + eps2d * (rr + ss) + eps2d * eps2d)
 
 
 # ---------------------------------------------------------------- tiles
@@ -231,22 +256,22 @@ def tile_rows(y: float, extent_y: float, tiles_y: int) -> wp.vec2i:
 
 @wp.func
 def tile_columns(
-    row: int, x: float, y: float, a: float, b: float, c: float, extent: wp.vec2, half_width: float, tiles_x: int
+    row: int, x: float, y: float, shear: wp.vec2, extent: wp.vec2, aspect: float, tiles_x: int
 ) -> wp.vec2i:
     """Columns [first, end) of tiles in one row that have a pixel centre in the x-range of ellipse ∩ row.
 
     Ellipse and row are convex, so the tiles met are exactly a range. At height dy the ellipse spans
-    −(B/A) dy ± half_width √(1 − dy²/extent_y²); it is widest to the right at dy = −(B/C) extent_x.
+    −(B/A) dy ± aspect √(extent_y² − dy²); it is widest to the right at dy = −(B/C) extent_x.
     """
     size = float(TILE_SIZE)
     low = wp.max(float(row * TILE_SIZE) + 0.5 - y - PIXEL_SLACK, -extent[1])
     high = wp.min(float(row * TILE_SIZE) + 0.5 + TILE_LAST - y + PIXEL_SLACK, extent[1])
-    widest = -b / c * extent[0]
+    widest = -shear[1] * extent[0]
     dy_right = wp.clamp(widest, low, high)
     dy_left = wp.clamp(-widest, low, high)
-    t_right, t_left = dy_right / extent[1], dy_left / extent[1]
-    right = x - b / a * dy_right + half_width * wp.sqrt(wp.max(1.0 - t_right * t_right, 0.0)) + PIXEL_SLACK
-    left = x - b / a * dy_left - half_width * wp.sqrt(wp.max(1.0 - t_left * t_left, 0.0)) - PIXEL_SLACK
+    square = extent[1] * extent[1]
+    right = x - shear[0] * dy_right + aspect * wp.sqrt(wp.max(square - dy_right * dy_right, 0.0)) + PIXEL_SLACK
+    left = x - shear[0] * dy_left - aspect * wp.sqrt(wp.max(square - dy_left * dy_left, 0.0)) - PIXEL_SLACK
     first = wp.ceil((left - TILE_LAST - 0.5) / size)
     last = wp.floor((right - 0.5) / size)
     end = float(tiles_x)
@@ -291,15 +316,16 @@ def project(
     if not (p[2] >= near and opacity >= ALPHA_MIN):
         return
     to_image = projection_jacobian(clamped_slopes(p, K, width, height), p[2], K) * rotation
-    cov = image_covariance(to_image, world_covariance(n, quats, scales, covars, has_covars), eps2d)
-    det = cov[0] * cov[2] - cov[1] * cov[1]
+    cov = image_covariance(n, to_image, quats, scales, covars, has_covars, eps2d)
+    det = cov[3]
     if not (det > 0.0 and cov[0] > 0.0):
         return
     x, y = K[0, 0] * p[0] / p[2] + K[0, 2], K[1, 1] * p[1] / p[2] + K[1, 2]
     a, b, c = cov[2] / det, -cov[1] / det, cov[0] / det
     level = 2.0 * (wp.log(255.0 * opacity) + LOG_ALPHA_SLACK)
     extent = wp.vec2(wp.sqrt(level * cov[0]), wp.sqrt(level * cov[2]))
-    half_width = wp.sqrt(level / a)
+    aspect = wp.vec2(wp.sqrt(det) / cov[2], wp.sqrt(det) / cov[0])
+    shear = wp.vec2(-cov[1] / cov[2], -cov[1] / cov[0])
 
     basis = vec16()
     if sh.shape[1] == 1:
@@ -307,7 +333,7 @@ def project(
     else:
         basis = sh_basis(sh.shape[1], wp.normalize(means[n] + wp.transpose(rotation) * translation))
     color = sh_color(n, sh.shape[1], basis, sh)
-    finite = wp.isfinite(x + y + a + b + c + extent[0] + extent[1] + half_width + opacity)
+    finite = wp.isfinite(x + y + a + b + c + extent[0] + extent[1] + aspect[0] + aspect[1] + opacity)
     if not (finite and wp.isfinite(color[0] + color[1] + color[2])):
         return
     if x + extent[0] < 0.0 or x - extent[0] > float(width) or y + extent[1] < 0.0 or y - extent[1] > float(height):
@@ -326,7 +352,10 @@ def project(
     splats[splat, RED + 2] = color[2]
     splats[splat, EXTENT_X] = extent[0]
     splats[splat, EXTENT_Y] = extent[1]
-    splats[splat, HALF_WIDTH] = half_width
+    splats[splat, ASPECT_X] = aspect[0]
+    splats[splat, ASPECT_Y] = aspect[1]
+    splats[splat, SHEAR_X] = shear[0]
+    splats[splat, SHEAR_Y] = shear[1]
     radii[splat] = int(wp.min(wp.ceil(wp.max(extent[0], extent[1])), 1.0e6))
     depth_keys[splat] = wp.cast(p[2], wp.int32)  # the bits of positive floats order as the floats do
 
@@ -335,10 +364,20 @@ def project(
     rows = tile_rows(y, extent[1], tiles_y)
     count = int(0)
     for row in range(rows[0], rows[1]):
-        columns = tile_columns(row, x, y, a, b, c, extent, half_width, tiles_x)
+        columns = tile_columns(row, x, y, shear, extent, aspect[0], tiles_x)
         for column in range(columns[0], columns[1]):
             count += int(tile_mask[(camera * tiles_y + row) * tiles_x + column])
     counts[splat] = count
+
+
+@wp.func_native("""
+#if !defined(__CUDA_ARCH__)
+    __builtin_prefetch(rows.data + (size_t)row * rows.shape[1]);
+#endif
+""")
+def prefetch_row(rows: wp.array2d[float], row: int):
+    """Ask a CPU's memory for a row that is needed soon; rows are read in an order that it cannot guess."""
+    ...
 
 
 @wp.kernel
@@ -358,6 +397,7 @@ def emit_intersections(
     owners: wp.array[int],  # out, splat of each intersection
 ):
     rank = offset + wp.tid()
+    prefetch_row(splats, order[wp.min(rank + LOOK_AHEAD, order.shape[0] - 1)])
     splat = order[rank]
     if counts[splat] == 0:
         return
@@ -366,11 +406,11 @@ def emit_intersections(
     firsts[splat] = i
     camera = splat // gaussian_count
     x, y = splats[splat, X], splats[splat, Y]
-    a, b, c = splats[splat, A], splats[splat, B], splats[splat, C]
     extent = wp.vec2(splats[splat, EXTENT_X], splats[splat, EXTENT_Y])
+    shear = wp.vec2(splats[splat, SHEAR_X], splats[splat, SHEAR_Y])
     rows = tile_rows(y, extent[1], tiles_y)
     for row in range(rows[0], rows[1]):
-        columns = tile_columns(row, x, y, a, b, c, extent, splats[splat, HALF_WIDTH], tiles_x)
+        columns = tile_columns(row, x, y, shear, extent, splats[splat, ASPECT_X], tiles_x)
         for column in range(columns[0], columns[1]):
             tile = (camera * tiles_y + row) * tiles_x + column
             if tile_mask[tile] != wp.uint8(0) and i < end:
@@ -418,6 +458,7 @@ def project_backward(
     firsts: wp.array[int],
     records: wp.array2d[float],
     wants_pose: int,
+    wants_absolute: int,
     v_means: wp.array[wp.vec3],  # out, as all below
     v_quats: wp.array[wp.vec4],
     v_scales: wp.array[wp.vec3],
@@ -425,11 +466,14 @@ def project_backward(
     v_opacities: wp.array[float],
     v_sh: wp.array2d[wp.vec3],
     v_viewmats: wp.array2d[wp.mat44],  # [C, N], each Gaussian's share, filled when wants_pose
+    v_absolute: wp.array2d[wp.vec2],  # [C, N], sums of absolute gradients of the mean in the image, filled when wants_absolute
 ):
     """Gradients of Gaussian n over all cameras: adds up the records of its splats and goes back through `project`."""
     n = offset + wp.tid()
     gaussian_count = means.shape[0]
     sh_count = sh.shape[1]
+    if n + LOOK_AHEAD < gaussian_count and counts[n + LOOK_AHEAD] > 0:
+        prefetch_row(records, firsts[n + LOOK_AHEAD])
     v_mean = wp.vec3()
     v_covariance = wp.mat33()
     v_opacity = float(0.0)
@@ -441,6 +485,11 @@ def project_backward(
         splat = camera * gaussian_count + n
         if wants_pose != 0:
             v_viewmats[camera, n] = wp.mat44()
+        if wants_absolute != 0:
+            total = wp.vec2()
+            for i in range(firsts[splat], firsts[splat] + counts[splat]):
+                total += wp.vec2(records[i, ABSOLUTE], records[i, ABSOLUTE + 1])
+            v_absolute[camera, n] = total
         if counts[splat] > 0:
             drawn = 1
             v = vec10()
@@ -456,8 +505,8 @@ def project_backward(
             slopes = clamped_slopes(p, K, width, height)
             to_image = projection_jacobian(slopes, z, K) * rotation
             covariance = world_covariance(n, quats, scales, covars, has_covars)
-            cov = image_covariance(to_image, covariance, eps2d)
-            det = cov[0] * cov[2] - cov[1] * cov[1]
+            cov = image_covariance(n, to_image, quats, scales, covars, has_covars, eps2d)
+            det = cov[3]
             conic = wp.mat22(cov[2] / det, -cov[1] / det, -cov[1] / det, cov[0] / det)
 
             # conic = cov⁻¹ and cov = T Σ Tᵀ with T = J R.
@@ -580,9 +629,13 @@ def pixel_in_tile(lane: int) -> wp.vec2i:
 
 @wp.func
 def splat_exponential(splats: wp.array2d[float], splat: int, dx: float, dy: float) -> float:
-    """exp(−σ) at an offset from the mean, pixels."""
-    a, b, c = splats[splat, A], splats[splat, B], splats[splat, C]
-    return wp.exp(-(0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy))
+    """exp(−σ) at an offset from the mean, pixels.
+
+    σ as a sum of squares: far from the mean of a needle the terms of the other form cancel.
+    """
+    run = dx + splats[splat, SHEAR_X] * dy
+    rise = splats[splat, ASPECT_X] * dy
+    return wp.exp(-0.5 * splats[splat, A] * (run * run + rise * rise))
 
 
 @wp.kernel
@@ -599,6 +652,8 @@ def render_pixels(
     depths: wp.array[float],
     alphas: wp.array[float],
     distortions: wp.array[float],
+    wants_owners: int,
+    owners_of_median: wp.array[int],  # splat at the median depth or -1, filled when wants_owners
 ):
     """Composite one pixel. Launched over tiles × 256 threads."""
     thread = offset + wp.tid()
@@ -619,6 +674,7 @@ def render_pixels(
     color = wp.vec3()
     depth, distortion = float(0.0), float(0.0)
     transmittance = float(1.0)
+    owner = int(-1)
     for slot in range(start, end):
         splat = owners[slots[slot]]
         exponential = splat_exponential(splats, splat, px - splats[splat, X], py - splats[splat, Y])
@@ -632,6 +688,8 @@ def render_pixels(
             color += weight * wp.vec3(splats[splat, RED], splats[splat, RED + 1], splats[splat, RED + 2])
             distortion += 2.0 * weight * (z * (1.0 - transmittance) - depth)
             depth += weight * z
+            if transmittance > MEDIAN and following <= MEDIAN:
+                owner = splat
             transmittance = following
 
     pixel = (tile // (tiles_x * tiles_y) * height + row) * width + column
@@ -639,6 +697,8 @@ def render_pixels(
     depths[pixel] = depth + reference * (1.0 - transmittance)
     alphas[pixel] = 1.0 - transmittance
     distortions[pixel] = distortion
+    if wants_owners != 0:
+        owners_of_median[pixel] = owner
 
 
 @wp.kernel
@@ -659,6 +719,7 @@ def render_pixels_backward(
     v_depths: wp.array[float],
     v_alphas: wp.array[float],
     v_distortions: wp.array[float],
+    wants_absolute: int,
     records: wp.array2d[float],  # out, zeroed before: each warp adds its share
 ):
     """Gradients of one pixel. All threads of a warp walk the same splats, also those whose pixel is finished."""
@@ -740,3 +801,8 @@ def render_pixels_backward(
                 total = warp_sum(v[k])
                 if leads_warp(lane) != 0:
                     wp.atomic_add(records, intersection, k, total)
+            if wants_absolute != 0:
+                for k in range(2):
+                    total = warp_sum(wp.abs(v[k]))
+                    if leads_warp(lane) != 0:
+                        wp.atomic_add(records, intersection, ABSOLUTE + k, total)

@@ -20,14 +20,18 @@ VECTOR_TYPES = """
     struct simd {
         static inline __attribute__((always_inline)) vfloat set(float x) { return vfloat{} + x; }
 
-        // exp(x) for x <= 0, to 2e-7 relative: 2^n times a polynomial for 2^f, |f| <= 1/2 (that of Cephes' exp2f).
-        static inline __attribute__((always_inline)) vfloat exp(vfloat x)
+        static inline __attribute__((always_inline)) vfloat negative(vfloat x)
         {
-            x *= 1.44269504f;
+            return (vfloat)((vint)x | (vint{} + (int)0x80000000));  // sets the sign, whatever it is
+        }
+
+        // 2^x for x <= 0, to 2e-7 relative: 2^n times a polynomial for 2^f, |f| <= 1/2 (that of Cephes' exp2f).
+        static inline __attribute__((always_inline)) vfloat exp2(vfloat x)
+        {
             x = x < -126.0f ? set(-126.0f) : x;
-            const float round = 12582912.0f;  // adding 1.5 2^23 leaves no fraction bits
-            vfloat n = (x + round) - round;
-            vfloat f = x - n;
+            const float round = 12582912.0f;  // adding 1.5 2^23 leaves no fraction bits, and n in the lowest
+            vfloat n = x + round;
+            vfloat f = x - (n - round);
             vfloat p = set(1.535336188319500e-4f);
             p = p * f + 1.339887440266574e-3f;
             p = p * f + 9.618437357674640e-3f;
@@ -35,7 +39,15 @@ VECTOR_TYPES = """
             p = p * f + 2.402264791363012e-1f;
             p = p * f + 6.931472028550421e-1f;
             p = p * f + 1.0f;
-            return (vfloat)((vint)p + (__builtin_convertvector(n, vint) << 23));
+            return (vfloat)((vint)p + ((vint)n << 23));
+        }
+
+        // opacity * exp(-sigma) at offsets from a splat's mean; sigma as in splat_exponential of the other kernels.
+        static inline __attribute__((always_inline)) vfloat alpha(const float* splat, vfloat dx, float dy)
+        {
+            const float rise = splat[12] * dy;
+            const vfloat run = dx + splat[14] * dy;
+            return splat[5] * exp2(-0.5f * 1.44269504f * splat[2] * (run * run + rise * rise));
         }
 
         static inline __attribute__((always_inline)) float sum(vfloat x)
@@ -57,16 +69,27 @@ VECTOR_TYPES = """
             return __builtin_reduce_or(live) == 0;
         }
 
-        // The rows [first, end) of a tile that a splat's bounding box meets.
-        static inline __attribute__((always_inline)) void rows(const float* splat, float y0, int& first, int& end)
+        // The rows [first, end) of a tile at (x0, y0) that have pixels in the y-range of ellipse and tile columns: the
+        // same as tile_columns of the other kernels, with x and y exchanged.
+        static inline __attribute__((always_inline)) void
+        rows(const float* splat, float x0, float y0, int& first, int& end)
         {
-            float low = ceilf(splat[1] - splat[11] - y0 - 0.51f), high = floorf(splat[1] + splat[11] - y0 - 0.49f);
+            const float extent = splat[10], widest = splat[14] * splat[11];
+            const float left = x0 + 0.49f - splat[0], right = left + 15.02f;
+            const float low_x = left > -extent ? left : -extent, high_x = right < extent ? right : extent;
+            const float x_low = widest < low_x ? low_x : widest > high_x ? high_x : widest;
+            const float x_high = -widest < low_x ? low_x : -widest > high_x ? high_x : -widest;
+            const float aspect = splat[13], square = extent * extent;
+            const float under = square - x_low * x_low, over = square - x_high * x_high;
+            const float low_y = splat[1] - splat[15] * x_low - aspect * sqrtf(under > 0.0f ? under : 0.0f);
+            const float high_y = splat[1] - splat[15] * x_high + aspect * sqrtf(over > 0.0f ? over : 0.0f);
+            const float low = ceilf(low_y - y0 - 0.51f), high = floorf(high_y - y0 - 0.49f);
             first = low > 0.0f ? (int)low : 0;
             end = high < 15.0f ? (int)high + 1 : 16;
         }
     };
     const vfloat lanes = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
-    const float alpha_min = 1.0f / 255.0f, alpha_max = 0.999f, transmittance_min = 1e-4f;
+    const float alpha_min = 1.0f / 255.0f, alpha_max = 0.999f, transmittance_min = 1e-4f, median = 0.5f;
 """
 
 TILE_PLACE = """
@@ -75,7 +98,8 @@ TILE_PLACE = """
     const int columns = wp::min(16, width - column0), rows = wp::min(16, height - row0);
     const size_t pixel0 = ((size_t)(tile / (tiles_x * tiles_y)) * height + row0) * width + column0;
     const int start = starts.data[tile], end = starts.data[tile + 1];
-    const float reference = start < end ? splats.data[16 * (size_t)owners.data[slots.data[start]] + 6] : 0.0f;
+    const auto splat_at = [&](int slot) { return splats.data + 16 * (size_t)owners.data[slots.data[slot]]; };
+    const float reference = start < end ? splat_at(start)[6] : 0.0f;
     const vfloat px = lanes + (column0 + 0.5f);
 """
 
@@ -91,35 +115,47 @@ def draw(counter: wp.array[int]) -> int:
     + TILE_PLACE
     + """
     vfloat transmittance[16], depth[16], distortion[16], red[16], green[16], blue[16];
+    vint owner[16];  // splat at the median depth
     for (int row = 0; row < 16; ++row) {
         // Pixels outside the image count as finished from the start.
         transmittance[row] = lanes < (row < rows ? (float)columns : 0.0f) ? simd::set(1.0f) : simd::set(-1.0f);
         depth[row] = distortion[row] = red[row] = green[row] = blue[row] = vfloat{};
+        owner[row] = vint{} - 1;
     }
+    int next_first, next_last;  // rows of the next splat, known before the processor asks for them
+    if (start < end)
+        simd::rows(splat_at(start), column0, row0, next_first, next_last);
     for (int slot = start; slot < end; ++slot) {
         if ((slot - start) % 8 == 7 && simd::finished(transmittance))
             break;
-        const float* splat = splats.data + 16 * (size_t)owners.data[slots.data[slot]];
+        if (slot + 8 < end)
+            __builtin_prefetch(splat_at(slot + 8));
+        const float* splat = splat_at(slot);
         const float z = splat[6] - reference;
         const vfloat dx = px - splat[0];
-        const vfloat along = -0.5f * splat[2] * dx * dx, across = -splat[3] * dx;
-        int first, last;
-        simd::rows(splat, row0, first, last);
+        const int first = next_first, last = next_last;
+        if (slot + 1 < end)
+            simd::rows(splat_at(slot + 1), column0, row0, next_first, next_last);
         for (int row = first; row < last; ++row) {
             const float dy = (row0 + row + 0.5f) - splat[1];
-            vfloat alpha = splat[5] * simd::exp(along + dy * (across - 0.5f * splat[4] * dy));
+            vfloat alpha = simd::alpha(splat, dx, dy);
             alpha = alpha < alpha_max ? alpha : simd::set(alpha_max);
             alpha = alpha < alpha_min ? vfloat{} : alpha;
             const vfloat before = transmittance[row];
             const vfloat after = before - before * alpha;
             const vint stop = after < transmittance_min;  // always true of a finished pixel
             const vfloat weight = stop ? vfloat{} : before * alpha;
-            transmittance[row] = stop ? (before > 0.0f ? -before : before) : after;
+            transmittance[row] = stop ? simd::negative(before) : after;
             distortion[row] += 2.0f * weight * (z * (1.0f - before) - depth[row]);
             depth[row] += weight * z;
             red[row] += weight * splat[7];
             green[row] += weight * splat[8];
             blue[row] += weight * splat[9];
+            if (wants_owners) {
+                // A pixel whose transmittance is above a half is not finished by one splat, as alpha_max is below 1.
+                const vint crosses = (before > median) & (after <= median);
+                owner[row] = crosses ? vint{} + owners.data[slots.data[slot]] : owner[row];
+            }
         }
     }
     for (int row = 0; row < rows; ++row) {
@@ -132,6 +168,8 @@ def draw(counter: wp.array[int]) -> int:
             depths.data[pixel] = depth[row][column] + reference * (1.0f - seen_through);
             alphas.data[pixel] = 1.0f - seen_through;
             distortions.data[pixel] = distortion[row][column];
+            if (wants_owners)
+                owners_of_median.data[pixel] = owner[row][column];
         }
     }
 """
@@ -149,6 +187,8 @@ def composite_tile(
     depths: wp.array[float],
     alphas: wp.array[float],
     distortions: wp.array[float],
+    wants_owners: int,
+    owners_of_median: wp.array[int],
 ): ...
 
 
@@ -187,22 +227,29 @@ def composite_tile(
             transmittance[row][column] = 1.0f;
         }
     }
+    int next_first, next_last;
+    if (start < end)
+        simd::rows(splat_at(start), column0, row0, next_first, next_last);
     int slot = start;
     for (; slot < end; ++slot) {
         if ((slot - start) % 8 == 7 && simd::finished(transmittance))
             break;
         const int intersection = slots.data[slot];
-        const float* splat = splats.data + 16 * (size_t)owners.data[intersection];
+        if (slot + 8 < end) {
+            __builtin_prefetch(splat_at(slot + 8));
+            __builtin_prefetch(records.data + 12 * (size_t)slots.data[slot + 8], 1);
+        }
+        const float* splat = splat_at(slot);
         const float z = splat[6] - reference;
         const vfloat dx = px - splat[0];
-        const vfloat along = -0.5f * splat[2] * dx * dx, across = -splat[3] * dx;
         // Sums over the rows of the gradients; s0, s1, s2 are the moments of v_sigma in dy.
-        vfloat s0{}, s1{}, s2{}, sum_red{}, sum_green{}, sum_blue{}, sum_z{};
-        int first, last;
-        simd::rows(splat, row0, first, last);
+        vfloat s0{}, s1{}, s2{}, sum_red{}, sum_green{}, sum_blue{}, sum_z{}, absolute_x{}, absolute_y{};
+        const int first = next_first, last = next_last;
+        if (slot + 1 < end)
+            simd::rows(splat_at(slot + 1), column0, row0, next_first, next_last);
         for (int row = first; row < last; ++row) {
             const float dy = (row0 + row + 0.5f) - splat[1];
-            vfloat alpha = splat[5] * simd::exp(along + dy * (across - 0.5f * splat[4] * dy));
+            vfloat alpha = simd::alpha(splat, dx, dy);
             const vint clamped = alpha > alpha_max;
             alpha = alpha < alpha_max ? alpha : simd::set(alpha_max);
             alpha = alpha < alpha_min ? vfloat{} : alpha;
@@ -210,7 +257,7 @@ def composite_tile(
             const vfloat after = before - before * alpha;
             const vint stop = after < transmittance_min;
             const vfloat weight = stop ? vfloat{} : before * alpha;
-            transmittance[row] = stop ? (before > 0.0f ? -before : before) : after;
+            transmittance[row] = stop ? simd::negative(before) : after;
 
             const vfloat spread = 2.0f - before - after - total_weight[row];
             const vfloat twice_distortion = v_distortion[row];
@@ -230,6 +277,10 @@ def composite_tile(
             sum_green += weight * v_green[row];
             sum_blue += weight * v_blue[row];
             sum_z += weight * (v_depth[row] + twice_distortion * spread);
+            if (wants_absolute) {
+                absolute_x += __builtin_elementwise_abs(v_sigma * (splat[2] * dx + splat[3] * dy));
+                absolute_y += __builtin_elementwise_abs(v_sigma * (splat[3] * dx + splat[4] * dy));
+            }
         }
         // Here d = pixel - mean, so the gradient of the mean has the opposite sign.
         float* record = records.data + 12 * (size_t)intersection;
@@ -244,6 +295,10 @@ def composite_tile(
         record[7] = simd::sum(sum_red);
         record[8] = simd::sum(sum_green);
         record[9] = simd::sum(sum_blue);
+        if (wants_absolute) {
+            record[10] = simd::sum(absolute_x);
+            record[11] = simd::sum(absolute_y);
+        }
     }
     for (; slot < end; ++slot)
         for (int k = 0; k < 12; ++k)
@@ -267,6 +322,7 @@ def composite_tile_backward(
     v_depths: wp.array[float],
     v_alphas: wp.array[float],
     v_distortions: wp.array[float],
+    wants_absolute: int,
     records: wp.array[float],
 ): ...
 
@@ -285,12 +341,15 @@ def render_tiles(
     depths: wp.array[float],
     alphas: wp.array[float],
     distortions: wp.array[float],
+    wants_owners: int,
+    owners_of_median: wp.array[int],
 ):
     tile = draw(counter)
     if tile < starts.shape[0] - 1:
         composite_tile(
-            tile, splats, owners, slots, starts, background, width, height, colors, depths, alphas, distortions
-        )
+            tile, splats, owners, slots, starts, background, width, height, colors, depths, alphas, distortions,
+            wants_owners, owners_of_median,
+        )  # fmt: skip
 
 
 @wp.kernel
@@ -311,11 +370,12 @@ def render_tiles_backward(
     v_depths: wp.array[float],
     v_alphas: wp.array[float],
     v_distortions: wp.array[float],
+    wants_absolute: int,
     records: wp.array[float],  # out
 ):
     tile = draw(counter)
     if tile < starts.shape[0] - 1:
         composite_tile_backward(
             tile, splats, owners, slots, starts, background, width, height, colors, depths, alphas, distortions,
-            v_colors, v_depths, v_alphas, v_distortions, records,
+            v_colors, v_depths, v_alphas, v_distortions, wants_absolute, records,
         )  # fmt: skip

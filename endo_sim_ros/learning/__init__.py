@@ -1,0 +1,1 @@
+"""Learning from what was recorded: episodes of observations and actions, and datasets of them."""

@@ -27,7 +27,6 @@ setup(
         "av",
         "numpy",
         "opencv-python-headless",
-        "plyfile",
         "pycolmap",
         "pyyaml",
         "rich",
@@ -40,7 +39,7 @@ setup(
     ],
     extras_require={
         "lerobot": ["pyarrow"],  # `endo-sim export`
-        "test": ["hypothesis", "mcap", "mcap-ros2-support", "pyarrow", "pytest", "ruff", "torchmetrics"],
+        "test": ["hypothesis", "mcap", "mcap-ros2-support", "plyfile", "pyarrow", "pytest", "ruff", "torchmetrics"],
     },
     entry_points={"console_scripts": ["endo-sim = endo_sim_ros.cli:main"]},
     data_files=[

@@ -226,12 +226,18 @@ class Up:
 
 @dataclass(frozen=True)
 class Config:
-    """Print the parameters of all nodes with their defaults as a ROS parameter file."""
+    """Print the parameters of all nodes, or of some, with their defaults as a ROS parameter file."""
+
+    nodes: Positional[tuple[str, ...]] = ()
+    """Names of nodes; default: all."""
 
     def run(self) -> None:
-        from endo_sim_ros.nodes.parameter_file import parameter_file
+        from endo_sim_ros.nodes.parameter_file import NODE_CONFIGS, parameter_file
 
-        print(parameter_file(), end="")
+        unknown = [name for name in self.nodes if name not in NODE_CONFIGS]
+        if unknown:
+            raise ConfigError(f"no node is called {', '.join(unknown)}; there are {', '.join(NODE_CONFIGS)}")
+        print(parameter_file(self.nodes or tuple(NODE_CONFIGS)), end="")
 
 
 @dataclass(frozen=True)
@@ -269,11 +275,14 @@ class BenchGraph:
     """Commands in lockstep."""
     device: str = "auto"
     """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""
+    kills: int = 3
+    """Deaths of each node whose recovery is timed; 0 = none."""
 
     def run(self) -> None:
         from endo_sim_ros.nodes.graph_bench import bench_graph
 
-        bench_graph(self.json, self.gaussians, self.width, self.height, self.rate, self.changes, self.commands, self.device)
+        options = {name: value for name, value in vars(self).items() if name != "json"}
+        bench_graph(self.json, **options)
 
 
 @dataclass(frozen=True)

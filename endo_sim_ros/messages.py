@@ -229,9 +229,13 @@ def decode_image(message: Any, topic: str = LEFT_IMAGE.name) -> np.ndarray:
     """RGB image [H, W, 3] uint8 of an Image or CompressedImage; a view of the message where the encoding is rgb8."""
     if not hasattr(message, "encoding"):
         data = np.frombuffer(message.data, np.uint8)
-        pixels = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+        try:
+            pixels = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+        except cv2.error:  # its size is beyond OPENCV_IO_MAX_IMAGE_PIXELS
+            pixels = None
         if pixels is None:
-            raise MessageError(f"{topic}: {data.size} bytes of format {message.format!r} are not a readable jpeg or png image")
+            what = f"{data.size} bytes of format {message.format!r}"
+            raise MessageError(f"{topic}: {what} are not a readable jpeg or png image of at most 64 megapixels")
         return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
     if message.encoding not in _COLOR_CHANNELS:
         raise MessageError(f"{topic}: encoding {message.encoding!r} is not supported; publish rgb8, bgr8 or mono8")

@@ -522,6 +522,14 @@ def test_absurd_force_is_caught_and_the_last_good_state_restored(kinematics):
     assert simulation.faults == 1 and np.isfinite(simulation.state().positions).all()
 
 
+@pytest.mark.parametrize("offset", [1e5, 1e30])
+def test_tissue_too_far_away_for_its_nodes_to_be_told_apart_is_refused(offset):
+    nodes = specimen((3, 3, 3), 0.01, lambda X: np.zeros(len(X), bool), lambda X: np.ones(len(X), bool))
+    far = dataclasses.replace(nodes, rest=nodes.rest + np.float32([offset, 0, 0]))
+    with pytest.raises(ValueError, match="from the world's origin, too far to tell its nodes 0.01 m apart"):
+        MpmSolver(far, PhysicsConfig(device="cpu"))
+
+
 @pytest.mark.parametrize("spacing", [1e-42, 1e-9, 1e6])
 def test_tissue_of_an_absurd_size_is_refused(spacing):
     nodes = specimen((3, 3, 3), spacing, lambda X: np.zeros(len(X), bool), lambda X: np.ones(len(X), bool))
@@ -533,7 +541,7 @@ def test_tissue_of_an_absurd_size_is_refused(spacing):
 def test_a_grid_beyond_memory_is_refused(size):
     ends = np.array([[0, 0, 0], [size, size, size]], np.float32)
     nodes = ControlNodes(ends, np.zeros(2, bool), np.full(2, 1e-9, np.float32), np.ones(2, bool), 1e-3)
-    with pytest.raises(ValueError, match="simulation grid would have"):
+    with pytest.raises(ValueError, match="simulation grid would have|from the world.s origin"):
         MpmSolver(nodes, PhysicsConfig(device="cpu"))
 
 

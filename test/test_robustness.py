@@ -1,15 +1,18 @@
 """What a graph must bear: hostile files, disturbed recordings, two machines, neighbours, random traffic."""
 
+import array
 import io
 import json
 import os
 import pickle
 import shutil
+import struct
 import subprocess
 import sys
 import time
 import tracemalloc
 import zipfile
+import zlib
 
 import numpy as np
 import pytest
@@ -201,6 +204,37 @@ def test_a_calibration_file_runs_no_code(tmp_path):
     with pytest.raises(SequenceError, match="calibration.yaml: not a readable YAML file"):
         read_calibration(path)
     assert not trace.exists()
+
+
+@pytest.mark.parametrize(
+    "text, sentence",
+    [
+        ("fx: true\n", "fx must be a positive number, got True"),
+        ("fx: " + "1" * 400, "fx must be a positive number"),
+        ("fx: " + "1" * 6000, "not a readable YAML file|must be a positive number"),
+        ("fx: " + "[" * 3000, "not a readable YAML file"),
+        ("fx: 500\nfy: 500\ncx: 1\ncy: 1\ndistortion: [.nan]\n", "distortion must be finite"),
+        ("a0: &a0 [x]\n" + "".join(f"a{i}: &a{i} [{f'*a{i - 1}, ' * 9}]\n" for i in range(1, 20)) + "fx: *a19\n", "fx must be"),
+        ("# " + "x" * 100_000, "far more than a calibration needs"),
+    ],
+)
+def test_a_calibration_file_beyond_all_bounds_is_one_short_sentence(tmp_path, text, sentence):
+    path = tmp_path / "calibration.yaml"
+    path.write_text(text)
+    with pytest.raises(SequenceError, match=sentence) as error:
+        read_calibration(path)
+    assert len(str(error.value)) < 1000
+
+
+def test_a_png_that_claims_gigabytes_is_no_image():
+    size = 20_000
+    row = zlib.compress(bytes(size * (size // 8 + 1)), 9)  # one bit a pixel
+    chunk = lambda kind, data: struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))  # noqa: E731
+    header = struct.pack(">IIBBBBB", size, size, 1, 0, 0, 0, 0)
+    png = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", row) + chunk(b"IEND", b"")
+    message = messages.ros_class(messages.LEFT_COMPRESSED.type)(format="png", data=array.array("B", png))
+    with pytest.raises(messages.MessageError, match="not a readable jpeg or png image of at most 64 megapixels"):
+        messages.decode_image(message)
 
 
 # --------------------------------------------------------------------------------------------------- disturbances

@@ -588,6 +588,12 @@ def test_endonerf_scales_can_be_stated(endonerf):
     [
         (lambda r: (r / "poses_bounds.npy").unlink(), "poses_bounds.npy: file is missing"),
         (lambda r: (r / "poses_bounds.npy").write_bytes(b"x"), "poses_bounds.npy: not a readable NumPy array"),
+        (
+            lambda r: (r / "poses_bounds.npy").write_bytes(
+                (r / "poses_bounds.npy").read_bytes().replace(b"(4, 17)", b"(9999999999, 17)")[:128] + bytes(100)
+            ),
+            "poses_bounds.npy: not a readable NumPy array",
+        ),
         (lambda r: np.save(r / "poses_bounds.npy", np.array([{}])), "poses_bounds.npy: not a readable NumPy array"),
         (lambda r: np.save(r / "poses_bounds.npy", np.ones((4, 15))), r"shape \[frames, 17\], got shape \[4, 15\]"),
         (lambda r: np.save(r / "poses_bounds.npy", np.ones((3, 17))), "has 3 poses, but .* has 4 images"),

@@ -1,5 +1,6 @@
 """What all nodes share: parameters from configurations, diagnostics, guarded callbacks, start and stop."""
 
+import contextlib
 import functools
 import os
 import re
@@ -328,8 +329,10 @@ def run(node_class: Callable[[], EndoNode]) -> int:
         if rclpy.ok():  # otherwise an interrupt came while the node was starting, and made that fail
             raise
     finally:
-        rclpy.try_shutdown()
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # an impatient second one must not cut short what follows
+        with contextlib.suppress(RuntimeError):  # ROS may be shutting itself down at the same moment
+            rclpy.try_shutdown()
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # ROS has put Python's handler back
         if node is not None:
             node.destroy_node()
     # Python waits for worker threads, and compiled code in them cannot be interrupted: give it a few seconds.

@@ -58,7 +58,7 @@ class _Arm:
     torque: np.ndarray | None = None  # [3] N·m about the tip, world
     heard: float = 0.0  # time of the last wrench, monotonic seconds
     acting: bool = False
-    angle: float = 0.0  # of the jaw, rad
+    angle: float = 1.0  # of the jaw, rad: open until told otherwise
     closed: bool = False  # the jaw
 
 

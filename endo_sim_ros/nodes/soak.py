@@ -220,7 +220,7 @@ def _still_works(client: Client, group: NodeGroup, traffic: _Traffic) -> list[Ro
     client.until(
         lambda: client.statuses["rendering_node"][2].get("following control nodes") == "True", "the renderer to follow"
     )
-    del client.images[:-1]
+    client.images.clear()
     client.until(lambda: client.images, "an image")
     before = client.images[-1][2].astype(int)
 

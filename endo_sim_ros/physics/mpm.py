@@ -98,6 +98,12 @@ class MpmSolver:
                 f"the grid cells would be {h:.3g} m wide, which is no tissue; is the model in metres, and is it the"
                 " viewpoint's own?"
             )
+        far = float(np.abs(nodes.rest).max())
+        if not far * np.finfo(np.float32).eps < 0.01 * h:  # else nodes of one cell fall together, and out of the grid
+            raise ValueError(
+                f"the tissue lies {far:.3g} m from the world's origin, too far to tell its nodes {nodes.spacing:.3g} m"
+                " apart; check the poses of the cameras"
+            )
         margin = MARGIN_CELLS * h + (config.travel if config.kinematics == "current" else 0.0)
         rest = nodes.rest.astype(np.float64)
         self.origin = rest.min(0) - margin  # [3] world, m

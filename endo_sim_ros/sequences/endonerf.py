@@ -120,7 +120,7 @@ def _read_table(path: Path) -> np.ndarray:
     if not path.is_file():
         raise SequenceError(f"{path}: file is missing; it holds the camera of every image")
     try:
-        table = np.load(path, allow_pickle=False)
+        table = np.load(path, allow_pickle=False, mmap_mode="r")  # a false header must not take memory
     except (ValueError, OSError, EOFError) as error:
         raise SequenceError(f"{path}: not a readable NumPy array ({error})") from None
     if table.ndim != 2 or table.shape[1] != 17 or not np.isfinite(table).all():

@@ -3,6 +3,7 @@
 import logging
 import math
 import re
+import reprlib
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from pathlib import Path
 
@@ -255,28 +256,36 @@ def rigid(matrix: np.ndarray, source: str) -> np.ndarray:
     return pose
 
 
+_MOST_BYTES = 65_536  # of a calibration file
+
+
 def read_calibration(path: Path) -> dict:
     """The calibration file of image folders and videos: YAML with fx, fy, cx, cy in pixels.
 
     Pixel (0, 0) has its centre at (0.5, 0.5), as everywhere in this package and in COLMAP; add 0.5 to cx and cy of an
     OpenCV calibration. Optional: width, height, baseline_m (metres), fps, distortion (OpenCV order k1 k2 p1 p2 k3).
     """
+    if path.is_file() and path.stat().st_size > _MOST_BYTES:
+        raise SequenceError(f"{path}: it has {path.stat().st_size} bytes, far more than a calibration needs")
     try:
         fields = yaml.safe_load(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise SequenceError(f"{path}: file is missing; it must give fx, fy, cx, cy in pixels") from None
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
         raise SequenceError(f"{path}: not a readable YAML file ({str(error).splitlines()[0]})") from None
     if not isinstance(fields, dict):
         raise SequenceError(f"{path}: expected `name: value` lines with fx, fy, cx, cy in pixels")
     for name in ("fx", "fy", "cx", "cy", *(n for n in ("width", "height", "baseline_m", "fps") if n in fields)):
         value = fields.get(name)
-        if not isinstance(value, int | float) or not math.isfinite(value) or value <= 0:
-            raise SequenceError(f"{path}: {name} must be a positive number, got {value!r}")
+        if not isinstance(value, int | float) or isinstance(value, bool) or not 0 < value < 1e9:
+            shown = reprlib.repr(value) if isinstance(value, int | float | str | None) else f"a {type(value).__name__}"  # lists may nest
+            raise SequenceError(f"{path}: {name} must be a positive number, got {shown}")
     try:
         fields["distortion"] = [float(k) for k in fields.get("distortion") or ()]
-    except (TypeError, ValueError):
-        raise SequenceError(f"{path}: distortion must be a list of numbers, got {fields['distortion']!r}") from None
+    except (TypeError, ValueError, OverflowError):
+        raise SequenceError(f"{path}: distortion must be a list of numbers") from None
+    if not all(map(math.isfinite, fields["distortion"])):
+        raise SequenceError(f"{path}: distortion must be finite, got {fields['distortion']}")
     return fields
 
 

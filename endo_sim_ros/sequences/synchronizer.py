@@ -65,7 +65,7 @@ class Synchronizer:
         self._streams = {name: _Stream(MAX_POSES if name == "pose" else MAX_OTHERS) for name in STREAMS}
         self._emitted = 0  # stamp of the last image that left
         self._complete: list[Frame] = []
-        self.dropped = {"without pose": 0, "without camera_info": 0, "out of order": 0, "invalid": 0, "without right eye": 0}
+        self.dropped = {"without pose": 0, "without camera_info": 0, "out of order": 0, "repeated": 0, "invalid": 0, "without right eye": 0}
 
     @property
     def pending(self) -> int:
@@ -89,6 +89,9 @@ class Synchronizer:
             raise SequenceError(f"{stream}: a stamp of zero marks an invalid message; set header.stamp")
         if stream == "image" and stamp_ns <= self._emitted:
             self.dropped["out of order"] += 1
+            return []
+        if stream == "image" and stamp_ns in self._streams["image"].stamps:
+            self.dropped["repeated"] += 1
             return []
         self._streams[stream].add(stamp_ns, value)
         return self._collect(final=False)

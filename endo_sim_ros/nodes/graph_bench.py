@@ -28,7 +28,7 @@ ARM = "PSM1"
 _WORLD = "world"
 _PATIENCE = 60.0  # seconds that anything may take
 _FORCE = 2.0  # N, towards the camera
-CHANGED = 12  # grey levels by which a picture must differ to show that the tissue moved; creeping tissue differs by 1-2
+CHANGED = 60  # grey levels by which a picture must differ to show that the tissue moved; creeping tissue differs by 1-5
 _HOLD = 0.6  # seconds between one change of the force and the next
 _LIMIT = 50.0  # ms; what latencies are compared with
 
@@ -158,6 +158,7 @@ def _graph(mode: str, scene: Scene, rate: float, device: str, logs: Path) -> Ite
 
 def _realtime(client: Client, scene: Scene, rate: float, changes: int) -> list[Row]:
     """Latency from a wrench that changes to the first image that shows it, while commands stream."""
+    client.until(lambda: "skipped steps" in client.statuses["physics_node"][2], "the first steps")
     latencies, began = [], time.perf_counter()
     skipped, first_state = client.value("physics_node", "skipped steps"), len(client.states)
     pulling, due = False, began

@@ -3,19 +3,24 @@
 from collections.abc import Callable, Hashable
 from typing import Any
 
+_SAME_RATE = 0.1  # part by which the interval of a stream may differ from the period for the rhythm to follow it
+_GAIN = 0.2  # part of the distance by which it follows at a time
 _MOST_WAITING = 1000  # commands; beyond it the oldest is given up, so that nothing grows without bound
 
 
 class Pacer:
     """Once a period on average, at the moment that serves best: work runs as soon as fresh input is there, up to half a
     period early or, while input streams in, late. What is missed by more than a period is skipped, never made up for.
-    To meet a new stream of inputs, the rhythm may come forward by half a period, once."""
+
+    Towards a stream of about the same rate the rhythm shifts, by a period at most, until inputs come in the middle of
+    that span, where jitter does no harm.
+    """
 
     def __init__(self):
         self._due: float | None = None
         self._inputs = (float("-inf"), float("-inf"))  # times of the last two
         self._waiting: float | None = None  # since when fresh input waits
-        self._may_shift = 0.6  # periods
+        self._shifted = 0.0  # periods
         self.skipped = 0
 
     def note_input(self, now: float) -> None:
@@ -27,22 +32,27 @@ class Pacer:
     def is_due(self, now: float, period: float) -> bool:
         """Whether the work should run at this time, seconds of any clock; if so it is taken to run now."""
         if self._due is None or now < self._due - 3 * period:  # the first time, or the clock went back
-            self._due, self._waiting = now, None
+            self._due, self._waiting, self._shifted = now, None, 0.0
         streaming = now - self._inputs[0] < 3 * period
-        if now - self._inputs[1] > 25 * period:  # whatever comes next is another stream
-            self._may_shift = 0.6
         early = -0.5 if self._waiting is not None else 0.5 if streaming else 0.0
         if now < self._due + early * period - 1e-9:
             return False
+        if self._waiting is not None:
+            self._follow((self._waiting - self._due) / period, period)
         missed = max(int((now - self._due) / period), 0)
         self.skipped += missed
         self._due += (missed + 1) * period
-        if streaming and self._waiting is not None and (waited := (now - self._waiting) / period) > 0.1:
-            shift = min(waited + 0.1, self._may_shift)
-            self._may_shift -= shift
-            self._due -= shift * period
         self._waiting = None
         return True
+
+    def _follow(self, phase: float, period: float) -> None:
+        """Shift the rhythm towards input that came so many periods after it was due."""
+        interval = (self._inputs[1] - self._inputs[0]) / period
+        if abs(interval - 1) < _SAME_RATE:
+            error = phase if phase > -1 else phase + 2  # what waited is nearer to this work, or to the one before
+            shift = min(max(_GAIN * error, -1 - self._shifted), 1 - self._shifted)
+            self._shifted += shift
+            self._due += shift * period
 
     def restart(self) -> None:
         """Forget the rhythm: the time since the last piece of work was not meant to be filled."""

@@ -146,6 +146,8 @@ class MpmSolver:
         self._flat_mv, self._flat_v = self._grid_mv.flatten(), self._grid_v.flatten()
         self._advance: Callable[[], None] | None = None
         self.reset()
+        if self.device == "cpu":  # now, where nobody waits, rather than when the tissue is first touched
+            self._advance = self._prepare()
 
     def reset(self) -> None:
         """Back to rest, no force, nothing held but the pinned nodes."""

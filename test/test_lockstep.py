@@ -1,15 +1,20 @@
 """Lockstep: one command, one step, one state, one image, all with the command's stamp; run after run the same bytes."""
 
+import re
+import subprocess
+import sys
 from collections import defaultdict
+from pathlib import Path
 
 import numpy as np
 import pytest
 import rclpy
 from conftest import wait_until
 from std_srvs.srv import SetBool, Trigger
-from test_nodes import Bench, send_camera, send_model, sheet
+from test_nodes import HEIGHT, WIDTH, Bench, K, send_camera, send_model, sheet
 
 from endo_sim_ros import messages
+from endo_sim_ros.cameras import Camera, save_cameras
 from endo_sim_ros.gaussians import save_ply
 from endo_sim_ros.messages import ERROR, OK
 from endo_sim_ros.nodes.graph import NodeGroup
@@ -225,3 +230,20 @@ def test_the_same_bag_gives_the_same_model_in_every_run(tmp_path, small_bag):
     first, second = models
     assert first.header.stamp == second.header.stamp and messages.stamp_to_ns(first.header.stamp) > 0
     assert first.data == second.data
+
+
+def test_the_policy_in_the_guide_runs(tmp_path):
+    guide = (Path(__file__).parents[1] / "docs" / "graph.md").read_text()
+    (code,) = re.findall(r"```python\n(.+?)```", guide, re.S)
+    (tmp_path / "policy.py").write_text(code)
+    save_ply(sheet(tilt=0.3), tmp_path / "model.ply")
+    camera = Camera(K, WIDTH, HEIGHT, np.eye(4))
+    save_cameras([camera], tmp_path / "cameras.json")
+    with NodeGroup(tmp_path / "logs") as group:
+        group.start("physics_node", arm_source="commanded", **PARAMETERS["physics_node"])
+        group.start("rendering_node", **PARAMETERS["rendering_node"])
+        group.start("reconstruction_node", mode="lockstep", model_file=tmp_path / "model.ply", output_dir=tmp_path)
+        command = [sys.executable, tmp_path / "policy.py"]
+        done = subprocess.run(command, env=group.environment, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout.split("pixels that changed:")[1]) > 20

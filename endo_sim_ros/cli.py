@@ -158,11 +158,13 @@ class Record:
     """Names of the tool arms."""
     topics: tuple[str, ...] = ("all",)
     """Names of the topics to record, such as rendered/image_raw; all records every topic of msg_conventions.md."""
+    namespace: str = ""
+    """Namespace of the graph; the bag has the names without it."""
 
     def run(self) -> None:
         from endo_sim_ros.nodes.recorder_node import record
 
-        record(self.out, self.arms, self.topics)
+        record(self.out, self.arms, self.topics, self.namespace)
 
 
 @dataclass(frozen=True)

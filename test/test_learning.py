@@ -653,6 +653,9 @@ def test_what_was_recorded_outlives_the_recorder(graph, tmp_path, number):
     recorder = start("endo_sim_ros.cli", "record", path, "--arms", "PSM1", "PSM2")
     try:
         wait_until(graph.heard, 30, "the recorder", graph.step)
+        begin = time.monotonic() + 1.5  # each side of a topic finds the other in its own time
+        while time.monotonic() < begin:
+            graph.say()
         began = len(graph.sent)
         end = time.monotonic() + 3.0
         while time.monotonic() < end:

@@ -4,6 +4,7 @@ import re
 import subprocess
 import sys
 from collections import defaultdict
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -91,7 +92,7 @@ def test_each_command_is_one_step_and_one_image_with_its_stamp(graph):
     await_images(graph, 21)
     graph.until(lambda: len(graph.heard["PSM1/body/measured_cf"]) == 20)
     for topic in STATES:
-        expected = sent if topic.name == "PSM1/body/measured_cf" else [MODEL_STAMP, *sent]
+        expected = sent if topic.name in ("PSM1/body/measured_cf", "/clock") else [MODEL_STAMP, *sent]
         assert stamps(graph, topic) == expected, topic.name
     images = [messages.decode_image(image).astype(int) for image in graph.heard[IMAGES.name]]
     assert np.abs(images[-1] - images[0]).max() > 8  # each shows its own state
@@ -123,6 +124,45 @@ def test_reset_gives_the_first_observation_and_time_begins_anew(graph):
     assert stamps(graph, IMAGES)[-2:] == [MODEL_STAMP, 7]
     first, again = (messages.decode_image(graph.heard[IMAGES.name][k]) for k in (0, 4))
     np.testing.assert_array_equal(first, again)
+
+
+def test_a_hundred_commands_at_once_are_all_taken_and_shown(graph):
+    physics, rendering = graph.nodes[1:3]
+    for k in range(1, 101):
+        command(graph, MODEL_STAMP + k * STEP)
+    graph.until(lambda: (physics._steps, rendering._images) == (100, 101), lambda: (physics._steps, rendering._images), 60)
+
+
+def test_a_new_model_in_the_middle_loses_no_image_of_the_old_one(graph):
+    send_model(graph, sheet(tilt=0.2), MODEL_STAMP + 10**9)
+    sent = [k * STEP for k in range(1, 9)]
+    for stamp in sent:
+        command(graph, stamp)
+    graph.until(lambda: MODEL_STAMP + 10**9 in stamps(graph, IMAGES), lambda: stamps(graph, IMAGES), 40)
+    command(graph, 10 * STEP)
+    graph.until(lambda: stamps(graph, IMAGES)[-1] == 10 * STEP, lambda: stamps(graph, IMAGES))
+    assert sorted(set(stamps(graph, IMAGES))) == sorted({MODEL_STAMP, MODEL_STAMP + 10**9, *sent, 10 * STEP})
+    assert stamps(graph, messages.CONTROL_NODES) == stamps(graph, IMAGES)
+
+
+def test_an_image_may_wait_for_the_camera_of_its_stamp(graph):
+    rendering = graph.nodes[2]
+    rendering._options = replace(rendering._options, lockstep_camera=True)
+    assert graph.call(Trigger, "/physics_node/reset").success
+    await_images(graph, 2)  # the first observation waits for no camera
+    for k in (1, 2, 3):
+        command(graph, k * STEP)
+    graph.spin(0.3)
+    assert len(graph.heard[IMAGES.name]) == 2
+    for k in (1, 3):  # that of the second step never comes
+        pose = np.eye(4)
+        pose[0, 3] = 0.01 * k
+        graph.publish(messages.CAMERA_POSE, messages.encode_pose(pose, k * STEP, "world"))
+    await_images(graph, 4)
+    assert stamps(graph, IMAGES)[-2:] == [STEP, 3 * STEP]
+    shown = messages.decode_pose(graph.heard["rendered/camera_pose"][-1], "world", "")
+    assert shown[0, 3] == pytest.approx(0.03)
+    graph.refused("rendering_node", "is not shown: it has no pose with its stamp on ECM/measured_cp")
 
 
 def test_mistakes_in_stamps_are_told_and_the_next_command_acts(graph):

@@ -36,6 +36,26 @@ def test_work_meets_input_of_the_same_rate_whatever_its_phase(phase):
     assert delays[10:].max() <= 0.0011
 
 
+@pytest.mark.parametrize("phase", [0.0, 0.01, 0.02, 0.03])
+@pytest.mark.parametrize("gap", [0.001, 0.01])
+def test_the_inputs_of_two_sources_are_used_together(phase, gap):
+    pacer, waiting, delays, ran = Pacer(), {}, [], 0
+    events = sorted((phase + 0.04 * k + gap * arm, arm) for k in range(400) for arm in (0, 1))
+    now = 0.0
+    while now < 15.9:
+        while events and events[0][0] <= now:
+            _, arm = events.pop(0)
+            pacer.note_input(now, arm)
+            waiting.setdefault(arm, now)
+        if pacer.is_due(now, 0.04):
+            ran += 1
+            delays += [now - since for since in waiting.values()]
+            waiting.clear()
+        now += 0.001
+    assert ran == pytest.approx(15.9 / 0.04, abs=3) and pacer.skipped == 0
+    assert max(delays[100:]) <= gap + 0.0021
+
+
 def test_jitter_and_late_inputs_do_not_make_work_wait():
     rng = np.random.default_rng(0)
     jitter = rng.uniform(-0.01, 0.01, 250) + 0.015 * (rng.random(250) < 0.05)

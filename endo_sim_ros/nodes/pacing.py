@@ -5,7 +5,7 @@ from typing import Any
 
 _SAME_RATE = 0.1  # part by which the interval of a stream may differ from the period for the rhythm to follow it
 _GAIN = 0.2  # part of the distance by which it follows at a time
-_MOST_WAITING = 1000  # commands; beyond it the oldest is given up, so that nothing grows without bound
+MOST_WAITING = 1000  # commands; beyond it the oldest is given up, so that nothing grows without bound
 
 
 class Pacer:
@@ -18,37 +18,41 @@ class Pacer:
 
     def __init__(self):
         self._due: float | None = None
-        self._inputs = (float("-inf"), float("-inf"))  # times of the last two
-        self._waiting: float | None = None  # since when fresh input waits
+        self._inputs: dict[Hashable, tuple[float, float]] = {}  # times of the last two of each source
+        self._fresh: dict[Hashable, float] = {}  # since when input of a source waits
         self._shifted = 0.0  # periods
         self.skipped = 0
 
-    def note_input(self, now: float) -> None:
-        """Input arrived that the next piece of work should use."""
-        self._inputs = self._inputs[1], now
-        if self._waiting is None:
-            self._waiting = now
+    def note_input(self, now: float, source: Hashable = None) -> None:
+        """Input arrived that the next piece of work should use; that of all sources that stream is waited for."""
+        self._inputs[source] = self._inputs.get(source, (float("-inf"), float("-inf")))[1], now
+        self._fresh.setdefault(source, now)
 
     def is_due(self, now: float, period: float) -> bool:
         """Whether the work should run at this time, seconds of any clock; if so it is taken to run now."""
         if self._due is None or now < self._due - 3 * period:  # the first time, or the clock went back
-            self._due, self._waiting, self._shifted = now, None, 0.0
-        streaming = now - self._inputs[0] < 3 * period
-        early = -0.5 if self._waiting is not None else 0.5 if streaming else 0.0
+            self._due, self._shifted = now, 0.0
+            self._fresh.clear()
+        streaming = {source for source, (before, _) in self._inputs.items() if now - before < 3 * period}
+        newest = max(self._fresh.values(), default=now)  # what is much older belonged to the inputs before
+        self._fresh = {source: since for source, since in self._fresh.items() if newest - since <= period / 2}
+        complete = bool(self._fresh) and streaming <= self._fresh.keys()
+        early = -0.5 if complete else 0.5 if streaming else 0.0
         if now < self._due + early * period - 1e-9:
             return False
-        if self._waiting is not None:
-            self._follow((self._waiting - self._due) / period, period)
+        if self._fresh:
+            self._follow(max(self._fresh, key=self._fresh.get), period)
         missed = max(int((now - self._due) / period), 0)
         self.skipped += missed
         self._due += (missed + 1) * period
-        self._waiting = None
+        self._fresh.clear()
         return True
 
-    def _follow(self, phase: float, period: float) -> None:
-        """Shift the rhythm towards input that came so many periods after it was due."""
-        interval = (self._inputs[1] - self._inputs[0]) / period
-        if abs(interval - 1) < _SAME_RATE:
+    def _follow(self, source: Hashable, period: float) -> None:
+        """Shift the rhythm towards the source whose input came last."""
+        before, last = self._inputs[source]
+        if abs((last - before) / period - 1) < _SAME_RATE:
+            phase = (self._fresh[source] - self._due) / period
             error = phase if phase > -1 else phase + 2  # what waited is nearer to this work, or to the one before
             shift = min(max(_GAIN * error, -1 - self._shifted), 1 - self._shifted)
             self._shifted += shift
@@ -86,10 +90,10 @@ class CommandQueue:
                 " stamps must grow from one command to the next (~/reset begins anew)"
             )
         self._waiting.setdefault(stamp_ns, {})[part] = value
-        if len(self._waiting) > _MOST_WAITING:
+        if len(self._waiting) > MOST_WAITING:
             first = min(self._waiting)
             del self._waiting[first]
-            raise ValueError(f"over {_MOST_WAITING} commands wait; the oldest, of {first * 1e-9:.6f} s, is dropped")
+            raise ValueError(f"over {MOST_WAITING} commands wait; the oldest, of {first * 1e-9:.6f} s, is dropped")
 
     def take(self, on_incomplete: Callable[[int, set], None]) -> tuple[int, dict[Hashable, Any]] | None:
         """The earliest complete command, as its stamp in ns and its parts, or None.

@@ -13,8 +13,8 @@ from endo_sim_ros import messages
 from endo_sim_ros.config import ConfigError, Range, StageConfig
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.messages import ControlNodeCloud, MessageError
-from endo_sim_ros.nodes.base import ERROR, OK, WARN, Background, EndoNode, WorldConfig, arm_names, run, sentence
-from endo_sim_ros.nodes.pacing import CommandQueue, Pacer
+from endo_sim_ros.nodes.base import ERROR, OK, STREAM_DEPTH, WARN, Background, EndoNode, WorldConfig, arm_names, run, sentence
+from endo_sim_ros.nodes.pacing import MOST_WAITING, CommandQueue, Pacer
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
 
 _SLOW = 0.5  # real-time factor below which the node warns
@@ -34,7 +34,7 @@ class PhysicsNodeConfig(WorldConfig):
     lockstep_inputs: tuple[str, ...] = ("pose", "wrench")
     """lockstep: what a command consists of (pose, wrench, jaw); a step is taken when all of it, for all arms and with the
     same stamp, has come. What is not named here acts when it comes."""
-    step_count: Annotated[int, Range(1, 1_000_000)] = 1
+    step_count: Annotated[int, Range(1, MOST_WAITING)] = 1
     """Steps that one call of ~/step takes."""
     arms: tuple[str, ...] = ("PSM1",)
     """Names of the tool arms; each has its topics under its name."""
@@ -48,6 +48,14 @@ class PhysicsNodeConfig(WorldConfig):
     jaw_open: Annotated[float, Range(-3.2, 3.2, "rad")] = 0.2
     """A jaw at or above this angle lets go; between the two it stays as it is."""
 
+    def __post_init__(self):
+        super().__post_init__()
+        if self.jaw_closed >= self.jaw_open:
+            raise ConfigError(f"jaw_closed, {self.jaw_closed:g} rad, must be less than jaw_open, {self.jaw_open:g} rad")
+        unknown = set(self.lockstep_inputs) - set(_INPUTS)
+        if unknown or not self.lockstep_inputs:
+            raise ConfigError(f"lockstep_inputs: {list(self.lockstep_inputs)} must be some of {', '.join(_INPUTS)}")
+
 
 @dataclass
 class _Arm:
@@ -56,7 +64,7 @@ class _Arm:
     pose: np.ndarray | None = None  # [4, 4], world
     force: np.ndarray | None = None  # [3] N, world
     torque: np.ndarray | None = None  # [3] N·m about the tip, world
-    heard: float = 0.0  # time of the last wrench, monotonic seconds
+    heard: float = 0.0  # time of the last wrench, seconds of the clock
     acting: bool = False
     angle: float = 1.0  # of the jaw, rad: open until told otherwise
     closed: bool = False  # the jaw
@@ -87,12 +95,10 @@ class PhysicsNode(EndoNode):
         self._pacer = Pacer()
         self._arms = {name: _Arm() for name in arm_names(self._options.arms)}
         self._lockstep = self._options.mode == "lockstep"
-        unknown = set(self._options.lockstep_inputs) - set(_INPUTS)
-        if unknown or not self._options.lockstep_inputs:
-            given = list(self._options.lockstep_inputs)
-            raise ConfigError(f"lockstep_inputs: {given} must be some of {', '.join(_INPUTS)}")
         self._commands = CommandQueue(frozenset((n, kind) for n in self._arms for kind in self._options.lockstep_inputs))
-        self._nodes_pub = self.publisher(messages.CONTROL_NODES)
+        # In real time only the newest command counts, and none may queue; in lockstep none may be lost.
+        depth = MOST_WAITING if self._lockstep else 1
+        self._nodes_pub = self.publisher(messages.CONTROL_NODES, MOST_WAITING if self._lockstep else STREAM_DEPTH)
         self._markers_pub = self.publisher(messages.TOOL_MARKERS)
         self._reaction_pubs = {name: self.publisher(messages.tool_reaction(name)) for name in self._arms}
         commanded = self._options.arm_source == "commanded"
@@ -107,9 +113,9 @@ class PhysicsNode(EndoNode):
         self.subscribe(messages.TRAINING_CAMERAS, self._on_training_cameras)
         self.subscribe(messages.CAMERA_POSE, self._on_camera)
         for name in self._arms:
-            self.subscribe(self._pose_topic(name), partial(self._on_tool_pose, name))
-            self.subscribe(messages.tool_wrench(name), partial(self._on_wrench, name))
-            self.subscribe(messages.tool_jaw(name), partial(self._on_jaw, name))
+            self.subscribe(self._pose_topic(name), partial(self._on_tool_pose, name), depth)
+            self.subscribe(messages.tool_wrench(name), partial(self._on_wrench, name), depth)
+            self.subscribe(messages.tool_jaw(name), partial(self._on_jaw, name), max(depth, STREAM_DEPTH))  # some come once
         self.service(Trigger, "~/reset", self._on_reset)
         self.service(Trigger, "~/step", self._on_step)
         self.service(SetBool, "~/pause", self._on_pause)
@@ -163,7 +169,7 @@ class PhysicsNode(EndoNode):
                 for arm in self._arms.values():
                     arm.acting = False
                 if self._lockstep:  # the first observation, before any command
-                    self._publish(self._simulation, self._simulated_stamp)
+                    self._publish(self._simulation, self._simulated_stamp, at_rest=True)
         except Exception as error:
             self._failure = sentence("physics", error)
             self.report_error(self._failure)
@@ -192,7 +198,9 @@ class PhysicsNode(EndoNode):
 
     def _on_tool_pose(self, name: str, message: Any) -> None:
         arm, topic = self._arms[name], self._pose_topic(name).name
-        pose = messages.decode_pose(message, self._options.frame_poses, topic)
+        frames = self._options.frame_poses
+        unnamed = frames.get(f"{name}_base", np.eye(4))  # clients of CRTK leave the frame empty
+        pose = messages.decode_pose(message, frames | {"": unnamed}, topic)
         self._receive(name, "pose", message, topic, lambda: setattr(arm, "pose", pose))
 
     def _on_wrench(self, name: str, message: Any) -> None:
@@ -204,11 +212,11 @@ class PhysicsNode(EndoNode):
         def act() -> None:
             self._require_pose(name, topic, "wrench")
             R = frames.get(frame, arm.pose)[:3, :3]  # any other is the tool's own
-            arm.force, arm.torque, arm.heard = R @ force, R @ torque, time.monotonic()
+            arm.force, arm.torque, arm.heard = R @ force, R @ torque, self._seconds()
 
         self._receive(name, "wrench", message, topic, act)
         if not self._lockstep:
-            self._pacer.note_input(self._seconds())
+            self._pacer.note_input(self._seconds(), name)
             self._step_if_due()
 
     def _on_jaw(self, name: str, message: Any) -> None:
@@ -256,7 +264,7 @@ class PhysicsNode(EndoNode):
             if arm.force is None:
                 continue
             timeout = self._options.command_timeout
-            stale = not self._lockstep and 0 < timeout < time.monotonic() - arm.heard
+            stale = not self._lockstep and 0 < timeout < self._seconds() - arm.heard
             force, torque = (np.zeros(3), np.zeros(3)) if stale else (arm.force, arm.torque)
             wanted = bool(force.any() or torque.any())
             if wanted or arm.acting:
@@ -286,7 +294,7 @@ class PhysicsNode(EndoNode):
     def _step_if_due(self) -> None:
         """Real time: take the next step if it is time for it."""
         simulation, now = self._simulation, self._seconds()
-        if simulation is None or not self._pacer.is_due(now, simulation.step_duration):
+        if simulation is None or now == 0 or not self._pacer.is_due(now, simulation.step_duration):  # 0: no /clock yet
             return
         if not self._paused:
             self._step(simulation)
@@ -323,10 +331,10 @@ class PhysicsNode(EndoNode):
             self.report_error(simulation.last_fault)
         self._seconds_per_step += 0.1 * (time.monotonic() - start - self._seconds_per_step)
 
-    def _publish(self, simulation: TissueSimulation, stamp: int) -> None:
-        """The state, the reactions and what belongs to them, all with one stamp."""
+    def _publish(self, simulation: TissueSimulation, stamp: int, at_rest: bool = False) -> None:
+        """The state, the reactions and what belongs to them, all with one stamp; the state at rest is no moment in time."""
         world, state = self._options.world_frame, simulation.state()
-        if self._clock_pub is not None:
+        if self._clock_pub is not None and not at_rest:
             self._clock_pub.publish(messages.encode_clock(stamp))
         cloud = ControlNodeCloud(state.rest, state.positions, state.F, self._simulated_stamp)
         self._nodes_pub.publish(messages.encode_control_nodes(cloud, stamp, world))
@@ -355,8 +363,8 @@ class PhysicsNode(EndoNode):
         self._commands.clear()
         self._start_timing()
         for arm in self._arms.values():
-            arm.force, arm.acting, arm.closed = None, False, False
-        self._publish(self._simulation, self._simulated_stamp if self._lockstep else self.now_ns())
+            arm.force, arm.acting, arm.closed, arm.angle = None, False, False, 1.0
+        self._publish(self._simulation, self._simulated_stamp if self._lockstep else self.now_ns(), at_rest=True)
         return True, "at rest"
 
     def _on_step(self, _: Trigger.Request) -> tuple[bool, str]:

@@ -62,7 +62,8 @@ class RecorderNode(EndoNode):
             self.create_subscription(kind, topic.name, self._recorder(topic), quality(topic, 100), raw=True)
 
     def _recorder(self, topic: Topic):
-        absolute = topic._replace(name=self.resolve_topic_name(topic.name))
+        # By the name in the contract, whatever the namespace: so it is replayed into any, and exported.
+        absolute = topic._replace(name="/" + topic.name.lstrip("/"))
 
         def record(data: bytes) -> None:
             if self.failure or self._waiting > _MAX_WAITING:
@@ -138,7 +139,7 @@ def _chosen(names: tuple[str, ...], arms: tuple[str, ...]) -> list[Topic]:
     return [known[name] for name in wanted]
 
 
-def record(bag: Path, arms: tuple[str, ...], topics: tuple[str, ...]) -> None:
+def record(bag: Path, arms: tuple[str, ...], topics: tuple[str, ...], namespace: str = "") -> None:
     """Record a running graph until interrupted, with a live line of counts.
 
     Raises:
@@ -150,7 +151,8 @@ def record(bag: Path, arms: tuple[str, ...], topics: tuple[str, ...]) -> None:
     prepare_transport()
     values = {"bag": str(bag), "arms": list(arms), "topics": list(topics)}
     parameters = [word for name, value in values.items() for word in ("-p", f"recorder:{name}:={json.dumps(value)}")]
-    rclpy.init(args=["--ros-args", *parameters])
+    remapped = ["-r", f"__ns:=/{namespace.strip('/')}"] if namespace.strip("/") else []
+    rclpy.init(args=["--ros-args", *remapped, *parameters])
     node = None
     try:
         node, executor, shown = RecorderNode(), SingleThreadedExecutor(), 0.0

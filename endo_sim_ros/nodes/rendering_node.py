@@ -12,14 +12,13 @@ from endo_sim_ros.cameras import Camera
 from endo_sim_ros.config import Range, StageConfig
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.messages import CameraInfo, ControlNodeCloud, MessageError
-from endo_sim_ros.nodes.base import ERROR, OK, STREAM_DEPTH, WARN, Background, EndoNode, WorldConfig, run, sentence
-from endo_sim_ros.nodes.pacing import Pacer
+from endo_sim_ros.nodes.base import ERROR, OK, WARN, Background, EndoNode, WorldConfig, run, sentence
+from endo_sim_ros.nodes.pacing import MOST_WAITING, Pacer
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.bag import LEFT_FRAME
 
 _MAX_SIDE = 8192  # pixels; a damaged camera_info must not make the node ask for all memory
 _POLLS = 8  # times per image that the timer asks whether one is due
-_MOST_WAITING = 1000  # states that wait in lockstep, before the oldest is given up
 
 
 @dataclass(frozen=True)
@@ -88,7 +87,7 @@ class RenderingNode(EndoNode):
         self.subscribe(messages.GAUSSIANS, self._on_model)
         self.subscribe(messages.TRAINING_CAMERAS, self._on_training_cameras)
         self.subscribe(messages.TRAINING_CAMERA_INFO, self._on_training_info)
-        depth = STREAM_DEPTH if self._lockstep else 1
+        depth = MOST_WAITING if self._lockstep else 1
         self.subscribe(messages.CONTROL_NODES, self._on_nodes, depth)
         self.subscribe(messages.CAMERA_POSE, self._on_camera, depth)
         self.subscribe(messages.LEFT_INFO, self._on_info, depth=1)
@@ -132,9 +131,9 @@ class RenderingNode(EndoNode):
         self._nodes = nodes
         if self._lockstep:
             self._states.append((messages.stamp_to_ns(message.header.stamp), nodes))
-            if len(self._states) > _MOST_WAITING:
+            if len(self._states) > MOST_WAITING:
                 self._states.popleft()
-                raise MessageError(f"{messages.CONTROL_NODES.name}: over {_MOST_WAITING} states wait to be shown; one is left out")
+                raise MessageError(f"{messages.CONTROL_NODES.name}: over {MOST_WAITING} states wait to be shown; one is left out")
             self._show_states()
         elif not same:
             self._change()
@@ -152,7 +151,7 @@ class RenderingNode(EndoNode):
         self._pose = pose
         if self._lockstep and self._options.lockstep_camera:
             self._poses[messages.stamp_to_ns(message.header.stamp)] = pose
-            while len(self._poses) > _MOST_WAITING:
+            while len(self._poses) > MOST_WAITING:
                 del self._poses[next(iter(self._poses))]
             self._show_states()
         elif not same:
@@ -188,7 +187,7 @@ class RenderingNode(EndoNode):
     def _show_if_due(self) -> None:
         """Real time: show the newest state, or what was shown once more, if it is time for it."""
         camera, now = self._camera(), time.monotonic()
-        if self._bound is None or camera is None:
+        if self._bound is None or camera is None or self.now_ns() == 0:  # with use_sim_time, before /clock
             return
         if self._dirty or self._output is None:
             if not self._pacer.is_due(now, 1 / self._options.rate):
@@ -204,22 +203,35 @@ class RenderingNode(EndoNode):
         """Lockstep: one image for each state, in order, as soon as its model and its camera are there."""
         while self._states and self._bound is not None:
             stamp, nodes = self._states[0]
-            if nodes.model_stamp_ns < self._bound.model_stamp:  # of a model that is gone
-                self._states.popleft()
+            at_rest = stamp == nodes.model_stamp_ns  # the first observation, for which nobody sends a camera
+            if nodes.model_stamp_ns not in (self._bound.model_stamp, self._model_stamp):
+                self._leave_out("belongs to a model that is gone")
                 continue
             camera = self._camera()
-            if self._options.lockstep_camera:
+            if self._options.lockstep_camera and not at_rest:
                 pose = self._poses.get(stamp)
+                if pose is None and any(other > stamp for other in self._poses):
+                    self._leave_out(f"has no pose with its stamp on {messages.CAMERA_POSE.name}")
+                    continue
                 camera = camera and pose is not None and replace(camera, pose=pose)
             if not self._bound.follows(nodes) or not camera:
                 return
             self._states.popleft()
-            for old in [other for other in self._poses if other <= stamp]:
+            for old in [other for other in self._poses if other <= stamp and not at_rest]:
                 del self._poses[old]
             self._publish(*self._render(self._bound, nodes, camera), stamp)
 
+    def _leave_out(self, why: str) -> None:
+        stamp, _ = self._states.popleft()
+        self.report_error(f"the state of {stamp * 1e-9:.6f} s is not shown: it {why}")
+
     def _build(self) -> None:
         """Bind the newest model to its control nodes in the background; the picture before stays meanwhile."""
+        if self._lockstep and self._bound is not None:
+            if self._states and self._bound.follows(self._states[0][1]):
+                return  # states of the model before come first
+            if self._nodes is None or self._nodes.model_stamp_ns != self._model_stamp:
+                return  # pictures of states are wanted, not of a model at rest
         try:
             built = self._background.take()
             if built is not None:

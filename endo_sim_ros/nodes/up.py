@@ -174,7 +174,7 @@ def run_up(
     Raises:
         UpError, SequenceError: If something given cannot be used, or all nodes are down; one sentence.
     """
-    console, logs = Console(), logs.expanduser()
+    console, logs = Console(), logs.expanduser() / namespace.strip("/")
     if bag is not None:
         with BagReader(bag.expanduser()) as reader:  # a bag that cannot do is reported before anything starts
             reader.require_recording()

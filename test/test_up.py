@@ -96,7 +96,7 @@ def test_up_runs_the_graph_and_ends_cleanly(up, small_bag):
     assert status == 0 and seconds < 15, run.output.read_text()
     assert not run.processes()
     assert "Traceback" not in run.output.read_text()
-    for log in (run.folder / "logs").iterdir():
+    for log in (run.folder / "logs" / "left").iterdir():
         assert "Traceback" not in log.read_text(), log.read_text()
 
 

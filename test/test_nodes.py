@@ -680,6 +680,12 @@ def test_poses_in_the_frame_of_a_robots_base_are_turned_into_the_world(bench, ph
     state = nodes_of(bench)
     shift = state.positions - state.rest
     assert shift[np.linalg.norm(shift, axis=1).argmax()].argmax() == 0  # along the world's x
+    arm = physics._arms["PSM1"]
+    for base, z in (("PSM2_base", 0.0), ("PSM1_base", 0.2)):  # a pose without a frame is in that of the arm, or in the world
+        assert bench.set("physics_node", frames=[f"{base} 0 0 0.2 0 0 0 1"])[0]
+        bench.publish(messages.tool_pose("PSM1"), messages.encode_pose(np.eye(4), S, ""))
+        bench.until(lambda: arm.pose[2, 3] == z, f"a tip at {z} m")
+    assert bench.set("physics_node", frames=["base 0 0 0.1 0 0 0 1"])[0]
     bench.publish(messages.tool_pose("PSM1"), messages.encode_pose(np.eye(4), S, "elsewhere"))
     bench.refused("physics_node", "unknown frame 'elsewhere'; this graph knows 'world' or 'base'")
 

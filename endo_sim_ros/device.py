@@ -4,6 +4,8 @@ import contextlib
 import functools
 import os
 import sys
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import torch
 
@@ -54,3 +56,19 @@ def cpu_threads() -> int:
     """Number of worker threads for CPU kernels: the cores this process may use, or ENDO_SIM_THREADS."""
     available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return int(os.environ.get("ENDO_SIM_THREADS", "0")) or available
+
+
+@functools.cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, "endo_sim")
+
+
+os.register_at_fork(after_in_child=_pool.cache_clear)  # a forked process has none of its parent's threads
+
+
+def run_in_threads(jobs: Sequence[Callable[[], object]]) -> None:
+    """Run callables at the same time; the last one in this thread. A kernel launch releases the interpreter lock."""
+    futures = [_pool(len(jobs) - 1).submit(job) for job in jobs[:-1]]
+    jobs[-1]()
+    for future in futures:
+        future.result()

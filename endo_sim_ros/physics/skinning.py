@@ -1,5 +1,6 @@
 """Skinning: Gaussians follow their nearest control nodes."""
 
+import functools
 from typing import Literal
 
 import numpy as np
@@ -8,16 +9,16 @@ import warp as wp
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from endo_sim_ros.device import init_warp, pick_device
+from endo_sim_ros.device import cpu_threads, init_warp, pick_device, run_in_threads
 from endo_sim_ros.gaussians import GaussianModel
-from endo_sim_ros.physics.skinning_kernels import blend_rotations, node_rotations, skin_gaussians
+from endo_sim_ros.physics import skinning_kernels as kernels
+from endo_sim_ros.physics import skinning_simd_kernels as simd_kernels
 
 STRETCH_RANGE = (0.2, 4.0)  # of a Gaussian; beyond it the picture shows needles or holes, not tissue
+SHARED_FROM = 4096  # Gaussians; fewer are done before a second thread has begun
 
 
-def bind_weights(
-    means: np.ndarray, node_rest: np.ndarray, neighbours: int, weighting: str
-) -> tuple[np.ndarray, np.ndarray]:
+def bind_weights(means: np.ndarray, node_rest: np.ndarray, neighbours: int, weighting: str) -> tuple[np.ndarray, np.ndarray]:
     """Nearest nodes [N, K] int32 and their weights [N, K] float32, which add up to one, of means [N, 3].
 
     ``compact``: (1 − (d/d_{K+1})²)², normalised; a node's weight falls smoothly to zero where it is no longer among the
@@ -66,13 +67,34 @@ class Skinning:
             raise ValueError(f"skinning: node_rest has shape {rest.shape}, expected [M, 3] with M > 0")
         if not np.isfinite(rest).all() or not np.isfinite(means).all():
             raise ValueError("skinning: node positions and Gaussian means must be finite")
-        index, weights = bind_weights(means, rest, neighbours, weighting)
+        _load_kernels(self.device)
         model = model.detach().to(self.device)
         self.means = model.means.float().contiguous()  # [N, 3] m, at rest
         self.covars = model.covariances.float().contiguous()  # [N, 3, 3] m², at rest
-        self.neighbours = torch.from_numpy(index).to(self.device)  # [N, K]
-        self.weights = torch.from_numpy(weights).to(self.device)  # [N, K]
         self.node_rest = torch.from_numpy(rest).float().to(self.device).contiguous()  # [M, 3] m
+        self._origin = wp.vec3(*rest.mean(0))  # of the maps
+        self.rebind(*bind_weights(means, rest, neighbours, weighting))
+
+    def rebind(self, index: np.ndarray, weights: np.ndarray) -> None:
+        """Let Gaussians follow other nodes from now on, e.g. those on their side of a cut.
+
+        Args:
+            index: Nodes that move each Gaussian [N, K], 0 to M − 1; K may differ from before.
+            weights: Their weights [N, K], which add up to one; a node with weight zero moves nothing.
+
+        Raises:
+            ValueError: If shapes disagree, a node does not exist, or weights do not add up to one; nothing changes then.
+        """
+        index, weights = np.asarray(index), np.asarray(weights)
+        count = len(self.means)
+        if index.ndim != 2 or len(index) != count or not index.shape[1] or index.shape != weights.shape:
+            raise ValueError(f"skinning: index has shape {index.shape} and weights {weights.shape}, expected both [{count}, K] with K > 0")
+        if index.dtype.kind not in "iu" or (index.size and not 0 <= index.min() <= index.max() < len(self.node_rest)):
+            raise ValueError(f"skinning: index must hold whole numbers from 0 to {len(self.node_rest) - 1}, the nodes there are")
+        if not (weights >= 0).all() or not (np.abs(weights.sum(1) - 1) < 1e-4).all():
+            raise ValueError("skinning: the weights of a Gaussian must not be negative and must add up to one")
+        self.neighbours = torch.tensor(index, dtype=torch.int32, device=self.device)  # [N, K]
+        self.weights = torch.tensor(weights, dtype=torch.float32, device=self.device)  # [N, K]
 
     def deform(self, positions: Tensor | np.ndarray, F: Tensor | np.ndarray) -> tuple[Tensor, Tensor]:
         """Means [N, 3] (m) and covariances [N, 3, 3] (m²) of the Gaussians.
@@ -82,14 +104,11 @@ class Skinning:
         """
         positions = self._nodes("positions", positions, (3,))
         F = self._nodes("F", F, (3, 3))
-        A = F
+        means, covars = self._skin(positions, F)
         if self.weighting == "softmax":
-            A = torch.empty_like(F)
-            self._launch(node_rotations, len(F), [_mat33(F), _mat33(A)])
-        means, covars = torch.empty_like(self.means), torch.empty_like(self.covars)
-        inputs = [_vec3(self.means), _mat33(self.covars), wp.from_torch(self.neighbours), wp.from_torch(self.weights)]
-        inputs += [_vec3(self.node_rest), _vec3(positions), _mat33(F), _mat33(A), *STRETCH_RANGE]
-        self._launch(skin_gaussians, len(means), [*inputs, _vec3(means), _mat33(covars)])
+            R = torch.empty_like(F)
+            self._launch(kernels.node_rotations, len(F), [_array(F, wp.mat33), _array(R, wp.mat33)])
+            means, _ = self._skin(positions, R)
         return means, covars
 
     def rotations(self, F: Tensor | np.ndarray) -> Tensor:
@@ -97,8 +116,8 @@ class Skinning:
         SH degree is above 0."""
         F = self._nodes("F", F, (3, 3))
         out = torch.empty_like(self.covars)
-        inputs = [wp.from_torch(self.neighbours), wp.from_torch(self.weights), _mat33(F), _mat33(out)]
-        self._launch(blend_rotations, len(out), inputs)
+        inputs = [_array(self.neighbours), _array(self.weights), _array(F, wp.mat33), _array(out, wp.mat33)]
+        self._launch_shares(kernels.blend_rotations, len(out), inputs)
         return out
 
     def _nodes(self, name: str, values: Tensor | np.ndarray, shape: tuple[int, ...]) -> Tensor:
@@ -108,16 +127,40 @@ class Skinning:
             raise ValueError(f"skinning: {name} has shape {tuple(values.shape)}, expected {expected}")
         return values
 
+    def _skin(self, positions: Tensor, A: Tensor) -> tuple[Tensor, Tensor]:
+        """Means [N, 3] and covariances [N, 3, 3] for node transforms A [M, 3, 3]."""
+        maps = torch.empty((len(A), 4, 4), device=self.device)
+        inputs = [_array(self.node_rest, wp.vec3), _array(positions, wp.vec3), _array(A, wp.mat33), self._origin, _array(maps, wp.mat44)]
+        self._launch(kernels.node_maps, len(A), inputs)
+        if self.device == "cpu" and not maps.any():  # nothing has moved yet
+            return self.means.clone(), self.covars.clone()
+        means, covars = torch.empty_like(self.means), torch.empty_like(self.covars)
+        inputs = [_array(self.means, wp.vec3), _array(self.covars, wp.mat33), _array(self.neighbours), _array(self.weights)]
+        inputs += [_array(maps, wp.mat44), self._origin, *STRETCH_RANGE, _array(means, wp.vec3), _array(covars, wp.mat33)]
+        kernel = simd_kernels.skin_gaussians if self.device == "cpu" else kernels.skin_gaussians
+        self._launch_shares(kernel, len(means), inputs)
+        return means, covars
+
     def _launch(self, kernel, count: int, inputs: list) -> None:
         stream = None
         if self.device != "cpu":  # in order with torch's own work
             stream = wp.stream_from_torch(torch.cuda.current_stream(self.device))
         wp.launch(kernel, count, inputs, device=self.device, stream=stream)
 
+    def _launch_shares(self, kernel, count: int, inputs: list) -> None:
+        """Launch a kernel whose first argument is an offset: at once on CUDA, in shares on the CPU."""
+        threads = cpu_threads() if self.device == "cpu" and count >= SHARED_FROM else 1
+        bounds = [count * i // threads for i in range(threads + 1)]
+        run_in_threads([functools.partial(self._launch, kernel, end - first, [first, *inputs]) for first, end in zip(bounds, bounds[1:])])
 
-def _vec3(tensor: Tensor) -> wp.array:
-    return wp.from_torch(tensor, dtype=wp.vec3)
+
+@functools.cache
+def _load_kernels(device: str) -> None:
+    """Compile the kernels before several threads ask for them."""
+    for module in (kernels, simd_kernels) if device == "cpu" else (kernels,):
+        wp.load_module(module, device)
 
 
-def _mat33(tensor: Tensor) -> wp.array:
-    return wp.from_torch(tensor, dtype=wp.mat33)
+def _array(tensor: Tensor, dtype=None):
+    """A tensor as a kernel argument, without copying."""
+    return wp.from_torch(tensor, dtype, requires_grad=False, return_ctype=True)

@@ -2,8 +2,15 @@
 
     μ' = Σ w (A_k (μ − p_k) + p_k')      Σ' = F Σ Fᵀ,  F = Σ w F_k
 
-with A_k = F_k (affine fields are then exact) or, as printed, its rotation R_k. The mean is evaluated as
-μ + Σ w ((A_k − 1)(μ − p_k) + p_k' − p_k), which leaves an undeformed Gaussian untouched bit for bit.
+with A_k = F_k (affine fields are then exact) or, as printed, its rotation R_k. As the weights add up to one, both are
+linear in one affine map per node, G_k = [B_k | c_k] with B_k = A_k − 1 and c_k = p_k' − p_k − B_k (p_k − o):
+
+    μ' = μ + B (μ − o) + c,  F = 1 + B,  where [B | c] = Σ w G_k
+
+A node that has not moved has G_k = 0, which leaves its Gaussians untouched bit for bit. The origin o lies within the
+tissue, so that the sum loses no digits however far the tissue is from the world's origin. A map takes 16 floats, a
+cache line: the columns of B and c, each padded to four. Kernels over Gaussians start at an offset, so that several
+threads can share them.
 """
 
 import warp as wp
@@ -39,42 +46,72 @@ def node_rotations(F: wp.array[wp.mat33], R: wp.array[wp.mat33]):
 
 
 @wp.kernel
-def skin_gaussians(
+def node_maps(
+    node_rest: wp.array[wp.vec3],
+    node_positions: wp.array[wp.vec3],
+    node_A: wp.array[wp.mat33],
+    origin: wp.vec3,
+    maps: wp.array[wp.mat44],  # out
+):
+    """G_k of every node: the columns of B_k and c_k as rows of four."""
+    k = wp.tid()
+    B = node_A[k] - wp.identity(3, float)
+    c = node_positions[k] - node_rest[k] - B * (node_rest[k] - origin)
+    G = wp.mat44()
+    for i in range(3):
+        for j in range(3):
+            G[j, i] = B[i, j]
+        G[3, i] = c[i]
+    maps[k] = G
+
+
+@wp.func
+def skin_gaussian(
+    n: int,
     means: wp.array[wp.vec3],
     covars: wp.array[wp.mat33],
     neighbours: wp.array2d[int],
     weights: wp.array2d[float],
-    node_rest: wp.array[wp.vec3],
-    node_positions: wp.array[wp.vec3],
-    node_F: wp.array[wp.mat33],
-    node_A: wp.array[wp.mat33],
+    maps: wp.array[wp.mat44],
+    origin: wp.vec3,
     low: float,
     high: float,
     out_means: wp.array[wp.vec3],
     out_covars: wp.array[wp.mat33],
 ):
-    n = wp.tid()
-    mean = means[n]
-    shift = wp.vec3()
-    F = wp.mat33()
+    G = wp.mat44()
     for j in range(neighbours.shape[1]):
-        k = neighbours[n, j]
-        w = weights[n, j]
-        rest = node_rest[k]
-        arm = mean - rest
-        shift += w * (node_A[k] * arm - arm + node_positions[k] - rest)
-        F += w * node_F[k]
-    F = clamp_stretch(F, low, high)
-    out_means[n] = mean + shift
+        G += weights[n, j] * maps[neighbours[n, j]]
+    B = wp.mat33(G[0, 0], G[1, 0], G[2, 0], G[0, 1], G[1, 1], G[2, 1], G[0, 2], G[1, 2], G[2, 2])
+    out_means[n] = means[n] + (B * (means[n] - origin) + wp.vec3(G[3, 0], G[3, 1], G[3, 2]))
+    F = clamp_stretch(wp.identity(3, float) + B, low, high)
     out_covars[n] = F * covars[n] * wp.transpose(F)
 
 
 @wp.kernel
+def skin_gaussians(
+    first: int,
+    means: wp.array[wp.vec3],
+    covars: wp.array[wp.mat33],
+    neighbours: wp.array2d[int],
+    weights: wp.array2d[float],
+    maps: wp.array[wp.mat44],
+    origin: wp.vec3,
+    low: float,
+    high: float,
+    out_means: wp.array[wp.vec3],
+    out_covars: wp.array[wp.mat33],
+):
+    n = first + wp.tid()
+    skin_gaussian(n, means, covars, neighbours, weights, maps, origin, low, high, out_means, out_covars)
+
+
+@wp.kernel
 def blend_rotations(
-    neighbours: wp.array2d[int], weights: wp.array2d[float], node_F: wp.array[wp.mat33], out: wp.array[wp.mat33]
+    first: int, neighbours: wp.array2d[int], weights: wp.array2d[float], node_F: wp.array[wp.mat33], out: wp.array[wp.mat33]
 ):
     """Rotation of every Gaussian's blended F."""
-    n = wp.tid()
+    n = first + wp.tid()
     F = wp.mat33()
     for j in range(neighbours.shape[1]):
         F += weights[n, j] * node_F[neighbours[n, j]]

@@ -6,8 +6,6 @@
 import contextlib
 import contextvars
 import functools
-import os
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import torch
@@ -15,7 +13,7 @@ import warp as wp
 from torch import Tensor
 
 from endo_sim_ros.cameras import Camera
-from endo_sim_ros.device import cpu_threads, init_warp
+from endo_sim_ros.device import cpu_threads, init_warp, run_in_threads
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.splatting import rasterizer_kernels as kernels
 from endo_sim_ros.splatting import rasterizer_simd_kernels as simd_kernels
@@ -232,22 +230,6 @@ def _black(device: torch.device) -> Tensor:
     return torch.zeros(3, device=device)
 
 
-@functools.cache
-def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, "splatting")
-
-
-os.register_at_fork(after_in_child=_pool.cache_clear)  # a forked process has none of its parent's threads
-
-
-def _in_threads(jobs: list) -> None:
-    """Run callables at the same time; the last one in this thread. A launch releases the interpreter lock."""
-    futures = [_pool(len(jobs) - 1).submit(job) for job in jobs[:-1]]
-    jobs[-1]()
-    for future in futures:
-        future.result()
-
-
 def _on_stream(device: torch.device):
     """Make Warp work on torch's current stream of a CUDA device."""
     if device.type == "cpu":
@@ -278,7 +260,7 @@ def _launch(kernel, count: int, arguments: list, device: torch.device, width: in
     def share(first, end):
         wp.launch(kernel, dim=end - first, inputs=[first, *arguments], device="cpu")
 
-    _in_threads([functools.partial(share, *pair) for pair in zip(bounds[:-1], bounds[1:])])
+    run_in_threads([functools.partial(share, *pair) for pair in zip(bounds[:-1], bounds[1:])])
 
 
 def _launch_tiles(kernel, tile_count: int, arguments: list) -> None:
@@ -286,7 +268,7 @@ def _launch_tiles(kernel, tile_count: int, arguments: list) -> None:
     counter = torch.zeros(1, dtype=torch.int32)
     inputs = [_array(counter), *arguments]
     command = wp.launch(kernel, dim=tile_count, inputs=inputs, device="cpu", record_cmd=True)
-    _in_threads([command.launch] * min(cpu_threads(), tile_count))
+    run_in_threads([command.launch] * min(cpu_threads(), tile_count))
 
 
 def _sort_pairs(keys: Tensor, values: Tensor, count: int, bits: int) -> None:

@@ -1,0 +1,148 @@
+"""Skinning at speed: threads, tissue at rest, the kernel that CUDA runs, and other nodes after a cut."""
+
+import numpy as np
+import pytest
+import torch
+from test_physics import affine_field, curved_sheet
+
+from endo_sim_ros.physics import Skinning, skinning
+
+
+def model_and_rest(count: int = 9001, offset: tuple = (0.0, 0.0, 0.0)):
+    model = curved_sheet(count, offset=offset)
+    return model, model.means[::40].numpy()
+
+
+def wild_state(rest: np.ndarray, where=slice(None)) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes moved by millimetres, of which some stretch their Gaussians beyond the range."""
+    rng = np.random.default_rng(3)
+    positions, F = rest.copy(), np.tile(np.eye(3, dtype=np.float32), (len(rest), 1, 1))
+    positions[where] += rng.normal(0, 1e-3, rest.shape)[where]
+    F[where] += (rng.normal(0, 0.2, F.shape) * rng.choice([1, 20], (len(rest), 1, 1), p=[0.9, 0.1]))[where]
+    return positions, F
+
+
+def _deform(s: Skinning, positions: np.ndarray, F: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
+    """Equations 10 and 11 with A = F in float64; Gaussians stretched beyond the range have covariance NaN."""
+    index, w, F = s.neighbours.numpy(), s.weights.double().numpy(), F.astype(np.float64)
+    p, rest, means = positions.astype(np.float64), s.node_rest.double().numpy(), s.means.double().numpy()
+    moved = np.einsum("nkij,nkj->nki", F[index], means[:, None] - rest[index]) + p[index]
+    blend = np.einsum("nk,nkij->nij", w, F[index])
+    sigma = np.linalg.svd(blend, compute_uv=False)
+    low, high = skinning.STRETCH_RANGE
+    blend[(np.linalg.det(blend) <= 0) | (sigma[:, -1] < low) | (sigma[:, 0] > high)] = np.nan
+    covars = blend @ s.covars.double().numpy() @ blend.transpose(0, 2, 1)
+    return torch.from_numpy((w[..., None] * moved).sum(1)), torch.from_numpy(covars)
+
+
+@pytest.mark.parametrize("weighting", ["compact", "softmax"])
+def test_number_of_threads_changes_no_bit(monkeypatch, weighting):
+    model, rest = model_and_rest()
+    positions, F = wild_state(rest)
+    results = []
+    for threads in ("1", "2", "3"):
+        monkeypatch.setenv("ENDO_SIM_THREADS", threads)
+        s = Skinning(model, rest, weighting=weighting, device="cpu")
+        results.append((*s.deform(positions, F), s.rotations(F)))
+    for others in results[1:]:
+        assert all(torch.equal(one, other) for one, other in zip(results[0], others, strict=True))
+
+
+@pytest.mark.parametrize("neighbours", [1, 4, 7])
+def test_vectors_agree_with_the_equations_and_with_the_kernel_of_cuda(monkeypatch, neighbours):
+    model, rest = model_and_rest(5000)
+    positions, F = wild_state(rest)
+    s = Skinning(model, rest, neighbours=neighbours, device="cpu")
+    means, covars = s.deform(positions, F)
+    expected_means, expected_covars = _deform(s, positions, F)
+    healthy = expected_covars.isfinite().all((1, 2))
+    if neighbours > 1:
+        assert 100 < healthy.sum() < 4900
+    torch.testing.assert_close(means.double(), expected_means, atol=2e-7, rtol=0)
+    torch.testing.assert_close(covars.double()[healthy], expected_covars[healthy], atol=2e-11, rtol=1e-4)
+    assert covars.isfinite().all()
+
+    monkeypatch.setattr(skinning.simd_kernels, "skin_gaussians", skinning.kernels.skin_gaussians)
+    scalar_means, scalar_covars = s.deform(positions, F)
+    torch.testing.assert_close(means, scalar_means, atol=1e-7, rtol=0)
+    torch.testing.assert_close(covars, scalar_covars, atol=2e-11, rtol=1e-4)
+
+
+def test_tissue_at_rest_is_copied_and_the_copies_belong_to_the_caller():
+    model, rest = model_and_rest()
+    s = Skinning(model, rest, device="cpu")
+    identity = np.tile(np.eye(3), (len(rest), 1, 1))
+    means, covars = s.deform(rest, identity)
+    assert torch.equal(means, model.means) and torch.equal(covars, s.covars)
+    means.zero_(), covars.zero_()
+    again, _ = s.deform(rest, identity)
+    assert torch.equal(again, model.means)
+
+    # A node without Gaussians moves: nothing is copied at once, and the general way gives the same bits.
+    s.rebind(np.where(s.neighbours == 0, 1, s.neighbours), s.weights.numpy())
+    moved = rest.copy()
+    moved[0] += 0.01
+    means, covars = s.deform(moved, identity)
+    assert torch.equal(means, model.means) and torch.equal(covars, s.covars)
+
+
+@pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (8.0, -4.0, 16.0)])
+def test_tissue_moves_only_where_its_nodes_have_moved(offset):
+    model, rest = model_and_rest(offset=offset)
+    moving = rest[:, 0] < offset[0] - 0.01
+    s = Skinning(model, rest, device="cpu")
+    means, covars = s.deform(*wild_state(rest, moving))
+    still = ~moving[s.neighbours.numpy()].any(1)
+    assert 0.2 < still.mean() < 0.8
+    assert torch.equal(means[still], model.means[still]) and torch.equal(covars[still], s.covars[still])
+    assert (means[~still] != model.means[~still]).any(1).float().mean() > 0.99
+
+
+def test_affine_fields_are_as_exact_far_from_the_origin_as_floats_are_there():
+    offset = np.array([8.0, -4.0, 16.0])
+    model, rest = model_and_rest(offset=tuple(offset))
+    _, around, F = affine_field(rest.astype(np.float64) - offset)
+    means, _ = Skinning(model, rest, device="cpu").deform(around + offset, F)
+    expected = affine_field(model.means.double().numpy() - offset)[1] + offset
+    np.testing.assert_allclose(means, expected, rtol=0, atol=2e-6)  # 16 m has floats 1.9e-6 m apart
+
+
+def test_a_state_that_is_not_finite_shows():
+    model, rest = model_and_rest(5000)
+    positions, F = wild_state(rest, slice(0))
+    positions[3], F[5] = np.nan, np.nan
+    s = Skinning(model, rest, device="cpu")
+    means, _ = s.deform(positions, F)
+    touched = torch.isin(s.neighbours, torch.tensor([3, 5])).any(1)
+    assert torch.equal(means.isnan().any(1), touched)
+
+
+def test_rebound_gaussians_follow_their_new_nodes():
+    model, rest = model_and_rest(5000)
+    s = Skinning(model, rest, device="cpu")
+    right = rest[:, 0] > 0
+    own = np.argmax(right), np.argmin(right)  # a node of each side
+    index = np.where(model.means[:, :1].numpy() > 0, own[0], own[1])
+    s.rebind(index, np.ones((5000, 1)))
+    positions = rest + np.where(right[:, None], [0.01, 0, 0], 0).astype(np.float32)
+    means, covars = s.deform(positions, np.tile(np.eye(3), (len(rest), 1, 1)))
+    shift = np.where(model.means[:, :1].numpy() > 0, np.float32([0.01, 0, 0]), 0)
+    np.testing.assert_allclose(means, model.means.numpy() + shift, atol=1e-8)
+    assert torch.equal(covars, s.covars)
+
+
+def test_bindings_that_make_no_sense_are_refused_and_change_nothing():
+    model, rest = model_and_rest(50)
+    s = Skinning(model, rest, device="cpu")
+    before = s.neighbours.clone(), s.weights.clone()
+    index, weights = np.zeros((50, 2), np.int32), np.full((50, 2), 0.5, np.float32)
+    with pytest.raises(ValueError, match=r"index has shape \(50, 2\) and weights \(50, 3\), expected both \[50, K\]"):
+        s.rebind(index, np.ones((50, 3)))
+    with pytest.raises(ValueError, match="whole numbers from 0 to 1,"):
+        s.rebind(index + 2, weights)
+    with pytest.raises(ValueError, match="whole numbers"):
+        s.rebind(index * 1.0, weights)
+    for wrong in (weights * 1.1, weights * np.nan, weights * [3, -1]):
+        with pytest.raises(ValueError, match="must add up to one"):
+            s.rebind(index, wrong)
+    assert torch.equal(s.neighbours, before[0]) and torch.equal(s.weights, before[1])

@@ -29,8 +29,15 @@ class PhysicsConfig(StageConfig):
     poisson_ratio: Annotated[float, Range(0.0, 0.49)] = 0.3
     """Compressibility. Wet tissue is nearer 0.49, but there the sound speed multiplies the substeps by four and
     the coarse grid locks; 0.3 keeps the paper's substep stable."""
+    viscosity: Annotated[float, Range(0.0, 1e4, "Pa·s")] = 0.0
+    """Kelvin-Voigt viscosity beside the elastic law: resists strain in proportion to its rate, 0 = none. Tens to hundreds make
+    tissue creep like liver; more substeps are then taken."""
     density: Annotated[float, Range(1.0, 1e5, "kg/m³")] = 1000.0
     """Mass density of the tissue."""
+    regions: tuple[str, ...] = ()
+    """Regions that are made of something else, later ones over earlier ones: "box x0 y0 z0 x1 y1 z1", "sphere x y z radius" (m, world)
+    or "mask IMAGE CAMERAS N" (what camera N of a cameras.json sees in the white of an image), then young_modulus=, poisson_ratio=
+    or density=, e.g. "sphere 0 0 0.12 0.01 young_modulus=40000"."""
     substeps: Annotated[int, Range(1, 100_000)] = 80
     """Substeps in one step, as the paper has them; see adapt_substeps."""
     substep_dt: Annotated[float, Range(1e-7, 0.1, "s")] = 0.0005
@@ -56,6 +63,13 @@ class PhysicsConfig(StageConfig):
     """Farthest a node may move from rest; a step that takes one farther is undone and counted as a fault."""
     force_radius: Annotated[float, Range(1e-4, 1.0, "m")] = 0.01
     """A tool pulls, and a closing jaw holds, the skin nodes within this distance of its tip."""
+    contact_radius: Annotated[float, Range(0.0, 0.1, "m")] = 0.0
+    """Radius of the rigid capsule that each tool pushes the tissue away with, 0 = tools act by wrench and jaw only. Nodes, not
+    the skin between them, are what it touches, so a capsule thinner than the node spacing acts as one as thick as that."""
+    contact_length: Annotated[float, Range(0.0, 1.0, "m")] = 0.0
+    """Length of that capsule from the tip backwards, against the tool's z axis; 0 = a sphere."""
+    friction: Annotated[float, Range(0.0, 10.0)] = 0.2
+    """Coulomb friction between tool and tissue; wet instruments have 0.05 to 0.3."""
     dense: bool = False
     """Simulate every Gaussian as a material point (PhysGaussian's way) instead of sparse nodes;
     layers are then ignored."""

@@ -1,8 +1,9 @@
-"""Hyperelastic materials.
+"""Materials: hyperelastic laws and the viscosity that may act beside each of them.
 
 A material is one ``@wp.func`` that maps the deformation gradient F and Lamé's parameters to the first Piola-Kirchhoff
 stress P = ∂ψ/∂F [Pa] (exactly zero at F = I, so that a rest state stays at rest bit for bit), one torch function with
-the same name and a leading underscore that gives its energy density ψ [J/m³], and one line in ``MATERIALS``.
+the same name and a leading underscore that gives its energy density ψ [J/m³], and one line in ``MATERIALS``. On a CPU
+it is fast if ``mpm_simd_kernels.STRESSES`` has a vectorised twin of it, and runs from this one function if not.
 The Kirchhoff stress is τ = P Fᵀ (``kirchhoff_stress``).
 """
 
@@ -84,6 +85,22 @@ def _neo_hookean(F: Tensor, mu: float, lam: float) -> Tensor:
     """ψ = μ/2 (tr FᵀF − 3) − μ ln J + λ/2 (ln J)² of F [..., 3, 3] with det F > 0, in J/m³."""
     log_J = torch.linalg.det(F).log()
     return 0.5 * mu * ((F * F).sum((-2, -1)) - 3) - mu * log_J + 0.5 * lam * log_J**2
+
+
+@wp.func
+def kelvin_voigt(F: wp.mat33, rate: wp.mat33, viscosity: float) -> wp.mat33:
+    """P = F S of a dashpot beside the elastic law, S = 2η Ė with the rate of Green's strain Ė = sym(Fᵀ Ḟ).
+
+    Being made of Ė it resists no rigid motion, and F S Fᵀ is symmetric: it conserves angular momentum and its power
+    2η |Ė|² is never negative.
+
+    Args:
+        F: Deformation gradient.
+        rate: Ḟ, 1/s.
+        viscosity: η, Pa·s.
+    """
+    slope = wp.transpose(F) * rate
+    return viscosity * (F * (slope + wp.transpose(slope)))
 
 
 @wp.func

@@ -10,11 +10,27 @@ import numpy as np
 import torch
 import warp as wp
 
-from endo_sim_ros.device import init_warp, pick_device
+from endo_sim_ros.device import cpu_threads, init_warp, pick_device, run_in_threads
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes
 from endo_sim_ros.physics.materials import energy_density, lame_parameters, sound_speed
-from endo_sim_ros.physics.mpm_kernels import Grid, Nodes, check_nodes, make_advance_kernel, update_grid
+from endo_sim_ros.physics.mpm_kernels import (
+    Grid,
+    Loads,
+    Nodes,
+    RigidTools,
+    State,
+    Substep,
+    Transfer,
+    check_nodes,
+    collect,
+    make_advance_kernel,
+    scatter,
+    undo_bad_steps,
+    update_grid,
+)
+from endo_sim_ros.physics.mpm_simd_kernels import LANES, SCRATCH, STRESSES, make_step_kernel
+from endo_sim_ros.physics.regions import TissueProperties
 
 CFL_LIMIT = 0.7  # c Δt / h; measured: 0.7 runs, 0.9 blows up
 CFL_CHOSEN = 0.5  # leaves room for tissue that stiffens where it is compressed
@@ -22,6 +38,7 @@ PIN_STIFFNESS = 50.0  # of a pinned node's spring, over that of a cube of tissue
 MARGIN_CELLS = 2.0  # between the nodes and the edge of the grid; a spline reaches 1.5
 MIN_CELL, MAX_CELL = 1e-6, 1e3  # m; beyond these float32 no longer holds masses and stiffnesses
 MAX_GRID_NODES = 64_000_000  # 28 bytes each
+MAX_SUBSTEPS = 100_000  # beyond it a step of the default tissue takes a minute
 
 
 # Held while a graph is captured on a GPU: what another thread launches there meanwhile would become part of it.
@@ -41,63 +58,103 @@ class Substepping:
     cfl: float  # c Δt / h
 
 
-def plan_substeps(config: PhysicsConfig, cell_size: float) -> Substepping:
+def plan_substeps(config: PhysicsConfig, cell_size: float, properties: TissueProperties | None = None, factor: float = 1.0) -> Substepping:
     """Divide a step so that the Courant number c Δt/h is stable: as few substeps as are safe, or those configured.
+
+    A viscosity η takes from the longest stable substep the factor √(1 + ξ²) − ξ of lagged damping, where
+    ξ = 2 η c / (h (λ + 2μ)) is the damping ratio of the shortest wave; the Courant number counts it in.
 
     Args:
         config: Material and substeps asked for; with ``adapt_substeps`` these give the duration of the step only.
         cell_size: Grid cell size h, metres.
+        properties: Of each node; default: those of the config everywhere.
+        factor: Largest factor on all moduli.
 
     Raises:
-        StabilityError: If the substeps are too long and ``adapt_substeps`` is off.
+        StabilityError: If the substeps are too long and ``adapt_substeps`` is off, or there would be too many of them.
     """
-    speed = sound_speed(config.young_modulus, config.poisson_ratio, config.density)
+    if properties is None:
+        properties = TissueProperties.uniform(1, config.young_modulus, config.poisson_ratio, config.density)
+    young = factor * properties.young_modulus
+    speeds = np.array([sound_speed(*each) for each in zip(young, properties.poisson_ratio, properties.density)])
+    ratios = 2 * config.viscosity / (properties.density * speeds * cell_size)
+    limits = speeds / (np.sqrt(1 + ratios**2) - ratios)  # of an elastic material with the same stable substep
+    worst = int(limits.argmax())
+    limit = float(limits[worst])
     count = config.substeps
     if config.adapt_substeps:
-        count = math.ceil(config.step_duration * speed / (CFL_CHOSEN * cell_size))
+        count = max(math.ceil(config.step_duration * limit / (CFL_CHOSEN * cell_size)), 1)
     dt = config.step_duration / count
-    cfl = speed * dt / cell_size
-    if cfl > CFL_LIMIT:
+    cfl = limit * dt / cell_size
+    if cfl > CFL_LIMIT or count > MAX_SUBSTEPS:
         fitting = math.ceil(count * cfl / CFL_LIMIT)
         raise StabilityError(
-            f"young_modulus {config.young_modulus:g} Pa, poisson_ratio {config.poisson_ratio:g} and density"
-            f" {config.density:g} kg/m³ on a grid of {cell_size:.3g} m give a Courant number of {cfl:.2f} with {count}"
-            f" substeps of {dt:g} s (limit {CFL_LIMIT}); use {fitting} substeps of {config.step_duration / fitting:.3g} s,"
-            " adapt_substeps, or a softer material"
+            f"young_modulus {young[worst]:g} Pa, poisson_ratio {properties.poisson_ratio[worst]:g}"
+            + f", viscosity {config.viscosity:g} Pa·s" * (config.viscosity > 0)
+            + f" and density {properties.density[worst]:g} kg/m³ on a grid of {cell_size:.3g} m give a Courant number of"
+            f" {cfl:.2f} with {count} substeps of {dt:.3g} s (limits {CFL_LIMIT} and {MAX_SUBSTEPS}); use {fitting}"
+            f" substeps of {config.step_duration / fitting:.3g} s, adapt_substeps, or a softer, less viscous material"
         )
     return Substepping(count, dt, cfl)
 
 
+@dataclass(frozen=True)
+class Launch:
+    """A kernel with what it is launched with."""
+
+    kernel: wp.Kernel
+    dim: int | tuple[int, ...]
+    inputs: list
+
+
 class MpmSolver:
-    """MLS-MPM over control nodes on one device.
+    """MLS-MPM over control nodes on one device, for one or many environments.
 
     The state lives in a local frame (world axes, origin at the grid's corner) as displacement from rest, so that a
     scene metres from the world's origin is as accurate as one at it and an undisturbed rest state is an exact fixed
-    point. On CPU the solver is serial and bit-for-bit repeatable.
+    point. A step whose end is bad (see `check_nodes`) is undone in its environment. On a CPU, and on a GPU with rest
+    kinematics, the same inputs give the same bits.
 
     Args:
-        nodes: The nodes at rest.
+        nodes: The nodes at rest, the same in all environments.
         config: Material, substeps, grid and device.
+        properties: Stiffness and density of each node; default: those of the config everywhere.
+        environments: Number of independent copies B.
+        tools: Number of rigid tools T in each.
+        stiffness: Factor on the moduli of each environment [B]; default 1.
+        vectorised: Use the CPU's own kernel where there is one; False runs the kernels of the GPU on it, to compare.
 
     Raises:
         StabilityError: If the substeps are too long for the material and may not be adapted.
         ValueError: If the grid would be absurdly large.
     """
 
-    def __init__(self, nodes: ControlNodes, config: PhysicsConfig):
+    def __init__(
+        self,
+        nodes: ControlNodes,
+        config: PhysicsConfig,
+        properties: TissueProperties | None = None,
+        *,
+        environments: int = 1,
+        tools: int = 1,
+        stiffness: np.ndarray | None = None,
+        vectorised: bool = True,
+    ):
         init_warp()
         self.device = pick_device(config.device)
         self.config = config
-        self.mu, self.lam = lame_parameters(config.young_modulus, config.poisson_ratio)
-        self.cell_size = config.grid_ratio * nodes.spacing
-        self.substepping = plan_substeps(config, self.cell_size)
-
-        h = self.cell_size
+        self.environments, self.tool_count, self.node_count = environments, tools, len(nodes)
+        if properties is None:
+            properties = TissueProperties.uniform(len(nodes), config.young_modulus, config.poisson_ratio, config.density)
+        scale = np.ones(environments) if stiffness is None else np.asarray(stiffness, np.float64)
+        if scale.shape != (environments,) or not (np.isfinite(scale).all() and (scale > 0).all()):
+            raise ValueError(f"stiffness must be {environments} positive factors, got {np.round(scale, 4).tolist()}")
+        self.cell_size = h = config.grid_ratio * nodes.spacing
         if not MIN_CELL <= h <= MAX_CELL:
             raise ValueError(
-                f"the grid cells would be {h:.3g} m wide, which is no tissue; is the model in metres, and is it the"
-                " viewpoint's own?"
+                f"the grid cells would be {h:.3g} m wide, which is no tissue; is the model in metres, and is it the viewpoint's own?"
             )
+        self.substepping = plan_substeps(config, h, properties, float(scale.max()))
         far = float(np.abs(nodes.rest).max())
         if not far * np.finfo(np.float32).eps < 0.01 * h:  # else nodes of one cell fall together, and out of the grid
             raise ValueError(
@@ -108,142 +165,260 @@ class MpmSolver:
         rest = nodes.rest.astype(np.float64)
         self.origin = rest.min(0) - margin  # [3] world, m
         cells = np.ceil((rest.max(0) + margin - self.origin) / h) + 1
-        if not cells.prod() <= MAX_GRID_NODES:  # as floats: a product of integers could wrap around to a small one
+        if not environments * cells.prod() <= MAX_GRID_NODES:  # as floats: a product of integers could wrap around
             raise ValueError(
-                f"the simulation grid would have {cells[0]:.0f}×{cells[1]:.0f}×{cells[2]:.0f} nodes of {h:.3g} m; remove"
-                " outlying Gaussians, lower node_count or raise grid_ratio"
+                f"the simulation grid would have {cells[0]:.0f}×{cells[1]:.0f}×{cells[2]:.0f} nodes of {h:.3g} m"
+                + f" in each of {environments} environments" * (environments > 1)
+                + "; remove outlying Gaussians, lower node_count or raise grid_ratio"
             )
         self.grid_shape = tuple(int(n) for n in cells)
+        self.rest_cells = (rest - self.origin) / h  # [M, 3] rest positions, in cells of the grid
         self._grid = Grid()
         self._grid.h, self._grid.inverse_h = h, 1 / h
         self._grid.nx, self._grid.ny, self._grid.nz = self.grid_shape
+        self._grid.count = int(cells.prod())
 
-        def array(values, dtype):
-            return wp.array(values, dtype=dtype, device=self.device)
-
-        # A pinned node's springs are stiffer than the tissue beside it, so that it gives way a few per cent at most.
-        self._hold_stiffness = PIN_STIFFNESS * (self.lam + 2 * self.mu) * np.cbrt(nodes.volumes)
-        self._pin_stiffness = self._hold_stiffness * nodes.pinned
-        count = len(nodes)
-        self._nodes = Nodes()
-        self._nodes.X = array((rest - self.origin).astype(np.float32), wp.vec3)
-        self._nodes.mass = array((nodes.volumes * config.density).astype(np.float32), float)
-        self._nodes.volume = array(nodes.volumes.astype(np.float32), float)
-        self._nodes.spring = wp.zeros(count, float, device=self.device)
-        self._nodes.target = wp.zeros(count, wp.vec3, device=self.device)
-        self._nodes.target_v = wp.zeros(count, wp.vec3, device=self.device)
-        self._nodes.force = wp.zeros(count, wp.vec3, device=self.device)
-        self._nodes.u = wp.zeros(count, wp.vec3, device=self.device)
-        self._nodes.v = wp.zeros(count, wp.vec3, device=self.device)
-        self._nodes.C = wp.zeros(count, wp.mat33, device=self.device)
-        self._nodes.F = wp.empty(count, wp.mat33, device=self.device)
-        self._state = (self._nodes.u, self._nodes.v, self._nodes.C, self._nodes.F)
-        self._backup = tuple(wp.empty_like(array) for array in self._state)
-        self._grid_mv = wp.zeros(self.grid_shape, wp.vec4, device=self.device)
-        self._grid_v = wp.zeros(self.grid_shape, wp.vec3, device=self.device)
-        self._fault = wp.zeros(1, int, device=self.device)
-        self._speed_sq = wp.zeros(1, float, device=self.device)
-        self._flat_mv, self._flat_v = self._grid_mv.flatten(), self._grid_v.flatten()
+        lame = [lame_parameters(*each) for each in zip(properties.young_modulus, properties.poisson_ratio)]
+        self.mu, self.lam = np.array(lame).T  # [M] Pa each
+        # What holds a node is stiffer than the tissue beside it, so that it gives way a few per cent at most.
+        stiffness_of_hold = PIN_STIFFNESS * scale.max() * (self.lam + 2 * self.mu) * np.cbrt(nodes.volumes)
+        self.nodes = Nodes()
+        self.nodes.X = self._array((rest - self.origin).astype(np.float32), wp.vec3)
+        self.nodes.mass = self._array(nodes.volumes * properties.density, float)
+        self.nodes.volume = self._array(nodes.volumes, float)
+        self.nodes.mu, self.nodes.lam = self._array(self.mu, float), self._array(self.lam, float)
+        self.nodes.viscosity = self._array(np.full(len(nodes), config.viscosity), float)
+        self.nodes.stiffness = self._array(stiffness_of_hold, float)
+        self._scale = self._array(scale, float)
+        count = environments * len(nodes)
+        self.pin_springs = self._array(np.tile(stiffness_of_hold * nodes.pinned, environments), float)  # [B · M] N/m
+        self.loads = Loads()
+        self.loads.force, self.loads.target, self.loads.target_v = (self._zeros(count, wp.vec3) for _ in range(3))
+        self.loads.spring = wp.clone(self.pin_springs)
+        self.loads.holder = wp.full(count, -1, dtype=int, device=self.device)
+        self.rigid = RigidTools()
+        self.rigid.count, self.rigid.friction = tools, config.friction
+        self.rigid.tip, self.rigid.tip_v, self.rigid.end, self.rigid.end_v = (self._zeros(environments * tools, wp.vec3) for _ in range(4))
+        self.rigid.radius = self._zeros(environments * tools, float)
+        self.rigid.impulse = self._zeros(count * tools, wp.vec3)
+        self.state, self._backup = self._new_state(), self._new_state()
+        self.bad_nodes = self._zeros(environments, int)  # in the last step; where there were any it was undone
+        self._speed_sq = self._zeros(environments, float)
+        self._substep = Substep()
+        self._substep.dt = self.substepping.dt
+        self._substep.decay = math.exp(-config.damping * self.substepping.dt)
+        self._substep.gravity = wp.vec3(*config.gravity)
+        self._before: list[Launch] = []
+        self._after: list[Launch] = []
+        self._vectorised = vectorised and self.device == "cpu" and config.material in STRESSES
         self._advance: Callable[[], None] | None = None
+        self.set_cut(np.empty(0, int), np.empty((0, 27), int), 0)
         self.reset()
+
+    def _array(self, values: np.ndarray, dtype) -> wp.array:
+        values = np.ascontiguousarray(values, np.int32 if dtype is int else np.float32)
+        return wp.array(values, dtype=dtype, device=self.device)
+
+    def _zeros(self, count: int, dtype) -> wp.array:
+        return wp.zeros(count, dtype, device=self.device)
+
+    def _new_state(self) -> State:
+        state, count = State(), self.environments * self.node_count
+        state.u, state.v = self._zeros(count, wp.vec3), self._zeros(count, wp.vec3)
+        state.C, state.F = self._zeros(count, wp.mat33), self._zeros(count, wp.mat33)
+        return state
+
+    def reset(self, environments: torch.Tensor | slice = slice(None)) -> None:
+        """Back to rest, no force, nothing held but the pinned nodes, in these environments."""
+        shape = (self.environments, self.node_count)
+
+        def of(array: wp.array) -> torch.Tensor:
+            values = wp.to_torch(array)
+            return values.view(*shape, *values.shape[1:])
+
+        for array in (self.loads.force, self.loads.target, self.loads.target_v, self.state.u, self.state.v, self.state.C):
+            of(array)[environments] = 0
+        of(self.state.F)[environments] = torch.eye(3, device=self.device)
+        of(self.loads.holder)[environments] = -1
+        of(self.loads.spring)[environments] = of(self.pin_springs)[environments]
+
+    def set_cut(self, affected: np.ndarray, table: np.ndarray, extra: int) -> None:
+        """Let nodes beside a cut transfer to grid nodes of their own side.
+
+        Args:
+            affected: Numbers of these nodes [A].
+            table: Numbers of the 27 grid nodes of each [A, 27], k fastest; those beyond the regular grid are copies.
+            extra: Number of the copies.
+
+        Raises:
+            ValueError: With current kinematics, whose nodes change their grid nodes in every substep.
+        """
+        if len(affected) and self.config.kinematics == "current":
+            raise ValueError("tissue with current kinematics cannot be cut; use kinematics rest")
+        self._grid.count = math.prod(self.grid_shape) + extra
+        row = np.full(self.node_count, -1)
+        row[affected] = np.arange(len(affected))
+        self.nodes.row = self._array(row, int)
+        self.nodes.table = self._array(np.asarray(table).ravel() if len(affected) else np.zeros(1), int)
+        self._table = row, np.asarray(table, np.int64)
+        self._advance = None
         if self.device == "cpu":  # now, where nobody waits, rather than when the tissue is first touched
             self._advance = self._prepare()
 
-    def reset(self) -> None:
-        """Back to rest, no force, nothing held but the pinned nodes."""
-        self.hold(np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3)))
-        for array in (self._nodes.force, self._nodes.u, self._nodes.v, self._nodes.C):
-            array.zero_()
-        self._nodes.F.fill_(wp.mat33(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))
+    def surround(self, before: list[Launch], after: list[Launch]) -> None:
+        """Make these launches part of every step, on a GPU of the one graph that it is."""
+        self._before, self._after = before, after
+        self._advance = self._prepare() if self.device == "cpu" else None
 
-    def set_forces(self, forces: np.ndarray) -> None:
-        """Forces on the nodes [M, 3], N, world; kept until set again."""
-        self._nodes.force.assign(np.ascontiguousarray(forces, np.float32))
+    def launch(self, launch: Launch) -> None:
+        """Launch now."""
+        wp.launch(launch.kernel, launch.dim, launch.inputs, device=self.device)
 
-    def hold(self, nodes: np.ndarray, start: np.ndarray, end: np.ndarray) -> None:
-        """Springs pull these nodes [K] along: displacements [K, 3] m at the start and at the end of the next step.
-
-        Pinned nodes stay held; all others are free. Kept until called again.
-        """
-        spring = self._pin_stiffness.copy()
-        spring[nodes] = self._hold_stiffness[nodes]
-        targets = np.zeros((2, len(spring), 3))
-        targets[:, nodes] = start, (end - start) / self.config.step_duration
-        for array, values in zip((self._nodes.spring, self._nodes.target, self._nodes.target_v), (spring, *targets)):
-            array.assign(np.ascontiguousarray(values, np.float32))
-
-    def holding_forces(self, nodes: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """Forces [K, 3] N that the springs exert on these nodes [K] at the end of the step, for the ``end`` given to `hold`."""
-        return self._hold_stiffness[nodes, None] * (end - self._nodes.u.numpy()[nodes])
+    def step(self) -> None:
+        """Take one step in every environment."""
+        if self._advance is None:
+            self._advance = self._prepare()
+        self._advance()
 
     @property
     def speed(self) -> float:
         """Speed of the fastest node at the end of the last step, m/s."""
-        return math.sqrt(max(float(self._speed_sq.numpy()[0]), 0.0))
-
-    def step(self) -> int:
-        """Take one step; returns how many nodes ended it non-finite or out of bounds (0 = a good step)."""
-        if self._advance is None:
-            self._advance = self._prepare()
-        self._advance()
-        return int(self._fault.numpy()[0])
+        return math.sqrt(max(float(self._speed_sq.numpy().max()), 0.0))
 
     def _prepare(self) -> Callable[[], None]:
-        """The whole step as one call; forces are read from their device array every time."""
-        advance = make_advance_kernel(self.config.material, self.config.kinematics)
-        for kernel in (advance, update_grid, check_nodes):
-            wp.load_module(kernel.module, device=self.device)
+        """The whole step as one call; loads and tools are read from their device arrays every time."""
         if self.device == "cpu":
             # No graph: a capture on the CPU takes in, and does not run, what other threads of the process launch meanwhile.
-            actions = self._actions(advance, lambda *arguments: wp.launch(*arguments, device="cpu", record_cmd=True).launch)
+            actions = self._actions()
             return lambda: [action() for action in actions]
+        actions = self._actions()
         with capturing, wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
-            for action in self._actions(advance, lambda *arguments: partial(wp.launch, *arguments, device=self.device)):
+            for action in actions:
                 action()
         return partial(wp.capture_launch, capture.graph)
 
-    def _actions(self, advance: wp.Kernel, launch: Callable[..., Callable[[], None]]) -> list[Callable[[], None]]:
-        """What one step does, in order; ``launch`` turns kernel, size and inputs into an action."""
-        dt, count = self.substepping.dt, self.substepping.count
-        gravity = wp.vec3(*self.config.gravity)
-        decay = math.exp(-self.config.damping * dt)
-        constants = [self._nodes, self._grid, dt, gravity, self.mu, self.lam]
-        actions = [partial(wp.copy, backup, array) for array, backup in zip(self._state, self._backup)]
-        actions += [array.zero_ for array in (self._fault, self._speed_sq, self._grid_mv)]
-        update = launch(update_grid, len(self._flat_mv), [decay, self._flat_mv, self._flat_v])
-        for substep in range(count + 1):
-            gather, scatter = int(substep > 0), int(substep < count)
-            if gather:
-                actions.append(update)
-            inputs = [*constants, (substep + 1) * dt, gather, scatter, self._grid_v, self._grid_mv]
-            actions.append(launch(advance, len(self._nodes.X), inputs))
-        inputs = [self._nodes.u, self._nodes.v, self._nodes.F, self.config.travel, self._fault, self._speed_sq]
-        return [*actions, launch(check_nodes, len(self._nodes.X), inputs)]
+    def _actions(self) -> list[Callable[[], None]]:
+        """What one step does, in order; memory and modules are ready when it returns."""
+        every, count = (self.environments, self.node_count), self.node_count
+        check = [self.state, count, self.config.travel, self.bad_nodes, self._speed_sq]
+        actions = [self._action(launch) for launch in self._before]
+        for name in ("u", "v", "C", "F"):
+            actions.append(partial(wp.copy, getattr(self._backup, name), getattr(self.state, name)))
+        actions += [array.zero_ for array in (self.bad_nodes, self._speed_sq, self.rigid.impulse)]
+        actions += self._vectorised_step() if self._vectorised else self._launched_substeps()
+        actions.append(self._action(Launch(check_nodes, every, check)))
+        actions.append(self._action(Launch(undo_bad_steps, every, [self.bad_nodes, count, self._backup, self.state])))
+        return actions + [self._action(launch) for launch in self._after]
 
-    def restore(self) -> None:
-        """Return to the state before the last step, at rest there."""
-        for array, backup in zip(self._state, self._backup):
-            wp.copy(array, backup)
-        self._nodes.v.zero_()
-        self._nodes.C.zero_()
+    def _action(self, launch: Launch) -> Callable[[], None]:
+        """The launch as a call."""
+        wp.load_module(launch.kernel.module, device=self.device)
+        arguments = (launch.kernel, launch.dim, launch.inputs)
+        if self.device == "cpu":
+            return wp.launch(*arguments, device="cpu", record_cmd=True).launch
+        return partial(wp.launch, *arguments, device=self.device)
 
-    def displacements(self) -> np.ndarray:
+    def _vectorised_step(self) -> list[Callable[[], None]]:
+        """CPU: one launch for all substeps; environments are shared out among threads, each with its scratch memory."""
+        kernel = make_step_kernel(self.config.material, self.config.kinematics)
+        slots = min(cpu_threads(), self.environments)
+        first = np.clip(np.floor(self.rest_cells - 0.5).astype(int), 0, np.array(self.grid_shape) - 3)
+        padded = -(-self.node_count // LANES) * LANES
+        order = np.full(padded, -1)
+        order[: self.node_count] = np.lexsort(first.T[::-1])
+        scratch = [self._array(order, int)]
+        scratch += [self._zeros(slots * 4 * (self._grid.count + 4), float) for _ in range(2)]
+        scratch += [self._zeros(slots * SCRATCH * padded, float), self._zeros(slots * padded, int)]
+        scratch += [self._zeros(slots * 4 * padded, float), wp.full(slots * padded, -1, dtype=int, device="cpu")]
+        inputs = [self.nodes, self.state, self.loads, self.rigid, self._grid, self._substep, self.substepping.count]
+        ends = [self.environments * slot // slots for slot in range(slots + 1)]
+        launches = [
+            self._action(Launch(kernel, end - begin, [begin, slot, *inputs, self._scale, *scratch]))
+            for slot, (begin, end) in enumerate(zip(ends, ends[1:]))
+        ]
+        return [lambda: run_in_threads(launches)]
+
+    def _launched_substeps(self) -> list[Callable[[], None]]:
+        """Two launches for each substep with rest kinematics, three with current kinematics."""
+        current = self.config.kinematics == "current"
+        advance = make_advance_kernel(self.config.material, self.config.kinematics)
+        every, grid_count = (self.environments, self.node_count), self.environments * self._grid.count
+        transfer = Transfer()
+        transfer.q, transfer.A = self._zeros(math.prod(every), wp.vec3), self._zeros(math.prod(every), wp.mat33)
+        transfer.mass, transfer.pull = self._zeros(math.prod(every), float), self._zeros(math.prod(every), wp.vec4)
+        transfer.giver = wp.full(math.prod(every), -1, dtype=int, device=self.device)
+        grid_v, decay = self._zeros(grid_count, wp.vec3), self._substep.decay
+        if current:
+            grid_mv = self._zeros(grid_count, wp.vec4)
+            collecting = [
+                self._action(Launch(scatter, every, [self.nodes, self.state, transfer, self._grid, grid_mv])),
+                self._action(Launch(update_grid, grid_count, [decay, grid_mv, grid_v])),
+            ]
+            actions = [grid_mv.zero_]
+        else:
+            lanes, entries = 1 if self.device == "cpu" else 32, self._entries()
+            inputs = [*entries, lanes, self.node_count, self._grid, decay, transfer, grid_v]
+            collecting = [self._action(Launch(collect, (self.environments, len(entries[-1]), lanes), inputs))]
+            actions = []
+        constants = [self.nodes, self.state, self.loads, self.rigid, transfer, self._grid, self._substep, self._scale]
+        for substep in range(self.substepping.count + 1):
+            halves = [int(substep > 0), int(substep < self.substepping.count)]
+            time = (substep + 1) * self.substepping.dt
+            actions.append(self._action(Launch(advance, every, [*constants, time, *halves, grid_v])))
+            if substep < self.substepping.count:
+                actions += collecting
+        return actions
+
+    def _entries(self) -> tuple[wp.array, wp.array, wp.array, wp.array]:
+        """For each grid node the nodes that give to it, as `collect` reads them."""
+        first = np.clip(np.floor(self.rest_cells - 0.5).astype(int), 0, np.array(self.grid_shape) - 3)
+        steps = np.stack(np.meshgrid(*[np.arange(3)] * 3, indexing="ij"), -1).reshape(27, 3)
+        f = self.rest_cells - first  # [M, 3]
+        splines = np.stack([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1) ** 2, 0.5 * (f - 0.5) ** 2], -1)  # [M, 3, 3]
+        weights = splines[:, 0, steps[:, 0]] * splines[:, 1, steps[:, 1]] * splines[:, 2, steps[:, 2]]  # [M, 27]
+        corners = first[:, None] + steps
+        numbers = np.ravel_multi_index(tuple(np.moveaxis(corners, -1, 0)), self.grid_shape)
+        row, table = self._table
+        numbers[row >= 0] = table[row[row >= 0]]
+        offsets = np.concatenate([steps - f[:, None], weights[..., None]], -1).reshape(-1, 4)
+        order = np.argsort(numbers.ravel(), kind="stable")
+        places, counts = np.unique(numbers, return_counts=True)
+        starts = np.concatenate([[0], np.cumsum(counts)])
+        members = np.repeat(np.arange(self.node_count), 27)[order]
+        return (
+            self._array(starts, int),
+            self._array(members, int),
+            self._array(offsets[order], wp.vec4),
+            self._array(places, int),
+        )
+
+    def displacements(self, environment: int = 0) -> np.ndarray:
         """Displacements [M, 3], m, world axes. Those of pinned nodes are how far their springs give way."""
-        return self._nodes.u.numpy().copy()
+        return self._of(self.state.u, environment)
 
-    def deformation_gradients(self) -> np.ndarray:
+    def deformation_gradients(self, environment: int = 0) -> np.ndarray:
         """F of all nodes [M, 3, 3]."""
-        return self._nodes.F.numpy().copy()
+        return self._of(self.state.F, environment)
 
-    def momentum(self) -> np.ndarray:
-        """Total linear momentum of the nodes [3], kg·m/s."""
-        return (self._nodes.mass.numpy().astype(np.float64)[:, None] * self._nodes.v.numpy()).sum(0)
+    def _of(self, array: wp.array, environment: int) -> np.ndarray:
+        return array.numpy()[environment * self.node_count : (environment + 1) * self.node_count].copy()
 
-    def energy(self) -> tuple[float, float]:
+    def momentum(self, environment: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """Linear momentum [3], kg·m/s, and angular momentum about the grid's corner [3], kg·m²/s, of all nodes.
+
+        The angular momentum has the part Σ m h²/4 ε : C that APIC carries in C."""
+        mass = self.nodes.mass.numpy().astype(np.float64)[:, None]
+        v, C = (self._of(array, environment).astype(np.float64) for array in (self.state.v, self.state.C))
+        x = self.nodes.X.numpy().astype(np.float64) + self.displacements(environment)
+        spin = np.stack([C[:, 2, 1] - C[:, 1, 2], C[:, 0, 2] - C[:, 2, 0], C[:, 1, 0] - C[:, 0, 1]], 1)
+        return (mass * v).sum(0), (mass * (np.cross(x, v) + self.cell_size**2 / 4 * spin)).sum(0)
+
+    def energy(self, environment: int = 0) -> tuple[float, float]:
         """Kinetic energy (with the affine motion that APIC carries) and elastic energy, J."""
-        mass, volume = self._nodes.mass.numpy().astype(np.float64), self._nodes.volume.numpy().astype(np.float64)
-        v, C = self._nodes.v.numpy().astype(np.float64), self._nodes.C.numpy().astype(np.float64)
+        mass, volume = self.nodes.mass.numpy().astype(np.float64), self.nodes.volume.numpy().astype(np.float64)
+        v, C = (self._of(array, environment).astype(np.float64) for array in (self.state.v, self.state.C))
         kinetic = 0.5 * (mass * ((v**2).sum(1) + self.cell_size**2 / 4 * (C**2).sum((1, 2)))).sum()
-        F = torch.from_numpy(self._nodes.F.numpy()).double()
-        density = energy_density(self.config.material, F, self.mu, self.lam).numpy()
-        return float(kinetic), float((volume * density).sum())
+        F = torch.from_numpy(self.deformation_gradients(environment)).double()
+        scale = float(self._scale.numpy()[environment])
+        mu, lam = (torch.from_numpy(scale * values) for values in (self.mu, self.lam))
+        return float(kinetic), float((volume * energy_density(self.config.material, F, mu, lam).numpy()).sum())

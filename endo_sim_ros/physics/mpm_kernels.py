@@ -8,52 +8,109 @@ For node p with weights w at grid nodes i (a distance d = X_i − X_p away), cel
 
 With current kinematics X is the current position, S = τ and F ← (I + Δt C) F. With rest kinematics (total Lagrangian,
 de Vaucorbeil et al. 2020) X is the rest position, S = P and F ← F + Δt C; the weights then never change, so stretched
-tissue cannot lose contact with itself.
+tissue cannot lose contact with itself, and each grid node can add up its own nodes, in a fixed order: no atomics, and
+the same bits in every run.
 
-The state is a displacement u from rest in the solver's local frame, all float32. G2P of one substep and P2G of the
-next share a kernel, so that one substep is two launches.
+The state is a displacement u from rest in the solver's local frame, all float32. A launch covers all environments,
+which are independent copies of the same nodes: node p of environment b is element b M + p.
 
 Pinned nodes are held by springs k to the displacement u* = 0, grasped ones to a u* that moves evenly through the step;
 k is zero for all others. Δt² k is the springs' implicit part, lumped, which makes them stable at any stiffness. (Holding
 grid nodes instead puts the wall up to half a cell off, and kinematic nodes without stress leave the tissue next to the
-wall hanging on nothing.)
+wall hanging on nothing.) Rigid tools push in the same way, see `push_of_tools`; what springs and tools give to a node
+is added up as impulses, so that the reaction is what the tissue really got.
 """
 
 import functools
 
 import warp as wp
 
-from endo_sim_ros.physics.materials import MATERIALS, kirchhoff_stress
+from endo_sim_ros.physics.materials import MATERIALS, kelvin_voigt, kirchhoff_stress
 
 wp.set_module_options({"enable_backward": False})
+
+PUSH_OUT = 0.1  # m/s; a tool that suddenly is deep within tissue pushes it out no faster than this
 
 
 @wp.struct
 class Grid:
-    """A regular grid whose node (i, j, k) lies at h (i, j, k) in the local frame."""
+    """A regular grid whose node (i, j, k) lies at h (i, j, k) in the local frame and is number (i ny + j) nz + k.
+    Behind the regular nodes lie copies of those that a cut has split; `count` is the number of all."""
 
     h: float
     inverse_h: float
     nx: int
     ny: int
     nz: int
+    count: int
 
 
 @wp.struct
 class Nodes:
-    """All nodes, shape [M] each: constants, the force on each and the state."""
+    """What all environments share [M]."""
 
     X: wp.array[wp.vec3]  # rest position, local, m
     mass: wp.array[float]  # kg
     volume: wp.array[float]  # at rest, m³
-    spring: wp.array[float]  # N/m, of pinned and grasped nodes; zero where free
-    target: wp.array[wp.vec3]  # displacement u* at the start of the step that the spring pulls to, m
-    target_v: wp.array[wp.vec3]  # its velocity during the step, m/s
-    force: wp.array[wp.vec3]  # N
+    mu: wp.array[float]  # Lamé's parameters, Pa
+    lam: wp.array[float]
+    viscosity: wp.array[float]  # Pa·s
+    stiffness: wp.array[float]  # N/m, of what holds or pushes the node
+    row: wp.array[int]  # in the table, of nodes beside a cut; -1 for all others
+    table: wp.array[int]  # [A · 27] numbers of the grid nodes of each such node, k fastest
+
+
+@wp.struct
+class State:
+    """What is stepped, all [B · M]."""
+
     u: wp.array[wp.vec3]  # displacement, m
     v: wp.array[wp.vec3]  # velocity, m/s
     C: wp.array[wp.mat33]  # APIC matrix: velocity gradient, 1/s
     F: wp.array[wp.mat33]  # deformation gradient
+
+
+@wp.struct
+class Loads:
+    """What acts on each node during the step, all [B · M]."""
+
+    force: wp.array[wp.vec3]  # N
+    spring: wp.array[float]  # N/m, of pinned and grasped nodes; zero where free
+    target: wp.array[wp.vec3]  # displacement u* at the start of the step that the spring pulls to, m
+    target_v: wp.array[wp.vec3]  # its velocity during the step, m/s
+    holder: wp.array[int]  # tool whose jaw the spring belongs to, -1 = none
+
+
+@wp.struct
+class RigidTools:
+    """Capsules in the local frame, all [B · T]; their ends move evenly through the step."""
+
+    count: int  # T
+    friction: float  # Coulomb's coefficient
+    tip: wp.array[wp.vec3]  # one end at the start of the step, m
+    tip_v: wp.array[wp.vec3]  # m/s
+    end: wp.array[wp.vec3]  # the other
+    end_v: wp.array[wp.vec3]
+    radius: wp.array[float]  # m; zero or less: touches nothing
+    impulse: wp.array[wp.vec3]  # out [B · T · M]: what each gave to each node during the step, N·s
+
+
+@wp.struct
+class Transfer:
+    """From nodes to the grid, all [B · M]."""
+
+    q: wp.array[wp.vec3]  # momentum at the node, kg·m/s
+    A: wp.array[wp.mat33]  # its growth per cell of distance
+    mass: wp.array[float]  # with the implicit part of springs and contact, kg
+    pull: wp.array[wp.vec4]  # the part of q and of mass that springs and contact gave
+    giver: wp.array[int]  # tool that gave it, -1 = none
+
+
+@wp.struct
+class Substep:
+    dt: float  # s
+    decay: float  # exp(-c Δt)
+    gravity: wp.vec3  # m/s²
 
 
 @wp.func
@@ -75,50 +132,106 @@ def first_cell(x: float, n: int) -> int:
     return 0
 
 
+@wp.func
+def grid_node(nodes: Nodes, row: int, entry: int, regular: int) -> int:
+    """Number of a grid node: the regular one, or the one in the table for a node beside a cut."""
+    if row < 0:
+        return regular
+    return nodes.table[27 * row + entry]
+
+
+@wp.func
+def push_of_tools(tools: RigidTools, first: int, x: wp.vec3, v: wp.vec3, mass: float, stiffness: float, dt: float, time: float):
+    """Momentum (x, y, z) and mass (w) by which the tool that a node is about to enter deepest pushes it out, and which.
+
+    The tool is where it will be at the end of the substep, `time`. The node is drawn to the tool's surface along the
+    normal n by an implicit spring k, mass Δt² k, with normal velocity −φ/Δt; along the surface that mass moves with the
+    node, less what Coulomb's friction takes from the velocity relative to the tool.
+    """
+    deepest = float(0.0)
+    giver = int(-1)
+    normal, along = wp.vec3(), wp.vec3()
+    outward = float(0.0)
+    for t in range(tools.count):
+        radius = tools.radius[first + t]
+        if radius > 0.0:
+            tip = tools.tip[first + t] + time * tools.tip_v[first + t]
+            axis = tools.end[first + t] + time * tools.end_v[first + t] - tip
+            share = wp.clamp(wp.dot(x - tip, axis) / wp.max(wp.length_sq(axis), 1.0e-12), 0.0, 1.0)
+            arm = x - tip - share * axis
+            distance = wp.length(arm)
+            if distance > 1.0e-9:
+                n = arm / distance
+                gap = distance - radius
+                if gap + dt * wp.dot(v, n) < deepest:
+                    deepest = gap + dt * wp.dot(v, n)
+                    giver = t
+                    normal = n
+                    along = tools.tip_v[first + t] + share * (tools.end_v[first + t] - tools.tip_v[first + t])
+                    outward = wp.min(-gap / dt, wp.max(wp.dot(along, n), 0.0) + PUSH_OUT)
+    pull = wp.vec4()
+    if giver >= 0:
+        added = dt * dt * stiffness
+        slip = v - along - wp.dot(v - along, normal) * normal
+        lost = tools.friction * added * wp.max(outward - wp.dot(v, normal), 0.0) / (mass + added)
+        kept = wp.max(1.0 - lost / wp.max(wp.length(slip), 1.0e-12), 0.0)
+        p = added * (outward * normal + along - wp.dot(along, normal) * normal + kept * slip)
+        pull = wp.vec4(p[0], p[1], p[2], added)
+    return pull, giver
+
+
 @functools.cache
 def make_advance_kernel(material: str, kinematics: str):
-    """The kernel that takes grid velocities to nodes (G2P) and nodes to grid momenta (P2G); either half can be off."""
+    """The kernel that takes grid velocities to nodes (G2P) and prepares what they give back; either half can be off."""
     stress_of = MATERIALS[material][0]
     current = kinematics == "current"
 
     @wp.kernel(enable_backward=False, module="unique")
     def advance(
         nodes: Nodes,
+        state: State,
+        loads: Loads,
+        tools: RigidTools,
+        transfer: Transfer,
         grid: Grid,
-        dt: float,
-        gravity: wp.vec3,
-        mu: float,
-        lam: float,
-        time: float,  # since the start of the step
+        step: Substep,
+        scale: wp.array[float],  # of each environment's moduli
+        time: float,  # at the end of the substep, since the start of the step
         gather: int,
         scatter: int,
-        grid_v: wp.array3d[wp.vec3],
-        grid_mv: wp.array3d[wp.vec4],
+        grid_v: wp.array[wp.vec3],  # [B · count]
     ):
-        p = wp.tid()
-        u = nodes.u[p]
-        v = nodes.v[p]
-        C = nodes.C[p]
-        F = nodes.F[p]
+        b, p = wp.tid()
+        count = nodes.X.shape[0]
+        e = b * count + p
+        dt = step.dt
+        u = state.u[e]
+        v = state.v[e]
+        C = state.C[e]
+        F = state.F[e]
         X = nodes.X[p]
-        x = X * grid.inverse_h
-        if wp.static(current):
-            x = (X + u) * grid.inverse_h
-        i0, j0, k0 = first_cell(x[0], grid.nx), first_cell(x[1], grid.ny), first_cell(x[2], grid.nz)
-        f = wp.vec3(x[0] - float(i0), x[1] - float(j0), x[2] - float(k0))
-        wx, wy, wz = spline(f[0]), spline(f[1]), spline(f[2])
 
         if gather != 0:
+            x = X * grid.inverse_h
+            if wp.static(current):
+                x = (X + u) * grid.inverse_h
+            i0, j0, k0 = first_cell(x[0], grid.nx), first_cell(x[1], grid.ny), first_cell(x[2], grid.nz)
+            f = wp.vec3(x[0] - float(i0), x[1] - float(j0), x[2] - float(k0))
+            wx, wy, wz = spline(f[0]), spline(f[1]), spline(f[2])
+            row = nodes.row[p]
+            first = b * grid.count
             v = wp.vec3()
             cx, cy, cz = wp.vec3(), wp.vec3(), wp.vec3()  # columns of Σ w v_i (i, j, k)
             for i in range(3):
                 plane, plane_y, plane_z = wp.vec3(), wp.vec3(), wp.vec3()
                 for j in range(3):
-                    g1 = wz[1] * grid_v[i0 + i, j0 + j, k0 + 1]
-                    g2 = wz[2] * grid_v[i0 + i, j0 + j, k0 + 2]
-                    row = wz[0] * grid_v[i0 + i, j0 + j, k0] + g1 + g2
-                    plane += wy[j] * row
-                    plane_y += wy[j] * float(j) * row
+                    regular = ((i0 + i) * grid.ny + j0 + j) * grid.nz + k0
+                    entry = 9 * i + 3 * j
+                    g1 = wz[1] * grid_v[first + grid_node(nodes, row, entry + 1, regular + 1)]
+                    g2 = wz[2] * grid_v[first + grid_node(nodes, row, entry + 2, regular + 2)]
+                    line = wz[0] * grid_v[first + grid_node(nodes, row, entry, regular)] + g1 + g2
+                    plane += wy[j] * line
+                    plane_y += wy[j] * float(j) * line
                     plane_z += wy[j] * (g1 + 2.0 * g2)
                 v += wx[i] * plane
                 cx += wx[i] * float(i) * plane
@@ -131,43 +244,108 @@ def make_advance_kernel(material: str, kinematics: str):
                 F += dt * (C * F)
             else:
                 F += dt * C
-            nodes.u[p] = u
-            nodes.v[p] = v
-            nodes.C[p] = C
-            nodes.F[p] = F
-            if wp.static(current):
-                x = (X + u) * grid.inverse_h
-                i0, j0, k0 = first_cell(x[0], grid.nx), first_cell(x[1], grid.ny), first_cell(x[2], grid.nz)
-                f = wp.vec3(x[0] - float(i0), x[1] - float(j0), x[2] - float(k0))
-                wx, wy, wz = spline(f[0]), spline(f[1]), spline(f[2])
+            state.u[e] = u
+            state.v[e] = v
+            state.C[e] = C
+            state.F[e] = F
+            giver = transfer.giver[e]
+            if giver >= 0:
+                pull = transfer.pull[e]
+                given = wp.vec3(pull[0], pull[1], pull[2]) - (pull[3] / step.decay) * v
+                tools.impulse[(b * tools.count + giver) * count + p] += given
 
         if scatter != 0:
             mass = nodes.mass[p]
-            S = stress_of(F, mu, lam)
+            rate = C
+            if wp.static(current):
+                rate = C * F
+            S = scale[b] * (stress_of(F, nodes.mu[p], nodes.lam[p]) + kelvin_voigt(F, rate, nodes.viscosity[p]))
             if wp.static(current):
                 S = kirchhoff_stress(S, F)
-            A = (mass * grid.h) * C - (dt * 4.0 * grid.inverse_h * nodes.volume[p]) * S  # per cell of distance
-            spring = nodes.spring[p]
-            stretch = u - nodes.target[p] - time * nodes.target_v[p]
-            q = mass * (v + dt * gravity) + dt * (nodes.force[p] - spring * stretch) - A * f
-            ax = wp.vec4(A[0, 0], A[1, 0], A[2, 0], 0.0)
-            ay = wp.vec4(A[0, 1], A[1, 1], A[2, 1], 0.0)
-            az = wp.vec4(A[0, 2], A[1, 2], A[2, 2], 0.0)
-            corner = wp.vec4(q[0], q[1], q[2], mass + dt * dt * spring)
-            for i in range(3):
-                for j in range(3):
-                    w = wx[i] * wy[j]
-                    edge = corner + float(i) * ax + float(j) * ay
-                    wp.atomic_add(grid_mv, i0 + i, j0 + j, k0, w * wz[0] * edge)
-                    wp.atomic_add(grid_mv, i0 + i, j0 + j, k0 + 1, w * wz[1] * (edge + az))
-                    wp.atomic_add(grid_mv, i0 + i, j0 + j, k0 + 2, w * wz[2] * (edge + 2.0 * az))
+            spring = loads.spring[e]
+            pull = wp.vec4()
+            giver = int(-1)
+            if spring > 0.0:
+                giver = loads.holder[e]
+                back = (-dt * spring) * (u - loads.target[e] - time * loads.target_v[e])
+                pull = wp.vec4(back[0], back[1], back[2], dt * dt * spring)
+            else:
+                pull, giver = push_of_tools(tools, b * tools.count, X + u, v, mass, nodes.stiffness[p], dt, time)
+            transfer.pull[e] = pull
+            transfer.giver[e] = giver
+            transfer.q[e] = mass * (v + dt * step.gravity) + dt * loads.force[e] + wp.vec3(pull[0], pull[1], pull[2])
+            transfer.mass[e] = mass + pull[3]
+            transfer.A[e] = (mass * grid.h) * C - (dt * 4.0 * grid.inverse_h * nodes.volume[p]) * S
 
     return advance
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    for (int offset = 16; offset > 0; offset /= 2)
+        value += __shfl_xor_sync(0xffffffffu, value, offset);
+#endif
+    return value;
+""")
+def lane_sum(value: float) -> float:
+    """Sum over the 32 lanes of a warp on a GPU, in the same order every time; on a CPU there is one lane."""
+    ...
+
+
+@wp.kernel
+def collect(
+    starts: wp.array[int],  # [n + 1] of the entries of each grid node that has any
+    members: wp.array[int],  # [E] nodes that give to it
+    offsets: wp.array[wp.vec4],  # [E] from node to grid node, cells, and weight
+    places: wp.array[int],  # [n] numbers of the grid nodes
+    lanes: int,
+    count: int,  # M
+    grid: Grid,
+    decay: float,
+    transfer: Transfer,
+    grid_v: wp.array[wp.vec3],
+):
+    """Grid velocities with decay, each grid node adding up what its nodes give. For rest kinematics, whose weights stay."""
+    b, n, lane = wp.tid()
+    x, y, z, mass = float(0.0), float(0.0), float(0.0), float(0.0)
+    for entry in range(starts[n] + lane, starts[n + 1], lanes):
+        e = b * count + members[entry]
+        offset = offsets[entry]
+        q = transfer.q[e] + transfer.A[e] * wp.vec3(offset[0], offset[1], offset[2])
+        x += offset[3] * q[0]
+        y += offset[3] * q[1]
+        z += offset[3] * q[2]
+        mass += offset[3] * transfer.mass[e]
+    x, y, z, mass = lane_sum(x), lane_sum(y), lane_sum(z), lane_sum(mass)
+    if lane == 0:
+        v = wp.vec3()
+        if mass > 0.0:
+            v = (decay / mass) * wp.vec3(x, y, z)
+        grid_v[b * grid.count + places[n]] = v
+
+
+@wp.kernel
+def scatter(nodes: Nodes, state: State, transfer: Transfer, grid: Grid, grid_mv: wp.array[wp.vec4]):
+    """Grid momenta and masses, each node adding what it gives. For current kinematics."""
+    b, p = wp.tid()
+    e = b * nodes.X.shape[0] + p
+    x = (nodes.X[p] + state.u[e]) * grid.inverse_h
+    i0, j0, k0 = first_cell(x[0], grid.nx), first_cell(x[1], grid.ny), first_cell(x[2], grid.nz)
+    f = wp.vec3(x[0] - float(i0), x[1] - float(j0), x[2] - float(k0))
+    wx, wy, wz = spline(f[0]), spline(f[1]), spline(f[2])
+    q, A, mass = transfer.q[e], transfer.A[e], transfer.mass[e]
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                given = q + A * wp.vec3(float(i) - f[0], float(j) - f[1], float(k) - f[2])
+                w = wx[i] * wy[j] * wz[k]
+                place = b * grid.count + ((i0 + i) * grid.ny + j0 + j) * grid.nz + k0 + k
+                wp.atomic_add(grid_mv, place, w * wp.vec4(given[0], given[1], given[2], mass))
+
+
 @wp.kernel
 def update_grid(decay: float, grid_mv: wp.array[wp.vec4], grid_v: wp.array[wp.vec3]):
-    """Momenta to velocities with decay exp(−c Δt), then clear the momenta. The grid is flat here: [nx · ny · nz]."""
+    """Momenta to velocities with decay, then clear the momenta. For current kinematics."""
     i = wp.tid()
     q = grid_mv[i]
     v = wp.vec3()
@@ -178,16 +356,22 @@ def update_grid(decay: float, grid_mv: wp.array[wp.vec4], grid_v: wp.array[wp.ve
 
 
 @wp.kernel
-def check_nodes(
-    u: wp.array[wp.vec3],
-    v: wp.array[wp.vec3],
-    F: wp.array[wp.mat33],
-    travel: float,
-    fault: wp.array[int],
-    speed_sq: wp.array[float],
-):
+def check_nodes(state: State, count: int, travel: float, faults: wp.array[int], speed_sq: wp.array[float]):
     """Count nodes that are not finite or out of bounds (the comparisons are false for NaN) and find the largest v²."""
-    p = wp.tid()
-    if not (wp.length_sq(u[p]) <= travel * travel and wp.ddot(F[p], F[p]) < 1.0e4):
-        wp.atomic_add(fault, 0, 1)
-    wp.atomic_max(speed_sq, 0, wp.length_sq(v[p]))
+    b, p = wp.tid()
+    e = b * count + p
+    if not (wp.length_sq(state.u[e]) <= travel * travel and wp.ddot(state.F[e], state.F[e]) < 1.0e4):
+        wp.atomic_add(faults, b, 1)
+    wp.atomic_max(speed_sq, b, wp.length_sq(state.v[e]))
+
+
+@wp.kernel
+def undo_bad_steps(faults: wp.array[int], count: int, backup: State, state: State):
+    """Environments with faults return to the state before the step, at rest there."""
+    b, p = wp.tid()
+    e = b * count + p
+    if faults[b] > 0:
+        state.u[e] = backup.u[e]
+        state.F[e] = backup.F[e]
+        state.v[e] = wp.vec3()
+        state.C[e] = wp.mat33()

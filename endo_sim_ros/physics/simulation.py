@@ -1,14 +1,81 @@
-"""The tissue that tools push and pull: control nodes, the solver, wrenches and faults."""
+"""The tissue that tools push, pull, grasp and cut: one scene by name and message, or many copies of it in tensors."""
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+import torch
+import warp as wp
+from torch import Tensor
 
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes, build_control_nodes
 from endo_sim_ros.physics.mpm import MpmSolver, capturing
-from endo_sim_ros.physics.wrench import fall_off, minimum_norm_forces
+from endo_sim_ros.physics.regions import TissueProperties, paint_regions
+from endo_sim_ros.physics.tools import Tools
+
+MAX_TOOLS = 8  # of a TissueSimulation
+_RESTING_SPEED = 1e-5  # m/s; tissue slower than this, with no tool acting, is left as it is
+
+
+def tissue_properties(nodes: ControlNodes, config: PhysicsConfig) -> TissueProperties:
+    """Stiffness and density of each node [M]: those of the config with its regions painted over."""
+    uniform = TissueProperties.uniform(len(nodes), config.young_modulus, config.poisson_ratio, config.density)
+    return paint_regions(uniform, nodes.rest, config.regions)
+
+
+class TissueBatch:
+    """B independent copies of the same tissue, stepped together, with T tools each; for learning.
+
+    Everything is a tensor on the simulation's device, and nothing waits for it: write commands into ``tools`` (see
+    :class:`Tools`), call :meth:`step`, read ``displacements``, ``F`` and the reactions. Copies differ by their tools
+    and, if asked for, by their stiffness. A step that ends badly is undone in its copy and counted in ``tools.faults``.
+
+    Args:
+        nodes: The nodes at rest.
+        config: Parameters.
+        environments: B.
+        tools: T.
+        properties: Stiffness and density of each node; default: those of the config, with its regions.
+        stiffness: Factor on the moduli of each copy [B]; default 1.
+
+    Raises:
+        ValueError: If the config or the nodes make no tissue, see :class:`MpmSolver`.
+    """
+
+    def __init__(
+        self,
+        nodes: ControlNodes,
+        config: PhysicsConfig,
+        environments: int,
+        tools: int = 1,
+        properties: TissueProperties | None = None,
+        stiffness: Sequence[float] | np.ndarray | None = None,
+    ):
+        self.nodes, self.config = nodes, config
+        properties = tissue_properties(nodes, config) if properties is None else properties
+        with capturing:
+            self.solver = MpmSolver(nodes, config, properties, environments=environments, tools=tools, stiffness=stiffness)
+            self.tools = Tools(self.solver, nodes, config)
+        self.step_duration = config.step_duration
+        self.displacements: Tensor = wp.to_torch(self.solver.state.u).view(environments, -1, 3)  # [B, M, 3] m
+        self.F: Tensor = wp.to_torch(self.solver.state.F).view(environments, -1, 3, 3)  # [B, M, 3, 3]
+        self._rest = torch.from_numpy(nodes.rest).to(self.solver.device)
+        self._free = torch.from_numpy(~nodes.pinned).to(self.solver.device)
+
+    def step(self) -> None:
+        """Advance all copies by ``step_duration``."""
+        self.solver.step()
+
+    def positions(self) -> Tensor:
+        """Positions of the nodes [B, M, 3], m, world; pinned ones where they rest."""
+        return self._rest + self.displacements * self._free[:, None]
+
+    def reset(self, environments: Tensor | slice = slice(None)) -> None:
+        """Back to rest, in these copies; their tools let go."""
+        self.solver.reset(environments)
+        self.tools.reset(environments)
 
 
 @dataclass(frozen=True)
@@ -21,36 +88,6 @@ class NodeState:
     time: float  # s since the start or the last reset
 
 
-@dataclass
-class _Tool:
-    tip: np.ndarray  # [3] m, world
-    force: np.ndarray  # [3] N
-    torque: np.ndarray  # [3] N·m
-    nodes: np.ndarray = field(default_factory=lambda: np.empty(0, int))  # attached, indices
-    weights: np.ndarray = field(default_factory=lambda: np.empty(0))
-    contact: np.ndarray = field(default_factory=lambda: np.zeros(3))  # tip relative to the nodes' centroid, kept, m
-    applied: tuple[np.ndarray, np.ndarray] = (np.zeros(3), np.zeros(3))  # force N and torque N·m that arrived
-
-
-@dataclass
-class _Grip:
-    """Tissue between the jaws of a tool."""
-
-    pose: np.ndarray  # tip-to-world [4, 4], m
-    nodes: np.ndarray  # held, indices
-    local: np.ndarray  # their positions in the axes of the tip when the jaw closed [K, 3], m
-    displacements: np.ndarray  # that they were last pulled to [K, 3], m
-    applied: tuple[np.ndarray, np.ndarray] = (np.zeros(3), np.zeros(3))  # what the jaw exerts: N and N·m about the tip
-
-    def targets(self, rest: np.ndarray) -> np.ndarray:
-        """Displacements [K, 3] m that put the nodes where the jaw is now."""
-        return self.local @ self.pose[:3, :3].T + self.pose[:3, 3] - rest[self.nodes]
-
-
-_RESTING_SPEED = 1e-5  # m/s; tissue slower than this, with no tool acting, is left as it is
-_SLIP = 0.9  # of the travel; tissue pulled farther slips out of the jaw
-
-
 class TissueSimulation:
     """Soft tissue behind a reconstructed skin, stepped in fixed steps of ``step_duration``.
 
@@ -59,7 +96,8 @@ class TissueSimulation:
     grabbed tissue follows without jitter. The wrench acts at the point of the tissue that was at the tip then, and
     moves with it: about a tip that stays behind, a mere force would be an ever greater couple on the few nodes. A
     tool that reaches no node applies nothing and tries again every step. A jaw that closes holds the nodes in the
-    same reach, which then follow the pose of its tip until it opens.
+    same reach, which then follow the pose of its tip until it opens. With a ``contact_radius`` tools are rigid capsules
+    that push tissue away.
     Tissue that nothing acts on and that has come to rest costs no time.
 
     Args:
@@ -75,32 +113,48 @@ class TissueSimulation:
         self._start(build_control_nodes(model, viewpoint, config), config)
 
     @classmethod
-    def from_nodes(cls, nodes: ControlNodes, config: PhysicsConfig) -> "TissueSimulation":
+    def from_nodes(cls, nodes: ControlNodes, config: PhysicsConfig, properties: TissueProperties | None = None) -> "TissueSimulation":
         """Simulate given nodes, such as a test specimen."""
         simulation = cls.__new__(cls)
-        simulation._start(nodes, config)
+        simulation._start(nodes, config, properties)
         return simulation
 
-    def _start(self, nodes: ControlNodes, config: PhysicsConfig) -> None:
+    def _start(self, nodes: ControlNodes, config: PhysicsConfig, properties: TissueProperties | None = None) -> None:
         self.nodes = nodes
         self.config = config
-        with capturing:
-            self.solver = MpmSolver(nodes, config)
+        self._batch = TissueBatch(nodes, config, 1, MAX_TOOLS, properties)
+        self.solver, self._tools = self._batch.solver, self._batch.tools
         self.substepping = self.solver.substepping
         self.step_duration = config.step_duration
         self.time = 0.0
-        self.faults = 0  # steps undone because a node ran away
         self.last_fault = ""
-        self.slips = 0  # times that tissue slipped out of a jaw because it was pulled farther than the travel allows
-        self._tools: dict[str, _Tool] = {}
-        self._touchable = np.flatnonzero(nodes.is_skin & ~nodes.pinned)
-        self._grips: dict[str, _Grip] = {}
-        self._loaded = False
+        self._slots: dict[str, int] = {}  # of tools, by name
+        self._disturbed = False  # since the last step: a tool moved, took hold or let go
         self._resting = not any(config.gravity)
 
-    def set_wrench(
-        self, tool: str, tip: np.ndarray, force: np.ndarray, torque: np.ndarray | tuple[float, ...] = (0.0, 0.0, 0.0)
-    ) -> bool:
+    @property
+    def faults(self) -> int:
+        """Steps undone because a node ran away."""
+        return int(self._tools.faults[0])
+
+    @property
+    def slips(self) -> int:
+        """Times that tissue slipped out of a jaw because it was pulled farther than the travel allows."""
+        return int(self._tools.slips[0].sum())
+
+    @property
+    def contact_radius(self) -> float:
+        """Radius of the capsule that tools push with, m; 0 = none."""
+        return self._tools.contact_radius
+
+    def _slot(self, tool: str) -> int:
+        if tool not in self._slots:
+            if len(self._slots) == MAX_TOOLS:
+                raise ValueError(f"tool {tool!r} is one too many; there can be {MAX_TOOLS}: {', '.join(self._slots)}")
+            self._slots[tool] = len(self._slots)
+        return self._slots[tool]
+
+    def set_wrench(self, tool: str, tip: np.ndarray, force: np.ndarray, torque: np.ndarray | tuple[float, ...] = (0.0, 0.0, 0.0)) -> bool:
         """The wrench that a tool exerts on the tissue at its tip, until changed; zero lets go.
 
         Args:
@@ -115,120 +169,108 @@ class TissueSimulation:
         Raises:
             ValueError: If an input has a wrong shape or is not finite; the tool then keeps its previous wrench.
         """
-        tip, force, torque = (
-            _vector(name, value, tool) for name, value in (("tip", tip), ("force", force), ("torque", torque))
-        )
-        if not (force.any() or torque.any()):
-            self._tools.pop(tool, None)
+        tip, force, torque = (_vector(name, value, tool) for name, value in (("tip", tip), ("force", force), ("torque", torque)))
+        wanted = bool(force.any() or torque.any())
+        if not wanted and tool not in self._slots:
             return True
-        held = self._tools.setdefault(tool, _Tool(tip, force, torque))
-        held.tip, held.force, held.torque = tip, force, torque
-        positions = self._positions()
-        self._attach(held, positions)
-        self._distribute(held, positions)
-        return len(held.nodes) > 0
+        slot, tools = self._slot(tool), self._tools
+        for tensor, value in ((tools.reaches, tip), (tools.forces, force), (tools.torques, torque)):
+            tensor[0, slot] = torch.from_numpy(value)
+        was = bool(tools.attached[0, slot])
+        if wanted != was:
+            tools.take_hold()
+            self._disturbed = True
+        if not wanted:
+            tools.reaction_forces[0, slot], tools.reaction_torques[0, slot] = 0.0, 0.0
+        return not wanted or bool(tools.attached[0, slot])
 
     def set_grasp(self, tool: str, pose: np.ndarray, closed: bool) -> bool:
-        """Close, move or open the jaw of a tool.
+        """Move a tool, and close or open its jaw.
 
         Args:
             tool: Name of the tool.
-            pose: Tip-to-world transform [4, 4], metres; held tissue follows it, reaching it at the end of the next step.
+            pose: Tip-to-world transform [4, 4], metres; held tissue, and the capsule of contact, reach it at the end
+                of the next step.
             closed: Whether the jaw is closed.
 
         Returns:
             Whether the jaw holds what it should: False when it is closed on nothing.
 
         Raises:
-            ValueError: If the pose has a wrong shape or is not finite; the jaw then stays as it was.
+            ValueError: If the pose has a wrong shape or is not finite; the tool then stays as it was.
         """
         pose = np.asarray(pose, np.float64)
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
             raise ValueError(f"pose of tool {tool!r} must be a finite 4×4 matrix, got {pose.tolist()}")
-        if not closed:
-            self._grips.pop(tool, None)
-            return True
-        if tool not in self._grips:
-            positions = self._positions()
-            nodes, _ = self._within_reach(pose[:3, 3], positions)
-            if not len(nodes):
-                return False
-            local = (positions[nodes] - pose[:3, 3]) @ pose[:3, :3]
-            self._grips[tool] = _Grip(pose, nodes, local, positions[nodes] - self.nodes.rest[nodes])
-        self._grips[tool].pose = pose
-        return True
+        slot, tools = self._slot(tool), self._tools
+        R, tip = torch.from_numpy(pose[:3, :3].copy()), torch.from_numpy(pose[:3, 3].copy())
+        moved = not (torch.equal(tools.tips[0, slot].cpu(), tip) and torch.equal(tools.rotations[0, slot].cpu(), R))
+        moved = moved or not tools.present[0, slot]
+        tools.tips[0, slot], tools.rotations[0, slot], tools.present[0, slot] = tip, R, 1
+        tools.closed[0, slot] = int(closed)
+        was = bool(tools.gripping[0, slot])
+        if closed != was:
+            tools.take_hold()
+        holding = bool(tools.gripping[0, slot])
+        self._disturbed |= holding != was or moved and (holding or self.contact_radius > 0)
+        if closed and not holding:
+            tools.closed[0, slot] = 0
+        return holding or not closed
 
     def reaction(self, tool: str) -> tuple[np.ndarray, np.ndarray]:
         """Force [3] N and torque [3] N·m that the tissue exerts back on a tool, world: minus what its wrench applies
-        (torque about the point held) and its jaw (about the tip); zero for a tool that is out of reach, has let go or is unknown."""
-        force, torque = np.zeros(3), np.zeros(3)
-        for acting in (self._tools.get(tool), self._grips.get(tool)):
-            if acting is not None:
-                force, torque = force - acting.applied[0], torque - acting.applied[1]
-        return force, torque
+        (torque about the point held) and the mean over the last step of what its jaw and its capsule gave (about the tip);
+        zero for a tool that is out of reach, has let go or is unknown."""
+        if tool not in self._slots:
+            return np.zeros(3), np.zeros(3)
+        slot, tools = self._slots[tool], self._tools
+        return tools.reaction_forces[0, slot].cpu().numpy().copy(), tools.reaction_torques[0, slot].cpu().numpy().copy()
 
     def held(self, tool: str) -> np.ndarray:
         """Positions now of the nodes that a tool holds on to [K, 3], m, world; none when it is in the air."""
-        acting = (self._tools.get(tool), self._grips.get(tool))
-        nodes = np.concatenate([np.zeros(0, int)] + [each.nodes for each in acting if each is not None])
+        nodes = self.held_nodes(tool)
         return self.nodes.rest[nodes] + self.solver.displacements()[nodes]
+
+    def held_nodes(self, tool: str) -> np.ndarray:
+        """Numbers of the nodes that a tool's wrench and jaw hold on to [K]."""
+        if not self.in_reach(tool):
+            return np.zeros(0, int)
+        slot, tools = self._slots[tool], self._tools
+        held = (tools.weights[0, slot] > 0) & bool(tools.attached[0, slot])
+        held |= (tools.held[0, slot] > 0) & bool(tools.gripping[0, slot])
+        return tools.touchable[held.cpu().numpy()]
 
     def in_reach(self, tool: str) -> bool:
         """Whether the tool holds on to tissue."""
-        return tool in self._grips or tool in self._tools and len(self._tools[tool].nodes) > 0
+        if tool not in self._slots:
+            return False
+        slot, tools = self._slots[tool], self._tools
+        return bool(tools.attached[0, slot] or tools.gripping[0, slot])
 
     def step(self) -> None:
         """Advance by ``step_duration``. A step that ends badly is undone, counted in ``faults`` and described in
         ``last_fault``; the tissue is then at rest where it was before."""
-        if self._resting and not (self._tools or self._grips or self._loaded):
-            self.time += self.step_duration
-            return
-        if self._tools or self._grips or self._loaded:
-            self._load()
-        bad = self.solver.step()
+        before = self.faults
         self.time += self.step_duration
+        if self._resting and not (self._disturbed or self._wrenches_act()):
+            return
+        self._batch.step()
+        self._disturbed = False
         self._resting = self.solver.speed < _RESTING_SPEED
-        if bad:
-            self.solver.restore()
-            self.faults += 1
+        if self.faults > before:
             self.last_fault = (
-                f"a step was undone: {bad} of {len(self.nodes)} nodes ended non-finite, torn or"
+                f"a step was undone: {self.solver.bad_nodes.numpy()[0]} of {len(self.nodes)} nodes ended non-finite, torn or"
                 f" over {self.config.travel:g} m from rest ({self._describe_tools()}); use less force or more travel"
             )
-            for grip in self._grips.values():  # pull on from where the tissue is
-                grip.displacements = self.solver.displacements()[grip.nodes].astype(np.float64)
-        for grip in self._grips.values():
-            forces = self.solver.holding_forces(grip.nodes, grip.displacements)
-            offsets = self.nodes.rest[grip.nodes] + grip.displacements - grip.pose[:3, 3]
-            grip.applied = (forces.sum(0), np.cross(offsets, forces).sum(0))
 
-    def _load(self) -> None:
-        """Hand the wrenches and jaws of the tools to the solver, for the next step."""
-        positions = self._positions()
-        forces = np.zeros_like(positions)
-        for held in self._tools.values():
-            self._attach(held, positions)
-            np.add.at(forces, held.nodes, self._distribute(held, positions))
-        self.solver.set_forces(forces)
-        for tool, grip in list(self._grips.items()):
-            if np.linalg.norm(grip.targets(self.nodes.rest), axis=1).max() > _SLIP * self.config.travel:
-                del self._grips[tool]
-                self.slips += 1
-        grips = list(self._grips.values())
-        starts = [np.zeros((0, 3))] + [grip.displacements for grip in grips]
-        for grip in grips:
-            grip.displacements = grip.targets(self.nodes.rest)
-        ends = [np.zeros((0, 3))] + [grip.displacements for grip in grips]
-        nodes = np.concatenate([np.zeros(0, int)] + [grip.nodes for grip in grips])
-        self.solver.hold(nodes, np.concatenate(starts), np.concatenate(ends))
-        self._loaded = bool(self._tools or grips)
+    def _wrenches_act(self) -> bool:
+        return bool(self._tools.forces.any() or self._tools.torques.any())
 
     def reset(self) -> None:
         """Back to the rest state at time zero; tools let go."""
-        self.solver.reset()
-        self._tools.clear()
-        self._grips.clear()
-        self._loaded = False
+        self._batch.reset()
+        self._slots.clear()
+        self._disturbed = False
         self._resting = not any(self.config.gravity)
         self.time = 0.0
 
@@ -239,41 +281,19 @@ class TissueSimulation:
         F = np.where(moving[..., None], self.solver.deformation_gradients(), np.eye(3, dtype=np.float32))
         return NodeState(self.nodes.rest, positions, F, self.time)
 
-    def _positions(self) -> np.ndarray:
-        return self.nodes.rest.astype(np.float64) + self.solver.displacements()
-
-    def _attach(self, held: _Tool, positions: np.ndarray) -> None:
-        if len(held.nodes) == 0:
-            held.nodes, distances = self._within_reach(held.tip, positions)
-            held.weights = fall_off(distances, self.config.force_radius)
-            if len(held.nodes):
-                held.contact = held.tip - np.average(positions[held.nodes], 0, held.weights)
-
-    def _within_reach(self, tip: np.ndarray, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Moving skin nodes within ``force_radius`` of a tip, and their distances, m."""
-        distances = np.linalg.norm(positions[self._touchable] - tip, axis=1)
-        near = distances <= self.config.force_radius
-        return self._touchable[near], distances[near]
-
-    def _distribute(self, held: _Tool, positions: np.ndarray) -> np.ndarray:
-        """Forces on the tool's nodes [K, 3]; remembers what they add up to."""
-        if len(held.nodes) == 0:
-            held.applied = (np.zeros(3), np.zeros(3))
-            return np.zeros((0, 3))
-        nodes = positions[held.nodes]
-        offsets = nodes - np.average(nodes, 0, held.weights) - held.contact
-        forces = minimum_norm_forces(offsets, held.weights, held.force, held.torque)
-        held.applied = (forces.sum(0), np.cross(offsets, forces).sum(0))
-        return forces
-
     def _describe_tools(self) -> str:
-        parts = [f"{name} {np.linalg.norm(held.force):.3g} N" for name, held in self._tools.items()]
-        parts += [f"{name} grasping" for name in self._grips]
+        tools, parts = self._tools, []
+        for name, slot in self._slots.items():
+            force = float(tools.forces[0, slot].norm())
+            if force or bool(tools.torques[0, slot].any()):
+                parts.append(f"{name} {force:.3g} N")
+            if tools.gripping[0, slot]:
+                parts.append(f"{name} grasping")
         return ", ".join(parts) or "no tool"
 
 
 def _vector(name: str, value: np.ndarray, tool: str) -> np.ndarray:
-    vector = np.asarray(value, np.float64)
+    vector = np.array(value, np.float64)
     if vector.shape != (3,) or not np.isfinite(vector).all():
         raise ValueError(f"{name} of tool {tool!r} must be three finite numbers, got {vector.tolist()}")
     return vector

@@ -1,0 +1,91 @@
+"""Tools: wrenches, jaws and rigid capsules that act on the nodes, in device memory."""
+
+import numpy as np
+import torch
+import warp as wp
+from scipy.spatial import cKDTree
+
+from endo_sim_ros.physics.config import PhysicsConfig
+from endo_sim_ros.physics.control_nodes import ControlNodes
+from endo_sim_ros.physics.mpm import Launch, MpmSolver
+from endo_sim_ros.physics.tools_kernels import Commands, Holds, Reach, load_nodes, measure_reactions, take_hold
+
+_THINNEST = 0.75  # of the distance between skin nodes: a thinner capsule would pass between them
+
+
+class Tools:
+    """T tools in each of the solver's B environments.
+
+    All tensors live on the solver's device and are read and written by its step; indexed [b, t], world frame, float64.
+
+    Args:
+        solver: Whose nodes the tools touch.
+        nodes: These nodes at rest.
+        config: Reach of wrenches and jaws, contact, travel.
+    """
+
+    def __init__(self, solver: MpmSolver, nodes: ControlNodes, config: PhysicsConfig):
+        self._solver = solver
+        self.touchable = np.flatnonzero(nodes.is_skin & ~nodes.pinned)  # [S]
+        shape = (solver.environments, solver.tool_count)
+        tools, entries = solver.environments * solver.tool_count, solver.environments * solver.tool_count * len(self.touchable)
+
+        def tensors(struct, names: str, dtype, count: int = tools) -> list[torch.Tensor]:
+            made = []
+            for name in names.split():
+                array = wp.zeros(count, dtype, device=solver.device)
+                setattr(struct, name, array)
+                made.append(wp.to_torch(array))
+            return made
+
+        commands, holds, reach = Commands(), Holds(), Reach()
+        # Wrench [B, T, 3], N and N·m about the point held; where it takes hold, m; the tip at the end of the step, m.
+        self.forces, self.torques, self.reaches, self.tips = (
+            each.view(*shape, 3) for each in tensors(commands, "force torque reach tip", wp.vec3d)
+        )
+        (R,) = tensors(commands, "R", wp.mat33d)
+        self.rotations = R.view(*shape, 3, 3)  # axes of the tip [B, T, 3, 3]
+        # Whether tip and axes mean anything, and whether the jaw is to be closed [B, T], int32.
+        self.present, self.closed = (each.view(shape) for each in tensors(commands, "present closed", int))
+        tensors(holds, "contact last_tip applied_force applied_torque", wp.vec3d)
+        tensors(holds, "last_R", wp.mat33d)
+        # Whether the wrench acts, whether the jaw holds tissue, how often it slipped out [B, T], int32.
+        self.attached, self.gripping, self.slips, self._placed = (
+            each.view(shape) for each in tensors(holds, "attached gripping slips placed", int)
+        )
+        # What the tissue exerts back [B, T, 3], N and N·m (of a wrench about the point held, else about the tip).
+        self.reaction_forces, self.reaction_torques = (
+            each.view(*shape, 3) for each in tensors(holds, "reaction_force reaction_torque", wp.vec3d)
+        )
+        (weight,), (held,) = tensors(holds, "weight", float, entries), tensors(holds, "held", int, entries)
+        self.weights, self.held = weight.view(*shape, -1), held.view(*shape, -1)
+        tensors(holds, "local pulled", wp.vec3d, entries)
+        reach.touchable = wp.array(self.touchable.astype(np.int32), dtype=int, device=solver.device)
+        reach.origin = wp.vec3d(*solver.origin)
+        reach.radius, reach.travel, reach.duration = config.force_radius, config.travel, config.step_duration
+        skin = nodes.rest[nodes.is_skin].astype(np.float64)
+        apart = float(np.median(cKDTree(skin).query(skin, k=2)[0][:, 1])) if len(skin) > 1 else 0.0
+        radius = max(config.contact_radius, _THINNEST * apart) if config.contact_radius else 0.0
+        reach.contact_radius, reach.contact_length = radius, config.contact_length
+        self.contact_radius = radius  # of the capsule that acts, m; 0 = none
+        self._faults = wp.zeros(solver.environments, int, device=solver.device)
+        self.faults = wp.to_torch(self._faults)  # steps undone [B], int32
+
+        lanes = 1 if solver.device == "cpu" else 32
+        dim = (solver.environments, lanes)
+        common = [solver.tool_count, lanes, commands, holds, reach, solver.nodes, solver.state]
+        self._take_hold = Launch(take_hold, dim, common)
+        load = Launch(load_nodes, dim, [*common, solver.loads, solver.rigid, solver.bad_nodes])
+        measure = Launch(measure_reactions, dim, [*common, solver.rigid, solver.bad_nodes, self._faults])
+        solver.surround([self._take_hold, load], [measure])
+
+    def take_hold(self) -> None:
+        """Take hold of, or let go, now what commands say; otherwise the next step begins with it."""
+        self._solver.launch(self._take_hold)
+
+    def reset(self, environments: torch.Tensor | slice = slice(None)) -> None:
+        """No command, nothing held, nothing counted in these environments."""
+        for tensor in (self.forces, self.torques, self.reaction_forces, self.reaction_torques):
+            tensor[environments] = 0
+        for tensor in (self.present, self.closed, self.attached, self.gripping, self.slips, self._placed, self.faults):
+            tensor[environments] = 0

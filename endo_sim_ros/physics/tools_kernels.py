@@ -1,0 +1,311 @@
+"""Kernels that turn what tools want into loads on nodes, and what nodes got into reactions.
+
+One warp of a GPU (one thread of a CPU) works for one environment b and its tools t, one after the other; its lanes share
+the nodes that tools may touch. Commands and sums are float64, which keeps a reaction equal to its wrench to the last digit that
+matters and a scene metres from the world's origin as accurate as one at it.
+"""
+
+import warp as wp
+
+from endo_sim_ros.physics.mpm_kernels import Loads, Nodes, RigidTools, State
+
+wp.set_module_options({"enable_backward": False})
+
+SLIP = 0.9  # of the travel; tissue pulled farther slips out of the jaw
+
+
+@wp.struct
+class Commands:
+    """What tools are told to do, all [B · T], world."""
+
+    force: wp.array[wp.vec3d]  # N
+    torque: wp.array[wp.vec3d]  # about the point held, N·m
+    reach: wp.array[wp.vec3d]  # where the wrench takes hold, m
+    tip: wp.array[wp.vec3d]  # of the tool at the end of the step, m
+    R: wp.array[wp.mat33d]  # its axes
+    present: wp.array[int]  # whether tip and R mean anything
+    closed: wp.array[int]  # whether the jaw is to be closed
+
+
+@wp.struct
+class Holds:
+    """What tools hold, all [B · T] but for the last four, [B · T · S] over the nodes that tools may touch."""
+
+    attached: wp.array[int]  # whether the wrench acts on nodes
+    contact: wp.array[wp.vec3d]  # the point held relative to their weighted centroid, kept, m
+    gripping: wp.array[int]  # whether the jaw holds nodes
+    last_tip: wp.array[wp.vec3d]  # at the end of the last step
+    last_R: wp.array[wp.mat33d]
+    placed: wp.array[int]  # whether these two mean anything
+    applied_force: wp.array[wp.vec3d]  # what arrived of the wrench, N and N·m
+    applied_torque: wp.array[wp.vec3d]
+    reaction_force: wp.array[wp.vec3d]  # out, N
+    reaction_torque: wp.array[wp.vec3d]  # out, N·m: of the wrench about the point held, of jaw and contact about the tip
+    slips: wp.array[int]  # times that tissue slipped out of the jaw
+    weight: wp.array[float]  # of each node in the wrench, zero = none
+    held: wp.array[int]  # whether the jaw holds the node
+    local: wp.array[wp.vec3d]  # where it was in the axes of the tip when the jaw closed, m
+    pulled: wp.array[wp.vec3d]  # displacement that it was last pulled to, m
+
+
+@wp.struct
+class Reach:
+    touchable: wp.array[int]  # [S] nodes that tools may take hold of
+    origin: wp.vec3d  # of the local frame, world, m
+    radius: wp.float64  # of the wrench and the jaw, m
+    travel: wp.float64  # m
+    duration: wp.float64  # of the step, s
+    contact_radius: float  # of the capsule, m
+    contact_length: wp.float64  # m
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    for (int offset = 16; offset > 0; offset /= 2)
+        value += __shfl_xor_sync(0xffffffffu, value, offset);
+#endif
+    return value;
+""")
+def lane_sum(value: wp.float64) -> wp.float64:
+    """Sum over the 32 lanes of a warp on a GPU, in the same order every time; on a CPU there is one lane."""
+    ...
+
+
+@wp.func
+def lanes_sum(v: wp.vec3d) -> wp.vec3d:
+    return wp.vec3d(lane_sum(v[0]), lane_sum(v[1]), lane_sum(v[2]))
+
+
+@wp.func
+def double(v: wp.vec3) -> wp.vec3d:
+    return wp.vec3d(wp.float64(v[0]), wp.float64(v[1]), wp.float64(v[2]))
+
+
+@wp.func
+def single(v: wp.vec3d) -> wp.vec3:
+    return wp.vec3(wp.float32(v[0]), wp.float32(v[1]), wp.float32(v[2]))
+
+
+@wp.func
+def solve_on_range(J: wp.mat33d, needed: wp.vec3d, floor: wp.float64) -> wp.vec3d:
+    """β with J β = needed for a symmetric J ≥ 0, nothing along axes about which nothing resists."""
+    axes, values = wp.eig3(J)
+    limit = wp.float64(1.0e-6) * wp.max(wp.max(wp.max(values[0], values[1]), values[2]), floor)
+    beta = wp.vec3d()
+    for i in range(3):
+        if values[i] > limit:
+            axis = wp.vec3d(axes[0, i], axes[1, i], axes[2, i])
+            beta += (wp.dot(axis, needed) / values[i]) * axis
+    return beta
+
+
+@wp.kernel
+def take_hold(
+    tools: int,
+    lanes: int,
+    commands: Commands,
+    holds: Holds,
+    reach: Reach,
+    nodes: Nodes,
+    state: State,
+):
+    """Wrenches and jaws that begin to act take hold of the nodes in reach, in their current positions; others let go."""
+    b, lane = wp.tid()
+    count = nodes.X.shape[0]
+    touchable = reach.touchable.shape[0]
+    zero, one = wp.float64(0.0), wp.float64(1.0)
+    for t in range(tools):
+        c = b * tools + t
+        wanted = wp.length_sq(commands.force[c]) > zero or wp.length_sq(commands.torque[c]) > zero
+        attach = wanted and holds.attached[c] == 0
+        close = commands.closed[c] != 0 and commands.present[c] != 0
+        grip = close and holds.gripping[c] == 0
+        if attach or grip:
+            centre = wp.vec3d()
+            total, gripped = wp.float64(0.0), wp.float64(0.0)
+            for s in range(lane, touchable, lanes):
+                p = reach.touchable[s]
+                u = double(state.u[b * count + p])
+                x = reach.origin + double(nodes.X[p]) + u
+                if attach:
+                    distance = wp.length(x - commands.reach[c]) / reach.radius
+                    weight = wp.float64(0.0)
+                    if distance <= one:  # smooth, and never quite zero, so that a node at the rim still counts
+                        near = wp.max(one - distance * distance, wp.float64(1.0e-3))
+                        weight = near * near
+                    holds.weight[c * touchable + s] = wp.float32(weight)
+                    weight = wp.float64(wp.float32(weight))
+                    total += weight
+                    centre += weight * x
+                if grip:
+                    arm = x - commands.tip[c]
+                    inside = int(0)
+                    if wp.length(arm) <= reach.radius:
+                        inside = 1
+                        gripped += one
+                        holds.local[c * touchable + s] = wp.transpose(commands.R[c]) * arm
+                        holds.pulled[c * touchable + s] = u
+                    holds.held[c * touchable + s] = inside
+            total, gripped, centre = lane_sum(total), lane_sum(gripped), lanes_sum(centre)
+            if lane == 0:
+                if attach and total > zero:
+                    holds.attached[c] = 1
+                    holds.contact[c] = commands.reach[c] - centre / total
+                if grip and gripped > zero:
+                    holds.gripping[c] = 1
+        if lane == 0:
+            if not wanted:
+                holds.attached[c] = 0
+            if not close:
+                holds.gripping[c] = 0
+
+
+@wp.kernel
+def load_nodes(
+    tools: int,
+    lanes: int,
+    commands: Commands,
+    holds: Holds,
+    reach: Reach,
+    nodes: Nodes,
+    state: State,
+    loads: Loads,
+    rigid: RigidTools,
+    bad_nodes: wp.array[int],
+):
+    """Forces, springs and moving capsules of the next step.
+
+    A wrench becomes the nodal forces f with Σ f = F and Σ r × f = τ that minimise Σ |f|²/w: f = w (F/Σw + β × s) with s
+    the offset from the weighted centroid c, β = J⁻¹ (τ − c × F), J = Σ w (|s|² 1 − s sᵀ), w scaled to Σ w = 1. Nodes on one line or point
+    resist no torque about it: the force is still exact and the torque is the nearest that the nodes can take.
+    """
+    b, lane = wp.tid()
+    count = nodes.X.shape[0]
+    touchable = reach.touchable.shape[0]
+    zero, one = wp.float64(0.0), wp.float64(1.0)
+    for s in range(lane, touchable, lanes):
+        e = b * count + reach.touchable[s]
+        loads.force[e] = wp.vec3()
+        loads.spring[e] = 0.0
+        loads.holder[e] = -1
+    for t in range(tools):
+        c = b * tools + t
+        F, torque = wp.vec3d(), wp.vec3d()
+        if holds.attached[c] != 0:
+            total, centre = wp.float64(0.0), wp.vec3d()
+            for s in range(lane, touchable, lanes):
+                w = wp.float64(holds.weight[c * touchable + s])
+                if w > zero:
+                    p = reach.touchable[s]
+                    total += w
+                    centre += w * (double(nodes.X[p]) + double(state.u[b * count + p]))
+            total, centre = lane_sum(total), lanes_sum(centre)
+            centre = centre / total
+            xx, yy, zz = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
+            xy, xz, yz = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
+            for s in range(lane, touchable, lanes):
+                w = wp.float64(holds.weight[c * touchable + s]) / total
+                if w > zero:
+                    p = reach.touchable[s]
+                    arm = double(nodes.X[p]) + double(state.u[b * count + p]) - centre
+                    xx += w * arm[0] * arm[0]
+                    yy += w * arm[1] * arm[1]
+                    zz += w * arm[2] * arm[2]
+                    xy += w * arm[0] * arm[1]
+                    xz += w * arm[0] * arm[2]
+                    yz += w * arm[1] * arm[2]
+            xx, yy, zz = lane_sum(xx), lane_sum(yy), lane_sum(zz)
+            xy, xz, yz = lane_sum(xy), lane_sum(xz), lane_sum(yz)
+            J = wp.mat33d(yy + zz, -xy, -xz, -xy, xx + zz, -yz, -xz, -yz, xx + yy)
+            F = commands.force[c]
+            lever = -holds.contact[c]  # of the centroid about the point held
+            floor = wp.max(xx + yy + zz + wp.length_sq(lever), wp.float64(1.0e-30))
+            beta = solve_on_range(J, commands.torque[c] - wp.cross(lever, F), floor)
+            torque = wp.cross(lever, F) + J * beta
+            for s in range(lane, touchable, lanes):
+                w = wp.float64(holds.weight[c * touchable + s]) / total
+                if w > zero:
+                    p = reach.touchable[s]
+                    arm = double(nodes.X[p]) + double(state.u[b * count + p]) - centre
+                    loads.force[b * count + p] += single(w * (F + wp.cross(beta, arm)))
+        if holds.gripping[c] != 0:
+            beyond = wp.float64(0.0)
+            for s in range(lane, touchable, lanes):
+                if holds.held[c * touchable + s] != 0:
+                    p = reach.touchable[s]
+                    goal = commands.tip[c] + commands.R[c] * holds.local[c * touchable + s]
+                    if wp.length(goal - reach.origin - double(nodes.X[p])) > wp.float64(SLIP) * reach.travel:
+                        beyond += one
+            beyond = lane_sum(beyond)
+            for s in range(lane, touchable, lanes):
+                if beyond == zero and holds.held[c * touchable + s] != 0:
+                    p = reach.touchable[s]
+                    e = b * count + p
+                    start = holds.pulled[c * touchable + s]
+                    if bad_nodes[b] > 0:  # the last step was undone: pull on from where the tissue is
+                        start = double(state.u[e])
+                    goal = commands.tip[c] + commands.R[c] * holds.local[c * touchable + s] - reach.origin - double(nodes.X[p])
+                    loads.spring[e] = nodes.stiffness[p]
+                    loads.target[e] = single(start)
+                    loads.target_v[e] = single((goal - start) / reach.duration)
+                    loads.holder[e] = t
+                    holds.pulled[c * touchable + s] = goal
+            if lane == 0 and beyond > zero:
+                holds.gripping[c] = 0
+                holds.slips[c] = holds.slips[c] + 1
+                commands.closed[c] = 0
+        if lane == 0:
+            holds.applied_force[c] = F
+            holds.applied_torque[c] = torque
+            rigid.radius[c] = 0.0
+            if commands.present[c] != 0:
+                if holds.placed[c] == 0:
+                    holds.last_tip[c] = commands.tip[c]
+                    holds.last_R[c] = commands.R[c]
+                tip, R, before, R_before = commands.tip[c], commands.R[c], holds.last_tip[c], holds.last_R[c]
+                end = tip - reach.contact_length * wp.vec3d(R[0, 2], R[1, 2], R[2, 2])
+                end_before = before - reach.contact_length * wp.vec3d(R_before[0, 2], R_before[1, 2], R_before[2, 2])
+                rigid.radius[c] = reach.contact_radius
+                rigid.tip[c] = single(before - reach.origin)
+                rigid.tip_v[c] = single((tip - before) / reach.duration)
+                rigid.end[c] = single(end_before - reach.origin)
+                rigid.end_v[c] = single((end - end_before) / reach.duration)
+                holds.last_tip[c] = tip
+                holds.last_R[c] = R
+            holds.placed[c] = commands.present[c]
+
+
+@wp.kernel
+def measure_reactions(
+    tools: int,
+    lanes: int,
+    commands: Commands,
+    holds: Holds,
+    reach: Reach,
+    nodes: Nodes,
+    state: State,
+    rigid: RigidTools,
+    bad_nodes: wp.array[int],
+    faults: wp.array[int],
+):
+    """What the tissue exerts back on each tool: minus its wrench, and minus the mean of what jaw and contact gave."""
+    b, lane = wp.tid()
+    count = nodes.X.shape[0]
+    for t in range(tools):
+        c = b * tools + t
+        force, torque = wp.vec3d(), wp.vec3d()
+        for p in range(lane, count, lanes):
+            given = rigid.impulse[c * count + p]
+            if wp.length_sq(given) > 0.0:
+                f = double(given) / reach.duration
+                force += f
+                arm = reach.origin + double(nodes.X[p]) + double(state.u[b * count + p]) - commands.tip[c]
+                torque += wp.cross(arm, f)
+        force, torque = lanes_sum(force), lanes_sum(torque)
+        if lane == 0:
+            if bad_nodes[b] > 0:
+                force, torque = wp.vec3d(), wp.vec3d()
+            holds.reaction_force[c] = -(force + holds.applied_force[c])
+            holds.reaction_torque[c] = -(torque + holds.applied_torque[c])
+    if lane == 0 and bad_nodes[b] > 0:
+        faults[b] = faults[b] + 1

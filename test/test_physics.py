@@ -16,9 +16,12 @@ from endo_sim_ros.physics import (
     PhysicsConfig,
     Skinning,
     StabilityError,
+    TissueBatch,
+    TissueProperties,
     TissueSimulation,
     build_control_nodes,
     lame_parameters,
+    mpm,
     plan_substeps,
     sample_farthest,
     sound_speed,
@@ -301,6 +304,44 @@ def test_released_tissue_returns_to_rest():
     assert depth_of_dent(simulation) < 0.05 * deep
 
 
+def free_block(**overrides) -> TissueSimulation:
+    """A block of 4 × 3 × 2 cm that nothing holds."""
+    nodes = specimen((9, 7, 5), 0.005, lambda x: np.zeros(len(x), bool), lambda x: np.ones(len(x), bool))
+    config = PhysicsConfig(device="cpu", **{"damping": 0.0, "travel": 0.3, "force_radius": 0.01, **overrides})
+    return TissueSimulation.from_nodes(nodes, config)
+
+
+@pytest.mark.parametrize("kinematics", ["rest", "current"])
+@pytest.mark.parametrize("relaxation", [0.0, 1.0])
+def test_free_tissue_keeps_its_linear_and_angular_momentum(kinematics, relaxation):
+    simulation = free_block(kinematics=kinematics, relaxation=relaxation, relaxation_time=0.05)
+    corner = simulation.nodes.rest.max(0)
+    simulation.set_wrench("probe", corner, [0.0, 0.02, 0.01], [0, 0, 2e-4])
+    steps(simulation, 2)
+    simulation.set_wrench("probe", corner, np.zeros(3))
+    linear, angular = simulation.solver.momentum()
+    steps(simulation, 10)
+    later = simulation.solver.momentum()
+    np.testing.assert_allclose(later[0], linear, atol=5e-5 * np.linalg.norm(linear))
+    np.testing.assert_allclose(later[1], angular, atol=1e-3 * np.linalg.norm(angular))
+    assert simulation.faults == 0 and depth_of_dent(simulation) > 0.02  # it flies, turns and wobbles
+
+
+@pytest.mark.parametrize("spacing", [0.005, 0.0025])
+def test_a_wide_slab_under_its_own_weight_is_a_confined_column(spacing):
+    height, width = 0.02, 0.08
+    counts = [round(edge / spacing) + 1 for edge in (width, width, height)]
+    nodes = specimen(counts, spacing, lambda x: x[:, 2] > height - 1e-6, lambda x: x[:, 2] < 1e-6)
+    config = PhysicsConfig(device="cpu", gravity_z=9.81, poisson_ratio=0.3, grid_ratio=2.0)
+    simulation = TissueSimulation.from_nodes(nodes, config)
+    steps(simulation, 25)
+    state = simulation.state()
+    middle = nodes.is_skin & (np.linalg.norm(nodes.rest[:, :2] - width / 2, axis=1) < 0.01)
+    sag = (state.positions - state.rest)[middle, 2].mean()
+    mu, lam = lame_parameters(10e3, 0.3)
+    assert sag == pytest.approx(1000 * 9.81 * height**2 / (2 * (lam + 2 * mu)), rel=0.1)
+
+
 @pytest.mark.parametrize("kinematics, ratio", [("rest", 1.75), ("rest", 2.0), ("current", 2.0)])
 def test_column_under_its_own_weight_shortens_as_theory_says(kinematics, ratio):
     height, spacing = 0.02, 0.005
@@ -365,6 +406,52 @@ def test_same_inputs_give_the_same_bits_twice(kinematics):
     np.testing.assert_array_equal(first.state().positions, second.state().positions)
 
 
+@pytest.mark.parametrize("kinematics", ["rest", "current"])
+@pytest.mark.parametrize("material", MATERIALS)
+def test_the_vectorised_step_agrees_with_the_kernels_of_the_gpu(kinematics, material, monkeypatch):
+    """The same kernels that a GPU runs, here on the CPU: a second implementation of everything that acts at once."""
+    states = []
+    for vectorised in (True, False):
+        if not vectorised:
+            monkeypatch.setattr(mpm, "STRESSES", {})
+        simulation = simulate(
+            kinematics=kinematics, material=material, contact_radius=0.006, relaxation=0.5, gravity_z=0.5,
+            regions=("sphere 0 0 0.12 0.02 young_modulus=20000",),
+        )  # fmt: skip
+        assert simulation.solver._vectorised == vectorised
+        assert simulation.set_wrench("pull", TIP - [0.03, 0, 0], [0.1, 0.0, -0.3])
+        assert simulation.set_grasp("grip", pose_at(TIP + [0.03, 0, 0]), True)
+        for step in range(6):
+            simulation.set_grasp("grip", pose_at(TIP + [0.03, 0, -0.001 * step]), True)
+            simulation.set_grasp("probe", pose_at(TIP + [0, 0, -0.006 + 0.0005 * step]), False)
+            simulation.step()
+        state = simulation.state()
+        reactions = [np.concatenate(simulation.reaction(tool)) for tool in ("pull", "grip", "probe")]
+        states.append((state.positions - state.rest, state.F, np.array(reactions)))
+    assert np.abs(states[0][0]).max() > 3e-3 and states[0][2][2, 2] < -0.01
+    np.testing.assert_allclose(states[1][0], states[0][0], atol=1e-6)
+    np.testing.assert_allclose(states[1][1], states[0][1], atol=2e-4)
+    np.testing.assert_allclose(states[1][2], states[0][2], atol=1e-3)
+
+
+def test_inverted_tissue_recovers_in_both_implementations(monkeypatch):
+    """Near-singular and inverted F take the decomposition instead of the iteration."""
+    ends, chosen = [], np.random.default_rng(6).permutation(300)[:20]
+    for vectorised in (True, False):
+        if not vectorised:
+            monkeypatch.setattr(mpm, "STRESSES", {})
+        simulation = simulate(node_count=300, damping=200.0)
+        F = simulation.solver.deformation_gradients()
+        F[chosen] = np.float32(np.diag([1.0, 1.0, -0.3]))
+        F[chosen[:4]] = 0.0
+        simulation.solver.state.F.assign(F)
+        simulation._disturbed = True
+        steps(simulation, 3)
+        assert simulation.faults == 0
+        ends.append(simulation.state().positions)
+    np.testing.assert_allclose(ends[1], ends[0], atol=2e-5)
+
+
 def test_moving_the_scene_by_metres_changes_nothing():
     dents = []
     for offset in ((0.0, 0.0, 0.0), (2.0, -4.0, 3.0)):
@@ -386,6 +473,102 @@ def test_printed_skin_only_method_and_dense_baseline_run():
         steps(simulation, 3)
         assert 1e-5 < depth_of_dent(simulation) < 0.02
         assert simulation.faults == 0
+
+
+# Stiffness, relaxation and many environments
+
+
+def test_tissue_that_relaxes_holds_back_less_and_less_as_a_standard_linear_solid():
+    ratio, time, forces = 1.5, 0.4, []
+    simulation = simulate(relaxation=ratio, relaxation_time=time)
+    simulation.set_grasp("PSM1", pose_at(TIP), True)
+    simulation.set_grasp("PSM1", pose_at(TIP - [0, 0, 0.002]), True)
+    for _ in range(60):
+        simulation.set_grasp("PSM1", pose_at(TIP - [0, 0, 0.002]), True)
+        simulation.step()
+        simulation._disturbed = True  # holding still, it would be left as it is
+        forces.append(simulation.reaction("PSM1")[0][2])
+    lasting = simulate()
+    lasting.set_grasp("PSM1", pose_at(TIP), True)
+    lasting.set_grasp("PSM1", pose_at(TIP - [0, 0, 0.002]), True)
+    steps(lasting, 60)
+    final = lasting.reaction("PSM1")[0][2]
+    elapsed = simulation.step_duration * np.arange(1, 61) - simulation.step_duration
+    expected = final * (1 + ratio * np.exp(-elapsed / time))
+    np.testing.assert_allclose(forces[5:], expected[5:], rtol=0.08)
+    assert forces[5] > 1.7 * forces[-1] > 0
+
+
+def test_relaxing_tissue_needs_the_substeps_of_its_fast_stiffness():
+    plain, relaxing = PhysicsConfig(adapt_substeps=False, substeps=30), PhysicsConfig(relaxation=3.0)
+    assert plan_substeps(relaxing, 0.01).count == pytest.approx(2 * plan_substeps(PhysicsConfig(), 0.01).count, abs=1)
+    with pytest.raises(StabilityError, match=r"young_modulus 2e\+06 Pa.*relaxation 3 and density"):
+        plan_substeps(dataclasses.replace(plain, relaxation=3.0, young_modulus=2e6), 0.01)
+
+
+def test_a_stiff_region_gives_way_less_and_the_tissue_beside_it_as_before():
+    region = "sphere 0.025 0 0.12 0.012 young_modulus=100000"
+    left, right = TIP - [0.025, 0, 0], TIP + [0.025, 0, 0]
+    dents = []
+    for regions in ((), (region,)):
+        simulation = simulate(node_count=2000, regions=regions)
+        for name, tip in (("left", left), ("right", right)):
+            simulation.set_wrench(name, tip, [0.0, 0.0, 0.2])
+        steps(simulation, 10)
+        state = simulation.state()
+        moved, x = state.positions[:, 2] - state.rest[:, 2], state.rest[:, 0]
+        dents.append((moved[x < 0].max(), moved[x > 0].max()))
+    assert dents[1][0] == pytest.approx(dents[0][0], rel=0.05)
+    assert dents[1][1] < 0.5 * dents[0][1]
+    with pytest.raises(ConfigError, match="sphere 5 5 5"):
+        simulate(regions=("sphere 5 5 5 0.01 young_modulus=1e5",))
+
+
+def test_each_node_obeys_its_own_material():
+    """A column of two halves in series, each shortening as its own modulus says."""
+    height, spacing = 0.02, 0.0025
+    nodes = specimen((9, 9, 9), spacing, lambda x: x[:, 2] > height - 1e-6, lambda x: x[:, 2] < 1e-6)
+    stiff = nodes.rest[:, 2] < height / 2 - 1e-6
+    properties = TissueProperties.uniform(len(nodes), 5e3, 0.0, 1000.0).painted(stiff, young_modulus=20e3)
+    config = PhysicsConfig(device="cpu", poisson_ratio=0.0, force_radius=0.05)
+    simulation = TissueSimulation.from_nodes(nodes, config, properties)
+    force, area = 0.05, (8 * spacing) ** 2
+    simulation.set_wrench("load", [0.01, 0.01, 0.0], [0.0, 0.0, force])
+    steps(simulation, 40)
+    moved = (simulation.state().positions - nodes.rest)[:, 2]
+    middle = nodes.is_skin & (np.linalg.norm(nodes.rest[:, :2] - 0.01, axis=1) < 0.008)
+    half = np.abs(nodes.rest[:, 2] - height / 2) < 1e-6
+    expected_half = force / area / 5e3 * height / 2
+    assert moved[half].mean() == pytest.approx(expected_half, rel=0.12)
+    assert moved[middle].mean() == pytest.approx(expected_half * 1.25, rel=0.12)
+
+
+def test_environments_are_independent_copies_on_any_number_of_threads(monkeypatch):
+    nodes = build_control_nodes(curved_sheet(), EYE, PhysicsConfig(node_count=400))
+    config = PhysicsConfig(device="cpu", node_count=400)
+
+    def run(threads: int):
+        monkeypatch.setenv("ENDO_SIM_THREADS", str(threads))
+        batch = TissueBatch(nodes, config, environments=5, tools=2, stiffness=[1.0, 1.0, 2.0, 1.0, 1.0])
+        batch.tools.reaches[:, 0] = torch.from_numpy(TIP)
+        batch.tools.forces[:, 0, 2] = torch.tensor([0.1, 0.2, 0.2, 0.0, 1e7])
+        for _ in range(5):
+            batch.step()
+        return batch
+
+    batch, other = run(1), run(3)
+    assert torch.equal(batch.displacements, other.displacements) and torch.equal(batch.F, other.F)
+    depths = batch.displacements.norm(dim=2).max(1).values
+    assert depths[1] > 1.8 * depths[0] and depths[2] < 0.6 * depths[1]
+    assert not batch.displacements[3].any() and torch.equal(batch.positions()[3], torch.from_numpy(nodes.rest))
+    assert batch.tools.faults.tolist() == [0, 0, 0, 0, 5] and batch.displacements.isfinite().all()
+    np.testing.assert_allclose(batch.tools.reaction_forces[:4, 0, 2], [-0.1, -0.2, -0.2, 0.0], atol=1e-12)
+    single = TissueSimulation.from_nodes(nodes, config)  # with fewer substeps, as nothing in it is stiffer
+    single.set_wrench("probe", TIP, [0.0, 0.0, 0.1])
+    steps(single, 5)
+    np.testing.assert_allclose(batch.positions()[0], single.state().positions, atol=0.03 * depths[0])
+    batch.reset(torch.tensor([1, 4]))
+    assert not batch.displacements[1].any() and batch.displacements[0].any() and batch.tools.faults[4] == 0
 
 
 # Grasping
@@ -472,6 +655,108 @@ def test_tissue_that_came_to_rest_is_not_stepped_until_a_tool_acts():
     steps(simulation, 200)
     assert 4 < len(calls) < 100
     assert depth_of_dent(simulation) < 2e-5
+
+
+# Cutting
+
+
+def cut_along(simulation: TissueSimulation, ys: np.ndarray, tool: str = "knife") -> None:
+    """Draw a blade, upright in the tissue, along y at x = 0."""
+    for y in ys:
+        simulation.set_cut(tool, pose_at([0.0, y, 0.145]), True)
+    simulation.set_cut(tool, pose_at([0.0, ys[-1], 0.145]), False)
+
+
+def pull_apart(simulation: TissueSimulation, force: float = 0.4) -> tuple[np.ndarray, np.ndarray]:
+    """Pull both sides of x = 0 away from it; displacement along x [S] and rest position [S, 3] of the skin nodes."""
+    for side in (-1, 1):
+        for y in (-0.02, 0.0, 0.02):
+            tip = simulation.nodes.rest[simulation.nodes.is_skin]
+            tip = tip[np.linalg.norm(tip[:, :2] - [0.012 * side, y], axis=1).argmin()]
+            simulation.set_wrench(f"pull{side}{y}", tip, [force * side, 0, 0])
+    steps(simulation, 20)
+    state, skin = simulation.state(), simulation.nodes.is_skin
+    return (state.positions - state.rest)[skin, 0], state.rest[skin]
+
+
+@pytest.mark.parametrize("vectorised", [True, False])
+def test_a_cut_separates_what_is_pulled_apart_and_heals_on_reset(vectorised, monkeypatch):
+    if not vectorised:
+        monkeypatch.setattr(mpm, "STRESSES", {})
+    gaps = []
+    simulation = simulate(node_count=2400, layers=3, blade_length=0.03)
+    for cut in (False, True, False):
+        simulation.reset()
+        assert len(simulation.cuts) == 0
+        if cut:
+            cut_along(simulation, np.linspace(-0.045, 0.045, 31))
+            state = simulation.state()
+            np.testing.assert_array_equal(state.positions, state.rest)  # a cut alone moves nothing
+        moved, rest = pull_apart(simulation)
+        near = (np.abs(rest[:, 0]) < 0.006) & (np.abs(rest[:, 1]) < 0.02)
+        gaps.append(moved[near & (rest[:, 0] > 0)].mean() - moved[near & (rest[:, 0] < 0)].mean())
+        assert simulation.faults == 0
+    assert gaps[1] > 4 * gaps[0] > 0 and gaps[1] > 0.004
+    assert gaps[2] == gaps[0]
+
+
+def test_a_cut_opens_where_the_blade_was_and_not_beyond_its_end():
+    simulation = simulate(node_count=2400, layers=3, blade_length=0.03)
+    cut_along(simulation, np.linspace(-0.045, 0.0, 16))
+    moved, rest = pull_apart(simulation)
+    near = np.abs(rest[:, 0]) < 0.007
+
+    def gap(low, high):
+        where = near & (rest[:, 1] > low) & (rest[:, 1] < high)
+        return moved[where & (rest[:, 0] > 0)].mean() - moved[where & (rest[:, 0] < 0)].mean()
+
+    assert gap(-0.03, -0.012) > 3 * gap(0.012, 0.03) > 0
+
+
+def test_momentum_is_kept_on_each_side_of_a_cut_through_free_tissue():
+    simulation = free_block(layers=0, blade_length=0.05, kinematics="rest")
+    x = simulation.nodes.rest[:, 0]
+    for y in np.linspace(-0.01, 0.04, 21):
+        simulation.set_cut("knife", pose_at([0.0225, y, 0.04]), True)
+    simulation.set_wrench("pull", [0.04, 0.015, 0.01], [0.01, 0, 0])
+    steps(simulation, 5)
+    moved = simulation.solver.displacements()[:, 0]
+    assert not moved[x < 0.0225].any() and moved[x > 0.0225].min() > 1e-3  # the other half feels nothing at all
+    momentum = simulation.solver.momentum()[0]
+    np.testing.assert_allclose(momentum, [0.01 * 0.2, 0, 0], atol=2e-6)
+
+
+def test_skin_follows_its_own_side_of_a_cut():
+    model = curved_sheet(4000)
+    simulation = simulate(model, node_count=2400, layers=3, blade_length=0.03)
+    skinning = Skinning(model, simulation.nodes.rest, device="cpu")
+    whole = Skinning(model, simulation.nodes.rest, device="cpu")
+    for y in np.linspace(-0.045, 0.045, 31):
+        simulation.set_cut("knife", pose_at([0.0, y, 0.145]), True)
+        skinning.cut(simulation.cuts)
+    pull_apart(simulation)
+    state = simulation.state()
+    x, y = model.means[:, 0].numpy(), model.means[:, 1].numpy()
+    inner = (np.abs(x) < 0.008) & (np.abs(y) < 0.015)
+    moved, bridged = ((each.deform(state.positions, state.F)[0] - model.means)[:, 0].numpy() for each in (skinning, whole))
+    assert (np.sign(moved[inner]) == np.sign(x[inner])).mean() > 0.99
+    assert np.abs(moved[inner]).min() > 2 * np.abs(bridged[inner]).min()  # without the cut some skin hangs in the gap
+    at_once = Skinning(model, simulation.nodes.rest, device="cpu")
+    at_once.cut(simulation.cuts)
+    assert torch.equal(at_once.neighbours, skinning.neighbours) and torch.equal(at_once.weights, skinning.weights)
+    skinning.cut(np.zeros((0, 3, 3)))  # healed
+    assert torch.equal(skinning.neighbours, whole.neighbours) and torch.equal(skinning.weights, whole.weights)
+
+
+def test_cutting_air_changes_nothing_and_what_cannot_be_cut_says_so():
+    simulation = simulate(blade_length=0.01)
+    for z in (0.02, 0.03, 0.04):
+        simulation.set_cut("knife", pose_at([0.0, 0.0, z]), True)
+    assert len(simulation.cuts) == 0
+    with pytest.raises(ValueError, match="pose of tool 'knife' must be a finite"):
+        simulation.set_cut("knife", np.full((4, 4), np.nan), True)
+    with pytest.raises(ValueError, match="kinematics current cannot be cut; set kinematics to rest"):
+        simulate(kinematics="current").set_cut("knife", pose_at(TIP), True)
 
 
 # Stability and faults
@@ -584,6 +869,112 @@ def test_too_few_nodes_for_a_torque_still_take_the_force():
         np.testing.assert_allclose(force, [0, 0, -1e-3], atol=1e-12)
         by_force = np.cross(r[0], [0, 0, 1e-3])[0]  # about the tip; what was asked for beside it nothing resists
         assert torque[0] == pytest.approx(-by_force, abs=1e-11)
+
+
+def press(simulation: TissueSimulation, depth: float, over: int = 10, hold: int = 10) -> None:
+    """Press the capsule of a tool into the tissue from the camera's side."""
+    above = TIP - [0, 0, simulation.contact_radius]
+    for step in range(over + hold):
+        simulation.set_grasp("probe", pose_at(above + [0, 0, depth * min(step + 1, over) / over]), False)
+        simulation.step()
+
+
+@pytest.mark.parametrize("kinematics", ["rest", "current"])
+def test_what_a_pushing_tool_feels_is_the_momentum_that_the_tissue_gets(kinematics):
+    simulation = free_block(kinematics=kinematics, contact_radius=0.006, contact_length=0.05, friction=0.3)
+    centre, given, turned = simulation.nodes.rest.mean(0), np.zeros(3), np.zeros(3)
+    for step in range(16):
+        tip = np.array([centre[0] - 0.002, centre[1], -0.008 + 0.001 * step])
+        simulation.set_grasp("probe", pose_at(tip), False)
+        simulation.step()
+        force, torque = simulation.reaction("probe")
+        given -= simulation.step_duration * force
+        turned -= simulation.step_duration * (torque + np.cross(tip, force))
+    linear, angular = simulation.solver.momentum()
+    np.testing.assert_allclose(given, linear, atol=1e-4 * np.linalg.norm(linear))
+    np.testing.assert_allclose(turned, angular, atol=0.1 * np.linalg.norm(angular))  # the tip moves during a step
+    assert linear[2] > 5e-4 and simulation.faults == 0
+
+
+@pytest.mark.parametrize("young", [5e3, 10e3])
+def test_a_pressed_layer_resists_as_the_theory_of_indentation_says(young):
+    """A frictionless sphere in a layer bonded to its ground: Hertz with the correction of Dimitriadis et al. (2002)."""
+    radius, spacing, layer, nu, forces, theory = 0.008, 0.0025, 0.015, 0.3, [], []
+    nodes = specimen((17, 17, 7), spacing, lambda x: x[:, 2] > layer - 1e-6, lambda x: x[:, 2] < 1e-6)
+    for depth in (0.001, 0.002):
+        config = PhysicsConfig(device="cpu", young_modulus=young, contact_radius=radius, friction=0.0)
+        simulation = TissueSimulation.from_nodes(nodes, config)
+        for step in range(20):
+            tip = np.array([0.02, 0.02, -radius + depth * min(1, (step + 1) / 10)])
+            simulation.set_grasp("probe", pose_at(tip), False)
+            simulation.step()
+        forces.append(-simulation.reaction("probe")[0][2])
+        chi = np.sqrt(radius * depth) / layer
+        alpha = -(1.2876 - 1.4678 * nu + 1.3442 * nu**2) / (1 - nu)
+        beta = (0.6387 - 1.0277 * nu + 1.5164 * nu**2) / (1 - nu)
+        correction = 1 - 2 * alpha / np.pi * chi + 4 * alpha**2 / np.pi**2 * chi**2
+        correction -= 8 / np.pi**3 * (alpha**3 + 4 * np.pi**2 / 15 * beta) * chi**3
+        correction += 16 * alpha / np.pi**4 * (alpha**3 + 3 * np.pi**2 / 5 * beta) * chi**4
+        theory.append(4 / 3 * young / (1 - nu**2) * np.sqrt(radius) * depth**1.5 * correction)
+        gap = np.linalg.norm(simulation.state().positions - tip, axis=1).min() - radius
+        assert abs(gap) < 0.1 * depth
+    np.testing.assert_allclose(forces, theory, rtol=0.15)
+
+
+def test_friction_drags_and_without_it_tools_slide():
+    drags = []
+    for friction in (0.0, 0.3):
+        simulation = simulate(node_count=2000, contact_radius=0.006, friction=friction)
+        press(simulation, 0.003)
+        level = np.array([0.0, 0.0, TIP[2] - simulation.contact_radius + 0.003])
+        pulls = []
+        for step in range(12):
+            simulation.set_grasp("probe", pose_at(level + [0.0005 * (step + 1), 0, 0]), False)
+            simulation.step()
+            force = simulation.reaction("probe")[0]
+            pulls.append(force[0] / -force[2])
+        drags.append(-np.mean(pulls[4:]))
+    assert 0.15 < drags[1] - drags[0] < 0.4  # about the coefficient, beside the shape of the tissue
+
+
+def test_a_capsule_touches_along_its_length_and_a_thin_one_does_not_pass_between_nodes():
+    simulation = simulate(node_count=2000, contact_radius=0.004, contact_length=0.03)
+    pose = pose_at(TIP - [0.015, 0, 0.003])
+    pose[:3, :3] = [[0, 0, -1], [0, 1, 0], [1, 0, 0]]  # its z axis along -x: the capsule lies along +x
+    for step in range(10):
+        pose[2, 3] += 0.0003
+        simulation.set_grasp("probe", pose, False)
+        simulation.step()
+    state = simulation.state()
+    moved = np.linalg.norm(state.positions - state.rest, axis=1)
+    along = state.rest[moved > 0.5 * moved.max(), 0]
+    assert np.ptp(along) > 0.02 and moved.max() > 1e-3
+    thin = simulate(node_count=2000, contact_radius=1e-4)
+    assert thin.contact_radius > 1e-3
+    press(thin, 0.002)
+    assert depth_of_dent(thin) > 0.0005 and thin.reaction("probe")[0][2] < -0.02
+
+
+def test_a_tool_that_appears_within_tissue_pushes_it_out_gently():
+    simulation, centre = simulate(contact_radius=0.01), TIP - [0, 0, 0.004]
+    simulation.set_grasp("probe", pose_at(centre), False)
+    for _ in range(20):
+        simulation.step()
+        assert simulation.faults == 0 and np.abs(simulation.solver.state.v.numpy()).max() < 2.0
+    gap = np.linalg.norm(simulation.state().positions - centre, axis=1).min() - 0.01
+    assert -0.0005 < gap < 0.0005
+
+
+def test_a_tool_that_goes_away_feels_nothing_and_too_many_tools_are_refused():
+    simulation = simulate(contact_radius=0.006)
+    press(simulation, 0.003)
+    assert simulation.reaction("probe")[0][2] < -0.05
+    simulation.set_grasp("probe", pose_at(TIP - [0, 0, 0.05]), False)
+    steps(simulation, 2)
+    assert not simulation.reaction("probe")[0].any()
+    with pytest.raises(ValueError, match="tool 'p7' is one too many; there can be 8: probe, p0"):
+        for k in range(8):
+            simulation.set_grasp(f"p{k}", pose_at(EYE), False)
 
 
 def test_reaction_is_minus_the_wrench_while_it_arrives():

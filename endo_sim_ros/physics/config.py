@@ -29,9 +29,11 @@ class PhysicsConfig(StageConfig):
     poisson_ratio: Annotated[float, Range(0.0, 0.49)] = 0.3
     """Compressibility. Wet tissue is nearer 0.49, but there the sound speed multiplies the substeps by four and
     the coarse grid locks; 0.3 keeps the paper's substep stable."""
-    viscosity: Annotated[float, Range(0.0, 1e4, "Pa·s")] = 0.0
-    """Kelvin-Voigt viscosity beside the elastic law: resists strain in proportion to its rate, 0 = none. Tens to hundreds make
-    tissue creep like liver; more substeps are then taken."""
+    relaxation: Annotated[float, Range(0.0, 20.0)] = 0.0
+    """Visco-elasticity: a Maxwell branch this many times as stiff as the material beside it. Fast motion meets all of it, held
+    tissue relaxes; liver has about 1, 0 = none."""
+    relaxation_time: Annotated[float, Range(1e-3, 1e3, "s")] = 0.3
+    """Time in which the Maxwell branch forgets."""
     density: Annotated[float, Range(1.0, 1e5, "kg/m³")] = 1000.0
     """Mass density of the tissue."""
     regions: tuple[str, ...] = ()
@@ -70,6 +72,9 @@ class PhysicsConfig(StageConfig):
     """Length of that capsule from the tip backwards, against the tool's z axis; 0 = a sphere."""
     friction: Annotated[float, Range(0.0, 10.0)] = 0.2
     """Coulomb friction between tool and tissue; wet instruments have 0.05 to 0.3."""
+    blade_length: Annotated[float, Range(1e-4, 0.1, "m")] = 0.01
+    """Length of the edge that a cutting tool sweeps through the tissue, from its tip backwards, against its z axis. A cut opens
+    once it is about one cell of the grid deep; more layers make that finer."""
     dense: bool = False
     """Simulate every Gaussian as a material point (PhysGaussian's way) instead of sparse nodes;
     layers are then ignored."""

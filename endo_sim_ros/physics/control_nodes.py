@@ -188,9 +188,7 @@ def build_control_nodes(model: GaussianModel, viewpoint: np.ndarray, config: Phy
     )
 
 
-def _dense_nodes(
-    points: np.ndarray, eye: np.ndarray, skin: np.ndarray, sheet: Skin, config: PhysicsConfig
-) -> ControlNodes:
+def _dense_nodes(points: np.ndarray, eye: np.ndarray, skin: np.ndarray, sheet: Skin, config: PhysicsConfig) -> ControlNodes:
     """Every solid Gaussian a node, as PhysGaussian has it: cells of 1/50 of the scene, shared evenly by their points.
 
     Points [N, 3] and sampled skin [S, 3] are relative to the viewpoint eye [3].

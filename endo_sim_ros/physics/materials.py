@@ -1,4 +1,4 @@
-"""Materials: hyperelastic laws and the viscosity that may act beside each of them.
+"""Materials: hyperelastic laws, and the relaxation that may act beside each of them.
 
 A material is one ``@wp.func`` that maps the deformation gradient F and Lamé's parameters to the first Piola-Kirchhoff
 stress P = ∂ψ/∂F [Pa] (exactly zero at F = I, so that a rest state stays at rest bit for bit), one torch function with
@@ -88,19 +88,25 @@ def _neo_hookean(F: Tensor, mu: float, lam: float) -> Tensor:
 
 
 @wp.func
-def kelvin_voigt(F: wp.mat33, rate: wp.mat33, viscosity: float) -> wp.mat33:
-    """P = F S of a dashpot beside the elastic law, S = 2η Ė with the rate of Green's strain Ė = sym(Fᵀ Ḟ).
+def second_piola(F: wp.mat33, P: wp.mat33) -> wp.mat33:
+    """S = F⁻¹ P, the stress that a rotation of the tissue does not change; finite for collapsed F as well."""
+    return (1.0 / wp.max(wp.determinant(F), 0.05)) * (wp.transpose(cofactor(F)) * P)
 
-    Being made of Ė it resists no rigid motion, and F S Fᵀ is symmetric: it conserves angular momentum and its power
-    2η |Ė|² is never negative.
+
+@wp.func
+def maxwell(F: wp.mat33, P: wp.mat33, relaxed: wp.mat33, ratio: float) -> wp.mat33:
+    """P of an elastic law with a Maxwell branch beside it (standard linear solid; Simo 1987): P + g (P − F Q).
+
+    The branch has g times the stiffness of the law, of which it has forgotten Q, which follows S: dQ/dt = (S − Q)/τ.
+    Fast tissue is 1 + g times as stiff as tissue at rest, and held tissue relaxes with the time τ.
 
     Args:
         F: Deformation gradient.
-        rate: Ḟ, 1/s.
-        viscosity: η, Pa·s.
+        P: First Piola-Kirchhoff stress of the elastic law, Pa.
+        relaxed: Q, a second Piola-Kirchhoff stress, Pa.
+        ratio: g.
     """
-    slope = wp.transpose(F) * rate
-    return viscosity * (F * (slope + wp.transpose(slope)))
+    return P + ratio * (P - F * relaxed)
 
 
 @wp.func

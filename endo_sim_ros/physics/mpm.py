@@ -13,6 +13,7 @@ import warp as wp
 from endo_sim_ros.device import cpu_threads, init_warp, pick_device, run_in_threads
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes
+from endo_sim_ros.physics.cutting import CutTable, first_nodes
 from endo_sim_ros.physics.materials import energy_density, lame_parameters, sound_speed
 from endo_sim_ros.physics.mpm_kernels import (
     Grid,
@@ -61,9 +62,6 @@ class Substepping:
 def plan_substeps(config: PhysicsConfig, cell_size: float, properties: TissueProperties | None = None, factor: float = 1.0) -> Substepping:
     """Divide a step so that the Courant number c Δt/h is stable: as few substeps as are safe, or those configured.
 
-    A viscosity η takes from the longest stable substep the factor √(1 + ξ²) − ξ of lagged damping, where
-    ξ = 2 η c / (h (λ + 2μ)) is the damping ratio of the shortest wave; the Courant number counts it in.
-
     Args:
         config: Material and substeps asked for; with ``adapt_substeps`` these give the duration of the step only.
         cell_size: Grid cell size h, metres.
@@ -75,10 +73,9 @@ def plan_substeps(config: PhysicsConfig, cell_size: float, properties: TissuePro
     """
     if properties is None:
         properties = TissueProperties.uniform(1, config.young_modulus, config.poisson_ratio, config.density)
-    young = factor * properties.young_modulus
-    speeds = np.array([sound_speed(*each) for each in zip(young, properties.poisson_ratio, properties.density)])
-    ratios = 2 * config.viscosity / (properties.density * speeds * cell_size)
-    limits = speeds / (np.sqrt(1 + ratios**2) - ratios)  # of an elastic material with the same stable substep
+    # A wave faster than the relaxation meets the elastic law and the Maxwell branch.
+    young = factor * (1 + config.relaxation) * properties.young_modulus
+    limits = np.array([sound_speed(*each) for each in zip(young, properties.poisson_ratio, properties.density)])
     worst = int(limits.argmax())
     limit = float(limits[worst])
     count = config.substeps
@@ -89,11 +86,11 @@ def plan_substeps(config: PhysicsConfig, cell_size: float, properties: TissuePro
     if cfl > CFL_LIMIT or count > MAX_SUBSTEPS:
         fitting = math.ceil(count * cfl / CFL_LIMIT)
         raise StabilityError(
-            f"young_modulus {young[worst]:g} Pa, poisson_ratio {properties.poisson_ratio[worst]:g}"
-            + f", viscosity {config.viscosity:g} Pa·s" * (config.viscosity > 0)
+            f"young_modulus {young[worst] / (1 + config.relaxation):g} Pa, poisson_ratio {properties.poisson_ratio[worst]:g}"
+            + f", relaxation {config.relaxation:g}" * (config.relaxation > 0)
             + f" and density {properties.density[worst]:g} kg/m³ on a grid of {cell_size:.3g} m give a Courant number of"
             f" {cfl:.2f} with {count} substeps of {dt:.3g} s (limits {CFL_LIMIT} and {MAX_SUBSTEPS}); use {fitting}"
-            f" substeps of {config.step_duration / fitting:.3g} s, adapt_substeps, or a softer, less viscous material"
+            f" substeps of {config.step_duration / fitting:.3g} s, adapt_substeps, or a softer material"
         )
     return Substepping(count, dt, cfl)
 
@@ -172,7 +169,8 @@ class MpmSolver:
                 + "; remove outlying Gaussians, lower node_count or raise grid_ratio"
             )
         self.grid_shape = tuple(int(n) for n in cells)
-        self.rest_cells = (rest - self.origin) / h  # [M, 3] rest positions, in cells of the grid
+        local = (rest - self.origin).astype(np.float32)
+        self.rest_cells = local.astype(np.float64) / h  # [M, 3] rest positions, in cells of the grid
         self._grid = Grid()
         self._grid.h, self._grid.inverse_h = h, 1 / h
         self._grid.nx, self._grid.ny, self._grid.nz = self.grid_shape
@@ -181,13 +179,12 @@ class MpmSolver:
         lame = [lame_parameters(*each) for each in zip(properties.young_modulus, properties.poisson_ratio)]
         self.mu, self.lam = np.array(lame).T  # [M] Pa each
         # What holds a node is stiffer than the tissue beside it, so that it gives way a few per cent at most.
-        stiffness_of_hold = PIN_STIFFNESS * scale.max() * (self.lam + 2 * self.mu) * np.cbrt(nodes.volumes)
+        stiffness_of_hold = PIN_STIFFNESS * scale.max() * (1 + config.relaxation) * (self.lam + 2 * self.mu) * np.cbrt(nodes.volumes)
         self.nodes = Nodes()
-        self.nodes.X = self._array((rest - self.origin).astype(np.float32), wp.vec3)
+        self.nodes.X = self._array(local, wp.vec3)
         self.nodes.mass = self._array(nodes.volumes * properties.density, float)
         self.nodes.volume = self._array(nodes.volumes, float)
         self.nodes.mu, self.nodes.lam = self._array(self.mu, float), self._array(self.lam, float)
-        self.nodes.viscosity = self._array(np.full(len(nodes), config.viscosity), float)
         self.nodes.stiffness = self._array(stiffness_of_hold, float)
         self._scale = self._array(scale, float)
         count = environments * len(nodes)
@@ -208,15 +205,17 @@ class MpmSolver:
         self._substep.dt = self.substepping.dt
         self._substep.decay = math.exp(-config.damping * self.substepping.dt)
         self._substep.gravity = wp.vec3(*config.gravity)
+        self._substep.ratio = config.relaxation
+        self._substep.forget = -math.expm1(-self.substepping.dt / config.relaxation_time)
         self._before: list[Launch] = []
         self._after: list[Launch] = []
         self._vectorised = vectorised and self.device == "cpu" and config.material in STRESSES
         self._advance: Callable[[], None] | None = None
-        self.set_cut(np.empty(0, int), np.empty((0, 27), int), 0)
+        self.set_cut(None)
         self.reset()
 
     def _array(self, values: np.ndarray, dtype) -> wp.array:
-        values = np.ascontiguousarray(values, np.int32 if dtype is int else np.float32)
+        values = np.ascontiguousarray(values, np.int32 if dtype in (int, wp.vec3i) else np.float32)
         return wp.array(values, dtype=dtype, device=self.device)
 
     def _zeros(self, count: int, dtype) -> wp.array:
@@ -225,7 +224,7 @@ class MpmSolver:
     def _new_state(self) -> State:
         state, count = State(), self.environments * self.node_count
         state.u, state.v = self._zeros(count, wp.vec3), self._zeros(count, wp.vec3)
-        state.C, state.F = self._zeros(count, wp.mat33), self._zeros(count, wp.mat33)
+        state.C, state.F, state.Q = (self._zeros(count, wp.mat33) for _ in range(3))
         return state
 
     def reset(self, environments: torch.Tensor | slice = slice(None)) -> None:
@@ -236,31 +235,28 @@ class MpmSolver:
             values = wp.to_torch(array)
             return values.view(*shape, *values.shape[1:])
 
-        for array in (self.loads.force, self.loads.target, self.loads.target_v, self.state.u, self.state.v, self.state.C):
+        for array in (self.loads.force, self.loads.target, self.loads.target_v, self.state.u, self.state.v, self.state.C, self.state.Q):
             of(array)[environments] = 0
         of(self.state.F)[environments] = torch.eye(3, device=self.device)
         of(self.loads.holder)[environments] = -1
         of(self.loads.spring)[environments] = of(self.pin_springs)[environments]
 
-    def set_cut(self, affected: np.ndarray, table: np.ndarray, extra: int) -> None:
-        """Let nodes beside a cut transfer to grid nodes of their own side.
-
-        Args:
-            affected: Numbers of these nodes [A].
-            table: Numbers of the 27 grid nodes of each [A, 27], k fastest; those beyond the regular grid are copies.
-            extra: Number of the copies.
+    def set_cut(self, cut: CutTable | None) -> None:
+        """Let nodes beside a cut transfer to grid nodes of their own side; None makes the tissue whole again.
 
         Raises:
             ValueError: With current kinematics, whose nodes change their grid nodes in every substep.
         """
-        if len(affected) and self.config.kinematics == "current":
-            raise ValueError("tissue with current kinematics cannot be cut; use kinematics rest")
-        self._grid.count = math.prod(self.grid_shape) + extra
-        row = np.full(self.node_count, -1)
-        row[affected] = np.arange(len(affected))
-        self.nodes.row = self._array(row, int)
-        self.nodes.table = self._array(np.asarray(table).ravel() if len(affected) else np.zeros(1), int)
-        self._table = row, np.asarray(table, np.int64)
+        if cut is not None and self.config.kinematics == "current":
+            raise ValueError("tissue with current kinematics cannot be cut; set kinematics to rest")
+        self._first = first_nodes(self.rest_cells, self.grid_shape)  # [M, 3]
+        self._row, self._table = np.full(self.node_count, -1), np.zeros((0, 27), int)
+        if cut is not None:
+            self._first[cut.affected], self._row[cut.affected] = cut.base, np.arange(len(cut.affected))
+            self._table = cut.table
+        self._grid.count = math.prod(self.grid_shape) + (cut.extra if cut is not None else 0)
+        self.nodes.first, self.nodes.row = self._array(self._first, wp.vec3i), self._array(self._row, int)
+        self.nodes.table = self._array(self._table.ravel() if len(self._table) else np.zeros(1), int)
         self._advance = None
         if self.device == "cpu":  # now, where nobody waits, rather than when the tissue is first touched
             self._advance = self._prepare()
@@ -302,7 +298,7 @@ class MpmSolver:
         every, count = (self.environments, self.node_count), self.node_count
         check = [self.state, count, self.config.travel, self.bad_nodes, self._speed_sq]
         actions = [self._action(launch) for launch in self._before]
-        for name in ("u", "v", "C", "F"):
+        for name in ("u", "F", "Q"):
             actions.append(partial(wp.copy, getattr(self._backup, name), getattr(self.state, name)))
         actions += [array.zero_ for array in (self.bad_nodes, self._speed_sq, self.rigid.impulse)]
         actions += self._vectorised_step() if self._vectorised else self._launched_substeps()
@@ -322,10 +318,9 @@ class MpmSolver:
         """CPU: one launch for all substeps; environments are shared out among threads, each with its scratch memory."""
         kernel = make_step_kernel(self.config.material, self.config.kinematics)
         slots = min(cpu_threads(), self.environments)
-        first = np.clip(np.floor(self.rest_cells - 0.5).astype(int), 0, np.array(self.grid_shape) - 3)
         padded = -(-self.node_count // LANES) * LANES
         order = np.full(padded, -1)
-        order[: self.node_count] = np.lexsort(first.T[::-1])
+        order[: self.node_count] = np.lexsort(self._first.T[::-1])
         scratch = [self._array(order, int)]
         scratch += [self._zeros(slots * 4 * (self._grid.count + 4), float) for _ in range(2)]
         scratch += [self._zeros(slots * SCRATCH * padded, float), self._zeros(slots * padded, int)]
@@ -371,15 +366,13 @@ class MpmSolver:
 
     def _entries(self) -> tuple[wp.array, wp.array, wp.array, wp.array]:
         """For each grid node the nodes that give to it, as `collect` reads them."""
-        first = np.clip(np.floor(self.rest_cells - 0.5).astype(int), 0, np.array(self.grid_shape) - 3)
         steps = np.stack(np.meshgrid(*[np.arange(3)] * 3, indexing="ij"), -1).reshape(27, 3)
-        f = self.rest_cells - first  # [M, 3]
+        f = self.rest_cells - self._first  # [M, 3]
         splines = np.stack([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1) ** 2, 0.5 * (f - 0.5) ** 2], -1)  # [M, 3, 3]
         weights = splines[:, 0, steps[:, 0]] * splines[:, 1, steps[:, 1]] * splines[:, 2, steps[:, 2]]  # [M, 27]
-        corners = first[:, None] + steps
+        corners = self._first[:, None] + steps
         numbers = np.ravel_multi_index(tuple(np.moveaxis(corners, -1, 0)), self.grid_shape)
-        row, table = self._table
-        numbers[row >= 0] = table[row[row >= 0]]
+        numbers[self._row >= 0] = self._table[self._row[self._row >= 0]]
         offsets = np.concatenate([steps - f[:, None], weights[..., None]], -1).reshape(-1, 4)
         order = np.argsort(numbers.ravel(), kind="stable")
         places, counts = np.unique(numbers, return_counts=True)
@@ -404,12 +397,14 @@ class MpmSolver:
         return array.numpy()[environment * self.node_count : (environment + 1) * self.node_count].copy()
 
     def momentum(self, environment: int = 0) -> tuple[np.ndarray, np.ndarray]:
-        """Linear momentum [3], kg·m/s, and angular momentum about the grid's corner [3], kg·m²/s, of all nodes.
+        """Linear momentum [3], kg·m/s, and angular momentum about the world's origin [3], kg·m²/s, of all nodes.
 
-        The angular momentum has the part Σ m h²/4 ε : C that APIC carries in C."""
+        The angular momentum has the part that APIC carries in C: Σ m h²/4 ε : C, with rest kinematics ε : C Fᵀ."""
         mass = self.nodes.mass.numpy().astype(np.float64)[:, None]
-        v, C = (self._of(array, environment).astype(np.float64) for array in (self.state.v, self.state.C))
-        x = self.nodes.X.numpy().astype(np.float64) + self.displacements(environment)
+        v, C, F = (self._of(array, environment).astype(np.float64) for array in (self.state.v, self.state.C, self.state.F))
+        x = self.nodes.X.numpy().astype(np.float64) + self.displacements(environment) + self.origin
+        if self.config.kinematics == "rest":
+            C = C @ F.transpose(0, 2, 1)
         spin = np.stack([C[:, 2, 1] - C[:, 1, 2], C[:, 0, 2] - C[:, 2, 0], C[:, 1, 0] - C[:, 0, 1]], 1)
         return (mass * v).sum(0), (mass * (np.cross(x, v) + self.cell_size**2 / 4 * spin)).sum(0)
 

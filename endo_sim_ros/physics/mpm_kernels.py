@@ -25,11 +25,11 @@ import functools
 
 import warp as wp
 
-from endo_sim_ros.physics.materials import MATERIALS, kelvin_voigt, kirchhoff_stress
+from endo_sim_ros.physics.materials import MATERIALS, kirchhoff_stress, maxwell, second_piola
 
 wp.set_module_options({"enable_backward": False})
 
-PUSH_OUT = 0.1  # m/s; a tool that suddenly is deep within tissue pushes it out no faster than this
+PUSH_OUT = 0.5  # m/s; a tool that suddenly is deep within tissue pushes it out no faster than this
 
 
 @wp.struct
@@ -54,8 +54,8 @@ class Nodes:
     volume: wp.array[float]  # at rest, m³
     mu: wp.array[float]  # Lamé's parameters, Pa
     lam: wp.array[float]
-    viscosity: wp.array[float]  # Pa·s
     stiffness: wp.array[float]  # N/m, of what holds or pushes the node
+    first: wp.array[wp.vec3i]  # first grid node (i, j, k) of its stencil at rest
     row: wp.array[int]  # in the table, of nodes beside a cut; -1 for all others
     table: wp.array[int]  # [A · 27] numbers of the grid nodes of each such node, k fastest
 
@@ -68,6 +68,7 @@ class State:
     v: wp.array[wp.vec3]  # velocity, m/s
     C: wp.array[wp.mat33]  # APIC matrix: velocity gradient, 1/s
     F: wp.array[wp.mat33]  # deformation gradient
+    Q: wp.array[wp.mat33]  # stress that the Maxwell branch has forgotten, Pa
 
 
 @wp.struct
@@ -111,6 +112,8 @@ class Substep:
     dt: float  # s
     decay: float  # exp(-c Δt)
     gravity: wp.vec3  # m/s²
+    ratio: float  # stiffness of the Maxwell branch over that of the elastic law, 0 = none
+    forget: float  # 1 - exp(-Δt/τ) of it
 
 
 @wp.func
@@ -213,9 +216,11 @@ def make_advance_kernel(material: str, kinematics: str):
 
         if gather != 0:
             x = X * grid.inverse_h
+            first_node = nodes.first[p]
             if wp.static(current):
                 x = (X + u) * grid.inverse_h
-            i0, j0, k0 = first_cell(x[0], grid.nx), first_cell(x[1], grid.ny), first_cell(x[2], grid.nz)
+                first_node = wp.vec3i(first_cell(x[0], grid.nx), first_cell(x[1], grid.ny), first_cell(x[2], grid.nz))
+            i0, j0, k0 = first_node[0], first_node[1], first_node[2]
             f = wp.vec3(x[0] - float(i0), x[1] - float(j0), x[2] - float(k0))
             wx, wy, wz = spline(f[0]), spline(f[1]), spline(f[2])
             row = nodes.row[p]
@@ -256,10 +261,12 @@ def make_advance_kernel(material: str, kinematics: str):
 
         if scatter != 0:
             mass = nodes.mass[p]
-            rate = C
-            if wp.static(current):
-                rate = C * F
-            S = scale[b] * (stress_of(F, nodes.mu[p], nodes.lam[p]) + kelvin_voigt(F, rate, nodes.viscosity[p]))
+            S = scale[b] * stress_of(F, nodes.mu[p], nodes.lam[p])
+            if step.ratio > 0.0:
+                Q = state.Q[e]
+                Q += step.forget * (second_piola(F, S) - Q)
+                state.Q[e] = Q
+                S = maxwell(F, S, Q, step.ratio)
             if wp.static(current):
                 S = kirchhoff_stress(S, F)
             spring = loads.spring[e]
@@ -373,5 +380,6 @@ def undo_bad_steps(faults: wp.array[int], count: int, backup: State, state: Stat
     if faults[b] > 0:
         state.u[e] = backup.u[e]
         state.F[e] = backup.F[e]
+        state.Q[e] = backup.Q[e]
         state.v[e] = wp.vec3()
         state.C[e] = wp.mat33()

@@ -17,7 +17,7 @@ from endo_sim_ros.physics.mpm_kernels import PUSH_OUT, Grid, Loads, Nodes, Rigid
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 LANES = 16
-SCRATCH = 48  # vectors of scratch for 16 nodes: 32 components and 16 rows of weights
+SCRATCH = 56  # vectors of scratch for 16 nodes: 40 components and 16 rows of weights
 
 # Vectorised twins of the laws in `materials`: P[9] of F[9] (row by row) for mu, lam.
 STRESSES = {
@@ -176,8 +176,8 @@ _STEP = (
     int* const base = bases.data + slot * (size_t)padded;
     const size_t e0 = b * (size_t)M;
     const auto at = [&](int block, int component) -> vfloat& { return soa[block * (SCRATCH_VECTORS - 16) + component]; };
-    enum { MASS, VOLUME, MU, LAM, VISCOSITY, STIFFNESS, SPRING, HOLDER, X, U = X + 3, F0 = U + 3, FORCE = F0 + 9,
-           TARGET = FORCE + 3, TARGET_V = TARGET + 3 };  // 32 in all
+    enum { MASS, VOLUME, MU, LAM, STIFFNESS, SPRING, HOLDER, X, U = X + 3, F0 = U + 3, FORCE = F0 + 9,
+           TARGET = FORCE + 3, TARGET_V = TARGET + 3, Q0 = TARGET_V + 3 };  // 40 in all
     vfloat* const pulls = (vfloat*)pulled.data + slot * (size_t)(4 * padded / 16);
     vint* const givers = (vint*)gave.data + slot * (size_t)(padded / 16);
     const vfloat zero = {};
@@ -197,7 +197,6 @@ _STEP = (
             fill(VOLUME, nodes.volume.data, p, 1);
             fill(MU, nodes.mu.data, p, 1);
             fill(LAM, nodes.lam.data, p, 1);
-            fill(VISCOSITY, nodes.viscosity.data, p, 1);
             fill(STIFFNESS, nodes.stiffness.data, p, 1);
             fill(SPRING, loads.spring.data, e, 1);
             fill(HOLDER, loads.holder.data, e, 1);  // an integer, bit by bit
@@ -207,6 +206,8 @@ _STEP = (
             fill(FORCE, loads.force.data, e, 3);
             fill(TARGET, loads.target.data, e, 3);
             fill(TARGET_V, loads.target_v.data, e, 3);
+            if (substep.ratio > 0.0f)
+                fill(Q0, state.Q.data, e, 9);
             if (p < 0)
                 at(block, F0)[lane] = at(block, F0 + 4)[lane] = at(block, F0 + 8)[lane] = 1.0f;
         }
@@ -217,11 +218,17 @@ _STEP = (
         const int n[3] = {grid.nx, grid.ny, grid.nz};
         for (int axis = 0; axis < 3; ++axis) {
             vfloat x = at(block, X + axis);
-            if (CURRENT)
-                x += at(block, U + axis);
-            x *= inverse_h;
-            first[axis] = __builtin_elementwise_floor(x - 0.5f);
-            first[axis] = first[axis] > 0.0f ? simd::min(first[axis], simd::set((float)(n[axis] - 3))) : zero;  // not NaN
+            if (CURRENT) {
+                x = (x + at(block, U + axis)) * inverse_h;
+                first[axis] = __builtin_elementwise_floor(x - 0.5f);
+                first[axis] = first[axis] > 0.0f ? simd::min(first[axis], simd::set((float)(n[axis] - 3))) : zero;  // not NaN
+            } else {
+                x *= inverse_h;
+                for (int lane = 0; lane < 16; ++lane) {
+                    const int p = order.data[16 * block + lane];
+                    first[axis][lane] = p < 0 ? 0.0f : (float)((const int*)nodes.first.data)[3 * p + axis];
+                }
+            }
             f[axis] = x - first[axis];
             const vfloat a = 1.5f - f[axis], c = f[axis] - 1.0f, d = f[axis] - 0.5f;
             rows[4 * axis] = 0.5f * a * a;
@@ -239,6 +246,12 @@ _STEP = (
         vfloat f[3];
         place(block, f);
     }
+    // Where nodes lay among their grid nodes when they were placed last.
+    const auto remembered = [&](int block, vfloat* f) {
+        for (int lane = 0; lane < 16; ++lane)
+            for (int axis = 0; axis < 3; ++axis)
+                f[axis][lane] = weights[16 * (size_t)(16 * block + lane) + 12 + axis];
+    };
 
     // Nodes beside a cut name their grid nodes one by one.
     const auto entry = [&](int node, int i, int j, int k) {
@@ -304,10 +317,7 @@ _STEP = (
                     v[i] = rows[i];
                     u[i] += dt * v[i];
                 }
-                // Where the node lay among its grid nodes when it gave to them.
-                for (int lane = 0; lane < 16; ++lane)
-                    for (int axis = 0; axis < 3; ++axis)
-                        f[axis][lane] = weights[16 * (size_t)(16 * block + lane) + 12 + axis];
+                remembered(block, f);
                 for (int r = 0; r < 3; ++r)
                     for (int c = 0; c < 3; ++c)
                         C[3 * r + c] = 4.0f * inverse_h * (rows[4 * (c + 1) + r] - f[c] * v[r]);
@@ -353,6 +363,8 @@ _STEP = (
                     for (int i = 0; i < 9; ++i) {
                         ((float*)state.C.data)[9 * (e0 + p) + i] = C[i][lane];
                         ((float*)state.F.data)[9 * (e0 + p) + i] = F[i][lane];
+                        if (substep.ratio > 0.0f)
+                            ((float*)state.Q.data)[9 * (e0 + p) + i] = at(block, Q0 + i)[lane];
                     }
                 }
                 continue;
@@ -363,20 +375,22 @@ _STEP = (
             const vfloat mass = at(block, MASS), mu = factor * at(block, MU), lam = factor * at(block, LAM);
             vfloat P[9];
             { STRESS }
-            const vfloat viscosity = factor * at(block, VISCOSITY);
-            if (simd::any(viscosity > 0.0f)) {
-                vfloat rate[9], slope[9];
+            if (substep.ratio > 0.0f) {
+                vfloat cofactor[9], given[9];
+                const vfloat J = simd::max(simd::cofactor(F, cofactor), simd::set(0.05f));
                 for (int r = 0; r < 3; ++r)
-                    for (int c = 0; c < 3; ++c)
-                        rate[3 * r + c] = CURRENT ? C[3 * r] * F[c] + C[3 * r + 1] * F[3 + c] + C[3 * r + 2] * F[6 + c]
-                                                  : C[3 * r + c];
+                    for (int c = 0; c < 3; ++c) {  // S = F⁻¹ P
+                        const vfloat S = (cofactor[r] * P[c] + cofactor[3 + r] * P[3 + c] + cofactor[6 + r] * P[6 + c]) / J;
+                        at(block, Q0 + 3 * r + c) += substep.forget * (S - at(block, Q0 + 3 * r + c));
+                    }
                 for (int r = 0; r < 3; ++r)
-                    for (int c = 0; c < 3; ++c)
-                        slope[3 * r + c] = F[r] * rate[c] + F[3 + r] * rate[3 + c] + F[6 + r] * rate[6 + c];
-                for (int r = 0; r < 3; ++r)
-                    for (int c = 0; c < 3; ++c)
+                    for (int c = 0; c < 3; ++c) {
+                        given[3 * r + c] = P[3 * r + c];
                         for (int k = 0; k < 3; ++k)
-                            P[3 * r + c] += viscosity * F[3 * r + k] * (slope[3 * k + c] + slope[3 * c + k]);
+                            given[3 * r + c] -= F[3 * r + k] * at(block, Q0 + 3 * k + c);
+                    }
+                for (int i = 0; i < 9; ++i)
+                    P[i] += substep.ratio * given[i];
             }
             if (CURRENT) {  // τ = P Fᵀ
                 vfloat tau[9];
@@ -467,14 +481,8 @@ _STEP = (
 
             // What the node gives: at its first grid node momentum and mass, then their growth along x, y and z.
             const float gravity[3] = {substep.gravity[0], substep.gravity[1], substep.gravity[2]};
-            if (!CURRENT)
-                for (int axis = 0; axis < 3; ++axis) {
-                    const vfloat x = at(block, X + axis) * inverse_h;
-                    vfloat first = __builtin_elementwise_floor(x - 0.5f);
-                    const int n = axis == 0 ? grid.nx : axis == 1 ? grid.ny : grid.nz;
-                    first = first > 0.0f ? simd::min(first, simd::set((float)(n - 3))) : zero;
-                    f[axis] = x - first;
-                }
+            if (!gather && !CURRENT)
+                remembered(block, f);
             const vfloat share = dt * 4.0f * inverse_h * at(block, VOLUME);
             for (int r = 0; r < 3; ++r) {
                 rows[r] = mass * (v[r] + dt * gravity[r]) + dt * at(block, FORCE + r) + pull[r];

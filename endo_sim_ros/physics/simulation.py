@@ -11,11 +11,13 @@ from torch import Tensor
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes, build_control_nodes
+from endo_sim_ros.physics.cutting import CutStencils, sweep, to_rest
 from endo_sim_ros.physics.mpm import MpmSolver, capturing
 from endo_sim_ros.physics.regions import TissueProperties, paint_regions
 from endo_sim_ros.physics.tools import Tools
 
 MAX_TOOLS = 8  # of a TissueSimulation
+_BLADE_POINTS = 4  # along a cutting edge; more than two follow tissue that is bent
 _RESTING_SPEED = 1e-5  # m/s; tissue slower than this, with no tool acting, is left as it is
 
 
@@ -129,6 +131,8 @@ class TissueSimulation:
         self.time = 0.0
         self.last_fault = ""
         self._slots: dict[str, int] = {}  # of tools, by name
+        self._stencils: CutStencils | None = None  # from the first cut on
+        self._blades: dict[str, np.ndarray] = {}  # edges of cutting tools where tissue was cut last [_BLADE_POINTS, 3], at rest
         self._disturbed = False  # since the last step: a tool moved, took hold or let go
         self._resting = not any(config.gravity)
 
@@ -199,9 +203,7 @@ class TissueSimulation:
         Raises:
             ValueError: If the pose has a wrong shape or is not finite; the tool then stays as it was.
         """
-        pose = np.asarray(pose, np.float64)
-        if pose.shape != (4, 4) or not np.isfinite(pose).all():
-            raise ValueError(f"pose of tool {tool!r} must be a finite 4×4 matrix, got {pose.tolist()}")
+        pose = _pose(tool, pose)
         slot, tools = self._slot(tool), self._tools
         R, tip = torch.from_numpy(pose[:3, :3].copy()), torch.from_numpy(pose[:3, 3].copy())
         moved = not (torch.equal(tools.tips[0, slot].cpu(), tip) and torch.equal(tools.rotations[0, slot].cpu(), R))
@@ -216,6 +218,46 @@ class TissueSimulation:
         if closed and not holding:
             tools.closed[0, slot] = 0
         return holding or not closed
+
+    def set_cut(self, tool: str, pose: np.ndarray, cutting: bool) -> None:
+        """Move the cutting edge of a tool; what it sweeps between two calls while cutting is cut.
+
+        The edge is ``blade_length`` long, from the tip backwards against the tool's z axis. Nodes on both sides of the
+        cut then share no momentum; ``cuts`` tells the skinning what not to bridge.
+
+        Args:
+            tool: Name of the tool.
+            pose: Tip-to-world transform [4, 4], metres.
+            cutting: Whether the edge cuts.
+
+        Raises:
+            ValueError: If the pose has a wrong shape or is not finite, or kinematics is not rest.
+        """
+        pose = _pose(tool, pose)
+        if not cutting:
+            self._blades.pop(tool, None)
+            return
+        if self.config.kinematics != "rest":
+            raise ValueError(f"tissue with kinematics {self.config.kinematics} cannot be cut; set kinematics to rest")
+        edge = pose[:3, 3] - np.linspace(0, self.config.blade_length, _BLADE_POINTS)[:, None] * pose[:3, 2]
+        state = self.state()
+        edge = to_rest(edge, state.rest, state.positions, state.F)
+        start = self._blades.setdefault(tool, edge)
+        triangles = sweep(start, edge)
+        if not len(triangles):
+            return
+        self._blades[tool] = edge
+        if self._stencils is None:
+            self._stencils = CutStencils(self.nodes.rest, self.solver.rest_cells, self.solver.grid_shape)
+        if self._stencils.cut(triangles):
+            with capturing:
+                self.solver.set_cut(self._stencils.table())
+            self._disturbed = True
+
+    @property
+    def cuts(self) -> np.ndarray:
+        """All that has been cut, as triangles in the tissue at rest [T, 3, 3], m, world."""
+        return np.zeros((0, 3, 3)) if self._stencils is None else self._stencils.triangles
 
     def reaction(self, tool: str) -> tuple[np.ndarray, np.ndarray]:
         """Force [3] N and torque [3] N·m that the tissue exerts back on a tool, world: minus what its wrench applies
@@ -267,9 +309,14 @@ class TissueSimulation:
         return bool(self._tools.forces.any() or self._tools.torques.any())
 
     def reset(self) -> None:
-        """Back to the rest state at time zero; tools let go."""
+        """Back to the rest state at time zero; tools let go, cuts heal."""
         self._batch.reset()
         self._slots.clear()
+        self._blades.clear()
+        if self._stencils is not None:
+            self._stencils.reset()
+            with capturing:
+                self.solver.set_cut(None)
         self._disturbed = False
         self._resting = not any(self.config.gravity)
         self.time = 0.0
@@ -290,6 +337,13 @@ class TissueSimulation:
             if tools.gripping[0, slot]:
                 parts.append(f"{name} grasping")
         return ", ".join(parts) or "no tool"
+
+
+def _pose(tool: str, value: np.ndarray) -> np.ndarray:
+    pose = np.asarray(value, np.float64)
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise ValueError(f"pose of tool {tool!r} must be a finite 4×4 matrix, got {pose.tolist()}")
+    return pose
 
 
 def _vector(name: str, value: np.ndarray, tool: str) -> np.ndarray:

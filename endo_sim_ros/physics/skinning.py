@@ -13,6 +13,7 @@ from endo_sim_ros.device import cpu_threads, init_warp, pick_device, run_in_thre
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.physics import skinning_kernels as kernels
 from endo_sim_ros.physics import skinning_simd_kernels as simd_kernels
+from endo_sim_ros.physics.cutting import CutNeighbours
 
 STRETCH_RANGE = (0.2, 4.0)  # of a Gaussian; beyond it the picture shows needles or holes, not tissue
 SHARED_FROM = 4096  # Gaussians; fewer are done before a second thread has begun
@@ -73,7 +74,19 @@ class Skinning:
         self.covars = model.covariances.float().contiguous()  # [N, 3, 3] m², at rest
         self.node_rest = torch.from_numpy(rest).float().to(self.device).contiguous()  # [M, 3] m
         self._origin = wp.vec3(*rest.mean(0))  # of the maps
-        self.rebind(*bind_weights(means, rest, neighbours, weighting))
+        index, weights = bind_weights(means, rest, neighbours, weighting)
+        self.rebind(index, weights)
+        self._cuts = CutNeighbours(means, rest, index, weights)
+
+    def cut(self, triangles: np.ndarray) -> None:
+        """Let no Gaussian follow nodes on the other side of a cut: all of it [T, 3, 3], m, world, in the tissue at rest."""
+        self._cuts.cut(triangles)
+        self.rebind(self._cuts.index, self._cuts.weights)
+
+    @property
+    def cuts(self) -> np.ndarray:
+        """The cuts that are heeded [T, 3, 3], m, world, at rest."""
+        return self._cuts.triangles
 
     def rebind(self, index: np.ndarray, weights: np.ndarray) -> None:
         """Let Gaussians follow other nodes from now on, e.g. those on their side of a cut.

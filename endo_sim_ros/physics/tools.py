@@ -10,7 +10,7 @@ from endo_sim_ros.physics.control_nodes import ControlNodes
 from endo_sim_ros.physics.mpm import Launch, MpmSolver
 from endo_sim_ros.physics.tools_kernels import Commands, Holds, Reach, load_nodes, measure_reactions, take_hold
 
-_THINNEST = 0.75  # of the distance between skin nodes: a thinner capsule would pass between them
+_THINNEST = 1.0  # of the distance between skin nodes; thinner, it would pass between them
 
 
 class Tools:

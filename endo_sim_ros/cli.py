@@ -188,6 +188,8 @@ class Export:
     """video: small (H.264); png: exact."""
     world_frame: str = "world"
     """Frame of the poses in the recording."""
+    frames: tuple[str, ...] = ()
+    """Other frames of poses and wrenches in the recording, as the nodes' parameter: 'PSM1_base x y z qx qy qz qw' each."""
 
     def run(self) -> None:
         from endo_sim_ros.learning.lerobot import export_lerobot
@@ -196,7 +198,7 @@ class Export:
             raise SequenceError("give one recording or more, then the folder of the dataset")
         *bags, out = self.paths
         episodes, frames = export_lerobot(
-            bags, out, self.task, self.fps, self.arm, self.sampling, self.images, self.world_frame
+            bags, out, self.task, self.fps, self.arm, self.sampling, self.images, self.world_frame, self.frames
         )
         print(f"{out}: {episodes} episode{'s' * (episodes != 1)}, {frames} frames")
 
@@ -258,6 +260,26 @@ class BenchRaster:
 
 
 @dataclass(frozen=True)
+class BenchPhysics:
+    """The simulation: the paper's comparison of every Gaussian with sparse nodes, the cost of a step, and many copies of a tissue."""
+
+    json: Path | None = None
+    """File for the results as a list of rows."""
+    device: str = "auto"
+    """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""
+    model: Path | None = None
+    """PLY model of the tissue, in metres, seen by the first camera of the cameras.json beside it, else from the world's
+    origin; default: a piece of the synthetic patient."""
+    environments: tuple[int, ...] = ()
+    """Numbers of copies stepped together; default: 1 4 16 64, on a GPU also 256 1024."""
+
+    def run(self) -> None:
+        from endo_sim_ros.evaluation.physics_bench import bench_physics
+
+        bench_physics(self.device, self.json, self.model, self.environments)
+
+
+@dataclass(frozen=True)
 class BenchGraph:
     """The node graph over DDS, each node its own process: latency from wrench to image, rates and losses."""
 
@@ -312,6 +334,7 @@ class Bench:
 
     what: tyro.conf.OmitArgPrefixes[
         Annotated[BenchRaster, tyro.conf.subcommand("raster", prefix_name=False)]
+        | Annotated[BenchPhysics, tyro.conf.subcommand("physics", prefix_name=False)]
         | Annotated[BenchGraph, tyro.conf.subcommand("graph", prefix_name=False)]
         | Annotated[BenchSoak, tyro.conf.subcommand("soak", prefix_name=False)]
     ]

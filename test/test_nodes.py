@@ -478,6 +478,19 @@ def test_a_model_file_is_published_when_set_and_a_bad_one_is_refused_with_the_re
     assert len(messages.decode_gaussians(models[0])) == 25
 
 
+def test_a_model_file_needs_no_image_and_a_recording_may_still_come(bench, reconstruction, small_frames, tmp_path):
+    save_ply(sheet(5), tmp_path / "model.ply")
+    assert bench.set("reconstruction_node", image_timeout=0.1, model_file=str(tmp_path / "model.ply"))[0]
+    bench.until(lambda: time.monotonic() - reconstruction._last_view > 0.2, "a long silence")
+    said = len(bench.statuses["reconstruction_node"])
+    assert bench.status("reconstruction_node", f"published the model of {tmp_path}/model.ply", OK, said)[2]["gaussians"] == "25"
+    send_frames(bench, small_frames, poses=False)
+    for _ in range(2):  # images without poses are given up when later ones come
+        reconstruction._flush()
+        bench.status("reconstruction_node", "images arrive but none is usable", WARN)
+    views_arrive(bench, small_frames)
+
+
 # ------------------------------------------------------------------------------------------------------- physics
 
 
@@ -713,6 +726,31 @@ def test_physics_follows_a_simulated_clock(bench):
     assert len(bench.heard["control_nodes"]) >= count + 5
 
 
+def test_overloaded_physics_acts_on_the_newest_command(bench, physics, monkeypatch):
+    """Each step takes longer than it should, and meanwhile three commands come, numbered by their force in millinewtons."""
+    send_model(bench)
+    await_nodes(bench, 5 * S)
+    send_tip(bench)
+    arm = physics._arms["PSM1"]
+    bench.until(lambda: arm.pose is not None, "a tip")
+    sent, delays, step = 1, [], physics._step
+
+    def slow(simulation):
+        nonlocal sent
+        if arm.force is not None:
+            delays.append(sent - round(-1e3 * arm.force[2]))
+        step(simulation)
+        for _ in range(3):
+            sent += 1
+            send_wrench(bench, (0, 0, -1e-3 * sent))
+            time.sleep(0.03)
+
+    send_wrench(bench, (0, 0, -1e-3))
+    monkeypatch.setattr(physics, "_step", slow)
+    bench.until(lambda: len(delays) > 15, "steps", 60)
+    assert max(delays) <= 6, delays  # the newest that had arrived: what is sent last may still be on its way
+
+
 def test_parameters_act_or_are_refused_with_the_reason(bench, physics):
     send_model(bench)
     await_nodes(bench, 5 * S)
@@ -862,6 +900,53 @@ def test_the_picture_follows_camera_info_pose_and_parameters(bench, rendering):
     assert not bench.set("rendering_node", device="cuda:99")[0]
 
 
+def test_images_bear_the_stamp_of_the_state_that_they_show(bench, rendering):
+    infos, poses, depths = (bench.hear(topic) for topic in messages.RENDERED_TOPICS if topic != messages.RENDERED_IMAGE)
+    images = bench.heard["rendered/image_raw"]
+    stamp_of = lambda message: messages.stamp_to_ns(message.header.stamp)  # noqa: E731
+    send_model(bench)
+    send_camera(bench)
+    await_image(bench, lambda image: image.max() > 100)
+    rest = sheet(8).means.numpy()
+    F = np.tile(np.eye(3, dtype=np.float32), (len(rest), 1, 1))
+
+    def shown(shift, stamp):
+        """Stamp of the first image of this state."""
+        before = newest_image(bench)
+        cloud = messages.ControlNodeCloud(rest, rest + np.float32([shift, 0, 0]), F, 5 * S)
+        count = len(images)
+        bench.publish(messages.CONTROL_NODES, messages.encode_control_nodes(cloud, stamp, "world"))
+
+        def first():
+            new = [image for image in images[count:] if np.abs(messages.decode_image(image).astype(int) - before).max() > 50]
+            return new and stamp_of(new[0])
+
+        return bench.until(first, "an image of the state")
+
+    shown(0.01, rendering.now_ns())  # from now on the renderer is bound to the nodes
+    bench.until(lambda: rendering.status()[2]["following control nodes"], "the renderer to follow")
+    assert bench.set("rendering_node", idle_rate=0.1)[0]  # nothing in between
+    for shift in (0.02, 0.03):
+        bench.spin(0.1)
+        taken = rendering.now_ns()
+        bench.spin(0.2)  # on its way
+        assert shown(shift, taken) == taken
+    moved_at = rendering.now_ns()
+    aside = np.eye(4)
+    aside[0, 3] = 0.03
+    send_camera(bench, aside)
+    await_image(bench, lambda _: stamp_of(images[-1]) > moved_at, "an image of the moved camera, of the time when it is shown")
+    assert shown(0.0, moved_at - S) > moved_at, "no stamp goes back"
+    assert shown(0.02, rendering.now_ns() + 100 * S) < rendering.now_ns(), "a clock that is ahead is not believed"
+    assert bench.set("rendering_node", idle_rate=20.0)[0]
+    count = len(images)
+    bench.until(lambda: len(images) > count + 3, "the same again")
+    stamps = [stamp_of(image) for image in images]
+    assert stamps == sorted(set(stamps))
+    bench.until(lambda: len(poses) == len(infos) == len(images) and stamp_of(depths[-1]) == stamp_of(images[-1]))
+    assert stamps == [stamp_of(info) for info in infos][: len(stamps)] == [stamp_of(pose) for pose in poses][: len(stamps)]
+
+
 def test_training_cameras_are_used_until_a_camera_comes(bench, rendering):
     bench.status("rendering_node", "waiting for a model", WARN)
     send_model(bench)
@@ -963,6 +1048,19 @@ def test_wrong_parameters_at_start_end_the_node_with_one_line(graph):
     for node, sentence in nodes.items():
         assert node.wait(30) == 2
         assert sentence in log_of(node) and "Traceback" not in log_of(node)
+
+
+def test_unknown_parameters_are_told_with_the_nearest_name_and_the_node_lives(bench, graph, tmp_path):
+    params = tmp_path / "params.yaml"
+    params.write_text("/**/physics_node: {ros__parameters: {node_count: 200, xyzzy: 1}}")
+    rclpys = {"use_sim_time": "false", "start_type_description_service": "true", "qos_overrides./clock.subscription.depth": 5}
+    known = [word for name, value in rclpys.items() for word in ("-p", f"{name}:={value}")]
+    node = graph.start("physics_node", "--params-file", str(params), *known, yuong_modulus=5000.0)
+    sentence = "unknown parameters xyzzy, yuong_modulus (did you mean young_modulus?)"
+    _, text, _ = bench.status("physics_node", sentence, WARN)
+    assert text == f"waiting for a model on gaussians; {sentence}"
+    assert log_of(node).count(sentence) == 1 and "[WARN]" in log_of(node)
+    assert bench.set("physics_node", young_modulus=6000.0)[0]
 
 
 def test_every_node_ends_by_sigterm_within_seconds_and_without_a_traceback(bench, graph, tmp_path):

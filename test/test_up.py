@@ -80,6 +80,8 @@ def up(tmp_path):
     for one in started:
         if one.process.poll() is None:
             one.end(signal.SIGTERM)
+        for number in one.processes().values():  # only when a test failed
+            os.kill(number, signal.SIGKILL)
 
 
 def test_up_runs_the_graph_and_ends_cleanly(up, small_bag):
@@ -131,6 +133,18 @@ def test_up_refuses_what_a_node_cannot_use(up):
     assert run.process.wait(120) == 1
     assert re.search(r"endo-sim: .*'not/a name' cannot name topics.*; its log is \S+physics_node\.log", run.output.read_text())
     assert not run.processes()
+
+
+@pytest.mark.parametrize("when", [r"physics_node +starting", r"rendering_node +warn"], ids=["starting", "running"])
+def test_nodes_do_not_outlive_a_killed_up(up, when):
+    run = up()
+    run.says(when)
+    assert len(run.processes()) == 3
+    run.process.kill()
+    run.process.wait(10)
+    wait_until(lambda: not run.processes(), 40, lambda: f"the end of {run.processes()}")  # importing alone may take 10 s
+    for log in (run.folder / "logs").iterdir():
+        assert "Traceback" not in log.read_text(), log.read_text()
 
 
 @pytest.mark.parametrize("given", ["bag", "params_file", "model"])

@@ -18,7 +18,7 @@ action              commanded pose of the tip (x y z qx qy qz qw), jaw, wrench (
 import functools
 import logging
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -36,6 +36,7 @@ NEAREST = 8  # control nodes around a tip; averages over them do not jump when o
 JAW_OPEN = 1.0  # rad, where no jaw was ever commanded; nothing is held then
 DEFAULT_FPS = 25
 _JUMP = 500_000_000  # ns; messages that are merely late step back by less
+_EVEN = 10_000  # ns; within it the steps of a policy are even, and those of a clock in real time are not
 
 _POSE, _XYZ = ("x", "y", "z", "qx", "qy", "qz", "qw"), ("x", "y", "z")
 _WRENCH = tuple(f"{kind}_{axis}" for kind in ("force", "torque") for axis in _XYZ)
@@ -97,6 +98,7 @@ def read_episode(
     arms: tuple[str, ...] = (),
     sampling: Sampling = "auto",
     world_frame: str = WORLD_FRAME,
+    frames: tuple[str, ...] = (),
 ) -> Episode:
     """Sample a recording.
 
@@ -106,11 +108,13 @@ def read_episode(
         arms: Names of the tool arms; default: all in the recording.
         sampling: ``rate``, ``lockstep``, or ``auto``: lockstep where that is what was recorded, unless another fps is given.
         world_frame: Frame of the recorded poses.
+        frames: Other frames in which they may be, each the name and the pose in the world: ``PSM1_base x y z qx qy qz qw``.
 
     Raises:
         SequenceError: If the recording is damaged, empty or too short, or lacks a topic; the sentence names it.
+        ValueError: If one of the frames is not a name and a pose.
     """
-    bag = Path(bag)
+    bag, known = Path(bag), messages.parse_frames(world_frame, frames)
     if fps is not None and fps <= 0:
         raise SequenceError(f"fps must be positive, got {fps}")
     with BagReader(bag) as reader:
@@ -118,7 +122,7 @@ def read_episode(
             raise SequenceError(f"{bag}: the recording is empty; was the graph running?")
         arms = arms or _arms(reader.topics)
         _require(reader, bag, arms)
-        streams = _usable(bag, lambda: _streams(reader, arms, world_frame))
+        streams = _usable(bag, lambda: _streams(reader, arms, known))
     for topic in _needed(arms):
         if topic not in streams:
             raise SequenceError(f"{bag}: no message with a time on /{topic.name}; record while the graph runs")
@@ -221,23 +225,20 @@ class _Stream(NamedTuple):
         return values if before is None else np.where((indices >= 0)[:, None], values, before.at(times))
 
 
-def _streams(reader: BagReader, arms: tuple[str, ...], world_frame: str) -> dict[Topic, _Stream]:
+def _streams(reader: BagReader, arms: tuple[str, ...], frames: Mapping[str, np.ndarray]) -> dict[Topic, _Stream]:
     """Streams of the topics that have messages; of images (number, height, width), of control nodes the number.
 
-    What is large is only numbered here, in the order of the bag, and read again when it is wanted.
+    Frames are taken as physics_node does. What is large is only numbered here, in the order of the bag, and read again when it is wanted.
     """
     decoders = {}
     for arm in arms:
+        bases = {**frames, "": frames.get(f"{arm}_base", np.eye(4))}  # clients of CRTK leave the frame empty
         for make in (messages.tool_pose, messages.tool_pose_command):
-            decoders[make(arm)] = lambda m, topic: _pose_row(messages.decode_pose(m, world_frame, topic))
+            decoders[make(arm)] = lambda m, topic, bases=bases: _pose_row(messages.decode_pose(m, bases, topic))
         for make in (messages.tool_jaw, messages.tool_jaw_state):
             decoders[make(arm)] = lambda m, topic: [messages.decode_jaw(m, topic)]
         for make in (messages.tool_wrench, messages.tool_reaction):
-            allowed = (arm, "", world_frame)
-            decoders[make(arm)] = lambda m, topic, allowed=allowed: [
-                *np.concatenate(messages.decode_wrench(m, topic)),
-                messages.check_frame(m, allowed, topic) == world_frame.lstrip("/"),
-            ]
+            decoders[make(arm)] = lambda m, topic, arm=arm: _wrench_row(m, topic, arm, frames)
     rows: dict[Topic, list] = defaultdict(list)
     numbers = {messages.RENDERED_IMAGE: -1, messages.CONTROL_NODES: -1}
     for topic, _, message in reader.messages((*numbers, *decoders)):
@@ -290,6 +291,13 @@ def _pose_row(pose: np.ndarray) -> np.ndarray:
     return np.array([*pose[:3, 3], *xyz, w])
 
 
+def _wrench_row(message: Any, topic: str, arm: str, frames: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Force and torque in world axes and 1 or, in those of the tip, and 0, [7]."""
+    frame = messages.check_frame(message, (arm, "", *frames), topic)
+    R = frames.get(frame, np.eye(4))[:3, :3]  # any other is the tool's own
+    return np.array([*(vector for part in messages.decode_wrench(message, topic) for vector in R @ part), frame in frames])
+
+
 def _to_world(wrenches: _Stream, tips: _Stream) -> _Stream:
     """Wrenches [N, 6] in world axes of ones [N, 7] whose last column says whether they are so already, else in the tip's."""
     x, y, z, w = tips.at(wrenches.stamps)[:, 3:].T[:, :, None]
@@ -327,7 +335,10 @@ def _frame_times(
     """Times [T + 1] (ns) of the rows and of what follows the last one."""
     if sampling != "rate":
         steps = _steps(streams, arms)
-        if len(steps) > 1:
+        if sampling == "auto" and len(steps) > 1 and not _even(steps):
+            text = "%s: stamps that commands share with images are not even, as in real time; it is sampled at a rate"
+            logging.getLogger(__name__).info(text, bag)
+        elif len(steps) > 1:
             hertz = 1e9 / np.median(np.diff(steps))
             whole = max(round(hertz), 1)
             if fps in (None, whole):
@@ -350,6 +361,14 @@ def _frame_times(
     if count < 2:
         raise SequenceError(f"{bag}: images, control nodes, poses and reactions have less than {1 / fps:g} s in common; record longer")
     return begin + np.round(np.arange(count) * (1e9 / fps)).astype(np.int64), _Rate(fps, False)
+
+
+def _even(steps: np.ndarray) -> bool:
+    """Whether these stamps are a policy's. In real time too commands may bear the stamps of observations: an arm without a
+    robot says where it is in each step, and policies answer with the stamp of what they saw."""
+    gaps = np.diff(steps)[1:]  # the first observation may be of any time
+    period = np.median(np.diff(steps))
+    return bool((np.abs(gaps - period * np.round(gaps / period)) < _EVEN).all())
 
 
 def _steps(streams: dict[Topic, _Stream], arms: tuple[str, ...]) -> np.ndarray:

@@ -54,6 +54,7 @@ def export_lerobot(
     sampling: Sampling = "auto",
     images: ImageFormat = "video",
     world_frame: str = WORLD_FRAME,
+    frames: tuple[str, ...] = (),
 ) -> tuple[int, int]:
     """Write recordings as one dataset and return the numbers of its episodes and frames.
 
@@ -61,11 +62,12 @@ def export_lerobot(
         bags: Recordings; each is an episode. All must have the arms, rate and image size of the first.
         out: Folder of the new dataset.
         task: What was done, in words.
-        fps, arms, sampling, world_frame: See `read_episode`.
+        fps, arms, sampling, world_frame, frames: See `read_episode`.
         images: ``video`` (H.264, small) or ``png`` (exact).
 
     Raises:
         SequenceError: If the folder exists or a recording cannot be used; nothing is left behind then.
+        ValueError: If one of the frames is not a name and a pose.
         RuntimeError: If pyarrow is not installed.
     """
     out, bags = Path(out), [Path(bag) for bag in bags]
@@ -76,7 +78,7 @@ def export_lerobot(
         raise SequenceError(f"{out} exists already; choose another name or remove it first")
     episodes = []
     for bag in bags:  # all of them before anything is written
-        episodes.append(read_episode(bag, fps, arms, sampling, world_frame))
+        episodes.append(read_episode(bag, fps, arms, sampling, world_frame, frames))
         _check_alike(episodes[0], episodes[-1])
     if images == "video" and any(side % 2 for side in episodes[0].image_size):
         height, width = episodes[0].image_size

@@ -1,6 +1,7 @@
 """What all nodes share: parameters from configurations, diagnostics, guarded callbacks, start and stop."""
 
 import contextlib
+import difflib
 import functools
 import os
 import re
@@ -28,6 +29,7 @@ from endo_sim_ros.config import ConfigError, StageConfig, options
 from endo_sim_ros.device import pick_device
 from endo_sim_ros.gaussians import ModelError
 from endo_sim_ros.messages import ERROR, OK, WARN, MessageError, Topic
+from endo_sim_ros.nodes.graph import end_with_parent
 from endo_sim_ros.nodes.transport import prepare_transport
 from endo_sim_ros.sequences.frames import SequenceError
 
@@ -118,6 +120,19 @@ class EndoNode(Node):
             self.add_on_set_parameters_callback(self._on_set_parameters)
         return self._configs[config_class]
 
+    @functools.cached_property
+    def _unknown(self) -> str:
+        """What was given at start but is no parameter of this node, in words; ROS itself says nothing about it."""
+        known, unknown = self.get_parameters_by_prefix(""), []
+        for name in sorted(self._parameter_overrides.keys() - known.keys()):
+            if not name.startswith("qos_overrides."):  # rclpy's own; it declares those that act
+                near = difflib.get_close_matches(name, known, 1)
+                unknown.append(f"{name} (did you mean {near[0]}?)" if near else name)
+        text = f"unknown parameter{'s' * (len(unknown) > 1)} {', '.join(unknown)}" if unknown else ""
+        if text:
+            self.get_logger().warning(text)
+        return text
+
     def config_changed(self, config: StageConfig) -> None:
         """Called with a whole, valid configuration after one of its parameters was set; override to use it.
 
@@ -202,6 +217,8 @@ class EndoNode(Node):
             level, text, values = self.status()
         except Exception as error:  # a fault in describing the state must not end the node
             level, text, values = ERROR, sentence("status", error), {}
+        if self._unknown and level != ERROR:
+            level, text = WARN, f"{text}; {self._unknown}"
         if time.monotonic() < self._error_until:
             level, text = ERROR, self._error_text
         values = values | {"errors": self.error_count}
@@ -308,6 +325,7 @@ def quality(topic: Topic, depth: int = STREAM_DEPTH, reliable: bool = True) -> Q
 
 def run(node_class: Callable[[], EndoNode]) -> int:
     """Start ROS, spin a node until it is told to stop, and return the exit status: 2 if it could not start."""
+    end_with_parent()
     prepare_transport()
     try:
         rclpy.init(args=sys.argv)

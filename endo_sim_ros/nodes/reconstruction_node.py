@@ -81,6 +81,7 @@ class ReconstructionNode(EndoNode):
         self._progress: Progress | None = None
         self._outbox: tuple[GaussianModel, list[Camera]] | None = None  # newest model of the worker, to be published
         self._published: GaussianModel | None = None
+        self._file: Path | None = None  # where the newest model that was read from a file lay
         self._model_stamp = 0
         self._saved, self._failure, self._finished = "", "", False  # how the last reconstruction ended
         self._cameras: list[Camera] = []  # of the newest published model
@@ -244,6 +245,7 @@ class ReconstructionNode(EndoNode):
                 raise SequenceError(f"{folder}: there is no model saved yet; model_file=latest has nothing to publish")
         cameras = path.with_name(_CAMERAS)
         self._publish(load_ply(path), load_cameras(cameras) if cameras.exists() else [])
+        self._file = path
 
     def _save(self, model: GaussianModel, cameras: list[Camera], trainer: Trainer | None = None) -> None:
         parent = Path(self._options.output_dir).expanduser()
@@ -294,6 +296,9 @@ class ReconstructionNode(EndoNode):
             return ERROR, self._failure, values
         if self._finished:
             return OK, f"finished, model saved in {self._saved}", values
+        if self._file is not None and not self._frames and not any(dropped.values()):
+            values["gaussians"] = len(self._published)
+            return OK, f"published the model of {self._file}; a recording that comes is reconstructed", values
         silent = time.monotonic() - self._last_view
         if silent > self._options.image_timeout:
             topic = self.resolve_topic_name(messages.LEFT_IMAGE.name)

@@ -150,7 +150,7 @@ def record(bag: Path, arms: tuple[str, ...], topics: tuple[str, ...], namespace:
         raise SequenceError(f"{bag} exists already; choose another name or remove it first")
     prepare_transport()
     values = {"bag": str(bag), "arms": list(arms), "topics": list(topics)}
-    parameters = [word for name, value in values.items() for word in ("-p", f"recorder:{name}:={json.dumps(value)}")]
+    parameters = [word for name, value in values.items() for word in ("-p", f"{name}:={json.dumps(value)}")]
     remapped = ["-r", f"__ns:=/{namespace.strip('/')}"] if namespace.strip("/") else []
     rclpy.init(args=["--ros-args", *remapped, *parameters])
     node = None

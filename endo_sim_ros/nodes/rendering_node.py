@@ -68,6 +68,7 @@ class RenderingNode(EndoNode):
         self._model: GaussianModel | None = None  # the newest; its stamp, and number in the order of arrival:
         self._model_stamp, self._model_number = 0, 0
         self._nodes: ControlNodeCloud | None = None
+        self._nodes_stamp = self._last_stamp = 0  # of that state, and of the newest image in real time, ns
         self._bound: _Bound | None = None
         self._background = Background()
         self._failure = ""  # why the newest model is not shown
@@ -128,9 +129,9 @@ class RenderingNode(EndoNode):
             and np.array_equal(old.positions, nodes.positions)
             and np.array_equal(old.F, nodes.F)
         )
-        self._nodes = nodes
+        self._nodes, self._nodes_stamp = nodes, messages.stamp_to_ns(message.header.stamp)
         if self._lockstep:
-            self._states.append((messages.stamp_to_ns(message.header.stamp), nodes))
+            self._states.append((self._nodes_stamp, nodes))
             if len(self._states) > MOST_WAITING:
                 self._states.popleft()
                 raise MessageError(f"{messages.CONTROL_NODES.name}: over {MOST_WAITING} states wait to be shown; one is left out")
@@ -197,7 +198,13 @@ class RenderingNode(EndoNode):
         elif now - self._last_image < 1 / self._options.idle_rate - 0.5 / self._options.rate:
             return
         self._last_image = now
-        self._publish(*self._output, self.now_ns())
+        self._last_stamp = self._stamp(self._bound)
+        self._publish(*self._output, self._last_stamp)
+
+    def _stamp(self, bound: _Bound) -> int:
+        """Real time: when the state that is shown was so; now, if there was an image of that time already."""
+        now = self.now_ns()
+        return self._nodes_stamp if bound.follows(self._nodes) and self._last_stamp < self._nodes_stamp <= now else now
 
     def _show_states(self) -> None:
         """Lockstep: one image for each state, in order, as soon as its model and its camera are there."""

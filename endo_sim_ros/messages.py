@@ -8,6 +8,7 @@ filled through ``array.array`` and read through ``np.frombuffer``.
 import array
 import functools
 import importlib
+import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -50,6 +51,7 @@ GAUSSIANS = Topic("gaussians", "sensor_msgs/msg/PointCloud2", "latched")
 TRAINING_CAMERAS = Topic("training_cameras", "geometry_msgs/msg/PoseArray", "latched")
 TRAINING_CAMERA_INFO = Topic("training_camera_info", "sensor_msgs/msg/CameraInfo", "latched")
 CONTROL_NODES = Topic("control_nodes", "sensor_msgs/msg/PointCloud2")
+CUT_SURFACE = Topic("cut_surface", "sensor_msgs/msg/PointCloud2", "latched")
 RENDERED_IMAGE = Topic("rendered/image_raw", "sensor_msgs/msg/Image")
 RENDERED_INFO = Topic("rendered/camera_info", "sensor_msgs/msg/CameraInfo")
 RENDERED_POSE = Topic("rendered/camera_pose", "geometry_msgs/msg/PoseStamped")
@@ -79,6 +81,10 @@ def tool_jaw_state(arm: str) -> Topic:
     return Topic(f"{arm}/jaw/measured_js", "sensor_msgs/msg/JointState")
 
 
+def tool_cut(arm: str) -> Topic:
+    return Topic(f"{arm}/cut", "sensor_msgs/msg/Joy")
+
+
 def tool_reaction(arm: str) -> Topic:
     return Topic(f"{arm}/body/measured_cf", "geometry_msgs/msg/WrenchStamped")
 
@@ -87,14 +93,14 @@ RECORDING_TOPICS = (
     LEFT_IMAGE, LEFT_COMPRESSED, LEFT_INFO, RIGHT_IMAGE, RIGHT_COMPRESSED, RIGHT_INFO, DEPTH, MASK, CAMERA_POSE,
 )  # fmt: skip
 MODEL_TOPICS = (GAUSSIANS, TRAINING_CAMERAS, TRAINING_CAMERA_INFO)
-TOOL_TOPICS = (tool_pose, tool_pose_command, tool_wrench, tool_jaw, tool_jaw_state, tool_reaction)  # of one arm
+TOOL_TOPICS = (tool_pose, tool_pose_command, tool_wrench, tool_jaw, tool_jaw_state, tool_cut, tool_reaction)  # of one arm
 RENDERED_TOPICS = (RENDERED_INFO, RENDERED_POSE, RENDERED_DEPTH, RENDERED_IMAGE)
 
 
 def all_topics(arms: tuple[str, ...] = ("PSM1",)) -> tuple[Topic, ...]:
     """Every topic of the contract for the given arms."""
     tools = tuple(make(arm) for arm in arms for make in TOOL_TOPICS)
-    return RECORDING_TOPICS + MODEL_TOPICS + (CONTROL_NODES,) + RENDERED_TOPICS + tools + (TOOL_MARKERS, DIAGNOSTICS, CLOCK)
+    return RECORDING_TOPICS + MODEL_TOPICS + (CONTROL_NODES, CUT_SURFACE) + RENDERED_TOPICS + tools + (TOOL_MARKERS, DIAGNOSTICS, CLOCK)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -108,7 +114,7 @@ _PACKAGES = {
     "geometry_msgs": (
         "Point", "Quaternion", "Pose", "PoseStamped", "PoseArray", "Vector3", "Wrench", "WrenchStamped",
     ),
-    "sensor_msgs": ("Image", "CompressedImage", "CameraInfo", "RegionOfInterest", "PointCloud2", "PointField", "JointState"),
+    "sensor_msgs": ("Image", "CompressedImage", "CameraInfo", "RegionOfInterest", "PointCloud2", "PointField", "JointState", "Joy"),
     "visualization_msgs": ("Marker", "MarkerArray", "UVCoordinate", "MeshFile"),
     "diagnostic_msgs": ("DiagnosticArray", "DiagnosticStatus", "KeyValue"),
 }  # fmt: skip
@@ -125,7 +131,7 @@ class _RosTypes:
     def sequence(values: np.ndarray) -> array.array:
         """A primitive sequence field; assigning numpy arrays directly is checked element by element and 1000 times slower."""
         values = np.ascontiguousarray(values)
-        field = array.array({"uint8": "B", "float64": "d"}[values.dtype.name])
+        field = array.array({"uint8": "B", "int32": "i", "float32": "f", "float64": "d"}[values.dtype.name])
         field.frombytes(values.data.cast("B") if values.size else b"")
         return field
 
@@ -349,9 +355,7 @@ def decode_camera_info(message: Any, topic: str = LEFT_INFO.name) -> CameraInfo:
     if message.width == 0 or message.height == 0:
         raise MessageError(f"{topic}: the image size is {message.width}×{message.height}")
     if message.distortion_model not in _DISTORTION_MODELS and D.any():
-        raise MessageError(
-            f"{topic}: distortion_model {message.distortion_model!r} is not supported; publish rectified images (D = 0)"
-        )
+        raise MessageError(f"{topic}: distortion_model {message.distortion_model!r} is not supported; publish rectified images (D = 0)")
     if D.size not in (0, 4, 5, 8, 12, 14) or np.abs(D).max(initial=0) > 1e3:
         raise MessageError(f"{topic}: D = {D.tolist()} is not a set of OpenCV distortion coefficients; calibrate the camera")
     if not R.any():
@@ -485,6 +489,23 @@ def decode_jaw(message: Any, topic: str) -> float:
     return float(positions[0])
 
 
+def decode_cut(message: Any, topic: str) -> bool:
+    """Whether the first button of a Joy is pressed: the edge of the tool cuts."""
+    if not len(message.buttons):
+        raise MessageError(f"{topic}: expected a button, 1 = cuts, got none")
+    return bool(message.buttons[0])
+
+
+def encode_cut(cutting: bool, stamp_ns: int, types: Any = None) -> Any:
+    """Joy with one button, pressed while the edge of a tool cuts."""
+    types = types or ros_types()
+    return types.Joy(
+        header=_header(types, stamp_ns, ""),
+        axes=types.sequence(np.zeros(0, np.float32)),
+        buttons=types.sequence(np.array([cutting], np.int32)),
+    )
+
+
 def encode_jaw(angle: float, stamp_ns: int, types: Any = None) -> Any:
     """JointState of a jaw's opening angle, radians."""
     types = types or ros_types()
@@ -542,9 +563,7 @@ def encode_tool_markers(tools: list[ToolDisplay], stamp_ns: int, frame_id: str, 
             points=[point(p) for p in points],
             colors=[],
             texture_resource="",
-            texture=types.CompressedImage(
-                header=_header(types, 0, ""), format="", data=types.sequence(np.zeros(0, np.uint8))
-            ),
+            texture=types.CompressedImage(header=_header(types, 0, ""), format="", data=types.sequence(np.zeros(0, np.uint8))),
             uv_coordinates=[],
             text="",
             mesh_resource="",
@@ -588,9 +607,7 @@ def decode_cloud(message: Any, topic: str) -> np.ndarray:
     if message.height > 1 and message.row_step != message.width * message.point_step:
         raise MessageError(f"{topic}: clouds with padded rows are not supported (row step {message.row_step})")
     if data.size < count * message.point_step:
-        raise MessageError(
-            f"{topic}: the cloud is truncated: {data.size} bytes for {count} points of {message.point_step} bytes"
-        )
+        raise MessageError(f"{topic}: the cloud is truncated: {data.size} bytes for {count} points of {message.point_step} bytes")
     dtype = np.dtype(
         {
             "names": [field.name for field in fields],
@@ -644,36 +661,41 @@ def decode_gaussians(message: Any, topic: str = GAUSSIANS.name) -> GaussianModel
 
 @dataclass(frozen=True)
 class ControlNodeCloud:
-    """State of the control nodes at one time, for the model whose stamp is ``model_stamp_ns``."""
+    """State of the control nodes at one time, for the model whose stamp is ``model_stamp_ns``.
+
+    ``cut`` is the number of the cut surface, see `cut_number`; 0 = whole tissue."""
 
     rest: np.ndarray  # [M, 3] float32, m, world
     positions: np.ndarray  # [M, 3] float32, m, world
     F: np.ndarray  # [M, 3, 3] float32, deformation gradient
     model_stamp_ns: int
+    cut: int = 0
 
 
 _NODE_DTYPE = np.dtype(
     [(name, "<f4") for name in ("x", "y", "z", "rest_x", "rest_y", "rest_z")]
     + [(f"f_{row}{column}", "<f4") for row in range(3) for column in range(3)]
-    + [("model_sec", "<u4"), ("model_nanosec", "<u4")]
+    + [("model_sec", "<u4"), ("model_nanosec", "<u4"), ("cut", "<u4")]
 )
 
 
 def encode_control_nodes(state: ControlNodeCloud, stamp_ns: int, frame_id: str, types: Any = None) -> Any:
-    """PointCloud2 of the control nodes: position, rest position, F row by row, and the stamp of their model."""
+    """PointCloud2 of the control nodes: position, rest position, F row by row, stamp of their model, number of their cut surface."""
     points = np.empty(len(state.rest), _NODE_DTYPE)
     floats = points.view(np.float32).reshape(len(points), -1)
     floats[:, 0:3] = state.positions
     floats[:, 3:6] = state.rest
     floats[:, 6:15] = state.F.reshape(-1, 9)
     points["model_sec"], points["model_nanosec"] = divmod(state.model_stamp_ns, 1_000_000_000)
+    points["cut"] = state.cut
     return _encode_cloud(points, stamp_ns, frame_id, types or ros_types())
 
 
 def decode_control_nodes(message: Any, topic: str = CONTROL_NODES.name) -> ControlNodeCloud:
     """State of the control nodes of a PointCloud2, decoded by field name."""
     points = decode_cloud(message, topic)
-    missing = [name for name in _NODE_DTYPE.names if name not in (points.dtype.names or ())]
+    names = points.dtype.names or ()
+    missing = [name for name in _NODE_DTYPE.names if name not in (*names, "cut")]  # recordings without cuts are fine
     if missing:
         raise MessageError(f"{topic}: missing field {', '.join(missing[:4])}; see control_nodes in msg_conventions.md")
     if not len(points):
@@ -684,10 +706,34 @@ def decode_control_nodes(message: Any, topic: str = CONTROL_NODES.name) -> Contr
         stack(["x", "y", "z"]),
         stack(_NODE_DTYPE.names[6:15]).reshape(-1, 3, 3),
         int(points["model_sec"][0]) * 1_000_000_000 + int(points["model_nanosec"][0]),
+        int(points["cut"][0]) if "cut" in names else 0,
     )
     if not (np.isfinite(state.rest).all() and np.isfinite(state.positions).all() and np.isfinite(state.F).all()):
         raise MessageError(f"{topic}: a control node is not finite; the state was ignored")
     return state
+
+
+def cut_number(triangles: np.ndarray) -> int:
+    """Number of a cut surface: the CRC-32 of the bytes of its corners [T, 3, 3] as little endian float32; 0 = no cut."""
+    return zlib.crc32(np.ascontiguousarray(triangles, "<f4").tobytes()) if len(triangles) else 0
+
+
+def encode_cut_surface(triangles: np.ndarray, model_stamp_ns: int, frame_id: str, types: Any = None) -> Any:
+    """PointCloud2 of the triangles [T, 3, 3] (m, in the tissue at rest) of all cuts, three points each; stamped as the model."""
+    points = np.ascontiguousarray(triangles, "<f4").reshape(-1, 3)
+    return _encode_cloud(points.view([(name, "<f4") for name in "xyz"]).reshape(-1), model_stamp_ns, frame_id, types or ros_types())
+
+
+def decode_cut_surface(message: Any, topic: str = CUT_SURFACE.name) -> np.ndarray:
+    """Triangles [T, 3, 3] float32, m, in the tissue at rest, of all cuts."""
+    points = decode_cloud(message, topic)
+    missing = [name for name in "xyz" if name not in (points.dtype.names or ())]
+    if missing or len(points) % 3:
+        raise MessageError(f"{topic}: expected three points with x, y and z for each triangle, got {len(points)} points without {missing}")
+    triangles = np.stack([points[name].astype(np.float32) for name in "xyz"], 1).reshape(-1, 3, 3)
+    if not np.isfinite(triangles).all():
+        raise MessageError(f"{topic}: a corner is not finite; the cut was ignored")
+    return triangles
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -715,6 +761,5 @@ def decode_diagnostics(message: Any) -> list[tuple[str, int, str, dict[str, str]
     """(name, level, text, values) of every status."""
     level = lambda value: value[0] if isinstance(value, bytes) else int(value)  # noqa: E731
     return [
-        (status.name, level(status.level), status.message, {pair.key: pair.value for pair in status.values})
-        for status in message.status
+        (status.name, level(status.level), status.message, {pair.key: pair.value for pair in status.values}) for status in message.status
     ]

@@ -53,10 +53,20 @@ class DeformableRenderer:
                 self.model, node_rest, neighbours=config.neighbours, weighting=config.skinning, device=self.device
             )
 
+    def cut(self, triangles: np.ndarray) -> None:
+        """Let the skin part where all these triangles [T, 3, 3] (m, world, in the tissue at rest) cut it."""
+        if self._skinning is not None and not np.array_equal(triangles, self._skinning.cuts):
+            self._skinning.cut(triangles)
+
     def camera(self, camera: Camera) -> Camera:
         """The camera at the configured image width."""
         width = self.config.image_width
         return camera.resized(width, max(round(camera.height * width / camera.width), 1)) if width else camera
+
+    @torch.no_grad()
+    def deform(self, positions: np.ndarray, F: np.ndarray) -> tuple[Tensor, Tensor]:
+        """Centres [N, 3], m, and covariances [N, 3, 3], m², world, of the Gaussians for nodes at positions [M, 3] with F [M, 3, 3]."""
+        return self._skinning.deform(positions, F)
 
     @torch.no_grad()
     def render(
@@ -65,7 +75,7 @@ class DeformableRenderer:
         """RGB image [H, W, 3] uint8 and depth [H, W] float32 (m, 0 = no surface) for nodes at positions [M, 3] with F [M, 3, 3]."""
         model, covars = self.model, None
         if positions is not None:
-            means, covars = self._skinning.deform(positions, F)
+            means, covars = self.deform(positions, F)
             sh = model.sh
             if model.sh_degree:
                 sh = self._turned_colors(means, F, camera)

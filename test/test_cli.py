@@ -62,11 +62,11 @@ def test_reconstruct_writes_a_model_and_measures_held_out_views(bag, tmp_path):
 @pytest.mark.parametrize(
     "arguments, sentence",
     [
-        (("convert", "no/such/thing", "out"), "no/such/thing: no such file or folder"),
-        (("convert", "launch", "out"), "no known layout recognised"),
+        (("convert", "no/such/thing", "no_bag"), "no/such/thing: no such file or folder"),
+        (("convert", "launch", "no_bag"), "no known layout recognised"),
         (("reconstruct", "no_bag", "out"), "no_bag: no such bag"),
         (("phantom", "README.md"), "README.md exists already"),
-        (("phantom", "out", "--frames", "0"), r"PhantomConfig.frames must lie in \[1, 100000\], got 0"),
+        (("phantom", "no_bag", "--frames", "0"), r"PhantomConfig.frames must lie in \[1, 100000\], got 0"),
         (("demo", "--bag", "no_bag"), "no_bag: no such bag"),
     ],
 )

@@ -126,6 +126,39 @@ def test_reset_gives_the_first_observation_and_time_begins_anew(graph):
     np.testing.assert_array_equal(first, again)
 
 
+def test_a_cut_is_shown_with_the_states_that_have_it_and_the_same_bytes_come_again(graph):
+    surfaces, runs = graph.hear(messages.CUT_SURFACE), []
+    assert graph.set("physics_node", blade_length=0.05)[0]
+    graph.until(lambda: graph.nodes[1]._simulation.config.blade_length == 0.05)
+    for _ in range(2):
+        first = len(graph.heard[IMAGES.name])
+        assert graph.call(Trigger, "/physics_node/reset").success
+        await_images(graph, first + 1)
+        for k in range(1, 22):
+            pose = np.eye(4)
+            pose[:3, 3] = 0.0, 0.004 * (k - 11), 0.13  # the blade goes right through
+            if k == 20:  # then the tool pulls at one side
+                pose[:3, 3] = 0.02, 0, 0.1
+            graph.publish(POSE, messages.encode_pose(pose, k * STEP, "world"))
+            force = np.array([1.0, 0, 0]) * (k >= 20)
+            if k == 2:
+                graph.publish(messages.tool_cut("PSM1"), messages.encode_cut(True, k * STEP))
+                graph.until(lambda: graph.nodes[1]._arms["PSM1"].cutting)
+            if k == 20:
+                graph.publish(messages.tool_cut("PSM1"), messages.encode_cut(False, k * STEP))
+                graph.until(lambda: not graph.nodes[1]._arms["PSM1"].cutting)
+            graph.publish(WRENCH, messages.encode_wrench(force, np.zeros(3), k * STEP, "world"))
+            await_images(graph, first + 1 + k)
+        states = [messages.decode_control_nodes(message) for message in graph.heard["control_nodes"][-22:]]
+        numbers = [state.cut for state in states]
+        assert numbers[0] == numbers[1] == 0 and len(set(numbers)) > 10 and numbers[-2] == numbers[-1]
+        assert messages.cut_number(messages.decode_cut_surface(surfaces[-1])) == numbers[-1]
+        assert graph.nodes[2]._bound.renderer._skinning.cuts.shape == (len(graph.nodes[1]._simulation.cuts), 3, 3)
+        assert np.abs(states[-1].positions - states[-1].rest).max() > 1e-3
+        runs.append([bytes(message.data) for message in graph.heard[IMAGES.name][-22:]])
+    assert runs[0] == runs[1]
+
+
 def test_a_hundred_commands_at_once_are_all_taken_and_shown(graph):
     physics, rendering = graph.nodes[1:3]
     for k in range(1, 101):

@@ -196,8 +196,7 @@ def test_clouds_are_decoded_by_field_name_whatever_their_layout():
     from sensor_msgs.msg import PointField
 
     message.fields = [
-        PointField(name=name, offset=layout.fields[name][1], datatype=8 if layout[name].itemsize == 8 else 7, count=1)
-        for name in names
+        PointField(name=name, offset=layout.fields[name][1], datatype=8 if layout[name].itemsize == 8 else 7, count=1) for name in names
     ]
     message.is_bigendian, message.point_step, message.row_step = True, layout.itemsize, other.nbytes
     message.data = ros_types().sequence(other.view(np.uint8))
@@ -338,3 +337,24 @@ def test_decoding_examples_of_the_conventions_run():
     assert stamp == STAMP
     depth = np.random.default_rng(0).random((3, 4), np.float32)
     np.testing.assert_array_equal(scope["decode_depth"](messages.encode_image(depth, 1, "cam")), depth)
+
+
+def test_cuts_keep_their_triangles_and_number(wire):
+    types, transport = wire
+    cloud = "sensor_msgs/msg/PointCloud2"
+    triangles = np.random.default_rng(0).normal(size=(5, 3, 3)).astype(np.float32)
+    for some in (triangles, triangles[:0]):
+        again = messages.decode_cut_surface(transport(messages.encode_cut_surface(some, 7, "world", types), cloud))
+        np.testing.assert_array_equal(again, some)
+        assert messages.cut_number(again) == messages.cut_number(some)
+    assert messages.cut_number(triangles[:0]) == 0 != messages.cut_number(triangles)
+    assert messages.cut_number(triangles) == messages.cut_number(triangles.astype(np.float64))
+    for pressed in (False, True):
+        assert messages.decode_cut(transport(messages.encode_cut(pressed, 7, types), "sensor_msgs/msg/Joy"), "PSM1/cut") == pressed
+    triangles[0, 0, 0] = np.nan
+    with pytest.raises(MessageError, match="cut_surface: a corner is not finite"):
+        messages.decode_cut_surface(messages.encode_cut_surface(triangles, 7, "world", types))
+    with pytest.raises(MessageError, match="three points .* for each triangle, got 4 points"):
+        wrong = messages.encode_cut_surface(triangles[:2], 7, "world", types)
+        wrong.width, wrong.row_step = 4, 48
+        messages.decode_cut_surface(wrong)

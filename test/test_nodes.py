@@ -299,9 +299,7 @@ def test_bad_recording_is_one_sentence_and_good_views_still_arrive(bench, recons
     views_arrive(bench, small_frames)
 
 
-def test_image_and_camera_info_of_different_sizes_are_refused_and_good_views_still_arrive(
-    bench, reconstruction, small_frames
-):
+def test_image_and_camera_info_of_different_sizes_are_refused_and_good_views_still_arrive(bench, reconstruction, small_frames):
     frame = small_frames[0]
     bench.publish(messages.LEFT_INFO, messages.encode_camera_info(K, 640, 512, frame.stamp_ns, "endoscope_left"))
     bench.publish(messages.CAMERA_POSE, messages.encode_pose(frame.camera.pose, frame.stamp_ns, "world"))
@@ -393,9 +391,7 @@ def test_recording_is_reconstructed_published_latched_and_saved(bench, reconstru
     assert messages.stamp_to_ns(models[-1].header.stamp) > messages.stamp_to_ns(models[count - 1].header.stamp)
 
 
-def test_stamps_that_jump_begin_a_new_recording_and_looping_does_not_reconstruct_again(
-    bench, reconstruction, small_frames
-):
+def test_stamps_that_jump_begin_a_new_recording_and_looping_does_not_reconstruct_again(bench, reconstruction, small_frames):
     long = [f.__class__(f.stamp_ns + i * S, f.image, f.camera, depth=f.depth) for i, f in enumerate(small_frames)]
     send_frames(bench, long)
     send_frames(bench, long[:6])  # the bag starts again
@@ -420,9 +416,7 @@ def test_a_live_camera_is_reconstructed_once_when_enough_views_came(bench, recon
     assert reconstruction._trained[1] < small_frames[0].stamp_ns + S  # not again with the views after the first six
 
 
-def test_a_place_that_cannot_be_written_is_told_and_the_model_is_published_all_the_same(
-    bench, reconstruction, small_frames, tmp_path
-):
+def test_a_place_that_cannot_be_written_is_told_and_the_model_is_published_all_the_same(bench, reconstruction, small_frames, tmp_path):
     models = bench.hear(messages.GAUSSIANS)
     assert bench.set("reconstruction_node", output_dir="/proc/nowhere", iterations=5)[0]
     send_frames(bench, small_frames)
@@ -622,6 +616,40 @@ def test_two_arms_act_and_each_hears_its_own_reaction(bench, physics):
     bench.until(lambda: moved(bench) < 1e-4, "the tissue to be released after command_timeout")
 
 
+def test_a_rigid_tool_pushes_the_tissue_and_feels_it(bench, physics):
+    reactions = bench.hear(messages.tool_reaction("PSM1"))
+    send_model(bench)
+    await_nodes(bench, 5 * S)
+    assert bench.set("physics_node", contact_radius=0.015, friction=0.1)[0]
+    bench.until(lambda: physics._simulation.contact_radius >= 0.015)
+
+    def feels():
+        send_tip(bench, (0, 0, 0.09), "PSM1")
+        bench.spin(0.03)
+        return reactions and messages.decode_wrench(reactions[-1], "")[0][2] < -0.02 and moved(bench) > 1e-3
+
+    bench.until(feels, "the tissue to be pushed away from the camera, and to push back")
+    assert physics._simulation.faults == 0
+
+
+def test_what_cannot_be_cut_says_so_and_the_tool_goes_on(bench, physics):
+    send_model(bench)
+    await_nodes(bench, 5 * S)
+    bench.publish(messages.tool_cut("PSM1"), messages.encode_cut(True, S))
+    bench.refused("physics_node", "PSM1/cut: a cut came before any pose on PSM1/measured_cp")
+    message = messages.encode_cut(True, S)
+    message.buttons = []
+    bench.publish(messages.tool_cut("PSM1"), message)
+    bench.refused("physics_node", "PSM1/cut: expected a button")
+    assert bench.set("physics_node", kinematics="current")[0]
+    bench.until(lambda: physics._simulation.config.kinematics == "current")
+    send_tip(bench, (0, 0, 0.1), "PSM1")
+    bench.until(lambda: physics._arms["PSM1"].pose is not None)
+    bench.publish(messages.tool_cut("PSM1"), messages.encode_cut(True, S))
+    bench.refused("physics_node", "kinematics current cannot be cut; set kinematics to rest")
+    pull(bench, lambda: moved(bench) > 1e-3)
+
+
 def test_services_in_every_state(bench, physics):
     call = lambda name: bench.call(Trigger, f"/physics_node/{name}")  # noqa: E731
     for name in ("reset", "step"):
@@ -673,9 +701,7 @@ def test_models_with_equal_or_zero_stamps_replace_each_other_too(bench, physics)
 
     for z in (0.1, 0.13, 0.16):
         send_model(bench, sheet(z=z), stamp=0)
-        bench.until(
-            lambda: bench.heard["control_nodes"] and abs(nodes_of(bench).rest[:, 2].min() - z) < 1e-3, f"nodes at {z}"
-        )
+        bench.until(lambda: bench.heard["control_nodes"] and abs(nodes_of(bench).rest[:, 2].min() - z) < 1e-3, f"nodes at {z}")
         bench.until(lambda: abs(depth() - z) < 0.005, f"a picture of the model at {z}")
 
 
@@ -1128,8 +1154,7 @@ def test_whole_graph_starts_in_the_wrong_order_and_survives_the_loss_of_each_nod
     def followed():
         bench.until(
             lambda: (
-                bench.statuses["rendering_node"][-1:]
-                and bench.statuses["rendering_node"][-1][2].get("following control nodes") == "True"
+                bench.statuses["rendering_node"][-1:] and bench.statuses["rendering_node"][-1][2].get("following control nodes") == "True"
             ),
             lambda: f"the renderer to follow control nodes; it said {bench.statuses['rendering_node'][-1:]}",
             40,

@@ -571,6 +571,23 @@ def test_environments_are_independent_copies_on_any_number_of_threads(monkeypatc
     assert not batch.displacements[1].any() and batch.displacements[0].any() and batch.tools.faults[4] == 0
 
 
+def test_tissue_whose_material_changes_goes_on_from_where_it_is():
+    soft, stiff = simulate(blade_length=0.03), simulate(blade_length=0.03, young_modulus=20e3)
+    for y in np.linspace(-0.045, 0.0, 10):
+        soft.set_cut("knife", pose_at([0.02, y, 0.145]), True)
+    soft.set_wrench("probe", TIP, [0.0, 0.0, 0.2])
+    soft.set_grasp("grip", pose_at(TIP + [0.03, 0, 0]), True)
+    steps(soft, 20)
+    assert stiff.continue_from(soft)
+    np.testing.assert_array_equal(stiff.state().positions, soft.state().positions)
+    assert len(stiff.cuts) == len(soft.cuts) > 0 and stiff.in_reach("grip") and stiff.time == soft.time
+    before = depth_of_dent(stiff)
+    steps(stiff, 20)
+    assert depth_of_dent(stiff) == pytest.approx(before / 2, rel=0.2)  # the same force, twice the stiffness
+    np.testing.assert_allclose(stiff.reaction("probe")[0], [0, 0, -0.2], atol=1e-9)
+    assert not simulate(node_count=400).continue_from(soft)
+
+
 # Grasping
 
 

@@ -314,10 +314,10 @@ def _checked(config_class: type[Config], values: dict[str, Any]) -> Config:
 
 
 def quality(topic: Topic, depth: int = STREAM_DEPTH, reliable: bool = True) -> QoSProfile:
-    """Quality of service of a topic: reliable; latched topics keep their last message for late joiners."""
+    """Quality of service of a topic: reliable; latched topics keep their last message, or the depth asked for, for late joiners."""
     latched = topic.qos == "latched"
     return QoSProfile(
-        depth=1 if latched else depth,
+        depth=1 if latched and depth <= STREAM_DEPTH else depth,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
     )

@@ -21,7 +21,7 @@ _SLOW = 0.5  # real-time factor below which the node warns
 _CAMERAS_LATE = 1.0  # seconds after a model in which its training cameras may still be on their way
 _POLLS = 8  # times per step that the timer asks whether a step is due
 _WINDOW = 1.0  # seconds over which the real-time factor is measured
-_INPUTS = ("pose", "wrench", "jaw")  # parts of a command in lockstep
+_INPUTS = ("pose", "wrench", "jaw", "cut")  # parts of a command in lockstep
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class PhysicsNodeConfig(WorldConfig):
     """realtime: steps follow the clock (the wall's, or /clock with use_sim_time) and meet the commands that come; what
     cannot be kept up with is skipped. lockstep: each command takes one step, and state, reaction and /clock bear its stamp."""
     lockstep_inputs: tuple[str, ...] = ("pose", "wrench")
-    """lockstep: what a command consists of (pose, wrench, jaw); a step is taken when all of it, for all arms and with the
+    """lockstep: what a command consists of (pose, wrench, jaw, cut); a step is taken when all of it, for all arms and with the
     same stamp, has come. What is not named here acts when it comes."""
     step_count: Annotated[int, Range(1, MOST_WAITING)] = 1
     """Steps that one call of ~/step takes."""
@@ -68,6 +68,7 @@ class _Arm:
     acting: bool = False
     angle: float = 1.0  # of the jaw, rad: open until told otherwise
     closed: bool = False  # the jaw
+    cutting: bool = False
 
 
 class PhysicsNode(EndoNode):
@@ -99,6 +100,8 @@ class PhysicsNode(EndoNode):
         # In real time only the newest command counts, and none may queue; in lockstep none may be lost.
         depth = MOST_WAITING if self._lockstep else 1
         self._nodes_pub = self.publisher(messages.CONTROL_NODES, MOST_WAITING if self._lockstep else STREAM_DEPTH)
+        self._cut_pub = self.publisher(messages.CUT_SURFACE, depth)
+        self._published_cut = 0  # number of the newest surface that was published
         self._markers_pub = self.publisher(messages.TOOL_MARKERS)
         self._reaction_pubs = {name: self.publisher(messages.tool_reaction(name)) for name in self._arms}
         commanded = self._options.arm_source == "commanded"
@@ -116,6 +119,7 @@ class PhysicsNode(EndoNode):
             self.subscribe(self._pose_topic(name), partial(self._on_tool_pose, name), depth)
             self.subscribe(messages.tool_wrench(name), partial(self._on_wrench, name), depth)
             self.subscribe(messages.tool_jaw(name), partial(self._on_jaw, name), max(depth, STREAM_DEPTH))  # some come once
+            self.subscribe(messages.tool_cut(name), partial(self._on_cut, name), max(depth, STREAM_DEPTH))
         self.service(Trigger, "~/reset", self._on_reset)
         self.service(Trigger, "~/step", self._on_step)
         self.service(SetBool, "~/pause", self._on_pause)
@@ -163,12 +167,15 @@ class PhysicsNode(EndoNode):
         try:
             built = self._background.take()
             if built is not None:
-                self._simulated_stamp, self._simulation = built[1]
-                self._failure = ""
+                (stamp, simulation), old = built[1], self._simulation
+                same_model = old is not None and stamp == self._simulated_stamp
+                continued = same_model and simulation.continue_from(old)  # only its material has changed
+                self._simulated_stamp, self._simulation, self._failure = stamp, simulation, ""
                 self._start_timing()
-                for arm in self._arms.values():
-                    arm.acting = False
-                if self._lockstep:  # the first observation, before any command
+                if not continued:
+                    for arm in self._arms.values():
+                        arm.acting = False
+                if self._lockstep and not continued:  # the first observation, before any command
                     self._publish(self._simulation, self._simulated_stamp, at_rest=True)
         except Exception as error:
             self._failure = sentence("physics", error)
@@ -176,9 +183,7 @@ class PhysicsNode(EndoNode):
         origin, viewpoint = self._viewpoint()
         if self._model is not None and viewpoint is not None:
             model, stamp, config = self._model, self._model_stamp, self._config
-            self._background.want(
-                (self._model_number, origin, config), lambda: (stamp, TissueSimulation(model, viewpoint, config))
-            )
+            self._background.want((self._model_number, origin, config), lambda: (stamp, TissueSimulation(model, viewpoint, config)))
 
     # ------------------------------------------------------------------ tools
 
@@ -233,6 +238,16 @@ class PhysicsNode(EndoNode):
 
         self._receive(name, "jaw", message, topic, act)
 
+    def _on_cut(self, name: str, message: Any) -> None:
+        topic, arm = messages.tool_cut(name).name, self._arms[name]
+        cutting = messages.decode_cut(message, topic)
+
+        def act() -> None:
+            self._require_pose(name, topic, "cut")
+            arm.cutting = cutting
+
+        self._receive(name, "cut", message, topic, act)
+
     def _require_pose(self, name: str, topic: str, what: str) -> None:
         if self._arms[name].pose is None:
             pose_topic = self._pose_topic(name).name
@@ -261,6 +276,11 @@ class PhysicsNode(EndoNode):
             if not simulation.set_grasp(name, arm.pose, arm.closed):
                 self.report_error(f"{name}: the jaw closed on nothing {where}; {self._reach(simulation)}")
                 arm.closed = False
+            try:
+                simulation.set_cut(name, arm.pose, arm.cutting)
+            except ValueError as error:
+                arm.cutting = False
+                self.report_error(sentence(f"{name}: cut", error))
             if arm.force is None:
                 continue
             timeout = self._options.command_timeout
@@ -321,9 +341,7 @@ class PhysicsNode(EndoNode):
         simulation.step()
         if simulation.slips > slips:
             travel = f"{simulation.config.travel:g} m"
-            self.report_error(
-                f"tissue slipped out of a jaw that pulled it almost {travel}; open it, come nearer, or raise travel"
-            )
+            self.report_error(f"tissue slipped out of a jaw that pulled it almost {travel}; open it, come nearer, or raise travel")
             for name, arm in self._arms.items():
                 arm.closed = arm.closed and simulation.in_reach(name)
         self._steps += 1
@@ -336,7 +354,11 @@ class PhysicsNode(EndoNode):
         world, state = self._options.world_frame, simulation.state()
         if self._clock_pub is not None and not at_rest:
             self._clock_pub.publish(messages.encode_clock(stamp))
-        cloud = ControlNodeCloud(state.rest, state.positions, state.F, self._simulated_stamp)
+        cut = messages.cut_number(simulation.cuts)
+        if cut != self._published_cut:  # before the state that has it
+            self._cut_pub.publish(messages.encode_cut_surface(simulation.cuts, self._simulated_stamp, world))
+            self._published_cut = cut
+        cloud = ControlNodeCloud(state.rest, state.positions, state.F, self._simulated_stamp, cut)
         self._nodes_pub.publish(messages.encode_control_nodes(cloud, stamp, world))
         shown = []
         for name, arm in self._arms.items():
@@ -363,7 +385,7 @@ class PhysicsNode(EndoNode):
         self._commands.clear()
         self._start_timing()
         for arm in self._arms.values():
-            arm.force, arm.acting, arm.closed, arm.angle = None, False, False, 1.0
+            arm.force, arm.acting, arm.closed, arm.angle, arm.cutting = None, False, False, 1.0, False
         self._publish(self._simulation, self._simulated_stamp if self._lockstep else self.now_ns(), at_rest=True)
         return True, "at rest"
 
@@ -413,6 +435,7 @@ class PhysicsNode(EndoNode):
             "simulated time": f"{simulation.time:.2f}",
             "faults": simulation.faults,
             "slips": simulation.slips,
+            "cut triangles": len(simulation.cuts),
         }
         if self._failure:
             return ERROR, f"{self._failure}; the model before goes on", values

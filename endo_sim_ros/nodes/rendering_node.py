@@ -12,7 +12,7 @@ from endo_sim_ros.cameras import Camera
 from endo_sim_ros.config import Range, StageConfig
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.messages import CameraInfo, ControlNodeCloud, MessageError
-from endo_sim_ros.nodes.base import ERROR, OK, WARN, Background, EndoNode, WorldConfig, run, sentence
+from endo_sim_ros.nodes.base import ERROR, OK, STREAM_DEPTH, WARN, Background, EndoNode, WorldConfig, run, sentence
 from endo_sim_ros.nodes.pacing import MOST_WAITING, Pacer
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.bag import LEFT_FRAME
@@ -68,6 +68,7 @@ class RenderingNode(EndoNode):
         self._model: GaussianModel | None = None  # the newest; its stamp, and number in the order of arrival:
         self._model_stamp, self._model_number = 0, 0
         self._nodes: ControlNodeCloud | None = None
+        self._cuts = {0: np.zeros((0, 3, 3), np.float32)}  # surfaces by their number, the newest last
         self._nodes_stamp = self._last_stamp = 0  # of that state, and of the newest image in real time, ns
         self._bound: _Bound | None = None
         self._background = Background()
@@ -90,6 +91,7 @@ class RenderingNode(EndoNode):
         self.subscribe(messages.TRAINING_CAMERA_INFO, self._on_training_info)
         depth = MOST_WAITING if self._lockstep else 1
         self.subscribe(messages.CONTROL_NODES, self._on_nodes, depth)
+        self.subscribe(messages.CUT_SURFACE, self._on_cut_surface, depth)
         self.subscribe(messages.CAMERA_POSE, self._on_camera, depth)
         self.subscribe(messages.LEFT_INFO, self._on_info, depth=1)
         self._timer = self.every(1.0 / self._options.rate / _POLLS, self._on_timer)
@@ -128,6 +130,7 @@ class RenderingNode(EndoNode):
             and old.model_stamp_ns == nodes.model_stamp_ns
             and np.array_equal(old.positions, nodes.positions)
             and np.array_equal(old.F, nodes.F)
+            and old.cut == nodes.cut
         )
         self._nodes, self._nodes_stamp = nodes, messages.stamp_to_ns(message.header.stamp)
         if self._lockstep:
@@ -139,6 +142,19 @@ class RenderingNode(EndoNode):
         elif not same:
             self._change()
             self._show_if_due()
+
+    def _on_cut_surface(self, message: Any) -> None:
+        messages.check_frame(message, (self._options.world_frame,), messages.CUT_SURFACE.name)
+        triangles = messages.decode_cut_surface(message)
+        number = messages.cut_number(triangles)
+        if number:
+            self._cuts[number] = triangles
+        while len(self._cuts) > (MOST_WAITING if self._lockstep else STREAM_DEPTH):
+            del self._cuts[list(self._cuts)[1]]
+        if self._lockstep:
+            self._show_states()
+        else:
+            self._change()
 
     def _change(self) -> None:
         """What is shown is out of date."""
@@ -160,9 +176,7 @@ class RenderingNode(EndoNode):
 
     def _on_info(self, message: Any) -> None:
         info, old = _decode_info(message, messages.LEFT_INFO.name), self._info
-        same = (
-            old is not None and np.array_equal(info.P, old.P) and (info.width, info.height) == (old.width, old.height)
-        )
+        same = old is not None and np.array_equal(info.P, old.P) and (info.width, info.height) == (old.width, old.height)
         self._info = info
         if not same:
             self._change()
@@ -221,7 +235,7 @@ class RenderingNode(EndoNode):
                     self._leave_out(f"has no pose with its stamp on {messages.CAMERA_POSE.name}")
                     continue
                 camera = camera and pose is not None and replace(camera, pose=pose)
-            if not self._bound.follows(nodes) or not camera:
+            if not self._bound.follows(nodes) or not camera or nodes.cut not in self._cuts:
                 return
             self._states.popleft()
             for old in [other for other in self._poses if other <= stamp and not at_rest]:
@@ -254,13 +268,15 @@ class RenderingNode(EndoNode):
             key = (self._model_number, rest.tobytes() if matching else b"", config)
             self._background.want(key, lambda: _Bound(DeformableRenderer(model, rest, config), stamp, rest))
 
-    def _render(
-        self, bound: _Bound, nodes: ControlNodeCloud | None, camera: Camera
-    ) -> tuple[np.ndarray, np.ndarray, Camera]:
+    def _render(self, bound: _Bound, nodes: ControlNodeCloud | None, camera: Camera) -> tuple[np.ndarray, np.ndarray, Camera]:
         start, camera = time.monotonic(), bound.renderer.camera(camera)
         if max(camera.width, camera.height) > _MAX_SIDE:
             raise MessageError(f"images of {camera.width}×{camera.height} are too large; set image_width")
-        state = (nodes.positions, nodes.F) if bound.follows(nodes) else ()
+        state = ()
+        if bound.follows(nodes):
+            state = (nodes.positions, nodes.F)
+            if nodes.cut in self._cuts:  # else its surface is still on its way
+                bound.renderer.cut(self._cuts[nodes.cut])
         image, depth = bound.renderer.render(camera, *state)
         self._seconds_per_image += 0.1 * (time.monotonic() - start - self._seconds_per_image)
         return image, depth, camera
@@ -302,9 +318,7 @@ class RenderingNode(EndoNode):
 def _decode_info(message: Any, topic: str) -> CameraInfo:
     info = messages.decode_camera_info(message, topic)
     if max(info.width, info.height) > _MAX_SIDE:
-        raise MessageError(
-            f"{topic}: images of {info.width}×{info.height} are too large to render; the limit is {_MAX_SIDE} a side"
-        )
+        raise MessageError(f"{topic}: images of {info.width}×{info.height} are too large to render; the limit is {_MAX_SIDE} a side")
     return info
 
 

@@ -108,6 +108,11 @@ class _Traffic:
             return messages.encode_pose(pose, stamp, "world")
         if topic == messages.tool_wrench(ARM):
             return messages.encode_wrench(np.array([rng.gauss(0, 1) for _ in range(3)]), np.zeros(3), stamp, "world")
+        if topic == messages.tool_cut(ARM):
+            return messages.encode_cut(rng.random() < 0.2, stamp)
+        if topic == messages.CUT_SURFACE:
+            triangles = self.scene.tip + np.array([rng.gauss(0, 0.01) for _ in range(9)]).reshape(1, 3, 3)
+            return messages.encode_cut_surface(triangles, stamp, "world")
         return messages.encode_jaw(rng.uniform(-0.2, 1.0), stamp)
 
     @staticmethod
@@ -117,7 +122,7 @@ class _Traffic:
 
 _TOPICS = (
     *messages.RECORDING_TOPICS, *messages.MODEL_TOPICS, messages.CONTROL_NODES,
-    messages.tool_pose(ARM), messages.tool_wrench(ARM), messages.tool_jaw(ARM),
+    messages.CUT_SURFACE, messages.tool_pose(ARM), messages.tool_wrench(ARM), messages.tool_jaw(ARM), messages.tool_cut(ARM),
 )  # fmt: skip
 _WEIGHTS = [0.02 if topic in messages.MODEL_TOPICS else 0.1 if topic == messages.CONTROL_NODES else 1.0 for topic in _TOPICS]
 
@@ -128,9 +133,7 @@ def _memory(pid: int) -> float:
     return next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmRSS")) / 1024
 
 
-def soak(
-    json_file: Path | None, minutes: float = 10.0, rate: float = 500.0, seed: int = 0, width: int = 96, height: int = 80
-) -> list[Row]:
+def soak(json_file: Path | None, minutes: float = 10.0, rate: float = 500.0, seed: int = 0, width: int = 96, height: int = 80) -> list[Row]:
     """Send random traffic to a graph, then let it do its work; print and return what was measured.
 
     Args:
@@ -147,7 +150,7 @@ def soak(
     traffic = _Traffic(rng, width, height, 2000)
     parameters = {
         "reconstruction_node": {"iterations": 20, "max_gaussians": 1500, "start_after": 0.5},
-        "physics_node": {"node_count": 400, "arms": [ARM]},
+        "physics_node": {"node_count": 400, "arms": [ARM], "contact_radius": 0.005},
         "rendering_node": {},
     }
     with tempfile.TemporaryDirectory() as folder, NodeGroup(Path(folder) / "logs") as group:
@@ -168,9 +171,7 @@ def soak(
     return rows
 
 
-def _send(
-    client: Client, group: NodeGroup, traffic: _Traffic, rng: random.Random, seconds: float, rate: float
-) -> list[Row]:
+def _send(client: Client, group: NodeGroup, traffic: _Traffic, rng: random.Random, seconds: float, rate: float) -> list[Row]:
     begin, sent, spoilt = time.perf_counter(), 0, 0
     used: dict[str, list[float]] = {name: [] for name in _NODES}
     with Progress() as progress:
@@ -217,9 +218,7 @@ def _still_works(client: Client, group: NodeGroup, traffic: _Traffic) -> list[Ro
         client.send(topic, traffic.message(topic, stamp))
     for name in _NODES:
         client.until(lambda: client.statuses[name][0] == OK, f"{name} to be well again")
-    client.until(
-        lambda: client.statuses["rendering_node"][2].get("following control nodes") == "True", "the renderer to follow"
-    )
+    client.until(lambda: client.statuses["rendering_node"][2].get("following control nodes") == "True", "the renderer to follow")
     client.images.clear()
     client.until(lambda: client.images, "an image")
     before = client.images[-1][2].astype(int)

@@ -14,6 +14,7 @@ from endo_sim_ros.physics.control_nodes import ControlNodes, build_control_nodes
 from endo_sim_ros.physics.cutting import CutStencils, sweep, to_rest
 from endo_sim_ros.physics.mpm import MpmSolver, capturing
 from endo_sim_ros.physics.regions import TissueProperties, paint_regions
+from endo_sim_ros.physics.skinning import Skinning
 from endo_sim_ros.physics.tools import Tools
 
 MAX_TOOLS = 8  # of a TissueSimulation
@@ -73,6 +74,24 @@ class TissueBatch:
     def positions(self) -> Tensor:
         """Positions of the nodes [B, M, 3], m, world; pinned ones where they rest."""
         return self._rest + self.displacements * self._free[:, None]
+
+    def carry(self, skinning: Skinning) -> tuple[Tensor, Tensor]:
+        """Make skinning part of every step from now on, in place of another that was; on a GPU of the one graph that a step is.
+
+        Args:
+            skinning: With compact weights, bound to these nodes at rest, on this device. What it is bound to now counts.
+
+        Returns:
+            Means [B, N, 3], m, world, and covariances [B, N, 3, 3], m², of the Gaussians at the end of each step, which the
+            next overwrites: the same bits as `Skinning.deform` gives.
+
+        Raises:
+            ValueError: If the skinning is another's.
+        """
+        state = self.solver.state
+        launches, means, covars = skinning.launches(state.u, state.F, self.nodes.pinned, self.solver.environments)
+        self.solver.end_with(launches)
+        return means, covars
 
     def reset(self, environments: Tensor | slice = slice(None)) -> None:
         """Back to rest, in these copies; their tools let go."""
@@ -320,6 +339,28 @@ class TissueSimulation:
         self._disturbed = False
         self._resting = not any(self.config.gravity)
         self.time = 0.0
+
+    def continue_from(self, other: "TissueSimulation") -> bool:
+        """Take over shape, motion, cuts and tools of other tissue; returns whether that can be: if it has the same nodes.
+
+        For tissue whose material changes while it is being touched.
+        """
+        same = self.nodes.rest.shape == other.nodes.rest.shape and np.array_equal(self.nodes.rest, other.nodes.rest)
+        same = same and np.array_equal(self.nodes.pinned, other.nodes.pinned) and self.solver.device == other.solver.device
+        if not same or (len(other.cuts) and self.config.kinematics != "rest"):
+            return False
+        for name in ("u", "v", "C", "F", "Q"):
+            wp.copy(getattr(self.solver.state, name), getattr(other.solver.state, name))
+        self._tools.copy(other._tools)
+        self._slots, self._blades, self.time = dict(other._slots), dict(other._blades), other.time
+        self.last_fault = other.last_fault
+        if len(other.cuts):
+            self._stencils = CutStencils(self.nodes.rest, self.solver.rest_cells, self.solver.grid_shape)
+            if self._stencils.cut(other.cuts):
+                with capturing:
+                    self.solver.set_cut(self._stencils.table())
+        self._disturbed = True
+        return True
 
     def state(self) -> NodeState:
         """Positions and deformation gradients of all nodes now."""

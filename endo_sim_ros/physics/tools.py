@@ -30,12 +30,15 @@ class Tools:
         shape = (solver.environments, solver.tool_count)
         tools, entries = solver.environments * solver.tool_count, solver.environments * solver.tool_count * len(self.touchable)
 
+        self._everything: list[torch.Tensor] = []
+
         def tensors(struct, names: str, dtype, count: int = tools) -> list[torch.Tensor]:
             made = []
             for name in names.split():
                 array = wp.zeros(count, dtype, device=solver.device)
                 setattr(struct, name, array)
                 made.append(wp.to_torch(array))
+            self._everything += made
             return made
 
         commands, holds, reach = Commands(), Holds(), Reach()
@@ -82,6 +85,12 @@ class Tools:
     def take_hold(self) -> None:
         """Take hold of, or let go, now what commands say; otherwise the next step begins with it."""
         self._solver.launch(self._take_hold)
+
+    def copy(self, other: "Tools") -> None:
+        """Take over commands, holds and counts of the tools of other tissue with the same nodes and environments."""
+        for mine, theirs in zip(self._everything, other._everything):
+            mine.copy_(theirs)
+        self.faults.copy_(other.faults)
 
     def reset(self, environments: torch.Tensor | slice = slice(None)) -> None:
         """No command, nothing held, nothing counted in these environments."""

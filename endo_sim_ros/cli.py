@@ -15,6 +15,7 @@ from rich.progress import track
 from endo_sim_ros.config import ConfigError
 from endo_sim_ros.gaussians import ModelError
 from endo_sim_ros.messages import MessageError
+from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.sequences.frames import Frame, SequenceError
 from endo_sim_ros.sequences.phantom import PhantomConfig
@@ -112,13 +113,29 @@ class Reconstruct:
     bag: Positional[Path]
     """Bag with images, camera_info and poses."""
     out: Positional[Path]
-    """Folder for model.ply, checkpoint.pt and held_out.png."""
+    """Folder for model.ply, cameras.json, checkpoint.pt and held_out.png."""
     config: Annotated[ReconstructionConfig, tyro.conf.arg(name="")] = field(default_factory=ReconstructionConfig)
 
     def run(self) -> None:
         from endo_sim_ros.evaluation.held_out import reconstruct_and_measure
 
         reconstruct_and_measure(self.bag, self.out, self.config)
+
+
+@dataclass(frozen=True)
+class Touch:
+    """Poke, pull, grasp and cut a reconstructed model without ROS, and draw what it looks like."""
+
+    model: Positional[Path]
+    """PLY model, with the cameras.json that is saved beside it."""
+    out: Path = Path("touch.png")
+    """Picture to write."""
+    config: Annotated[PhysicsConfig, tyro.conf.arg(name="")] = field(default_factory=PhysicsConfig)
+
+    def run(self) -> None:
+        from endo_sim_ros.evaluation.touch_sheet import draw_touches
+
+        draw_touches(self.model, self.out, self.config)
 
 
 @dataclass(frozen=True)
@@ -344,6 +361,7 @@ class Bench:
 
 
 COMMANDS = {
+    "touch": Touch,
     "demo": Demo,
     "up": Up,
     "convert": Convert,

@@ -2,13 +2,20 @@
 
 import json
 import math
+import sys
+from functools import partial
 
+import numpy as np
 import pytest
 import torch
 
+from endo_sim_ros.cameras import look_at, save_cameras
+from endo_sim_ros.evaluation import physics_bench
 from endo_sim_ros.evaluation.bench import Row, machine, median_seconds, report
+from endo_sim_ros.evaluation.physics_bench import bench_physics, load_scene, phantom_scene
 from endo_sim_ros.evaluation.raster_bench import Plan, bench_raster, tissue
-from endo_sim_ros.splatting import rasterize
+from endo_sim_ros.gaussians import save_ply
+from endo_sim_ros.splatting import rasterize, render
 
 SMALL = Plan(
     counts=(50,),
@@ -18,6 +25,19 @@ SMALL = Plan(
     overlaps=(2.0,),
     reference=(40, 24, 16),
     training=(300, 96, 80),
+    seconds=0.0,
+)
+
+SMALL_PHYSICS = physics_bench.Plan(
+    gaussians=800,
+    width=96,
+    printed_nodes=100,
+    travel=0.003,
+    node_counts=(80,),
+    substeps=(3,),
+    skin_counts=(500,),
+    batch_nodes=(80,),
+    peer_grid=16,
     seconds=0.0,
 )
 
@@ -64,3 +84,90 @@ def test_the_rasteriser_bench_reports_every_row(tmp_path, capsys):
     errors = {name: row for name, row in rows.items() if name.startswith("error of")}
     assert len(errors) == 22
     assert all(row["unit"] == "relative" and 0 <= row["value"] < 1e-4 for row in errors.values())
+
+
+def rows_of_physics(tmp_path, **arguments) -> dict[tuple[str, str | None], dict]:
+    bench_physics("cpu", tmp_path / "rows.json", environments=(1, 2), plan=SMALL_PHYSICS, **arguments)
+    return {(row["name"], row["peer"]): row for row in json.loads((tmp_path / "rows.json").read_text())}
+
+
+def test_the_physics_bench_reports_every_row(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(physics_bench.importlib.util, "find_spec", lambda name: None)  # no peer
+    threads = torch.get_num_threads()
+    rows = rows_of_physics(tmp_path)
+    assert torch.get_num_threads() == threads
+    assert "Simulation on" in capsys.readouterr().out
+    dense, plain = "dense", "plain Warp kernels"
+    expected = {("dense: simulation alone", None): "FPS", ("dense: with images 96x77", None): "FPS"}
+    expected |= {(f"{name}: {what}", dense): "FPS" for name in ("printed", "default") for what in ("simulation alone", "with images 96x77")}
+    shown = ("at rest", "printed", "printed, compact weights", "default")
+    expected |= {(f"{name}: PSNR, {what}", "dense's images"): "dB" for name in shown for what in ("mean", "lowest")}
+    expected |= {("over nodes: 80, printed, 80 substeps", plain): "ms", ("over nodes: 80, default", plain): "ms"}
+    expected |= {("over substeps: 3, 100 nodes", plain): "ms", ("100 nodes, pressed by a capsule", "no contact"): "ms"}
+    expected |= {(name, plain): "ms" for name in ("100 nodes, pressed by a capsule", "skin 500", "step and skin 500")}
+    expected |= {("step and skin 500", "step, then skin"): "ms", ("1 x 80 nodes: steps of all", None): "1/s"}
+    expected |= {("2 x 80 nodes: steps of all", "1 x 80 nodes"): "1/s", ("2 x 80 nodes: steps of each", None): "1/s"}
+    expected |= {("state of a node", None): "B", ("solver per node", None): "B"}
+    for key, unit in expected.items():
+        assert rows[key]["unit"] == unit and 0 < rows[key]["value"] < math.inf, key
+        ratio = rows[key]["ratio"]
+        assert (ratio is None) == (key[1] in (None, "dense's images")) and (ratio is None or 0 < ratio < math.inf), key
+    assert rows["paper: its sparse nodes, RTX 3090", "PhysGaussian, in the paper"]["ratio"] == 57 / 4
+    assert 2 < rows["dense: farthest any node went", None]["value"] < 10
+    assert rows["state of a node", None]["value"] == 4 * (3 + 3 + 9 + 9 + 9)
+    assert not any("PhysGaussian's solver" in name for name, _ in rows)
+
+
+PEER = """
+import numpy as np
+
+class MPM_Simulator_WARP:
+    def __init__(self, n_particles, n_grid, grid_lim, device):
+        assert device == "cpu"
+        self.mpm_state, self.grid_lim, self.steps = type("State", (), {})(), grid_lim, 0
+        print("loud")
+
+    def set_parameters_dict(self, kwargs, device):
+        assert kwargs["density"] == 1000.0
+
+    def finalize_mu_lam(self, device):
+        pass
+
+    def p2g2p(self, step, dt, device):
+        x = self.mpm_state.particle_x.numpy()
+        assert (x > 0.1 * self.grid_lim).all() and (x < 0.9 * self.grid_lim).all() and 0 <= step < 80
+"""
+
+
+@pytest.mark.parametrize("working", [True, False])
+def test_the_peer_is_measured_where_it_works_and_otherwise_noted(working, tmp_path, capsys, monkeypatch):
+    (tmp_path / "mpm_solver_warp.py").write_text(PEER if working else "import warp.no_such_module")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "mpm_solver_warp", raising=False)
+    only_the_peer = lambda scene, device, environments, *rest: [("", partial(physics_bench._beside_peer, scene, device, *rest))]
+    monkeypatch.setattr(physics_bench, "_stages", only_the_peer)
+    rows = rows_of_physics(tmp_path)
+    monkeypatch.delitem(sys.modules, "mpm_solver_warp", raising=False)
+    out = capsys.readouterr().out
+    assert "loud" not in out
+    if working:
+        assert ("PhysGaussian's solver, 100 nodes, 16³ grid, 80 substeps", None) in rows
+        for kinematics in ("current", "rest"):
+            assert rows[f"100 nodes, {kinematics} kinematics, 80 substeps", "PhysGaussian's solver"]["ratio"] > 0
+    else:
+        assert not rows and "PhysGaussian's solver could not be measured: ModuleNotFoundError: No module named" in out
+
+
+def test_a_model_file_is_seen_by_its_camera_or_from_the_origin(tmp_path):
+    scene = phantom_scene(500, 64)
+    assert 400 < len(scene.model) < 600
+    assert render(scene.model, scene.camera).alphas.mean() > 0.9
+    save_ply(scene.model, tmp_path / "model.ply")
+    seen = load_scene(tmp_path / "model.ply", 64)
+    assert (seen.camera.position == 0).all() and seen.camera.height == 51
+    assert abs(seen.tip[2] - scene.tip[2]) < 0.01
+    moved = scene.camera.at(look_at(np.array([0.01, 0.0, 0.0]), scene.tip))
+    save_cameras([moved], tmp_path / "cameras.json")
+    seen = load_scene(tmp_path / "model.ply", 128)
+    assert seen.camera.width == 128 and seen.camera.position[0] == 0.01
+    assert np.abs(seen.tip - scene.tip).max() < 0.003

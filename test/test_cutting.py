@@ -5,7 +5,7 @@ import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from endo_sim_ros.physics.cutting import CutNeighbours, CutStencils, cut_stencils, separated, sweep, to_rest
+from endo_sim_ros.physics.cutting import CutNeighbours, CutStencils, clip_to_sides, cut_stencils, separated, sweep, to_rest
 from endo_sim_ros.physics.skinning import bind_weights
 
 SPACING = 0.005
@@ -460,3 +460,21 @@ def test_a_gaussian_with_few_or_no_nodes_left_keeps_finite_weights():
     none_left = cut_neighbours(means, rest, index, weights, np.concatenate([plane(0.05), plane(0.3)]))
     np.testing.assert_array_equal(none_left[0][0], index[0])
     np.testing.assert_array_equal(none_left[1][0], weights[0])
+
+
+def test_gaussians_do_not_reach_across_a_cut_and_those_away_from_it_are_untouched():
+    means = skin()
+    spread = np.random.default_rng(1).normal(size=(len(means), 3, 3)) * 0.002
+    covars = spread @ spread.transpose(0, 2, 1)
+    triangles = wall()
+    clipped = clip_to_sides(means, covars, triangles)
+    before, after = (np.sqrt(each[:, 0, 0]) for each in (covars, clipped))  # the wall is x = MIDDLE
+    distance = np.abs(means[:, 0] - MIDDLE)
+    over = distance < 2 * before
+    assert over.sum() > 300
+    np.testing.assert_allclose(after[over], np.maximum(distance / 2, 0.05 * before)[over], rtol=1e-6)
+    np.testing.assert_array_equal(clipped[~over], covars[~over])
+    np.testing.assert_allclose(clipped[:, 1:, 1:], covars[:, 1:, 1:], atol=1e-12)  # only across the cut
+    assert (np.linalg.eigvalsh(clipped) > -1e-12).all()
+    piecewise = clip_to_sides(means, clip_to_sides(means, covars, triangles[:7]), triangles[7:])
+    np.testing.assert_array_equal(piecewise, clipped)

@@ -5,7 +5,7 @@ import pytest
 import torch
 from test_physics import affine_field, curved_sheet
 
-from endo_sim_ros.physics import Skinning, skinning
+from endo_sim_ros.physics import PhysicsConfig, Skinning, TissueBatch, build_control_nodes, skinning
 
 
 def model_and_rest(count: int = 9001, offset: tuple = (0.0, 0.0, 0.0)):
@@ -146,3 +146,36 @@ def test_bindings_that_make_no_sense_are_refused_and_change_nothing():
         with pytest.raises(ValueError, match="must add up to one"):
             s.rebind(index, wrong)
     assert torch.equal(s.neighbours, before[0]) and torch.equal(s.weights, before[1])
+
+
+@pytest.mark.parametrize("environments", [1, 3])
+def test_skinning_within_the_step_gives_the_same_bits_as_after_it(environments):
+    model, _ = model_and_rest(5000)
+    config = PhysicsConfig(node_count=400, device="cpu")
+    nodes = build_control_nodes(model, np.zeros(3), config)
+    batch = TissueBatch(nodes, config, environments)
+    s = Skinning(model, nodes.rest, device="cpu")
+    means, covars = batch.carry(s)
+    assert torch.equal(means[0], s.means) and torch.equal(covars[-1], s.covars)
+    force = torch.tensor([0.2, 0.0, -0.4], dtype=torch.float64)
+    batch.tools.reaches[:] = torch.tensor([0.0, 0.0, 0.12])
+    batch.tools.forces[:, 0] = force * torch.arange(1, environments + 1)[:, None]
+    for _ in range(3):
+        batch.step()
+    positions, pinned = batch.positions(), torch.from_numpy(nodes.pinned)
+    for b in range(environments):
+        expected = s.deform(positions[b], torch.where(pinned[:, None, None], torch.eye(3), batch.F[b]))
+        assert torch.equal(means[b], expected[0]) and torch.equal(covars[b], expected[1])
+        assert 1e-3 < (means[b] - s.means).norm(dim=1).max() < 0.02
+    assert environments == 1 or not torch.equal(means[0], means[1])
+
+
+def test_skinning_of_other_nodes_or_with_the_printed_weights_cannot_be_part_of_the_step():
+    model, rest = model_and_rest(5000)
+    config = PhysicsConfig(node_count=400, device="cpu")
+    nodes = build_control_nodes(model, np.zeros(3), config)
+    batch = TissueBatch(nodes, config, 2)
+    with pytest.raises(ValueError, match="125 nodes on cpu cannot follow 2 × 400 nodes on cpu"):
+        batch.carry(Skinning(model, rest, device="cpu"))
+    with pytest.raises(ValueError, match="softmax cannot be part of the step"):
+        batch.carry(Skinning(model, nodes.rest, weighting="softmax", device="cpu"))

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from rich.progress import Progress as ProgressBar
 
+from endo_sim_ros.cameras import save_cameras
 from endo_sim_ros.evaluation import figures, metrics
 from endo_sim_ros.gaussians import GaussianModel, save_ply
 from endo_sim_ros.reconstruction import Progress, ReconstructionConfig, Trainer, select_keyframes, shrink
@@ -34,6 +35,7 @@ def reconstruct_and_measure(bag: Path, out: Path, config: ReconstructionConfig) 
 
         model = trainer.run(on_progress)
     save_ply(model, out / "model.ply")
+    save_cameras([frames[index].camera for index in chosen], out / "cameras.json")
     trainer.save_checkpoint(out / "checkpoint.pt")
     held_out = [shrink(frame, config.image_width) for index, frame in enumerate(frames) if index not in chosen]
     held_out = [frame for frame in held_out if frame.mask is None or frame.mask.any()]

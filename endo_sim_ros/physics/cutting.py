@@ -22,6 +22,7 @@ BLADE_NEIGHBOURS = 4  # nodes that carry a point of the blade
 MIN_HEIGHT = 1e-6  # m; of a triangle worth keeping
 ON_PLANE = 1e-9  # m; points this near to the plane of a triangle lie on its positive side
 OVERLAP = 1e-6  # of a triangle, by which it reaches over its edges, so that two that share one leave no gap
+FLATTEST = 0.05  # of its extent; a Gaussian in the cut itself keeps that much across it
 UPWARD = np.array([0.531, 0.616, 0.582])  # tells the positive side of a plane, however its triangle is wound
 BLOCK = 4_000_000  # bounding boxes compared at once
 
@@ -364,7 +365,7 @@ class CutNeighbours:
     """
 
     def __init__(self, means: np.ndarray, node_rest: np.ndarray, index: np.ndarray, weights: np.ndarray):
-        self._means, self._rest = np.asarray(means, np.float64), np.asarray(node_rest, np.float64)
+        self.means, self._rest = np.asarray(means, np.float64), np.asarray(node_rest, np.float64)
         self._uncut = index, weights
         self.triangles = np.zeros((0, 3, 3))  # of all cuts [T, 3, 3], m, world, at rest
         self.index, self.weights = index.copy(), weights.copy()  # now
@@ -377,14 +378,14 @@ class CutNeighbours:
         if not (known <= len(triangles) and np.array_equal(triangles[:known], self.triangles)):
             self.index, self.weights, known = self._uncut[0].copy(), self._uncut[1].copy(), 0
         new, self.triangles = triangles[known:], triangles.copy()
-        if not len(new) or not len(self._means):
+        if not len(new) or not len(self.means):
             return
         count = self.index.shape[1]
         if self._candidates is None:
             ranks = list(range(1, min(4 * count + 1, len(self._rest)) + 1))
-            self._candidates = cKDTree(self._rest).query(self._means, k=ranks, workers=-1)  # nearest first
+            self._candidates = cKDTree(self._rest).query(self.means, k=ranks, workers=-1)  # nearest first
         reach = self._candidates[0][:, -1].max()
-        near = (self._means >= new.min((0, 1)) - reach) & (self._means <= new.max((0, 1)) + reach)
+        near = (self.means >= new.min((0, 1)) - reach) & (self.means <= new.max((0, 1)) + reach)
         near = np.flatnonzero(near.all(1))
         near = near[self._parted(near, self._candidates[1], new).any(1)]
         uncut = near[~self._parted(near, self._uncut[0], triangles, self._uncut[1]).any(1)]
@@ -411,8 +412,40 @@ class CutNeighbours:
     def _parted(self, gaussians: np.ndarray, nodes: np.ndarray, triangles: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
         """Which of their nodes [N, C] triangles part from these Gaussians [G]: bool [G, C]; those of weight zero do not count."""
         ends = nodes[gaussians]
-        crossed = separated(np.repeat(self._means[gaussians], ends.shape[1], 0), self._rest[ends.ravel()], triangles).reshape(ends.shape)
+        crossed = separated(np.repeat(self.means[gaussians], ends.shape[1], 0), self._rest[ends.ravel()], triangles).reshape(ends.shape)
         return crossed if weights is None else crossed & (weights[gaussians] > 0)
+
+
+def clip_to_sides(means: np.ndarray, covars: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Covariances [N, 3, 3] of Gaussians that no longer reach across a cut, so that its edges are sharp when it opens.
+
+    A Gaussian less than two standard deviations from a triangle below it is flattened along the triangle's normal until
+    it is two away, or to a twentieth. Triangles act one after the other, so it does not matter how cuts are divided into calls.
+
+    Args:
+        means: Gaussians at rest [N, 3], m, world.
+        covars: Their covariances [N, 3, 3], m².
+        triangles: Of the cut [T, 3, 3], m, world, at rest.
+    """
+    covars, reach = covars.copy(), 2 * np.sqrt(np.trace(covars, axis1=1, axis2=2))
+    for a, b, c in np.asarray(triangles, np.float64):
+        e1, e2 = b - a, c - a
+        cross = np.cross(e1, e2)
+        square = cross @ cross
+        normal = cross / np.sqrt(square)
+        low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+        near = np.flatnonzero(((means >= low - reach[:, None]) & (means <= high + reach[:, None])).all(1))
+        x = means[near] - a
+        u, v, height = np.cross(x, e2) @ cross / square, np.cross(e1, x) @ cross / square, np.abs(x @ normal)
+        along = covars[near] @ normal  # [n, 3]
+        spread = 2 * np.sqrt(np.maximum(along @ normal, 0))
+        over = (u >= -OVERLAP) & (v >= -OVERLAP) & (u + v <= 1 + OVERLAP) & (height < spread)
+        near, along = near[over], along[over]
+        lost = 1 - np.maximum(height[over] / spread[over], FLATTEST)
+        outer = lost[:, None, None] * along[:, :, None] * normal
+        kept = lost**2 * (along @ normal)
+        covars[near] += kept[:, None, None] * np.outer(normal, normal) - outer - outer.transpose(0, 2, 1)
+    return covars
 
 
 def _compact_weights(d: np.ndarray, beyond: np.ndarray, kept: np.ndarray | bool = True) -> np.ndarray:

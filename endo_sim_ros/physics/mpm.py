@@ -209,6 +209,7 @@ class MpmSolver:
         self._substep.forget = -math.expm1(-self.substepping.dt / config.relaxation_time)
         self._before: list[Launch] = []
         self._after: list[Launch] = []
+        self._last: list[Launch | list[Launch]] = []
         self._vectorised = vectorised and self.device == "cpu" and config.material in STRESSES
         self._advance: Callable[[], None] | None = None
         self.set_cut(None)
@@ -266,6 +267,11 @@ class MpmSolver:
         self._before, self._after = before, after
         self._advance = self._prepare() if self.device == "cpu" else None
 
+    def end_with(self, last: list[Launch | list[Launch]]) -> None:
+        """Make these launches the end of every step, in place of earlier ones; those in a list may run at the same time."""
+        self._last = last
+        self._advance = self._prepare() if self.device == "cpu" else None
+
     def launch(self, launch: Launch) -> None:
         """Launch now."""
         wp.launch(launch.kernel, launch.dim, launch.inputs, device=self.device)
@@ -304,10 +310,13 @@ class MpmSolver:
         actions += self._vectorised_step() if self._vectorised else self._launched_substeps()
         actions.append(self._action(Launch(check_nodes, every, check)))
         actions.append(self._action(Launch(undo_bad_steps, every, [self.bad_nodes, count, self._backup, self.state])))
-        return actions + [self._action(launch) for launch in self._after]
+        return actions + [self._action(launch) for launch in (*self._after, *self._last)]
 
-    def _action(self, launch: Launch) -> Callable[[], None]:
-        """The launch as a call."""
+    def _action(self, launch: Launch | list[Launch]) -> Callable[[], None]:
+        """The launch as a call; a list of them is shared out among threads on the CPU, and in order on a GPU."""
+        if isinstance(launch, list):
+            actions = [self._action(each) for each in launch]
+            return partial(run_in_threads, actions) if self.device == "cpu" else lambda: [action() for action in actions]
         wp.load_module(launch.kernel.module, device=self.device)
         arguments = (launch.kernel, launch.dim, launch.inputs)
         if self.device == "cpu":

@@ -13,7 +13,8 @@ from endo_sim_ros.device import cpu_threads, init_warp, pick_device, run_in_thre
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.physics import skinning_kernels as kernels
 from endo_sim_ros.physics import skinning_simd_kernels as simd_kernels
-from endo_sim_ros.physics.cutting import CutNeighbours
+from endo_sim_ros.physics.cutting import CutNeighbours, clip_to_sides
+from endo_sim_ros.physics.mpm import Launch
 
 STRETCH_RANGE = (0.2, 4.0)  # of a Gaussian; beyond it the picture shows needles or holes, not tissue
 SHARED_FROM = 4096  # Gaussians; fewer are done before a second thread has begun
@@ -45,6 +46,7 @@ class Skinning:
         neighbours: Number of nearest nodes K that move one Gaussian.
         weighting: ``compact`` (with F_k) or the paper's ``softmax`` (with R_k), see :func:`bind_weights`.
         device: Where to compute: auto, cpu, cuda or cuda:N.
+        vectorised: Use the CPU's own kernel; False runs that of the GPU on it, to compare.
 
     Raises:
         ValueError: If there are no nodes, or positions are not finite.
@@ -58,10 +60,12 @@ class Skinning:
         neighbours: int = 4,
         weighting: Literal["compact", "softmax"] = "compact",
         device: str = "auto",
+        vectorised: bool = True,
     ):
         init_warp()
         self.device = pick_device(device)
         self.weighting = weighting
+        self._vectorised = vectorised and self.device == "cpu"
         rest = torch.as_tensor(node_rest).detach().cpu().double().numpy()
         means = model.means.detach().cpu().double().numpy()
         if rest.ndim != 2 or rest.shape[1] != 3 or not len(rest):
@@ -77,11 +81,17 @@ class Skinning:
         index, weights = bind_weights(means, rest, neighbours, weighting)
         self.rebind(index, weights)
         self._cuts = CutNeighbours(means, rest, index, weights)
+        self._covars = self._clipped = self.covars.cpu().double().numpy()
 
     def cut(self, triangles: np.ndarray) -> None:
-        """Let no Gaussian follow nodes on the other side of a cut: all of it [T, 3, 3], m, world, in the tissue at rest."""
+        """Let no Gaussian follow nodes, or reach, across a cut: all of it [T, 3, 3], m, world, in the tissue at rest."""
+        known = len(self.cuts)
+        grown = np.array_equal(self.cuts, np.asarray(triangles)[:known])
         self._cuts.cut(triangles)
         self.rebind(self._cuts.index, self._cuts.weights)
+        clipped = self._clipped if grown else self._covars
+        self._clipped = clip_to_sides(self._cuts.means, clipped, self.cuts[known if grown else 0 :])
+        self.covars = torch.from_numpy(self._clipped).to(self.device, torch.float32)
 
     @property
     def cuts(self) -> np.ndarray:
@@ -150,9 +160,44 @@ class Skinning:
         means, covars = torch.empty_like(self.means), torch.empty_like(self.covars)
         inputs = [_array(self.means, wp.vec3), _array(self.covars, wp.mat33), _array(self.neighbours), _array(self.weights)]
         inputs += [_array(maps, wp.mat44), self._origin, *STRETCH_RANGE, _array(means, wp.vec3), _array(covars, wp.mat33)]
-        kernel = simd_kernels.skin_gaussians if self.device == "cpu" else kernels.skin_gaussians
-        self._launch_shares(kernel, len(means), inputs)
+        self._launch_shares(self._kernel(), len(means), inputs)
         return means, covars
+
+    def launches(
+        self, u: wp.array, F: wp.array, pinned: np.ndarray, environments: int
+    ) -> tuple[list[Launch | list[Launch]], Tensor, Tensor]:
+        """What computes `deform` from the state of a solver, as launches (those in a list may run at the same time), and the
+        means [B, N, 3] and covariances [B, N, 3, 3] that they overwrite.
+
+        Args:
+            u: Displacements of the nodes in all environments [B · M].
+            F: Their deformation gradients [B · M].
+            pinned: Nodes that never move [M].
+            environments: B.
+
+        Raises:
+            ValueError: If the weights are not compact, or the nodes or the device are others than the solver's.
+        """
+        count, device = len(self.node_rest), self.device
+        if self.weighting != "compact":
+            raise ValueError(f"skinning: weights {self.weighting} cannot be part of the step; use compact")
+        if len(pinned) != count or u.shape != (environments * count,) or str(u.device) != device:
+            raise ValueError(f"skinning: {count} nodes on {device} cannot follow {environments} × {len(pinned)} nodes on {u.device}")
+        means, covars = (rest.repeat(environments, *[1] * rest.ndim) for rest in (self.means, self.covars))
+        maps = torch.zeros((environments, count, 4, 4), device=device)
+        array = functools.partial(wp.from_torch, requires_grad=False)  # which keeps the tensor
+        held = array(torch.from_numpy(pinned).to(device, torch.int32))
+        inputs = [array(self.node_rest, wp.vec3), held, u, F, self._origin, array(maps.view(-1, 4, 4), wp.mat44)]
+        done: list[Launch | list[Launch]] = [Launch(kernels.moved_node_maps, (environments, count), inputs)]
+        at_rest = [array(self.means, wp.vec3), array(self.covars, wp.mat33), array(self.neighbours), array(self.weights)]
+        for b in range(environments):
+            inputs = [*at_rest, array(maps[b], wp.mat44), self._origin, *STRETCH_RANGE]
+            inputs += [array(means[b], wp.vec3), array(covars[b], wp.mat33)]
+            done.append([Launch(self._kernel(), size, [first, *inputs]) for first, size in self._shares(len(self.means))])
+        return done, means, covars
+
+    def _kernel(self) -> wp.Kernel:
+        return simd_kernels.skin_gaussians if self._vectorised else kernels.skin_gaussians
 
     def _launch(self, kernel, count: int, inputs: list) -> None:
         stream = None
@@ -162,9 +207,14 @@ class Skinning:
 
     def _launch_shares(self, kernel, count: int, inputs: list) -> None:
         """Launch a kernel whose first argument is an offset: at once on CUDA, in shares on the CPU."""
+        shares = self._shares(count)
+        run_in_threads([functools.partial(self._launch, kernel, size, [first, *inputs]) for first, size in shares])
+
+    def _shares(self, count: int) -> list[tuple[int, int]]:
+        """First and number of the Gaussians of each thread."""
         threads = cpu_threads() if self.device == "cpu" and count >= SHARED_FROM else 1
         bounds = [count * i // threads for i in range(threads + 1)]
-        run_in_threads([functools.partial(self._launch, kernel, end - first, [first, *inputs]) for first, end in zip(bounds, bounds[1:])])
+        return [(first, end - first) for first, end in zip(bounds, bounds[1:])]
 
 
 @functools.cache

@@ -45,6 +45,19 @@ def node_rotations(F: wp.array[wp.mat33], R: wp.array[wp.mat33]):
     R[k] = rotation_of(F[k])
 
 
+@wp.func
+def node_map(rest: wp.vec3, position: wp.vec3, A: wp.mat33, origin: wp.vec3) -> wp.mat44:
+    """G_k: the columns of B_k and c_k as rows of four."""
+    B = A - wp.identity(3, float)
+    c = position - rest - B * (rest - origin)
+    G = wp.mat44()
+    for i in range(3):
+        for j in range(3):
+            G[j, i] = B[i, j]
+        G[3, i] = c[i]
+    return G
+
+
 @wp.kernel
 def node_maps(
     node_rest: wp.array[wp.vec3],
@@ -53,16 +66,27 @@ def node_maps(
     origin: wp.vec3,
     maps: wp.array[wp.mat44],  # out
 ):
-    """G_k of every node: the columns of B_k and c_k as rows of four."""
+    """G_k of every node."""
     k = wp.tid()
-    B = node_A[k] - wp.identity(3, float)
-    c = node_positions[k] - node_rest[k] - B * (node_rest[k] - origin)
-    G = wp.mat44()
-    for i in range(3):
-        for j in range(3):
-            G[j, i] = B[i, j]
-        G[3, i] = c[i]
-    maps[k] = G
+    maps[k] = node_map(node_rest[k], node_positions[k], node_A[k], origin)
+
+
+@wp.kernel
+def moved_node_maps(
+    node_rest: wp.array[wp.vec3],  # [M]
+    pinned: wp.array[int],  # [M]
+    u: wp.array[wp.vec3],  # displacements [B · M]
+    F: wp.array[wp.mat33],  # [B · M]
+    origin: wp.vec3,
+    maps: wp.array[wp.mat44],  # out [B · M]
+):
+    """G_k of every node in every environment, A_k = F_k; pinned nodes have not moved."""
+    b, k = wp.tid()
+    e = b * node_rest.shape[0] + k
+    if pinned[k] != 0:
+        maps[e] = wp.mat44()
+    else:
+        maps[e] = node_map(node_rest[k], node_rest[k] + u[e], F[e], origin)
 
 
 @wp.func

@@ -57,6 +57,10 @@ def test_reconstruct_writes_a_model_and_measures_held_out_views(bag, tmp_path):
     assert 1000 < len(load_ply(out / "model.ply")) <= 4000
     assert (out / "checkpoint.pt").is_file()
     assert cv2.imread(str(out / "held_out.png")).std() > 10
+    touched = endo_sim("touch", out / "model.ply", "--out", out / "touch.png", "--node-count", 400, "--device", "cpu")
+    assert touched.returncode == 0 and "undone" not in touched.stderr, touched.stderr
+    picture = cv2.imread(str(out / "touch.png"))
+    assert picture.shape[1] == 3 * 128 and picture.std() > 10
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,11 @@
 """Physics: nodes, materials, the solver against theory, tools, faults and skinning."""
 
 import dataclasses
+import re
+import subprocess
+import sys
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +13,7 @@ import torch
 import warp as wp
 
 from endo_sim_ros.config import ConfigError, options
-from endo_sim_ros.gaussians import GaussianModel
+from endo_sim_ros.gaussians import GaussianModel, save_ply
 from endo_sim_ros.physics import (
     ControlNodes,
     MpmSolver,
@@ -569,6 +573,15 @@ def test_environments_are_independent_copies_on_any_number_of_threads(monkeypatc
     np.testing.assert_allclose(batch.positions()[0], single.state().positions, atol=0.03 * depths[0])
     batch.reset(torch.tensor([1, 4]))
     assert not batch.displacements[1].any() and batch.displacements[0].any() and batch.tools.faults[4] == 0
+
+
+def test_the_documented_batch_runs(tmp_path):
+    text = (Path(__file__).parents[1] / "docs" / "physics.md").read_text()
+    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    save_ply(curved_sheet(), tmp_path / "model.ply")
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "0.2000" in done.stdout  # the reaction to the wrench
 
 
 def test_tissue_whose_material_changes_goes_on_from_where_it_is():

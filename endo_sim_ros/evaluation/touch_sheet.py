@@ -1,4 +1,4 @@
-"""One picture of what tools do to a model: poked, pulled, grasped and cut."""
+"""One picture of what tools do to a model: poked, pulled, let go, grasped and cut."""
 
 import dataclasses
 import logging
@@ -19,7 +19,7 @@ _STEPS = 25  # of each touch
 
 
 def draw_touches(model_path: Path, out: Path, config: PhysicsConfig) -> None:
-    """Touch a model in the middle of its middle camera's picture, in four ways, and write a sheet of what that camera sees.
+    """Touch a model in the middle of its middle camera's picture, in five ways, and write a sheet of what that camera sees.
 
     Args:
         model_path: PLY file, with the cameras.json that the reconstruction saves beside it.
@@ -42,7 +42,7 @@ def draw_touches(model_path: Path, out: Path, config: PhysicsConfig) -> None:
     config = dataclasses.replace(config, force_radius=0.5 * size, blade_length=max(4 * size, 2 * config.thickness))
     rod = dataclasses.replace(config, contact_radius=0.5 * size, contact_length=4 * size)
     pictures = [("at rest", picture)]
-    for touch in track((_poke, _pull, _grasp, _cut), description="touching the tissue"):
+    for touch in track((_poke, _pull, _let_go, _grasp, _cut), description="touching the tissue"):
         simulation = TissueSimulation(model, views, rod if touch is _poke else config)
         renderer = DeformableRenderer(model, simulation.nodes.rest, RenderingConfig(device=config.device))
         text, tip, force = touch(simulation, camera, middle, size)
@@ -87,6 +87,16 @@ def _pull(simulation: TissueSimulation, camera: Camera, middle: np.ndarray, size
             break
         force *= 1.1
     return f"pulled by {np.linalg.norm(force * direction):.2f} N", middle + moved, force * direction
+
+
+def _let_go(simulation: TissueSimulation, camera: Camera, middle: np.ndarray, size: float):
+    _pull(simulation, camera, middle, size)
+    simulation.set_wrench("tool", middle, np.zeros(3))
+    for _ in range(_STEPS):
+        simulation.step()
+    left = np.linalg.norm(simulation.solver.displacements(), axis=1).max()
+    seconds = _STEPS * simulation.step_duration
+    return f"let go: {1e3 * left:.2f} mm from rest after {seconds:g} s", middle, np.zeros(3)
 
 
 def _grasp(simulation: TissueSimulation, camera: Camera, middle: np.ndarray, size: float):

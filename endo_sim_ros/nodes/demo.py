@@ -85,7 +85,9 @@ def run_demo(
         count = figures.write_video(out / "touch.mp4", report.video(_FPS), _FPS)
         pictures, quality = report.moments()
         figures.write_png(out / "contact_sheet.png", figures.sheet(pictures))
-        shutil.copy(max((out / "models").glob("*/model.ply")), out / "model.ply")
+        newest = max((out / "models").glob("*/model.ply")).parent
+        for name in ("model.ply", "cameras.json"):
+            shutil.copy(newest / name, out / name)
     for path, what in (
         (out / "touch.mp4", f"the tissue pulled by the tool, {count / _FPS:.1f} s"),
         (out / "contact_sheet.png", quality),

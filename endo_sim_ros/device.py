@@ -52,6 +52,15 @@ def _silent_stderr():
         os.close(nowhere)
 
 
+def on_torch_stream(device: torch.device | str) -> contextlib.AbstractContextManager:
+    """Make Warp work on torch's current stream of a CUDA device, in order with torch's own work."""
+    if torch.device(device).type == "cpu":
+        return contextlib.nullcontext()
+    import warp as wp
+
+    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False)
+
+
 def cpu_threads() -> int:
     """Number of worker threads for CPU kernels: the cores this process may use, or ENDO_SIM_THREADS."""
     available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -6,7 +6,7 @@ import torch
 
 from endo_sim_ros.cameras import Camera
 from endo_sim_ros.gaussians import GaussianModel
-from endo_sim_ros.physics import PhysicsConfig, Skinning, TissueSimulation
+from endo_sim_ros.physics import PhysicsConfig, Skinning, TissueBatch, TissueSimulation, build_control_nodes
 from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 from endo_sim_ros.splatting import rasterize, render
@@ -49,36 +49,84 @@ def test_rasteriser_images_and_gradients_agree():
         assert float(error.max()) < 2e-2 and float(error.flatten().quantile(0.999) if error.numel() < 1e7 else 0) < 1e-4, index
 
 
-def test_physics_agrees_step_for_step():
-    states = {}
-    for device in ("cpu", "cuda"):
-        simulation = TissueSimulation(sheet(), np.zeros(3), PhysicsConfig(device=device, node_count=2000))
-        assert simulation.set_wrench("PSM1", TIP, [0.3, 0.0, -1.0])
-        for _ in range(10):
-            simulation.step()
-        assert simulation.faults == 0
-        states[device] = simulation.state()
-    np.testing.assert_array_equal(states["cpu"].rest, states["cuda"].rest)
-    moved = np.abs(states["cpu"].positions - states["cpu"].rest).max()
+def touch(device: str, **overrides) -> tuple[TissueSimulation, dict[str, np.ndarray]]:
+    """Pull with a wrench, lift with a jaw, press with a rod and cut, all at once; the end, and all that was felt."""
+    config = PhysicsConfig(**{"device": device, "node_count": 2000, "contact_radius": 0.006, "blade_length": 0.03, **overrides})
+    simulation, felt = TissueSimulation(sheet(), np.zeros(3), config), []
+    pose = np.eye(4)
+    assert simulation.set_wrench("pull", TIP - [0.04, 0, 0], [0.1, 0.0, -0.3])
+    for step in range(10):
+        pose[:3, 3] = TIP + [0.04, 0, -0.0008 * step]
+        assert simulation.set_grasp("grip", pose, True)
+        pose[:3, 3] = TIP + [0, 0, -0.006 + 0.0005 * step]
+        simulation.set_grasp("press", pose, False)
+        pose[:3, 3] = 0.02, -0.03 + 0.005 * step, 0.15
+        if config.kinematics == "rest":
+            simulation.set_cut("knife", pose, True)
+        simulation.step()
+        felt.append(np.concatenate([simulation.reaction(tool) for tool in ("pull", "grip", "press")]))
+    assert simulation.faults == 0 and (len(simulation.cuts) > 0) == (config.kinematics == "rest")
+    state = simulation.state()
+    return simulation, {"positions": state.positions, "F": state.F, "felt": np.array(felt)}
+
+
+@pytest.mark.parametrize("kinematics", ["rest", "current"])
+@pytest.mark.parametrize("material", ["fixed_corotated", "neo_hookean"])
+def test_physics_agrees_step_for_step(kinematics, material):
+    options = {"kinematics": kinematics, "material": material, "relaxation": 0.5}
+    (simulation, cpu), (_, cuda) = touch("cpu", **options), touch("cuda", **options)
+    moved = np.abs(cpu["positions"] - simulation.nodes.rest).max()
     assert moved > 2e-3
-    np.testing.assert_allclose(states["cuda"].positions, states["cpu"].positions, atol=1e-3 * moved)
-    np.testing.assert_allclose(states["cuda"].F, states["cpu"].F, atol=2e-3)
+    np.testing.assert_allclose(cuda["positions"], cpu["positions"], atol=2e-3 * moved)
+    np.testing.assert_allclose(cuda["F"], cpu["F"], atol=5e-3)
+    np.testing.assert_allclose(cuda["felt"], cpu["felt"], atol=0.01 * np.abs(cpu["felt"]).max())
 
 
-def test_grasp_agrees():
-    moved = {}
-    for device in ("cpu", "cuda"):
-        simulation = TissueSimulation(sheet(), np.zeros(3), PhysicsConfig(device=device, node_count=1000))
-        pose = np.eye(4)
-        pose[:3, 3] = TIP
-        assert simulation.set_grasp("PSM1", pose, True)
-        pose[2, 3] -= 0.005
-        simulation.set_grasp("PSM1", pose, True)
-        for _ in range(5):
-            simulation.step()
-        moved[device] = simulation.state().positions, simulation.reaction("PSM1")[0]
-    np.testing.assert_allclose(moved["cuda"][0], moved["cpu"][0], atol=1e-5)
-    np.testing.assert_allclose(moved["cuda"][1], moved["cpu"][1], rtol=0.02, atol=1e-3)
+def test_the_same_touches_give_the_same_bits_twice():
+    (_, first), (_, second) = touch("cuda"), touch("cuda")
+    for name, values in first.items():
+        np.testing.assert_array_equal(second[name], values, err_msg=name)
+
+
+def test_many_environments_agree_with_one_and_faults_stay_in_theirs():
+    config, count = PhysicsConfig(device="cuda", node_count=1000), 64
+    nodes = build_control_nodes(sheet(), np.zeros(3), config)
+    batch = TissueBatch(nodes, config, environments=count, tools=2)
+    skinning = Skinning(sheet(), nodes.rest, device="cuda")
+    means, covars = batch.carry(skinning)
+    batch.tools.reaches[:, 0] = torch.from_numpy(TIP)
+    batch.tools.forces[:, 0, 2] = torch.linspace(0.0, 0.3, count, dtype=torch.float64)
+    batch.tools.forces[7, 0, 2] = 1e7
+    for _ in range(5):
+        batch.step()
+    assert batch.tools.faults.tolist() == [5 * (b == 7) for b in range(count)]
+    assert batch.displacements.isfinite().all() and not batch.displacements[0].any()
+    depths = batch.displacements.norm(dim=2).amax(1)
+    assert bool((depths[8:] > depths[7:-1]).all())
+    single = TissueBatch(nodes, config, environments=1, tools=2)
+    single.tools.reaches[:, 0] = torch.from_numpy(TIP)
+    single.tools.forces[:, 0, 2] = 0.3
+    for _ in range(5):
+        single.step()
+    assert torch.equal(single.displacements[0], batch.displacements[-1])
+    pinned = torch.from_numpy(nodes.pinned).cuda()[:, None, None]
+    expected = skinning.deform(batch.positions()[-1], torch.where(pinned, torch.eye(3, device="cuda"), batch.F[-1]))
+    torch.testing.assert_close(means[-1], expected[0], atol=1e-7, rtol=0)
+    torch.testing.assert_close(covars[-1], expected[1], atol=1e-10, rtol=1e-4)
+    batch.reset(torch.arange(0, count, 2, device="cuda"))
+    assert not batch.displacements[::2].any() and bool(batch.displacements[9].any())
+
+
+def test_commands_written_on_a_side_stream_reach_the_next_step():
+    config = PhysicsConfig(device="cuda", node_count=400)
+    batch = TissueBatch(build_control_nodes(sheet(), np.zeros(3), config), config, environments=4)
+    with torch.cuda.stream(torch.cuda.Stream()):
+        for step in range(20):
+            batch.tools.reaches[:, 0] = torch.from_numpy(TIP)
+            batch.tools.forces[:, 0, 2] = 0.01 * (step + 1)
+            batch.step()
+            reactions = batch.tools.reaction_forces[:, 0, 2].clone()
+            torch.testing.assert_close(reactions, torch.full_like(reactions, -0.01 * (step + 1)), atol=1e-9, rtol=0)
 
 
 def test_skinning_agrees():

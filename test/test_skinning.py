@@ -148,13 +148,13 @@ def test_bindings_that_make_no_sense_are_refused_and_change_nothing():
     assert torch.equal(s.neighbours, before[0]) and torch.equal(s.weights, before[1])
 
 
-@pytest.mark.parametrize("environments", [1, 3])
-def test_skinning_within_the_step_gives_the_same_bits_as_after_it(environments):
+@pytest.mark.parametrize("environments, vectorised", [(1, True), (3, True), (3, False)])
+def test_skinning_within_the_step_gives_the_same_bits_as_after_it(environments, vectorised):
     model, _ = model_and_rest(5000)
     config = PhysicsConfig(node_count=400, device="cpu")
     nodes = build_control_nodes(model, np.zeros(3), config)
     batch = TissueBatch(nodes, config, environments)
-    s = Skinning(model, nodes.rest, device="cpu")
+    s = Skinning(model, nodes.rest, device="cpu", vectorised=vectorised)
     means, covars = batch.carry(s)
     assert torch.equal(means[0], s.means) and torch.equal(covars[-1], s.covars)
     force = torch.tensor([0.2, 0.0, -0.4], dtype=torch.float64)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from endo_sim_ros.device import cpu_threads, init_warp, pick_device, run_in_threads
+from endo_sim_ros.device import cpu_threads, init_warp, on_torch_stream, pick_device, run_in_threads
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes
 from endo_sim_ros.physics.cutting import CutTable, first_nodes
@@ -39,6 +39,7 @@ PIN_STIFFNESS = 50.0  # of a pinned node's spring, over that of a cube of tissue
 MARGIN_CELLS = 2.0  # between the nodes and the edge of the grid; a spline reaches 1.5
 MIN_CELL, MAX_CELL = 1e-6, 1e3  # m; beyond these float32 no longer holds masses and stiffnesses
 MAX_GRID_NODES = 64_000_000  # 28 bytes each
+BLOCK = 64  # threads of a GPU's block: a few thousand nodes then reach many multiprocessors
 MAX_SUBSTEPS = 100_000  # beyond it a step of the default tissue takes a minute
 
 
@@ -274,13 +275,15 @@ class MpmSolver:
 
     def launch(self, launch: Launch) -> None:
         """Launch now."""
-        wp.launch(launch.kernel, launch.dim, launch.inputs, device=self.device)
+        with on_torch_stream(self.device):
+            wp.launch(launch.kernel, launch.dim, launch.inputs, device=self.device, block_dim=BLOCK)
 
     def step(self) -> None:
         """Take one step in every environment."""
         if self._advance is None:
             self._advance = self._prepare()
-        self._advance()
+        with on_torch_stream(self.device):
+            self._advance()
 
     @property
     def speed(self) -> float:
@@ -317,11 +320,12 @@ class MpmSolver:
         if isinstance(launch, list):
             actions = [self._action(each) for each in launch]
             return partial(run_in_threads, actions) if self.device == "cpu" else lambda: [action() for action in actions]
-        wp.load_module(launch.kernel.module, device=self.device)
         arguments = (launch.kernel, launch.dim, launch.inputs)
         if self.device == "cpu":
+            wp.load_module(launch.kernel.module, device="cpu")
             return wp.launch(*arguments, device="cpu", record_cmd=True).launch
-        return partial(wp.launch, *arguments, device=self.device)
+        wp.load_module(launch.kernel.module, device=self.device, block_dim=BLOCK)
+        return partial(wp.launch, *arguments, device=self.device, block_dim=BLOCK)
 
     def _vectorised_step(self) -> list[Callable[[], None]]:
         """CPU: one launch for all substeps; environments are shared out among threads, each with its scratch memory."""

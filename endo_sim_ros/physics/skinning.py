@@ -9,7 +9,7 @@ import warp as wp
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from endo_sim_ros.device import cpu_threads, init_warp, pick_device, run_in_threads
+from endo_sim_ros.device import cpu_threads, init_warp, on_torch_stream, pick_device, run_in_threads
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.physics import skinning_kernels as kernels
 from endo_sim_ros.physics import skinning_simd_kernels as simd_kernels
@@ -190,20 +190,25 @@ class Skinning:
         inputs = [array(self.node_rest, wp.vec3), held, u, F, self._origin, array(maps.view(-1, 4, 4), wp.mat44)]
         done: list[Launch | list[Launch]] = [Launch(kernels.moved_node_maps, (environments, count), inputs)]
         at_rest = [array(self.means, wp.vec3), array(self.covars, wp.mat33), array(self.neighbours), array(self.weights)]
-        for b in range(environments):
-            inputs = [*at_rest, array(maps[b], wp.mat44), self._origin, *STRETCH_RANGE]
-            inputs += [array(means[b], wp.vec3), array(covars[b], wp.mat33)]
-            done.append([Launch(self._kernel(), size, [first, *inputs]) for first, size in self._shares(len(self.means))])
+        limits = [self._origin, *STRETCH_RANGE]
+        if not self._vectorised:
+            outputs = [array(means.view(-1, 3), wp.vec3), array(covars.view(-1, 3, 3), wp.mat33)]
+            inputs = [count, *at_rest, array(maps.view(-1, 4, 4), wp.mat44), *limits, *outputs]
+            done.append(Launch(kernels.skin_environments, (environments, len(self.means)), inputs))
+        else:
+            for b in range(environments):
+                outputs = [array(means[b], wp.vec3), array(covars[b], wp.mat33)]
+                inputs = [*at_rest, array(maps[b], wp.mat44), *limits, *outputs]
+                shares = self._shares(len(self.means))
+                done.append([Launch(simd_kernels.skin_gaussians, size, [first, *inputs]) for first, size in shares])
         return done, means, covars
 
     def _kernel(self) -> wp.Kernel:
         return simd_kernels.skin_gaussians if self._vectorised else kernels.skin_gaussians
 
     def _launch(self, kernel, count: int, inputs: list) -> None:
-        stream = None
-        if self.device != "cpu":  # in order with torch's own work
-            stream = wp.stream_from_torch(torch.cuda.current_stream(self.device))
-        wp.launch(kernel, count, inputs, device=self.device, stream=stream)
+        with on_torch_stream(self.device):
+            wp.launch(kernel, count, inputs, device=self.device)
 
     def _launch_shares(self, kernel, count: int, inputs: list) -> None:
         """Launch a kernel whose first argument is an offset: at once on CUDA, in shares on the CPU."""

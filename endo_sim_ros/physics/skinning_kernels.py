@@ -92,6 +92,8 @@ def moved_node_maps(
 @wp.func
 def skin_gaussian(
     n: int,
+    out: int,  # where to write
+    first_map: int,
     means: wp.array[wp.vec3],
     covars: wp.array[wp.mat33],
     neighbours: wp.array2d[int],
@@ -105,11 +107,11 @@ def skin_gaussian(
 ):
     G = wp.mat44()
     for j in range(neighbours.shape[1]):
-        G += weights[n, j] * maps[neighbours[n, j]]
+        G += weights[n, j] * maps[first_map + neighbours[n, j]]
     B = wp.mat33(G[0, 0], G[1, 0], G[2, 0], G[0, 1], G[1, 1], G[2, 1], G[0, 2], G[1, 2], G[2, 2])
-    out_means[n] = means[n] + (B * (means[n] - origin) + wp.vec3(G[3, 0], G[3, 1], G[3, 2]))
+    out_means[out] = means[n] + (B * (means[n] - origin) + wp.vec3(G[3, 0], G[3, 1], G[3, 2]))
     F = clamp_stretch(wp.identity(3, float) + B, low, high)
-    out_covars[n] = F * covars[n] * wp.transpose(F)
+    out_covars[out] = F * covars[n] * wp.transpose(F)
 
 
 @wp.kernel
@@ -127,7 +129,27 @@ def skin_gaussians(
     out_covars: wp.array[wp.mat33],
 ):
     n = first + wp.tid()
-    skin_gaussian(n, means, covars, neighbours, weights, maps, origin, low, high, out_means, out_covars)
+    skin_gaussian(n, n, 0, means, covars, neighbours, weights, maps, origin, low, high, out_means, out_covars)
+
+
+@wp.kernel
+def skin_environments(
+    nodes: int,  # M
+    means: wp.array[wp.vec3],
+    covars: wp.array[wp.mat33],
+    neighbours: wp.array2d[int],
+    weights: wp.array2d[float],
+    maps: wp.array[wp.mat44],  # [B · M]
+    origin: wp.vec3,
+    low: float,
+    high: float,
+    out_means: wp.array[wp.vec3],  # out [B · N]
+    out_covars: wp.array[wp.mat33],  # out [B · N]
+):
+    """The same Gaussians in all environments at once."""
+    b, n = wp.tid()
+    out = b * means.shape[0] + n
+    skin_gaussian(n, out, b * nodes, means, covars, neighbours, weights, maps, origin, low, high, out_means, out_covars)
 
 
 @wp.kernel

@@ -85,4 +85,4 @@ def skin_gaussians(
 ):
     n = first + wp.tid()
     if not skin_healthy(n, means, covars, neighbours, weights, maps, origin, low, high, out_means, out_covars):
-        skin_gaussian(n, means, covars, neighbours, weights, maps, origin, low, high, out_means, out_covars)
+        skin_gaussian(n, n, 0, means, covars, neighbours, weights, maps, origin, low, high, out_means, out_covars)

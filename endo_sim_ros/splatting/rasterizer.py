@@ -13,7 +13,7 @@ import warp as wp
 from torch import Tensor
 
 from endo_sim_ros.cameras import Camera
-from endo_sim_ros.device import cpu_threads, init_warp, run_in_threads
+from endo_sim_ros.device import cpu_threads, init_warp, on_torch_stream, run_in_threads
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.splatting import rasterizer_kernels as kernels
 from endo_sim_ros.splatting import rasterizer_simd_kernels as simd_kernels
@@ -230,13 +230,6 @@ def _black(device: torch.device) -> Tensor:
     return torch.zeros(3, device=device)
 
 
-def _on_stream(device: torch.device):
-    """Make Warp work on torch's current stream of a CUDA device."""
-    if device.type == "cpu":
-        return contextlib.nullcontext()
-    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False)
-
-
 def _array(tensor: Tensor | None, dtype=None):
     """A tensor as a kernel argument, without copying; None becomes an array that must not be read."""
     if tensor is None:
@@ -386,7 +379,7 @@ class _Rasterize(torch.autograd.Function):
         images = [torch.empty(*size, 3, device=device)] + [torch.empty(size, device=device) for _ in range(3)]
         owners = torch.empty(size if settings.median else 0, dtype=torch.int32, device=device)
         tile_mask = _tile_mask(masks, settings, camera_count, device)
-        with _on_stream(device):
+        with on_torch_stream(device):
             arguments = _gaussian_arguments(means, quats, scales, covars) + [_array(opacities)]
             arguments += _camera_arguments(sh, viewmats, Ks, settings) + [settings.near, settings.eps2d]
             outputs = (tile_mask, splats, radii.view(-1), depth_keys, counts)
@@ -411,7 +404,7 @@ class _Rasterize(torch.autograd.Function):
         v_quats, v_scales, v_covars = (None if x is None else torch.empty_like(x) for x in (quats, scales, covars))
         shares = torch.empty(len(viewmats), len(means), 4, 4, device=device) if wants_pose else None
         v_absgrad = torch.empty(len(viewmats), len(means), 2, device=device) if wants_absolute else None
-        with _on_stream(device):
+        with on_torch_stream(device):
             lists_and_images = (intersections, ctx.splats, background, settings, ctx.tile_count, images)
             records = _composite_backward(*lists_and_images, v_images, wants_absolute)
             arguments = _gaussian_arguments(means, quats, scales, covars)

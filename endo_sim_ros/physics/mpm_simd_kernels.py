@@ -167,7 +167,7 @@ _STEP = (
     _VECTORS
     + """
     const int M = (int)nodes.X.shape.dims[0], padded = (M + 15) / 16 * 16, T = tools.count;
-    const float dt = substep.dt, h = grid.h, inverse_h = grid.inverse_h, factor = scale.data[b];
+    const float dt = substep.dt, h = grid.h, inverse_h = grid.inverse_h;
     const size_t sx = 4 * (size_t)grid.ny * grid.nz, sy = 4 * (size_t)grid.nz;
     float* mv = momenta.data + slot * 4 * (size_t)(grid.count + 4);
     float* gv = velocities.data + slot * 4 * (size_t)(grid.count + 4);
@@ -181,9 +181,6 @@ _STEP = (
     vfloat* const pulls = (vfloat*)pulled.data + slot * (size_t)(4 * padded / 16);
     vint* const givers = (vint*)gave.data + slot * (size_t)(padded / 16);
     const vfloat zero = {};
-    for (size_t i = 0; i < 4 * (size_t)(grid.count + 4); ++i)
-        mv[i] = gv[i] = 0.0f;
-
     // From the order and layout of the arrays to that of the lanes. Padding has no mass and rests in cell zero.
     for (int block = 0; block < padded / 16; ++block)
         for (int lane = 0; lane < 16; ++lane) {
@@ -197,6 +194,9 @@ _STEP = (
             fill(VOLUME, nodes.volume.data, p, 1);
             fill(MU, nodes.mu.data, p, 1);
             fill(LAM, nodes.lam.data, p, 1);
+            const float factor = p < 0 ? 0.0f : scale.data[e];
+            at(block, MU)[lane] *= factor;
+            at(block, LAM)[lane] *= factor;
             fill(STIFFNESS, nodes.stiffness.data, p, 1);
             fill(SPRING, loads.spring.data, e, 1);
             fill(HOLDER, loads.holder.data, e, 1);  // an integer, bit by bit
@@ -212,6 +212,14 @@ _STEP = (
                 at(block, F0)[lane] = at(block, F0 + 4)[lane] = at(block, F0 + 8)[lane] = 1.0f;
         }
 
+    for (size_t i = 0; i < 4 * (size_t)(grid.count + 4); ++i)
+        mv[i] = 0.0f;
+    // The part of the grid that nodes give to; momenta are zero everywhere when a substep begins.
+    int low[3], high[3];
+    const auto empty_box = [&]() {
+        for (int axis = 0; axis < 3; ++axis)
+            low[axis] = grid.count, high[axis] = 0;
+    };
     // Weights of 16 nodes, the first grid node of each, and where it lies among its grid nodes, in cells.
     const auto place = [&](int block, vfloat* f) {
         vfloat rows[16] = {}, first[3];
@@ -241,7 +249,12 @@ _STEP = (
             ((vfloat*)weights)[16 * block + lane] = rows[lane];
             base[16 * block + lane] = ((int)first[0][lane] * grid.ny + (int)first[1][lane]) * grid.nz + (int)first[2][lane];
         }
+        for (int axis = 0; axis < 3; ++axis) {
+            low[axis] = wp::min(low[axis], (int)__builtin_reduce_min(first[axis]));
+            high[axis] = wp::max(high[axis], (int)__builtin_reduce_max(first[axis]));
+        }
     };
+    empty_box();
     for (int block = 0; block < padded / 16; ++block) {
         vfloat f[3];
         place(block, f);
@@ -258,11 +271,14 @@ _STEP = (
         return 4 * (size_t)nodes.table.data[27 * (size_t)nodes.row.data[order.data[node]] + 9 * i + 3 * j + k];
     };
     const auto beside_cut = [&](int node) { return order.data[node] >= 0 && nodes.row.data[order.data[node]] >= 0; };
+    const vint three = {-1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, 0, 0, 0, 0};  // grid nodes of a row
     const vfloat third = {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 0, 0, 0, 0};
 
     for (int s = 0; s <= substeps; ++s) {
         const bool gather = s > 0, scatter = s < substeps;
         const float time = (s + 1) * dt;
+        if (CURRENT)
+            empty_box();
         int gathered = -1, scattered = -1;  // cells whose rows are in registers
         vfloat from[9], to[9];
         const auto flush = [&]() {
@@ -300,7 +316,8 @@ _STEP = (
                         gathered = base[node];
                         for (int i = 0; i < 3; ++i)
                             for (int j = 0; j < 3; ++j)
-                                from[3 * i + j] = simd::load(gv + 4 * (size_t)gathered + i * sx + j * sy);
+                                from[3 * i + j]
+                                    = three ? simd::load(gv + 4 * (size_t)gathered + i * sx + j * sy) : zero;
                     }
                     vfloat sum = zero, sum_x = zero, sum_y = zero;  // Σ w v (1, i, j) along x and y
                     for (int i = 0; i < 3; ++i) {
@@ -372,7 +389,7 @@ _STEP = (
 
             if (CURRENT)
                 place(block, f);
-            const vfloat mass = at(block, MASS), mu = factor * at(block, MU), lam = factor * at(block, LAM);
+            const vfloat mass = at(block, MASS), mu = at(block, MU), lam = at(block, LAM);
             vfloat P[9];
             { STRESS }
             if (substep.ratio > 0.0f) {
@@ -529,12 +546,28 @@ _STEP = (
         }
         if (scatter) {
             flush();
-            for (size_t i = 0; i < 4 * (size_t)grid.count; i += 16) {
-                const vfloat q = simd::load(mv + i);
-                const vfloat m = __builtin_shufflevector(q, q, 3, 3, 3, 3, 7, 7, 7, 7, 11, 11, 11, 11, 15, 15, 15, 15);
-                simd::store(gv + i, m > 0.0f ? q * (substep.decay / m) : zero);
-                simd::store(mv + i, zero);
-            }
+            const auto update = [&](size_t begin, size_t end) {
+                size_t i = 4 * begin;
+                for (; i + 16 <= 4 * end; i += 16) {
+                    const vfloat q = simd::load(mv + i);
+                    const vfloat m
+                        = __builtin_shufflevector(q, q, 3, 3, 3, 3, 7, 7, 7, 7, 11, 11, 11, 11, 15, 15, 15, 15);
+                    simd::store(gv + i, m > 0.0f ? q * (substep.decay / m) : zero);
+                    simd::store(mv + i, zero);
+                }
+                for (; i < 4 * end; i += 4) {
+                    const quad q = *(const quad_anywhere*)(mv + i), none = {};
+                    *(quad_anywhere*)(gv + i) = q[3] > 0.0f ? q * (substep.decay / q[3]) : none;
+                    *(quad_anywhere*)(mv + i) = none;
+                }
+            };
+            for (int i = low[0]; i < high[0] + 3; ++i)
+                for (int j = low[1]; j < high[1] + 3; ++j) {
+                    const size_t row = ((size_t)i * grid.ny + j) * grid.nz;
+                    update(row + low[2], row + high[2] + 3);
+                }
+            const size_t regular = (size_t)grid.nx * grid.ny * grid.nz;
+            update(regular, grid.count);
         }
     }
 """
@@ -580,7 +613,7 @@ def make_step_kernel(material: str, kinematics: str):
         grid: Grid,
         substep: Substep,
         substeps: int,
-        scale: wp.array[float],  # [B]
+        scale: wp.array[float],  # [B · M]
         order: wp.array[int],  # nodes sorted by cell, padded by -1 to a multiple of 16
         momenta: wp.array[float],  # scratch of each slot, as all below: [S, count + 4, 4]
         velocities: wp.array[float],

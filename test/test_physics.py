@@ -12,6 +12,7 @@ import pytest
 import torch
 import warp as wp
 
+from endo_sim_ros.cameras import Camera
 from endo_sim_ros.config import ConfigError, options
 from endo_sim_ros.gaussians import GaussianModel, save_ply
 from endo_sim_ros.physics import (
@@ -156,6 +157,33 @@ def test_several_viewpoints_mean_their_centre():
 def test_a_viewpoint_that_is_not_finite_is_refused(viewpoint):
     with pytest.raises(ValueError, match="viewpoint must be a finite"):
         build_control_nodes(curved_sheet(), np.array(viewpoint), PhysicsConfig())
+
+
+def test_tissue_is_carved_where_a_camera_sees_through_it_and_only_there():
+    """A small plate in front of a wide one: what hangs behind its edge is seen from the side."""
+    rng = np.random.default_rng(7)
+    plates = [np.c_[rng.uniform(-half, half, (count, 2)), np.full(count, z)] for half, z, count in ((0.02, 0.1, 4000), (0.1, 0.16, 16000))]
+    points = torch.from_numpy(np.concatenate(plates)).float()
+    model = GaussianModel.from_points(points, torch.rand(len(points), 3), torch.full((len(points),), 0.0014))
+    model = dataclasses.replace(model, logit_opacities=torch.full((len(points),), 4.0))
+    K = np.array([[300.0, 0, 160], [0, 300, 128], [0, 0, 1]])
+    cameras = [Camera(K, 320, 256, pose_at([x, 0.0, 0.0])) for x in (-0.06, 0.0, 0.06)]
+    whole = build_control_nodes(model, EYE, PhysicsConfig(node_count=6000))
+    config = PhysicsConfig(node_count=6000)
+    carved = build_control_nodes(model, EYE, config, cameras)
+    left = {tuple(position) for position in carved.rest.tolist()}
+    gone = np.array([position for position in whole.rest.tolist() if tuple(position) not in left])
+    assert len(gone) > 20 and len(whole) - len(carved) == len(gone)
+    depth = gone[:, 2]
+    assert depth.min() > 0.1 and depth.max() < 0.125  # behind the plate, in front of the other
+    # The camera at 6 cm sees, past the edge at 2 cm, what lies right of the line through both.
+    behind = whole.rest[(whole.rest[:, 2] > 0.101) & (whole.rest[:, 2] < 0.125) & ~whole.is_skin]
+    past_edge = np.abs(behind[:, 0]) - (0.02 - (behind[:, 2] - 0.1) * 0.04 / 0.1)
+    kept = np.array([tuple(position) in left for position in behind.tolist()])
+    assert kept[past_edge < 0].all() and kept[past_edge > 0.003].mean() < 0.1
+    assert carved.is_skin.sum() == whole.is_skin.sum()
+    same = build_control_nodes(model, EYE, dataclasses.replace(config, carve=False), cameras)
+    np.testing.assert_array_equal(same.rest, whole.rest)
 
 
 def test_a_model_without_opaque_gaussians_is_refused():

@@ -43,7 +43,7 @@ def draw_touches(model_path: Path, out: Path, config: PhysicsConfig) -> None:
     rod = dataclasses.replace(config, contact_radius=0.5 * size, contact_length=4 * size)
     pictures = [("at rest", picture)]
     for touch in track((_poke, _pull, _let_go, _grasp, _cut), description="touching the tissue"):
-        simulation = TissueSimulation(model, views, rod if touch is _poke else config)
+        simulation = TissueSimulation(model, views, rod if touch is _poke else config, cameras)
         renderer = DeformableRenderer(model, simulation.nodes.rest, RenderingConfig(device=config.device))
         text, tip, force = touch(simulation, camera, middle, size)
         renderer.cut(simulation.cuts)

@@ -10,6 +10,7 @@ import numpy as np
 from std_srvs.srv import SetBool, Trigger
 
 from endo_sim_ros import messages
+from endo_sim_ros.cameras import Camera
 from endo_sim_ros.config import ConfigError, Range, StageConfig
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.messages import ControlNodeCloud, MessageError
@@ -84,9 +85,10 @@ class PhysicsNode(EndoNode):
         self._simulated_stamp = 0  # stamp of the simulated model
         self._model: GaussianModel | None = None  # the newest; its stamp, number, and time of arrival:
         self._model_stamp, self._model_number, self._model_came = 0, 0, 0.0
-        self._views: np.ndarray | None = None  # positions [V, 3] of the newest training cameras that were any
+        self._views: np.ndarray | None = None  # poses [V, 4, 4] of the newest training cameras that were any
         self._views_stamp: int | None = None  # stamp of the newest training_cameras, and whether there were any:
         self._views_given = False
+        self._view_info: tuple[int, messages.CameraInfo] | None = None  # stamp and intrinsics of the newest training cameras
         self._camera_position: np.ndarray | None = None
         self._background = Background()
         self._failure = ""  # why the newest model is not simulated
@@ -114,6 +116,7 @@ class PhysicsNode(EndoNode):
         self._clock_pub = self.publisher(messages.CLOCK) if self._lockstep else None
         self.subscribe(messages.GAUSSIANS, self._on_model)
         self.subscribe(messages.TRAINING_CAMERAS, self._on_training_cameras)
+        self.subscribe(messages.TRAINING_CAMERA_INFO, self._on_training_info)
         self.subscribe(messages.CAMERA_POSE, self._on_camera)
         for name in self._arms:
             self.subscribe(self._pose_topic(name), partial(self._on_tool_pose, name), depth)
@@ -145,7 +148,11 @@ class PhysicsNode(EndoNode):
         poses = messages.decode_poses(message)
         self._views_stamp, self._views_given = messages.stamp_to_ns(message.header.stamp), len(poses) > 0
         if self._views_given:
-            self._views = poses[:, :3, 3]
+            self._views = poses
+
+    def _on_training_info(self, message: Any) -> None:
+        info = messages.decode_camera_info(message, messages.TRAINING_CAMERA_INFO.name)
+        self._view_info = messages.stamp_to_ns(message.header.stamp), info
 
     def _on_camera(self, message: Any) -> None:
         pose = messages.decode_pose(message, self._options.frame_poses, messages.CAMERA_POSE.name)
@@ -154,13 +161,24 @@ class PhysicsNode(EndoNode):
     def _viewpoint(self) -> tuple[str, np.ndarray | None]:
         """Where the tissue was seen from, and whose place that is: the model's own cameras, else wherever the camera is
         now, else the cameras of an earlier model."""
-        if self._views_stamp == self._model_stamp and self._views_given:
-            return "own cameras", self._views
-        if self._views_stamp != self._model_stamp and time.monotonic() - self._model_came < _CAMERAS_LATE:
+        own = self._views_stamp == self._model_stamp
+        whole = own and (not self._views_given or self._own_cameras())
+        if not whole and time.monotonic() - self._model_came < _CAMERAS_LATE:
             return "", None
+        if own and self._views_given:
+            return "own cameras", self._views[:, :3, 3]
         if self._camera_position is not None:
             return "camera", self._camera_position
-        return "earlier cameras", self._views
+        return "earlier cameras", None if self._views is None else self._views[:, :3, 3]
+
+    def _own_cameras(self) -> list[Camera]:
+        """The cameras that the newest model was seen from, if all about them has come."""
+        if self._views_stamp != self._model_stamp or not self._views_given or self._view_info is None:
+            return []
+        stamp, info = self._view_info
+        if stamp != self._model_stamp:
+            return []
+        return [Camera(info.P[:, :3], info.width, info.height, pose) for pose in self._views]
 
     def _build(self) -> None:
         """Build a simulation of the newest model in the background; the old one goes on meanwhile."""

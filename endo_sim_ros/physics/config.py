@@ -16,6 +16,8 @@ class PhysicsConfig(StageConfig):
     """Depth of the tissue behind the reconstructed skin; the layers divide it evenly."""
     layers: Annotated[int, Range(0, 32)] = 3
     """Number of layers extruded behind the skin; 0 simulates the skin alone, as the paper prints it."""
+    carve: bool = True
+    """Leave out tissue where a training camera sees through it, as behind the edge of one organ in front of another."""
     pin_back: bool = True
     """Hold the deepest layer in place."""
     pin_rim: bool = True

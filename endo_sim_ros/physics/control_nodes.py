@@ -1,19 +1,25 @@
 """Control nodes: the sparse material points that stand for the tissue behind a reconstructed skin."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 import warp as wp
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
+from endo_sim_ros.cameras import Camera
 from endo_sim_ros.device import init_warp
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes_kernels import sample_farthest_points
+from endo_sim_ros.splatting import render
 
 OUTLIER_FACTOR = 5.0  # a Gaussian this many times farther from its neighbours than the median one floats
 OUTLIER_NEIGHBOURS = 8
 RIM_WIDTH = 0.4  # spacings from the border; a free node between pinned ones would only rattle
+CARVING_VIEWS = 8  # that look for free space, spread over the cameras
+CARVING_WIDTH = 160  # pixels
 GAP_FACTOR = 3.0  # a triangle with an edge this many spacings long bridges a gap and is not skin
 
 
@@ -128,17 +134,45 @@ def measure_skin(points: np.ndarray, viewpoint: np.ndarray) -> Skin:
     return Skin(areas, rim, spacing)
 
 
-def build_control_nodes(model: GaussianModel, viewpoint: np.ndarray, config: PhysicsConfig) -> ControlNodes:
+@torch.no_grad()
+def in_free_space(points: np.ndarray, model: GaussianModel, cameras: Sequence[Camera], margin: float) -> np.ndarray:
+    """Points [N, 3] (m, world) that some camera sees through: those that lie over a margin (m) in front of the surface behind them.
+
+    Args:
+        points: Candidates.
+        model: What the cameras see.
+        cameras: Where it was seen from; a few of them, spread over all, look.
+        margin: How far in front of the surface counts, m.
+    """
+    free = np.zeros(len(points), bool)
+    for index in np.unique(np.linspace(0, len(cameras) - 1, min(CARVING_VIEWS, len(cameras))).round().astype(int)):
+        camera = cameras[index]
+        width = min(CARVING_WIDTH, camera.width)
+        camera = camera.resized(width, max(round(camera.height * width / camera.width), 1))
+        output = render(model, camera, median=True)
+        depth = torch.where(output.alphas[0] > 0.5, output.medians[0], 0.0).cpu().numpy()
+        uv, z = camera.project(points)
+        column, row = np.floor(uv[:, 0]), np.floor(uv[:, 1])
+        seen = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        surface = np.zeros(len(points))
+        surface[seen] = depth[row[seen].astype(int), column[seen].astype(int)]
+        free |= z + margin < surface
+    return free
+
+
+def build_control_nodes(model: GaussianModel, viewpoint: np.ndarray, config: PhysicsConfig, cameras: Sequence[Camera] = ()) -> ControlNodes:
     """Nodes of the tissue behind a model's skin.
 
     The skin is sampled from the opaque Gaussians by farthest points and extruded along the viewing rays: layer l of L
     lies l/L of the thickness deeper. A node stands for its share of the skin's area (growing with the squared distance
-    from the viewpoint) times its share of the depth (half a layer at the skin and at the back).
+    from the viewpoint) times its share of the depth (half a layer at the skin and at the back). With ``carve`` the part of
+    a column that some camera sees through, as behind the edge of an organ in front of another, is left out.
 
     Args:
         model: Gaussians, world.
         viewpoint: Camera position [3] or positions [V, 3] (their mean is used), metres, world.
         config: Node count, layers, thickness and what is pinned.
+        cameras: Those that the model was seen from, for carving; without any nothing is carved.
 
     Raises:
         ValueError: If the viewpoint or means are not finite, or too few opaque Gaussians span a surface.
@@ -179,11 +213,15 @@ def build_control_nodes(model: GaussianModel, viewpoint: np.ndarray, config: Phy
     pinned = np.tile(sheet.rim & config.pin_rim, config.layers + 1)
     if config.pin_back and config.layers:
         pinned |= layer_of == config.layers
+    positions, kept = np.concatenate(rest) + eye, np.ones(len(pinned), bool)
+    if config.carve and config.layers and len(cameras):
+        free = in_free_space(positions[len(skin) :], model, cameras, gap / 2).reshape(config.layers, -1)
+        kept[len(skin) :] = ~np.logical_or.accumulate(free, axis=0).ravel()  # nor does tissue go on behind free space
     return ControlNodes(
-        (np.concatenate(rest) + eye).astype(np.float32),
-        pinned,
-        np.concatenate(volumes).astype(np.float32),
-        layer_of == 0,
+        positions[kept].astype(np.float32),
+        pinned[kept],
+        np.concatenate(volumes)[kept].astype(np.float32),
+        (layer_of == 0)[kept],
         max(sheet.spacing, gap),
     )
 

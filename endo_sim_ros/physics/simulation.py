@@ -8,6 +8,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from endo_sim_ros.cameras import Camera
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes, build_control_nodes
@@ -125,13 +126,14 @@ class TissueSimulation:
         model: The reconstructed Gaussians, world.
         viewpoint: Camera position [3] or positions [V, 3], metres, world; the tissue extends away from it.
         config: Parameters.
+        cameras: Those that the model was seen from; where they see through the extruded tissue it is left out.
 
     Raises:
         ValueError: If no tissue can be built from the model, or (:class:`StabilityError`) the substeps are too long.
     """
 
-    def __init__(self, model: GaussianModel, viewpoint: np.ndarray, config: PhysicsConfig):
-        self._start(build_control_nodes(model, viewpoint, config), config)
+    def __init__(self, model: GaussianModel, viewpoint: np.ndarray, config: PhysicsConfig, cameras: Sequence[Camera] = ()):
+        self._start(build_control_nodes(model, viewpoint, config, cameras), config)
 
     @classmethod
     def from_nodes(cls, nodes: ControlNodes, config: PhysicsConfig, properties: TissueProperties | None = None) -> "TissueSimulation":

@@ -119,7 +119,8 @@ class MpmSolver:
         properties: Stiffness and density of each node; default: those of the config everywhere.
         environments: Number of independent copies B.
         tools: Number of rigid tools T in each.
-        stiffness: Factor on the moduli of each environment [B]; default 1.
+        stiffness: Factor on the moduli of each environment [B], or of each of its nodes [B, M]; default 1. The largest
+            one is also the largest that `set_stiffness` takes later.
         vectorised: Use the CPU's own kernel where there is one; False runs the kernels of the GPU on it, to compare.
 
     Raises:
@@ -145,14 +146,16 @@ class MpmSolver:
         if properties is None:
             properties = TissueProperties.uniform(len(nodes), config.young_modulus, config.poisson_ratio, config.density)
         scale = np.ones(environments) if stiffness is None else np.asarray(stiffness, np.float64)
-        if scale.shape != (environments,) or not (np.isfinite(scale).all() and (scale > 0).all()):
+        good = scale.shape in ((environments,), (environments, len(nodes))) and np.isfinite(scale).all() and (scale > 0).all()
+        if not good:
             raise ValueError(f"stiffness must be {environments} positive factors, got {np.round(scale, 4).tolist()}")
+        self.largest_stiffness = float(scale.max())
         self.cell_size = h = config.grid_ratio * nodes.spacing
         if not MIN_CELL <= h <= MAX_CELL:
             raise ValueError(
                 f"the grid cells would be {h:.3g} m wide, which is no tissue; is the model in metres, and is it the viewpoint's own?"
             )
-        self.substepping = plan_substeps(config, h, properties, float(scale.max()))
+        self.substepping = plan_substeps(config, h, properties, self.largest_stiffness)
         far = float(np.abs(nodes.rest).max())
         if not far * np.finfo(np.float32).eps < 0.01 * h:  # else nodes of one cell fall together, and out of the grid
             raise ValueError(
@@ -180,20 +183,21 @@ class MpmSolver:
         lame = [lame_parameters(*each) for each in zip(properties.young_modulus, properties.poisson_ratio)]
         self.mu, self.lam = np.array(lame).T  # [M] Pa each
         # What holds a node is stiffer than the tissue beside it, so that it gives way a few per cent at most.
-        stiffness_of_hold = PIN_STIFFNESS * scale.max() * (1 + config.relaxation) * (self.lam + 2 * self.mu) * np.cbrt(nodes.volumes)
+        hold = PIN_STIFFNESS * (1 + config.relaxation) * (self.lam + 2 * self.mu) * np.cbrt(nodes.volumes)
+        self._hold = torch.from_numpy(hold).to(self.device)  # [M] N/m, for a factor of one
+        self._pinned = torch.from_numpy(nodes.pinned).to(self.device)
         self.nodes = Nodes()
         self.nodes.X = self._array(local, wp.vec3)
         self.nodes.mass = self._array(nodes.volumes * properties.density, float)
         self.nodes.volume = self._array(nodes.volumes, float)
         self.nodes.mu, self.nodes.lam = self._array(self.mu, float), self._array(self.lam, float)
-        self.nodes.stiffness = self._array(stiffness_of_hold, float)
-        self._scale = self._array(scale, float)
         count = environments * len(nodes)
-        self.pin_springs = self._array(np.tile(stiffness_of_hold * nodes.pinned, environments), float)  # [B · M] N/m
+        self.nodes.stiffness, self.pin_springs, self._scale = (self._zeros(count, float) for _ in range(3))  # [B · M]; N/m, N/m, 1
         self.loads = Loads()
         self.loads.force, self.loads.target, self.loads.target_v = (self._zeros(count, wp.vec3) for _ in range(3))
-        self.loads.spring = wp.clone(self.pin_springs)
+        self.loads.spring = self._zeros(count, float)
         self.loads.holder = wp.full(count, -1, dtype=int, device=self.device)
+        self.set_stiffness(slice(None), np.broadcast_to(scale.reshape(environments, -1), (environments, len(nodes))))
         self.rigid = RigidTools()
         self.rigid.count, self.rigid.friction = tools, config.friction
         self.rigid.tip, self.rigid.tip_v, self.rigid.end, self.rigid.end_v = (self._zeros(environments * tools, wp.vec3) for _ in range(4))
@@ -242,6 +246,22 @@ class MpmSolver:
         of(self.state.F)[environments] = torch.eye(3, device=self.device)
         of(self.loads.holder)[environments] = -1
         of(self.loads.spring)[environments] = of(self.pin_springs)[environments]
+
+    def set_stiffness(self, environments: torch.Tensor | slice, stiffness: np.ndarray) -> None:
+        """Other factors on the moduli [K, M] in these K environments; what pins or pushes their nodes is as much stiffer.
+
+        Raises:
+            ValueError: If one is not above zero, or larger than any factor that the substeps were planned for.
+        """
+        stiffness = np.asarray(stiffness, np.float64)
+        if not ((stiffness > 0) & (stiffness <= self.largest_stiffness)).all():
+            raise ValueError(f"stiffness factors must lie above 0 and not above {self.largest_stiffness:g}, the largest planned for")
+        factors = torch.from_numpy(stiffness.copy()).to(self.device)
+        hold = factors * self._hold
+        for array, values in ((self._scale, factors), (self.nodes.stiffness, hold), (self.pin_springs, hold * self._pinned)):
+            wp.to_torch(array).view(self.environments, -1)[environments] = values.float()
+        springs = wp.to_torch(self.loads.spring).view(self.environments, -1)
+        springs[environments] = torch.where(self._pinned, hold.float(), springs[environments])
 
     def set_cut(self, cut: CutTable | None) -> None:
         """Let nodes beside a cut transfer to grid nodes of their own side; None makes the tissue whole again.
@@ -427,6 +447,5 @@ class MpmSolver:
         v, C = (self._of(array, environment).astype(np.float64) for array in (self.state.v, self.state.C))
         kinetic = 0.5 * (mass * ((v**2).sum(1) + self.cell_size**2 / 4 * (C**2).sum((1, 2)))).sum()
         F = torch.from_numpy(self.deformation_gradients(environment)).double()
-        scale = float(self._scale.numpy()[environment])
-        mu, lam = (torch.from_numpy(scale * values) for values in (self.mu, self.lam))
+        mu, lam = (torch.from_numpy(self._of(self._scale, environment) * values) for values in (self.mu, self.lam))
         return float(kinetic), float((volume * energy_density(self.config.material, F, mu, lam).numpy()).sum())

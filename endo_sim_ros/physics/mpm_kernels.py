@@ -54,7 +54,7 @@ class Nodes:
     volume: wp.array[float]  # at rest, m³
     mu: wp.array[float]  # Lamé's parameters, Pa
     lam: wp.array[float]
-    stiffness: wp.array[float]  # N/m, of what holds or pushes the node
+    stiffness: wp.array[float]  # N/m, of what holds or pushes the node; of each environment its own, [B · M]
     first: wp.array[wp.vec3i]  # first grid node (i, j, k) of its stencil at rest
     row: wp.array[int]  # in the table, of nodes beside a cut; -1 for all others
     table: wp.array[int]  # [A · 27] numbers of the grid nodes of each such node, k fastest
@@ -198,7 +198,7 @@ def make_advance_kernel(material: str, kinematics: str):
         transfer: Transfer,
         grid: Grid,
         step: Substep,
-        scale: wp.array[float],  # of each environment's moduli
+        scale: wp.array[float],  # of the moduli of each node [B · M]
         time: float,  # at the end of the substep, since the start of the step
         gather: int,
         scatter: int,
@@ -261,7 +261,7 @@ def make_advance_kernel(material: str, kinematics: str):
 
         if scatter != 0:
             mass = nodes.mass[p]
-            S = scale[b] * stress_of(F, nodes.mu[p], nodes.lam[p])
+            S = scale[e] * stress_of(F, nodes.mu[p], nodes.lam[p])
             if step.ratio > 0.0:
                 Q = state.Q[e]
                 Q += step.forget * (second_piola(F, S) - Q)
@@ -277,7 +277,7 @@ def make_advance_kernel(material: str, kinematics: str):
                 back = (-dt * spring) * (u - loads.target[e] - time * loads.target_v[e])
                 pull = wp.vec4(back[0], back[1], back[2], dt * dt * spring)
             else:
-                pull, giver = push_of_tools(tools, b * tools.count, X + u, v, mass, nodes.stiffness[p], dt, time)
+                pull, giver = push_of_tools(tools, b * tools.count, X + u, v, mass, nodes.stiffness[e], dt, time)
             transfer.pull[e] = pull
             transfer.giver[e] = giver
             transfer.q[e] = mass * (v + dt * step.gravity) + dt * loads.force[e] + wp.vec3(pull[0], pull[1], pull[2])

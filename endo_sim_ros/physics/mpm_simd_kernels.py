@@ -197,7 +197,7 @@ _STEP = (
             const float factor = p < 0 ? 0.0f : scale.data[e];
             at(block, MU)[lane] *= factor;
             at(block, LAM)[lane] *= factor;
-            fill(STIFFNESS, nodes.stiffness.data, p, 1);
+            fill(STIFFNESS, nodes.stiffness.data, e, 1);
             fill(SPRING, loads.spring.data, e, 1);
             fill(HOLDER, loads.holder.data, e, 1);  // an integer, bit by bit
             fill(X, nodes.X.data, p, 3);

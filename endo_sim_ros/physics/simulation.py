@@ -42,7 +42,7 @@ class TissueBatch:
         environments: B.
         tools: T.
         properties: Stiffness and density of each node; default: those of the config, with its regions.
-        stiffness: Factor on the moduli of each copy [B]; default 1.
+        stiffness: Factor on the moduli of each copy [B], or of each of its nodes [B, M]; default 1. See `MpmSolver.set_stiffness`.
 
     Raises:
         ValueError: If the config or the nodes make no tissue, see :class:`MpmSolver`.

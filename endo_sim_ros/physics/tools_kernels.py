@@ -245,7 +245,7 @@ def load_nodes(
                     if bad_nodes[b] > 0:  # the last step was undone: pull on from where the tissue is
                         start = double(state.u[e])
                     goal = commands.tip[c] + commands.R[c] * holds.local[c * touchable + s] - reach.origin - double(nodes.X[p])
-                    loads.spring[e] = nodes.stiffness[p]
+                    loads.spring[e] = nodes.stiffness[e]
                     loads.target[e] = single(start)
                     loads.target_v[e] = single((goal - start) / reach.duration)
                     loads.holder[e] = t

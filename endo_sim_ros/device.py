@@ -62,9 +62,16 @@ def on_torch_stream(device: torch.device | str) -> contextlib.AbstractContextMan
 
 
 def cpu_threads() -> int:
-    """Number of worker threads for CPU kernels: the cores this process may use, or ENDO_SIM_THREADS."""
+    """Number of worker threads for CPU kernels: the cores this process may use, or ENDO_SIM_THREADS.
+
+    Raises:
+        ValueError: If ENDO_SIM_THREADS is no whole number.
+    """
     available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return int(os.environ.get("ENDO_SIM_THREADS", "0")) or available
+    wanted = os.environ.get("ENDO_SIM_THREADS", "0")
+    if not wanted.isdecimal():
+        raise ValueError(f"ENDO_SIM_THREADS is {wanted!r}; it must be a number of threads, or 0 for as many as there are cores")
+    return int(wanted) or available
 
 
 @functools.cache

@@ -5,7 +5,7 @@ import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from endo_sim_ros.physics.cutting import CutNeighbours, CutStencils, clip_to_sides, cut_stencils, separated, sweep, to_rest
+from endo_sim_ros.physics.cutting import Blade, CutNeighbours, CutStencils, clip_to_sides, cut_stencils, separated, sweep, to_rest
 from endo_sim_ros.physics.skinning import bind_weights
 
 SPACING = 0.005
@@ -109,7 +109,8 @@ def test_to_rest_inverts_an_affine_deformation_exactly():
     rng = np.random.default_rng(0)
     rest, points = block(jitter=0.3), rng.uniform([-0.01] * 3, [0.07, 0.05, 0.03], (50, 3))
     A, shift = np.eye(3) + rng.uniform(-0.4, 0.4, (3, 3)), np.array([1.0, -2.0, 3.0])
-    found = to_rest(points @ A.T + shift, rest, rest @ A.T + shift, np.tile(A, (len(rest), 1, 1)))
+    found, inside = to_rest(points @ A.T + shift, rest, rest @ A.T + shift, np.tile(A, (len(rest), 1, 1)))
+    assert inside.all()
     np.testing.assert_allclose(found, points, atol=1e-12)
 
 
@@ -118,13 +119,61 @@ def test_to_rest_of_collapsed_or_broken_nodes_stays_near():
     F = np.tile(np.eye(3), (len(rest), 1, 1))
     F[::3, 2, 2], F[1::3, 0, 0] = 1e-9, np.nan
     points = np.array([[0.03, 0.02, 0.01], [0.011, 0.012, 0.013]])
-    np.testing.assert_allclose(to_rest(points, rest, rest, F), points, atol=1e-12)
+    np.testing.assert_allclose(to_rest(points, rest, rest, F)[0], points, atol=1e-12)
 
 
 @pytest.mark.parametrize("count", [1, 2, 4])
 def test_to_rest_works_with_few_nodes(count):
     rest = block()[:count]
-    np.testing.assert_allclose(to_rest(rest, rest, rest + 0.5, np.tile(np.eye(3), (count, 1, 1))), rest - 0.5, atol=1e-12)
+    np.testing.assert_allclose(to_rest(rest, rest, rest + 0.5, np.tile(np.eye(3), (count, 1, 1)))[0], rest - 0.5, atol=1e-12)
+
+
+def knife(x=0.0, y=0.0, z=0.0) -> np.ndarray:
+    """Pose of a tool whose edge stands along z, below the tip."""
+    pose = np.eye(4)
+    pose[:3, 3] = x, y, z
+    return pose
+
+
+def still(rest: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return rest, rest, np.tile(np.eye(3), (len(rest), 1, 1))
+
+
+def test_a_trembling_blade_cuts_nothing_and_a_slow_one_as_much_as_a_fast_one():
+    rest, none = block(), np.zeros((0, 3, 3))
+    blade, rng = Blade(0.03, 0.005), np.random.default_rng(0)
+    assert not len(blade.move(knife(0.021, 0.02, 0.025), *still(rest), none))
+    for _ in range(100):
+        tremor = rng.uniform(-1e-4, 1e-4, 3)
+        assert not len(blade.move(knife(*(tremor + [0.021, 0.02, 0.025])), *still(rest), none))
+    areas = []
+    for steps in (200, 4):
+        blade, triangles = Blade(0.03, 0.005), [none]
+        for y in np.linspace(-0.02, 0.06, steps + 1):
+            triangles.append(blade.move(knife(0.021, y, 0.025), *still(rest), none))
+        corners = np.concatenate(triangles)
+        areas.append(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2)
+        np.testing.assert_allclose(corners[..., 0], 0.021, atol=1e-12)
+        a, b = rest[rest[:, 0] < 0.021][:40], rest[rest[:, 0] > 0.021][:40]
+        assert separated(a, b * [1, 0, 0] + a * [0, 1, 1], corners).all()
+    np.testing.assert_allclose(areas[0], areas[1], rtol=0.15)  # both end a spacing beside the tissue
+
+
+def test_a_blade_in_the_air_or_in_an_open_wound_cuts_nothing():
+    rest, cut = block(), wall()
+    wide = rest + [0.02, 0, 0] * (rest[:, :1] > MIDDLE)  # the wound is open by 2 cm
+    F = np.tile(np.eye(3), (len(rest), 1, 1))
+    for x in (MIDDLE + 0.003, MIDDLE + 0.01, MIDDLE + 0.017):  # beside one lip, between, beside the other
+        blade = Blade(0.03, 0.005)
+        for step in range(5):
+            assert not len(blade.move(knife(x + 0.0006 * step, 0.005 * step, 0.025), rest, wide, F, cut))
+    blade, triangles = Blade(0.03, 0.005), []
+    for y in np.linspace(0.0, 0.04, 9):  # in the lip itself it does cut
+        triangles.append(blade.move(knife(MIDDLE + 0.028, y, 0.025), rest, wide, F, cut))
+    np.testing.assert_allclose(np.concatenate(triangles)[..., 0], MIDDLE + 0.008, atol=1e-9)
+    blade = Blade(0.01, 0.005)
+    for x in (-0.02, -0.01):
+        assert not len(blade.move(knife(x, 0.02, 0.01), *still(rest), np.zeros((0, 3, 3))))
 
 
 def brute_force(a, b, triangle) -> bool:
@@ -430,7 +479,8 @@ def test_neighbours_renewed_piece_by_piece_are_those_of_the_whole_cut_bit_for_bi
     assert same[whole[1] > 0].all()
     np.testing.assert_array_equal(neighbours.index, whole[0])
     np.testing.assert_array_equal(neighbours.weights, whole[1])
-    neighbours.cut(np.zeros((0, 3, 3)))  # healed
+    assert not neighbours.extends(np.zeros((0, 3, 3)))
+    neighbours.heal()
     np.testing.assert_array_equal(neighbours.index, bound[0])
 
 
@@ -467,7 +517,10 @@ def test_gaussians_do_not_reach_across_a_cut_and_those_away_from_it_are_untouche
     spread = np.random.default_rng(1).normal(size=(len(means), 3, 3)) * 0.002
     covars = spread @ spread.transpose(0, 2, 1)
     triangles = wall()
-    clipped = clip_to_sides(means, covars, triangles)
+    reach = 2 * np.sqrt(np.trace(covars, axis1=1, axis2=2))
+    clipped = covars.copy()
+    changed = clip_to_sides(means, clipped, reach, triangles)
+    np.testing.assert_array_equal(changed, np.flatnonzero((clipped != covars).any((1, 2))))
     before, after = (np.sqrt(each[:, 0, 0]) for each in (covars, clipped))  # the wall is x = MIDDLE
     distance = np.abs(means[:, 0] - MIDDLE)
     over = distance < 2 * before
@@ -476,5 +529,7 @@ def test_gaussians_do_not_reach_across_a_cut_and_those_away_from_it_are_untouche
     np.testing.assert_array_equal(clipped[~over], covars[~over])
     np.testing.assert_allclose(clipped[:, 1:, 1:], covars[:, 1:, 1:], atol=1e-12)  # only across the cut
     assert (np.linalg.eigvalsh(clipped) > -1e-12).all()
-    piecewise = clip_to_sides(means, clip_to_sides(means, covars, triangles[:7]), triangles[7:])
+    piecewise = covars.copy()
+    for part in (triangles[:7], triangles[7:]):
+        clip_to_sides(means, piecewise, reach, part)
     np.testing.assert_array_equal(piecewise, clipped)

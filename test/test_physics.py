@@ -516,9 +516,7 @@ def test_tissue_that_relaxes_holds_back_less_and_less_as_a_standard_linear_solid
     simulation.set_grasp("PSM1", pose_at(TIP), True)
     simulation.set_grasp("PSM1", pose_at(TIP - [0, 0, 0.002]), True)
     for _ in range(60):
-        simulation.set_grasp("PSM1", pose_at(TIP - [0, 0, 0.002]), True)
         simulation.step()
-        simulation._disturbed = True  # holding still, it would be left as it is
         forces.append(simulation.reaction("PSM1")[0][2])
     lasting = simulate()
     lasting.set_grasp("PSM1", pose_at(TIP), True)
@@ -529,6 +527,20 @@ def test_tissue_that_relaxes_holds_back_less_and_less_as_a_standard_linear_solid
     expected = final * (1 + ratio * np.exp(-elapsed / time))
     np.testing.assert_allclose(forces[5:], expected[5:], rtol=0.08)
     assert forces[5] > 1.7 * forces[-1] > 0
+
+
+def test_slowly_relaxing_tissue_is_not_left_as_it_is_before_it_has_relaxed():
+    held, lasting = [], []
+    for relaxation, results in ((1.0, held), (0.0, lasting)):
+        simulation = simulate(node_count=300, relaxation=relaxation, relaxation_time=4.0)
+        simulation.set_grasp("PSM1", pose_at(TIP), True)
+        simulation.set_grasp("PSM1", pose_at(TIP - [0, 0, 0.002]), True)
+        for _ in range(7):
+            results.append(simulation.reaction("PSM1")[0][2])
+            steps(simulation, 100)  # 4 s
+    assert held[1] > 1.25 * lasting[-1] and held[-1] == pytest.approx(lasting[-1], rel=0.02)
+    steps(simulation, 1)
+    assert simulation._resting
 
 
 def test_relaxing_tissue_needs_the_substeps_of_its_fast_stiffness():
@@ -599,8 +611,43 @@ def test_environments_are_independent_copies_on_any_number_of_threads(monkeypatc
     single.set_wrench("probe", TIP, [0.0, 0.0, 0.1])
     steps(single, 5)
     np.testing.assert_allclose(batch.positions()[0], single.state().positions, atol=0.03 * depths[0])
+    assert not batch.tools.reaction_forces[4].any()  # its steps were undone, and what the wrench did
     batch.reset(torch.tensor([1, 4]))
     assert not batch.displacements[1].any() and batch.displacements[0].any() and batch.tools.faults[4] == 0
+
+
+def test_copies_feel_their_own_stiffness_whatever_that_of_the_others():
+    nodes = build_control_nodes(curved_sheet(), EYE, PhysicsConfig(node_count=400))
+    felt = []
+    for other in (1.0, 4.0):
+        config = PhysicsConfig(device="cpu", node_count=400, adapt_substeps=False)
+        batch = TissueBatch(nodes, config, environments=2, stiffness=[1.0, other])
+        batch.tools.present[:], batch.tools.closed[:] = 1, 1
+        batch.tools.rotations[:] = torch.eye(3)
+        for lift in (0.0, 0.001, 0.002, 0.002):
+            batch.tools.tips[:, 0] = torch.from_numpy(TIP - [0, 0, lift])
+            batch.step()
+        felt.append(batch.tools.reaction_forces[:, 0, 2].clone())
+    assert felt[0][0] == felt[1][0] == felt[0][1] > 0.01
+    assert felt[1][1] > 3 * felt[1][0]
+
+
+@pytest.mark.parametrize("name", ["forces", "torques", "tips", "rotations"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_commands_that_are_not_finite_are_faults_of_their_copy(name, value):
+    nodes = build_control_nodes(curved_sheet(), EYE, PhysicsConfig(node_count=300))
+    batch = TissueBatch(nodes, PhysicsConfig(device="cpu", node_count=300, contact_radius=0.005), environments=2)
+    batch.tools.reaches[:, 0] = torch.from_numpy(TIP)
+    batch.tools.forces[:, 0, 2] = 0.1
+    batch.tools.present[:] = 1
+    batch.tools.rotations[:] = torch.eye(3)
+    batch.step()
+    before = batch.displacements[1].clone()
+    getattr(batch.tools, name)[1] = value
+    batch.step()
+    assert batch.tools.faults.tolist() == [0, 1]
+    assert torch.equal(batch.displacements[1], before) and not batch.tools.reaction_forces[1].any()
+    assert batch.displacements[0].norm(dim=1).max() > before.norm(dim=1).max()
 
 
 def test_the_documented_batch_runs(tmp_path):
@@ -663,6 +710,34 @@ def test_reaction_of_a_grasp_grows_with_stiffness():
     assert pulls[1] / pulls[0] == pytest.approx(2, rel=0.1)
 
 
+def test_what_a_jaw_feels_hardly_depends_on_how_many_nodes_there_are():
+    pulls = []
+    for count, layers in ((1000, 3), (4000, 3), (12000, 5)):
+        simulation = simulate(curved_sheet(12000), node_count=count, layers=layers)
+        simulation.set_grasp("PSM1", pose_at(TIP), True)
+        simulation.set_grasp("PSM1", pose_at(TIP - [0, 0, 0.003]), True)
+        held = simulation.held_nodes("PSM1")
+        steps(simulation, 15)
+        lag = np.linalg.norm(simulation.state().positions[held] - simulation.nodes.rest[held] + [0, 0, 0.003], axis=1)
+        assert lag.mean() < 0.1 * 0.003
+        pulls.append(simulation.reaction("PSM1")[0][2])
+    assert max(pulls) < 1.35 * min(pulls)
+
+
+def test_turning_free_tissue_steadily_takes_no_torque():
+    simulation = free_block(force_radius=0.006)
+    centre = simulation.nodes.rest.mean(0).astype(float)
+    pose, torques = pose_at(centre), []
+    simulation.set_grasp("PSM1", pose, True)
+    for step in range(40):
+        c, s = np.cos(0.02 * step), np.sin(0.02 * step)
+        pose[:2, :2] = [[c, -s], [s, c]]
+        simulation.set_grasp("PSM1", pose, True)
+        simulation.step()
+        torques.append(simulation.reaction("PSM1")[1][2])
+    assert np.abs(torques[30:]).max() < 0.02 * np.abs(torques).max()  # which was to set it going
+
+
 def test_turning_the_jaw_turns_the_tissue_and_is_resisted():
     simulation = simulate()
     simulation.set_grasp("PSM1", pose_at(TIP), True)
@@ -697,6 +772,8 @@ def test_jaw_closed_in_the_air_holds_nothing_and_tissue_pulled_too_far_slips():
     simulation.set_grasp("PSM1", pose_at(TIP - [0, 0, 0.06]), True)
     simulation.step()
     assert simulation.slips == 1 and not simulation.in_reach("PSM1") and simulation.faults == 0
+    with pytest.raises(ValueError, match="must turn and shift, not scale or mirror"):
+        simulation.set_grasp("PSM1", np.diag([2.0, 2.0, 2.0, 1.0]), True)
     with pytest.raises(ValueError, match="pose of tool 'PSM1' must be a finite"):
         simulation.set_grasp("PSM1", np.full((4, 4), np.nan), True)
 
@@ -894,7 +971,7 @@ def nodal_forces(positions: np.ndarray, force, torque, tip=(0.0, 0.0, 0.0)) -> t
     """Forces [K, 3] on free nodes [K, 3] within a reach of 3 cm, and the reaction to them."""
     count = len(positions)
     nodes = ControlNodes(np.float32(positions), np.zeros(count, bool), np.full(count, 1e-6, np.float32), np.ones(count, bool), 0.01)
-    simulation = TissueSimulation.from_nodes(nodes, PhysicsConfig(device="cpu", force_radius=0.03, damping=1e5))
+    simulation = TissueSimulation.from_nodes(nodes, PhysicsConfig(device="cpu", force_radius=0.03, damping=1000.0))
     assert simulation.set_wrench("probe", tip, force, torque)
     simulation.step()
     return simulation.solver.loads.force.numpy().astype(np.float64), simulation.reaction("probe")
@@ -950,7 +1027,7 @@ def test_what_a_pushing_tool_feels_is_the_momentum_that_the_tissue_gets(kinemati
         turned -= simulation.step_duration * (torque + np.cross(tip, force))
     linear, angular = simulation.solver.momentum()
     np.testing.assert_allclose(given, linear, atol=1e-4 * np.linalg.norm(linear))
-    np.testing.assert_allclose(turned, angular, atol=0.1 * np.linalg.norm(angular))  # the tip moves during a step
+    np.testing.assert_allclose(turned, angular, atol=2e-3 * np.linalg.norm(angular))
     assert linear[2] > 5e-4 and simulation.faults == 0
 
 

@@ -29,10 +29,12 @@ def draw_touches(model_path: Path, out: Path, config: PhysicsConfig) -> None:
     Raises:
         ValueError: If there is no camera, or nothing in the middle of its picture.
     """
-    cameras = load_cameras(model_path.parent / "cameras.json")
+    if config.kinematics != "rest":
+        raise ValueError(f"tissue with kinematics {config.kinematics} cannot be cut, as the picture shows; leave it at rest")
+    model, cameras = load_ply(model_path), load_cameras(model_path.parent / "cameras.json")
     if not cameras:
         raise ValueError(f"{model_path.parent / 'cameras.json'}: there is no camera in it")
-    model, camera = load_ply(model_path), cameras[len(cameras) // 2]
+    camera = cameras[len(cameras) // 2]
     views = np.stack([each.position for each in cameras])
     picture, depth = DeformableRenderer(model, None, RenderingConfig(device=config.device)).render(camera)
     middle = camera.backproject(depth)[depth.shape[0] // 2, depth.shape[1] // 2]
@@ -118,6 +120,8 @@ def _cut(simulation: TissueSimulation, camera: Camera, middle: np.ndarray, size:
         simulation.set_cut("tool", _tool(camera, middle + along * down + simulation.config.blade_length / 2 * ahead), True)
     simulation.set_cut("tool", _tool(camera, middle), False)
     skin = simulation.nodes.rest[simulation.nodes.is_skin & ~simulation.nodes.pinned]
+    if not len(skin):
+        raise ValueError(f"all {len(simulation.nodes)} nodes are pinned; raise node_count, or set pin_rim to false")
     held = {}
     for side in (-1, 1):
         for along in (-0.7, 0.0, 0.7):

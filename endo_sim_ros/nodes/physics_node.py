@@ -474,6 +474,14 @@ class PhysicsNode(EndoNode):
         super().destroy_node()
 
 
+def _tissue(model: GaussianModel, viewpoint: np.ndarray, config: PhysicsConfig, cameras: list[Camera]) -> TissueSimulation:
+    """Tissue that is ready for the first cut: that would make a step late otherwise."""
+    simulation = TissueSimulation(model, viewpoint, config, cameras)
+    if config.kinematics == "rest" and not config.dense:
+        simulation.prepare_cutting()
+    return simulation
+
+
 def main() -> int:
     return run(PhysicsNode)
 

@@ -49,7 +49,7 @@ class PhysicsConfig(StageConfig):
     adapt_substeps: bool = True
     """Divide the step into as few substeps as the material and the grid safely allow; off, the configured ones are taken,
     as the paper does, or refused where they would blow up."""
-    damping: Annotated[float, Range(0.0, 1e5, "1/s")] = 50.0
+    damping: Annotated[float, Range(0.0, 1000.0, "1/s")] = 50.0
     """Rate c at which velocities decay, exp(-c t)."""
     gravity_x: Annotated[float, Range(-100.0, 100.0, "m/s²")] = 0.0
     """Gravity along world x. Zero by default: the reconstruction already hangs under gravity."""

@@ -19,6 +19,8 @@ LINK_REACH = 2.0  # cells; nodes farther apart than this have no tissue between 
 MIN_FRAGMENT = 3  # nodes; fewer than this stay with a neighbour where there is one
 MIN_DETERMINANT = 0.05  # of F; below it a node has collapsed and says nothing of where rest is
 BLADE_NEIGHBOURS = 4  # nodes that carry a point of the blade
+BLADE_POINTS, BLADE_PIECES = 16, 16  # most along an edge, and on its way in one step
+SHORTEST_MOVE = 0.1  # spacings that a blade moves before it cuts again
 MIN_HEIGHT = 1e-6  # m; of a triangle worth keeping
 ON_PLANE = 1e-9  # m; points this near to the plane of a triangle lie on its positive side
 OVERLAP = 1e-6  # of a triangle, by which it reaches over its edges, so that two that share one leave no gap
@@ -27,12 +29,16 @@ UPWARD = np.array([0.531, 0.616, 0.582])  # tells the positive side of a plane, 
 BLOCK = 4_000_000  # bounding boxes compared at once
 
 
-def sweep(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+def sweep(start: np.ndarray, end: np.ndarray, whole: np.ndarray | None = None) -> np.ndarray:
     """Triangles [T, 3, 3] between a blade at the start and at the end of a step, as polylines [S, 3] each, in metres.
 
     A blade of two points gives T = 2. Triangles lower than a micrometre are left out, so a blade at rest or drawn along
-    itself gives none; keep `start` for the next step then, so that slow cuts have no gaps. For a quad between two sweeps
-    to be closed as well, start the next at this one's `end` as it was mapped to rest.
+    itself gives none.
+
+    Args:
+        start: Points of the blade [S, 3].
+        end: The same later.
+        whole: Which points cut all the way [S]; default: all. Between others there is no triangle.
 
     Raises:
         ValueError: If the shapes differ, or are not [S, 3] with S of at least 2.
@@ -40,40 +46,110 @@ def sweep(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     start, end = np.asarray(start, np.float64), np.asarray(end, np.float64)
     if start.shape != end.shape or start.ndim != 2 or start.shape[1] != 3 or len(start) < 2:
         raise ValueError(f"sweep: start has shape {start.shape} and end {end.shape}, expected both [S, 3] with S > 1")
-    a, b, c, d = start[:-1], start[1:], end[1:], end[:-1]
+    cutting = np.ones(len(start) - 1, bool) if whole is None else whole[:-1] & whole[1:]
+    a, b, c, d = start[:-1][cutting], start[1:][cutting], end[1:][cutting], end[:-1][cutting]
     triangles = np.stack([np.stack([a, b, c], 1), np.stack([a, c, d], 1)], 1).reshape(-1, 3, 3)
     edges = triangles - np.roll(triangles, 1, axis=1)
     longest = np.linalg.norm(edges, axis=2).max(1)
     return triangles[np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) > MIN_HEIGHT * longest]
 
 
-def to_rest(points: np.ndarray, rest: np.ndarray, positions: np.ndarray, F: np.ndarray) -> np.ndarray:
-    """Where points [P, 3] of the deformed tissue were at rest [P, 3]: X = Σ w_k (X_k + F_k⁻¹ (x − x_k)), metres, world.
+class Blade:
+    """A straight cutting edge that moves through tissue.
+
+    Its points are carried to rest by the tissue around them. One that is farther from all nodes than these are from each
+    other is in the air, and so is one that an older cut parts from its nearest node: it is in an open wound. Nothing is
+    cut there.
+
+    Args:
+        length: Of the edge, from the tip backwards against the tool's z axis, m.
+        spacing: Typical distance between nodes, m.
+    """
+
+    def __init__(self, length: float, spacing: float):
+        self._spacing = spacing
+        points = min(max(round(2 * length / spacing), 3), BLADE_POINTS) + 1
+        self._along = np.linspace(0, length, points)[:, None]  # half a spacing apart, so that they follow bent tissue
+        self._edge: np.ndarray | None = None  # points now where they cut last [S, 3], world
+        self._rest, self._inside = np.zeros((0, 3)), np.zeros(0, bool)  # the same at rest, and which are in tissue
+
+    def move(self, pose: np.ndarray, rest: np.ndarray, positions: np.ndarray, F: np.ndarray, cuts: np.ndarray) -> np.ndarray:
+        """Triangles [T, 3, 3], m, at rest, that the edge cuts on its way to a pose [4, 4] of its tool.
+
+        Moves of less than a tenth of the spacing are saved up, so that a trembling blade does not cut the same over and over.
+
+        Args:
+            pose: Tip-to-world transform.
+            rest: Nodes at rest [M, 3], m, world.
+            positions: Nodes now [M, 3], m, world.
+            F: Their deformation gradients [M, 3, 3].
+            cuts: Triangles of all cuts [T, 3, 3], m, at rest.
+        """
+        edge = pose[:3, 3] - self._along * pose[:3, 2]
+        if self._edge is None:
+            self._edge = edge
+            self._rest, self._inside = to_rest(edge, rest, positions, F, self._spacing, cuts)
+            return np.zeros((0, 3, 3))
+        moved = float(np.linalg.norm(edge - self._edge, axis=1).max())
+        if moved < SHORTEST_MOVE * self._spacing:
+            return np.zeros((0, 3, 3))
+        # In pieces, so that what enters or leaves tissue on the way is cut as far as it is in it.
+        pieces = min(max(round(2 * moved / self._spacing), 1), BLADE_PIECES)
+        shares = np.arange(1, pieces + 1)[:, None, None] / pieces
+        way = (self._edge + shares * (edge - self._edge)).reshape(-1, 3)
+        carried, inside = to_rest(way, rest, positions, F, self._spacing, cuts)
+        carried = np.concatenate([self._rest[None], carried.reshape(pieces, -1, 3)])
+        inside = np.concatenate([self._inside[None], inside.reshape(pieces, -1)])
+        triangles = [sweep(carried[k], carried[k + 1], inside[k] & inside[k + 1]) for k in range(pieces)]
+        self._edge, self._rest, self._inside = edge, carried[-1], inside[-1]
+        return np.concatenate(triangles)
+
+
+def to_rest(
+    points: np.ndarray,
+    rest: np.ndarray,
+    positions: np.ndarray,
+    F: np.ndarray,
+    reach: float = np.inf,
+    cuts: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where points [P, 3] of the deformed tissue were at rest [P, 3], X = Σ w_k (X_k + F_k⁻¹ (x − x_k)), metres, world;
+    and which of them are in tissue [P].
 
     The nodes k are the nearest by their current positions, with the compact weights of the skinning, which this inverts
-    (exactly where the deformation is affine). Collapsed nodes count as undeformed. All P × M distances are computed:
-    meant for the few points of a blade.
+    (exactly where the deformation is affine); those that a cut parts from the nearest one have no say. Collapsed nodes
+    count as undeformed. All P × M distances are computed: meant for the few points of a blade.
 
     Args:
         points: Points [P, 3], m, world.
         rest: Nodes at rest [M, 3], m, world.
         positions: Nodes now [M, 3], m, world.
         F: Their deformation gradients [M, 3, 3].
+        reach: Points farther than this from every node are not in tissue, m.
+        cuts: Triangles of all cuts [T, 3, 3], m, at rest. A point that one of them parts from its nearest node is not in
+            tissue.
     """
     points, positions = np.asarray(points, np.float64), np.asarray(positions, np.float64)
+    rest = np.asarray(rest, np.float64)
     count = min(BLADE_NEIGHBOURS, max(len(positions) - 1, 1))
     squared = sum((points[:, axis, None] - positions[:, axis]) ** 2 for axis in range(3))  # [P, M]
     nearest = np.argpartition(squared, min(count, len(positions) - 1), axis=1)[:, : count + 1]
     d = np.sqrt(np.take_along_axis(squared, nearest, 1))
     order = np.argsort(d, axis=1)
     nearest, d = np.take_along_axis(nearest, order, 1)[:, :count], np.take_along_axis(d, order, 1)
-    weights = _compact_weights(d[:, :count], d[:, count:])
     gradients = np.asarray(F, np.float64)[nearest]  # [P, K, 3, 3]
     with np.errstate(invalid="ignore"):
         collapsed = ~(np.linalg.det(gradients) >= MIN_DETERMINANT)
     gradients[collapsed] = np.eye(3)
     offsets = np.linalg.solve(gradients, (points[:, None] - positions[nearest])[..., None])[..., 0]
-    return (weights[..., None] * (np.asarray(rest, np.float64)[nearest] + offsets)).sum(1)
+    said = rest[nearest] + offsets  # [P, K, 3] where each node says that the point was
+    inside, kept = d[:, 0] <= reach, np.ones(nearest.shape, bool)
+    if cuts is not None and len(cuts):
+        own = rest[nearest[:, 0]]
+        inside &= ~separated(own, said[:, 0], cuts)
+        kept = ~separated(rest[nearest].reshape(-1, 3), np.repeat(own, count, 0), cuts).reshape(kept.shape)
+    weights = _compact_weights(d[:, :count], d[:, count:], kept)
+    return (weights[..., None] * said).sum(1), inside
 
 
 def separated(a: np.ndarray, b: np.ndarray, triangles: np.ndarray) -> np.ndarray:
@@ -369,33 +445,50 @@ class CutNeighbours:
         self._uncut = index, weights
         self.triangles = np.zeros((0, 3, 3))  # of all cuts [T, 3, 3], m, world, at rest
         self.index, self.weights = index.copy(), weights.copy()  # now
-        self._candidates: tuple[np.ndarray, np.ndarray] | None = None  # distances and nodes [N, 4 K + 1], from the first cut on
+        # Distances, nodes and whether a cut parts them [N, 4 K + 1], nearest first, from the first cut on.
+        self._candidates: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
-    def cut(self, triangles: np.ndarray) -> None:
-        """Heed all cuts [T, 3, 3], m, world, at rest. Where they begin with those of the last call, only what is new is looked at."""
-        triangles = np.asarray(triangles, np.float64).reshape(-1, 3, 3)
+    def extends(self, triangles: np.ndarray) -> bool:
+        """Whether cuts [T, 3, 3] begin with those that are heeded."""
         known = len(self.triangles)
-        if not (known <= len(triangles) and np.array_equal(triangles[:known], self.triangles)):
-            self.index, self.weights, known = self._uncut[0].copy(), self._uncut[1].copy(), 0
-        new, self.triangles = triangles[known:], triangles.copy()
+        return known <= len(triangles) and np.array_equal(triangles[:known], self.triangles)
+
+    def heal(self) -> None:
+        """Forget all cuts."""
+        self.index, self.weights = self._uncut[0].copy(), self._uncut[1].copy()
+        self.triangles = np.zeros((0, 3, 3))
+        if self._candidates is not None:
+            self._candidates[2][:] = False
+
+    def cut(self, triangles: np.ndarray) -> np.ndarray:
+        """Heed all cuts [T, 3, 3], m, world, at rest, and return the numbers of the Gaussians that follow other nodes now.
+
+        They begin with those of the last call: only what is new is looked at.
+        """
+        triangles = np.asarray(triangles, np.float64).reshape(-1, 3, 3)
+        new, self.triangles = triangles[len(self.triangles) :], triangles.copy()
         if not len(new) or not len(self.means):
-            return
+            return np.zeros(0, int)
         count = self.index.shape[1]
         if self._candidates is None:
             ranks = list(range(1, min(4 * count + 1, len(self._rest)) + 1))
-            self._candidates = cKDTree(self._rest).query(self.means, k=ranks, workers=-1)  # nearest first
-        reach = self._candidates[0][:, -1].max()
+            d, node = cKDTree(self._rest).query(self.means, k=ranks, workers=-1)
+            self._candidates = d, node, np.zeros(d.shape, bool)
+        d, node, parted = self._candidates
+        reach = d[:, -1].max()
         near = (self.means >= new.min((0, 1)) - reach) & (self.means <= new.max((0, 1)) + reach)
         near = np.flatnonzero(near.all(1))
-        near = near[self._parted(near, self._candidates[1], new).any(1)]
-        uncut = near[~self._parted(near, self._uncut[0], triangles, self._uncut[1]).any(1)]
-        self.index[uncut], self.weights[uncut] = self._uncut[0][uncut], self._uncut[1][uncut]
-        near = np.setdiff1d(near, uncut, assume_unique=True)
+        ends = node[near]
+        crossed = separated(np.repeat(self.means[near], ends.shape[1], 0), self._rest[ends.ravel()], new)
+        crossed = crossed.reshape(ends.shape)
+        parted[near] |= crossed
+        near = near[crossed.any(1)]
+        # The nodes that it follows while whole are the first of the candidates.
+        near = near[(parted[near, :count] & (self._uncut[1][near] > 0)).any(1)]
         if not len(near):
-            return
+            return near
 
-        d, node = self._candidates[0][near], self._candidates[1][near]
-        parted = self._parted(near, self._candidates[1], triangles)
+        d, node, parted = d[near], node[near], parted[near]
         order = np.argsort(parted, axis=1, kind="stable")  # those on this side first
         node, kept = np.take_along_axis(node, order, 1), ~np.take_along_axis(parted, order, 1)
         distances = np.where(kept, np.take_along_axis(d, order, 1), d[:, -1:])  # all others are at least this far
@@ -408,35 +501,41 @@ class CutNeighbours:
         able = kept[:, 0]
         self.index[near[able]] = np.where(kept[:, :count], node[:, :count], node[:, :1])[able]
         self.weights[near[able]] = compact[able]
-
-    def _parted(self, gaussians: np.ndarray, nodes: np.ndarray, triangles: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
-        """Which of their nodes [N, C] triangles part from these Gaussians [G]: bool [G, C]; those of weight zero do not count."""
-        ends = nodes[gaussians]
-        crossed = separated(np.repeat(self.means[gaussians], ends.shape[1], 0), self._rest[ends.ravel()], triangles).reshape(ends.shape)
-        return crossed if weights is None else crossed & (weights[gaussians] > 0)
+        return near
 
 
-def clip_to_sides(means: np.ndarray, covars: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Covariances [N, 3, 3] of Gaussians that no longer reach across a cut, so that its edges are sharp when it opens.
+def clip_to_sides(means: np.ndarray, covars: np.ndarray, reach: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Make covariances [N, 3, 3] no longer reach across a cut, so that its edges are sharp when it opens; returns the
+    numbers of those that changed.
 
     A Gaussian less than two standard deviations from a triangle below it is flattened along the triangle's normal until
     it is two away, or to a twentieth. Triangles act one after the other, so it does not matter how cuts are divided into calls.
 
     Args:
         means: Gaussians at rest [N, 3], m, world.
-        covars: Their covariances [N, 3, 3], m².
+        covars: Their covariances [N, 3, 3], m²; changed in place.
+        reach: Bounds on two standard deviations [N], m.
         triangles: Of the cut [T, 3, 3], m, world, at rest.
     """
-    covars, reach = covars.copy(), 2 * np.sqrt(np.trace(covars, axis1=1, axis2=2))
-    for a, b, c in np.asarray(triangles, np.float64):
+    triangles, changed = np.asarray(triangles, np.float64), np.zeros(len(means), bool)
+    if not len(triangles):
+        return np.flatnonzero(changed)
+    low, high = triangles.min((0, 1)), triangles.max((0, 1))
+    some = np.ones(len(means), bool)
+    for axis in range(3):
+        some &= (means[:, axis] >= low[axis] - reach) & (means[:, axis] <= high[axis] + reach)
+    some = np.flatnonzero(some)
+    x, reach = means[some], reach[some, None]
+    for a, b, c in triangles:
         e1, e2 = b - a, c - a
         cross = np.cross(e1, e2)
         square = cross @ cross
         normal = cross / np.sqrt(square)
-        low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
-        near = np.flatnonzero(((means >= low - reach[:, None]) & (means <= high + reach[:, None])).all(1))
-        x = means[near] - a
-        u, v, height = np.cross(x, e2) @ cross / square, np.cross(e1, x) @ cross / square, np.abs(x @ normal)
+        corners = np.stack([a, b, c])
+        near = np.flatnonzero(((x >= corners.min(0) - reach) & (x <= corners.max(0) + reach)).all(1))
+        arm = x[near] - a
+        u, v, height = arm @ np.cross(e2, cross) / square, arm @ np.cross(cross, e1) / square, np.abs(arm @ normal)
+        near = some[near]
         along = covars[near] @ normal  # [n, 3]
         spread = 2 * np.sqrt(np.maximum(along @ normal, 0))
         over = (u >= -OVERLAP) & (v >= -OVERLAP) & (u + v <= 1 + OVERLAP) & (height < spread)
@@ -445,7 +544,8 @@ def clip_to_sides(means: np.ndarray, covars: np.ndarray, triangles: np.ndarray) 
         outer = lost[:, None, None] * along[:, :, None] * normal
         kept = lost**2 * (along @ normal)
         covars[near] += kept[:, None, None] * np.outer(normal, normal) - outer - outer.transpose(0, 2, 1)
-    return covars
+        changed[near] = True
+    return np.flatnonzero(changed)
 
 
 def _compact_weights(d: np.ndarray, beyond: np.ndarray, kept: np.ndarray | bool = True) -> np.ndarray:

@@ -35,7 +35,10 @@ from endo_sim_ros.physics.regions import TissueProperties
 
 CFL_LIMIT = 0.7  # c Δt / h; measured: 0.7 runs, 0.9 blows up
 CFL_CHOSEN = 0.5  # leaves room for tissue that stiffens where it is compressed
-PIN_STIFFNESS = 50.0  # of a pinned node's spring, over that of a cube of tissue of its volume
+# Springs that hold nodes, over the stiffness (λ + 2μ) V/h² of a cell's tissue, so that all springs in a cell together are as stiff
+# however many nodes share it. Stiffer ones lock tissue that is few cells thick; softer ones let tissue lag behind its jaw.
+PIN_STIFFNESS = 100.0
+HOLD_STIFFNESS = 400.0
 MARGIN_CELLS = 2.0  # between the nodes and the edge of the grid; a spline reaches 1.5
 MIN_CELL, MAX_CELL = 1e-6, 1e3  # m; beyond these float32 no longer holds masses and stiffnesses
 MAX_GRID_NODES = 64_000_000  # 28 bytes each
@@ -142,6 +145,8 @@ class MpmSolver:
         init_warp()
         self.device = pick_device(config.device)
         self.config = config
+        if environments < 1 or tools < 0:
+            raise ValueError(f"there must be at least one environment and no fewer than zero tools, not {environments} and {tools}")
         self.environments, self.tool_count, self.node_count = environments, tools, len(nodes)
         if properties is None:
             properties = TissueProperties.uniform(len(nodes), config.young_modulus, config.poisson_ratio, config.density)
@@ -182,8 +187,7 @@ class MpmSolver:
 
         lame = [lame_parameters(*each) for each in zip(properties.young_modulus, properties.poisson_ratio)]
         self.mu, self.lam = np.array(lame).T  # [M] Pa each
-        # What holds a node is stiffer than the tissue beside it, so that it gives way a few per cent at most.
-        hold = PIN_STIFFNESS * (1 + config.relaxation) * (self.lam + 2 * self.mu) * np.cbrt(nodes.volumes)
+        hold = HOLD_STIFFNESS * (self.lam + 2 * self.mu) * nodes.volumes / h**2
         self._hold = torch.from_numpy(hold).to(self.device)  # [M] N/m, for a factor of one
         self._pinned = torch.from_numpy(nodes.pinned).to(self.device)
         self.nodes = Nodes()
@@ -202,7 +206,7 @@ class MpmSolver:
         self.rigid.count, self.rigid.friction = tools, config.friction
         self.rigid.tip, self.rigid.tip_v, self.rigid.end, self.rigid.end_v = (self._zeros(environments * tools, wp.vec3) for _ in range(4))
         self.rigid.radius = self._zeros(environments * tools, float)
-        self.rigid.impulse = self._zeros(count * tools, wp.vec3)
+        self.rigid.impulse, self.rigid.moment = (self._zeros(count * tools, wp.vec3) for _ in range(2))
         self.state, self._backup = self._new_state(), self._new_state()
         self.bad_nodes = self._zeros(environments, int)  # in the last step; where there were any it was undone
         self._speed_sq = self._zeros(environments, float)
@@ -258,10 +262,11 @@ class MpmSolver:
             raise ValueError(f"stiffness factors must lie above 0 and not above {self.largest_stiffness:g}, the largest planned for")
         factors = torch.from_numpy(stiffness.copy()).to(self.device)
         hold = factors * self._hold
-        for array, values in ((self._scale, factors), (self.nodes.stiffness, hold), (self.pin_springs, hold * self._pinned)):
+        pins = PIN_STIFFNESS / HOLD_STIFFNESS * hold * self._pinned
+        for array, values in ((self._scale, factors), (self.nodes.stiffness, hold), (self.pin_springs, pins)):
             wp.to_torch(array).view(self.environments, -1)[environments] = values.float()
         springs = wp.to_torch(self.loads.spring).view(self.environments, -1)
-        springs[environments] = torch.where(self._pinned, hold.float(), springs[environments])
+        springs[environments] = torch.where(self._pinned, pins.float(), springs[environments])
 
     def set_cut(self, cut: CutTable | None) -> None:
         """Let nodes beside a cut transfer to grid nodes of their own side; None makes the tissue whole again.
@@ -308,7 +313,8 @@ class MpmSolver:
     @property
     def speed(self) -> float:
         """Speed of the fastest node at the end of the last step, m/s."""
-        return math.sqrt(max(float(self._speed_sq.numpy().max()), 0.0))
+        with on_torch_stream(self.device):
+            return math.sqrt(max(float(self._speed_sq.numpy().max()), 0.0))
 
     def _prepare(self) -> Callable[[], None]:
         """The whole step as one call; loads and tools are read from their device arrays every time."""
@@ -320,6 +326,8 @@ class MpmSolver:
         with capturing, wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
             for action in actions:
                 action()
+        wp.synchronize_device(self.device)  # its arrays were filled on another stream than torch's, on which it runs
+        self._captured = actions  # a graph does not keep the memory that it works in
         return partial(wp.capture_launch, capture.graph)
 
     def _actions(self) -> list[Callable[[], None]]:
@@ -329,7 +337,7 @@ class MpmSolver:
         actions = [self._action(launch) for launch in self._before]
         for name in ("u", "F", "Q"):
             actions.append(partial(wp.copy, getattr(self._backup, name), getattr(self.state, name)))
-        actions += [array.zero_ for array in (self.bad_nodes, self._speed_sq, self.rigid.impulse)]
+        actions += [array.zero_ for array in (self.bad_nodes, self._speed_sq, self.rigid.impulse, self.rigid.moment)]
         actions += self._vectorised_step() if self._vectorised else self._launched_substeps()
         actions.append(self._action(Launch(check_nodes, every, check)))
         actions.append(self._action(Launch(undo_bad_steps, every, [self.bad_nodes, count, self._backup, self.state])))
@@ -427,7 +435,8 @@ class MpmSolver:
         return self._of(self.state.F, environment)
 
     def _of(self, array: wp.array, environment: int) -> np.ndarray:
-        return array.numpy()[environment * self.node_count : (environment + 1) * self.node_count].copy()
+        with on_torch_stream(self.device):
+            return array.numpy()[environment * self.node_count : (environment + 1) * self.node_count].copy()
 
     def momentum(self, environment: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Linear momentum [3], kg·m/s, and angular momentum about the world's origin [3], kg·m²/s, of all nodes.

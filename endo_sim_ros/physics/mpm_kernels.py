@@ -94,6 +94,7 @@ class RigidTools:
     end_v: wp.array[wp.vec3]
     radius: wp.array[float]  # m; zero or less: touches nothing
     impulse: wp.array[wp.vec3]  # out [B · T · M]: what each gave to each node during the step, N·s
+    moment: wp.array[wp.vec3]  # out [B · T · M]: its moment about the local origin, N·m·s
 
 
 @wp.struct
@@ -258,6 +259,7 @@ def make_advance_kernel(material: str, kinematics: str):
                 pull = transfer.pull[e]
                 given = wp.vec3(pull[0], pull[1], pull[2]) - (pull[3] / step.decay) * v
                 tools.impulse[(b * tools.count + giver) * count + p] += given
+                tools.moment[(b * tools.count + giver) * count + p] += wp.cross(X + u - dt * v, given)  # where it was given
 
         if scatter != 0:
             mass = nodes.mass[p]
@@ -282,7 +284,8 @@ def make_advance_kernel(material: str, kinematics: str):
             transfer.giver[e] = giver
             transfer.q[e] = mass * (v + dt * step.gravity) + dt * loads.force[e] + wp.vec3(pull[0], pull[1], pull[2])
             transfer.mass[e] = mass + pull[3]
-            transfer.A[e] = (mass * grid.h) * C - (dt * 4.0 * grid.inverse_h * nodes.volume[p]) * S
+            # What springs and contact add turns with the node: adding mass alone would resist turning.
+            transfer.A[e] = ((mass + pull[3]) * grid.h) * C - (dt * 4.0 * grid.inverse_h * nodes.volume[p]) * S
 
     return advance
 

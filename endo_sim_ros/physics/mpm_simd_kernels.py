@@ -353,10 +353,18 @@ _STEP = (
                         for (int lane = 0; lane < 16; ++lane)
                             if (giver[lane] >= 0) {
                                 const int p = order.data[16 * block + lane];
-                                float* given = (float*)tools.impulse.data + 3 * ((b * (size_t)T + giver[lane]) * M + p);
-                                for (int i = 0; i < 3; ++i)
-                                    given[i] += pulls[4 * block + i][lane]
+                                const size_t place = 3 * ((b * (size_t)T + giver[lane]) * M + p);
+                                float *impulse = (float*)tools.impulse.data + place, *moment = (float*)tools.moment.data + place;
+                                float given[3], x[3];
+                                for (int i = 0; i < 3; ++i) {
+                                    given[i] = pulls[4 * block + i][lane]
                                         - pulls[4 * block + 3][lane] / substep.decay * v[i][lane];
+                                    x[i] = at(block, X + i)[lane] + u[i][lane] - dt * v[i][lane];  // where it was given
+                                }
+                                for (int i = 0; i < 3; ++i) {
+                                    impulse[i] += given[i];
+                                    moment[i] += x[(i + 1) % 3] * given[(i + 2) % 3] - x[(i + 2) % 3] * given[(i + 1) % 3];
+                                }
                             }
                 }
             } else {
@@ -504,7 +512,7 @@ _STEP = (
             for (int r = 0; r < 3; ++r) {
                 rows[r] = mass * (v[r] + dt * gravity[r]) + dt * at(block, FORCE + r) + pull[r];
                 for (int c = 0; c < 3; ++c) {
-                    rows[4 * (c + 1) + r] = (mass * h) * C[3 * r + c] - share * P[3 * r + c];
+                    rows[4 * (c + 1) + r] = ((mass + added) * h) * C[3 * r + c] - share * P[3 * r + c];
                     rows[r] -= rows[4 * (c + 1) + r] * f[c];
                 }
             }

@@ -12,15 +12,15 @@ from endo_sim_ros.cameras import Camera
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes, build_control_nodes
-from endo_sim_ros.physics.cutting import CutStencils, sweep, to_rest
+from endo_sim_ros.physics.cutting import Blade, CutStencils
 from endo_sim_ros.physics.mpm import MpmSolver, capturing
 from endo_sim_ros.physics.regions import TissueProperties, paint_regions
 from endo_sim_ros.physics.skinning import Skinning
 from endo_sim_ros.physics.tools import Tools
 
 MAX_TOOLS = 8  # of a TissueSimulation
-_BLADE_POINTS = 4  # along a cutting edge; more than two follow tissue that is bent
 _RESTING_SPEED = 1e-5  # m/s; tissue slower than this, with no tool acting, is left as it is
+_RELAXED = 8.0  # relaxation times after the last touch, too
 
 
 def tissue_properties(nodes: ControlNodes, config: PhysicsConfig) -> TissueProperties:
@@ -80,7 +80,7 @@ class TissueBatch:
         """Make skinning part of every step from now on, in place of another that was; on a GPU of the one graph that a step is.
 
         Args:
-            skinning: With compact weights, bound to these nodes at rest, on this device. What it is bound to now counts.
+            skinning: With compact weights, bound to these nodes at rest, on this device; cuts that come later count.
 
         Returns:
             Means [B, N, 3], m, world, and covariances [B, N, 3, 3], m², of the Gaussians at the end of each step, which the
@@ -153,8 +153,9 @@ class TissueSimulation:
         self.last_fault = ""
         self._slots: dict[str, int] = {}  # of tools, by name
         self._stencils: CutStencils | None = None  # from the first cut on
-        self._blades: dict[str, np.ndarray] = {}  # edges of cutting tools where tissue was cut last [_BLADE_POINTS, 3], at rest
+        self._blades: dict[str, Blade] = {}  # of tools that cut
         self._disturbed = False  # since the last step: a tool moved, took hold or let go
+        self._quiet = 0.0  # s since tools did anything
         self._resting = not any(config.gravity)
 
     @property
@@ -258,22 +259,25 @@ class TissueSimulation:
         if not cutting:
             self._blades.pop(tool, None)
             return
-        if self.config.kinematics != "rest":
-            raise ValueError(f"tissue with kinematics {self.config.kinematics} cannot be cut; set kinematics to rest")
-        edge = pose[:3, 3] - np.linspace(0, self.config.blade_length, _BLADE_POINTS)[:, None] * pose[:3, 2]
+        self.prepare_cutting()
+        self._blades.setdefault(tool, Blade(self.config.blade_length, self.nodes.spacing))
         state = self.state()
-        edge = to_rest(edge, state.rest, state.positions, state.F)
-        start = self._blades.setdefault(tool, edge)
-        triangles = sweep(start, edge)
-        if not len(triangles):
-            return
-        self._blades[tool] = edge
-        if self._stencils is None:
-            self._stencils = CutStencils(self.nodes.rest, self.solver.rest_cells, self.solver.grid_shape)
+        triangles = self._blades[tool].move(pose, state.rest, state.positions, state.F, self.cuts)
         if self._stencils.cut(triangles):
             with capturing:
                 self.solver.set_cut(self._stencils.table())
             self._disturbed = True
+
+    def prepare_cutting(self) -> None:
+        """Find the links between nodes now, which the first cut would otherwise wait for (a tenth of a second).
+
+        Raises:
+            ValueError: If kinematics is not rest.
+        """
+        if self.config.kinematics != "rest":
+            raise ValueError(f"tissue with kinematics {self.config.kinematics} cannot be cut; set kinematics to rest")
+        if self._stencils is None:
+            self._stencils = CutStencils(self.nodes.rest, self.solver.rest_cells, self.solver.grid_shape)
 
     @property
     def cuts(self) -> np.ndarray:
@@ -317,9 +321,11 @@ class TissueSimulation:
         self.time += self.step_duration
         if self._resting and not (self._disturbed or self._wrenches_act()):
             return
+        self._quiet = 0.0 if self._disturbed or self._wrenches_act() else self._quiet + self.step_duration
         self._batch.step()
         self._disturbed = False
-        self._resting = self.solver.speed < _RESTING_SPEED
+        relaxed = not self.config.relaxation or self._quiet > _RELAXED * self.config.relaxation_time
+        self._resting = relaxed and self.solver.speed < _RESTING_SPEED
         if self.faults > before:
             self.last_fault = (
                 f"a step was undone: {self.solver.bad_nodes.numpy()[0]} of {len(self.nodes)} nodes ended non-finite, torn or"
@@ -338,9 +344,9 @@ class TissueSimulation:
             self._stencils.reset()
             with capturing:
                 self.solver.set_cut(None)
-        self._disturbed = False
+        self._disturbed, self._quiet = False, 0.0
         self._resting = not any(self.config.gravity)
-        self.time = 0.0
+        self.time, self.last_fault = 0.0, ""
 
     def continue_from(self, other: "TissueSimulation") -> bool:
         """Take over shape, motion, cuts and tools of other tissue; returns whether that can be: if it has the same nodes.
@@ -357,10 +363,13 @@ class TissueSimulation:
         self._slots, self._blades, self.time = dict(other._slots), dict(other._blades), other.time
         self.last_fault = other.last_fault
         if len(other.cuts):
-            self._stencils = CutStencils(self.nodes.rest, self.solver.rest_cells, self.solver.grid_shape)
-            if self._stencils.cut(other.cuts):
-                with capturing:
-                    self.solver.set_cut(self._stencils.table())
+            if self.solver.grid_shape == other.solver.grid_shape and self.solver.cell_size == other.solver.cell_size:
+                self._stencils = other._stencils
+            else:
+                self.prepare_cutting()
+                self._stencils.cut(other.cuts)
+            with capturing:
+                self.solver.set_cut(self._stencils.table())
         self._disturbed = True
         return True
 
@@ -386,6 +395,9 @@ def _pose(tool: str, value: np.ndarray) -> np.ndarray:
     pose = np.asarray(value, np.float64)
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise ValueError(f"pose of tool {tool!r} must be a finite 4×4 matrix, got {pose.tolist()}")
+    R = pose[:3, :3]
+    if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0:
+        raise ValueError(f"pose of tool {tool!r} must turn and shift, not scale or mirror, got {pose.round(4).tolist()}")
     return pose
 
 

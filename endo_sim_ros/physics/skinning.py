@@ -81,17 +81,27 @@ class Skinning:
         index, weights = bind_weights(means, rest, neighbours, weighting)
         self.rebind(index, weights)
         self._cuts = CutNeighbours(means, rest, index, weights)
-        self._covars = self._clipped = self.covars.cpu().double().numpy()
+        self._covars = self.covars.cpu().double().numpy()
+        self._clipped = self._covars.copy()  # where the cuts left them
+        self._reach = 2 * np.sqrt(np.trace(self._covars, axis1=1, axis2=2))
 
     def cut(self, triangles: np.ndarray) -> None:
         """Let no Gaussian follow nodes, or reach, across a cut: all of it [T, 3, 3], m, world, in the tissue at rest."""
-        known = len(self.cuts)
-        grown = np.array_equal(self.cuts, np.asarray(triangles)[:known])
-        self._cuts.cut(triangles)
-        self.rebind(self._cuts.index, self._cuts.weights)
-        clipped = self._clipped if grown else self._covars
-        self._clipped = clip_to_sides(self._cuts.means, clipped, self.cuts[known if grown else 0 :])
-        self.covars = torch.from_numpy(self._clipped).to(self.device, torch.float32)
+        cuts, known = self._cuts, len(self.cuts)
+        if not cuts.extends(triangles):
+            cuts.heal()
+            self._clipped, known = self._covars.copy(), 0
+            self.rebind(cuts.index, cuts.weights)
+            self.covars.copy_(torch.from_numpy(self._clipped))
+        rebound = cuts.cut(triangles)
+        clipped = clip_to_sides(cuts.means, self._clipped, self._reach, cuts.triangles[known:])
+        for tensor, values, some in (
+            (self.neighbours, cuts.index, rebound),
+            (self.weights, cuts.weights, rebound),
+            (self.covars, self._clipped, clipped),
+        ):
+            rows = torch.from_numpy(values[some]).to(tensor.device, tensor.dtype)
+            tensor[torch.from_numpy(some).to(tensor.device)] = rows
 
     @property
     def cuts(self) -> np.ndarray:

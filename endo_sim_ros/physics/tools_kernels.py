@@ -116,7 +116,8 @@ def take_hold(
     zero, one = wp.float64(0.0), wp.float64(1.0)
     for t in range(tools):
         c = b * tools + t
-        wanted = wp.length_sq(commands.force[c]) > zero or wp.length_sq(commands.torque[c]) > zero
+        # Not finite is wanted as well: then the step fails, and is counted, instead of being another.
+        wanted = not (wp.length_sq(commands.force[c]) == zero and wp.length_sq(commands.torque[c]) == zero)
         attach = wanted and holds.attached[c] == 0
         close = commands.closed[c] != 0 and commands.present[c] != 0
         grip = close and holds.gripping[c] == 0
@@ -254,6 +255,11 @@ def load_nodes(
                 holds.gripping[c] = 0
                 holds.slips[c] = holds.slips[c] + 1
                 commands.closed[c] = 0
+        unusable = not wp.isfinite(wp.length_sq(commands.force[c]) + wp.length_sq(commands.torque[c]))
+        if commands.present[c] != 0:
+            unusable = unusable or not wp.isfinite(wp.length_sq(commands.tip[c]) + wp.ddot(commands.R[c], commands.R[c]))
+        if unusable and lane == 0 and touchable > 0:
+            loads.force[b * count + reach.touchable[0]] = wp.vec3(wp.nan, wp.nan, wp.nan)
         if lane == 0:
             holds.applied_force[c] = F
             holds.applied_torque[c] = torque
@@ -293,19 +299,21 @@ def measure_reactions(
     count = nodes.X.shape[0]
     for t in range(tools):
         c = b * tools + t
-        force, torque = wp.vec3d(), wp.vec3d()
-        for p in range(lane, count, lanes):
-            given = rigid.impulse[c * count + p]
-            if wp.length_sq(given) > 0.0:
-                f = double(given) / reach.duration
-                force += f
-                arm = reach.origin + double(nodes.X[p]) + double(state.u[b * count + p]) - commands.tip[c]
-                torque += wp.cross(arm, f)
-        force, torque = lanes_sum(force), lanes_sum(torque)
+        force, moment = wp.vec3d(), wp.vec3d()
+        if commands.present[c] != 0:  # others push and hold nothing
+            for p in range(lane, count, lanes):
+                given = rigid.impulse[c * count + p]
+                if wp.length_sq(given) > 0.0:
+                    force += double(given) / reach.duration
+                    moment += double(rigid.moment[c * count + p]) / reach.duration
+            force, moment = lanes_sum(force), lanes_sum(moment)
         if lane == 0:
-            if bad_nodes[b] > 0:
+            torque = moment - wp.cross(commands.tip[c] - reach.origin, force)
+            force += holds.applied_force[c]
+            torque += holds.applied_torque[c]
+            if bad_nodes[b] > 0:  # the step was undone, and all that tools did in it
                 force, torque = wp.vec3d(), wp.vec3d()
-            holds.reaction_force[c] = -(force + holds.applied_force[c])
-            holds.reaction_torque[c] = -(torque + holds.applied_torque[c])
+            holds.reaction_force[c] = -force
+            holds.reaction_torque[c] = -torque
     if lane == 0 and bad_nodes[b] > 0:
         faults[b] = faults[b] + 1

@@ -22,6 +22,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidParameterTypeException, NameValidationException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from endo_sim_ros import messages
@@ -107,8 +108,10 @@ class EndoNode(Node):
                 bounds = IntegerRange(from_value=int(option.range.minimum), to_value=int(option.range.maximum), step=1)
                 descriptor.integer_range = [bounds]
             try:
-                default = list(option.default) if option.type is tuple else option.default
-                values[option.name] = self.declare_parameter(option.name, default, descriptor).value
+                # ROS takes an empty list for one of bytes.
+                default = (list(option.default) or Parameter.Type.STRING_ARRAY) if option.type is tuple else option.default
+                value = self.declare_parameter(option.name, default, descriptor).value
+                values[option.name] = () if value is None else value
             except InvalidParameterTypeException as error:
                 kind = {float: "float, with a decimal point", tuple: "list such as [PSM1, PSM2]"}
                 kind = kind.get(option.type, option.type.__name__)

@@ -1,0 +1,342 @@
+"""The tissue in a browser: what the graph publishes is shown, and the mouse is one more tool."""
+
+import time
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+from rcl_interfaces.srv import GetParameters, SetParameters
+from rclpy.parameter import Parameter, parameter_value_to_python
+from std_srvs.srv import SetBool, Trigger
+
+from endo_sim_ros import messages
+from endo_sim_ros.cameras import Camera
+from endo_sim_ros.config import StageConfig
+from endo_sim_ros.gaussians import GaussianModel
+from endo_sim_ros.messages import ControlNodeCloud
+from endo_sim_ros.nodes.base import OK, WARN, Background, EndoNode, WorldConfig, arm_names, run
+from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
+from endo_sim_ros.viewer import Tool, Viewer, ViewerConfig
+from endo_sim_ros.viewer.viewer import PARAMETERS, plain_camera
+
+_PERIOD = 0.02  # s between two looks at what users did
+_GONE = 1.0  # s after which a tool that says nothing is not shown any more
+_SILENT = 5.0  # s after which a node that says nothing is reported
+_STALE = 1.5  # s in which diagnostics may be older than the answer of a service
+_ASK_EVERY = 2.0  # s between two looks at the parameters of the physics
+_JAW_OPEN, _JAW_CLOSED = 1.0, 0.0  # rad
+_SHOWN = ("physics_node", "rendering_node", "reconstruction_node")  # whose diagnostics are on the page
+
+
+@dataclass(frozen=True)
+class ViewerNodeConfig(WorldConfig):
+    """Parameters of the node beside those of the page."""
+
+    arm: str = "PSM1"
+    """Name of the arm that the mouse moves while it holds tissue; its topics are published only then."""
+    arm_source: Literal["measured", "commanded"] = "measured"
+    """As that of physics_node. measured: the mouse publishes measured_cp. commanded: it publishes servo_cp."""
+    arms: tuple[str, ...] = ("PSM1",)
+    """Names of the arms that are shown with their forces."""
+    physics_node: str = "physics_node"
+    """Name of the node whose parameters and services the page uses."""
+
+
+@dataclass
+class _Arm:
+    """What was last heard from one arm."""
+
+    pose: np.ndarray | None = None  # [4, 4], world
+    reaction: np.ndarray | None = None  # [3] N on the tool, in its axes
+    heard: float = 0.0  # when the reaction came
+
+
+@dataclass(frozen=True)
+class _Bound:
+    """A model that follows its nodes."""
+
+    renderer: DeformableRenderer
+    model_stamp: int
+    rest: np.ndarray | None  # [M, 3] m, None without control nodes
+
+
+class ViewerNode(EndoNode):
+    """Hands what it hears to a `Viewer`, and what users do there to the graph."""
+
+    read_at_start = frozenset({"arm", "arm_source", "arms", "physics_node", "host", "port"})
+
+    def __init__(self):
+        super().__init__("viewer_node")
+        self._options = self.declare(ViewerNodeConfig)
+        config, self._rendering = self.declare(ViewerConfig), self.declare(RenderingConfig)
+        (arm,) = arm_names([self._options.arm])
+        self._arms = {name: _Arm() for name in arm_names((*self._options.arms, arm))}
+        self._hand = arm
+        self._model: GaussianModel | None = None  # the newest; its stamp, and number in the order of arrival:
+        self._model_stamp, self._model_number = 0, 0
+        self._cameras: np.ndarray | None = None  # [V, 4, 4], of the training views
+        self._infos: dict[str, messages.CameraInfo] = {}  # by topic
+        self._rendered: dict[str, tuple[int, Any]] = {}  # stamp and content of the newest rendered messages
+        self._nodes: ControlNodeCloud | None = None
+        self._cuts = {0: np.zeros((0, 3, 3), np.float32)}  # no cut, and the newest surface, by number
+        self._bound: _Bound | None = None
+        self._background = Background()
+        self._said: dict[str, tuple[float, str, dict[str, str]]] = {}  # when, sentence and values of each node
+        self._asked, self._closed, self._lockstep = 0.0, False, False
+        self._paused, self._paused_until = False, 0.0  # as a service said, which counts more than diagnostics before it
+        self.viewer = Viewer(config, self)
+        commanded = self._options.arm_source == "commanded"
+        self._pose_pub = self.publisher((messages.tool_pose_command if commanded else messages.tool_pose)(arm))
+        self._jaw_pub = self.publisher(messages.tool_jaw(arm))
+        name = self._options.physics_node
+        self._physics = self._full_name(name)
+        self._set = self.create_client(SetParameters, f"{name}/set_parameters")
+        self._get = self.create_client(GetParameters, f"{name}/get_parameters")
+        self._calls = {"reset": Trigger, "step": Trigger, "pause": SetBool}
+        self._calls = {what: self.create_client(kind, f"{name}/{what}") for what, kind in self._calls.items()}
+        self.subscribe(messages.GAUSSIANS, self._on_model)
+        self.subscribe(messages.TRAINING_CAMERAS, self._on_training_cameras)
+        self.subscribe(messages.CUT_SURFACE, self._on_cut_surface, depth=1)
+        self.subscribe(messages.CONTROL_NODES, self._on_nodes, depth=1)
+        for topic in (messages.TRAINING_CAMERA_INFO, messages.RENDERED_INFO):
+            self.subscribe(topic, partial(self._on_info, topic.name), depth=1)
+        self.subscribe(messages.RENDERED_POSE, self._on_rendered_pose, depth=1)
+        self.subscribe(messages.RENDERED_IMAGE, self._on_rendered_image, depth=1)
+        for name in self._arms:
+            self.subscribe(messages.tool_pose(name), partial(self._on_tool_pose, name), depth=1)
+            self.subscribe(messages.tool_reaction(name), partial(self._on_reaction, name), depth=1)
+        self.subscribe(messages.DIAGNOSTICS, self._on_diagnostics)
+        self.every(_PERIOD, self._on_timer)
+        self.get_logger().info(f"open {self.viewer.url} in a browser")
+
+    def config_changed(self, config: StageConfig) -> None:
+        if isinstance(config, ViewerConfig):
+            self.viewer.config = config
+        elif isinstance(config, RenderingConfig):
+            self._rendering = config  # the timer binds the model anew
+        else:
+            self._options = config
+
+    # ------------------------------------------------------------------ input
+
+    def _on_model(self, message: Any) -> None:
+        messages.check_frame(message, (self._options.world_frame,), messages.GAUSSIANS.name)
+        self._model = messages.decode_gaussians(message)
+        self._model_stamp = messages.stamp_to_ns(message.header.stamp)
+        self._model_number += 1
+
+    def _on_training_cameras(self, message: Any) -> None:
+        messages.check_frame(message, (self._options.world_frame,), messages.TRAINING_CAMERAS.name)
+        poses = messages.decode_poses(message)
+        if len(poses):
+            self._cameras = poses
+
+    def _on_info(self, topic: str, message: Any) -> None:
+        self._infos[topic] = messages.decode_camera_info(message, topic)
+
+    def _on_nodes(self, message: Any) -> None:
+        messages.check_frame(message, (self._options.world_frame,), messages.CONTROL_NODES.name)
+        self._nodes = messages.decode_control_nodes(message)
+        bound = self._bound
+        if bound is None or self._nodes.model_stamp_ns != bound.model_stamp:
+            return
+        if bound.rest is None or not np.array_equal(bound.rest, self._nodes.rest):
+            return
+        if self._nodes.cut in self._cuts:  # else its surface is still on its way
+            bound.renderer.cut(self._cuts[self._nodes.cut])
+        milliseconds = float(self._value("milliseconds per step", "0"))
+        age = 1e-9 * (self.now_ns() - messages.stamp_to_ns(message.header.stamp)) + 1e-3 * milliseconds
+        self.viewer.show_state(self._nodes.positions, self._nodes.F, age)
+
+    def _on_cut_surface(self, message: Any) -> None:
+        triangles = messages.decode_cut_surface(message)
+        self._cuts = {0: self._cuts[0], messages.cut_number(triangles): triangles}
+
+    def _on_rendered_pose(self, message: Any) -> None:
+        pose = messages.decode_pose(message, self._options.world_frame, messages.RENDERED_POSE.name)
+        self._rendered["pose"] = messages.stamp_to_ns(message.header.stamp), pose
+        self._show_endoscope()
+
+    def _on_rendered_image(self, message: Any) -> None:
+        self._rendered["image"] = messages.stamp_to_ns(message.header.stamp), message
+        self._show_endoscope()
+
+    def _show_endoscope(self) -> None:
+        """Show image and pose of one stamp, if anybody looks."""
+        info = self._infos.get(messages.RENDERED_INFO.name)
+        if info is None or len(self._rendered) < 2 or not self.viewer.wants_endoscope:
+            return
+        (stamp, pose), (image_stamp, message) = self._rendered["pose"], self._rendered["image"]
+        if stamp == image_stamp and (message.width, message.height) == (info.width, info.height):
+            image = messages.decode_image(message, messages.RENDERED_IMAGE.name)
+            self.viewer.show_endoscope(image, Camera(info.P[:, :3], info.width, info.height, pose))
+
+    def _on_tool_pose(self, name: str, message: Any) -> None:
+        frames = self._options.frame_poses
+        unnamed = frames.get(f"{name}_base", np.eye(4))
+        self._arms[name].pose = messages.decode_pose(message, frames | {"": unnamed}, messages.tool_pose(name).name)
+
+    def _on_reaction(self, name: str, message: Any) -> None:
+        self._arms[name].reaction, _ = messages.decode_wrench(message, messages.tool_reaction(name).name)
+        self._arms[name].heard = time.monotonic()
+
+    def _on_diagnostics(self, message: Any) -> None:
+        for name, _, text, values in messages.decode_diagnostics(message):
+            self._said[name] = time.monotonic(), text, values
+            if name == self._physics and time.monotonic() > self._paused_until:
+                self._paused = text == "paused"
+                self._lockstep = text.startswith("in lockstep")
+
+    def _value(self, key: str, default: str) -> str:
+        """What physics last said about itself."""
+        return self._said.get(self._physics, (0.0, "", {}))[2].get(key, default)
+
+    def _full_name(self, name: str) -> str:
+        """The name of a node on /diagnostics."""
+        return name[1:] if name.startswith("/") else f"{self.get_namespace()}/{name}".lstrip("/")
+
+    # -------------------------------------------------------------------- page
+
+    def _on_timer(self) -> None:
+        with self.guard("viewer"):
+            self._bind()
+            now = time.monotonic()
+            tools = {
+                name: Tool(arm.pose[:3, 3], -arm.pose[:3, :3] @ arm.reaction)
+                for name, arm in self._arms.items()
+                if arm.pose is not None and arm.reaction is not None and now - arm.heard < _GONE
+            }
+            mine = tools.get(self._hand)
+            self.viewer.show_tools(tools, 0.0 if mine is None else float(np.linalg.norm(mine.force)))
+            if now - self._asked > _ASK_EVERY:
+                self._asked = now
+                self._ask_parameters()
+            self.viewer.show_text(*self._text(now), paused=self._paused)
+        with self.guard("viewer"):
+            self.viewer.update()
+
+    def _bind(self) -> None:
+        """Bind the newest model to its nodes in the background, and show it when that is done."""
+        built = self._background.take()
+        if built is not None:
+            self._bound = built[1]
+            self.viewer.show_model(self._bound.renderer, self._bound.rest, self._camera())
+        if self._model is None:
+            return
+        model, stamp, config = self._model, self._model_stamp, self._rendering
+        matching = self._nodes is not None and self._nodes.model_stamp_ns == stamp
+        rest = self._nodes.rest if matching else None
+        key = (self._model_number, rest.tobytes() if matching else b"", config)
+        self._background.want(key, lambda: _Bound(DeformableRenderer(model, rest, config), stamp, rest))
+
+    def _camera(self) -> Camera:
+        """Where pages look from first: the endoscope, else a training view, else the world's origin."""
+        info = self._infos.get(messages.RENDERED_INFO.name) or self._infos.get(messages.TRAINING_CAMERA_INFO.name)
+        pose = self._rendered["pose"][1] if "pose" in self._rendered else np.eye(4)
+        if "pose" not in self._rendered and self._cameras is not None:
+            pose = self._cameras[len(self._cameras) // 2]
+        if info is None:
+            return plain_camera(pose)
+        return Camera(info.P[:, :3], info.width, info.height, pose)
+
+    def _text(self, now: float) -> list[str]:
+        lines = []
+        if self._bound is not None:
+            count = 0 if self._bound.rest is None else len(self._bound.rest)
+            lines.append(f"{len(self._bound.renderer.model)} Gaussians, {count} nodes")
+        lines.append(f"{self._value('simulated time', '0')} s, real time × {self._value('real-time factor', '0')}")
+        for name in dict.fromkeys((self._options.physics_node, *_SHOWN)):
+            heard, sentence, _ = self._said.get(self._full_name(name), (0.0, "not heard yet", {}))
+            silent = " (silent)" if heard and now - heard > _SILENT else ""
+            lines.append(f"{name.lstrip('/')}: {sentence}{silent}")
+        return lines
+
+    def _ask_parameters(self) -> None:
+        if not self._get.service_is_ready():
+            return
+
+        def answered(future: Any) -> None:
+            with self.guard("parameters"):
+                values = [parameter_value_to_python(value) for value in future.result().values]
+                if len(values) == len(PARAMETERS):  # else another node bears that name
+                    self.viewer.show_parameters(dict(zip(PARAMETERS, values)))
+
+        self._get.call_async(GetParameters.Request(names=list(PARAMETERS))).add_done_callback(answered)
+
+    # ----------------------------------------------------------------- actions
+
+    def hold(self, pose: np.ndarray, closed: bool) -> None:
+        if self._lockstep:
+            self.viewer.notify("in lockstep only the policy moves the arms")
+            self.viewer.release()
+            return
+        self._pose_pub.publish(messages.encode_pose(pose, self.now_ns(), self._options.world_frame))
+        if closed:
+            self._jaw_pub.publish(messages.encode_jaw(_JAW_CLOSED, self.now_ns()))
+            self._closed = True
+
+    def let_go(self) -> None:
+        if self._closed:  # else it may be somebody else's
+            self._jaw_pub.publish(messages.encode_jaw(_JAW_OPEN, self.now_ns()))
+            self._closed = False
+
+    def set_parameters(self, values: dict[str, float]) -> None:
+        parameters = [Parameter(name, value=float(value)).to_parameter_msg() for name, value in values.items()]
+        self._call(self._set, SetParameters.Request(parameters=parameters), "parameters")
+        self._asked = time.monotonic()  # the old values must not come back to the sliders before the answer
+
+    def reset(self) -> None:
+        self._call(self._calls["reset"], Trigger.Request(), "reset")
+
+    def pause(self, paused: bool) -> None:
+        self._call(self._calls["pause"], SetBool.Request(data=paused), "pause")
+
+    def step(self) -> None:
+        self._call(self._calls["step"], Trigger.Request(), "step")
+
+    def _call(self, client: Any, request: Any, what: str) -> None:
+        """Call a service of the physics; users are told when it refuses."""
+        if not client.service_is_ready():
+            self.viewer.notify(f"{what}: {self._options.physics_node} is not there")
+            return
+
+        def answered(future: Any) -> None:
+            with self.guard(what):
+                response = future.result()
+                for result in getattr(response, "results", [response]):
+                    if not getattr(result, "successful", getattr(result, "success", True)):
+                        self.viewer.notify(f"{what}: {getattr(result, 'reason', '') or getattr(result, 'message', '')}")
+                if what == "parameters":
+                    self._ask_parameters()
+                elif what == "pause" and response.success:
+                    self._paused, self._paused_until = request.data, time.monotonic() + _STALE
+
+        client.call_async(request).add_done_callback(answered)
+
+    # ------------------------------------------------------------- diagnostics
+
+    def status(self):
+        viewer = self.viewer
+        values = {
+            "browsers": len(viewer.browsers),
+            "pictures per second": f"{viewer.pictures_per_second:.1f}",
+            "milliseconds from mouse to picture": f"{1e3 * viewer.latency:.0f}",
+            "holding": viewer.holding,
+        }
+        if self._model is None:
+            return WARN, f"waiting for a model on gaussians; the page is at {viewer.url}", values
+        return OK, f"showing the tissue at {viewer.url}", values
+
+    def destroy_node(self) -> None:
+        self._background.stop()
+        self.viewer.stop()
+        super().destroy_node()
+
+
+def main() -> int:
+    return run(ViewerNode)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

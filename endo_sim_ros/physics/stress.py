@@ -1,0 +1,33 @@
+"""How hard the tissue is strained, from the deformation gradients of its nodes."""
+
+import numpy as np
+import torch
+
+from endo_sim_ros.physics.materials import energy_density, lame_parameters
+
+_LEAST_VOLUME = 0.05  # of that at rest; below it the laws have no value
+
+
+def von_mises(F: np.ndarray, young_modulus: float, poisson_ratio: float, material: str = "fixed_corotated") -> np.ndarray:
+    """Von Mises stress √(3/2 s:s), s the deviator of the Cauchy stress σ = P Fᵀ / J with P = ∂ψ/∂F.
+
+    Args:
+        F: Deformation gradients [M, 3, 3].
+        young_modulus: Pa.
+        poisson_ratio: Poisson's ratio.
+        material: Name of the law in `MATERIALS`.
+
+    Returns:
+        Stress [M], Pa, float32; zero where F is collapsed or inverted, as the laws have no value there.
+    """
+    mu, lam = lame_parameters(young_modulus, poisson_ratio)
+    gradients = torch.tensor(F, dtype=torch.float32)
+    J = torch.linalg.det(gradients)
+    sound = J > _LEAST_VOLUME
+    gradients = torch.where(sound[:, None, None], gradients, torch.eye(3)).requires_grad_()
+    (P,) = torch.autograd.grad(energy_density(material, gradients, mu, lam).sum(), gradients)
+    with torch.no_grad():
+        cauchy = P @ gradients.transpose(1, 2) / torch.where(sound, J, 1.0)[:, None, None]
+        mean = cauchy.diagonal(dim1=1, dim2=2).mean(1)
+        deviator = cauchy - mean[:, None, None] * torch.eye(3)
+        return (1.5 * (deviator**2).sum((1, 2))).sqrt().numpy()

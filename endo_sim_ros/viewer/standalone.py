@@ -1,0 +1,180 @@
+"""The viewer on a simulation in the same process: a model file and a browser are all it needs."""
+
+import dataclasses
+import logging
+import time
+from pathlib import Path
+
+import numpy as np
+
+from endo_sim_ros.cameras import Camera, load_cameras, look_at
+from endo_sim_ros.gaussians import GaussianModel, load_ply
+from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
+from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
+from endo_sim_ros.viewer.config import ViewerConfig
+from endo_sim_ros.viewer.viewer import PARAMETERS, Tool, Viewer, plain_camera
+
+_logger = logging.getLogger(__name__)
+_HAND = "mouse"  # name of the tool
+_WINDOW = 1.0  # s over which the real-time factor is measured
+
+
+class Standalone:
+    """Tissue that follows the clock, and the page on which it is seen and touched.
+
+    Args:
+        model: The Gaussians.
+        cameras: From where they were seen; the one in the middle is the endoscope of the page.
+        physics: Parameters of the tissue.
+        config: Parameters of the page.
+    """
+
+    def __init__(self, model: GaussianModel, cameras: list[Camera], physics: PhysicsConfig, config: ViewerConfig):
+        self._model, self._physics = model, physics
+        self._camera = cameras[len(cameras) // 2]
+        self._cameras = cameras
+        self.simulation = self._simulate(physics)
+        self._pose: np.ndarray | None = None
+        self._faults = self._slips = 0
+        self._real_time_factor = 1.0
+        self._endoscope_dirty = True
+        self.viewer = Viewer(config, self)
+        self._show_model()
+
+    def _simulate(self, physics: PhysicsConfig) -> TissueSimulation:
+        viewpoint = np.stack([camera.position for camera in self._cameras])
+        return TissueSimulation(self._model, viewpoint, physics, self._cameras)
+
+    def _show_model(self) -> None:
+        rest = self.simulation.nodes.rest
+        self._renderer = DeformableRenderer(self._model, rest, RenderingConfig(device=self._physics.device))
+        self.viewer.show_model(self._renderer, rest, self._camera)
+        self._show_parameters()
+        self._restart_clock()
+        self._show()
+
+    def _show_parameters(self) -> None:
+        self.viewer.show_parameters({name: getattr(self._physics, name) for name in PARAMETERS})
+
+    # ---------------------------------------------------------------- actions
+
+    def hold(self, pose: np.ndarray, closed: bool) -> None:
+        if not closed:
+            return
+        if self.simulation.set_grasp(_HAND, pose, True):
+            self._pose = pose
+        else:
+            self.viewer.notify("nothing here can be held: it is fixed, or further away than the hold radius")
+            self.viewer.release()
+
+    def let_go(self) -> None:
+        if self._pose is not None:
+            self.simulation.set_grasp(_HAND, self._pose, False)
+        self._pose = None
+
+    def set_parameters(self, values: dict[str, float]) -> None:
+        try:
+            physics = dataclasses.replace(self._physics, **values)
+            simulation = self._simulate(physics)
+        except ValueError as error:
+            self.viewer.notify(str(error))
+            self._show_parameters()
+            return
+        continued = simulation.continue_from(self.simulation)
+        if not continued:
+            self.viewer.release()
+        self.simulation, self._physics, self._faults, self._slips = simulation, physics, simulation.faults, simulation.slips
+        if not continued:
+            self._show_model()
+        self._show_parameters()
+        self._restart_clock()
+
+    def reset(self) -> None:
+        self.simulation.reset()
+        self._restart_clock()
+        self._show()
+
+    def pause(self, paused: bool) -> None:
+        self.viewer.show_text(*self._text(), paused=paused)
+        self._restart_clock()
+
+    def step(self) -> None:
+        if self.viewer.paused:
+            self._step()
+
+    # ------------------------------------------------------------------- time
+
+    def run(self) -> None:
+        """Until interrupted."""
+        try:
+            while True:
+                self.turn()
+        finally:
+            self.viewer.stop()
+
+    def turn(self) -> None:
+        """Take what users did and, when it is time for it, a step."""
+        try:
+            self.viewer.update()
+        except Exception as error:  # one user's mishap must not end the page for all
+            _logger.exception("the page failed")
+            self.viewer.notify(f"{type(error).__name__}: {error}")
+        now = time.monotonic()
+        if self.viewer.paused or now < self._due:
+            time.sleep(min(0.005, max(self._due - now, 0.001)))
+            return
+        duration = self.simulation.step_duration
+        self._due = max(self._due + duration, now - duration)  # what cannot be kept up with is left out
+        self._step()
+        self._measure(time.monotonic())
+
+    def _step(self) -> None:
+        begun, simulation = time.monotonic(), self.simulation
+        simulation.step()
+        if simulation.faults > self._faults:
+            self.viewer.notify(simulation.last_fault)
+        if simulation.slips > self._slips:
+            self.viewer.notify("the tissue slipped out of the jaw")
+        self._faults, self._slips = simulation.faults, simulation.slips
+        self._show(time.monotonic() - begun)
+
+    def _show(self, age: float = 0.0) -> None:
+        state = self.simulation.state()
+        force, _ = self.simulation.reaction(_HAND)
+        tools = {} if self._pose is None else {_HAND: Tool(self._pose[:3, 3], -force)}
+        viewer, moved = self.viewer, self.viewer.show_state(state.positions, state.F, age)
+        viewer.show_tools(tools, float(np.linalg.norm(force)))
+        viewer.show_text(*self._text())
+        self._endoscope_dirty |= moved
+        if viewer.wants_endoscope and self._endoscope_dirty:
+            self._endoscope_dirty = False
+            viewer.show_endoscope(self._renderer.render(self._camera, state.positions, state.F)[0], self._camera)
+
+    def _restart_clock(self) -> None:
+        self._due = time.monotonic()
+        self._window = self._due, self.simulation.time
+
+    def _measure(self, now: float) -> None:
+        if now - self._window[0] > _WINDOW:
+            self._real_time_factor = (self.simulation.time - self._window[1]) / (now - self._window[0])
+            self._window = now, self.simulation.time
+
+    def _text(self) -> list[str]:
+        pace = "paused" if self.viewer.paused else f"real time × {self._real_time_factor:.2f}"
+        return [f"{len(self._model)} Gaussians, {len(self.simulation.nodes.rest)} nodes", f"{self.simulation.time:.1f} s, {pace}"]
+
+
+def view(path: Path, physics: PhysicsConfig, config: ViewerConfig) -> None:
+    """Serve the page on a PLY model, seen by the cameras in the cameras.json beside it, else from the world's origin."""
+    model = load_ply(path)
+    beside = path.parent / "cameras.json"
+    page = Standalone(model, load_cameras(beside) if beside.is_file() else [_camera_at_origin(model)], physics, config)
+    print(f"open {page.viewer.url} in a browser; Ctrl-C ends", flush=True)
+    page.run()
+
+
+def _camera_at_origin(model: GaussianModel) -> Camera:
+    """A camera at the world's origin that looks at the model."""
+    target = model.means.median(0).values.double().numpy()
+    ahead = np.linalg.norm(target[::2]) > 0.1 * abs(target[1])
+    return plain_camera(look_at(np.zeros(3), target, np.array([0.0, -1, 0] if ahead else [0.0, 0, 1])))

@@ -1,0 +1,445 @@
+"""The page: what browsers show, and what users do there. It knows no ROS; what drives it is behind `Actions`."""
+
+import queue
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import cv2
+import numpy as np
+import torch
+
+from endo_sim_ros.cameras import Camera
+from endo_sim_ros.config import ConfigError
+from endo_sim_ros.evaluation.figures import draw_force
+from endo_sim_ros.physics import PhysicsConfig
+from endo_sim_ros.physics.stress import von_mises
+from endo_sim_ros.rendering import DeformableRenderer
+from endo_sim_ros.viewer.browser import CENTIMETRES, ENDOSCOPE, Browser, Pointer
+from endo_sim_ros.viewer.config import ViewerConfig
+from endo_sim_ros.viewer.grasp import Grasp
+
+_QUIET = 0.4  # s without a change after which the sliders act; each change builds new tissue
+_TEXT_EVERY = 0.5  # s
+_SLIDER_HINT = "Acts a moment after the slider stands still; a new thickness brings the tissue back to rest."
+_NOTICE_FOR = 8.0  # s that a notice stays
+_ARROW = 1.0  # cm of arrow per newton, as in tool_markers
+_TRAVEL = 0.8  # share of the physics' travel that the mouse may pull; tissue slips out of a jaw at 0.9
+_FOCAL = 0.85  # focal length of a camera that nothing is known of, in image widths
+_RED = 99.7  # percentile of the stress that is shown red: single nodes at the edge of a jaw are torn at
+_LEAST_SCALE = 0.05  # of Young's modulus: the smallest stress that is shown red
+
+
+class Slider(NamedTuple):
+    """One of the physics' parameters on the page."""
+
+    parameter: str
+    label: str
+    unit: float  # SI units in one of the label
+    low: float
+    high: float
+    step: float
+
+
+SLIDERS = (
+    Slider("young_modulus", "stiffness, kPa", 1e3, 0.5, 100, 0.5),
+    Slider("damping", "damping, 1/s", 1, 0, 300, 5),
+    Slider("thickness", "thickness, mm", 1e-3, 2, 80, 1),
+    Slider("force_radius", "hold radius, mm", 1e-3, 2, 40, 1),
+)
+PARAMETERS = (*(slider.parameter for slider in SLIDERS), "poisson_ratio", "material", "travel")  # that the page needs to know
+
+
+class Actions(Protocol):
+    """What a user can do to the tissue."""
+
+    def hold(self, pose: np.ndarray, closed: bool) -> None:
+        """A jaw is at this pose [4, 4], m, world; again and again until `let_go`."""
+
+    def let_go(self) -> None:
+        """The jaw opens."""
+
+    def set_parameters(self, values: dict[str, float]) -> None:
+        """Parameters of the physics have new values, SI units."""
+
+    def reset(self) -> None:
+        """Tissue back to rest."""
+
+    def pause(self, paused: bool) -> None:
+        """Time stands still, or goes on."""
+
+    def step(self) -> None:
+        """One step while time stands still."""
+
+
+@dataclass(frozen=True)
+class Tool:
+    """A tool, and what it does to the tissue."""
+
+    position: np.ndarray  # [3] m, world
+    force: np.ndarray  # [3] N on the tissue, world
+
+
+class Viewer:
+    """Serves the page to any number of browsers.
+
+    Everything happens in the thread that calls :meth:`update`, several times per picture: what users do waits in a queue
+    until then. Of several users, one at a time holds tissue.
+
+    Args:
+        config: Parameters.
+        actions: Takes what users do.
+
+    Raises:
+        ConfigError: If viser is not installed or the page cannot be served at that address.
+    """
+
+    def __init__(self, config: ViewerConfig, actions: Actions):
+        self.config = config
+        self._actions = actions
+        self._events: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self.browsers: dict[int, Browser] = {}
+        self.renderer: DeformableRenderer | None = None
+        self.camera: Camera | None = None  # of the endoscope
+        self.endoscope: tuple[np.ndarray, Camera] | None = None  # its newest picture
+        self.state: tuple[np.ndarray, np.ndarray] | None = None  # positions [M, 3] and F [M, 3, 3] of the nodes, None at rest
+        self.tools: dict[str, Tool] = {}
+        self._node_size = 0.0  # cm
+        self._stress_scale = 0.0  # Pa
+        self._begun = 0.0  # when the step to that state began
+        self._dirty, self._drawn = False, 0.0
+        self._grasp: Grasp | None = None
+        self._holder, self._resistance = 0, 0.0  # who holds, and the force in N
+        self._plane: tuple[np.ndarray, np.ndarray, float] = np.zeros(3), np.zeros(3), 0.0
+        self._asked: float | None = None  # when the mouse moved; its pull has not been seen yet
+        self.latency, self.pictures_per_second = 0.0, 0.0  # s; Hz
+        self._pictures, self._texted, self._updated = 0, 0.0, time.monotonic()
+        self._parameters: dict[str, Any] = {name: getattr(PhysicsConfig(), name) for name in PARAMETERS}
+        self._wanted: dict[str, float] = {}
+        self._wanted_at = 0.0
+        self.paused = False
+        self._lines: tuple[str, ...] = ()
+        self._notice, self._notice_until = "", 0.0
+        self._server = _serve(config)
+        self._build_page()
+
+    @property
+    def url(self) -> str:
+        host = "localhost" if self.config.host in ("0.0.0.0", "::") else self.config.host
+        return f"http://{host}:{self._server.get_port()}"
+
+    @property
+    def holding(self) -> bool:
+        """Whether somebody holds tissue."""
+        return self._grasp is not None
+
+    # ----------------------------------------------------------- what is shown
+
+    def show_model(self, renderer: DeformableRenderer, node_rest: np.ndarray | None, camera: Camera) -> None:
+        """A new model, at rest, and the camera from which pages look at it first; or the same one with other nodes."""
+        old = self.renderer
+        same = old is not None and torch.equal(old.model.means, renderer.model.means)
+        self.renderer, self.state, self.camera = renderer, None, camera
+        self.release()
+        means = renderer.model.means.cpu().numpy()
+        if node_rest is not None and len(node_rest) > 1:
+            extent = np.percentile(node_rest, 95, 0) - np.percentile(node_rest, 5, 0)
+            self._node_size = 0.4 * CENTIMETRES * float(np.sort(extent)[1:].prod() / len(node_rest)) ** 0.5
+        pose, target = camera.pose, camera.position + camera.pose[:3, 2] * np.median((means - camera.position) @ camera.pose[:3, 2])
+        self._server.scene.set_up_direction(-pose[:3, 1])
+        start = self._server.initial_camera
+        start.position, start.look_at, start.up = CENTIMETRES * camera.position, CENTIMETRES * target, -pose[:3, 1]
+        start.fov = 2 * np.arctan(camera.height / 2 / camera.K[1, 1])
+        for browser in self.browsers.values():
+            if not same:
+                browser.show_model(self)
+        self._dirty = True
+
+    def show_state(self, positions: np.ndarray, F: np.ndarray, age: float = 0.0) -> bool:
+        """Where the nodes are [M, 3], m, with F [M, 3, 3]; the step to there began ``age`` seconds ago. Whether they moved."""
+        old = self.state
+        moved = old is None or not (np.array_equal(positions, old[0]) and np.array_equal(F, old[1]))
+        self.state, self._begun = (positions, F), time.monotonic() - age
+        self._dirty |= moved
+        return moved
+
+    def show_endoscope(self, image: np.ndarray, camera: Camera) -> None:
+        """The endoscope's picture [H, W, 3] uint8 and its camera."""
+        self.endoscope = image, camera
+        self._dirty |= self.wants_endoscope
+
+    @property
+    def wants_endoscope(self) -> bool:
+        """Whether anybody looks through the endoscope."""
+        return any(browser.view == ENDOSCOPE for browser in self.browsers.values())
+
+    def show_tools(self, tools: dict[str, Tool], resistance: float) -> None:
+        """All tools by name, and the force in N with which the tissue resists the mouse."""
+        self.tools, self._resistance = tools, resistance
+
+    def show_parameters(self, values: dict[str, Any]) -> None:
+        """The physics' parameters as they are."""
+        self._parameters |= values
+        for slider in SLIDERS:
+            if slider.parameter in values and slider.parameter not in self._wanted:
+                self._sliders[slider.parameter].value = _on_slider(slider, values[slider.parameter])
+
+    def show_text(self, *lines: str, paused: bool | None = None) -> None:
+        """What there is to say about the simulation."""
+        self._lines = lines
+        if paused is not None and paused != self.paused:
+            self.paused = paused
+            self._play.label = "play" if paused else "pause"
+
+    def notify(self, text: str) -> None:
+        """Tell all users something for a while."""
+        self._notice, self._notice_until = text, time.monotonic() + _NOTICE_FOR
+
+    # -------------------------------------------------------- what users do
+
+    def post(self, event: Callable[[], None]) -> None:
+        """Have something done by the next `update`, from any thread."""
+        self._events.put(event)
+
+    def point(self, pointer: Pointer) -> None:
+        """The mouse takes hold of tissue, moves or lets go."""
+        browser = self.browsers.get(pointer.client)
+        if pointer.phase == "end" or browser is None:
+            if self._grasp is not None and pointer.client == self._holder:
+                self.release()
+            return
+        if pointer.phase == "start" and self._grasp is None:
+            self._take_hold(browser, pointer)
+        if self._grasp is None or pointer.client != self._holder:
+            return
+        origin, ray, _ = browser.ray(*pointer.at)
+        point, normal, height = self._plane
+        if pointer.lifts:  # up on the screen is towards the user
+            self._grasp.aim(point - normal * height * (pointer.began_at[1] - pointer.at[1]))
+        elif ray @ normal > 1e-6:
+            self._grasp.aim(origin + ray * ((point - origin) @ normal / (ray @ normal)))
+        if self._asked is None:
+            self._asked = time.monotonic()
+
+    def _take_hold(self, browser: Browser, pointer: Pointer) -> None:
+        point = self.pick(browser, *pointer.began_at)
+        if point is None:
+            return
+        origin, _, camera = browser.ray(*pointer.began_at)
+        pose = camera.pose.copy()
+        pose[:3, 3] = point
+        reach = _TRAVEL * self._parameters["travel"]
+        self._grasp = Grasp(pose, self.config.max_force, self.config.max_speed, reach)
+        self._holder, self._resistance = pointer.client, 0.0
+        depth = (point - origin) @ camera.pose[:3, 2]
+        self._plane = point, camera.pose[:3, 2], depth * camera.height / camera.K[1, 1]  # the last: height of the view there
+
+    def pick(self, browser: Browser, x: float, y: float) -> np.ndarray | None:
+        """Point of the tissue [3], m, world, seen at a place in a browser's picture (0 to 1); None where there is none."""
+        if self.renderer is None:
+            return None
+        _, _, camera = browser.ray(x, y)
+        K, half = camera.K.copy(), 8  # a picture of a few pixels around that place
+        K[:2, 2] += half - np.array([x * camera.width, y * camera.height])
+        window = Camera(K, 2 * half, 2 * half, camera.pose)
+        depth = self.renderer.render(window, *(self.state or ()))[1]
+        points = window.backproject(depth)[half - 1 : half + 1, half - 1 : half + 1].reshape(-1, 3)
+        seen = depth[half - 1 : half + 1, half - 1 : half + 1].reshape(-1) > 0
+        return points[seen].mean(0) if seen.any() else None
+
+    def release(self) -> None:
+        """Let go of the tissue."""
+        if self._grasp is not None:
+            self._grasp, self._asked = None, None
+            self._actions.let_go()
+
+    def _reset(self) -> None:
+        self.release()
+        self._actions.reset()
+
+    def _slide(self, slider: Slider, value: float) -> None:
+        self._wanted[slider.parameter] = value * slider.unit
+        self._wanted_at = time.monotonic()
+
+    # ----------------------------------------------------------------- drawing
+
+    def update(self) -> None:
+        """Act on what users did, and send pictures that are due."""
+        while not self._events.empty():
+            self._events.get()()
+        now = time.monotonic()
+        if self._grasp is not None:
+            pose = self._grasp.advance(now - self._updated, self._resistance)
+            self._actions.hold(pose, self._grasp.closed)
+        self._updated = now
+        if self._wanted and now - self._wanted_at > _QUIET:
+            wanted, self._wanted = self._wanted, {}
+            self._actions.set_parameters(wanted)
+        if now - self._drawn >= 1 / self.config.rate and self.renderer is not None:
+            self._draw(now)
+        if now - self._texted >= _TEXT_EVERY:
+            self._write_text(now)
+
+    def _draw(self, now: float) -> None:
+        self._drawn, dirty, self._dirty = now, self._dirty, False
+        self._draw_tools()
+        splats = colors = None
+        for browser in self.browsers.values():
+            if dirty and browser.wants_splats:
+                splats = splats or self.splats()
+                browser.show_splats(*splats)
+            if dirty and browser.wants_nodes and self.state is not None:
+                if browser.wants_stress and colors is None:
+                    colors = self.stress_colors()
+                browser.show_nodes(self.state[0], colors, self._node_size)
+            browser.show_picture(self, dirty)
+        self._pictures += dirty
+        if self._asked is not None and self._begun >= self._asked:
+            if dirty:  # else the tissue cannot follow
+                self.latency += (0.2 if self.latency else 1.0) * (time.monotonic() - self._asked - self.latency)
+            self._asked = None
+
+    def splats(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Centres, covariances, colours and opacities of the Gaussians now, centimetres."""
+        model = self.renderer.model
+        if self.state is None:
+            means, covars = model.means, model.covariances
+        else:
+            means, covars = self.renderer.deform(*self.state)
+        rgb, opacity = ((values * 255).byte().cpu().numpy() for values in (model.base_colors, model.opacities[:, None]))
+        return (CENTIMETRES * means).cpu().numpy(), (CENTIMETRES**2 * covars).cpu().numpy(), rgb, opacity
+
+    def stress_colors(self) -> np.ndarray:
+        """Colours [M, 3] uint8 of the nodes: blue without stress, red at almost the largest von Mises stress of late."""
+        known = self._parameters
+        stress = von_mises(self.state[1], known["young_modulus"], known["poisson_ratio"], known["material"])
+        largest = max(float(np.percentile(stress, _RED)), _LEAST_SCALE * known["young_modulus"])
+        self._stress_scale = max(largest, 0.98 * self._stress_scale)
+        levels = (255 * np.minimum(stress / self._stress_scale, 1)).astype(np.uint8)
+        return cv2.applyColorMap(levels[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1]
+
+    def draw_tools_on(self, image: np.ndarray, camera: Camera) -> np.ndarray:
+        """A picture with the tools' forces."""
+        for tool in self.tools.values():
+            image = draw_force(image, camera, tool.position, tool.force, _ARROW / CENTIMETRES)
+        return image
+
+    def _draw_tools(self) -> None:
+        tips = np.array([tool.position for tool in self.tools.values()]).reshape(-1, 3) * CENTIMETRES
+        ends = tips + _ARROW * np.array([tool.force for tool in self.tools.values()]).reshape(-1, 3)
+        pulling = np.linalg.norm(ends - tips, axis=1) > 0.02
+        self._tips.visible, self._arrows.visible = bool(len(tips)), bool(pulling.any())
+        if len(tips):
+            self._tips.points = tips.astype(np.float32)
+        if pulling.any():
+            self._arrows.points = np.stack([tips, ends], 1)[pulling].astype(np.float32)
+        for name in self._labels.keys() - self.tools.keys():
+            self._labels.pop(name).remove()
+        for name, tip in zip(self.tools, tips):
+            if name not in self._labels:
+                self._labels[name] = self._server.scene.add_label(f"/force_of/{name}", "", font_screen_scale=1.2, anchor="bottom-left")
+            self._labels[name].position = tip
+            self._labels[name].text = f"{np.linalg.norm(self.tools[name].force):.1f} N"
+
+    def _write_text(self, now: float) -> None:
+        elapsed, self._texted = now - self._texted, now
+        self.pictures_per_second = self._pictures / elapsed if elapsed < 10 else 0.0
+        self._pictures = 0
+        lines = list(self._lines)
+        numbers = f"{self.pictures_per_second:.0f} pictures/s"
+        if self.latency:
+            numbers += f", mouse to picture {1e3 * self.latency:.0f} ms"
+        lines.append(f"{numbers}, {len(self.browsers)} browser{'s' * (len(self.browsers) != 1)}")
+        lines += [f"{name}: {np.linalg.norm(tool.force):.2f} N" for name, tool in self.tools.items()]
+        if any(browser.wants_stress for browser in self.browsers.values()):
+            lines.append(f"red: von Mises stress of {self._stress_scale / 1e3:.2g} kPa")
+        if now < self._notice_until:
+            lines.append(f"**{self._notice}**")
+        self._text.content = "  \n".join(lines)
+
+    # ---------------------------------------------------------------- the page
+
+    def _build_page(self) -> None:
+        scene, gui = self._server.scene, self._server.gui
+        gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+        gui.set_panel_label("endo-sim")
+        scene.configure_environment_map(None)  # only arrows are lit; surroundings and shadows cost seconds where a GPU is missing
+        scene.configure_default_lights(cast_shadow=False)
+        scene.add_light_ambient("/light", intensity=1.0)
+        self._text = gui.add_markdown("waiting for a model")
+        gui.add_markdown("*Shift* + drag pulls tissue, *Ctrl* + drag up lifts it.")
+
+        def button(label: str, act: Callable[[], None], hint: str) -> Any:
+            made = gui.add_button(label, hint=hint)
+            made.on_click(lambda _: self.post(act))
+            return made
+
+        self._play = button("pause", lambda: self._actions.pause(not self.paused), "Let time stand still, or go on.")
+        button("step", self._actions.step, "One step while time stands still.")
+        button("reset", self._reset, "Tissue back to rest.")
+        self._sliders = {}
+        with gui.add_folder("tissue"):
+            for slider in SLIDERS:
+                made = gui.add_slider(slider.label, slider.low, slider.high, slider.step, slider.low, hint=_SLIDER_HINT)
+                self._sliders[slider.parameter] = made
+
+                def slide(event: Any, slider: Slider = slider) -> None:
+                    if event.client is not None:  # not set by this program
+                        value = event.target.value
+                        self.post(lambda: self._slide(slider, value))
+
+                made.on_update(slide)
+        nowhere = np.zeros((1, 3), np.float32)
+        self._tips = scene.add_point_cloud(
+            "/tips", nowhere, (235, 235, 235), point_size=0.25, point_shape="circle", precision="float32", visible=False
+        )
+        self._arrows = scene.add_arrows(
+            "/forces", np.eye(3)[None, :2], (255, 140, 25), shaft_radius=0.06, head_radius=0.15, head_length=0.3, visible=False
+        )
+        self._labels: dict[str, Any] = {}
+        self._server.on_client_connect(lambda client: self.post(lambda: self._join(client)))
+        self._server.on_client_disconnect(lambda client: self.post(lambda: self._leave(client.client_id)))
+
+    def _join(self, client: Any) -> None:
+        browser = self.browsers[client.client_id] = Browser(client, self.post, self.point)
+        browser.on_record(lambda: browser.record(Path(self.config.videos).expanduser(), self.config.rate))
+        browser.on_changed(lambda: setattr(self, "_dirty", True))
+        if self.renderer is not None:
+            browser.show_model(self)
+        self._dirty = True
+
+    def _leave(self, client: int) -> None:
+        browser = self.browsers.pop(client, None)
+        if browser is not None:
+            browser.close()
+        if client == self._holder:
+            self.release()
+
+    def stop(self) -> None:
+        """End the page."""
+        for browser in self.browsers.values():
+            browser.close()
+        self._server.stop()
+
+
+def _serve(config: ViewerConfig) -> Any:
+    try:
+        import viser
+    except ImportError:
+        raise ConfigError("the viewer needs viser, which is not installed: pip install 'endo_sim_ros[viewer]'") from None
+    try:
+        return viser.ViserServer(host=config.host, port=config.port, verbose=False)
+    except (OSError, RuntimeError) as error:
+        raise ConfigError(f"the page cannot be served at {config.host}:{config.port}: {error}") from error
+
+
+def _on_slider(slider: Slider, value: float) -> float:
+    return float(np.clip(round(value / slider.unit / slider.step) * slider.step, slider.low, slider.high))
+
+
+def plain_camera(pose: np.ndarray) -> Camera:
+    """A camera at a pose [4, 4] for scenes that come without one."""
+    width, height = 640, 512
+    return Camera(np.array([[_FOCAL * width, 0, width / 2], [0, _FOCAL * width, height / 2], [0, 0, 1]]), width, height, pose)

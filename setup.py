@@ -38,8 +38,10 @@ setup(
         "warp-lang>=1.19",
     ],
     extras_require={
+        "learning": ["gymnasium>=1.1"],  # endo_sim_ros.learning.environments
         "lerobot": ["pyarrow"],  # `endo-sim export`
-        "test": ["hypothesis", "mcap", "mcap-ros2-support", "plyfile", "pyarrow", "pytest", "ruff", "torchmetrics"],
+        "viewer": ["viser>=1.1"],  # `endo-sim view`, viewer_node
+        "test": "gymnasium hypothesis mcap mcap-ros2-support plyfile pyarrow pytest ruff torchmetrics viser>=1.1".split(),
     },
     entry_points={"console_scripts": ["endo-sim = endo_sim_ros.cli:main"]},
     data_files=[

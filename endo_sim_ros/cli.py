@@ -14,11 +14,13 @@ from rich.progress import track
 
 from endo_sim_ros.config import ConfigError
 from endo_sim_ros.gaussians import ModelError
+from endo_sim_ros.learning.config import Randomisation, TrainingConfig
 from endo_sim_ros.messages import MessageError
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.sequences.frames import Frame, SequenceError
 from endo_sim_ros.sequences.phantom import PhantomConfig
+from endo_sim_ros.viewer.config import ViewerConfig
 
 Positional = tyro.conf.Positional
 
@@ -166,6 +168,25 @@ class Demo:
 
 
 @dataclass(frozen=True)
+class View:
+    """Show a model in the browser and pull it with the mouse; needs no ROS."""
+
+    model: Positional[Path]
+    """PLY model, in metres; seen by the cameras in the cameras.json beside it, else from the world's origin."""
+    config: Annotated[ViewerConfig, tyro.conf.arg(name="")] = field(default_factory=ViewerConfig)
+    node_count: int | None = None
+    """Number of control nodes; default: that of the physics."""
+    device: str = "auto"
+    """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""
+
+    def run(self) -> None:
+        from endo_sim_ros.viewer.standalone import view
+
+        count = {} if self.node_count is None else {"node_count": self.node_count}
+        view(self.model, PhysicsConfig(device=self.device, **count), self.config)
+
+
+@dataclass(frozen=True)
 class Record:
     """Record a running graph into a rosbag2, for replay or `export`, until interrupted."""
 
@@ -221,6 +242,51 @@ class Export:
 
 
 @dataclass(frozen=True)
+class SaveScene:
+    """Write what starts the graph on a task to learn: model.ply, cameras.json and parameters.yaml for its nodes."""
+
+    out: Positional[Path]
+    """Folder to write; it may exist."""
+    task: str = "retraction"
+    """retraction or palpation."""
+    model: Path | None = None
+    """PLY model with its cameras.json; default: a piece of the synthetic patient."""
+    seed: int = 0
+    """Of the first episode."""
+
+    def run(self) -> None:
+        from endo_sim_ros.learning.scenes import load_scene, save_scene
+
+        save_scene(load_scene(self.model), self.out, self.task, self.seed)
+        print(f"{self.out}: model.ply, cameras.json, parameters.yaml")
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train a small policy on a task, and draw its learning curve."""
+
+    out: Positional[Path]
+    """Folder for policy.npz, curve.json and curve.png."""
+    task: str = "retraction"
+    """retraction or palpation."""
+    model: Path | None = None
+    """PLY model with its cameras.json; default: a piece of the synthetic patient."""
+    device: str = "auto"
+    """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""
+    config: Annotated[TrainingConfig, tyro.conf.arg(name="")] = field(default_factory=TrainingConfig)
+    vary: Randomisation = field(default_factory=Randomisation)
+
+    def run(self) -> None:
+        from endo_sim_ros.learning.scenes import load_scene
+        from endo_sim_ros.learning.train import save_training, train
+
+        policy, curve = train(self.task, load_scene(self.model), self.config, self.vary, self.device)
+        save_training(self.out, policy, curve, self.config)
+        last = curve[-1]
+        print(f"{self.out}: {last['test_success']:.0%} of test episodes solved after {last['episodes']} episodes")
+
+
+@dataclass(frozen=True)
 class Up:
     """Start the graph, each node its own process, and show what each says, until Ctrl-C; `ros2 launch` without ROS installed."""
 
@@ -238,11 +304,13 @@ class Up:
     """Folder for what each node prints."""
     respawn: bool = True
     """Start a node that crashes again, once."""
+    view: bool = False
+    """Serve the page as well, on which tissue is seen and pulled with the mouse: http://localhost:8080."""
 
     def run(self) -> None:
         from endo_sim_ros.nodes.up import run_up
 
-        run_up(self.bag, self.params_file, self.namespace, self.arms, self.model, self.logs, self.respawn)
+        run_up(self.bag, self.params_file, self.namespace, self.arms, self.model, self.logs, self.respawn, self.view)
 
 
 @dataclass(frozen=True)
@@ -327,6 +395,25 @@ class BenchGraph:
 
 
 @dataclass(frozen=True)
+class BenchEnvironments:
+    """The environments to learn in: steps per second, with states and with images."""
+
+    json: Path | None = None
+    """File for the results as a list of rows."""
+    task: str = "retraction"
+    """retraction or palpation."""
+    environments: tuple[int, ...] = (1, 64)
+    """Numbers of environments stepped together."""
+    device: str = "auto"
+    """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""
+
+    def run(self) -> None:
+        from endo_sim_ros.learning.bench import bench_environments
+
+        bench_environments(self.json, self.task, self.environments, self.device)
+
+
+@dataclass(frozen=True)
 class BenchSoak:
     """The node graph under random traffic, half of it spoilt: who dies, whose memory grows, does it still work."""
 
@@ -353,6 +440,7 @@ class Bench:
         Annotated[BenchRaster, tyro.conf.subcommand("raster", prefix_name=False)]
         | Annotated[BenchPhysics, tyro.conf.subcommand("physics", prefix_name=False)]
         | Annotated[BenchGraph, tyro.conf.subcommand("graph", prefix_name=False)]
+        | Annotated[BenchEnvironments, tyro.conf.subcommand("environments", prefix_name=False)]
         | Annotated[BenchSoak, tyro.conf.subcommand("soak", prefix_name=False)]
     ]
 
@@ -367,8 +455,11 @@ COMMANDS = {
     "convert": Convert,
     "phantom": Phantom,
     "reconstruct": Reconstruct,
+    "view": View,
     "record": Record,
     "export": Export,
+    "scene": SaveScene,
+    "train": Train,
     "config": Config,
     "bench": Bench,
 }

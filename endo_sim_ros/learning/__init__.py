@@ -1,1 +1,1 @@
-"""Learning from what was recorded: episodes of observations and actions, and datasets of them."""
+"""Learning: from what was recorded, as datasets of episodes; and by doing, in tasks as Gymnasium environments or over topics."""

@@ -5,13 +5,16 @@ import textwrap
 from endo_sim_ros.config import StageConfig, options
 from endo_sim_ros.nodes.bag_player_node import BagPlayerConfig
 from endo_sim_ros.nodes.physics_node import PhysicsNodeConfig
+from endo_sim_ros.nodes.policy_node import PolicyConfig
 from endo_sim_ros.nodes.reconstruction_node import ReconstructionNodeConfig
 from endo_sim_ros.nodes.recorder_node import RecorderConfig
 from endo_sim_ros.nodes.rendering_node import RenderingNodeConfig
 from endo_sim_ros.nodes.scripted_tool_node import ScriptedToolConfig
+from endo_sim_ros.nodes.viewer_node import ViewerNodeConfig
 from endo_sim_ros.physics import PhysicsConfig
 from endo_sim_ros.reconstruction import ReconstructionConfig
 from endo_sim_ros.rendering import RenderingConfig
+from endo_sim_ros.viewer import ViewerConfig
 
 NODE_CONFIGS: dict[str, tuple[type[StageConfig], ...]] = {
     "reconstruction_node": (ReconstructionNodeConfig, ReconstructionConfig),
@@ -20,6 +23,8 @@ NODE_CONFIGS: dict[str, tuple[type[StageConfig], ...]] = {
     "bag_player": (BagPlayerConfig,),
     "recorder": (RecorderConfig,),
     "scripted_tool": (ScriptedToolConfig,),
+    "policy": (PolicyConfig,),
+    "viewer_node": (ViewerNodeConfig, ViewerConfig, RenderingConfig),
 }
 
 

@@ -135,7 +135,7 @@ class _Supervisor:
         rows = []
         for name, node in self._graph.nodes.items():
             heard, level, text, values = statuses.get(self.full_name(name), (0.0, OK, "", {}))
-            shown = ", ".join(f"{key} {values[key]}" for key in _VALUES[name] if values.get(key, "0") != "0")
+            shown = ", ".join(f"{key} {values[key]}" for key in _VALUES.get(name, ()) if values.get(key, "0") != "0")
             if node.exit_status is not None:  # what it said last is history unless it finished
                 done = node.exit_status == 0
                 rows.append(_Row(name, "ended" if done else "down", "dim" if done else "red", text if done else "", shown))
@@ -168,8 +168,9 @@ def run_up(
     model: str,
     logs: Path,
     respawn: bool,
+    view: bool = False,
 ) -> None:
-    """Run reconstruction, physics and rendering, and a bag player if there is a bag, until interrupted.
+    """Run reconstruction, physics and rendering, a bag player if there is a bag and the page if it is wanted, until interrupted.
 
     Raises:
         UpError, SequenceError: If something given cannot be used, or all nodes are down; one sentence.
@@ -190,6 +191,8 @@ def run_up(
         supervisor.start("reconstruction_node", *common, **({"model_file": model} if model else {}))
         supervisor.start("physics_node", *common, **({"arms": list(arms)} if arms else {}))
         supervisor.start("rendering_node", *common)
+        if view:
+            supervisor.start("viewer_node", *common, **({"arm": arms[0], "arms": list(arms)} if arms else {}))
         if bag is not None:
             supervisor.start("bag_player_node", *common, bag=bag.expanduser())
         _introduce(console, logs)

@@ -1,0 +1,44 @@
+"""Parameters of environments and of training."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from endo_sim_ros.config import Range, StageConfig
+
+
+@dataclass(frozen=True)
+class Randomisation(StageConfig):
+    """How much each episode differs from the scene; all zero: not at all."""
+
+    stiffness: Annotated[float, Range(0, 2)] = 0.0
+    """Moduli are multiplied by a factor between exp(-x) and exp(x)."""
+    light: Annotated[float, Range(0, 0.9)] = 0.0
+    """Brightness is multiplied by a factor between 1 - x and 1 + x, and falls off to as much as 1 - x towards the corners."""
+    texture: Annotated[float, Range(0, 0.9)] = 0.0
+    """Contrast of the tissue's colours is multiplied by a factor between 1 - x and 1 + x."""
+    camera_position: Annotated[float, Range(0, 0.05, "m")] = 0.0
+    """The endoscope is moved by up to this along each axis."""
+    camera_angle: Annotated[float, Range(0, 45, "deg")] = 0.0
+    """The endoscope is turned by up to this about each axis."""
+
+
+@dataclass(frozen=True)
+class TrainingConfig(StageConfig):
+    """The cross-entropy method: policies are drawn from a Gaussian, which moves to the best of them, again and again."""
+
+    generations: Annotated[int, Range(0, 100_000)] = 30
+    """How often the Gaussian moves."""
+    population: Annotated[int, Range(4, 100_000)] = 128
+    """Policies drawn each time; all run at once."""
+    episodes: Annotated[int, Range(1, 1000)] = 1
+    """Episodes by which each is judged, the same for all of a generation."""
+    elite: Annotated[float, Range(0.01, 0.9)] = 0.08
+    """Part of the population that the Gaussian moves to."""
+    hidden: Annotated[int, Range(0, 1000)] = 0
+    """Size of the network's hidden layer; 0 = a linear policy."""
+    spread: Annotated[float, Range(1e-3, 100)] = 3.0
+    """Standard deviation of the weights at the beginning."""
+    test_episodes: Annotated[int, Range(1, 100_000)] = 64
+    """Other episodes on which the mean of the Gaussian is tested after each generation."""
+    seed: Annotated[int, Range(0, 2**31 - 1)] = 0
+    """Another seed draws other policies and episodes."""

@@ -1,0 +1,169 @@
+"""The tasks as Gymnasium environments: importing this module registers ``endo_sim_ros/Retraction-v0`` and ``endo_sim_ros/Palpation-v0``.
+
+``gymnasium.make`` gives one environment, ``gymnasium.make_vec(id, num_envs, vectorization_mode="vector_entry_point")`` many in
+one batched simulation. Environment i of those, with seed s + i, is the single one with that seed. Both take the arguments of
+:class:`TaskEnvironment`.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from endo_sim_ros.learning.config import Randomisation
+from endo_sim_ros.learning.scenes import Scene, load_scene
+from endo_sim_ros.learning.task_batch import Observations, TaskBatch
+from endo_sim_ros.learning.tasks import BOUND, TASKS, Outcome
+
+try:
+    import gymnasium
+    from gymnasium.vector.utils import batch_space
+except ImportError as error:
+    raise ImportError("the environments need gymnasium, which is not installed; pip install 'endo_sim_ros[learning]'") from error
+
+FPS = 25
+
+
+def _make(
+    task: str,
+    scene: Scene | Path | str | None,
+    count: int,
+    observations: Observations,
+    randomisation: Randomisation | dict[str, float] | None,
+    image_width: int,
+    device: str,
+    render_mode: str | None,
+) -> tuple[TaskBatch, gymnasium.Space]:
+    """The simulation, and the space of the observations of one environment."""
+    if observations not in ("state", "image", "both"):
+        raise ValueError(f"observations must be state, image or both, got {observations!r}")
+    if render_mode not in (None, "rgb_array"):
+        raise ValueError(f"render_mode must be rgb_array or None, got {render_mode!r}")
+    randomisation = Randomisation(**randomisation) if isinstance(randomisation, dict) else randomisation or Randomisation()
+    scene = scene if isinstance(scene, Scene) else load_scene(scene)
+    images = render_mode is not None or observations != "state"
+    batch = TaskBatch(task, scene, count, observations, randomisation, image_width, device, images=images)
+    state = gymnasium.spaces.Box(-BOUND, BOUND, (len(batch.task.observation_names),), np.float32)
+    image = gymnasium.spaces.Box(0, 255, (batch.camera.height, batch.camera.width, 3), np.uint8)
+    spaces = {"state": state, "image": image, "both": gymnasium.spaces.Dict({"state": state, "image": image})}
+    return batch, spaces[observations]
+
+
+_ACTIONS = gymnasium.spaces.Box(-1.0, 1.0, (4,), np.float32)
+
+
+def _info(batch: TaskBatch, outcome: Outcome | None = None) -> dict[str, np.ndarray]:
+    success = np.zeros(batch.count, bool) if outcome is None else outcome.success
+    return {"success": success, "force": np.sqrt((batch.task.force**2).sum(1)), "faults": batch.tissue.tools.faults.cpu().numpy().copy()}
+
+
+class TaskEnvironment(gymnasium.Env):
+    """One episode at a time.
+
+    Args:
+        task: retraction or palpation, see :mod:`endo_sim_ros.learning.tasks`.
+        scene: A PLY model with its cameras.json, or the folder of a model.ply, or a :class:`Scene`; default: a piece of the
+            synthetic patient.
+        observations: ``state``, ``image`` (the endoscope's, without the tool), or ``both`` in a dict.
+        randomisation: How episodes differ from the scene, as :class:`Randomisation` or its values in a dict.
+        image_width: Pixels; the height follows from the scene's camera.
+        device: Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N.
+        render_mode: ``rgb_array`` for images by :meth:`render`.
+
+    Raises:
+        ValueError: If an argument cannot be used, or the model is too small.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012
+
+    def __init__(
+        self,
+        task: str,
+        scene: Scene | Path | str | None = None,
+        observations: Observations = "state",
+        randomisation: Randomisation | dict[str, float] | None = None,
+        image_width: int = 64,
+        device: str = "auto",
+        render_mode: str | None = None,
+    ):
+        self.batch, self.observation_space = _make(task, scene, 1, observations, randomisation, image_width, device, render_mode)
+        self.action_space, self.render_mode = _ACTIONS, render_mode
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+        super().reset(seed=seed)
+        self.batch.reset([0], [self.np_random])
+        return _first(self.batch.observe()), _first(_info(self.batch))
+
+    def step(self, action: np.ndarray):
+        observations, outcome = self.batch.step(np.asarray(action)[None])
+        ended = bool(outcome.terminated[0]), bool(outcome.truncated[0])
+        return _first(observations), float(outcome.reward[0]), *ended, _first(_info(self.batch, outcome))
+
+    def render(self) -> np.ndarray | None:
+        return self.batch.image(0) if self.render_mode else None
+
+
+class VectorTaskEnvironment(gymnasium.vector.VectorEnv):
+    """Many episodes at once in one batched simulation, on one device; an ended one begins anew at the next step.
+
+    Args:
+        task: As for :class:`TaskEnvironment`, like all others.
+        num_envs: How many.
+    """
+
+    metadata = {  # noqa: RUF012
+        "render_modes": ["rgb_array"], "render_fps": FPS, "autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP,
+    }  # fmt: skip
+
+    def __init__(
+        self,
+        task: str,
+        num_envs: int = 1,
+        scene: Scene | Path | str | None = None,
+        observations: Observations = "state",
+        randomisation: Randomisation | dict[str, float] | None = None,
+        image_width: int = 64,
+        device: str = "auto",
+        render_mode: str | None = None,
+    ):
+        made = _make(task, scene, num_envs, observations, randomisation, image_width, device, render_mode)
+        self.batch, self.single_observation_space = made
+        self.num_envs, self.single_action_space, self.render_mode = num_envs, _ACTIONS, render_mode
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(_ACTIONS, num_envs)
+        self._generators = [np.random.default_rng() for _ in range(num_envs)]
+        self._ended = np.zeros(num_envs, bool)
+
+    def reset(self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None):
+        seeds = [None if seed is None else seed + i for i in range(self.num_envs)] if not isinstance(seed, list) else seed
+        for i, each in enumerate(seeds):
+            if each is not None:
+                self._generators[i] = np.random.default_rng(each)
+        self.batch.reset(range(self.num_envs), self._generators)
+        self._ended[:] = False
+        return self.batch.observe(), _info(self.batch)
+
+    def step(self, actions: np.ndarray):
+        renew = np.flatnonzero(self._ended)
+        observations, outcome = self.batch.step(actions, renew.tolist(), [self._generators[i] for i in renew])
+        self._ended = outcome.terminated | outcome.truncated
+        return observations, outcome.reward, outcome.terminated, outcome.truncated, _info(self.batch, outcome)
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        return tuple(self.batch.image(b) for b in range(self.num_envs)) if self.render_mode else None
+
+
+def _first(values: Any) -> Any:
+    """Of the first environment, out of batched arrays."""
+    if isinstance(values, dict):
+        return {name: _first(value) for name, value in values.items()}
+    return values[0].item() if values.ndim == 1 else values[0]
+
+
+for _name in TASKS:
+    gymnasium.register(
+        f"endo_sim_ros/{_name.capitalize()}-v0",
+        entry_point=f"{__name__}:TaskEnvironment",
+        vector_entry_point=f"{__name__}:VectorTaskEnvironment",
+        kwargs={"task": _name},
+    )

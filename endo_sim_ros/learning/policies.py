@@ -1,0 +1,194 @@
+"""Policies: scripted ones that solve the tasks, and a small network with its weights in a .npz file."""
+
+from collections.abc import Callable, Generator, Sequence
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from endo_sim_ros.learning.tasks import LENGTH, Palpation, Retraction, Task, find_task
+
+_MOST_WEIGHTS = 10_000_000
+
+
+class Policy(Protocol):
+    """Acts in B episodes."""
+
+    def reset(self, episodes: Sequence[int]) -> None:
+        """These episodes begin anew."""
+
+    def act(self, observations: np.ndarray) -> np.ndarray:
+        """Actions [B, 4] for state observations [B, n]."""
+
+
+class RetractionScript:
+    """Goes to the spot, grasps, lifts a little farther than needed and holds."""
+
+    grasp, beyond = 0.002, 1.15  # m from the spot at which the jaw closes; how far to lift, in parts of the goal
+
+    def reset(self, episodes: Sequence[int]) -> None:
+        pass
+
+    def act(self, observations: np.ndarray) -> np.ndarray:
+        names = Retraction.observation_names
+        o = {name: observations[:, i].astype(np.float64) for i, name in enumerate(names)}
+        holding = (o["jaw"] > 0) & (o["distance"] < 4 * self.grasp / LENGTH)
+        close = holding | (o["distance"] < self.grasp / LENGTH)
+        towards = np.stack([o[f"spot_from_tip_{axis}"] for axis in "xyz"], 1) * LENGTH / Retraction.step_length
+        up = (self.beyond - o["spot_moved_z"]) * Retraction.lift / Retraction.step_length
+        lift = np.stack([np.zeros_like(up), np.zeros_like(up), 0.5 * up], 1)
+        moves = np.where(close[:, None], lift, towards)
+        return np.concatenate([np.clip(moves, -1, 1), np.where(close, 1.0, -1.0)[:, None]], 1)
+
+
+class PalpationScript:
+    """Presses equally deep at points of a grid, feels the stiffness at each, and reports where it is greatest."""
+
+    spacing, above = 0.01, 0.012  # m: of the grid; of the tip over the skin between presses
+    deep, further = 0.003, 0.002  # m: of the tip over the skin at last; by how much that is deeper than before
+
+    def __init__(self, count: int = 1):
+        self._runs: list[Generator[np.ndarray, dict[str, float], None]] = [iter(()) for _ in range(count)]
+        self.reset(range(count))
+
+    def reset(self, episodes: Sequence[int]) -> None:
+        for b in episodes:
+            self._runs[b] = self._search()
+            next(self._runs[b])
+
+    def act(self, observations: np.ndarray) -> np.ndarray:
+        names = Palpation.observation_names
+        rows = [dict(zip(names, row)) for row in observations.astype(np.float64)]
+        return np.stack([run.send(row) for run, row in zip(self._runs, rows)])
+
+    def _search(self) -> Generator[np.ndarray, dict[str, float], None]:
+        step, felt = Palpation.step_length, {}
+        o = yield np.zeros(4)
+
+        def to(goal: Callable[[dict[str, float]], np.ndarray], near: float = 5e-4):
+            """Move until the remaining way [3], m, is short."""
+            nonlocal o
+            for _ in range(40):
+                way = goal(o)
+                if np.abs(way).max() < near:
+                    return
+                o = yield np.array([*np.clip(way / step, -1, 1), -1.0])
+
+        def over(x: float, y: float, height: float):
+            return lambda o: np.array([x - LENGTH * o["tip_x"], y - LENGTH * o["tip_y"], height - LENGTH * o["height"]])
+
+        def press(x: float, y: float):
+            yield from to(over(x, y, self.above), 1.5e-3)
+            yield from to(over(x, y, self.deep + self.further))
+            shallow = o["force"]
+            yield from to(over(x, y, self.deep))
+            felt[x, y] = o["force"] - shallow
+            yield from to(lambda o: np.array([0, 0, self.above - LENGTH * o["height"]]), 1.5e-3)
+
+        def best() -> np.ndarray:
+            """Middle of the stiffest places [2], m."""
+            places, forces = np.array(list(felt)), np.array(list(felt.values()))
+            near = ((places - places[forces.argmax()]) ** 2).sum(1) < (1.1 * self.spacing) ** 2
+            weights = near * np.maximum(forces - np.median(forces), 0) ** 2
+            return (weights[:, None] * places).sum(0) / max(weights.sum(), 1e-12)
+
+        for j in (-1, 0, 1):
+            for i in (-j or -1, 0, j or 1):  # to and fro
+                yield from press(i * self.spacing, j * self.spacing)
+        x, y = best()
+        for i, j in ((1, 0), (0, 1), (-1, 0), (0, -1)):
+            yield from press(x + i * self.spacing / 2, y + j * self.spacing / 2)
+        x, y = best()
+        yield from to(lambda o: np.array([x - LENGTH * o["tip_x"], y - LENGTH * o["tip_y"], 0]))
+        while True:
+            o = yield np.array([0, 0, 0, 1.0])
+
+
+class NetworkPolicy:
+    """A network with tanh between its layers; without hidden ones it is linear. Actions are clipped to ±1 by the task.
+
+    Args:
+        task: Name of the task that it was made for.
+        layers: Weights [n_in + 1, n_out] of each layer, the last row being the bias; or [B, n_in + 1, n_out], one for each episode.
+
+    Raises:
+        ValueError: If the layers do not fit together or do not fit the task.
+    """
+
+    def __init__(self, task: str, layers: Sequence[np.ndarray]):
+        self.task, self.layers = task, [np.asarray(layer, np.float64) for layer in layers]
+        sizes = self.sizes(task, [layer.shape[-1] for layer in self.layers[:-1]])
+        shapes = [layer.shape[-2:] for layer in self.layers]
+        if shapes != sizes or not all(np.isfinite(layer).all() for layer in self.layers):
+            raise ValueError(f"policy for {task}: layers of {shapes} do not fit, expected {sizes} of finite numbers")
+
+    @staticmethod
+    def sizes(task: str, hidden: Sequence[int]) -> list[tuple[int, int]]:
+        """Shapes of the layers for a task, with hidden layers of these sizes."""
+        widths = [len(find_task(task).observation_names), *hidden, 4]
+        return [(before + 1, after) for before, after in zip(widths, widths[1:])]
+
+    @classmethod
+    def from_vectors(cls, task: str, hidden: Sequence[int], vectors: np.ndarray) -> "NetworkPolicy":
+        """From all weights in a row [P], or one row for each episode [B, P]."""
+        sizes = cls.sizes(task, hidden)
+        ends = np.cumsum([rows * columns for rows, columns in sizes])
+        parts = np.split(vectors, ends[:-1], axis=-1)
+        return cls(task, [part.reshape(*vectors.shape[:-1], *size) for part, size in zip(parts, sizes)])
+
+    def reset(self, episodes: Sequence[int]) -> None:
+        pass
+
+    def act(self, observations: np.ndarray) -> np.ndarray:
+        values = observations.astype(np.float64)
+        for number, layer in enumerate(self.layers):
+            values = np.tanh(values) if number else values
+            # One input after the other: the same bits for any number of episodes.
+            total = layer[..., -1, :] + np.zeros((len(values), 1))
+            for i in range(values.shape[1]):
+                total = total + values[:, i : i + 1] * layer[..., i, :]
+            values = total
+        return values
+
+    def save(self, path: str | Path) -> None:
+        """Write a .npz file of plain arrays."""
+        with Path(path).open("wb") as file:
+            np.savez(file, task=np.array(self.task), **{f"layer{i}": layer for i, layer in enumerate(self.layers)})
+
+    @classmethod
+    def load(cls, path: str | Path) -> "NetworkPolicy":
+        """Read what `save` wrote; nothing in the file is executed.
+
+        Raises:
+            ValueError: If it is something else; the message names the file.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                layers = [file[f"layer{i}"] for i in range(len(file.files) - 1)]
+                if sum(layer.size for layer in layers) > _MOST_WEIGHTS or not layers or any(layer.ndim != 2 for layer in layers):
+                    raise ValueError("it has no layers, or too large ones")
+                return cls(str(file["task"]), layers)
+        except Exception as error:  # zipfile, numpy and the file system have a type each
+            raise ValueError(f"{path}: not a readable policy ({error})") from error
+
+
+def scripted_policy(task: str, count: int = 1) -> Policy:
+    """The scripted policy that solves a task."""
+    return PalpationScript(count) if find_task(task) is Palpation else RetractionScript()
+
+
+def make_policy(policy: str, task: str, count: int = 1) -> Policy:
+    """``scripted``, or the policy in a .npz file.
+
+    Raises:
+        ValueError: If the file cannot be read or is for another task.
+    """
+    if policy == "scripted":
+        return scripted_policy(task, count)
+    loaded = NetworkPolicy.load(policy)
+    if loaded.task != task:
+        raise ValueError(f"{policy} was trained for {loaded.task}, not for {task}")
+    return loaded
+
+
+__all__ = ["NetworkPolicy", "PalpationScript", "Policy", "RetractionScript", "Task", "make_policy", "scripted_policy"]

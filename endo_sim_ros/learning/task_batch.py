@@ -1,0 +1,178 @@
+"""B episodes of a task in the simulation: one batched solver, one renderer, no framework; what environments and training share."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from endo_sim_ros.cameras import Camera
+from endo_sim_ros.gaussians import GaussianModel
+from endo_sim_ros.learning.config import Randomisation
+from endo_sim_ros.learning.scenes import Scene
+from endo_sim_ros.learning.tasks import Outcome, find_task
+from endo_sim_ros.physics import Skinning, TissueBatch
+from endo_sim_ros.splatting import render
+
+RESTING_SPEED = 1e-5  # m/s; as in TissueSimulation: one tissue slower than this, that no tool moves, is left as it is
+_BELOW = 1e-9  # keeps factors of the stiffness, rounded, within the largest that was planned for
+
+Observations = Literal["state", "image", "both"]
+
+
+@dataclass
+class _View:
+    """How one episode is seen."""
+
+    camera: Camera
+    sh: torch.Tensor  # [N, K, 3]
+    light: np.ndarray | None  # [H, W, 1] factor, None = 1
+
+
+class TaskBatch:
+    """B episodes of one task.
+
+    On a CPU the same seeds and actions give the same observations, images too, bit by bit, whatever the number of threads and B.
+
+    Args:
+        task: Its name.
+        scene: What is touched.
+        count: B.
+        observations: ``state``: float32 [B, n]; ``image``: uint8 [B, H, W, 3]; ``both``: a dict of the two by these names.
+        randomisation: How episodes differ.
+        image_width: Pixels; the height follows from the scene's camera.
+        device: Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N.
+        images: Make `image` possible also where images are not observed.
+
+    Raises:
+        ValueError: If there is no such task, or the scene is too small for it.
+    """
+
+    def __init__(
+        self,
+        task: str,
+        scene: Scene,
+        count: int = 1,
+        observations: Observations = "state",
+        randomisation: Randomisation = Randomisation(),
+        image_width: int = 64,
+        device: str = "auto",
+        images: bool = False,
+    ):
+        kind = find_task(task)
+        config = kind.physics(device)
+        nodes = scene.nodes(config)
+        self.task, self.count = kind(nodes, scene.camera.position, count), count
+        self.observations, self.randomisation = observations, randomisation
+        largest = kind.largest_stiffness * float(np.exp(randomisation.stiffness))
+        self.tissue = TissueBatch(nodes, config, count, 1, stiffness=np.full(count, largest) if largest != 1 else None)
+        self._varies = largest != 1
+        self._sites = torch.zeros((count, kind.site_count), dtype=torch.long)
+        self._rest = torch.from_numpy(nodes.rest)
+        self._resting, self._placed = True, False  # of a single tissue
+        camera = scene.camera
+        self.camera = camera.resized(image_width, max(round(camera.height * image_width / camera.width), 1))
+        self.views: list[_View] = []
+        if images or observations != "state":
+            device = self.tissue.solver.device
+            model = scene.model.detach().to(device)
+            self._skinning = Skinning(model, nodes.rest, device=device)
+            self._means, self._covars = self.tissue.carry(self._skinning)
+            self._model = model
+            self.views = [_View(self.camera, model.sh, None) for _ in range(count)]
+
+    def reset(self, episodes: Sequence[int], generators: Sequence[np.random.Generator]) -> None:
+        """Begin these episodes anew, each by the chance of its generator."""
+        for b, rng in zip(episodes, generators):
+            self.task.reset(b, rng)
+            chance = rng.uniform(-1, 1, 10)  # always as many, so that what is randomised does not change the task
+            if self._varies:
+                factor = np.exp(self.randomisation.stiffness * chance[0]) * (1 - _BELOW * (self.randomisation.stiffness > 0))
+                self.tissue.solver.set_stiffness(slice(b, b + 1), factor * self.task.stiffness(b)[None])
+            if self.views:
+                self.views[b] = self._view(chance)
+        chosen = torch.as_tensor(list(episodes), dtype=torch.long, device=self.tissue.solver.device)
+        self.tissue.reset(chosen)
+        self._resting, self._placed = True, False
+        if self.views:
+            self._means[chosen], self._covars[chosen] = self._skinning.means, self._skinning.covars
+
+    def step(
+        self, actions: np.ndarray, renew: Sequence[int] = (), generators: Sequence[np.random.Generator] = ()
+    ) -> tuple[np.ndarray | dict[str, np.ndarray], Outcome]:
+        """Take one step with actions [B, 4]; episodes to be renewed, each by its generator, are at their beginning afterwards instead.
+
+        Returns:
+            What `observe` gives at the end of the step, and its outcome.
+        """
+        self._advance(actions, renew, generators)
+        observations = self.observe()
+        return observations, self.task.judge()
+
+    def _advance(self, actions: np.ndarray, renew: Sequence[int], generators: Sequence[np.random.Generator]) -> None:
+        tips, closed = self.task.act(actions)
+        if len(renew):
+            self.reset(renew, generators)
+        tools = self.tissue.tools
+        tips = torch.from_numpy(tips)[:, None].to(tools.tips.device)
+        moved = not self._placed or not torch.equal(tips, tools.tips)
+        present = torch.ones((self.count, 1), dtype=torch.int32)
+        present[list(renew)] = 0
+        tools.tips.copy_(tips)
+        tools.rotations.copy_(torch.eye(3, dtype=torch.float64).expand_as(tools.rotations))
+        tools.present.copy_(present)
+        tools.closed.copy_(torch.from_numpy(closed.astype(np.int32))[:, None] * present)
+        self._placed = True
+        if self.count == 1 and self._rests(moved):
+            return
+        self.tissue.step()
+        self._resting = self.count == 1 and self.tissue.solver.speed < RESTING_SPEED
+
+    def _rests(self, moved: bool) -> bool:
+        """Whether a single tissue is left as it is, as TissueSimulation does, so that the graph gives the same bits."""
+        tools = self.tissue.tools
+        before = bool(tools.gripping[0, 0])
+        tools.take_hold()
+        holding = bool(tools.gripping[0, 0])
+        return self._resting and holding == before and not (moved and (holding or tools.contact_radius > 0))
+
+    def observe(self) -> np.ndarray | dict[str, np.ndarray]:
+        """Observations of all episodes now."""
+        state = self._state()
+        if self.observations == "state":
+            return state
+        images = np.stack([self.image(b) for b in range(self.count)])
+        return images if self.observations == "image" else {"state": state, "image": images}
+
+    def _state(self) -> np.ndarray:
+        sites, device = torch.from_numpy(self.task.sites), self.tissue.solver.device
+        rows = torch.arange(self.count)[:, None]
+        moved = self.tissue.displacements[rows.to(device), sites.to(device)].cpu()
+        positions = (self._rest[sites] + moved).numpy()
+        return self.task.observe(positions, self.tissue.tools.reaction_forces[:, 0].cpu().numpy())
+
+    @torch.no_grad()
+    def image(self, b: int) -> np.ndarray:
+        """What the endoscope sees of episode b [H, W, 3], uint8."""
+        view, at_rest = self.views[b], self._model
+        model = GaussianModel(self._means[b], at_rest.quats, at_rest.log_scales, at_rest.logit_opacities, view.sh)
+        colors = render(model, view.camera, covars=self._covars[b]).colors[0]
+        if view.light is not None:
+            colors = colors * torch.from_numpy(view.light).to(colors.device)
+        return (colors.clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
+
+    def _view(self, chance: np.ndarray) -> _View:
+        """How an episode is seen, by numbers [10] in -1 … 1."""
+        by, camera = self.randomisation, self.camera
+        pose = camera.pose.copy()
+        pose[:3, 3] += by.camera_position * chance[1:4]
+        pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(np.radians(by.camera_angle) * chance[4:7]).as_matrix()
+        light = None
+        if by.light:
+            centred = (camera.rays()[..., :2] / np.abs(camera.rays()[..., :2]).max((0, 1))) ** 2
+            falloff = by.light * 0.5 * (1 + chance[8])
+            light = ((1 + by.light * chance[7]) * (1 - falloff * centred.sum(-1, keepdims=True) / 2)).astype(np.float32)
+        sh = self._model.sh * (1 + by.texture * float(chance[9])) if by.texture else self._model.sh
+        return _View(replace(camera, pose=pose) if by.camera_position or by.camera_angle else camera, sh, light)

@@ -1,0 +1,322 @@
+"""Tasks to learn, free of any framework: B episodes at once, as arrays [B, …]; B = 1 is the same code and the same bits.
+
+A task knows the nodes of the tissue at rest and where it is seen from. It turns actions into commands of a tool, and what can be
+measured (where some nodes of the skin are, what the tool feels) into observations, rewards and an end. It never looks into the
+simulation, so that the same task runs over topics.
+
+All lengths of a task are in its own frame: the origin on the skin, z towards the endoscope, x and y across. An action
+[4] in -1 … 1 is how far the tip moves in this step along x, y and z, in parts of `step_length`, and a fourth number that each
+task explains.
+Sums are written out, term by term, so that their bits do not depend on B.
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+
+from endo_sim_ros.physics import ControlNodes, PhysicsConfig
+from endo_sim_ros.physics.regions import inside_sphere
+
+LENGTH, FORCE = 0.02, 1.0  # m and N; observations are in these units
+BOUND = 10.0  # observations are clipped to ± this
+
+
+@dataclass
+class Outcome:
+    """Of one step of B episodes."""
+
+    reward: np.ndarray  # [B]
+    success: np.ndarray  # [B] bool
+    terminated: np.ndarray  # [B] bool: success, or too much force
+    truncated: np.ndarray  # [B] bool: out of time
+
+
+class Task(ABC):
+    """B episodes of one task.
+
+    Args:
+        nodes: The tissue at rest.
+        viewpoint: Where the endoscope is [3], m, world.
+        count: B.
+    """
+
+    name: str
+    observation_names: tuple[str, ...]
+    horizon: int  # steps of an episode
+    step_length = 0.002  # m in one step, per axis
+    force_limit: float  # N; above it tissue is hurt, and the episode lost
+    low: tuple[float, float, float]  # where the tip may be, m, task frame
+    high: tuple[float, float, float]
+    site_count = 1  # nodes per episode whose positions are observed
+    largest_stiffness = 1.0  # factor on the moduli that an episode may have
+    same_tissue = True  # in all episodes, but for randomisation
+    margin = 0.012  # m from tissue that is held in place to a place that is worked on
+    around, smooth = 0.012, 0.6  # that part of the places is used where the skin within a distance, m, is nearest to a plane
+
+    @staticmethod
+    @abstractmethod
+    def physics(device: str = "auto") -> PhysicsConfig:
+        """The tissue and the tools of the task."""
+
+    def __init__(self, nodes: ControlNodes, viewpoint: np.ndarray, count: int):
+        self.nodes, self.viewpoint, self.count = nodes, np.asarray(viewpoint, np.float64), count
+        self.rest = nodes.rest.astype(np.float64)  # [M, 3] m, world
+        self.skin = np.flatnonzero(nodes.is_skin & ~nodes.pinned)
+        self.places = self.skin[self._clearances() >= self.margin]  # nodes that an episode may be about
+        if not len(self.places):
+            raise ValueError(f"{self.name}: no skin node is {self.margin:g} m from where tissue is held; the model is too small")
+        relief = np.array([self._relief(place) for place in self.places])
+        self.places = self.places[relief <= np.quantile(relief, self.smooth)]
+        self.origin, self.axes = np.zeros((count, 3)), np.tile(np.eye(3), (count, 1, 1))  # rows: x, y, z in the world
+        self.sites = np.zeros((count, self.site_count), int)
+        self.tip = np.zeros((count, 3))  # m, task frame
+        self.fourth = np.zeros(count)  # of the last action
+        self.steps = np.zeros(count, int)
+        self.force = np.zeros((count, 3))  # what the tissue exerts on the tool, N, task frame
+        self._potential = np.zeros(count)
+
+    def _clearances(self) -> np.ndarray:
+        held = self.rest[self.nodes.is_skin & self.nodes.pinned]
+        if not len(held):
+            return np.full(len(self.skin), np.inf)
+        return np.sqrt(((self.rest[self.skin, None] - held) ** 2).sum(2).min(1))
+
+    def _relief(self, place: int) -> float:
+        """How far the skin around a node departs from a plane (root mean square), m."""
+        near = self.rest[self.skin] - self.rest[place]
+        near = near[(near**2).sum(1) <= self.around**2]
+        return float(np.linalg.svd(near - near.mean(0), compute_uv=False)[-1] / np.sqrt(len(near)))
+
+    def reset(self, b: int, rng: np.random.Generator) -> None:
+        """Begin episode b anew; all chance comes from the generator."""
+        place = int(rng.choice(self.places))
+        z = self.viewpoint - self.rest[place]
+        z /= np.sqrt(_dot(z, z))
+        x = np.cross(np.eye(3)[np.abs(z).argmin()], z)
+        x /= np.sqrt(_dot(x, x))
+        self.origin[b], self.axes[b] = self.rest[place], np.stack([x, np.cross(z, x), z])
+        self.sites[b] = place
+        self.tip[b] = rng.uniform(self.low, self.high)
+        self.fourth[b], self.steps[b], self.force[b] = -1.0, 0, 0.0
+        self._reset(b, rng)
+
+    def _reset(self, b: int, rng: np.random.Generator) -> None:
+        """What else begins anew."""
+
+    def act(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where the tips shall be at the end of the step [B, 3], m, world, and whether jaws are closed [B], for actions [B, 4]."""
+        actions = np.clip(np.asarray(actions, np.float64), -1.0, 1.0)
+        self.tip = np.clip(self.tip + self.step_length * actions[:, :3], self.low, self.high)
+        self.fourth = actions[:, 3]
+        self.steps = self.steps + 1
+        return self.origin + self._to_world(self.tip), self._closed()
+
+    def _closed(self) -> np.ndarray:
+        return np.zeros(self.count, bool)
+
+    def observe(self, positions: np.ndarray, forces: np.ndarray) -> np.ndarray:
+        """Observations [B, n], float32.
+
+        Args:
+            positions: Of the nodes `sites` [B, K, 3], m, world, float32.
+            forces: What the tissue exerts on the tools [B, 3], N, world.
+        """
+        self.force = self._to_task(np.asarray(forces, np.float64))
+        here = np.stack([self._to_task(positions[:, k].astype(np.float64) - self.origin) for k in range(self.site_count)], 1)
+        columns = self._columns(here)
+        columns += [*(self.force / FORCE).T, _norm(self.force) / FORCE, 1 - self.steps / self.horizon]
+        observation = np.clip(np.stack(columns, 1), -BOUND, BOUND).astype(np.float32) + np.float32(0)  # no negative zeros
+        fresh = self.steps == 0
+        self._potential[fresh] = self._value()[fresh]
+        return observation
+
+    @abstractmethod
+    def _columns(self, here: np.ndarray) -> list[np.ndarray]:
+        """The task's own observations, [B] each; here [B, K, 3] m, task frame: where the sites are now."""
+
+    @abstractmethod
+    def _value(self) -> np.ndarray:
+        """How near to the goal each episode is [B]; the reward of a step is how much it grows."""
+
+    @abstractmethod
+    def _solved(self) -> np.ndarray:
+        """Whether each episode has reached its goal [B]."""
+
+    def _ended(self) -> np.ndarray:
+        """Whether an episode has ended by its own action [B]."""
+        return np.zeros(self.count, bool)
+
+    def judge(self) -> Outcome:
+        """The outcome of the step whose end was just observed. Reward: progress, 1 for success, -1 for too much force."""
+        hurt = _norm(self.force) > self.force_limit
+        truncated = self.steps >= self.horizon
+        success = self._solved() & ~hurt
+        value = self._value()
+        reward = value - self._potential + success - hurt
+        self._potential = value
+        terminated = hurt | success | self._ended()
+        return Outcome(reward, success, terminated, truncated & ~terminated)
+
+    def stiffness(self, b: int) -> np.ndarray:
+        """Factor on the moduli of each node [M] in episode b."""
+        return np.ones(len(self.nodes))
+
+    def regions(self) -> tuple[str, ...]:
+        """The same for the first episode, as physics_node's parameter of that name."""
+        return ()
+
+    def _to_world(self, v: np.ndarray) -> np.ndarray:
+        return _dot(self.axes.transpose(0, 2, 1), v[:, None])
+
+    def _to_task(self, v: np.ndarray) -> np.ndarray:
+        return _dot(self.axes, v[:, None])
+
+
+class Retraction(Task):
+    """Grasp tissue and lift it off what it covers.
+
+    A spot of the skin hides what the surgeon wants to see. It is uncovered when it has been raised by `lift` towards the endoscope and
+    stayed there for `hold` steps, without ever pulling harder than `force_limit`. The fourth action closes the jaw where above zero.
+    """
+
+    name = "retraction"
+    observation_names = (
+        *(f"tip_{axis}" for axis in "xyz"), *(f"spot_from_tip_{axis}" for axis in "xyz"), "distance",
+        *(f"spot_moved_{axis}" for axis in "xyz"), "jaw",
+        *(f"force_{axis}" for axis in "xyz"), "force", "time_left",
+    )  # fmt: skip
+    horizon, force_limit = 60, 3.0
+    low, high = (-0.02, -0.02, -0.004), (0.02, 0.02, 0.025)
+    lift, hold = 0.006, 3  # m, steps
+    reach = 0.008  # m, of the jaw
+
+    @staticmethod
+    def physics(device: str = "auto") -> PhysicsConfig:
+        return PhysicsConfig(node_count=800, layers=2, thickness=0.015, young_modulus=4e3, force_radius=Retraction.reach, device=device)
+
+    def __init__(self, nodes: ControlNodes, viewpoint: np.ndarray, count: int):
+        super().__init__(nodes, viewpoint, count)
+        self._spot, self._moved = np.zeros((count, 3)), np.zeros((count, 3))  # from the tip, and from rest, m, task frame
+        self._held = np.zeros(count, int)  # steps that the spot has been raised
+
+    def _reset(self, b: int, rng: np.random.Generator) -> None:
+        self.tip[b, 2] = self.high[2]
+        self._held[b] = 0
+
+    def _closed(self) -> np.ndarray:
+        return self.fourth > 0
+
+    def _columns(self, here: np.ndarray) -> list[np.ndarray]:
+        self._moved = here[:, 0]
+        self._spot = here[:, 0] - self.tip
+        jaw = np.where(self.fourth > 0, 1.0, -1.0)
+        distance = _norm(self._spot) / LENGTH
+        return [*(self.tip / LENGTH).T, *(self._spot / LENGTH).T, distance, *(self._moved / self.lift).T, jaw]
+
+    def _value(self) -> np.ndarray:
+        distance = _norm(self._spot)
+        grasped = (self.fourth > 0) & (distance <= self.reach)
+        return np.minimum(self._moved[:, 2] / self.lift, 1.0) * 2 - distance / LENGTH + 0.5 * grasped
+
+    def _solved(self) -> np.ndarray:
+        self._held = np.where(self._moved[:, 2] >= self.lift, self._held + 1, 0)
+        return self._held >= self.hold
+
+
+class Palpation(Task):
+    """Find a stiff inclusion by pressing.
+
+    Somewhere below a patch of skin, within `patch` of its centre, lies a ball of tissue `ratio` times as stiff. The tool is a
+    ball that pushes and feels. With the fourth action above zero, or when time is out, the episode ends and the place under the tip is the
+    report; it is right within `tolerance` across the line of sight. The reward of the end is 1 - distance / patch, and 1 if right.
+    """
+
+    name = "palpation"
+    observation_names = (
+        *(f"tip_{axis}" for axis in "xyz"), "height",
+        *(f"force_{axis}" for axis in "xyz"), "force", "time_left",
+    )  # fmt: skip
+    horizon, force_limit = 200, 4.0
+    step_length = 0.003
+    low, high = (-0.025, -0.025, -0.02), (0.025, 0.025, 0.03)
+    same_tissue = False
+    largest_stiffness = ratio = 8.0  # a power of two: as a factor or as a modulus, it gives the same bits
+    patch, radius, depth, tolerance = 0.016, 0.008, 0.005, 0.007  # m
+    margin, around, smooth = 0.02, 0.024, 0.5
+
+    @staticmethod
+    def physics(device: str = "auto") -> PhysicsConfig:
+        tool = {"contact_radius": 0.008, "friction": 0.1}
+        return PhysicsConfig(node_count=1000, layers=3, thickness=0.02, young_modulus=4e3, **tool, device=device)
+
+    def __init__(self, nodes: ControlNodes, viewpoint: np.ndarray, count: int):
+        super().__init__(nodes, viewpoint, count)
+        self.centre = np.zeros((count, 3))  # of the inclusion, m, task frame
+        self.place = np.zeros((count, 3))  # the same in the world
+        self._over = np.zeros((count, len(self.skin), 3))  # the skin at rest, m, task frame
+
+    def _reset(self, b: int, rng: np.random.Generator) -> None:
+        over = _dot(self.axes[b], (self.rest[self.skin] - self.origin[b])[:, None])  # [S, 3]
+        self._over[b] = over
+        near = over[(over[:, 0] ** 2 + over[:, 1] ** 2) <= self.patch**2]
+        self.centre[b] = near[rng.integers(len(near))] - [0, 0, self.depth]
+        self.place[b] = self.origin[b] + _dot(self.axes[b].T, self.centre[b])
+        self.tip[b] = 0, 0, self.high[2]
+
+    def _columns(self, here: np.ndarray) -> list[np.ndarray]:
+        across = (self._over[..., 0] - self.tip[:, None, 0]) ** 2 + (self._over[..., 1] - self.tip[:, None, 1]) ** 2
+        skin = self._over[np.arange(self.count), across.argmin(1), 2]
+        return [*(self.tip / LENGTH).T, (self.tip[:, 2] - skin) / LENGTH]
+
+    def _error(self) -> np.ndarray:
+        off = self.tip - self.centre
+        return np.sqrt(off[:, 0] ** 2 + off[:, 1] ** 2)
+
+    def _ended(self) -> np.ndarray:
+        return (self.fourth > 0) | (self.steps >= self.horizon)
+
+    def _value(self) -> np.ndarray:
+        return np.where(self._ended(), 1 - self._error() / self.patch, 0.0)
+
+    def _solved(self) -> np.ndarray:
+        return self._ended() & (self._error() <= self.tolerance)
+
+    def stiffness(self, b: int) -> np.ndarray:
+        return np.where(inside_sphere(self.nodes.rest, self.place[b], self.radius), self.ratio, 1.0)
+
+    def regions(self) -> tuple[str, ...]:
+        x, y, z = self.place[0].tolist()
+        return (f"sphere {x!r} {y!r} {z!r} {self.radius!r} young_modulus={self.ratio * self.physics().young_modulus!r}",)
+
+
+TASKS: dict[str, type[Task]] = {task.name: task for task in (Retraction, Palpation)}
+
+
+def make_task(name: str, nodes: ControlNodes, viewpoint: np.ndarray, count: int = 1) -> Task:
+    """A task by its name.
+
+    Raises:
+        ValueError: If there is no such task, or the tissue is too small for it.
+    """
+    return find_task(name)(nodes, viewpoint, count)
+
+
+def find_task(name: str) -> type[Task]:
+    """The class of a task by its name.
+
+    Raises:
+        ValueError: If there is no such task.
+    """
+    if name not in TASKS:
+        raise ValueError(f"there is no task {name!r}; there are {', '.join(TASKS)}")
+    return TASKS[name]
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Sum over the last axis, of three, in one order."""
+    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
+
+
+def _norm(v: np.ndarray) -> np.ndarray:
+    return np.sqrt(_dot(v, v))

@@ -1,0 +1,121 @@
+"""Train a small policy by the cross-entropy method, many episodes at once: `endo-sim train`."""
+
+import json
+import time
+from dataclasses import asdict
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from rich.progress import Progress
+
+from endo_sim_ros.learning.config import Randomisation, TrainingConfig
+from endo_sim_ros.learning.policies import NetworkPolicy, Policy
+from endo_sim_ros.learning.scenes import Scene
+from endo_sim_ros.learning.task_batch import TaskBatch
+
+_TESTED_FROM = 1_000_000  # seeds of episodes that are only tested on
+
+
+def run_episodes(batch: TaskBatch, policy: Policy, seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """One episode in each copy of a batch: returns [B], success [B], and lengths [B]."""
+    everyone = range(batch.count)
+    batch.reset(everyone, [np.random.default_rng(int(seed)) for seed in seeds])
+    policy.reset(everyone)
+    returns, success, lengths = np.zeros(batch.count), np.zeros(batch.count, bool), np.zeros(batch.count, int)
+    running = np.ones(batch.count, bool)
+    observations = batch.observe()
+    while running.any():
+        observations, outcome = batch.step(policy.act(observations))
+        returns += outcome.reward * running
+        lengths += running
+        success |= outcome.success & running
+        running &= ~(outcome.terminated | outcome.truncated)
+    return returns, success, lengths
+
+
+def train(
+    task: str, scene: Scene, config: TrainingConfig, randomisation: Randomisation = Randomisation(), device: str = "auto"
+) -> tuple[NetworkPolicy, list[dict[str, float]]]:
+    """Train a policy.
+
+    Returns:
+        The policy, and its learning curve: for each generation, the first being the untrained policy, the number of
+        training episodes so far, returns of population and elite, test return and success rate, and seconds.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # the kernels bring their own
+    try:
+        return _train(task, scene, config, randomisation, device)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _train(task, scene, config, randomisation, device):
+    hidden = [config.hidden] if config.hidden else []
+    rng = np.random.default_rng([config.seed, 0xCE])
+    batch = TaskBatch(task, scene, config.population, randomisation=randomisation, device=device)
+    testing = TaskBatch(task, scene, config.test_episodes, randomisation=randomisation, device=device)
+    size = sum(rows * columns for rows, columns in NetworkPolicy.sizes(task, hidden))
+    mean, deviation = np.zeros(size), np.full(size, config.spread)
+    elite_count = max(round(config.elite * config.population), 2)
+    curve, began = [], time.monotonic()
+    with Progress() as bar:
+        progress = bar.add_task("training", total=config.generations)
+        for generation in range(config.generations + 1):
+            scores = np.zeros(config.population)
+            best = np.zeros(1, int)
+            if generation:
+                vectors = mean + deviation * rng.standard_normal((config.population, size))
+                policy = NetworkPolicy.from_vectors(task, hidden, vectors)
+                for _ in range(config.episodes):
+                    scores += run_episodes(batch, policy, np.full(config.population, rng.integers(_TESTED_FROM)))[0] / config.episodes
+                best = np.argsort(-scores, kind="stable")[:elite_count]
+                # Noise that fades keeps the Gaussian from collapsing before it has arrived.
+                noise = 0.3 * config.spread * max(1 - generation / (0.7 * config.generations), 0.0)
+                mean, deviation = vectors[best].mean(0), vectors[best].std(0) + noise
+            tested = NetworkPolicy.from_vectors(task, hidden, mean)
+            returns, success, _ = run_episodes(testing, tested, _TESTED_FROM + np.arange(config.test_episodes))
+            curve.append(
+                {
+                    "generation": generation,
+                    "episodes": generation * config.episodes * config.population,
+                    "population_return": float(scores.mean()),
+                    "elite_return": float(scores[best].mean()),
+                    "test_return": float(returns.mean()),
+                    "test_success": float(success.mean()),
+                    "seconds": time.monotonic() - began,
+                }
+            )
+            bar.update(progress, completed=generation, description=f"solved {success.mean():.0%}")
+    return tested, curve
+
+
+def save_training(folder: Path, policy: NetworkPolicy, curve: list[dict[str, float]], config: TrainingConfig) -> None:
+    """Write policy.npz, curve.json and curve.png."""
+    folder.mkdir(parents=True, exist_ok=True)
+    policy.save(folder / "policy.npz")
+    (folder / "curve.json").write_text(json.dumps({"task": policy.task, "config": asdict(config), "curve": curve}, indent=1) + "\n")
+    cv2.imwrite(str(folder / "curve.png"), draw_curve(policy.task, curve))
+
+
+def draw_curve(task: str, curve: list[dict[str, float]], width: int = 640, height: int = 400) -> np.ndarray:
+    """Success rate over training episodes, as an image [H, W, 3] BGR."""
+    image = np.full((height, width, 3), 255, np.uint8)
+    left, right, top, bottom = 60, width - 20, 40, height - 50
+    last = max(curve[-1]["episodes"], 1)
+
+    def write(text: str, x: int, y: int) -> None:
+        cv2.putText(image, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (60, 60, 60), 1, cv2.LINE_AA)
+
+    for part in (0.0, 0.25, 0.5, 0.75, 1.0):
+        y, x = round(bottom + part * (top - bottom)), round(left + part * (right - left))
+        cv2.line(image, (left, y), (right, y), (225, 225, 225), 1)
+        write(f"{part:.0%}", 12, y + 5)
+        write(f"{part * last:.0f}", x - 15, bottom + 20)
+    points = [(left + p["episodes"] / last * (right - left), bottom + p["test_success"] * (top - bottom)) for p in curve]
+    cv2.polylines(image, [np.rint(points).astype(np.int32)], False, (180, 90, 20), 2, cv2.LINE_AA)
+    write(f"{task}: test episodes solved", left, 25)
+    write("training episodes", (left + right) // 2 - 60, height - 10)
+    return image

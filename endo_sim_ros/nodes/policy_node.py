@@ -1,0 +1,179 @@
+"""A policy that works on a task over topics, in lockstep: the observations and actions are those of the environment in one process."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from std_srvs.srv import Trigger
+
+from endo_sim_ros import messages
+from endo_sim_ros.config import ConfigError, Range, StageConfig
+from endo_sim_ros.learning.policies import make_policy
+from endo_sim_ros.learning.scenes import load_scene
+from endo_sim_ros.learning.tasks import find_task, make_task
+from endo_sim_ros.nodes.base import OK, WARN, EndoNode, arm_names, run
+
+_OPEN, _CLOSED = 1.0, 0.0  # rad
+
+
+@dataclass(frozen=True)
+class PolicyConfig(StageConfig):
+    """Parameters of the policy; physics_node needs mode lockstep, arm_source commanded, lockstep_inputs [pose, jaw] and the task's
+    tissue: `endo-sim scene` writes them to a file."""
+
+    task: Literal["retraction", "palpation"] = "retraction"
+    """What is to be done."""
+    policy: str = "scripted"
+    """scripted, or the .npz file of a trained policy."""
+    scene: str = ""
+    """Folder of the model.ply and cameras.json that the graph runs on; empty = the piece of the synthetic patient."""
+    seed: Annotated[int, Range(0, 2**31 - 1)] = 0
+    """Of the first episode; each following one has the next."""
+    episodes: Annotated[int, Range(1, 1_000_000)] = 1
+    """How many episodes; palpation has one, as the inclusion is part of physics_node's parameters."""
+    record: str = ""
+    """File (.npz) for observations, actions, rewards and success of all steps; empty = none."""
+    arm: str = "PSM1"
+    """Name of the arm that acts."""
+    world_frame: str = "world"
+    """Frame of the tool's pose."""
+    physics_node: str = "physics_node"
+    """Name of the node to reset."""
+
+
+class PolicyNode(EndoNode):
+    """One command, one observation, and so on; begins when the tissue of its scene is there."""
+
+    read_at_start = frozenset(PolicyConfig.__dataclass_fields__)
+
+    def __init__(self):
+        super().__init__("policy")
+        self._config = config = self.declare(PolicyConfig)
+        (arm,) = arm_names([config.arm])
+        try:
+            scene = load_scene(config.scene or None)
+            physics = find_task(config.task).physics()
+            self._task = make_task(config.task, scene.nodes(physics), scene.camera.position)
+            self._policy = make_policy(config.policy, config.task)
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
+        if not self._task.same_tissue and config.episodes > 1:
+            raise ConfigError(f"episodes: {config.task} has one episode over topics, as its tissue is part of physics_node's parameters")
+        self._step_ns = round(physics.step_duration * 1e9)
+        self._pose_pub = self.publisher(messages.tool_pose_command(arm))
+        self._jaw_pub = self.publisher(messages.tool_jaw(arm))
+        self._resetting = self.create_client(Trigger, f"{config.physics_node}/reset")
+        self._state, self._doing, self._solved, self._done = "starting", "", 0, 0
+        self._stamp = 0  # of the command whose answer is awaited; 0 = the state at rest
+        self._heard: dict[str, Any] = {}  # parts of that answer
+        self._rows: list[tuple[np.ndarray, np.ndarray, float, bool, int]] = []
+        self.subscribe(messages.CONTROL_NODES, self._on_nodes)
+        self.subscribe(messages.tool_reaction(arm), self._on_reaction)
+        self._asked: Any = None  # the reset that was asked for last
+        self._begin()
+        self.every(0.5, self._ask)
+
+    # ------------------------------------------------------------- episodes
+
+    def _begin(self) -> None:
+        """Set up the next episode and ask for the tissue at rest."""
+        self._task.reset(0, np.random.default_rng(self._config.seed + self._done))
+        self._policy.reset([0])
+        self._stamp, self._heard, self._doing = 0, {}, ""
+        self._ask()
+
+    def _ask(self) -> None:
+        """Reset the tissue; again and again until its state at rest is heard, as there may be no model or no connection yet."""
+        if self._stamp != 0 or self._asked is not None and not self._asked.done():
+            return
+        listening = all(publisher.get_subscription_count() for publisher in (self._pose_pub, self._jaw_pub))
+        if not (listening and self._resetting.service_is_ready()):
+            self._state = "waiting for physics_node with arm_source commanded"
+            return
+        self._state = "waiting for the tissue of the scene"
+        self._heard.pop("reset", None)
+        self._asked = self._resetting.call_async(Trigger.Request())
+        self._asked.add_done_callback(self._on_reset)
+
+    def _on_reset(self, future: Any) -> None:
+        with self.guard("reset"):
+            if future.result().success:
+                self._answer("reset", True)
+
+    # -------------------------------------------------------------- answers
+
+    def _on_nodes(self, message: Any) -> None:
+        cloud, stamp = messages.decode_control_nodes(message), messages.stamp_to_ns(message.header.stamp)
+        if self._stamp == 0 and stamp == cloud.model_stamp_ns:
+            if not np.array_equal(cloud.rest, self._task.nodes.rest):
+                text = f"the tissue on control_nodes, {len(cloud.rest)} nodes, is not that of the scene and the task"
+                raise ValueError(f"{text}, {len(self._task.nodes)} nodes; start the graph with what `endo-sim scene` wrote")
+            self._answer("nodes", cloud.positions)
+        elif stamp == self._stamp:
+            self._answer("nodes", cloud.positions)
+
+    def _on_reaction(self, message: Any) -> None:
+        if self._stamp and messages.stamp_to_ns(message.header.stamp) == self._stamp:
+            self._answer("force", messages.decode_wrench(message, "measured_cf")[0])
+
+    def _answer(self, part: str, value: Any) -> None:
+        """Take in a part of what answers the last command; when it is complete, act."""
+        self._heard[part] = value
+        if not {"nodes", "force" if self._stamp else "reset"} <= self._heard.keys():
+            return
+        positions, force = self._heard["nodes"][self._task.sites], self._heard.get("force", np.zeros(3))
+        observation = self._task.observe(positions, force[None])
+        ended = False
+        if self._stamp:
+            outcome = self._task.judge()
+            ended = bool(outcome.terminated[0] or outcome.truncated[0])
+            self._rows.append((self._seen, self._action, float(outcome.reward[0]), bool(outcome.success[0]), self._done))
+        if ended:
+            self._end(outcome.success[0])
+        else:
+            self._seen = observation[0]
+            self._act(observation)
+
+    def _act(self, observation: np.ndarray) -> None:
+        actions = self._policy.act(observation)
+        self._action = actions[0]
+        tips, closed = self._task.act(actions)
+        self._stamp, self._heard = self._stamp + self._step_ns, {}
+        pose = np.eye(4)
+        pose[:3, 3] = tips[0]
+        self._doing = f"step {self._task.steps[0]} of episode {self._done + 1}"
+        self._state = f"working on {self._config.task}"
+        self._pose_pub.publish(messages.encode_pose(pose, self._stamp, self._config.world_frame))
+        self._jaw_pub.publish(messages.encode_jaw(_CLOSED if closed[0] else _OPEN, self._stamp))
+
+    def _end(self, success: bool) -> None:
+        self._done += 1
+        self._solved += int(success)
+        self._stamp = -1  # nothing is awaited
+        self.get_logger().info(f"episode {self._done}: {'solved' if success else 'not solved'} in {self._task.steps[0]} steps")
+        if self._done < self._config.episodes:
+            self._begin()
+            return
+        self._state, self._doing = "finished", ""
+        if self._config.record:
+            names, path = ("observations", "actions", "rewards", "success", "episode"), Path(self._config.record)
+            partial = path.with_name(path.name + ".part")
+            with partial.open("wb") as file:
+                np.savez(file, **{name: np.array(column) for name, column in zip(names, zip(*self._rows))})
+            partial.replace(path)  # there whole or not at all
+        self.publish_diagnostics()
+
+    def status(self):
+        working = self._state == "finished" or bool(self._doing)
+        text = f"{self._state}, {self._doing}" if self._doing else self._state
+        values = {"episodes": self._done, "solved": self._solved, "steps": len(self._rows)}
+        return (OK if working else WARN), f"{text}, {self._solved} of {self._done} solved" if self._done else text, values
+
+
+def main() -> int:
+    return run(PolicyNode)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -23,10 +23,10 @@ from endo_sim_ros.nodes.rendering_node import RenderingNode
 from endo_sim_ros.physics import PhysicsConfig
 from endo_sim_ros.physics.materials import MATERIALS
 from endo_sim_ros.physics.stress import von_mises
-from endo_sim_ros.viewer import Tool, ViewerConfig
 from endo_sim_ros.viewer.browser import SPLATS, VIEWS, Pointer, _padded
+from endo_sim_ros.viewer.config import ViewerConfig
 from endo_sim_ros.viewer.grasp import Grasp
-from endo_sim_ros.viewer.viewer import PARAMETERS, SLIDERS
+from endo_sim_ros.viewer.viewer import PARAMETERS, SLIDERS, Tool
 
 PORT = 20000 + os.getpid() % 20000
 CAMERA = Camera(np.array([[200.0, 0, 100], [0, 200.0, 80], [0, 0, 1]]), 200, 160)

@@ -12,7 +12,7 @@ from playwright.sync_api import sync_playwright
 from endo_sim_ros.cameras import load_cameras
 from endo_sim_ros.gaussians import load_ply
 from endo_sim_ros.physics import PhysicsConfig
-from endo_sim_ros.viewer import ViewerConfig
+from endo_sim_ros.viewer.config import ViewerConfig
 from endo_sim_ros.viewer.standalone import Standalone, _camera_at_origin
 
 SIZE = 1100, 660

@@ -14,7 +14,7 @@ from endo_sim_ros.nodes.viewer_node import ViewerNodeConfig
 from endo_sim_ros.physics import PhysicsConfig
 from endo_sim_ros.reconstruction import ReconstructionConfig
 from endo_sim_ros.rendering import RenderingConfig
-from endo_sim_ros.viewer import ViewerConfig
+from endo_sim_ros.viewer.config import ViewerConfig
 
 NODE_CONFIGS: dict[str, tuple[type[StageConfig], ...]] = {
     "reconstruction_node": (ReconstructionNodeConfig, ReconstructionConfig),

@@ -17,8 +17,8 @@ from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.messages import ControlNodeCloud
 from endo_sim_ros.nodes.base import OK, WARN, Background, EndoNode, WorldConfig, arm_names, run
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
-from endo_sim_ros.viewer import Tool, Viewer, ViewerConfig
-from endo_sim_ros.viewer.viewer import PARAMETERS, plain_camera
+from endo_sim_ros.viewer.config import ViewerConfig
+from endo_sim_ros.viewer.viewer import PARAMETERS, Tool, Viewer, plain_camera
 
 _PERIOD = 0.02  # s between two looks at what users did
 _GONE = 1.0  # s after which a tool that says nothing is not shown any more

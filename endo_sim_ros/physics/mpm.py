@@ -380,10 +380,9 @@ class MpmSolver:
         advance = make_advance_kernel(self.config.material, self.config.kinematics)
         every, grid_count = (self.environments, self.node_count), self.environments * self._grid.count
         transfer = Transfer()
-        transfer.q, transfer.A = self._zeros(math.prod(every), wp.vec3), self._zeros(math.prod(every), wp.mat33)
-        transfer.mass, transfer.pull = self._zeros(math.prod(every), float), self._zeros(math.prod(every), wp.vec4)
+        transfer.given, transfer.pull = self._zeros(4 * math.prod(every), wp.vec4), self._zeros(math.prod(every), wp.vec4)
         transfer.giver = wp.full(math.prod(every), -1, dtype=int, device=self.device)
-        grid_v, decay = self._zeros(grid_count, wp.vec3), self._substep.decay
+        grid_v, decay = self._zeros(grid_count, wp.vec4), self._substep.decay
         if current:
             grid_mv = self._zeros(grid_count, wp.vec4)
             collecting = [

@@ -99,12 +99,10 @@ class RigidTools:
 
 @wp.struct
 class Transfer:
-    """From nodes to the grid, all [B · M]."""
+    """From nodes to the grid, all [B · M] but for the first, in fours that a GPU loads at once."""
 
-    q: wp.array[wp.vec3]  # momentum at the node, kg·m/s
-    A: wp.array[wp.mat33]  # its growth per cell of distance
-    mass: wp.array[float]  # with the implicit part of springs and contact, kg
-    pull: wp.array[wp.vec4]  # the part of q and of mass that springs and contact gave
+    given: wp.array[wp.vec4]  # [B · M · 4] momentum at the node (kg·m/s) and mass with springs and contact (kg); its growth along x, y, z
+    pull: wp.array[wp.vec4]  # the part of momentum and mass that springs and contact gave
     giver: wp.array[int]  # tool that gave it, -1 = none
 
 
@@ -115,6 +113,39 @@ class Substep:
     gravity: wp.vec3  # m/s²
     ratio: float  # stiffness of the Maxwell branch over that of the elastic law, 0 = none
     forget: float  # 1 - exp(-Δt/τ) of it
+
+
+_FOUR = "reinterpret_cast<float4*>(array.data)[index]"
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    const float4 four = {_FOUR};
+    return wp::vec4(four.x, four.y, four.z, four.w);
+#else
+    return array.data[index];
+#endif
+""")
+def load(array: wp.array[wp.vec4], index: int) -> wp.vec4:
+    """array[index], on a GPU in one piece."""
+    ...
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    {_FOUR} = make_float4(value[0], value[1], value[2], value[3]);
+#else
+    array.data[index] = value;
+#endif
+""")
+def store(array: wp.array[wp.vec4], index: int, value: wp.vec4):
+    """array[index] = value, on a GPU in one piece."""
+    ...
+
+
+@wp.func
+def three(v: wp.vec4) -> wp.vec3:
+    return wp.vec3(v[0], v[1], v[2])
 
 
 @wp.func
@@ -203,19 +234,21 @@ def make_advance_kernel(material: str, kinematics: str):
         time: float,  # at the end of the substep, since the start of the step
         gather: int,
         scatter: int,
-        grid_v: wp.array[wp.vec3],  # [B · count]
+        grid_v: wp.array[wp.vec4],  # [B · count]
     ):
         b, p = wp.tid()
         count = nodes.X.shape[0]
         e = b * count + p
         dt = step.dt
         u = state.u[e]
-        v = state.v[e]
-        C = state.C[e]
         F = state.F[e]
         X = nodes.X[p]
-
-        if gather != 0:
+        v = wp.vec3()
+        C = wp.mat33()
+        if gather == 0:
+            v = state.v[e]
+            C = state.C[e]
+        else:
             x = X * grid.inverse_h
             first_node = nodes.first[p]
             if wp.static(current):
@@ -226,16 +259,16 @@ def make_advance_kernel(material: str, kinematics: str):
             wx, wy, wz = spline(f[0]), spline(f[1]), spline(f[2])
             row = nodes.row[p]
             first = b * grid.count
-            v = wp.vec3()
             cx, cy, cz = wp.vec3(), wp.vec3(), wp.vec3()  # columns of Σ w v_i (i, j, k)
             for i in range(3):
                 plane, plane_y, plane_z = wp.vec3(), wp.vec3(), wp.vec3()
                 for j in range(3):
                     regular = ((i0 + i) * grid.ny + j0 + j) * grid.nz + k0
                     entry = 9 * i + 3 * j
-                    g1 = wz[1] * grid_v[first + grid_node(nodes, row, entry + 1, regular + 1)]
-                    g2 = wz[2] * grid_v[first + grid_node(nodes, row, entry + 2, regular + 2)]
-                    line = wz[0] * grid_v[first + grid_node(nodes, row, entry, regular)] + g1 + g2
+                    g0 = wz[0] * three(load(grid_v, first + grid_node(nodes, row, entry, regular)))
+                    g1 = wz[1] * three(load(grid_v, first + grid_node(nodes, row, entry + 1, regular + 1)))
+                    g2 = wz[2] * three(load(grid_v, first + grid_node(nodes, row, entry + 2, regular + 2)))
+                    line = g0 + g1 + g2
                     plane += wy[j] * line
                     plane_y += wy[j] * float(j) * line
                     plane_z += wy[j] * (g1 + 2.0 * g2)
@@ -251,13 +284,14 @@ def make_advance_kernel(material: str, kinematics: str):
             else:
                 F += dt * C
             state.u[e] = u
-            state.v[e] = v
-            state.C[e] = C
             state.F[e] = F
+            if scatter == 0:  # else they are only for what the node gives below
+                state.v[e] = v
+                state.C[e] = C
             giver = transfer.giver[e]
             if giver >= 0:
-                pull = transfer.pull[e]
-                given = wp.vec3(pull[0], pull[1], pull[2]) - (pull[3] / step.decay) * v
+                pull = load(transfer.pull, e)
+                given = three(pull) - (pull[3] / step.decay) * v
                 tools.impulse[(b * tools.count + giver) * count + p] += given
                 tools.moment[(b * tools.count + giver) * count + p] += wp.cross(X + u - dt * v, given)  # where it was given
 
@@ -280,12 +314,14 @@ def make_advance_kernel(material: str, kinematics: str):
                 pull = wp.vec4(back[0], back[1], back[2], dt * dt * spring)
             else:
                 pull, giver = push_of_tools(tools, b * tools.count, X + u, v, mass, nodes.stiffness[e], dt, time)
-            transfer.pull[e] = pull
+            store(transfer.pull, e, pull)
             transfer.giver[e] = giver
-            transfer.q[e] = mass * (v + dt * step.gravity) + dt * loads.force[e] + wp.vec3(pull[0], pull[1], pull[2])
-            transfer.mass[e] = mass + pull[3]
+            q = mass * (v + dt * step.gravity) + dt * loads.force[e] + three(pull)
+            store(transfer.given, 4 * e, wp.vec4(q[0], q[1], q[2], mass + pull[3]))
             # What springs and contact add turns with the node: adding mass alone would resist turning.
-            transfer.A[e] = ((mass + pull[3]) * grid.h) * C - (dt * 4.0 * grid.inverse_h * nodes.volume[p]) * S
+            A = ((mass + pull[3]) * grid.h) * C - (dt * 4.0 * grid.inverse_h * nodes.volume[p]) * S
+            for axis in range(3):
+                store(transfer.given, 4 * e + 1 + axis, wp.vec4(A[0, axis], A[1, axis], A[2, axis], 0.0))
 
     return advance
 
@@ -313,25 +349,23 @@ def collect(
     grid: Grid,
     decay: float,
     transfer: Transfer,
-    grid_v: wp.array[wp.vec3],
+    grid_v: wp.array[wp.vec4],
 ):
     """Grid velocities with decay, each grid node adding up what its nodes give. For rest kinematics, whose weights stay."""
     b, n, lane = wp.tid()
-    x, y, z, mass = float(0.0), float(0.0), float(0.0), float(0.0)
+    total = wp.vec4()
     for entry in range(starts[n] + lane, starts[n + 1], lanes):
-        e = b * count + members[entry]
-        offset = offsets[entry]
-        q = transfer.q[e] + transfer.A[e] * wp.vec3(offset[0], offset[1], offset[2])
-        x += offset[3] * q[0]
-        y += offset[3] * q[1]
-        z += offset[3] * q[2]
-        mass += offset[3] * transfer.mass[e]
-    x, y, z, mass = lane_sum(x), lane_sum(y), lane_sum(z), lane_sum(mass)
+        e = 4 * (b * count + members[entry])
+        offset = load(offsets, entry)
+        given = load(transfer.given, e)
+        given += offset[0] * load(transfer.given, e + 1) + offset[1] * load(transfer.given, e + 2)
+        total += offset[3] * (given + offset[2] * load(transfer.given, e + 3))
+    total = wp.vec4(lane_sum(total[0]), lane_sum(total[1]), lane_sum(total[2]), lane_sum(total[3]))
     if lane == 0:
-        v = wp.vec3()
-        if mass > 0.0:
-            v = (decay / mass) * wp.vec3(x, y, z)
-        grid_v[b * grid.count + places[n]] = v
+        v = wp.vec4()
+        if total[3] > 0.0:
+            v = (decay / total[3]) * total
+        store(grid_v, b * grid.count + places[n], v)
 
 
 @wp.kernel
@@ -343,26 +377,28 @@ def scatter(nodes: Nodes, state: State, transfer: Transfer, grid: Grid, grid_mv:
     i0, j0, k0 = first_cell(x[0], grid.nx), first_cell(x[1], grid.ny), first_cell(x[2], grid.nz)
     f = wp.vec3(x[0] - float(i0), x[1] - float(j0), x[2] - float(k0))
     wx, wy, wz = spline(f[0]), spline(f[1]), spline(f[2])
-    q, A, mass = transfer.q[e], transfer.A[e], transfer.mass[e]
+    q, ax, ay, az = (
+        load(transfer.given, 4 * e), load(transfer.given, 4 * e + 1), load(transfer.given, 4 * e + 2), load(transfer.given, 4 * e + 3),
+    )  # fmt: skip
     for i in range(3):
         for j in range(3):
             for k in range(3):
-                given = q + A * wp.vec3(float(i) - f[0], float(j) - f[1], float(k) - f[2])
+                given = q + (float(i) - f[0]) * ax + (float(j) - f[1]) * ay + (float(k) - f[2]) * az
                 w = wx[i] * wy[j] * wz[k]
                 place = b * grid.count + ((i0 + i) * grid.ny + j0 + j) * grid.nz + k0 + k
-                wp.atomic_add(grid_mv, place, w * wp.vec4(given[0], given[1], given[2], mass))
+                wp.atomic_add(grid_mv, place, w * given)
 
 
 @wp.kernel
-def update_grid(decay: float, grid_mv: wp.array[wp.vec4], grid_v: wp.array[wp.vec3]):
+def update_grid(decay: float, grid_mv: wp.array[wp.vec4], grid_v: wp.array[wp.vec4]):
     """Momenta to velocities with decay, then clear the momenta. For current kinematics."""
     i = wp.tid()
-    q = grid_mv[i]
-    v = wp.vec3()
+    q = load(grid_mv, i)
+    v = wp.vec4()
     if q[3] > 0.0:
-        v = (decay / q[3]) * wp.vec3(q[0], q[1], q[2])
-    grid_v[i] = v
-    grid_mv[i] = wp.vec4()
+        v = (decay / q[3]) * q
+    store(grid_v, i, v)
+    store(grid_mv, i, wp.vec4())
 
 
 @wp.kernel

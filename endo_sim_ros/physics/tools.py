@@ -61,7 +61,7 @@ class Tools:
             each.view(*shape, 3) for each in tensors(holds, "reaction_force reaction_torque", wp.vec3d)
         )
         (weight,), (held,) = tensors(holds, "weight", float, entries), tensors(holds, "held", int, entries)
-        self.weights, self.held = weight.view(*shape, -1), held.view(*shape, -1)
+        self.weights, self.held = (each.view(*shape, len(self.touchable)) for each in (weight, held))
         tensors(holds, "local pulled", wp.vec3d, entries)
         reach.touchable = wp.array(self.touchable.astype(np.int32), dtype=int, device=solver.device)
         reach.origin = wp.vec3d(*solver.origin)

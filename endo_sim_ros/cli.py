@@ -378,7 +378,7 @@ class BenchGraph:
     """Height of the images, pixels."""
     rate: float = 25.0
     """Commands and images per second, Hz."""
-    changes: int = 60
+    changes: int = 200
     """Changes of the wrench in real time whose way to the image is timed."""
     commands: int = 200
     """Commands in lockstep."""

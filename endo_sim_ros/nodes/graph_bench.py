@@ -22,6 +22,7 @@ from endo_sim_ros.evaluation.bench import Row, machine, report
 from endo_sim_ros.gaussians import GaussianModel, save_ply
 from endo_sim_ros.nodes.base import EndoNode
 from endo_sim_ros.nodes.graph import NodeGroup
+from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
 ARM = "PSM1"
@@ -125,7 +126,8 @@ def tissue(gaussians: int, width: int, height: int) -> Scene:
 def _parameters(mode: str, rate: float, device: str) -> dict[str, dict[str, Any]]:
     """What the nodes under test are started with."""
     common = {"mode": mode, "device": device}
-    return {"physics_node": {**common, "arms": [ARM]}, "rendering_node": {**common, "rate": rate}}
+    step = {"substep_dt": 1 / (PhysicsConfig.substeps * rate)}  # as many steps per second as images
+    return {"physics_node": {**common, **step, "arms": [ARM]}, "rendering_node": {**common, "rate": rate}}
 
 
 @contextmanager

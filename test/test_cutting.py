@@ -5,11 +5,18 @@ import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from endo_sim_ros.physics.cutting import Blade, CutNeighbours, CutStencils, clip_to_sides, cut_stencils, separated, sweep, to_rest
+from endo_sim_ros.physics.cutting import Blade, CutNeighbours, CutStencils, CutTable, clip_to_sides, separated, sweep, to_rest
 from endo_sim_ros.physics.skinning import bind_weights
 
 SPACING = 0.005
 MIDDLE = 0.0311  # m along x; no node lies there
+
+
+def cut_stencils(rest_cells: np.ndarray, shape: tuple[int, int, int], triangles: np.ndarray, rest: np.ndarray) -> CutTable | None:
+    """Stencils after cuts by all triangles [T, 3, 3] (m, world, at rest) at once; see :class:`CutStencils`."""
+    stencils = CutStencils(rest, rest_cells, shape)
+    stencils.cut(triangles)
+    return stencils.table()
 
 
 def block(shape=(13, 9, 5), jitter=0.0, seed=0) -> np.ndarray:

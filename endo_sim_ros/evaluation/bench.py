@@ -1,5 +1,6 @@
 """What all benchmarks share: medians, rows of results, the table that people read and the file that machines read."""
 
+import ctypes
 import json
 import platform
 import statistics
@@ -8,6 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
+import warp as wp
 from rich.console import Console
 from rich.table import Table
 
@@ -71,3 +73,50 @@ def report(title: str, rows: Iterable[Row], json_file: Path | None = None) -> No
     if json_file is not None:
         json_file.parent.mkdir(parents=True, exist_ok=True)
         json_file.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n")
+
+
+def short(count: int) -> str:
+    """A count in thousands or millions where that is exact: 30k, 1M."""
+    return f"{count // 1_000_000}M" if count % 1_000_000 == 0 else f"{count // 1000}k" if count % 1000 == 0 else str(count)
+
+
+def milliseconds(actions: list[Callable[[], object]], device: str, seconds: float) -> list[float]:
+    """Median durations of actions, each run for some seconds in all, in turns: a busy machine then slows all alike."""
+    turns, repeats = 3, []
+    for action in actions:
+        duration = median_seconds(action, 1, device, warm_up=0)
+        if duration < 0.3 or device != "cpu":  # the first call may have compiled; a slow one need not be repeated to know
+            duration = median_seconds(action, 1, device, warm_up=0)
+        repeats.append(min(max(round(seconds / turns / duration), 1), 30))
+    medians = [[median_seconds(*each, device, warm_up=0) for each in zip(actions, repeats)] for _ in range(turns)]
+    return [1000 * statistics.median(durations) for durations in zip(*medians)]
+
+
+def peak_megabytes(action: Callable[[], object], device: str) -> float | None:
+    """Memory that an action needs above what was in use before, 10⁶ bytes; None where it cannot be told.
+
+    On a GPU what torch and Warp allocated; on a CPU the growth of the process's resident memory (Linux only).
+    """
+    if device != "cpu":
+        torch.cuda.synchronize(device)
+        torch.cuda.reset_peak_memory_stats(device)
+        before = torch.cuda.memory_allocated(device)
+        warp_before = wp.get_mempool_used_mem_current(device)
+        action()
+        torch.cuda.synchronize(device)
+        # Warp's high-water mark cannot be reset; its share is the buffers of the sort, the same in every call.
+        warp = max(wp.get_mempool_used_mem_high(device) - warp_before, 0)
+        return (torch.cuda.max_memory_allocated(device) - before + warp) / 1e6
+    try:
+        ctypes.CDLL(None).malloc_trim(0)  # else the allocator would serve the action from what it keeps
+        Path("/proc/self/clear_refs").write_text("5")  # sets the peak to what is resident now
+        before = _status_kilobytes("VmRSS")
+        action()
+        return (_status_kilobytes("VmHWM") - before) * 1024 / 1e6
+    except (OSError, AttributeError):
+        return None
+
+
+def _status_kilobytes(field: str) -> int:
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return int(next(line for line in lines if line.startswith(field + ":")).split()[1])

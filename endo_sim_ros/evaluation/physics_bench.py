@@ -20,8 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from endo_sim_ros.cameras import Camera, load_cameras, look_at
 from endo_sim_ros.device import pick_device
-from endo_sim_ros.evaluation.bench import Row, machine, median_seconds, report
-from endo_sim_ros.evaluation.raster_bench import _milliseconds, _peak_megabytes, _short
+from endo_sim_ros.evaluation.bench import Row, machine, median_seconds, milliseconds, peak_megabytes, report, short
 from endo_sim_ros.gaussians import SH_C0, GaussianModel, load_ply
 from endo_sim_ros.physics import ControlNodes, MpmSolver, PhysicsConfig, Skinning, TissueBatch, TissueSimulation, build_control_nodes
 from endo_sim_ros.physics.tools import Tools
@@ -95,14 +94,14 @@ def _stages(
 ) -> list[tuple[str, Callable[[], list[Row]]]]:
     stages = [("dense and sparse", partial(_paper, scene, device, plan))]
     for count in plan.node_counts:
-        stages.append((f"{_short(count)} nodes", partial(_over_nodes, scene, count, device, plan.seconds)))
+        stages.append((f"{short(count)} nodes", partial(_over_nodes, scene, count, device, plan.seconds)))
     for count in plan.substeps:
         stages.append((f"{count} substeps", partial(_over_substeps, scene, count, plan.printed_nodes, device, plan.seconds)))
     stages.append(("contact", partial(_contact, scene, plan.printed_nodes, device, plan.seconds)))
     for count in plan.skin_counts:
-        stages.append((f"{_short(count)} Gaussians", partial(_over_gaussians, count, plan, device)))
+        stages.append((f"{short(count)} Gaussians", partial(_over_gaussians, count, plan, device)))
     for count in plan.batch_nodes:
-        stages.append((f"environments of {_short(count)} nodes", partial(_many, scene, count, environments, device, plan)))
+        stages.append((f"environments of {short(count)} nodes", partial(_many, scene, count, environments, device, plan)))
     stages.append((f"{PEER} solver", partial(_beside_peer, scene, device, plan, notes)))
     stages.append(("memory", partial(_memory, scene, plan.printed_nodes, device)))
     return stages
@@ -279,7 +278,7 @@ def _pull(tools: Tools, scene: Scene, pressed: bool = False) -> None:
 def _against_plain(name: str, make: Callable[[bool], Callable[[], object]], device: str, seconds: float) -> list[Row]:
     """Time of an action, on a CPU beside the same without vectors; `make` is told whether to use these."""
     actions = [make(vectorised) for vectorised in ((True, False) if device == "cpu" else (True,))]
-    ours, *plain = _milliseconds(actions, device, seconds)
+    ours, *plain = milliseconds(actions, device, seconds)
     return [Row(name, ours, "ms", ours / plain[0], PLAIN) if plain else Row(name, ours, "ms")]
 
 
@@ -295,24 +294,24 @@ def _over_nodes(scene: Scene, count: int, device: str, seconds: float) -> list[R
     common = {"node_count": count, "device": device}
     printed = PhysicsConfig(layers=0, kinematics="current", adapt_substeps=False, young_modulus=100.0, **common)
     return [
-        *_step_rows(f"over nodes: {_short(count)}, printed, 80 substeps", scene, printed, device, seconds),
-        *_step_rows(f"over nodes: {_short(count)}, default", scene, PhysicsConfig(**common), device, seconds),
+        *_step_rows(f"over nodes: {short(count)}, printed, 80 substeps", scene, printed, device, seconds),
+        *_step_rows(f"over nodes: {short(count)}, default", scene, PhysicsConfig(**common), device, seconds),
     ]
 
 
 def _over_substeps(scene: Scene, substeps: int, nodes: int, device: str, seconds: float) -> list[Row]:
     """The default method in steps of so many substeps."""
     config = PhysicsConfig(node_count=nodes, substeps=substeps, adapt_substeps=False, device=device)
-    return _step_rows(f"over substeps: {substeps}, {_short(nodes)} nodes", scene, config, device, seconds)
+    return _step_rows(f"over substeps: {substeps}, {short(nodes)} nodes", scene, config, device, seconds)
 
 
 def _contact(scene: Scene, nodes: int, device: str, seconds: float) -> list[Row]:
     """A step of the default method with a tool that presses, and the same without contact."""
     config = PhysicsConfig(node_count=nodes, device=device)
     touching = dataclasses.replace(config, contact_radius=0.005, contact_length=0.03)
-    name = f"{_short(nodes)} nodes, pressed by a capsule"
+    name = f"{short(nodes)} nodes, pressed by a capsule"
     rows = _step_rows(name, scene, touching, device, seconds, pressed=True)
-    with_it, without = _milliseconds([_pulled(scene, each, pressed=True).step for each in (touching, config)], device, seconds)
+    with_it, without = milliseconds([_pulled(scene, each, pressed=True).step for each in (touching, config)], device, seconds)
     return [*rows, Row(name, with_it, "ms", with_it / without, "no contact")]
 
 
@@ -340,12 +339,12 @@ def _over_gaussians(count: int, plan: Plan, device: str) -> list[Row]:
         solver.end_with(skinning(vectorised).launches(solver.state.u, solver.state.F, nodes.pinned, 1)[0])
         return solver.step
 
-    name, seconds = _short(count), plan.seconds
+    name, seconds = short(count), plan.seconds
     rows = _against_plain(f"skin {name}", lambda vectorised: partial(skinning(vectorised).deform, positions, F), device, seconds)
     rows += _against_plain(f"step and skin {name}", both, device, seconds)
     one, apart, skin = moving(), moving(), skinning()
     one.carry(skin)
-    together, separate = _milliseconds([one.step, lambda: (apart.step(), skin.deform(apart.positions()[0], apart.F[0]))], device, seconds)
+    together, separate = milliseconds([one.step, lambda: (apart.step(), skin.deform(apart.positions()[0], apart.F[0]))], device, seconds)
     return [*rows, Row(f"step and skin {name}", together, "ms", together / separate, "step, then skin")]
 
 
@@ -365,11 +364,11 @@ def _many(scene: Scene, count: int, environments: tuple[int, ...], device: str, 
         except (ValueError, RuntimeError):  # a grid beyond bounds, or memory
             break
         _pull(batch.tools, scene)
-        duration = _milliseconds([batch.step], device, plan.seconds)[0] / 1000
+        duration = milliseconds([batch.step], device, plan.seconds)[0] / 1000
         each, together = 1 / duration, B / duration
-        ratio = (together / alone[1], f"{alone[0]} x {_short(count)} nodes") if alone else (None, None)
-        rows.append(Row(f"{B} x {_short(count)} nodes: steps of all", together, "1/s", *ratio))
-        rows.append(Row(f"{B} x {_short(count)} nodes: steps of each", each, "1/s"))
+        ratio = (together / alone[1], f"{alone[0]} x {short(count)} nodes") if alone else (None, None)
+        rows.append(Row(f"{B} x {short(count)} nodes: steps of all", together, "1/s", *ratio))
+        rows.append(Row(f"{B} x {short(count)} nodes: steps of each", each, "1/s"))
         alone = alone or (B, together)
         last = B, duration, _solver_bytes(batch.solver)
     return rows
@@ -405,8 +404,8 @@ def _memory(scene: Scene, count: int, device: str) -> list[Row]:
     state = sum(getattr(solver.state, name).capacity for name in solver.state._cls.vars)
     rows = [Row("state of a node", state / len(nodes), "B"), Row("solver per node", _solver_bytes(solver) / len(nodes), "B")]
     for B in (1, 16):
-        peak = _peak_megabytes(lambda B=B: TissueBatch(nodes, config, B).step(), device)
-        rows += [] if peak is None else [Row(f"{B} x {_short(count)} nodes: peak memory", peak, "MB")]
+        peak = peak_megabytes(lambda B=B: TissueBatch(nodes, config, B).step(), device)
+        rows += [] if peak is None else [Row(f"{B} x {short(count)} nodes: peak memory", peak, "MB")]
     return rows
 
 
@@ -422,9 +421,9 @@ def _beside_peer(scene: Scene, device: str, plan: Plan, notes: list[str]) -> lis
     grid = plan.peer_grid or (48 if device == "cpu" else 100)
     common = {"adapt_substeps": False, "device": device}
     printed = PhysicsConfig(node_count=plan.printed_nodes, layers=0, kinematics="current", **common)
-    configs = {_short(plan.printed_nodes): [printed, dataclasses.replace(printed, kinematics="rest")]}
+    configs = {short(plan.printed_nodes): [printed, dataclasses.replace(printed, kinematics="rest")]}
     if plan.peer_dense:
-        configs[f"{_short(len(scene.model))} dense"] = [PhysicsConfig.baseline(**common)]
+        configs[f"{short(len(scene.model))} dense"] = [PhysicsConfig.baseline(**common)]
     rows = []
     for name, ours in configs.items():
         try:
@@ -433,7 +432,7 @@ def _beside_peer(scene: Scene, device: str, plan: Plan, notes: list[str]) -> lis
                 theirs = _physgaussian(nodes, printed, grid, device)
                 theirs()  # compiles
                 actions = [_pulled(scene, config).step for config in ours]
-                *durations, peer = _milliseconds([*actions, theirs], device, plan.seconds)
+                *durations, peer = milliseconds([*actions, theirs], device, plan.seconds)
         except Exception as error:  # whatever is installed under that name, and however it fails with this Warp
             notes.append(f"{PEER} solver could not be measured: {type(error).__name__}: {error}".splitlines()[0])
             break

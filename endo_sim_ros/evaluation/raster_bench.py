@@ -1,22 +1,19 @@
 """Speed, memory and precision of the rasteriser on this machine, beside its peers: `endo-sim bench raster`."""
 
-import ctypes
 import dataclasses
 import importlib.util
 import math
-import statistics
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
-import warp as wp
 from rich.progress import Progress
 from torch import Tensor
 
 from endo_sim_ros.device import pick_device
-from endo_sim_ros.evaluation.bench import Row, machine, median_seconds, report
+from endo_sim_ros.evaluation.bench import Row, machine, milliseconds, peak_megabytes, report, short
 from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 from endo_sim_ros.splatting import RenderOutput, _rasterize, rasterize, rasterizer
@@ -78,7 +75,7 @@ def bench_raster(device: str, json_file: Path | None = None, plan: Plan = Plan()
     gradients of means, quaternions, scales, opacities and colours from all of these. Peers compute colour and depth.
     """
     device = pick_device(device)
-    named = lambda count, size: f"{_short(count)} {size[0]}x{size[1]}"
+    named = lambda count, size: f"{short(count)} {size[0]}x{size[1]}"
     stages: list[tuple[str, Callable[[], list[Row]]]] = []
     for size in plan.sizes:
         for count in plan.counts:
@@ -108,10 +105,6 @@ def bench_raster(device: str, json_file: Path | None = None, plan: Plan = Plan()
     report(f"Rasteriser on {machine(device)}", rows, json_file)
 
 
-def _short(count: int) -> str:
-    return f"{count // 1_000_000}M" if count % 1_000_000 == 0 else f"{count // 1000}k" if count % 1000 == 0 else str(count)
-
-
 # ---------------------------------------------------------------- what is measured
 
 
@@ -129,8 +122,8 @@ def _speed(name: str, count: int, size: tuple[int, int], device: str, seconds: f
     peers = {peer: prepare(scene) for peer, prepare in _peers(device).items()}
     rows = _compare(name, scene, peers, device, seconds)
     # Our scalar kernels need what our vectors need.
-    peaks = [_peak_megabytes(_forward_and_backward(draw, scene), device) for draw in peers.values() if device != "cpu"]
-    ours = _peak_megabytes(_forward_and_backward(_ours(scene), scene), device)
+    peaks = [peak_megabytes(_forward_and_backward(draw, scene), device) for draw in peers.values() if device != "cpu"]
+    ours = peak_megabytes(_forward_and_backward(_ours(scene), scene), device)
     if ours is not None:
         others = zip(peers, peaks) if peaks else [(None, None)]
         rows += [Row(f"{name} peak memory", ours, "MB", ours / peak if peak else None, peer) for peer, peak in others]
@@ -144,7 +137,7 @@ def _compare(name: str, scene: Scene, peers: dict[str, Draw], device: str, secon
         ours, *theirs = [draw(scene.gaussians)[0] for draw in draws]
     rows = [Row(f"{name} mean colour difference", float((ours - x).abs().mean()), "", None, peer) for peer, x in zip(peers, theirs)]
     for what, action in (("forward", _forward), ("forward + backward", _forward_and_backward)):
-        ours, *theirs = _milliseconds([action(draw, scene) for draw in draws], device, seconds)
+        ours, *theirs = milliseconds([action(draw, scene) for draw in draws], device, seconds)
         rows += [Row(f"{name} {what}", ours, "ms", ours / value, peer) for peer, value in zip(peers, theirs)]
         if not peers:
             rows.append(Row(f"{name} {what}", ours, "ms"))
@@ -163,48 +156,6 @@ def _forward_and_backward(draw: Draw, scene: Scene) -> Callable[[], object]:
     generator = torch.Generator().manual_seed(1)
     cotangents = [torch.randn(image.shape, generator=generator).to(image) for image in differentiable()]
     return lambda: torch.autograd.grad(differentiable(), leaves, cotangents)
-
-
-def _milliseconds(actions: list[Callable[[], object]], device: str, seconds: float) -> list[float]:
-    """Median durations of actions, each run for some seconds in all, in turns: a busy machine then slows all alike."""
-    turns, repeats = 3, []
-    for action in actions:
-        duration = median_seconds(action, 1, device, warm_up=0)
-        if duration < 0.3 or device != "cpu":  # the first call may have compiled; a slow one need not be repeated to know
-            duration = median_seconds(action, 1, device, warm_up=0)
-        repeats.append(min(max(round(seconds / turns / duration), 1), 30))
-    medians = [[median_seconds(*each, device, warm_up=0) for each in zip(actions, repeats)] for _ in range(turns)]
-    return [1000 * statistics.median(durations) for durations in zip(*medians)]
-
-
-def _peak_megabytes(action: Callable[[], object], device: str) -> float | None:
-    """Memory that an action needs above what was in use before, 10⁶ bytes; None where it cannot be told.
-
-    On a GPU what torch and Warp allocated; on a CPU the growth of the process's resident memory (Linux only).
-    """
-    if device != "cpu":
-        torch.cuda.synchronize(device)
-        torch.cuda.reset_peak_memory_stats(device)
-        before = torch.cuda.memory_allocated(device)
-        warp_before = wp.get_mempool_used_mem_current(device)
-        action()
-        torch.cuda.synchronize(device)
-        # Warp's high-water mark cannot be reset; its share is the buffers of the sort, the same in every call.
-        warp = max(wp.get_mempool_used_mem_high(device) - warp_before, 0)
-        return (torch.cuda.max_memory_allocated(device) - before + warp) / 1e6
-    try:
-        ctypes.CDLL(None).malloc_trim(0)  # else the allocator would serve the action from what it keeps
-        Path("/proc/self/clear_refs").write_text("5")  # sets the peak to what is resident now
-        before = _status_kilobytes("VmRSS")
-        action()
-        return (_status_kilobytes("VmHWM") - before) * 1024 / 1e6
-    except (OSError, AttributeError):
-        return None
-
-
-def _status_kilobytes(field: str) -> int:
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return int(next(line for line in lines if line.startswith(field + ":")).split()[1])
 
 
 def _against_reference(name: str, count: int, size: tuple[int, int], device: str, seconds: float) -> list[Row]:
@@ -237,8 +188,8 @@ def _precision(count: int, size: tuple[int, int], device: str) -> list[Row]:
 def _curve(name: str, count: int, size: tuple[int, int], overlap: float, device: str, seconds: float) -> list[Row]:
     """One point of a curve: forward and backward."""
     scene = tissue(count, *size, device, overlap)
-    point = f"{_short(count)} {size[0]}x{size[1]}" + (f" overlap x{overlap:g}" if "overlap" in name else "")
-    return [Row(f"{name}: {point}", *_milliseconds([_forward_and_backward(_ours(scene), scene)], device, seconds), "ms")]
+    point = f"{short(count)} {size[0]}x{size[1]}" + (f" overlap x{overlap:g}" if "overlap" in name else "")
+    return [Row(f"{name}: {point}", *milliseconds([_forward_and_backward(_ours(scene), scene)], device, seconds), "ms")]
 
 
 def _training(count: int, width: int, height: int, device: str, seconds: float) -> list[Row]:
@@ -250,8 +201,8 @@ def _training(count: int, width: int, height: int, device: str, seconds: float) 
         trainer.step()
     # Refinement is rare in a training; here it has done its part.
     trainer.config = dataclasses.replace(config, refine_every=100)
-    name = f"training {_short(len(trainer.model))} {width}x{height}"
-    return [Row(name, 1000 / _milliseconds([trainer.step], device, 3 * seconds)[0], "iterations/s")]
+    name = f"training {short(len(trainer.model))} {width}x{height}"
+    return [Row(name, 1000 / milliseconds([trainer.step], device, 3 * seconds)[0], "iterations/s")]
 
 
 # ---------------------------------------------------------------- peers

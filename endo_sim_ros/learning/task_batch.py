@@ -69,7 +69,6 @@ class TaskBatch:
         largest = kind.largest_stiffness * float(np.exp(randomisation.stiffness))
         self.tissue = TissueBatch(nodes, config, count, 1, stiffness=np.full(count, largest) if largest != 1 else None)
         self._varies = largest != 1
-        self._sites = torch.zeros((count, kind.site_count), dtype=torch.long)
         self._rest = torch.from_numpy(nodes.rest)
         self._resting, self._placed = True, False  # of a single tissue
         camera = scene.camera

@@ -419,13 +419,6 @@ class CutStencils:
         self._copies[point, step @ [9, 3, 1]] = number
 
 
-def cut_stencils(rest_cells: np.ndarray, shape: tuple[int, int, int], triangles: np.ndarray, rest: np.ndarray) -> CutTable | None:
-    """Stencils after cuts by all triangles [T, 3, 3] (m, world, at rest) at once; see :class:`CutStencils`."""
-    stencils = CutStencils(rest, rest_cells, shape)
-    stencils.cut(triangles)
-    return stencils.table()
-
-
 class CutNeighbours:
     """Nodes and weights by which Gaussians follow the tissue on their own side of a cut, as cuts accumulate.
 

@@ -2,6 +2,7 @@
 
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.keyframes import select_keyframes
+from endo_sim_ros.reconstruction.presets import ABLATIONS, PRESETS, preset
 from endo_sim_ros.reconstruction.trainer import Progress, Trainer, shrink
 
-__all__ = ["Progress", "ReconstructionConfig", "Trainer", "select_keyframes", "shrink"]
+__all__ = ["ABLATIONS", "PRESETS", "Progress", "ReconstructionConfig", "Trainer", "preset", "select_keyframes", "shrink"]

@@ -10,6 +10,8 @@ from endo_sim_ros.config import Range, StageConfig
 class ReconstructionConfig(StageConfig):
     """From sparse posed views to a Gaussian model."""
 
+    preset: Literal["default", "paper", "3dgs"] = "default"
+    """Method: ours, that of the paper as printed, or 3DGS. Options left at their defaults take its values."""
     keyframes: Annotated[int, Range(1, 1000)] = 8
     """Number of views to train on, spread over the camera path."""
     image_width: Annotated[int, Range(16, 8192, "pixels")] = 640
@@ -20,6 +22,8 @@ class ReconstructionConfig(StageConfig):
     """Largest number of Gaussians."""
     sh_degree: Annotated[int, Range(0, 3)] = 0
     """Degree of the spherical harmonics; 0 is the paper's frequency regularisation."""
+    initialization: Literal["depth", "points"] = "depth"
+    """What training starts from: the depth prior of every view, checked between views, or triangulated points alone."""
     depth: Literal["auto", "topic", "stereo", "points", "none"] = "auto"
     """Depth prior: the depth topic, matching with the right image, interpolation between triangulated points, none, or
     the first of these that exists."""

@@ -1,5 +1,6 @@
 """The Gaussians that training starts from: depth back-projected from every view, checked between views."""
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -34,6 +35,8 @@ def initial_model(
     Raises:
         SequenceError: If neither depth nor points give the scene a shape.
     """
+    if config.initialization == "points":
+        frames = [dataclasses.replace(frame, depth=None) for frame in frames]
     chosen = _surface_pixels(frames, config.depth_tolerance)
     stride = _stride(chosen, config.max_gaussians)
     taken = [pixels & _lattice(pixels.shape, stride) for pixels in chosen]

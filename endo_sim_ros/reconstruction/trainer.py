@@ -22,6 +22,7 @@ from endo_sim_ros.reconstruction import densification, losses
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.depth import with_depth_prior
 from endo_sim_ros.reconstruction.initialization import initial_model
+from endo_sim_ros.reconstruction.presets import resolved
 from endo_sim_ros.reconstruction.triangulation import triangulate
 from endo_sim_ros.sequences.frames import Frame, SequenceError
 from endo_sim_ros.splatting import RenderOutput, rasterize
@@ -75,7 +76,7 @@ class Trainer:
             raise SequenceError("there are no views to reconstruct from; check the image, camera_info and pose topics")
         if all(frame.mask is not None and not frame.mask.any() for frame in frames):
             raise SequenceError("every pixel of every view is masked; a mask has 255 where there is tissue")
-        self.config = config
+        self.config = config = resolved(config)
         self.device = pick_device(config.device)
         points, colors, _ = triangulate(frames)
         frames = [shrink(frame, config.image_width) for frame in with_depth_prior(frames, points, config)]

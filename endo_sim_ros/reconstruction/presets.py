@@ -1,0 +1,55 @@
+"""Named methods as options of the one trainer, and what each is made of.
+
+A preset is the set of options in which it differs from the defaults; `default` is the best we know.
+"""
+
+import dataclasses
+from typing import Any
+
+from endo_sim_ros.reconstruction.config import ReconstructionConfig
+
+_NOTHING_EXTRA = {"lambda_flat": 0.0}
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "default": {},
+    # As printed (Yang): triangulated points, L1 depth, distortion and total variation, virtual cameras.
+    "paper": _NOTHING_EXTRA | {"initialization": "points"},
+    # Kerbl et al. 2023: colour alone.
+    "3dgs": _NOTHING_EXTRA
+    | {"initialization": "points", "lambda_depth": 0.0, "lambda_dist": 0.0, "lambda_tv": 0.0, "virtual_every": 0},
+}
+
+ABLATIONS: dict[str, dict[str, dict[str, Any]]] = {
+    "paper": {
+        "without virtual cameras": {"virtual_every": 0},
+        "without frequency": {"sh_degree": 3},
+        "without distortion": {"lambda_dist": 0.0},
+        "without total variation": {"lambda_tv": 0.0},
+        "without depth": {"lambda_depth": 0.0},
+    },
+    "default": {
+        "without virtual cameras": {"virtual_every": 0},
+        "without distortion": {"lambda_dist": 0.0},
+        "without total variation": {"lambda_tv": 0.0},
+        "without depth": {"lambda_depth": 0.0},
+        "without dense initialisation": {"initialization": "points"},
+        "without flat Gaussians": {"lambda_flat": 0.0},
+    },
+}
+"""Of each preset, the options without one of its parts at a time, by name."""
+
+
+def preset(name: str, **overrides: Any) -> ReconstructionConfig:
+    """The options of a preset, some of them replaced.
+
+    Raises:
+        ConfigError: If there is no such preset or option, or a value is out of range.
+    """
+    return dataclasses.replace(resolved(ReconstructionConfig(preset=name)), **overrides)
+
+
+def resolved(config: ReconstructionConfig) -> ReconstructionConfig:
+    """The options spelled out: those left at their defaults take the values of the preset that is named."""
+    usual = ReconstructionConfig()
+    values = {key: value for key, value in PRESETS[config.preset].items() if getattr(config, key) == getattr(usual, key)}
+    return dataclasses.replace(config, preset="default", **values)

@@ -13,6 +13,7 @@ import tyro
 from rich.progress import track
 
 from endo_sim_ros.config import ConfigError
+from endo_sim_ros.evaluation.config import EvaluationConfig
 from endo_sim_ros.gaussians import ModelError
 from endo_sim_ros.learning.config import Randomisation, TrainingConfig
 from endo_sim_ros.messages import MessageError
@@ -122,6 +123,25 @@ class Reconstruct:
         from endo_sim_ros.evaluation.held_out import reconstruct_and_measure
 
         reconstruct_and_measure(self.bag, self.out, self.config)
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Train methods on few views of sequences, measure each on the views held out, and compare, beside the paper's figures."""
+
+    sequences: Annotated[Positional[tuple[str, ...]], tyro.conf.arg(metavar="SEQ [SEQ ...]")]
+    """Bags, recordings as for convert, or phantom:0 (synthetic patients); options of the reader follow as ,name=value:
+    phantom:1,frames=100 my_bag,step=2 video.mp4,fx=907."""
+    config: Annotated[EvaluationConfig, tyro.conf.arg(name="")] = field(default_factory=EvaluationConfig)
+
+    def run(self) -> None:
+        from endo_sim_ros.evaluation.evaluate import evaluate
+
+        cells = evaluate(self.sequences, self.config)["cells"]
+        print(f"{self.config.out}: table.md, table.csv, results.json, views.csv, strips/, plots/")
+        failed = sum(cell["error"] is not None for cell in cells)
+        if failed:
+            raise RuntimeError(f"{failed} of {len(cells)} cells failed, as the table says; the same command tries them again")
 
 
 @dataclass(frozen=True)
@@ -449,6 +469,7 @@ class Bench:
 
 
 COMMANDS = {
+    "evaluate": Evaluate,
     "touch": Touch,
     "demo": Demo,
     "up": Up,

@@ -1,11 +1,17 @@
-"""Image and depth measures against torchmetrics and by hand."""
+"""Image and depth measures against torchmetrics, the authors' values and by hand."""
 
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
 import torch
 from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
 from endo_sim_ros.evaluation import metrics
+from endo_sim_ros.evaluation.lpips import Lpips, WeightsError
+
+SHARED = Path(__file__).parents[2] / "shared/data"
 
 
 @pytest.fixture
@@ -63,3 +69,52 @@ def test_depth_rmse_counts_pixels_that_have_both_depths():
     mask = np.uint8([[255, 255], [255, 0]])
     assert metrics.depth_rmse(depth, reference, mask) == pytest.approx(np.sqrt((0.003**2 + 0.004**2) / 2), rel=1e-5)
     assert np.isnan(metrics.depth_rmse(depth, np.zeros_like(depth)))
+
+
+def test_median_scaling_leaves_the_shape_of_the_error():
+    reference = np.float32([[0.10, 0.12, 0.0], [0.14, 0.16, 0.2]])
+    depth = np.where(reference > 0, 3 * reference, 5)
+    np.testing.assert_allclose(metrics.median_scaled(depth, reference)[reference > 0], reference[reference > 0], rtol=1e-6)
+    assert metrics.depth_rmse(metrics.median_scaled(depth, reference), reference) == pytest.approx(0, abs=1e-6)
+
+
+def test_psnr_of_an_empty_mask_is_nan(pair):
+    assert np.isnan(metrics.psnr(*pair, np.zeros(pair[0].shape[:2], np.uint8)))
+
+
+weights = pytest.mark.skipif(not (SHARED / "weights").is_dir(), reason="the weights of LPIPS are not at ../shared/data/weights")
+
+
+@weights
+@pytest.mark.parametrize("backbone, expected", [("alex", (0.722, 0.138)), ("vgg", (0.569, 0.422))])
+def test_lpips_is_that_of_its_authors(backbone, expected):
+    images = [cv2.imread(str(SHARED / f"lpips_images/ex_{name}.png"))[..., ::-1] for name in ("ref", "p0", "p1")]
+    network = Lpips(backbone, SHARED / "weights")
+    assert [network(images[0], other)[0] for other in images[1:]] == pytest.approx(expected, abs=6e-4)
+    assert network(images[0], images[0]) == (0.0,)
+
+
+@weights
+def test_lpips_over_masks(pair):
+    network = Lpips("alex", SHARED / "weights")
+    everything, nothing, left = (np.full(pair[0].shape[:2], value, np.uint8) for value in (255, 0, 0))
+    left[:, :20] = 255
+    whole, same, part, none = network(*pair, None, everything, left, nothing)
+    assert whole == same == network(*pair)[0]
+    assert part > 0 and part != whole
+    assert np.isnan(none)
+    changed = pair[0].copy()
+    changed[:, 20:] = 0
+    assert network(changed, pair[1], left) == network(*pair, left)  # what the first mask leaves out does not count
+    assert np.isnan(network(pair[0][:20, :20], pair[1][:20, :20])[0])  # too small for its last layer
+
+
+def test_weights_that_are_missing_or_damaged_are_named(tmp_path):
+    with pytest.raises(WeightsError, match=rf"no vgg16\*.pth \(torchvision's\) in {tmp_path}"):
+        Lpips("vgg", tmp_path)
+    (tmp_path / "alexnet.pth").write_bytes(b"no weights")
+    with pytest.raises(WeightsError, match="alexnet.pth: not readable weights"):
+        Lpips("alex", tmp_path)
+    torch.save({"features.0.weight": torch.zeros(1)}, tmp_path / "alexnet.pth")
+    with pytest.raises(WeightsError, match="no weights of LPIPS alex, '0.bias' is not in them"):
+        Lpips("alex", tmp_path)

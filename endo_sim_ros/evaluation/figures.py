@@ -1,10 +1,10 @@
 """Pictures for people: force arrows, coloured depth, labelled sheets and videos."""
 
+import re
 from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
 
-import av
 import cv2
 import numpy as np
 
@@ -62,6 +62,11 @@ def sheet(pictures: list[tuple[str, np.ndarray]], columns: int = 3) -> np.ndarra
     return np.vstack([np.hstack(cells[i : i + columns]) for i in range(0, len(cells), columns)])
 
 
+def slug(text: str) -> str:
+    """A text, such as a split's name, as part of a file's name."""
+    return re.sub(r"[^\w.+-]+", "_", re.sub(r"(\d):(\d)", r"\1to\2", text))
+
+
 def write_png(path: str | Path, image: np.ndarray) -> None:
     """Write an RGB image."""
     if not cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)):
@@ -70,6 +75,8 @@ def write_png(path: str | Path, image: np.ndarray) -> None:
 
 def write_video(path: str | Path, images: Iterable[np.ndarray], fps: float) -> int:
     """Write RGB images [H, W, 3] uint8 of one size as H.264 that browsers play, and return their number."""
+    import av
+
     count = 0
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000), options={"crf": "18"})

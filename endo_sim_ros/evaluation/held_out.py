@@ -1,13 +1,17 @@
-"""Train on a few views of a bag and measure the rest."""
+"""Views that were not trained on, measured; `endo-sim reconstruct`."""
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+import torch
 from rich.progress import Progress as ProgressBar
 
-from endo_sim_ros.cameras import save_cameras
+from endo_sim_ros.cameras import Camera, save_cameras
 from endo_sim_ros.evaluation import figures, metrics
+from endo_sim_ros.evaluation.lpips import Lpips
 from endo_sim_ros.gaussians import GaussianModel, save_ply
 from endo_sim_ros.reconstruction import Progress, ReconstructionConfig, Trainer, select_keyframes, shrink
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
@@ -17,6 +21,118 @@ from endo_sim_ros.sequences.frames import Frame
 log = logging.getLogger(__name__)
 
 _STRIPS = 3  # held-out views shown in the picture
+_SAME_SURFACE = 0.03  # relative difference of depth within which two views see the same surface
+
+
+class Figure(NamedTuple):
+    """What one figure of a view is."""
+
+    heading: str
+    unit: str
+    digits: int  # worth showing, after the point
+
+    @property
+    def title(self) -> str:
+        return f"{self.heading} [{self.unit}]" if self.unit else self.heading
+
+
+_OF_PIXELS = {
+    "psnr": Figure("PSNR", "dB", 2),
+    "psnr_gain": Figure("PSNR, gain fitted", "dB", 2),
+    "ssim": Figure("SSIM", "", 3),
+    "lpips_alex": Figure("LPIPS alex", "", 3),
+    "lpips_vgg": Figure("LPIPS vgg", "", 3),
+}
+FIGURES: dict[str, Figure] = {
+    **_OF_PIXELS,
+    "seen_share": Figure("seen", "%", 1),
+    **{f"seen_{name}": figure._replace(heading=f"{figure.heading}, seen") for name, figure in _OF_PIXELS.items()},
+    "depth_rmse": Figure("depth RMSE", "m", 5),
+    "depth_rmse_scaled": Figure("depth RMSE, median scaled", "m", 5),
+    "psnr_unmasked": Figure("PSNR, unmasked", "dB", 2),
+    "ssim_unmasked": Figure("SSIM, unmasked", "", 3),
+}
+"""All figures of a view by their names in files. Over the pixels of its mask, except the unmasked; `seen` over those
+of them that a training view saw."""
+
+
+def measure(
+    image: np.ndarray, depth: np.ndarray, frame: Frame, seen: np.ndarray | None = None, lpips: Sequence[Lpips] = ()
+) -> dict[str, float]:
+    """The figures of a rendered view that can be told; see FIGURES.
+
+    Args:
+        image: Rendered RGB [H, W, 3], uint8.
+        depth: Rendered depth [H, W], metres, 0 = none.
+        frame: What the camera saw there; its depth is the reference.
+        seen: [H, W], not 0 where a training view saw what this view sees; None leaves these figures out.
+        lpips: Networks to compare with.
+    """
+    reference, mask = frame.image, frame.mask
+    row = {}
+    masks = [("", mask)]
+    if seen is not None:
+        inside = (seen > 0) & (True if mask is None else mask > 0)
+        row["seen_share"] = 100 * float(inside.sum() / max(seen.size if mask is None else (mask > 0).sum(), 1))
+        masks.append(("seen_", inside))
+    for prefix, where in masks:
+        row[f"{prefix}psnr"] = metrics.psnr(image, reference, where)
+        row[f"{prefix}psnr_gain"] = metrics.psnr(metrics.gain_fitted(image, reference, where), reference, where)
+        row[f"{prefix}ssim"] = metrics.ssim(image, reference, where)
+    for network in lpips:
+        distances = network(image, reference, *(where for _, where in masks))
+        row |= {f"{prefix}lpips_{network.backbone}": value for (prefix, _), value in zip(masks, distances)}
+    if frame.depth is not None:
+        row["depth_rmse"] = metrics.depth_rmse(depth, frame.depth, mask)
+        scaled = metrics.median_scaled(depth, frame.depth, mask)
+        row["depth_rmse_scaled"] = metrics.depth_rmse(scaled, frame.depth, mask)
+    if mask is not None and not mask.all():
+        row["psnr_unmasked"], row["ssim_unmasked"] = metrics.psnr(image, reference), metrics.ssim(image, reference)
+    return row
+
+
+def mean_figures(rows: Sequence[dict[str, float]]) -> dict[str, float]:
+    """Mean of each figure over the views that have it."""
+    found = {name: np.array([row[name] for row in rows if name in row]) for name in FIGURES}
+    return {name: float(np.nanmean(values)) for name, values in found.items() if np.isfinite(values).any()}
+
+
+def seen_pixels(
+    camera: Camera, depth: np.ndarray, views: Sequence[tuple[Camera, np.ndarray, np.ndarray | None]], device: str = "cpu"
+) -> np.ndarray:
+    """Which pixels [H, W] of a view show a surface that one of the other views sees, too, and not hidden.
+
+    Args:
+        camera: The view.
+        depth: Its depth [H, W], metres, 0 = none; a pixel without depth counts as not seen.
+        views: Camera, depth [H, W] and mask [H, W] (0 = does not see) of the others.
+        device: Where to compute.
+    """
+    tensor = lambda array: torch.as_tensor(np.ascontiguousarray(array), dtype=torch.float32, device=device)
+    points = tensor(camera.rays()) * tensor(depth)[..., None]
+    seen = torch.zeros(depth.shape, dtype=torch.bool, device=device)
+    for other, surface, mask in views:
+        there = other.viewmat @ camera.pose
+        x, y, z = (points @ tensor(there[:3, :3]).T + tensor(there[:3, 3])).unbind(-1)
+        safe = z.clamp_min(1e-6)
+        u = (x / safe * other.K[0, 0] + other.K[0, 2]).floor()
+        v = (y / safe * other.K[1, 1] + other.K[1, 2]).floor()
+        inside = (z > 0) & (u >= 0) & (v >= 0) & (u < other.width) & (v < other.height)
+        u, v = (each.clamp(0, limit - 1).long() for each, limit in ((u, other.width), (v, other.height)))
+        there_is = tensor(surface)[v, u]
+        visible = inside & (there_is > 0) & ((z - there_is).abs() < _SAME_SURFACE * there_is)
+        seen |= visible if mask is None else visible & (tensor(mask)[v, u] > 0)
+    return (seen & (tensor(depth) > 0)).cpu().numpy()
+
+
+def model_renderer(model: GaussianModel, device: str) -> DeformableRenderer:
+    """Renders the model at rest, as large as the camera."""
+    return DeformableRenderer(model, None, RenderingConfig(device=device, image_width=0))
+
+
+def difference(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Absolute difference of RGB images, three times as strong."""
+    return np.abs(image.astype(int) - reference).clip(0, 85).astype(np.uint8) * 3
 
 
 def reconstruct_and_measure(bag: Path, out: Path, config: ReconstructionConfig) -> dict[str, float]:
@@ -42,36 +158,21 @@ def reconstruct_and_measure(bag: Path, out: Path, config: ReconstructionConfig) 
     if not held_out:
         log.info("no view was held out that shows tissue; lower keyframes")
         return {}
-    figures_of, pictures = _measure(model, held_out, config)
-    figures.write_png(out / "held_out.png", figures.sheet(pictures, columns=4))
-    for name, value in figures_of.items():
-        log.info("%-28s %.4g", name, value)
-    return figures_of
-
-
-def _measure(model: GaussianModel, frames: list[Frame], config: ReconstructionConfig):
-    renderer = DeformableRenderer(model, None, RenderingConfig(device=config.device, image_width=0))
+    renderer = model_renderer(model, config.device)
     rows, pictures = [], []
-    shown = {int(i) for i in np.linspace(0, len(frames) - 1, min(_STRIPS, len(frames)))}
-    for index, frame in enumerate(frames):
-        mask, reference = frame.mask, frame.image
+    shown = {int(i) for i in np.linspace(0, len(held_out) - 1, min(_STRIPS, len(held_out)))}
+    for index, frame in enumerate(held_out):
         image, depth = renderer.render(frame.camera)
-        row = {
-            "PSNR [dB]": metrics.psnr(image, reference, mask),
-            "PSNR, gain fitted [dB]": metrics.psnr(metrics.gain_fitted(image, reference, mask), reference, mask),
-            "SSIM": metrics.ssim(image, reference, mask),
-        }
-        if frame.depth is not None:
-            row["depth RMSE [mm]"] = 1e3 * metrics.depth_rmse(depth, frame.depth, mask)
-        rows.append(row)
+        rows.append(measure(image, depth, frame))
         if index in shown:
-            difference = np.abs(image.astype(int) - reference).clip(0, 85).astype(np.uint8) * 3
             pictures += [
-                (f"held-out view {index}", reference),
-                (f"rendered, {row['PSNR [dB]']:.1f} dB", image),
-                ("difference × 3", difference),
+                (f"held-out view {index}", frame.image),
+                (f"rendered, {rows[-1]['psnr']:.1f} dB", image),
+                ("difference × 3", difference(image, frame.image)),
                 ("rendered depth", figures.color_depth(depth)),
             ]
-    names = dict.fromkeys(name for row in rows for name in row)  # each once, in order
-    means = {name: float(np.nanmean([row.get(name, np.nan) for row in rows])) for name in names}
-    return means | {"held-out views": float(len(rows))}, pictures
+    figures.write_png(out / "held_out.png", figures.sheet(pictures, columns=4))
+    found = mean_figures(rows)
+    for name, value in found.items():
+        log.info("%-30s %.4g", FIGURES[name].title, value)
+    return found | {"held_out_views": float(len(held_out))}

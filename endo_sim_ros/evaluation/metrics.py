@@ -5,10 +5,11 @@ import numpy as np
 
 
 def psnr(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Peak signal-to-noise ratio, dB, of images [H, W, 3] uint8 over the pixels where the mask [H, W] is not 0."""
+    """Peak signal-to-noise ratio, dB, of images [H, W, 3] uint8 over the pixels where the mask [H, W] is not 0; NaN if there are none."""
     error = (image.astype(np.float64) - reference) ** 2
-    mse = error.mean() if mask is None else error[mask > 0].mean()
-    return float(10 * np.log10(255.0**2 / max(mse, 1e-12)))
+    if mask is not None:
+        error = error[mask > 0]
+    return float(10 * np.log10(255.0**2 / max(error.mean(), 1e-12))) if error.size else float("nan")
 
 
 def gain_fitted(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
@@ -43,3 +44,12 @@ def depth_rmse(depth: np.ndarray, reference: np.ndarray, mask: np.ndarray | None
     """Root mean square depth error, metres, of [H, W] where both have a value (> 0)."""
     valid = (depth > 0) & (reference > 0) & (True if mask is None else mask > 0)
     return float(np.sqrt(((depth - reference)[valid].astype(np.float64) ** 2).mean())) if valid.any() else float("nan")
+
+
+def median_scaled(depth: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
+    """The depth [H, W] times the one factor that makes its median that of the reference, over the pixels that `depth_rmse` takes.
+
+    Where the scale of the poses is arbitrary, only the error that is left then says something.
+    """
+    valid = (depth > 0) & (reference > 0) & (True if mask is None else mask > 0)
+    return depth * (np.median(reference[valid]) / np.median(depth[valid])) if valid.any() else depth

@@ -1,0 +1,246 @@
+"""The results of an evaluation as tables for people and files for machines."""
+
+import csv
+import json
+import statistics
+import sys
+from collections.abc import Iterable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from endo_sim_ros.evaluation import figures, plots
+from endo_sim_ros.evaluation.bench import Row
+from endo_sim_ros.evaluation.held_out import FIGURES, Figure
+from endo_sim_ros.evaluation.paper import PRINTED, Printed
+
+COLUMNS = FIGURES | {
+    "seconds": Figure("training", "s", 1),
+    "gaussians": Figure("Gaussians", "", 0),
+    "megabytes": Figure("peak memory", "MB", 0),
+}
+_IN_TERMINAL = ("psnr", "psnr_gain", "ssim", "lpips_alex", "lpips_vgg", "seen_psnr_gain", "depth_rmse", "seconds", "gaussians")
+BASELINE = "3dgs"  # what ratios are to
+_STRIP_WIDTH = 320  # of each picture in a strip, pixels
+
+
+class Summary(NamedTuple):
+    """All seeds of one method on one split of one sequence."""
+
+    sequence: str
+    split: str
+    method: str
+    means: dict[str, float]
+    spreads: dict[str, float]  # standard deviation, of two seeds or more
+    cells: list[dict[str, Any]]  # those that did not fail
+    errors: list[str]
+
+    @property
+    def seeds(self) -> str:
+        return str(len(self.cells)) if not self.errors else f"{len(self.cells)} of {len(self.cells) + len(self.errors)}"
+
+    def text(self, name: str, missing: Iterable[str] = ()) -> str:
+        """A figure as it stands in a table."""
+        if name not in self.means:
+            return "no weights" if name.removeprefix("seen_") in missing and self.cells else "–"
+        digits = COLUMNS[name].digits
+        spread = f" ± {self.spreads[name]:.{digits}f}" if name in self.spreads else ""
+        return f"{self.means[name]:.{digits}f}{spread}"
+
+
+def summarise(results: dict[str, Any]) -> list[Summary]:
+    """Means and spreads over the seeds, in the order of the cells."""
+    groups: dict[tuple, list[dict]] = {}
+    for record in results["cells"]:
+        cell = record["cell"]
+        groups.setdefault((cell["sequence"], cell["split"], cell["method"]), []).append(record)
+    found = []
+    for key, records in groups.items():
+        done = [record for record in records if record["error"] is None]
+        values = {name: [r["figures"][name] for r in done if r["figures"].get(name) is not None] for name in COLUMNS}
+        means = {name: statistics.fmean(each) for name, each in values.items() if each}
+        spreads = {name: statistics.stdev(each) for name, each in values.items() if len(each) > 1}
+        found.append(Summary(*key, means, spreads, done, [r["error"] for r in records if r["error"] is not None]))
+    return found
+
+
+def printed_rows(split: str, methods: Iterable[str]) -> list[Printed]:
+    """What the paper prints for a split: its three methods that are here, and of its ablation what is in the run."""
+    return [row for row in PRINTED if row.split == split and (" " not in row.method or row.method in methods)]
+
+
+def printed_text(row: Printed, name: str) -> str:
+    """A figure of the paper as it stands in a table."""
+    marks = {"lpips_alex": "†", "lpips_vgg": "†", "depth_rmse": "‡"}
+    value = row.figures.get(name)
+    return "–" if value is None else f"{value:.{min(COLUMNS[name].digits, 3)}f}{marks.get(name, '')}"
+
+
+def shown_columns(summaries: list[Summary], missing: Iterable[str]) -> list[str]:
+    """The columns that have something in them, and PSNR in any case."""
+    return [n for n in COLUMNS if n == "psnr" or any(n in s.means for s in summaries) or n.removeprefix("seen_") in missing]
+
+
+def notes(results: dict[str, Any]) -> list[str]:
+    """What a reader must know to read the table."""
+    done = [record for record in results["cells"] if record["error"] is None]
+    sequences: dict[str, dict] = {}
+    for record in done:
+        sequences.setdefault(record["cell"]["sequence"], record)
+    lines = [f"Measured on {', '.join(dict.fromkeys(record['machine'] for record in done)) or results['machine']}."]
+    depths = {
+        "recorded": "the recorded depth",
+        "stereo matching": "stereo matching of the held-out view with its right image, which is no ground truth",
+        "none": "none",
+    }
+    for name, record in sequences.items():
+        (width, height), cell = record["size"], record["cell"]
+        pixels = "over the pixels of the mask (tissue); the others are black" if record["masked"] else "over all pixels, unmasked"
+        changes = ["the recorded depth"] * cell["train_depth"] + ["no right images"] * cell["mono"]
+        given = f"; training views were given {' and '.join(changes)}" if changes else ""
+        lines.append(f"{name}: {width}×{height}, {pixels}; reference depth: {depths[record['depth_source']]}{given}.")
+    models = any(record["seen_by"] == "model" for record in done)
+    lines += [
+        "PSNR, gain fitted: after one factor per colour channel and view, as exposure would. Means over the held-out views.",
+        "Seen: pixels with a depth whose surface a training view shows, too, visibility checked with the reference depth"
+        + ("; without one, with the model's own." if models else "."),
+        "Median scaled: depth times the factor that makes its median right. Depth stays in floating point throughout.",
+        "Training: all that happens between the views and the model. Memory: what the training needed at most, more than before.",
+    ]
+    lines += [f"{text}." for text in results["missing"].values()]
+    if any(printed_rows(record["cell"]["split"], ()) for record in done):
+        lines += [
+            "The paper's rows are as printed there, of its own data and hardware; differences between methods compare, not the numbers.",
+            "† Backbone not stated; the same number stands under both. ‡ Unit, scaling and reference not stated.",
+        ]
+    return lines
+
+
+def write(results: dict[str, Any], out: Path, json_file: Path | None) -> None:
+    """Print the table, and write table.md, table.csv, views.csv, strips, plots and, if asked for, rows for machines."""
+    summaries = summarise(results)
+    (out / "table.md").write_text(markdown(results, summaries))
+    _write_csv(results, summaries, out)
+    _write_strips(summaries, out)
+    plots.write(summaries, out)
+    if json_file is not None:
+        json_file.parent.mkdir(parents=True, exist_ok=True)
+        json_file.write_text(json.dumps([asdict(row) for row in machine_rows(summaries)], indent=1) + "\n")
+    Console(width=None if sys.stdout.isatty() else 150).print(_terminal_table(summaries, results["missing"]))
+
+
+def markdown(results: dict[str, Any], summaries: list[Summary]) -> str:
+    """One table per split, ours and the paper's, and notes."""
+    missing, methods = results["missing"], {s.method for s in summaries}
+    columns = shown_columns(summaries, missing)
+    lines = ["# Evaluation", "", f"{results['date']}, {results['machine']}."]
+    for split in dict.fromkeys(s.split for s in summaries):
+        titles = [COLUMNS[name].title for name in columns]
+        lines += ["", f"## {split}", "", "| sequence | method | " + " | ".join(titles) + " | seeds |"]
+        lines.append("|---|---|" + "---:|" * (len(columns) + 1))
+        for summary in (s for s in summaries if s.split == split):
+            cells = [summary.sequence, summary.method]
+            if summary.cells:
+                cells += [summary.text(name, missing) for name in columns] + [summary.seeds]
+            else:
+                cells += [f"failed: {_one_line(summary.errors[0])}"] + [""] * (len(columns) - 1) + [summary.seeds]
+            lines.append("| " + " | ".join(cells) + " |")
+        for row in printed_rows(split, methods):
+            cells = [f"the paper's, {row.dataset}", row.method, *(printed_text(row, name) for name in columns), ""]
+            lines.append("| " + " | ".join(cells) + " |")
+    failed = [(s, error) for s in summaries for error in s.errors if s.cells]
+    lines += [""] + [f"- {s.sequence}, {s.split}, {s.method}: a seed failed: {_one_line(error)}" for s, error in failed]
+    return "\n".join([*lines, *(f"- {note}" for note in notes(results))]) + "\n"
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split()).replace("|", "/")
+
+
+def machine_rows(summaries: list[Summary]) -> list[Row]:
+    """Every mean as a row; the ratio is to the baseline on the same split of the same sequence."""
+    baseline = {(s.sequence, s.split): s.means for s in summaries if s.method == BASELINE}
+    rows = []
+    for s in summaries:
+        peers = baseline.get((s.sequence, s.split), {}) if s.method != BASELINE else {}
+        for name, value in s.means.items():
+            ratio = value / peers[name] if peers.get(name) else None
+            label = f"{s.sequence}, {s.split}, {s.method}: {COLUMNS[name].heading}"
+            rows.append(Row(label, value, COLUMNS[name].unit, ratio, BASELINE if ratio is not None else None))
+    return rows
+
+
+def _write_csv(results: dict[str, Any], summaries: list[Summary], out: Path) -> None:
+    with (out / "table.csv").open("w", newline="") as file:
+        columns = [name for base in COLUMNS for name in (base, f"{base}_sd")]
+        writer = csv.DictWriter(file, ["source", "sequence", "split", "method", "seeds", "error", *columns], restval="")
+        writer.writeheader()
+        for s in summaries:
+            row = {"source": "measured", "sequence": s.sequence, "split": s.split, "method": s.method, "seeds": len(s.cells)}
+            row |= {"error": "; ".join(s.errors)} | s.means | {f"{name}_sd": value for name, value in s.spreads.items()}
+            writer.writerow(row)
+        for split in dict.fromkeys(s.split for s in summaries):
+            for row in printed_rows(split, {s.method for s in summaries}):
+                labels = {"source": "printed in the paper", "sequence": row.dataset, "split": split, "method": row.method}
+                writer.writerow(labels | row.figures)
+    with (out / "views.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, ["sequence", "split", "method", "seed", "view", *FIGURES], restval="")
+        writer.writeheader()
+        for record in results["cells"]:
+            for row in record.get("views", ()):
+                writer.writerow({name: record["cell"][name] for name in ("sequence", "split", "method", "seed")} | row)
+
+
+def _terminal_table(summaries: list[Summary], missing: Iterable[str]) -> Table:
+    table = Table()
+    columns = [name for name in shown_columns(summaries, missing) if name in _IN_TERMINAL]
+    for heading in ("sequence", "split", "method"):
+        table.add_column(heading)
+    for name in columns:
+        table.add_column(COLUMNS[name].title, justify="right")
+    for s in summaries:
+        texts = [s.text(name, missing) for name in columns] if s.cells else ["failed"]
+        table.add_row(s.sequence, s.split, s.method, *texts)
+    return table
+
+
+# ----------------------------------------------------------------------------------------------------------- pictures
+
+
+def comparisons(summaries: list[Summary]) -> dict[tuple[str, str], dict[str, dict[str, str]]]:
+    """Picture files of the first seed: (sequence, split) → view → name, or method and name, → path below the folder."""
+    found: dict[tuple[str, str], dict[str, dict[str, str]]] = {}
+    for s in summaries:
+        for name, path in s.cells[0]["pictures"].items() if s.cells else ():
+            view, kind = name.split("-", 1)
+            views = found.setdefault((s.sequence, s.split), {})
+            key = kind if kind.startswith("reference") else f"{s.method}\n{kind}"
+            views.setdefault(view, {}).setdefault(key, path)
+    return found
+
+
+def _write_strips(summaries: list[Summary], out: Path) -> None:
+    """A picture for each split: the held-out view, and what each method makes of it; below, depth."""
+    (out / "strips").mkdir(exist_ok=True)
+    for (sequence, split), views in comparisons(summaries).items():
+        methods = [s.method for s in summaries if (s.sequence, s.split) == (sequence, split) and s.cells]
+        cells = []
+        for view, paths in views.items():
+            for kind, reference in (("rendered", "reference"), ("depth", "reference_depth")):
+                names = [reference, *(f"{method}\n{kind}" for method in methods)]
+                labels = [f"view {int(view)}" if kind == "rendered" else "its depth", *methods]
+                images = [_small(out / paths[name]) if name in paths else None for name in names]
+                blank = np.zeros_like(next(image for image in images if image is not None))
+                cells += [(label, blank if image is None else image) for label, image in zip(labels, images)]
+        figures.write_png(out / "strips" / f"{figures.slug(f'{sequence}-{split}')}.png", figures.sheet(cells, len(methods) + 1))
+
+
+def _small(path: Path) -> np.ndarray:
+    image = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
+    scale = min(_STRIP_WIDTH / image.shape[1], 1.0)
+    return cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)

@@ -10,7 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from endo_sim_ros.light import Light
+
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 sqrt(pi))
+_LIGHT = "endo_sim_light"  # mark of the comment that holds the light
 _LONGEST_HEADER = 65536  # bytes of a PLY file; that of a model of degree 3 has 1500
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 _TYPES = {
@@ -33,6 +36,7 @@ class GaussianModel:
         log_scales: Logarithm of the standard deviations along the rotated axes [N, 3], log metres.
         logit_opacities: Logit of the opacity [N].
         sh: Spherical harmonic colour coefficients [N, (degree + 1)², 3], degree 0 to 3.
+        light: What makes an image of the rendered colours; None: they are the image.
     """
 
     means: Tensor
@@ -40,6 +44,7 @@ class GaussianModel:
     log_scales: Tensor
     logit_opacities: Tensor
     sh: Tensor
+    light: Light | None = None
 
     def __post_init__(self):
         n = len(self.means)
@@ -73,10 +78,10 @@ class GaussianModel:
         return (self.sh[:, 0] * SH_C0 + 0.5).clamp(0, 1)
 
     @property
-    def covariances(self) -> Tensor:
-        """World covariances R diag(s²) Rᵀ [N, 3, 3], m²."""
+    def rotations(self) -> Tensor:
+        """Rotation matrices [N, 3, 3]."""
         w, x, y, z = torch.nn.functional.normalize(self.quats, dim=1).unbind(1)
-        R = torch.stack(
+        return torch.stack(
             [
                 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
                 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
@@ -84,22 +89,27 @@ class GaussianModel:
             ],
             1,
         ).view(-1, 3, 3)  # fmt: skip
+
+    @property
+    def covariances(self) -> Tensor:
+        """World covariances R diag(s²) Rᵀ [N, 3, 3], m²."""
+        R = self.rotations
         half = R * self.scales[:, None]
         return half @ half.transpose(1, 2)
 
     def tensors(self) -> dict[str, Tensor]:
         """The five arrays by field name."""
-        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return {name: getattr(self, name) for name in ("means", "quats", "log_scales", "logit_opacities", "sh")}
 
     def to(self, device: str | torch.device) -> "GaussianModel":
-        return GaussianModel(**{name: value.to(device) for name, value in self.tensors().items()})
+        return dataclasses.replace(self, **{name: value.to(device) for name, value in self.tensors().items()})
 
     def detach(self) -> "GaussianModel":
-        return GaussianModel(**{name: value.detach() for name, value in self.tensors().items()})
+        return dataclasses.replace(self, **{name: value.detach() for name, value in self.tensors().items()})
 
     def select(self, index: Tensor) -> "GaussianModel":
         """The Gaussians at an index or boolean mask."""
-        return GaussianModel(**{name: value[index] for name, value in self.tensors().items()})
+        return dataclasses.replace(self, **{name: value[index] for name, value in self.tensors().items()})
 
     @staticmethod
     def from_points(points: Tensor, colors: Tensor, scales: Tensor, opacity: float = 0.5, sh_degree: int = 0) -> "GaussianModel":
@@ -173,12 +183,17 @@ def from_columns(columns: dict[str, np.ndarray], source: str) -> GaussianModel:
 
 
 def save_ply(model: GaussianModel, path: str | Path) -> None:
-    """Write a binary PLY that SuperSplat, viser and other 3DGS viewers open. Written whole or not at all."""
+    """Write a binary PLY that SuperSplat, viser and other 3DGS viewers open. Written whole or not at all.
+
+    The light, which they ignore, is a comment in the header.
+    """
     path = Path(path)
     columns, names = to_columns(model), ply_fields(model.sh_degree)
     names = names[:3] + ["nx", "ny", "nz"] + names[3:]
     columns = np.concatenate([columns[:, :3], np.zeros((len(model), 3), np.float32), columns[:, 3:]], 1)
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(model)}"]
+    if model.light is not None:
+        lines.insert(2, f"comment {_LIGHT} {model.light.to_json()}")
     lines += [*(f"property float {name}" for name in names), "end_header", ""]
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".part")
@@ -197,14 +212,15 @@ def load_ply(path: str | Path) -> GaussianModel:
         raise ModelError(f"{path}: no such file")
     try:
         with path.open("rb") as file:
-            vertices = _read_vertices(file, path.stat().st_size)
+            vertices, light = _read_vertices(file, path.stat().st_size)
     except (OSError, ValueError) as error:
         raise ModelError(f"{path}: not a readable PLY model ({error})") from error
-    return from_columns({name: vertices[name] for name in vertices.dtype.names}, str(path))
+    model = from_columns({name: vertices[name] for name in vertices.dtype.names}, str(path))
+    return dataclasses.replace(model, light=light)
 
 
-def _read_vertices(file: BinaryIO, size: int) -> np.ndarray:
-    """The element `vertex` of a PLY file of a size in bytes, as a structured array.
+def _read_vertices(file: BinaryIO, size: int) -> tuple[np.ndarray, Light | None]:
+    """The element `vertex` of a PLY file of a size in bytes, as a structured array, and the light.
 
     What the header claims is held against the size of the file before any memory is asked for.
     """
@@ -212,7 +228,7 @@ def _read_vertices(file: BinaryIO, size: int) -> np.ndarray:
     end = re.search(rb"\nend_header[ \t\r]*\n", head)
     if not head.startswith(b"ply") or end is None:
         raise ValueError(f"no PLY header within {_LONGEST_HEADER} bytes")
-    order, name, count, fields = "", "", 0, []
+    order, name, count, fields, light = "", "", 0, [], None
     for line in head[: end.start()].decode("ascii", "replace").splitlines()[1:]:
         match line.split():
             case ["format", layout, "1.0"] if layout in _ORDERS:
@@ -223,6 +239,8 @@ def _read_vertices(file: BinaryIO, size: int) -> np.ndarray:
                 count = int(number)
             case ["property", kind, field] if kind in _TYPES:
                 fields.append((field, order + _TYPES[kind]))
+            case ["comment", mark, *_] if mark == _LIGHT:
+                light = Light.from_json(line.split(_LIGHT, 1)[1])
             case [] | ["comment" | "obj_info", *_]:
                 pass
             case _:
@@ -234,11 +252,11 @@ def _read_vertices(file: BinaryIO, size: int) -> np.ndarray:
     if not 0 <= count <= (room + text) // least:
         raise ValueError(f"its header claims {count} vertices of {least} bytes or more, {room} bytes follow")
     if not count:
-        return np.empty(0, dtype)
+        return np.empty(0, dtype), light
     if not text:
-        return np.memmap(file, dtype, "r", end.end(), (count,))
+        return np.memmap(file, dtype, "r", end.end(), (count,)), light
     file.seek(end.end())
     vertices = np.loadtxt(file, dtype, comments=None, max_rows=count, ndmin=1)
     if len(vertices) < count:
         raise ValueError(f"its header claims {count} vertices, {len(vertices)} follow")
-    return vertices
+    return vertices, light

@@ -81,8 +81,10 @@ class DeformableRenderer:
                 sh = self._turned_colors(means, F, camera)
             model = GaussianModel(means, model.quats, model.log_scales, model.logit_opacities, sh)
         output = render(model, camera, background=self._background, covars=covars)
-        image = (output.colors[0].clamp(0, 1) * 255 + 0.5).to(torch.uint8)
-        alpha = output.alphas[0]
+        colors, alpha = output.colors[0], output.alphas[0]
+        if self.model.light is not None:
+            colors = self.model.light.shade(colors, output.depths[0], alpha, camera)
+        image = (colors.clamp(0, 1) * 255 + 0.5).to(torch.uint8)
         depth = torch.where(alpha > _MIN_ALPHA, output.depths[0] / alpha.clamp_min(1e-6), 0.0)
         return image.cpu().numpy(), depth.cpu().numpy()
 

@@ -10,8 +10,8 @@ from endo_sim_ros.config import Range, StageConfig
 class ReconstructionConfig(StageConfig):
     """From sparse posed views to a Gaussian model."""
 
-    preset: Literal["default", "paper", "3dgs"] = "default"
-    """Method: ours, that of the paper as printed, or 3DGS. Options left at their defaults take its values."""
+    preset: Literal["default", "paper", "fsgs", "3dgs"] = "default"
+    """Method: ours, that of the paper as printed, FSGS, or 3DGS. Options left at their defaults take its values."""
     keyframes: Annotated[int, Range(1, 1000)] = 8
     """Number of views to train on, spread over the camera path."""
     image_width: Annotated[int, Range(16, 8192, "pixels")] = 640
@@ -37,10 +37,25 @@ class ReconstructionConfig(StageConfig):
     """Weight of the distortion loss, in units of the scene's median depth (paper eq. 5)."""
     lambda_tv: Annotated[float, Range(0, 1000)] = 0.5
     """Weight of the total variation of the rendered depth, in units of the scene's median depth (paper eq. 6)."""
+    edge_aware: bool = False
+    """Total variation of the disparity instead, less where the image has an edge."""
+    lambda_pearson: Annotated[float, Range(0, 1000)] = 0.0
+    """Weight of 1 − correlation of depth and prior, in training views and in virtual ones to which the prior is carried (FSGS)."""
+    lambda_gradient: Annotated[float, Range(0, 1000)] = 0.0
+    """Weight of differences between the slopes of the logarithms of depth and prior."""
     lambda_flat: Annotated[float, Range(0, 1000)] = 0.01
     """Weight of Gaussians being deeper than 1.5 times their width, which turns into streaks when the tissue is sheared."""
     virtual_every: Annotated[int, Range(0, 1000)] = 1
     """A virtual camera regularises every n-th iteration (paper eq. 8, 9); 0 = never."""
+    exposure: bool = True
+    """Each view has an exposure of its own, from which that of unseen views is predicted as a camera's automatic one would be."""
+    light: bool = True
+    """The light travels with the camera: brightness falls off with distance and angle."""
+    right_views: bool = True
+    """Train on the right images as well."""
+    densification: Literal["mcmc", "gradient", "proximity"] = "mcmc"
+    """How Gaussians are added: a Markov chain up to max_gaussians, where image gradients are large (3DGS), or there and
+    between those that lie alone (FSGS)."""
     refine_every: Annotated[int, Range(1, 100_000)] = 100
     """Iterations between relocations of dead Gaussians and growth."""
     growth: Annotated[float, Range(0, 1)] = 0.05

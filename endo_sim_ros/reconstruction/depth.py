@@ -22,7 +22,8 @@ _DISAGREEMENT = 0.1  # largest relative difference from them
 def with_depth_prior(frames: list[Frame], points: np.ndarray, config: ReconstructionConfig) -> list[Frame]:
     """The frames with ``depth`` set to the configured prior, or None where there is none.
 
-    The prior is 0 where it has no finite positive measurement and where the mask says that there is no tissue.
+    The prior is 0 where it has no finite positive measurement and where the mask says that there is no tissue. Where the
+    right eye's principal point turns out to be wrong, the frames have it right.
 
     Args:
         frames: Training views, best at full size: disparities are as precise as the pixels are fine.
@@ -50,7 +51,15 @@ def with_depth_prior(frames: list[Frame], points: np.ndarray, config: Reconstruc
         return [_with_depth(frame, frame.depth) for frame in frames]
     disparities = [None if frame.right is None else stereo_disparity(frame) for frame in frames]
     offset = disparity_offset(frames, disparities, points)
-    return [_with_depth(f, None if d is None else _to_depth(f, d, offset)) for f, d in zip(frames, disparities)]
+    frames = [_with_depth(f, None if d is None else _to_depth(f, d, offset)) for f, d in zip(frames, disparities)]
+    return [frame if frame.right is None else _with_right_shifted(frame, offset) for frame in frames]
+
+
+def _with_right_shifted(frame: Frame, offset: float) -> Frame:
+    """The frame with the right eye's principal point where the poses and the disparity say that it is."""
+    K = (frame.camera.K if frame.right_K is None else frame.right_K).copy()
+    K[0, 2] += offset
+    return dataclasses.replace(frame, right_K=K)
 
 
 def interpolated_depth(frame: Frame, points: np.ndarray) -> np.ndarray | None:

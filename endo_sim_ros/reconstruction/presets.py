@@ -8,15 +8,19 @@ from typing import Any
 
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 
-_NOTHING_EXTRA = {"lambda_flat": 0.0}
+_PLAIN = {  # 3DGS as Kerbl et al. 2023 have it, and what the others build upon
+    "initialization": "points", "densification": "gradient", "lambda_flat": 0.0, "exposure": False, "light": False, "right_views": False,
+}  # fmt: skip
 
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
     # As printed (Yang): triangulated points, L1 depth, distortion and total variation, virtual cameras.
-    "paper": _NOTHING_EXTRA | {"initialization": "points"},
-    # Kerbl et al. 2023: colour alone.
-    "3dgs": _NOTHING_EXTRA
-    | {"initialization": "points", "lambda_depth": 0.0, "lambda_dist": 0.0, "lambda_tv": 0.0, "virtual_every": 0},
+    "paper": _PLAIN,
+    # Zhu et al. 2024: correlation with the depth prior, in pseudo-views too, and new Gaussians between those that lie alone.
+    "fsgs": _PLAIN
+    | {"densification": "proximity", "lambda_pearson": 0.05, "lambda_depth": 0.0, "lambda_dist": 0.0, "lambda_tv": 0.0},
+    # Colour alone.
+    "3dgs": _PLAIN | {"lambda_depth": 0.0, "lambda_dist": 0.0, "lambda_tv": 0.0, "virtual_every": 0},
 }
 
 ABLATIONS: dict[str, dict[str, dict[str, Any]]] = {
@@ -34,6 +38,10 @@ ABLATIONS: dict[str, dict[str, dict[str, Any]]] = {
         "without depth": {"lambda_depth": 0.0},
         "without dense initialisation": {"initialization": "points"},
         "without flat Gaussians": {"lambda_flat": 0.0},
+        "without light": {"light": False},
+        "without light and exposure": {"light": False, "exposure": False},
+        "without right views": {"right_views": False},
+        "without Markov chain": {"densification": "gradient"},
     },
 }
 """Of each preset, the options without one of its parts at a time, by name."""

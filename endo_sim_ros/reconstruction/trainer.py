@@ -18,13 +18,15 @@ from torch import Tensor
 from endo_sim_ros.cameras import Camera, interpolate_pose
 from endo_sim_ros.device import pick_device
 from endo_sim_ros.gaussians import GaussianModel
-from endo_sim_ros.reconstruction import densification, losses
+from endo_sim_ros.light import Light, falloff, features, log_brightness
+from endo_sim_ros.reconstruction import densification, losses, photometry
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.depth import with_depth_prior
 from endo_sim_ros.reconstruction.initialization import initial_model
 from endo_sim_ros.reconstruction.presets import resolved
 from endo_sim_ros.reconstruction.triangulation import triangulate
 from endo_sim_ros.sequences.frames import Frame, SequenceError
+from endo_sim_ros.sequences.recordings import lit_area
 from endo_sim_ros.splatting import RenderOutput, rasterize
 
 log = logging.getLogger(__name__)
@@ -37,6 +39,9 @@ _RATES = {
 _NOISE = 5e5  # of 3DGS-MCMC, in units of the means' learning rate, for a scene of depth 1
 _LARGEST = 0.06  # standard deviation of a Gaussian, in units of the scene's depth
 _LAST_REFINEMENT = 0.8  # share of the iterations after which the number of Gaussians stays fixed
+_WIDEST_PARALLAX = 0.1  # of the image's width, between the eyes
+_LIGHT_ANCHOR = 1e-3  # weight of the light's changes in training
+_EXPOSURE_RATE, _LIGHT_RATE = 1e-3, 2e-3  # learning rates of log exposures and of the light's four numbers
 
 
 @dataclass(frozen=True)
@@ -49,6 +54,7 @@ class _View:
     image: Tensor  # [H, W, 3] in [0, 1]
     depth: Tensor | None  # [H, W] m, 0 = none
     mask: Tensor | None  # [H, W] 1 = tissue
+    exposure: int  # whose exposure it has: its own, or that of the left view of its pair
 
 
 class Progress(NamedTuple):
@@ -81,29 +87,70 @@ class Trainer:
         points, colors, _ = triangulate(frames)
         frames = [shrink(frame, config.image_width) for frame in with_depth_prior(frames, points, config)]
         model = initial_model(frames, points, colors, config)
-        self._views = [self._to_device(frame) for frame in frames]
+        self.scene_depth = _median_depth(frames, model)
+        light, exposures = np.zeros(4), np.zeros((len(frames), 3))
+        if self._lit:
+            means = model.means.numpy().astype(np.float64)
+            light, exposures = photometry.fit_light(
+                frames, means, self.scene_depth, config.depth_tolerance, light=config.light, exposure=config.exposure
+            )
+            model = photometry.unlit(model, frames, light, exposures, self.scene_depth, config.depth_tolerance)
+        self._views = [self._to_device(frame, i) for i, frame in enumerate(frames)]
+        if config.right_views:
+            self._views += [self._to_device(right_view(f), i) for i, f in enumerate(frames) if f.right is not None]
         eye = np.mean([view.camera.position for view in self._views], 0)
         self._eye = torch.as_tensor(eye, dtype=torch.float32, device=self.device)
         self._nearest = _nearest_views(frames)
-        self.scene_depth = _median_depth(frames, model)
         self._stamps = [frame.stamp_ns for frame in frames]
         self.iteration = 0
         self._generator = torch.Generator().manual_seed(config.seed)
         self._order: list[int] = []
         self._last_loss = torch.zeros(())
+        self._light_prior = torch.tensor(light, dtype=torch.float32, device=self.device)
+        self._set_light(self._light_prior, torch.tensor(exposures, dtype=torch.float32, device=self.device))
         self._set_model(model.to(self.device))
 
     # ------------------------------------------------------------------ state
 
     @property
     def model(self) -> GaussianModel:
-        """The current model, detached."""
+        """The current model, detached, with its light."""
+        return dataclasses.replace(self._detached(), light=self.light)
+
+    def _detached(self) -> GaussianModel:
         return GaussianModel(**{name: tensor.detach().clone() for name, tensor in self._current().tensors().items()})
 
     @property
+    def _lit(self) -> bool:
+        return self.config.light or self.config.exposure
+
+    @property
+    @torch.no_grad()
+    def light(self) -> Light | None:
+        """The light, with the exposure that was learnt from the training views."""
+        if not self._lit:
+            return None
+        exposures = self._light["exposures"].cpu().numpy().astype(np.float64)
+        brightness = []
+        for view in self._views[: len(exposures)]:
+            output = self._render(view.viewmat, view.K, view.camera)
+            alphas = output.alphas[0]
+            where = alphas > 0.5 if view.mask is None else (alphas > 0.5) & (view.mask > 0)
+            brightness.append(float(log_brightness(self._shaded(output, view.camera), where)))
+        response, levels = photometry.fit_exposure(exposures, np.array(brightness))
+        return Light(*self._light["light"].tolist(), self.scene_depth, *map(float, levels), response)
+
+    def _shaded(self, output: RenderOutput, camera: Camera) -> Tensor:
+        """The rendered colours [H, W, 3] in the light of the camera, without exposure."""
+        if not self.config.light:
+            return output.colors[0]
+        quantities = features(output.depths[0], output.alphas[0], camera, self.scene_depth)
+        return output.colors[0] * falloff(quantities, self._light["light"])[..., None]
+
+    @property
     def cameras(self) -> list[Camera]:
-        """The training cameras at training size."""
-        return [view.camera for view in self._views]
+        """The training cameras at training size, without right ones."""
+        return [view.camera for view in self._views[: len(self._stamps)]]
 
     @property
     def progress(self) -> Progress:
@@ -116,8 +163,11 @@ class Trainer:
             "config": dataclasses.asdict(self.config),
             "stamps": self._stamps,
             "iteration": self.iteration,
-            "model": self.model.tensors(),
+            "model": self._detached().tensors(),
             "optimizer": self._optimizer.state_dict(),
+            "gradients": self._gradients,
+            "light": {name: value.detach() for name, value in self._light.items()},
+            "light_optimizer": self._light_optimizer.state_dict() if self._light_optimizer else {"state": {}},
             "generator": self._generator.get_state(),
             "order": self._order,
         }
@@ -142,10 +192,16 @@ class Trainer:
             iteration, order = int(state["iteration"]), [int(view) for view in state["order"]]
             if iteration < 0 or not set(order) <= set(range(len(self._views))):
                 raise ValueError("it names views or an iteration that there cannot be")
+            if {name: value.shape for name, value in state["light"].items()} != {name: value.shape for name, value in self._light.items()}:
+                raise ValueError("its light is not that of these views")
             generator = torch.Generator()
             generator.set_state(state["generator"].cpu())
             self._set_model(GaussianModel(**state["model"]))  # what is refused was so before: a training goes on as it was
             self._optimizer.load_state_dict(self._optimizer.state_dict() | {"state": state["optimizer"]["state"]})
+            self._set_light(**state["light"])
+            if self._light_optimizer:
+                self._light_optimizer.load_state_dict(self._light_optimizer.state_dict() | {"state": state["light_optimizer"]["state"]})
+            self._gradients = state["gradients"]
             self._generator = generator
             self.iteration, self._order = iteration, order
         except SequenceError:
@@ -170,18 +226,28 @@ class Trainer:
         config = self.config
         if not self._order:
             self._order = torch.randperm(len(self._views), generator=self._generator).tolist()
-        index = self._order.pop()
-        loss = self._view_loss(self._views[index])
-        if config.virtual_every and self.iteration % config.virtual_every == 0 and len(self._views) > 1:
-            loss = loss + self._virtual_loss(index)
+        view = self._views[self._order.pop()]
+        absgrad = None
+        if config.densification != "mcmc":
+            absgrad = torch.zeros(1, len(self._parameters["means"]), 2, device=self.device, requires_grad=True)
+        loss = self._view_loss(view, absgrad)
+        if config.virtual_every and self.iteration % config.virtual_every == 0 and len(self._stamps) > 1:
+            loss = loss + self._virtual_loss(view.exposure)
         if config.lambda_flat:
             loss = loss + config.lambda_flat * losses.depth_extent(self._current(), self._eye).mean()
+        if config.light:
+            loss = loss + _LIGHT_ANCHOR * ((self._light["light"] - self._light_prior) ** 2).sum()
         loss.backward()
         self._last_loss = loss.detach()
+        if absgrad is not None:
+            half = absgrad.new_tensor([view.camera.width / 2, view.camera.height / 2])
+            steepness = (absgrad.grad[0] * half).norm(dim=1)
+            self._gradients += torch.stack([steepness, (steepness > 0).to(steepness.dtype)])
         decay = 0.01 ** (self.iteration / config.iterations)
         self._optimizer.param_groups[0]["lr"] = _RATES["means"] * self.scene_depth * config.learning_rate * decay
-        self._optimizer.step()
-        self._optimizer.zero_grad(set_to_none=True)
+        for optimizer in filter(None, (self._optimizer, self._light_optimizer)):
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
         self.iteration += 1
         with torch.no_grad():
             # Nothing holds the size of Gaussians where every view is masked; one that grew would smear the deformed scene.
@@ -189,25 +255,37 @@ class Trainer:
             refining = self.iteration <= _LAST_REFINEMENT * config.iterations
             if refining and self.iteration % config.refine_every == 0:
                 self._refine()
-            self._explore()
+            if config.densification == "mcmc":
+                self._explore()
 
-    def _render(self, viewmat: Tensor, K: Tensor, camera: Camera, masks: Tensor | None = None) -> RenderOutput:
+    def _render(
+        self, viewmat: Tensor, K: Tensor, camera: Camera, masks: Tensor | None = None, absgrad: Tensor | None = None
+    ) -> RenderOutput:
         model = self._current()
         return rasterize(
             model.means, model.quats, model.scales, model.opacities, model.sh,
-            viewmat, K, camera.width, camera.height, masks=masks,
+            viewmat, K, camera.width, camera.height, masks=masks, absgrad=absgrad,
         )  # fmt: skip
 
-    def _view_loss(self, view: _View) -> Tensor:
+    def _view_loss(self, view: _View, absgrad: Tensor | None) -> Tensor:
         """Paper eq. 7: photometric, depth, distortion and total variation of one training view."""
         config = self.config
         masks = None if view.mask is None else view.mask[None] > 0
-        output = self._render(view.viewmat, view.K, view.camera, masks)
-        loss = losses.photometric(output.colors[0], view.image, view.mask, config.lambda_ssim)
-        if view.depth is not None and config.lambda_depth:
-            error = losses.depth_l1(output.depths[0], view.depth, view.mask)
-            loss = loss + config.lambda_depth / self.scene_depth * error
-        return loss + self._regularization(output, view.mask)
+        output = self._render(view.viewmat, view.K, view.camera, masks, absgrad)
+        image = self._shaded(output, view.camera)
+        if config.exposure:
+            image = image * self._light["exposures"][view.exposure].exp()
+        loss = losses.photometric(image, view.image, view.mask, config.lambda_ssim)
+        if view.depth is not None:
+            if config.lambda_depth:
+                error = losses.depth_l1(output.depths[0], view.depth, view.mask)
+                loss = loss + config.lambda_depth / self.scene_depth * error
+            if config.lambda_pearson:
+                loss = loss + config.lambda_pearson * losses.pearson(output.depths[0], view.depth, view.mask)
+            if config.lambda_gradient:
+                error = losses.gradient_difference(output.depths[0], output.alphas[0], view.depth, view.mask)
+                loss = loss + config.lambda_gradient * error
+        return loss + self._regularization(output, view.mask, view.image)
 
     def _virtual_loss(self, index: int) -> Tensor:
         """Paper eq. 9: distortion and total variation from a virtual camera between a view and its nearest view."""
@@ -215,13 +293,21 @@ class Trainer:
         alpha = torch.rand((), generator=self._generator).item()
         camera = first.camera.at(interpolate_pose(first.camera.pose, second.camera.pose, alpha))
         viewmat = torch.as_tensor(camera.viewmat, dtype=torch.float32, device=self.device)[None]
-        return self._regularization(self._render(viewmat, first.K, camera), None)
+        output = self._render(viewmat, first.K, camera)
+        loss = self._regularization(output, None, output.colors[0].detach())
+        if self.config.lambda_pearson and first.depth is not None:
+            prior = _carried_depth(first, viewmat[0])
+            loss = loss + self.config.lambda_pearson * losses.pearson(output.depths[0], prior, None)
+        return loss
 
-    def _regularization(self, output: RenderOutput, mask: Tensor | None) -> Tensor:
-        config = self.config
-        distortion = losses.masked_mean(output.distortions[0], mask)
-        variation = losses.total_variation(output.depths[0], mask)
-        return (config.lambda_dist * distortion + config.lambda_tv * variation) / self.scene_depth
+    def _regularization(self, output: RenderOutput, mask: Tensor | None, image: Tensor) -> Tensor:
+        config, unit = self.config, self.scene_depth
+        distortion = losses.masked_mean(output.distortions[0], mask) / unit
+        if config.edge_aware:
+            variation = losses.edge_aware_variation(output.depths[0], output.alphas[0], image, mask, unit)
+        else:
+            variation = losses.total_variation(output.depths[0], mask) / unit
+        return config.lambda_dist * distortion + config.lambda_tv * variation
 
     # --------------------------------------------------------------- Gaussians
 
@@ -231,6 +317,18 @@ class Trainer:
         factor = self.config.learning_rate
         groups = [{"params": [tensor], "lr": factor * _RATES[name]} for name, tensor in self._parameters.items()]
         self._optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True)
+        # Σ of image gradients and number of views that had any, since the last refinement.
+        self._gradients = torch.zeros(2, len(model), device=self.device)
+
+    def _set_light(self, light: Tensor, exposures: Tensor) -> None:
+        """Start optimising the light [4] and the logarithm of the exposures [V, 3], as far as there are any."""
+        self._light = {
+            "light": light.clone().requires_grad_(self.config.light),
+            "exposures": exposures.clone().requires_grad_(self.config.exposure),
+        }
+        rates = {"light": _LIGHT_RATE, "exposures": _EXPOSURE_RATE}
+        groups = [{"params": [value], "lr": rates[name]} for name, value in self._light.items() if value.requires_grad]
+        self._light_optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True) if groups else None
 
     def _current(self) -> GaussianModel:
         """The model made of the parameters, through which gradients flow."""
@@ -240,9 +338,17 @@ class Trainer:
 
     def _refine(self) -> None:
         """Relocate and add Gaussians, carrying the optimiser's state of those that stay."""
-        model, source, fresh = densification.refine(
-            self.model, self.config.growth, self.config.max_gaussians, self._generator
-        )
+        config, model = self.config, self._detached()
+        if config.densification == "mcmc":
+            model, source, fresh = densification.refine(model, config.growth, config.max_gaussians, self._generator)
+        else:
+            total, count = self._gradients
+            model, source, fresh = densification.split_and_clone(
+                model, total / count.clamp_min(1), self.scene_depth, config.max_gaussians, self._generator
+            )
+            if config.densification == "proximity":
+                model, others, added = densification.unpool(model, config.max_gaussians)
+                source, fresh = source[others], fresh[others] | added
         states = [self._optimizer.state[group["params"][0]] for group in self._optimizer.param_groups]
         self._set_model(model)
         for group, state in zip(self._optimizer.param_groups, states):
@@ -265,7 +371,7 @@ class Trainer:
 
     # --------------------------------------------------------------- inputs
 
-    def _to_device(self, frame: Frame) -> _View:
+    def _to_device(self, frame: Frame, exposure: int) -> _View:
         tensor = lambda array: torch.tensor(array, dtype=torch.float32, device=self.device)
         camera = frame.camera
         return _View(
@@ -275,6 +381,7 @@ class Trainer:
             tensor(frame.image) / 255,
             None if frame.depth is None else tensor(frame.depth),
             None if frame.mask is None or frame.mask.all() else tensor(frame.mask > 0),
+            exposure,
         )
 
 
@@ -301,14 +408,18 @@ def _read_checkpoint(path: Path, device: torch.device) -> dict:
     except pickle.UnpicklingError:  # whose text advises to load it all the same
         raise ValueError("it holds other objects than tensors and numbers") from None
     moments = state["optimizer"]["state"]  # of each parameter, by its number; empty before the first step
-    tensors = [*state["model"].values(), *(value for values in moments.values() for value in values.values())]
+    lights = state["light_optimizer"]["state"]
+    tensors = [*state["model"].values(), *state["light"].values(), state["gradients"]]
+    tensors += [value for values in [*moments.values(), *lights.values()] for value in values.values()]
     if sum(tensor.numel() * tensor.element_size() for tensor in tensors) > size:  # views of less
         raise ValueError("it claims more than it holds")
     if any(tensor.dtype != torch.float32 or tensor.is_meta or not tensor.isfinite().all() for tensor in tensors):
         raise ValueError("its tensors are not of finite float32 numbers")
     shapes = [tensor.shape for tensor in _parameters(GaussianModel(**state["model"])).values()]  # none without Gaussians
     found = {number: {name: value.shape for name, value in values.items()} for number, values in moments.items()}
-    if not shapes or found and found != {n: {"step": (), "exp_avg": shape, "exp_avg_sq": shape} for n, shape in enumerate(shapes)}:
+    if state["gradients"].shape != (2, *shapes[0][:1]) if shapes else True:
+        raise ValueError("the gradients do not fit the model")
+    if found and found != {n: {"step": (), "exp_avg": shape, "exp_avg_sq": shape} for n, shape in enumerate(shapes)}:
         raise ValueError("the state of the optimiser does not fit the model")
     return state
 
@@ -341,6 +452,34 @@ def shrink(frame: Frame, width: int) -> Frame:
         depth=None if frame.depth is None else cv2.resize(frame.depth, size, interpolation=cv2.INTER_NEAREST_EXACT),
         mask=None if frame.mask is None else np.uint8(255) * (average(np.float32(frame.mask > 0)) > 0.999),
     )
+
+
+def _carried_depth(view: _View, viewmat: Tensor) -> Tensor:
+    """The prior of a view as another camera [4, 4] of its kind sees it [H, W], metres; 0 where nothing falls."""
+    height, width = view.depth.shape
+    v, u = (view.depth > 0).nonzero(as_tuple=True)
+    K, z = view.K[0], view.depth[v, u]
+    local = torch.stack([(u + 0.5 - K[0, 2]) / K[0, 0] * z, (v + 0.5 - K[1, 2]) / K[1, 1] * z, z, torch.ones_like(z)], 1)
+    x, y, z = (local @ (viewmat @ torch.linalg.inv(view.viewmat[0]))[:3].T).unbind(1)
+    u, v = (x / z * K[0, 0] + K[0, 2]).floor(), (y / z * K[1, 1] + K[1, 2]).floor()
+    inside = (z > 0) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
+    index = (v * width + u)[inside].long()
+    carried = torch.full((height * width,), math.inf, device=z.device).scatter_reduce(0, index, z[inside], "amin")
+    return torch.where(carried.isfinite(), carried, 0).view(height, width)
+
+
+def right_view(frame: Frame) -> Frame:
+    """The right image of a stereo frame as a view of its own, without depth."""
+    pose = frame.camera.pose.copy()
+    pose[:3, 3] += frame.baseline * pose[:3, 0]
+    K = frame.camera.K if frame.right_K is None else frame.right_K
+    mask = lit_area([frame.right])
+    if frame.mask is not None:
+        # Tools of the left image lie farther to the left, by any of the disparities that there are.
+        tools = (frame.mask == 0) & (lit_area([frame.image]) > 0)
+        farthest = int(_WIDEST_PARALLAX * frame.camera.width)
+        mask[cv2.dilate(np.uint8(tools), np.ones((1, farthest + 1), np.uint8), anchor=(0, 0)) > 0] = 0
+    return Frame(frame.stamp_ns, frame.right, Camera(K, frame.camera.width, frame.camera.height, pose), mask=mask)
 
 
 def _nearest_views(frames: list[Frame]) -> list[int]:

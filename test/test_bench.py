@@ -77,7 +77,7 @@ def test_the_rasteriser_bench_reports_every_row(tmp_path, capsys):
     expected |= {"over overlap: 50 32x24 overlap x2": "ms", "training 300 96x80": "iterations/s"}
     for name, unit in expected.items():
         assert rows[name]["unit"] == unit and 0 < rows[name]["value"] < math.inf
-    for name, peer in {"50 32x24 forward": "plain scalar kernel", "40 24x16 forward + backward": "torch reference"}.items():
+    for name, peer in {"50 32x24 forward": "plain scalar kernel, one thread", "40 24x16 forward + backward": "torch reference"}.items():
         assert rows[name]["peer"] == peer and rows[name]["ratio"] > 0
     for name in ("50 32x24 mean colour difference", "40 24x16 mean colour difference"):
         assert rows[name]["peer"] and rows[name]["value"] < 1e-5

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from endo_sim_ros.cameras import Camera, look_at
 from endo_sim_ros.gaussians import GaussianModel
-from endo_sim_ros.splatting import RenderOutput, _rasterize, rasterize, rasterizer, render
+from endo_sim_ros.splatting import RenderOutput, _rasterize, rasterize, rasterizer, rasterizer_simd, rasterizer_tiled, render
 
 DEVICES = ["cpu"] + (["cuda"] if torch.cuda.is_available() else [])
 WIDTH, HEIGHT = 70, 45  # no multiple of the tile
@@ -543,7 +543,7 @@ def test_results_repeat_bit_for_bit_with_any_number_of_threads(monkeypatch):
     gaussians, cameras = make_gaussians(3000, 4, seed=11), make_cameras(2, 150, 90)
     results = []
     for threads in (1, 2, 2, 5):
-        monkeypatch.setattr(rasterizer, "cpu_threads", lambda: threads)
+        monkeypatch.setattr(rasterizer_simd, "cpu_threads", lambda: threads)
         absgrad = torch.zeros(2, 3000, 2, requires_grad=True)
         options = {"size": (150, 90), "absgrad": absgrad, "median": True}
         output, gradients = run(rasterize, gaussians, cameras, dtype=torch.float32, **options)
@@ -608,3 +608,31 @@ def test_gradient_descent_recovers_a_moved_gaussian():
         (draw(mean) - target).square().mean().backward()
         optimizer.step()
     assert torch.allclose(mean, torch.tensor([0.01, -0.005, 0.12]), atol=2e-3)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_pictures_for_whose_lists_there_is_no_room_are_the_same(device, monkeypatch):
+    """Two cameras, one of which sees nothing, and Gaussians behind the camera and beside the image."""
+    gaussians, cameras = make_gaussians(300, 4, seed=13), make_cameras()
+    gaussians[0][:20, 2] = -1.0
+    gaussians[0][20:40, 0] = 50.0
+    cameras[0][1, 2, 3] = -100.0
+    with rasterizer.scalar_kernels():
+        roomy = run(rasterize, gaussians, cameras, device=device, dtype=torch.float32)
+        monkeypatch.setattr(rasterizer_tiled, "_MOST", 0.01)
+        cramped = run(rasterize, gaussians, cameras, device=device, dtype=torch.float32)
+        device = torch.device(f"{device}:0" if device == "cuda" else device)
+        scratch = rasterizer_tiled._scratch(device, rasterizer_tiled._stream(device))
+    assert scratch.seen[0] > scratch.room
+    for expected, actual in zip([*roomy[0][:4], *roomy[1]], [*cramped[0][:4], *cramped[1]]):
+        assert_close("it", actual, expected.cpu(), 1e-5)
+
+
+def test_room_follows_what_pictures_needed():
+    expectation = rasterizer_tiled._Expectation(torch.device("cpu"))
+    assert 4000 <= expectation.room(1000) < 8000
+    expectation.seen.copy_(torch.tensor([30_000, 1000]))
+    assert 30_000 < expectation.room(1000) < 60_000
+    assert 60_000 < expectation.room(2000) < 120_000
+    expectation.seen.copy_(torch.tensor([10_000_000, 1000]))
+    assert expectation.room(1000) < 100_000

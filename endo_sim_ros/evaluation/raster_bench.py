@@ -121,7 +121,6 @@ def _speed(name: str, count: int, size: tuple[int, int], device: str, seconds: f
     scene = tissue(count, *size, device)
     peers = {peer: prepare(scene) for peer, prepare in _peers(device).items()}
     rows = _compare(name, scene, peers, device, seconds)
-    # Our scalar kernels need what our vectors need.
     peaks = [peak_megabytes(_forward_and_backward(draw, scene), device) for draw in peers.values() if device != "cpu"]
     ours = peak_megabytes(_forward_and_backward(_ours(scene), scene), device)
     if ours is not None:
@@ -211,13 +210,13 @@ def _training(count: int, width: int, height: int, device: str, seconds: float) 
 def _peers(device: str) -> dict[str, Callable[[Scene], Draw]]:
     """What else could draw a scene here."""
     if device == "cpu":
-        return {"plain scalar kernel": _scalar}
+        return {"plain scalar kernel, one thread": _scalar}
     peers = {"gsplat": _gsplat, "gswarp": _gswarp}
     return {name: prepare for name, prepare in peers.items() if importlib.util.find_spec(name)}
 
 
 def _scalar(scene: Scene) -> Draw:
-    """Our kernels for GPUs, one pixel at a time, in all threads."""
+    """Our kernels for GPUs, one pixel at a time."""
 
     def draw(gaussians):
         with rasterizer.scalar_kernels():

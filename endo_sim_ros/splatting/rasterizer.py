@@ -6,6 +6,7 @@
 import contextlib
 import contextvars
 import functools
+import types
 from typing import NamedTuple
 
 import torch
@@ -13,10 +14,11 @@ import warp as wp
 from torch import Tensor
 
 from endo_sim_ros.cameras import Camera
-from endo_sim_ros.device import cpu_threads, init_warp, on_torch_stream, run_in_threads
+from endo_sim_ros.device import init_warp, on_torch_stream
 from endo_sim_ros.gaussians import GaussianModel
-from endo_sim_ros.splatting import rasterizer_kernels as kernels
-from endo_sim_ros.splatting import rasterizer_simd_kernels as simd_kernels
+from endo_sim_ros.splatting import rasterizer_simd, rasterizer_tiled
+from endo_sim_ros.splatting.launching import Scene, Settings
+from endo_sim_ros.splatting.rasterizer_kernels import TILE
 
 ALPHA_MIN = 1 / 255  # fainter contributions are skipped
 ALPHA_MAX = 0.999
@@ -96,14 +98,13 @@ def rasterize(
     if means.device.type == "cpu" and not means.isfinite().all():
         index = int((~means.detach().isfinite()).any(1).nonzero()[0])
         raise ValueError(f"rasterize: means[{index}] is not finite: {means[index].tolist()}")
-    _load_kernels(str(means.device))
-    settings = _Settings(int(width), int(height), float(near), float(eps2d), bool(median), _uses_vectors(means.device))
+    settings = Settings(int(width), int(height), float(near), float(eps2d), bool(median))
     if background is None:
         background = _black(means.device)
     arguments = [means, quats, scales, covars, opacities, sh, viewmats, background, absgrad]
     arguments = [None if x is None else x.to(means.device, torch.float32).contiguous() for x in arguments]
     Ks = Ks.to(means.device, torch.float32).contiguous()
-    *images, owners = _Rasterize.apply(settings, Ks, masks, *arguments)
+    *images, owners = _Rasterize.apply(settings, masks, Ks, *arguments)
     return RenderOutput(*images, _depths_of(owners, arguments[0], arguments[6]) if median else None)
 
 
@@ -197,31 +198,31 @@ def _depths_of(owners: Tensor, means: Tensor, viewmats: Tensor) -> Tensor:
 
 # ---------------------------------------------------------------- running the kernels
 
+_scalar = contextvars.ContextVar("scalar", default=False)
 
-class _Settings(NamedTuple):
-    """What `_Rasterize` needs besides tensors."""
 
-    width: int
-    height: int
-    near: float
-    eps2d: float
-    median: bool
-    vectors: bool  # whether to composite with the kernels made for CPUs, rather than one thread per pixel
+@contextlib.contextmanager
+def scalar_kernels():
+    """Within it, `rasterize` runs the kernels made for GPUs on the CPU too, in one thread, pixel by pixel: to compare with."""
+    token = _scalar.set(True)
+    try:
+        yield
+    finally:
+        _scalar.reset(token)
 
-    @property
-    def tiles_x(self) -> int:
-        return -(-self.width // kernels.TILE)
 
-    @property
-    def tiles_y(self) -> int:
-        return -(-self.height // kernels.TILE)
+def _way(device: torch.device) -> types.ModuleType:
+    """The module with the functions `forward` and `backward` for a device."""
+    way = rasterizer_simd if device.type == "cpu" and not _scalar.get() else rasterizer_tiled
+    _load_kernels(way, str(device))
+    return way
 
 
 @functools.cache
-def _load_kernels(device: str) -> None:
+def _load_kernels(way: types.ModuleType, device: str) -> None:
     """Compile the kernels before several threads ask for them."""
     init_warp()
-    for module in (kernels, simd_kernels) if device == "cpu" else (kernels,):
+    for module in way.MODULES:
         wp.load_module(module, device)
 
 
@@ -230,211 +231,50 @@ def _black(device: torch.device) -> Tensor:
     return torch.zeros(3, device=device)
 
 
-def _array(tensor: Tensor | None, dtype=None):
-    """A tensor as a kernel argument, without copying; None becomes an array that must not be read."""
-    if tensor is None:
-        return None
-    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+@functools.cache
+def _all_tiles(count: int, device: torch.device) -> Tensor:
+    return torch.ones(count, dtype=torch.uint8, device=device)
 
 
-def _launch(kernel, count: int, arguments: list, device: torch.device, width: int = 1) -> None:
-    """Launch a kernel whose first argument is an offset, over count items of some threads each.
-
-    At once on CUDA, in shares of whole items on the CPU.
-    """
-    if count == 0:
-        return
-    if device.type != "cpu":
-        wp.launch(kernel, dim=count * width, inputs=[0, *arguments], device=str(device))
-        return
-    threads = cpu_threads() if count * width >= 1024 else 1
-    bounds = [width * (count * i // threads) for i in range(threads + 1)]
-
-    def share(first, end):
-        wp.launch(kernel, dim=end - first, inputs=[first, *arguments], device="cpu")
-
-    run_in_threads([functools.partial(share, *pair) for pair in zip(bounds[:-1], bounds[1:])])
-
-
-def _launch_tiles(kernel, tile_count: int, arguments: list) -> None:
-    """Launch a CPU kernel that draws tiles from a counter, its first argument, in all threads."""
-    counter = torch.zeros(1, dtype=torch.int32)
-    inputs = [_array(counter), *arguments]
-    command = wp.launch(kernel, dim=tile_count, inputs=inputs, device="cpu", record_cmd=True)
-    run_in_threads([command.launch] * min(cpu_threads(), tile_count))
-
-
-def _sort_pairs(keys: Tensor, values: Tensor, count: int, bits: int) -> None:
-    """Stable sort of the first count keys, from 0 to 2^bits − 1, and their values; both have room for 2·count."""
-    wp.utils.radix_sort_pairs(wp.from_torch(keys), wp.from_torch(values), count, 0, bits)
-
-
-def _tile_mask(masks: Tensor | None, settings: _Settings, camera_count: int, device: torch.device) -> Tensor:
+def _tile_mask(masks: Tensor | None, settings: Settings, camera_count: int, device: torch.device) -> Tensor:
     """Whether any pixel of each tile matters, uint8 [C · tiles]."""
     s = settings
     if masks is None:
-        return torch.ones(camera_count * s.tiles_x * s.tiles_y, dtype=torch.uint8, device=device)
-    padding = (0, s.tiles_x * kernels.TILE - s.width, 0, s.tiles_y * kernels.TILE - s.height)
+        return _all_tiles(camera_count * s.tiles_x * s.tiles_y, device)
+    padding = (0, s.tiles_x * TILE - s.width, 0, s.tiles_y * TILE - s.height)
     padded = torch.nn.functional.pad(masks.to(device, torch.uint8), padding)
-    return padded.reshape(camera_count, s.tiles_y, kernels.TILE, s.tiles_x, kernels.TILE).amax((2, 4)).flatten()
-
-
-class _Intersections(NamedTuple):
-    """Which splat meets which tile; the header of the kernels defines the terms."""
-
-    owners: Tensor  # [I] splat of each intersection
-    slots: Tensor  # [I] intersections by tile, then depth
-    starts: Tensor  # [tiles + 1] first slot of each tile
-    counts: Tensor  # [C·N] intersections of each splat
-    firsts: Tensor  # [C·N] first intersection of each splat
-
-
-def _intersect(splats, depth_keys, counts, tile_mask, gaussian_count, settings) -> _Intersections:
-    """List the splats of every tile in depth order."""
-    device = splats.device
-    splat_count, tile_count = len(counts), len(tile_mask)
-    order = torch.empty(2 * splat_count, dtype=torch.int32, device=device)
-    torch.arange(splat_count, dtype=torch.int32, device=device, out=order[:splat_count])
-    _sort_pairs(depth_keys, order, splat_count, 31)
-    order = order[:splat_count]
-    ends = counts[order].cumsum(0, dtype=torch.int32)
-    count = int(ends[-1]) if splat_count else 0
-
-    firsts = torch.empty_like(counts)
-    tiles = torch.empty(2 * count, dtype=torch.int32, device=device)
-    slots = torch.empty_like(tiles)
-    owners = torch.empty(count, dtype=torch.int32, device=device)
-    starts = torch.empty(tile_count + 1, dtype=torch.int32, device=device)
-    arguments = [_array(order), _array(ends), _array(counts), gaussian_count, _array(splats), _array(tile_mask)]
-    arguments += [settings.tiles_x, settings.tiles_y, _array(firsts), _array(tiles), _array(slots), _array(owners)]
-    _launch(kernels.emit_intersections, splat_count if count else 0, arguments, device)
-    if count:
-        _sort_pairs(tiles, slots, count, (tile_count + 1).bit_length())
-    _launch(kernels.find_tile_starts, count + 1, [_array(tiles), count, _array(starts)], device)
-    return _Intersections(owners, slots, starts, counts, firsts)
-
-
-_scalar = contextvars.ContextVar("scalar", default=False)
-
-
-@contextlib.contextmanager
-def scalar_kernels():
-    """Within it, `rasterize` runs the kernels made for GPUs on the CPU too, pixel by pixel: to compare with."""
-    token = _scalar.set(True)
-    try:
-        yield
-    finally:
-        _scalar.reset(token)
-
-
-def _uses_vectors(device: torch.device) -> bool:
-    return device.type == "cpu" and not _scalar.get()
-
-
-def _composite(intersections, splats, background, settings, tile_count, images, owners) -> None:
-    """Fill images (colours, depths, alphas, distortions) and, if wanted, the owners of median depths."""
-    arguments = [*_image_arguments(intersections, splats, background, settings, images), int(settings.median), _array(owners)]
-    if settings.vectors:
-        _launch_tiles(simd_kernels.render_tiles, tile_count, arguments)
-    else:
-        _launch(kernels.render_pixels, tile_count, arguments, splats.device, kernels.TILE**2)
-
-
-def _composite_backward(intersections, splats, background, settings, tile_count, images, v_images, absolute) -> Tensor:
-    """The gradient records, from the gradients of the images."""
-    # One kernel writes every record, the other adds to them.
-    size = (len(intersections.owners), kernels.RECORD_SIZE)
-    records = (torch.empty if settings.vectors else torch.zeros)(size, device=splats.device)
-    arguments = _image_arguments(intersections, splats, background, settings, (*images, *v_images)) + [int(absolute)]
-    if settings.vectors:
-        _launch_tiles(simd_kernels.render_tiles_backward, tile_count, [*arguments, _array(records.view(-1))])
-    else:
-        # No two threads of a CPU share a tile, and with it a record.
-        _launch(kernels.render_pixels_backward, tile_count, [*arguments, _array(records)], splats.device, kernels.TILE**2)
-    return records
-
-
-def _image_arguments(intersections, splats, background, settings, images) -> list:
-    """The arguments with which all compositing kernels begin."""
-    lists = [_array(x) for x in (intersections.owners, intersections.slots, intersections.starts)]
-    if settings.vectors:
-        arrays = [_array(x.view(-1)) for x in images]
-        return [_array(splats.view(-1)), *lists, _array(background), settings.width, settings.height, *arrays]
-    arrays = [_array(x.view(-1, 3), wp.vec3) if x.ndim == 4 else _array(x.view(-1)) for x in images]
-    return [_array(splats), *lists, _array(background[None], wp.vec3), settings.width, settings.height, *arrays]
+    return padded.reshape(camera_count, s.tiles_y, TILE, s.tiles_x, TILE).amax((2, 4)).flatten()
 
 
 class _Rasterize(torch.autograd.Function):
-    """Takes settings, Ks and masks, then the differentiable tensors; float32, contiguous, on one device."""
+    """Takes settings, masks and Ks, then the differentiable tensors; float32, contiguous, on one device."""
 
     @staticmethod
-    def forward(ctx, settings, Ks, masks, means, quats, scales, covars, opacities, sh, viewmats, background, absgrad):
-        device, n, camera_count = means.device, len(means), len(viewmats)
-        splat_count = camera_count * n
-        splats = torch.empty(splat_count, kernels.SPLAT_SIZE, device=device)
-        radii = torch.empty(camera_count, n, dtype=torch.int32, device=device)
-        counts = torch.empty(splat_count, dtype=torch.int32, device=device)
-        depth_keys = torch.empty(2 * splat_count, dtype=torch.int32, device=device)
-        size = (camera_count, settings.height, settings.width)
-        images = [torch.empty(*size, 3, device=device)] + [torch.empty(size, device=device) for _ in range(3)]
-        owners = torch.empty(size if settings.median else 0, dtype=torch.int32, device=device)
-        tile_mask = _tile_mask(masks, settings, camera_count, device)
+    def forward(ctx, settings, masks, Ks, means, quats, scales, covars, opacities, sh, viewmats, background, absgrad):
+        device = means.device
+        scene = Scene(means, quats, scales, covars, opacities, sh, viewmats, Ks, background)
+        ctx.way, ctx.settings = _way(device), settings
+        tile_mask = _tile_mask(masks, settings, len(viewmats), device)
         with on_torch_stream(device):
-            arguments = _gaussian_arguments(means, quats, scales, covars) + [_array(opacities)]
-            arguments += _camera_arguments(sh, viewmats, Ks, settings) + [settings.near, settings.eps2d]
-            outputs = (tile_mask, splats, radii.view(-1), depth_keys, counts)
-            _launch(kernels.project, splat_count, arguments + [_array(x) for x in outputs], device)
-            intersections = _intersect(splats, depth_keys, counts, tile_mask, n, settings)
-            _composite(intersections, splats, background, settings, len(tile_mask), images, owners.view(-1))
-        ctx.settings, ctx.intersections, ctx.tile_count = settings, intersections, len(tile_mask)
-        ctx.splats, ctx.Ks = splats, Ks
-        ctx.save_for_backward(means, quats, scales, covars, opacities, sh, viewmats, background, *images)
+            images, radii, owners, ctx.state = ctx.way.forward(scene, tile_mask, settings)
+        ctx.save_for_backward(*scene, *images)
         ctx.mark_non_differentiable(radii, owners)
         return *images, radii, owners
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, *v_outputs):
-        means, quats, scales, covars, opacities, sh, viewmats, background, *images = ctx.saved_tensors
-        settings, intersections, device = ctx.settings, ctx.intersections, means.device
+        scene, images = Scene(*ctx.saved_tensors[:-4]), ctx.saved_tensors[-4:]
         v_images = [v.float().contiguous() for v in v_outputs[:4]]
         wants_pose, wants_background, wants_absolute = ctx.needs_input_grad[9:12]
-
-        v_means, v_opacities, v_sh = (torch.empty_like(x) for x in (means, opacities, sh))
-        v_quats, v_scales, v_covars = (None if x is None else torch.empty_like(x) for x in (quats, scales, covars))
-        shares = torch.empty(len(viewmats), len(means), 4, 4, device=device) if wants_pose else None
-        v_absgrad = torch.empty(len(viewmats), len(means), 2, device=device) if wants_absolute else None
-        with on_torch_stream(device):
-            lists_and_images = (intersections, ctx.splats, background, settings, ctx.tile_count, images)
-            records = _composite_backward(*lists_and_images, v_images, wants_absolute)
-            arguments = _gaussian_arguments(means, quats, scales, covars)
-            arguments += _camera_arguments(sh, viewmats, ctx.Ks, settings) + [settings.eps2d]
-            arguments += [_array(x) for x in (intersections.counts, intersections.firsts, records)]
-            arguments += [int(wants_pose), int(wants_absolute)]
-            arguments += [_array(v_means, wp.vec3), _array(v_quats, wp.vec4), _array(v_scales, wp.vec3)]
-            arguments += [_array(v_covars, wp.mat33), _array(v_opacities), _array(v_sh, wp.vec3)]
-            arguments += [_array(shares, wp.mat44), _array(v_absgrad, wp.vec2)]
-            _launch(kernels.project_backward, len(means), arguments, device)
-
+        with on_torch_stream(scene.means.device):
+            v = ctx.way.backward(scene, ctx.state, ctx.settings, images, v_images, wants_pose, wants_absolute)
         v_viewmats = v_background = None
         if wants_pose:
-            v_viewmats = _repeatable_sum(shares, 1)
+            v_viewmats = _repeatable_sum(v.camera_shares, 1)
         if wants_background:
             v_background = _repeatable_sum((v_images[0] * (1 - images[2])[..., None]).view(-1, 3), 0)
-        v_gaussians = (v_means, v_quats, v_scales, v_covars, v_opacities, v_sh)
-        return None, None, None, *v_gaussians, v_viewmats, v_background, v_absgrad
-
-
-def _gaussian_arguments(means, quats, scales, covars) -> list:
-    """The arguments with which `project` and `project_backward` begin."""
-    arrays = [_array(means, wp.vec3), _array(quats, wp.vec4), _array(scales, wp.vec3), _array(covars, wp.mat33)]
-    return [*arrays, int(covars is not None)]
-
-
-def _camera_arguments(sh, viewmats, Ks, settings) -> list:
-    """The arguments that both kernels have next: colours and cameras."""
-    arrays = [_array(sh, wp.vec3), _array(viewmats, wp.mat44), _array(Ks, wp.mat33)]
-    return [*arrays, settings.width, settings.height]
+        return None, None, None, *v[:6], v_viewmats, v_background, v.absolutes
 
 
 def _repeatable_sum(x: Tensor, dim: int) -> Tensor:

@@ -1,4 +1,4 @@
-"""Kernels of the rasteriser: projection, tile lists, and one-thread-per-pixel compositing.
+"""What both ways to rasterise have in common: the mathematics of a splat, projection and its gradients, tile lists.
 
 Notation. A splat is one Gaussian n seen by one camera c; splats are numbered c·N + n. With mean position p in the
 camera frame, J the Jacobian of the pinhole projection (x/z and y/z clamped to 1.3 fields of view), R the camera
@@ -25,10 +25,10 @@ Depths are taken relative to the first splat of a tile: L does not change, and f
 
 Memory layout. `splats` is one float32 row of 16 per splat, one cache line; its columns are the constants below. A splat
 touches the tiles whose pixel centres its ellipse α ≥ 1/255 meets. Those (splat, tile) pairs are *intersections*,
-numbered in depth order of their splats, so that the intersections of a splat are consecutive; `slots` lists them by
-tile, and within a tile by depth. The backward pass writes one gradient row of 12 per intersection; `project_backward`
-adds up the consecutive rows of a splat. The absolute gradients of the mean, Σ_pixels |∂L/∂mean|, take the same way.
-No two CPU threads write to the same place, so results repeat bit for bit.
+numbered in depth order of their splats, so that the intersections of a splat are consecutive, and listed by tile, within
+a tile by depth. On a CPU the backward pass writes one gradient row of 12 per intersection, and `project_backward` adds
+up the consecutive rows of a splat: no two threads write to the same place, so results repeat bit for bit. On a GPU all
+tiles add to one row per splat. The absolute gradients of the mean, Σ_pixels |∂L/∂mean|, take the same way.
 """
 
 import warp as wp
@@ -298,6 +298,7 @@ def project(
     splats: wp.array2d[float],  # out
     radii: wp.array[int],  # out, pixels, 0 = not in the image
     depth_keys: wp.array[int],  # out, order as depths do
+    order: wp.array[int],  # out, number of each splat, to be sorted by depth
     counts: wp.array[int],  # out, intersections of each splat
 ):
     splat = offset + wp.tid()
@@ -306,6 +307,7 @@ def project(
     n = splat - camera * gaussian_count
     radii[splat] = 0
     depth_keys[splat] = 0
+    order[splat] = splat
     counts[splat] = 0
 
     viewmat, K = viewmats[camera], Ks[camera]
@@ -383,27 +385,37 @@ def prefetch_row(rows: wp.array2d[float], row: int):
 @wp.kernel
 def emit_intersections(
     offset: int,
-    order: wp.array[int],  # [C·N] splats by depth
-    ends: wp.array[int],  # [C·N] running sum of counts in that order
+    order: wp.array[int],  # [C·N] splats by depth (the first half is used)
+    ends: wp.array[wp.int64],  # [C·N] running sum of counts in that order
     counts: wp.array[int],
     gaussian_count: int,
     splats: wp.array2d[float],
     tile_mask: wp.array[wp.uint8],
     tiles_x: int,
     tiles_y: int,
-    firsts: wp.array[int],  # out, first intersection of each splat
+    room: int,
+    by_splat: int,  # whether values are splats, rather than numbers of intersections with the two arrays after them
     tiles: wp.array[int],  # out, tile of each intersection (the first half is used)
-    slots: wp.array[int],  # out, number of each intersection (the first half is used)
+    values: wp.array[int],  # out, what is sorted with it (the first half is used)
+    firsts: wp.array[int],  # out, first intersection of each splat
     owners: wp.array[int],  # out, splat of each intersection
 ):
+    """List the intersections; does nothing if there is no room for all."""
     rank = offset + wp.tid()
-    prefetch_row(splats, order[wp.min(rank + LOOK_AHEAD, order.shape[0] - 1)])
+    prefetch_row(splats, order[wp.min(rank + LOOK_AHEAD, ends.shape[0] - 1)])
     splat = order[rank]
-    if counts[splat] == 0:
+    if counts[splat] == 0 or ends[ends.shape[0] - 1] > wp.int64(room):
         return
-    end = ends[rank]
+    end = int(ends[rank])
     i = end - counts[splat]
-    firsts[splat] = i
+    if by_splat == 0:
+        firsts[splat] = i
+        for j in range(i, end):
+            owners[j] = splat
+            values[j] = j
+    else:
+        for j in range(i, end):
+            values[j] = splat
     camera = splat // gaussian_count
     x, y = splats[splat, X], splats[splat, Y]
     extent = wp.vec2(splats[splat, EXTENT_X], splats[splat, EXTENT_Y])
@@ -415,29 +427,12 @@ def emit_intersections(
             tile = (camera * tiles_y + row) * tiles_x + column
             if tile_mask[tile] != wp.uint8(0) and i < end:
                 tiles[i] = tile
-                slots[i] = i
-                owners[i] = splat
                 i += 1
     # Compilers may round differently in the two kernels: an intersection that was counted but not met here
     # goes to the tile after the last one, which nobody draws.
     while i < end:
         tiles[i] = tile_mask.shape[0]
-        slots[i] = i
-        owners[i] = splat
         i += 1
-
-
-@wp.kernel
-def find_tile_starts(offset: int, tiles: wp.array[int], count: int, starts: wp.array[int]):
-    """starts[t] = first slot whose tile is t or later; launched over count + 1 slots of the sorted tiles."""
-    slot = offset + wp.tid()
-    low, high = int(0), starts.shape[0]
-    if slot > 0:
-        low = tiles[slot - 1] + 1
-    if slot < count:
-        high = tiles[slot] + 1
-    for tile in range(low, wp.min(high, starts.shape[0])):
-        starts[tile] = slot
 
 
 @wp.kernel
@@ -455,6 +450,7 @@ def project_backward(
     height: int,
     eps2d: float,
     counts: wp.array[int],
+    by_splat: int,  # whether there is one record for each splat, rather than for each intersection
     firsts: wp.array[int],
     records: wp.array2d[float],
     wants_pose: int,
@@ -472,7 +468,7 @@ def project_backward(
     n = offset + wp.tid()
     gaussian_count = means.shape[0]
     sh_count = sh.shape[1]
-    if n + LOOK_AHEAD < gaussian_count and counts[n + LOOK_AHEAD] > 0:
+    if by_splat == 0 and n + LOOK_AHEAD < gaussian_count and counts[n + LOOK_AHEAD] > 0:
         prefetch_row(records, firsts[n + LOOK_AHEAD])
     v_mean = wp.vec3()
     v_covariance = wp.mat33()
@@ -485,15 +481,20 @@ def project_backward(
         splat = camera * gaussian_count + n
         if wants_pose != 0:
             v_viewmats[camera, n] = wp.mat44()
+        first = splat + 0
+        end = splat + wp.min(counts[splat], 1)
+        if by_splat == 0:
+            first = firsts[splat] + 0
+            end = first + counts[splat]
         if wants_absolute != 0:
             total = wp.vec2()
-            for i in range(firsts[splat], firsts[splat] + counts[splat]):
+            for i in range(first, end):
                 total += wp.vec2(records[i, ABSOLUTE], records[i, ABSOLUTE + 1])
             v_absolute[camera, n] = total
         if counts[splat] > 0:
             drawn = 1
             v = vec10()
-            for i in range(firsts[splat], firsts[splat] + counts[splat]):
+            for i in range(first, end):
                 for k in range(10):
                     v[k] += records[i, k]
 
@@ -579,230 +580,3 @@ def project_backward(
         rv = wp.transpose(r) * v_m
         v_scales[n] = wp.vec3(rv[0, 0], rv[1, 1], rv[2, 2])
         v_quats[n] = quat_gradient(quats[n], v_m * wp.diag(scale))
-
-
-# ---------------------------------------------------------------- one thread per pixel (GPU)
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    return __any_sync(0xffffffffu, condition != 0);
-#else
-    return condition;
-#endif
-""")
-def warp_any(condition: int) -> int:
-    """Whether the condition holds in any thread of the warp, which must be here together; a CPU warp is one thread."""
-    ...
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    for (int step = 16; step > 0; step /= 2)
-        value += __shfl_xor_sync(0xffffffffu, value, step);
-#endif
-    return value;
-""")
-def warp_sum(value: float) -> float:
-    """Sum over the threads of the warp, which must be here together; a CPU warp is one thread."""
-    ...
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    return lane % 32 == 0;
-#else
-    return 1;
-#endif
-""")
-def leads_warp(lane: int) -> int:
-    """Whether this thread writes for its warp; a CPU warp is one thread."""
-    ...
-
-
-@wp.func
-def pixel_in_tile(lane: int) -> wp.vec2i:
-    """Position of a thread's pixel in its tile. A warp covers 8×4 pixels, so that its threads agree more often."""
-    warp = lane // 32
-    return wp.vec2i((warp % 2) * 8 + lane % 8, (warp // 2) * 4 + (lane % 32) // 8)
-
-
-@wp.func
-def splat_exponential(splats: wp.array2d[float], splat: int, dx: float, dy: float) -> float:
-    """exp(−σ) at an offset from the mean, pixels.
-
-    σ as a sum of squares: far from the mean of a needle the terms of the other form cancel.
-    """
-    run = dx + splats[splat, SHEAR_X] * dy
-    rise = splats[splat, ASPECT_X] * dy
-    return wp.exp(-0.5 * splats[splat, A] * (run * run + rise * rise))
-
-
-@wp.kernel
-def render_pixels(
-    offset: int,
-    splats: wp.array2d[float],
-    owners: wp.array[int],
-    slots: wp.array[int],
-    starts: wp.array[int],
-    background: wp.array[wp.vec3],  # [1]
-    width: int,
-    height: int,
-    colors: wp.array[wp.vec3],  # out [C·H·W], as all below
-    depths: wp.array[float],
-    alphas: wp.array[float],
-    distortions: wp.array[float],
-    wants_owners: int,
-    owners_of_median: wp.array[int],  # splat at the median depth or -1, filled when wants_owners
-):
-    """Composite one pixel. Launched over tiles × 256 threads."""
-    thread = offset + wp.tid()
-    tile = thread // (TILE_SIZE * TILE_SIZE)
-    tiles_x = (width + TILE_SIZE - 1) // TILE_SIZE
-    tiles_y = (height + TILE_SIZE - 1) // TILE_SIZE
-    in_tile = pixel_in_tile(thread % (TILE_SIZE * TILE_SIZE))
-    column = (tile % tiles_x) * TILE_SIZE + in_tile[0]
-    row = (tile // tiles_x % tiles_y) * TILE_SIZE + in_tile[1]
-    if column >= width or row >= height:
-        return
-    px, py = float(column) + 0.5, float(row) + 0.5
-    start, end = starts[tile], starts[tile + 1]
-    reference = float(0.0)
-    if start < end:
-        reference = splats[owners[slots[start]], Z]
-
-    color = wp.vec3()
-    depth, distortion = float(0.0), float(0.0)
-    transmittance = float(1.0)
-    owner = int(-1)
-    for slot in range(start, end):
-        splat = owners[slots[slot]]
-        exponential = splat_exponential(splats, splat, px - splats[splat, X], py - splats[splat, Y])
-        alpha = wp.min(ALPHA_MAX, splats[splat, OPACITY] * exponential)
-        if alpha >= ALPHA_MIN:
-            following = transmittance * (1.0 - alpha)
-            if following < TRANSMITTANCE_MIN:
-                break
-            weight = alpha * transmittance
-            z = splats[splat, Z] - reference
-            color += weight * wp.vec3(splats[splat, RED], splats[splat, RED + 1], splats[splat, RED + 2])
-            distortion += 2.0 * weight * (z * (1.0 - transmittance) - depth)
-            depth += weight * z
-            if transmittance > MEDIAN and following <= MEDIAN:
-                owner = splat
-            transmittance = following
-
-    pixel = (tile // (tiles_x * tiles_y) * height + row) * width + column
-    colors[pixel] = color + transmittance * background[0]
-    depths[pixel] = depth + reference * (1.0 - transmittance)
-    alphas[pixel] = 1.0 - transmittance
-    distortions[pixel] = distortion
-    if wants_owners != 0:
-        owners_of_median[pixel] = owner
-
-
-@wp.kernel
-def render_pixels_backward(
-    offset: int,
-    splats: wp.array2d[float],
-    owners: wp.array[int],
-    slots: wp.array[int],
-    starts: wp.array[int],
-    background: wp.array[wp.vec3],  # [1]
-    width: int,
-    height: int,
-    colors: wp.array[wp.vec3],
-    depths: wp.array[float],
-    alphas: wp.array[float],
-    distortions: wp.array[float],
-    v_colors: wp.array[wp.vec3],
-    v_depths: wp.array[float],
-    v_alphas: wp.array[float],
-    v_distortions: wp.array[float],
-    wants_absolute: int,
-    records: wp.array2d[float],  # out, zeroed before: each warp adds its share
-):
-    """Gradients of one pixel. All threads of a warp walk the same splats, also those whose pixel is finished."""
-    thread = offset + wp.tid()
-    tile = thread // (TILE_SIZE * TILE_SIZE)
-    lane = thread % (TILE_SIZE * TILE_SIZE)
-    tiles_x = (width + TILE_SIZE - 1) // TILE_SIZE
-    tiles_y = (height + TILE_SIZE - 1) // TILE_SIZE
-    in_tile = pixel_in_tile(lane)
-    column = (tile % tiles_x) * TILE_SIZE + in_tile[0]
-    row = (tile // tiles_x % tiles_y) * TILE_SIZE + in_tile[1]
-    px, py = float(column) + 0.5, float(row) + 0.5
-    start, end = starts[tile], starts[tile + 1]
-    reference = float(0.0)
-    if start < end:
-        reference = splats[owners[slots[start]], Z]
-
-    live = int(0)
-    v_color = wp.vec3()
-    v_depth, v_alpha, v_distortion = float(0.0), float(0.0), float(0.0)
-    total_weight, total_depth, remaining = float(0.0), float(0.0), float(0.0)
-    if column < width and row < height:
-        live = 1
-        pixel = (tile // (tiles_x * tiles_y) * height + row) * width + column
-        v_color = v_colors[pixel]
-        v_depth = v_depths[pixel]
-        v_distortion = v_distortions[pixel]
-        total_weight = alphas[pixel]
-        total_depth = depths[pixel] - reference * total_weight
-        # The background is seen through the transmittance 1 − alpha, and depths count from the reference.
-        v_alpha = v_alphas[pixel] - wp.dot(v_color, background[0]) + v_depth * reference
-        foreground = colors[pixel] - (1.0 - total_weight) * background[0]
-        remaining = wp.dot(v_color, foreground) + v_depth * total_depth + v_alpha * total_weight
-        remaining += 2.0 * v_distortion * distortions[pixel]
-
-    transmittance, depth = float(1.0), float(0.0)
-    for slot in range(start, end):
-        if warp_any(live) == 0:
-            break
-        intersection = slots[slot]
-        splat = owners[intersection]
-        dx, dy = splats[splat, X] - px, splats[splat, Y] - py
-        opacity = splats[splat, OPACITY]
-        exponential = splat_exponential(splats, splat, dx, dy)
-        alpha = wp.min(ALPHA_MAX, opacity * exponential)
-        following = transmittance * (1.0 - alpha)
-        draws = int(0)
-        if live != 0 and alpha >= ALPHA_MIN:
-            if following < TRANSMITTANCE_MIN:
-                live = 0
-            else:
-                draws = 1
-        if warp_any(draws) != 0:
-            v = vec10()
-            if draws != 0:
-                weight = alpha * transmittance
-                z = splats[splat, Z] - reference
-                color = wp.vec3(splats[splat, RED], splats[splat, RED + 1], splats[splat, RED + 2])
-                spread = 2.0 - transmittance - following - total_weight  # W_i + W_{i+1} − W
-                v_weight = wp.dot(v_color, color) + v_depth * z + v_alpha
-                v_weight += 2.0 * v_distortion * (z * spread + total_depth - 2.0 * depth - weight * z)
-                depth += weight * z
-                remaining -= weight * v_weight
-                v_splat_alpha = transmittance * v_weight - remaining / (1.0 - alpha)
-                transmittance = following
-                v[Z] = weight * (v_depth + 2.0 * v_distortion * spread)
-                v[RED] = weight * v_color[0]
-                v[RED + 1] = weight * v_color[1]
-                v[RED + 2] = weight * v_color[2]
-                if opacity * exponential <= ALPHA_MAX:
-                    v_sigma = -alpha * v_splat_alpha
-                    v[OPACITY] = exponential * v_splat_alpha
-                    v[X] = v_sigma * (splats[splat, A] * dx + splats[splat, B] * dy)
-                    v[Y] = v_sigma * (splats[splat, B] * dx + splats[splat, C] * dy)
-                    v[A] = 0.5 * v_sigma * dx * dx
-                    v[B] = v_sigma * dx * dy
-                    v[C] = 0.5 * v_sigma * dy * dy
-            for k in range(10):
-                total = warp_sum(v[k])
-                if leads_warp(lane) != 0:
-                    wp.atomic_add(records, intersection, k, total)
-            if wants_absolute != 0:
-                for k in range(2):
-                    total = warp_sum(wp.abs(v[k]))
-                    if leads_warp(lane) != 0:
-                        wp.atomic_add(records, intersection, ABSOLUTE + k, total)

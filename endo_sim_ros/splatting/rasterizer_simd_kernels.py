@@ -328,6 +328,19 @@ def composite_tile_backward(
 
 
 @wp.kernel
+def find_tile_starts(offset: int, tiles: wp.array[int], count: int, starts: wp.array[int]):
+    """starts[t] = first slot whose tile is t or later; launched over count + 1 slots of the sorted tiles."""
+    slot = offset + wp.tid()
+    low, high = int(0), starts.shape[0]
+    if slot > 0:
+        low = tiles[slot - 1] + 1
+    if slot < count:
+        high = tiles[slot] + 1
+    for tile in range(low, wp.min(high, starts.shape[0])):
+        starts[tile] = slot
+
+
+@wp.kernel
 def render_tiles(
     counter: wp.array[int],
     splats: wp.array[float],

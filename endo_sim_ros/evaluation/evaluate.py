@@ -9,7 +9,9 @@ import re
 import tempfile
 import time
 import typing
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,13 +22,13 @@ import yaml
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from endo_sim_ros.config import ConfigError
-from endo_sim_ros.device import pick_device
+from endo_sim_ros.device import cpu_threads, pick_device
 from endo_sim_ros.evaluation import figures, metrics, tables
 from endo_sim_ros.evaluation.bench import machine, peak_megabytes
 from endo_sim_ros.evaluation.config import EvaluationConfig
 from endo_sim_ros.evaluation.held_out import difference, mean_figures, measure, model_renderer, seen_pixels
 from endo_sim_ros.evaluation.lpips import Lpips, WeightsError
-from endo_sim_ros.evaluation.splits import STEREO, Split, right_views, split_views
+from endo_sim_ros.evaluation.splits import STEREO, Split, check_split, right_views, split_views
 from endo_sim_ros.evaluation.workers import Finished, News, ray_is_installed, run_in_processes, run_in_ray
 from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer, shrink
 from endo_sim_ros.reconstruction.depth import disparity_offset, stereo_disparity
@@ -83,9 +85,11 @@ def evaluate(sequences: Sequence[str], config: EvaluationConfig) -> dict[str, An
         What `results.json` holds.
 
     Raises:
-        SequenceError, ConfigError: If a sequence cannot be read, or an option cannot be; a cell that fails is in the table.
+        SequenceError, ConfigError: If a sequence, a split or an option is not there. What fails later is in the table, with why.
     """
     names = _names(sequences)
+    for split in config.splits:
+        check_split(split)
     networks, missing = _networks(config)
     methods = _methods(config)
     given = {"train_depth": config.train_depth, "mono": config.mono, "lpips": networks, "curve": config.curve}
@@ -126,6 +130,8 @@ def _names(sequences: Sequence[str]) -> dict[str, str]:
     names: dict[str, str] = {}
     for source in sequences:
         place = _place(source)[0]
+        if not place.startswith(_PHANTOM) and not Path(place).exists():
+            raise SequenceError(f"{place}: no such file or folder; give a bag, a recording, or {_PHANTOM}0")
         parts = [place] if place.startswith(_PHANTOM) else list(Path(place).resolve().parts)
         for length in range(1, len(parts) + 1):
             name = "/".join(parts[-length:])
@@ -275,7 +281,14 @@ def _run(cells: list[Cell], config: EvaluationConfig) -> Iterator[tuple[Cell, Fi
         task = bar.add_task("cells", total=len(cells))
         for sequence in dict.fromkeys(cell.sequence for cell in cells):
             ours = [cell for cell in cells if cell.sequence == sequence]
-            prepared = _prepare(ours, bar)
+            try:
+                prepared = _prepare(ours, bar)
+            except (ValueError, OSError, RuntimeError) as error:
+                log.warning("%s failed: %s", sequence, error)
+                for index, cell in enumerate(ours):
+                    bar.advance(task)
+                    yield cell, Finished(index, error=str(error))
+                continue
             if with_ray:
                 import ray
 
@@ -365,19 +378,29 @@ def _job(argument: tuple, device: str, report: Callable[[Any], None]) -> dict[st
     report((0, len(held_out), "measuring"))
     networks = [_network(name, weights, device) for name in cell.lpips]
     seen_by = [shrink(prepared.frames[index], config.image_width) for index in split.train]
-    renderer, rows, pictures = model_renderer(model, device), [], {}
+    renderer = model_renderer(model, device)
     shown = set(spread(range(len(held_out)), _SHOWN))
     # Without reference depth that of the model tells what was seen.
     known = all(frame.depth is not None for frame in [*held_out, *seen_by])
     surfaces = [(view.camera, view.depth if known else renderer.render(view.camera)[1], view.mask) for view in seen_by]
-    for index, frame in enumerate(held_out):
-        image, depth = renderer.render(frame.camera)
-        seen = seen_pixels(frame.camera, frame.depth if known else depth, surfaces, device)
-        row = measure(image, depth, frame, seen, networks)
-        rows.append({"view": split.held_out[index]} | {name: float(value) for name, value in row.items()})
-        if index in shown:
-            pictures |= _pictures(split.held_out[index], image, depth, frame)
-        report((index + 1, len(held_out), "measuring"))
+
+    def of_view(index: int, image: np.ndarray, depth: np.ndarray) -> tuple[dict[str, float], dict[str, bytes]]:
+        frame, number = held_out[index], split.held_out[index]
+        seen = seen_pixels(frame.camera, frame.depth if known else depth, surfaces)
+        found = measure(image, depth, frame, seen, networks)
+        row = {"view": number} | {name: value for name, value in found.items() if np.isfinite(value)}
+        return row, _pictures(number, image, depth, frame) if index in shown else {}
+
+    rows, pictures = [], {}
+    with ThreadPoolExecutor(cpu_threads()) as pool:  # measuring takes longer than drawing
+        waiting = deque()
+        for index, frame in enumerate(held_out):
+            waiting.append(pool.submit(of_view, index, *renderer.render(frame.camera)))
+            while len(waiting) > 2 * cpu_threads() or waiting and index == len(held_out) - 1:
+                row, new = waiting.popleft().result()
+                rows.append(row)
+                pictures |= new
+                report((len(rows), len(held_out), "measuring"))
     return {
         "machine": machine(device),
         "size": [held_out[0].camera.width, held_out[0].camera.height],
@@ -385,6 +408,10 @@ def _job(argument: tuple, device: str, report: Callable[[Any], None]) -> dict[st
         "held_out": len(held_out),
         "masked": any(frame.mask is not None and not frame.mask.all() for frame in held_out),
         "depth_source": "none" if split.right else prepared.depth_source,
+        "given": [
+            *["right images"] * any(view.right is not None for view in views),
+            *["recorded depth"] * any(view.depth is not None for view in views),
+        ],
         "seen_by": "reference" if known else "model",
         "figures": mean_figures(rows) | {"seconds": training["seconds"], "gaussians": len(model), "megabytes": memory},
         "views": rows,

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import numpy as np
-import torch
 from rich.progress import Progress as ProgressBar
 
 from endo_sim_ros.cameras import Camera, save_cameras
@@ -98,7 +98,7 @@ def mean_figures(rows: Sequence[dict[str, float]]) -> dict[str, float]:
 
 
 def seen_pixels(
-    camera: Camera, depth: np.ndarray, views: Sequence[tuple[Camera, np.ndarray, np.ndarray | None]], device: str = "cpu"
+    camera: Camera, depth: np.ndarray, views: Sequence[tuple[Camera, np.ndarray, np.ndarray | None]]
 ) -> np.ndarray:
     """Which pixels [H, W] of a view show a surface that one of the other views sees, too, and not hidden.
 
@@ -106,23 +106,18 @@ def seen_pixels(
         camera: The view.
         depth: Its depth [H, W], metres, 0 = none; a pixel without depth counts as not seen.
         views: Camera, depth [H, W] and mask [H, W] (0 = does not see) of the others.
-        device: Where to compute.
     """
-    tensor = lambda array: torch.as_tensor(np.ascontiguousarray(array), dtype=torch.float32, device=device)
-    points = tensor(camera.rays()) * tensor(depth)[..., None]
-    seen = torch.zeros(depth.shape, dtype=torch.bool, device=device)
+    points = camera.rays().astype(np.float32) * depth[..., None]
+    seen = np.zeros(depth.shape, bool)
     for other, surface, mask in views:
-        there = other.viewmat @ camera.pose
-        x, y, z = (points @ tensor(there[:3, :3]).T + tensor(there[:3, 3])).unbind(-1)
-        safe = z.clamp_min(1e-6)
-        u = (x / safe * other.K[0, 0] + other.K[0, 2]).floor()
-        v = (y / safe * other.K[1, 1] + other.K[1, 2]).floor()
-        inside = (z > 0) & (u >= 0) & (v >= 0) & (u < other.width) & (v < other.height)
-        u, v = (each.clamp(0, limit - 1).long() for each, limit in ((u, other.width), (v, other.height)))
-        there_is = tensor(surface)[v, u]
-        visible = inside & (there_is > 0) & ((z - there_is).abs() < _SAME_SURFACE * there_is)
-        seen |= visible if mask is None else visible & (tensor(mask)[v, u] > 0)
-    return (seen & (tensor(depth) > 0)).cpu().numpy()
+        x, y, z = cv2.split(cv2.transform(points, (other.viewmat @ camera.pose)[:3]))
+        ahead = np.where(z > 0, z, np.inf)
+        # cv2 counts pixels from the centre of the first; outside the image there is no surface.
+        u, v = x / ahead * other.K[0, 0] + (other.K[0, 2] - 0.5), y / ahead * other.K[1, 1] + (other.K[1, 2] - 0.5)
+        shown = surface if mask is None else np.where(mask > 0, surface, 0)
+        there = cv2.remap(shown.astype(np.float32), u.astype(np.float32), v.astype(np.float32), cv2.INTER_NEAREST, borderValue=0)
+        seen |= (z > 0) & (there > 0) & (np.abs(z - there) < _SAME_SURFACE * there)
+    return seen & (depth > 0)
 
 
 def model_renderer(model: GaussianModel, device: str) -> DeformableRenderer:

@@ -9,7 +9,9 @@ import numpy as np
 from endo_sim_ros.sequences.frames import Frame, SequenceError
 from endo_sim_ros.sequences.recordings import lit_area, spread
 
-STEREO = "stereo"
+STEREO, TWO_VIEWS = "stereo", "two-views"
+_RATIO = r"([1-9]\d*):([1-9]\d*)"
+_STEPPED = r"(every|all-but)-([2-9]|[1-9]\d+)(?:st|nd|rd|th)?"
 _HELP = "1:49 and the like, two-views, every-12th, all-but-12th and the like, stereo"
 
 
@@ -19,6 +21,12 @@ class Split(NamedTuple):
     train: list[int]
     held_out: list[int]
     right: bool = False
+
+
+def check_split(name: str) -> None:
+    """Raise SequenceError unless there is such a split."""
+    if not any(re.fullmatch(pattern, name) for pattern in (_RATIO, _STEPPED, TWO_VIEWS, STEREO)):
+        raise SequenceError(f"there is no split {name!r}; give {_HELP}")
 
 
 def split_views(name: str, count: int) -> Split:
@@ -33,19 +41,19 @@ def split_views(name: str, count: int) -> Split:
     Raises:
         SequenceError: If there is no such split, or it leaves no view to train on or none to hold out.
     """
-    everything, ratio = list(range(count)), re.fullmatch(r"(\d+):(\d+)", name)
-    stepped = re.fullmatch(r"(every|all-but)-(\d+)(?:st|nd|rd|th)?", name)
+    check_split(name)
+    everything = list(range(count))
     if name == STEREO:
         return Split(everything, everything, right=True)
-    if name == "two-views":
-        train = sorted({0, count - 1} & set(everything))
-    elif ratio and int(ratio[1]) and int(ratio[2]):
-        group = int(ratio[1]) + int(ratio[2])
-        train = [i for i in everything if i % group < int(ratio[1])]
-    elif stepped and int(stepped[2]) > 1:
-        train = [i for i in everything if (i % int(stepped[2]) == 0) == (stepped[1] == "every")]
+    if name == TWO_VIEWS:
+        trains = lambda i: i in (0, count - 1)
+    elif ratio := re.fullmatch(_RATIO, name):
+        share, group = int(ratio[1]), int(ratio[1]) + int(ratio[2])
+        trains = lambda i: i % group < share
     else:
-        raise SequenceError(f"there is no split {name!r}; give {_HELP}")
+        kind, step = re.fullmatch(_STEPPED, name).groups()
+        trains = lambda i: (i % int(step) == 0) == (kind == "every")
+    train = [i for i in everything if trains(i)]
     held_out = sorted(set(everything) - set(train))
     if not train or not held_out:
         raise SequenceError(f"split {name} of {count} views leaves {len(train)} to train on and {len(held_out)} to hold out")

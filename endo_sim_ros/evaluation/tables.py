@@ -99,10 +99,9 @@ def notes(results: dict[str, Any]) -> list[str]:
         "none": "none",
     }
     for name, record in sequences.items():
-        (width, height), cell = record["size"], record["cell"]
+        width, height = record["size"]
         pixels = "over the pixels of the mask (tissue); the others are black" if record["masked"] else "over all pixels, unmasked"
-        changes = ["the recorded depth"] * cell["train_depth"] + ["no right images"] * cell["mono"]
-        given = f"; training views were given {' and '.join(changes)}" if changes else ""
+        given = f"; training views came with {' and '.join(record['given'])}" if record["given"] else ""
         lines.append(f"{name}: {width}×{height}, {pixels}; reference depth: {depths[record['depth_source']]}{given}.")
     models = any(record["seen_by"] == "model" for record in done)
     lines += [

@@ -11,6 +11,7 @@ World frame: the wall is around z = 0.14 m and faces the endoscope, whose tip mo
 import functools
 import math
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
@@ -20,7 +21,7 @@ import warp as wp
 
 from endo_sim_ros.cameras import Camera
 from endo_sim_ros.config import Range, StageConfig
-from endo_sim_ros.device import init_warp
+from endo_sim_ros.device import cpu_threads, init_warp
 from endo_sim_ros.sequences import phantom_kernels as kernels
 from endo_sim_ros.sequences.frames import Frame
 
@@ -641,7 +642,7 @@ def _border(config: PhantomConfig) -> np.ndarray:
 
 
 def phantom_sequence(config: PhantomConfig) -> Iterator[Frame]:
-    """Film the patient: frames with exact pose and depth, rendered as they are asked for.
+    """Film the patient: frames with exact pose and depth, rendered as they are asked for, a few at a time.
 
     Args:
         config: The patient and the endoscope.
@@ -665,7 +666,7 @@ def phantom_sequence(config: PhantomConfig) -> Iterator[Frame]:
             image += np.float32(config.noise) * rng.standard_normal(image.shape, np.float32)
         return _quantise(image), depth
 
-    for index, pose in enumerate(phantom_poses(config)):
+    def film(index: int, pose: np.ndarray) -> Frame:
         camera = phantom_camera(config, pose)
         image, depth = expose(camera, camera, index, 0)
         right = None
@@ -673,7 +674,7 @@ def phantom_sequence(config: PhantomConfig) -> Iterator[Frame]:
             shifted = pose.copy()
             shifted[:3, 3] += config.baseline * pose[:3, 0]
             right = expose(camera.at(shifted), camera, index, 1)[0]
-        yield Frame(
+        return Frame(
             stamp_ns=1_000_000_000 + round(index * 1e9 / config.fps),
             image=image,
             camera=camera,
@@ -682,3 +683,11 @@ def phantom_sequence(config: PhantomConfig) -> Iterator[Frame]:
             depth=np.where(mask > 0, depth, np.float32(0.0)),
             mask=mask,
         )
+
+    poses = phantom_poses(config)
+    yield film(0, poses[0])  # alone, since it may compile
+    step = cpu_threads()
+    with ThreadPoolExecutor(step) as pool:
+        for start in range(1, config.frames, step):
+            numbers = range(start, min(start + step, config.frames))
+            yield from pool.map(film, numbers, poses[numbers])

@@ -18,6 +18,7 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 
 from endo_sim_ros import messages
+from endo_sim_ros.cameras import Camera, make_pose
 from endo_sim_ros.gaussians import GaussianModel, load_ply, save_ply
 from endo_sim_ros.messages import ERROR, OK, WARN
 from endo_sim_ros.nodes.base import _MOST_LOGGED, EndoNode
@@ -27,6 +28,7 @@ from endo_sim_ros.nodes.reconstruction_node import ReconstructionNode
 from endo_sim_ros.nodes.recorder_node import RecorderNode
 from endo_sim_ros.nodes.rendering_node import RenderingNode
 from endo_sim_ros.nodes.scripted_tool_node import ScriptedToolNode
+from endo_sim_ros.physics.control_nodes import build_control_nodes
 from endo_sim_ros.sequences.bag import BagReader, BagWriter
 
 S = 1_000_000_000
@@ -678,6 +680,22 @@ def test_a_model_without_training_cameras_is_seen_from_where_the_camera_is(bench
     await_nodes(bench, 6 * S)
     bench.publish(messages.GAUSSIANS, cloud(lambda m: setattr(m.header.stamp, "sec", 9)))  # cameras stay those of 6
     await_nodes(bench, 9 * S)
+
+
+def test_tissue_is_left_out_where_the_training_cameras_see_through_it(bench, physics):
+    """A small plate in front of a wide one, seen from both sides."""
+    rng = np.random.default_rng(7)
+    plates = [np.c_[rng.uniform(-half, half, (count, 2)), np.full(count, z)] for half, z, count in ((0.02, 0.1, 1000), (0.06, 0.16, 3000))]
+    points = torch.from_numpy(np.concatenate(plates)).float()
+    model = GaussianModel.from_points(points, torch.full((len(points), 3), 0.5), torch.full((len(points),), 0.003), opacity=0.95)
+    poses = [make_pose(np.array([x, 0, 0]), np.array([1.0, 0, 0, 0])) for x in (-0.06, 0, 0.06)]
+    bench.hear(messages.CONTROL_NODES)
+    bench.publish(messages.TRAINING_CAMERA_INFO, messages.encode_camera_info(K, WIDTH, HEIGHT, 5 * S, "endoscope_left"))
+    send_model(bench, model, cameras=poses)
+    cameras = [Camera(K, WIDTH, HEIGHT, pose) for pose in poses]
+    carved, whole = (build_control_nodes(model, np.stack(poses)[:, :3, 3], physics._config, seen) for seen in (cameras, ()))
+    assert len(carved) < len(whole)
+    np.testing.assert_array_equal(await_nodes(bench, 5 * S).rest, carved.rest.astype(np.float32))
 
 
 def test_a_new_model_replaces_the_old_one_while_it_is_touched(bench, physics):

@@ -200,8 +200,9 @@ class PhysicsNode(EndoNode):
             self.report_error(self._failure)
         origin, viewpoint = self._viewpoint()
         if self._model is not None and viewpoint is not None:
-            model, stamp, config = self._model, self._model_stamp, self._config
-            self._background.want((self._model_number, origin, config), lambda: (stamp, TissueSimulation(model, viewpoint, config)))
+            model, stamp, config, cameras = self._model, self._model_stamp, self._config, self._own_cameras()
+            key = self._model_number, origin, bool(cameras), config
+            self._background.want(key, lambda: (stamp, _tissue(model, viewpoint, config, cameras)))
 
     # ------------------------------------------------------------------ tools
 

@@ -3,60 +3,51 @@
 from collections.abc import Callable, Hashable
 from typing import Any
 
-_SAME_RATE = 0.1  # part by which the interval of a stream may differ from the period for the rhythm to follow it
-_GAIN = 0.2  # part of the distance by which it follows at a time
 MOST_WAITING = 1000  # commands; beyond it the oldest is given up, so that nothing grows without bound
 
 
 class Pacer:
-    """Once a period on average, at the moment that serves best: work runs as soon as fresh input is there, up to half a
-    period early or, while input streams in, late. What is missed by more than a period is skipped, never made up for.
+    """Once a period on average, at the moment that serves best: work runs as soon as fresh input is there, up to a period
+    early or, while input streams in, half a period late. What is missed by more than a period is skipped, never made up for.
 
-    Towards a stream of about the same rate the rhythm shifts, by a period at most, until inputs come in the middle of
-    that span, where jitter does no harm.
+    Input that finds the work a whole period ahead waits for the next one, and both are used at once: had it run when that
+    period was over, all those after it would have had to wait as well.
     """
 
     def __init__(self):
         self._due: float | None = None
         self._inputs: dict[Hashable, tuple[float, float]] = {}  # times of the last two of each source
-        self._fresh: dict[Hashable, float] = {}  # since when input of a source waits
-        self._shifted = 0.0  # periods
+        self._fresh: set[Hashable] = set()  # sources whose last input was not used yet
+        self._ahead = False  # what is fresh waits for the next input
         self.skipped = 0
 
     def note_input(self, now: float, source: Hashable = None) -> None:
         """Input arrived that the next piece of work should use; that of all sources that stream is waited for."""
         self._inputs[source] = self._inputs.get(source, (float("-inf"), float("-inf")))[1], now
-        self._fresh.setdefault(source, now)
+        self._fresh.add(source)
+        self._ahead = False
 
     def is_due(self, now: float, period: float) -> bool:
         """Whether the work should run at this time, seconds of any clock; if so it is taken to run now."""
         if self._due is None or now < self._due - 3 * period:  # the first time, or the clock went back
-            self._due, self._shifted = now, 0.0
+            self._due = now
+            self._inputs.clear()
             self._fresh.clear()
         streaming = {source for source, (before, _) in self._inputs.items() if now - before < 3 * period}
-        newest = max(self._fresh.values(), default=now)  # what is much older belonged to the inputs before
-        self._fresh = {source: since for source, since in self._fresh.items() if newest - since <= period / 2}
-        complete = bool(self._fresh) and streaming <= self._fresh.keys()
-        early = -0.5 if complete else 0.5 if streaming else 0.0
+        newest = max((self._inputs[source][1] for source in self._fresh), default=now)
+        belated = {source for source in self._fresh if newest - self._inputs[source][1] > period / 2}
+        self._fresh -= belated  # they belonged to the inputs before
+        complete = bool(self._fresh) and streaming <= self._fresh
+        early = -1.0 if complete and not self._ahead else 0.5 if streaming else 0.0
         if now < self._due + early * period - 1e-9:
+            self._ahead = complete
             return False
-        if self._fresh:
-            self._follow(max(self._fresh, key=self._fresh.get), period)
         missed = max(int((now - self._due) / period), 0)
         self.skipped += missed
         self._due += (missed + 1) * period
         self._fresh.clear()
+        self._ahead = False
         return True
-
-    def _follow(self, source: Hashable, period: float) -> None:
-        """Shift the rhythm towards the source whose input came last."""
-        before, last = self._inputs[source]
-        if abs((last - before) / period - 1) < _SAME_RATE:
-            phase = (self._fresh[source] - self._due) / period
-            error = phase if phase > -1 else phase + 2  # what waited is nearer to this work, or to the one before
-            shift = min(max(_GAIN * error, -1 - self._shifted), 1 - self._shifted)
-            self._shifted += shift
-            self._due += shift * period
 
     def restart(self) -> None:
         """Forget the rhythm: the time since the last piece of work was not meant to be filled."""

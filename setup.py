@@ -40,6 +40,7 @@ setup(
     extras_require={
         "learning": ["gymnasium>=1.1"],  # endo_sim_ros.learning.environments
         "lerobot": ["pyarrow"],  # `endo-sim export`
+        "rl": ["gymnasium>=1.1", "stable-baselines3>=2.4"],  # `endo-sim train --algorithm ppo`
         "viewer": ["viser>=1.1"],  # `endo-sim view`, viewer_node
         "test": "gymnasium hypothesis mcap mcap-ros2-support plyfile pyarrow pytest ruff torchmetrics viser>=1.1".split(),
     },

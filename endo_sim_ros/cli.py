@@ -15,7 +15,7 @@ from rich.progress import track
 from endo_sim_ros.config import ConfigError
 from endo_sim_ros.evaluation.config import EvaluationConfig
 from endo_sim_ros.gaussians import ModelError
-from endo_sim_ros.learning.config import Randomisation, TrainingConfig
+from endo_sim_ros.learning.config import PPOConfig, Randomisation, TrainingConfig
 from endo_sim_ros.messages import MessageError
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
@@ -300,13 +300,22 @@ class Train:
         from endo_sim_ros.learning.scenes import load_scene
         from endo_sim_ros.learning.train import save_training, train
 
-        policy, curve = train(self.task, load_scene(self.model), self.config, self.vary, self.device)
-        save_training(self.out, policy, curve, self.config)
+        config = self.config
+        if self.algorithm == "ppo":
+            from endo_sim_ros.learning.ppo import train_ppo as train
+
+            config = self.ppo
+        policy, curve = train(self.task, load_scene(self.model), config, self.vary, self.device)
+        save_training(self.out, policy, curve, config)
+    algorithm: Literal["cem", "ppo"] = "cem"
+    """cem: the cross-entropy method, by the options below; ppo: proximal policy optimisation, by those that begin with ppo; it
+    needs stable-baselines3."""
         last = curve[-1]
         print(f"{self.out}: {last['test_success']:.0%} of test episodes solved after {last['episodes']} episodes")
 
 
 @dataclass(frozen=True)
+    ppo: PPOConfig = field(default_factory=PPOConfig)
 class Up:
     """Start the graph, each node its own process, and show what each says, until Ctrl-C; `ros2 launch` without ROS installed."""
 
@@ -513,7 +522,7 @@ def main() -> int:
         command.run()
     except KeyboardInterrupt:
         return 130
-    except (SequenceError, MessageError, ModelError, ConfigError, RuntimeError, ValueError, OSError) as error:
+    except (SequenceError, MessageError, ModelError, ConfigError, ImportError, RuntimeError, ValueError, OSError) as error:
         print(f"endo-sim: {str(error) or type(error).__name__}", file=sys.stderr)
         return 1
     logging.getLogger(__name__).info("done in %.0f s", time.monotonic() - start)

@@ -1,5 +1,6 @@
 """Tasks to learn: as Gymnasium environments, many at once, over topics; scripted and learned policies."""
 
+import importlib.util
 import json
 import os
 import re
@@ -18,7 +19,7 @@ from gymnasium.utils.env_checker import check_env
 
 from endo_sim_ros.config import ConfigError
 from endo_sim_ros.learning import bench, environments
-from endo_sim_ros.learning.config import Randomisation, TrainingConfig
+from endo_sim_ros.learning.config import PPOConfig, Randomisation, TrainingConfig
 from endo_sim_ros.learning.policies import NetworkPolicy, make_policy, scripted_policy
 from endo_sim_ros.learning.scenes import Scene, load_scene, save_scene
 from endo_sim_ros.learning.task_batch import TaskBatch
@@ -245,6 +246,79 @@ def test_training_learns_and_leaves_its_curve(tmp_path):
     assert (tmp_path / "curve.png").stat().st_size > 1000 and NetworkPolicy.load(tmp_path / "policy.npz").task == "retraction"
 
 
+def test_what_was_felt_most_is_remembered():
+    batch = TaskBatch("palpation", load_scene(), 2, device="cpu")
+    batch.reset([0, 1], [np.random.default_rng(s) for s in (5, 6)])
+    policy, observations = scripted_policy("palpation", 2), batch.observe()
+    rows, tips = [], []
+    for _ in range(60):
+        observations, _ = batch.step(policy.act(observations))
+        rows.append(dict(zip(batch.task.observation_names, observations[0].astype(np.float64))))
+        tips.append(0.02 * np.array([rows[-1]["tip_x"], rows[-1]["tip_y"]]))
+    forces = [row["force"] for row in rows]
+    assert max(forces) > 0.3 and forces[-1] < max(forces)
+    np.testing.assert_allclose(rows[-1]["most"], max(forces))
+    where = tips[-1] + 0.02 * np.array([rows[-1]["most_from_tip_x"], rows[-1]["most_from_tip_y"]])
+    np.testing.assert_allclose(where, tips[int(np.argmax(forces))], atol=1e-8)
+
+
+def test_a_report_is_ten_steps_that_say_so():
+    environment = make("palpation")
+    environment.reset(seed=0)
+    ended = [environment.step(np.array([0, 0, 0, sign]))[2] for sign in [1] * 9 + [-1] + [1] * 10]
+    assert ended == [False] * 19 + [True]
+
+
+@pytest.mark.parametrize("task, observations", [("retraction", "state"), ("palpation", "both")])
+def test_stable_baselines3_finds_nothing_to_complain_about(task, observations):
+    checker = pytest.importorskip("stable_baselines3.common.env_checker")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        checker.check_env(make(task, observations=observations, render_mode="rgb_array").unwrapped)
+
+
+def test_environments_of_stable_baselines3_begin_anew_at_once():
+    ppo = pytest.importorskip("endo_sim_ros.learning.ppo", exc_type=ImportError)
+    many = environments.VectorTaskEnvironment("retraction", 2, device="cpu")
+    stable, policy = ppo.StableEnvironments(many), scripted_policy("retraction")
+    stable.seed(0)
+    observations, dones = stable.reset(), np.zeros(2, bool)
+    while not dones.any():
+        actions = policy.act(observations)
+        actions[1] = 0, 0, 0, -1
+        before = observations
+        observations, rewards, dones, infos = stable.step(actions)
+    assert dones.tolist() == [True, False] and infos[0]["success"] and rewards[0] > 1
+    names = many.batch.task.observation_names
+    at_end, begun = (dict(zip(names, row)) for row in (infos[0]["terminal_observation"], observations[0]))
+    assert at_end["spot_moved_z"] >= 1 and begun["spot_moved_z"] == 0 and begun["time_left"] == 1 and begun["force"] == 0
+    assert "terminal_observation" not in infos[1] and observations[1][-1] < before[1][-1]
+    seen, *_ = play(make(), scripted_policy("retraction"), 0)
+    np.testing.assert_array_equal(infos[0]["terminal_observation"], seen[-1])  # the episode of gymnasium with that seed
+    for _ in range(60):
+        _, _, dones, infos = stable.step(np.tile([0, 0, 0, -1.0], (2, 1)))
+        if dones[1]:
+            break
+    assert infos[1]["TimeLimit.truncated"] and not infos[1]["success"]
+
+
+def test_ppo_trains_a_policy_that_needs_no_torch(tmp_path):
+    ppo = pytest.importorskip("endo_sim_ros.learning.ppo", exc_type=ImportError)
+    config = PPOConfig(steps=1200, environments=6, rollout=100, hidden=8, tests=1, test_episodes=4)
+    (policy, curve), (again, _) = (ppo.train_ppo("retraction", load_scene(), config, device="cpu") for _ in range(2))
+    for layer, same in zip(policy.layers, again.layers):
+        np.testing.assert_array_equal(layer, same)
+    assert [point["steps"] for point in curve] == [0, 1200] and curve[-1]["episodes"] > 0
+    assert curve[-1]["test_return"] > curve[0]["test_return"]
+    save_training(tmp_path, policy, curve, config)
+    assert make_policy(str(tmp_path / "policy.npz"), "retraction").layers[0].shape == (17, 8)
+    stable = ppo.StableEnvironments(environments.VectorTaskEnvironment("retraction", 2, device="cpu"))
+    model = ppo.PPO("MlpPolicy", stable, n_steps=2, batch_size=2, device="cpu")  # with stable-baselines3's own network
+    observations = stable.reset()
+    actions = np.clip(ppo.network("retraction", model).act(observations), -1, 1)
+    np.testing.assert_allclose(actions, model.predict(observations, deterministic=True)[0], atol=1e-6)
+
+
 def linear_policy():
     """Weights by hand that solve retraction: towards the spot, closed when near, up until it is raised."""
     names = TASKS["retraction"].observation_names
@@ -327,6 +401,14 @@ def test_a_model_too_small_for_the_task_is_refused():
         TaskBatch("palpation", small, 1, device="cpu")
 
 
+def test_without_stable_baselines3_one_sentence_says_what_to_install(tmp_path):
+    code = "import sys; sys.modules['stable_baselines3'] = None; from endo_sim_ros.cli import main; sys.exit(main())"
+    command = [sys.executable, "-c", code, "train", tmp_path / "out", "--algorithm", "ppo"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    sentence = "endo-sim: PPO needs stable-baselines3, which is not installed; pip install 'endo_sim_ros[rl]'"
+    assert done.returncode == 1 and done.stderr.strip() == sentence
+
+
 def test_without_gymnasium_one_sentence_says_what_to_install():
     code = "import sys; sys.modules['gymnasium'] = None; import endo_sim_ros.learning.train, endo_sim_ros.learning.environments"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
@@ -342,7 +424,10 @@ def test_bench_gives_a_row_for_each_number_of_environments(tmp_path, capsys):
 
 def test_the_code_in_the_guide_runs(tmp_path):
     guide = (ROOT / "docs" / "learning.md").read_text()
-    code = "\n".join(re.findall(r"```python\n(.+?)```", guide, re.S))
+    blocks = re.findall(r"```python\n(.+?)```", guide, re.S)
+    if importlib.util.find_spec("stable_baselines3") is None:
+        blocks = [block for block in blocks if "stable_baselines3" not in block]
+    code = "\n".join(blocks)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, timeout=120)
     assert done.returncode == 0, done.stderr
     assert "solved: 1.0" in done.stdout

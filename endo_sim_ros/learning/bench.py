@@ -3,12 +3,12 @@
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from endo_sim_ros.device import pick_device
 from endo_sim_ros.evaluation.bench import Row, machine, median_seconds, report
 from endo_sim_ros.learning.scenes import Scene, load_scene
 from endo_sim_ros.learning.task_batch import TaskBatch
+from endo_sim_ros.learning.train import single_threaded_torch
 
 _STEPS = 25  # of random actions in one measurement
 
@@ -25,10 +25,8 @@ def bench_environments(
         device: Compute device.
         repeats: Measurements, of which the median counts.
     """
-    device, scene, threads = pick_device(device), load_scene(), torch.get_num_threads()
-    torch.set_num_threads(1)  # as in the nodes: on a CPU the kernels bring their own threads
-    try:
-        rows = []
+    device, scene, rows = pick_device(device), load_scene(), []
+    with single_threaded_torch():
         for observations in ("state", "image"):
             rates = [_rate(task, scene, count, observations, device, repeats) for count in environments]
             peer = f"{environments[0]} environment{'s' * (environments[0] > 1)}"
@@ -36,8 +34,6 @@ def bench_environments(
                 first = count == environments[0]
                 name = f"{observations} observations, {count} environment{'s' * (count > 1)}"
                 rows.append(Row(name, rate, "steps/s", None if first else rate / rates[0], None if first else peer))
-    finally:
-        torch.set_num_threads(threads)
     report(f"Environments: {task} on {machine(device)}", rows, json_file)
 
 

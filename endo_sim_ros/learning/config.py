@@ -42,3 +42,33 @@ class TrainingConfig(StageConfig):
     """Other episodes on which the mean of the Gaussian is tested after each generation."""
     seed: Annotated[int, Range(0, 2**31 - 1)] = 0
     """Another seed draws other policies and episodes."""
+
+
+@dataclass(frozen=True)
+class PPOConfig(StageConfig):
+    """Proximal policy optimisation by stable-baselines3: two hidden layers, tanh."""
+
+    steps: Annotated[int, Range(1, 1_000_000_000)] = 300_000
+    """Steps of all environments together."""
+    environments: Annotated[int, Range(1, 100_000)] = 32
+    """Episodes at once."""
+    rollout: Annotated[int, Range(2, 10_000)] = 100
+    """Steps of each environment between two updates."""
+    minibatches: Annotated[int, Range(1, 10_000)] = 8
+    """Parts in which the steps of a rollout are learned from."""
+    hidden: Annotated[int, Range(1, 1000)] = 64
+    """Size of each hidden layer."""
+    learning_rate: Annotated[float, Range(1e-7, 1)] = 7e-4
+    """Of Adam."""
+    gamma: Annotated[float, Range(0, 1)] = 0.99
+    """Discount per step."""
+    gae_lambda: Annotated[float, Range(0, 1)] = 0.97
+    """Of the generalised advantage estimate."""
+    spread: Annotated[float, Range(1e-3, 10)] = 0.6
+    """Standard deviation of the actions at the beginning."""
+    tests: Annotated[int, Range(1, 10_000)] = 10
+    """Points of the learning curve after its first."""
+    test_episodes: Annotated[int, Range(1, 100_000)] = 64
+    """Other episodes on which the mean action is tested."""
+    seed: Annotated[int, Range(0, 2**31 - 1)] = 0
+    """Another seed draws other weights, actions and episodes."""

@@ -72,6 +72,7 @@ class Task(ABC):
         self.sites = np.zeros((count, self.site_count), int)
         self.tip = np.zeros((count, 3))  # m, task frame
         self.fourth = np.zeros(count)  # of the last action
+        self.raised = np.zeros(count, int)  # steps that it has been above zero, one after the other
         self.steps = np.zeros(count, int)
         self.force = np.zeros((count, 3))  # what the tissue exerts on the tool, N, task frame
         self._potential = np.zeros(count)
@@ -98,7 +99,7 @@ class Task(ABC):
         self.origin[b], self.axes[b] = self.rest[place], np.stack([x, np.cross(z, x), z])
         self.sites[b] = place
         self.tip[b] = rng.uniform(self.low, self.high)
-        self.fourth[b], self.steps[b], self.force[b] = -1.0, 0, 0.0
+        self.fourth[b], self.raised[b], self.steps[b], self.force[b] = -1.0, 0, 0, 0.0
         self._reset(b, rng)
 
     def _reset(self, b: int, rng: np.random.Generator) -> None:
@@ -109,6 +110,7 @@ class Task(ABC):
         actions = np.clip(np.asarray(actions, np.float64), -1.0, 1.0)
         self.tip = np.clip(self.tip + self.step_length * actions[:, :3], self.low, self.high)
         self.fourth = actions[:, 3]
+        self.raised = np.where(self.fourth > 0, self.raised + 1, 0)
         self.steps = self.steps + 1
         return self.origin + self._to_world(self.tip), self._closed()
 
@@ -228,13 +230,14 @@ class Palpation(Task):
     """Find a stiff inclusion by pressing.
 
     Somewhere below a patch of skin, within `patch` of its centre, lies a ball of tissue `ratio` times as stiff. The tool is a
-    ball that pushes and feels. With the fourth action above zero, or when time is out, the episode ends and the place under the tip is the
-    report; it is right within `tolerance` across the line of sight. The reward of the end is 1 - distance / patch, and 1 if right.
+    ball that pushes and feels. With the fourth action above zero for `sure` steps together, or when time is out, the episode ends and the
+    place under the tip is the report; it is right within `tolerance` across the line of sight. What was felt is part of the
+    observations: the greatest force so far, and where that was, so that a policy needs no memory of its own.
     """
 
     name = "palpation"
     observation_names = (
-        *(f"tip_{axis}" for axis in "xyz"), "height",
+        *(f"tip_{axis}" for axis in "xyz"), "height", "most_from_tip_x", "most_from_tip_y", "most",
         *(f"force_{axis}" for axis in "xyz"), "force", "time_left",
     )  # fmt: skip
     horizon, force_limit = 200, 4.0
@@ -244,6 +247,8 @@ class Palpation(Task):
     largest_stiffness = ratio = 8.0  # a power of two: as a factor or as a modulus, it gives the same bits
     patch, radius, depth, tolerance = 0.016, 0.008, 0.005, 0.007  # m
     margin, around, smooth = 0.02, 0.024, 0.5
+    sure = 10  # steps
+    touch = 0.05  # N; less is not felt
 
     @staticmethod
     def physics(device: str = "auto") -> PhysicsConfig:
@@ -255,6 +260,7 @@ class Palpation(Task):
         self.centre = np.zeros((count, 3))  # of the inclusion, m, task frame
         self.place = np.zeros((count, 3))  # the same in the world
         self._over = np.zeros((count, len(self.skin), 3))  # the skin at rest, m, task frame
+        self._most, self._where = np.zeros(count), np.zeros((count, 2))  # greatest force so far, N, and the tip's place then, m, task frame
 
     def _reset(self, b: int, rng: np.random.Generator) -> None:
         over = _dot(self.axes[b], (self.rest[self.skin] - self.origin[b])[:, None])  # [S, 3]
@@ -263,24 +269,32 @@ class Palpation(Task):
         self.centre[b] = near[rng.integers(len(near))] - [0, 0, self.depth]
         self.place[b] = self.origin[b] + _dot(self.axes[b].T, self.centre[b])
         self.tip[b] = 0, 0, self.high[2]
+        self._most[b], self._where[b] = 0, 0
 
     def _columns(self, here: np.ndarray) -> list[np.ndarray]:
+        force = _norm(self.force)
+        more = force > self._most
+        self._most = np.where(more, force, self._most)
+        self._where = np.where(more[:, None], self.tip[:, :2], self._where)
+        felt = [*((self._where - self.tip[:, :2]) / LENGTH).T, self._most / FORCE]
         across = (self._over[..., 0] - self.tip[:, None, 0]) ** 2 + (self._over[..., 1] - self.tip[:, None, 1]) ** 2
         skin = self._over[np.arange(self.count), across.argmin(1), 2]
-        return [*(self.tip / LENGTH).T, (self.tip[:, 2] - skin) / LENGTH]
+        return [*(self.tip / LENGTH).T, (self.tip[:, 2] - skin) / LENGTH, *felt]
 
-    def _error(self) -> np.ndarray:
-        off = self.tip - self.centre
-        return np.sqrt(off[:, 0] ** 2 + off[:, 1] ** 2)
+    def _off(self, places: np.ndarray) -> np.ndarray:
+        """How far places [B, 2] are from the inclusion, across the line of sight [B], m."""
+        x, y = (places - self.centre[:, :2]).T
+        return np.sqrt(x**2 + y**2)
 
     def _ended(self) -> np.ndarray:
-        return (self.fourth > 0) | (self.steps >= self.horizon)
+        return (self.raised >= self.sure) | (self.steps >= self.horizon)
 
     def _value(self) -> np.ndarray:
-        return np.where(self._ended(), 1 - self._error() / self.patch, 0.0)
+        found = np.where(self._most > self.touch, np.maximum(1 - self._off(self._where) / self.patch, -1.0), 0.0)
+        return 3 * found + np.where(self._ended(), 1 - self._off(self.tip[:, :2]) / self.patch, 0.0)
 
     def _solved(self) -> np.ndarray:
-        return self._ended() & (self._error() <= self.tolerance)
+        return self._ended() & (self._off(self.tip[:, :2]) <= self.tolerance)
 
     def stiffness(self, b: int) -> np.ndarray:
         return np.where(inside_sphere(self.nodes.rest, self.place[b], self.radius), self.ratio, 1.0)

@@ -1,7 +1,9 @@
 """Train a small policy by the cross-entropy method, many episodes at once: `endo-sim train`."""
 
+import contextlib
 import json
 import time
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 
@@ -10,7 +12,7 @@ import numpy as np
 import torch
 from rich.progress import Progress
 
-from endo_sim_ros.learning.config import Randomisation, TrainingConfig
+from endo_sim_ros.learning.config import PPOConfig, Randomisation, TrainingConfig
 from endo_sim_ros.learning.policies import NetworkPolicy, Policy
 from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.learning.task_batch import TaskBatch
@@ -35,6 +37,23 @@ def run_episodes(batch: TaskBatch, policy: Policy, seeds: np.ndarray) -> tuple[n
     return returns, success, lengths
 
 
+def measure_policy(batch: TaskBatch, policy: Policy) -> dict[str, float]:
+    """Mean return and success rate in episodes that no training sees, one in each copy of a batch."""
+    returns, success, _ = run_episodes(batch, policy, _TESTED_FROM + np.arange(batch.count))
+    return {"test_return": float(returns.mean()), "test_success": float(success.mean())}
+
+
+@contextlib.contextmanager
+def single_threaded_torch() -> Iterator[None]:
+    """As in the nodes: on a CPU the kernels bring their own threads."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
 def train(
     task: str, scene: Scene, config: TrainingConfig, randomisation: Randomisation = Randomisation(), device: str = "auto"
 ) -> tuple[NetworkPolicy, list[dict[str, float]]]:
@@ -44,12 +63,8 @@ def train(
         The policy, and its learning curve: for each generation, the first being the untrained policy, the number of
         training episodes so far, returns of population and elite, test return and success rate, and seconds.
     """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # the kernels bring their own
-    try:
+    with single_threaded_torch():
         return _train(task, scene, config, randomisation, device)
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _train(task, scene, config, randomisation, device):
@@ -76,23 +91,22 @@ def _train(task, scene, config, randomisation, device):
                 noise = 0.3 * config.spread * max(1 - generation / (0.7 * config.generations), 0.0)
                 mean, deviation = vectors[best].mean(0), vectors[best].std(0) + noise
             tested = NetworkPolicy.from_vectors(task, hidden, mean)
-            returns, success, _ = run_episodes(testing, tested, _TESTED_FROM + np.arange(config.test_episodes))
+            result = measure_policy(testing, tested)
             curve.append(
                 {
                     "generation": generation,
                     "episodes": generation * config.episodes * config.population,
                     "population_return": float(scores.mean()),
                     "elite_return": float(scores[best].mean()),
-                    "test_return": float(returns.mean()),
-                    "test_success": float(success.mean()),
+                    **result,
                     "seconds": time.monotonic() - began,
                 }
             )
-            bar.update(progress, completed=generation, description=f"solved {success.mean():.0%}")
+            bar.update(progress, completed=generation, description=f"solved {result['test_success']:.0%}")
     return tested, curve
 
 
-def save_training(folder: Path, policy: NetworkPolicy, curve: list[dict[str, float]], config: TrainingConfig) -> None:
+def save_training(folder: Path, policy: NetworkPolicy, curve: list[dict[str, float]], config: TrainingConfig | PPOConfig) -> None:
     """Write policy.npz, curve.json and curve.png."""
     folder.mkdir(parents=True, exist_ok=True)
     policy.save(folder / "policy.npz")

@@ -1,0 +1,142 @@
+"""Proximal policy optimisation by stable-baselines3, on many episodes at once: `endo-sim train --algorithm ppo`."""
+
+import time
+
+import numpy as np
+import torch
+from rich.progress import Progress
+
+from endo_sim_ros.learning.config import PPOConfig, Randomisation
+from endo_sim_ros.learning.environments import VectorTaskEnvironment
+from endo_sim_ros.learning.policies import NetworkPolicy
+from endo_sim_ros.learning.scenes import Scene
+from endo_sim_ros.learning.task_batch import TaskBatch
+from endo_sim_ros.learning.train import measure_policy, single_threaded_torch
+
+try:
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.callbacks import BaseCallback
+    from stable_baselines3.common.vec_env import VecEnv
+except ImportError as error:
+    raise ImportError("PPO needs stable-baselines3, which is not installed; pip install 'endo_sim_ros[rl]'") from error
+
+
+class StableEnvironments(VecEnv):
+    """Many environments as stable-baselines3 takes them: an ended episode begins anew within the step that ended it.
+
+    Args:
+        environment: The environments.
+    """
+
+    def __init__(self, environment: VectorTaskEnvironment):
+        self.environment = environment
+        super().__init__(environment.num_envs, environment.single_observation_space, environment.single_action_space)
+
+    def reset(self):
+        observations, _ = self.environment.reset(seed=list(self._seeds))
+        self._reset_seeds()
+        return observations
+
+    def step_async(self, actions: np.ndarray) -> None:
+        self._actions = actions
+
+    def step_wait(self):
+        observations, rewards, terminated, truncated, info = self.environment.step(self._actions)
+        ended = np.flatnonzero(terminated | truncated)
+        infos = [{name: values[i] for name, values in info.items()} for i in range(self.num_envs)]
+        for i in ended:
+            infos[i]["terminal_observation"] = _of(observations, i)
+            infos[i]["TimeLimit.truncated"] = bool(truncated[i])
+        if len(ended):
+            observations = self.environment.renew(ended)
+        return observations, rewards.astype(np.float32), terminated | truncated, infos
+
+    def close(self) -> None:
+        self.environment.close()
+
+    def get_images(self):
+        return self.environment.render()
+
+    def get_attr(self, attr_name, indices=None):
+        return [getattr(self.environment, attr_name)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name, value, indices=None):
+        raise NotImplementedError("the environments are one object; they cannot be set one by one")
+
+    def env_method(self, method_name, *method_args, indices=None, **method_kwargs):
+        raise NotImplementedError("the environments are one object; its methods are those of `environment`")
+
+    def env_is_wrapped(self, wrapper_class, indices=None):
+        return [False] * len(list(self._get_indices(indices)))
+
+
+def _of(observations, i: int):
+    """A copy of environment i's observation."""
+    if isinstance(observations, dict):
+        return {name: values[i].copy() for name, values in observations.items()}
+    return observations[i].copy()
+
+
+def network(task: str, model: PPO) -> NetworkPolicy:
+    """The mean action of a PPO model with tanh layers and state observations, as a policy that needs no torch."""
+    linear = [layer for layer in model.policy.mlp_extractor.policy_net if isinstance(layer, torch.nn.Linear)]
+    layers = [torch.cat([layer.weight.T, layer.bias[None]]) for layer in (*linear, model.policy.action_net)]
+    return NetworkPolicy(task, [layer.detach().cpu().numpy() for layer in layers])
+
+
+class _Curve(BaseCallback):
+    """Tests the policy now and then while it learns."""
+
+    def __init__(self, task: str, testing: TaskBatch, config: PPOConfig, bar: Progress):
+        super().__init__()
+        self._task, self._testing, self._config, self._bar = task, testing, config, bar
+        self._progress = bar.add_task("training", total=config.steps)
+        self._episodes, self._began = 0, time.monotonic()
+        self.curve: list[dict[str, float]] = []
+
+    def _on_step(self) -> bool:
+        self._episodes += int(self.locals["dones"].sum())
+        self._bar.update(self._progress, completed=self.num_timesteps)
+        return True
+
+    def _on_rollout_start(self) -> None:  # the policy has just been improved
+        if self.num_timesteps >= len(self.curve) * self._config.steps / self._config.tests:
+            self.test()
+
+    def test(self) -> None:
+        tested = measure_policy(self._testing, network(self._task, self.model))
+        seconds = time.monotonic() - self._began
+        self.curve.append({"episodes": self._episodes, "steps": self.num_timesteps, **tested, "seconds": seconds})
+        self._bar.update(self._progress, description=f"solved {tested['test_success']:.0%}")
+
+
+def train_ppo(
+    task: str, scene: Scene, config: PPOConfig, randomisation: Randomisation = Randomisation(), device: str = "auto"
+) -> tuple[NetworkPolicy, list[dict[str, float]]]:
+    """Train a policy by PPO on states; repeatable bit by bit on a CPU.
+
+    Returns:
+        The policy, and its learning curve: number of training episodes and steps so far, test return and success rate, and
+        seconds; first of the untrained policy, last of the one returned.
+    """
+    with single_threaded_torch(), Progress() as bar:
+        options = {"scene": scene, "randomisation": randomisation, "device": device}
+        environments = StableEnvironments(VectorTaskEnvironment(task, config.environments, **options))
+        testing = TaskBatch(task, scene, config.test_episodes, randomisation=randomisation, device=device)
+        rollout = config.environments * config.rollout
+        model = PPO(
+            "MlpPolicy",
+            environments,
+            seed=config.seed,
+            n_steps=config.rollout,
+            batch_size=max(rollout // config.minibatches, 2),
+            learning_rate=config.learning_rate,
+            gamma=config.gamma,
+            gae_lambda=config.gae_lambda,
+            policy_kwargs={"net_arch": [config.hidden] * 2, "log_std_init": np.log(config.spread)},
+            device="cpu",  # so small a network is faster there
+        )
+        callback = _Curve(task, testing, config, bar)
+        model.learn(config.steps, callback=callback)
+        callback.test()
+        return network(task, model), callback.curve

@@ -10,33 +10,15 @@ import numpy as np
 from endo_sim_ros import messages
 from endo_sim_ros.cameras import Camera
 from endo_sim_ros.config import Range, StageConfig
-from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.messages import CameraInfo, ControlNodeCloud, MessageError
-from endo_sim_ros.nodes.base import ERROR, OK, STREAM_DEPTH, WARN, Background, EndoNode, WorldConfig, run, sentence
+from endo_sim_ros.nodes.base import ERROR, OK, STREAM_DEPTH, WARN, EndoNode, WorldConfig, run, sentence
 from endo_sim_ros.nodes.pacing import MOST_WAITING, Pacer
-from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
+from endo_sim_ros.nodes.shown_tissue import Bound, ShownTissue
+from endo_sim_ros.rendering import RenderingConfig
 from endo_sim_ros.sequences.bag import LEFT_FRAME
 
 _MAX_SIDE = 8192  # pixels; a damaged camera_info must not make the node ask for all memory
 _POLLS = 8  # times per image that the timer asks whether one is due
-
-
-@dataclass(frozen=True)
-class _Bound:
-    """A renderer and what it is for."""
-
-    renderer: DeformableRenderer
-    model_stamp: int
-    node_rest: np.ndarray | None  # [M, 3] m, None without control nodes
-
-    def follows(self, nodes: ControlNodeCloud | None) -> bool:
-        """Whether it can show the state of these nodes."""
-        return (
-            nodes is not None
-            and self.node_rest is not None
-            and nodes.model_stamp_ns == self.model_stamp
-            and np.array_equal(nodes.rest, self.node_rest)
-        )
 
 
 @dataclass(frozen=True)
@@ -65,19 +47,16 @@ class RenderingNode(EndoNode):
         super().__init__("rendering_node")
         self._options = self.declare(RenderingNodeConfig)
         self._config = self.declare(RenderingConfig)
-        self._model: GaussianModel | None = None  # the newest; its stamp, and number in the order of arrival:
-        self._model_stamp, self._model_number = 0, 0
+        self._lockstep = self._options.mode == "lockstep"
+        depth = MOST_WAITING if self._lockstep else 1
+        self._tissue = ShownTissue(max(depth, STREAM_DEPTH))
         self._nodes: ControlNodeCloud | None = None
-        self._cuts = {0: np.zeros((0, 3, 3), np.float32)}  # surfaces by their number, the newest last
         self._nodes_stamp = self._last_stamp = 0  # of that state, and of the newest image in real time, ns
-        self._bound: _Bound | None = None
-        self._background = Background()
         self._failure = ""  # why the newest model is not shown
         self._pose: np.ndarray | None = None
         self._training_pose: np.ndarray | None = None
         self._info: CameraInfo | None = None
         self._training_info: CameraInfo | None = None
-        self._lockstep = self._options.mode == "lockstep"
         self._states: deque[tuple[int, ControlNodeCloud]] = deque()  # lockstep: stamps and states still to be shown
         self._poses: dict[int, np.ndarray] = {}  # lockstep_camera: poses that wait for their state, by stamp
         self._pacer = Pacer()
@@ -89,7 +68,6 @@ class RenderingNode(EndoNode):
         self.subscribe(messages.GAUSSIANS, self._on_model)
         self.subscribe(messages.TRAINING_CAMERAS, self._on_training_cameras)
         self.subscribe(messages.TRAINING_CAMERA_INFO, self._on_training_info)
-        depth = MOST_WAITING if self._lockstep else 1
         self.subscribe(messages.CONTROL_NODES, self._on_nodes, depth)
         self.subscribe(messages.CUT_SURFACE, self._on_cut_surface, depth)
         self.subscribe(messages.CAMERA_POSE, self._on_camera, depth)
@@ -106,10 +84,7 @@ class RenderingNode(EndoNode):
     # ------------------------------------------------------------------ input
 
     def _on_model(self, message: Any) -> None:
-        messages.check_frame(message, (self._options.world_frame,), messages.GAUSSIANS.name)
-        self._model = messages.decode_gaussians(message)
-        self._model_stamp = messages.stamp_to_ns(message.header.stamp)
-        self._model_number += 1
+        self._tissue.take_model(message, self._options.world_frame)
 
     def _on_training_cameras(self, message: Any) -> None:
         messages.check_frame(message, (self._options.world_frame,), messages.TRAINING_CAMERAS.name)
@@ -144,13 +119,7 @@ class RenderingNode(EndoNode):
             self._show_if_due()
 
     def _on_cut_surface(self, message: Any) -> None:
-        messages.check_frame(message, (self._options.world_frame,), messages.CUT_SURFACE.name)
-        triangles = messages.decode_cut_surface(message)
-        number = messages.cut_number(triangles)
-        if number:
-            self._cuts[number] = triangles
-        while len(self._cuts) > (MOST_WAITING if self._lockstep else STREAM_DEPTH):
-            del self._cuts[list(self._cuts)[1]]
+        self._tissue.take_cut_surface(message, self._options.world_frame)
         if self._lockstep:
             self._show_states()
         else:
@@ -202,30 +171,30 @@ class RenderingNode(EndoNode):
     def _show_if_due(self) -> None:
         """Real time: show the newest state, or what was shown once more, if it is time for it."""
         camera, now = self._camera(), time.monotonic()
-        if self._bound is None or camera is None or self.now_ns() == 0:  # with use_sim_time, before /clock
+        if self._tissue.bound is None or camera is None or self.now_ns() == 0:  # with use_sim_time, before /clock
             return
         if self._dirty or self._output is None:
             if not self._pacer.is_due(now, 1 / self._options.rate):
                 return
             self._dirty = False
-            self._output = self._render(self._bound, self._nodes, camera)
+            self._output = self._render(self._tissue.bound, self._nodes, camera)
         elif now - self._last_image < 1 / self._options.idle_rate - 0.5 / self._options.rate:
             return
         self._last_image = now
-        self._last_stamp = self._stamp(self._bound)
+        self._last_stamp = self._stamp(self._tissue.bound)
         self._publish(*self._output, self._last_stamp)
 
-    def _stamp(self, bound: _Bound) -> int:
+    def _stamp(self, bound: Bound) -> int:
         """Real time: when the state that is shown was so; now, if there was an image of that time already."""
         now = self.now_ns()
         return self._nodes_stamp if bound.follows(self._nodes) and self._last_stamp < self._nodes_stamp <= now else now
 
     def _show_states(self) -> None:
         """Lockstep: one image for each state, in order, as soon as its model and its camera are there."""
-        while self._states and self._bound is not None:
+        while self._states and self._tissue.bound is not None:
             stamp, nodes = self._states[0]
             at_rest = stamp == nodes.model_stamp_ns  # the first observation, for which nobody sends a camera
-            if nodes.model_stamp_ns not in (self._bound.model_stamp, self._model_stamp):
+            if nodes.model_stamp_ns not in (self._tissue.bound.model_stamp, self._tissue.model_stamp):
                 self._leave_out("belongs to a model that is gone")
                 continue
             camera = self._camera()
@@ -235,12 +204,12 @@ class RenderingNode(EndoNode):
                     self._leave_out(f"has no pose with its stamp on {messages.CAMERA_POSE.name}")
                     continue
                 camera = camera and pose is not None and replace(camera, pose=pose)
-            if not self._bound.follows(nodes) or not camera or nodes.cut not in self._cuts:
+            if not self._tissue.bound.follows(nodes) or not camera or not self._tissue.knows_cut(nodes):
                 return
             self._states.popleft()
             for old in [other for other in self._poses if other <= stamp and not at_rest]:
                 del self._poses[old]
-            self._publish(*self._render(self._bound, nodes, camera), stamp)
+            self._publish(*self._render(self._tissue.bound, nodes, camera), stamp)
 
     def _leave_out(self, why: str) -> None:
         stamp, _ = self._states.popleft()
@@ -248,35 +217,27 @@ class RenderingNode(EndoNode):
 
     def _build(self) -> None:
         """Bind the newest model to its control nodes in the background; the picture before stays meanwhile."""
-        if self._lockstep and self._bound is not None:
-            if self._states and self._bound.follows(self._states[0][1]):
+        if self._lockstep and self._tissue.bound is not None:
+            if self._states and self._tissue.bound.follows(self._states[0][1]):
                 return  # states of the model before come first
-            if self._nodes is None or self._nodes.model_stamp_ns != self._model_stamp:
+            if self._nodes is None or self._nodes.model_stamp_ns != self._tissue.model_stamp:
                 return  # pictures of states are wanted, not of a model at rest
         try:
-            built = self._background.take()
-            if built is not None:
-                self._bound, self._failure = built[1], ""
+            if self._tissue.bind(self._nodes, self._config):
+                self._failure = ""
                 self._change()
         except Exception as error:
             self._failure = sentence("rendering", error)
             self.report_error(self._failure)
-        if self._model is not None:
-            model, stamp, config = self._model, self._model_stamp, self._config
-            matching = self._nodes is not None and self._nodes.model_stamp_ns == stamp
-            rest = self._nodes.rest if matching else None  # without nodes the model is shown at rest
-            key = (self._model_number, rest.tobytes() if matching else b"", config)
-            self._background.want(key, lambda: _Bound(DeformableRenderer(model, rest, config), stamp, rest))
 
-    def _render(self, bound: _Bound, nodes: ControlNodeCloud | None, camera: Camera) -> tuple[np.ndarray, np.ndarray, Camera]:
+    def _render(self, bound: Bound, nodes: ControlNodeCloud | None, camera: Camera) -> tuple[np.ndarray, np.ndarray, Camera]:
         start, camera = time.monotonic(), bound.renderer.camera(camera)
         if max(camera.width, camera.height) > _MAX_SIDE:
             raise MessageError(f"images of {camera.width}×{camera.height} are too large; set image_width")
         state = ()
         if bound.follows(nodes):
             state = (nodes.positions, nodes.F)
-            if nodes.cut in self._cuts:  # else its surface is still on its way
-                bound.renderer.cut(self._cuts[nodes.cut])
+            self._tissue.cut(bound, nodes)
         image, depth = bound.renderer.render(camera, *state)
         self._seconds_per_image += 0.1 * (time.monotonic() - start - self._seconds_per_image)
         return image, depth, camera
@@ -293,15 +254,15 @@ class RenderingNode(EndoNode):
     # ------------------------------------------------------------ diagnostics
 
     def status(self):
-        if self._model is None:
+        if self._tissue.model is None:
             return WARN, "waiting for a model on gaussians", {}
         if self._camera() is None:
             return WARN, "waiting for a camera on ECM/measured_cp and endoscope/left/camera_info", {}
         values = {
-            "gaussians": len(self._model),
+            "gaussians": len(self._tissue.model),
             "images": self._images,
             "milliseconds per image": f"{1e3 * self._seconds_per_image:.1f}",
-            "following control nodes": self._bound is not None and self._bound.follows(self._nodes),
+            "following control nodes": self._tissue.bound is not None and self._tissue.bound.follows(self._nodes),
         }
         if self._failure:
             return ERROR, self._failure, values
@@ -311,7 +272,7 @@ class RenderingNode(EndoNode):
         return OK, "rendering", values
 
     def destroy_node(self) -> None:
-        self._background.stop()
+        self._tissue.stop()
         super().destroy_node()
 
 

@@ -13,10 +13,10 @@ from std_srvs.srv import SetBool, Trigger
 from endo_sim_ros import messages
 from endo_sim_ros.cameras import Camera
 from endo_sim_ros.config import StageConfig
-from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.messages import ControlNodeCloud
-from endo_sim_ros.nodes.base import OK, WARN, Background, EndoNode, WorldConfig, arm_names, run
-from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
+from endo_sim_ros.nodes.base import OK, WARN, EndoNode, WorldConfig, arm_names, run
+from endo_sim_ros.nodes.shown_tissue import ShownTissue
+from endo_sim_ros.rendering import RenderingConfig
 from endo_sim_ros.viewer.config import ViewerConfig
 from endo_sim_ros.viewer.viewer import PARAMETERS, Tool, Viewer, plain_camera
 
@@ -52,15 +52,6 @@ class _Arm:
     heard: float = 0.0  # when the reaction came
 
 
-@dataclass(frozen=True)
-class _Bound:
-    """A model that follows its nodes."""
-
-    renderer: DeformableRenderer
-    model_stamp: int
-    rest: np.ndarray | None  # [M, 3] m, None without control nodes
-
-
 class ViewerNode(EndoNode):
     """Hands what it hears to a `Viewer`, and what users do there to the graph."""
 
@@ -73,15 +64,11 @@ class ViewerNode(EndoNode):
         (arm,) = arm_names([self._options.arm])
         self._arms = {name: _Arm() for name in arm_names((*self._options.arms, arm))}
         self._hand = arm
-        self._model: GaussianModel | None = None  # the newest; its stamp, and number in the order of arrival:
-        self._model_stamp, self._model_number = 0, 0
+        self._tissue = ShownTissue()
         self._cameras: np.ndarray | None = None  # [V, 4, 4], of the training views
         self._infos: dict[str, messages.CameraInfo] = {}  # by topic
         self._rendered: dict[str, tuple[int, Any]] = {}  # stamp and content of the newest rendered messages
         self._nodes: ControlNodeCloud | None = None
-        self._cuts = {0: np.zeros((0, 3, 3), np.float32)}  # no cut, and the newest surface, by number
-        self._bound: _Bound | None = None
-        self._background = Background()
         self._said: dict[str, tuple[float, str, dict[str, str]]] = {}  # when, sentence and values of each node
         self._asked, self._closed, self._lockstep = 0.0, False, False
         self._paused, self._paused_until = False, 0.0  # as a service said, which counts more than diagnostics before it
@@ -121,10 +108,7 @@ class ViewerNode(EndoNode):
     # ------------------------------------------------------------------ input
 
     def _on_model(self, message: Any) -> None:
-        messages.check_frame(message, (self._options.world_frame,), messages.GAUSSIANS.name)
-        self._model = messages.decode_gaussians(message)
-        self._model_stamp = messages.stamp_to_ns(message.header.stamp)
-        self._model_number += 1
+        self._tissue.take_model(message, self._options.world_frame)
 
     def _on_training_cameras(self, message: Any) -> None:
         messages.check_frame(message, (self._options.world_frame,), messages.TRAINING_CAMERAS.name)
@@ -138,20 +122,16 @@ class ViewerNode(EndoNode):
     def _on_nodes(self, message: Any) -> None:
         messages.check_frame(message, (self._options.world_frame,), messages.CONTROL_NODES.name)
         self._nodes = messages.decode_control_nodes(message)
-        bound = self._bound
-        if bound is None or self._nodes.model_stamp_ns != bound.model_stamp:
+        bound = self._tissue.bound
+        if bound is None or not bound.follows(self._nodes):
             return
-        if bound.rest is None or not np.array_equal(bound.rest, self._nodes.rest):
-            return
-        if self._nodes.cut in self._cuts:  # else its surface is still on its way
-            bound.renderer.cut(self._cuts[self._nodes.cut])
+        self._tissue.cut(bound, self._nodes)
         milliseconds = float(self._value("milliseconds per step", "0"))
         age = 1e-9 * (self.now_ns() - messages.stamp_to_ns(message.header.stamp)) + 1e-3 * milliseconds
         self.viewer.show_state(self._nodes.positions, self._nodes.F, age)
 
     def _on_cut_surface(self, message: Any) -> None:
-        triangles = messages.decode_cut_surface(message)
-        self._cuts = {0: self._cuts[0], messages.cut_number(triangles): triangles}
+        self._tissue.take_cut_surface(message, self._options.world_frame)
 
     def _on_rendered_pose(self, message: Any) -> None:
         pose = messages.decode_pose(message, self._options.world_frame, messages.RENDERED_POSE.name)
@@ -200,7 +180,9 @@ class ViewerNode(EndoNode):
 
     def _on_timer(self) -> None:
         with self.guard("viewer"):
-            self._bind()
+            if self._tissue.bind(self._nodes, self._rendering):
+                bound = self._tissue.bound
+                self.viewer.show_model(bound.renderer, bound.node_rest, self._camera())
             now = time.monotonic()
             tools = {
                 name: Tool(arm.pose[:3, 3], -arm.pose[:3, :3] @ arm.reaction)
@@ -216,20 +198,6 @@ class ViewerNode(EndoNode):
         with self.guard("viewer"):
             self.viewer.update()
 
-    def _bind(self) -> None:
-        """Bind the newest model to its nodes in the background, and show it when that is done."""
-        built = self._background.take()
-        if built is not None:
-            self._bound = built[1]
-            self.viewer.show_model(self._bound.renderer, self._bound.rest, self._camera())
-        if self._model is None:
-            return
-        model, stamp, config = self._model, self._model_stamp, self._rendering
-        matching = self._nodes is not None and self._nodes.model_stamp_ns == stamp
-        rest = self._nodes.rest if matching else None
-        key = (self._model_number, rest.tobytes() if matching else b"", config)
-        self._background.want(key, lambda: _Bound(DeformableRenderer(model, rest, config), stamp, rest))
-
     def _camera(self) -> Camera:
         """Where pages look from first: the endoscope, else a training view, else the world's origin."""
         info = self._infos.get(messages.RENDERED_INFO.name) or self._infos.get(messages.TRAINING_CAMERA_INFO.name)
@@ -242,9 +210,9 @@ class ViewerNode(EndoNode):
 
     def _text(self, now: float) -> list[str]:
         lines = []
-        if self._bound is not None:
-            count = 0 if self._bound.rest is None else len(self._bound.rest)
-            lines.append(f"{len(self._bound.renderer.model)} Gaussians, {count} nodes")
+        if (bound := self._tissue.bound) is not None:
+            count = 0 if bound.node_rest is None else len(bound.node_rest)
+            lines.append(f"{len(bound.renderer.model)} Gaussians, {count} nodes")
         lines.append(f"{self._value('simulated time', '0')} s, real time × {self._value('real-time factor', '0')}")
         for name in dict.fromkeys((self._options.physics_node, *_SHOWN)):
             heard, sentence, _ = self._said.get(self._full_name(name), (0.0, "not heard yet", {}))
@@ -324,12 +292,12 @@ class ViewerNode(EndoNode):
             "milliseconds from mouse to picture": f"{1e3 * viewer.latency:.0f}",
             "holding": viewer.holding,
         }
-        if self._model is None:
+        if self._tissue.model is None:
             return WARN, f"waiting for a model on gaussians; the page is at {viewer.url}", values
         return OK, f"showing the tissue at {viewer.url}", values
 
     def destroy_node(self) -> None:
-        self._background.stop()
+        self._tissue.stop()
         self.viewer.stop()
         super().destroy_node()
 

@@ -18,6 +18,7 @@ ARGUMENTS = {
     "arms": ("", "Names of the tool arms with commas between, such as PSM1,PSM2; empty = as in the parameter file."),
     "namespace": ("", "Namespace of all nodes and topics (except /diagnostics)."),
     "enclaves": ("", "Parent of the nodes' security enclaves, such as /endo_sim; empty = none named."),
+    "view": ("false", "Serve the page on which the tissue is seen and pulled with the mouse; its log says where."),
     "rviz": ("false", "Open RViz with the view of this package."),
 }
 
@@ -39,16 +40,21 @@ def _actions(context: LaunchContext) -> list[Node]:
             sigterm_timeout="15",  # seconds to end after Ctrl-C; a busy machine needs more than the usual 5
         )
 
+    def wanted(name: str) -> bool:
+        return given[name].lower() in ("true", "1")
+
+    arms = [arm.strip() for arm in given["arms"].split(",") if arm.strip()]
     actions = []
-    if given["rviz"].lower() in ("true", "1"):  # first: where it is not installed nothing must have been started
+    if wanted("rviz"):  # first: where it is not installed nothing must have been started
         arguments = ["-d", str(CONFIG / "endo_sim.rviz")]
         actions.append(Node(package="rviz2", executable="rviz2", namespace=given["namespace"], arguments=arguments))
     actions.append(node("reconstruction_node", model_file=given["model"]))
-    actions.append(node("physics_node", arms=[arm.strip() for arm in given["arms"].split(",") if arm.strip()]))
+    actions.append(node("physics_node", arms=arms))
     actions.append(node("rendering_node"))
+    if wanted("view"):
+        actions.append(node("viewer_node", arm="".join(arms[:1]), arms=arms))
     if given["bag"]:
-        rate, loop = float(given["rate"]), given["loop"].lower() in ("true", "1")
-        actions.append(node("bag_player_node", bag=given["bag"], rate=rate, loop=loop))
+        actions.append(node("bag_player_node", bag=given["bag"], rate=float(given["rate"]), loop=wanted("loop")))
     return actions
 
 

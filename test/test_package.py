@@ -167,14 +167,16 @@ def test_launch_file_starts_the_graph_with_what_is_given(monkeypatch):
     graph = ["reconstruction_node", "physics_node", "rendering_node"]
     assert [node["executable"] for node in start()] == graph
     assert [node["parameters"] for node in start()] == [[defaults["params"], {}]] * 3
-    nodes = start(bag="b", rate="2.0", loop="true", model="latest", arms="PSM1, PSM2", namespace="left", enclaves="/e", rviz="true")
+    everything = {"bag": "b", "rate": "2.0", "loop": "true", "model": "latest", "arms": "PSM1, PSM2", "view": "true", "rviz": "true"}
+    nodes = start(**everything, namespace="left", enclaves="/e")
     names = [node["executable"] for node in nodes]
-    assert names == ["rviz2", *graph, "bag_player_node"], "RViz first: nothing is left behind where it is not installed"
+    assert names == ["rviz2", *graph, "viewer_node", "bag_player_node"], "RViz first: nothing is left behind where it is not installed"
     assert {node["namespace"] for node in nodes} == {"left"}
     assert Path(nodes[0]["arguments"][1]).is_file()
     names, nodes = names[1:], nodes[1:]
     given = [node["parameters"][1] for node in nodes]
-    assert given == [{"model_file": "latest"}, {"arms": ["PSM1", "PSM2"]}, {}, {"bag": "b", "rate": 2.0, "loop": True}]
+    arms = ["PSM1", "PSM2"]
+    assert given == [{"model_file": "latest"}, {"arms": arms}, {}, {"arm": "PSM1", "arms": arms}, {"bag": "b", "rate": 2.0, "loop": True}]
     assert [node["ros_arguments"] for node in nodes] == [["--enclave", f"/e/{name}"] for name in names]
     with pytest.raises(FileNotFoundError, match="params"):
         start(params="/does/not/exist.yaml")

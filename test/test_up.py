@@ -19,10 +19,12 @@ from endo_sim_ros import messages
 from endo_sim_ros.nodes.bag_player_node import BagPlayerNode
 from endo_sim_ros.nodes.base import EndoNode
 from endo_sim_ros.nodes.physics_node import PhysicsNode
+from endo_sim_ros.nodes.policy_node import PolicyNode
 from endo_sim_ros.nodes.reconstruction_node import ReconstructionNode
 from endo_sim_ros.nodes.rendering_node import RenderingNode
 from endo_sim_ros.nodes.scripted_tool_node import ScriptedToolNode
 from endo_sim_ros.nodes.up import UpError, run_up
+from endo_sim_ros.nodes.viewer_node import ViewerNode
 from endo_sim_ros.sequences.frames import SequenceError
 
 CONFIG = Path(__file__).parents[1] / "config"
@@ -254,13 +256,17 @@ ENCLAVES = {
     "physics_node": (PhysicsNode, [[], ["mode:=lockstep"], ["arm_source:=commanded"]]),
     "rendering_node": (RenderingNode, [[]]),
     "scripted_tool_node": (ScriptedToolNode, [[]]),
+    "viewer_node": (ViewerNode, [[], ["arm_source:=commanded"]]),
+    "policy_node": (PolicyNode, [[]]),
     "bag_player_node": (BagPlayerNode, [["bag:=/does/not/exist"]]),
 }
-RULES = {"subscribe": ("topics", "topic"), "publish": ("topics", "topic"), "reply": ("services", "service")}
+RULES = {
+    "subscribe": ("topics", "topic"), "publish": ("topics", "topic"), "reply": ("services", "service"), "request": ("services", "service"),
+}  # fmt: skip
 
 
 def allowed(profile: ElementTree.Element) -> dict[str, set[str]]:
-    """Absolute names that a profile allows to hear, to say and to answer."""
+    """Absolute names that a profile allows to hear, to say, to answer and to call."""
     assert profile.get("ns") == "/"
     names = {rule: set() for rule in RULES}
     for group in profile:
@@ -273,7 +279,7 @@ def allowed(profile: ElementTree.Element) -> dict[str, set[str]]:
 
 
 def used(node_class: type[EndoNode], parameters: list[str]) -> tuple[str, dict[str, set[str]]]:
-    """A node's name and the names that it hears, says and answers."""
+    """A node's name and the names that it hears, says, answers and calls."""
     rclpy.init(args=["--ros-args", *(word for value in parameters for word in ("-p", value))])
     node = node_class()
     try:
@@ -282,6 +288,7 @@ def used(node_class: type[EndoNode], parameters: list[str]) -> tuple[str, dict[s
             "subscribe": node.get_subscriber_names_and_types_by_node(*me),
             "publish": node.get_publisher_names_and_types_by_node(*me),
             "reply": node.get_service_names_and_types_by_node(*me),
+            "request": node.get_client_names_and_types_by_node(*me),
         }
         names = {rule: {name for name, _ in pairs} for rule, pairs in found.items()}
         names["subscribe"].add("/clock")  # with use_sim_time

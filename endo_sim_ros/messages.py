@@ -6,8 +6,10 @@ filled through ``array.array`` and read through ``np.frombuffer``.
 """
 
 import array
+import dataclasses
 import functools
 import importlib
+import importlib.util
 import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -18,6 +20,7 @@ import numpy as np
 
 from endo_sim_ros.cameras import make_pose, matrix_to_quat
 from endo_sim_ros.gaussians import GaussianModel, ModelError, from_columns, ply_fields, to_columns
+from endo_sim_ros.light import Light
 
 
 class MessageError(ValueError):
@@ -638,14 +641,17 @@ def _encode_cloud(points: np.ndarray, stamp_ns: int, frame_id: str, types: Any) 
 
 
 def encode_gaussians(model: GaussianModel, stamp_ns: int, frame_id: str, types: Any = None) -> Any:
-    """PointCloud2 with INRIA's field names (float32) plus packed `rgb`; the stamp identifies the model."""
-    columns, names = to_columns(model), ply_fields(model.sh_degree)
-    points = np.empty((len(model), len(names) + 1), np.float32)
-    points[:, :-1] = columns
+    """PointCloud2 with INRIA's field names (float32) plus packed `rgb` and `light`, if any; the stamp identifies the model."""
     r, g, b = (model.base_colors.detach().cpu().numpy() * 255 + 0.5).astype(np.uint32).T
-    points[:, -1] = (r << 16 | g << 8 | b).view(np.float32)
-    dtype = np.dtype([(name, "<f4") for name in [*names, "rgb"]])
-    return _encode_cloud(points.view(dtype).reshape(-1), stamp_ns, frame_id, types or ros_types())
+    columns, names = [to_columns(model), (r << 16 | g << 8 | b).view(np.float32)[:, None]], [*ply_fields(model.sh_degree), "rgb"]
+    if model.light is not None:
+        numbers = np.float32(dataclasses.astuple(model.light))
+        if len(model) < len(numbers):
+            raise MessageError(f"{GAUSSIANS.name}: a model with a light needs {len(numbers)} Gaussians, got {len(model)}")
+        columns.append(np.pad(numbers, (0, len(model) - len(numbers)))[:, None])
+        names.append("light")
+    points = np.concatenate(columns, 1)
+    return _encode_cloud(points.view([(name, "<f4") for name in names]).reshape(-1), stamp_ns, frame_id, types or ros_types())
 
 
 def decode_gaussians(message: Any, topic: str = GAUSSIANS.name) -> GaussianModel:
@@ -654,8 +660,12 @@ def decode_gaussians(message: Any, topic: str = GAUSSIANS.name) -> GaussianModel
     if not len(points):
         raise MessageError(f"{topic}: the model is empty; reconstruct a scene first")
     try:
-        return from_columns({name: points[name] for name in points.dtype.names}, topic)
-    except ModelError as error:
+        model = from_columns({name: points[name] for name in points.dtype.names}, topic)
+        if "light" in points.dtype.names:
+            numbers = points["light"][: len(dataclasses.fields(Light))].tolist()
+            model = dataclasses.replace(model, light=Light(*numbers))
+        return model
+    except (ModelError, ValueError, TypeError) as error:
         raise MessageError(str(error)) from error
 
 

@@ -27,6 +27,8 @@ class ReconstructionConfig(StageConfig):
     depth: Literal["auto", "topic", "stereo", "points", "none"] = "auto"
     """Depth prior: the depth topic, matching with the right image, interpolation between triangulated points, none, or
     the first of these that exists."""
+    complete_depth: bool = True
+    """Fill the holes of the prior from around them."""
     depth_tolerance: Annotated[float, Range(0.001, 1)] = 0.05
     """Relative depth difference at which two views contradict each other."""
     lambda_ssim: Annotated[float, Range(0, 1)] = 0.2
@@ -43,6 +45,8 @@ class ReconstructionConfig(StageConfig):
     """Weight of 1 − correlation of depth and prior, in training views and in virtual ones to which the prior is carried (FSGS)."""
     lambda_gradient: Annotated[float, Range(0, 1000)] = 0.0
     """Weight of differences between the slopes of the logarithms of depth and prior."""
+    lambda_front: Annotated[float, Range(0, 1000)] = 1.0
+    """Weight of Gaussians that float in front of the depth prior, as a log ratio of depths."""
     lambda_flat: Annotated[float, Range(0, 1000)] = 0.01
     """Weight of Gaussians being deeper than 1.5 times their width, which turns into streaks when the tissue is sheared."""
     virtual_every: Annotated[int, Range(0, 1000)] = 1

@@ -15,6 +15,8 @@ log = logging.getLogger(__name__)
 
 _NEAREST = 0.02  # metres; closer than an endoscope works
 _MIN_POINTS = 30  # points needed to trust an offset or an interpolation
+_FEATURES = 3000  # matched to find by how much the right image lies too high or too low
+_ROWS = 0.01  # of the image's height: the farthest that it may
 _NEIGHBOURS = 8  # points around a point that it is compared with
 _DISAGREEMENT = 0.1  # largest relative difference from them
 
@@ -49,10 +51,36 @@ def with_depth_prior(frames: list[Frame], points: np.ndarray, config: Reconstruc
         return [_with_depth(frame, interpolated_depth(frame, points)) for frame in frames]
     if source == "topic":
         return [_with_depth(frame, frame.depth) for frame in frames]
+    frames = [frame if frame.right is None else _aligned(frame) for frame in frames]
     disparities = [None if frame.right is None else stereo_disparity(frame) for frame in frames]
     offset = disparity_offset(frames, disparities, points)
     frames = [_with_depth(f, None if d is None else _to_depth(f, d, offset)) for f, d in zip(frames, disparities)]
     return [frame if frame.right is None else _with_right_shifted(frame, offset) for frame in frames]
+
+
+def _aligned(frame: Frame) -> Frame:
+    """The frame with its right image moved up or down by whole pixels, and that eye's principal point by what it takes to
+    put matched features on the rows where the left image has them: rectification is seldom that good."""
+    sift = cv2.SIFT_create(nfeatures=_FEATURES, contrastThreshold=0.01)
+    features = lambda image, mask: sift.detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), mask)
+    (left, first), (right, second) = features(frame.image, frame.mask), features(frame.right, None)
+    if first is None or second is None or len(second) < 2:
+        return frame
+    matches = [m for m, n in cv2.BFMatcher(cv2.NORM_L2).knnMatch(first, second, k=2) if m.distance < 0.75 * n.distance]
+    shifts = np.array([right[m.trainIdx].pt[1] - left[m.queryIdx].pt[1] for m in matches])
+    shifts = shifts[np.abs(shifts) < _ROWS * frame.camera.height]
+    if len(shifts) < _MIN_POINTS:
+        return frame
+    shift = float(np.median(shifts))
+    K = (frame.camera.K if frame.right_K is None else frame.right_K).copy()
+    rows = round(shift)
+    K[1, 2] += shift - rows
+    return dataclasses.replace(frame, right=_moved_up(frame.right, rows), right_K=K)
+
+
+def _moved_up(image: np.ndarray, rows: int) -> np.ndarray:
+    """The image moved up by a number of rows, the last one repeated."""
+    return image[np.clip(np.arange(len(image)) + rows, 0, len(image) - 1)]
 
 
 def _with_right_shifted(frame: Frame, offset: float) -> Frame:
@@ -89,6 +117,34 @@ def _with_depth(frame: Frame, depth: np.ndarray | None) -> Frame:
         return dataclasses.replace(frame, depth=None)
     valid = np.isfinite(depth) & (depth > 0) & (True if frame.mask is None else frame.mask > 0)
     return dataclasses.replace(frame, depth=np.where(valid, depth, 0).astype(np.float32))
+
+
+def completed(depth: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
+    """Depth [H, W] (m) with a value everywhere in the mask, if it has any: inverse depth, averaged over ever wider surroundings.
+
+    Holes are what matching leaves at glints, at occlusions and beside the field that both eyes see.
+    """
+    weight = (depth > 0).astype(np.float32)
+    if not weight.any() or weight.all():
+        return depth
+    levels = [(weight, np.where(depth > 0, 1 / np.maximum(depth, 1e-6), 0).astype(np.float32))]
+    while min(levels[-1][0].shape) > 1:
+        weight, total = (_halved(array) for array in (levels[-1][0], levels[-1][0] * levels[-1][1]))
+        levels.append(((weight > 0).astype(np.float32), total / np.maximum(weight, 1e-6)))
+    weight, filled = levels[-1]
+    filled = np.where(weight > 0, filled, np.average(levels[0][1], weights=levels[0][0])).astype(np.float32)
+    for weight, values in levels[-2::-1]:
+        coarse = cv2.resize(filled, weight.shape[::-1], interpolation=cv2.INTER_LINEAR)
+        filled = np.where(weight > 0, values, coarse)
+    filled = 1 / filled
+    return np.where(True if mask is None else mask > 0, filled, 0).astype(np.float32)
+
+
+def _halved(array: np.ndarray) -> np.ndarray:
+    """Sums of 2 × 2 pixels; an odd row or column is repeated."""
+    rows, columns = array.shape
+    padded = np.pad(array, ((0, rows % 2), (0, columns % 2)), mode="edge")
+    return padded[::2, ::2] + padded[1::2, ::2] + padded[::2, 1::2] + padded[1::2, 1::2]
 
 
 def stereo_disparity(frame: Frame) -> np.ndarray:

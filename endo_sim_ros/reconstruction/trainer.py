@@ -21,7 +21,7 @@ from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.light import Light, falloff, features, log_brightness
 from endo_sim_ros.reconstruction import densification, losses, photometry
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
-from endo_sim_ros.reconstruction.depth import with_depth_prior
+from endo_sim_ros.reconstruction.depth import completed, with_depth_prior
 from endo_sim_ros.reconstruction.initialization import initial_model
 from endo_sim_ros.reconstruction.presets import resolved
 from endo_sim_ros.reconstruction.triangulation import triangulate
@@ -86,6 +86,9 @@ class Trainer:
         self.device = pick_device(config.device)
         points, colors, _ = triangulate(frames)
         frames = [shrink(frame, config.image_width) for frame in with_depth_prior(frames, points, config)]
+        if config.complete_depth:
+            whole = [None if f.depth is None else completed(f.depth, f.mask) for f in frames]
+            frames = [dataclasses.replace(frame, depth=depth) for frame, depth in zip(frames, whole)]
         model = initial_model(frames, points, colors, config)
         self.scene_depth = _median_depth(frames, model)
         light, exposures = np.zeros(4), np.zeros((len(frames), 3))
@@ -285,6 +288,9 @@ class Trainer:
             if config.lambda_gradient:
                 error = losses.gradient_difference(output.depths[0], output.alphas[0], view.depth, view.mask)
                 loss = loss + config.lambda_gradient * error
+            if config.lambda_front:
+                floating = losses.in_front(self._parameters["means"], view.viewmat[0], view.K[0], view.depth)
+                loss = loss + config.lambda_front * floating.mean()
         return loss + self._regularization(output, view.mask, view.image)
 
     def _virtual_loss(self, index: int) -> Tensor:

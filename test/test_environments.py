@@ -25,6 +25,7 @@ from endo_sim_ros.learning.scenes import Scene, load_scene, save_scene
 from endo_sim_ros.learning.task_batch import TaskBatch
 from endo_sim_ros.learning.tasks import TASKS
 from endo_sim_ros.learning.train import run_episodes, save_training, train
+from endo_sim_ros.light import Light
 from endo_sim_ros.nodes.graph import NodeGroup
 from endo_sim_ros.physics import TissueSimulation
 
@@ -198,16 +199,19 @@ def test_randomisation_changes_what_it_names_and_nothing_else():
         make(randomisation={"light": 2.0})
 
 
-def test_images_are_those_of_the_renderer():
+@pytest.mark.parametrize("light", [None, Light(distance=0.9, angle=0.4, response=0.3)], ids=["plain", "lit"])
+def test_images_are_those_of_the_renderer(light):
     from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 
-    environment = make(observations="image")
+    scene = load_scene()
+    scene = replace(scene, model=replace(scene.model, light=light))
+    environment = make(observations="image", scene=scene)
     batch = environment.unwrapped.batch
     script = scripted_policy("retraction")
     image, _ = environment.reset(seed=0)
     for _ in range(16):
         image, *_ = environment.step(script.act(batch._state())[0])
-    renderer = DeformableRenderer(load_scene().model, batch.task.nodes.rest, RenderingConfig(device="cpu"))
+    renderer = DeformableRenderer(scene.model, batch.task.nodes.rest, RenderingConfig(device="cpu"))
     pinned = torch.from_numpy(batch.task.nodes.pinned)[:, None, None]
     F = torch.where(pinned, torch.eye(3), batch.tissue.F[0])  # as on control_nodes
     expected, _ = renderer.render(batch.camera, batch.tissue.positions()[0], F)

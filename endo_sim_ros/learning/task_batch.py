@@ -157,7 +157,10 @@ class TaskBatch:
         """What the endoscope sees of episode b [H, W, 3], uint8."""
         view, at_rest = self.views[b], self._model
         model = GaussianModel(self._means[b], at_rest.quats, at_rest.log_scales, at_rest.logit_opacities, view.sh)
-        colors = render(model, view.camera, covars=self._covars[b]).colors[0]
+        seen = render(model, view.camera, covars=self._covars[b])
+        colors = seen.colors[0]
+        if at_rest.light is not None:
+            colors = at_rest.light.shade(colors, seen.depths[0], seen.alphas[0], view.camera)
         if view.light is not None:
             colors = colors * torch.from_numpy(view.light).to(colors.device)
         return (colors.clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()

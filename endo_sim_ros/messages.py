@@ -84,6 +84,36 @@ def tool_jaw_state(arm: str) -> Topic:
     return Topic(f"{arm}/jaw/measured_js", "sensor_msgs/msg/JointState")
 
 
+def tool_jaw_move(arm: str) -> Topic:
+    return Topic(f"{arm}/jaw/move_jp", "sensor_msgs/msg/JointState")
+
+
+def tool_jaw_setpoint(arm: str) -> Topic:
+    return Topic(f"{arm}/jaw/setpoint_js", "sensor_msgs/msg/JointState")
+
+
+def tool_move(arm: str) -> Topic:
+    return Topic(f"{arm}/move_cp", "geometry_msgs/msg/PoseStamped")
+
+
+def tool_setpoint(arm: str) -> Topic:
+    return Topic(f"{arm}/setpoint_cp", "geometry_msgs/msg/PoseStamped")
+
+
+def tool_state(arm: str) -> Topic:
+    return Topic(f"{arm}/operating_state", _crtk_type("OperatingState"), "latched")
+
+
+def tool_state_command(arm: str) -> Topic:
+    return Topic(f"{arm}/state_command", _crtk_type("StringStamped"))
+
+
+@functools.cache
+def _crtk_type(name: str) -> str:
+    """A type of CRTK's own messages where they are installed, else a plain string."""
+    return f"crtk_msgs/msg/{name}" if importlib.util.find_spec("crtk_msgs") else "std_msgs/msg/String"
+
+
 def tool_cut(arm: str) -> Topic:
     return Topic(f"{arm}/cut", "sensor_msgs/msg/Joy")
 
@@ -96,7 +126,10 @@ RECORDING_TOPICS = (
     LEFT_IMAGE, LEFT_COMPRESSED, LEFT_INFO, RIGHT_IMAGE, RIGHT_COMPRESSED, RIGHT_INFO, DEPTH, MASK, CAMERA_POSE,
 )  # fmt: skip
 MODEL_TOPICS = (GAUSSIANS, TRAINING_CAMERAS, TRAINING_CAMERA_INFO)
-TOOL_TOPICS = (tool_pose, tool_pose_command, tool_wrench, tool_jaw, tool_jaw_state, tool_cut, tool_reaction)  # of one arm
+TOOL_TOPICS = (  # of one arm; its states are not among them, as their type is not always there
+    tool_pose, tool_pose_command, tool_move, tool_setpoint, tool_wrench, tool_jaw, tool_jaw_move, tool_jaw_state, tool_jaw_setpoint,
+    tool_cut, tool_reaction,
+)  # fmt: skip
 RENDERED_TOPICS = (RENDERED_INFO, RENDERED_POSE, RENDERED_DEPTH, RENDERED_IMAGE)
 
 
@@ -507,6 +540,19 @@ def encode_cut(cutting: bool, stamp_ns: int, types: Any = None) -> Any:
         axes=types.sequence(np.zeros(0, np.float32)),
         buttons=types.sequence(np.array([cutting], np.int32)),
     )
+
+
+def encode_operating_state(state: str, homed: bool, busy: bool, stamp_ns: int) -> Any:
+    """OperatingState of CRTK; without crtk_msgs a String of the state and, while a move is under way, BUSY."""
+    kind = ros_class(_crtk_type("OperatingState"))
+    if kind.__name__ == "String":
+        return kind(data=f"{state} BUSY" if busy else state)
+    return kind(header=_header(ros_types(), stamp_ns, ""), state=state, is_homed=homed, is_busy=busy)
+
+
+def decode_state_command(message: Any) -> str:
+    """Command in a StringStamped of CRTK or a String."""
+    return (message.data if hasattr(message, "data") else message.string).strip()
 
 
 def encode_jaw(angle: float, stamp_ns: int, types: Any = None) -> Any:

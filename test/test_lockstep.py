@@ -231,6 +231,40 @@ def test_a_commanded_arm_answers_like_a_robot_and_shows_its_markers(graph):
     assert reaction.points[1].z > tip.pose.position.z and len(held.points) > 2
 
 
+def test_a_commanded_arm_moves_in_its_time_and_tells_its_state(graph):
+    """The client's way: move, wait until the arm is no longer busy, pause, resume."""
+    told, setpoints = graph.hear(messages.tool_state("PSM1")), graph.hear(messages.tool_setpoint("PSM1"))
+    jaws = graph.hear(messages.tool_jaw_setpoint("PSM1"))
+    saying = lambda: [message.data for message in told]  # noqa: E731
+
+    def send(text):
+        topic = messages.tool_state_command("PSM1")
+        graph.publish(topic, messages.ros_class(topic.type)(data=text))
+
+    graph.until(lambda: saying() == ["ENABLED"], "the state that was told before anybody listened")
+    command(graph, 100)
+    graph.until(lambda: setpoints, "a first pose")
+    assert graph.set("physics_node", move_speed=0.05, turn_speed=10.0, step_count=3)[0]
+    goal = np.eye(4)
+    goal[:3, 3] = 0.003, 0, 0.1
+    graph.publish(messages.tool_move("PSM1"), messages.encode_pose(goal, 1, "world"))
+    graph.publish(messages.tool_jaw_move("PSM1"), messages.encode_jaw(0.5, 1))
+    graph.until(lambda: saying()[1:] == ["ENABLED BUSY"] and graph.nodes[1]._arms["PSM1"].angle_goal, "the arm to be busy")
+    assert graph.call(Trigger, "/physics_node/step").success
+    graph.until(lambda: len(setpoints) == len(jaws) == 4 and saying()[2:] == ["ENABLED"], lambda: f"the end of the move; {saying()}")
+    ways = [messages.decode_pose(message, "world", "")[0, 3] for message in setpoints]
+    np.testing.assert_allclose(ways, [0, 0.001, 0.002, 0.003], atol=1e-9)  # 5 cm a second, 20 ms a step
+    np.testing.assert_allclose([messages.decode_jaw(jaw, "") for jaw in jaws], [1.0, 0.8, 0.6, 0.5])
+    send("pause")
+    graph.until(lambda: saying()[3:] == ["PAUSED"])
+    graph.publish(messages.tool_move("PSM1"), messages.encode_pose(np.eye(4), 1, "world"))
+    graph.refused("physics_node", "PSM1/move_cp: PSM1 is PAUSED; send resume on PSM1/state_command")
+    send("enable")
+    graph.refused("physics_node", "PSM1/state_command: enable is not possible while PSM1 is PAUSED")
+    send("resume")
+    graph.until(lambda: saying()[4:] == ["ENABLED"])
+
+
 def record(tmp_path, name, model):
     """A scripted episode with the graph in processes of its own; all output as bytes, by topic."""
     bench, bag = Bench(), tmp_path / name

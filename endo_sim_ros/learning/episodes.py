@@ -132,7 +132,8 @@ def read_episode(
     tips, state, action = [], [], []
     for arm in arms:
         tip = streams[messages.tool_pose(arm)]
-        jaw_command = streams.get(messages.tool_jaw(arm), _Stream.constant([JAW_OPEN]))
+        jaw_state = streams.get(messages.tool_jaw_state(arm), _Stream.constant([JAW_OPEN]))
+        jaw_command = streams.get(messages.tool_jaw(arm), jaw_state)
         jaw = streams.get(messages.tool_jaw_state(arm), jaw_command)
         pose = _continuous(tip.at(times))
         command = streams.get(messages.tool_pose_command(arm), tip).at(times, before=tip)

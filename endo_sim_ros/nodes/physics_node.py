@@ -14,6 +14,7 @@ from endo_sim_ros.cameras import Camera
 from endo_sim_ros.config import ConfigError, Range, StageConfig
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.messages import ControlNodeCloud, MessageError
+from endo_sim_ros.nodes.arm import Arm
 from endo_sim_ros.nodes.base import ERROR, OK, STREAM_DEPTH, WARN, Background, EndoNode, WorldConfig, arm_names, run, sentence
 from endo_sim_ros.nodes.pacing import MOST_WAITING, CommandQueue, Pacer
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
@@ -41,7 +42,11 @@ class PhysicsNodeConfig(WorldConfig):
     """Names of the tool arms; each has its topics under its name."""
     arm_source: Literal["measured", "commanded"] = "measured"
     """measured: tips follow measured_cp, as robots and their simulators publish it. commanded: there is no other robot;
-    tips follow servo_cp at once, and this node publishes measured_cp and jaw/measured_js as an arm would."""
+    tips follow servo_cp at once and move_cp in their time, and this node publishes measured_cp and jaw/measured_js as an arm would."""
+    move_speed: Annotated[float, Range(1e-4, 10, "m/s")] = 0.05
+    """Speed of a tip on its way to the goal of move_cp."""
+    turn_speed: Annotated[float, Range(1e-2, 100, "rad/s")] = 1.5
+    """Speed at which a tip turns on its way, and at which a jaw goes to the goal of jaw/move_jp."""
     command_timeout: Annotated[float, Range(0, 3600, "s")] = 0.5
     """A wrench that is not repeated for this long is dropped; 0 = held until changed."""
     jaw_closed: Annotated[float, Range(-3.2, 3.2, "rad")] = 0.1
@@ -56,20 +61,6 @@ class PhysicsNodeConfig(WorldConfig):
         unknown = set(self.lockstep_inputs) - set(_INPUTS)
         if unknown or not self.lockstep_inputs:
             raise ConfigError(f"lockstep_inputs: {list(self.lockstep_inputs)} must be some of {', '.join(_INPUTS)}")
-
-
-@dataclass
-class _Arm:
-    """What was last heard from one arm."""
-
-    pose: np.ndarray | None = None  # [4, 4], world
-    force: np.ndarray | None = None  # [3] N, world
-    torque: np.ndarray | None = None  # [3] N·m about the tip, world
-    heard: float = 0.0  # time of the last wrench, seconds of the clock
-    acting: bool = False
-    angle: float = 1.0  # of the jaw, rad: open until told otherwise
-    closed: bool = False  # the jaw
-    cutting: bool = False
 
 
 class PhysicsNode(EndoNode):
@@ -96,7 +87,7 @@ class PhysicsNode(EndoNode):
         self._window: tuple[float, float] | None = None  # clock and simulated time where the real-time factor begins
         self._real_time_factor = 1.0
         self._pacer = Pacer()
-        self._arms = {name: _Arm() for name in arm_names(self._options.arms)}
+        self._arms = {name: Arm(name) for name in arm_names(self._options.arms)}
         self._lockstep = self._options.mode == "lockstep"
         self._commands = CommandQueue(frozenset((n, kind) for n in self._arms for kind in self._options.lockstep_inputs))
         # In real time only the newest command counts, and none may queue; in lockstep none may be lost.
@@ -107,11 +98,9 @@ class PhysicsNode(EndoNode):
         self._markers_pub = self.publisher(messages.TOOL_MARKERS)
         self._reaction_pubs = {name: self.publisher(messages.tool_reaction(name)) for name in self._arms}
         commanded = self._options.arm_source == "commanded"
-        self._arm_pubs = {
-            name: (self.publisher(messages.tool_pose(name)), self.publisher(messages.tool_jaw_state(name)))
-            for name in self._arms
-            if commanded
-        }
+        shown = messages.tool_pose, messages.tool_setpoint, messages.tool_jaw_state, messages.tool_jaw_setpoint, messages.tool_state
+        self._arm_pubs = {name: [self.publisher(topic(name)) for topic in shown] for name in self._arms if commanded}
+        self._told: dict[str, tuple[str, bool, bool]] = {}  # what was last said on operating_state
         self._pose_topic = messages.tool_pose_command if commanded else messages.tool_pose
         self._clock_pub = self.publisher(messages.CLOCK) if self._lockstep else None
         self.subscribe(messages.GAUSSIANS, self._on_model)
@@ -121,8 +110,14 @@ class PhysicsNode(EndoNode):
         for name in self._arms:
             self.subscribe(self._pose_topic(name), partial(self._on_tool_pose, name), depth)
             self.subscribe(messages.tool_wrench(name), partial(self._on_wrench, name), depth)
-            self.subscribe(messages.tool_jaw(name), partial(self._on_jaw, name), max(depth, STREAM_DEPTH))  # some come once
-            self.subscribe(messages.tool_cut(name), partial(self._on_cut, name), max(depth, STREAM_DEPTH))
+            several = max(depth, STREAM_DEPTH)  # some come once
+            self.subscribe(messages.tool_jaw(name), partial(self._on_jaw, name), several)
+            self.subscribe(messages.tool_jaw_move(name), partial(self._on_jaw_move, name), several)
+            self.subscribe(messages.tool_cut(name), partial(self._on_cut, name), several)
+            if commanded:
+                self.subscribe(messages.tool_move(name), partial(self._on_move, name), several)
+                self.subscribe(messages.tool_state_command(name), partial(self._on_state_command, name))
+        self._tell_states()
         self.service(Trigger, "~/reset", self._on_reset)
         self.service(Trigger, "~/step", self._on_step)
         self.service(SetBool, "~/pause", self._on_pause)
@@ -220,12 +215,52 @@ class PhysicsNode(EndoNode):
             raise MessageError(f"{topic}: {error}") from error
         self._run_commands()
 
-    def _on_tool_pose(self, name: str, message: Any) -> None:
-        arm, topic = self._arms[name], self._pose_topic(name).name
+    def _decode_tip(self, name: str, message: Any, topic: str) -> np.ndarray:
         frames = self._options.frame_poses
         unnamed = frames.get(f"{name}_base", np.eye(4))  # clients of CRTK leave the frame empty
-        pose = messages.decode_pose(message, frames | {"": unnamed}, topic)
-        self._receive(name, "pose", message, topic, lambda: setattr(arm, "pose", pose))
+        return messages.decode_pose(message, frames | {"": unnamed}, topic)
+
+    def _on_tool_pose(self, name: str, message: Any) -> None:
+        arm, topic = self._arms[name], self._pose_topic(name).name
+        pose = self._decode_tip(name, message, topic)
+
+        def act() -> None:
+            self._require_enabled(arm, topic)
+            arm.pose, arm.pose_goal = pose, None
+            self._tell_states()
+
+        self._receive(name, "pose", message, topic, act)
+
+    def _on_move(self, name: str, message: Any) -> None:
+        arm, topic = self._arms[name], messages.tool_move(name).name
+        goal = self._decode_tip(name, message, topic)
+        self._require_enabled(arm, topic)
+        arm.pose_goal = goal
+        self._tell_states()
+
+    def _on_jaw_move(self, name: str, message: Any) -> None:
+        arm, topic = self._arms[name], messages.tool_jaw_move(name).name
+        goal = messages.decode_jaw(message, topic)
+        self._require_pose(name, topic, "jaw command")
+        arm.angle_goal = goal
+        self._tell_states()
+
+    def _on_state_command(self, name: str, message: Any) -> None:
+        try:
+            self._arms[name].command_state(messages.decode_state_command(message))
+        except ValueError as error:
+            raise MessageError(f"{messages.tool_state_command(name).name}: {error}") from error
+        finally:
+            self._tell_states()
+
+    def _tell_states(self) -> None:
+        """Publish the operating state of each commanded arm when it has changed."""
+        for name, (*_, publisher) in self._arm_pubs.items():
+            arm = self._arms[name]
+            state = arm.state, arm.homed, arm.busy
+            if self._told.get(name) != state:
+                self._told[name] = state
+                publisher.publish(messages.encode_operating_state(*state, self.now_ns()))
 
     def _on_wrench(self, name: str, message: Any) -> None:
         topic, arm = messages.tool_wrench(name).name, self._arms[name]
@@ -249,11 +284,9 @@ class PhysicsNode(EndoNode):
 
         def act() -> None:
             self._require_pose(name, topic, "jaw command")
-            arm.angle = angle
-            if angle <= self._options.jaw_closed:
-                arm.closed = True
-            elif angle >= self._options.jaw_open:
-                arm.closed = False
+            arm.angle, arm.angle_goal = angle, None
+            arm.hold(self._options.jaw_closed, self._options.jaw_open)
+            self._tell_states()
 
         self._receive(name, "jaw", message, topic, act)
 
@@ -267,7 +300,15 @@ class PhysicsNode(EndoNode):
 
         self._receive(name, "cut", message, topic, act)
 
+    @staticmethod
+    def _require_enabled(arm: Arm, topic: str) -> None:
+        try:
+            arm.require_enabled()
+        except ValueError as error:
+            raise MessageError(f"{topic}: {error}") from error
+
     def _require_pose(self, name: str, topic: str, what: str) -> None:
+        self._require_enabled(self._arms[name], topic)
         if self._arms[name].pose is None:
             pose_topic = self._pose_topic(name).name
             raise MessageError(f"{topic}: a {what} came before any pose on {pose_topic}; publish the tip's pose")
@@ -356,6 +397,12 @@ class PhysicsNode(EndoNode):
 
     def _step(self, simulation: TissueSimulation) -> None:
         start, faults, slips = time.monotonic(), simulation.faults, simulation.slips
+        for arm in self._arms.values():
+            turning = arm.angle_goal is not None
+            arm.move(simulation.step_duration, self._options.move_speed, self._options.turn_speed)
+            if turning:  # else a jaw that tissue slipped out of would close again
+                arm.hold(self._options.jaw_closed, self._options.jaw_open)
+        self._tell_states()
         self._apply_tools(simulation)
         simulation.step()
         if simulation.slips > slips:
@@ -387,9 +434,11 @@ class PhysicsNode(EndoNode):
             axes = arm.pose[:3, :3].T  # the reaction is given in the axes of the tool
             self._reaction_pubs[name].publish(messages.encode_wrench(axes @ reaction, axes @ torque, stamp, name))
             if name in self._arm_pubs:
-                pose_pub, jaw_pub = self._arm_pubs[name]
-                pose_pub.publish(messages.encode_pose(arm.pose, stamp, world))
-                jaw_pub.publish(messages.encode_jaw(arm.angle, stamp))
+                *pose_pubs, jaw_pub, jaw_setpoint_pub, _ = self._arm_pubs[name]
+                for publisher in pose_pubs:  # an ideal arm is where it is told to be
+                    publisher.publish(messages.encode_pose(arm.pose, stamp, world))
+                for publisher in (jaw_pub, jaw_setpoint_pub):
+                    publisher.publish(messages.encode_jaw(arm.angle, stamp))
             force = arm.force if arm.acting and arm.force is not None else np.zeros(3)
             shown.append(messages.ToolDisplay(name, arm.pose[:3, 3], force, reaction, simulation.held(name)))
         if shown and self._markers_pub.get_subscription_count():
@@ -404,7 +453,8 @@ class PhysicsNode(EndoNode):
         self._commands.clear()
         self._start_timing()
         for arm in self._arms.values():
-            arm.force, arm.acting, arm.closed, arm.angle, arm.cutting = None, False, False, 1.0, False
+            arm.reset()
+        self._tell_states()
         self._publish(self._simulation, self._simulated_stamp if self._lockstep else self.now_ns(), at_rest=True)
         return True, "at rest"
 

@@ -122,7 +122,8 @@ class _Traffic:
 
 _TOPICS = (
     *messages.RECORDING_TOPICS, *messages.MODEL_TOPICS, messages.CONTROL_NODES,
-    messages.CUT_SURFACE, messages.tool_pose(ARM), messages.tool_wrench(ARM), messages.tool_jaw(ARM), messages.tool_cut(ARM),
+    messages.CUT_SURFACE, messages.tool_pose(ARM), messages.tool_wrench(ARM), messages.tool_jaw(ARM),
+    messages.tool_jaw_move(ARM), messages.tool_cut(ARM),
 )  # fmt: skip
 _WEIGHTS = [0.02 if topic in messages.MODEL_TOPICS else 0.1 if topic == messages.CONTROL_NODES else 1.0 for topic in _TOPICS]
 

@@ -1,0 +1,103 @@
+"""One tool arm as physics_node knows it: what it was last told and, where there is no robot, how it moves and what state it is in."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from endo_sim_ros.cameras import interpolate_pose
+
+_ROUNDED = 1 + 1e-9  # a way that takes a whole number of steps must not take one more
+JAW_AT_START = 1.0  # rad: open until told otherwise
+ENABLED, DISABLED, PAUSED = "ENABLED", "DISABLED", "PAUSED"  # CRTK; an ideal arm has no FAULT
+_TRANSITIONS = {  # of CRTK: from which states a command leads to which
+    "enable": ({ENABLED, DISABLED}, ENABLED),
+    "disable": ({ENABLED, DISABLED, PAUSED}, DISABLED),
+    "pause": ({ENABLED, PAUSED}, PAUSED),
+    "resume": ({PAUSED}, ENABLED),
+}
+
+
+@dataclass
+class Arm:
+    """What was last heard from one arm, and where it is on its way to."""
+
+    name: str
+    pose: np.ndarray | None = None  # [4, 4], world
+    force: np.ndarray | None = None  # [3] N, world
+    torque: np.ndarray | None = None  # [3] N·m about the tip, world
+    heard: float = 0.0  # time of the last wrench, seconds of the clock
+    acting: bool = False
+    angle: float = JAW_AT_START  # of the jaw, rad
+    closed: bool = False  # the jaw
+    cutting: bool = False
+    state: str = ENABLED
+    homed: bool = True
+    pose_goal: np.ndarray | None = None  # [4, 4], world; None while no move is under way
+    angle_goal: float | None = None  # rad
+
+    @property
+    def busy(self) -> bool:
+        """Whether a move is under way."""
+        return self.pose_goal is not None or self.angle_goal is not None
+
+    def command_state(self, command: str) -> None:
+        """Follow a state command of CRTK: enable, disable, pause, resume, home or unhome.
+
+        Raises:
+            ValueError: If there is no such command, or none in this state.
+        """
+        if command in ("home", "unhome"):
+            self.homed = command == "home"
+            return
+        if command not in _TRANSITIONS:
+            raise ValueError(f"{command!r} is no state command; there are {', '.join(_TRANSITIONS)}, home, unhome")
+        states, after = _TRANSITIONS[command]
+        if self.state not in states:
+            raise ValueError(f"{command} is not possible while {self.name} is {self.state}")
+        self.state = after
+        if after != ENABLED:
+            self.stop()
+        if after == DISABLED:
+            self.force, self.cutting = None if self.force is None else np.zeros(3), False
+            self.torque = None if self.torque is None else np.zeros(3)
+
+    def require_enabled(self) -> None:
+        """Raise ValueError if the arm does not move now."""
+        if self.state != ENABLED:
+            what = "resume" if self.state == PAUSED else "enable"
+            raise ValueError(f"{self.name} is {self.state}; send {what} on {self.name}/state_command")
+
+    def stop(self) -> None:
+        """End all moves where they are."""
+        self.pose_goal = self.angle_goal = None
+
+    def move(self, seconds: float, speed: float, turn_speed: float) -> None:
+        """Go on for some seconds towards the goals, with at most these speeds, m/s and rad/s."""
+        if self.pose_goal is not None:
+            if self.pose is None:  # nobody knows where it comes from
+                self.pose = self.pose_goal
+            turn = self.pose[:3, :3].T @ self.pose_goal[:3, :3]
+            angle = np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))
+            needed = max(np.linalg.norm(self.pose_goal[:3, 3] - self.pose[:3, 3]) / speed, angle / turn_speed)
+            if needed <= seconds * _ROUNDED:
+                self.pose, self.pose_goal = self.pose_goal, None
+            else:
+                self.pose = interpolate_pose(self.pose, self.pose_goal, seconds / needed)
+        if self.angle_goal is not None:
+            way, most = self.angle_goal - self.angle, seconds * turn_speed
+            if abs(way) <= most * _ROUNDED:
+                self.angle, self.angle_goal = self.angle_goal, None
+            else:
+                self.angle += float(np.copysign(most, way))
+
+    def hold(self, closed_at: float, open_at: float) -> None:
+        """Close or open the jaw by its angle; between the two it stays as it is."""
+        if self.angle <= closed_at:
+            self.closed = True
+        elif self.angle >= open_at:
+            self.closed = False
+
+    def reset(self) -> None:
+        """Let go of everything; pose and state stay."""
+        self.force, self.acting, self.closed, self.angle, self.cutting = None, False, False, JAW_AT_START, False
+        self.stop()

@@ -85,6 +85,20 @@ def test_after_a_late_input_those_that_follow_do_not_wait():
     assert (delays > 0.0011).mean() < 0.02 and pacer.skipped == 0
 
 
+def test_input_that_came_while_nobody_asked_is_used_by_the_first_work():
+    pacer, ran = Pacer(), []
+    for k in range(200):  # asked eight times a period, with a stall from 0.4 to 0.48 s
+        now = 0.005 * k
+        if 0.4 < now < 0.48:
+            continue
+        due = [pacer.is_due(now, 0.04)]
+        if k % 8 == 6 or now == 0.48:
+            pacer.note_input(now)
+            due.append(pacer.is_due(now, 0.04))
+        ran += [now] * sum(due)
+    assert np.diff(ran).min() > 0.02, "work ran without the input, and once more with it"
+
+
 def test_two_sources_faster_than_the_rate_are_used_together():
     pacer, since, delays, now = Pacer(), {}, [], 0.0
     events = sorted((0.039 * k + gap * arm, arm) for k in range(400) for arm, gap in ((0, 0.0), (1, 0.01)))

@@ -19,6 +19,7 @@ class Pacer:
         self._inputs: dict[Hashable, tuple[float, float]] = {}  # times of the last two of each source
         self._fresh: set[Hashable] = set()  # sources whose last input was not used yet
         self._ahead = False  # what is fresh waits for the next input
+        self._asked = float("-inf")  # when it was last asked for
         self.skipped = 0
 
     def note_input(self, now: float, source: Hashable = None) -> None:
@@ -33,11 +34,15 @@ class Pacer:
             self._due = now
             self._inputs.clear()
             self._fresh.clear()
-        streaming = {source for source, (before, _) in self._inputs.items() if now - before < 3 * period}
+        asked, self._asked = self._asked, now
+        stalled = now - asked > period / 2
+        streaming = {source for source, (before, _) in self._inputs.items() if (asked if stalled else now) - before < 3 * period}
         newest = max((self._inputs[source][1] for source in self._fresh), default=now)
         belated = {source for source in self._fresh if newest - self._inputs[source][1] > period / 2}
         self._fresh -= belated  # they belonged to the inputs before
         complete = bool(self._fresh) and streaming <= self._fresh
+        if stalled and streaming and not complete:
+            return False  # what came meanwhile is noted first
         early = -1.0 if complete and not self._ahead else 0.5 if streaming else 0.0
         if now < self._due + early * period - 1e-9:
             self._ahead = complete

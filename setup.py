@@ -42,7 +42,8 @@ setup(
         "lerobot": ["pyarrow"],  # `endo-sim export`
         "rl": ["gymnasium>=1.1", "stable-baselines3>=2.4"],  # `endo-sim train --algorithm ppo`
         "viewer": ["viser>=1.1"],  # `endo-sim view`, viewer_node
-        "test": "gymnasium hypothesis mcap mcap-ros2-support plyfile pyarrow pytest ruff torchmetrics viser>=1.1".split(),
+        "report": ["matplotlib"],  # `endo-sim report`, plots of `endo-sim evaluate`
+        "test": "gymnasium hypothesis matplotlib mcap mcap-ros2-support plyfile pyarrow pytest ruff torchmetrics viser>=1.1".split(),
     },
     entry_points={"console_scripts": ["endo-sim = endo_sim_ros.cli:main"]},
     data_files=[
@@ -54,6 +55,6 @@ setup(
         # `ros2 run` looks for executables here; console scripts would land in bin/ under pip.
         (f"lib/{NAME}", sorted(map(str, Path("scripts").glob("*_node")))),
     ],
-    package_data={f"{NAME}.nodes": ["fastdds.xml"]},
+    package_data={f"{NAME}.evaluation": ["page.html"], f"{NAME}.nodes": ["fastdds.xml"]},
     zip_safe=False,
 )

@@ -145,6 +145,19 @@ class Evaluate:
 
 
 @dataclass(frozen=True)
+class Report:
+    """Show an evaluation as one HTML page: sortable tables beside the paper's, plots, pictures with a slider."""
+
+    run_folder: Positional[Path]
+    """Folder that `endo-sim evaluate` wrote; report.html goes there, too."""
+
+    def run(self) -> None:
+        from endo_sim_ros.evaluation.page import write_page
+
+        print(write_page(self.run_folder))
+
+
+@dataclass(frozen=True)
 class Touch:
     """Poke, pull, grasp and cut a reconstructed model without ROS, and draw what it looks like."""
 
@@ -289,11 +302,15 @@ class Train:
     """Folder for policy.npz, curve.json and curve.png."""
     task: str = "retraction"
     """retraction or palpation."""
+    algorithm: Literal["cem", "ppo"] = "cem"
+    """cem: the cross-entropy method, by the options below; ppo: proximal policy optimisation, by those that begin with ppo; it
+    needs stable-baselines3."""
     model: Path | None = None
     """PLY model with its cameras.json; default: a piece of the synthetic patient."""
     device: str = "auto"
     """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""
     config: Annotated[TrainingConfig, tyro.conf.arg(name="")] = field(default_factory=TrainingConfig)
+    ppo: PPOConfig = field(default_factory=PPOConfig)
     vary: Randomisation = field(default_factory=Randomisation)
 
     def run(self) -> None:
@@ -307,15 +324,11 @@ class Train:
             config = self.ppo
         policy, curve = train(self.task, load_scene(self.model), config, self.vary, self.device)
         save_training(self.out, policy, curve, config)
-    algorithm: Literal["cem", "ppo"] = "cem"
-    """cem: the cross-entropy method, by the options below; ppo: proximal policy optimisation, by those that begin with ppo; it
-    needs stable-baselines3."""
         last = curve[-1]
         print(f"{self.out}: {last['test_success']:.0%} of test episodes solved after {last['episodes']} episodes")
 
 
 @dataclass(frozen=True)
-    ppo: PPOConfig = field(default_factory=PPOConfig)
 class Up:
     """Start the graph, each node its own process, and show what each says, until Ctrl-C; `ros2 launch` without ROS installed."""
 
@@ -479,6 +492,7 @@ class Bench:
 
 COMMANDS = {
     "evaluate": Evaluate,
+    "report": Report,
     "touch": Touch,
     "demo": Demo,
     "up": Up,

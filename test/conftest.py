@@ -1,6 +1,7 @@
 """Every test process has a graph of its own, on this machine only, and quiet kernels."""
 
 import os
+import shutil
 import time
 
 # Set before anything starts ROS; processes that a test starts inherit it.
@@ -43,3 +44,18 @@ def small_bag(small_frames, tmp_path_factory):
     path = tmp_path_factory.mktemp("bags") / "small"
     write_bag(path, small_frames)
     return path
+
+
+@pytest.fixture(scope="module")  # playwright keeps an event loop running
+def chromium():
+    """Headless Chromium with software rendering."""
+    api = pytest.importorskip("playwright.sync_api", reason="needs playwright")
+    arguments = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    with api.sync_playwright() as playwright:
+        found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+        try:
+            browser = playwright.chromium.launch(executable_path=found, args=arguments)
+        except api.Error as error:
+            pytest.skip(f"needs Chromium: {str(error).splitlines()[0]}")
+        yield browser
+        browser.close()

@@ -6,6 +6,7 @@ import os
 import re
 import signal
 
+import cv2
 import numpy as np
 import pytest
 
@@ -15,6 +16,7 @@ from endo_sim_ros.evaluation import paper, tables
 from endo_sim_ros.evaluation.config import EvaluationConfig
 from endo_sim_ros.evaluation.evaluate import evaluate, open_named
 from endo_sim_ros.evaluation.held_out import FIGURES, measure, seen_pixels
+from endo_sim_ros.evaluation.page import write_page
 from endo_sim_ros.evaluation.splits import right_views, split_views
 from endo_sim_ros.evaluation.workers import Finished, News, run_in_processes
 from endo_sim_ros.sequences.frames import SequenceError
@@ -246,3 +248,46 @@ def test_a_reader_takes_its_options_from_the_name(small_bag, small_frames, tmp_p
 def test_the_papers_numbers_are_complete():
     assert len(paper.PRINTED) == 30 and len({row[:3] for row in paper.PRINTED}) == 30
     assert all(15 < row.psnr < 30 and 0.6 < row.ssim < 0.9 and 0.2 < row.lpips < 0.5 for row in paper.PRINTED)
+
+
+# ------------------------------------------------------------------------------------------------------------- the page
+
+
+def test_the_page_needs_nothing_else_and_sorts_and_slides(run, chromium):
+    pytest.importorskip("matplotlib")
+    _, config, _ = run
+    page = write_page(config.out)
+    tab = chromium.new_page(viewport={"width": 1200, "height": 900})
+    asked, errors = [], []
+    tab.on("request", lambda request: asked.append(request.url))
+    tab.on("pageerror", lambda error: errors.append(error))
+    tab.goto(page.as_uri())
+    column = tab.locator("thead th", has_text=re.compile(r"^PSNR \[dB\]$"))
+    order = lambda: [cells.split("\t")[1] for cells in tab.locator("tbody").all_inner_texts()[0].splitlines() if "StereoMIS" in cells]
+    assert order() == ["3dgs", "fsgs", "paper"]
+    column.click()
+    assert order() == ["fsgs", "3dgs", "paper"]
+    column.click()
+    assert order() == ["paper", "3dgs", "fsgs"]
+    texts = tab.locator("tbody").inner_text()
+    assert "failed: " in texts and "22.94" in texts and "0.184‡" in texts
+
+    stage = tab.locator(".stage")
+    stage.scroll_into_view_if_needed()
+    picture = lambda: cv2.imdecode(np.frombuffer(stage.screenshot(), np.uint8), cv2.IMREAD_COLOR).astype(float)
+    tab.locator("select[aria-label=right]").select_option("default, depth")
+    at = lambda percent: (tab.locator("input[type=range]").fill(str(percent)), picture())[1]
+    depth, half, reference = at(0), at(50), at(100)
+    middle = depth.shape[1] // 2
+    assert np.abs(depth - reference).mean() > 20  # coloured depth is unlike a picture
+    assert np.abs(half - reference)[:, : middle - 5].mean() < 2 and np.abs(half - depth)[:, middle + 5 :].mean() < 2
+    tab.locator("summary").click()
+    loaded = tab.evaluate("[...document.images].every(image => image.naturalWidth == 96)")
+    assert loaded and tab.locator(".plots svg").count() == 2
+    assert not errors and all(url.startswith(("file:", "data:")) for url in asked)
+    tab.close()
+
+
+def test_a_folder_without_results_is_an_error(tmp_path):
+    with pytest.raises(ValueError, match="no results of an evaluation .* give the --out of"):
+        write_page(tmp_path)

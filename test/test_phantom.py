@@ -157,6 +157,12 @@ def test_poses_are_rigid_smooth_and_rest_at_both_ends():
     np.testing.assert_allclose(trocar, np.tile([0, 0, -config.lever], (len(poses), 1)), atol=1e-9)
 
 
+def test_half_a_round_ends_elsewhere_and_a_whole_one_at_the_beginning():
+    half, whole = (phantom_poses(PhantomConfig(frames=9, rounds=rounds))[:, :3, 3] for rounds in (0.5, 1.0))
+    assert np.linalg.norm(half[-1] - half[0]) > 0.005
+    np.testing.assert_allclose(whole[-1], whole[0], atol=1e-9)
+
+
 def test_border_is_black_masked_and_without_depth():
     frame = next(phantom_sequence(PhantomConfig(width=160, height=128, frames=1, border=0.05, noise=0.0)))
     assert set(np.unique(frame.mask)) == {0, 255}

@@ -2,7 +2,6 @@
 
 import itertools
 import os
-import shutil
 import sys
 import threading
 from pathlib import Path
@@ -417,22 +416,6 @@ def test_endoscope_view_shows_what_rendering_published(graph):
 # ---------------------------------------------------------------------------------------------------- a real browser
 
 
-@pytest.fixture(scope="module")
-def chromium():
-    """Headless Chromium with software rendering."""
-    pytest.importorskip("viser")
-    api = pytest.importorskip("playwright.sync_api", reason="needs playwright")
-    arguments = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    with api.sync_playwright() as playwright:
-        found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-        try:
-            browser = playwright.chromium.launch(executable_path=found, args=arguments)
-        except api.Error as error:
-            pytest.skip(f"needs Chromium: {str(error).splitlines()[0]}")
-        yield browser
-        browser.close()
-
-
 def seen(tab):
     """Pixels of the tissue, beside panel and notifications; coarse, as the page draws fewer pixels on slow machines."""
     picture = cv2.imdecode(np.frombuffer(tab.screenshot(), np.uint8), cv2.IMREAD_COLOR)[200:380, 150:320]
@@ -444,6 +427,7 @@ def difference(a, b):
 
 
 def test_in_a_browser_tissue_is_seen_dragged_and_reset(chromium, tmp_path):
+    pytest.importorskip("viser")
     from endo_sim_ros.viewer.standalone import Standalone
 
     camera = Camera(np.array([[330.0, 0, 330], [0, 330, 200], [0, 0, 1]]), 660, 400)

@@ -207,7 +207,8 @@ def open_named(source: str) -> Iterable[Frame]:
         seed = place.removeprefix(_PHANTOM)
         if not seed.isdecimal():
             raise SequenceError(f"{place}: the synthetic patients have numbers, as {_PHANTOM}0")
-        config = PhantomConfig(seed=int(seed), **_values(texts, place, PhantomConfig))
+        # Half a round: after a whole one the last view would be the first again, and two views one.
+        config = PhantomConfig(**{"seed": int(seed), "rounds": 0.5} | _values(texts, place, PhantomConfig))
         return Recording(lambda: phantom_sequence(config), config.frames)
     options = {name: yaml.safe_load(value) for name, _, value in (text.partition("=") for text in texts)}
     if "distortion" in options:

@@ -2,15 +2,13 @@
 
 import importlib.util
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from endo_sim_ros.evaluation.figures import slug
 
 log = logging.getLogger(__name__)
-
-_NAMES = {"views": "PSNR of each held-out view", "time": "PSNR over training time"}
 
 
 def available() -> bool:
@@ -23,36 +21,31 @@ def write(summaries: Sequence, out: Path) -> None:
         log.info("no plots without matplotlib; `pip install matplotlib` and the same command again draws them")
         return
     (out / "plots").mkdir(exist_ok=True)
-    for name, figure in all_plots(summaries).items():
-        figure.savefig(out / "plots" / f"{slug(name)}.png", dpi=110)
+    for key, figure in all_plots(summaries).items():
+        figure.savefig(out / "plots" / f"{slug('-'.join(key))}.png", dpi=110)
 
 
-def all_plots(summaries: Sequence) -> dict[str, Any]:
-    """Figures of matplotlib by title, for each split of each sequence."""
+def all_plots(summaries: Sequence) -> dict[tuple[str, str, str], Any]:
+    """Figures of matplotlib by sequence, split and `views` or `time`."""
     found = {}
-    for key in dict.fromkeys((s.sequence, s.split) for s in summaries):
+    for key in dict.fromkeys((s.sequence, s.split) for s in summaries if s.cells):
         ours = [s for s in summaries if (s.sequence, s.split) == key and s.cells]
-        if not ours:
-            continue
-        found[f"{', '.join(key)}: {_NAMES['views']}"] = _lines(
-            ours, lambda cell: cell["views"], "view", "psnr_gain", "held-out view", "PSNR, gain fitted [dB]"
-        )
+        found[(*key, "views")] = _lines(ours, "views", "view", "held-out view")
         if any(s.cells[0]["curve"] for s in ours):
-            found[f"{', '.join(key)}: {_NAMES['time']}"] = _lines(
-                ours, lambda cell: cell["curve"], "seconds", "psnr_gain", "training time [s]", "PSNR, gain fitted [dB]"
-            )
+            found[(*key, "time")] = _lines(ours, "curve", "seconds", "training time [s]")
     return found
 
 
-def _lines(ours: Sequence, points: Callable, x: str, y: str, x_label: str, y_label: str) -> Any:
+def _lines(ours: Sequence, rows: str, x: str, x_label: str) -> Any:
+    """Gain-fitted PSNR of each method's first seed over x."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(7, 3.2), layout="constrained")
+    figure = Figure(figsize=(6, 3.2), layout="constrained")
     axes = figure.subplots()
     for s in ours:
-        rows = points(s.cells[0])
-        axes.plot([row[x] for row in rows], [row[y] for row in rows], marker="." if len(rows) < 60 else None, label=s.method)
-    axes.set(xlabel=x_label, ylabel=y_label)
+        points = [row for row in s.cells[0][rows] if "psnr_gain" in row]
+        axes.plot([p[x] for p in points], [p["psnr_gain"] for p in points], marker="." if len(points) < 60 else None, label=s.method)
+    axes.set(xlabel=x_label, ylabel="PSNR, gain fitted [dB]")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
     return figure

@@ -211,15 +211,17 @@ def _terminal_table(summaries: list[Summary], missing: Iterable[str]) -> Table:
 # ----------------------------------------------------------------------------------------------------------- pictures
 
 
-def comparisons(summaries: list[Summary]) -> dict[tuple[str, str], dict[str, dict[str, str]]]:
-    """Picture files of the first seed: (sequence, split) → view → name, or method and name, → path below the folder."""
-    found: dict[tuple[str, str], dict[str, dict[str, str]]] = {}
+Pictures = dict[tuple[str, str], str]  # (method, or nothing for what was recorded; kind) → path below the folder of results
+
+
+def comparisons(summaries: list[Summary]) -> dict[tuple[str, str], dict[str, Pictures]]:
+    """Pictures of the first seeds, by sequence and split and then by view."""
+    found: dict[tuple[str, str], dict[str, Pictures]] = {}
     for s in summaries:
         for name, path in s.cells[0]["pictures"].items() if s.cells else ():
             view, kind = name.split("-", 1)
-            views = found.setdefault((s.sequence, s.split), {})
-            key = kind if kind.startswith("reference") else f"{s.method}\n{kind}"
-            views.setdefault(view, {}).setdefault(key, path)
+            pictures = found.setdefault((s.sequence, s.split), {}).setdefault(view, {})
+            pictures["" if kind.startswith("reference") else s.method, kind] = path
     return found
 
 
@@ -231,10 +233,10 @@ def _write_strips(summaries: list[Summary], out: Path) -> None:
         cells = []
         for view, paths in views.items():
             for kind, reference in (("rendered", "reference"), ("depth", "reference_depth")):
-                names = [reference, *(f"{method}\n{kind}" for method in methods)]
-                labels = [f"view {int(view)}" if kind == "rendered" else "its depth", *methods]
-                images = [_small(out / paths[name]) if name in paths else None for name in names]
+                keys = [("", reference), *((method, kind) for method in methods)]
+                images = [_small(out / paths[key]) if key in paths else None for key in keys]
                 blank = np.zeros_like(next(image for image in images if image is not None))
+                labels = [f"view {int(view)}" if kind == "rendered" else "its depth", *methods]
                 cells += [(label, blank if image is None else image) for label, image in zip(labels, images)]
         figures.write_png(out / "strips" / f"{figures.slug(f'{sequence}-{split}')}.png", figures.sheet(cells, len(methods) + 1))
 

@@ -44,6 +44,8 @@ class PhantomConfig(StageConfig):
     """Horizontal field of view."""
     travel: Annotated[float, Range(0.0, 0.06, "m")] = 0.03
     """How far the tip of the endoscope moves sideways, end to end; it dives in and out by half as much."""
+    rounds: Annotated[float, Range(0.05, 10.0)] = 1.0
+    """How often it goes round its path; after whole rounds it is back where it began."""
     lever: Annotated[float, Range(0.05, 0.5, "m")] = 0.14
     """Distance from the trocar, about which the endoscope pivots, to its tip."""
     stereo: bool = True
@@ -608,7 +610,7 @@ def phantom_poses(config: PhantomConfig) -> np.ndarray:
     """Camera-to-world poses [frames, 4, 4] of an endoscope that pivots about its trocar; it starts and ends at rest."""
     rng = np.random.default_rng([config.seed, 0x9A7])
     s = np.linspace(0.0, 1.0, config.frames)
-    phase = 2.0 * math.pi * (s - np.sin(2.0 * math.pi * s) / (2.0 * math.pi))  # slow in, slow out, one round
+    phase = config.rounds * 2.0 * math.pi * (s - np.sin(2.0 * math.pi * s) / (2.0 * math.pi))  # slow in, slow out
     swing = config.travel / (2.0 * config.lever)  # radians
     start = rng.uniform(0.0, 2.0 * math.pi)
     yaw = swing * np.cos(phase + start)

@@ -42,7 +42,7 @@ setup(
         "lerobot": ["pyarrow"],  # `endo-sim export`
         "rl": ["gymnasium>=1.1", "stable-baselines3>=2.4"],  # `endo-sim train --algorithm ppo`
         "viewer": ["viser>=1.1"],  # `endo-sim view`, viewer_node
-        "report": ["matplotlib"],  # `endo-sim report`, plots of `endo-sim evaluate`
+        "report": ["matplotlib"],  # `endo-sim report`, `endo-sim plot`, plots of `endo-sim evaluate`
         "test": "gymnasium hypothesis matplotlib mcap mcap-ros2-support plyfile pyarrow pytest ruff torchmetrics viser>=1.1".split(),
     },
     entry_points={"console_scripts": ["endo-sim = endo_sim_ros.cli:main"]},

@@ -490,6 +490,25 @@ class Bench:
         self.what.run()
 
 
+@dataclass(frozen=True)
+class Plot:
+    """Draw results of `bench … --json` as bars; several files, such as those of two machines, side by side."""
+
+    files: Positional[tuple[Path, ...]]
+    """Files of rows; each gives its name to its bars."""
+    out: Path = Path("bench.png")
+    """Picture to write: .png, .svg or .pdf."""
+    only: str = ""
+    """Regular expression; rows whose names it is not found in are left out."""
+    title: str = ""
+    """Over the picture, such as the name of the machine."""
+
+    def run(self) -> None:
+        from endo_sim_ros.evaluation.bench_plot import plot_rows
+
+        print(f"{self.out}: {plot_rows(self.files, self.out, self.only, self.title)} rows")
+
+
 COMMANDS = {
     "evaluate": Evaluate,
     "report": Report,
@@ -506,6 +525,7 @@ COMMANDS = {
     "train": Train,
     "config": Config,
     "bench": Bench,
+    "plot": Plot,
 }
 
 

@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -12,6 +13,7 @@ import torch
 from endo_sim_ros.cameras import look_at, save_cameras
 from endo_sim_ros.evaluation import physics_bench
 from endo_sim_ros.evaluation.bench import Row, machine, median_seconds, report
+from endo_sim_ros.evaluation.bench_plot import plot_rows
 from endo_sim_ros.evaluation.physics_bench import bench_physics, load_scene, phantom_scene
 from endo_sim_ros.evaluation.raster_bench import Plan, bench_raster, tissue
 from endo_sim_ros.gaussians import save_ply
@@ -54,6 +56,26 @@ def test_a_report_is_a_table_for_people_and_a_list_for_machines(tmp_path, capsys
     printed = capsys.readouterr().out
     assert all(text in printed for text in ("Things", "a thing", "1.5", "0.25", "a peer", "another"))
     assert [Row(**row) for row in json.loads((tmp_path / "new" / "rows.json").read_text())] == rows
+
+
+def test_results_of_two_machines_are_drawn_side_by_side(tmp_path):
+    matplotlib = pytest.importorskip("matplotlib")
+    rows = [Row("step of 2k nodes", 4.13, "ms", 0.1, "plain"), Row("step of 2k nodes", 4.13, "ms", 0.5, "other"), Row("PSNR", 31.7, "dB")]
+    for name, factor in (("laptop", 1.0), ("gpu", 0.1)):
+        report("", [replace(row, value=row.value * factor) for row in rows], tmp_path / f"{name}.json")
+    files, picture = [tmp_path / "laptop.json", tmp_path / "gpu.json"], tmp_path / "both.svg"
+    with matplotlib.rc_context({"svg.fonttype": "none"}):
+        assert plot_rows(files, picture, title="Speed") == 6
+    drawn = picture.read_text()
+    for text in ("laptop", "gpu", "step of 2k nodes", "PSNR", "ms", "dB", "Speed", "peer in the same run"):
+        assert text in drawn, text
+    assert drawn.count("31.7<") == 1 and drawn.count("4.13<") == 1  # once, though it has two peers
+    plot_rows(files, tmp_path / "some.png", only="step")
+    with pytest.raises(ValueError, match="gpu.json: no row to draw whose name has 'cut'"):
+        plot_rows(files, picture, only="cut")
+    (tmp_path / "no.json").write_text('{"value": 1}')
+    with pytest.raises(ValueError, match="no.json: not the rows that `endo-sim bench … --json` writes"):
+        plot_rows([tmp_path / "no.json"], picture)
 
 
 def test_the_machine_is_named():

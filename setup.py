@@ -38,6 +38,7 @@ setup(
         "warp-lang>=1.19",
     ],
     extras_require={
+        "depth": ["onnxruntime", "transformers"],  # reconstruction with depth:=network
         "learning": ["gymnasium>=1.1"],  # endo_sim_ros.learning.environments
         "lerobot": ["pyarrow"],  # `endo-sim export`
         "rl": ["gymnasium>=1.1", "stable-baselines3>=2.4"],  # `endo-sim train --algorithm ppo`

@@ -24,9 +24,12 @@ class ReconstructionConfig(StageConfig):
     """Degree of the spherical harmonics; 0 is the paper's frequency regularisation."""
     initialization: Literal["depth", "points"] = "depth"
     """What training starts from: the depth prior of every view, checked between views, or triangulated points alone."""
-    depth: Literal["auto", "topic", "stereo", "points", "none"] = "auto"
-    """Depth prior: the depth topic, matching with the right image, interpolation between triangulated points, none, or
-    the first of these that exists."""
+    depth: Literal["auto", "topic", "stereo", "network", "points", "none"] = "auto"
+    """Depth prior: the depth topic, matching with the right image, a network that sees relative depth in one image,
+    interpolation between triangulated points, none, or the first of these that exists."""
+    depth_model: str = ""
+    """network: folder of a Depth-Anything-V2 checkpoint (transformers) or ONNX file; nothing is ever downloaded. Empty:
+    one that Hugging Face's cache holds."""
     complete_depth: bool = True
     """Fill the holes of the prior from around them."""
     depth_tolerance: Annotated[float, Range(0.001, 1)] = 0.05
@@ -55,7 +58,7 @@ class ReconstructionConfig(StageConfig):
     """Each view has an exposure of its own, from which that of unseen views is predicted as a camera's automatic one would be."""
     light: bool = True
     """The light travels with the camera: brightness falls off with distance and angle."""
-    right_views: bool = True
+    right_views: bool = False
     """Train on the right images as well."""
     densification: Literal["mcmc", "gradient", "proximity"] = "mcmc"
     """How Gaussians are added: a Markov chain up to max_gaussians, where image gradients are large (3DGS), or there and

@@ -77,7 +77,7 @@ def refine(
 def exploration_noise(model: GaussianModel, scale: float, generator: torch.Generator) -> Tensor:
     """Random steps [N, 3] (m) along each Gaussian's own shape, only where it is faint (their eq. 8)."""
     faint = torch.sigmoid(-100 * (model.opacities - DEAD_OPACITY))
-    noise = torch.randn(len(model), 3, generator=generator).to(model.means)
+    noise = torch.randn(len(model), 3, generator=generator, device=generator.device).to(model.means)
     return scale * faint[:, None] * torch.einsum("nij,nj->ni", model.covariances, noise)
 
 

@@ -8,13 +8,16 @@ import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import Delaunay, cKDTree
 
+from endo_sim_ros.device import pick_device
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
+from endo_sim_ros.reconstruction.depth_network import cached_checkpoint, load_network, network_depth
 from endo_sim_ros.sequences.frames import Frame, SequenceError
 
 log = logging.getLogger(__name__)
 
 _NEAREST = 0.02  # metres; closer than an endoscope works
 _MIN_POINTS = 30  # points needed to trust an offset or an interpolation
+_SPARSE = 16  # pixels between stereo matches that a network's depth is held against
 _FEATURES = 3000  # matched to find by how much the right image lies too high or too low
 _ROWS = 0.01  # of the image's height: the farthest that it may
 _NEIGHBOURS = 8  # points around a point that it is compared with
@@ -31,7 +34,8 @@ def with_depth_prior(frames: list[Frame], points: np.ndarray, config: Reconstruc
         frames: Training views, best at full size: disparities are as precise as the pixels are fine.
         points: Triangulated scene points [N, 3] (m, world), to interpolate between, or to find a constant disparity
             offset of stereo matching.
-        config: ``depth`` names the source; ``auto`` takes the depth topic, else stereo, else the points.
+        config: ``depth`` names the source; ``auto`` takes the depth topic, else stereo, else a network if there is one,
+            else the points.
 
     Raises:
         SequenceError: If the source asked for is not in the recording.
@@ -40,7 +44,8 @@ def with_depth_prior(frames: list[Frame], points: np.ndarray, config: Reconstruc
     has_stereo = any(frame.right is not None for frame in frames)
     source = config.depth
     if source == "auto":
-        source = "topic" if has_topic else "stereo" if has_stereo else "points"
+        network = config.depth_model or cached_checkpoint()
+        source = "topic" if has_topic else "stereo" if has_stereo else "network" if network else "points"
     if source == "topic" and not has_topic:
         raise SequenceError("depth=topic, but no view has a depth image; publish endoscope/left/depth or use auto")
     if source == "stereo" and not has_stereo:
@@ -51,6 +56,14 @@ def with_depth_prior(frames: list[Frame], points: np.ndarray, config: Reconstruc
         return [_with_depth(frame, interpolated_depth(frame, points)) for frame in frames]
     if source == "topic":
         return [_with_depth(frame, frame.depth) for frame in frames]
+    if source == "network":
+        network = load_network(config.depth_model, pick_device(config.device))
+        frames = [_with_depth(frame, network_depth(frame, network, _known_depths(frame, points))) for frame in frames]
+        if all(frame.depth is None for frame in frames):
+            raise SequenceError(
+                "depth=network, but no view's depth fits the scene points; check the poses, give views that overlap, or use depth=points"
+            )
+        return frames
     frames = [frame if frame.right is None else _aligned(frame) for frame in frames]
     disparities = [None if frame.right is None else stereo_disparity(frame) for frame in frames]
     offset = disparity_offset(frames, disparities, points)
@@ -88,6 +101,19 @@ def _with_right_shifted(frame: Frame, offset: float) -> Frame:
     K = (frame.camera.K if frame.right_K is None else frame.right_K).copy()
     K[0, 2] += offset
     return dataclasses.replace(frame, right_K=K)
+
+
+def _known_depths(frame: Frame, points: np.ndarray) -> np.ndarray:
+    """Pixels u, v and depths z (m) [N, 3] of what is known in a view: scene points, or stereo matches where there is a right image."""
+    if frame.right is not None:
+        frame = _aligned(frame)
+        depth = _to_depth(frame, stereo_disparity(frame), 0.0)
+        v, u = np.nonzero(depth[_SPARSE // 2 :: _SPARSE, _SPARSE // 2 :: _SPARSE])
+        u, v = (_SPARSE * x + _SPARSE // 2 for x in (u, v))
+        return np.stack([u + 0.5, v + 0.5, depth[v, u]], 1)
+    uv, z = frame.camera.project(points)
+    inside = (z > _NEAREST) & (uv >= 0).all(1) & (uv < [frame.camera.width, frame.camera.height]).all(1)
+    return np.column_stack([uv[inside], z[inside]])
 
 
 def interpolated_depth(frame: Frame, points: np.ndarray) -> np.ndarray | None:

@@ -3,6 +3,7 @@
 Images are [H, W, 3] in [0, 1], depths [H, W] in metres, masks [H, W] in {0, 1}.
 """
 
+import functools
 import math
 
 import cv2
@@ -107,7 +108,7 @@ def in_front(means: Tensor, viewmat: Tensor, K: Tensor, surface: Tensor) -> Tens
     local = means @ viewmat[:3, :3].T + viewmat[:3, 3]
     z = local[:, 2].clamp_min(1e-3)
     height, width = surface.shape
-    u, v = (local[:, :2].detach() / z.detach()[:, None] * K[[0, 1], [0, 1]] + K[:2, 2]).floor().unbind(1)
+    u, v = (local[:, :2].detach() / z.detach()[:, None] * K.diagonal()[:2] + K[:2, 2]).floor().unbind(1)
     inside = (local[:, 2] > 1e-3) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
     index = v.clamp(0, height - 1) * width + u.clamp(0, width - 1)
     seen = surface.reshape(-1)[index.long()]
@@ -149,12 +150,17 @@ def _blur(image: Tensor) -> Tensor:
         return torch.from_numpy(
             cv2.sepFilter2D(image.numpy(), -1, kernel, kernel, borderType=cv2.BORDER_CONSTANT).reshape(image.shape)
         )
-    kernel = torch.as_tensor(_gaussian(), dtype=image.dtype, device=image.device)
-    planes = image.permute(2, 0, 1)[:, None]
-    pad = _WINDOW // 2
-    planes = torch.nn.functional.conv2d(planes, kernel.view(1, 1, 1, -1), padding=(0, pad))
-    planes = torch.nn.functional.conv2d(planes, kernel.view(1, 1, -1, 1), padding=(pad, 0))
-    return planes[:, 0].permute(1, 2, 0)
+    # Two products with band matrices are faster on a GPU than convolutions, and no less exact than float32 is.
+    rows, columns = (_band(size, image.dtype, image.device) for size in image.shape[:2])
+    return (rows @ image.permute(2, 0, 1) @ columns).permute(1, 2, 0)
+
+
+@functools.lru_cache(maxsize=8)
+def _band(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """The window as a symmetric matrix [size, size]."""
+    offsets = np.arange(size)[:, None] - np.arange(size) + _WINDOW // 2
+    inside = (offsets >= 0) & (offsets < _WINDOW)
+    return torch.as_tensor(np.where(inside, _gaussian()[offsets.clip(0, _WINDOW - 1)], 0), dtype=dtype, device=device)
 
 
 class _Ssim(torch.autograd.Function):
@@ -163,9 +169,8 @@ class _Ssim(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x: Tensor, y: Tensor) -> Tensor:
         x, y = x.detach().contiguous(), y.detach().contiguous()
-        mu_x, mu_y = _blur(x), _blur(y)
-        var_x, var_y = _blur(x * x) - mu_x**2, _blur(y * y) - mu_y**2
-        cov = _blur(x * y) - mu_x * mu_y
+        mu_x, mu_y, xx, yy, xy = _blur(torch.cat([x, y, x * x, y * y, x * y], 2)).split(x.shape[2], 2)
+        var_x, var_y, cov = xx - mu_x**2, yy - mu_y**2, xy - mu_x * mu_y
         ctx.save_for_backward(x, y, mu_x, mu_y, var_x, var_y, cov)
         return (2 * mu_x * mu_y + _C1) * (2 * cov + _C2) / ((mu_x**2 + mu_y**2 + _C1) * (var_x + var_y + _C2))
 
@@ -177,4 +182,5 @@ class _Ssim(torch.autograd.Function):
         s = A * B / (C * D)
         v_var, v_cov = -v * s / D, v * 2 * A / (C * D)
         v_mu = v * (2 * mu_y * B / (C * D) - 2 * mu_x * s / C) - 2 * mu_x * v_var - mu_y * v_cov
-        return _blur(v_mu.contiguous()) + 2 * x * _blur(v_var.contiguous()) + y * _blur(v_cov.contiguous()), None
+        v_mu, v_var, v_cov = _blur(torch.cat([v_mu, v_var, v_cov], 2)).split(x.shape[2], 2)
+        return v_mu + 2 * x * v_var + y * v_cov, None

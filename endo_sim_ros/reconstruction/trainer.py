@@ -107,6 +107,8 @@ class Trainer:
         self._stamps = [frame.stamp_ns for frame in frames]
         self.iteration = 0
         self._generator = torch.Generator().manual_seed(config.seed)
+        # Drawn where it is needed: a GPU that waits for numbers stands still.
+        self._noise = self._generator if self.device == "cpu" else torch.Generator(self.device).manual_seed(config.seed)
         self._order: list[int] = []
         self._last_loss = torch.zeros(())
         self._light_prior = torch.tensor(light, dtype=torch.float32, device=self.device)
@@ -172,6 +174,7 @@ class Trainer:
             "light": {name: value.detach() for name, value in self._light.items()},
             "light_optimizer": self._light_optimizer.state_dict() if self._light_optimizer else {"state": {}},
             "generator": self._generator.get_state(),
+            "noise": self._noise.get_state(),
             "order": self._order,
         }
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -199,13 +202,16 @@ class Trainer:
                 raise ValueError("its light is not that of these views")
             generator = torch.Generator()
             generator.set_state(state["generator"].cpu())
+            noise = generator if self.device == "cpu" else torch.Generator(self.device)
+            if noise is not generator:
+                noise.set_state(state["noise"].cpu())
             self._set_model(GaussianModel(**state["model"]))  # what is refused was so before: a training goes on as it was
             self._optimizer.load_state_dict(self._optimizer.state_dict() | {"state": state["optimizer"]["state"]})
             self._set_light(**state["light"])
             if self._light_optimizer:
                 self._light_optimizer.load_state_dict(self._light_optimizer.state_dict() | {"state": state["light_optimizer"]["state"]})
             self._gradients = state["gradients"]
-            self._generator = generator
+            self._generator, self._noise = generator, noise
             self.iteration, self._order = iteration, order
         except SequenceError:
             raise
@@ -243,8 +249,7 @@ class Trainer:
         loss.backward()
         self._last_loss = loss.detach()
         if absgrad is not None:
-            half = absgrad.new_tensor([view.camera.width / 2, view.camera.height / 2])
-            steepness = (absgrad.grad[0] * half).norm(dim=1)
+            steepness = torch.hypot(absgrad.grad[0, :, 0] * (view.camera.width / 2), absgrad.grad[0, :, 1] * (view.camera.height / 2))
             self._gradients += torch.stack([steepness, (steepness > 0).to(steepness.dtype)])
         decay = 0.01 ** (self.iteration / config.iterations)
         self._optimizer.param_groups[0]["lr"] = _RATES["means"] * self.scene_depth * config.learning_rate * decay
@@ -366,14 +371,15 @@ class Trainer:
 
     def _explore(self) -> None:
         """Move faint Gaussians about at random."""
-        model = self._current()
-        faint = (model.opacities < 10 * densification.DEAD_OPACITY).nonzero()[:, 0]
-        if len(faint):
+        model, faint = self._current(), slice(None)
+        if self.device == "cpu":  # a GPU is sooner done with all than it has told how many they are
+            faint = (model.opacities < 10 * densification.DEAD_OPACITY).nonzero()[:, 0]
+            if not len(faint):
+                return
             model = model.select(faint)
-            # Variances are in m²: divided by the squared depth of the scene, steps are those of a scene of depth 1.
-            scale = _NOISE * self._optimizer.param_groups[0]["lr"] / self.scene_depth**2
-            noise = densification.exploration_noise(model, scale, self._generator)
-            self._parameters["means"][faint] += noise
+        # Variances are in m²: divided by the squared depth of the scene, steps are those of a scene of depth 1.
+        scale = _NOISE * self._optimizer.param_groups[0]["lr"] / self.scene_depth**2
+        self._parameters["means"][faint] += densification.exploration_noise(model, scale, self._noise)
 
     # --------------------------------------------------------------- inputs
 

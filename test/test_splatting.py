@@ -1,6 +1,8 @@
 """The rasteriser against its float64 reference, and what must hold at the edges."""
 
 import contextlib
+import gc
+import threading
 
 import numpy as np
 import pytest
@@ -479,6 +481,11 @@ def test_wrong_shapes_are_named_with_both_shapes(function):
         function(*gaussians, viewmats, Ks, WIDTH, HEIGHT, covars=torch.eye(3).repeat(6, 1, 1))
     with pytest.raises(ValueError, match="image size"):
         function(*gaussians, viewmats, Ks, 0, HEIGHT)
+    with pytest.raises(ValueError, match="no camera"):
+        function(*gaussians, viewmats[:0], Ks[:0], WIDTH, HEIGHT)
+    for option in ({"near": -1.0}, {"eps2d": float("nan")}):
+        with pytest.raises(ValueError, match="must not be negative"):
+            function(*gaussians, viewmats, Ks, WIDTH, HEIGHT, **option)
 
 
 # ---------------------------------------------------------------- fuzzing
@@ -568,6 +575,15 @@ def test_a_mask_that_skips_tiles_does_not_change_the_other_pixels(compositor):
         assert_close(name, gradient, expected, 1e-5)
 
 
+def test_whatever_is_not_zero_in_a_mask_is_true():
+    gaussians, cameras = make_gaussians(seed=12), make_cameras()
+    mask = torch.zeros(2, HEIGHT, WIDTH)
+    mask[0, 20, 30] = 0.4
+    expected, _ = run(rasterize, gaussians, cameras, dtype=torch.float32, masks=mask > 0)
+    output, _ = run(rasterize, gaussians, cameras, dtype=torch.float32, masks=mask)
+    assert torch.equal(output.alphas, expected.alphas) and output.alphas.any()
+
+
 def test_hidden_gaussians_do_not_change_the_picture():
     gaussians, cameras = make_gaussians(seed=13), make_cameras()
     hidden = [torch.cat([x, y]) for x, y in zip(gaussians, make_gaussians(50, seed=14))]
@@ -620,6 +636,7 @@ def test_pictures_for_whose_lists_there_is_no_room_are_the_same(device, monkeypa
     with rasterizer.scalar_kernels():
         roomy = run(rasterize, gaussians, cameras, device=device, dtype=torch.float32)
         monkeypatch.setattr(rasterizer_tiled, "_MOST", 0.01)
+        monkeypatch.setattr(rasterizer_tiled, "_ALWAYS", 0)
         cramped = run(rasterize, gaussians, cameras, device=device, dtype=torch.float32)
         device = torch.device(f"{device}:0" if device == "cuda" else device)
         scratch = rasterizer_tiled._scratch(device, rasterizer_tiled._stream(device))
@@ -634,5 +651,65 @@ def test_room_follows_what_pictures_needed():
     expectation.seen.copy_(torch.tensor([30_000, 1000]))
     assert 30_000 < expectation.room(1000) < 60_000
     assert 60_000 < expectation.room(2000) < 120_000
-    expectation.seen.copy_(torch.tensor([10_000_000, 1000]))
-    assert expectation.room(1000) < 100_000
+    expectation.seen.copy_(torch.tensor([100_000_000, 1000]))
+    assert expectation.room(1000) == rasterizer_tiled._ALWAYS
+    assert 64_000_000 <= expectation.room(1_000_000) < 100_000_000
+
+
+def test_pictures_in_inference_mode_do_not_disturb_later_gradients():
+    rasterizer._black.cache_clear()
+    rasterizer._all_tiles.cache_clear()
+    *gaussians, viewmats, Ks = (x.float() for x in (*make_gaussians(), *make_cameras()))
+    with torch.inference_mode():
+        expected = rasterize(*gaussians, viewmats, Ks, WIDTH, HEIGHT).colors
+    gaussians[0].requires_grad_()
+    colors = rasterize(*gaussians, viewmats, Ks, WIDTH, HEIGHT).colors
+    colors.sum().backward()
+    assert torch.equal(colors, expected) and gaussians[0].grad.any()
+
+
+def test_the_default_dtype_changes_nothing(compositor):
+    gaussians, cameras = make_gaussians(), make_cameras()
+    rasterizer._black.cache_clear()
+    expected, _ = run(rasterize, gaussians, cameras, dtype=torch.float32)
+    torch.set_default_dtype(torch.float64)
+    try:
+        output, _ = run(rasterize, gaussians, cameras, dtype=torch.float32)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert torch.equal(output.colors, expected.colors)
+
+
+def test_pictures_drawn_in_several_threads_are_those_drawn_in_one(compositor):
+    """Of different sizes, each with two forward passes before their backward passes."""
+    scalar, scenes = rasterizer._scalar.get(), [(make_gaussians(400, seed=31), (70, 45)), (make_gaussians(150, seed=32), (33, 60))]
+
+    def draw(turn):
+        with rasterizer.scalar_kernels() if scalar else contextlib.nullcontext():
+            leaves, losses = [], []
+            for gaussians, size in scenes[::turn]:
+                leaves.append([x.float().requires_grad_() for x in gaussians])
+                viewmats, Ks = (x.float() for x in make_cameras(1, *size))
+                losses.append(rasterize(*leaves[-1], viewmats, Ks, *size).colors.square().sum())
+            return [torch.autograd.grad(loss, x, retain_graph=True) for loss, x in zip(losses, leaves)][::turn]
+
+    expected, same = draw(1), []
+
+    def work(turn):
+        for _ in range(4):
+            same.extend(torch.equal(x, y) for a, b in zip(draw(turn), expected) for x, y in zip(a, b))
+
+    threads = [threading.Thread(target=work, args=(turn,)) for turn in (1, -1, 1)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(same) == 3 * 4 * 10 and all(same)
+
+
+def test_nothing_holds_the_memory_of_a_picture_that_is_gone(compositor):
+    size = (59, 41)  # of no other test
+    run(rasterize, make_gaussians(), make_cameras(), size=size, dtype=torch.float32)
+    gc.collect()
+    held = [x for x in gc.get_objects() if type(x) is torch.Tensor and x.numel() in (2 * 59 * 41, 3 * 2 * 59 * 41)]
+    assert not held, f"{len(held)} images are still there"

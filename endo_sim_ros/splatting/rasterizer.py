@@ -14,7 +14,7 @@ import warp as wp
 from torch import Tensor
 
 from endo_sim_ros.cameras import Camera
-from endo_sim_ros.device import init_warp, on_torch_stream
+from endo_sim_ros.device import init_warp
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.splatting import rasterizer_simd, rasterizer_tiled
 from endo_sim_ros.splatting.launching import Scene, Settings
@@ -94,7 +94,7 @@ def rasterize(
             device). Any other Gaussian whose projection is not finite is not drawn and gets zero gradients.
     """
     options = {"covars": covars, "background": background, "masks": masks, "absgrad": absgrad}
-    _check_inputs("rasterize", means, quats, scales, opacities, sh, viewmats, Ks, width, height, **options)
+    _check_inputs("rasterize", means, quats, scales, opacities, sh, viewmats, Ks, width, height, near, eps2d, **options)
     if means.device.type == "cpu" and not means.isfinite().all():
         index = int((~means.detach().isfinite()).any(1).nonzero()[0])
         raise ValueError(f"rasterize: means[{index}] is not finite: {means[index].tolist()}")
@@ -153,13 +153,15 @@ def render(
 
 
 def _check_inputs(
-    name, means, quats, scales, opacities, sh, viewmats, Ks, width, height, *, covars, background, masks, absgrad
+    name, means, quats, scales, opacities, sh, viewmats, Ks, width, height, near, eps2d, *, covars, background, masks, absgrad
 ) -> None:
-    """Raise ValueError, naming the argument and both shapes, unless all shapes agree."""
+    """Raise ValueError, naming the argument and both shapes, unless all shapes agree and numbers make sense."""
     if means.ndim != 2 or means.shape[1] != 3:
         raise ValueError(f"{name}: means shape {tuple(means.shape)} != expected shape (N, 3)")
     if viewmats.ndim != 3 or viewmats.shape[1:] != (4, 4):
         raise ValueError(f"{name}: viewmats shape {tuple(viewmats.shape)} != expected shape (C, 4, 4)")
+    if not len(viewmats):
+        raise ValueError(f"{name}: viewmats has no camera; at least one must be given")
     if sh.ndim != 3 or sh.shape[1] not in (1, 4, 9, 16):
         raise ValueError(f"{name}: sh shape {tuple(sh.shape)} != expected shape ({len(means)}, 1|4|9|16, 3)")
     if covars is None and (quats is None or scales is None):
@@ -168,6 +170,8 @@ def _check_inputs(
         raise ValueError(f"{name}: covars replaces quats and scales; pass None for those")
     if width < 1 or height < 1:
         raise ValueError(f"{name}: image size must be positive, got width {width} and height {height}")
+    if not (near >= 0 and eps2d >= 0):
+        raise ValueError(f"{name}: near and eps2d must not be negative, got near {near} and eps2d {eps2d}")
     n, c = len(means), len(viewmats)
     expected = {
         "quats": (quats, (n, 4)),
@@ -226,12 +230,17 @@ def _load_kernels(way: types.ModuleType, device: str) -> None:
         wp.load_module(module, device)
 
 
+# Tensors made in inference mode could not be saved for a backward pass later.
+
+
 @functools.cache
+@torch.inference_mode(False)
 def _black(device: torch.device) -> Tensor:
-    return torch.zeros(3, device=device)
+    return torch.zeros(3, dtype=torch.float32, device=device)
 
 
 @functools.cache
+@torch.inference_mode(False)
 def _all_tiles(count: int, device: torch.device) -> Tensor:
     return torch.ones(count, dtype=torch.uint8, device=device)
 
@@ -242,7 +251,7 @@ def _tile_mask(masks: Tensor | None, settings: Settings, camera_count: int, devi
     if masks is None:
         return _all_tiles(camera_count * s.tiles_x * s.tiles_y, device)
     padding = (0, s.tiles_x * TILE - s.width, 0, s.tiles_y * TILE - s.height)
-    padded = torch.nn.functional.pad(masks.to(device, torch.uint8), padding)
+    padded = torch.nn.functional.pad(masks.to(device, torch.bool).view(torch.uint8), padding)
     return padded.reshape(camera_count, s.tiles_y, TILE, s.tiles_x, TILE).amax((2, 4)).flatten()
 
 
@@ -255,8 +264,7 @@ class _Rasterize(torch.autograd.Function):
         scene = Scene(means, quats, scales, covars, opacities, sh, viewmats, Ks, background)
         ctx.way, ctx.settings = _way(device), settings
         tile_mask = _tile_mask(masks, settings, len(viewmats), device)
-        with on_torch_stream(device):
-            images, radii, owners, ctx.state = ctx.way.forward(scene, tile_mask, settings)
+        images, radii, owners, ctx.state = ctx.way.forward(scene, tile_mask, settings)
         ctx.save_for_backward(*scene, *images)
         ctx.mark_non_differentiable(radii, owners)
         return *images, radii, owners
@@ -267,8 +275,7 @@ class _Rasterize(torch.autograd.Function):
         scene, images = Scene(*ctx.saved_tensors[:-4]), ctx.saved_tensors[-4:]
         v_images = [v.float().contiguous() for v in v_outputs[:4]]
         wants_pose, wants_background, wants_absolute = ctx.needs_input_grad[9:12]
-        with on_torch_stream(scene.means.device):
-            v = ctx.way.backward(scene, ctx.state, ctx.settings, images, v_images, wants_pose, wants_absolute)
+        v = ctx.way.backward(scene, ctx.state, ctx.settings, images, v_images, wants_pose, wants_absolute)
         v_viewmats = v_background = None
         if wants_pose:
             v_viewmats = _repeatable_sum(v.camera_shares, 1)
@@ -309,7 +316,7 @@ def _rasterize(
     Same arguments, errors and result as `rasterize`; masks are checked, but nothing is skipped.
     """
     options = {"covars": covars, "background": background, "masks": masks, "absgrad": absgrad}
-    _check_inputs("_rasterize", means, quats, scales, opacities, sh, viewmats, Ks, width, height, **options)
+    _check_inputs("_rasterize", means, quats, scales, opacities, sh, viewmats, Ks, width, height, near, eps2d, **options)
     if covars is None:
         rotations = _quat_to_matrix(quats)
         covars = rotations @ torch.diag_embed(scales**2) @ rotations.mT

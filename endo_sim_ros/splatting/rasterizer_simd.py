@@ -29,9 +29,9 @@ class State(NamedTuple):
 def forward(scene: Scene, tile_mask: Tensor, settings: Settings) -> tuple[list[Tensor], Tensor, Tensor, State]:
     """Images, radii, owners of median depths, and what `backward` needs."""
     s, splat_count = settings, scene.splat_count
-    integers = functools.partial(torch.empty, dtype=torch.int32)
+    integers = functools.partial(scene.means.new_empty, dtype=torch.int32)
     images, owners = empty_images(scene, settings)
-    splats, counts = torch.empty(splat_count, kernels.SPLAT_SIZE), integers(splat_count)
+    splats, counts = scene.means.new_empty(splat_count, kernels.SPLAT_SIZE), integers(splat_count)
     radii, depth_keys, order = integers((len(scene.viewmats), len(scene.means))), integers(2 * splat_count), integers(2 * splat_count)
     arguments = [*scene.gaussian_arguments(), scene.opacities, scene.sh, scene.viewmats, scene.Ks, s.width, s.height, s.near, s.eps2d]
     _launch(kernels.project, splat_count, [*arguments, tile_mask, splats, radii, depth_keys, order, counts])
@@ -46,7 +46,7 @@ def backward(
 ) -> Gradients:
     """The gradients of the scene, from those of the images."""
     gradients = Gradients.empty(scene, wants_pose, wants_absolute)
-    records = torch.empty(len(state.owners), kernels.RECORD_SIZE)
+    records = scene.means.new_empty(len(state.owners), kernels.RECORD_SIZE)
     arguments = [*_image_arguments(state, scene, settings, images), *v_images, int(wants_absolute), records]
     _launch_tiles(simd_kernels.render_tiles_backward, len(state.starts) - 1, arguments)
     arguments = [*scene.gaussian_arguments(), scene.sh, scene.viewmats, scene.Ks, settings.width, settings.height, settings.eps2d]
@@ -62,8 +62,8 @@ def _intersect(splats, depth_keys, order, counts, tile_mask, gaussian_count, set
     ends = counts[order[:splat_count]].cumsum(0)
     count = int(ends[-1]) if splat_count else 0
 
-    firsts, tiles, slots = torch.empty_like(counts), *torch.empty(2, 2 * count, dtype=torch.int32)
-    owners, starts = torch.empty(count, dtype=torch.int32), torch.empty(tile_count + 1, dtype=torch.int32)
+    firsts, tiles, slots = torch.empty_like(counts), *counts.new_empty(2, 2 * count)
+    owners, starts = counts.new_empty(count), counts.new_empty(tile_count + 1)
     arguments = [order, ends, counts, gaussian_count, splats, tile_mask, settings.tiles_x, settings.tiles_y, count, 0]
     _launch(kernels.emit_intersections, splat_count if count else 0, [*arguments, tiles, slots, firsts, owners])
     if count:
@@ -99,6 +99,6 @@ def _launch(kernel, count: int, arguments: list) -> None:
 
 def _launch_tiles(kernel, tile_count: int, arguments: list) -> None:
     """Launch a kernel that draws tiles from a counter, its first argument, in all threads."""
-    inputs = kernel_arguments(kernel, [torch.zeros(1, dtype=torch.int32), *arguments])
+    inputs = kernel_arguments(kernel, [torch.zeros(1, dtype=torch.int32, device="cpu"), *arguments])
     command = wp.launch(kernel, dim=tile_count, inputs=inputs, device="cpu", record_cmd=True)
     run_in_threads([command.launch] * min(cpu_threads(), tile_count))

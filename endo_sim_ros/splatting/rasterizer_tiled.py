@@ -10,13 +10,15 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from endo_sim_ros.device import on_torch_stream
 from endo_sim_ros.splatting import rasterizer_kernels as kernels
 from endo_sim_ros.splatting import rasterizer_tiled_kernels as tiled_kernels
 from endo_sim_ros.splatting.launching import Gradients, Scene, Settings, empty_images, kernel_arguments
 
 MODULES = (kernels, tiled_kernels)
 _FIRST_GUESS = 4.0  # intersections of a splat, on average
-_MOST = 64.0  # that lists have room for; pictures that need more are drawn without lists
+_MOST = 64.0  # of them that lists have room for
+_ALWAYS = 2**24  # that lists have room for however few splats there are; pictures that need more are drawn without lists
 _SPARE = 1.25  # room, relative to what is expected
 _FORGETTING = 0.98  # of what was needed once, at every picture
 _COMMANDS = 512  # recorded launches kept
@@ -38,7 +40,7 @@ def forward(scene: Scene, tile_mask: Tensor, settings: Settings) -> tuple[list[T
     images, owners = empty_images(scene, settings)
     radii = integers((len(scene.viewmats), len(scene.means)))
     splats, counts, ranges = scene.means.new_empty(splat_count, kernels.SPLAT_SIZE), integers(splat_count), integers((tile_count, 2))
-    with _lock:  # the scratch memory serves one picture after the other
+    with _lock, on_torch_stream(device):  # the scratch memory serves one picture after the other, and Warp has one stream
         if splat_count:
             scratch = _scratch(device, _stream(device))
             room = scratch.reserve(splat_count, tile_count)
@@ -70,7 +72,7 @@ def backward(
     """The gradients of the scene, from those of the images."""
     gradients = Gradients.empty(scene, wants_pose, wants_absolute)
     records = scene.means.new_zeros(scene.splat_count, kernels.RECORD_SIZE)
-    with _lock:
+    with _lock, on_torch_stream(scene.means.device):
         arguments = [*_image_arguments(state, scene, settings, images), *v_images, int(wants_absolute), records]
         _launch(tiled_kernels.render_pixels_backward, len(state.ranges) * tiled_kernels.BLOCK, arguments)
         arguments = [0, *scene.gaussian_arguments(), *_cameras(scene, settings)[1:], settings.eps2d, state.counts, 1, None, records]
@@ -108,7 +110,8 @@ class _Expectation:
         intersections, splats = self._numbers.tolist()
         if splats:
             self._mean = max(_FORGETTING * self._mean, intersections / splats)
-        return math.ceil(2 ** (math.ceil(2 * math.log2(splat_count * min(_SPARE * self._mean, _MOST))) / 2))
+        wanted = min(_SPARE * self._mean * splat_count, max(_MOST * splat_count, _ALWAYS))
+        return math.ceil(2 ** (math.ceil(2 * math.log2(wanted)) / 2))
 
 
 class _Scratch:
@@ -178,6 +181,8 @@ def _launch(kernel, count: int, arguments: list) -> None:
         device = str(tensors[0].device)
         command = wp.launch(kernel, dim=count, inputs=kernel_arguments(kernel, arguments), device=device, record_cmd=True)
         places = [command.params[1 + i] for i, x in enumerate(arguments) if isinstance(x, Tensor)]
+        for place in places:
+            place._ref = None  # Warp's hold on the tensor, whose memory would never be free again
         while len(_commands) >= _COMMANDS:
             del _commands[next(iter(_commands))]
         _commands[kind] = command, places

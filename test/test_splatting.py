@@ -320,6 +320,13 @@ def test_no_gaussians_render_the_background(compositor):
     assert_only_background(make_gaussians(0))
 
 
+def test_the_gradient_of_the_background_is_exact_in_large_images():
+    gaussians, (viewmats, Ks) = [x.float() for x in make_gaussians(0)], [x.float() for x in make_cameras(1, 1024, 512)]
+    background = torch.zeros(3, requires_grad=True)
+    rasterize(*gaussians, viewmats, Ks, 1024, 512, background=background).colors.mean().backward()
+    assert torch.allclose(background.grad, torch.full((3,), 1 / 3), rtol=1e-6)
+
+
 @pytest.mark.parametrize("opacity", [0.3, 1.0])
 def test_one_gaussian_matches_the_reference(opacity, compositor):
     gaussians = make_gaussians(1, 4, seed=15)
@@ -643,6 +650,21 @@ def test_pictures_for_whose_lists_there_is_no_room_are_the_same(device, monkeypa
     assert scratch.seen[0] > scratch.room
     for expected, actual in zip([*roomy[0][:4], *roomy[1]], [*cramped[0][:4], *cramped[1]]):
         assert_close("it", actual, expected.cpu(), 1e-5)
+
+
+def test_memory_that_runs_out_is_asked_for_again(monkeypatch):
+    scratch = rasterizer_tiled._Scratch(torch.device("cpu"))
+    scratch.reserve(10, 1)
+
+    def run_out(count, dtype=torch.int32):
+        raise torch.OutOfMemoryError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(scratch, "_integers", run_out)
+        with pytest.raises(torch.OutOfMemoryError):
+            scratch.reserve(20, 1)
+    room = scratch.reserve(20, 1)
+    assert len(scratch.depth_keys) == len(scratch.order) == 40 and len(scratch.tiles) == len(scratch.values) >= 2 * room
 
 
 def test_room_follows_what_pictures_needed():

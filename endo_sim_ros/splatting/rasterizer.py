@@ -9,6 +9,7 @@ import functools
 import types
 from typing import NamedTuple
 
+import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
@@ -285,8 +286,8 @@ class _Rasterize(torch.autograd.Function):
 
 
 def _repeatable_sum(x: Tensor, dim: int) -> Tensor:
-    """Sum that does not depend on the number of torch threads."""
-    return torch.from_numpy(x.numpy().sum(dim)) if x.device.type == "cpu" else x.sum(dim)
+    """Sum that does not depend on the number of torch threads; numpy adds one by one, which float32 is too coarse for."""
+    return torch.from_numpy(x.numpy().sum(dim, dtype=np.float64)).to(x.dtype) if x.device.type == "cpu" else x.sum(dim)
 
 
 # ---------------------------------------------------------------- reference

@@ -128,15 +128,17 @@ class _Scratch:
         self.seen = expectation.seen
         self.room = max(expectation.room(splat_count), splat_count, tile_count)
         if splat_count != self._splat_count:
-            self._splat_count = splat_count
+            self._splat_count = 0  # if there is no memory, the next picture must not find it either
             self.depth_keys, self.order = self._integers(2 * splat_count), self._integers(2 * splat_count)
             self.sorted_counts, self.ends = (self._integers(splat_count, torch.int64) for _ in range(2))
             self._by_depth = wp.from_torch(self.depth_keys), wp.from_torch(self.order)
             self._sums = wp.from_torch(self.sorted_counts), wp.from_torch(self.ends)
+            self._splat_count = splat_count
         if self.room > self._room:
-            self._room = self.room
+            self._room = 0
             self.tiles, self.values = self._integers(2 * self.room), self._integers(2 * self.room)
             self._by_tile = wp.from_torch(self.tiles), wp.from_torch(self.values)
+            self._room = self.room
         return self.room
 
     def sort_by_depth(self) -> None:

@@ -1,6 +1,7 @@
 """Evaluations: what is held out, who saw what, cells that fail or are finished already, tables, and the command."""
 
 import csv
+import dataclasses
 import json
 import os
 import re
@@ -62,11 +63,15 @@ def test_a_split_that_leaves_nothing_is_an_error():
 
 
 def test_right_views_stand_beside_the_left_ones(small_frames):
-    frame, (view, *_) = small_frames[0], right_views(small_frames, offset=2.0)
+    K = small_frames[0].camera.K + [[0, 0, 2], [0, 0, 0], [0, 0, 0]]
+    frame = dataclasses.replace(small_frames[0], right_K=K)
+    (view,) = right_views([frame, dataclasses.replace(small_frames[1], right=None)])
     assert np.array_equal(view.image, frame.right)
     step = view.camera.position - frame.camera.position
     np.testing.assert_allclose(step @ frame.camera.pose[:3, :3], [frame.baseline, 0, 0], atol=1e-12)
-    assert view.camera.K[0, 2] == frame.camera.K[0, 2] + 2 and frame.camera.K[0, 2] == 48
+    assert view.camera.K[0, 2] == frame.camera.K[0, 2] + 2
+    with pytest.raises(SequenceError, match="no right images"):
+        right_views(small_frames[:0])
 
 
 # --------------------------------------------------------------------------------------------------------- who saw what

@@ -31,7 +31,7 @@ from endo_sim_ros.evaluation.lpips import Lpips, WeightsError
 from endo_sim_ros.evaluation.splits import STEREO, Split, check_split, right_views, split_views
 from endo_sim_ros.evaluation.workers import Finished, News, ray_is_installed, run_in_processes, run_in_ray
 from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer, shrink
-from endo_sim_ros.reconstruction.depth import disparity_offset, stereo_disparity
+from endo_sim_ros.reconstruction.depth import with_depth_prior
 from endo_sim_ros.reconstruction.presets import ABLATIONS, preset
 from endo_sim_ros.reconstruction.triangulation import triangulate
 from endo_sim_ros.sequences.bag import read_bag
@@ -44,7 +44,7 @@ log = logging.getLogger(__name__)
 
 _SHOWN = 3  # held-out views of a cell of which pictures are kept
 _CURVE_VIEWS = 8  # held-out views measured at each moment of a curve
-_OFFSET_VIEWS = 24  # views that a constant disparity offset is found from
+_POINT_VIEWS = 24  # views that the points are from that a constant disparity offset is fitted to
 _PHANTOM = "phantom:"
 
 
@@ -73,6 +73,7 @@ class Prepared(NamedTuple):
     frames: list[Frame]  # left; those that no split trains on are as small as is measured
     right: list[Frame]  # the right images as views, for the split of that name
     depth_source: str  # where the reference depth of the frames is from: recorded, stereo matching, or none
+    points: tuple[np.ndarray, np.ndarray] | None = None  # of structure from motion with all views, for methods that start from them
 
 
 def evaluate(sequences: Sequence[str], config: EvaluationConfig) -> dict[str, Any]:
@@ -234,31 +235,34 @@ def _prepare(cells: Sequence[Cell], bar: Progress) -> Prepared:
     frames = [frame for frame in frames if frame.mask is None or frame.mask.any()]
     splits = {cell.split for cell in cells}
     trained = {index for split in splits for index in split_views(split, len(frames)).train}
-    depth_source, offset = "none", 0.0
-    if any(frame.depth is not None and (frame.depth > 0).any() for frame in frames):
-        depth_source = "recorded"
-    elif any(frame.right is not None for frame in frames):
-        depth_source = "stereo matching"
-        task = bar.add_task(f"stereo of {cells[0].sequence}", total=len(frames))
-        disparities = []
-        for frame in frames:
-            disparities.append(None if frame.right is None else stereo_disparity(frame))
-            bar.advance(task)
+    depth_source, matched = "none", frames
+    recorded = any(frame.depth is not None and (frame.depth > 0).any() for frame in frames)
+    if any(frame.right is not None for frame in frames) and (STEREO in splits or not recorded):
+        task = bar.add_task(f"stereo matching of {cells[0].sequence}", total=None)
+        points = triangulate(spread(frames, _POINT_VIEWS))[0]
+        matched = with_depth_prior(frames, points, ReconstructionConfig(depth="stereo"))
         bar.remove_task(task)
-        chosen = spread(range(len(frames)), _OFFSET_VIEWS)
-        some = [frames[i] for i in chosen]
-        offset = disparity_offset(some, [disparities[i] for i in chosen], triangulate(some)[0])
-        frames = [f if d is None else dataclasses.replace(f, depth=_depth(f, d + offset * (d > 0))) for f, d in zip(frames, disparities)]
+    if recorded:
+        depth_source = "recorded"
+    elif matched is not frames:
+        depth_source = "stereo matching"
+        frames = [dataclasses.replace(frame, depth=_trusted(match)) for frame, match in zip(frames, matched)]
     width = max(cell.options["image_width"] for cell in cells)
-    right = [shrink(frame, width) for frame in right_views(frames, offset)] if STEREO in splits else []
+    right = [shrink(frame, width) for frame in right_views(matched)] if STEREO in splits else []
     small = lambda frame: shrink(dataclasses.replace(frame, right=None, baseline=None, right_K=None), width)
-    return Prepared([f if i in trained else small(f) for i, f in enumerate(frames)], right, depth_source)
+    found = None
+    if any(cell.options["initialization"] == "points" for cell in cells):
+        task = bar.add_task(f"scene points of {cells[0].sequence}", total=None)
+        found = triangulate(spread(frames, 2 * _POINT_VIEWS))[:2]
+        bar.remove_task(task)
+    return Prepared([f if i in trained else small(f) for i, f in enumerate(frames)], right, depth_source, found)
 
 
-def _depth(frame: Frame, disparity: np.ndarray) -> np.ndarray:
-    """Depth [H, W] (m, 0 = none) of a disparity (pixels, 0 = none)."""
-    near = disparity > 0.5
-    return np.where(near, frame.camera.K[0, 0] * frame.baseline / np.where(near, disparity, 1), 0).astype(np.float32)
+def _trusted(frame: Frame) -> np.ndarray | None:
+    """Matched depth [H, W] (m, 0 = none) where half a pixel of disparity is less than a twentieth of it."""
+    if frame.depth is None or frame.baseline is None:
+        return None
+    return np.where(frame.depth < frame.camera.K[0, 0] * frame.baseline / 10, frame.depth, 0)
 
 
 # ------------------------------------------------------------------------------------------------------------ running
@@ -364,6 +368,8 @@ def _job(argument: tuple, device: str, report: Callable[[Any], None]) -> dict[st
     views = [prepared.frames[index] for index in split.train]
     if not (cell.train_depth and prepared.depth_source == "recorded"):
         views = [dataclasses.replace(view, depth=None) for view in views]
+    # As the papers do it, which have them from structure from motion with all views.
+    points = prepared.points if config.initialization == "points" else None
     if cell.mono or split.right:
         views = [dataclasses.replace(view, right=None, baseline=None, right_K=None) for view in views]
     held_out = [shrink(frame, config.image_width) for frame in _held_out(prepared, split)]
@@ -372,7 +378,7 @@ def _job(argument: tuple, device: str, report: Callable[[Any], None]) -> dict[st
     training: dict[str, Any] = {}
 
     def train() -> None:
-        training.update(_train(views, config, spread(held_out, _CURVE_VIEWS), cell.curve, report))
+        training.update(_train(views, config, points, spread(held_out, _CURVE_VIEWS), cell.curve, report))
 
     memory = peak_megabytes(train, device)
     model = training.pop("model")
@@ -425,7 +431,9 @@ def _held_out(prepared: Prepared, split: Split) -> list[Frame]:
     return prepared.right if split.right else [prepared.frames[index] for index in split.held_out]
 
 
-def _train(views: list[Frame], config: ReconstructionConfig, probes: list[Frame], moments: int, report: Callable) -> dict[str, Any]:
+def _train(
+    views: list[Frame], config: ReconstructionConfig, points: tuple | None, probes: list[Frame], moments: int, report: Callable
+) -> dict[str, Any]:
     """Train; the seconds that it took, without those of the measurements for the curve."""
 
     def now() -> float:
@@ -434,7 +442,7 @@ def _train(views: list[Frame], config: ReconstructionConfig, probes: list[Frame]
         return time.perf_counter()
 
     curve, start, away = [], now(), 0.0
-    trainer = Trainer(views, config)
+    trainer = Trainer(views, config, points)
     # Quality changes fastest in the beginning.
     due = sorted({round(config.iterations * 50 ** (i / max(moments - 1, 1) - 1)) for i in range(moments)})
 

@@ -4,8 +4,6 @@ import dataclasses
 import re
 from typing import NamedTuple
 
-import numpy as np
-
 from endo_sim_ros.sequences.frames import Frame, SequenceError
 from endo_sim_ros.sequences.recordings import lit_area, spread
 
@@ -60,12 +58,11 @@ def split_views(name: str, count: int) -> Split:
     return Split(train, held_out)
 
 
-def right_views(frames: list[Frame], offset: float = 0.0) -> list[Frame]:
-    """The right images of stereo frames as views of their own.
+def right_views(frames: list[Frame]) -> list[Frame]:
+    """The right images of stereo frames as views of their own; a frame without one is left out.
 
-    Args:
-        frames: Left views; those without a right image are left out.
-        offset: What `disparity_offset` found for them, pixels: by so much the right principal point is farther right.
+    Raises:
+        SequenceError: If there are none.
     """
     pairs = [frame for frame in frames if frame.right is not None]
     if not pairs:
@@ -73,8 +70,7 @@ def right_views(frames: list[Frame], offset: float = 0.0) -> list[Frame]:
     lit = lit_area(frame.right for frame in spread(pairs, 10))
     views = []
     for frame in pairs:
-        K, pose = np.array(frame.camera.K if frame.right_K is None else frame.right_K), frame.camera.pose.copy()
-        K[0, 2] += offset
+        K, pose = frame.camera.K if frame.right_K is None else frame.right_K, frame.camera.pose.copy()
         pose[:3, 3] += frame.baseline * pose[:3, 0]
         camera = dataclasses.replace(frame.camera, K=K, pose=pose)
         views.append(Frame(frame.stamp_ns, frame.right, camera, mask=lit))

@@ -73,7 +73,6 @@ class Prepared(NamedTuple):
     frames: list[Frame]  # left; those that no split trains on are as small as is measured
     right: list[Frame]  # the right images as views, for the split of that name
     depth_source: str  # where the reference depth of the frames is from: recorded, stereo matching, or none
-    points: tuple[np.ndarray, np.ndarray] | None = None  # of structure from motion with all views, for methods that start from them
 
 
 def evaluate(sequences: Sequence[str], config: EvaluationConfig) -> dict[str, Any]:
@@ -250,12 +249,7 @@ def _prepare(cells: Sequence[Cell], bar: Progress) -> Prepared:
     width = max(cell.options["image_width"] for cell in cells)
     right = [shrink(frame, width) for frame in right_views(matched)] if STEREO in splits else []
     small = lambda frame: shrink(dataclasses.replace(frame, right=None, baseline=None, right_K=None), width)
-    found = None
-    if any(cell.options["initialization"] == "points" for cell in cells):
-        task = bar.add_task(f"scene points of {cells[0].sequence}", total=None)
-        found = triangulate(spread(frames, 2 * _POINT_VIEWS))[:2]
-        bar.remove_task(task)
-    return Prepared([f if i in trained else small(f) for i, f in enumerate(frames)], right, depth_source, found)
+    return Prepared([f if i in trained else small(f) for i, f in enumerate(frames)], right, depth_source)
 
 
 def _trusted(frame: Frame) -> np.ndarray | None:
@@ -368,8 +362,6 @@ def _job(argument: tuple, device: str, report: Callable[[Any], None]) -> dict[st
     views = [prepared.frames[index] for index in split.train]
     if not (cell.train_depth and prepared.depth_source == "recorded"):
         views = [dataclasses.replace(view, depth=None) for view in views]
-    # As the papers do it, which have them from structure from motion with all views.
-    points = prepared.points if config.initialization == "points" else None
     if cell.mono or split.right:
         views = [dataclasses.replace(view, right=None, baseline=None, right_K=None) for view in views]
     held_out = [shrink(frame, config.image_width) for frame in _held_out(prepared, split)]
@@ -378,7 +370,7 @@ def _job(argument: tuple, device: str, report: Callable[[Any], None]) -> dict[st
     training: dict[str, Any] = {}
 
     def train() -> None:
-        training.update(_train(views, config, points, spread(held_out, _CURVE_VIEWS), cell.curve, report))
+        training.update(_train(views, config, spread(held_out, _CURVE_VIEWS), cell.curve, report))
 
     memory = peak_megabytes(train, device)
     model = training.pop("model")
@@ -431,9 +423,7 @@ def _held_out(prepared: Prepared, split: Split) -> list[Frame]:
     return prepared.right if split.right else [prepared.frames[index] for index in split.held_out]
 
 
-def _train(
-    views: list[Frame], config: ReconstructionConfig, points: tuple | None, probes: list[Frame], moments: int, report: Callable
-) -> dict[str, Any]:
+def _train(views: list[Frame], config: ReconstructionConfig, probes: list[Frame], moments: int, report: Callable) -> dict[str, Any]:
     """Train; the seconds that it took, without those of the measurements for the curve."""
 
     def now() -> float:
@@ -442,7 +432,7 @@ def _train(
         return time.perf_counter()
 
     curve, start, away = [], now(), 0.0
-    trainer = Trainer(views, config, points)
+    trainer = Trainer(views, config)
     # Quality changes fastest in the beginning.
     due = sorted({round(config.iterations * 50 ** (i / max(moments - 1, 1) - 1)) for i in range(moments)})
 

@@ -30,8 +30,9 @@ class ReconstructionConfig(StageConfig):
     depth_model: str = ""
     """network: folder of a Depth-Anything-V2 checkpoint (transformers) or ONNX file; nothing is ever downloaded. Empty:
     one that Hugging Face's cache holds."""
-    complete_depth: bool = True
-    """Fill the holes of the prior from around them."""
+    surroundings: Annotated[float, Range(0, 1)] = 0.3
+    """How far tissue goes on, coarsely, beyond what the training views see, in widths of the image, so that other views do
+    not look into the void; holes of the depth prior are filled likewise. 0 = neither."""
     depth_tolerance: Annotated[float, Range(0.001, 1)] = 0.05
     """Relative depth difference at which two views contradict each other."""
     lambda_ssim: Annotated[float, Range(0, 1)] = 0.2
@@ -48,8 +49,6 @@ class ReconstructionConfig(StageConfig):
     """Weight of 1 − correlation of depth and prior, in training views and in virtual ones to which the prior is carried (FSGS)."""
     lambda_gradient: Annotated[float, Range(0, 1000)] = 0.0
     """Weight of differences between the slopes of the logarithms of depth and prior."""
-    lambda_front: Annotated[float, Range(0, 1000)] = 1.0
-    """Weight of Gaussians that float in front of the depth prior, as a log ratio of depths."""
     lambda_flat: Annotated[float, Range(0, 1000)] = 0.01
     """Weight of Gaussians being deeper than 1.5 times their width, which turns into streaks when the tissue is sheared."""
     virtual_every: Annotated[int, Range(0, 1000)] = 1

@@ -145,34 +145,6 @@ def _with_depth(frame: Frame, depth: np.ndarray | None) -> Frame:
     return dataclasses.replace(frame, depth=np.where(valid, depth, 0).astype(np.float32))
 
 
-def completed(depth: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
-    """Depth [H, W] (m) with a value everywhere in the mask, if it has any: inverse depth, averaged over ever wider surroundings.
-
-    Holes are what matching leaves at glints, at occlusions and beside the field that both eyes see.
-    """
-    weight = (depth > 0).astype(np.float32)
-    if not weight.any() or weight.all():
-        return depth
-    levels = [(weight, np.where(depth > 0, 1 / np.maximum(depth, 1e-6), 0).astype(np.float32))]
-    while min(levels[-1][0].shape) > 1:
-        weight, total = (_halved(array) for array in (levels[-1][0], levels[-1][0] * levels[-1][1]))
-        levels.append(((weight > 0).astype(np.float32), total / np.maximum(weight, 1e-6)))
-    weight, filled = levels[-1]
-    filled = np.where(weight > 0, filled, np.average(levels[0][1], weights=levels[0][0])).astype(np.float32)
-    for weight, values in levels[-2::-1]:
-        coarse = cv2.resize(filled, weight.shape[::-1], interpolation=cv2.INTER_LINEAR)
-        filled = np.where(weight > 0, values, coarse)
-    filled = 1 / filled
-    return np.where(True if mask is None else mask > 0, filled, 0).astype(np.float32)
-
-
-def _halved(array: np.ndarray) -> np.ndarray:
-    """Sums of 2 × 2 pixels; an odd row or column is repeated."""
-    rows, columns = array.shape
-    padded = np.pad(array, ((0, rows % 2), (0, columns % 2)), mode="edge")
-    return padded[::2, ::2] + padded[1::2, ::2] + padded[::2, 1::2] + padded[1::2, 1::2]
-
-
 def stereo_disparity(frame: Frame) -> np.ndarray:
     """Disparity [H, W] float32 in pixels (0 = none) of a rectified pair by semi-global matching, checked both ways.
 

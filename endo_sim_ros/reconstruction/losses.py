@@ -14,7 +14,6 @@ from torch import Tensor
 from endo_sim_ros.gaussians import GaussianModel
 
 _WINDOW, _SIGMA = 11, 1.5  # the SSIM window of the field
-_FREE = 0.01  # log ratio of depths, about the error of a prior
 _EDGES = 10.0  # how much an edge of the image excuses one of the depth
 _C1, _C2 = 0.01**2, 0.03**2
 
@@ -98,21 +97,6 @@ def gradient_difference(depth: Tensor, alpha: Tensor, prior: Tensor, mask: Tenso
                 pairs = valid.narrow(axis, 0, size) * valid.narrow(axis, step, size)
                 total = total + masked_mean((error.narrow(axis, step, size) - error.narrow(axis, 0, size)).abs(), pairs)
     return total / 4
-
-
-def in_front(means: Tensor, viewmat: Tensor, K: Tensor, surface: Tensor) -> Tensor:
-    """How far each Gaussian floats between a camera and the surface that it sees [H, W] (m, 0 = unknown), log ratio [N].
-
-    A hundredth is free. Fog near the camera fits a few images well and no other.
-    """
-    local = means @ viewmat[:3, :3].T + viewmat[:3, 3]
-    z = local[:, 2].clamp_min(1e-3)
-    height, width = surface.shape
-    u, v = (local[:, :2].detach() / z.detach()[:, None] * K.diagonal()[:2] + K[:2, 2]).floor().unbind(1)
-    inside = (local[:, 2] > 1e-3) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
-    index = v.clamp(0, height - 1) * width + u.clamp(0, width - 1)
-    seen = surface.reshape(-1)[index.long()]
-    return torch.relu((seen.clamp_min(1e-6) / z).log() - _FREE) * (inside & (seen > 0))
 
 
 def depth_extent(model: GaussianModel, eye: Tensor) -> Tensor:

@@ -20,7 +20,8 @@ _MOST_POINTS = 4000
 _DARK, _BRIGHT = 12, 235  # grey levels between which a camera is not far from its curve
 _BLUR = 1.5  # pixels
 _BRIGHTEST = 4.0  # colour that tissue in the corner of a picture may have in full light
-_RESPONSE, _RESPONSE_SPREAD, _EXPOSURE_NOISE = 1.0, 0.5, 0.04  # of the automatic exposure, and of its logarithm
+_RESPONSE, _RESPONSE_SPREAD = 1.0, 0.5  # of the automatic exposure
+_EXPOSURE_NOISE = 0.01, 0.04  # the least and the most that the logarithm of an exposure varies by itself
 
 
 def fit_light(
@@ -82,11 +83,12 @@ def unlit(
 def fit_exposure(exposures: np.ndarray, brightness: np.ndarray) -> tuple[float, np.ndarray]:
     """Response and levels [3] of the automatic exposure from each view's log exposure [V, 3] and log brightness [V] without it.
 
-    See `Light`. A camera that holds its brightness is the prior, as brightness may be much the same in all views.
+    See `Light`. A camera that holds its brightness is the prior, as brightness may be much the same in all views; exposures
+    that hardly vary speak for a fixed one.
     """
-    centred = brightness - brightness.mean()
-    trust = 1 / _EXPOSURE_NOISE**2
-    slope = (_RESPONSE / _RESPONSE_SPREAD**2 - trust * centred @ exposures.mean(1)) / (1 / _RESPONSE_SPREAD**2 + trust * centred @ centred)
+    centred, mean = brightness - brightness.mean(), exposures.mean(1)
+    trust, doubt = 1 / np.clip(mean.std(), *_EXPOSURE_NOISE) ** 2, 1 / _RESPONSE_SPREAD**2
+    slope = (doubt * _RESPONSE - trust * centred @ mean) / (doubt + trust * centred @ centred)
     response = float(np.clip(slope, 0, 1))
     return response, exposures.mean(0) + response * brightness.mean()
 

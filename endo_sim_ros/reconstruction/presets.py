@@ -10,7 +10,7 @@ from endo_sim_ros.reconstruction.config import ReconstructionConfig
 
 _PLAIN = {  # 3DGS as Kerbl et al. 2023 have it, and what the others build upon
     "initialization": "points", "densification": "gradient", "lambda_flat": 0.0, "exposure": False, "light": False, "right_views": False,
-    "complete_depth": False, "lambda_front": 0.0,
+    "surroundings": 0.0,
 }  # fmt: skip
 
 PRESETS: dict[str, dict[str, Any]] = {

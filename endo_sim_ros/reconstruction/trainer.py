@@ -21,10 +21,11 @@ from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.light import Light, falloff, features, log_brightness
 from endo_sim_ros.reconstruction import densification, losses, photometry
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
-from endo_sim_ros.reconstruction.depth import completed, with_depth_prior
+from endo_sim_ros.reconstruction.depth import with_depth_prior
 from endo_sim_ros.reconstruction.initialization import initial_model
 from endo_sim_ros.reconstruction.presets import resolved
-from endo_sim_ros.reconstruction.triangulation import triangulate
+from endo_sim_ros.reconstruction.surroundings import with_surroundings
+from endo_sim_ros.reconstruction.triangulation import match_features, misposed, triangulate
 from endo_sim_ros.sequences.frames import Frame, SequenceError
 from endo_sim_ros.sequences.recordings import lit_area
 from endo_sim_ros.splatting import RenderOutput, rasterize
@@ -39,6 +40,7 @@ _RATES = {
 _NOISE = 5e5  # of 3DGS-MCMC, in units of the means' learning rate, for a scene of depth 1
 _LARGEST = 0.06  # standard deviation of a Gaussian, in units of the scene's depth
 _LAST_REFINEMENT = 0.8  # share of the iterations after which the number of Gaussians stays fixed
+_SEEN = 0.8  # share of the Gaussians that stand for what the training views see, at first
 _WIDEST_PARALLAX = 0.1  # of the image's width, between the eyes
 _LIGHT_ANCHOR = 1e-3  # weight of the light's changes in training
 _EXPOSURE_RATE, _LIGHT_RATE = 1e-3, 2e-3  # learning rates of log exposures and of the light's four numbers
@@ -72,24 +74,25 @@ class Trainer:
     Args:
         frames: Training views; every one is used (see `select_keyframes`).
         config: Options.
+        points: Scene points [N, 3] (m, world) and their RGB [N, 3] in [0, 1], for instance of structure from motion with
+            more views than these; None triangulates these views.
 
     Raises:
         SequenceError: If there are no views, all pixels are masked, or the views give no scene points to start from.
     """
 
-    def __init__(self, frames: list[Frame], config: ReconstructionConfig):
+    def __init__(self, frames: list[Frame], config: ReconstructionConfig, points: tuple[np.ndarray, np.ndarray] | None = None):
         if not frames:
             raise SequenceError("there are no views to reconstruct from; check the image, camera_info and pose topics")
         if all(frame.mask is not None and not frame.mask.any() for frame in frames):
             raise SequenceError("every pixel of every view is masked; a mask has 255 where there is tissue")
         self.config = config = resolved(config)
         self.device = pick_device(config.device)
-        points, colors, _ = triangulate(frames)
+        frames, *found = _consistent(frames)
+        points, colors = found if points is None else points
         frames = [shrink(frame, config.image_width) for frame in with_depth_prior(frames, points, config)]
-        if config.complete_depth:
-            whole = [None if f.depth is None else completed(f.depth, f.mask) for f in frames]
-            frames = [dataclasses.replace(frame, depth=depth) for frame, depth in zip(frames, whole)]
-        model = initial_model(frames, points, colors, config)
+        seen = int(_SEEN * config.max_gaussians) if config.surroundings else config.max_gaussians
+        model = initial_model(frames, points, colors, dataclasses.replace(config, max_gaussians=max(seen, 1)))
         self.scene_depth = _median_depth(frames, model)
         light, exposures = np.zeros(4), np.zeros((len(frames), 3))
         if self._lit:
@@ -98,6 +101,8 @@ class Trainer:
                 frames, means, self.scene_depth, config.depth_tolerance, light=config.light, exposure=config.exposure
             )
             model = photometry.unlit(model, frames, light, exposures, self.scene_depth, config.depth_tolerance)
+        if config.surroundings:
+            model = with_surroundings(model, frames, light, exposures, self.scene_depth, config.surroundings, config.max_gaussians)
         self._views = [self._to_device(frame, i) for i, frame in enumerate(frames)]
         if config.right_views:
             self._views += [self._to_device(right_view(f), i) for i, f in enumerate(frames) if f.right is not None]
@@ -293,9 +298,6 @@ class Trainer:
             if config.lambda_gradient:
                 error = losses.gradient_difference(output.depths[0], output.alphas[0], view.depth, view.mask)
                 loss = loss + config.lambda_gradient * error
-            if config.lambda_front:
-                floating = losses.in_front(self._parameters["means"], view.viewmat[0], view.K[0], view.depth)
-                loss = loss + config.lambda_front * floating.mean()
         return loss + self._regularization(output, view.mask, view.image)
 
     def _virtual_loss(self, index: int) -> Tensor:
@@ -434,6 +436,19 @@ def _read_checkpoint(path: Path, device: torch.device) -> dict:
     if found and found != {n: {"step": (), "exp_avg": shape, "exp_avg_sq": shape} for n, shape in enumerate(shapes)}:
         raise ValueError("the state of the optimiser does not fit the model")
     return state
+
+
+def _consistent(frames: list[Frame]) -> tuple[list[Frame], np.ndarray, np.ndarray]:
+    """The views without those whose poses contradict the others, and triangulated points [N, 3] (m) with RGB [N, 3] in [0, 1]."""
+    matches = match_features(frames)
+    wrong = misposed(frames, matches)
+    if wrong:
+        stamps = ", ".join(f"{frames[i].stamp_ns * 1e-9:.3f} s" for i in wrong)
+        log.warning("views at %s left out: their poses contradict what they share with the others", stamps)
+        frames = [frame for i, frame in enumerate(frames) if i not in wrong]
+        matches = match_features(frames)
+    points, colors, _ = triangulate(frames, matches)
+    return frames, points, colors
 
 
 def _median_depth(frames: list[Frame], model: GaussianModel) -> float:

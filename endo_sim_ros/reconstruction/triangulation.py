@@ -1,40 +1,118 @@
-"""Sparse scene points from matched features of posed views."""
+"""Sparse scene points from matched features of posed views, and views whose pose contradicts what they see."""
+
+import logging
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from endo_sim_ros.sequences.frames import Frame
 
+log = logging.getLogger(__name__)
+
 _RATIO = 0.8  # Lowe's ratio test
 _MAX_ERROR = 2.0  # pixels, reprojection in both views
 _MIN_PARALLAX = np.radians(1.0)
 _NEIGHBOURS = 3  # views matched with each view: the nearest in space
+_LEAST_MATCHES = 25  # consistent with some motion of the camera, to judge the given one by
+_LEAST_SHARE = 0.5  # of all matches, for that motion to be no accident
+_FARTHEST_OFF = 0.02  # of the image's width, median distance from where the poses expect these; tissue moves by less
+_NEAR, _FAR = 0.02, 1e3  # metres, between which a match may lie
 
 
-def triangulate(frames: list[Frame], max_features: int = 4000) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+class Matches(NamedTuple):
+    """Features that two views share."""
+
+    views: tuple[int, int]
+    first: np.ndarray  # [M, 2] pixels
+    second: np.ndarray  # [M, 2] pixels
+
+
+def triangulate(frames: list[Frame], matches: list[Matches] | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """World points [N, 3] (m), their RGB [N, 3] in [0, 1], and the pair of views [N, 2] that each was seen in.
 
-    SIFT matches between near views, kept where triangulation with the known poses reprojects within two pixels.
+    SIFT matches between near views (those of `match_features`), kept where triangulation with the known poses reprojects
+    within two pixels.
     """
-    sift = cv2.SIFT_create(nfeatures=max_features, contrastThreshold=0.01)
-    features = [sift.detectAndCompute(cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY), frame.mask) for frame in frames]
     points, colors, views = [np.empty((0, 3))], [np.empty((0, 3))], [np.empty((0, 2), int)]
-    for i, j in _pairs(frames):
-        (keys_i, desc_i), (keys_j, desc_j) = features[i], features[j]
-        if desc_i is None or desc_j is None or len(desc_j) < 2:
-            continue
-        matches = cv2.BFMatcher(cv2.NORM_L2).knnMatch(desc_i, desc_j, k=2)
-        good = [m for m, n in matches if m.distance < _RATIO * n.distance]
-        if not good:
-            continue
-        uv_i = np.array([keys_i[m.queryIdx].pt for m in good]) + 0.5  # OpenCV counts from the centre of the first pixel
-        uv_j = np.array([keys_j[m.trainIdx].pt for m in good]) + 0.5
+    for (i, j), uv_i, uv_j in match_features(frames) if matches is None else matches:
         found, kept = _intersect(frames[i], frames[j], uv_i, uv_j)
         points.append(found)
         views.append(np.tile([i, j], (len(found), 1)))
         u, v = (uv_i[kept] - 0.5).round().astype(int).T
         colors.append(frames[i].image[v, u] / 255.0)
     return np.concatenate(points), np.concatenate(colors), np.concatenate(views)
+
+
+def misposed(frames: list[Frame], matches: list[Matches]) -> list[int]:
+    """Indices of the views whose poses contradict most of the views that they share features with.
+
+    Matches of two views that fit one motion of the camera, whichever, must fit the given one. Where only two views
+    contradict each other nobody can tell which is wrong: that is logged, and neither is named.
+    """
+    verdicts: dict[tuple[int, int], bool] = {}
+    for (i, j), uv_i, uv_j in matches:
+        inliers = _of_one_motion(frames[i], frames[j], uv_i, uv_j)
+        if inliers.sum() >= max(_LEAST_MATCHES, _LEAST_SHARE * len(inliers)):
+            off = _distance_from_epipolar(frames[i], frames[j], uv_i[inliers], uv_j[inliers])
+            verdicts[i, j] = bool(np.median(off) > _FARTHEST_OFF * frames[j].camera.width)
+    wrong: list[int] = []
+    while True:  # the worst first: what contradicts it may be right without it
+        bad, all_of = np.zeros(len(frames)), np.zeros(len(frames))
+        for pair, contradicts in verdicts.items():
+            if not set(pair) & set(wrong):
+                bad[list(pair)] += contradicts
+                all_of[list(pair)] += 1
+        worst = int(np.argmax(bad / np.maximum(all_of, 1)))
+        if not bad[worst]:
+            return sorted(wrong)
+        others = bad / np.maximum(all_of, 1)
+        if all_of[worst] < 2 or bad[worst] <= all_of[worst] / 2 or (others == others[worst]).sum() > 1:
+            pairs = ", ".join(f"{i} and {j}" for (i, j), contradicts in verdicts.items() if contradicts and not {i, j} & set(wrong))
+            log.warning("the poses of views %s contradict what both see; check them", pairs)
+            return sorted(wrong)
+        wrong.append(worst)
+
+
+def match_features(frames: list[Frame], max_features: int = 4000) -> list[Matches]:
+    """SIFT features matched between each view and the nearest others."""
+    sift = cv2.SIFT_create(nfeatures=max_features, contrastThreshold=0.01)
+    features = [sift.detectAndCompute(cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY), frame.mask) for frame in frames]
+    found = []
+    for i, j in _pairs(frames):
+        (keys_i, desc_i), (keys_j, desc_j) = features[i], features[j]
+        if desc_i is None or desc_j is None or len(desc_j) < 2:
+            continue
+        matches = cv2.BFMatcher(cv2.NORM_L2).knnMatch(desc_i, desc_j, k=2)
+        good = [m for m, n in matches if m.distance < _RATIO * n.distance]
+        if good:
+            uv_i = np.array([keys_i[m.queryIdx].pt for m in good]) + 0.5  # OpenCV counts from the centre of the first pixel
+            uv_j = np.array([keys_j[m.trainIdx].pt for m in good]) + 0.5
+            found.append(Matches((i, j), uv_i, uv_j))
+    return found
+
+
+def _of_one_motion(first: Frame, second: Frame, uv1: np.ndarray, uv2: np.ndarray) -> np.ndarray:
+    """Which matches [M] fit the motion of the camera that most of them fit."""
+    if len(uv1) < _LEAST_MATCHES:
+        return np.zeros(len(uv1), bool)
+    sight = [(uv - f.camera.K[:2, 2]) / f.camera.K.diagonal()[:2] for f, uv in ((first, uv1), (second, uv2))]
+    _, inliers = cv2.findEssentialMat(*sight, np.eye(3), cv2.RANSAC, 0.999, _MAX_ERROR / second.camera.K[0, 0])
+    return np.zeros(len(uv1), bool) if inliers is None else inliers[:, 0] > 0
+
+
+def _distance_from_epipolar(first: Frame, second: Frame, uv1: np.ndarray, uv2: np.ndarray) -> np.ndarray:
+    """Pixels [M] from a feature in the second view to where the first view's feature may appear there: a piece of a line."""
+    K, pose = first.camera.K, first.camera.pose
+    rays = np.column_stack([(uv1 - K[:2, 2]) / K.diagonal()[:2], np.ones(len(uv1))]) @ pose[:3, :3].T
+    start, rise = (first.camera.position - second.camera.position) @ second.camera.pose[:3, 2], rays @ second.camera.pose[:3, 2]
+    nearest = np.maximum(_NEAR, (_NEAR / 2 - start) / np.maximum(rise, 1e-6))  # where both cameras have it in front of them
+    ends = [second.camera.project(first.camera.position + depth * rays) for depth in (nearest[:, None], _FAR)]
+    (near, z_near), (far, z_far) = ends
+    along = far - near
+    t = ((uv2 - near) * along).sum(1) / np.maximum((along * along).sum(1), 1e-12)
+    distance = np.linalg.norm(uv2 - near - t.clip(0, 1)[:, None] * along, axis=1)
+    return np.where((z_near > 0) & (z_far > 0), distance, np.inf)
 
 
 def _pairs(frames: list[Frame]) -> list[tuple[int, int]]:

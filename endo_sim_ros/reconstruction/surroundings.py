@@ -1,0 +1,136 @@
+"""Tissue goes on where no training view has seen it: coarse Gaussians in the holes of the depth prior and beyond the pictures.
+
+They keep other views from looking into the void. They are far apart, so that physics takes no control nodes from beyond the pictures.
+"""
+
+import cv2
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from endo_sim_ros.cameras import Camera
+from endo_sim_ros.gaussians import GaussianModel
+from endo_sim_ros.light import features_at
+from endo_sim_ros.sequences.frames import Frame
+
+_INSIDE, _BEYOND = 1 / 80, 1 / 27  # spacing in holes and beyond the picture, in widths of the image
+_OPACITY = 0.7
+_LEAST_SEEN = 0.02  # share of the pixels with depth, from which on its surroundings can be told
+_BRIGHTEST = 2.0
+
+
+def with_surroundings(
+    model: GaussianModel,
+    frames: list[Frame],
+    light: np.ndarray,
+    exposures: np.ndarray,
+    reference: float,
+    reach: float,
+    limit: int,
+) -> GaussianModel:
+    """The model and what may be around it: inverse depth and colour continue those of the nearest pixels.
+
+    Args:
+        model: What was seen.
+        frames: Training views with their depth prior; views without one add nothing.
+        light, exposures, reference: The light [4], the logarithm of each view's exposure [V, 3] and the distance (m) at which
+            colours are the tissue's own.
+        reach: How far to go beyond the pictures, in their widths.
+        limit: Largest number of Gaussians in all.
+    """
+    parts = [model.means.numpy().astype(np.float64)]
+    colors, spacings = [], []
+    for frame, exposure in zip(frames, exposures):
+        if frame.depth is None or (frame.depth > 0).mean() < _LEAST_SEEN:
+            continue
+        camera, depth, picture = _continued(frame, light, exposure, reference, int(reach * frame.camera.width))
+        width, height, pad = frame.camera.width, frame.camera.height, (camera.width - frame.camera.width) // 2
+        known = np.pad(frame.depth > 0, pad)
+        inside = np.zeros(known.shape, bool)
+        inside[pad : pad + height, pad : pad + width] = True if frame.mask is None else frame.mask > 0
+        for where, share in ((inside, _INSIDE), (~inside, _BEYOND)):
+            stride = max(round(share * width), 1)
+            chosen = np.zeros(known.shape, bool)
+            chosen[stride // 2 :: stride, stride // 2 :: stride] = True
+            chosen &= where & ~known
+            points, spacing = camera.backproject(depth)[chosen], stride * depth[chosen] / camera.K[0, 0]
+            new = _unknown(points, frames)
+            if new.any():
+                new[new] = cKDTree(np.concatenate(parts)).query(points[new])[0] > 0.7 * spacing[new]
+            parts.append(points[new])
+            colors.append(picture[chosen][new])
+            spacings.append(spacing[new])
+    count, room = sum(map(len, spacings)), limit - len(model)
+    if not count or room <= 0:
+        return model
+    arrays = np.concatenate(parts[1:]), np.concatenate(colors), np.concatenate(spacings)
+    if count > room:  # fewer and larger ones
+        kept = np.linspace(0, count - 1, room).astype(int)
+        arrays = arrays[0][kept], arrays[1][kept], arrays[2][kept] * (count / room) ** 0.5
+    around = GaussianModel.from_points(*(torch.from_numpy(a.astype(np.float32)) for a in arrays), _OPACITY, model.sh_degree)
+    return GaussianModel(**{name: torch.cat([value, around.tensors()[name]]) for name, value in model.tensors().items()})
+
+
+def _continued(
+    frame: Frame, light: np.ndarray, exposure: np.ndarray, reference: float, pad: int
+) -> tuple[Camera, np.ndarray, np.ndarray]:
+    """The view with a margin: its camera, depth [H', W'] (m) everywhere, and colours without light [H', W', 3]."""
+    K = frame.camera.K.copy()
+    K[:2, 2] += pad
+    camera = Camera(K, frame.camera.width + 2 * pad, frame.camera.height + 2 * pad, frame.camera.pose)
+    depth, image = np.pad(frame.depth, pad), np.pad(frame.image, ((pad, pad), (pad, pad), (0, 0))) / np.float32(255)
+    known = depth > 0
+    v, u = np.nonzero(known)
+    inverse = 1 / depth[known].astype(np.float64)
+    # A plane has inverse depth that is linear in the picture; what departs from it fades.
+    plane = np.column_stack([u, v, np.ones(len(u))])
+    step = max(len(u) // 20_000, 1)
+    slope = np.linalg.lstsq(plane[::step], inverse[::step], rcond=None)[0]
+    flat = slope[0] * np.arange(camera.width) + slope[1] * np.arange(camera.height)[:, None] + slope[2]
+    rest = np.zeros(depth.shape, np.float32)
+    rest[known] = inverse - flat[known]
+    low, high = np.percentile(inverse, [1, 99])
+    depth = 1 / np.clip(flat + _filled(rest[..., None], known)[..., 0], 0.8 * low, 1.2 * high)
+    lit = np.exp((features_at(camera.backproject(depth).reshape(-1, 3), camera, reference) @ light)[:, None] + exposure)
+    colors = np.clip(image.reshape(-1, 3) / lit, 0, _BRIGHTEST).reshape(image.shape).astype(np.float32)
+    tissue = np.zeros(known.shape, bool)
+    rows, columns = frame.depth.shape
+    tissue[pad : pad + rows, pad : pad + columns] = True if frame.mask is None else frame.mask > 0
+    return camera, depth, _filled(colors, tissue)
+
+
+def _unknown(points: np.ndarray, frames: list[Frame]) -> np.ndarray:
+    """Which points [N] lie where no view knows the depth."""
+    unknown = np.ones(len(points), bool)
+    for frame in frames:
+        if frame.depth is None:
+            continue
+        uv, z = frame.camera.project(points)
+        inside = np.nonzero((z > 0) & (uv >= 0).all(1) & (uv < [frame.camera.width, frame.camera.height]).all(1))[0]
+        u, v = np.floor(uv[inside]).astype(int).T
+        unknown[inside[frame.depth[v, u] > 0]] = False
+    return unknown
+
+
+def _filled(values: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Values [H, W, C] where known [H, W]; elsewhere the mean over ever wider surroundings (pull-push)."""
+    weight = known.astype(np.float32)
+    levels = [(weight, values.astype(np.float32) * weight[..., None])]
+    while min(levels[-1][0].shape) > 1:
+        weight, total = (_halved(array) for array in levels[-1])
+        scale = np.maximum(weight, 1)
+        levels.append((weight / scale, total / scale[..., None]))
+    weight, total = levels[-1]
+    mean = sum(t.reshape(-1, t.shape[-1]).sum(0) for _, t in levels[-1:]) / max(float(weight.sum()), 1e-6)
+    filled = total + (1 - weight)[..., None] * mean
+    for weight, total in levels[-2::-1]:
+        coarse = cv2.resize(filled, weight.shape[::-1], interpolation=cv2.INTER_LINEAR).reshape(total.shape)
+        filled = total + (1 - weight)[..., None] * coarse
+    return filled
+
+
+def _halved(array: np.ndarray) -> np.ndarray:
+    """Sums of 2 × 2 pixels; an odd row or column is alone."""
+    rows, columns = array.shape[:2]
+    padded = np.pad(array, ((0, rows % 2), (0, columns % 2), *[(0, 0)] * (array.ndim - 2)))
+    return padded[::2, ::2] + padded[1::2, ::2] + padded[::2, 1::2] + padded[1::2, 1::2]

@@ -6,7 +6,7 @@ import torch
 
 from endo_sim_ros.cameras import Camera
 from endo_sim_ros.gaussians import GaussianModel
-from endo_sim_ros.physics import PhysicsConfig, Skinning, TissueBatch, TissueSimulation, build_control_nodes
+from endo_sim_ros.physics import PhysicsConfig, Skinning, TissueBatch, TissueSimulation, build_control_nodes, mpm
 from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 from endo_sim_ros.splatting import rasterize, render
@@ -80,6 +80,15 @@ def test_physics_agrees_step_for_step(kinematics, material):
     np.testing.assert_allclose(cuda["positions"], cpu["positions"], atol=2e-3 * moved)
     np.testing.assert_allclose(cuda["F"], cpu["F"], atol=5e-3)
     np.testing.assert_allclose(cuda["felt"], cpu["felt"], atol=0.01 * np.abs(cpu["felt"]).max())
+
+
+@pytest.mark.parametrize("count", [300, 2000, 4500, 9000])
+def test_blocks_that_share_the_tissue_agree_with_launches_for_each_substep(count, monkeypatch):
+    one, few = touch("cuda", node_count=count, relaxation=0.5)
+    monkeypatch.setattr(mpm.cluster, "divide", lambda *arguments: None)
+    many = touch("cuda", node_count=count, relaxation=0.5)[1]
+    np.testing.assert_allclose(few["positions"], many["positions"], atol=2e-3 * np.abs(many["positions"] - one.nodes.rest).max())
+    np.testing.assert_allclose(few["felt"], many["felt"], atol=2e-2 * np.abs(many["felt"]).max())
 
 
 def test_the_same_touches_give_the_same_bits_twice():

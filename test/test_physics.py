@@ -31,6 +31,7 @@ from endo_sim_ros.physics import (
     sample_farthest,
     sound_speed,
 )
+from endo_sim_ros.physics import mpm_cluster_kernels as cluster
 from endo_sim_ros.physics.materials import MATERIALS, energy_density, kirchhoff_stress, rotation_of
 
 EYE = np.zeros(3)  # the camera of the test scene, looking along +z
@@ -291,6 +292,33 @@ def test_rest_state_stays_bit_identical_without_force(kinematics, material):
     np.testing.assert_array_equal(state.positions, state.rest)
     np.testing.assert_array_equal(state.F, np.tile(np.eye(3, dtype=np.float32), (len(state.F), 1, 1)))
     assert state.time == pytest.approx(0.12) and state.positions.dtype == np.float32
+
+
+@pytest.mark.parametrize("count", [20, 700, 2000, 4000])
+def test_blocks_of_a_cluster_add_up_what_all_nodes_give_to_a_grid_node(count):
+    solver = simulate(node_count=count).solver
+    corners = solver._corners()
+    division = cluster.divide(solver.rest_cells, corners)
+    given = np.random.default_rng(0).normal(size=corners.shape)
+    expected = np.zeros(corners.max() + 1)
+    np.add.at(expected, corners, given)
+    assert sorted(division.nodes[division.nodes >= 0]) == list(range(len(corners)))
+    patch, planes = division.shares.shape[1], -(-3 // division.passes)
+    sums = np.zeros((cluster.CLUSTER, patch))
+    for nodes, slots, rows, block in zip(division.nodes, division.slots, division.rows, sums):
+        for n in range(division.passes):
+            part = slice(9 * planes * n, 9 * planes * (n + 1))
+            memory = np.full(cluster.SHARED, np.nan)
+            memory[slots[nodes >= 0, part]] = given[nodes[nodes >= 0], part]
+            block += [memory[begin:end].sum() for begin, end in zip(rows[n], rows[n, 1:])]
+    for nodes, places, shares in zip(division.nodes, division.corners, division.shares):
+        totals = np.array([sums.ravel()[division.published[begin:end]].sum() for begin, end in shares])
+        np.testing.assert_allclose(totals[places[nodes >= 0]], expected[corners[nodes[nodes >= 0]]], atol=1e-12)
+
+
+def test_more_nodes_than_a_cluster_holds_are_not_divided():
+    solver = simulate(curved_sheet(20_000), node_count=8000).solver
+    assert cluster.divide(solver.rest_cells, solver._corners()) is None
 
 
 @pytest.mark.parametrize("kinematics", ["rest", "current"])

@@ -48,7 +48,7 @@ def rotation_of(F: wp.mat33) -> wp.mat33:
     R = F
     if J > 0.02 * size * wp.sqrt(size):
         for _ in range(12):
-            following = 0.5 * (R + cofactor(R) / wp.determinant(R))
+            following = 0.5 * R + (0.5 / wp.determinant(R)) * cofactor(R)
             change = following - R
             R = following
             if wp.ddot(change, change) < 1.0e-9:  # quadratic convergence: the next change would be below rounding

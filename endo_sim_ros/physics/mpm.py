@@ -11,6 +11,7 @@ import torch
 import warp as wp
 
 from endo_sim_ros.device import cpu_threads, init_warp, on_torch_stream, pick_device, run_in_threads
+from endo_sim_ros.physics import mpm_cluster_kernels as cluster
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes
 from endo_sim_ros.physics.cutting import CutTable, first_nodes
@@ -43,6 +44,7 @@ MARGIN_CELLS = 2.0  # between the nodes and the edge of the grid; a spline reach
 MIN_CELL, MAX_CELL = 1e-6, 1e3  # m; beyond these float32 no longer holds masses and stiffnesses
 MAX_GRID_NODES = 64_000_000  # 28 bytes each
 BLOCK = 64  # threads of a GPU's block: a few thousand nodes then reach many multiprocessors
+STENCIL = np.stack(np.meshgrid(*[np.arange(3)] * 3, indexing="ij"), -1).reshape(27, 3)  # grid nodes around a node, k fastest
 MAX_SUBSTEPS = 100_000  # beyond it a step of the default tissue takes a minute
 
 
@@ -106,6 +108,7 @@ class Launch:
     kernel: wp.Kernel
     dim: int | tuple[int, ...]
     inputs: list
+    block: int = BLOCK  # threads of a GPU's block
 
 
 class MpmSolver:
@@ -301,7 +304,7 @@ class MpmSolver:
     def launch(self, launch: Launch) -> None:
         """Launch now."""
         with on_torch_stream(self.device):
-            wp.launch(launch.kernel, launch.dim, launch.inputs, device=self.device, block_dim=BLOCK)
+            wp.launch(launch.kernel, launch.dim, launch.inputs, device=self.device, block_dim=launch.block)
 
     def step(self) -> None:
         """Take one step in every environment."""
@@ -338,7 +341,7 @@ class MpmSolver:
         for name in ("u", "F", "Q"):
             actions.append(partial(wp.copy, getattr(self._backup, name), getattr(self.state, name)))
         actions += [array.zero_ for array in (self.bad_nodes, self._speed_sq, self.rigid.impulse, self.rigid.moment)]
-        actions += self._vectorised_step() if self._vectorised else self._launched_substeps()
+        actions += self._vectorised_step() if self._vectorised else self._clustered_step() or self._launched_substeps()
         actions.append(self._action(Launch(check_nodes, every, check)))
         actions.append(self._action(Launch(undo_bad_steps, every, [self.bad_nodes, count, self._backup, self.state])))
         return actions + [self._action(launch) for launch in (*self._after, *self._last)]
@@ -352,8 +355,8 @@ class MpmSolver:
         if self.device == "cpu":
             wp.load_module(launch.kernel.module, device="cpu")
             return wp.launch(*arguments, device="cpu", record_cmd=True).launch
-        wp.load_module(launch.kernel.module, device=self.device, block_dim=BLOCK)
-        return partial(wp.launch, *arguments, device=self.device, block_dim=BLOCK)
+        wp.load_module(launch.kernel.module, device=self.device, block_dim=launch.block)
+        return partial(wp.launch, *arguments, device=self.device, block_dim=launch.block)
 
     def _vectorised_step(self) -> list[Callable[[], None]]:
         """CPU: one launch for all substeps; environments are shared out among threads, each with its scratch memory."""
@@ -373,6 +376,21 @@ class MpmSolver:
             for slot, (begin, end) in enumerate(zip(ends, ends[1:]))
         ]
         return [lambda: run_in_threads(launches)]
+
+    def _clustered_step(self) -> list[Callable[[], None]]:
+        """One launch for all substeps, on a GPU with clusters of multiprocessors; none for more nodes than they hold."""
+        if self.device == "cpu" or self.config.kinematics == "current" or wp.get_device(self.device).arch < 90:
+            return []
+        division = cluster.divide(self.rest_cells, self._corners())
+        if division is None:
+            return []
+        kernel = cluster.make_step_kernel(self.config.material, *division[:4])
+        if wp.get_cuda_max_cluster_dim(kernel, self.device, block_dim=cluster.BLOCK) < cluster.CLUSTER:
+            return []
+        tables = [wp.array(values, dtype=int, device=self.device) for values in division[4:]]
+        given = self._zeros(2 * self.environments * division.shares[..., 0].size, wp.vec4)
+        inputs = [self.nodes, self.state, self.loads, self.rigid, self._grid, self._substep, self.substepping.count, self._scale]
+        return [self._action(Launch(kernel, self.environments * cluster.THREADS, [*inputs, *tables, given], cluster.BLOCK))]
 
     def _launched_substeps(self) -> list[Callable[[], None]]:
         """Two launches for each substep with rest kinematics, three with current kinematics."""
@@ -404,26 +422,23 @@ class MpmSolver:
                 actions += collecting
         return actions
 
+    def _corners(self) -> np.ndarray:
+        """Numbers of each node's grid nodes [M, 27], for rest kinematics."""
+        corners = np.ravel_multi_index(tuple(np.moveaxis(self._first[:, None] + STENCIL, -1, 0)), self.grid_shape)
+        corners[self._row >= 0] = self._table[self._row[self._row >= 0]]
+        return corners
+
     def _entries(self) -> tuple[wp.array, wp.array, wp.array, wp.array]:
         """For each grid node the nodes that give to it, as `collect` reads them."""
-        steps = np.stack(np.meshgrid(*[np.arange(3)] * 3, indexing="ij"), -1).reshape(27, 3)
         f = self.rest_cells - self._first  # [M, 3]
         splines = np.stack([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1) ** 2, 0.5 * (f - 0.5) ** 2], -1)  # [M, 3, 3]
-        weights = splines[:, 0, steps[:, 0]] * splines[:, 1, steps[:, 1]] * splines[:, 2, steps[:, 2]]  # [M, 27]
-        corners = self._first[:, None] + steps
-        numbers = np.ravel_multi_index(tuple(np.moveaxis(corners, -1, 0)), self.grid_shape)
-        numbers[self._row >= 0] = self._table[self._row[self._row >= 0]]
-        offsets = np.concatenate([steps - f[:, None], weights[..., None]], -1).reshape(-1, 4)
-        order = np.argsort(numbers.ravel(), kind="stable")
+        weights = splines[:, 0, STENCIL[:, 0]] * splines[:, 1, STENCIL[:, 1]] * splines[:, 2, STENCIL[:, 2]]  # [M, 27]
+        offsets = np.concatenate([STENCIL - f[:, None], weights[..., None]], -1).reshape(-1, 4)
+        numbers = self._corners().ravel()
+        order = np.argsort(numbers, kind="stable")
         places, counts = np.unique(numbers, return_counts=True)
         starts = np.concatenate([[0], np.cumsum(counts)])
-        members = np.repeat(np.arange(self.node_count), 27)[order]
-        return (
-            self._array(starts, int),
-            self._array(members, int),
-            self._array(offsets[order], wp.vec4),
-            self._array(places, int),
-        )
+        return self._array(starts, int), self._array(order // 27, int), self._array(offsets[order], wp.vec4), self._array(places, int)
 
     def displacements(self, environment: int = 0) -> np.ndarray:
         """Displacements [M, 3], m, world axes. Those of pinned nodes are how far their springs give way."""

@@ -1,5 +1,6 @@
 """`endo-sim evaluate`: sequences × splits × methods × seeds, each trained and measured on its own."""
 
+import contextlib
 import dataclasses
 import functools
 import json
@@ -21,6 +22,7 @@ import torch
 import yaml
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
+from endo_sim_ros.cameras import Camera
 from endo_sim_ros.config import ConfigError
 from endo_sim_ros.device import cpu_threads, pick_device
 from endo_sim_ros.evaluation import figures, metrics, tables
@@ -73,6 +75,7 @@ class Prepared(NamedTuple):
     frames: list[Frame]  # left; those that no split trains on are as small as is measured
     right: list[Frame]  # the right images as views, for the split of that name
     depth_source: str  # where the reference depth of the frames is from: recorded, stereo matching, or none
+    points: tuple[np.ndarray, np.ndarray] | None = None  # of structure from motion with all views, for methods that start from them
 
 
 def evaluate(sequences: Sequence[str], config: EvaluationConfig) -> dict[str, Any]:
@@ -249,7 +252,12 @@ def _prepare(cells: Sequence[Cell], bar: Progress) -> Prepared:
     width = max(cell.options["image_width"] for cell in cells)
     right = [shrink(frame, width) for frame in right_views(matched)] if STEREO in splits else []
     small = lambda frame: shrink(dataclasses.replace(frame, right=None, baseline=None, right_K=None), width)
-    return Prepared([f if i in trained else small(f) for i, f in enumerate(frames)], right, depth_source)
+    found = None
+    if any(cell.options["initialization"] == "points" for cell in cells):
+        task = bar.add_task(f"scene points of {cells[0].sequence}", total=None)
+        found = triangulate(spread(frames, 2 * _POINT_VIEWS))[:2]
+        bar.remove_task(task)
+    return Prepared([f if i in trained else small(f) for i, f in enumerate(frames)], right, depth_source, found)
 
 
 def _trusted(frame: Frame) -> np.ndarray | None:
@@ -348,8 +356,12 @@ def _network(name: str, weights: Path | None, device: str) -> Lpips:
 @functools.lru_cache(maxsize=1)
 def _warm_up(device: str) -> None:
     """Load or compile every kernel, which is no part of the time of a training."""
-    frames = list(phantom_sequence(PhantomConfig(frames=2, width=64, height=48)))
-    Trainer(frames, ReconstructionConfig(iterations=3, max_gaussians=500, device=device)).run()
+    image = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
+    camera, poses = Camera(np.array([[60, 0, 32], [0, 60, 24], [0, 0, 1]]), 64, 48), np.tile(np.eye(4), (2, 1, 1))
+    poses[1, 0, 3] = 0.005
+    frames = [Frame(i, image, camera.at(pose), depth=np.full((48, 64), 0.1, np.float32)) for i, pose in enumerate(poses)]
+    with contextlib.suppress(SequenceError):  # they need not make a scene
+        Trainer(frames, ReconstructionConfig(iterations=3, max_gaussians=500, depth="topic", device=device)).run()
 
 
 def _job(argument: tuple, device: str, report: Callable[[Any], None]) -> dict[str, Any]:
@@ -362,6 +374,8 @@ def _job(argument: tuple, device: str, report: Callable[[Any], None]) -> dict[st
     views = [prepared.frames[index] for index in split.train]
     if not (cell.train_depth and prepared.depth_source == "recorded"):
         views = [dataclasses.replace(view, depth=None) for view in views]
+    # As the papers do it, which have them from structure from motion with all views.
+    points = prepared.points if config.initialization == "points" else None
     if cell.mono or split.right:
         views = [dataclasses.replace(view, right=None, baseline=None, right_K=None) for view in views]
     held_out = [shrink(frame, config.image_width) for frame in _held_out(prepared, split)]
@@ -370,7 +384,7 @@ def _job(argument: tuple, device: str, report: Callable[[Any], None]) -> dict[st
     training: dict[str, Any] = {}
 
     def train() -> None:
-        training.update(_train(views, config, spread(held_out, _CURVE_VIEWS), cell.curve, report))
+        training.update(_train(views, config, points, spread(held_out, _CURVE_VIEWS), cell.curve, report))
 
     memory = peak_megabytes(train, device)
     model = training.pop("model")
@@ -423,7 +437,9 @@ def _held_out(prepared: Prepared, split: Split) -> list[Frame]:
     return prepared.right if split.right else [prepared.frames[index] for index in split.held_out]
 
 
-def _train(views: list[Frame], config: ReconstructionConfig, probes: list[Frame], moments: int, report: Callable) -> dict[str, Any]:
+def _train(
+    views: list[Frame], config: ReconstructionConfig, points: tuple | None, probes: list[Frame], moments: int, report: Callable
+) -> dict[str, Any]:
     """Train; the seconds that it took, without those of the measurements for the curve."""
 
     def now() -> float:
@@ -432,7 +448,7 @@ def _train(views: list[Frame], config: ReconstructionConfig, probes: list[Frame]
         return time.perf_counter()
 
     curve, start, away = [], now(), 0.0
-    trainer = Trainer(views, config)
+    trainer = Trainer(views, config, points)
     # Quality changes fastest in the beginning.
     due = sorted({round(config.iterations * 50 ** (i / max(moments - 1, 1) - 1)) for i in range(moments)})
 

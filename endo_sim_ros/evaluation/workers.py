@@ -44,9 +44,8 @@ def run_in_processes(job: Job, arguments: Sequence[Any], devices: Sequence[str])
         devices: Where the processes compute; a device may be there several times.
     """
     waiting, workers = list(enumerate(arguments)), []
-    on_cpu = max(sum(device == "cpu" for device in devices), 1)
     try:
-        workers = [_Worker(job, device, max(cpu_threads() // on_cpu, 1)) for device in devices[: len(arguments)]]
+        workers = [_Worker(job, device, max(cpu_threads() // len(devices), 1)) for device in devices[: len(arguments)]]
         while waiting or any(worker.index is not None for worker in workers):
             for worker in workers:
                 if worker.index is None and waiting:

@@ -60,7 +60,7 @@ class Light:
     def shade(self, colors: Tensor, depths: Tensor, alphas: Tensor, camera: Camera) -> Tensor:
         """What the camera makes of a rendered picture: colours [H, W, 3], with Σ w z [H, W] (m) and alpha [H, W]."""
         theta = colors.new_tensor([self.distance, self.angle, self.tilt_x, self.tilt_y])
-        lit = colors * falloff(features(depths, alphas, camera, self.reference), theta)[..., None]
+        lit = colors * falloff(features(depths, alphas, directions(camera, colors.device), self.reference), theta)[..., None]
         level = colors.new_tensor([self.level_r, self.level_g, self.level_b])
         return lit * (level - self.response * log_brightness(lit, alphas > _SURFACE)).exp()
 
@@ -83,22 +83,31 @@ class Light:
 
 
 @functools.lru_cache(maxsize=64)
-def _angles(fx: float, fy: float, cx: float, cy: float, width: int, height: int, device: torch.device) -> Tensor:
-    """Logarithm of the cosine of the angle from the axis, and the slopes x and y, of every pixel [3, H, W]."""
+def _directions(fx: float, fy: float, cx: float, cy: float, width: int, height: int, device: torch.device) -> Tensor:
     x = (torch.arange(width, dtype=torch.float64) + 0.5 - cx) / fx
     y = (torch.arange(height, dtype=torch.float64) + 0.5 - cy) / fy
     y, x = torch.meshgrid(y, x, indexing="ij")
     return torch.stack([-0.5 * (1 + x * x + y * y).log(), x, y]).to(device, torch.float32)
 
 
-def features(depths: Tensor, alphas: Tensor, camera: Camera, reference: float) -> Tensor:
-    """The four quantities [4, H, W] that brightness depends on: −log(d/reference), log cos θ, x and y. No gradient."""
+def directions(camera: Camera, device: torch.device | str) -> Tensor:
+    """Logarithm of the cosine of the angle from the axis, and the slopes x and y, of a camera's pixels [3, H, W]."""
     K = camera.K
-    angles = _angles(*(float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2])), camera.width, camera.height, depths.device)
+    return _directions(*(float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2])), camera.width, camera.height, torch.device(device))
+
+
+def features(depths: Tensor, alphas: Tensor, directions: Tensor, reference: float) -> Tensor:
+    """The four quantities [4, H, W] that brightness depends on: −log(d/reference), log cos θ, x and y. No gradient.
+
+    Args:
+        depths, alphas: Σ w z [H, W], metres, and Σ w [H, W].
+        directions: Those of the camera's pixels [3, H, W].
+        reference: Distance at which brightness is the tissue's own, metres.
+    """
     depth = depths.detach() / alphas.detach().clamp_min(_NEAREST)
     # Where nothing is drawn there is nothing to be lit.
-    distance = torch.where(alphas > _NEAREST, depth.clamp_min(_NEAREST) / reference, 1).log() - angles[0]
-    return torch.cat([-distance[None], angles])
+    distance = torch.where(alphas > _NEAREST, depth.clamp_min(_NEAREST) / reference, 1).log() - directions[0]
+    return torch.cat([-distance[None], directions])
 
 
 def falloff(quantities: Tensor, theta: Tensor) -> Tensor:

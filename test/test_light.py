@@ -11,7 +11,7 @@ import torch
 from endo_sim_ros import messages
 from endo_sim_ros.cameras import Camera, look_at
 from endo_sim_ros.gaussians import GaussianModel, ModelError, load_ply, save_ply
-from endo_sim_ros.light import Light, features, features_at
+from endo_sim_ros.light import Light, directions, features, features_at
 from endo_sim_ros.messages import MessageError
 from endo_sim_ros.reconstruction.photometry import PRIOR, fit_exposure, fit_light, unlit
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
@@ -45,7 +45,7 @@ def test_points_and_pixels_have_the_same_quantities():
     rng = np.random.default_rng(0)
     depth = rng.uniform(0.08, 0.2, (128, 160)).astype(np.float32)
     alpha = np.full_like(depth, 0.7)
-    image = features(torch.from_numpy(depth * alpha), torch.from_numpy(alpha), camera, 0.1)
+    image = features(torch.from_numpy(depth * alpha), torch.from_numpy(alpha), directions(camera, "cpu"), 0.1)
     points = camera.backproject(depth).reshape(-1, 3)
     np.testing.assert_allclose(image.reshape(4, -1).T.numpy(), features_at(points, camera, 0.1), atol=1e-5)
 

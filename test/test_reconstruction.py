@@ -428,9 +428,9 @@ def test_virtual_camera_lies_between_two_views(small, monkeypatch):
     seen = []
     draw = trainer._render
 
-    def spy(viewmat, K, camera, masks=None, absgrad=None):
-        seen.append(camera.position)
-        return draw(viewmat, K, camera, masks, absgrad)
+    def spy(cameras, *arguments):
+        seen.extend(camera.position for camera in cameras)
+        return draw(cameras, *arguments)
 
     monkeypatch.setattr(trainer, "_render", spy)
     for _ in range(3):

@@ -10,8 +10,9 @@ from endo_sim_ros.config import Range, StageConfig
 class ReconstructionConfig(StageConfig):
     """From sparse posed views to a Gaussian model."""
 
-    preset: Literal["default", "paper", "fsgs", "3dgs"] = "default"
-    """Method: ours, that of the paper as printed, FSGS, or 3DGS. Options left at their defaults take its values."""
+    preset: Literal["default", "laptop", "paper", "fsgs", "3dgs"] = "default"
+    """Method: ours, ours sized for a CPU, that of the paper as printed, FSGS, or 3DGS. Options left at their defaults take
+    its values."""
     keyframes: Annotated[int, Range(1, 1000)] = 8
     """Number of views to train on, spread over the camera path."""
     image_width: Annotated[int, Range(16, 8192, "pixels")] = 640

@@ -18,7 +18,7 @@ from torch import Tensor
 from endo_sim_ros.cameras import Camera, interpolate_pose
 from endo_sim_ros.device import pick_device
 from endo_sim_ros.gaussians import GaussianModel
-from endo_sim_ros.light import Light, falloff, features, log_brightness
+from endo_sim_ros.light import Light, directions, falloff, features, log_brightness
 from endo_sim_ros.reconstruction import densification, losses, photometry
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.depth import with_depth_prior
@@ -43,6 +43,8 @@ _LAST_REFINEMENT = 0.8  # share of the iterations after which the number of Gaus
 _SEEN = 0.8  # share of the Gaussians that stand for what the training views see, at first
 _WIDEST_PARALLAX = 0.1  # of the image's width, between the eyes
 _LIGHT_ANCHOR = 1e-3  # weight of the light's changes in training
+_NARROWEST = 64  # pixels; images are not halved below when memory runs out
+_SELDOM = 4  # iterations between steps that may be taken seldom, and then are as much larger
 _EXPOSURE_RATE, _LIGHT_RATE = 1e-3, 2e-3  # learning rates of log exposures and of the light's four numbers
 
 
@@ -51,8 +53,6 @@ class _View:
     """A training view on the compute device."""
 
     camera: Camera
-    viewmat: Tensor  # [1, 4, 4]
-    K: Tensor  # [1, 3, 3]
     image: Tensor  # [H, W, 3] in [0, 1]
     depth: Tensor | None  # [H, W] m, 0 = none
     mask: Tensor | None  # [H, W] 1 = tissue
@@ -103,9 +103,7 @@ class Trainer:
             model = photometry.unlit(model, frames, light, exposures, self.scene_depth, config.depth_tolerance)
         if config.surroundings:
             model = with_surroundings(model, frames, light, exposures, self.scene_depth, config.surroundings, config.max_gaussians)
-        self._views = [self._to_device(frame, i) for i, frame in enumerate(frames)]
-        if config.right_views:
-            self._views += [self._to_device(right_view(f), i) for i, f in enumerate(frames) if f.right is not None]
+        self._load(frames)
         eye = np.mean([view.camera.position for view in self._views], 0)
         self._eye = torch.as_tensor(eye, dtype=torch.float32, device=self.device)
         self._nearest = _nearest_views(frames)
@@ -115,6 +113,7 @@ class Trainer:
         # Drawn where it is needed: a GPU that waits for numbers stands still.
         self._noise = self._generator if self.device == "cpu" else torch.Generator(self.device).manual_seed(config.seed)
         self._order: list[int] = []
+        self._graphs: dict[tuple, Callable[..., Tensor]] = {}
         self._last_loss = torch.zeros(())
         self._light_prior = torch.tensor(light, dtype=torch.float32, device=self.device)
         self._set_light(self._light_prior, torch.tensor(exposures, dtype=torch.float32, device=self.device))
@@ -143,19 +142,15 @@ class Trainer:
         exposures = self._light["exposures"].cpu().numpy().astype(np.float64)
         brightness = []
         for view in self._views[: len(exposures)]:
-            output = self._render(view.viewmat, view.K, view.camera)
-            alphas = output.alphas[0]
-            where = alphas > 0.5 if view.mask is None else (alphas > 0.5) & (view.mask > 0)
-            brightness.append(float(log_brightness(self._shaded(output, view.camera), where)))
+            output = self._render([view.camera])
+            image, depth, alpha = output.colors[0], output.depths[0], output.alphas[0]
+            if self.config.light:
+                rays = directions(view.camera, self.device)
+                image = image * falloff(features(depth, alpha, rays, self.scene_depth), self._light["light"])[..., None]
+            where = alpha > 0.5 if view.mask is None else (alpha > 0.5) & (view.mask > 0)
+            brightness.append(float(log_brightness(image, where)))
         response, levels = photometry.fit_exposure(exposures, np.array(brightness))
         return Light(*self._light["light"].tolist(), self.scene_depth, *map(float, levels), response)
-
-    def _shaded(self, output: RenderOutput, camera: Camera) -> Tensor:
-        """The rendered colours [H, W, 3] in the light of the camera, without exposure."""
-        if not self.config.light:
-            return output.colors[0]
-        quantities = features(output.depths[0], output.alphas[0], camera, self.scene_depth)
-        return output.colors[0] * falloff(quantities, self._light["light"])[..., None]
 
     @property
     def cameras(self) -> list[Camera]:
@@ -227,13 +222,31 @@ class Trainer:
     # --------------------------------------------------------------- training
 
     def run(self, on_progress: Callable[[Progress], bool | None] | None = None, every: int = 20) -> GaussianModel:
-        """Train to the end; ``on_progress`` is called every few iterations and may return False to stop early."""
+        """Train to the end; ``on_progress`` is called every few iterations and may return False to stop early.
+
+        Out of memory, training goes on with images of half the size, as long as they are not tiny.
+        """
         while self.iteration < self.config.iterations:
-            self.step()
+            try:
+                self.step()
+            except torch.OutOfMemoryError:
+                if self._frames[0].camera.width < 2 * _NARROWEST:
+                    raise
+                self._halve()
+                continue
             due = self.iteration % every == 0 or self.iteration == self.config.iterations
             if on_progress and due and on_progress(self.progress) is False:
                 break
         return self.model
+
+    def _halve(self) -> None:
+        """Go on with images of half the size."""
+        width = self._frames[0].camera.width // 2
+        log.warning("out of memory: going on with images %d pixels wide; fewer max_gaussians may help, too", width)
+        self._optimizer.zero_grad(set_to_none=True)
+        self._graphs, self._views = {}, []
+        torch.cuda.empty_cache()
+        self._load([shrink(frame, width) for frame in self._frames])
 
     def step(self) -> None:
         """One iteration: a training view, a virtual view, one step of the optimiser."""
@@ -241,14 +254,22 @@ class Trainer:
         if not self._order:
             self._order = torch.randperm(len(self._views), generator=self._generator).tolist()
         view = self._views[self._order.pop()]
+        virtual = None
+        if config.virtual_every and self.iteration % config.virtual_every == 0 and len(self._stamps) > 1:
+            virtual = self._virtual_camera(view.exposure)
         absgrad = None
         if config.densification != "mcmc":
-            absgrad = torch.zeros(1, len(self._parameters["means"]), 2, device=self.device, requires_grad=True)
-        loss = self._view_loss(view, absgrad)
-        if config.virtual_every and self.iteration % config.virtual_every == 0 and len(self._stamps) > 1:
-            loss = loss + self._virtual_loss(view.exposure)
-        if config.lambda_flat:
-            loss = loss + config.lambda_flat * losses.depth_extent(self._current(), self._eye).mean()
+            absgrad = torch.zeros(1 + (virtual is not None), len(self._parameters["means"]), 2, device=self.device, requires_grad=True)
+        cameras = [view.camera] if virtual is None else [view.camera, virtual]
+        masks = None if view.mask is None else (view.mask > 0)[None]
+        if masks is not None and virtual is not None:
+            masks = torch.cat([masks, torch.ones_like(masks)])
+        output = self._render(cameras, masks, absgrad)
+        loss = self._view_loss(output, view)
+        if virtual is not None:
+            loss = loss + self._virtual_loss(output, self._views[view.exposure], virtual)
+        if config.lambda_flat and self.iteration % _SELDOM == 0:
+            loss = loss + _SELDOM * config.lambda_flat * losses.depth_extent(self._current(), self._eye).mean()
         if config.light:
             loss = loss + _LIGHT_ANCHOR * ((self._light["light"] - self._light_prior) ** 2).sum()
         loss.backward()
@@ -268,59 +289,88 @@ class Trainer:
             refining = self.iteration <= _LAST_REFINEMENT * config.iterations
             if refining and self.iteration % config.refine_every == 0:
                 self._refine()
-            if config.densification == "mcmc":
+            if config.densification == "mcmc" and self.iteration % _SELDOM == 0:
                 self._explore()
 
-    def _render(
-        self, viewmat: Tensor, K: Tensor, camera: Camera, masks: Tensor | None = None, absgrad: Tensor | None = None
-    ) -> RenderOutput:
+    def _render(self, cameras: list[Camera], masks: Tensor | None = None, absgrad: Tensor | None = None) -> RenderOutput:
+        """Images of cameras of one size."""
         model = self._current()
+        tensor = lambda matrices: torch.from_numpy(np.stack(matrices).astype(np.float32)).to(self.device)
         return rasterize(
             model.means, model.quats, model.scales, model.opacities, model.sh,
-            viewmat, K, camera.width, camera.height, masks=masks, absgrad=absgrad,
+            tensor([camera.viewmat for camera in cameras]), tensor([camera.K for camera in cameras]),
+            cameras[0].width, cameras[0].height, masks=masks, absgrad=absgrad,
         )  # fmt: skip
 
-    def _view_loss(self, view: _View, absgrad: Tensor | None) -> Tensor:
-        """Paper eq. 7: photometric, depth, distortion and total variation of one training view."""
-        config = self.config
-        masks = None if view.mask is None else view.mask[None] > 0
-        output = self._render(view.viewmat, view.K, view.camera, masks, absgrad)
-        image = self._shaded(output, view.camera)
-        if config.exposure:
-            image = image * self._light["exposures"][view.exposure].exp()
-        loss = losses.photometric(image, view.image, view.mask, config.lambda_ssim)
-        if view.depth is not None:
-            if config.lambda_depth:
-                error = losses.depth_l1(output.depths[0], view.depth, view.mask)
-                loss = loss + config.lambda_depth / self.scene_depth * error
-            if config.lambda_pearson:
-                loss = loss + config.lambda_pearson * losses.pearson(output.depths[0], view.depth, view.mask)
-            if config.lambda_gradient:
-                error = losses.gradient_difference(output.depths[0], output.alphas[0], view.depth, view.mask)
-                loss = loss + config.lambda_gradient * error
-        return loss + self._regularization(output, view.mask, view.image)
-
-    def _virtual_loss(self, index: int) -> Tensor:
-        """Paper eq. 9: distortion and total variation from a virtual camera between a view and its nearest view."""
-        first, second = self._views[index], self._views[self._nearest[index]]
+    def _virtual_camera(self, index: int) -> Camera:
+        """Paper eq. 8: a random camera between a view and its nearest view."""
+        first, second = (self._views[i].camera for i in (index, self._nearest[index]))
         alpha = torch.rand((), generator=self._generator).item()
-        camera = first.camera.at(interpolate_pose(first.camera.pose, second.camera.pose, alpha))
-        viewmat = torch.as_tensor(camera.viewmat, dtype=torch.float32, device=self.device)[None]
-        output = self._render(viewmat, first.K, camera)
-        loss = self._regularization(output, None, output.colors[0].detach())
-        if self.config.lambda_pearson and first.depth is not None:
-            prior = _carried_depth(first, viewmat[0])
-            loss = loss + self.config.lambda_pearson * losses.pearson(output.depths[0], prior, None)
-        return loss
+        return first.at(interpolate_pose(first.pose, second.pose, alpha))
 
-    def _regularization(self, output: RenderOutput, mask: Tensor | None, image: Tensor) -> Tensor:
+    def _view_loss(self, output: RenderOutput, view: _View) -> Tensor:
+        """Paper eq. 7: photometric, depth, distortion and total variation of a training view, the first camera."""
+
+        def loss(colors, depth, alpha, distortion, target, rays, light, exposure, mask, prior):
+            config = self.config
+            image = colors
+            if config.light:
+                image = image * falloff(features(depth, alpha, rays, self.scene_depth), light)[..., None]
+            if config.exposure:
+                image = image * exposure.exp()
+            total = losses.photometric(image, target, mask, config.lambda_ssim)
+            if prior is not None and config.lambda_depth:
+                total = total + config.lambda_depth / self.scene_depth * losses.depth_l1(depth, prior, mask)
+            if prior is not None and config.lambda_pearson:
+                total = total + config.lambda_pearson * losses.pearson(depth, prior, mask)
+            if prior is not None and config.lambda_gradient:
+                total = total + config.lambda_gradient * losses.gradient_difference(depth, alpha, prior, mask)
+            return total + self._regularization(depth, alpha, distortion, target, mask)
+
+        exposure = self._light["exposures"][view.exposure]
+        rays = directions(view.camera, self.device)
+        images = (output.colors[0], output.depths[0], output.alphas[0], output.distortions[0])
+        return self._captured(loss, "view", *images, view.image, rays, self._light["light"], exposure, view.mask, view.depth)
+
+    def _virtual_loss(self, output: RenderOutput, view: _View, camera: Camera) -> Tensor:
+        """Paper eq. 9: distortion and total variation from a virtual camera, the second one, beside a view."""
+
+        def loss(colors, depth, alpha, distortion, prior):
+            total = self._regularization(depth, alpha, distortion, colors.detach(), None)
+            if prior is not None:
+                total = total + self.config.lambda_pearson * losses.pearson(depth, prior, None)
+            return total
+
+        prior = None
+        if self.config.lambda_pearson and view.depth is not None:
+            prior = _carried_depth(view, torch.from_numpy(camera.viewmat).to(view.depth))
+        images = (output.colors[1], output.depths[1], output.alphas[1], output.distortions[1])
+        return self._captured(loss, "virtual", *images, prior)
+
+    def _regularization(self, depth: Tensor, alpha: Tensor, distortion: Tensor, image: Tensor, mask: Tensor | None) -> Tensor:
         config, unit = self.config, self.scene_depth
-        distortion = losses.masked_mean(output.distortions[0], mask) / unit
         if config.edge_aware:
-            variation = losses.edge_aware_variation(output.depths[0], output.alphas[0], image, mask, unit)
+            variation = losses.edge_aware_variation(depth, alpha, image, mask, unit)
         else:
-            variation = losses.total_variation(output.depths[0], mask) / unit
-        return config.lambda_dist * distortion + config.lambda_tv * variation
+            variation = losses.total_variation(depth, mask) / unit
+        return config.lambda_dist * losses.masked_mean(distortion, mask) / unit + config.lambda_tv * variation
+
+    def _captured(self, function: Callable[..., Tensor], name: str, *tensors: Tensor | None) -> Tensor:
+        """The value of a function of tensors or None. On a GPU its many small steps are recorded once, then replayed as one."""
+        given = [tensor for tensor in tensors if tensor is not None]
+        present = tuple(tensor is not None for tensor in tensors)
+
+        def call(*values):
+            rest = iter(values)
+            return function(*(next(rest) if there else None for there in present))
+
+        if self.device == "cpu":
+            return call(*given)
+        key = (name, present, *(tuple(tensor.shape) for tensor in given))
+        if key not in self._graphs:
+            samples = tuple(tensor.detach().clone().requires_grad_(tensor.requires_grad) for tensor in given)
+            self._graphs[key] = torch.cuda.make_graphed_callables(call, samples, allow_unused_input=True)
+        return self._graphs[key](*given)
 
     # --------------------------------------------------------------- Gaussians
 
@@ -380,18 +430,23 @@ class Trainer:
                 return
             model = model.select(faint)
         # Variances are in m²: divided by the squared depth of the scene, steps are those of a scene of depth 1.
-        scale = _NOISE * self._optimizer.param_groups[0]["lr"] / self.scene_depth**2
+        scale = _SELDOM**0.5 * _NOISE * self._optimizer.param_groups[0]["lr"] / self.scene_depth**2
         self._parameters["means"][faint] += densification.exploration_noise(model, scale, self._noise)
 
     # --------------------------------------------------------------- inputs
+
+    def _load(self, frames: list[Frame]) -> None:
+        """Train on these from now on."""
+        self._frames = frames
+        self._views = [self._to_device(frame, i) for i, frame in enumerate(frames)]
+        if self.config.right_views:
+            self._views += [self._to_device(right_view(f), i) for i, f in enumerate(frames) if f.right is not None]
 
     def _to_device(self, frame: Frame, exposure: int) -> _View:
         tensor = lambda array: torch.tensor(array, dtype=torch.float32, device=self.device)
         camera = frame.camera
         return _View(
             camera,
-            tensor(camera.viewmat)[None],
-            tensor(camera.K)[None],
             tensor(frame.image) / 255,
             None if frame.depth is None else tensor(frame.depth),
             None if frame.mask is None or frame.mask.all() else tensor(frame.mask > 0),
@@ -485,9 +540,10 @@ def _carried_depth(view: _View, viewmat: Tensor) -> Tensor:
     """The prior of a view as another camera [4, 4] of its kind sees it [H, W], metres; 0 where nothing falls."""
     height, width = view.depth.shape
     v, u = (view.depth > 0).nonzero(as_tuple=True)
-    K, z = view.K[0], view.depth[v, u]
+    K, pose = (torch.from_numpy(matrix).to(viewmat) for matrix in (view.camera.K, view.camera.pose))
+    z = view.depth[v, u]
     local = torch.stack([(u + 0.5 - K[0, 2]) / K[0, 0] * z, (v + 0.5 - K[1, 2]) / K[1, 1] * z, z, torch.ones_like(z)], 1)
-    x, y, z = (local @ (viewmat @ torch.linalg.inv(view.viewmat[0]))[:3].T).unbind(1)
+    x, y, z = (local @ (viewmat @ pose)[:3].T).unbind(1)
     u, v = (x / z * K[0, 0] + K[0, 2]).floor(), (y / z * K[1, 1] + K[1, 2]).floor()
     inside = (z > 0) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
     index = (v * width + u)[inside].long()

@@ -173,9 +173,11 @@ def test_the_peer_is_measured_where_it_works_and_otherwise_noted(working, tmp_pa
     out = capsys.readouterr().out
     assert "loud" not in out
     if working:
-        assert ("PhysGaussian's solver, 100 nodes, 16³ grid, 80 substeps", None) in rows
-        for kinematics in ("current", "rest"):
-            assert rows[f"100 nodes, {kinematics} kinematics, 80 substeps", "PhysGaussian's solver"]["ratio"] > 0
+        assert ("PhysGaussian's solver, 100 nodes, 16³ grid", None) in rows
+        for name in ("80 substeps", "default"):
+            assert rows[f"100 nodes, {name}", "PhysGaussian's solver, 100 nodes"]["ratio"] > 0
+            skinned = [row for (what, _), row in rows.items() if what.startswith("100 nodes and skin of") and what.endswith(name)]
+            assert len(skinned) == 1 and skinned[0]["ratio"] > 0 and "dense nodes" in skinned[0]["peer"]
     else:
         assert not rows and "PhysGaussian's solver could not be measured: ModuleNotFoundError: No module named" in out
 

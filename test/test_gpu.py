@@ -82,7 +82,7 @@ def test_physics_agrees_step_for_step(kinematics, material):
     np.testing.assert_allclose(cuda["felt"], cpu["felt"], atol=0.01 * np.abs(cpu["felt"]).max())
 
 
-@pytest.mark.parametrize("count", [300, 2000, 4500, 9000])
+@pytest.mark.parametrize("count", [700, 2000, 4000])
 def test_blocks_that_share_the_tissue_agree_with_launches_for_each_substep(count, monkeypatch):
     one, few = touch("cuda", node_count=count, relaxation=0.5)
     monkeypatch.setattr(mpm.cluster, "divide", lambda *arguments: None)

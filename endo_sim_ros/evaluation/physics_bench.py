@@ -333,15 +333,11 @@ def _over_gaussians(count: int, plan: Plan, device: str) -> list[Row]:
     def skinning(vectorised: bool = True) -> Skinning:
         return Skinning(scene.model, nodes.rest, device=device, vectorised=vectorised)
 
-    def both(vectorised: bool) -> Callable[[], object]:
-        solver = MpmSolver(nodes, config, vectorised=vectorised)
-        _pull(Tools(solver, nodes, config), scene)
-        solver.end_with(skinning(vectorised).launches(solver.state.u, solver.state.F, nodes.pinned, 1)[0])
-        return solver.step
-
     name, seconds = short(count), plan.seconds
     rows = _against_plain(f"skin {name}", lambda vectorised: partial(skinning(vectorised).deform, positions, F), device, seconds)
-    rows += _against_plain(f"step and skin {name}", both, device, seconds)
+    rows += _against_plain(
+        f"step and skin {name}", lambda vectorised: _pulled_with_skin(scene, config, vectorised).step, device, seconds
+    )
     one, apart, skin = moving(), moving(), skinning()
     one.carry(skin)
     together, separate = milliseconds([one.step, lambda: (apart.step(), skin.deform(apart.positions()[0], apart.F[0]))], device, seconds)
@@ -412,35 +408,51 @@ def _memory(scene: Scene, count: int, device: str) -> list[Row]:
 # ---------------------------------------------------------------- a peer
 
 PEER = "PhysGaussian's"
+PEER_GAUSSIANS = 100_000  # of the scene that both move on a GPU, beside the plan's own
 
 
 def _beside_peer(scene: Scene, device: str, plan: Plan, notes: list[str]) -> list[Row]:
-    """80 substeps of the same nodes by us and by the solver that PhysGaussian uses, where it can be imported."""
+    """The solver that PhysGaussian uses, where it can be imported: with the nodes that we step, and its way, with every Gaussian.
+
+    All take a step of the same duration, PhysGaussian's solver and the rows that say so in 80 substeps.
+    """
     if not importlib.util.find_spec("mpm_solver_warp"):
         return []
-    grid = plan.peer_grid or (48 if device == "cpu" else 100)
-    common = {"adapt_substeps": False, "device": device}
-    printed = PhysicsConfig(node_count=plan.printed_nodes, layers=0, kinematics="current", **common)
-    configs = {short(plan.printed_nodes): [printed, dataclasses.replace(printed, kinematics="rest")]}
-    if plan.peer_dense:
-        configs[f"{short(len(scene.model))} dense"] = [PhysicsConfig.baseline(**common)]
+    sparse = PhysicsConfig(node_count=plan.printed_nodes, layers=0, adapt_substeps=False, device=device)
+    ours = {f"{sparse.substeps} substeps": sparse, "default": PhysicsConfig(node_count=plan.printed_nodes, device=device)}
+    dense = PhysicsConfig.baseline(adapt_substeps=False, device=device)
+    nodes = short(plan.printed_nodes)
+    tried = [(scene, sparse, f"{nodes} nodes", {f"{nodes} nodes, {name}": _pulled(scene, config).step for name, config in ours.items()})]
+    for each in [scene, *([] if device == "cpu" else [phantom_scene(PEER_GAUSSIANS, plan.width)])] if plan.peer_dense else []:
+        count = short(len(each.model))
+        actions = {f"{nodes} nodes and skin of {count}, {name}": _pulled_with_skin(each, config).step for name, config in ours.items()}
+        if each is scene:
+            actions[f"{count} dense nodes, {dense.substeps} substeps"] = _pulled(each, dense).step
+        tried.append((each, dense, f"{count} dense nodes", actions))
     rows = []
-    for name, ours in configs.items():
+    for each, config, what, actions in tried:
         try:
-            nodes = build_control_nodes(scene.model, scene.camera.position, ours[0])
+            stepped = build_control_nodes(each.model, each.camera.position, config)
+            grid = plan.peer_grid or (48 if device == "cpu" else 100)
             with contextlib.redirect_stdout(io.StringIO()):
-                theirs = _physgaussian(nodes, printed, grid, device)
+                theirs = _physgaussian(stepped, config, grid, device)
                 theirs()  # compiles
-                actions = [_pulled(scene, config).step for config in ours]
-                *durations, peer = milliseconds([*actions, theirs], device, plan.seconds)
+                *durations, peer = milliseconds([*actions.values(), theirs], device, plan.seconds)
         except Exception as error:  # whatever is installed under that name, and however it fails with this Warp
             notes.append(f"{PEER} solver could not be measured: {type(error).__name__}: {error}".splitlines()[0])
             break
-        rows.append(Row(f"{PEER} solver, {name} nodes, {grid}³ grid, {printed.substeps} substeps", peer, "ms"))
-        for config, duration in zip(ours, durations):
-            title = f"{name} nodes, {config.kinematics} kinematics, {config.substeps} substeps"
-            rows.append(Row(title, duration, "ms", duration / peer, f"{PEER} solver"))
+        rows.append(Row(f"{PEER} solver, {what}, {grid}³ grid", peer, "ms"))
+        rows += [Row(name, duration, "ms", duration / peer, f"{PEER} solver, {what}") for name, duration in zip(actions, durations)]
     return rows
+
+
+def _pulled_with_skin(scene: Scene, config: PhysicsConfig, vectorised: bool = True) -> MpmSolver:
+    """A solver whose tissue a tool pulls and whose step ends with the Gaussians where it took them."""
+    solver = _pulled(scene, config, vectorised)
+    nodes = build_control_nodes(scene.model, scene.camera.position, config)
+    skinning = Skinning(scene.model, nodes.rest, device=config.device, vectorised=vectorised)
+    solver.end_with(skinning.launches(solver.state.u, solver.state.F, nodes.pinned, 1)[0])
+    return solver
 
 
 def _physgaussian(nodes: ControlNodes, config: PhysicsConfig, grid: int, device: str) -> Callable[[], None]:

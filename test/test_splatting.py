@@ -654,7 +654,7 @@ def test_pictures_for_whose_lists_there_is_no_room_are_the_same(device, monkeypa
 
 def test_memory_that_runs_out_is_asked_for_again(monkeypatch):
     scratch = rasterizer_tiled._Scratch(torch.device("cpu"))
-    scratch.reserve(10, 1)
+    scratch.reserve_splats(10)
 
     def run_out(count, dtype=torch.int32):
         raise torch.OutOfMemoryError
@@ -662,9 +662,26 @@ def test_memory_that_runs_out_is_asked_for_again(monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(scratch, "_integers", run_out)
         with pytest.raises(torch.OutOfMemoryError):
-            scratch.reserve(20, 1)
-    room = scratch.reserve(20, 1)
-    assert len(scratch.depth_keys) == len(scratch.order) == 40 and len(scratch.tiles) == len(scratch.values) >= 2 * room
+            scratch.reserve_splats(20)
+    scratch.reserve_splats(20)
+    assert len(scratch.depth_keys) == len(scratch.order) == 40
+    scratch.ends.fill_(1000)
+    with monkeypatch.context() as patch:
+        patch.setattr(scratch, "_integers", run_out)
+        with pytest.raises(torch.OutOfMemoryError):
+            scratch.reserve_lists(1)
+    room = scratch.reserve_lists(1)
+    assert room >= 1000 and len(scratch.tiles) == len(scratch.values) == 2 * room
+
+
+def test_the_first_picture_on_a_cpu_has_room():
+    rasterizer_tiled._scratch.cache_clear()
+    gaussians, cameras = make_gaussians(20, seed=33), make_cameras(1, 300, 200)
+    gaussians[2] *= 10
+    with rasterizer.scalar_kernels():
+        run(rasterize, gaussians, cameras, size=(300, 200), dtype=torch.float32)
+    scratch = rasterizer_tiled._scratch(torch.device("cpu"), 0)
+    assert rasterizer_tiled._FIRST_GUESS * 20 * 1.5 < scratch.seen[0] <= scratch.room
 
 
 def test_room_follows_what_pictures_needed():
@@ -678,9 +695,9 @@ def test_room_follows_what_pictures_needed():
     assert 64_000_000 <= expectation.room(1_000_000) < 100_000_000
 
 
-def test_pictures_in_inference_mode_do_not_disturb_later_gradients():
-    rasterizer._black.cache_clear()
-    rasterizer._all_tiles.cache_clear()
+def test_pictures_in_inference_mode_do_not_disturb_later_gradients(compositor):
+    for cache in (rasterizer._black, rasterizer._all_tiles, rasterizer_tiled._scratch):
+        cache.cache_clear()
     *gaussians, viewmats, Ks = (x.float() for x in (*make_gaussians(), *make_cameras()))
     with torch.inference_mode():
         expected = rasterize(*gaussians, viewmats, Ks, WIDTH, HEIGHT).colors

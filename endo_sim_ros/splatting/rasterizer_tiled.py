@@ -43,14 +43,15 @@ def forward(scene: Scene, tile_mask: Tensor, settings: Settings) -> tuple[list[T
     with _lock, on_torch_stream(device):  # the scratch memory serves one picture after the other, and Warp has one stream
         if splat_count:
             scratch = _scratch(device, _stream(device))
-            room = scratch.reserve(splat_count, tile_count)
-            splat_list = integers(room)
+            scratch.reserve_splats(splat_count)
             arguments = [*scene.gaussian_arguments(), *_cameras(scene, settings), settings.near, settings.eps2d, tile_mask]
             outputs = [splats, radii, scratch.depth_keys, scratch.order, counts]
             _launch(kernels.project, splat_count, [0, *arguments, *outputs])
             scratch.sort_by_depth()
             _launch(tiled_kernels.gather_counts, splat_count, [scratch.order, counts, scratch.sorted_counts])
             scratch.sum_counts()
+            room = scratch.reserve_lists(tile_count)
+            splat_list = integers(room)
             _launch(tiled_kernels.clear_lists, room, [tile_count, ranges, scratch.tiles])
             arguments = [scratch.order, scratch.ends, counts, len(scene.means), splats, tile_mask, settings.tiles_x, settings.tiles_y]
             _launch(kernels.emit_intersections, splat_count, [0, *arguments, room, 1, scratch.tiles, scratch.values, None, None])
@@ -97,17 +98,18 @@ class _Expectation:
     """How many intersections a splat has on average, in pictures of one size.
 
     The host learns it later and without asking: the GPU writes it into the host's memory. A picture that needs more room
-    than it got comes out right all the same (see the kernels), only slower, and the next one finds room.
+    than it got comes out right all the same (see the kernels), only slower, and the next one finds room. On a CPU there is
+    nothing to wait for, and it is known at once.
     """
 
     def __init__(self, device: torch.device):
         self.seen = torch.zeros(2, dtype=torch.int64, pin_memory=device.type == "cuda")  # intersections and splats
-        self._numbers = self.seen.numpy()
+        self.numbers = self.seen.numpy()
         self._mean = _FIRST_GUESS
 
     def room(self, splat_count: int) -> int:
         """Of how many intersections the next picture should have room, in steps of √2."""
-        intersections, splats = self._numbers.tolist()
+        intersections, splats = self.numbers.tolist()
         if splats:
             self._mean = max(_FORGETTING * self._mean, intersections / splats)
         wanted = min(_SPARE * self._mean * splat_count, max(_MOST * splat_count, _ALWAYS))
@@ -122,11 +124,8 @@ class _Scratch:
         self._splat_count, self._room, self.room = 0, 0, 0
         self._expectations = collections.defaultdict(functools.partial(_Expectation, device))
 
-    def reserve(self, splat_count: int, tile_count: int) -> int:
-        """Make the memory for a picture, and return the room for intersections."""
-        expectation = self._expectations[tile_count]
-        self.seen = expectation.seen
-        self.room = max(expectation.room(splat_count), splat_count, tile_count)
+    def reserve_splats(self, splat_count: int) -> None:
+        """Make the memory for what each splat has."""
         if splat_count != self._splat_count:
             self._splat_count = 0  # if there is no memory, the next picture must not find it either
             self.depth_keys, self.order = self._integers(2 * splat_count), self._integers(2 * splat_count)
@@ -134,6 +133,14 @@ class _Scratch:
             self._by_depth = wp.from_torch(self.depth_keys), wp.from_torch(self.order)
             self._sums = wp.from_torch(self.sorted_counts), wp.from_torch(self.ends)
             self._splat_count = splat_count
+
+    def reserve_lists(self, tile_count: int) -> int:
+        """Make the memory for lists of intersections, which are counted by now, and return the room for them."""
+        expectation = self._expectations[tile_count]
+        self.seen = expectation.seen
+        if self._device.type == "cpu":  # no need to wait
+            expectation.numbers[:] = int(self.ends[-1]), self._splat_count
+        self.room = max(expectation.room(self._splat_count), self._splat_count, tile_count)
         if self.room > self._room:
             self._room = 0
             self.tiles, self.values = self._integers(2 * self.room), self._integers(2 * self.room)

@@ -752,3 +752,36 @@ def test_nothing_holds_the_memory_of_a_picture_that_is_gone(compositor):
     gc.collect()
     held = [x for x in gc.get_objects() if type(x) is torch.Tensor and x.numel() in (2 * 59 * 41, 3 * 2 * 59 * 41)]
     assert not held, f"{len(held)} images are still there"
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_gaussians_of_each_camera_match_the_reference_and_the_cameras_one_by_one(device, compositor):
+    viewmats, Ks = make_cameras(3)
+    sets = [make_gaussians(60, 4, seed) for seed in (1, 2, 3)]
+    means, covars, sh = (torch.stack(x) for x in zip(*[(s[0], covariances(s[1], s[2]), s[4]) for s in sets]))
+    opacities = sets[0][3]
+    draw = lambda function, x: function(x[0], None, None, x[2], x[3], x[4], x[5], WIDTH, HEIGHT, covars=x[1], median=True)
+    everything = [means, covars, opacities, sh, viewmats, Ks]
+    expected = draw(_rasterize, everything)
+    output = draw(rasterize, [x.to(device, torch.float32) for x in everything])
+    for name, actual, image in zip(RenderOutput._fields, output, expected):
+        if name == "radii":
+            assert (actual.cpu() - image).abs().max() <= 1
+        else:
+            assert_close(name, actual, image, IMAGE_TOLERANCE if name != "medians" else 1e-4)
+    for c in range(3):
+        alone = [means[c], covars[c], opacities, sh[c], viewmats[c : c + 1], Ks[c : c + 1]]
+        one = draw(rasterize, [x.to(device, torch.float32) for x in alone])
+        assert torch.equal(one.colors[0], output.colors[c]) and torch.equal(one.depths[0], output.depths[c])
+
+
+def test_gaussians_of_each_camera_need_covariances_of_each_and_have_no_gradients():
+    (means, quats, scales, opacities, sh), (viewmats, Ks) = make_gaussians(), make_cameras(2)
+    own = lambda x: x.expand(2, *x.shape).float()
+    covars = covariances(quats, scales)
+    with pytest.raises(ValueError, match=r"covars of each camera, \(2, 60, 3, 3\)"):
+        rasterize(own(means), quats, scales, opacities, own(sh), viewmats, Ks, 8, 8)
+    with pytest.raises(ValueError, match=r"sh shape \(60, 1, 3\) != expected shape \(2, 60, '1|4|9|16', 3\)"):
+        rasterize(own(means), None, None, opacities, sh, viewmats, Ks, 8, 8, covars=own(covars))
+    with pytest.raises(ValueError, match="have no gradients"):
+        rasterize(own(means).requires_grad_(), None, None, opacities, own(sh), viewmats, Ks, 8, 8, covars=own(covars))

@@ -100,7 +100,7 @@ class TaskEnvironment(gymnasium.Env):
         return _first(observations), float(outcome.reward[0]), *ended, _first(_info(self.batch, outcome))
 
     def render(self) -> np.ndarray | None:
-        return self.batch.image(0) if self.render_mode else None
+        return self.batch.images([0])[0] if self.render_mode else None
 
 
 class VectorTaskEnvironment(gymnasium.vector.VectorEnv):
@@ -156,7 +156,7 @@ class VectorTaskEnvironment(gymnasium.vector.VectorEnv):
         return self.batch.observe()
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        return tuple(self.batch.image(b) for b in range(self.num_envs)) if self.render_mode else None
+        return tuple(self.batch.images()) if self.render_mode else None
 
 
 def _first(values: Any) -> Any:

@@ -9,14 +9,14 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from endo_sim_ros.cameras import Camera
-from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.learning.config import Randomisation
 from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.learning.tasks import Outcome, find_task
 from endo_sim_ros.physics import Skinning, TissueBatch
-from endo_sim_ros.splatting import render
+from endo_sim_ros.splatting import rasterize
 
 RESTING_SPEED = 1e-5  # m/s; as in TissueSimulation: one tissue slower than this, that no tool moves, is left as it is
+_AT_ONCE = 64  # images drawn together
 _BELOW = 1e-9  # keeps factors of the stiffness, rounded, within the largest that was planned for
 
 Observations = Literal["state", "image", "both"]
@@ -44,7 +44,7 @@ class TaskBatch:
         randomisation: How episodes differ.
         image_width: Pixels; the height follows from the scene's camera.
         device: Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N.
-        images: Make `image` possible also where images are not observed.
+        images: Make `images` possible also where images are not observed.
 
     Raises:
         ValueError: If there is no such task, or the scene is too small for it.
@@ -142,7 +142,7 @@ class TaskBatch:
         state = self._state()
         if self.observations == "state":
             return state
-        images = np.stack([self.image(b) for b in range(self.count)])
+        images = self.images()
         return images if self.observations == "image" else {"state": state, "image": images}
 
     def _state(self) -> np.ndarray:
@@ -153,16 +153,29 @@ class TaskBatch:
         return self.task.observe(positions, self.tissue.tools.reaction_forces[:, 0].cpu().numpy())
 
     @torch.no_grad()
-    def image(self, b: int) -> np.ndarray:
-        """What the endoscope sees of episode b [H, W, 3], uint8."""
-        view, at_rest = self.views[b], self._model
-        model = GaussianModel(self._means[b], at_rest.quats, at_rest.log_scales, at_rest.logit_opacities, view.sh)
-        seen = render(model, view.camera, covars=self._covars[b])
-        colors = seen.colors[0]
+    def images(self, episodes: Sequence[int] | None = None) -> np.ndarray:
+        """What the endoscope sees of these episodes, by default all [B, H, W, 3], uint8."""
+        episodes = range(self.count) if episodes is None else episodes
+        groups = [episodes[i : i + _AT_ONCE] for i in range(0, len(episodes), _AT_ONCE)]
+        return np.concatenate([self._render(group) for group in groups])
+
+    def _render(self, episodes: Sequence[int]) -> np.ndarray:
+        views, at_rest = [self.views[b] for b in episodes], self._model
+        tensor = lambda arrays: torch.from_numpy(np.stack(arrays).astype(np.float32)).to(at_rest.means.device)
+        own = slice(episodes[0], episodes[-1] + 1) if len(episodes) == episodes[-1] + 1 - episodes[0] else list(episodes)
+        seen = rasterize(
+            self._means[own], None, None, at_rest.opacities, torch.stack([view.sh for view in views]),
+            tensor([view.camera.viewmat for view in views]), tensor([view.camera.K for view in views]),
+            self.camera.width, self.camera.height, covars=self._covars[own],
+        )  # fmt: skip
+        colors = seen.colors
         if at_rest.light is not None:
-            colors = at_rest.light.shade(colors, seen.depths[0], seen.alphas[0], view.camera)
-        if view.light is not None:
-            colors = colors * torch.from_numpy(view.light).to(colors.device)
+            pictures = zip(colors, seen.depths, seen.alphas, (view.camera for view in views))
+            colors = torch.stack([at_rest.light.shade(*picture) for picture in pictures])
+        if any(view.light is not None for view in views):
+            one = np.ones((1, 1, 1), np.float32)
+            factors = [np.broadcast_to(one if view.light is None else view.light, (*colors.shape[1:3], 1)) for view in views]
+            colors = colors * tensor(factors)
         return (colors.clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
 
     def _view(self, chance: np.ndarray) -> _View:

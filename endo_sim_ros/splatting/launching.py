@@ -10,7 +10,7 @@ from endo_sim_ros.splatting.rasterizer_kernels import TILE
 
 
 class Scene(NamedTuple):
-    """N Gaussians and C cameras: float32, contiguous, on one device. Shapes and units as in `rasterize`."""
+    """N Gaussians, or as many for each camera, and C cameras: float32, contiguous, on one device. As in `rasterize`."""
 
     means: Tensor
     quats: Tensor | None
@@ -23,8 +23,18 @@ class Scene(NamedTuple):
     background: Tensor
 
     @property
+    def gaussian_count(self) -> int:
+        """N."""
+        return self.means.shape[-2]
+
+    @property
     def splat_count(self) -> int:
-        return len(self.viewmats) * len(self.means)
+        return len(self.viewmats) * self.gaussian_count
+
+    @property
+    def apart(self) -> int:
+        """Whether each camera has means, covariances and colours of its own."""
+        return int(self.means.ndim == 3)
 
     def gaussian_arguments(self) -> list:
         """With these `project` and `project_backward` begin."""
@@ -65,7 +75,7 @@ class Gradients(NamedTuple):
     def empty(cls, scene: Scene, wants_pose: bool, wants_absolute: bool) -> "Gradients":
         """Room for them."""
         room = [None if x is None else torch.empty_like(x) for x in scene[:6]]
-        size = (len(scene.viewmats), len(scene.means))
+        size = (len(scene.viewmats), scene.gaussian_count)
         shares = scene.means.new_empty(*size, 4, 4) if wants_pose else None
         return cls(*room, shares, scene.means.new_empty(*size, 2) if wants_absolute else None)
 
@@ -89,6 +99,7 @@ def kernel_arguments(kernel, arguments: list, offset: int = 0) -> list:
 
 def _array(kind, tensor: Tensor):
     tensor = tensor.detach()
-    if kind.ndim == 1:
-        tensor = tensor.view(-1, *getattr(kind.dtype, "_shape_", ()))
+    dims = kind.ndim + len(getattr(kind.dtype, "_shape_", ()))
+    if tensor.ndim > dims:  # the kernel counts through the first ones
+        tensor = tensor.view(-1, *tensor.shape[tensor.ndim - dims + 1 :])
     return wp.from_torch(tensor, dtype=kind.dtype, requires_grad=False, return_ctype=True)

@@ -68,7 +68,8 @@ def rasterize(
     On the CPU results repeat bit for bit whatever the number of threads; on CUDA gradients are summed with atomics.
 
     Args:
-        means: Centres [N, 3], metres, world.
+        means: Centres [N, 3], metres, world. Or of each camera its own [C, N, 3], e.g. of as many copies of tissue; then
+            covars [C, N, 3, 3] and sh [C, N, K, 3] must be, too, and there are no gradients.
         quats: Rotations wxyz [N, 4], not necessarily normalised; zero means no rotation. None when covars is given.
         scales: Standard deviations along the rotated axes [N, 3], metres. None when covars is given.
         opacities: Opacities in [0, 1] [N].
@@ -97,8 +98,11 @@ def rasterize(
     options = {"covars": covars, "background": background, "masks": masks, "absgrad": absgrad}
     _check_inputs("rasterize", means, quats, scales, opacities, sh, viewmats, Ks, width, height, near, eps2d, **options)
     if means.device.type == "cpu" and not means.isfinite().all():
-        index = int((~means.detach().isfinite()).any(1).nonzero()[0])
-        raise ValueError(f"rasterize: means[{index}] is not finite: {means[index].tolist()}")
+        index = tuple((~means.detach().isfinite()).any(-1).nonzero()[0].tolist())
+        raise ValueError(f"rasterize: means[{', '.join(map(str, index))}] is not finite: {means[index].tolist()}")
+    differentiable = (means, covars, opacities, sh, viewmats, background, absgrad)
+    if means.ndim == 3 and torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in differentiable):
+        raise ValueError("rasterize: means of each camera have no gradients; call it under torch.no_grad()")
     settings = Settings(int(width), int(height), float(near), float(eps2d), bool(median))
     if background is None:
         background = _black(means.device)
@@ -157,14 +161,14 @@ def _check_inputs(
     name, means, quats, scales, opacities, sh, viewmats, Ks, width, height, near, eps2d, *, covars, background, masks, absgrad
 ) -> None:
     """Raise ValueError, naming the argument and both shapes, unless all shapes agree and numbers make sense."""
-    if means.ndim != 2 or means.shape[1] != 3:
+    if means.ndim not in (2, 3) or means.shape[-1] != 3:
         raise ValueError(f"{name}: means shape {tuple(means.shape)} != expected shape (N, 3)")
     if viewmats.ndim != 3 or viewmats.shape[1:] != (4, 4):
         raise ValueError(f"{name}: viewmats shape {tuple(viewmats.shape)} != expected shape (C, 4, 4)")
     if not len(viewmats):
         raise ValueError(f"{name}: viewmats has no camera; at least one must be given")
-    if sh.ndim != 3 or sh.shape[1] not in (1, 4, 9, 16):
-        raise ValueError(f"{name}: sh shape {tuple(sh.shape)} != expected shape ({len(means)}, 1|4|9|16, 3)")
+    if sh.ndim != means.ndim + 1 or sh.shape[-2] not in (1, 4, 9, 16):
+        raise ValueError(f"{name}: sh shape {tuple(sh.shape)} != expected shape {(*means.shape[:-1], '1|4|9|16', 3)}")
     if covars is None and (quats is None or scales is None):
         raise ValueError(f"{name}: either covars or both quats and scales must be given")
     if covars is not None and (quats is not None or scales is not None):
@@ -173,13 +177,17 @@ def _check_inputs(
         raise ValueError(f"{name}: image size must be positive, got width {width} and height {height}")
     if not (near >= 0 and eps2d >= 0):
         raise ValueError(f"{name}: near and eps2d must not be negative, got near {near} and eps2d {eps2d}")
-    n, c = len(means), len(viewmats)
+    n, c = means.shape[-2], len(viewmats)
+    own = (c,) if means.ndim == 3 else ()
+    if own and covars is None:
+        raise ValueError(f"{name}: means of each camera need covars of each camera, {(c, n, 3, 3)}")
     expected = {
+        "means": (means, (*own, n, 3)),
         "quats": (quats, (n, 4)),
         "scales": (scales, (n, 3)),
-        "covars": (covars, (n, 3, 3)),
+        "covars": (covars, (*own, n, 3, 3)),
         "opacities": (opacities, (n,)),
-        "sh": (sh, (n, sh.shape[1], 3)),
+        "sh": (sh, (*own, n, sh.shape[-2], 3)),
         "Ks": (Ks, (c, 3, 3)),
         "background": (background, (3,)),
         "masks": (masks, (c, height, width)),
@@ -192,7 +200,7 @@ def _check_inputs(
 
 def _depths_of(owners: Tensor, means: Tensor, viewmats: Tensor) -> Tensor:
     """Depth z [C, H, W] in its camera of the splat c·N + n named at each pixel; 0 for none, −1; differentiable."""
-    if not len(means):
+    if not means.shape[-2]:
         return means.new_zeros(owners.shape)
     # Nobody is drawn at a mean that is not finite, but zero times such a mean would spoil the cameras' gradients.
     axes, means = viewmats[:, None, 2], means.nan_to_num(0, 0, 0)
@@ -324,14 +332,19 @@ def _rasterize(
     covars = (covars + covars.mT) / 2
     if background is None:
         background = means.new_zeros(3)
+    count = means.shape[-2]
     if absgrad is None:
-        absgrad = means.new_zeros(len(viewmats), len(means), 2)
+        absgrad = means.new_zeros(len(viewmats), count, 2)
+    shared = means.ndim == 2
     cameras = [
-        _render_reference(means, covars, opacities, sh, viewmat, K, width, height, background, absgrad[c], near, eps2d)
+        _render_reference(
+            *((means, covars, opacities, sh) if shared else (means[c], covars[c], opacities, sh[c])),
+            viewmat, K, width, height, background, absgrad[c], near, eps2d,
+        )
         for c, (viewmat, K) in enumerate(zip(viewmats, Ks))
-    ]
+    ]  # fmt: skip
     *images, owners = (torch.stack(images) for images in zip(*cameras))
-    first = len(means) * torch.arange(len(viewmats), device=means.device)[:, None, None]
+    first = count * torch.arange(len(viewmats), device=means.device)[:, None, None]
     owners = torch.where(owners >= 0, owners + first, -1)
     return RenderOutput(*images, _depths_of(owners, means, viewmats) if median else None)
 

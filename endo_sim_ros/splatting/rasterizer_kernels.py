@@ -294,6 +294,7 @@ def project(
     height: int,
     near: float,
     eps2d: float,
+    apart: int,  # whether means, covars and sh are those of each camera, one after the other
     tile_mask: wp.array[wp.uint8],  # [C · tiles], 0 = nobody looks at this tile
     splats: wp.array2d[float],  # out
     radii: wp.array[int],  # out, pixels, 0 = not in the image
@@ -302,9 +303,10 @@ def project(
     counts: wp.array[int],  # out, intersections of each splat
 ):
     splat = offset + wp.tid()
-    gaussian_count = means.shape[0]
+    gaussian_count = opacities.shape[0]
     camera = splat // gaussian_count
     n = splat - camera * gaussian_count
+    own = n + apart * camera * gaussian_count
     radii[splat] = 0
     depth_keys[splat] = 0
     order[splat] = splat
@@ -312,13 +314,13 @@ def project(
 
     viewmat, K = viewmats[camera], Ks[camera]
     rotation, translation = camera_rotation(viewmat), camera_translation(viewmat)
-    p = rotation * means[n] + translation
+    p = rotation * means[own] + translation
     opacity = opacities[n]
     # Written so that NaN fails the test too.
     if not (p[2] >= near and opacity >= ALPHA_MIN):
         return
     to_image = projection_jacobian(clamped_slopes(p, K, width, height), p[2], K) * rotation
-    cov = image_covariance(n, to_image, quats, scales, covars, has_covars, eps2d)
+    cov = image_covariance(own, to_image, quats, scales, covars, has_covars, eps2d)
     det = cov[3]
     if not (det > 0.0 and cov[0] > 0.0):
         return
@@ -333,8 +335,8 @@ def project(
     if sh.shape[1] == 1:
         basis[0] = 0.28209479177387814
     else:
-        basis = sh_basis(sh.shape[1], wp.normalize(means[n] + wp.transpose(rotation) * translation))
-    color = sh_color(n, sh.shape[1], basis, sh)
+        basis = sh_basis(sh.shape[1], wp.normalize(means[own] + wp.transpose(rotation) * translation))
+    color = sh_color(own, sh.shape[1], basis, sh)
     finite = wp.isfinite(x + y + a + b + c + extent[0] + extent[1] + aspect[0] + aspect[1] + opacity)
     if not (finite and wp.isfinite(color[0] + color[1] + color[2])):
         return

@@ -32,10 +32,10 @@ def forward(scene: Scene, tile_mask: Tensor, settings: Settings) -> tuple[list[T
     integers = functools.partial(scene.means.new_empty, dtype=torch.int32)
     images, owners = empty_images(scene, settings)
     splats, counts = scene.means.new_empty(splat_count, kernels.SPLAT_SIZE), integers(splat_count)
-    radii, depth_keys, order = integers((len(scene.viewmats), len(scene.means))), integers(2 * splat_count), integers(2 * splat_count)
+    radii, depth_keys, order = integers((len(scene.viewmats), scene.gaussian_count)), integers(2 * splat_count), integers(2 * splat_count)
     arguments = [*scene.gaussian_arguments(), scene.opacities, scene.sh, scene.viewmats, scene.Ks, s.width, s.height, s.near, s.eps2d]
-    _launch(kernels.project, splat_count, [*arguments, tile_mask, splats, radii, depth_keys, order, counts])
-    state = _intersect(splats, depth_keys, order, counts, tile_mask, len(scene.means), settings)
+    _launch(kernels.project, splat_count, [*arguments, scene.apart, tile_mask, splats, radii, depth_keys, order, counts])
+    state = _intersect(splats, depth_keys, order, counts, tile_mask, scene.gaussian_count, settings)
     arguments = [*_image_arguments(state, scene, settings, images), int(settings.median), owners]
     _launch_tiles(simd_kernels.render_tiles, len(tile_mask), arguments)
     return images, radii, owners, state

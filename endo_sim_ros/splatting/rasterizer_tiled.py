@@ -38,13 +38,13 @@ def forward(scene: Scene, tile_mask: Tensor, settings: Settings) -> tuple[list[T
     device, splat_count, tile_count = scene.means.device, scene.splat_count, len(tile_mask)
     integers = functools.partial(torch.empty, dtype=torch.int32, device=device)
     images, owners = empty_images(scene, settings)
-    radii = integers((len(scene.viewmats), len(scene.means)))
+    radii = integers((len(scene.viewmats), scene.gaussian_count))
     splats, counts, ranges = scene.means.new_empty(splat_count, kernels.SPLAT_SIZE), integers(splat_count), integers((tile_count, 2))
     with _lock, on_torch_stream(device):  # the scratch memory serves one picture after the other, and Warp has one stream
         if splat_count:
             scratch = _scratch(device, _stream(device))
             scratch.reserve_splats(splat_count)
-            arguments = [*scene.gaussian_arguments(), *_cameras(scene, settings), settings.near, settings.eps2d, tile_mask]
+            arguments = [*scene.gaussian_arguments(), *_cameras(scene, settings), settings.near, settings.eps2d, scene.apart, tile_mask]
             outputs = [splats, radii, scratch.depth_keys, scratch.order, counts]
             _launch(kernels.project, splat_count, [0, *arguments, *outputs])
             scratch.sort_by_depth()
@@ -53,7 +53,7 @@ def forward(scene: Scene, tile_mask: Tensor, settings: Settings) -> tuple[list[T
             room = scratch.reserve_lists(tile_count)
             splat_list = integers(room)
             _launch(tiled_kernels.clear_lists, room, [tile_count, ranges, scratch.tiles])
-            arguments = [scratch.order, scratch.ends, counts, len(scene.means), splats, tile_mask, settings.tiles_x, settings.tiles_y]
+            arguments = [scratch.order, scratch.ends, counts, scene.gaussian_count, splats, tile_mask, settings.tiles_x, settings.tiles_y]
             _launch(kernels.emit_intersections, splat_count, [0, *arguments, room, 1, scratch.tiles, scratch.values, None, None])
             scratch.sort_by_tile(tile_count)
             arguments = [scratch.tiles, scratch.values, scratch.order, scratch.ends, tile_mask]
@@ -87,7 +87,7 @@ def _cameras(scene: Scene, settings: Settings) -> list:
 
 def _image_arguments(state: State, scene: Scene, settings: Settings, images: list[Tensor]) -> list:
     """With these both kernels that composite begin."""
-    lists = [state.splats, state.counts, len(scene.means), state.splat_list, state.ranges]
+    lists = [state.splats, state.counts, scene.gaussian_count, state.splat_list, state.ranges]
     return [*lists, scene.background, settings.width, settings.height, *images]
 
 

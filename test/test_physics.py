@@ -949,6 +949,11 @@ def test_stiff_material_is_refused_with_the_numbers_when_substeps_may_not_adapt(
     numbers = r"young_modulus 1e\+06 Pa.*0\.3.*1000 kg.*0\.00875 m.*use \d+ substeps of"
     with pytest.raises(StabilityError, match=numbers):
         plan_substeps(PhysicsConfig(young_modulus=1e6, adapt_substeps=False), 0.00875)
+    # Where no number of substeps is allowed that would do, the stiffness that would.
+    with pytest.raises(StabilityError, match=r"use young_modulus \S+ Pa or less") as refusal:
+        plan_substeps(PhysicsConfig(young_modulus=1e9, density=1.0), 0.00875)
+    largest = float(re.search(r"use young_modulus (\S+)", str(refusal.value))[1])
+    assert plan_substeps(PhysicsConfig(young_modulus=largest, density=1.0), 0.00875).count > 90_000
 
 
 @pytest.mark.parametrize("kinematics", ["rest", "current"])
@@ -967,6 +972,20 @@ def test_absurd_force_is_caught_and_the_last_good_state_restored(kinematics):
     simulation.set_wrench("probe", TIP, [0.0, 0.0, 0.1])
     steps(simulation, 2)
     assert simulation.faults == 1 and np.isfinite(simulation.state().positions).all()
+
+
+@pytest.mark.parametrize(("material", "relaxation"), [("neo_hookean", 0.0), ("fixed_corotated", 5.0)])
+def test_tissue_crushed_until_no_step_goes_on_comes_back_when_the_tool_has_gone(material, relaxation):
+    simulation = simulate(material=material, relaxation=relaxation, contact_radius=0.05)
+    simulation.set_grasp("ball", pose_at(TIP), False)
+    steps(simulation, 20)
+    crushed = depth_of_dent(simulation)
+    simulation.set_grasp("ball", pose_at(TIP - [0, 0, 0.2]), False)
+    steps(simulation, 60)
+    faults = simulation.faults
+    steps(simulation, 190)
+    assert faults > 0 and simulation.faults == faults
+    assert crushed > 0.03 and depth_of_dent(simulation) < 0.03 * crushed
 
 
 @pytest.mark.parametrize("offset", [1e5, 1e30])

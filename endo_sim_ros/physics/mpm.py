@@ -91,12 +91,15 @@ def plan_substeps(config: PhysicsConfig, cell_size: float, properties: TissuePro
     cfl = limit * dt / cell_size
     if cfl > CFL_LIMIT or count > MAX_SUBSTEPS:
         fitting = math.ceil(count * cfl / CFL_LIMIT)
+        fit = f"use {fitting} substeps of {config.step_duration / fitting:.3g} s, adapt_substeps, or a softer material"
+        if fitting > MAX_SUBSTEPS:
+            largest = young[worst] / (1 + config.relaxation) * (MAX_SUBSTEPS * CFL_CHOSEN / (count * cfl)) ** 2
+            fit = f"use young_modulus {0.99 * largest:.3g} Pa or less with adapt_substeps, or shorter steps"
         raise StabilityError(
             f"young_modulus {young[worst] / (1 + config.relaxation):g} Pa, poisson_ratio {properties.poisson_ratio[worst]:g}"
             + f", relaxation {config.relaxation:g}" * (config.relaxation > 0)
             + f" and density {properties.density[worst]:g} kg/m³ on a grid of {cell_size:.3g} m give a Courant number of"
-            f" {cfl:.2f} with {count} substeps of {dt:.3g} s (limits {CFL_LIMIT} and {MAX_SUBSTEPS}); use {fitting}"
-            f" substeps of {config.step_duration / fitting:.3g} s, adapt_substeps, or a softer material"
+            f" {cfl:.2f} with {count} substeps of {dt:.3g} s (limits {CFL_LIMIT} and {MAX_SUBSTEPS}); {fit}"
         )
     return Substepping(count, dt, cfl)
 
@@ -212,6 +215,7 @@ class MpmSolver:
         self.rigid.impulse, self.rigid.moment = (self._zeros(count * tools, wp.vec3) for _ in range(2))
         self.state, self._backup = self._new_state(), self._new_state()
         self.bad_nodes = self._zeros(environments, int)  # in the last step; where there were any it was undone
+        self._bad_before = self._zeros(environments, int)  # in the step before
         self._speed_sq = self._zeros(environments, float)
         self._substep = Substep()
         self._substep.dt = self.substepping.dt
@@ -340,10 +344,11 @@ class MpmSolver:
         actions = [self._action(launch) for launch in self._before]
         for name in ("u", "F", "Q"):
             actions.append(partial(wp.copy, getattr(self._backup, name), getattr(self.state, name)))
+        actions.append(partial(wp.copy, self._bad_before, self.bad_nodes))
         actions += [array.zero_ for array in (self.bad_nodes, self._speed_sq, self.rigid.impulse, self.rigid.moment)]
         actions += self._vectorised_step() if self._vectorised else self._clustered_step() or self._launched_substeps()
         actions.append(self._action(Launch(check_nodes, every, check)))
-        actions.append(self._action(Launch(undo_bad_steps, every, [self.bad_nodes, count, self._backup, self.state])))
+        actions.append(self._action(Launch(undo_bad_steps, every, [self.bad_nodes, self._bad_before, count, self._backup, self.state])))
         return actions + [self._action(launch) for launch in (*self._after, *self._last)]
 
     def _action(self, launch: Launch | list[Launch]) -> Callable[[], None]:
@@ -379,7 +384,9 @@ class MpmSolver:
 
     def _clustered_step(self) -> list[Callable[[], None]]:
         """One launch for all substeps, on a GPU with clusters of multiprocessors; none for more nodes than they hold."""
-        if self.device == "cpu" or self.config.kinematics == "current" or wp.get_device(self.device).arch < 90:
+        # What it compiles for, which is less than the GPU where another one in the machine is older.
+        arch = wp.get_device(self.device).get_cuda_compile_arch()
+        if arch is None or arch < 90 or self.config.kinematics == "current":
             return []
         division = cluster.divide(self.rest_cells, self._corners())
         if division is None:

@@ -30,6 +30,7 @@ from endo_sim_ros.physics.materials import MATERIALS, kirchhoff_stress, maxwell,
 wp.set_module_options({"enable_backward": False})
 
 PUSH_OUT = 0.5  # m/s; a tool that suddenly is deep within tissue pushes it out no faster than this
+EASED = 0.9  # of its deformation is left to tissue of which two steps in a row were bad
 
 
 @wp.struct
@@ -412,13 +413,21 @@ def check_nodes(state: State, count: int, travel: float, faults: wp.array[int], 
 
 
 @wp.kernel
-def undo_bad_steps(faults: wp.array[int], count: int, backup: State, state: State):
-    """Environments with faults return to the state before the step, at rest there."""
+def undo_bad_steps(faults: wp.array[int], faults_before: wp.array[int], count: int, backup: State, state: State):
+    """Environments with faults return to the state before the step, at rest there.
+
+    Where the step before was bad as well, they give way towards rest: from tissue that is turned inside out or stretched
+    too far for its substeps every step is bad. u and F − 1 shrink together, and still fit.
+    """
     b, p = wp.tid()
     e = b * count + p
     if faults[b] > 0:
         state.u[e] = backup.u[e]
         state.F[e] = backup.F[e]
         state.Q[e] = backup.Q[e]
+        if faults_before[b] > 0:
+            state.u[e] = EASED * backup.u[e]
+            state.F[e] = EASED * backup.F[e] + (1.0 - EASED) * wp.identity(3, float)
+            state.Q[e] = EASED * backup.Q[e]
         state.v[e] = wp.vec3()
         state.C[e] = wp.mat33()

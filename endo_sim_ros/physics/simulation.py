@@ -316,7 +316,7 @@ class TissueSimulation:
 
     def step(self) -> None:
         """Advance by ``step_duration``. A step that ends badly is undone, counted in ``faults`` and described in
-        ``last_fault``; the tissue is then at rest where it was before."""
+        ``last_fault``; the tissue is then at rest where it was before, or, after several in a row, nearer to its rest state."""
         before = self.faults
         self.time += self.step_duration
         if self._resting and not (self._disturbed or self._wrenches_act()):
@@ -325,8 +325,9 @@ class TissueSimulation:
         self._batch.step()
         self._disturbed = False
         relaxed = not self.config.relaxation or self._quiet > _RELAXED * self.config.relaxation_time
-        self._resting = relaxed and self.solver.speed < _RESTING_SPEED
-        if self.faults > before:
+        undone = self.faults > before
+        self._resting = relaxed and not undone and self.solver.speed < _RESTING_SPEED
+        if undone:
             self.last_fault = (
                 f"a step was undone: {self.solver.bad_nodes.numpy()[0]} of {len(self.nodes)} nodes ended non-finite, torn or"
                 f" over {self.config.travel:g} m from rest ({self._describe_tools()}); use less force or more travel"

@@ -169,8 +169,8 @@ def test_tissue_is_carved_where_a_camera_sees_through_it_and_only_there():
     model = dataclasses.replace(model, logit_opacities=torch.full((len(points),), 4.0))
     K = np.array([[300.0, 0, 160], [0, 300, 128], [0, 0, 1]])
     cameras = [Camera(K, 320, 256, pose_at([x, 0.0, 0.0])) for x in (-0.06, 0.0, 0.06)]
-    whole = build_control_nodes(model, EYE, PhysicsConfig(node_count=6000))
     config = PhysicsConfig(node_count=6000)
+    whole = build_control_nodes(model, EYE, dataclasses.replace(config, carve=False), cameras)
     carved = build_control_nodes(model, EYE, config, cameras)
     left = {tuple(position) for position in carved.rest.tolist()}
     gone = np.array([position for position in whole.rest.tolist() if tuple(position) not in left])
@@ -181,10 +181,21 @@ def test_tissue_is_carved_where_a_camera_sees_through_it_and_only_there():
     behind = whole.rest[(whole.rest[:, 2] > 0.101) & (whole.rest[:, 2] < 0.125) & ~whole.is_skin]
     past_edge = np.abs(behind[:, 0]) - (0.02 - (behind[:, 2] - 0.1) * 0.04 / 0.1)
     kept = np.array([tuple(position) in left for position in behind.tolist()])
-    assert kept[past_edge < 0].all() and kept[past_edge > 0.003].mean() < 0.1
+    assert kept[past_edge < 0].all() and kept[past_edge > 0.003].mean() < 0.15
     assert carved.is_skin.sum() == whole.is_skin.sum()
-    same = build_control_nodes(model, EYE, dataclasses.replace(config, carve=False), cameras)
-    np.testing.assert_array_equal(same.rest, whole.rest)
+
+
+def test_what_no_camera_has_seen_gives_no_nodes():
+    """A reconstruction continues tissue beyond the pictures."""
+    cameras = [Camera(np.array([[600.0, 0, 160], [0, 600, 128], [0, 0, 1]]), 320, 256, pose_at([x, 0.0, 0.0])) for x in (-0.01, 0.01)]
+    model = curved_sheet()
+    in_pictures = lambda points: np.any([((c.project(points)[0] >= 0) & (c.project(points)[0] <= [320, 256])).all(1) for c in cameras], 0)
+    skin = lambda nodes: nodes.rest[nodes.is_skin].astype(np.float64)
+    config = PhysicsConfig(node_count=600, carve=False)
+    assert in_pictures(skin(build_control_nodes(model, EYE, config))).mean() < 0.95
+    assert in_pictures(skin(build_control_nodes(model, EYE, config, cameras))).all()
+    away = [camera.at(camera.pose @ np.diag([-1.0, 1, -1, 1])) for camera in cameras]  # not those that saw it
+    np.testing.assert_array_equal(build_control_nodes(model, EYE, config, away).rest, build_control_nodes(model, EYE, config).rest)
 
 
 def test_a_model_without_opaque_gaussians_is_refused():
@@ -1001,6 +1012,18 @@ def test_tissue_of_an_absurd_size_is_refused(spacing):
     nodes = specimen((3, 3, 3), spacing, lambda X: np.zeros(len(X), bool), lambda X: np.ones(len(X), bool))
     with pytest.raises(ValueError, match="grid cells would be .* m wide.*metres"):
         MpmSolver(nodes, PhysicsConfig(device="cpu"))
+
+
+def test_nodes_without_volume_and_properties_of_other_nodes_are_refused():
+    nodes = specimen((3, 3, 3), 0.01, lambda X: np.zeros(len(X), bool), lambda X: np.ones(len(X), bool))
+    config = PhysicsConfig(device="cpu")
+    with pytest.raises(ValueError, match="properties of 5 nodes, but the tissue has 27"):
+        MpmSolver(nodes, config, TissueProperties.uniform(5, 1e4, 0.3, 1e3))
+    for volume in (0.0, np.nan):
+        with pytest.raises(ValueError, match="volume of node 4 is"):
+            MpmSolver(dataclasses.replace(nodes, volumes=np.where(np.arange(27) == 4, volume, nodes.volumes)), config)
+    with pytest.raises(ValueError, match=r"stiffness has shape \(1, 5\), expected \[K, 27\]"):
+        MpmSolver(nodes, config).set_stiffness(slice(None), np.ones((1, 5)))
 
 
 @pytest.mark.parametrize("size", [100, 1e15, 2.0**61, 1e30])  # in integers the larger ones would wrap around

@@ -134,7 +134,7 @@ class MpmSolver:
 
     Raises:
         StabilityError: If the substeps are too long for the material and may not be adapted.
-        ValueError: If the grid would be absurdly large.
+        ValueError: If the grid would be absurdly large, or nodes, properties and stiffness do not fit together.
     """
 
     def __init__(
@@ -156,6 +156,8 @@ class MpmSolver:
         self.environments, self.tool_count, self.node_count = environments, tools, len(nodes)
         if properties is None:
             properties = TissueProperties.uniform(len(nodes), config.young_modulus, config.poisson_ratio, config.density)
+        if len(properties) != len(nodes):
+            raise ValueError(f"there are properties of {len(properties)} nodes, but the tissue has {len(nodes)}")
         scale = np.ones(environments) if stiffness is None else np.asarray(stiffness, np.float64)
         good = scale.shape in ((environments,), (environments, len(nodes))) and np.isfinite(scale).all() and (scale > 0).all()
         if not good:
@@ -166,6 +168,9 @@ class MpmSolver:
             raise ValueError(
                 f"the grid cells would be {h:.3g} m wide, which is no tissue; is the model in metres, and is it the viewpoint's own?"
             )
+        bad = np.flatnonzero(~((nodes.volumes > 0) & np.isfinite(nodes.volumes)))
+        if len(bad):
+            raise ValueError(f"the volume of node {bad[0]} is {nodes.volumes[bad[0]]:g} m³; every node must have some")
         self.substepping = plan_substeps(config, h, properties, self.largest_stiffness)
         far = float(np.abs(nodes.rest).max())
         if not far * np.finfo(np.float32).eps < 0.01 * h:  # else nodes of one cell fall together, and out of the grid
@@ -265,6 +270,8 @@ class MpmSolver:
             ValueError: If one is not above zero, or larger than any factor that the substeps were planned for.
         """
         stiffness = np.asarray(stiffness, np.float64)
+        if stiffness.ndim != 2 or stiffness.shape[1] != self.node_count:
+            raise ValueError(f"stiffness has shape {stiffness.shape}, expected [K, {self.node_count}], a factor for each node")
         if not ((stiffness > 0) & (stiffness <= self.largest_stiffness)).all():
             raise ValueError(f"stiffness factors must lie above 0 and not above {self.largest_stiffness:g}, the largest planned for")
         factors = torch.from_numpy(stiffness.copy()).to(self.device)

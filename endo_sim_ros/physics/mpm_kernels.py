@@ -427,7 +427,7 @@ def undo_bad_steps(faults: wp.array[int], faults_before: wp.array[int], count: i
         state.Q[e] = backup.Q[e]
         if faults_before[b] > 0:
             state.u[e] = EASED * backup.u[e]
-            state.F[e] = EASED * backup.F[e] + (1.0 - EASED) * wp.identity(3, float)
+            state.F[e] = EASED * (backup.F[e] - wp.identity(3, float)) + wp.identity(3, float)
             state.Q[e] = EASED * backup.Q[e]
         state.v[e] = wp.vec3()
         state.C[e] = wp.mat33()

@@ -389,6 +389,8 @@ class TissueSimulation:
                 parts.append(f"{name} {force:.3g} N")
             if tools.gripping[0, slot]:
                 parts.append(f"{name} grasping")
+            elif self.contact_radius and tools.present[0, slot]:
+                parts.append(f"{name} pushing")
         return ", ".join(parts) or "no tool"
 
 

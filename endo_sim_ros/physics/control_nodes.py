@@ -17,6 +17,7 @@ from endo_sim_ros.splatting import render
 
 OUTLIER_FACTOR = 5.0  # a Gaussian this many times farther from its neighbours than the median one floats
 OUTLIER_NEIGHBOURS = 8
+LEAST_IN_PICTURES = 0.3  # share of the Gaussians; with fewer the cameras are hardly those that saw the tissue
 RIM_WIDTH = 0.4  # spacings from the border; a free node between pinned ones would only rattle
 CARVING_VIEWS = 8  # that look for free space, spread over the cameras
 CARVING_WIDTH = 160  # pixels
@@ -160,6 +161,15 @@ def in_free_space(points: np.ndarray, model: GaussianModel, cameras: Sequence[Ca
     return free
 
 
+def _in_pictures(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
+    """Which points [N, 3] (m, world) lie in the picture of some camera; all without any, or if hardly any does."""
+    inside = np.zeros(len(points), bool)
+    for camera in cameras:
+        uv, z = camera.project(points)
+        inside |= (z > 0) & (uv >= 0).all(1) & (uv < [camera.width, camera.height]).all(1)
+    return inside if inside.sum() > LEAST_IN_PICTURES * len(points) else np.ones(len(points), bool)
+
+
 def build_control_nodes(model: GaussianModel, viewpoint: np.ndarray, config: PhysicsConfig, cameras: Sequence[Camera] = ()) -> ControlNodes:
     """Nodes of the tissue behind a model's skin.
 
@@ -172,7 +182,8 @@ def build_control_nodes(model: GaussianModel, viewpoint: np.ndarray, config: Phy
         model: Gaussians, world.
         viewpoint: Camera position [3] or positions [V, 3] (their mean is used), metres, world.
         config: Node count, layers, thickness and what is pinned.
-        cameras: Those that the model was seen from, for carving; without any nothing is carved.
+        cameras: Those that the model was seen from, for carving; without any nothing is carved. Gaussians beyond the pictures
+            of all of them, which nobody has seen, give no nodes.
 
     Raises:
         ValueError: If the viewpoint or means are not finite, or too few opaque Gaussians span a surface.
@@ -189,6 +200,7 @@ def build_control_nodes(model: GaussianModel, viewpoint: np.ndarray, config: Phy
     eye = eye.mean(0)
     points = means - eye
     solid = select_solid(points, opacities, config.min_opacity)
+    solid = solid[_in_pictures(means[solid], cameras)]
     if len(solid) < 4:
         raise ValueError(
             f"only {len(solid)} of {len(means)} Gaussians are as opaque as min_opacity {config.min_opacity:g} and near"

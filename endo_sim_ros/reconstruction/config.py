@@ -17,9 +17,10 @@ class ReconstructionConfig(StageConfig):
     """Number of views to train on, spread over the camera path."""
     image_width: Annotated[int, Range(16, 8192, "pixels")] = 640
     """Views wider than this are shrunk to it before training."""
-    iterations: Annotated[int, Range(1, 1_000_000)] = 3000
-    """Optimisation steps (the paper uses 3000)."""
-    max_gaussians: Annotated[int, Range(1, 10_000_000)] = 60_000
+    iterations: Annotated[int, Range(1, 1_000_000)] = 1000
+    """Optimisation steps. The paper uses 3000; from few views of moving tissue more than these only fit what is wrong with
+    the views."""
+    max_gaussians: Annotated[int, Range(1, 10_000_000)] = 30_000
     """Largest number of Gaussians."""
     sh_degree: Annotated[int, Range(0, 3)] = 0
     """Degree of the spherical harmonics; 0 is the paper's frequency regularisation."""
@@ -44,12 +45,8 @@ class ReconstructionConfig(StageConfig):
     """Weight of the distortion loss, in units of the scene's median depth (paper eq. 5)."""
     lambda_tv: Annotated[float, Range(0, 1000)] = 0.5
     """Weight of the total variation of the rendered depth, in units of the scene's median depth (paper eq. 6)."""
-    edge_aware: bool = False
-    """Total variation of the disparity instead, less where the image has an edge."""
     lambda_pearson: Annotated[float, Range(0, 1000)] = 0.0
     """Weight of 1 − correlation of depth and prior, in training views and in virtual ones to which the prior is carried (FSGS)."""
-    lambda_gradient: Annotated[float, Range(0, 1000)] = 0.0
-    """Weight of differences between the slopes of the logarithms of depth and prior."""
     lambda_flat: Annotated[float, Range(0, 1000)] = 0.01
     """Weight of Gaussians being deeper than 1.5 times their width, which turns into streaks when the tissue is sheared."""
     virtual_every: Annotated[int, Range(0, 1000)] = 1
@@ -67,7 +64,7 @@ class ReconstructionConfig(StageConfig):
     """Iterations between relocations of dead Gaussians and growth."""
     growth: Annotated[float, Range(0, 1)] = 0.05
     """Share of new Gaussians added at each refinement until max_gaussians is reached."""
-    learning_rate: Annotated[float, Range(1e-3, 100)] = 1.0
+    learning_rate: Annotated[float, Range(1e-3, 100)] = 0.3
     """Factor on all learning rates."""
     seed: Annotated[int, Range(0, 2**31 - 1)] = 0
     """Seed of all random draws; the same seed gives the same model on a CPU, bit for bit."""

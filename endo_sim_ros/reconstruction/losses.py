@@ -14,7 +14,6 @@ from torch import Tensor
 from endo_sim_ros.gaussians import GaussianModel
 
 _WINDOW, _SIGMA = 11, 1.5  # the SSIM window of the field
-_EDGES = 10.0  # how much an edge of the image excuses one of the depth
 _C1, _C2 = 0.01**2, 0.03**2
 
 
@@ -55,23 +54,6 @@ def total_variation(depth: Tensor, mask: Tensor | None) -> Tensor:
     return masked_mean(dx, mask[:, 1:] * mask[:, :-1]) + masked_mean(dy, mask[1:] * mask[:-1])
 
 
-def edge_aware_variation(depth: Tensor, alpha: Tensor, image: Tensor, mask: Tensor | None, unit: float) -> Tensor:
-    """Total variation of the disparity unit / z, less where the image [H, W, 3] has an edge; pairs across a mask's edge do not count.
-
-    Args:
-        depth, alpha: Σ w z [H, W] (m) and Σ w [H, W]; pixels without surface count as at the depth ``unit``.
-        unit: Depth that makes the disparity a pure number, metres.
-    """
-    disparity = (alpha * unit + 1e-4 * unit) / (depth + 1e-4 * unit)
-    total = depth.new_zeros(())
-    for axis in (0, 1):
-        first, second = (lambda x: x.narrow(axis, 0, x.shape[axis] - 1)), (lambda x: x.narrow(axis, 1, x.shape[axis] - 1))  # noqa: B023
-        edges = (-_EDGES * (first(image) - second(image)).abs().mean(-1)).exp()
-        pairs = None if mask is None else first(mask) * second(mask)
-        total = total + masked_mean(edges * (first(disparity) - second(disparity)).abs(), pairs)
-    return total
-
-
 def pearson(depth: Tensor, prior: Tensor, mask: Tensor | None) -> Tensor:
     """1 − correlation of depth and prior where the prior has a measurement (> 0) (FSGS, eq. 6)."""
     valid = (prior > 0).to(depth.dtype)
@@ -79,24 +61,6 @@ def pearson(depth: Tensor, prior: Tensor, mask: Tensor | None) -> Tensor:
     centre = lambda x: (x - masked_mean(x, valid)) * valid
     a, b = centre(depth), centre(prior)
     return 1 - (a * b).sum() / ((a * a).sum() * (b * b).sum()).clamp_min(1e-20).sqrt()
-
-
-def gradient_difference(depth: Tensor, alpha: Tensor, prior: Tensor, mask: Tensor | None) -> Tensor:
-    """Mean |∇(log D − log D̂)| at steps of 1, 2, 4 and 8 pixels, where the prior has a measurement on both sides.
-
-    It sees the shape of the surface and no error in its scale (gradient matching, Li & Snavely 2018, eq. 3).
-    """
-    valid = ((prior > 0) & (alpha.detach() > 0.5)).to(depth.dtype)
-    valid = valid if mask is None else valid * mask
-    error = valid * ((depth / alpha.clamp_min(1e-3)).clamp_min(1e-4).log() - prior.clamp_min(1e-4).log())
-    total = depth.new_zeros(())
-    for step in (1, 2, 4, 8):
-        for axis in (0, 1):
-            size = error.shape[axis] - step
-            if size > 0:
-                pairs = valid.narrow(axis, 0, size) * valid.narrow(axis, step, size)
-                total = total + masked_mean((error.narrow(axis, step, size) - error.narrow(axis, 0, size)).abs(), pairs)
-    return total / 4
 
 
 def depth_extent(model: GaussianModel, eye: Tensor) -> Tensor:

@@ -43,6 +43,7 @@ _LAST_REFINEMENT = 0.8  # share of the iterations after which the number of Gaus
 _SEEN = 0.8  # share of the Gaussians that stand for what the training views see, at first
 _WIDEST_PARALLAX = 0.1  # of the image's width, between the eyes
 _LIGHT_ANCHOR = 1e-3  # weight of the light's changes in training
+_WHITE, _MOSTLY = 250, 0.5  # grey level of all channels, and share of the tissue, from which on a view is overexposed
 _NARROWEST = 64  # pixels; images are not halved below when memory runs out
 _SELDOM = 4  # iterations between steps that may be taken seldom, and then are as much larger
 _EXPOSURE_RATE, _LIGHT_RATE = 1e-3, 2e-3  # learning rates of log exposures and of the light's four numbers
@@ -78,7 +79,7 @@ class Trainer:
             more views than these; None triangulates these views.
 
     Raises:
-        SequenceError: If there are no views, all pixels are masked, or the views give no scene points to start from.
+        SequenceError: If there are no views, all pixels are masked or white, or the views give no scene points to start from.
     """
 
     def __init__(self, frames: list[Frame], config: ReconstructionConfig, points: tuple[np.ndarray, np.ndarray] | None = None):
@@ -88,7 +89,7 @@ class Trainer:
             raise SequenceError("every pixel of every view is masked; a mask has 255 where there is tissue")
         self.config = config = resolved(config)
         self.device = pick_device(config.device)
-        frames, *found = _consistent(frames)
+        frames, *found = _consistent(_exposed(frames))
         points, colors = found if points is None else points
         frames = [shrink(frame, config.image_width) for frame in with_depth_prior(frames, points, config)]
         seen = int(_SEEN * config.max_gaussians) if config.surroundings else config.max_gaussians
@@ -323,9 +324,7 @@ class Trainer:
                 total = total + config.lambda_depth / self.scene_depth * losses.depth_l1(depth, prior, mask)
             if prior is not None and config.lambda_pearson:
                 total = total + config.lambda_pearson * losses.pearson(depth, prior, mask)
-            if prior is not None and config.lambda_gradient:
-                total = total + config.lambda_gradient * losses.gradient_difference(depth, alpha, prior, mask)
-            return total + self._regularization(depth, alpha, distortion, target, mask)
+            return total + self._regularization(depth, distortion, mask)
 
         exposure = self._light["exposures"][view.exposure]
         rays = directions(view.camera, self.device)
@@ -335,8 +334,8 @@ class Trainer:
     def _virtual_loss(self, output: RenderOutput, view: _View, camera: Camera) -> Tensor:
         """Paper eq. 9: distortion and total variation from a virtual camera, the second one, beside a view."""
 
-        def loss(colors, depth, alpha, distortion, prior):
-            total = self._regularization(depth, alpha, distortion, colors.detach(), None)
+        def loss(depth, distortion, prior):
+            total = self._regularization(depth, distortion, None)
             if prior is not None:
                 total = total + self.config.lambda_pearson * losses.pearson(depth, prior, None)
             return total
@@ -344,16 +343,11 @@ class Trainer:
         prior = None
         if self.config.lambda_pearson and view.depth is not None:
             prior = _carried_depth(view, torch.from_numpy(camera.viewmat).to(view.depth))
-        images = (output.colors[1], output.depths[1], output.alphas[1], output.distortions[1])
-        return self._captured(loss, "virtual", *images, prior)
+        return self._captured(loss, "virtual", output.depths[1], output.distortions[1], prior)
 
-    def _regularization(self, depth: Tensor, alpha: Tensor, distortion: Tensor, image: Tensor, mask: Tensor | None) -> Tensor:
-        config, unit = self.config, self.scene_depth
-        if config.edge_aware:
-            variation = losses.edge_aware_variation(depth, alpha, image, mask, unit)
-        else:
-            variation = losses.total_variation(depth, mask) / unit
-        return config.lambda_dist * losses.masked_mean(distortion, mask) / unit + config.lambda_tv * variation
+    def _regularization(self, depth: Tensor, distortion: Tensor, mask: Tensor | None) -> Tensor:
+        distorted, varied = losses.masked_mean(distortion, mask), losses.total_variation(depth, mask)
+        return (self.config.lambda_dist * distorted + self.config.lambda_tv * varied) / self.scene_depth
 
     def _captured(self, function: Callable[..., Tensor], name: str, *tensors: Tensor | None) -> Tensor:
         """The value of a function of tensors or None. On a GPU its many small steps are recorded once, then replayed as one."""
@@ -491,6 +485,19 @@ def _read_checkpoint(path: Path, device: torch.device) -> dict:
     if found and found != {n: {"step": (), "exp_avg": shape, "exp_avg_sq": shape} for n, shape in enumerate(shapes)}:
         raise ValueError("the state of the optimiser does not fit the model")
     return state
+
+
+def _exposed(frames: list[Frame]) -> list[Frame]:
+    """The views that are not mostly white."""
+    tissue = [frame.image if frame.mask is None else frame.image[frame.mask > 0] for frame in frames]
+    white = [len(pixels) > 0 and float((pixels.min(-1) >= _WHITE).mean()) > _MOSTLY for pixels in tissue]
+    kept = [frame for frame, blind in zip(frames, white) if not blind]
+    if not kept:
+        raise SequenceError("every view is overexposed; lower the light or the camera's exposure")
+    if any(white):
+        stamps = ", ".join(f"{frame.stamp_ns * 1e-9:.3f} s" for frame, blind in zip(frames, white) if blind)
+        log.warning("views at %s left out: overexposed", stamps)
+    return kept
 
 
 def _consistent(frames: list[Frame]) -> tuple[list[Frame], np.ndarray, np.ndarray]:

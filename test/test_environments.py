@@ -390,11 +390,27 @@ def test_over_topics_observations_and_actions_are_bit_for_bit_those_of_the_envir
         ({"render_mode": "human"}, "render_mode must be rgb_array or None, got 'human'"),
         ({"scene": "no/such/model.ply"}, "no/such/model.ply: no such file"),
         ({"device": "abacus"}, "unknown device 'abacus'"),
+        ({"observations": "image", "image_width": 0}, "image_width must be at least 1, got 0"),
     ],
 )
 def test_mistakes_are_one_sentence(options, sentence):
     with pytest.raises(ValueError, match=re.escape(sentence)):
         environments.TaskEnvironment(**{"task": "retraction", "device": "cpu", **options})
+
+
+@pytest.mark.parametrize(
+    "actions, sentence",
+    [
+        (np.zeros((1, 4)), "retraction: actions must be 2 × 4 numbers, got the shape (1, 4)"),
+        (np.array([[0, 0, 0, 1], [0, np.nan, 0, 1]]), "retraction: the action of episode 1 is not finite: [0.0, nan, 0.0, 1.0]"),
+    ],
+)
+def test_a_wrong_action_is_one_sentence_and_changes_nothing(actions, sentence):
+    environment = environments.VectorTaskEnvironment("retraction", 2, device="cpu")
+    before, _ = environment.reset(seed=1)
+    with pytest.raises(ValueError, match=re.escape(sentence)):
+        environment.step(actions)
+    np.testing.assert_array_equal(environment.batch.observe(), before)
 
 
 def test_a_model_too_small_for_the_task_is_refused():

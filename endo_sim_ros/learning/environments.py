@@ -39,6 +39,8 @@ def _make(
         raise ValueError(f"observations must be state, image or both, got {observations!r}")
     if render_mode not in (None, "rgb_array"):
         raise ValueError(f"render_mode must be rgb_array or None, got {render_mode!r}")
+    if image_width < 1:
+        raise ValueError(f"image_width must be at least 1, got {image_width}")
     randomisation = Randomisation(**randomisation) if isinstance(randomisation, dict) else randomisation or Randomisation()
     scene = scene if isinstance(scene, Scene) else load_scene(scene)
     images = render_mode is not None or observations != "state"
@@ -100,7 +102,7 @@ class TaskEnvironment(gymnasium.Env):
         return _first(observations), float(outcome.reward[0]), *ended, _first(_info(self.batch, outcome))
 
     def render(self) -> np.ndarray | None:
-        return self.batch.images([0])[0] if self.render_mode else None
+        return self.batch.images()[0] if self.render_mode else None
 
 
 class VectorTaskEnvironment(gymnasium.vector.VectorEnv):

@@ -153,16 +153,13 @@ class TaskBatch:
         return self.task.observe(positions, self.tissue.tools.reaction_forces[:, 0].cpu().numpy())
 
     @torch.no_grad()
-    def images(self, episodes: Sequence[int] | None = None) -> np.ndarray:
-        """What the endoscope sees of these episodes, by default all [B, H, W, 3], uint8."""
-        episodes = range(self.count) if episodes is None else episodes
-        groups = [episodes[i : i + _AT_ONCE] for i in range(0, len(episodes), _AT_ONCE)]
-        return np.concatenate([self._render(group) for group in groups])
+    def images(self) -> np.ndarray:
+        """What the endoscope sees of all episodes [B, H, W, 3], uint8."""
+        return np.concatenate([self._render(slice(i, i + _AT_ONCE)) for i in range(0, self.count, _AT_ONCE)])
 
-    def _render(self, episodes: Sequence[int]) -> np.ndarray:
-        views, at_rest = [self.views[b] for b in episodes], self._model
+    def _render(self, own: slice) -> np.ndarray:
+        views, at_rest = self.views[own], self._model
         tensor = lambda arrays: torch.from_numpy(np.stack(arrays).astype(np.float32)).to(at_rest.means.device)
-        own = slice(episodes[0], episodes[-1] + 1) if len(episodes) == episodes[-1] + 1 - episodes[0] else list(episodes)
         seen = rasterize(
             self._means[own], None, None, at_rest.opacities, torch.stack([view.sh for view in views]),
             tensor([view.camera.viewmat for view in views]), tensor([view.camera.K for view in views]),

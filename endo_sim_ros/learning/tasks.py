@@ -106,8 +106,18 @@ class Task(ABC):
         """What else begins anew."""
 
     def act(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where the tips shall be at the end of the step [B, 3], m, world, and whether jaws are closed [B], for actions [B, 4]."""
-        actions = np.clip(np.asarray(actions, np.float64), -1.0, 1.0)
+        """Where the tips shall be at the end of the step [B, 3], m, world, and whether jaws are closed [B], for actions [B, 4].
+
+        Raises:
+            ValueError: If actions have another shape, or are not finite; nothing has changed then.
+        """
+        actions = np.asarray(actions, np.float64)
+        if actions.shape != (self.count, 4):
+            raise ValueError(f"{self.name}: actions must be {self.count} × 4 numbers, got the shape {actions.shape}")
+        if not np.isfinite(actions).all():
+            wrong = int((~np.isfinite(actions)).any(1).argmax())
+            raise ValueError(f"{self.name}: the action of episode {wrong} is not finite: {actions[wrong].tolist()}; has learning diverged?")
+        actions = np.clip(actions, -1.0, 1.0)
         self.tip = np.clip(self.tip + self.step_length * actions[:, :3], self.low, self.high)
         self.fourth = actions[:, 3]
         self.raised = np.where(self.fourth > 0, self.raised + 1, 0)

@@ -69,7 +69,8 @@ class PhysicsConfig(StageConfig):
     """A tool pulls, and a closing jaw holds, the skin nodes within this distance of its tip."""
     contact_radius: Annotated[float, Range(0.0, 0.1, "m")] = 0.0
     """Radius of the rigid capsule that each tool pushes the tissue away with, 0 = tools act by wrench and jaw only. Nodes, not
-    the skin between them, are what it touches, so a capsule thinner than the node spacing acts as one as thick as that."""
+    the skin between them, are what it touches, so a capsule thinner than 1.5 times their distance, or 0.3 of a grid cell, acts as
+    one as thick as that."""
     contact_length: Annotated[float, Range(0.0, 1.0, "m")] = 0.0
     """Length of that capsule from the tip backwards, against the tool's z axis; 0 = a sphere."""
     friction: Annotated[float, Range(0.0, 10.0)] = 0.2

@@ -10,7 +10,9 @@ from endo_sim_ros.physics.control_nodes import ControlNodes
 from endo_sim_ros.physics.mpm import Launch, MpmSolver
 from endo_sim_ros.physics.tools_kernels import Commands, Holds, Reach, load_nodes, measure_reactions, take_hold
 
-_THINNEST = 1.0  # of the distance between skin nodes; thinner, it would pass between them
+# A capsule acts as at least this thick: of the distance between skin nodes, as a thinner one would part them and pass, and of
+# a cell of the grid, as it would touch too few of its nodes to push the cell away.
+_THINNEST, _THINNEST_CELL = 1.5, 0.3
 
 
 class Tools:
@@ -68,7 +70,8 @@ class Tools:
         reach.radius, reach.travel, reach.duration = config.force_radius, config.travel, config.step_duration
         skin = nodes.rest[nodes.is_skin].astype(np.float64)
         apart = float(np.median(cKDTree(skin).query(skin, k=2)[0][:, 1])) if len(skin) > 1 else 0.0
-        radius = max(config.contact_radius, _THINNEST * apart) if config.contact_radius else 0.0
+        thinnest = max(_THINNEST * apart, _THINNEST_CELL * solver.cell_size)
+        radius = max(config.contact_radius, thinnest) if config.contact_radius else 0.0
         reach.contact_radius, reach.contact_length = radius, config.contact_length
         self.contact_radius = radius  # of the capsule that acts, m; 0 = none
         self._faults = wp.zeros(solver.environments, int, device=solver.device)

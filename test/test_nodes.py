@@ -827,6 +827,8 @@ def test_errors_at_500_hz_flood_neither_the_log_nor_diagnostics_nor_memory(bench
     bench.until(lambda: any(s[2]["errors"] == "1000" for s in bench.statuses["physics_node"]), "the count of errors")
     assert len(bench.statuses["physics_node"]) < _MOST_LOGGED + 10
     assert bench.statuses["physics_node"][-1][1] == "error 999"
+    physics.report_error("x" * 2_000_000)  # a frame_id of that length, quoted
+    bench.until(lambda: 1000 < len(bench.statuses["physics_node"][-1][1]) < 1010, "the beginning of a long error")
 
 
 # ----------------------------------------------------------------------------------------------------- rendering

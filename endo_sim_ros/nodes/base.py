@@ -37,6 +37,7 @@ from endo_sim_ros.sequences.frames import SequenceError
 
 _ERROR_SHOWN = 5.0  # seconds that an error stays on /diagnostics, and that its repetitions are not logged
 _MOST_LOGGED = 10  # different errors logged in that time: one whose text differs at 500 Hz must not flood the log
+_LONGEST_ERROR = 1000  # characters; a sentence may quote what came, and that may be megabytes
 _END_WITHIN = 3.0  # seconds that worker threads have to end before the process ends without them
 STREAM_DEPTH = 20
 
@@ -204,6 +205,7 @@ class EndoNode(Node):
     def report_error(self, text: str) -> None:
         """Show an error on /diagnostics for a while, beginning now; repetitions are only counted."""
         now = time.monotonic()
+        text = text if len(text) <= _LONGEST_ERROR else text[:_LONGEST_ERROR] + " …"
         self.error_count += 1
         self._error_text, self._error_until = text, now + _ERROR_SHOWN
         self._logged = {old: when for old, when in self._logged.items() if now - when < _ERROR_SHOWN}

@@ -93,7 +93,8 @@ def rasterize(
 
     Raises:
         ValueError: If shapes disagree, there is no camera, near or eps2d is negative, or a mean is not finite (this on
-            the CPU only: on CUDA that test would stall the device). Any other Gaussian whose projection is not finite is not drawn and gets zero gradients.
+            the CPU only: on CUDA that test would stall the device). Any other Gaussian whose projection is not finite
+            is not drawn and gets zero gradients.
     """
     options = {"covars": covars, "background": background, "masks": masks, "absgrad": absgrad}
     _check_inputs("rasterize", means, quats, scales, opacities, sh, viewmats, Ks, width, height, near, eps2d, **options)

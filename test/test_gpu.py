@@ -5,11 +5,13 @@ import pytest
 import torch
 
 from endo_sim_ros.cameras import Camera
+from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.physics import PhysicsConfig, Skinning, TissueBatch, TissueSimulation, build_control_nodes, mpm
 from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer
+from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
-from endo_sim_ros.splatting import rasterize, render
+from endo_sim_ros.splatting import rasterize
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 
@@ -155,7 +157,7 @@ def test_training_reaches_the_same_quality():
     for device in ("cpu", "cuda"):
         config = ReconstructionConfig(iterations=150, max_gaussians=8000, image_width=160, device=device)
         model = Trainer(frames[::2], config).run()
-        image = render(model, frames[1].camera).colors[0].detach().cpu()
-        quality[device] = float(-10 * torch.log10(((image - torch.from_numpy(frames[1].image) / 255) ** 2).mean()))
+        image, _ = DeformableRenderer(model, None, RenderingConfig(device="cpu")).render(frames[1].camera)
+        quality[device] = metrics.psnr(image, frames[1].image)
     assert quality["cpu"] > 20
     assert abs(quality["cpu"] - quality["cuda"]) < 0.7

@@ -365,10 +365,11 @@ class Config:
     def run(self) -> None:
         from endo_sim_ros.nodes.parameter_file import NODE_CONFIGS, parameter_file
 
-        unknown = [name for name in self.nodes if name not in NODE_CONFIGS]
+        nodes = [name if name in NODE_CONFIGS else name.removesuffix("_node") for name in self.nodes]  # executables end in _node
+        unknown = [name for name in nodes if name not in NODE_CONFIGS]
         if unknown:
             raise ConfigError(f"no node is called {', '.join(unknown)}; there are {', '.join(NODE_CONFIGS)}")
-        print(parameter_file(self.nodes or tuple(NODE_CONFIGS)), end="")
+        print(parameter_file(nodes or tuple(NODE_CONFIGS)), end="")
 
 
 @dataclass(frozen=True)
@@ -506,6 +507,8 @@ class Plot:
     def run(self) -> None:
         from endo_sim_ros.evaluation.bench_plot import plot_rows
 
+        if not self.files:
+            raise ValueError("no files to plot; give those that `endo-sim bench … --json FILE` wrote")
         print(f"{self.out}: {plot_rows(self.files, self.out, self.only, self.title)} rows")
 
 

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import pytest
 import yaml
 
+from endo_sim_ros import cli
 from endo_sim_ros.config import ConfigError, Range, StageConfig, options
 from endo_sim_ros.nodes.parameter_file import NODE_CONFIGS, parameter_file
 
@@ -77,3 +78,8 @@ def test_parameter_file_gives_every_node_its_defaults():
             mine = {option.name: values.pop(option.name) for option in options(config)}
             assert config.from_mapping(mine) == config()
         assert not values
+
+
+def test_parameters_are_found_by_the_name_of_the_executable_too(capsys):
+    cli.Config(("policy_node", "viewer_node")).run()
+    assert capsys.readouterr().out == parameter_file(("policy", "viewer_node"))

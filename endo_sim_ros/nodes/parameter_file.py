@@ -1,6 +1,7 @@
 """The ROS parameter files in config/, generated from the configurations."""
 
 import textwrap
+from collections.abc import Sequence
 
 from endo_sim_ros.config import StageConfig, options
 from endo_sim_ros.nodes.bag_player_node import BagPlayerConfig
@@ -28,7 +29,7 @@ NODE_CONFIGS: dict[str, tuple[type[StageConfig], ...]] = {
 }
 
 
-def parameter_file(nodes: tuple[str, ...] = tuple(NODE_CONFIGS)) -> str:
+def parameter_file(nodes: Sequence[str] = tuple(NODE_CONFIGS)) -> str:
     """A YAML file with every parameter of the nodes at its default, each under its description and range."""
     lines = []
     for node in nodes:

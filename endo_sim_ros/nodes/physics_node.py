@@ -318,7 +318,7 @@ class PhysicsNode(EndoNode):
 
         def give_up(stamp: int, missing: set) -> None:
             parts = ", ".join(sorted(f"{name}'s {kind}" for name, kind in missing))
-            self.report_error(f"the command of {stamp * 1e-9:.6f} s is given up: a later one is complete but its {parts} never came")
+            self.report_error(f"the command of {stamp * 1e-9:.6f} s is given up: a later one is complete, but {parts} never came")
 
         while self._simulation is not None and (command := self._commands.take(give_up)):
             stamp, parts = command

@@ -17,6 +17,7 @@ log = logging.getLogger(__name__)
 
 _NEAREST = 0.02  # metres; closer than an endoscope works
 _MIN_POINTS = 30  # points needed to trust an offset or an interpolation
+_LEAST_DISPARITY = 5.0  # pixels; farther away half a pixel is more than a tenth of the depth
 _SPARSE = 16  # pixels between stereo matches that a network's depth is held against
 _FEATURES = 3000  # matched to find by how much the right image lies too high or too low
 _ROWS = 0.01  # of the image's height: the farthest that it may
@@ -201,4 +202,5 @@ def disparity_offset(frames: list[Frame], disparities: list[np.ndarray | None], 
 
 def _to_depth(frame: Frame, disparity: np.ndarray, offset: float) -> np.ndarray:
     corrected = np.where(disparity > 0, disparity + offset, 0)
-    return np.where(corrected > 0.5, frame.camera.K[0, 0] * frame.baseline / np.maximum(corrected, 0.5), 0)
+    far = frame.camera.K[0, 0] * frame.baseline / np.maximum(corrected, _LEAST_DISPARITY)
+    return np.where(corrected > _LEAST_DISPARITY, far, 0)

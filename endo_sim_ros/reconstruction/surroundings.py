@@ -54,7 +54,7 @@ def with_surroundings(
             chosen[stride // 2 :: stride, stride // 2 :: stride] = True
             chosen &= where & ~known
             points, spacing = camera.backproject(depth)[chosen], stride * depth[chosen] / camera.K[0, 0]
-            new = _unknown(points, frames)
+            new = _unknown(points, frames, where is not inside)
             if new.any():
                 new[new] = cKDTree(np.concatenate(parts)).query(points[new])[0] > 0.7 * spacing[new]
             parts.append(points[new])
@@ -99,8 +99,8 @@ def _continued(
     return camera, depth, _filled(colors, tissue)
 
 
-def _unknown(points: np.ndarray, frames: list[Frame]) -> np.ndarray:
-    """Which points [N] lie where no view knows the depth."""
+def _unknown(points: np.ndarray, frames: list[Frame], beyond: bool) -> np.ndarray:
+    """Which points [N] lie where no view knows the depth, or beyond what any view sees."""
     unknown = np.ones(len(points), bool)
     for frame in frames:
         if frame.depth is None:
@@ -108,7 +108,10 @@ def _unknown(points: np.ndarray, frames: list[Frame]) -> np.ndarray:
         uv, z = frame.camera.project(points)
         inside = np.nonzero((z > 0) & (uv >= 0).all(1) & (uv < [frame.camera.width, frame.camera.height]).all(1))[0]
         u, v = np.floor(uv[inside]).astype(int).T
-        unknown[inside[frame.depth[v, u] > 0]] = False
+        known = frame.depth[v, u] > 0
+        if beyond:
+            known |= True if frame.mask is None else frame.mask[v, u] > 0
+        unknown[inside[known]] = False
     return unknown
 
 

@@ -236,14 +236,14 @@ class PhysicsNode(EndoNode):
         goal = self._decode_tip(name, message, topic)
         self._require_enabled(arm, topic)
         arm.pose_goal = goal
-        self._tell_states()
+        self._tell_states(name)
 
     def _on_jaw_move(self, name: str, message: Any) -> None:
         arm, topic = self._arms[name], messages.tool_jaw_move(name).name
         goal = messages.decode_jaw(message, topic)
         self._require_pose(name, topic, "jaw command")
         arm.angle_goal = goal
-        self._tell_states()
+        self._tell_states(name)
 
     def _on_state_command(self, name: str, message: Any) -> None:
         try:
@@ -251,14 +251,15 @@ class PhysicsNode(EndoNode):
         except ValueError as error:
             raise MessageError(f"{messages.tool_state_command(name).name}: {error}") from error
         finally:
-            self._tell_states()
+            self._tell_states(name)
 
-    def _tell_states(self) -> None:
-        """Publish the operating state of each commanded arm when it has changed."""
+    def _tell_states(self, asked: str = "") -> None:
+        """Publish the operating state of each commanded arm when it has changed, and of the one that was asked for
+        something: clients of CRTK wait for a message after their command, even if it changes nothing."""
         for name, (*_, publisher) in self._arm_pubs.items():
             arm = self._arms[name]
             state = arm.state, arm.homed, arm.busy
-            if self._told.get(name) != state:
+            if name == asked or self._told.get(name) != state:
                 self._told[name] = state
                 publisher.publish(messages.encode_operating_state(*state, self.now_ns()))
 

@@ -605,3 +605,20 @@ def test_no_gaussian_outgrows_the_scene():
     trainer = Trainer(frames, ReconstructionConfig(iterations=60, max_gaussians=1000, device="cpu", learning_rate=5.0))
     trainer.run()
     assert trainer.model.scales.max() <= 0.06 * trainer.scene_depth * 1.001
+
+
+def test_points_that_float_before_the_surface_or_before_a_hole_of_it_do_not_become_gaussians(small):
+    frame, camera = small[0], small[0].camera
+    depth = frame.depth.copy()
+    row, column = camera.height // 2, camera.width // 2
+    true = float(depth[row, column])
+    depth[row - 10 : row + 11, column - 10 : column + 11] = 0  # a highlight: no depth there
+    ray = camera.backproject(np.ones_like(depth))[row, column] - camera.position
+    points = camera.position + ray * np.array([[0.5 * true], [true], [0.98 * true]])
+    points = np.concatenate([points, points + 1e-4])
+    views = [dataclasses.replace(frame, depth=depth)]
+    model = initial_model(views, points, np.full((6, 3), 0.5), options(max_gaussians=50_000))
+    z = camera.project(model.means.double().numpy())[1]
+    assert z.min() > 0.9 * frame.depth[frame.depth > 0].min()
+    near = np.linalg.norm(model.means.double().numpy()[:, None] - points, axis=2).min(0)
+    assert (near[[1, 2, 4, 5]] < 1e-6).all() and (near[[0, 3]] > 0.01).all()

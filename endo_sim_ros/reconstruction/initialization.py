@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
 from endo_sim_ros.gaussians import GaussianModel
@@ -12,6 +13,7 @@ from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.sequences.frames import Frame, SequenceError
 
 _OPACITY = 0.5
+_STEEPEST = 2.0  # slope of a surface across the line of sight, beyond which a point near it floats in front of it
 _MIN_POINTS = 10
 
 
@@ -41,7 +43,8 @@ def initial_model(
     stride = _stride(chosen, config.max_gaussians)
     taken = [pixels & _lattice(pixels.shape, stride) for pixels in chosen]
     parts = [_back_project(frames, i, pixels, stride, config.depth_tolerance) for i, pixels in enumerate(taken)]
-    parts.append(_in_holes(parts, points, colors))
+    afloat = _afloat(frames, points, config.depth_tolerance)
+    parts.append(_in_holes(parts, points[~afloat], colors[~afloat]))
     positions, colors, spacing = (np.concatenate(arrays) for arrays in zip(*parts))
     if len(positions) < _MIN_POINTS:
         raise SequenceError(
@@ -123,6 +126,22 @@ def _back_project(frames: list[Frame], index: int, pixels: np.ndarray, stride: f
         agrees = ((surface > 0) & (np.abs(z - surface) < tolerance * surface))[:, None]
         colors, count = colors + agrees * seen, count + agrees
     return _Points(points, colors / count, stride * frame.depth[pixels].astype(np.float64) / frame.camera.K[0, 0])
+
+
+def _afloat(frames: list[Frame], points: np.ndarray, tolerance: float) -> np.ndarray:
+    """Which triangulated points [N] float in front of the surface that some view sees there or, in a hole of it, beside it.
+
+    Highlights are where depth has holes, and where points are matched that are no tissue: they move with the light.
+    """
+    floats = np.zeros(len(points), bool)
+    for frame in frames:
+        if frame.depth is None or not (frame.depth > 0).any():
+            continue
+        distance, nearest = distance_transform_edt(frame.depth <= 0, return_indices=True)
+        beside = (frame.depth[tuple(nearest)] * (1 - tolerance - _STEEPEST * distance / frame.camera.K[0, 0])).astype(np.float32)
+        z, surface, _ = _seen(dataclasses.replace(frame, depth=np.maximum(beside, 0)), points)
+        floats |= (surface > 0) & (z < surface)
+    return floats
 
 
 def _in_holes(parts: list[_Points], points: np.ndarray, colors: np.ndarray) -> _Points:

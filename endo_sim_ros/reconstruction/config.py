@@ -19,7 +19,7 @@ class ReconstructionConfig(StageConfig):
     """Views wider than this are shrunk to it before training."""
     iterations: Annotated[int, Range(1, 1_000_000)] = 1000
     """Optimisation steps. The paper uses 3000; on a real abdomen seen in few views more than these lowered the quality of
-    other views, while still scenes with many views gain from more."""
+    other views, while a scene whose poses and stillness are exact gains from more."""
     max_gaussians: Annotated[int, Range(1, 10_000_000)] = 30_000
     """Largest number of Gaussians."""
     sh_degree: Annotated[int, Range(0, 3)] = 0

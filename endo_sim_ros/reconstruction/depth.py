@@ -17,7 +17,7 @@ log = logging.getLogger(__name__)
 
 _NEAREST = 0.02  # metres; closer than an endoscope works
 _MIN_POINTS = 30  # points needed to trust an offset or an interpolation
-_LEAST_DISPARITY = 5.0  # pixels; farther away half a pixel is more than a tenth of the depth
+_LEAST_DISPARITY = 2.0  # pixels; farther away half a pixel is more than a quarter of the depth
 _SPARSE = 16  # pixels between stereo matches that a network's depth is held against
 _FEATURES = 3000  # matched to find by how much the right image lies too high or too low
 _ROWS = 0.01  # of the image's height: the farthest that it may

@@ -424,7 +424,7 @@ def test_a_place_that_cannot_be_written_is_told_and_the_model_is_published_all_t
     send_frames(bench, small_frames)
     assert bench.call(Trigger, "/reconstruction_node/reconstruct").success
     bench.refused("reconstruction_node", "the model cannot be saved", "/proc/nowhere", "set output_dir")
-    bench.until(lambda: models, "the model")
+    bench.until(lambda: models and not reconstruction._training, "the model, and the end of its training")
     assert reconstruction.status()[0] == ERROR  # still
     assert "cannot be saved" in bench.call(Trigger, "/reconstruction_node/save").message
     assert bench.set("reconstruction_node", output_dir=str(tmp_path))[0]

@@ -297,6 +297,11 @@ def test_environments_of_stable_baselines3_begin_anew_at_once():
     at_end, begun = (dict(zip(names, row)) for row in (infos[0]["terminal_observation"], observations[0]))
     assert at_end["spot_moved_z"] >= 1 and begun["spot_moved_z"] == 0 and begun["time_left"] == 1 and begun["force"] == 0
     assert "terminal_observation" not in infos[1] and observations[1][-1] < before[1][-1]
+    stable.set_attr("label", "tissue")
+    assert many.label == "tissue" and stable.get_attr("label") == ["tissue"] * 2
+    assert stable.env_method("render") == [many.render()] * 2
+    with pytest.raises(ValueError, match="the 2 environments are one object"):
+        stable.env_method("render", indices=[1])
     seen, *_ = play(make(), scripted_policy("retraction"), 0)
     np.testing.assert_array_equal(infos[0]["terminal_observation"], seen[-1])  # the episode of gymnasium with that seed
     for _ in range(60):

@@ -61,10 +61,16 @@ class StableEnvironments(VecEnv):
         return [getattr(self.environment, attr_name)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name, value, indices=None):
-        raise NotImplementedError("the environments are one object; they cannot be set one by one")
+        self._all(indices)
+        setattr(self.environment, attr_name, value)
 
     def env_method(self, method_name, *method_args, indices=None, **method_kwargs):
-        raise NotImplementedError("the environments are one object; its methods are those of `environment`")
+        self._all(indices)
+        return [getattr(self.environment, method_name)(*method_args, **method_kwargs)] * self.num_envs
+
+    def _all(self, indices) -> None:
+        if sorted(self._get_indices(indices)) != list(range(self.num_envs)):
+            raise ValueError(f"the {self.num_envs} environments are one object; set or call all of them, without indices")
 
     def env_is_wrapped(self, wrapper_class, indices=None):
         return [False] * len(list(self._get_indices(indices)))

@@ -44,7 +44,10 @@ setup(
         "rl": ["gymnasium>=1.1", "stable-baselines3>=2.4"],  # `endo-sim train --algorithm ppo`
         "viewer": ["viser>=1.1"],  # `endo-sim view`, viewer_node
         "report": ["matplotlib"],  # `endo-sim report`, `endo-sim plot`, plots of `endo-sim evaluate`
-        "test": "gymnasium hypothesis matplotlib mcap mcap-ros2-support plyfile pyarrow pytest ruff torchmetrics viser>=1.1".split(),
+        "test": [
+            *("gaussforge", "gymnasium", "hypothesis", "matplotlib", "mcap", "mcap-ros2-support", "plyfile", "pyarrow", "pytest"),
+            *("ruff", "torchmetrics", "viser>=1.1"),
+        ],
     },
     entry_points={"console_scripts": ["endo-sim = endo_sim_ros.cli:main"]},
     data_files=[

@@ -220,6 +220,25 @@ class View:
 
 
 @dataclass(frozen=True)
+class Compress:
+    """Write a model in SuperSplat's compressed layout, a quarter of the size; every command reads either."""
+
+    model: Positional[Path]
+    """PLY model, compressed or not."""
+    out: Positional[Path]
+    """File to write; a name that ends in .compressed.ply makes it compressed, any other .ply whole again."""
+
+    def run(self) -> None:
+        from endo_sim_ros.gaussians import load_ply, save_ply
+
+        if self.out.suffix != ".ply":
+            raise ModelError(f"{self.out}: models are written as .compressed.ply or .ply; give such a name")
+        model = load_ply(self.model)
+        save_ply(model, self.out)
+        print(f"{self.out}: {len(model)} Gaussians, {self.out.stat().st_size / 1e6:.1f} MB, was {self.model.stat().st_size / 1e6:.1f} MB")
+
+
+@dataclass(frozen=True)
 class Record:
     """Record a running graph into a rosbag2, for replay or `export`, until interrupted."""
 
@@ -522,6 +541,7 @@ COMMANDS = {
     "phantom": Phantom,
     "reconstruct": Reconstruct,
     "view": View,
+    "compress": Compress,
     "record": Record,
     "export": Export,
     "scene": SaveScene,

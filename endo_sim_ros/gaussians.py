@@ -1,4 +1,4 @@
-"""The Gaussian model (structure of arrays) and its PLY files in the INRIA layout."""
+"""The Gaussian model (structure of arrays) and its PLY files, in the INRIA layout and in SuperSplat's compressed one."""
 
 import dataclasses
 import re
@@ -10,9 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from endo_sim_ros import compressed_ply
+from endo_sim_ros.compressed_ply import SH_C0
 from endo_sim_ros.light import Light
 
-SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 sqrt(pi))
+_COMPRESSED = ".compressed.ply"  # ending of the names of compressed models, as SuperSplat has it
 _LIGHT = "endo_sim_light"  # mark of the comment that holds the light
 _LONGEST_HEADER = 65536  # bytes of a PLY file; that of a model of degree 3 has 1500
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
@@ -185,24 +187,36 @@ def from_columns(columns: dict[str, np.ndarray], source: str) -> GaussianModel:
 def save_ply(model: GaussianModel, path: str | Path) -> None:
     """Write a binary PLY that SuperSplat, viser and other 3DGS viewers open. Written whole or not at all.
 
-    The light, which they ignore, is a comment in the header.
+    The light, which they ignore, is a comment in the header. A name that ends in .compressed.ply makes it SuperSplat's
+    compressed layout, which other viewers may not read.
     """
     path = Path(path)
     columns, names = to_columns(model), ply_fields(model.sh_degree)
-    names = names[:3] + ["nx", "ny", "nz"] + names[3:]
-    columns = np.concatenate([columns[:, :3], np.zeros((len(model), 3), np.float32), columns[:, 3:]], 1)
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(model)}"]
+    if path.name.endswith(_COMPRESSED) and len(model):
+        chunks, vertices, harmonics = compressed_ply.pack(dict(zip(names, columns.T)))
+        elements = [
+            ("chunk", "float", compressed_ply.CHUNK_FIELDS, chunks.astype("<f4")),
+            ("vertex", "uint", compressed_ply.VERTEX_FIELDS, vertices.astype("<u4")),
+        ]
+        if harmonics.size:
+            elements.append(("sh", "uchar", [name for name in names if name.startswith("f_rest_")], harmonics))
+    else:
+        columns = np.concatenate([columns[:, :3], np.zeros((len(model), 3), np.float32), columns[:, 3:]], 1)
+        elements = [("vertex", "float", names[:3] + ["nx", "ny", "nz"] + names[3:], columns.astype("<f4"))]
+    lines = ["ply", "format binary_little_endian 1.0"]
     if model.light is not None:
-        lines.insert(2, f"comment {_LIGHT} {model.light.to_json()}")
-    lines += [*(f"property float {name}" for name in names), "end_header", ""]
+        lines.append(f"comment {_LIGHT} {model.light.to_json()}")
+    for name, kind, fields, array in elements:
+        lines += [f"element {name} {len(array)}", *(f"property {kind} {field}" for field in fields)]
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".part")
-    partial.write_bytes("\n".join(lines).encode() + columns.astype("<f4").tobytes())
+    header = "\n".join([*lines, "end_header", ""]).encode()
+    partial.write_bytes(header + b"".join(array.tobytes() for *_, array in elements))
     partial.replace(path)
 
 
 def load_ply(path: str | Path) -> GaussianModel:
-    """Read a 3DGS PLY of SH degree 0 to 3, binary or ASCII.
+    """Read a 3DGS PLY of SH degree 0 to 3, binary or ASCII, or one in SuperSplat's compressed layout.
 
     Raises:
         ModelError: If the file is absent, not a PLY, truncated, or lacks a field; the message names the file.
@@ -212,15 +226,17 @@ def load_ply(path: str | Path) -> GaussianModel:
         raise ModelError(f"{path}: no such file")
     try:
         with path.open("rb") as file:
-            vertices, light = _read_vertices(file, path.stat().st_size)
+            elements, light = _read_elements(file, path.stat().st_size)
+        columns = elements.pop("vertex")
+        if elements:
+            columns = compressed_ply.unpack(elements.get("chunk", {}), columns, elements.get("sh", {}))
     except (OSError, ValueError) as error:
         raise ModelError(f"{path}: not a readable PLY model ({error})") from error
-    model = from_columns({name: vertices[name] for name in vertices.dtype.names}, str(path))
-    return dataclasses.replace(model, light=light)
+    return dataclasses.replace(from_columns(columns, str(path)), light=light)
 
 
-def _read_vertices(file: BinaryIO, size: int) -> tuple[np.ndarray, Light | None]:
-    """The element `vertex` of a PLY file of a size in bytes, as a structured array, and the light.
+def _read_elements(file: BinaryIO, size: int) -> tuple[dict[str, dict[str, np.ndarray]], Light | None]:
+    """The columns of the elements of a PLY file of a size in bytes, and the light: of `vertex`, and of a compressed model's others.
 
     What the header claims is held against the size of the file before any memory is asked for.
     """
@@ -228,16 +244,17 @@ def _read_vertices(file: BinaryIO, size: int) -> tuple[np.ndarray, Light | None]
     end = re.search(rb"\nend_header[ \t\r]*\n", head)
     if not head.startswith(b"ply") or end is None:
         raise ValueError(f"no PLY header within {_LONGEST_HEADER} bytes")
-    order, name, count, fields, light = "", "", 0, [], None
+    order, elements, light = "", {}, None
     for line in head[: end.start()].decode("ascii", "replace").splitlines()[1:]:
         match line.split():
             case ["format", layout, "1.0"] if layout in _ORDERS:
                 order = _ORDERS[layout]
-            case ["element", _, _] if name == "vertex":
+            case ["element", name, _] if "vertex" in elements and name != "sh":
                 break  # what follows the vertices does not matter
-            case ["element", name, number]:
-                count = int(number)
-            case ["property", kind, field] if kind in _TYPES:
+            case ["element", name, number] if name not in elements:
+                fields = []
+                elements[name] = int(number), fields
+            case ["property", kind, field] if kind in _TYPES and elements:
                 fields.append((field, order + _TYPES[kind]))
             case ["comment", mark, *_] if mark == _LIGHT:
                 light = Light.from_json(line.split(_LIGHT, 1)[1])
@@ -245,18 +262,31 @@ def _read_vertices(file: BinaryIO, size: int) -> tuple[np.ndarray, Light | None]
                 pass
             case _:
                 raise ValueError(f"its header has {line[:60]!r}, which no Gaussian model has")
-    if name != "vertex" or not fields or not order:
+    begins = ("vertex",) if order == "=" else ("vertex", "chunk")
+    if next(iter(elements), "") not in begins or "vertex" not in elements or not order or not all(f for _, f in elements.values()):
         raise ValueError("its header has no format, or its data does not begin with vertices")
-    dtype, room, text = np.dtype(fields), size - end.end(), order == "="
-    least = 2 * len(fields) if text else dtype.itemsize  # bytes of a row; as text a digit and a blank, the last one optional
+    columns, start = {}, end.end()
+    for name, (count, fields) in elements.items():
+        array = _read_rows(file, start, size - start, name, count, np.dtype(fields), order == "=")
+        columns[name] = {field: array[field] for field, _ in fields}
+        start += array.nbytes
+        if order == "=":
+            break
+    return columns, light
+
+
+def _read_rows(file: BinaryIO, start: int, room: int, name: str, count: int, dtype: np.dtype, text: bool) -> np.ndarray:
+    """Rows of an element as a structured array [count], from where they start, of so many bytes as there are."""
+    least = 2 * len(dtype) if text else dtype.itemsize  # bytes of a row; as text a digit and a blank, the last one optional
     if not 0 <= count <= (room + text) // least:
-        raise ValueError(f"its header claims {count} vertices of {least} bytes or more, {room} bytes follow")
+        what = "vertices" if name == "vertex" else f"rows of {name}"
+        raise ValueError(f"its header claims {count} {what} of {least} bytes or more, {room} bytes follow")
     if not count:
-        return np.empty(0, dtype), light
+        return np.empty(0, dtype)
     if not text:
-        return np.memmap(file, dtype, "r", end.end(), (count,)), light
-    file.seek(end.end())
-    vertices = np.loadtxt(file, dtype, comments=None, max_rows=count, ndmin=1)
-    if len(vertices) < count:
-        raise ValueError(f"its header claims {count} vertices, {len(vertices)} follow")
-    return vertices, light
+        return np.memmap(file, dtype, "r", start, (count,))
+    file.seek(start)
+    rows = np.loadtxt(file, dtype, comments=None, max_rows=count, ndmin=1)
+    if len(rows) < count:
+        raise ValueError(f"its header claims {count} vertices, {len(rows)} follow")
+    return rows

@@ -152,27 +152,45 @@ def test_the_right_image_is_a_view_of_the_same_scene(views):
     assert finite(Trainer(views[::4], options(right_views=True)).run())
 
 
-@pytest.mark.parametrize("fault", ["turned", "moved"])
-def test_a_wrong_pose_among_good_ones_is_left_out(large, fault, caplog):
-    pose = large[2].camera.pose.copy()
-    if fault == "turned":
-        pose[:3, :3] = pose[:3, :3] @ cv2.Rodrigues(np.array([0.1, -0.08, 0.0]))[0]
-    else:
-        pose[:3, 3] += [0.03, 0.02, 0.0]
+FAULTS = {  # of view 2 of five: a rotation vector of its camera, and a movement along its axes in metres
+    "turned": ([0.1, -0.08, 0.0], [0.0, 0.0, 0.0]),
+    "rolled": ([0.0, 0.0, 0.1], [0.0, 0.0, 0.0]),
+    "moved": ([0.0, 0.0, 0.0], [0.03, 0.02, 0.0]),
+    "nearer": ([0.0, 0.0, 0.0], [0.0, 0.0, 0.01]),  # as a zoom would
+    "farther": ([0.0, 0.0, 0.0], [0.0, 0.0, -0.01]),
+}
+
+
+def misplaced(frame, fault):
+    pose, (rotation, movement) = frame.camera.pose.copy(), FAULTS[fault]
+    pose[:3, 3] += pose[:3, :3] @ np.array(movement)
+    pose[:3, :3] = pose[:3, :3] @ cv2.Rodrigues(np.array(rotation))[0]
+    return dataclasses.replace(frame, camera=frame.camera.at(pose))
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_wrong_pose_among_good_ones_is_found(large, fault, caplog):
     frames = [bare(frame) for frame in large]
-    frames[2] = dataclasses.replace(frames[2], camera=frames[2].camera.at(pose))
-    assert misposed([bare(frame) for frame in large], match_features(large)) == []
+    assert misposed(frames, match_features(frames)) == [] and not caplog.text
+    frames[2] = misplaced(frames[2], fault)
     assert misposed(frames, match_features(frames)) == [2]
-    trainer = Trainer(frames, options(image_width=160, depth="points"))
-    assert len(trainer.cameras) == 4 and "left out" in caplog.text
+    if fault == "moved":
+        trainer = Trainer(frames, options(image_width=160, depth="points"))
+        assert len(trainer.cameras) == 4 and "left out" in caplog.text
+
+
+def test_swapped_poses_of_two_views_are_found(large):
+    frames = [bare(frame) for frame in large]
+    frames[1], frames[3] = (dataclasses.replace(frames[i], camera=frames[j].camera) for i, j in ((1, 3), (3, 1)))
+    assert misposed(frames, match_features(frames)) == [1, 3]
 
 
 def test_of_two_views_neither_is_left_out(large, caplog):
-    pose = large[1].camera.pose.copy()
-    pose[:3, :3] = pose[:3, :3] @ cv2.Rodrigues(np.array([0.1, -0.08, 0.0]))[0]
-    frames = [large[0], dataclasses.replace(large[1], camera=large[1].camera.at(pose))]
-    assert misposed(frames, match_features(frames)) == []
-    assert "the poses of views 0 and 1 contradict" in caplog.text
+    for first, second, fault in ((bare(large[0]), bare(large[1]), "turned"), (large[0], large[1], "nearer")):  # the latter takes depth
+        frames = [first, misplaced(second, fault)]
+        caplog.clear()
+        assert misposed(frames, match_features(frames)) == []
+        assert "the poses of views 0 and 1 contradict" in caplog.text
 
 
 def test_pure_rotation_trains_with_depth_and_is_an_error_without(views):

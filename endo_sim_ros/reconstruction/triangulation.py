@@ -1,6 +1,7 @@
 """Sparse scene points from matched features of posed views, and views whose pose contradicts what they see."""
 
 import logging
+from itertools import combinations
 from typing import NamedTuple
 
 import cv2
@@ -17,6 +18,9 @@ _NEIGHBOURS = 3  # views matched with each view: the nearest in space
 _LEAST_MATCHES = 25  # consistent with some motion of the camera, to judge the given one by
 _LEAST_SHARE = 0.5  # of all matches, for that motion to be no accident
 _FARTHEST_OFF = 0.02  # of the image's width, median distance from where the poses expect these; tissue moves by less
+_CLOSE = 0.007  # of the width, within which poses are right
+_USUAL, _TIMES_USUAL = 0.2, 5.0  # the share of all groups of views that is taken to be right, and how many times as far off others may be
+_MOST_NAMED = 5
 _NEAR, _FAR = 0.02, 1e3  # metres, between which a match may lie
 
 
@@ -47,31 +51,45 @@ def triangulate(frames: list[Frame], matches: list[Matches] | None = None) -> tu
 def misposed(frames: list[Frame], matches: list[Matches]) -> list[int]:
     """Indices of the views whose poses contradict most of the views that they share features with.
 
-    Matches of two views that fit one motion of the camera, whichever, must fit the given one. Where only two views
-    contradict each other nobody can tell which is wrong: that is logged, and neither is named.
+    Matches of two views that fit one motion of the camera, whichever, must fit the given one, with the depth of the views
+    if there is any; and what three views share must be one point each, which a pose wrong along the line of sight fails.
+    Where views contradict each other and nobody can tell which is wrong, that is logged, and none is named.
     """
-    verdicts: dict[tuple[int, int], bool] = {}
-    for (i, j), uv_i, uv_j in matches:
-        inliers = _of_one_motion(frames[i], frames[j], uv_i, uv_j)
-        if inliers.sum() >= max(_LEAST_MATCHES, _LEAST_SHARE * len(inliers)):
-            off = _distance_from_epipolar(frames[i], frames[j], uv_i[inliers], uv_j[inliers])
-            verdicts[i, j] = bool(np.median(off) > _FARTHEST_OFF * frames[j].camera.width)
-    wrong: list[int] = []
+    moving = [m._replace(first=m.first[fits], second=m.second[fits]) for m in matches if (fits := _judged(frames, m)).any()]
+    wrong = _outvoted([(m.views, _off_in_two(frames, m)) for m in moving])
+    moving = [m for m in moving if not set(m.views) & set(wrong)]
+    return sorted(wrong + _outvoted([(views, _off_in_three(frames, views, uv)) for views, uv in _tracks(moving)]))
+
+
+def _outvoted(errors: list[tuple[tuple[int, ...], float]]) -> list[int]:
+    """The views that most of their groups contradict, of groups of views and how far off (widths of the image) each group is.
+
+    None if no more than as many others agree with each other.
+    """
+    if not errors:
+        return []
+    usual = np.quantile([off for _, off in errors], _USUAL, method="lower")
+    limit = min(max(_CLOSE, _TIMES_USUAL * usual), _FARTHEST_OFF)
+    count, wrong = 1 + max(max(views) for views, _ in errors), []
     while True:  # the worst first: what contradicts it may be right without it
-        bad, all_of = np.zeros(len(frames)), np.zeros(len(frames))
-        for pair, contradicts in verdicts.items():
-            if not set(pair) & set(wrong):
-                bad[list(pair)] += contradicts
-                all_of[list(pair)] += 1
-        worst = int(np.argmax(bad / np.maximum(all_of, 1)))
-        if not bad[worst]:
-            return sorted(wrong)
-        others = bad / np.maximum(all_of, 1)
-        if all_of[worst] < 2 or bad[worst] <= all_of[worst] / 2 or (others == others[worst]).sum() > 1:
-            pairs = ", ".join(f"{i} and {j}" for (i, j), contradicts in verdicts.items() if contradicts and not {i, j} & set(wrong))
-            log.warning("the poses of views %s contradict what both see; check them", pairs)
-            return sorted(wrong)
+        left = [(views, off) for views, off in errors if not set(views) & set(wrong)]
+        bad, all_of, total = np.zeros((3, count))
+        for views, off in left:
+            bad[list(views)] += off > limit
+            all_of[list(views)] += 1
+            total[list(views)] += min(off, 1.0)
+        share = bad / np.maximum(all_of, 1)
+        worst = max(range(count), key=lambda view: (share[view], bad[view], total[view]))
+        if not bad[worst] or all_of[worst] < 2 or share[worst] <= 0.5:
+            break
         wrong.append(worst)
+    agreeing = {view for views, off in left if off <= limit for view in views}
+    wrong = wrong if len(agreeing) > len(wrong) else []
+    unsettled = {tuple(sorted(views)) for views, off in errors if off > limit and not set(views) & set(wrong)}
+    if unsettled:
+        groups = ", ".join(" and ".join(map(str, views)) for views in sorted(unsettled)[:_MOST_NAMED])
+        log.warning("the poses of views %s contradict what they see; check them", groups)
+    return wrong
 
 
 def match_features(frames: list[Frame], max_features: int = 4000) -> list[Matches]:
@@ -99,6 +117,58 @@ def _of_one_motion(first: Frame, second: Frame, uv1: np.ndarray, uv2: np.ndarray
     sight = [(uv - f.camera.K[:2, 2]) / f.camera.K.diagonal()[:2] for f, uv in ((first, uv1), (second, uv2))]
     _, inliers = cv2.findEssentialMat(*sight, np.eye(3), cv2.RANSAC, 0.999, _MAX_ERROR / second.camera.K[0, 0])
     return np.zeros(len(uv1), bool) if inliers is None else inliers[:, 0] > 0
+
+
+def _judged(frames: list[Frame], matches: Matches) -> np.ndarray:
+    """Which matches [M] poses can be judged by: those of one motion of the camera, if it is no accident."""
+    inliers = _of_one_motion(*(frames[view] for view in matches.views), matches.first, matches.second)
+    return inliers & (inliers.sum() >= max(_LEAST_MATCHES, _LEAST_SHARE * len(inliers)))
+
+
+def _off_in_two(frames: list[Frame], matches: Matches) -> float:
+    """How far matches are from where the poses expect them, median in widths of the image."""
+    first, second = (frames[view] for view in matches.views)
+    off = [np.median(_distance_from_epipolar(first, second, matches.first, matches.second))]
+    for one, other, here, there in ((first, second, matches.first, matches.second), (second, first, matches.second, matches.first)):
+        if one.depth is None:
+            continue
+        u, v = np.floor(here).astype(int).T
+        known = one.depth[v, u] > 0
+        if known.sum() >= _LEAST_MATCHES:
+            points = one.camera.backproject(one.depth)[v, u][known]
+            off.append(np.median(np.linalg.norm(other.camera.project(points)[0] - there[known], axis=1)))
+    return float(max(off)) / second.camera.width
+
+
+def _tracks(matches: list[Matches]) -> list[tuple[tuple[int, int, int], list[np.ndarray]]]:
+    """Three views each, with their pixels [M, 2] of the features that the first shares with both others."""
+    ends: dict[int, list[tuple[int, np.ndarray, np.ndarray]]] = {}
+    for (i, j), first, second in matches:
+        ends.setdefault(i, []).append((j, first, second))
+        ends.setdefault(j, []).append((i, second, first))
+    found = []
+    for view, others in ends.items():
+        for (j, here_j, there_j), (k, here_k, there_k) in combinations(others, 2):
+            _, of_j, of_k = np.intersect1d(here_j @ [1, 1j], here_k @ [1, 1j], return_indices=True)
+            if len(of_j) >= _LEAST_MATCHES:
+                found.append(((view, j, k), [here_j[of_j], there_j[of_j], there_k[of_k]]))
+    return found
+
+
+def _off_in_three(frames: list[Frame], views: tuple[int, ...], pixels: list[np.ndarray]) -> float:
+    """How far features [M, 2] of several views are from one point each, median of the worst view's in widths of the image."""
+    cameras = [frames[view].camera for view in views]
+    rows = []
+    for camera, uv in zip(cameras, pixels):
+        x, y = ((uv - camera.K[:2, 2]) / camera.K.diagonal()[:2]).T[..., None]
+        rows += [x * camera.viewmat[2] - camera.viewmat[0], y * camera.viewmat[2] - camera.viewmat[1]]
+    homogeneous = np.linalg.svd(np.stack(rows, 1))[2][:, -1]
+    points = homogeneous[:, :3] / np.where(np.abs(homogeneous[:, 3:]) < 1e-9, 1e-9, homogeneous[:, 3:])
+    off = np.zeros(len(points))
+    for camera, uv in zip(cameras, pixels):
+        expected, z = camera.project(points)
+        off = np.maximum(off, np.where(z > 0, np.linalg.norm(expected - uv, axis=1) / camera.width, np.inf))
+    return float(np.median(off))
 
 
 def _distance_from_epipolar(first: Frame, second: Frame, uv1: np.ndarray, uv2: np.ndarray) -> np.ndarray:

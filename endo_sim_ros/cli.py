@@ -117,12 +117,14 @@ class Reconstruct:
     """Bag with images, camera_info and poses."""
     out: Positional[Path]
     """Folder for model.ply, cameras.json, checkpoint.pt and held_out.png."""
+    resume: bool = False
+    """Go on from the checkpoint.pt that an interrupted reconstruction of the same bag with the same options left in that folder."""
     config: Annotated[ReconstructionConfig, tyro.conf.arg(name="")] = field(default_factory=ReconstructionConfig)
 
     def run(self) -> None:
         from endo_sim_ros.evaluation.held_out import reconstruct_and_measure
 
-        reconstruct_and_measure(self.bag, self.out, self.config)
+        reconstruct_and_measure(self.bag, self.out, self.config, self.resume)
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,10 @@
 """The commands as a user types them."""
 
+import logging
 import re
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import cv2
@@ -11,7 +13,9 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
+from endo_sim_ros.evaluation.held_out import reconstruct_and_measure
 from endo_sim_ros.gaussians import load_ply
+from endo_sim_ros.reconstruction import ReconstructionConfig
 from endo_sim_ros.sequences.bag import read_bag
 
 ROOT = Path(__file__).parents[1]
@@ -46,6 +50,24 @@ def test_bag_is_read_by_the_authors_of_the_format(bag):
     assert found["/endoscope/right/camera_info"].p[3] == pytest.approx(-frame.camera.K[0, 0] * frame.baseline)
     position = found["/ECM/measured_cp"].pose.position
     np.testing.assert_allclose([position.x, position.y, position.z], frame.camera.position)
+
+
+def test_a_killed_reconstruction_goes_on_to_the_same_model(bag, tmp_path, caplog):
+    values = {"iterations": 120, "max_gaussians": 2000, "keyframes": 3, "image_width": 96, "device": "cpu"}
+    options = [word for name, value in values.items() for word in (f"--{name.replace('_', '-')}", str(value))]
+    command = [sys.executable, "-m", "endo_sim_ros.cli", "reconstruct", bag, tmp_path / "killed", *options]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        deadline = time.monotonic() + 100
+        while not (tmp_path / "killed" / "checkpoint.pt").exists() and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.005)
+        process.kill()
+    assert process.returncode == -9 and not (tmp_path / "killed" / "model.ply").exists()
+    config = ReconstructionConfig(**values)
+    with caplog.at_level(logging.INFO):
+        reconstruct_and_measure(bag, tmp_path / "killed", config, resume=True)
+    assert re.search(r"going on after [1-9]\d* iterations", caplog.text)
+    reconstruct_and_measure(bag, tmp_path / "whole", config)
+    assert (tmp_path / "killed" / "model.ply").read_bytes() == (tmp_path / "whole" / "model.ply").read_bytes()
 
 
 def test_reconstruct_writes_a_model_and_measures_held_out_views(bag, tmp_path):

@@ -20,6 +20,7 @@ from endo_sim_ros.sequences.frames import Frame
 
 log = logging.getLogger(__name__)
 
+_REPORTS, _CHECKPOINTS = 20, 10  # iterations between looks at the progress; checkpoints of a reconstruction
 _STRIPS = 3  # held-out views shown in the picture
 _SAME_SURFACE = 0.03  # relative difference of depth within which two views see the same surface
 
@@ -130,21 +131,30 @@ def difference(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
     return np.abs(image.astype(int) - reference).clip(0, 85).astype(np.uint8) * 3
 
 
-def reconstruct_and_measure(bag: Path, out: Path, config: ReconstructionConfig) -> dict[str, float]:
-    """Reconstruct a bag, save the model, and return mean figures over the views that were not trained on."""
+def reconstruct_and_measure(bag: Path, out: Path, config: ReconstructionConfig, resume: bool = False) -> dict[str, float]:
+    """Reconstruct a bag, save the model, and return mean figures over the views that were not trained on.
+
+    A checkpoint is written every tenth of the way; ``resume`` goes on from it, to the same model.
+    """
     out.mkdir(parents=True, exist_ok=True)  # before the long work
     frames = list(read_bag(bag))
     chosen = select_keyframes(frames, config.keyframes)
     log.info("%d views, training on %d", len(frames), len(chosen))
     trainer = Trainer([frames[index] for index in chosen], config)
+    if resume:
+        trainer.load_checkpoint(out / "checkpoint.pt")
+        log.info("going on after %d iterations", trainer.iteration)
+    iterations = trainer.config.iterations
     with ProgressBar() as bar:
-        task = bar.add_task("reconstructing", total=config.iterations)
+        task = bar.add_task("reconstructing", total=iterations)
 
         def on_progress(progress: Progress) -> None:
             text = f"reconstructing, {progress.gaussians} Gaussians, loss {progress.loss:.4f}"
             bar.update(task, completed=progress.iteration, description=text)
+            if progress.iteration % max(iterations // (_CHECKPOINTS * _REPORTS) * _REPORTS, _REPORTS) == 0:
+                trainer.save_checkpoint(out / "checkpoint.pt")
 
-        model = trainer.run(on_progress)
+        model = trainer.run(on_progress, _REPORTS)
     save_ply(model, out / "model.ply")
     save_cameras([frames[index].camera for index in chosen], out / "cameras.json")
     trainer.save_checkpoint(out / "checkpoint.pt")

@@ -4,7 +4,7 @@ import contextlib
 import functools
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import torch
@@ -88,3 +88,9 @@ def run_in_threads(jobs: Sequence[Callable[[], object]]) -> None:
     jobs[-1]()
     for future in futures:
         future.result()
+
+
+def map_in_threads(function: Callable, items: Iterable) -> list:
+    """Results of a function, which mostly waits for OpenCV or numpy, for each of the items, several at a time."""
+    with ThreadPoolExecutor(cpu_threads(), "endo_sim") as pool:
+        return list(pool.map(function, items))

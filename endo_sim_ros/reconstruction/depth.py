@@ -8,7 +8,7 @@ import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import Delaunay, cKDTree
 
-from endo_sim_ros.device import pick_device
+from endo_sim_ros.device import map_in_threads, pick_device
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.depth_network import cached_checkpoint, load_network, network_depth
 from endo_sim_ros.sequences.frames import Frame, SequenceError
@@ -54,7 +54,7 @@ def with_depth_prior(frames: list[Frame], points: np.ndarray, config: Reconstruc
     if source == "none":
         return [dataclasses.replace(frame, depth=None) for frame in frames]
     if source == "points":
-        return [_with_depth(frame, interpolated_depth(frame, points)) for frame in frames]
+        return map_in_threads(lambda frame: _with_depth(frame, interpolated_depth(frame, points)), frames)
     if source == "topic":
         return [_with_depth(frame, frame.depth) for frame in frames]
     if source == "network":
@@ -65,8 +65,8 @@ def with_depth_prior(frames: list[Frame], points: np.ndarray, config: Reconstruc
                 "depth=network, but no view's depth fits the scene points; check the poses, give views that overlap, or use depth=points"
             )
         return frames
-    frames = [frame if frame.right is None else _aligned(frame) for frame in frames]
-    disparities = [None if frame.right is None else stereo_disparity(frame) for frame in frames]
+    frames = map_in_threads(lambda frame: frame if frame.right is None else _aligned(frame), frames)
+    disparities = map_in_threads(lambda frame: None if frame.right is None else stereo_disparity(frame), frames)
     offset = disparity_offset(frames, disparities, points)
     frames = [_with_depth(f, None if d is None else _to_depth(f, d, offset)) for f, d in zip(frames, disparities)]
     return [frame if frame.right is None else _with_right_shifted(frame, offset) for frame in frames]

@@ -8,6 +8,7 @@ import torch
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
+from endo_sim_ros.device import map_in_threads
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.sequences.frames import Frame, SequenceError
@@ -70,28 +71,23 @@ def _surface_pixels(frames: list[Frame], tolerance: float) -> list[np.ndarray]:
         frame = frames[i]
         pixels = (frame.depth > 0) & (True if frame.mask is None else frame.mask > 0)
         points = frame.camera.backproject(frame.depth)[pixels]
-        keep = np.ones(len(points), bool)
-        for j in with_depth:
-            if j == i:
-                continue
-            z, surface, _ = _seen(frames[j], points)
-            keep &= ~((surface > 0) & (z < surface * (1 - tolerance)))
-            if j in done:
-                keep &= ~((surface > 0) & (z < surface * (1 + tolerance)))
-        chosen[i][pixels] = keep
+
+        def keeps(j: int) -> np.ndarray:
+            z, surface, _ = _seen(frames[j], points)  # noqa: B023
+            return (surface <= 0) | (z >= surface * (1 + tolerance if j in done else 1 - tolerance))
+
+        chosen[i][pixels] = np.all([np.ones(len(points), bool), *map_in_threads(keeps, [j for j in with_depth if j != i])], 0)
         done.append(i)
     return chosen
 
 
 def _seen(frame: Frame, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Depth [N] (m) of points [N, 3] in a view; depth (0 = none) and RGB [N, 3] of the surface that it sees there."""
+    """Depth [N] (m) of points [N, 3] in a view; depth (0 = none) of the surface that it sees there, and which of its pixels that is [N]."""
     uv, z = frame.camera.project(points)
-    u, v = np.floor(uv).T
+    u, v = uv.T
     inside = (z > 0) & (u >= 0) & (v >= 0) & (u < frame.camera.width) & (v < frame.camera.height)
-    surface, colors = np.zeros(len(points)), np.zeros((len(points), 3))
-    rows, columns = v[inside].astype(int), u[inside].astype(int)
-    surface[inside], colors[inside] = frame.depth[rows, columns], frame.image[rows, columns] / 255.0
-    return z, surface, colors
+    pixels = np.where(inside, v, 0).astype(int) * frame.camera.width + np.where(inside, u, 0).astype(int)
+    return z, np.where(inside, frame.depth.reshape(-1)[pixels], 0.0), pixels
 
 
 def _stride(chosen: list[np.ndarray], limit: int) -> float:
@@ -124,7 +120,7 @@ def _back_project(frames: list[Frame], index: int, pixels: np.ndarray, stride: f
             continue
         z, surface, seen = _seen(other, points)
         agrees = ((surface > 0) & (np.abs(z - surface) < tolerance * surface))[:, None]
-        colors, count = colors + agrees * seen, count + agrees
+        colors, count = colors + agrees * (other.image.reshape(-1, 3)[seen] / 255.0), count + agrees
     return _Points(points, colors / count, stride * frame.depth[pixels].astype(np.float64) / frame.camera.K[0, 0])
 
 

@@ -9,6 +9,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from endo_sim_ros.cameras import Camera
+from endo_sim_ros.device import map_in_threads
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.light import features_at
 from endo_sim_ros.sequences.frames import Frame
@@ -40,10 +41,9 @@ def with_surroundings(
     """
     parts = [model.means.numpy().astype(np.float64)]
     colors, spacings = [], []
-    for frame, exposure in zip(frames, exposures):
-        if frame.depth is None or (frame.depth > 0).mean() < _LEAST_SEEN:
-            continue
-        camera, depth, picture = _continued(frame, light, exposure, reference, int(reach * frame.camera.width))
+    told = [(f, e) for f, e in zip(frames, exposures) if f.depth is not None and (f.depth > 0).mean() >= _LEAST_SEEN]
+    continued = map_in_threads(lambda view: _continued(view[0], light, view[1], reference, int(reach * view[0].camera.width)), told)
+    for (frame, _), (camera, depth, picture) in zip(told, continued):
         width, height, pad = frame.camera.width, frame.camera.height, (camera.width - frame.camera.width) // 2
         known = np.pad(frame.depth > 0, pad)
         inside = np.zeros(known.shape, bool)

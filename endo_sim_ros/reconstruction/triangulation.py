@@ -7,6 +7,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from endo_sim_ros.device import map_in_threads
 from endo_sim_ros.sequences.frames import Frame
 
 log = logging.getLogger(__name__)
@@ -94,20 +95,24 @@ def _outvoted(errors: list[tuple[tuple[int, ...], float]]) -> list[int]:
 
 def match_features(frames: list[Frame], max_features: int = 4000) -> list[Matches]:
     """SIFT features matched between each view and the nearest others."""
-    sift = cv2.SIFT_create(nfeatures=max_features, contrastThreshold=0.01)
-    features = [sift.detectAndCompute(cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY), frame.mask) for frame in frames]
-    found = []
-    for i, j in _pairs(frames):
-        (keys_i, desc_i), (keys_j, desc_j) = features[i], features[j]
+
+    def detect(frame: Frame):
+        sift = cv2.SIFT_create(nfeatures=max_features, contrastThreshold=0.01)
+        return sift.detectAndCompute(cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY), frame.mask)
+
+    features = map_in_threads(detect, frames)
+
+    def match(pair: tuple[int, int]) -> Matches | None:
+        (keys_i, desc_i), (keys_j, desc_j) = (features[i] for i in pair)
         if desc_i is None or desc_j is None or len(desc_j) < 2:
-            continue
+            return None
         matches = cv2.BFMatcher(cv2.NORM_L2).knnMatch(desc_i, desc_j, k=2)
         good = [m for m, n in matches if m.distance < _RATIO * n.distance]
-        if good:
-            uv_i = np.array([keys_i[m.queryIdx].pt for m in good]) + 0.5  # OpenCV counts from the centre of the first pixel
-            uv_j = np.array([keys_j[m.trainIdx].pt for m in good]) + 0.5
-            found.append(Matches((i, j), uv_i, uv_j))
-    return found
+        uv_i = np.array([keys_i[m.queryIdx].pt for m in good]) + 0.5  # OpenCV counts from the centre of the first pixel
+        uv_j = np.array([keys_j[m.trainIdx].pt for m in good]) + 0.5
+        return Matches(pair, uv_i, uv_j) if good else None
+
+    return [found for found in map_in_threads(match, _pairs(frames)) if found is not None]
 
 
 def _of_one_motion(first: Frame, second: Frame, uv1: np.ndarray, uv2: np.ndarray) -> np.ndarray:

@@ -58,7 +58,19 @@ def on_torch_stream(device: torch.device | str) -> contextlib.AbstractContextMan
         return contextlib.nullcontext()
     import warp as wp
 
-    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False)
+    return wp.ScopedStream(warp_stream(torch.cuda.current_stream(device)), sync_enter=False)
+
+
+def warp_stream(stream: torch.cuda.Stream):
+    """Warp's name for a stream of torch; the same object each time, as Warp forgets what it knows of a stream with it."""
+    return _warp_stream(stream.device, stream.cuda_stream)
+
+
+@functools.cache
+def _warp_stream(device: torch.device, handle: int):
+    import warp as wp
+
+    return wp.Stream(wp.device_from_torch(device), cuda_stream=handle)
 
 
 def cpu_threads() -> int:

@@ -139,7 +139,7 @@ def huge(model, _):
 
 
 def short_moments(optimizer, _):
-    return {"state": {0: {name: value[:1] if value.ndim else value for name, value in optimizer["state"][0].items()}}}
+    return optimizer | {"means": {name: value[:1] if value.ndim else value for name, value in optimizer["means"].items()}}
 
 
 HOSTILE_CHECKPOINTS = {

@@ -695,6 +695,22 @@ def test_room_follows_what_pictures_needed():
     assert 64_000_000 <= expectation.room(1_000_000) < 100_000_000
 
 
+def test_recorded_pictures_know_whether_their_room_still_fits():
+    expectation = rasterizer_tiled._Expectation(torch.device("cpu"))
+    room = rasterizer_tiled.Room.for_picture(expectation, 1000, 40)
+    assert room.fits()
+    expectation.seen.copy_(torch.tensor([30_000, 1000]))
+    assert not room.fits()  # too small
+    room = rasterizer_tiled.Room.for_picture(expectation, 1000, 40)
+    assert room.fits()
+    expectation.seen.copy_(torch.tensor([3000, 1000]))
+    for _ in range(20):
+        assert room.fits()
+    while room.fits():  # in the end too large
+        pass
+    assert rasterizer_tiled.Room.for_picture(expectation, 1000, 40).size < room.size / 2
+
+
 def test_pictures_in_inference_mode_do_not_disturb_later_gradients(compositor):
     for cache in (rasterizer._black, rasterizer._all_tiles, rasterizer_tiled._scratch):
         cache.cache_clear()

@@ -229,11 +229,11 @@ def test_out_of_memory_goes_on_at_half_the_size(views, monkeypatch, caplog):
     trainer = Trainer(views[::4], options())
     draw, widths = trainer._render, []
 
-    def short_of_memory(cameras, *arguments):
-        widths.append(cameras[0].width)
-        if cameras[0].width > 80:
+    def short_of_memory(viewmats, Ks, size, *arguments):
+        widths.append(size[0])
+        if size[0] > 80:
             raise torch.OutOfMemoryError("CUDA out of memory")
-        return draw(cameras, *arguments)
+        return draw(viewmats, Ks, size, *arguments)
 
     monkeypatch.setattr(trainer, "_render", short_of_memory)
     assert finite(trainer.run()) and trainer.iteration == 12

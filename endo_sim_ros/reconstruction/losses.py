@@ -3,18 +3,19 @@
 Images are [H, W, 3] in [0, 1], depths [H, W] in metres, masks [H, W] in {0, 1}.
 """
 
-import functools
 import math
 
 import cv2
-import numpy as np
 import torch
+import warp as wp
 from torch import Tensor
 
+from endo_sim_ros.device import init_warp, warp_stream
 from endo_sim_ros.gaussians import GaussianModel
+from endo_sim_ros.reconstruction import losses_kernels as kernels
+from endo_sim_ros.splatting.launching import kernel_arguments
 
-_WINDOW, _SIGMA = 11, 1.5  # the SSIM window of the field
-_C1, _C2 = 0.01**2, 0.03**2
+_C1, _C2 = kernels.C1, kernels.C2
 
 
 def masked_mean(values: Tensor, mask: Tensor | None) -> Tensor:
@@ -82,33 +83,14 @@ def depth_extent(model: GaussianModel, eye: Tensor) -> Tensor:
 
 def ssim(image: Tensor, target: Tensor) -> Tensor:
     """Structural similarity map [H, W, 3] (Wang et al. 2004; 11×11, σ 1.5, zeros around); gradient in ``image``."""
-    return _Ssim.apply(image, target)
-
-
-def _gaussian() -> np.ndarray:
-    x = np.arange(_WINDOW) - _WINDOW // 2
-    weights = np.exp(-(x**2) / (2 * _SIGMA**2))
-    return weights / weights.sum()
+    return (_SsimOnGpu if image.is_cuda else _Ssim).apply(image, target)
 
 
 def _blur(image: Tensor) -> Tensor:
     """Gaussian window over [H, W, C] with zero padding; symmetric, hence its own adjoint."""
-    if image.device.type == "cpu":  # OpenCV's separable filter is 10 times faster than a convolution here
-        kernel = _gaussian()
-        return torch.from_numpy(
-            cv2.sepFilter2D(image.numpy(), -1, kernel, kernel, borderType=cv2.BORDER_CONSTANT).reshape(image.shape)
-        )
-    # Two products with band matrices are faster on a GPU than convolutions, and no less exact than float32 is.
-    rows, columns = (_band(size, image.dtype, image.device) for size in image.shape[:2])
-    return (rows @ image.permute(2, 0, 1) @ columns).permute(1, 2, 0)
-
-
-@functools.lru_cache(maxsize=8)
-def _band(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """The window as a symmetric matrix [size, size]."""
-    offsets = np.arange(size)[:, None] - np.arange(size) + _WINDOW // 2
-    inside = (offsets >= 0) & (offsets < _WINDOW)
-    return torch.as_tensor(np.where(inside, _gaussian()[offsets.clip(0, _WINDOW - 1)], 0), dtype=dtype, device=device)
+    # OpenCV's separable filter is 10 times faster than a convolution here.
+    blurred = cv2.sepFilter2D(image.numpy(), -1, kernels.gaussian, kernels.gaussian, borderType=cv2.BORDER_CONSTANT)
+    return torch.from_numpy(blurred.reshape(image.shape))
 
 
 class _Ssim(torch.autograd.Function):
@@ -132,3 +114,32 @@ class _Ssim(torch.autograd.Function):
         v_mu = v * (2 * mu_y * B / (C * D) - 2 * mu_x * s / C) - 2 * mu_x * v_var - mu_y * v_cov
         v_mu, v_var, v_cov = _blur(torch.cat([v_mu, v_var, v_cov], 2)).split(x.shape[2], 2)
         return v_mu + 2 * x * v_var + y * v_cov, None
+
+
+class _SsimOnGpu(torch.autograd.Function):
+    """The same by kernels, on any device."""
+
+    @staticmethod
+    def forward(ctx, x: Tensor, y: Tensor) -> Tensor:
+        x, y = x.detach().contiguous(), y.detach().contiguous()
+        moments, slopes, values = x.new_empty(5, x.numel()), x.new_empty(3, x.numel()), torch.empty_like(x)
+        _launch(kernels.moments_across, [x, y, *x.shape[1:], moments], x)
+        _launch(kernels.similarity_down, [moments, x[0].numel(), values, slopes], x)
+        ctx.save_for_backward(x, y, slopes)
+        return values
+
+    @staticmethod
+    def backward(ctx, v: Tensor) -> tuple[Tensor, None]:
+        x, y, slopes = ctx.saved_tensors
+        sums, v_x = torch.empty_like(slopes), torch.empty_like(x)
+        _launch(kernels.gradient_across, [v.contiguous(), slopes, *x.shape[1:], sums], x)
+        _launch(kernels.gradient_down, [sums, x, y, x[0].numel(), v_x], x)
+        return v_x, None
+
+
+def _launch(kernel, arguments: list, image: Tensor) -> None:
+    """Launch a kernel for each value of an image."""
+    init_warp()
+    arguments = kernel_arguments(kernel, [a.view(-1) if isinstance(a, Tensor) and a.ndim == 3 else a for a in arguments])
+    stream = warp_stream(torch.cuda.current_stream(image.device)) if image.is_cuda else None
+    wp.launch(kernel, image.numel(), arguments, device=str(image.device), stream=stream)

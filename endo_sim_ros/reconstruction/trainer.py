@@ -1,6 +1,7 @@
 """Optimises Gaussians against a few views (paper eq. 7) and virtual cameras between them (eq. 8, 9)."""
 
 import dataclasses
+import functools
 import logging
 import math
 import pickle
@@ -23,12 +24,14 @@ from endo_sim_ros.reconstruction import densification, losses, photometry
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.depth import with_depth_prior
 from endo_sim_ros.reconstruction.initialization import initial_model
+from endo_sim_ros.reconstruction.optimizer import Adam
 from endo_sim_ros.reconstruction.presets import resolved
 from endo_sim_ros.reconstruction.surroundings import with_surroundings
 from endo_sim_ros.reconstruction.triangulation import match_features, misposed, triangulate
 from endo_sim_ros.sequences.frames import Frame, SequenceError
 from endo_sim_ros.sequences.recordings import lit_area
 from endo_sim_ros.splatting import RenderOutput, rasterize
+from endo_sim_ros.splatting.recording import Recording
 
 log = logging.getLogger(__name__)
 
@@ -58,6 +61,20 @@ class _View:
     depth: Tensor | None  # [H, W] m, 0 = none
     mask: Tensor | None  # [H, W] 1 = tissue
     exposure: int  # whose exposure it has: its own, or that of the left view of its pair
+    exposure_index: Tensor  # [1] the same
+
+
+class _Inputs(NamedTuple):
+    """What is new in an iteration, on the compute device; C = 2 with a virtual camera, else 1."""
+
+    viewmats: Tensor  # [C, 4, 4]
+    Ks: Tensor  # [C, 3, 3]
+    image: Tensor  # [H, W, 3] of the training view, and so on
+    exposure: Tensor  # [1] int64
+    mask: Tensor | None  # [H, W]
+    depth: Tensor | None  # [H, W]
+    rays: Tensor | None  # [3, H, W], for the light
+    carried: Tensor | None  # [H, W] depth prior as the virtual camera sees it
 
 
 class Progress(NamedTuple):
@@ -114,7 +131,7 @@ class Trainer:
         # Drawn where it is needed: a GPU that waits for numbers stands still.
         self._noise = self._generator if self.device == "cpu" else torch.Generator(self.device).manual_seed(config.seed)
         self._order: list[int] = []
-        self._graphs: dict[tuple, Callable[..., Tensor]] = {}
+        self._recordings: dict[tuple, Recording] = {}
         self._last_loss = torch.zeros(())
         self._light_prior = torch.tensor(light, dtype=torch.float32, device=self.device)
         self._set_light(self._light_prior, torch.tensor(exposures, dtype=torch.float32, device=self.device))
@@ -143,7 +160,7 @@ class Trainer:
         exposures = self._light["exposures"].cpu().numpy().astype(np.float64)
         brightness = []
         for view in self._views[: len(exposures)]:
-            output = self._render([view.camera])
+            output = self._render(*self._matrices([view.camera]), (view.camera.width, view.camera.height))
             image, depth, alpha = output.colors[0], output.depths[0], output.alphas[0]
             if self.config.light:
                 rays = directions(view.camera, self.device)
@@ -170,10 +187,10 @@ class Trainer:
             "stamps": self._stamps,
             "iteration": self.iteration,
             "model": self._detached().tensors(),
-            "optimizer": self._optimizer.state_dict(),
+            "optimizer": self._optimizer.state,
             "gradients": self._gradients,
             "light": {name: value.detach() for name, value in self._light.items()},
-            "light_optimizer": self._light_optimizer.state_dict() if self._light_optimizer else {"state": {}},
+            "light_optimizer": self._light_optimizer.state,
             "generator": self._generator.get_state(),
             "noise": self._noise.get_state(),
             "order": self._order,
@@ -207,10 +224,9 @@ class Trainer:
             if noise is not generator:
                 noise.set_state(state["noise"].cpu())
             self._set_model(GaussianModel(**state["model"]))  # what is refused was so before: a training goes on as it was
-            self._optimizer.load_state_dict(self._optimizer.state_dict() | {"state": state["optimizer"]["state"]})
+            self._optimizer.state = state["optimizer"]
             self._set_light(**state["light"])
-            if self._light_optimizer:
-                self._light_optimizer.load_state_dict(self._light_optimizer.state_dict() | {"state": state["light_optimizer"]["state"]})
+            self._light_optimizer.state = state["light_optimizer"]
             self._gradients = state["gradients"]
             self._generator, self._noise = generator, noise
             self.iteration, self._order = iteration, order
@@ -244,8 +260,7 @@ class Trainer:
         """Go on with images of half the size."""
         width = self._frames[0].camera.width // 2
         log.warning("out of memory: going on with images %d pixels wide; fewer max_gaussians may help, too", width)
-        self._optimizer.zero_grad(set_to_none=True)
-        self._graphs, self._views = {}, []
+        self._recordings, self._views = {}, []
         torch.cuda.empty_cache()
         self._load([shrink(frame, width) for frame in self._frames])
 
@@ -258,50 +273,84 @@ class Trainer:
         virtual = None
         if config.virtual_every and self.iteration % config.virtual_every == 0 and len(self._stamps) > 1:
             virtual = self._virtual_camera(view.exposure)
-        absgrad = None
-        if config.densification != "mcmc":
-            absgrad = torch.zeros(1 + (virtual is not None), len(self._parameters["means"]), 2, device=self.device, requires_grad=True)
-        cameras = [view.camera] if virtual is None else [view.camera, virtual]
-        masks = None if view.mask is None else (view.mask > 0)[None]
-        if masks is not None and virtual is not None:
-            masks = torch.cat([masks, torch.ones_like(masks)])
-        output = self._render(cameras, masks, absgrad)
-        loss = self._view_loss(output, view)
-        if virtual is not None:
-            loss = loss + self._virtual_loss(output, self._views[view.exposure], virtual)
-        if config.lambda_flat and self.iteration % _SELDOM == 0:
-            loss = loss + _SELDOM * config.lambda_flat * losses.depth_extent(self._current(), self._eye).mean()
-        if config.light:
-            loss = loss + _LIGHT_ANCHOR * ((self._light["light"] - self._light_prior) ** 2).sum()
-        loss.backward()
-        self._last_loss = loss.detach()
-        if absgrad is not None:
-            steepness = torch.hypot(absgrad.grad[0, :, 0] * (view.camera.width / 2), absgrad.grad[0, :, 1] * (view.camera.height / 2))
-            self._gradients += torch.stack([steepness, (steepness > 0).to(steepness.dtype)])
-        decay = 0.01 ** (self.iteration / config.iterations)
-        self._optimizer.param_groups[0]["lr"] = _RATES["means"] * self.scene_depth * config.learning_rate * decay
-        for optimizer in filter(None, (self._optimizer, self._light_optimizer)):
-            optimizer.step()
-            optimizer.zero_grad(set_to_none=True)
+        inputs = self._inputs(view, virtual)
+        self._optimizer.set_rate("means", self._step_size)
+        flat = bool(config.lambda_flat) and self.iteration % _SELDOM == 0
+        self._last_loss = self._descend(flat, inputs)
         self.iteration += 1
         with torch.no_grad():
-            # Nothing holds the size of Gaussians where every view is masked; one that grew would smear the deformed scene.
-            self._parameters["log_scales"].clamp_(max=math.log(_LARGEST * self.scene_depth))
             refining = self.iteration <= _LAST_REFINEMENT * config.iterations
             if refining and self.iteration % config.refine_every == 0:
                 self._refine()
             if config.densification == "mcmc" and self.iteration % _SELDOM == 0:
                 self._explore()
 
-    def _render(self, cameras: list[Camera], masks: Tensor | None = None, absgrad: Tensor | None = None) -> RenderOutput:
-        """Images of cameras of one size."""
+    @property
+    def _step_size(self) -> float:
+        """Learning rate of the means, metres."""
+        return _RATES["means"] * self.scene_depth * self.config.learning_rate * 0.01 ** (self.iteration / self.config.iterations)
+
+    def _inputs(self, view: _View, virtual: Camera | None) -> _Inputs:
+        viewmats, Ks = self._matrices([view.camera] if virtual is None else [view.camera, virtual])
+        carried, beside = None, self._views[view.exposure]
+        if virtual is not None and self.config.lambda_pearson and beside.depth is not None:
+            carried = _carried_depth(beside, viewmats[1])
+        rays = directions(view.camera, self.device) if self.config.light else None
+        return _Inputs(viewmats, Ks, view.image, view.exposure_index, view.mask, view.depth, rays, carried)
+
+    def _matrices(self, cameras: list[Camera]) -> tuple[Tensor, Tensor]:
+        """Of cameras, viewmats [C, 4, 4] and Ks [C, 3, 3]."""
+        # Without waiting for what the GPU still does.
+        tensor = lambda matrices: torch.from_numpy(np.stack(matrices).astype(np.float32)).to(self.device, non_blocking=True)
+        return tensor([camera.viewmat for camera in cameras]), tensor([camera.K for camera in cameras])
+
+    def _descend(self, flat: bool, inputs: _Inputs) -> Tensor:
+        """One step of the optimisers, ``flat`` with the seldom term in the loss that is returned; on a GPU replayed as one piece."""
+        function = functools.partial(self._descend_once, flat)
+        if self.device == "cpu":
+            return function(*inputs)
+        key = (flat, *(None if x is None else x.shape for x in inputs))
+        if key not in self._recordings:
+            self._recordings[key] = Recording(function)
+        return self._recordings[key](*inputs)
+
+    def _descend_once(self, flat: bool, *inputs: Tensor | None) -> Tensor:
+        config, view = self.config, _Inputs(*inputs)
+        cameras, (height, width) = len(view.viewmats), view.image.shape[:2]
+        wanted = {name: value for name, value in (self._parameters | self._light).items() if value.requires_grad}
+        absgrad = None
+        if config.densification != "mcmc":
+            wanted["absgrad"] = absgrad = torch.zeros(cameras, len(self._parameters["means"]), 2, device=self.device, requires_grad=True)
+        masks = None
+        if view.mask is not None:
+            masks = torch.stack([view.mask > 0, *[torch.ones_like(view.mask, dtype=torch.bool)] * (cameras - 1)])
+        output = self._render(view.viewmats, view.Ks, (width, height), masks, absgrad)
+        loss = self._view_loss(output, view)
+        if cameras > 1:
+            loss = loss + self._virtual_loss(output, view)
+        if flat:
+            loss = loss + _SELDOM * config.lambda_flat * losses.depth_extent(self._current(), self._eye).mean()
+        if config.light:
+            loss = loss + _LIGHT_ANCHOR * ((self._light["light"] - self._light_prior) ** 2).sum()
+        gradients = dict(zip(wanted, torch.autograd.grad(loss, list(wanted.values()))))
+        if absgrad is not None:
+            across, down = gradients["absgrad"][0].unbind(1)
+            steepness = torch.hypot(across * (width / 2), down * (height / 2))
+            self._gradients += torch.stack([steepness, (steepness > 0).to(steepness.dtype)])
+        for optimizer in (self._optimizer, self._light_optimizer):
+            optimizer.step({name: gradients[name] for name in optimizer.parameters})
+        with torch.no_grad():
+            # Nothing holds the size of Gaussians where every view is masked; one that grew would smear the deformed scene.
+            self._parameters["log_scales"].clamp_(max=math.log(_LARGEST * self.scene_depth))
+        return loss.detach()
+
+    def _render(
+        self, viewmats: Tensor, Ks: Tensor, size: tuple[int, int], masks: Tensor | None = None, absgrad: Tensor | None = None
+    ) -> RenderOutput:
+        """Images of cameras, width × height pixels."""
         model = self._current()
-        tensor = lambda matrices: torch.from_numpy(np.stack(matrices).astype(np.float32)).to(self.device)
-        return rasterize(
-            model.means, model.quats, model.scales, model.opacities, model.sh,
-            tensor([camera.viewmat for camera in cameras]), tensor([camera.K for camera in cameras]),
-            cameras[0].width, cameras[0].height, masks=masks, absgrad=absgrad,
-        )  # fmt: skip
+        tensors = model.means, model.quats, model.scales, model.opacities, model.sh
+        return rasterize(*tensors, viewmats, Ks, *size, masks=masks, absgrad=absgrad)
 
     def _virtual_camera(self, index: int) -> Camera:
         """Paper eq. 8: a random camera between a view and its nearest view."""
@@ -309,71 +358,40 @@ class Trainer:
         alpha = torch.rand((), generator=self._generator).item()
         return first.at(interpolate_pose(first.pose, second.pose, alpha))
 
-    def _view_loss(self, output: RenderOutput, view: _View) -> Tensor:
+    def _view_loss(self, output: RenderOutput, view: _Inputs) -> Tensor:
         """Paper eq. 7: photometric, depth, distortion and total variation of a training view, the first camera."""
+        config = self.config
+        image, depth, alpha, distortion = (images[0] for images in output[:4])
+        if config.light:
+            image = image * falloff(features(depth, alpha, view.rays, self.scene_depth), self._light["light"])[..., None]
+        if config.exposure:
+            image = image * self._light["exposures"].index_select(0, view.exposure).exp()
+        total = losses.photometric(image, view.image, view.mask, config.lambda_ssim)
+        if view.depth is not None and config.lambda_depth:
+            total = total + config.lambda_depth / self.scene_depth * losses.depth_l1(depth, view.depth, view.mask)
+        if view.depth is not None and config.lambda_pearson:
+            total = total + config.lambda_pearson * losses.pearson(depth, view.depth, view.mask)
+        return total + self._regularization(depth, distortion, view.mask)
 
-        def loss(colors, depth, alpha, distortion, target, rays, light, exposure, mask, prior):
-            config = self.config
-            image = colors
-            if config.light:
-                image = image * falloff(features(depth, alpha, rays, self.scene_depth), light)[..., None]
-            if config.exposure:
-                image = image * exposure.exp()
-            total = losses.photometric(image, target, mask, config.lambda_ssim)
-            if prior is not None and config.lambda_depth:
-                total = total + config.lambda_depth / self.scene_depth * losses.depth_l1(depth, prior, mask)
-            if prior is not None and config.lambda_pearson:
-                total = total + config.lambda_pearson * losses.pearson(depth, prior, mask)
-            return total + self._regularization(depth, distortion, mask)
-
-        exposure = self._light["exposures"][view.exposure]
-        rays = directions(view.camera, self.device)
-        images = (output.colors[0], output.depths[0], output.alphas[0], output.distortions[0])
-        return self._captured(loss, "view", *images, view.image, rays, self._light["light"], exposure, view.mask, view.depth)
-
-    def _virtual_loss(self, output: RenderOutput, view: _View, camera: Camera) -> Tensor:
-        """Paper eq. 9: distortion and total variation from a virtual camera, the second one, beside a view."""
-
-        def loss(depth, distortion, prior):
-            total = self._regularization(depth, distortion, None)
-            if prior is not None:
-                total = total + self.config.lambda_pearson * losses.pearson(depth, prior, None)
-            return total
-
-        prior = None
-        if self.config.lambda_pearson and view.depth is not None:
-            prior = _carried_depth(view, torch.from_numpy(camera.viewmat).to(view.depth))
-        return self._captured(loss, "virtual", output.depths[1], output.distortions[1], prior)
+    def _virtual_loss(self, output: RenderOutput, view: _Inputs) -> Tensor:
+        """Paper eq. 9: distortion and total variation from a virtual camera, the second one."""
+        total = self._regularization(output.depths[1], output.distortions[1], None)
+        if view.carried is not None:
+            total = total + self.config.lambda_pearson * losses.pearson(output.depths[1], view.carried, None)
+        return total
 
     def _regularization(self, depth: Tensor, distortion: Tensor, mask: Tensor | None) -> Tensor:
         distorted, varied = losses.masked_mean(distortion, mask), losses.total_variation(depth, mask)
         return (self.config.lambda_dist * distorted + self.config.lambda_tv * varied) / self.scene_depth
 
-    def _captured(self, function: Callable[..., Tensor], name: str, *tensors: Tensor | None) -> Tensor:
-        """The value of a function of tensors or None. On a GPU its many small steps are recorded once, then replayed as one."""
-        given = [tensor for tensor in tensors if tensor is not None]
-        present = tuple(tensor is not None for tensor in tensors)
-
-        def call(*values):
-            rest = iter(values)
-            return function(*(next(rest) if there else None for there in present))
-
-        if self.device == "cpu":
-            return call(*given)
-        key = (name, present, *(tuple(tensor.shape) for tensor in given))
-        if key not in self._graphs:
-            samples = tuple(tensor.detach().clone().requires_grad_(tensor.requires_grad) for tensor in given)
-            self._graphs[key] = torch.cuda.make_graphed_callables(call, samples, allow_unused_input=True)
-        return self._graphs[key](*given)
-
     # --------------------------------------------------------------- Gaussians
 
     def _set_model(self, model: GaussianModel) -> None:
         """Start optimising a model with a fresh optimiser."""
+        for recording in self._recordings.values():
+            recording.forget()
         self._parameters = {name: tensor.clone().requires_grad_() for name, tensor in _parameters(model).items()}
-        factor = self.config.learning_rate
-        groups = [{"params": [tensor], "lr": factor * _RATES[name]} for name, tensor in self._parameters.items()]
-        self._optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True)
+        self._optimizer = Adam(self._parameters, {name: self.config.learning_rate * rate for name, rate in _RATES.items()})
         # Σ of image gradients and number of views that had any, since the last refinement.
         self._gradients = torch.zeros(2, len(model), device=self.device)
 
@@ -383,9 +401,8 @@ class Trainer:
             "light": light.clone().requires_grad_(self.config.light),
             "exposures": exposures.clone().requires_grad_(self.config.exposure),
         }
-        rates = {"light": _LIGHT_RATE, "exposures": _EXPOSURE_RATE}
-        groups = [{"params": [value], "lr": rates[name]} for name, value in self._light.items() if value.requires_grad]
-        self._light_optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True) if groups else None
+        learnt = {name: value for name, value in self._light.items() if value.requires_grad}
+        self._light_optimizer = Adam(learnt, {"light": _LIGHT_RATE, "exposures": _EXPOSURE_RATE})
 
     def _current(self) -> GaussianModel:
         """The model made of the parameters, through which gradients flow."""
@@ -406,14 +423,13 @@ class Trainer:
             if config.densification == "proximity":
                 model, others, added = densification.unpool(model, config.max_gaussians)
                 source, fresh = source[others], fresh[others] | added
-        states = [self._optimizer.state[group["params"][0]] for group in self._optimizer.param_groups]
+        states = self._optimizer.state
         self._set_model(model)
-        for group, state in zip(self._optimizer.param_groups, states):
+        for name, state in states.items():
             moved = {key: value[source] if value.ndim else value for key, value in state.items()}
             for key in ("exp_avg", "exp_avg_sq"):
-                if key in moved:
-                    moved[key][fresh] = 0
-            self._optimizer.state[group["params"][0]] = moved
+                moved[key][fresh] = 0
+            self._optimizer.state[name] = moved
 
     def _explore(self) -> None:
         """Move faint Gaussians about at random."""
@@ -424,7 +440,7 @@ class Trainer:
                 return
             model = model.select(faint)
         # Variances are in m²: divided by the squared depth of the scene, steps are those of a scene of depth 1.
-        scale = _SELDOM**0.5 * _NOISE * self._optimizer.param_groups[0]["lr"] / self.scene_depth**2
+        scale = _SELDOM**0.5 * _NOISE * self._step_size / self.scene_depth**2
         self._parameters["means"][faint] += densification.exploration_noise(model, scale, self._noise)
 
     # --------------------------------------------------------------- inputs
@@ -445,6 +461,7 @@ class Trainer:
             None if frame.depth is None else tensor(frame.depth),
             None if frame.mask is None or frame.mask.all() else tensor(frame.mask > 0),
             exposure,
+            torch.tensor([exposure], device=self.device),
         )
 
 
@@ -470,19 +487,19 @@ def _read_checkpoint(path: Path, device: torch.device) -> dict:
         state = torch.load(path, map_location=device, weights_only=True)
     except pickle.UnpicklingError:  # whose text advises to load it all the same
         raise ValueError("it holds other objects than tensors and numbers") from None
-    moments = state["optimizer"]["state"]  # of each parameter, by its number; empty before the first step
-    lights = state["light_optimizer"]["state"]
+    moments, lights = state["optimizer"], state["light_optimizer"]  # of each parameter, by its name
     tensors = [*state["model"].values(), *state["light"].values(), state["gradients"]]
     tensors += [value for values in [*moments.values(), *lights.values()] for value in values.values()]
     if sum(tensor.numel() * tensor.element_size() for tensor in tensors) > size:  # views of less
         raise ValueError("it claims more than it holds")
     if any(tensor.dtype != torch.float32 or tensor.is_meta or not tensor.isfinite().all() for tensor in tensors):
         raise ValueError("its tensors are not of finite float32 numbers")
-    shapes = [tensor.shape for tensor in _parameters(GaussianModel(**state["model"])).values()]  # none without Gaussians
-    found = {number: {name: value.shape for name, value in values.items()} for number, values in moments.items()}
-    if state["gradients"].shape != (2, *shapes[0][:1]) if shapes else True:
+    parameters = _parameters(GaussianModel(**state["model"]))  # none without Gaussians
+    if state["gradients"].shape != (2, len(parameters["means"])) if parameters else True:
         raise ValueError("the gradients do not fit the model")
-    if found and found != {n: {"step": (), "exp_avg": shape, "exp_avg_sq": shape} for n, shape in enumerate(shapes)}:
+    optimized = parameters | {name: state["light"][name] for name in lights}
+    expected = {name: {"step": (), "exp_avg": x.shape, "exp_avg_sq": x.shape} for name, x in optimized.items()}
+    if {name: {key: value.shape for key, value in values.items()} for name, values in (moments | lights).items()} != expected:
         raise ValueError("the state of the optimiser does not fit the model")
     return state
 

@@ -1,6 +1,8 @@
 """Runs the kernels made for GPUs. Nothing here waits for the GPU, and little is done in Python while it waits for us."""
 
 import collections
+import contextlib
+import contextvars
 import functools
 import math
 import threading
@@ -43,6 +45,8 @@ def forward(scene: Scene, tile_mask: Tensor, settings: Settings) -> tuple[list[T
     with _lock, on_torch_stream(device):  # the scratch memory serves one picture after the other, and Warp has one stream
         if splat_count:
             scratch = _scratch(device, _stream(device))
+            if device.type == "cuda" and torch.cuda.is_current_stream_capturing():
+                scratch = scratch.anew()
             scratch.reserve_splats(splat_count)
             arguments = [*scene.gaussian_arguments(), *_cameras(scene, settings), settings.near, settings.eps2d, scene.apart, tile_mask]
             outputs = [splats, radii, scratch.depth_keys, scratch.order, counts]
@@ -116,13 +120,50 @@ class _Expectation:
         return math.ceil(2 ** (math.ceil(2 * math.log2(wanted)) / 2))
 
 
+class Room(NamedTuple):
+    """What recorded work has for the lists of a picture."""
+
+    expectation: _Expectation
+    splat_count: int
+    tile_count: int
+    size: int
+
+    @classmethod
+    def for_picture(cls, expectation: _Expectation, splat_count: int, tile_count: int) -> "Room":
+        """Room as it should be now."""
+        return cls(expectation, splat_count, tile_count, max(expectation.room(splat_count), splat_count, tile_count))
+
+    def fits(self) -> bool:
+        """Whether it is neither too small nor much too large by now."""
+        wanted = Room.for_picture(*self[:3]).size
+        return wanted <= self.size <= 2 * wanted
+
+
+_noted: contextvars.ContextVar[list[Room] | None] = contextvars.ContextVar("noted", default=None)
+
+
+@contextlib.contextmanager
+def noting_rooms():
+    """Within it, work is recorded: the list that it gives is of the room that the recorded pictures have."""
+    rooms: list[Room] = []
+    token = _noted.set(rooms)
+    try:
+        yield rooms
+    finally:
+        _noted.reset(token)
+
+
 class _Scratch:
     """What is written and read within one picture, in one stream of a device."""
 
-    def __init__(self, device: torch.device):
+    def __init__(self, device: torch.device, expectations: dict[int, _Expectation] | None = None):
         self._device = device
         self._splat_count, self._room, self.room = 0, 0, 0
-        self._expectations = collections.defaultdict(functools.partial(_Expectation, device))
+        self._expectations = collections.defaultdict(functools.partial(_Expectation, device)) if expectations is None else expectations
+
+    def anew(self) -> "_Scratch":
+        """Memory of its own for a picture that is recorded, which shall be there whenever it is replayed."""
+        return _Scratch(self._device, self._expectations)
 
     def reserve_splats(self, splat_count: int) -> None:
         """Make the memory for what each splat has."""
@@ -140,7 +181,10 @@ class _Scratch:
         self.seen = expectation.seen
         if self._device.type == "cpu":  # no need to wait
             expectation.numbers[:] = int(self.ends[-1]), self._splat_count
-        self.room = max(expectation.room(self._splat_count), self._splat_count, tile_count)
+        room = Room.for_picture(expectation, self._splat_count, tile_count)
+        self.room = room.size
+        if (noted := _noted.get()) is not None:
+            noted.append(room)
         if self.room > self._room:
             self._room = 0
             self.tiles, self.values = self._integers(2 * self.room), self._integers(2 * self.room)

@@ -1,0 +1,43 @@
+"""Adam with a rate for each tensor, nothing of whose step waits for a GPU: it can be recorded."""
+
+import torch
+from torch import Tensor
+from torch.optim.adam import adam
+
+
+class Adam:
+    """Adam (Kingma and Ba 2015), β = (0.9, 0.999), ε = 1e-15.
+
+    `torch.optim.Adam` is the same, but loads torch's compiler, which takes a second.
+
+    Args:
+        parameters: What to optimise, by name, of one device.
+        rates: Of each of them, the learning rate.
+    """
+
+    def __init__(self, parameters: dict[str, Tensor], rates: dict[str, float]):
+        self.parameters = parameters
+        # Where a GPU finds them, a recorded step reads what they are by then.
+        self.rates = {name: x.new_tensor(rates[name]) if x.is_cuda else rates[name] for name, x in parameters.items()}
+        self.state = {
+            name: {"step": x.new_zeros(()), "exp_avg": torch.zeros_like(x), "exp_avg_sq": torch.zeros_like(x)}
+            for name, x in parameters.items()
+        }
+
+    def set_rate(self, name: str, rate: float) -> None:
+        """Change the rate of a tensor."""
+        if isinstance(self.rates[name], Tensor):
+            self.rates[name].fill_(rate)
+        else:
+            self.rates[name] = rate
+
+    @torch.no_grad()
+    def step(self, gradients: dict[str, Tensor]) -> None:
+        """Move each tensor that has a gradient [of its shape]."""
+        for name, gradient in gradients.items():
+            state = self.state[name]
+            adam(
+                [self.parameters[name].detach()], [gradient], [state["exp_avg"]], [state["exp_avg_sq"]], [], [state["step"]],
+                fused=True, capturable=gradient.is_cuda, amsgrad=False, maximize=False, weight_decay=0.0,
+                lr=self.rates[name], beta1=0.9, beta2=0.999, eps=1e-15,
+            )  # fmt: skip

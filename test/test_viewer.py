@@ -426,6 +426,19 @@ def difference(a, b):
     return float(np.abs(a - b).mean())
 
 
+def rows(tab):
+    """Mean brightness [400] of the rows of the picture."""
+    return cv2.imdecode(np.frombuffer(tab.screenshot(), np.uint8), cv2.IMREAD_GRAYSCALE)[:, :300].mean(1)
+
+
+def frames_of(video):
+    """Pictures of a video, in floating point."""
+    capture, frames = cv2.VideoCapture(str(video)), []
+    while (read := capture.read())[0]:
+        frames.append(read[1].astype(float))
+    return frames
+
+
 def test_in_a_browser_tissue_is_seen_dragged_and_reset(chromium, tmp_path):
     pytest.importorskip("viser")
     from endo_sim_ros.viewer.standalone import Standalone
@@ -443,7 +456,7 @@ def test_in_a_browser_tissue_is_seen_dragged_and_reset(chromium, tmp_path):
     thread = threading.Thread(target=drive)
     thread.start()
     try:
-        first, second = (chromium.new_page(viewport={"width": 660, "height": 400}) for _ in range(2))
+        first, second = (chromium.new_page(viewport={"width": 934, "height": 400}) for _ in range(2))
         first.goto(page.viewer.url)
         second.goto(page.viewer.url)
         wait_until(lambda: seen(first).std() > 10, 30, "tissue on the page")
@@ -451,6 +464,9 @@ def test_in_a_browser_tissue_is_seen_dragged_and_reset(chromium, tmp_path):
         rest = seen(first)
         wait_until(lambda: difference(seen(second), rest) < 2, 30, "the second browser to show the same")
 
+        recorded = lambda: next((b._recording._count for b in page.viewer.browsers.values() if b._recording is not None), 0)
+        first.get_by_role("button", name="record").click()
+        wait_until(recorded, 20, "a recording")
         first.keyboard.down("Shift")
         first.mouse.move(200, 250)
         first.mouse.down()
@@ -461,6 +477,14 @@ def test_in_a_browser_tissue_is_seen_dragged_and_reset(chromium, tmp_path):
         assert page.viewer.tools["mouse"].force[0] > 0
         first.mouse.up()
         first.keyboard.up("Shift")
+        first.get_by_role("button", name="stop recording").click()
+        with first.expect_download() as download:
+            first.get_by_role("link", name=".mp4").click()
+        first.get_by_role("alert").filter(has_text=".mp4").get_by_role("button").last.click()  # it covers tissue
+        (video,) = tmp_path.glob("*.mp4")
+        assert Path(download.value.path()).read_bytes() == video.read_bytes()
+        frames = frames_of(video)
+        assert frames[0].std() > 5 and max(difference(frames[0], frame) for frame in frames) > 2, "tissue moves in the video"
 
         first.get_by_role("button", name="reset").click()
         wait_until(lambda: moved(page) == 0, 20, "tissue at rest", lambda: first.wait_for_timeout(50))
@@ -473,19 +497,11 @@ def test_in_a_browser_tissue_is_seen_dragged_and_reset(chromium, tmp_path):
         wait_until(lambda: difference(seen(first), rest) > 3, 20, "the view to turn")
         assert moved(page) == 0 and difference(seen(second), rest) < 2
 
-        first.get_by_role("button", name="record").click()
-        recording = lambda: next((b for b in page.viewer.browsers.values() if b._recording is not None), None)
-        browser = wait_until(recording, 20, "a recording")
-        first.wait_for_timeout(500)
-        first.get_by_role("button", name="stop recording").click()
-        wait_until(lambda: browser._button.label == "record", 20, "its end")
-        (video,) = tmp_path.glob("*.mp4")
-        good, frame = cv2.VideoCapture(str(video)).read()
-        assert good and frame.std() > 5
-
-        browser._view.value = VIEWS[-1]
-        page.viewer.post(browser._choose)
+        first.get_by_role("combobox", name="view").click()
+        first.get_by_role("option", name="endoscope").click()
         wait_until(lambda: difference(seen(first), rest) < 10 and seen(first).std() > 10, 20, "the endoscope's picture")
+        first.set_viewport_size({"width": 604, "height": 400})  # half the room beside the panel: the picture fits its width
+        wait_until(lambda: rows(first)[310:].max() < 5 < rows(first)[150:250].min(), 20, "the endoscope's whole picture, smaller")
     finally:
         going.clear()
         thread.join()

@@ -44,7 +44,7 @@ class Browser:
         self._changed: Callable[[], None] = lambda: None
         self._splats = self._points = self._room = None
         self._camera_shown: tuple | None = None  # of the newest rendered picture
-        self._picture_shown: int = 0  # which of the endoscope's it was
+        self._endoscope_shown: tuple[np.ndarray | None, float] = None, 0.0  # its picture, and the aspect that it was shown in
         self._recording: Recording | None = None
         gui = client.gui
         with gui.add_folder("view"):
@@ -88,7 +88,7 @@ class Browser:
             self._points.visible = self.wants_nodes
         if self.view == SPLATS or not self._tissue.value:
             self.client.scene.set_background_image(None)
-        self._camera_shown, self._picture_shown = None, 0
+        self._camera_shown, self._endoscope_shown = None, (None, 0.0)
         if self._room is not None:
             self._room.remove_drag_callback()
             self._listen()
@@ -110,7 +110,7 @@ class Browser:
         )  # seen from inside only, so that it hides nothing
         self._listen()
         self.look_from(viewer.camera)
-        self._camera_shown, self._picture_shown = None, 0
+        self._camera_shown, self._endoscope_shown = None, (None, 0.0)
 
     def _listen(self) -> None:
         """Hear drags: Shift pulls, Ctrl lifts, and plain ones pull where they are not for turning."""
@@ -182,9 +182,10 @@ class Browser:
         if self.view == ENDOSCOPE and viewer.endoscope is not None:
             picture = viewer.endoscope
             self.look_from(picture[1])
-            if self._tissue.value and id(picture[0]) != self._picture_shown:
-                self._picture_shown = id(picture[0])
-                aspect = self.client.camera.image_width / max(self.client.camera.image_height, 1)
+            aspect = self.client.camera.image_width / max(self.client.camera.image_height, 1)
+            image, shown_aspect = self._endoscope_shown
+            if self._tissue.value and (picture[0] is not image or aspect != shown_aspect):
+                self._endoscope_shown = picture[0], aspect
                 self._send(_padded(*picture, aspect))
         elif self.view == RENDERED and self._tissue.value:
             camera = _small(self.camera())

@@ -23,6 +23,7 @@ from endo_sim_ros.viewer.grasp import Grasp
 
 _QUIET = 0.4  # s without a change after which the sliders act; each change builds new tissue
 _TEXT_EVERY = 0.5  # s
+_PANEL_WIDTH = 270  # pixels
 _SLIDER_HINT = "Acts a moment after the slider stands still; a new thickness brings the tissue back to rest."
 _NOTICE_FOR = 8.0  # s that a notice stays
 _ARROW = 1.0  # cm of arrow per newton, as in tool_markers
@@ -365,6 +366,8 @@ class Viewer:
         scene, gui = self._server.scene, self._server.gui
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         gui.set_panel_label("endo-sim")
+        gui.main_panel.dock_right()  # beside the picture, which it would cover otherwise
+        gui.main_panel.set_width(_PANEL_WIDTH)
         scene.configure_environment_map(None)  # only arrows are lit; surroundings and shadows cost seconds where a GPU is missing
         scene.configure_default_lights(cast_shadow=False)
         scene.add_light_ambient("/light", intensity=1.0)

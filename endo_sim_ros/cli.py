@@ -343,6 +343,7 @@ class Train:
             from endo_sim_ros.learning.ppo import train_ppo as train
 
             config = self.ppo
+        self.out.mkdir(parents=True, exist_ok=True)  # before the long work
         policy, curve = train(self.task, load_scene(self.model), config, self.vary, self.device)
         save_training(self.out, policy, curve, config)
         last = curve[-1]

@@ -24,7 +24,12 @@ def bench_environments(
         environments: Numbers of environments stepped together.
         device: Compute device.
         repeats: Measurements, of which the median counts.
+
+    Raises:
+        ValueError: If a number of environments is not positive, or there is none.
     """
+    if not environments or min(environments) < 1:
+        raise ValueError(f"give numbers of environments of at least 1, got {' '.join(map(str, environments)) or 'none'}")
     device, scene, rows = pick_device(device), load_scene(), []
     with single_threaded_torch():
         for observations in ("state", "image"):

@@ -26,7 +26,7 @@ class Randomisation(StageConfig):
 class TrainingConfig(StageConfig):
     """The cross-entropy method: policies are drawn from a Gaussian, which moves to the best of them, again and again."""
 
-    generations: Annotated[int, Range(0, 100_000)] = 30
+    generations: Annotated[int, Range(1, 100_000)] = 30
     """How often the Gaussian moves."""
     population: Annotated[int, Range(4, 100_000)] = 128
     """Policies drawn each time; all run at once."""

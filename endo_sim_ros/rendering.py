@@ -76,9 +76,7 @@ class DeformableRenderer:
         model, covars = self.model, None
         if positions is not None:
             means, covars = self.deform(positions, F)
-            sh = model.sh
-            if model.sh_degree:
-                sh = self._turned_colors(means, F, camera)
+            sh = turned_colors(model.sh, self._skinning, means, F, camera) if model.sh_degree else model.sh
             model = GaussianModel(means, model.quats, model.log_scales, model.logit_opacities, sh)
         output = render(model, camera, background=self._background, covars=covars)
         colors, alpha = output.colors[0], output.alphas[0]
@@ -88,10 +86,18 @@ class DeformableRenderer:
         depth = torch.where(alpha > _MIN_ALPHA, output.depths[0] / alpha.clamp_min(1e-6), 0.0)
         return image.cpu().numpy(), depth.cpu().numpy()
 
-    def _turned_colors(self, means: Tensor, F: np.ndarray, camera: Camera) -> Tensor:
-        """Degree 0 coefficients [N, 1, 3] of the colours seen by the camera: view directions turn back with the tissue."""
-        position = torch.as_tensor(camera.position, dtype=torch.float32, device=self.device)
-        directions = torch.nn.functional.normalize(means - position, dim=1)
-        at_rest = torch.einsum("nij,ni->nj", self._skinning.rotations(F), directions)
-        sh = self.model.sh
-        return (sh_basis(at_rest, sh.shape[1])[..., None] * sh).sum(1, keepdim=True) / SH_C0
+
+def turned_colors(sh: Tensor, skinning: Skinning, means: Tensor, F: Tensor | np.ndarray, camera: Camera) -> Tensor:
+    """Degree 0 coefficients [N, 1, 3] of what a camera sees of colours sh [N, K, 3]: view directions turn back with the tissue.
+
+    Args:
+        sh: Of the Gaussians at rest.
+        skinning: How they follow the nodes.
+        means: Their centres now [N, 3], m, world.
+        F: Deformation gradients of the nodes [M, 3, 3].
+        camera: Where they are seen from.
+    """
+    position = torch.as_tensor(camera.position, dtype=torch.float32, device=means.device)
+    directions = torch.nn.functional.normalize(means - position, dim=1)
+    at_rest = torch.einsum("nij,ni->nj", skinning.rotations(F), directions)
+    return (sh_basis(at_rest, sh.shape[1])[..., None] * sh).sum(1, keepdim=True) / SH_C0

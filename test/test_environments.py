@@ -13,10 +13,13 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
+import rclpy
 import torch
 from conftest import wait_until
 from gymnasium.utils.env_checker import check_env
+from test_nodes import Bench
 
+from endo_sim_ros import messages
 from endo_sim_ros.config import ConfigError
 from endo_sim_ros.learning import bench, environments
 from endo_sim_ros.learning.config import PPOConfig, Randomisation, TrainingConfig
@@ -199,12 +202,13 @@ def test_randomisation_changes_what_it_names_and_nothing_else():
         make(randomisation={"light": 2.0})
 
 
-@pytest.mark.parametrize("light", [None, Light(distance=0.9, angle=0.4, response=0.3)], ids=["plain", "lit"])
-def test_images_are_those_of_the_renderer(light):
+@pytest.mark.parametrize("light, degree", [(None, 0), (None, 1), (Light(distance=0.9, angle=0.4, response=0.3), 0)])
+def test_images_are_those_of_the_renderer(light, degree):
     from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 
     scene = load_scene()
-    scene = replace(scene, model=replace(scene.model, light=light))
+    sh = torch.cat([scene.model.sh, torch.randn(len(scene.model), 3, 3, generator=torch.Generator().manual_seed(0))], 1)
+    scene = replace(scene, model=replace(scene.model, light=light, sh=sh[:, : (degree + 1) ** 2]))
     environment = make(observations="image", scene=scene)
     batch = environment.unwrapped.batch
     script = scripted_policy("retraction")
@@ -217,6 +221,13 @@ def test_images_are_those_of_the_renderer(light):
     expected, _ = renderer.render(batch.camera, batch.tissue.positions()[0], F)
     assert batch.tissue.displacements.abs().max() > 1e-3
     np.testing.assert_array_equal(image, expected)
+
+
+def test_a_task_is_seen_by_the_view_in_the_middle_as_in_the_graph():
+    scene = load_scene()
+    poses = [np.eye(4), scene.camera.pose, np.eye(4)]
+    poses[0][0, 3], poses[2][1, 3] = 0.01, 0.02
+    assert np.array_equal(Scene(scene.model, tuple(scene.camera.at(pose) for pose in poses)).camera.pose, poses[1])
 
 
 def test_a_network_is_saved_and_loaded_and_nothing_else_is(tmp_path):
@@ -341,10 +352,11 @@ def linear_policy():
 
 
 def assert_same_as_environment(record, task, policy, seed, episodes):
-    """The steps in a file are, bit for bit, those of the environment."""
-    heard, environment, k = np.load(record), make(task), 0
+    """The steps in a file are, bit for bit, those of the environment; returns its images of the last episode, the first at rest."""
+    heard, environment, k = np.load(record), make(task, render_mode="rgb_array"), 0
     for episode in range(episodes):
         observation, _ = environment.reset(seed=seed + episode)
+        images = [environment.render()]
         policy.reset([0])
         ended = False
         while not ended:
@@ -354,13 +366,26 @@ def assert_same_as_environment(record, task, policy, seed, episodes):
             observation, reward, terminated, truncated, info = environment.step(action)
             ended = terminated or truncated
             assert heard["rewards"][k] == reward and heard["success"][k] == info["success"], k
+            images.append(environment.render())
             k += 1
     assert k == len(heard["rewards"]) and heard["success"][-1]
+    return images
+
+
+@pytest.fixture
+def user():
+    """Somebody who listens to the graph."""
+    rclpy.init()
+    user = Bench()
+    yield user
+    user.close()
+    rclpy.try_shutdown()
 
 
 @pytest.mark.parametrize("task, episodes", [("retraction", 2), ("palpation", 1)])
-def test_over_topics_observations_and_actions_are_bit_for_bit_those_of_the_environment(task, episodes, tmp_path):
+def test_over_topics_observations_images_and_actions_are_bit_for_bit_those_of_the_environment(task, episodes, user, tmp_path):
     save_scene(load_scene(), tmp_path, task, seed=4)
+    seen = user.hear(messages.RENDERED_IMAGE)
     with NodeGroup(tmp_path / "logs") as group:
         parameters = ("--params-file", str(tmp_path / "parameters.yaml"))
         logs = lambda: [(log.name, log.read_text()[-800:]) for log in (tmp_path / "logs").iterdir()]  # noqa: E731
@@ -369,20 +394,33 @@ def test_over_topics_observations_and_actions_are_bit_for_bit_those_of_the_envir
             node = group.start("policy_node", *parameters, record=record, episodes=episodes, **options)
             if "reconstruction_node" not in group.nodes:
                 group.start("reconstruction_node", *parameters, output_dir=tmp_path)
-            wait_until(lambda: record.exists() or group.dead(), 90, logs)
+            user.until(lambda: record.exists() or group.dead(), logs, 90)
             assert not group.dead(), logs()
             node.interrupt()
             assert node.wait() == 0
 
         group.start("physics_node", *parameters, device="cpu")
+        group.start("rendering_node", *parameters, device="cpu", image_width=64)
+        user.until(lambda: user.user.count_publishers("rendered/image_raw"), "the rendering node", 60)
         run(tmp_path / "scripted.npz")
+        steps = np.load(tmp_path / "scripted.npz")["episode"]
+        last = int((steps == steps[-1]).sum())  # steps of the last episode
+        number = lambda message: messages.stamp_to_ns(message.header.stamp) / 40_000_000  # of the step
+        user.until(lambda: seen and number(seen[-1]) == last, "the last image")
+        shown = {}
+        for message in seen:
+            if number(message) < max(shown, default=0):
+                shown = {}  # another episode
+            shown[number(message)] = messages.decode_image(message, "rendered")
         if task == "retraction":
             linear_policy().save(tmp_path / "policy.npz")
             run(tmp_path / "learned.npz", policy=tmp_path / "policy.npz")
             other = group.start("policy_node", scene=tmp_path, task="palpation")  # for which other tissue is needed
             wait_until(lambda: "is not that of the scene and the task" in other.log.read_text(), 60, logs)
             assert other.exit_status is None
-    assert_same_as_environment(tmp_path / "scripted.npz", task, scripted_policy(task), 4, episodes)
+    images = assert_same_as_environment(tmp_path / "scripted.npz", task, scripted_policy(task), 4, episodes)
+    assert len(shown) > last / 2, "of the images; this process, which spins now and then, may miss some"
+    np.testing.assert_array_equal(list(shown.values()), [images[int(k)] for k in shown])
     if task == "retraction":
         assert_same_as_environment(tmp_path / "learned.npz", task, linear_policy(), 4, episodes)
 
@@ -445,6 +483,8 @@ def test_bench_gives_a_row_for_each_number_of_environments(tmp_path, capsys):
     rows = json.loads((tmp_path / "rows.json").read_text())
     assert len(rows) == 4 and all(row["value"] > 0 and row["unit"] == "steps/s" for row in rows)
     assert rows[1]["ratio"] > 0 and rows[1]["peer"] == "1 environment"
+    with pytest.raises(ValueError, match="numbers of environments of at least 1, got 4 0"):
+        bench.bench_environments(None, "retraction", (4, 0), "cpu")
 
 
 def test_the_code_in_the_guide_runs(tmp_path):

@@ -789,6 +789,11 @@ def test_gaussians_of_each_camera_match_the_reference_and_the_cameras_one_by_one
         alone = [means[c], covars[c], opacities, sh[c], viewmats[c : c + 1], Ks[c : c + 1]]
         one = draw(rasterize, [x.to(device, torch.float32) for x in alone])
         assert torch.equal(one.colors[0], output.colors[c]) and torch.equal(one.depths[0], output.depths[c])
+    everything[3] = sh[0]  # the same colours for all
+    shared = draw(rasterize, [x.to(device, torch.float32) for x in everything])
+    everything[3] = sh[:1].expand_as(sh)
+    assert torch.equal(shared.colors, draw(rasterize, [x.to(device, torch.float32) for x in everything]).colors)
+    assert not torch.equal(shared.colors, output.colors)
 
 
 def test_gaussians_of_each_camera_need_covariances_of_each_and_have_no_gradients():
@@ -797,7 +802,7 @@ def test_gaussians_of_each_camera_need_covariances_of_each_and_have_no_gradients
     covars = covariances(quats, scales)
     with pytest.raises(ValueError, match=r"covars of each camera, \(2, 60, 3, 3\)"):
         rasterize(own(means), quats, scales, opacities, own(sh), viewmats, Ks, 8, 8)
-    with pytest.raises(ValueError, match=r"sh shape \(60, 1, 3\) != expected shape \(2, 60, '1|4|9|16', 3\)"):
-        rasterize(own(means), None, None, opacities, sh, viewmats, Ks, 8, 8, covars=own(covars))
+    with pytest.raises(ValueError, match=r"sh shape \(3, 60, 1, 3\) != expected shape \(2, 60, 1, 3\)"):
+        rasterize(own(means), None, None, opacities, sh.expand(3, *sh.shape), viewmats, Ks, 8, 8, covars=own(covars))
     with pytest.raises(ValueError, match="have no gradients"):
         rasterize(own(means).requires_grad_(), None, None, opacities, own(sh), viewmats, Ks, 8, 8, covars=own(covars))

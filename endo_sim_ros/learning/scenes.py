@@ -26,11 +26,11 @@ class Scene:
 
     @property
     def camera(self) -> Camera:
-        """The endoscope that looks at a task."""
-        return self.cameras[0]
+        """The endoscope that looks at a task: as in the graph at the pose of the view in the middle, with the intrinsics of the first."""
+        return self.cameras[0].at(self.cameras[len(self.cameras) // 2].pose)
 
     def nodes(self, config: PhysicsConfig) -> ControlNodes:
-        """The tissue's nodes: those that physics_node makes of the same files, whose cameras have the intrinsics of the first."""
+        """The tissue's nodes: those that physics_node makes of the same files, whose cameras all have the same intrinsics."""
         cameras = [self.camera.at(camera.pose) for camera in self.cameras]
         return build_control_nodes(self.model, np.stack([camera.position for camera in cameras]), config, cameras)
 

@@ -13,6 +13,7 @@ from endo_sim_ros.learning.config import Randomisation
 from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.learning.tasks import Outcome, find_task
 from endo_sim_ros.physics import Skinning, TissueBatch
+from endo_sim_ros.rendering import turned_colors
 from endo_sim_ros.splatting import rasterize
 
 RESTING_SPEED = 1e-5  # m/s; as in TissueSimulation: one tissue slower than this, that no tool moves, is left as it is
@@ -27,8 +28,8 @@ class _View:
     """How one episode is seen."""
 
     camera: Camera
-    sh: torch.Tensor  # [N, K, 3]
-    light: np.ndarray | None  # [H, W, 1] factor, None = 1
+    light: np.ndarray | None = None  # [H, W, 1] factor, None = 1
+    contrast: float = 1.0  # factor on the colours' coefficients
 
 
 class TaskBatch:
@@ -80,7 +81,8 @@ class TaskBatch:
             self._skinning = Skinning(model, nodes.rest, device=device)
             self._means, self._covars = self.tissue.carry(self._skinning)
             self._model = model
-            self.views = [_View(self.camera, model.sh, None) for _ in range(count)]
+            self._pinned = torch.from_numpy(nodes.pinned).to(device)[:, None, None]
+            self.views = [_View(self.camera) for _ in range(count)]
 
     def reset(self, episodes: Sequence[int], generators: Sequence[np.random.Generator]) -> None:
         """Begin these episodes anew, each by the chance of its generator."""
@@ -161,7 +163,7 @@ class TaskBatch:
         views, at_rest = self.views[own], self._model
         tensor = lambda arrays: torch.from_numpy(np.stack(arrays).astype(np.float32)).to(at_rest.means.device)
         seen = rasterize(
-            self._means[own], None, None, at_rest.opacities, torch.stack([view.sh for view in views]),
+            self._means[own], None, None, at_rest.opacities, self._colors(own),
             tensor([view.camera.viewmat for view in views]), tensor([view.camera.K for view in views]),
             self.camera.width, self.camera.height, covars=self._covars[own],
         )  # fmt: skip
@@ -175,6 +177,17 @@ class TaskBatch:
             colors = colors * tensor(factors)
         return (colors.clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
 
+    def _colors(self, own: slice) -> torch.Tensor:
+        """Colours of all these episodes [N, K, 3], or of each [b, N, K, 3], as `rasterize` takes them."""
+        views, sh = self.views[own], self._model.sh
+        if self._model.sh_degree:
+            F = torch.where(self._pinned, torch.eye(3, device=sh.device), self.tissue.F[own])  # as on control_nodes
+            seen = zip(self._means[own], F, (view.camera for view in views))
+            sh = torch.stack([turned_colors(sh, self._skinning, *each) for each in seen])
+        if self.randomisation.texture:
+            sh = sh * sh.new_tensor([view.contrast for view in views])[:, None, None, None]
+        return sh
+
     def _view(self, chance: np.ndarray) -> _View:
         """How an episode is seen, by numbers [10] in -1 … 1."""
         by, camera = self.randomisation, self.camera
@@ -186,5 +199,5 @@ class TaskBatch:
             centred = (camera.rays()[..., :2] / np.abs(camera.rays()[..., :2]).max((0, 1))) ** 2
             falloff = by.light * 0.5 * (1 + chance[8])
             light = ((1 + by.light * chance[7]) * (1 - falloff * centred.sum(-1, keepdims=True) / 2)).astype(np.float32)
-        sh = self._model.sh * (1 + by.texture * float(chance[9])) if by.texture else self._model.sh
-        return _View(replace(camera, pose=pose) if by.camera_position or by.camera_angle else camera, sh, light)
+        camera = replace(camera, pose=pose) if by.camera_position or by.camera_angle else camera
+        return _View(camera, light, 1 + by.texture * float(chance[9]))

@@ -33,7 +33,7 @@ class Scene(NamedTuple):
 
     @property
     def apart(self) -> int:
-        """Whether each camera has means, covariances and colours of its own."""
+        """Whether each camera has means and covariances of its own."""
         return int(self.means.ndim == 3)
 
     def gaussian_arguments(self) -> list:

@@ -69,7 +69,7 @@ def rasterize(
 
     Args:
         means: Centres [N, 3], metres, world. Or of each camera its own [C, N, 3], e.g. of as many copies of tissue; then
-            covars [C, N, 3, 3] and sh [C, N, K, 3] must be, too, and there are no gradients.
+            covars [C, N, 3, 3] must be, too, sh [C, N, K, 3] may be, and there are no gradients.
         quats: Rotations wxyz [N, 4], not necessarily normalised; zero means no rotation. None when covars is given.
         scales: Standard deviations along the rotated axes [N, 3], metres. None when covars is given.
         opacities: Opacities in [0, 1] [N].
@@ -168,7 +168,7 @@ def _check_inputs(
         raise ValueError(f"{name}: viewmats shape {tuple(viewmats.shape)} != expected shape (C, 4, 4)")
     if not len(viewmats):
         raise ValueError(f"{name}: viewmats has no camera; at least one must be given")
-    if sh.ndim != means.ndim + 1 or sh.shape[-2] not in (1, 4, 9, 16):
+    if sh.ndim not in (3, means.ndim + 1) or sh.shape[-2] not in (1, 4, 9, 16):
         raise ValueError(f"{name}: sh shape {tuple(sh.shape)} != expected shape {(*means.shape[:-1], '1|4|9|16', 3)}")
     if covars is None and (quats is None or scales is None):
         raise ValueError(f"{name}: either covars or both quats and scales must be given")
@@ -188,7 +188,7 @@ def _check_inputs(
         "scales": (scales, (n, 3)),
         "covars": (covars, (*own, n, 3, 3)),
         "opacities": (opacities, (n,)),
-        "sh": (sh, (*own, n, sh.shape[-2], 3)),
+        "sh": (sh, (*own[: sh.ndim - 3], n, sh.shape[-2], 3)),
         "Ks": (Ks, (c, 3, 3)),
         "background": (background, (3,)),
         "masks": (masks, (c, height, width)),
@@ -339,7 +339,7 @@ def _rasterize(
     shared = means.ndim == 2
     cameras = [
         _render_reference(
-            *((means, covars, opacities, sh) if shared else (means[c], covars[c], opacities, sh[c])),
+            *((means, covars) if shared else (means[c], covars[c])), opacities, sh if sh.ndim == 3 else sh[c],
             viewmat, K, width, height, background, absgrad[c], near, eps2d,
         )
         for c, (viewmat, K) in enumerate(zip(viewmats, Ks))

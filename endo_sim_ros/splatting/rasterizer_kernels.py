@@ -294,7 +294,7 @@ def project(
     height: int,
     near: float,
     eps2d: float,
-    apart: int,  # whether means, covars and sh are those of each camera, one after the other
+    apart: int,  # whether means and covars are those of each camera, one after the other; sh may be, too
     tile_mask: wp.array[wp.uint8],  # [C · tiles], 0 = nobody looks at this tile
     splats: wp.array2d[float],  # out
     radii: wp.array[int],  # out, pixels, 0 = not in the image
@@ -336,7 +336,7 @@ def project(
         basis[0] = 0.28209479177387814
     else:
         basis = sh_basis(sh.shape[1], wp.normalize(means[own] + wp.transpose(rotation) * translation))
-    color = sh_color(own, sh.shape[1], basis, sh)
+    color = sh_color(wp.where(sh.shape[0] > gaussian_count, own, n), sh.shape[1], basis, sh)
     finite = wp.isfinite(x + y + a + b + c + extent[0] + extent[1] + aspect[0] + aspect[1] + opacity)
     if not (finite and wp.isfinite(color[0] + color[1] + color[2])):
         return

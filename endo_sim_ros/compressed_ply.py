@@ -79,8 +79,8 @@ def unpack(chunks: dict[str, np.ndarray], vertices: dict[str, np.ndarray], harmo
     largest, quats = packed[1] >> 30, np.empty((count, 4))
     here = np.arange(4) == largest[:, None]
     quats[~here], quats[here] = others.ravel(), np.sqrt(np.maximum(1 - (others**2).sum(1), 0))
-    with np.errstate(divide="ignore"):
-        opacity = np.log(colors[:, 3]) - np.log1p(-colors[:, 3])
+    opacity = colors[:, 3].clip(0.5 / 255, 1 - 0.5 / 255)  # within what was rounded, so that its logit is finite
+    opacity = np.log(opacity) - np.log1p(-opacity)
     names = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
     values = np.column_stack([means, (base - 0.5) / SH_C0, opacity, scales, quats])
     return dict(zip(names, values.T)) | {name: (np.asarray(v) + 0.5) / 32 - 4 for name, v in harmonics.items()}

@@ -11,6 +11,7 @@ from endo_sim_ros.config import ConfigError
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.reconstruction import ABLATIONS, PRESETS, ReconstructionConfig, Trainer, densification, losses, preset
+from endo_sim_ros.reconstruction.motion import without_motion
 from endo_sim_ros.reconstruction.presets import resolved
 from endo_sim_ros.reconstruction.trainer import right_view, shrink
 from endo_sim_ros.reconstruction.triangulation import match_features, misposed, triangulate
@@ -207,12 +208,38 @@ def test_pure_rotation_trains_with_depth_and_is_an_error_without(views):
         Trainer([bare(frame) for frame in turned], options())
 
 
-def test_an_overexposed_view_is_left_out(views, caplog):
-    white = dataclasses.replace(views[4], image=np.full_like(views[4].image, 255))
-    trainer = Trainer([views[0], white, views[8]], options())
-    assert len(trainer.cameras) == 2 and "overexposed" in caplog.text
-    with pytest.raises(SequenceError, match="every view is overexposed"):
-        Trainer([white], options())
+@pytest.mark.parametrize("reason, change", {
+    "overexposed": lambda frame: {"image": np.full_like(frame.image, 255)},
+    "black": lambda frame: {"image": np.zeros_like(frame.image)},
+    "masked": lambda frame: {"mask": np.zeros_like(frame.mask)},
+}.items())  # fmt: skip
+def test_a_view_that_shows_nothing_is_left_out(views, caplog, reason, change):
+    blind = dataclasses.replace(views[4], **change(views[4]))
+    trainer = Trainer([views[0], blind, views[8]], options())
+    assert len(trainer.cameras) == 2 and f"left out: {reason}" in caplog.text
+    with pytest.raises(SequenceError, match=f"every (view|pixel of every view) is {reason}"):
+        Trainer([blind], options())
+
+
+def test_an_instrument_in_one_of_several_views_is_left_out(views, caplog):
+    frame, tool = views[4], np.zeros((128, 160), np.uint8)
+    cv2.line(tool, (60, 100), (110, 50), 1, 14)
+    shown = (tool > 0) & (frame.depth > 0)
+    image = np.where(shown[..., None], np.uint8(150), frame.image)
+    held = dataclasses.replace(frame, image=image, depth=np.where(shown, 0.6 * frame.depth, frame.depth).astype(np.float32))
+    still = [views[0], views[2], views[6], views[8]]
+    assert all(a is b for a, b in zip(without_motion([*still, frame], 0.05), [*still, frame])) and not caplog.text
+    found = without_motion([*still, held], 0.05)
+    assert all(a is b for a, b in zip(found[:4], still)) and f"{frame.stamp_ns * 1e-9:.3f} s: " in caplog.text
+    hidden = (found[4].mask == 0) & (frame.mask > 0)
+    assert hidden[shown].mean() > 0.8 and hidden[~shown].mean() < 0.05
+    assert without_motion([views[0], held], 0.05)[1] is held  # nobody can tell which of two is right
+    shallow = dataclasses.replace(frame, depth=0.6 * frame.depth)
+    assert without_motion([*still, shallow], 0.05)[4] is shallow and "check its depth and pose" in caplog.text
+    for choice in (False, True):
+        caplog.clear()
+        assert finite(Trainer([*still, held], options(still=choice)).run())
+        assert ("something moved" in caplog.text) == choice
 
 
 @pytest.mark.parametrize("size", [(161, 97), (3840, 2160)])

@@ -161,7 +161,7 @@ def reconstruct_and_measure(bag: Path, out: Path, config: ReconstructionConfig, 
     held_out = [shrink(frame, config.image_width) for index, frame in enumerate(frames) if index not in chosen]
     held_out = [frame for frame in held_out if frame.mask is None or frame.mask.any()]
     if not held_out:
-        log.info("no view was held out that shows tissue; lower keyframes")
+        log.info("no view was held out that shows tissue%s", "; lower keyframes" if len(chosen) > 1 else "")
         return {}
     renderer = model_renderer(model, config.device)
     rows, pictures = [], []

@@ -37,6 +37,8 @@ class ReconstructionConfig(StageConfig):
     not look into the void; holes of the depth prior are filled likewise. 0 = neither."""
     depth_tolerance: Annotated[float, Range(0.001, 1)] = 0.05
     """Relative depth difference at which two views contradict each other."""
+    still: bool = True
+    """Leave out of a view what contradicts two others: an instrument that is there in it alone, for instance."""
     lambda_ssim: Annotated[float, Range(0, 1)] = 0.2
     """Share of 1 − SSIM in the photometric loss; the rest is L1."""
     lambda_depth: Annotated[float, Range(0, 1000)] = 1.0

@@ -24,6 +24,7 @@ from endo_sim_ros.reconstruction import densification, losses, photometry
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.depth import with_depth_prior
 from endo_sim_ros.reconstruction.initialization import initial_model
+from endo_sim_ros.reconstruction.motion import without_motion
 from endo_sim_ros.reconstruction.optimizer import Adam
 from endo_sim_ros.reconstruction.presets import resolved
 from endo_sim_ros.reconstruction.surroundings import with_surroundings
@@ -46,7 +47,14 @@ _LAST_REFINEMENT = 0.8  # share of the iterations after which the number of Gaus
 _SEEN = 0.8  # share of the Gaussians that stand for what the training views see, at first
 _WIDEST_PARALLAX = 0.1  # of the image's width, between the eyes
 _LIGHT_ANCHOR = 1e-3  # weight of the light's changes in training
-_WHITE, _MOSTLY = 250, 0.5  # grey level of all channels, and share of the tissue, from which on a view is overexposed
+_WHITE, _BLACK = 250, 8  # grey levels of all channels, from which on, and up to which, nothing is seen
+_MOSTLY = 0.5  # share of the tissue, from which on a white view is overexposed
+_ALMOST_ALL = 0.95  # share of a black view; much of a good one may lie in the dark
+_NOTHING = {
+    "masked": "every pixel of every view is masked; a mask has 255 where there is tissue",
+    "overexposed": "every view is overexposed; lower the light or the camera's exposure",
+    "black": "every view is black; switch on the light, or check the camera",
+}
 _NARROWEST = 64  # pixels; images are not halved below when memory runs out
 _SELDOM = 4  # iterations between steps that may be taken seldom, and then are as much larger
 _EXPOSURE_RATE, _LIGHT_RATE = 1e-3, 2e-3  # learning rates of log exposures and of the light's four numbers
@@ -102,13 +110,14 @@ class Trainer:
     def __init__(self, frames: list[Frame], config: ReconstructionConfig, points: tuple[np.ndarray, np.ndarray] | None = None):
         if not frames:
             raise SequenceError("there are no views to reconstruct from; check the image, camera_info and pose topics")
-        if all(frame.mask is not None and not frame.mask.any() for frame in frames):
-            raise SequenceError("every pixel of every view is masked; a mask has 255 where there is tissue")
         self.config = config = resolved(config)
         self.device = pick_device(config.device)
-        frames, *found = _consistent(_exposed(frames))
+        frames, *found = _consistent(_showing(frames))
         points, colors = found if points is None else points
-        frames = [shrink(frame, config.image_width) for frame in with_depth_prior(frames, points, config)]
+        frames = with_depth_prior(frames, points, config)
+        if config.still:
+            frames = without_motion(frames, config.depth_tolerance)
+        frames = [shrink(frame, config.image_width) for frame in frames]
         seen = int(_SEEN * config.max_gaussians) if config.surroundings else config.max_gaussians
         model = initial_model(frames, points, colors, dataclasses.replace(config, max_gaussians=max(seen, 1)))
         self.scene_depth = _median_depth(frames, model)
@@ -504,16 +513,23 @@ def _read_checkpoint(path: Path, device: torch.device) -> dict:
     return state
 
 
-def _exposed(frames: list[Frame]) -> list[Frame]:
-    """The views that are not mostly white."""
-    tissue = [frame.image if frame.mask is None else frame.image[frame.mask > 0] for frame in frames]
-    white = [len(pixels) > 0 and float((pixels.min(-1) >= _WHITE).mean()) > _MOSTLY for pixels in tissue]
-    kept = [frame for frame, blind in zip(frames, white) if not blind]
+def _showing(frames: list[Frame]) -> list[Frame]:
+    """The views that show tissue: not masked whole, not mostly white, not black."""
+    kept, out = [], {}
+    for frame in frames:
+        pixels = frame.image.reshape(-1, 3) if frame.mask is None else frame.image[frame.mask > 0]
+        if not len(pixels):
+            out.setdefault("masked", []).append(frame)
+        elif (pixels.min(-1) >= _WHITE).mean() > _MOSTLY:
+            out.setdefault("overexposed", []).append(frame)
+        elif (pixels.max(-1) <= _BLACK).mean() > _ALMOST_ALL:
+            out.setdefault("black", []).append(frame)
+        else:
+            kept.append(frame)
     if not kept:
-        raise SequenceError("every view is overexposed; lower the light or the camera's exposure")
-    if any(white):
-        stamps = ", ".join(f"{frame.stamp_ns * 1e-9:.3f} s" for frame, blind in zip(frames, white) if blind)
-        log.warning("views at %s left out: overexposed", stamps)
+        raise SequenceError(_NOTHING[max(out, key=lambda reason: len(out[reason]))])
+    for reason, views in out.items():
+        log.warning("views at %s left out: %s", ", ".join(f"{frame.stamp_ns * 1e-9:.3f} s" for frame in views), reason)
     return kept
 
 
@@ -523,7 +539,7 @@ def _consistent(frames: list[Frame]) -> tuple[list[Frame], np.ndarray, np.ndarra
     wrong = misposed(frames, matches)
     if wrong:
         stamps = ", ".join(f"{frames[i].stamp_ns * 1e-9:.3f} s" for i in wrong)
-        log.warning("views at %s left out: their poses contradict what they share with the others", stamps)
+        log.warning("views at %s left out: their poses contradict what they share with the others, or much of the tissue moved", stamps)
         frames = [frame for i, frame in enumerate(frames) if i not in wrong]
         matches = match_features(frames)
     points, colors, _ = triangulate(frames, matches)

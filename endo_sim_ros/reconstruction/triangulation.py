@@ -190,11 +190,15 @@ def _distance_from_epipolar(first: Frame, second: Frame, uv1: np.ndarray, uv2: n
     return np.where((z_near > 0) & (z_far > 0), distance, np.inf)
 
 
-def _pairs(frames: list[Frame]) -> list[tuple[int, int]]:
+def neighbours(frames: list[Frame]) -> np.ndarray:
+    """Indices [V, up to 4] of the views nearest to each in space, mostly itself among them."""
     centres = np.array([frame.camera.position for frame in frames])
     distance = np.linalg.norm(centres[:, None] - centres, axis=2)
-    nearest = np.argsort(distance, axis=1, kind="stable")[:, : _NEIGHBOURS + 1]
-    return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(nearest) for j in row if j != i})
+    return np.argsort(distance, axis=1, kind="stable")[:, : _NEIGHBOURS + 1]
+
+
+def _pairs(frames: list[Frame]) -> list[tuple[int, int]]:
+    return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(neighbours(frames)) for j in row if j != i})
 
 
 def _intersect(first: Frame, second: Frame, uv1: np.ndarray, uv2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -4,6 +4,7 @@ import errno
 import itertools
 import shutil
 import signal
+import threading
 import time
 from collections import defaultdict
 
@@ -22,6 +23,7 @@ from endo_sim_ros.cameras import Camera, make_pose
 from endo_sim_ros.gaussians import GaussianModel, load_ply, save_ply
 from endo_sim_ros.messages import ERROR, OK, WARN
 from endo_sim_ros.nodes.base import _MOST_LOGGED, EndoNode
+from endo_sim_ros.nodes.executor import NodeExecutor
 from endo_sim_ros.nodes.graph import NodeGroup
 from endo_sim_ros.nodes.physics_node import PhysicsNode
 from endo_sim_ros.nodes.reconstruction_node import ReconstructionNode
@@ -140,6 +142,36 @@ def bench():
     bench = Bench()
     yield bench
     bench.close()
+
+
+def test_the_loop_of_a_node_serves_what_is_there_and_what_is_added_or_removed_meanwhile(bench):
+    node, executor, ticks = EndoNode("loop"), NodeExecutor(), []
+    heard = {topic: [] for topic in (messages.CAMERA_POSE, messages.LEFT_INFO)}
+    node.subscribe(messages.CAMERA_POSE, heard[messages.CAMERA_POSE].append)
+
+    def exchange(_):
+        node.destroy_subscription(next(s for s in node.subscriptions if s.topic_name.endswith("measured_cp")))
+        node.subscribe(messages.LEFT_INFO, heard[messages.LEFT_INFO].append)
+        node.every(0.02, lambda: ticks.append(0))
+        return True, "exchanged"
+
+    node.service(Trigger, "~/exchange", exchange)
+    executor.add_node(node)
+    thread = threading.Thread(target=executor.spin)
+    thread.start()
+    try:
+        for stamp in (1, 2, 3):
+            bench.publish(messages.CAMERA_POSE, messages.encode_pose(np.eye(4), stamp * S, "world"))
+        bench.until(lambda: [m.header.stamp.sec for m in heard[messages.CAMERA_POSE]] == [1, 2, 3], "poses")
+        assert bench.call(Trigger, "/loop/exchange").message == "exchanged" and bench.set("loop", use_sim_time=False)[0]
+        send_camera(bench, stamp=4 * S)
+        bench.until(lambda: heard[messages.LEFT_INFO] and len(ticks) > 3, "what was added")
+        assert len(heard[messages.CAMERA_POSE]) == 3 and thread.is_alive()
+    finally:
+        executor.shutdown()
+        thread.join(5)
+        node.destroy_node()
+    assert not thread.is_alive()
 
 
 # ------------------------------------------------------------------------------------------------------ material

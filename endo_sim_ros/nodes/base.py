@@ -21,7 +21,7 @@ import torch
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidParameterTypeException, NameValidationException
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -31,6 +31,7 @@ from endo_sim_ros.config import ConfigError, StageConfig, options
 from endo_sim_ros.device import pick_device
 from endo_sim_ros.gaussians import ModelError
 from endo_sim_ros.messages import ERROR, OK, WARN, MessageError, Topic
+from endo_sim_ros.nodes.executor import NodeExecutor
 from endo_sim_ros.nodes.graph import end_with_parent
 from endo_sim_ros.nodes.transport import prepare_transport
 from endo_sim_ros.sequences.frames import SequenceError
@@ -341,7 +342,7 @@ def run(node_class: Callable[[], EndoNode]) -> int:
     node, status = None, 0
     try:
         node = node_class()
-        executor = SingleThreadedExecutor()
+        executor = NodeExecutor()
         executor.add_node(node)
         gc.freeze()  # looking through all that was imported takes 0.15 s, in which nothing else happens
         executor.spin()

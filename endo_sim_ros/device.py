@@ -86,6 +86,13 @@ def cpu_threads() -> int:
     return int(wanted) or available
 
 
+def shares(count: int, least: int) -> list[tuple[int, int]]:
+    """First and number of the items, of count, that each CPU thread takes; fewer than ``least`` are left to one."""
+    threads = cpu_threads() if count >= least else 1
+    bounds = [count * i // threads for i in range(threads + 1)]
+    return [(first, end - first) for first, end in zip(bounds, bounds[1:])]
+
+
 @functools.cache
 def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, "endo_sim")

@@ -20,8 +20,8 @@ from endo_sim_ros.cameras import Camera
 FEATURES = 4
 _SHARPNESS = 6  # exponent of the mean that the exposure responds to: mostly to the brighter parts of a picture
 _STRIDE = 4  # pixels; an exposure needs no more
-_SURFACE = 0.5  # alpha from which on there is tissue
-_NEAREST = 1e-3  # metres
+SURFACE = 0.5  # alpha from which on there is tissue
+NEAREST = 1e-3  # metres
 
 
 @dataclass(frozen=True)
@@ -56,13 +56,6 @@ class Light:
             number = isinstance(value, (int, float)) and math.isfinite(value) and abs(value) < 1e3
             if not number or name == "reference" and value <= 0:
                 raise ValueError(f"light: {name} is {value!r}; it must be a finite number{', above 0' * (name == 'reference')}")
-
-    def shade(self, colors: Tensor, depths: Tensor, alphas: Tensor, camera: Camera) -> Tensor:
-        """What the camera makes of a rendered picture: colours [H, W, 3], with Σ w z [H, W] (m) and alpha [H, W]."""
-        theta = colors.new_tensor([self.distance, self.angle, self.tilt_x, self.tilt_y])
-        lit = colors * falloff(features(depths, alphas, directions(camera, colors.device), self.reference), theta)[..., None]
-        level = colors.new_tensor([self.level_r, self.level_g, self.level_b])
-        return lit * (level - self.response * log_brightness(lit, alphas > _SURFACE)).exp()
 
     def to_json(self) -> str:
         """One line, for a file's comment or a message."""
@@ -104,9 +97,9 @@ def features(depths: Tensor, alphas: Tensor, directions: Tensor, reference: floa
         directions: Those of the camera's pixels [3, H, W].
         reference: Distance at which brightness is the tissue's own, metres.
     """
-    depth = depths.detach() / alphas.detach().clamp_min(_NEAREST)
+    depth = depths.detach() / alphas.detach().clamp_min(NEAREST)
     # Where nothing is drawn there is nothing to be lit.
-    distance = torch.where(alphas > _NEAREST, depth.clamp_min(_NEAREST) / reference, 1).log() - directions[0]
+    distance = torch.where(alphas > NEAREST, depth.clamp_min(NEAREST) / reference, 1).log() - directions[0]
     return torch.cat([-distance[None], directions])
 
 

@@ -12,6 +12,7 @@ from endo_sim_ros.config import Range, StageConfig
 from endo_sim_ros.device import pick_device
 from endo_sim_ros.gaussians import SH_C0, GaussianModel
 from endo_sim_ros.physics.skinning import Skinning
+from endo_sim_ros.pictures import shade, to_bytes
 from endo_sim_ros.splatting import render, sh_basis
 
 _MIN_ALPHA = 0.5  # below it there is no surface whose depth could be told
@@ -70,9 +71,10 @@ class DeformableRenderer:
 
     @torch.no_grad()
     def render(
-        self, camera: Camera, positions: np.ndarray | None = None, F: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """RGB image [H, W, 3] uint8 and depth [H, W] float32 (m, 0 = no surface) for nodes at positions [M, 3] with F [M, 3, 3]."""
+        self, camera: Camera, positions: np.ndarray | None = None, F: np.ndarray | None = None, *, depth: bool = True
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """RGB image [H, W, 3] uint8 and, if asked for, depth [H, W] float32 (m, 0 = no surface) for nodes at positions [M, 3]
+        with F [M, 3, 3]."""
         model, covars = self.model, None
         if positions is not None:
             means, covars = self.deform(positions, F)
@@ -81,10 +83,11 @@ class DeformableRenderer:
         output = render(model, camera, background=self._background, covars=covars)
         colors, alpha = output.colors[0], output.alphas[0]
         if self.model.light is not None:
-            colors = self.model.light.shade(colors, output.depths[0], alpha, camera)
-        image = (colors.clamp(0, 1) * 255 + 0.5).to(torch.uint8)
-        depth = torch.where(alpha > _MIN_ALPHA, output.depths[0] / alpha.clamp_min(1e-6), 0.0)
-        return image.cpu().numpy(), depth.cpu().numpy()
+            colors = shade(self.model.light, colors, output.depths[0], alpha, camera)
+        image = to_bytes(colors).cpu().numpy()
+        if not depth:
+            return image, None
+        return image, torch.where(alpha > _MIN_ALPHA, output.depths[0] / alpha.clamp_min(1e-6), 0.0).cpu().numpy()
 
 
 def turned_colors(sh: Tensor, skinning: Skinning, means: Tensor, F: Tensor | np.ndarray, camera: Camera) -> Tensor:

@@ -11,8 +11,9 @@ import torch
 from endo_sim_ros import messages
 from endo_sim_ros.cameras import Camera, look_at
 from endo_sim_ros.gaussians import GaussianModel, ModelError, load_ply, save_ply
-from endo_sim_ros.light import Light, directions, features, features_at
+from endo_sim_ros.light import Light, directions, falloff, features, features_at, log_brightness
 from endo_sim_ros.messages import MessageError
+from endo_sim_ros.pictures import shade, to_bytes
 from endo_sim_ros.reconstruction.photometry import PRIOR, fit_exposure, fit_light, unlit
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.frames import Frame
@@ -32,12 +33,27 @@ def wall(count: int = 12_000) -> GaussianModel:
 def test_brightness_falls_with_distance_and_angle_as_written():
     one = torch.ones(CAMERA.height, CAMERA.width)
     fixed = dataclasses.replace(LAMP, level_r=0.0, level_g=0.0, level_b=0.0, response=0.0)
-    image = fixed.shade(torch.ones(CAMERA.height, CAMERA.width, 3), 0.2 * one, one, CAMERA)
+    image = shade(fixed, torch.ones(CAMERA.height, CAMERA.width, 3), 0.2 * one, one, CAMERA)
     v, u = 100, 30
     x, y = (u + 0.5 - 80) / 200, (v + 0.5 - 64) / 200
     cosine = 1 / math.sqrt(1 + x * x + y * y)
     expected = (0.2 / cosine / 0.1) ** -1.2 * cosine**8 * math.exp(0.4 * x - 0.3 * y)
     assert image[v, u].tolist() == pytest.approx([expected] * 3, rel=1e-5)
+
+
+def test_kernels_of_the_cpu_shade_and_round_as_written_whatever_the_size():
+    g = torch.Generator().manual_seed(0)
+    for height, width in ((37, 41), (1, 3)):
+        camera = dataclasses.replace(CAMERA, width=width, height=height)
+        colors = 1.4 * torch.rand(height, width, 3, generator=g) - 0.2
+        alphas = torch.rand(height, width, generator=g).round(decimals=1)  # some are 0
+        depths = alphas * (0.4 * torch.rand(height, width, generator=g)).round(decimals=1)
+        theta = torch.tensor([LAMP.distance, LAMP.angle, LAMP.tilt_x, LAMP.tilt_y])
+        lit = colors * falloff(features(depths, alphas, directions(camera, "cpu"), LAMP.reference), theta)[..., None]
+        level = torch.tensor([LAMP.level_r, LAMP.level_g, LAMP.level_b])
+        expected = lit * (level - LAMP.response * log_brightness(lit, alphas > 0.5)).exp()
+        torch.testing.assert_close(shade(LAMP, colors, depths, alphas, camera), expected, rtol=3e-6, atol=0)
+        assert torch.equal(to_bytes(colors), (colors.clamp(0, 1) * 255 + 0.5).to(torch.uint8))
 
 
 def test_points_and_pixels_have_the_same_quantities():
@@ -54,7 +70,7 @@ def test_a_full_response_holds_the_brightness_whatever_the_light():
     light = dataclasses.replace(LAMP, level_r=-0.4, level_g=-0.4, level_b=-0.4, response=1.0)
     one = torch.ones(CAMERA.height, CAMERA.width)
     for factor in (0.2, 1.0, 5.0):
-        image = light.shade(factor * torch.rand(128, 160, 3, generator=torch.Generator().manual_seed(1)), 0.1 * one, one, CAMERA)
+        image = shade(light, factor * torch.rand(128, 160, 3, generator=torch.Generator().manual_seed(1)), 0.1 * one, one, CAMERA)
         peak = float((image[::4, ::4].amax(-1) ** 6).mean() ** (1 / 6))
         assert peak == pytest.approx(math.exp(-0.4), rel=1e-4)
 

@@ -13,6 +13,7 @@ from endo_sim_ros.learning.config import Randomisation
 from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.learning.tasks import Outcome, find_task
 from endo_sim_ros.physics import Skinning, TissueBatch
+from endo_sim_ros.pictures import shade, to_bytes
 from endo_sim_ros.rendering import turned_colors
 from endo_sim_ros.splatting import rasterize
 
@@ -170,12 +171,12 @@ class TaskBatch:
         colors = seen.colors
         if at_rest.light is not None:
             pictures = zip(colors, seen.depths, seen.alphas, (view.camera for view in views))
-            colors = torch.stack([at_rest.light.shade(*picture) for picture in pictures])
+            colors = torch.stack([shade(at_rest.light, *picture) for picture in pictures])
         if any(view.light is not None for view in views):
             one = np.ones((1, 1, 1), np.float32)
             factors = [np.broadcast_to(one if view.light is None else view.light, (*colors.shape[1:3], 1)) for view in views]
             colors = colors * tensor(factors)
-        return (colors.clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
+        return to_bytes(colors).cpu().numpy()
 
     def _colors(self, own: slice) -> torch.Tensor:
         """Colours of all these episodes [N, K, 3], or of each [b, N, K, 3], as `rasterize` takes them."""

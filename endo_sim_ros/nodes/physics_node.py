@@ -21,7 +21,7 @@ from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
 
 _SLOW = 0.5  # real-time factor below which the node warns
 _CAMERAS_LATE = 1.0  # seconds after a model in which its training cameras may still be on their way
-_POLLS = 8  # times per step that the timer asks whether a step is due
+_POLLS = 4  # times per step that the timer asks whether a step is due
 _WINDOW = 1.0  # seconds over which the real-time factor is measured
 _INPUTS = ("pose", "wrench", "jaw", "cut")  # parts of a command in lockstep
 

@@ -18,7 +18,7 @@ from endo_sim_ros.rendering import RenderingConfig
 from endo_sim_ros.sequences.bag import LEFT_FRAME
 
 _MAX_SIDE = 8192  # pixels; a damaged camera_info must not make the node ask for all memory
-_POLLS = 8  # times per image that the timer asks whether one is due
+_POLLS = 4  # times per image that the timer asks whether one is due
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class RenderingNode(EndoNode):
         self._poses: dict[int, np.ndarray] = {}  # lockstep_camera: poses that wait for their state, by stamp
         self._pacer = Pacer()
         self._dirty, self._images, self._last_image = True, 0, 0.0
-        self._output: tuple[np.ndarray, np.ndarray, Camera] | None = None
+        self._output: tuple[np.ndarray, np.ndarray | None, Camera] | None = None
         self._seconds_per_image = 0.0
         publishers = (self.publisher(topic) for topic in messages.RENDERED_TOPICS)
         self._info_pub, self._pose_pub, self._depth_pub, self._image_pub = publishers
@@ -173,7 +173,7 @@ class RenderingNode(EndoNode):
         camera, now = self._camera(), time.monotonic()
         if self._tissue.bound is None or camera is None or self.now_ns() == 0:  # with use_sim_time, before /clock
             return
-        if self._dirty or self._output is None:
+        if self._dirty or self._output is None or (self._output[1] is None and self._wants_depth()):
             if not self._pacer.is_due(now, 1 / self._options.rate):
                 return
             self._dirty = False
@@ -230,7 +230,10 @@ class RenderingNode(EndoNode):
             self._failure = sentence("rendering", error)
             self.report_error(self._failure)
 
-    def _render(self, bound: Bound, nodes: ControlNodeCloud | None, camera: Camera) -> tuple[np.ndarray, np.ndarray, Camera]:
+    def _wants_depth(self) -> bool:
+        return self._depth_pub.get_subscription_count() > 0  # else a megabyte would only delay the next image
+
+    def _render(self, bound: Bound, nodes: ControlNodeCloud | None, camera: Camera) -> tuple[np.ndarray, np.ndarray | None, Camera]:
         start, camera = time.monotonic(), bound.renderer.camera(camera)
         if max(camera.width, camera.height) > _MAX_SIDE:
             raise MessageError(f"images of {camera.width}×{camera.height} are too large; set image_width")
@@ -238,16 +241,16 @@ class RenderingNode(EndoNode):
         if bound.follows(nodes):
             state = (nodes.positions, nodes.F)
             self._tissue.cut(bound, nodes)
-        image, depth = bound.renderer.render(camera, *state)
+        image, depth = bound.renderer.render(camera, *state, depth=self._wants_depth())
         self._seconds_per_image += 0.1 * (time.monotonic() - start - self._seconds_per_image)
         return image, depth, camera
 
-    def _publish(self, image: np.ndarray, depth: np.ndarray, camera: Camera, stamp: int) -> None:
+    def _publish(self, image: np.ndarray, depth: np.ndarray | None, camera: Camera, stamp: int) -> None:
         frame = self._options.camera_frame
         self._info_pub.publish(messages.encode_camera_info(camera.K, camera.width, camera.height, stamp, frame))
         self._pose_pub.publish(messages.encode_pose(camera.pose, stamp, self._options.world_frame))
         self._image_pub.publish(messages.encode_image(image, stamp, frame))
-        if self._depth_pub.get_subscription_count():  # a megabyte that would only delay the next image
+        if depth is not None:
             self._depth_pub.publish(messages.encode_image(depth, stamp, frame))
         self._images += 1
 

@@ -9,7 +9,7 @@ import warp as wp
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from endo_sim_ros.device import cpu_threads, init_warp, on_torch_stream, pick_device, run_in_threads
+from endo_sim_ros.device import init_warp, on_torch_stream, pick_device, run_in_threads, shares
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.physics import skinning_kernels as kernels
 from endo_sim_ros.physics import skinning_simd_kernels as simd_kernels
@@ -209,8 +209,8 @@ class Skinning:
             for b in range(environments):
                 outputs = [array(means[b], wp.vec3), array(covars[b], wp.mat33)]
                 inputs = [*at_rest, array(maps[b], wp.mat44), *limits, *outputs]
-                shares = self._shares(len(self.means))
-                done.append([Launch(simd_kernels.skin_gaussians, size, [first, *inputs]) for first, size in shares])
+                own = self._shares(len(self.means))
+                done.append([Launch(simd_kernels.skin_gaussians, size, [first, *inputs]) for first, size in own])
         return done, means, covars
 
     def _kernel(self) -> wp.Kernel:
@@ -222,14 +222,12 @@ class Skinning:
 
     def _launch_shares(self, kernel, count: int, inputs: list) -> None:
         """Launch a kernel whose first argument is an offset: at once on CUDA, in shares on the CPU."""
-        shares = self._shares(count)
-        run_in_threads([functools.partial(self._launch, kernel, size, [first, *inputs]) for first, size in shares])
+        jobs = [functools.partial(self._launch, kernel, size, [first, *inputs]) for first, size in self._shares(count)]
+        run_in_threads(jobs)
 
     def _shares(self, count: int) -> list[tuple[int, int]]:
         """First and number of the Gaussians of each thread."""
-        threads = cpu_threads() if self.device == "cpu" and count >= SHARED_FROM else 1
-        bounds = [count * i // threads for i in range(threads + 1)]
-        return [(first, end - first) for first, end in zip(bounds, bounds[1:])]
+        return shares(count, SHARED_FROM) if self.device == "cpu" else [(0, count)]
 
 
 @functools.cache

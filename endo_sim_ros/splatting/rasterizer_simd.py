@@ -7,7 +7,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from endo_sim_ros.device import cpu_threads, run_in_threads
+from endo_sim_ros.device import cpu_threads, run_in_threads, shares
 from endo_sim_ros.splatting import rasterizer_kernels as kernels
 from endo_sim_ros.splatting import rasterizer_simd_kernels as simd_kernels
 from endo_sim_ros.splatting.launching import Gradients, Scene, Settings, empty_images, kernel_arguments
@@ -87,14 +87,12 @@ def _launch(kernel, count: int, arguments: list) -> None:
     """Launch a kernel whose first argument is an offset over count items, in shares."""
     if count == 0:
         return
-    threads = cpu_threads() if count >= 1024 else 1
-    bounds = [count * i // threads for i in range(threads + 1)]
     arguments = kernel_arguments(kernel, arguments, 1)
 
-    def share(first, end):
-        wp.launch(kernel, dim=end - first, inputs=[first, *arguments], device="cpu")
+    def share(first, size):
+        wp.launch(kernel, dim=size, inputs=[first, *arguments], device="cpu")
 
-    run_in_threads([functools.partial(share, *pair) for pair in zip(bounds[:-1], bounds[1:])])
+    run_in_threads([functools.partial(share, *pair) for pair in shares(count, 1024)])
 
 
 def _launch_tiles(kernel, tile_count: int, arguments: list) -> None:

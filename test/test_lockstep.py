@@ -196,6 +196,15 @@ def test_an_image_may_wait_for_the_camera_of_its_stamp(graph):
     shown = messages.decode_pose(graph.heard["rendered/camera_pose"][-1], "world", "")
     assert shown[0, 3] == pytest.approx(0.03)
     graph.refused("rendering_node", "is not shown: it has no pose with its stamp on ECM/measured_cp")
+    graph.publish(messages.CAMERA_POSE, messages.encode_pose(np.eye(4), 9 * STEP, "world"))  # its command never comes
+    graph.spin(0.3)
+    assert graph.call(Trigger, "/physics_node/reset").success
+    await_images(graph, 5)
+    command(graph, STEP)
+    graph.spin(0.3)
+    graph.publish(messages.CAMERA_POSE, messages.encode_pose(np.eye(4), STEP, "world"))
+    await_images(graph, 6)
+    assert stamps(graph, IMAGES)[-1] == STEP
 
 
 def test_mistakes_in_stamps_are_told_and_the_next_command_acts(graph):

@@ -107,8 +107,10 @@ class RenderingNode(EndoNode):
             and np.array_equal(old.F, nodes.F)
             and old.cut == nodes.cut
         )
-        self._nodes, self._nodes_stamp = nodes, messages.stamp_to_ns(message.header.stamp)
+        last, self._nodes, self._nodes_stamp = self._nodes_stamp, nodes, messages.stamp_to_ns(message.header.stamp)
         if self._lockstep:
+            if self._nodes_stamp == nodes.model_stamp_ns and old is not None and old.model_stamp_ns == nodes.model_stamp_ns:
+                self._poses = {stamp: pose for stamp, pose in self._poses.items() if stamp <= last}  # reset: no state will want others
             self._states.append((self._nodes_stamp, nodes))
             if len(self._states) > MOST_WAITING:
                 self._states.popleft()

@@ -367,7 +367,7 @@ class Up:
     logs: Path = Path("~/.ros/endo_sim_ros/logs")
     """Folder for what each node prints."""
     respawn: bool = True
-    """Start a node that crashes again, once."""
+    """Start a node that crashes again, after a pause that grows, until it has crashed four times in a row soon after its start."""
     view: bool = False
     """Serve the page as well, on which tissue is seen and pulled with the mouse: http://localhost:8080."""
 

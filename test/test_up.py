@@ -1,5 +1,6 @@
 """`endo-sim up` as a user runs it, and the files for other tools: RViz, Foxglove, SROS 2."""
 
+import io
 import json
 import os
 import re
@@ -14,16 +15,19 @@ import pytest
 import rclpy
 import yaml
 from conftest import wait_until
+from rich.console import Console
 
 from endo_sim_ros import messages
+from endo_sim_ros.nodes import up as up_module
 from endo_sim_ros.nodes.bag_player_node import BagPlayerNode
 from endo_sim_ros.nodes.base import EndoNode
+from endo_sim_ros.nodes.graph import NodeGroup
 from endo_sim_ros.nodes.physics_node import PhysicsNode
 from endo_sim_ros.nodes.policy_node import PolicyNode
 from endo_sim_ros.nodes.reconstruction_node import ReconstructionNode
 from endo_sim_ros.nodes.rendering_node import RenderingNode
 from endo_sim_ros.nodes.scripted_tool_node import ScriptedToolNode
-from endo_sim_ros.nodes.up import UpError, run_up
+from endo_sim_ros.nodes.up import UpError, _Supervisor, run_up
 from endo_sim_ros.nodes.viewer_node import ViewerNode
 from endo_sim_ros.sequences.frames import SequenceError
 
@@ -104,21 +108,32 @@ def test_up_runs_the_graph_and_ends_cleanly(up, small_bag):
         assert "Traceback" not in log.read_text(), log.read_text()
 
 
-def test_up_reports_a_node_that_dies_and_starts_it_again_once(up):
+def test_up_reports_a_node_that_dies_and_starts_it_again(up):
     run = up()
     run.says(r"rendering_node +warn")
     run.says(r"physics_node +warn")
     first = run.processes()["rendering_node"]
     os.kill(first, signal.SIGKILL)
-    said = run.says(r"rendering_node was ended by SIGKILL; it is started again; its log is (\S+)")
+    said = run.says(r"rendering_node was ended by SIGKILL; it is started again in 1 s; its log is (\S+)")
     assert Path(said[1]).is_file()
     second = wait_until(lambda: run.processes().get("rendering_node"), 30, "a new rendering_node")
     assert second != first
-    os.kill(second, signal.SIGKILL)
-    run.says(r"rendering_node was ended by SIGKILL; it stays down; its log is \S+rendering_node\.log")
-    run.says(r"rendering_node +down")
     assert run.process.poll() is None and "physics_node" in run.processes(), "the others go on"
     assert run.end(signal.SIGTERM)[0] == 0
+
+
+def test_a_node_that_crashes_again_and_again_stays_down_after_the_fourth_time(tmp_path, monkeypatch):
+    monkeypatch.setattr(up_module, "_FIRST_PAUSE", 0.01)
+    console = Console(file=io.StringIO(), width=200)
+    with NodeGroup(tmp_path) as graph:
+        supervisor = _Supervisor(graph, "", console, respawn=True)
+        supervisor.start("no_such_node")
+        with pytest.raises(UpError, match="no node is left"):
+            wait_until(supervisor.check, 30, "the end")
+    said = [line.split(";")[:2] for line in console.file.getvalue().splitlines()]
+    ended = "no_such_node ended with status 1"
+    assert said[:3] == [[ended, f" it is started again in {pause} s"] for pause in (0.01, 0.02, 0.04)]
+    assert said[3:] == [[f"{ended}, 4 times in a row within 30 s of its start", " it stays down"]]
 
 
 def test_up_without_respawn_leaves_a_dead_node_down(up):

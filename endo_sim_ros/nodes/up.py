@@ -29,6 +29,9 @@ from endo_sim_ros.sequences.bag import BagReader
 _CANNOT_START = 2  # exit status of a node that was given something it cannot use; see base.run
 _SILENT_AFTER = 5.0  # seconds without a word on /diagnostics after which a node counts as silent
 _REFRESH = 0.2  # seconds
+_FIRST_PAUSE = 1.0  # seconds before a node that crashed is started again; doubled each time it crashes soon
+_MOST_CRASHES = 4  # one soon after the other, after which a node stays down
+_SOON = 30.0  # seconds after its start
 _LEVELS = {OK: ("ok", "green"), WARN: ("warn", "yellow"), ERROR: ("error", "red")}
 # What a process must share with the graph to take part in it.
 _SHARED = (
@@ -84,6 +87,8 @@ class _Supervisor:
         self._graph, self._namespace, self._console, self._respawn = graph, namespace.strip("/"), console, respawn
         self._arguments: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {}
         self._began: dict[str, float] = {}
+        self._crashes: dict[str, int] = {}  # of each node, one soon after the other
+        self._due: dict[str, float] = {}  # when those that crashed are started again
         self.restarted: set[str] = set()
         self._ended: set[str] = set()
         self._said: dict[str, tuple[str, str]] = {}
@@ -100,14 +105,19 @@ class _Supervisor:
         return [self.full_name(name) for name in self._graph.nodes]
 
     def check(self) -> None:
-        """Report nodes that ended; start one that crashed again, once.
+        """Report nodes that ended; start those that crashed again after a pause, unless they crash again and again.
 
         Raises:
             UpError: If a node was given something it cannot use, or no node is left.
         """
         for name, node in list(self._graph.nodes.items()):
             status = node.exit_status
-            if status is None or name in self._ended:
+            if name in self._due and time.monotonic() >= self._due[name]:
+                del self._due[name]
+                ros_arguments, parameters = self._arguments[name]
+                self.start(name, *ros_arguments, **parameters)
+                continue
+            if status is None or name in self._ended or name in self._due:
                 continue
             if status == 0:
                 self._ended.add(name)
@@ -115,16 +125,20 @@ class _Supervisor:
             if status == _CANNOT_START:
                 raise UpError(f"{_last_line(node.log) or f'{name} cannot start'}; its log is {node.log}")
             how = f"was ended by {signal.Signals(-status).name}" if status < 0 else f"ended with status {status}"
-            again = self._respawn and name not in self.restarted
+            now = time.monotonic()
+            crashes = self._crashes[name] = self._crashes.get(name, 0) + 1 if now - self._began[name] < _SOON else 1
+            again = self._respawn and crashes < _MOST_CRASHES
             log = node.log
             if again:  # the new process would overwrite the log that tells what went wrong
                 log = node.log.replace(node.log.with_suffix(".crashed.log"))
-            what = "it is started again" if again else "it stays down"
+            pause = _FIRST_PAUSE * 2 ** (crashes - 1)
+            what = f"it is started again in {pause:g} s" if again else "it stays down"
+            if crashes == _MOST_CRASHES:
+                how += f", {crashes} times in a row within {_SOON:g} s of its start"
             self._console.print(Text.assemble((f"{name} {how}", "red"), f"; {what}; its log is {log}"), soft_wrap=True)
             if again:
                 self.restarted.add(name)
-                ros_arguments, parameters = self._arguments[name]
-                self.start(name, *ros_arguments, **parameters)
+                self._due[name] = now + pause
             else:
                 self._ended.add(name)
         if self._ended >= self._graph.nodes.keys() - {"bag_player_node"}:

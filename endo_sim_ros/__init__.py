@@ -1,8 +1,21 @@
 """From an endoscope recording to tissue that a robot can touch: 3D Gaussian Splatting and MPM as ROS 2 nodes."""
 
 import os
+import signal
+import sys
 
 # Read by OpenCV when it is imported: a few kilobytes of PNG may claim, and would get, gigabytes.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**26))
+
+# While one of our own programs starts (`-m` is what Python calls a module that it is about to run), Ctrl-C just ends it.
+if os.path.basename(sys.argv[0]) in ("-m", "endo-sim") and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def hear_interrupts() -> None:
+    """Called by a program that is ready to be interrupted: from now on Ctrl-C raises KeyboardInterrupt again."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
 
 __version__ = "0.1.0"

@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 import tyro
 from rich.progress import track
 
+from endo_sim_ros import hear_interrupts
 from endo_sim_ros.config import ConfigError
 from endo_sim_ros.evaluation.config import EvaluationConfig
 from endo_sim_ros.gaussians import ModelError
@@ -573,6 +574,7 @@ def _tracked(frames: Iterable[Frame], text: str) -> Iterable[Frame]:
 
 
 def main() -> int:
+    hear_interrupts()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     start = time.monotonic()
     try:

@@ -2,6 +2,7 @@
 
 import logging
 import re
+import signal
 import subprocess
 import sys
 import time
@@ -24,6 +25,15 @@ ROOT = Path(__file__).parents[1]
 def endo_sim(*arguments, timeout: float = 120) -> subprocess.CompletedProcess:
     command = [sys.executable, "-m", "endo_sim_ros.cli", *map(str, arguments)]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=timeout)
+
+
+@pytest.mark.parametrize("module", ["cli", "nodes.physics_node"])
+def test_an_interrupt_while_a_program_starts_ends_it_without_a_traceback(module):
+    program = subprocess.Popen([sys.executable, "-m", f"endo_sim_ros.{module}", "--help"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    time.sleep(0.4)  # torch is being imported
+    program.send_signal(signal.SIGINT)
+    said, _ = program.communicate(timeout=30)
+    assert b"Traceback" not in said and program.returncode in (-signal.SIGINT, 130, 0)
 
 
 @pytest.fixture(scope="module")

@@ -13,11 +13,13 @@ import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 import rclpy
 import torch
+import yaml
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidParameterTypeException, NameValidationException
@@ -26,7 +28,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from endo_sim_ros import messages
+from endo_sim_ros import hear_interrupts, messages
 from endo_sim_ros.config import ConfigError, StageConfig, options
 from endo_sim_ros.device import pick_device
 from endo_sim_ros.gaussians import ModelError
@@ -130,7 +132,8 @@ class EndoNode(Node):
     def _unknown(self) -> str:
         """What was given at start but is no parameter of this node, in words; ROS itself says nothing about it."""
         known, unknown = self.get_parameters_by_prefix(""), []
-        for name in sorted(self._parameter_overrides.keys() - known.keys()):
+        missing = self._parameter_overrides.keys() - known.keys()
+        for name in sorted(missing - _meant_for_others() if missing else missing):
             if not name.startswith("qos_overrides."):  # rclpy's own; it declares those that act
                 near = difflib.get_close_matches(name, known, 1)
                 unknown.append(f"{name} (did you mean {near[0]}?)" if near else name)
@@ -240,6 +243,18 @@ class EndoNode(Node):
                 raise
 
 
+def _meant_for_others() -> set[str]:
+    """Parameters of our other nodes that a file gives to all nodes, under /**."""
+    from endo_sim_ros.nodes.parameter_file import NODE_CONFIGS  # imports all nodes
+
+    ours, general = {option.name for configs in NODE_CONFIGS.values() for config in configs for option in options(config)}, set()
+    for flag, path in zip(sys.argv, sys.argv[1:]):
+        if flag == "--params-file":
+            nodes = yaml.safe_load(Path(path).read_text())  # which ROS has read without complaint
+            general |= (nodes.get("/**") or {}).get("ros__parameters", {}).keys()
+    return ours & general
+
+
 class _Guard:
     def __init__(self, node: EndoNode, where: str):
         self._node, self._where = node, where
@@ -332,6 +347,7 @@ def quality(topic: Topic, depth: int = STREAM_DEPTH, reliable: bool = True) -> Q
 
 def run(node_class: Callable[[], EndoNode]) -> int:
     """Start ROS, spin a node until it is told to stop, and return the exit status: 2 if it could not start."""
+    hear_interrupts()
     end_with_parent()
     prepare_transport()
     try:

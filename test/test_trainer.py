@@ -180,6 +180,17 @@ def test_a_wrong_pose_among_good_ones_is_found(large, fault, caplog):
         assert len(trainer.cameras) == 4 and "left out" in caplog.text
 
 
+def test_with_stereo_a_wrong_pose_among_three_is_left_out(caplog):
+    views = list(phantom_sequence(PhantomConfig(width=320, height=256, frames=3, travel=0.02)))
+    views = [dataclasses.replace(view, depth=None) for view in views]
+    short = options(image_width=80, iterations=1)
+    assert len(Trainer(views, short).cameras) == 3 and "left out" not in caplog.text
+    trainer = Trainer([views[0], misplaced(views[1], "farther"), views[2]], short)
+    assert len(trainer.cameras) == 2 and f"{views[1].stamp_ns * 1e-9:.3f} s left out" in caplog.text
+    Trainer([views[0], misplaced(views[1], "farther")], short)
+    assert "the poses of views 0 and 1 contradict" in caplog.text
+
+
 def test_swapped_poses_of_two_views_are_found(large):
     frames = [bare(frame) for frame in large]
     frames[1], frames[3] = (dataclasses.replace(frames[i], camera=frames[j].camera) for i, j in ((1, 3), (3, 1)))

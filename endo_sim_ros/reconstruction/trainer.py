@@ -112,9 +112,7 @@ class Trainer:
             raise SequenceError("there are no views to reconstruct from; check the image, camera_info and pose topics")
         self.config = config = resolved(config)
         self.device = pick_device(config.device)
-        frames, *found = _consistent(_showing(frames))
-        points, colors = found if points is None else points
-        frames = with_depth_prior(frames, points, config)
+        frames, points, colors = _consistent(_showing(frames), config, points)
         if config.still:
             frames = without_motion(frames, config.depth_tolerance)
         frames = [shrink(frame, config.image_width) for frame in frames]
@@ -533,17 +531,22 @@ def _showing(frames: list[Frame]) -> list[Frame]:
     return kept
 
 
-def _consistent(frames: list[Frame]) -> tuple[list[Frame], np.ndarray, np.ndarray]:
-    """The views without those whose poses contradict the others, and triangulated points [N, 3] (m) with RGB [N, 3] in [0, 1]."""
+def _consistent(
+    frames: list[Frame], config: ReconstructionConfig, points: tuple[np.ndarray, np.ndarray] | None
+) -> tuple[list[Frame], np.ndarray, np.ndarray]:
+    """The views with their depth prior, without those whose poses contradict the others, and scene points [N, 3] (m) with
+    RGB [N, 3] in [0, 1]: the given ones, or triangulated."""
     matches = match_features(frames)
-    wrong = misposed(frames, matches)
-    if wrong:
-        stamps = ", ".join(f"{frames[i].stamp_ns * 1e-9:.3f} s" for i in wrong)
-        log.warning("views at %s left out: their poses contradict what they share with the others, or much of the tissue moved", stamps)
-        frames = [frame for i, frame in enumerate(frames) if i not in wrong]
-        matches = match_features(frames)
-    points, colors, _ = triangulate(frames, matches)
-    return frames, points, colors
+    # What the eyes of one view tell of depth does not hang on the poses of the views: it helps to judge them.
+    by_stereo = config.depth in ("auto", "stereo") and any(frame.right is not None for frame in frames)
+    if by_stereo or not (wrong := misposed(frames, matches)):
+        found = triangulate(frames, matches)[:2] if points is None else points
+        prior = with_depth_prior(frames, found[0], config)
+        if not by_stereo or not (wrong := misposed(prior, matches)):
+            return prior, *found
+    stamps = ", ".join(f"{frames[i].stamp_ns * 1e-9:.3f} s" for i in wrong)
+    log.warning("views at %s left out: their poses contradict what they share with the others, or much of the tissue moved", stamps)
+    return _consistent([frame for i, frame in enumerate(frames) if i not in wrong], config, points)
 
 
 def _median_depth(frames: list[Frame], model: GaussianModel) -> float:

@@ -156,7 +156,7 @@ def reconstruct_and_measure(bag: Path, out: Path, config: ReconstructionConfig, 
 
         model = trainer.run(on_progress, _REPORTS)
     save_ply(model, out / "model.ply")
-    save_cameras([frames[index].camera for index in chosen], out / "cameras.json")
+    save_cameras([frames[index].camera for index in chosen if frames[index].stamp_ns in trainer.stamps], out / "cameras.json")
     trainer.save_checkpoint(out / "checkpoint.pt")
     held_out = [shrink(frame, config.image_width) for index, frame in enumerate(frames) if index not in chosen]
     held_out = [frame for frame in held_out if frame.mask is None or frame.mask.any()]

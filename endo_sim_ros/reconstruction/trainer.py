@@ -183,6 +183,11 @@ class Trainer:
         return [view.camera for view in self._views[: len(self._stamps)]]
 
     @property
+    def stamps(self) -> list[int]:
+        """When the views were taken that are trained on, nanoseconds; views that were left out are not among them."""
+        return self._stamps
+
+    @property
     def progress(self) -> Progress:
         return Progress(self.iteration, self.config.iterations, float(self._last_loss), len(self._parameters["means"]))
 

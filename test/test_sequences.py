@@ -15,7 +15,7 @@ import tifffile
 
 from endo_sim_ros.cameras import Camera, matrix_to_quat
 from endo_sim_ros.sequences.endonerf import read_endonerf
-from endo_sim_ros.sequences.folder import read_folder
+from endo_sim_ros.sequences.folder import read_folder, read_points
 from endo_sim_ros.sequences.frames import Frame, SequenceError
 from endo_sim_ros.sequences.readers import READERS, open_sequence
 from endo_sim_ros.sequences.recordings import Video, lit_area, numbered_files, read_poses, tool_is_white
@@ -645,6 +645,20 @@ def test_image_folder_frames(folder):
         assert not frame.mask[:, :12].any()
         assert_frame_agrees(frame)
     assert not frames[1].mask[:30].any() and frames[0].mask[10, 80] == frames[1].mask[60, 80] == 255
+
+
+def test_points_of_a_folder_are_those_of_its_poses(folder):
+    assert read_points(folder) is None
+    (folder / "points.txt").write_text("# x y z r g b track\n0.01 0.02 0.1 255 0 51 7\n0 0 0.2 0 0 0 2\n")
+    points, colors = read_points(folder)
+    np.testing.assert_allclose(points, [[0.01, 0.02, 0.1], [0, 0, 0.2]])
+    np.testing.assert_allclose(colors, [[1, 0, 0.2], [0, 0, 0]])
+    for text, reason in (("1 2 3\n", "not lines of x y z r g b"), ("0 0 nan 1 1 1\n", "finite"), ("0 0 1 300 1 1\n", "0 to 255")):
+        (folder / "points.txt").write_text(text)
+        with pytest.raises(SequenceError, match=f"points.txt: .*{reason}"):
+            read_points(folder)
+    (folder / "poses_left.txt").unlink()
+    assert read_points(folder) is None
 
 
 def test_image_folder_with_left_images_only(folder):

@@ -37,6 +37,7 @@ from endo_sim_ros.reconstruction.depth import with_depth_prior
 from endo_sim_ros.reconstruction.presets import ABLATIONS, preset
 from endo_sim_ros.reconstruction.triangulation import triangulate
 from endo_sim_ros.sequences.bag import read_bag
+from endo_sim_ros.sequences.folder import read_points
 from endo_sim_ros.sequences.frames import Frame, SequenceError
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 from endo_sim_ros.sequences.readers import open_sequence
@@ -255,7 +256,7 @@ def _prepare(cells: Sequence[Cell], bar: Progress) -> Prepared:
     found = None
     if any(cell.options["initialization"] == "points" for cell in cells):
         task = bar.add_task(f"scene points of {cells[0].sequence}", total=None)
-        found = triangulate(spread(frames, 2 * _POINT_VIEWS))[:2]
+        found = read_points(_place(source)[0]) or triangulate(spread(frames, 2 * _POINT_VIEWS))[:2]
         bar.remove_task(task)
     return Prepared([f if i in trained else small(f) for i, f in enumerate(frames)], right, depth_source, found)
 

@@ -7,6 +7,7 @@ my_recording/
   poses_left.txt          frame tx ty tz qx qy qz qw, camera-to-world, metres; without it poses are estimated
   masks/000001.png …      optional; 255 = tissue, 0 = ignore
   depth/000001.png …      optional; 16 bit, millimetres (see depth_scale), 0 = none
+  points.txt              optional, with poses; x y z [m, world] r g b [0-255], of structure from motion, for methods that start from it
 """
 
 import logging
@@ -46,6 +47,7 @@ logger = logging.getLogger(__name__)
 
 CALIBRATION_FILE = "calibration.yaml"
 POSE_FILES = ("poses_left.txt", "poses.txt")
+POINTS_FILE = "points.txt"
 
 
 def read_folder(
@@ -139,3 +141,23 @@ def read_folder(
         return recording
     logger.warning("%s: no %s, so poses come from structure from motion", root, " or ".join(POSE_FILES))
     return with_estimated_poses(recording, len(numbers), root)
+
+
+def read_points(path: Path | str) -> tuple[np.ndarray, np.ndarray] | None:
+    """Scene points [N, 3] (m, world of the poses) and their RGB [N, 3] in [0, 1] of a folder; None if it has none, or no poses.
+
+    Raises:
+        SequenceError: If they cannot be read.
+    """
+    root = Path(path)
+    file = root / POINTS_FILE
+    if not file.is_file() or not any((root / name).is_file() for name in POSE_FILES):
+        return None
+    try:
+        values = np.loadtxt(file, usecols=range(6), ndmin=2)
+    except (ValueError, IndexError, OSError) as error:
+        reason = next(iter(str(error).splitlines()), "")
+        raise SequenceError(f"{file}: not lines of x y z r g b ({reason}); correct or remove it") from None
+    if not len(values) or not np.isfinite(values).all() or values[:, 3:].min() < 0 or values[:, 3:].max() > 255:
+        raise SequenceError(f"{file}: expected finite x y z and colours r g b from 0 to 255; correct or remove it")
+    return values[:, :3], values[:, 3:] / 255

@@ -314,17 +314,25 @@ def test_blocks_of_a_cluster_add_up_what_all_nodes_give_to_a_grid_node(count):
     expected = np.zeros(corners.max() + 1)
     np.add.at(expected, corners, given)
     assert sorted(division.nodes[division.nodes >= 0]) == list(range(len(corners)))
-    patch, planes = division.shares.shape[1], -(-3 // division.passes)
-    sums = np.zeros((cluster.CLUSTER, patch))
-    for nodes, slots, rows, block in zip(division.nodes, division.slots, division.rows, sums):
-        for n in range(division.passes):
-            part = slice(9 * planes * n, 9 * planes * (n + 1))
-            memory = np.full(cluster.SHARED, np.nan)
-            memory[slots[nodes >= 0, part]] = given[nodes[nodes >= 0], part]
-            block += [memory[begin:end].sum() for begin, end in zip(rows[n], rows[n, 1:])]
-    for nodes, places, shares in zip(division.nodes, division.corners, division.shares):
-        totals = np.array([sums.ravel()[division.published[begin:end]].sum() for begin, end in shares])
-        np.testing.assert_allclose(totals[places[nodes >= 0]], expected[corners[nodes[nodes >= 0]]], atol=1e-12)
+    patch = division.shares.shape[2]
+    inboxes = np.zeros((cluster.CLUSTER, division.inbox))
+    for nodes, places, sums, inbox in zip(division.nodes, division.places, division.sums.reshape(cluster.CLUSTER, -1, 4), inboxes):
+        memory = np.zeros(division.slots)
+        memory[places[nodes >= 0]] = given[nodes[nodes >= 0]]
+        assert not memory[-1] and len(np.unique(places[nodes >= 0])) == 27 * (nodes >= 0).sum()
+        for thread, (_, _, sharing, g) in enumerate(sums):
+            if g >= 0:
+                threads = sums[thread : thread + cluster.BANKS * sharing : cluster.BANKS]
+                inbox[g] = sum(memory[begin : end : cluster.WARP].sum() for begin, end, _, _ in threads)
+    totals = inboxes[:, :patch].copy()
+    for block, sends in enumerate(division.sends.reshape(cluster.CLUSTER, -1, 3)):
+        for g, other, place in sends[sends[:, 0] >= 0]:
+            assert other != block and not inboxes[other, place]
+            inboxes[other, place] = totals[block, g]
+    np.testing.assert_array_equal((inboxes[:, patch:] != 0).sum(1), division.received)
+    for nodes, corners_of, shares, inbox in zip(division.nodes, division.corners, division.shares, inboxes):
+        totals = inbox[shares].sum(0)
+        np.testing.assert_allclose(totals[corners_of[nodes >= 0]], expected[corners[nodes[nodes >= 0]]], atol=1e-12)
 
 
 def test_more_nodes_than_a_cluster_holds_are_not_divided():

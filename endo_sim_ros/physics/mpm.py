@@ -17,6 +17,7 @@ from endo_sim_ros.physics.control_nodes import ControlNodes
 from endo_sim_ros.physics.cutting import CutTable, first_nodes
 from endo_sim_ros.physics.materials import energy_density, lame_parameters, sound_speed
 from endo_sim_ros.physics.mpm_kernels import (
+    REDUCING,
     Grid,
     Loads,
     Nodes,
@@ -24,11 +25,10 @@ from endo_sim_ros.physics.mpm_kernels import (
     State,
     Substep,
     Transfer,
-    check_nodes,
     collect,
+    end_step,
     make_advance_kernel,
     scatter,
-    undo_bad_steps,
     update_grid,
 )
 from endo_sim_ros.physics.mpm_simd_kernels import LANES, SCRATCH, STRESSES, make_step_kernel
@@ -119,7 +119,7 @@ class MpmSolver:
 
     The state lives in a local frame (world axes, origin at the grid's corner) as displacement from rest, so that a
     scene metres from the world's origin is as accurate as one at it and an undisturbed rest state is an exact fixed
-    point. A step whose end is bad (see `check_nodes`) is undone in its environment. On a CPU, and on a GPU with rest
+    point. A step whose end is bad (see `end_step`) is undone in its environment. On a CPU, and on a GPU with rest
     kinematics, the same inputs give the same bits.
 
     Args:
@@ -163,6 +163,7 @@ class MpmSolver:
         if not good:
             raise ValueError(f"stiffness must be {environments} positive factors, got {np.round(scale, 4).tolist()}")
         self.largest_stiffness = float(scale.max())
+        self.reducing = 1 if self.device == "cpu" else REDUCING  # threads that add up for one environment
         self.cell_size = h = config.grid_ratio * nodes.spacing
         if not MIN_CELL <= h <= MAX_CELL:
             raise ValueError(
@@ -217,10 +218,9 @@ class MpmSolver:
         self.rigid.count, self.rigid.friction = tools, config.friction
         self.rigid.tip, self.rigid.tip_v, self.rigid.end, self.rigid.end_v = (self._zeros(environments * tools, wp.vec3) for _ in range(4))
         self.rigid.radius = self._zeros(environments * tools, float)
-        self.rigid.impulse, self.rigid.moment = (self._zeros(count * tools, wp.vec3) for _ in range(2))
-        self.state, self._backup = self._new_state(), self._new_state()
+        self._given, (self.rigid.impulse, self.rigid.moment) = self._together(count * tools, wp.vec3, wp.vec3)
+        (self._saved, self.state), (self._backed_up, self._backup) = self._new_state(), self._new_state()
         self.bad_nodes = self._zeros(environments, int)  # in the last step; where there were any it was undone
-        self._bad_before = self._zeros(environments, int)  # in the step before
         self._speed_sq = self._zeros(environments, float)
         self._substep = Substep()
         self._substep.dt = self.substepping.dt
@@ -243,11 +243,20 @@ class MpmSolver:
     def _zeros(self, count: int, dtype) -> wp.array:
         return wp.zeros(count, dtype, device=self.device)
 
-    def _new_state(self) -> State:
+    def _together(self, count: int, *dtypes) -> tuple[wp.array, list[wp.array]]:
+        """Arrays of zeros that lie one after the other, and all of them as one array of float, to be copied or cleared at once."""
+        sizes = [count * wp.types.type_size(dtype) for dtype in dtypes]
+        everything = torch.zeros(sum(sizes), device=self.device)
+        parts = [part.view(count, *dtype._shape_) for part, dtype in zip(everything.split(sizes), dtypes)]
+        arrays = [wp.from_torch(part, dtype, requires_grad=False) for part, dtype in zip(parts, dtypes)]
+        return wp.from_torch(everything, requires_grad=False), arrays
+
+    def _new_state(self) -> tuple[wp.array, State]:
+        """What a bad step brings back, as one array, and the state."""
         state, count = State(), self.environments * self.node_count
-        state.u, state.v = self._zeros(count, wp.vec3), self._zeros(count, wp.vec3)
-        state.C, state.F, state.Q = (self._zeros(count, wp.mat33) for _ in range(3))
-        return state
+        saved, (state.u, state.F, state.Q) = self._together(count, wp.vec3, wp.mat33, wp.mat33)
+        state.v, state.C = self._zeros(count, wp.vec3), self._zeros(count, wp.mat33)
+        return saved, state
 
     def reset(self, environments: torch.Tensor | slice = slice(None)) -> None:
         """Back to rest, no force, nothing held but the pinned nodes, in these environments."""
@@ -346,16 +355,12 @@ class MpmSolver:
 
     def _actions(self) -> list[Callable[[], None]]:
         """What one step does, in order; memory and modules are ready when it returns."""
-        every, count = (self.environments, self.node_count), self.node_count
-        check = [self.state, count, self.config.travel, self.bad_nodes, self._speed_sq]
+        threads = self.reducing
+        check = [threads, self.node_count, self.config.travel, self._backup, self.state, self.bad_nodes, self._speed_sq]
         actions = [self._action(launch) for launch in self._before]
-        for name in ("u", "F", "Q"):
-            actions.append(partial(wp.copy, getattr(self._backup, name), getattr(self.state, name)))
-        actions.append(partial(wp.copy, self._bad_before, self.bad_nodes))
-        actions += [array.zero_ for array in (self.bad_nodes, self._speed_sq, self.rigid.impulse, self.rigid.moment)]
+        actions += [partial(wp.copy, self._backed_up, self._saved), self._given.zero_]
         actions += self._vectorised_step() if self._vectorised else self._clustered_step() or self._launched_substeps()
-        actions.append(self._action(Launch(check_nodes, every, check)))
-        actions.append(self._action(Launch(undo_bad_steps, every, [self.bad_nodes, self._bad_before, count, self._backup, self.state])))
+        actions.append(self._action(Launch(end_step, (self.environments, threads), check, threads)))
         return actions + [self._action(launch) for launch in (*self._after, *self._last)]
 
     def _action(self, launch: Launch | list[Launch]) -> Callable[[], None]:
@@ -398,13 +403,16 @@ class MpmSolver:
         division = cluster.divide(self.rest_cells, self._corners())
         if division is None:
             return []
-        kernel = cluster.make_step_kernel(self.config.material, *division[:4])
-        if wp.get_cuda_max_cluster_dim(kernel, self.device, block_dim=cluster.BLOCK) < cluster.CLUSTER:
+        device, memory = wp.get_device(self.device), 16 * cluster.SHARED
+        if device.max_shared_memory_per_block < memory + cluster.OTHERS:
             return []
-        tables = [wp.array(values, dtype=int, device=self.device) for values in division[4:]]
-        given = self._zeros(2 * self.environments * division.shares[..., 0].size, wp.vec4)
+        kernel = cluster.make_step_kernel(self.config.material, division.lanes)
+        if wp.get_cuda_max_cluster_dim(kernel, device, block_dim=cluster.BLOCK, dynamic_smem_bytes=memory) < cluster.CLUSTER:
+            return []
+        tables = [wp.array(values, dtype=int, device=device) for values in division[3:]]
         inputs = [self.nodes, self.state, self.loads, self.rigid, self._grid, self._substep, self.substepping.count, self._scale]
-        return [self._action(Launch(kernel, self.environments * cluster.THREADS, [*inputs, *tables, given], cluster.BLOCK))]
+        inputs += [division.slots, division.inbox, *tables]
+        return [self._action(Launch(kernel, self.environments * cluster.THREADS, inputs, cluster.BLOCK))]
 
     def _launched_substeps(self) -> list[Callable[[], None]]:
         """Two launches for each substep with rest kinematics, three with current kinematics."""

@@ -30,6 +30,7 @@ from endo_sim_ros.physics.materials import MATERIALS, kirchhoff_stress, maxwell,
 wp.set_module_options({"enable_backward": False})
 
 PUSH_OUT = 0.5  # m/s; a tool that suddenly is deep within tissue pushes it out no faster than this
+REDUCING = 512  # threads of a GPU's block that adds up over an environment
 EASED = 0.9  # of its deformation is left to tissue of which two steps in a row were bad
 
 
@@ -402,32 +403,76 @@ def update_grid(decay: float, grid_mv: wp.array[wp.vec4], grid_v: wp.array[wp.ve
     store(grid_mv, i, wp.vec4())
 
 
-@wp.kernel
-def check_nodes(state: State, count: int, travel: float, faults: wp.array[int], speed_sq: wp.array[float]):
-    """Count nodes that are not finite or out of bounds (the comparisons are false for NaN) and find the largest v²."""
-    b, p = wp.tid()
-    e = b * count + p
-    if not (wp.length_sq(state.u[e]) <= travel * travel and wp.ddot(state.F[e], state.F[e]) < 1.0e4):
-        wp.atomic_add(faults, b, 1)
-    wp.atomic_max(speed_sq, b, wp.length_sq(state.v[e]))
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __shared__ double sums[32];
+    for (int offset = 16; offset > 0; offset /= 2)
+        value += __shfl_xor_sync(0xffffffffu, value, offset);
+    __syncthreads();  // the sums before have been read
+    if (threadIdx.x % 32 == 0)
+        sums[threadIdx.x / 32] = value;
+    __syncthreads();
+    value = 0.0;
+    for (int warp = 0; warp < blockDim.x / 32; ++warp)
+        value += sums[warp];
+#endif
+    return value;
+""")
+def block_sum(value: wp.float64) -> wp.float64:
+    """Sum over the threads of a block on a GPU, in the same order every time; all must be here. On a CPU there is one."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __shared__ float most[32];
+    for (int offset = 16; offset > 0; offset /= 2)
+        value = fmaxf(value, __shfl_xor_sync(0xffffffffu, value, offset));
+    __syncthreads();
+    if (threadIdx.x % 32 == 0)
+        most[threadIdx.x / 32] = value;
+    __syncthreads();
+    for (int warp = 0; warp < blockDim.x / 32; ++warp)
+        value = fmaxf(value, most[warp]);
+#endif
+    return value;
+""")
+def block_max(value: float) -> float:
+    """Largest value of the threads of a block on a GPU; all must be here."""
+    ...
 
 
 @wp.kernel
-def undo_bad_steps(faults: wp.array[int], faults_before: wp.array[int], count: int, backup: State, state: State):
-    """Environments with faults return to the state before the step, at rest there.
+def end_step(
+    threads: int, count: int, travel: float, backup: State, state: State, faults: wp.array[int], speed_sq: wp.array[float]
+):
+    """Count nodes that are not finite or out of bounds (the comparisons are false for NaN) and find the largest v².
 
-    Where the step before was bad as well, they give way towards rest: from tissue that is turned inside out or stretched
-    too far for its substeps every step is bad. u and F − 1 shrink together, and still fit.
+    Environments where there are any return to the state before the step, at rest there. Where the step before was bad as
+    well, they give way towards rest: from tissue that is turned inside out or stretched too far for its substeps every step
+    is bad. u and F − 1 shrink together, and still fit.
     """
-    b, p = wp.tid()
-    e = b * count + p
-    if faults[b] > 0:
-        state.u[e] = backup.u[e]
-        state.F[e] = backup.F[e]
-        state.Q[e] = backup.Q[e]
-        if faults_before[b] > 0:
-            state.u[e] = EASED * backup.u[e]
-            state.F[e] = EASED * (backup.F[e] - wp.identity(3, float)) + wp.identity(3, float)
-            state.Q[e] = EASED * backup.Q[e]
-        state.v[e] = wp.vec3()
-        state.C[e] = wp.mat33()
+    b, thread = wp.tid()
+    before = faults[b]
+    bad, fastest = wp.float64(0.0), float(0.0)
+    for p in range(thread, count, threads):
+        e = b * count + p
+        if not (wp.length_sq(state.u[e]) <= travel * travel and wp.ddot(state.F[e], state.F[e]) < 1.0e4):
+            bad += wp.float64(1.0)
+        fastest = wp.max(fastest, wp.length_sq(state.v[e]))
+    bad, fastest = block_sum(bad), block_max(fastest)
+    if thread == 0:
+        faults[b] = int(bad)
+        speed_sq[b] = fastest
+    if bad > wp.float64(0.0):
+        for p in range(thread, count, threads):
+            e = b * count + p
+            state.u[e] = backup.u[e]
+            state.F[e] = backup.F[e]
+            state.Q[e] = backup.Q[e]
+            if before > 0:
+                state.u[e] = EASED * backup.u[e]
+                state.F[e] = EASED * (backup.F[e] - wp.identity(3, float)) + wp.identity(3, float)
+                state.Q[e] = EASED * backup.Q[e]
+            state.v[e] = wp.vec3()
+            state.C[e] = wp.mat33()

@@ -77,12 +77,12 @@ class Tools:
         self._faults = wp.zeros(solver.environments, int, device=solver.device)
         self.faults = wp.to_torch(self._faults)  # steps undone [B], int32
 
-        lanes = 1 if solver.device == "cpu" else 32
-        dim = (solver.environments, lanes)
-        common = [solver.tool_count, lanes, commands, holds, reach, solver.nodes, solver.state]
-        self._take_hold = Launch(take_hold, dim, common)
-        load = Launch(load_nodes, dim, [*common, solver.loads, solver.rigid, solver.bad_nodes])
-        measure = Launch(measure_reactions, dim, [*common, solver.rigid, solver.bad_nodes, self._faults])
+        threads = solver.reducing
+        dim = (solver.environments, threads)
+        common = [solver.tool_count, threads, commands, holds, reach, solver.nodes, solver.state]
+        self._take_hold = Launch(take_hold, dim, common, threads)
+        load = Launch(load_nodes, dim, [*common, solver.loads, solver.rigid, solver.bad_nodes], threads)
+        measure = Launch(measure_reactions, dim, [*common, solver.rigid, solver.bad_nodes, self._faults], threads)
         solver.surround([self._take_hold, load], [measure])
 
     def take_hold(self) -> None:

@@ -1,13 +1,13 @@
 """Kernels that turn what tools want into loads on nodes, and what nodes got into reactions.
 
-One warp of a GPU (one thread of a CPU) works for one environment b and its tools t, one after the other; its lanes share
+One block of a GPU (one thread of a CPU) works for one environment b and its tools t, one after the other; its threads share
 the nodes that tools may touch. Commands and sums are float64, which keeps a reaction equal to its wrench to the last digit that
 matters and a scene metres from the world's origin as accurate as one at it.
 """
 
 import warp as wp
 
-from endo_sim_ros.physics.mpm_kernels import Loads, Nodes, RigidTools, State
+from endo_sim_ros.physics.mpm_kernels import REDUCING, Loads, Nodes, RigidTools, State, block_sum
 
 wp.set_module_options({"enable_backward": False})
 
@@ -59,21 +59,9 @@ class Reach:
     contact_length: wp.float64  # m
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    for (int offset = 16; offset > 0; offset /= 2)
-        value += __shfl_xor_sync(0xffffffffu, value, offset);
-#endif
-    return value;
-""")
-def lane_sum(value: wp.float64) -> wp.float64:
-    """Sum over the 32 lanes of a warp on a GPU, in the same order every time; on a CPU there is one lane."""
-    ...
-
-
 @wp.func
-def lanes_sum(v: wp.vec3d) -> wp.vec3d:
-    return wp.vec3d(lane_sum(v[0]), lane_sum(v[1]), lane_sum(v[2]))
+def block_sum3(v: wp.vec3d) -> wp.vec3d:
+    return wp.vec3d(block_sum(v[0]), block_sum(v[1]), block_sum(v[2]))
 
 
 @wp.func
@@ -102,7 +90,7 @@ def solve_on_range(J: wp.mat33d, needed: wp.vec3d, floor: wp.float64) -> wp.vec3
 @wp.kernel
 def take_hold(
     tools: int,
-    lanes: int,
+    threads: int,
     commands: Commands,
     holds: Holds,
     reach: Reach,
@@ -110,7 +98,7 @@ def take_hold(
     state: State,
 ):
     """Wrenches and jaws that begin to act take hold of the nodes in reach, in their current positions; others let go."""
-    b, lane = wp.tid()
+    b, thread = wp.tid()
     count = nodes.X.shape[0]
     touchable = reach.touchable.shape[0]
     zero, one = wp.float64(0.0), wp.float64(1.0)
@@ -124,7 +112,7 @@ def take_hold(
         if attach or grip:
             centre = wp.vec3d()
             total, gripped = wp.float64(0.0), wp.float64(0.0)
-            for s in range(lane, touchable, lanes):
+            for s in range(thread, touchable, threads):
                 p = reach.touchable[s]
                 u = double(state.u[b * count + p])
                 x = reach.origin + double(nodes.X[p]) + u
@@ -147,24 +135,24 @@ def take_hold(
                         holds.local[c * touchable + s] = wp.transpose(commands.R[c]) * arm
                         holds.pulled[c * touchable + s] = u
                     holds.held[c * touchable + s] = inside
-            total, gripped, centre = lane_sum(total), lane_sum(gripped), lanes_sum(centre)
-            if lane == 0:
+            total, gripped, centre = block_sum(total), block_sum(gripped), block_sum3(centre)
+            if thread == 0:
                 if attach and total > zero:
                     holds.attached[c] = 1
                     holds.contact[c] = commands.reach[c] - centre / total
                 if grip and gripped > zero:
                     holds.gripping[c] = 1
-        if lane == 0:
+        if thread == 0:
             if not wanted:
                 holds.attached[c] = 0
             if not close:
                 holds.gripping[c] = 0
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=REDUCING)
 def load_nodes(
     tools: int,
-    lanes: int,
+    threads: int,
     commands: Commands,
     holds: Holds,
     reach: Reach,
@@ -180,11 +168,11 @@ def load_nodes(
     the offset from the weighted centroid c, β = J⁻¹ (τ − c × F), J = Σ w (|s|² 1 − s sᵀ), w scaled to Σ w = 1. Nodes on one line or point
     resist no torque about it: the force is still exact and the torque is the nearest that the nodes can take.
     """
-    b, lane = wp.tid()
+    b, thread = wp.tid()
     count = nodes.X.shape[0]
     touchable = reach.touchable.shape[0]
     zero, one = wp.float64(0.0), wp.float64(1.0)
-    for s in range(lane, touchable, lanes):
+    for s in range(thread, touchable, threads):
         e = b * count + reach.touchable[s]
         loads.force[e] = wp.vec3()
         loads.spring[e] = 0.0
@@ -194,17 +182,17 @@ def load_nodes(
         F, torque = wp.vec3d(), wp.vec3d()
         if holds.attached[c] != 0:
             total, centre = wp.float64(0.0), wp.vec3d()
-            for s in range(lane, touchable, lanes):
+            for s in range(thread, touchable, threads):
                 w = wp.float64(holds.weight[c * touchable + s])
                 if w > zero:
                     p = reach.touchable[s]
                     total += w
                     centre += w * (double(nodes.X[p]) + double(state.u[b * count + p]))
-            total, centre = lane_sum(total), lanes_sum(centre)
+            total, centre = block_sum(total), block_sum3(centre)
             centre = centre / total
             xx, yy, zz = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
             xy, xz, yz = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
-            for s in range(lane, touchable, lanes):
+            for s in range(thread, touchable, threads):
                 w = wp.float64(holds.weight[c * touchable + s]) / total
                 if w > zero:
                     p = reach.touchable[s]
@@ -215,15 +203,15 @@ def load_nodes(
                     xy += w * arm[0] * arm[1]
                     xz += w * arm[0] * arm[2]
                     yz += w * arm[1] * arm[2]
-            xx, yy, zz = lane_sum(xx), lane_sum(yy), lane_sum(zz)
-            xy, xz, yz = lane_sum(xy), lane_sum(xz), lane_sum(yz)
+            xx, yy, zz = block_sum(xx), block_sum(yy), block_sum(zz)
+            xy, xz, yz = block_sum(xy), block_sum(xz), block_sum(yz)
             J = wp.mat33d(yy + zz, -xy, -xz, -xy, xx + zz, -yz, -xz, -yz, xx + yy)
             F = commands.force[c]
             lever = -holds.contact[c]  # of the centroid about the point held
             floor = wp.max(xx + yy + zz + wp.length_sq(lever), wp.float64(1.0e-30))
             beta = solve_on_range(J, commands.torque[c] - wp.cross(lever, F), floor)
             torque = wp.cross(lever, F) + J * beta
-            for s in range(lane, touchable, lanes):
+            for s in range(thread, touchable, threads):
                 w = wp.float64(holds.weight[c * touchable + s]) / total
                 if w > zero:
                     p = reach.touchable[s]
@@ -231,14 +219,14 @@ def load_nodes(
                     loads.force[b * count + p] += single(w * (F + wp.cross(beta, arm)))
         if holds.gripping[c] != 0:
             beyond = wp.float64(0.0)
-            for s in range(lane, touchable, lanes):
+            for s in range(thread, touchable, threads):
                 if holds.held[c * touchable + s] != 0:
                     p = reach.touchable[s]
                     goal = commands.tip[c] + commands.R[c] * holds.local[c * touchable + s]
                     if wp.length(goal - reach.origin - double(nodes.X[p])) > wp.float64(SLIP) * reach.travel:
                         beyond += one
-            beyond = lane_sum(beyond)
-            for s in range(lane, touchable, lanes):
+            beyond = block_sum(beyond)
+            for s in range(thread, touchable, threads):
                 if beyond == zero and holds.held[c * touchable + s] != 0:
                     p = reach.touchable[s]
                     e = b * count + p
@@ -251,16 +239,16 @@ def load_nodes(
                     loads.target_v[e] = single((goal - start) / reach.duration)
                     loads.holder[e] = t
                     holds.pulled[c * touchable + s] = goal
-            if lane == 0 and beyond > zero:
+            if thread == 0 and beyond > zero:
                 holds.gripping[c] = 0
                 holds.slips[c] = holds.slips[c] + 1
                 commands.closed[c] = 0
         unusable = not wp.isfinite(wp.length_sq(commands.force[c]) + wp.length_sq(commands.torque[c]))
         if commands.present[c] != 0:
             unusable = unusable or not wp.isfinite(wp.length_sq(commands.tip[c]) + wp.ddot(commands.R[c], commands.R[c]))
-        if unusable and lane == 0 and touchable > 0:
+        if unusable and thread == 0 and touchable > 0:
             loads.force[b * count + reach.touchable[0]] = wp.vec3(wp.nan, wp.nan, wp.nan)
-        if lane == 0:
+        if thread == 0:
             holds.applied_force[c] = F
             holds.applied_torque[c] = torque
             rigid.radius[c] = 0.0
@@ -284,7 +272,7 @@ def load_nodes(
 @wp.kernel
 def measure_reactions(
     tools: int,
-    lanes: int,
+    threads: int,
     commands: Commands,
     holds: Holds,
     reach: Reach,
@@ -295,19 +283,19 @@ def measure_reactions(
     faults: wp.array[int],
 ):
     """What the tissue exerts back on each tool: minus its wrench, and minus the mean of what jaw and contact gave."""
-    b, lane = wp.tid()
+    b, thread = wp.tid()
     count = nodes.X.shape[0]
     for t in range(tools):
         c = b * tools + t
         force, moment = wp.vec3d(), wp.vec3d()
         if commands.present[c] != 0:  # others push and hold nothing
-            for p in range(lane, count, lanes):
+            for p in range(thread, count, threads):
                 given = rigid.impulse[c * count + p]
                 if wp.length_sq(given) > 0.0:
                     force += double(given) / reach.duration
                     moment += double(rigid.moment[c * count + p]) / reach.duration
-            force, moment = lanes_sum(force), lanes_sum(moment)
-        if lane == 0:
+            force, moment = block_sum3(force), block_sum3(moment)
+        if thread == 0:
             torque = moment - wp.cross(commands.tip[c] - reach.origin, force)
             force += holds.applied_force[c]
             torque += holds.applied_torque[c]
@@ -315,5 +303,5 @@ def measure_reactions(
                 force, torque = wp.vec3d(), wp.vec3d()
             holds.reaction_force[c] = -force
             holds.reaction_torque[c] = -torque
-    if lane == 0 and bad_nodes[b] > 0:
+    if thread == 0 and bad_nodes[b] > 0:
         faults[b] = faults[b] + 1

@@ -800,6 +800,34 @@ def test_turning_the_jaw_turns_the_tissue_and_is_resisted():
     assert simulation.reaction("PSM1")[1][2] < -1e-4
 
 
+def test_tissue_is_handed_from_jaw_to_jaw_without_a_jerk():
+    simulation, aside = simulate(), TIP + [0.0048, 0, 0]
+    for closed in (False, True):
+        for tool in ("PSM1", "PSM2"):
+            assert simulation.set_grasp(tool, pose_at(TIP), closed)
+    held = simulation.held_nodes("PSM1")
+
+    def follow(tool):
+        for _ in range(3):
+            simulation.step()
+            moved = (simulation.state().positions - simulation.nodes.rest)[held].mean(0)
+            yield *moved, simulation.reaction(tool)[0][0]
+
+    for part in np.linspace(0, 1, 6):  # both hold it, and only one goes away
+        simulation.set_grasp("PSM1", pose_at(TIP + part * (aside - TIP)), True)
+        simulation.step()
+    assert np.abs(list(follow("PSM1"))[-1]).max() < 1e-4  # it has nothing yet
+    simulation.set_grasp("PSM2", pose_at(TIP), False)
+    given = np.array(list(follow("PSM1")))
+    np.testing.assert_allclose(given[:, :3], np.tile(aside - TIP, (3, 1)), atol=1e-4)
+    assert given[-1, 3] < -0.5 and abs(given[0, 3]) < 1.1 * abs(given[-1, 3])
+    simulation.set_grasp("PSM2", pose_at(aside), True)
+    simulation.set_grasp("PSM1", pose_at(aside), False)
+    back = np.array(list(follow("PSM2")))
+    np.testing.assert_allclose(back[:, :3], given[:, :3], atol=1e-4)
+    assert back[:, 3] == pytest.approx(given[-1, 3], rel=0.15) and not simulation.reaction("PSM1")[0].any()
+
+
 def test_opening_the_jaw_releases_the_tissue():
     simulation = simulate()
     simulation.set_grasp("PSM1", pose_at(TIP), True)

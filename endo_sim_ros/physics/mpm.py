@@ -311,6 +311,12 @@ class MpmSolver:
         if self.device == "cpu":  # now, where nobody waits, rather than when the tissue is first touched
             self._advance = self._prepare()
 
+    def load_kernels(self) -> None:
+        """Load now what a step of cut tissue may need on a GPU: its grid nodes can become too many for one launch."""
+        if self.device != "cpu":
+            for kernel in (make_advance_kernel(self.config.material, self.config.kinematics), collect):
+                wp.load_module(kernel.module, self.device, block_dim=BLOCK)
+
     def surround(self, before: list[Launch], after: list[Launch]) -> None:
         """Make these launches part of every step, on a GPU of the one graph that it is."""
         self._before, self._after = before, after

@@ -81,7 +81,7 @@ class Loads:
     spring: wp.array[float]  # N/m, of pinned and grasped nodes; zero where free
     target: wp.array[wp.vec3]  # displacement u* at the start of the step that the spring pulls to, m
     target_v: wp.array[wp.vec3]  # its velocity during the step, m/s
-    holder: wp.array[int]  # tool whose jaw the spring belongs to, -1 = none
+    holder: wp.array[int]  # tool whose jaw the spring belongs to, or did when the node was held last; -1 = none
 
 
 @wp.struct

@@ -269,7 +269,8 @@ class TissueSimulation:
             self._disturbed = True
 
     def prepare_cutting(self) -> None:
-        """Find the links between nodes now, which the first cut would otherwise wait for (a tenth of a second).
+        """Find the links between nodes now, which the first cut would otherwise wait for (a tenth of a second), and on a GPU load
+        the kernels for tissue that cuts have divided too much for one launch (many seconds, when they are compiled).
 
         Raises:
             ValueError: If kinematics is not rest.
@@ -278,6 +279,8 @@ class TissueSimulation:
             raise ValueError(f"tissue with kinematics {self.config.kinematics} cannot be cut; set kinematics to rest")
         if self._stencils is None:
             self._stencils = CutStencils(self.nodes.rest, self.solver.rest_cells, self.solver.grid_shape)
+            with capturing:
+                self.solver.load_kernels()
 
     @property
     def cuts(self) -> np.ndarray:

@@ -167,6 +167,8 @@ def load_nodes(
     A wrench becomes the nodal forces f with Σ f = F and Σ r × f = τ that minimise Σ |f|²/w: f = w (F/Σw + β × s) with s
     the offset from the weighted centroid c, β = J⁻¹ (τ − c × F), J = Σ w (|s|² 1 − s sᵀ), w scaled to Σ w = 1. Nodes on one line or point
     resist no torque about it: the force is still exact and the torque is the nearest that the nodes can take.
+
+    A node that several jaws hold follows the last of them; when that opens, the one before has it.
     """
     b, thread = wp.tid()
     count = nodes.X.shape[0]
@@ -175,8 +177,7 @@ def load_nodes(
     for s in range(thread, touchable, threads):
         e = b * count + reach.touchable[s]
         loads.force[e] = wp.vec3()
-        loads.spring[e] = 0.0
-        loads.holder[e] = -1
+        loads.spring[e] = 0.0  # its last holder stays known
     for t in range(tools):
         c = b * tools + t
         F, torque = wp.vec3d(), wp.vec3d()
@@ -231,7 +232,8 @@ def load_nodes(
                     p = reach.touchable[s]
                     e = b * count + p
                     start = holds.pulled[c * touchable + s]
-                    if bad_nodes[b] > 0:  # the last step was undone: pull on from where the tissue is
+                    # Where the last step was undone, or another jaw had the node: pull on from where the tissue is.
+                    if bad_nodes[b] > 0 or loads.holder[e] != t:
                         start = double(state.u[e])
                     goal = commands.tip[c] + commands.R[c] * holds.local[c * touchable + s] - reach.origin - double(nodes.X[p])
                     loads.spring[e] = nodes.stiffness[e]

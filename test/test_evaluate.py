@@ -18,7 +18,7 @@ from endo_sim_ros.evaluation.config import EvaluationConfig
 from endo_sim_ros.evaluation.evaluate import evaluate, open_named
 from endo_sim_ros.evaluation.held_out import FIGURES, measure, seen_pixels
 from endo_sim_ros.evaluation.page import write_page
-from endo_sim_ros.evaluation.splits import right_views, split_views
+from endo_sim_ros.evaluation.splits import explain_split, right_views, split_views
 from endo_sim_ros.evaluation.workers import Finished, News, run_in_processes
 from endo_sim_ros.sequences.frames import SequenceError
 
@@ -29,19 +29,20 @@ SMALL = "phantom:0,frames=6,width=96,height=80"
 
 
 @pytest.mark.parametrize(
-    "name, count, train",
+    "name, count, train, said",
     [
-        ("1:49", 250, [0, 50, 100, 150, 200]),
-        ("1:99", 250, [0, 100, 200]),
-        ("2:3", 11, [0, 1, 5, 6, 10]),
-        ("two-views", 7, [0, 6]),
-        ("every-12th", 25, [0, 12, 24]),
-        ("every-5", 11, [0, 5, 10]),
-        ("all-but-3rd", 7, [1, 2, 4, 5]),
+        ("1:49", 250, [0, 50, 100, 150, 200], "Of each 50 views in order the first one trains"),
+        ("1:99", 250, [0, 100, 200], "Of each 100 views"),
+        ("2:3", 11, [0, 1, 5, 6, 10], "Of each 5 views in order the first 2 train"),
+        ("two-views", 7, [0, 6], "The first and the last view train"),
+        ("every-12th", 25, [0, 12, 24], "One view in 12 trains"),
+        ("every-5", 11, [0, 5, 10], "One view in 5 trains"),
+        ("all-but-3rd", 7, [1, 2, 4, 5], "One view in 3 is held out"),
     ],
 )
-def test_a_split_trains_on_some_views_and_holds_out_the_others(name, count, train):
+def test_a_split_trains_on_some_views_and_holds_out_the_others(name, count, train, said):
     split = split_views(name, count)
+    assert explain_split(name).startswith(said)
     assert split.train == train
     assert sorted(split.train + split.held_out) == list(range(count))
     assert not split.right
@@ -274,6 +275,7 @@ def test_the_page_needs_nothing_else_and_sorts_and_slides(run, chromium):
     assert order() == ["fsgs", "3dgs", "paper"]
     column.click()
     assert order() == ["paper", "3dgs", "fsgs"]
+    assert tab.get_by_text("The first and the last view train, all others are held out.").is_visible()
     texts = tab.locator("tbody").inner_text()
     assert "failed: " in texts and "22.94" in texts and "0.184‡" in texts
 

@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 
 from endo_sim_ros.evaluation import plots, tables
+from endo_sim_ros.evaluation.splits import explain_split
 from endo_sim_ros.evaluation.tables import COLUMNS, Pictures, Summary
 
 _WIDTH = 480  # of pictures in the page, pixels
@@ -78,7 +79,7 @@ def _table(summaries: list[Summary], split: str, missing: dict[str, str]) -> str
     titles = ["sequence", "method", *(COLUMNS[name].title for name in columns), "seeds"]
     head = "".join(f"<th>{escape(title)}</th>" for title in titles)
     return (
-        f"<h2>{escape(split)}</h2><div class=scroll><table><thead><tr>{head}</tr></thead>"
+        f"<h2>split {escape(split)}</h2><p>{escape(explain_split(split))}</p><div class=scroll><table><thead><tr>{head}</tr></thead>"
         f"<tbody>{''.join(rows)}</tbody></table></div>"
     )
 

@@ -58,6 +58,22 @@ def split_views(name: str, count: int) -> Split:
     return Split(train, held_out)
 
 
+def explain_split(name: str) -> str:
+    """A sentence for readers of results."""
+    if name == STEREO:
+        return "All left images train, all right images are held out."
+    if name == TWO_VIEWS:
+        return "The first and the last view train, all others are held out."
+    if ratio := re.fullmatch(_RATIO, name):
+        share, rest = int(ratio[1]), int(ratio[2])
+        first = f"first {share} train" if share > 1 else "first one trains"
+        return f"Of each {share + rest} views in order the {first}, the others are held out."
+    kind, step = re.fullmatch(_STEPPED, name).groups()
+    if kind == "every":
+        return f"One view in {step} trains, beginning with the first; the others are held out."
+    return f"One view in {step} is held out, beginning with the first; the others train."
+
+
 def right_views(frames: list[Frame]) -> list[Frame]:
     """The right images of stereo frames as views of their own; a frame without one is left out.
 

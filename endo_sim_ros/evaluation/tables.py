@@ -18,6 +18,7 @@ from endo_sim_ros.evaluation import figures, plots
 from endo_sim_ros.evaluation.bench import Row
 from endo_sim_ros.evaluation.held_out import FIGURES, Figure
 from endo_sim_ros.evaluation.paper import PRINTED, Printed
+from endo_sim_ros.evaluation.splits import explain_split
 
 COLUMNS = FIGURES | {
     "seconds": Figure("training", "s", 1),
@@ -146,7 +147,7 @@ def markdown(results: dict[str, Any], summaries: list[Summary]) -> str:
     lines = ["# Evaluation", "", f"{results['date']}, {results['machine']}."]
     for split in dict.fromkeys(s.split for s in summaries):
         titles = [COLUMNS[name].title for name in columns]
-        lines += ["", f"## {split}", "", "| sequence | method | " + " | ".join(titles) + " | seeds |"]
+        lines += ["", f"## {split}", "", explain_split(split), "", "| sequence | method | " + " | ".join(titles) + " | seeds |"]
         lines.append("|---|---|" + "---:|" * (len(columns) + 1))
         for summary in (s for s in summaries if s.split == split):
             cells = [summary.sequence, summary.method]

@@ -536,21 +536,21 @@ class Plot:
 
 
 COMMANDS = {
-    "evaluate": Evaluate,
-    "report": Report,
-    "touch": Touch,
     "demo": Demo,
+    "view": View,
     "up": Up,
     "convert": Convert,
     "phantom": Phantom,
     "reconstruct": Reconstruct,
-    "view": View,
     "compress": Compress,
+    "touch": Touch,
     "record": Record,
     "export": Export,
     "scene": SaveScene,
     "train": Train,
     "config": Config,
+    "evaluate": Evaluate,
+    "report": Report,
     "bench": Bench,
     "plot": Plot,
 }

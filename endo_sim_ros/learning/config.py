@@ -17,9 +17,9 @@ class Randomisation(StageConfig):
     texture: Annotated[float, Range(0, 0.9)] = 0.0
     """Contrast of the tissue's colours is multiplied by a factor between 1 - x and 1 + x."""
     camera_position: Annotated[float, Range(0, 0.05, "m")] = 0.0
-    """The endoscope is moved by up to this along each axis."""
+    """The endoscope is moved by up to this along each axis, m."""
     camera_angle: Annotated[float, Range(0, 45, "deg")] = 0.0
-    """The endoscope is turned by up to this about each axis."""
+    """The endoscope is turned by up to this about each axis, degrees."""
 
 
 @dataclass(frozen=True)

@@ -74,7 +74,7 @@ def views():
 def test_a_networks_depth_becomes_metric(views):
     """A network that sees the exact shape, up to scale and shift, gives the exact depth."""
     frame = views[0]
-    points, _, _ = triangulate(views)
+    points = triangulate(views).positions
     uv, z = frame.camera.project(points)
     inside = (uv >= 0).all(1) & (uv < [320, 256]).all(1)
     known = np.column_stack([uv, z])[inside]
@@ -84,7 +84,7 @@ def test_a_networks_depth_becomes_metric(views):
 
 
 def test_views_that_do_not_fit_are_dropped_and_none_at_all_is_an_error(views, tiny):
-    points, _, _ = triangulate(views)
+    points = triangulate(views)
     with pytest.raises(SequenceError, match="no view's depth fits"):
         with_depth_prior(views, points, ReconstructionConfig(depth="network", depth_model=str(tiny), device="cpu"))
 

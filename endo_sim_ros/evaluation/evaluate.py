@@ -35,7 +35,7 @@ from endo_sim_ros.evaluation.workers import Finished, News, ray_is_installed, ru
 from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer, shrink
 from endo_sim_ros.reconstruction.depth import with_depth_prior
 from endo_sim_ros.reconstruction.presets import ABLATIONS, preset
-from endo_sim_ros.reconstruction.triangulation import triangulate
+from endo_sim_ros.reconstruction.triangulation import ScenePoints, triangulate
 from endo_sim_ros.sequences.bag import read_bag
 from endo_sim_ros.sequences.folder import read_points
 from endo_sim_ros.sequences.frames import Frame, SequenceError
@@ -47,7 +47,8 @@ log = logging.getLogger(__name__)
 
 _SHOWN = 3  # held-out views of a cell of which pictures are kept
 _CURVE_VIEWS = 8  # held-out views measured at each moment of a curve
-_POINT_VIEWS = 24  # views that the points are from that a constant disparity offset is fitted to
+_POINT_VIEWS = 48  # views that structure from motion is done with
+_POINT_ERROR = 0.003  # relative error of the depth of points that a recording brings
 _PHANTOM = "phantom:"
 
 
@@ -76,7 +77,7 @@ class Prepared(NamedTuple):
     frames: list[Frame]  # left; those that no split trains on are as small as is measured
     right: list[Frame]  # the right images as views, for the split of that name
     depth_source: str  # where the reference depth of the frames is from: recorded, stereo matching, or none
-    points: tuple[np.ndarray, np.ndarray] | None = None  # of structure from motion with all views, for methods that start from them
+    points: ScenePoints  # of structure from motion with all views, like the poses
 
 
 def evaluate(sequences: Sequence[str], config: EvaluationConfig) -> dict[str, Any]:
@@ -238,11 +239,14 @@ def _prepare(cells: Sequence[Cell], bar: Progress) -> Prepared:
     frames = [frame for frame in frames if frame.mask is None or frame.mask.any()]
     splits = {cell.split for cell in cells}
     trained = {index for split in splits for index in split_views(split, len(frames)).train}
+    task = bar.add_task(f"scene points of {cells[0].sequence}", total=None)
+    known = read_points(_place(source)[0])
+    points = ScenePoints(*known, _POINT_ERROR) if known else triangulate(spread(frames, _POINT_VIEWS))
+    bar.remove_task(task)
     depth_source, matched = "none", frames
     recorded = any(frame.depth is not None and (frame.depth > 0).any() for frame in frames)
     if any(frame.right is not None for frame in frames) and (STEREO in splits or not recorded):
         task = bar.add_task(f"stereo matching of {cells[0].sequence}", total=None)
-        points = triangulate(spread(frames, _POINT_VIEWS))[0]
         matched = with_depth_prior(frames, points, ReconstructionConfig(depth="stereo"))
         bar.remove_task(task)
     if recorded:
@@ -253,12 +257,7 @@ def _prepare(cells: Sequence[Cell], bar: Progress) -> Prepared:
     width = max(cell.options["image_width"] for cell in cells)
     right = [shrink(frame, width) for frame in right_views(matched)] if STEREO in splits else []
     small = lambda frame: shrink(dataclasses.replace(frame, right=None, baseline=None, right_K=None), width)
-    found = None
-    if any(cell.options["initialization"] == "points" for cell in cells):
-        task = bar.add_task(f"scene points of {cells[0].sequence}", total=None)
-        found = read_points(_place(source)[0]) or triangulate(spread(frames, 2 * _POINT_VIEWS))[:2]
-        bar.remove_task(task)
-    return Prepared([f if i in trained else small(f) for i, f in enumerate(frames)], right, depth_source, found)
+    return Prepared([f if i in trained else small(f) for i, f in enumerate(frames)], right, depth_source, points)
 
 
 def _trusted(frame: Frame) -> np.ndarray | None:
@@ -375,8 +374,6 @@ def _job(argument: tuple, device: str, report: Callable[[Any], None]) -> dict[st
     views = [prepared.frames[index] for index in split.train]
     if not (cell.train_depth and prepared.depth_source == "recorded"):
         views = [dataclasses.replace(view, depth=None) for view in views]
-    # As the papers do it, which have them from structure from motion with all views.
-    points = prepared.points if config.initialization == "points" else None
     if cell.mono or split.right:
         views = [dataclasses.replace(view, right=None, baseline=None, right_K=None) for view in views]
     held_out = [shrink(frame, config.image_width) for frame in _held_out(prepared, split)]
@@ -385,7 +382,7 @@ def _job(argument: tuple, device: str, report: Callable[[Any], None]) -> dict[st
     training: dict[str, Any] = {}
 
     def train() -> None:
-        training.update(_train(views, config, points, spread(held_out, _CURVE_VIEWS), cell.curve, report))
+        training.update(_train(views, config, prepared.points, spread(held_out, _CURVE_VIEWS), cell.curve, report))
 
     memory = peak_megabytes(train, device)
     model = training.pop("model")
@@ -439,7 +436,7 @@ def _held_out(prepared: Prepared, split: Split) -> list[Frame]:
 
 
 def _train(
-    views: list[Frame], config: ReconstructionConfig, points: tuple | None, probes: list[Frame], moments: int, report: Callable
+    views: list[Frame], config: ReconstructionConfig, points: ScenePoints, probes: list[Frame], moments: int, report: Callable
 ) -> dict[str, Any]:
     """Train; the seconds that it took, without those of the measurements for the curve."""
 

@@ -50,6 +50,7 @@ FIGURES: dict[str, Figure] = {
     **{f"seen_{name}": figure._replace(heading=f"{figure.heading}, seen") for name, figure in _OF_PIXELS.items()},
     "depth_rmse": Figure("depth RMSE", "m", 5),
     "depth_rmse_scaled": Figure("depth RMSE, median scaled", "m", 5),
+    "seen_depth_rmse": Figure("depth RMSE, seen", "m", 5),
     "psnr_unmasked": Figure("PSNR, unmasked", "dB", 2),
     "ssim_unmasked": Figure("SSIM, unmasked", "", 3),
 }
@@ -87,6 +88,8 @@ def measure(
         row["depth_rmse"] = metrics.depth_rmse(depth, frame.depth, mask)
         scaled = metrics.median_scaled(depth, frame.depth, mask)
         row["depth_rmse_scaled"] = metrics.depth_rmse(scaled, frame.depth, mask)
+        if seen is not None:
+            row["seen_depth_rmse"] = metrics.depth_rmse(depth, frame.depth, masks[1][1])
     if mask is not None and not mask.all():
         row["psnr_unmasked"], row["ssim_unmasked"] = metrics.psnr(image, reference), metrics.ssim(image, reference)
     return row

@@ -6,11 +6,12 @@ import logging
 import cv2
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator
-from scipy.spatial import Delaunay, cKDTree
+from scipy.spatial import Delaunay
 
 from endo_sim_ros.device import map_in_threads, pick_device
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.depth_network import cached_checkpoint, load_network, network_depth
+from endo_sim_ros.reconstruction.triangulation import ScenePoints, points_in_view
 from endo_sim_ros.sequences.frames import Frame, SequenceError
 
 log = logging.getLogger(__name__)
@@ -18,14 +19,13 @@ log = logging.getLogger(__name__)
 _NEAREST = 0.02  # metres; closer than an endoscope works
 _MIN_POINTS = 30  # points needed to trust an offset or an interpolation
 _LEAST_DISPARITY = 2.0  # pixels; farther away half a pixel is more than a quarter of the depth
+MATCHED = 0.5  # pixels, error of a disparity
 _SPARSE = 16  # pixels between stereo matches that a network's depth is held against
 _FEATURES = 3000  # matched to find by how much the right image lies too high or too low
 _ROWS = 0.01  # of the image's height: the farthest that it may
-_NEIGHBOURS = 8  # points around a point that it is compared with
-_DISAGREEMENT = 0.1  # largest relative difference from them
 
 
-def with_depth_prior(frames: list[Frame], points: np.ndarray, config: ReconstructionConfig) -> list[Frame]:
+def with_depth_prior(frames: list[Frame], points: ScenePoints, config: ReconstructionConfig) -> list[Frame]:
     """The frames with ``depth`` set to the configured prior, or None where there is none.
 
     The prior is 0 where it has no finite positive measurement and where the mask says that there is no tissue. Where the
@@ -33,33 +33,27 @@ def with_depth_prior(frames: list[Frame], points: np.ndarray, config: Reconstruc
 
     Args:
         frames: Training views, best at full size: disparities are as precise as the pixels are fine.
-        points: Triangulated scene points [N, 3] (m, world), to interpolate between, or to find a constant disparity
-            offset of stereo matching.
+        points: Triangulated scene points, to interpolate between, or to find a constant disparity offset of stereo matching.
         config: ``depth`` names the source; ``auto`` takes the depth topic, else stereo, else a network if there is one,
             else the points.
 
     Raises:
         SequenceError: If the source asked for is not in the recording.
     """
-    has_topic = any(frame.depth is not None and (frame.depth > 0).any() for frame in frames)
-    has_stereo = any(frame.right is not None for frame in frames)
-    source = config.depth
-    if source == "auto":
-        network = config.depth_model or cached_checkpoint()
-        source = "topic" if has_topic else "stereo" if has_stereo else "network" if network else "points"
-    if source == "topic" and not has_topic:
+    source = depth_source(frames, config)
+    if source == "topic" and not _has_topic(frames):
         raise SequenceError("depth=topic, but no view has a depth image; publish endoscope/left/depth or use auto")
-    if source == "stereo" and not has_stereo:
+    if source == "stereo" and all(frame.right is None for frame in frames):
         raise SequenceError("depth=stereo, but no view has a right image; publish endoscope/right/* or use depth=auto")
     if source == "none":
         return [dataclasses.replace(frame, depth=None) for frame in frames]
     if source == "points":
-        return map_in_threads(lambda frame: _with_depth(frame, interpolated_depth(frame, points)), frames)
+        return map_in_threads(lambda frame: _with_depth(frame, interpolated_depth(frame, points.positions)), frames)
     if source == "topic":
         return [_with_depth(frame, frame.depth) for frame in frames]
     if source == "network":
         network = load_network(config.depth_model, pick_device(config.device))
-        frames = [_with_depth(frame, network_depth(frame, network, _known_depths(frame, points))) for frame in frames]
+        frames = [_with_depth(frame, network_depth(frame, network, _known_depths(frame, points.positions))) for frame in frames]
         if all(frame.depth is None for frame in frames):
             raise SequenceError(
                 "depth=network, but no view's depth fits the scene points; check the poses, give views that overlap, or use depth=points"
@@ -70,6 +64,18 @@ def with_depth_prior(frames: list[Frame], points: np.ndarray, config: Reconstruc
     offset = disparity_offset(frames, disparities, points)
     frames = [_with_depth(f, None if d is None else _to_depth(f, d, offset)) for f, d in zip(frames, disparities)]
     return [frame if frame.right is None else _with_right_shifted(frame, offset) for frame in frames]
+
+
+def depth_source(frames: list[Frame], config: ReconstructionConfig) -> str:
+    """Where the depth of these views is from: the source that is configured, or what ``auto`` finds."""
+    if config.depth != "auto":
+        return config.depth
+    network = config.depth_model or cached_checkpoint()
+    return "topic" if _has_topic(frames) else "stereo" if any(f.right is not None for f in frames) else "network" if network else "points"
+
+
+def _has_topic(frames: list[Frame]) -> bool:
+    return any(frame.depth is not None and (frame.depth > 0).any() for frame in frames)
 
 
 def _aligned(frame: Frame) -> Frame:
@@ -120,18 +126,10 @@ def _known_depths(frame: Frame, points: np.ndarray) -> np.ndarray:
 def interpolated_depth(frame: Frame, points: np.ndarray) -> np.ndarray | None:
     """Depth [H, W] (m, 0 outside their hull) interpolated between the triangulated points seen in a view; None if few.
 
-    Linear in inverse depth, which keeps planes flat. A point that disagrees with its neighbours in the image is a wrong
-    match or hidden from this view, and left out.
+    Linear in inverse depth, which keeps planes flat.
     """
-    uv, z = frame.camera.project(points)
-    inside = (z > _NEAREST) & (uv >= 0).all(1) & (uv < [frame.camera.width, frame.camera.height]).all(1)
-    uv, inverse = np.unique(uv[inside], axis=0, return_index=True)
-    inverse = 1 / z[inside][inverse]
-    if len(uv) < _MIN_POINTS:
-        return None
-    neighbours = cKDTree(uv).query(uv, k=_NEIGHBOURS + 1)[1][:, 1:]
-    agrees = np.abs(inverse / np.median(inverse[neighbours], axis=1) - 1) < _DISAGREEMENT
-    uv, inverse = uv[agrees], inverse[agrees]
+    uv, z = points_in_view(frame.camera, points)
+    inverse = 1 / z
     if len(uv) < _MIN_POINTS or np.linalg.matrix_rank(uv - uv.mean(0), tol=1.0) < 2:
         return None
     v, u = np.mgrid[: frame.camera.height, : frame.camera.width] + 0.5
@@ -172,32 +170,39 @@ def stereo_disparity(frame: Frame) -> np.ndarray:
     return np.where(valid, np.maximum(disparity - np.float32(shift), 0), np.float32(0))
 
 
-def disparity_offset(frames: list[Frame], disparities: list[np.ndarray | None], points: np.ndarray) -> float:
+def disparity_offset(frames: list[Frame], disparities: list[np.ndarray | None], points: ScenePoints) -> float:
     """Constant to add to stereo disparities (pixels) so that they agree with points triangulated from the poses.
 
     A wrong principal point of one eye shifts every disparity by the same amount. Zero when too few points are seen, or
-    when the offset is within the scatter that explains it by chance.
+    when the offset is within the scatter that explains it by chance. A point counts the less the farther a pixel's error moves it.
     """
-    residuals = [np.empty(0)]
+    residuals, weights = [np.empty(0)], [np.empty(0)]
     for frame, disparity in zip(frames, disparities):
-        if disparity is None or not len(points):
+        if disparity is None or not len(points.positions):
             continue
-        uv, z = frame.camera.project(points)
+        uv, z = frame.camera.project(points.positions)
         u, v = np.floor(np.nan_to_num(uv, nan=-1.0)).astype(int).T
         inside = (z > _NEAREST) & (u >= 0) & (v >= 0) & (u < frame.camera.width) & (v < frame.camera.height)
         measured = disparity[v[inside], u[inside]]
         expected = frame.camera.K[0, 0] * frame.baseline / z[inside]
         residuals.append((expected - measured)[measured > 0])
-    residual = np.concatenate(residuals)
+        error = np.broadcast_to(points.error, z.shape)[inside][measured > 0]
+        weights.append(1 / (MATCHED**2 + (error * expected[measured > 0]) ** 2))
+    residual, weight = np.concatenate(residuals), np.concatenate(weights)
     if len(residual) < _MIN_POINTS:
         return 0.0
-    offset = float(np.median(residual))
-    spread = 1.4826 * float(np.median(np.abs(residual - offset)))
-    if abs(offset) < max(0.25, 3 * spread / np.sqrt(len(residual))):
+    offset = _weighted_median(residual, weight)
+    spread = 1.4826 * _weighted_median(np.abs(residual - offset), weight)
+    if abs(offset) < max(0.25, 3 * spread * np.sqrt((weight**2).sum()) / weight.sum()):
         return 0.0
     text = "stereo disparity shifted by %.2f pixels to agree with the poses (%d points, scatter %.2f)"
     log.info(text, offset, len(residual), spread)
     return offset
+
+
+def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
+    order = np.argsort(values)
+    return float(values[order][np.searchsorted(np.cumsum(weights[order]), weights.sum() / 2)])
 
 
 def _to_depth(frame: Frame, disparity: np.ndarray, offset: float) -> np.ndarray:

@@ -11,7 +11,7 @@ from endo_sim_ros.reconstruction.config import ReconstructionConfig
 _PLAIN = {  # 3DGS as Kerbl et al. 2023 have it, and what the others build upon, for 3000 iterations
     "iterations": 3000, "max_gaussians": 60_000, "learning_rate": 1.0,
     "initialization": "points", "densification": "gradient", "lambda_flat": 0.0, "exposure": False, "light": False,
-    "surroundings": 0.0, "still": False,
+    "agreement": False, "surroundings": 0.0, "still": False,
 }  # fmt: skip
 
 PRESETS: dict[str, dict[str, Any]] = {
@@ -41,6 +41,7 @@ ABLATIONS: dict[str, dict[str, dict[str, Any]]] = {
         "without total variation": {"lambda_tv": 0.0},
         "without depth": {"lambda_depth": 0.0},
         "without dense initialisation": {"initialization": "points"},
+        "without agreement of depths": {"agreement": False},
         "without flat Gaussians": {"lambda_flat": 0.0},
         "without light": {"light": False},
         "without light and exposure": {"light": False, "exposure": False},

@@ -12,6 +12,7 @@ from endo_sim_ros.cameras import Camera
 from endo_sim_ros.device import map_in_threads
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.light import features_at
+from endo_sim_ros.reconstruction.triangulation import points_in_view
 from endo_sim_ros.sequences.frames import Frame
 
 _INSIDE, _BEYOND = 1 / 80, 1 / 27  # spacing in holes and beyond the picture, in widths of the image
@@ -26,6 +27,7 @@ def with_surroundings(
     light: np.ndarray,
     exposures: np.ndarray,
     reference: float,
+    points: np.ndarray,
     reach: float,
     limit: int,
 ) -> GaussianModel:
@@ -36,13 +38,14 @@ def with_surroundings(
         frames: Training views with their depth prior; views without one add nothing.
         light, exposures, reference: The light [4], the logarithm of each view's exposure [V, 3] and the distance (m) at which
             colours are the tissue's own.
+        points: Scene points [N, 3] (m, world) that other views may have given; they tell how the surface goes on.
         reach: How far to go beyond the pictures, in their widths.
         limit: Largest number of Gaussians in all.
     """
     parts = [model.means.numpy().astype(np.float64)]
     colors, spacings = [], []
     told = [(f, e) for f, e in zip(frames, exposures) if f.depth is not None and (f.depth > 0).mean() >= _LEAST_SEEN]
-    continued = map_in_threads(lambda view: _continued(view[0], light, view[1], reference, int(reach * view[0].camera.width)), told)
+    continued = map_in_threads(lambda view: _continued(view[0], points, light, view[1], reference, int(reach * view[0].camera.width)), told)
     for (frame, _), (camera, depth, picture) in zip(told, continued):
         width, height, pad = frame.camera.width, frame.camera.height, (camera.width - frame.camera.width) // 2
         known = np.pad(frame.depth > 0, pad)
@@ -72,7 +75,7 @@ def with_surroundings(
 
 
 def _continued(
-    frame: Frame, light: np.ndarray, exposure: np.ndarray, reference: float, pad: int
+    frame: Frame, points: np.ndarray, light: np.ndarray, exposure: np.ndarray, reference: float, pad: int
 ) -> tuple[Camera, np.ndarray, np.ndarray]:
     """The view with a margin: its camera, depth [H', W'] (m) everywhere, and colours without light [H', W', 3]."""
     K = frame.camera.K.copy()
@@ -89,14 +92,21 @@ def _continued(
     flat = slope[0] * np.arange(camera.width) + slope[1] * np.arange(camera.height)[:, None] + slope[2]
     rest = np.zeros(depth.shape, np.float32)
     rest[known] = inverse - flat[known]
-    low, high = np.percentile(inverse, [1, 99])
-    depth = 1 / np.clip(flat + _filled(rest[..., None], known)[..., 0], 0.8 * low, 1.2 * high)
+    uv, z = points_in_view(camera, points)
+    columns, rows = np.floor(uv).astype(int).T
+    beyond = ~known[rows, columns]
+    columns, rows, there = columns[beyond], rows[beyond], 1 / z[beyond]
+    rest[rows, columns] = there - flat[rows, columns]
+    low, high = np.percentile(np.concatenate([inverse, there]), [1, 99])
+    anchored = known.copy()
+    anchored[rows, columns] = True
+    depth = 1 / np.clip(flat + filled(rest[..., None], anchored)[..., 0], 0.8 * low, 1.2 * high)
     lit = np.exp((features_at(camera.backproject(depth).reshape(-1, 3), camera, reference) @ light)[:, None] + exposure)
     colors = np.clip(image.reshape(-1, 3) / lit, 0, _BRIGHTEST).reshape(image.shape).astype(np.float32)
     tissue = np.zeros(known.shape, bool)
     rows, columns = frame.depth.shape
     tissue[pad : pad + rows, pad : pad + columns] = True if frame.mask is None else frame.mask > 0
-    return camera, depth, _filled(colors, tissue)
+    return camera, depth, filled(colors, tissue)
 
 
 def _unknown(points: np.ndarray, frames: list[Frame], beyond: bool) -> np.ndarray:
@@ -115,7 +125,7 @@ def _unknown(points: np.ndarray, frames: list[Frame], beyond: bool) -> np.ndarra
     return unknown
 
 
-def _filled(values: np.ndarray, known: np.ndarray) -> np.ndarray:
+def filled(values: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Values [H, W, C] where known [H, W]; elsewhere the mean over ever wider surroundings (pull-push)."""
     weight = known.astype(np.float32)
     levels = [(weight, values.astype(np.float32) * weight[..., None])]

@@ -21,14 +21,15 @@ from endo_sim_ros.device import pick_device
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.light import Light, directions, falloff, features, log_brightness
 from endo_sim_ros.reconstruction import densification, losses, photometry
+from endo_sim_ros.reconstruction.agreement import agreed
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
-from endo_sim_ros.reconstruction.depth import with_depth_prior
+from endo_sim_ros.reconstruction.depth import depth_source, with_depth_prior
 from endo_sim_ros.reconstruction.initialization import initial_model
 from endo_sim_ros.reconstruction.motion import without_motion
 from endo_sim_ros.reconstruction.optimizer import Adam
 from endo_sim_ros.reconstruction.presets import resolved
 from endo_sim_ros.reconstruction.surroundings import with_surroundings
-from endo_sim_ros.reconstruction.triangulation import match_features, misposed, triangulate
+from endo_sim_ros.reconstruction.triangulation import ScenePoints, match_features, misposed, triangulate
 from endo_sim_ros.sequences.frames import Frame, SequenceError
 from endo_sim_ros.sequences.recordings import lit_area
 from endo_sim_ros.splatting import RenderOutput, rasterize
@@ -100,24 +101,27 @@ class Trainer:
     Args:
         frames: Training views; every one is used (see `select_keyframes`).
         config: Options.
-        points: Scene points [N, 3] (m, world) and their RGB [N, 3] in [0, 1], for instance of structure from motion with
-            more views than these; None triangulates these views.
+        points: Scene points: positions [N, 3] (m, world), RGB [N, 3] in [0, 1] and, if known, error (see `ScenePoints`), for
+            instance of structure from motion with more views than these; None triangulates these views.
 
     Raises:
         SequenceError: If there are no views, all pixels are masked or white, or the views give no scene points to start from.
     """
 
-    def __init__(self, frames: list[Frame], config: ReconstructionConfig, points: tuple[np.ndarray, np.ndarray] | None = None):
+    def __init__(self, frames: list[Frame], config: ReconstructionConfig, points: ScenePoints | tuple | None = None):
         if not frames:
             raise SequenceError("there are no views to reconstruct from; check the image, camera_info and pose topics")
         self.config = config = resolved(config)
         self.device = pick_device(config.device)
-        frames, points, colors = _consistent(_showing(frames), config, points)
+        frames, points = _consistent(_showing(frames), config, None if points is None else ScenePoints(*points))
+        source = depth_source(frames, config)
+        frames = [shrink(frame, config.image_width) for frame in frames]
+        if config.agreement and source not in ("topic", "none"):
+            frames = agreed(frames, points)
         if config.still:
             frames = without_motion(frames, config.depth_tolerance)
-        frames = [shrink(frame, config.image_width) for frame in frames]
         seen = int(_SEEN * config.max_gaussians) if config.surroundings else config.max_gaussians
-        model = initial_model(frames, points, colors, dataclasses.replace(config, max_gaussians=max(seen, 1)))
+        model = initial_model(frames, points.positions, points.colors, dataclasses.replace(config, max_gaussians=max(seen, 1)))
         self.scene_depth = _median_depth(frames, model)
         light, exposures = np.zeros(4), np.zeros((len(frames), 3))
         if self._lit:
@@ -127,7 +131,8 @@ class Trainer:
             )
             model = photometry.unlit(model, frames, light, exposures, self.scene_depth, config.depth_tolerance)
         if config.surroundings:
-            model = with_surroundings(model, frames, light, exposures, self.scene_depth, config.surroundings, config.max_gaussians)
+            about = light, exposures, self.scene_depth, points.positions
+            model = with_surroundings(model, frames, *about, config.surroundings, config.max_gaussians)
         self._load(frames)
         eye = np.mean([view.camera.position for view in self._views], 0)
         self._eye = torch.as_tensor(eye, dtype=torch.float32, device=self.device)
@@ -537,18 +542,18 @@ def _showing(frames: list[Frame]) -> list[Frame]:
 
 
 def _consistent(
-    frames: list[Frame], config: ReconstructionConfig, points: tuple[np.ndarray, np.ndarray] | None
-) -> tuple[list[Frame], np.ndarray, np.ndarray]:
-    """The views with their depth prior, without those whose poses contradict the others, and scene points [N, 3] (m) with
-    RGB [N, 3] in [0, 1]: the given ones, or triangulated."""
+    frames: list[Frame], config: ReconstructionConfig, points: ScenePoints | None
+) -> tuple[list[Frame], ScenePoints]:
+    """The views with their depth prior, without those whose poses contradict the others, and scene points: the given ones, or
+    triangulated."""
     matches = match_features(frames)
     # What the eyes of one view tell of depth does not hang on the poses of the views: it helps to judge them.
     by_stereo = config.depth in ("auto", "stereo") and any(frame.right is not None for frame in frames)
     if by_stereo or not (wrong := misposed(frames, matches)):
-        found = triangulate(frames, matches)[:2] if points is None else points
-        prior = with_depth_prior(frames, found[0], config)
+        found = triangulate(frames, matches) if points is None else points
+        prior = with_depth_prior(frames, found, config)
         if not by_stereo or not (wrong := misposed(prior, matches)):
-            return prior, *found
+            return prior, found
     stamps = ", ".join(f"{frames[i].stamp_ns * 1e-9:.3f} s" for i in wrong)
     log.warning("views at %s left out: their poses contradict what they share with the others, or much of the tissue moved", stamps)
     return _consistent([frame for i, frame in enumerate(frames) if i not in wrong], config, points)

@@ -6,7 +6,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
+from endo_sim_ros.cameras import Camera
 from endo_sim_ros.device import map_in_threads
 from endo_sim_ros.sequences.frames import Frame
 
@@ -22,6 +24,8 @@ _FARTHEST_OFF = 0.02  # of the image's width, median distance from where the pos
 _CLOSE = 0.007  # of the width, within which poses are right
 _USUAL, _TIMES_USUAL = 0.2, 5.0  # the share of all groups of views that is taken to be right, and how many times as far off others may be
 _MOST_NAMED = 5
+_AROUND = 8  # points around a point that it is compared with
+_DISAGREEMENT = 0.1  # largest relative difference from them
 _NEAR, _FAR = 0.02, 1e3  # metres, between which a match may lie
 
 
@@ -33,20 +37,45 @@ class Matches(NamedTuple):
     second: np.ndarray  # [M, 2] pixels
 
 
-def triangulate(frames: list[Frame], matches: list[Matches] | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """World points [N, 3] (m), their RGB [N, 3] in [0, 1], and the pair of views [N, 2] that each was seen in.
+class ScenePoints(NamedTuple):
+    """Points on the tissue, as structure from motion gives them."""
+
+    positions: np.ndarray  # [N, 3] m, world
+    colors: np.ndarray  # [N, 3] RGB in [0, 1]
+    error: np.ndarray | float = 0.01  # [N] of the depth, relative, that a pixel's error makes
+
+    @classmethod
+    def none(cls) -> "ScenePoints":
+        return cls(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
+
+
+def triangulate(frames: list[Frame], matches: list[Matches] | None = None) -> ScenePoints:
+    """Points where rays of features meet that near views share.
 
     SIFT matches between near views (those of `match_features`), kept where triangulation with the known poses reprojects
     within two pixels.
     """
-    points, colors, views = [np.empty((0, 3))], [np.empty((0, 3))], [np.empty((0, 2), int)]
+    parts = [ScenePoints.none()]
     for (i, j), uv_i, uv_j in match_features(frames) if matches is None else matches:
-        found, kept = _intersect(frames[i], frames[j], uv_i, uv_j)
-        points.append(found)
-        views.append(np.tile([i, j], (len(found), 1)))
+        points, kept, parallax = _intersect(frames[i], frames[j], uv_i, uv_j)
         u, v = (uv_i[kept] - 0.5).round().astype(int).T
-        colors.append(frames[i].image[v, u] / 255.0)
-    return np.concatenate(points), np.concatenate(colors), np.concatenate(views)
+        parts.append(ScenePoints(points, frames[i].image[v, u] / 255.0, 1 / (frames[i].camera.K[0, 0] * np.tan(parallax))))
+    return ScenePoints(*(np.concatenate(arrays) for arrays in zip(*parts)))
+
+
+def points_in_view(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels [M, 2] and depths [M] (m) of those of the points [N, 3] that lie in a view.
+
+    A point whose depth disagrees with that of its neighbours in the image is a wrong match or hidden, and left out.
+    """
+    uv, z = camera.project(points)
+    inside = (z > _NEAR) & (uv >= 0).all(1) & (uv < [camera.width, camera.height]).all(1)
+    uv, first = np.unique(uv[inside], axis=0, return_index=True)
+    z = z[inside][first]
+    if len(uv) <= _AROUND:
+        return np.empty((0, 2)), np.empty(0)
+    agrees = np.abs(np.median(z[cKDTree(uv).query(uv, k=_AROUND + 1)[1][:, 1:]], axis=1) / z - 1) < _DISAGREEMENT
+    return uv[agrees], z[agrees]
 
 
 def misposed(frames: list[Frame], matches: list[Matches]) -> list[int]:
@@ -201,8 +230,8 @@ def _pairs(frames: list[Frame]) -> list[tuple[int, int]]:
     return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(neighbours(frames)) for j in row if j != i})
 
 
-def _intersect(first: Frame, second: Frame, uv1: np.ndarray, uv2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points where the rays of two views meet, and the indices of the matches that gave one."""
+def _intersect(first: Frame, second: Frame, uv1: np.ndarray, uv2: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points where the rays of two views meet, the indices of the matches that gave one, and the angles between the rays."""
     P1, P2 = (frame.camera.K @ frame.camera.viewmat[:3] for frame in (first, second))
     homogeneous = cv2.triangulatePoints(P1, P2, uv1.T, uv2.T)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -216,5 +245,6 @@ def _intersect(first: Frame, second: Frame, uv1: np.ndarray, uv2: np.ndarray) ->
         good = good & (z > 1e-3) & (np.linalg.norm(projected - uv, axis=1) < _MAX_ERROR)
         ray = points - frame.camera.position
         directions.append(ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-12))
-    good &= np.arccos(np.clip((directions[0] * directions[1]).sum(1), -1, 1)) > _MIN_PARALLAX
-    return points[good], np.nonzero(good)[0]
+    parallax = np.arccos(np.clip((directions[0] * directions[1]).sum(1), -1, 1))
+    good &= parallax > _MIN_PARALLAX
+    return points[good], np.nonzero(good)[0], np.minimum(parallax[good], np.pi / 4)

@@ -1,0 +1,158 @@
+"""Depth priors corrected by other views of the same tissue.
+
+The lenses of a stereo endoscope are millimetres apart, its views centimetres: by how many pixels tissue in one view
+lies beside where another view's depth and pose expect it tells that depth several times better than the pair of lenses.
+"""
+
+import dataclasses
+
+import cv2
+import numpy as np
+
+from endo_sim_ros.cameras import Camera
+from endo_sim_ros.reconstruction.depth import MATCHED
+from endo_sim_ros.reconstruction.surroundings import filled
+from endo_sim_ros.reconstruction.triangulation import ScenePoints
+from endo_sim_ros.sequences.frames import Frame
+
+_NEIGHBOURS = 4  # views that each view is compared with: the nearest in space
+_LEAST_SHARED = 0.05  # of the picture, below which two views are not compared
+_GUESSED = 0.05  # relative error of a depth that no right image gave
+_FLOW = 1.0  # pixels, error of a displacement, that of the poses included
+_ALIKE = 0.5  # correlation from which on two pixels show the same tissue
+_LEAST_SEEN = 0.02  # share of the pixels with depth
+_TOO_FAR = 0.25  # relative difference from which on a point lies on another surface
+# In pixels of an image 640 wide:
+_OFF_LINE = 2.0  # farthest beside the line on which depth alone can move a point
+_FARTHEST = 40.0  # longest displacement that optical flow is believed
+_LOCAL = 8.0  # standard deviation of the window that brightness is compared to
+_WINDOW = 9  # side of the window of the correlation
+_REACH = 15  # side of the square that a scene point speaks for
+_SMOOTH = 12.0  # standard deviation over which corrections are carried to pixels without
+
+
+def agreed(frames: list[Frame], points: ScenePoints) -> list[Frame]:
+    """The frames with depth corrected, in their holes as little as before, by scene points and by what neighbouring views show.
+
+    A view's image is predicted from each neighbour's with the view's depth; the optical flow between prediction and
+    image, along the direction in which depth moves a pixel, is a correction of inverse depth that is the more precise the
+    farther apart the views are. Corrections and prior are averaged by their precision; where there is none, that of
+    the surroundings counts.
+
+    Args:
+        frames: Views with a depth prior, of matching with the right image where there is one.
+        points: Scene points.
+    """
+    plain = [_plain(frame) for frame in frames]
+    tissue = [np.ones(frame.image.shape[:2], np.float32) if frame.mask is None else np.float32(frame.mask > 0) for frame in frames]
+    centres = np.array([frame.camera.position for frame in frames])
+    corrected = []
+    for i, frame in enumerate(frames):
+        if frame.depth is None or (frame.depth > 0).mean() < _LEAST_SEEN:
+            corrected.append(frame)
+            continue
+        known, camera = frame.depth > 0, frame.camera
+        inverse = filled((known / np.where(known, frame.depth, 1)).astype(np.float32)[..., None], known)[..., 0]
+        total, weight = _of_points(frame, inverse, points)
+        for j in np.argsort(np.linalg.norm(centres - centres[i], axis=1), kind="stable")[: _NEIGHBOURS + 1]:
+            if j != i:
+                correction, precision = _of_view(camera, inverse, plain[i], tissue[i], frames[j].camera, plain[j], tissue[j])
+                total, weight = total + precision * correction, weight + precision
+        error = _GUESSED * inverse if frame.baseline is None else MATCHED / (camera.K[0, 0] * frame.baseline)
+        correction, trust = total / np.maximum(weight, 1e-12), weight / (weight + 1 / error**2)
+        blur = lambda values: cv2.GaussianBlur(values.astype(np.float32), (0, 0), _SMOOTH * camera.width / 640)  # noqa: B023
+        around = blur(trust)
+        carried = blur(trust * correction) / np.maximum(around, 1e-6) * np.minimum(4 * around, 1)
+        inverse = inverse + trust * correction + (1 - trust) * carried
+        good = known & np.isfinite(inverse) & (inverse > 0)
+        corrected.append(dataclasses.replace(frame, depth=np.where(good, 1 / np.where(good, inverse, 1), 0).astype(np.float32)))
+    return corrected
+
+
+def _plain(frame: Frame) -> np.ndarray:
+    """Grey image [H, W] uint8 freed of light and contrast, which differ between views."""
+    grey = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    tissue = np.ones_like(grey) if frame.mask is None else np.float32(frame.mask > 0)
+    blur = lambda values: cv2.GaussianBlur(values, (0, 0), _LOCAL * frame.camera.width / 640)
+    share = np.maximum(blur(tissue), 1e-3)
+    mean = blur(grey * tissue) / share
+    variance = np.maximum(blur(grey * grey * tissue) / share - mean * mean, 0)
+    return np.uint8(np.clip(128 + 40 * (grey - mean) / np.sqrt(variance + 4), 0, 255))
+
+
+def _of_points(frame: Frame, inverse: np.ndarray, points: ScenePoints) -> tuple[np.ndarray, np.ndarray]:
+    """Σ precision × correction and Σ precision [H, W] of inverse depth [H, W] (1/m) by the scene points around."""
+    total, weight = np.zeros(inverse.shape, np.float32), np.zeros(inverse.shape, np.float32)
+    if len(points.positions):
+        uv, z = frame.camera.project(points.positions)
+        inside = (z > 0) & (uv >= 0).all(1) & (uv < inverse.shape[::-1]).all(1)
+        u, v = np.floor(uv[inside]).astype(int).T
+        there = inverse[v, u]
+        correction = 1 / z[inside] - there
+        near = np.abs(correction) < _TOO_FAR * there
+        u, v, there, correction = u[near], v[near], there[near], correction[near]
+        precision = 1 / (np.broadcast_to(points.error, z.shape)[inside][near] * there) ** 2
+        np.add.at(total, (v, u), precision * correction)
+        np.add.at(weight, (v, u), precision)
+        side = 2 * round(_REACH * frame.camera.width / 1280) + 1
+        total, weight = (cv2.boxFilter(array, -1, (side, side), normalize=False) for array in (total, weight))
+    return total, weight
+
+
+def _of_view(
+    camera: Camera, inverse: np.ndarray, image: np.ndarray, tissue: np.ndarray,
+    other: Camera, other_image: np.ndarray, other_tissue: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Correction (1/m) of a view's inverse depth [H, W] by another view, and its precision (m²), 0 where it tells nothing."""
+    unit = camera.width / 640
+    nothing = np.zeros_like(inverse), np.zeros_like(inverse)
+    u, v, z = _projected(camera, inverse, other)
+    inside = (z > 0) & (_sampled(other_tissue, u, v, cv2.INTER_NEAREST) > 0)
+    if inside.mean() < _LEAST_SHARED:
+        return nothing
+    predicted = np.where(inside, _sampled(other_image, u, v), image)
+    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    flow.setFinestScale(0)
+    flow = flow.calc(image, predicted, None)
+    # A pixel is seen where the prediction took the pixel from that flow leads to.
+    rows, columns = np.mgrid[: inverse.shape[0], : inverse.shape[1]].astype(np.float32) + np.float32(0.5)
+    columns, rows = columns + flow[..., 0], rows + flow[..., 1]
+    seen_u, seen_v = _sampled(u, columns, rows), _sampled(v, columns, rows)
+    step = 0.01 * inverse
+    ahead_u, ahead_v, _ = _projected(camera, inverse + step, other)
+    along_u, along_v = (ahead_u - u) / step, (ahead_v - v) / step
+    speed = np.maximum(along_u**2 + along_v**2, 1e-9)  # squared pixels per 1/m
+    off_u, off_v = seen_u - u, seen_v - v
+    beside = np.abs(along_u * off_v - along_v * off_u) / np.sqrt(speed)
+    alike = _correlation(image, _sampled(other_image, seen_u, seen_v), _WINDOW)
+    good = inside & (_sampled(np.float32(inside), columns, rows, cv2.INTER_NEAREST) > 0) & (tissue > 0)
+    good &= (alike > _ALIKE) & (beside < _OFF_LINE * unit) & (np.abs(flow).max(2) < _FARTHEST * unit)
+    good &= np.hypot(off_u, off_v) < _FARTHEST * unit
+    return (along_u * off_u + along_v * off_v) / speed, np.where(good, speed * (alike / _FLOW) ** 2, 0)
+
+
+def _projected(camera: Camera, inverse: np.ndarray, other: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where another camera sees a view's pixels of the given inverse depth: u, v and z [H, W] float32."""
+    motion = (other.viewmat @ camera.pose)[:3]
+    # Scaled by inverse depth, which leaves u and v alone, z keeps its sign.
+    rays = camera.rays().astype(np.float32)
+    x, y, z = cv2.split(cv2.transform(rays, motion[:, :3]) + (inverse[..., None] * motion[:, 3]).astype(np.float32))
+    ahead = np.where(z > 1e-3, z, np.inf)
+    K = other.K
+    far = np.float32(-1e4)
+    u, v = (np.where(z > 1e-3, a / ahead * f + c, far) for a, f, c in ((x, K[0, 0], K[0, 2]), (y, K[1, 1], K[1, 2])))
+    return u.astype(np.float32), v.astype(np.float32), z
+
+
+def _sampled(image: np.ndarray, u: np.ndarray, v: np.ndarray, how: int = cv2.INTER_LINEAR) -> np.ndarray:
+    half = np.float32(0.5)  # cv2 counts from the centre of the first pixel
+    return cv2.remap(image, u - half, v - half, how, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+
+
+def _correlation(a: np.ndarray, b: np.ndarray, side: int) -> np.ndarray:
+    """Correlation [H, W] of two images over a window."""
+    a, b = a.astype(np.float32), b.astype(np.float32)
+    mean = lambda values: cv2.blur(values, (side, side))
+    ma, mb = mean(a), mean(b)
+    spread = np.maximum((mean(a * a) - ma * ma) * (mean(b * b) - mb * mb), 1e-3)
+    return np.clip((mean(a * b) - ma * mb) / np.sqrt(spread), 0, 1)

@@ -18,7 +18,9 @@ log = logging.getLogger(__name__)
 
 _NEAREST = 0.02  # metres; closer than an endoscope works
 _MIN_POINTS = 30  # points needed to trust an offset or an interpolation
+_MANY_POINTS = 100  # needed for an offset of one view
 _LEAST_DISPARITY = 2.0  # pixels; farther away half a pixel is more than a quarter of the depth
+_ISLAND = 0.003  # share of the image, below which a patch of disparity that is like none around it is no surface
 MATCHED = 0.5  # pixels, error of a disparity
 _SPARSE = 16  # pixels between stereo matches that a network's depth is held against
 _FEATURES = 3000  # matched to find by how much the right image lies too high or too low
@@ -61,9 +63,9 @@ def with_depth_prior(frames: list[Frame], points: ScenePoints, config: Reconstru
         return frames
     frames = map_in_threads(lambda frame: frame if frame.right is None else _aligned(frame), frames)
     disparities = map_in_threads(lambda frame: None if frame.right is None else stereo_disparity(frame), frames)
-    offset = disparity_offset(frames, disparities, points)
-    frames = [_with_depth(f, None if d is None else _to_depth(f, d, offset)) for f, d in zip(frames, disparities)]
-    return [frame if frame.right is None else _with_right_shifted(frame, offset) for frame in frames]
+    offsets = disparity_offsets(frames, disparities, points)
+    frames = [_with_depth(f, None if d is None else _to_depth(f, d, offset)) for f, d, offset in zip(frames, disparities, offsets)]
+    return [frame if frame.right is None else _with_right_shifted(frame, offset) for frame, offset in zip(frames, offsets)]
 
 
 def depth_source(frames: list[Frame], config: ReconstructionConfig) -> str:
@@ -167,17 +169,22 @@ def stereo_disparity(frame: Frame) -> np.ndarray:
     columns = np.arange(width) - disparity.round().astype(int)
     back = np.take_along_axis(back, columns.clip(0, width - 1), 1)
     valid = (disparity > 0) & (columns >= 0) & (np.abs(back - disparity) <= 1)
-    return np.where(valid, np.maximum(disparity - np.float32(shift), 0), np.float32(0))
+    # What is left of wrong matches are islands.
+    sixteenths = np.where(valid, 16 * disparity, 0).astype(np.int16)
+    cv2.filterSpeckles(sixteenths, 0, int(_ISLAND * disparity.size), 16)
+    return np.where(sixteenths > 0, np.maximum(disparity - np.float32(shift), 0), np.float32(0))
 
 
-def disparity_offset(frames: list[Frame], disparities: list[np.ndarray | None], points: ScenePoints) -> float:
-    """Constant to add to stereo disparities (pixels) so that they agree with points triangulated from the poses.
+def disparity_offsets(frames: list[Frame], disparities: list[np.ndarray | None], points: ScenePoints) -> np.ndarray:
+    """Constants [V] to add to the stereo disparities (pixels) of views so that they agree with scene points.
 
-    A wrong principal point of one eye shifts every disparity by the same amount. Zero when too few points are seen, or
-    when the offset is within the scatter that explains it by chance. A point counts the less the farther a pixel's error moves it.
+    A wrong principal point of one eye shifts every disparity by the same amount, an error of the poses or the baseline
+    those of one view. A view has an offset of its own where it sees points enough; all are zero when too few points are seen, or
+    when their common offset is within the scatter that explains it by chance. A point counts the less the farther a pixel's
+    error moves it.
     """
-    residuals, weights = [np.empty(0)], [np.empty(0)]
-    for frame, disparity in zip(frames, disparities):
+    residuals, weights = [np.empty(0)] * len(frames), [np.empty(0)] * len(frames)
+    for i, (frame, disparity) in enumerate(zip(frames, disparities)):
         if disparity is None or not len(points.positions):
             continue
         uv, z = frame.camera.project(points.positions)
@@ -185,19 +192,21 @@ def disparity_offset(frames: list[Frame], disparities: list[np.ndarray | None], 
         inside = (z > _NEAREST) & (u >= 0) & (v >= 0) & (u < frame.camera.width) & (v < frame.camera.height)
         measured = disparity[v[inside], u[inside]]
         expected = frame.camera.K[0, 0] * frame.baseline / z[inside]
-        residuals.append((expected - measured)[measured > 0])
+        residuals[i] = (expected - measured)[measured > 0]
         error = np.broadcast_to(points.error, z.shape)[inside][measured > 0]
-        weights.append(1 / (MATCHED**2 + (error * expected[measured > 0]) ** 2))
+        weights[i] = 1 / (MATCHED**2 + (error * expected[measured > 0]) ** 2)
     residual, weight = np.concatenate(residuals), np.concatenate(weights)
     if len(residual) < _MIN_POINTS:
-        return 0.0
+        return np.zeros(len(frames))
     offset = _weighted_median(residual, weight)
     spread = 1.4826 * _weighted_median(np.abs(residual - offset), weight)
     if abs(offset) < max(0.25, 3 * spread * np.sqrt((weight**2).sum()) / weight.sum()):
-        return 0.0
-    text = "stereo disparity shifted by %.2f pixels to agree with the poses (%d points, scatter %.2f)"
-    log.info(text, offset, len(residual), spread)
-    return offset
+        return np.zeros(len(frames))
+    worth = [w.sum() * MATCHED**2 for w in weights]  # in points of no error
+    offsets = [_weighted_median(r, w) if n > _MANY_POINTS else offset for r, w, n in zip(residuals, weights, worth)]
+    text = "stereo disparity shifted by %.2f pixels to agree with the poses (%d points, scatter %.2f; views %.2f to %.2f)"
+    log.info(text, offset, len(residual), spread, min(offsets), max(offsets))
+    return np.array(offsets)
 
 
 def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:

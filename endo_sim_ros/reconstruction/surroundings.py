@@ -43,6 +43,7 @@ def with_surroundings(
         limit: Largest number of Gaussians in all.
     """
     parts = [model.means.numpy().astype(np.float64)]
+    points = np.concatenate([parts[0], points])
     colors, spacings = [], []
     told = [(f, e) for f, e in zip(frames, exposures) if f.depth is not None and (f.depth > 0).mean() >= _LEAST_SEEN]
     continued = map_in_threads(lambda view: _continued(view[0], points, light, view[1], reference, int(reach * view[0].camera.width)), told)

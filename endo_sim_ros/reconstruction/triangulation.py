@@ -53,11 +53,13 @@ def triangulate(frames: list[Frame], matches: list[Matches] | None = None) -> Sc
     """Points where rays of features meet that near views share.
 
     SIFT matches between near views (those of `match_features`), kept where triangulation with the known poses reprojects
-    within two pixels.
+    within two pixels, at a depth like that of the neighbours.
     """
     parts = [ScenePoints.none()]
     for (i, j), uv_i, uv_j in match_features(frames) if matches is None else matches:
         points, kept, parallax = _intersect(frames[i], frames[j], uv_i, uv_j)
+        alike = _like_those_around(uv_i[kept], frames[i].camera.project(points)[1])
+        points, kept, parallax = points[alike], kept[alike], parallax[alike]
         u, v = (uv_i[kept] - 0.5).round().astype(int).T
         parts.append(ScenePoints(points, frames[i].image[v, u] / 255.0, 1 / (frames[i].camera.K[0, 0] * np.tan(parallax))))
     return ScenePoints(*(np.concatenate(arrays) for arrays in zip(*parts)))
@@ -72,10 +74,15 @@ def points_in_view(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.n
     inside = (z > _NEAR) & (uv >= 0).all(1) & (uv < [camera.width, camera.height]).all(1)
     uv, first = np.unique(uv[inside], axis=0, return_index=True)
     z = z[inside][first]
-    if len(uv) <= _AROUND:
-        return np.empty((0, 2)), np.empty(0)
-    agrees = np.abs(np.median(z[cKDTree(uv).query(uv, k=_AROUND + 1)[1][:, 1:]], axis=1) / z - 1) < _DISAGREEMENT
+    agrees = _like_those_around(uv, z)
     return uv[agrees], z[agrees]
+
+
+def _like_those_around(uv: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Which of the points at pixels [N, 2] have a depth [N] like that of their neighbours; none of too few."""
+    if len(uv) <= _AROUND:
+        return np.zeros(len(uv), bool)
+    return np.abs(np.median(z[cKDTree(uv).query(uv, k=_AROUND + 1)[1][:, 1:]], axis=1) / z - 1) < _DISAGREEMENT
 
 
 def misposed(frames: list[Frame], matches: list[Matches]) -> list[int]:

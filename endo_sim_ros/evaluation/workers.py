@@ -107,6 +107,8 @@ def _serve(connection: Connection, job: Job, device: str, threads: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
     os.environ["ENDO_SIM_THREADS"] = str(threads)
     torch.set_num_threads(threads)
+    if device != "cpu":
+        torch.cuda.set_device(device)
     while True:
         try:
             argument = connection.recv()

@@ -20,7 +20,7 @@ _MOST_POINTS = 4000
 _DARK, _BRIGHT = 12, 235  # grey levels between which a camera is not far from its curve
 _BLUR = 1.5  # pixels
 _BRIGHTEST = 4.0  # colour that tissue in the corner of a picture may have in full light
-_RESPONSE, _RESPONSE_SPREAD = 1.0, 0.5  # of the automatic exposure
+_RESPONSE, _RESPONSE_SPREAD = 0.9, 0.5  # of the automatic exposure: cameras even out most of the brightness
 _EXPOSURE_NOISE = 0.01, 0.04  # the least and the most that the logarithm of an exposure varies by itself
 
 

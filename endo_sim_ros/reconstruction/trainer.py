@@ -329,7 +329,8 @@ class Trainer:
         key = (flat, *(None if x is None else x.shape for x in inputs))
         if key not in self._recordings:
             self._recordings[key] = Recording(function)
-        return self._recordings[key](*inputs)
+        with torch.cuda.device(self.device):
+            return self._recordings[key](*inputs)
 
     def _descend_once(self, flat: bool, *inputs: Tensor | None) -> Tensor:
         config, view = self.config, _Inputs(*inputs)

@@ -83,7 +83,7 @@ def unlit(
 def fit_exposure(exposures: np.ndarray, brightness: np.ndarray) -> tuple[float, np.ndarray]:
     """Response and levels [3] of the automatic exposure from each view's log exposure [V, 3] and log brightness [V] without it.
 
-    See `Light`. A camera that holds its brightness is the prior, as brightness may be much the same in all views; exposures
+    See `Light`. A camera that evens out most of the brightness is the prior, as brightness may be much the same in all views; exposures
     that hardly vary speak for a fixed one.
     """
     centred, mean = brightness - brightness.mean(), exposures.mean(1)

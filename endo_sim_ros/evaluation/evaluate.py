@@ -32,10 +32,9 @@ from endo_sim_ros.evaluation.held_out import difference, mean_figures, measure, 
 from endo_sim_ros.evaluation.lpips import Lpips, WeightsError
 from endo_sim_ros.evaluation.splits import STEREO, Split, check_split, right_views, split_views
 from endo_sim_ros.evaluation.workers import Finished, News, ray_is_installed, run_in_processes, run_in_ray
-from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer, shrink
+from endo_sim_ros.reconstruction import ReconstructionConfig, ScenePoints, Trainer, scene_points, shrink
 from endo_sim_ros.reconstruction.depth import with_depth_prior
 from endo_sim_ros.reconstruction.presets import ABLATIONS, preset
-from endo_sim_ros.reconstruction.triangulation import ScenePoints, triangulate
 from endo_sim_ros.sequences.bag import read_bag
 from endo_sim_ros.sequences.folder import read_points
 from endo_sim_ros.sequences.frames import Frame, SequenceError
@@ -241,7 +240,7 @@ def _prepare(cells: Sequence[Cell], bar: Progress) -> Prepared:
     trained = {index for split in splits for index in split_views(split, len(frames)).train}
     task = bar.add_task(f"scene points of {cells[0].sequence}", total=None)
     known = read_points(_place(source)[0])
-    points = ScenePoints(*known, _POINT_ERROR) if known else triangulate(spread(frames, _POINT_VIEWS))
+    points = ScenePoints(*known, _POINT_ERROR) if known else scene_points(frames, _POINT_VIEWS)
     bar.remove_task(task)
     depth_source, matched = "none", frames
     recorded = any(frame.depth is not None and (frame.depth > 0).any() for frame in frames)

@@ -13,7 +13,7 @@ from endo_sim_ros.cameras import Camera, save_cameras
 from endo_sim_ros.evaluation import figures, metrics
 from endo_sim_ros.evaluation.lpips import Lpips
 from endo_sim_ros.gaussians import GaussianModel, save_ply
-from endo_sim_ros.reconstruction import Progress, ReconstructionConfig, Trainer, select_keyframes, shrink
+from endo_sim_ros.reconstruction import Progress, ReconstructionConfig, Trainer, scene_points, select_keyframes, shrink
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.bag import read_bag
 from endo_sim_ros.sequences.frames import Frame
@@ -143,7 +143,8 @@ def reconstruct_and_measure(bag: Path, out: Path, config: ReconstructionConfig, 
     frames = list(read_bag(bag))
     chosen = select_keyframes(frames, config.keyframes)
     log.info("%d views, training on %d", len(frames), len(chosen))
-    trainer = Trainer([frames[index] for index in chosen], config)
+    points = scene_points(frames) if len(chosen) < len(frames) else None
+    trainer = Trainer([frames[index] for index in chosen], config, points)
     if resume:
         trainer.load_checkpoint(out / "checkpoint.pt")
         log.info("going on after %d iterations", trainer.iteration)

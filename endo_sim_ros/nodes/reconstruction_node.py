@@ -17,7 +17,7 @@ from endo_sim_ros.config import Range, StageConfig
 from endo_sim_ros.gaussians import GaussianModel, load_ply, save_ply
 from endo_sim_ros.messages import Topic
 from endo_sim_ros.nodes.base import ERROR, OK, WARN, EndoNode, WorldConfig, run, sentence
-from endo_sim_ros.reconstruction import Progress, ReconstructionConfig, Trainer, select_keyframes
+from endo_sim_ros.reconstruction import Progress, ReconstructionConfig, Trainer, scene_points, select_keyframes
 from endo_sim_ros.sequences.bag import LEFT_FRAME, feed
 from endo_sim_ros.sequences.frames import Frame, SequenceError
 from endo_sim_ros.sequences.synchronizer import Synchronizer
@@ -186,13 +186,14 @@ class ReconstructionNode(EndoNode):
         self._recording_stamp = self._trained[1]
         self._progress, self._saved, self._failure, self._finished = None, "", "", False
         self._cancel.clear()
-        self._thread = threading.Thread(target=self._train, args=(views, self._config))
+        self._thread = threading.Thread(target=self._train, args=(views, list(self._frames), self._config))
         self._thread.start()
         self.get_logger().info(f"reconstructing from {len(views)} of {len(self._frames)} views")
 
-    def _train(self, views: list[Frame], config: ReconstructionConfig) -> None:
+    def _train(self, views: list[Frame], frames: list[Frame], config: ReconstructionConfig) -> None:
         try:
-            trainer, lockstep = Trainer(views, config), self._options.mode == "lockstep"
+            points = scene_points(frames) if len(views) < len(frames) else None
+            trainer, lockstep = Trainer(views, config, points), self._options.mode == "lockstep"
             if not lockstep:
                 self._offer(trainer)
             published = time.monotonic()

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from endo_sim_ros.cameras import Camera
+from endo_sim_ros.device import map_in_threads
 from endo_sim_ros.reconstruction.depth import MATCHED
 from endo_sim_ros.reconstruction.surroundings import filled
 from endo_sim_ros.reconstruction.triangulation import ScenePoints
@@ -46,12 +47,12 @@ def agreed(frames: list[Frame], points: ScenePoints) -> list[Frame]:
     plain = [_plain(frame) for frame in frames]
     tissue = [np.ones(frame.image.shape[:2], np.float32) if frame.mask is None else np.float32(frame.mask > 0) for frame in frames]
     centres = np.array([frame.camera.position for frame in frames])
-    corrected = []
-    for i, frame in enumerate(frames):
+
+    def corrected(i: int) -> Frame:
+        frame, camera = frames[i], frames[i].camera
         if frame.depth is None or (frame.depth > 0).mean() < _LEAST_SEEN:
-            corrected.append(frame)
-            continue
-        known, camera = frame.depth > 0, frame.camera
+            return frame
+        known = frame.depth > 0
         inverse = filled((known / np.where(known, frame.depth, 1)).astype(np.float32)[..., None], known)[..., 0]
         total, weight = _of_points(frame, inverse, points)
         for j in np.argsort(np.linalg.norm(centres - centres[i], axis=1), kind="stable")[: _NEIGHBOURS + 1]:
@@ -60,13 +61,14 @@ def agreed(frames: list[Frame], points: ScenePoints) -> list[Frame]:
                 total, weight = total + precision * correction, weight + precision
         error = _GUESSED * inverse if frame.baseline is None else MATCHED / (camera.K[0, 0] * frame.baseline)
         correction, trust = total / np.maximum(weight, 1e-12), weight / (weight + 1 / error**2)
-        blur = lambda values: cv2.GaussianBlur(values.astype(np.float32), (0, 0), _SMOOTH * camera.width / 640)  # noqa: B023
+        blur = lambda values: cv2.GaussianBlur(values.astype(np.float32), (0, 0), _SMOOTH * camera.width / 640)
         around = blur(trust)
         carried = blur(trust * correction) / np.maximum(around, 1e-6) * np.minimum(4 * around, 1)
         inverse = inverse + trust * correction + (1 - trust) * carried
         good = known & np.isfinite(inverse) & (inverse > 0)
-        corrected.append(dataclasses.replace(frame, depth=np.where(good, 1 / np.where(good, inverse, 1), 0).astype(np.float32)))
-    return corrected
+        return dataclasses.replace(frame, depth=np.where(good, 1 / np.where(good, inverse, 1), 0).astype(np.float32))
+
+    return map_in_threads(corrected, range(len(frames)))
 
 
 def _plain(frame: Frame) -> np.ndarray:

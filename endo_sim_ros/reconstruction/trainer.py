@@ -113,8 +113,8 @@ class Trainer:
             raise SequenceError("there are no views to reconstruct from; check the image, camera_info and pose topics")
         self.config = config = resolved(config)
         self.device = pick_device(config.device)
-        frames, points = _consistent(_showing(frames), config, None if points is None else ScenePoints(*points))
         source = depth_source(frames, config)
+        frames, points = _consistent(_showing(frames), config, None if points is None else ScenePoints(*points))
         frames = [shrink(frame, config.image_width) for frame in frames]
         if config.agreement and source not in ("topic", "none"):
             frames = agreed(frames, points)

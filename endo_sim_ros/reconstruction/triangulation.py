@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from endo_sim_ros.cameras import Camera
 from endo_sim_ros.device import map_in_threads
 from endo_sim_ros.sequences.frames import Frame
+from endo_sim_ros.sequences.recordings import spread
 
 log = logging.getLogger(__name__)
 
@@ -63,6 +64,11 @@ def triangulate(frames: list[Frame], matches: list[Matches] | None = None) -> Sc
         u, v = (uv_i[kept] - 0.5).round().astype(int).T
         parts.append(ScenePoints(points, frames[i].image[v, u] / 255.0, 1 / (frames[i].camera.K[0, 0] * np.tan(parallax))))
     return ScenePoints(*(np.concatenate(arrays) for arrays in zip(*parts)))
+
+
+def scene_points(frames: list[Frame], views: int = 24) -> ScenePoints:
+    """Points of a whole recording, triangulated from so many of its views: more of the scene than those one trains on show."""
+    return triangulate(spread([frame for frame in frames if frame.mask is None or frame.mask.any()], views))
 
 
 def points_in_view(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,7 +1,9 @@
 """Work on a GPU that draws pictures, recorded once and then replayed: hundreds of launches take the host the time of one."""
 
+import contextlib
 import functools
-from collections.abc import Callable
+import gc
+from collections.abc import Callable, Iterator
 
 import torch
 import warp as wp
@@ -57,9 +59,26 @@ class Recording:
         graph = torch.cuda.CUDAGraph()
         # Other threads may go on using the GPU. Warp has to know, for the memory that it takes.
         recording = torch.cuda.graph(graph, self._pool, self._stream, capture_error_mode="thread_local")
-        with rasterizer_tiled.noting_rooms() as rooms, recording, wp.ScopedCapture(stream=warp_stream(self._stream), external=True):
+        with (
+            _no_garbage_collection(),
+            rasterizer_tiled.noting_rooms() as rooms,
+            recording,
+            wp.ScopedCapture(stream=warp_stream(self._stream), external=True),
+        ):
             result = self._function(*self._inputs)
         self._graph, self._result, self._rooms, self._valid = graph, result, rooms, True
+
+
+@contextlib.contextmanager
+def _no_garbage_collection() -> Iterator[None]:
+    """What the collector finds may be tensors and recordings, and to free their memory on the GPU would end a recording."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 @functools.cache

@@ -13,6 +13,7 @@ from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.evaluation.held_out import reconstruct_and_measure
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer, densification, losses, select_keyframes, shrink
+from endo_sim_ros.reconstruction.agreement import agreed
 from endo_sim_ros.reconstruction.depth import disparity_offsets, interpolated_depth, stereo_disparity, with_depth_prior
 from endo_sim_ros.reconstruction.initialization import initial_model
 from endo_sim_ros.reconstruction.optimizer import Adam
@@ -318,6 +319,58 @@ def test_depth_sources_are_chosen_or_refused(small):
         with_depth_prior([bare(frame)], NO_POINTS, options(depth="topic"))
     with pytest.raises(SequenceError, match="depth=stereo"):
         with_depth_prior([bare(frame)], NO_POINTS, options(depth="stereo"))
+
+
+def test_each_view_has_its_own_offset_where_it_sees_many_points(large):
+    points = triangulate(list(large))
+    moved = [dataclasses.replace(f, right=np.ascontiguousarray(np.roll(f.right, -2 - i, axis=1))) for i, f in enumerate(large[:2])]
+    offsets = disparity_offsets(moved, [stereo_disparity(frame) for frame in moved], points)
+    np.testing.assert_allclose(offsets, [-2, -3], atol=0.3)
+
+
+def test_small_islands_of_disparity_are_no_surface(large):
+    frame = large[0]
+    clean = stereo_disparity(frame)
+    image, right = frame.image.copy(), frame.right.copy()
+    patch = np.random.default_rng(0).integers(0, 255, (20, 20, 3), np.uint8)
+    image[200:220, 300:320], right[200:220, 240:260] = patch, patch  # as if 2 cm before the tissue
+    disparity = stereo_disparity(dataclasses.replace(frame, image=image, right=right))
+    assert (disparity[202:218, 302:318] == 0).mean() > 0.9
+    assert (disparity > 0).mean() > (clean > 0).mean() - 0.02
+
+
+# ---------------------------------------------------------------------------------------- agreement of views
+
+
+def test_views_correct_each_others_depth(large):
+    frames = with_depth_prior(list(large), NO_POINTS, options(depth="stereo"))
+    corrected, contradiction = agreed(frames, NO_POINTS)
+    error = lambda views: np.median(np.concatenate([np.abs(v.depth - e.depth)[v.depth > 0] for v, e in zip(views, large)]))
+    assert error(corrected) < 0.8 * error(frames)
+    assert contradiction < 0.2
+    assert all(((a.depth > 0) == (b.depth > 0)).mean() > 0.999 for a, b in zip(corrected, frames))
+
+
+def test_scene_points_correct_the_depth_around_them(large):
+    frame = large[0]
+    off = dataclasses.replace(frame, depth=frame.depth * np.float32(1.04), right=None, baseline=None)
+    v, u = np.mgrid[8:512:16, 8:640:16].reshape(2, -1)
+    positions = frame.camera.backproject(frame.depth)[v, u]
+    (corrected,), contradiction = agreed([off], ScenePoints(positions, np.zeros_like(positions), 0.002))
+    assert np.median(np.abs(corrected.depth / frame.depth - 1)) < 0.01
+    assert np.isnan(contradiction)  # one view contradicts none
+
+
+def test_views_that_contradict_each_other_are_trained_on_for_less_long(large):
+    views = [dataclasses.replace(frame, right=None, baseline=None, right_K=None) for frame in large]
+    turned = views[0].camera.pose.copy()
+    turned[:3, :3] = turned[:3, :3] @ cv2.Rodrigues(np.radians([0.15, 0, 0]))[0]
+    wrong = [dataclasses.replace(views[0], camera=views[0].camera.at(turned)), *views[1:]]
+    iterations = lambda frames: Trainer(frames, options(iterations=0, image_width=320)).config.iterations
+    assert iterations(views) == 3000
+    assert 1000 <= iterations(wrong) < 2500
+    assert iterations(views[:1]) == 1000
+    assert Trainer(views, options(iterations=7)).config.iterations == 7
 
 
 # ----------------------------------------------------------------------------------------- initial model

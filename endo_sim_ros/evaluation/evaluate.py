@@ -376,7 +376,7 @@ def _job(argument: tuple, device: str, report: Callable[[Any], None]) -> dict[st
     if cell.mono or split.right:
         views = [dataclasses.replace(view, right=None, baseline=None, right_K=None) for view in views]
     held_out = [shrink(frame, config.image_width) for frame in _held_out(prepared, split)]
-    report((0, config.iterations, "warming up"))
+    report((0, 1, "warming up"))
     _warm_up(device)
     training: dict[str, Any] = {}
 
@@ -446,12 +446,13 @@ def _train(
 
     curve, start, away = [], now(), 0.0
     trainer = Trainer(views, config, points)
+    iterations = trainer.config.iterations
     # Quality changes fastest in the beginning.
-    due = sorted({round(config.iterations * 50 ** (i / max(moments - 1, 1) - 1)) for i in range(moments)})
+    due = sorted({round(iterations * 50 ** (i / max(moments - 1, 1) - 1)) for i in range(moments)})
 
     def on_progress(progress) -> None:
         nonlocal away
-        report((progress.iteration, config.iterations, f"{progress.gaussians} Gaussians"))
+        report((progress.iteration, iterations, f"{progress.gaussians} Gaussians"))
         if not due or progress.iteration < due[0]:
             return
         while due and progress.iteration >= due[0]:
@@ -469,7 +470,7 @@ def _train(
         )
         away += now() - paused
 
-    model = trainer.run(on_progress, every=max(min(20, config.iterations // 50), 1))
+    model = trainer.run(on_progress, every=max(min(20, iterations // 50), 1))
     return {"model": model, "seconds": now() - start - away, "curve": curve}
 
 

@@ -32,13 +32,15 @@ _REACH = 15  # side of the square that a scene point speaks for
 _SMOOTH = 12.0  # standard deviation over which corrections are carried to pixels without
 
 
-def agreed(frames: list[Frame], points: ScenePoints) -> list[Frame]:
-    """The frames with depth corrected, in their holes as little as before, by scene points and by what neighbouring views show.
+def agreed(frames: list[Frame], points: ScenePoints) -> tuple[list[Frame], float]:
+    """The frames with depth corrected, in their holes as little as before, by scene points and by what neighbouring views show,
+    and by how many pixels the views contradict each other all the same.
 
     A view's image is predicted from each neighbour's with the view's depth; the optical flow between prediction and
     image, along the direction in which depth moves a pixel, is a correction of inverse depth that is the more precise the
     farther apart the views are. Corrections and prior are averaged by their precision; where there is none, that of
-    the surroundings counts.
+    the surroundings counts. What flow is left across that direction no depth explains: it is from poses, calibration or motion;
+    its median is returned (pixels), NaN where no two views show the same.
 
     Args:
         frames: Views with a depth prior, of matching with the right image where there is one.
@@ -48,17 +50,20 @@ def agreed(frames: list[Frame], points: ScenePoints) -> list[Frame]:
     tissue = [np.ones(frame.image.shape[:2], np.float32) if frame.mask is None else np.float32(frame.mask > 0) for frame in frames]
     centres = np.array([frame.camera.position for frame in frames])
 
-    def corrected(i: int) -> Frame:
-        frame, camera = frames[i], frames[i].camera
+    def corrected(i: int) -> tuple[Frame, list[tuple[float, float]]]:
+        frame, camera, contradictions = frames[i], frames[i].camera, []
         if frame.depth is None or (frame.depth > 0).mean() < _LEAST_SEEN:
-            return frame
+            return frame, []
         known = frame.depth > 0
         inverse = filled((known / np.where(known, frame.depth, 1)).astype(np.float32)[..., None], known)[..., 0]
         total, weight = _of_points(frame, inverse, points)
         for j in np.argsort(np.linalg.norm(centres - centres[i], axis=1), kind="stable")[: _NEIGHBOURS + 1]:
             if j != i:
-                correction, precision = _of_view(camera, inverse, plain[i], tissue[i], frames[j].camera, plain[j], tissue[j])
-                total, weight = total + precision * correction, weight + precision
+                found = _of_view(camera, inverse, plain[i], tissue[i], frames[j].camera, plain[j], tissue[j])
+                if found is not None:
+                    correction, precision, *contradiction = found
+                    total, weight = total + precision * correction, weight + precision
+                    contradictions.append(contradiction)
         error = _GUESSED * inverse if frame.baseline is None else MATCHED / (camera.K[0, 0] * frame.baseline)
         correction, trust = total / np.maximum(weight, 1e-12), weight / (weight + 1 / error**2)
         blur = lambda values: cv2.GaussianBlur(values.astype(np.float32), (0, 0), _SMOOTH * camera.width / 640)
@@ -66,9 +71,12 @@ def agreed(frames: list[Frame], points: ScenePoints) -> list[Frame]:
         carried = blur(trust * correction) / np.maximum(around, 1e-6) * np.minimum(4 * around, 1)
         inverse = inverse + trust * correction + (1 - trust) * carried
         good = known & np.isfinite(inverse) & (inverse > 0)
-        return dataclasses.replace(frame, depth=np.where(good, 1 / np.where(good, inverse, 1), 0).astype(np.float32))
+        depth = np.where(good, 1 / np.where(good, inverse, 1), 0).astype(np.float32)
+        return dataclasses.replace(frame, depth=depth), contradictions
 
-    return map_in_threads(corrected, range(len(frames)))
+    results = map_in_threads(corrected, range(len(frames)))
+    off, shares = np.array([pair for _, pairs in results for pair in pairs]).reshape(-1, 2).T
+    return [frame for frame, _ in results], float((off * shares).sum() / shares.sum()) if shares.sum() else float("nan")
 
 
 def _plain(frame: Frame) -> np.ndarray:
@@ -104,14 +112,16 @@ def _of_points(frame: Frame, inverse: np.ndarray, points: ScenePoints) -> tuple[
 def _of_view(
     camera: Camera, inverse: np.ndarray, image: np.ndarray, tissue: np.ndarray,
     other: Camera, other_image: np.ndarray, other_tissue: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Correction (1/m) of a view's inverse depth [H, W] by another view, and its precision (m²), 0 where it tells nothing."""
+) -> tuple[np.ndarray, np.ndarray, float, float] | None:  # fmt: skip
+    """Correction (1/m) of a view's inverse depth [H, W] by another view, and its precision (m²), 0 where it tells nothing.
+
+    Also the median of what no depth explains (pixels), and the share of the picture that it is of; None if they share too little.
+    """
     unit = camera.width / 640
-    nothing = np.zeros_like(inverse), np.zeros_like(inverse)
     u, v, z = _projected(camera, inverse, other)
     inside = (z > 0) & (_sampled(other_tissue, u, v, cv2.INTER_NEAREST) > 0)
     if inside.mean() < _LEAST_SHARED:
-        return nothing
+        return None
     predicted = np.where(inside, _sampled(other_image, u, v), image)
     flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     flow.setFinestScale(0)
@@ -127,10 +137,11 @@ def _of_view(
     off_u, off_v = seen_u - u, seen_v - v
     beside = np.abs(along_u * off_v - along_v * off_u) / np.sqrt(speed)
     alike = _correlation(image, _sampled(other_image, seen_u, seen_v), _WINDOW)
-    good = inside & (_sampled(np.float32(inside), columns, rows, cv2.INTER_NEAREST) > 0) & (tissue > 0)
-    good &= (alike > _ALIKE) & (beside < _OFF_LINE * unit) & (np.abs(flow).max(2) < _FARTHEST * unit)
+    good = inside & (_sampled(np.float32(inside), columns, rows, cv2.INTER_NEAREST) > 0) & (tissue > 0) & (alike > _ALIKE)
+    contradiction = float(np.median(beside[good])) if good.any() else 0.0, float(good.mean())
+    good &= (beside < _OFF_LINE * unit) & (np.abs(flow).max(2) < _FARTHEST * unit)
     good &= np.hypot(off_u, off_v) < _FARTHEST * unit
-    return (along_u * off_u + along_v * off_v) / speed, np.where(good, speed * (alike / _FLOW) ** 2, 0)
+    return (along_u * off_u + along_v * off_v) / speed, np.where(good, speed * (alike / _FLOW) ** 2, 0), *contradiction
 
 
 def _projected(camera: Camera, inverse: np.ndarray, other: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

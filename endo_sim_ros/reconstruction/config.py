@@ -17,10 +17,10 @@ class ReconstructionConfig(StageConfig):
     """Number of views to train on, spread over the camera path."""
     image_width: Annotated[int, Range(16, 8192, "pixels")] = 640
     """Views wider than this are shrunk to it before training."""
-    iterations: Annotated[int, Range(1, 1_000_000)] = 1000
-    """Optimisation steps. The paper uses 3000; on a real abdomen seen in few views more than these lowered the quality of
-    other views, while a scene whose poses and stillness are exact gains from more."""
-    max_gaussians: Annotated[int, Range(1, 10_000_000)] = 30_000
+    iterations: Annotated[int, Range(0, 1_000_000)] = 0
+    """Optimisation steps; 0 = 3000, and down to a third of them, which are as much smaller, the more the views contradict each
+    other in what no depth explains: poses, calibration, motion."""
+    max_gaussians: Annotated[int, Range(1, 10_000_000)] = 60_000
     """Largest number of Gaussians."""
     sh_degree: Annotated[int, Range(0, 3)] = 0
     """Degree of the spherical harmonics; 0 is the paper's frequency regularisation."""
@@ -45,15 +45,15 @@ class ReconstructionConfig(StageConfig):
     """Share of 1 − SSIM in the photometric loss; the rest is L1."""
     lambda_depth: Annotated[float, Range(0, 1000)] = 1.0
     """Weight of the depth loss, in units of the scene's median depth (paper eq. 4)."""
-    lambda_dist: Annotated[float, Range(0, 1000)] = 0.1
+    lambda_dist: Annotated[float, Range(0, 1000)] = 0.0
     """Weight of the distortion loss, in units of the scene's median depth (paper eq. 5)."""
-    lambda_tv: Annotated[float, Range(0, 1000)] = 0.5
+    lambda_tv: Annotated[float, Range(0, 1000)] = 0.3
     """Weight of the total variation of the rendered depth, in units of the scene's median depth (paper eq. 6)."""
     lambda_pearson: Annotated[float, Range(0, 1000)] = 0.0
     """Weight of 1 − correlation of depth and prior, in training views and in virtual ones to which the prior is carried (FSGS)."""
     lambda_flat: Annotated[float, Range(0, 1000)] = 0.01
     """Weight of Gaussians being deeper than 1.5 times their width, which turns into streaks when the tissue is sheared."""
-    virtual_every: Annotated[int, Range(0, 1000)] = 1
+    virtual_every: Annotated[int, Range(0, 1000)] = 4
     """A virtual camera regularises every n-th iteration (paper eq. 8, 9); 0 = never."""
     exposure: bool = True
     """Each view has an exposure of its own, from which that of unseen views is predicted as a camera's automatic one would be."""
@@ -68,7 +68,7 @@ class ReconstructionConfig(StageConfig):
     """Iterations between relocations of dead Gaussians and growth."""
     growth: Annotated[float, Range(0, 1)] = 0.05
     """Share of new Gaussians added at each refinement until max_gaussians is reached."""
-    learning_rate: Annotated[float, Range(1e-3, 100)] = 0.3
+    learning_rate: Annotated[float, Range(1e-3, 100)] = 1.0
     """Factor on all learning rates."""
     seed: Annotated[int, Range(0, 2**31 - 1)] = 0
     """Seed of all random draws; the same seed gives the same model on a CPU, bit for bit."""

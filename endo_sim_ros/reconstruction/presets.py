@@ -9,7 +9,7 @@ from typing import Any
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 
 _PLAIN = {  # 3DGS as Kerbl et al. 2023 have it, and what the others build upon, for 3000 iterations
-    "iterations": 3000, "max_gaussians": 60_000, "learning_rate": 1.0,
+    "iterations": 3000, "lambda_dist": 0.1, "lambda_tv": 0.5, "virtual_every": 1,
     "initialization": "points", "densification": "gradient", "lambda_flat": 0.0, "exposure": False, "light": False,
     "agreement": False, "surroundings": 0.0, "still": False,
 }  # fmt: skip
@@ -17,7 +17,7 @@ _PLAIN = {  # 3DGS as Kerbl et al. 2023 have it, and what the others build upon,
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
     # The same in a minute or two on a CPU.
-    "laptop": {"image_width": 320, "iterations": 600, "max_gaussians": 15_000, "refine_every": 50},
+    "laptop": {"image_width": 320, "iterations": 600, "learning_rate": 0.3, "max_gaussians": 15_000, "refine_every": 50},
     # As printed (Yang): triangulated points, L1 depth, distortion and total variation, virtual cameras.
     "paper": _PLAIN,
     # Zhu et al. 2024: correlation with the depth prior, in pseudo-views too, and new Gaussians between those that lie alone.
@@ -37,9 +37,11 @@ ABLATIONS: dict[str, dict[str, dict[str, Any]]] = {
     },
     "default": {
         "without virtual cameras": {"virtual_every": 0},
-        "without distortion": {"lambda_dist": 0.0},
+        "a virtual camera in every iteration": {"virtual_every": 1},
+        "with distortion": {"lambda_dist": 0.1},
         "without total variation": {"lambda_tv": 0.0},
         "without depth": {"lambda_depth": 0.0},
+        "3000 full steps whatever the views agree in": {"iterations": 3000},
         "without dense initialisation": {"initialization": "points"},
         "without agreement of depths": {"agreement": False},
         "without flat Gaussians": {"lambda_flat": 0.0},

@@ -56,6 +56,8 @@ _NOTHING = {
     "overexposed": "every view is overexposed; lower the light or the camera's exposure",
     "black": "every view is black; switch on the light, or check the camera",
 }
+_MOST_ITERATIONS, _LEAST_TRAINING = 3000, 1 / 3  # and the least share of them
+_SHARP = 0.15  # pixels: views that agree so well are worth all iterations
 _NARROWEST = 64  # pixels; images are not halved below when memory runs out
 _SELDOM = 4  # iterations between steps that may be taken seldom, and then are as much larger
 _EXPOSURE_RATE, _LIGHT_RATE = 1e-3, 2e-3  # learning rates of log exposures and of the light's four numbers
@@ -116,8 +118,12 @@ class Trainer:
         source = depth_source(frames, config)
         frames, points = _consistent(_showing(frames), config, None if points is None else ScenePoints(*points))
         frames = [shrink(frame, config.image_width) for frame in frames]
-        if config.agreement and source not in ("topic", "none"):
-            frames = agreed(frames, points)
+        if config.agreement or not config.iterations:
+            corrected, contradiction = agreed(frames, points)
+            if config.agreement and source != "topic":
+                frames = corrected
+            if not config.iterations:
+                self.config = config = _as_long_as_worth(config, contradiction)
         if config.still:
             frames = without_motion(frames, config.depth_tolerance)
         seen = int(_SEEN * config.max_gaussians) if config.surroundings else config.max_gaussians
@@ -520,6 +526,17 @@ def _read_checkpoint(path: Path, device: torch.device) -> dict:
     if {name: {key: value.shape for key, value in values.items()} for name, values in (moments | lights).items()} != expected:
         raise ValueError("the state of the optimiser does not fit the model")
     return state
+
+
+def _as_long_as_worth(config: ReconstructionConfig, contradiction: float) -> ReconstructionConfig:
+    """The options with a number of iterations: fewer and smaller steps where views contradict each other (pixels, NaN = unknown).
+
+    Details that contradict each other can only be learnt by heart, one view by one, and make other views worse.
+    """
+    share = float(np.clip(_SHARP / max(contradiction, 1e-9), _LEAST_TRAINING, 1)) if np.isfinite(contradiction) else _LEAST_TRAINING
+    iterations = max(round(_MOST_ITERATIONS * share), 1)
+    log.info("views contradict each other by %.2f pixels that no depth explains: %d iterations", contradiction, iterations)
+    return dataclasses.replace(config, iterations=iterations, learning_rate=config.learning_rate * share)
 
 
 def _showing(frames: list[Frame]) -> list[Frame]:

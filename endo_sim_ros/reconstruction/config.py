@@ -47,7 +47,7 @@ class ReconstructionConfig(StageConfig):
     """Weight of the depth loss, in units of the scene's median depth (paper eq. 4)."""
     lambda_dist: Annotated[float, Range(0, 1000)] = 0.0
     """Weight of the distortion loss, in units of the scene's median depth (paper eq. 5)."""
-    lambda_tv: Annotated[float, Range(0, 1000)] = 0.3
+    lambda_tv: Annotated[float, Range(0, 1000)] = 0.5
     """Weight of the total variation of the rendered depth, in units of the scene's median depth (paper eq. 6)."""
     lambda_pearson: Annotated[float, Range(0, 1000)] = 0.0
     """Weight of 1 − correlation of depth and prior, in training views and in virtual ones to which the prior is carried (FSGS)."""

@@ -9,7 +9,7 @@ from typing import Any
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 
 _PLAIN = {  # 3DGS as Kerbl et al. 2023 have it, and what the others build upon, for 3000 iterations
-    "iterations": 3000, "lambda_dist": 0.1, "lambda_tv": 0.5, "virtual_every": 1,
+    "iterations": 3000, "lambda_dist": 0.1, "virtual_every": 1,
     "initialization": "points", "densification": "gradient", "lambda_flat": 0.0, "exposure": False, "light": False,
     "agreement": False, "surroundings": 0.0, "still": False,
 }  # fmt: skip

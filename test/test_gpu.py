@@ -151,11 +151,12 @@ def test_skinning_agrees():
         torch.testing.assert_close(c2.cpu(), c1, atol=1e-9, rtol=1e-3)
 
 
-def test_training_reaches_the_same_quality():
+@pytest.mark.parametrize("sh_degree", (0, 1))
+def test_training_reaches_the_same_quality(sh_degree):
     frames = list(phantom_sequence(PhantomConfig(frames=5, width=160, height=128, travel=0.01)))
     quality = {}
     for device in ("cpu", "cuda"):
-        config = ReconstructionConfig(iterations=150, max_gaussians=8000, image_width=160, device=device)
+        config = ReconstructionConfig(iterations=150, max_gaussians=8000, image_width=160, sh_degree=sh_degree, device=device)
         model = Trainer(frames[::2], config).run()
         image, _ = DeformableRenderer(model, None, RenderingConfig(device="cpu")).render(frames[1].camera)
         quality[device] = metrics.psnr(image, frames[1].image)

@@ -37,7 +37,7 @@ class Adam:
         for name, gradient in gradients.items():
             state = self.state[name]
             adam(
-                [self.parameters[name].detach()], [gradient], [state["exp_avg"]], [state["exp_avg_sq"]], [], [state["step"]],
+                [self.parameters[name].detach()], [gradient.contiguous()], [state["exp_avg"]], [state["exp_avg_sq"]], [], [state["step"]],
                 fused=True, capturable=gradient.is_cuda, amsgrad=False, maximize=False, weight_decay=0.0,
                 lr=self.rates[name], beta1=0.9, beta2=0.999, eps=1e-15,
             )  # fmt: skip

@@ -112,12 +112,12 @@ def notes(results: dict[str, Any]) -> list[str]:
         "Median scaled: depth times the factor that makes its median right. Depth stays in floating point throughout.",
         "Training: all that happens between the views and the model. Memory: what the training needed at most, more than before.",
     ]
-    if any(record["cell"]["options"].get("initialization") == "points" for record in done):
-        methods = dict.fromkeys(r["cell"]["method"] for r in done if r["cell"]["options"].get("initialization") == "points")
-        lines.append(
-            f"{', '.join(methods)}: training starts from scene points matched between all views with their known poses, "
-            "the held-out views too, as the papers' structure from motion does; finding them is not in the training time."
-        )
+    methods = dict.fromkeys(r["cell"]["method"] for r in done if r["cell"]["options"].get("initialization") == "points")
+    start = f"; {', '.join(methods)} start from them" if methods else ""
+    lines.append(
+        "Every training got scene points that all views show with their known poses, the held-out ones too, as the papers' structure "
+        f"from motion does{start}. Finding them is not in the training time."
+    )
     lines += [f"{text}." for text in results["missing"].values()]
     if any(printed_rows(record["cell"]["split"], ()) for record in done):
         lines += [

@@ -23,7 +23,9 @@ _FLOW = 1.0  # pixels, error of a displacement, that of the poses included
 _ALIKE = 0.5  # correlation from which on two pixels show the same tissue
 _LEAST_SEEN = 0.02  # share of the pixels with depth
 _TOO_FAR = 0.25  # relative difference from which on a point lies on another surface
+_EDGE = 0.05  # relative step of depth that is an edge
 # In pixels of an image 640 wide:
+_RIPPLE = 10.0  # standard deviation over which depth is smoothed within edges
 _OFF_LINE = 2.0  # farthest beside the line on which depth alone can move a point
 _FARTHEST = 40.0  # longest displacement that optical flow is believed
 _LOCAL = 8.0  # standard deviation of the window that brightness is compared to
@@ -39,8 +41,9 @@ def agreed(frames: list[Frame], points: ScenePoints) -> tuple[list[Frame], float
     A view's image is predicted from each neighbour's with the view's depth; the optical flow between prediction and
     image, along the direction in which depth moves a pixel, is a correction of inverse depth that is the more precise the
     farther apart the views are. Corrections and prior are averaged by their precision; where there is none, that of
-    the surroundings counts. What flow is left across that direction no depth explains: it is from poses, calibration or motion;
-    its median is returned (pixels), NaN where no two views show the same.
+    the surroundings counts; what ripples are left within edges is smoothed. What flow is left across that direction no
+    depth explains: it is from poses, calibration or motion; its median is returned (pixels), NaN where no two views show
+    the same.
 
     Args:
         frames: Views with a depth prior, of matching with the right image where there is one.
@@ -69,7 +72,7 @@ def agreed(frames: list[Frame], points: ScenePoints) -> tuple[list[Frame], float
         blur = lambda values: cv2.GaussianBlur(values.astype(np.float32), (0, 0), _SMOOTH * camera.width / 640)
         around = blur(trust)
         carried = blur(trust * correction) / np.maximum(around, 1e-6) * np.minimum(4 * around, 1)
-        inverse = inverse + trust * correction + (1 - trust) * carried
+        inverse = _smooth(inverse + trust * correction + (1 - trust) * carried, camera.width)
         good = known & np.isfinite(inverse) & (inverse > 0)
         depth = np.where(good, 1 / np.where(good, inverse, 1), 0).astype(np.float32)
         return dataclasses.replace(frame, depth=depth), contradictions
@@ -77,6 +80,12 @@ def agreed(frames: list[Frame], points: ScenePoints) -> tuple[list[Frame], float
     results = map_in_threads(corrected, range(len(frames)))
     off, shares = np.array([pair for _, pairs in results for pair in pairs]).reshape(-1, 2).T
     return [frame for frame, _ in results], float((off * shares).sum() / shares.sum()) if shares.sum() else float("nan")
+
+
+def _smooth(inverse: np.ndarray, width: int) -> np.ndarray:
+    """Inverse depth [H, W] without the ripples of matching, its edges kept."""
+    middle = np.float32(np.median(inverse))
+    return middle * cv2.bilateralFilter((inverse / middle).astype(np.float32), 0, _EDGE, _RIPPLE * width / 640)
 
 
 def _plain(frame: Frame) -> np.ndarray:

@@ -511,7 +511,7 @@ def test_adam_is_that_of_torch():
 
 
 def test_virtual_camera_lies_between_two_views(small, monkeypatch):
-    trainer = Trainer([small[0], small[4]], options())
+    trainer = Trainer([small[0], small[4]], options(virtual_every=1))
     first, second = (small[i].camera.position for i in (0, 4))
     seen = []
     draw = trainer._render

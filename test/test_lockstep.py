@@ -205,6 +205,12 @@ def test_an_image_may_wait_for_the_camera_of_its_stamp(graph):
     graph.publish(messages.CAMERA_POSE, messages.encode_pose(np.eye(4), STEP, "world"))
     await_images(graph, 6)
     assert stamps(graph, IMAGES)[-1] == STEP
+    command(graph, 2 * STEP)  # its camera never comes
+    graph.status("rendering_node", "1 states wait for a pose on ECM/measured_cp of 0.040000 s", OK)
+    assert graph.call(Trigger, "/physics_node/reset").success
+    await_images(graph, 7)
+    assert stamps(graph, IMAGES)[-1] == MODEL_STAMP
+    graph.refused("rendering_node", "what waited for its pose", "0.040000 s")
 
 
 def test_mistakes_in_stamps_are_told_and_the_next_command_acts(graph):

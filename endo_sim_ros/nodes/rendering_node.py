@@ -111,6 +111,7 @@ class RenderingNode(EndoNode):
         if self._lockstep:
             if self._nodes_stamp == nodes.model_stamp_ns and old is not None and old.model_stamp_ns == nodes.model_stamp_ns:
                 self._poses = {stamp: pose for stamp, pose in self._poses.items() if stamp <= last}  # reset: no state will want others
+                self._forget_waiting()
             self._states.append((self._nodes_stamp, nodes))
             if len(self._states) > MOST_WAITING:
                 self._states.popleft()
@@ -195,23 +196,36 @@ class RenderingNode(EndoNode):
         """Lockstep: one image for each state, in order, as soon as its model and its camera are there."""
         while self._states and self._tissue.bound is not None:
             stamp, nodes = self._states[0]
-            at_rest = stamp == nodes.model_stamp_ns  # the first observation, for which nobody sends a camera
             if nodes.model_stamp_ns not in (self._tissue.bound.model_stamp, self._tissue.model_stamp):
                 self._leave_out("belongs to a model that is gone")
                 continue
             camera = self._camera()
+            if self._lacks_pose(stamp, nodes):
+                if not any(other > stamp for other in self._poses):
+                    return
+                self._leave_out(f"has no pose with its stamp on {messages.CAMERA_POSE.name}")
+                continue
+            at_rest = stamp == nodes.model_stamp_ns  # the first observation
             if self._options.lockstep_camera and not at_rest:
-                pose = self._poses.get(stamp)
-                if pose is None and any(other > stamp for other in self._poses):
-                    self._leave_out(f"has no pose with its stamp on {messages.CAMERA_POSE.name}")
-                    continue
-                camera = camera and pose is not None and replace(camera, pose=pose)
+                camera = camera and replace(camera, pose=self._poses[stamp])
             if not self._tissue.bound.follows(nodes) or not camera or not self._tissue.knows_cut(nodes):
                 return
             self._states.popleft()
             for old in [other for other in self._poses if other <= stamp and not at_rest]:
                 del self._poses[old]
             self._publish(*self._render(self._tissue.bound, nodes, camera), stamp)
+
+    def _lacks_pose(self, stamp: int, nodes: ControlNodeCloud) -> bool:
+        """Lockstep: whether a state still waits for its camera; the one at rest does not, as nobody sends one for it."""
+        return self._options.lockstep_camera and stamp != nodes.model_stamp_ns and stamp not in self._poses
+
+    def _forget_waiting(self) -> None:
+        """Leave out the states whose cameras did not come before a reset: the first observation must not wait for them."""
+        waiting = [stamp for stamp, nodes in self._states if self._lacks_pose(stamp, nodes)]
+        self._states = deque(state for state in self._states if not self._lacks_pose(*state))
+        if waiting:
+            which = ", ".join(f"{stamp * 1e-9:.6f} s" for stamp in waiting)
+            self.report_error(f"reset: what waited for its pose on {messages.CAMERA_POSE.name} is not shown, the state of {which}")
 
     def _leave_out(self, why: str) -> None:
         stamp, _ = self._states.popleft()
@@ -273,6 +287,8 @@ class RenderingNode(EndoNode):
             return ERROR, self._failure, values
         if self._lockstep:
             waiting = f", {len(self._states)} states wait" if self._states else ""
+            if self._states and self._lacks_pose(*self._states[0]):
+                waiting += f" for a pose on {messages.CAMERA_POSE.name} of {self._states[0][0] * 1e-9:.6f} s"
             return OK, f"in lockstep, {self._images} images rendered{waiting}", values
         return OK, "rendering", values
 

@@ -837,16 +837,22 @@ def test_parameters_act_or_are_refused_with_the_reason(bench, physics):
         ("material", "jelly", "must be one of fixed_corotated, neo_hookean, got 'jelly'"),
         ("device", "tpu", "unknown device 'tpu'"),
         ("arms", ["PSM3"], "arms: read at start only; restart the node"),
+        ("regions", ["sphere 0 0"], "region 'sphere 0 0': a sphere takes 4 values"),
     ):
         successful, text = bench.set("physics_node", **{name: value})
         assert not successful and reason in text, (name, value, text)
     assert bench.set("physics_node", arms=["PSM1", "PSM2"])[0]  # as it is already
     assert bench.set("physics_node", young_modulus=5000.0)[0]
     bench.until(lambda: physics._simulation.config.young_modulus == 5000.0, "softer tissue")
-    assert bench.set("physics_node", adapt_substeps=False, substep_dt=0.05)[0]  # far too long for the material
+    painted = ["sphere 0 0 0.1 0.02 young_modulus=20000"]
+    assert bench.set("physics_node", regions=painted)[0]
+    bench.until(lambda: physics._simulation.config.regions == tuple(painted), "a stiffer region")
+    assert bench.set("physics_node", regions=[""])[0]
+    bench.until(lambda: physics._simulation.config.regions == ("",), "no region")
+    assert bench.set("physics_node", adapt_substeps=False, substeps=100_000, substep_dt=0.1)[0]  # far too long for the material
     bench.refused("physics_node", "substep")
     count = len(bench.heard["control_nodes"])
-    assert bench.set("physics_node", adapt_substeps=True, substep_dt=0.0005)[0]
+    assert bench.set("physics_node", adapt_substeps=True, substeps=80, substep_dt=0.0005)[0]
     bench.until(lambda: len(bench.heard["control_nodes"]) > count + 5 and not physics._failure, "steps to go on")
 
 

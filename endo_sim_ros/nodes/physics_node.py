@@ -18,10 +18,12 @@ from endo_sim_ros.nodes.arm import Arm
 from endo_sim_ros.nodes.base import ERROR, OK, STREAM_DEPTH, WARN, Background, EndoNode, WorldConfig, arm_names, run, sentence
 from endo_sim_ros.nodes.pacing import MOST_WAITING, CommandQueue, Pacer
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
+from endo_sim_ros.physics.regions import read_regions
 
 _SLOW = 0.5  # real-time factor below which the node warns
 _CAMERAS_LATE = 1.0  # seconds after a model in which its training cameras may still be on their way
 _POLLS = 4  # times per step that the timer asks whether a step is due
+_LONGEST_POLL = 0.1  # seconds; models and parameters must not wait for steps that take minutes
 _WINDOW = 1.0  # seconds over which the real-time factor is measured
 _INPUTS = ("pose", "wrench", "jaw", "cut")  # parts of a command in lockstep
 
@@ -121,12 +123,14 @@ class PhysicsNode(EndoNode):
         self.service(Trigger, "~/reset", self._on_reset)
         self.service(Trigger, "~/step", self._on_step)
         self.service(SetBool, "~/pause", self._on_pause)
-        self._timer = self.every(self._config.step_duration / _POLLS, self._on_timer)
+        self._timer = self.every(_poll(self._config), self._on_timer)
 
     def config_changed(self, config: StageConfig) -> None:
         if isinstance(config, PhysicsConfig):
+            if config.regions != self._config.regions:
+                read_regions(config.regions)  # what cannot be read is refused
             self._config = config  # the timer builds a simulation for it
-            self._timer.timer_period_ns = int(config.step_duration / _POLLS * 1e9)
+            self._timer.timer_period_ns = int(_poll(config) * 1e9)
         else:
             self._options = config
 
@@ -524,6 +528,11 @@ class PhysicsNode(EndoNode):
     def destroy_node(self) -> None:
         self._background.stop()
         super().destroy_node()
+
+
+def _poll(config: PhysicsConfig) -> float:
+    """Seconds from one look for something to do to the next."""
+    return min(config.step_duration / _POLLS, _LONGEST_POLL)
 
 
 def _tissue(model: GaussianModel, viewpoint: np.ndarray, config: PhysicsConfig, cameras: list[Camera]) -> TissueSimulation:

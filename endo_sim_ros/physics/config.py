@@ -41,7 +41,7 @@ class PhysicsConfig(StageConfig):
     regions: tuple[str, ...] = ()
     """Regions that are made of something else, later ones over earlier ones: "box x0 y0 z0 x1 y1 z1", "sphere x y z radius" (m, world)
     or "mask IMAGE CAMERAS N" (what camera N of a cameras.json sees in the white of an image), then young_modulus=, poisson_ratio=
-    or density=, e.g. "sphere 0 0 0.12 0.01 young_modulus=40000"."""
+    or density=, e.g. "sphere 0 0 0.12 0.01 young_modulus=40000". [""] is none, as [] is, which `ros2 param set` does not know."""
     substeps: Annotated[int, Range(1, 100_000)] = 80
     """Substeps in one step, as the paper has them; see adapt_substeps."""
     substep_dt: Annotated[float, Range(1e-7, 0.1, "s")] = 0.0005

@@ -13,7 +13,7 @@ Quotes keep a path with spaces together. At least one property is given; the oth
 
 import math
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
@@ -222,8 +222,13 @@ def parse_region(text: str) -> Region:
     return Region(text, **properties, _contains=lambda points: inside_box(points, low, high))
 
 
+def read_regions(texts: Iterable[str]) -> list[Region]:
+    """Regions of their texts, see :func:`parse_region`; an empty text is none, as ROS cannot set an array to an empty one."""
+    return [parse_region(text) for text in texts if text]
+
+
 def paint_regions(properties: TissueProperties, points: np.ndarray, regions: Sequence[str]) -> TissueProperties:
-    """Paint regions, as :func:`parse_region` reads them, in order: where they overlap, the last one counts.
+    """Paint regions, as :func:`read_regions` reads them, in order: where they overlap, the last one counts.
 
     Args:
         properties: What the M nodes are made of.
@@ -236,12 +241,11 @@ def paint_regions(properties: TissueProperties, points: np.ndarray, regions: Seq
     points = np.asarray(points, np.float64)
     if points.shape != (len(properties), 3):
         raise ConfigError(f"paint_regions: points have shape {points.shape}, expected ({len(properties)}, 3)")
-    for text in regions:
-        region = parse_region(text)
+    for region in read_regions(regions):
         where = region.contains(points)
         if not where.any():
             low, high = (" ".join(f"{x:.4g}" for x in corner) for corner in (points.min(0), points.max(0)))
-            raise ConfigError(f"region {text!r} contains none of the nodes, which lie between {low} and {high} (metres, world)")
+            raise ConfigError(f"region {region.text!r} contains none of the nodes, which lie between {low} and {high} (metres, world)")
         properties = properties.painted(where, region.young_modulus, region.poisson_ratio, region.density)
     return properties
 

@@ -16,13 +16,14 @@ from test_nodes import Bench, S, send_camera, send_model, sheet
 from endo_sim_ros import messages
 from endo_sim_ros.cameras import Camera, save_cameras
 from endo_sim_ros.config import ConfigError
+from endo_sim_ros.evaluation.figures import draw_points
 from endo_sim_ros.gaussians import save_ply
 from endo_sim_ros.nodes.physics_node import PhysicsNode
 from endo_sim_ros.nodes.rendering_node import RenderingNode
 from endo_sim_ros.physics import PhysicsConfig
 from endo_sim_ros.physics.materials import MATERIALS
 from endo_sim_ros.physics.stress import von_mises
-from endo_sim_ros.viewer.browser import SPLATS, VIEWS, Pointer, _padded
+from endo_sim_ros.viewer.browser import SPLATS, VIEWS, Pointer, _fitted, _padded
 from endo_sim_ros.viewer.config import ViewerConfig
 from endo_sim_ros.viewer.grasp import Grasp
 from endo_sim_ros.viewer.viewer import PARAMETERS, SLIDERS, Tool
@@ -275,6 +276,19 @@ def test_endoscope_picture_is_centred_at_its_optical_axis():
         bright = np.argwhere(padded[..., 0] > 127).mean(0) + 0.5
         np.testing.assert_allclose(bright, np.array(padded.shape[:2]) / 2, atol=0.6)
         assert padded.shape[1] / padded.shape[0] == pytest.approx(aspect, rel=0.02)
+
+
+def test_pictures_of_another_shape_fit_into_a_video_and_near_nodes_hide_far_ones():
+    wide = _fitted(np.full((20, 40, 3), 200, np.uint8), 30, 60)
+    assert wide.shape == (60, 30, 3)
+    lit = np.argwhere(wide[..., 0] > 0)
+    np.testing.assert_array_equal([lit.min(0), lit.max(0)], [[22, 0], [36, 29]])
+    camera = Camera(np.array([[100.0, 0, 40], [0, 100.0, 30], [0, 0, 1]]), 80, 60)
+    points = np.array([[0, 0, 0.1], [0.003, 0, 0.2], [0.02, 0, 0.1], [0, 0, -0.1], [9, 0, 0.1]])
+    colors = np.uint8([[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 0], [255, 255, 255]])
+    image = draw_points(np.zeros((60, 80, 3), np.uint8), camera, points, colors, 0.008)
+    assert image[30, 40].tolist() == [255, 0, 0] and image[30, 60].tolist() == [0, 0, 255], "near ones hide far ones"
+    assert 40 < (image[..., 0] > 127).sum() < 80  # a disc of 8 pixels
 
 
 def test_missing_viser_is_one_sentence_that_says_how_to_install_it(monkeypatch):

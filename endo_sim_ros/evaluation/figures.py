@@ -30,6 +30,18 @@ def draw_force(image: np.ndarray, camera: Camera, tip: np.ndarray, force: np.nda
     return image
 
 
+def draw_points(image: np.ndarray, camera: Camera, points: np.ndarray, colors: np.ndarray, size: float) -> np.ndarray:
+    """The RGB image with points [M, 3] (m, world) as discs of a diameter (m) in colours [M, 3] uint8, near ones over far ones."""
+    image = np.ascontiguousarray(image.copy())
+    uv, z = camera.project(points)
+    inside = (z > 0) & (uv >= 0).all(1) & (uv < image.shape[1::-1]).all(1)
+    order = np.flatnonzero(inside)[np.argsort(-z[inside])]
+    radii = np.maximum(np.rint(0.5 * size * camera.K[1, 1] / z[order]), 1).astype(int)
+    for center, radius, color in zip(np.rint(uv[order]).astype(int).tolist(), radii.tolist(), colors[order].tolist()):
+        cv2.circle(image, center, radius, color, -1)
+    return image
+
+
 def color_depth(depth: np.ndarray, near: float | None = None, far: float | None = None) -> np.ndarray:
     """RGB picture [H, W, 3] of a depth image [H, W] (m); black where there is none. The range defaults to the 1-99 % of it."""
     valid = depth > 0

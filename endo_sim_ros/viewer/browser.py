@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from endo_sim_ros.cameras import Camera, make_pose
-from endo_sim_ros.evaluation.figures import write_video
+from endo_sim_ros.evaluation.figures import draw_points, write_video
 
 if TYPE_CHECKING:
     from endo_sim_ros.viewer.viewer import Viewer
@@ -198,7 +198,14 @@ class Browser:
             if picture is None:
                 camera = _small(self.camera())
                 picture = viewer.renderer.render(camera, *(viewer.state or ()))[0], camera
-            self._recording.add(viewer.draw_tools_on(*picture))
+            self._recording.add(self._drawn_on(viewer, *picture))
+
+    def _drawn_on(self, viewer: "Viewer", image: np.ndarray, camera: Camera) -> np.ndarray:
+        """A picture with all that the browser draws over it."""
+        image, points = image if self._tissue.value else np.zeros_like(image), self._points
+        if points is not None and self.wants_nodes:
+            image = draw_points(image, camera, points.points / CENTIMETRES, points.colors, points.point_size / CENTIMETRES)
+        return viewer.draw_tools_on(image, camera)
 
     def _send(self, image: np.ndarray) -> None:
         self.client.scene.set_background_image(image, "jpeg", jpeg_quality=_JPEG_QUALITY)
@@ -257,7 +264,7 @@ class Recording:
         """The picture [H, W, 3] uint8 that is seen now."""
         self._size = self._size or image.shape[1::-1]
         if image.shape[1::-1] != self._size:
-            image = cv2.resize(image, self._size)
+            image = _fitted(image, *self._size)
         while self.due:
             self._images.put(image)
             self._count += 1
@@ -278,6 +285,14 @@ def _small(camera: Camera) -> Camera:
     """The camera at the size of rendered pictures."""
     scale = min(1.0, _LARGEST[0] / camera.width, _LARGEST[1] / camera.height)
     return camera.resized(max(round(camera.width * scale), 2), max(round(camera.height * scale), 2))
+
+
+def _fitted(image: np.ndarray, width: int, height: int) -> np.ndarray:
+    """The picture as large as there is room, undistorted, the rest black."""
+    scale = min(width / image.shape[1], height / image.shape[0])
+    small = cv2.resize(image, (max(round(scale * image.shape[1]), 1), max(round(scale * image.shape[0]), 1)))
+    right, below = width - small.shape[1], height - small.shape[0]
+    return cv2.copyMakeBorder(small, below // 2, below - below // 2, right // 2, right - right // 2, cv2.BORDER_CONSTANT)
 
 
 def _around_axis(camera: Camera, aspect: float) -> tuple[float, float, float]:

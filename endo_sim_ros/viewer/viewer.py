@@ -1,7 +1,9 @@
 """The page: what browsers show, and what users do there. It knows no ROS; what drives it is behind `Actions`."""
 
+import logging
 import queue
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -432,6 +434,8 @@ def _serve(config: ViewerConfig) -> Any:
         import viser
     except ImportError:
         raise ConfigError("the viewer needs viser, which is not installed: pip install 'endo_sim_ros[viewer]'") from None
+    logging.getLogger("websockets").setLevel(logging.WARNING)  # else it tells of every browser that comes and goes
+    warnings.filterwarnings("ignore", "Queued a .* on a closed connection")  # browsers leave while they are drawn for
     try:
         return viser.ViserServer(host=config.host, port=config.port, verbose=False)
     except (OSError, RuntimeError) as error:

@@ -119,6 +119,20 @@ def test_each_of_many_environments_is_the_single_one_with_its_seed(task):
         assert recorded[k][1][1] == reward
 
 
+def test_many_environments_begin_anew_one_by_one_and_count_their_seeds():
+    many = gymnasium.make_vec(IDS["retraction"], num_envs=2, vectorization_mode="vector_entry_point", device="cpu")
+    first, _ = many.reset(seed=np.array([5, 8]))
+    np.testing.assert_array_equal(first[1], many.reset(seed=7)[0][1])
+    moved = many.step(np.ones((2, 4)))[0]
+    again, _ = many.reset(seed=[3, 5], options={"reset_mask": np.array([False, True])})
+    np.testing.assert_array_equal(again[0], moved[0])
+    np.testing.assert_array_equal(again[1], first[0])
+    with pytest.raises(ValueError, match="2 environments need as many seeds, got 1"):
+        many.reset(seed=[1])
+    with pytest.raises(ValueError, match="as many places in reset_mask, got 3"):
+        many.reset(options={"reset_mask": np.ones(3, bool)})
+
+
 def test_ended_environments_begin_anew_at_the_next_step_and_others_go_on():
     many = gymnasium.make_vec(IDS["retraction"], num_envs=2, vectorization_mode="vector_entry_point", device="cpu")
     policy = scripted_policy("retraction")
@@ -198,6 +212,8 @@ def test_randomisation_changes_what_it_names_and_nothing_else():
     np.testing.assert_array_equal(other["image"], observed["image"])
     factors = soft.tissue.solver._scale.numpy()
     assert np.ptp(factors) == 0 and factors[0] != 1 and np.exp(-1) <= factors[0] <= np.e
+    with pytest.raises(ConfigError, match="Randomisation has no option stifness; it has stiffness, "):
+        make("retraction", randomisation={"stifness": 0.1})
     with pytest.raises(ConfigError, match=r"Randomisation.light must lie in \[0, 0.9\]"):
         make(randomisation={"light": 2.0})
 

@@ -41,7 +41,7 @@ def _make(
         raise ValueError(f"render_mode must be rgb_array or None, got {render_mode!r}")
     if image_width < 1:
         raise ValueError(f"image_width must be at least 1, got {image_width}")
-    randomisation = Randomisation(**randomisation) if isinstance(randomisation, dict) else randomisation or Randomisation()
+    randomisation = Randomisation.from_mapping(randomisation) if isinstance(randomisation, dict) else randomisation or Randomisation()
     scene = scene if isinstance(scene, Scene) else load_scene(scene)
     images = render_mode is not None or observations != "state"
     batch = TaskBatch(task, scene, count, observations, randomisation, image_width, device, images=images)
@@ -137,13 +137,15 @@ class VectorTaskEnvironment(gymnasium.vector.VectorEnv):
         self._ended = np.zeros(num_envs, bool)
 
     def reset(self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None):
-        seeds = [None if seed is None else seed + i for i in range(self.num_envs)] if not isinstance(seed, list) else seed
+        seeds = [None if seed is None else seed + i for i in range(self.num_envs)] if seed is None or np.isscalar(seed) else list(seed)
+        chosen = np.array((options or {}).get("reset_mask", np.ones(self.num_envs)), bool)
+        for what, given in (("seeds", seeds), ("places in reset_mask", chosen)):
+            if np.shape(given) != (self.num_envs,):
+                raise ValueError(f"{self.num_envs} environments need as many {what}, got {np.size(given)}")
         for i, each in enumerate(seeds):
-            if each is not None:
+            if each is not None and chosen[i]:
                 self._generators[i] = np.random.default_rng(each)
-        self.batch.reset(range(self.num_envs), self._generators)
-        self._ended[:] = False
-        return self.batch.observe(), _info(self.batch)
+        return self.renew(np.flatnonzero(chosen)), _info(self.batch)
 
     def step(self, actions: np.ndarray):
         renew = np.flatnonzero(self._ended)

@@ -236,9 +236,9 @@ class Compress:
 
         if self.out.suffix != ".ply":
             raise ModelError(f"{self.out}: models are written as .compressed.ply or .ply; give such a name")
-        model = load_ply(self.model)
+        model, before = load_ply(self.model), self.model.stat().st_size  # the two files may be one
         save_ply(model, self.out)
-        print(f"{self.out}: {len(model)} Gaussians, {self.out.stat().st_size / 1e6:.1f} MB, was {self.model.stat().st_size / 1e6:.1f} MB")
+        print(f"{self.out}: {len(model)} Gaussians, {self.out.stat().st_size / 1e6:.1f} MB, was {before / 1e6:.1f} MB")
 
 
 @dataclass(frozen=True)
@@ -339,11 +339,13 @@ class Train:
         from endo_sim_ros.learning.scenes import load_scene
         from endo_sim_ros.learning.train import save_training, train
 
-        config = self.config
+        config, unused = self.config, self.ppo
         if self.algorithm == "ppo":
             from endo_sim_ros.learning.ppo import train_ppo as train
 
-            config = self.ppo
+            config, unused = unused, config
+        if unused != type(unused)():
+            raise ConfigError(f"options that begin with --ppo. are for ppo, the others for cem; --algorithm is {self.algorithm}")
         self.out.mkdir(parents=True, exist_ok=True)  # before the long work
         policy, curve = train(self.task, load_scene(self.model), config, self.vary, self.device)
         save_training(self.out, policy, curve, config)

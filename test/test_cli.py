@@ -104,6 +104,7 @@ def test_reconstruct_writes_a_model_and_measures_held_out_views(bag, tmp_path):
         (("phantom", "README.md"), "README.md exists already"),
         (("phantom", "no_bag", "--frames", "0"), r"PhantomConfig.frames must lie in \[1, 100000\], got 0"),
         (("demo", "--bag", "no_bag"), "no_bag: no such bag"),
+        (("train", "no_out", "--algorithm", "cem", "--ppo.steps", "5"), "options that begin with --ppo. are for ppo, the others for cem"),
         (("plot",), "no files to plot; give those that `endo-sim bench … --json FILE` wrote"),
         (("config", "policy_nod"), "no node is called policy_nod; there are reconstruction_node, "),
     ],

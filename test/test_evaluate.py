@@ -183,6 +183,16 @@ def test_what_cannot_be_read_loses_its_own_cells_only(run):
     assert "| damaged.mcap | default | failed: " in (config.out / "table.md").read_text()
 
 
+def test_a_split_that_a_sequence_has_not_loses_its_own_cells_only(tmp_path):
+    config = EvaluationConfig(
+        out=tmp_path, splits=("two-views", "stereo", "9:1"), presets=("default",), device="cpu", lpips=(),
+        set=("iterations=2", "max_gaussians=300", "image_width=96"),
+    )  # fmt: skip
+    errors = [cell["error"] for cell in evaluate([f"{SMALL},stereo=false"], config)["cells"]]
+    assert errors[:2] == [None, "split stereo: the sequence has no right images"]
+    assert "leaves" in errors[2] and "0 to hold out" in errors[2]
+
+
 def test_finished_cells_are_not_done_again(run):
     sequences, config, results = run
     kept, gone = (config.out / f"cells/phantom_0-two-views-default-{seed}.json" for seed in (0, 1))

@@ -237,7 +237,10 @@ def _prepare(cells: Sequence[Cell], bar: Progress) -> Prepared:
     bar.remove_task(task)
     frames = [frame for frame in frames if frame.mask is None or frame.mask.any()]
     splits = {cell.split for cell in cells}
-    trained = {index for split in splits for index in split_views(split, len(frames)).train}
+    trained: set[int] = set()
+    for split in splits:
+        with contextlib.suppress(SequenceError):  # too few views for this one: its own cells say so
+            trained.update(split_views(split, len(frames)).train)
     task = bar.add_task(f"scene points of {cells[0].sequence}", total=None)
     known = read_points(_place(source)[0])
     points = ScenePoints(*known, _POINT_ERROR) if known else scene_points(frames, _POINT_VIEWS)
@@ -254,7 +257,8 @@ def _prepare(cells: Sequence[Cell], bar: Progress) -> Prepared:
         depth_source = "stereo matching"
         frames = [dataclasses.replace(frame, depth=_trusted(match)) for frame, match in zip(frames, matched)]
     width = max(cell.options["image_width"] for cell in cells)
-    right = [shrink(frame, width) for frame in right_views(matched)] if STEREO in splits else []
+    paired = STEREO in splits and any(frame.right is not None for frame in frames)
+    right = [shrink(frame, width) for frame in right_views(matched)] if paired else []
     small = lambda frame: shrink(dataclasses.replace(frame, right=None, baseline=None, right_K=None), width)
     return Prepared([f if i in trained else small(f) for i, f in enumerate(frames)], right, depth_source, points)
 
@@ -431,7 +435,11 @@ def _job(argument: tuple, device: str, report: Callable[[Any], None]) -> dict[st
 
 
 def _held_out(prepared: Prepared, split: Split) -> list[Frame]:
-    return prepared.right if split.right else [prepared.frames[index] for index in split.held_out]
+    if not split.right:
+        return [prepared.frames[index] for index in split.held_out]
+    if not prepared.right:
+        raise SequenceError("split stereo: the sequence has no right images")
+    return prepared.right
 
 
 def _train(

@@ -150,6 +150,8 @@ def _names(sequences: Sequence[str]) -> dict[str, str]:
 def _methods(config: EvaluationConfig) -> dict[str, dict[str, Any]]:
     """All options of each method, by its name."""
     common = {"device": "auto"} | _values(config.set, "--set", ReconstructionConfig)
+    if "preset" in common:
+        raise ConfigError("--set preset: methods are named with --presets")
     unlike = {name: dataclasses.asdict(preset(name, **common)) for name in config.presets}
     if config.ablation:
         for name in config.presets:

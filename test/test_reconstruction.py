@@ -13,7 +13,7 @@ from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.evaluation.held_out import reconstruct_and_measure
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer, densification, losses, select_keyframes, shrink
-from endo_sim_ros.reconstruction.agreement import agreed
+from endo_sim_ros.reconstruction.agreement import _smooth, agreed
 from endo_sim_ros.reconstruction.depth import disparity_offsets, interpolated_depth, stereo_disparity, with_depth_prior
 from endo_sim_ros.reconstruction.initialization import initial_model
 from endo_sim_ros.reconstruction.optimizer import Adam
@@ -349,6 +349,14 @@ def test_views_correct_each_others_depth(large):
     assert error(corrected) < 0.8 * error(frames)
     assert contradiction < 0.2
     assert all(((a.depth > 0) == (b.depth > 0)).mean() > 0.999 for a, b in zip(corrected, frames))
+
+
+def test_ripples_of_wide_images_are_smoothed_and_edges_are_not():
+    width, noise = 1920, np.random.default_rng(0).normal(0, 0.1, (160, 1920))
+    step = np.where(np.arange(width) < 960, 8.0, 12.0) + np.zeros_like(noise)
+    error = _smooth((step + noise).astype(np.float32), width) - step
+    assert error.std() < 0.1 * noise.std()
+    assert np.abs(error[:, 950:970]).max() < 0.5 * noise.std()
 
 
 def test_scene_points_correct_the_depth_around_them(large):

@@ -84,8 +84,13 @@ def agreed(frames: list[Frame], points: ScenePoints) -> tuple[list[Frame], float
 
 def _smooth(inverse: np.ndarray, width: int) -> np.ndarray:
     """Inverse depth [H, W] without the ripples of matching, its edges kept."""
-    middle = np.float32(np.median(inverse))
-    return middle * cv2.bilateralFilter((inverse / middle).astype(np.float32), 0, _EDGE, _RIPPLE * width / 640)
+    relative = (inverse / np.float32(np.median(inverse))).astype(np.float32)
+    smooth, stride = np.empty_like(relative), max(round(width / 640), 1)
+    # The filter takes as long as its window is large: of wide images every n-th pixel is filtered with others of its kind.
+    for row, column in np.ndindex(min(stride, len(relative)), stride):
+        part = np.ascontiguousarray(relative[row::stride, column::stride])
+        smooth[row::stride, column::stride] = cv2.bilateralFilter(part, 0, _EDGE, _RIPPLE * width / 640 / stride)
+    return np.float32(np.median(inverse)) * smooth
 
 
 def _plain(frame: Frame) -> np.ndarray:

@@ -118,9 +118,10 @@ class Trainer:
         source = depth_source(frames, config)
         frames, points = _consistent(_showing(frames), config, None if points is None else ScenePoints(*points))
         frames = [shrink(frame, config.image_width) for frame in frames]
-        if config.agreement or not config.iterations:
+        correcting = config.agreement and source not in ("topic", "none")
+        if correcting or not config.iterations:
             corrected, contradiction = agreed(frames, points)
-            if config.agreement and source != "topic":
+            if correcting:
                 frames = corrected
             if not config.iterations:
                 self.config = config = _as_long_as_worth(config, contradiction)
@@ -535,7 +536,10 @@ def _as_long_as_worth(config: ReconstructionConfig, contradiction: float) -> Rec
     """
     share = float(np.clip(_SHARP / max(contradiction, 1e-9), _LEAST_TRAINING, 1)) if np.isfinite(contradiction) else _LEAST_TRAINING
     iterations = max(round(_MOST_ITERATIONS * share), 1)
-    log.info("views contradict each other by %.2f pixels that no depth explains: %d iterations", contradiction, iterations)
+    if np.isfinite(contradiction):
+        log.info("views contradict each other by %.2f pixels that no depth explains: %d iterations", contradiction, iterations)
+    else:
+        log.info("no two views with depth show the same, so nobody can tell how well views agree: %d iterations", iterations)
     return dataclasses.replace(config, iterations=iterations, learning_rate=config.learning_rate * share)
 
 

@@ -369,6 +369,20 @@ def test_scene_points_correct_the_depth_around_them(large):
     assert np.isnan(contradiction)  # one view contradicts none
 
 
+@pytest.mark.parametrize(
+    "positions, error, said",
+    [
+        (np.full((9, 3), np.nan), 0.01, "not finite"),
+        (np.ones((9, 3)), np.zeros(9), "above zero"),
+        (np.ones((9, 3)), np.full(9, np.nan), "above zero"),
+        (np.ones((9, 2)), 0.01, r"arrays \[N, 3\]"),
+    ],
+)
+def test_scene_points_that_are_none_are_refused(large, positions, error, said):
+    with pytest.raises(SequenceError, match=said):
+        Trainer(list(large[:1]), options(iterations=1), (positions, np.ones((len(positions), positions.shape[1])), error))
+
+
 def test_views_that_contradict_each_other_are_trained_on_for_less_long(large):
     views = [dataclasses.replace(frame, right=None, baseline=None, right_K=None) for frame in large]
     turned = views[0].camera.pose.copy()

@@ -107,7 +107,8 @@ class Trainer:
             instance of structure from motion with more views than these; None triangulates these views.
 
     Raises:
-        SequenceError: If there are no views, all pixels are masked or white, or the views give no scene points to start from.
+        SequenceError: If there are no views, all pixels are masked or white, the views give no scene points to start from, or
+            those given are not finite.
     """
 
     def __init__(self, frames: list[Frame], config: ReconstructionConfig, points: ScenePoints | tuple | None = None):
@@ -116,7 +117,7 @@ class Trainer:
         self.config = config = resolved(config)
         self.device = pick_device(config.device)
         source = depth_source(frames, config)
-        frames, points = _consistent(_showing(frames), config, None if points is None else ScenePoints(*points))
+        frames, points = _consistent(_showing(frames), config, None if points is None else _checked(ScenePoints(*points)))
         frames = [shrink(frame, config.image_width) for frame in frames]
         correcting = config.agreement and source not in ("topic", "none")
         if correcting or not config.iterations:
@@ -541,6 +542,18 @@ def _as_long_as_worth(config: ReconstructionConfig, contradiction: float) -> Rec
     else:
         log.info("no two views with depth show the same, so nobody can tell how well views agree: %d iterations", iterations)
     return dataclasses.replace(config, iterations=iterations, learning_rate=config.learning_rate * share)
+
+
+def _checked(points: ScenePoints) -> ScenePoints:
+    """Scene points that somebody gave."""
+    shape, error = np.shape(points.positions), np.asarray(points.error)
+    if len(shape) != 2 or shape[1] != 3 or np.shape(points.colors) != shape or error.shape not in ((), shape[:1]):
+        raise SequenceError("scene points: give positions and colours as arrays [N, 3], and errors [N] or one for all")
+    if not (np.isfinite(points.positions).all() and np.isfinite(points.colors).all()):
+        raise SequenceError("scene points: some positions or colours are not finite; leave those out")
+    if not (np.isfinite(error) & (error > 0)).all():
+        raise SequenceError("scene points: errors are relative and above zero; leave points without one out")
+    return points
 
 
 def _showing(frames: list[Frame]) -> list[Frame]:

@@ -167,6 +167,10 @@ def test_the_loop_of_a_node_serves_what_is_there_and_what_is_added_or_removed_me
         send_camera(bench, stamp=4 * S)
         bench.until(lambda: heard[messages.LEFT_INFO] and len(ticks) > 3, "what was added")
         assert len(heard[messages.CAMERA_POSE]) == 3 and thread.is_alive()
+        answered = []
+        for i in range(5):  # at once, as callbacks of several answers
+            executor.create_task(answered.append, i)
+        bench.until(lambda: sorted(answered) == [0, 1, 2, 3, 4], "all of them")
     finally:
         executor.shutdown()
         thread.join(5)

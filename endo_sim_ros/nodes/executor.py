@@ -17,8 +17,9 @@ class NodeExecutor(SingleThreadedExecutor):
     def spin(self) -> None:
         """Run callbacks until ROS is shut down."""
         while self._context.ok() and not self._is_shutdown:
-            with ExitStack() as in_use:  # nothing may be destroyed while it is waited for
-                self._run_messages_and_timers(in_use)
+            if all(task.done() for task, *_ in self._tasks):  # else do those first: they wake the loop once only
+                with ExitStack() as in_use:  # nothing may be destroyed while it is waited for
+                    self._run_messages_and_timers(in_use)
             self.spin_once(timeout_sec=0)
 
     def _run_messages_and_timers(self, in_use: ExitStack) -> None:

@@ -150,7 +150,7 @@ class PolicyNode(EndoNode):
     def _end(self, success: bool) -> None:
         self._done += 1
         self._solved += int(success)
-        self._stamp = -1  # nothing is awaited
+        self._stamp, self._heard = -1, {}  # nothing is awaited, and nothing that comes late completes an answer
         self.get_logger().info(f"episode {self._done}: {'solved' if success else 'not solved'} in {self._task.steps[0]} steps")
         if self._done < self._config.episodes:
             self._begin()

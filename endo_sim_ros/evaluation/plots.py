@@ -10,6 +10,8 @@ from endo_sim_ros.evaluation.figures import slug
 
 log = logging.getLogger(__name__)
 
+_IN_THE_PLOT = 6  # methods that a legend has room for beside the lines
+
 
 def available() -> bool:
     return importlib.util.find_spec("matplotlib") is not None
@@ -40,12 +42,14 @@ def _lines(ours: Sequence, rows: str, x: str, x_label: str) -> Any:
     """Gain-fitted PSNR of each method's first seed over x."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(6, 3.2), layout="constrained")
+    ours = [s for s in ours if s.cells[0][rows]]
+    beside = len(ours) > _IN_THE_PLOT
+    figure = Figure(figsize=(9 if beside else 6, max(3.2, 0.18 * len(ours) * beside)), layout="constrained")
     axes = figure.subplots()
     for s in ours:
         points = [row for row in s.cells[0][rows] if "psnr_gain" in row]
         axes.plot([p[x] for p in points], [p["psnr_gain"] for p in points], marker="." if len(points) < 60 else None, label=s.method)
     axes.set(xlabel=x_label, ylabel="PSNR, gain fitted [dB]")
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
+    figure.legend(fontsize=8, loc="outside right upper") if beside else axes.legend(fontsize=8)
     return figure

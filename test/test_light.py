@@ -130,7 +130,7 @@ def test_the_response_of_the_exposure_is_found_where_brightness_varies(response)
     found, levels = fit_exposure(exposures, brightness)
     assert found == pytest.approx(response, abs=0.01)
     np.testing.assert_allclose(levels, [0, 0.2, 0.4], atol=1e-9)
-    assert fit_exposure(exposures[:1], brightness[:1])[0] == 1
+    assert fit_exposure(exposures[:1], brightness[:1])[0] == 0.9  # one view tells nothing
 
 
 def test_the_light_travels_with_the_model(tmp_path):

@@ -68,7 +68,7 @@ def test_installed_executable_starts_its_node(prefix, node):
     site = next(prefix.glob("lib/python*/site-packages"))
     paths = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     name = "rate" if node in ("bag_player_node", "rendering_node") else "iterations" if node[0] == "r" else "density"
-    value = "0" if name == "iterations" else "-1.0"
+    value = "-1" if name == "iterations" else "-1.0"
     done = subprocess.run(
         [str(prefix / "lib" / "endo_sim_ros" / node), "--ros-args", "-p", f"{name}:={value}"],
         env={**os.environ, "PATH": paths, "PYTHONPATH": str(site)}, cwd="/", capture_output=True, text=True, timeout=120,

@@ -7,7 +7,7 @@ import io
 import math
 import os
 import statistics
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -366,7 +366,7 @@ def _many(scene: Scene, count: int, environments: tuple[int, ...], device: str, 
         rows.append(Row(f"{B} x {short(count)} nodes: steps of all", together, "1/s", *ratio))
         rows.append(Row(f"{B} x {short(count)} nodes: steps of each", each, "1/s"))
         alone = alone or (B, together)
-        last = B, duration, _solver_bytes(batch.solver)
+        last = B, duration, _bytes(_arrays(batch.solver))
     return rows
 
 
@@ -388,8 +388,12 @@ def _arrays(holder: object) -> Iterator[wp.array]:
             yield from (getattr(value, name) for name in value._cls.vars if isinstance(getattr(value, name), wp.array))
 
 
-def _solver_bytes(solver: MpmSolver) -> int:
-    return sum(array.capacity for array in _arrays(solver))
+def _bytes(arrays: Iterable[wp.array]) -> int:
+    """The memory of arrays; what several of them share counts once."""
+    total = end = 0
+    for first, last in sorted((a.ptr, a.ptr + a.size * wp.types.type_size_in_bytes(a.dtype)) for a in arrays if a.ptr):
+        total, end = total + max(last - max(first, end), 0), max(end, last)
+    return total
 
 
 def _memory(scene: Scene, count: int, device: str) -> list[Row]:
@@ -397,8 +401,8 @@ def _memory(scene: Scene, count: int, device: str) -> list[Row]:
     config = PhysicsConfig(node_count=count, device=device)
     nodes = build_control_nodes(scene.model, scene.camera.position, config)
     solver = MpmSolver(nodes, config)
-    state = sum(getattr(solver.state, name).capacity for name in solver.state._cls.vars)
-    rows = [Row("state of a node", state / len(nodes), "B"), Row("solver per node", _solver_bytes(solver) / len(nodes), "B")]
+    state = _bytes(getattr(solver.state, name) for name in solver.state._cls.vars)
+    rows = [Row("state of a node", state / len(nodes), "B"), Row("solver per node", _bytes(_arrays(solver)) / len(nodes), "B")]
     for B in (1, 16):
         peak = peak_megabytes(lambda B=B: TissueBatch(nodes, config, B).step(), device)
         rows += [] if peak is None else [Row(f"{B} x {short(count)} nodes: peak memory", peak, "MB")]

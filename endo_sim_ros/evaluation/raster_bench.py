@@ -199,7 +199,7 @@ def _training(count: int, width: int, height: int, device: str, seconds: float) 
     while len(trainer.model) < count and trainer.iteration < 20:
         trainer.step()
     # Refinement is rare in a training; here it has done its part.
-    trainer.config = dataclasses.replace(config, refine_every=100)
+    trainer.config = dataclasses.replace(trainer.config, refine_every=100)
     name = f"training {short(len(trainer.model))} {width}x{height}"
     return [Row(name, 1000 / milliseconds([trainer.step], device, 3 * seconds)[0], "iterations/s")]
 

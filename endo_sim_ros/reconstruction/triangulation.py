@@ -68,7 +68,8 @@ def triangulate(frames: list[Frame], matches: list[Matches] | None = None) -> Sc
 
 def scene_points(frames: list[Frame], views: int = 24) -> ScenePoints:
     """Points of a whole recording, triangulated from so many of its views: more of the scene than those one trains on show."""
-    return triangulate(spread([frame for frame in frames if frame.mask is None or frame.mask.any()], views))
+    shown = spread([frame for frame in frames if frame.mask is None or frame.mask.any()], views)
+    return triangulate(shown) if len(shown) > 1 else ScenePoints.none()
 
 
 def points_in_view(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -328,6 +328,13 @@ def test_each_view_has_its_own_offset_where_it_sees_many_points(large):
     np.testing.assert_allclose(offsets, [-2, -3], atol=0.3)
 
 
+def test_an_offset_that_no_principal_point_explains_is_refused(large, caplog):
+    points = triangulate(list(large))
+    far = ScenePoints(2 * points.positions, points.colors, points.error)  # as of poses of twice the scale
+    assert (disparity_offsets(list(large), [stereo_disparity(frame) for frame in large], far) == 0).all()
+    assert "check poses, their scale and the baseline" in caplog.text
+
+
 def test_small_islands_of_disparity_are_no_surface(large):
     frame = large[0]
     clean = stereo_disparity(frame)

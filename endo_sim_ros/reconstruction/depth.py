@@ -18,6 +18,7 @@ log = logging.getLogger(__name__)
 
 _NEAREST = 0.02  # metres; closer than an endoscope works
 _MIN_POINTS = 30  # points needed to trust an offset or an interpolation
+_MOST_OFFSET = 0.3  # of the disparities: more is no principal point
 _MANY_POINTS = 100  # needed for an offset of one view
 _LEAST_DISPARITY = 2.0  # pixels; farther away half a pixel is more than a quarter of the depth
 _ISLAND = 0.003  # share of the image, below which a patch of disparity that is like none around it is no surface
@@ -179,8 +180,8 @@ def disparity_offsets(frames: list[Frame], disparities: list[np.ndarray | None],
     """Constants [V] to add to the stereo disparities (pixels) of views so that they agree with scene points.
 
     A wrong principal point of one eye shifts every disparity by the same amount, an error of the poses or the baseline
-    those of one view. A view has an offset of its own where it sees points enough; all are zero when too few points are seen, or
-    when their common offset is within the scatter that explains it by chance. A point counts the less the farther a pixel's
+    those of one view. A view has an offset of its own where it sees points enough; all are zero when too few points are seen,
+    when their common offset is within the scatter that explains it by chance, or so large that the poses must be wrong. A point counts the less the farther a pixel's
     error moves it.
     """
     residuals, weights = [np.empty(0)] * len(frames), [np.empty(0)] * len(frames)
@@ -201,6 +202,11 @@ def disparity_offsets(frames: list[Frame], disparities: list[np.ndarray | None],
     offset = _weighted_median(residual, weight)
     spread = 1.4826 * _weighted_median(np.abs(residual - offset), weight)
     if abs(offset) < max(0.25, 3 * spread * np.sqrt((weight**2).sum()) / weight.sum()):
+        return np.zeros(len(frames))
+    typical = float(np.median(np.concatenate([d[d > 0] for d in disparities if d is not None])))
+    if abs(offset) > _MOST_OFFSET * typical:
+        text = "stereo disparity, %.1f pixels, and the poses are %.1f pixels apart: left as it is; check poses, their scale and the baseline"
+        log.warning(text, typical, abs(offset))
         return np.zeros(len(frames))
     worth = [w.sum() * MATCHED**2 for w in weights]  # in points of no error
     offsets = [_weighted_median(r, w) if n > _MANY_POINTS else offset for r, w, n in zip(residuals, weights, worth)]

@@ -180,9 +180,9 @@ def disparity_offsets(frames: list[Frame], disparities: list[np.ndarray | None],
     """Constants [V] to add to the stereo disparities (pixels) of views so that they agree with scene points.
 
     A wrong principal point of one eye shifts every disparity by the same amount, an error of the poses or the baseline
-    those of one view. A view has an offset of its own where it sees points enough; all are zero when too few points are seen,
-    when their common offset is within the scatter that explains it by chance, or so large that the poses must be wrong. A point counts the less the farther a pixel's
-    error moves it.
+    those of one view. A view has an offset of its own where it sees points enough; all are zero when too few points are
+    seen, when their common offset is within the scatter that explains it by chance, or so large that the poses must be
+    wrong. A point counts the less the farther a pixel's error moves it.
     """
     residuals, weights = [np.empty(0)] * len(frames), [np.empty(0)] * len(frames)
     for i, (frame, disparity) in enumerate(zip(frames, disparities)):
@@ -205,7 +205,7 @@ def disparity_offsets(frames: list[Frame], disparities: list[np.ndarray | None],
         return np.zeros(len(frames))
     typical = float(np.median(np.concatenate([d[d > 0] for d in disparities if d is not None])))
     if abs(offset) > _MOST_OFFSET * typical:
-        text = "stereo disparity, %.1f pixels, and the poses are %.1f pixels apart: left as it is; check poses, their scale and the baseline"
+        text = "stereo disparity, %.1f pixels, and the poses are %.1f pixels apart: left so; check poses, their scale and the baseline"
         log.warning(text, typical, abs(offset))
         return np.zeros(len(frames))
     worth = [w.sum() * MATCHED**2 for w in weights]  # in points of no error

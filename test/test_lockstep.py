@@ -212,6 +212,26 @@ def test_an_image_may_wait_for_the_camera_of_its_stamp(graph):
     assert stamps(graph, IMAGES)[-1] == MODEL_STAMP
     graph.refused("rendering_node", "what waited for its pose", "0.040000 s")
 
+    def commanded(k: int, x: float) -> None:
+        pose = np.eye(4)
+        pose[0, 3] = x
+        graph.publish(messages.CAMERA_POSE, messages.encode_pose(pose, k * STEP, "world"))
+        command(graph, k * STEP)
+
+    show, rendering._show_states = rendering._show_states, lambda: None  # it lags: the next episode begins before it shows this one
+    for k in (1, 2, 3):
+        commanded(k, 0.01 * k)
+    graph.spin(0.3)
+    assert graph.call(Trigger, "/physics_node/reset").success
+    commanded(1, 0.05)
+    graph.spin(0.3)
+    rendering._show_states = show
+    commanded(2, 0.06)
+    await_images(graph, 13)
+    assert stamps(graph, IMAGES)[-6:] == [STEP, 2 * STEP, 3 * STEP, MODEL_STAMP, STEP, 2 * STEP]
+    shown = [messages.decode_pose(message, "world", "")[0, 3] for message in graph.heard["rendered/camera_pose"][-6:]]
+    assert shown[:3] + shown[4:] == pytest.approx([0.01, 0.02, 0.03, 0.05, 0.06])
+
 
 def test_mistakes_in_stamps_are_told_and_the_next_command_acts(graph):
     command(graph, 100)

@@ -57,7 +57,8 @@ class RenderingNode(EndoNode):
         self._training_pose: np.ndarray | None = None
         self._info: CameraInfo | None = None
         self._training_info: CameraInfo | None = None
-        self._states: deque[tuple[int, ControlNodeCloud]] = deque()  # lockstep: stamps and states still to be shown
+        # Lockstep: stamps and states still to be shown, with their poses if a reset came since.
+        self._states: deque[tuple[int, ControlNodeCloud, np.ndarray | None]] = deque()
         self._poses: dict[int, np.ndarray] = {}  # lockstep_camera: poses that wait for their state, by stamp
         self._pacer = Pacer()
         self._dirty, self._images, self._last_image = True, 0, 0.0
@@ -110,9 +111,8 @@ class RenderingNode(EndoNode):
         last, self._nodes, self._nodes_stamp = self._nodes_stamp, nodes, messages.stamp_to_ns(message.header.stamp)
         if self._lockstep:
             if self._nodes_stamp == nodes.model_stamp_ns and old is not None and old.model_stamp_ns == nodes.model_stamp_ns:
-                self._poses = {stamp: pose for stamp, pose in self._poses.items() if stamp <= last}  # reset: no state will want others
-                self._forget_waiting()
-            self._states.append((self._nodes_stamp, nodes))
+                self._end_episode(last)
+            self._states.append((self._nodes_stamp, nodes, None))
             if len(self._states) > MOST_WAITING:
                 self._states.popleft()
                 raise MessageError(f"{messages.CONTROL_NODES.name}: over {MOST_WAITING} states wait to be shown; one is left out")
@@ -195,40 +195,46 @@ class RenderingNode(EndoNode):
     def _show_states(self) -> None:
         """Lockstep: one image for each state, in order, as soon as its model and its camera are there."""
         while self._states and self._tissue.bound is not None:
-            stamp, nodes = self._states[0]
+            stamp, nodes, pose = self._states[0]
             if nodes.model_stamp_ns not in (self._tissue.bound.model_stamp, self._tissue.model_stamp):
                 self._leave_out("belongs to a model that is gone")
                 continue
             camera = self._camera()
-            if self._lacks_pose(stamp, nodes):
+            if self._lacks_pose(*self._states[0]):
                 if not any(other > stamp for other in self._poses):
                     return
                 self._leave_out(f"has no pose with its stamp on {messages.CAMERA_POSE.name}")
                 continue
             at_rest = stamp == nodes.model_stamp_ns  # the first observation
             if self._options.lockstep_camera and not at_rest:
-                camera = camera and replace(camera, pose=self._poses[stamp])
+                camera = camera and replace(camera, pose=self._poses[stamp] if pose is None else pose)
             if not self._tissue.bound.follows(nodes) or not camera or not self._tissue.knows_cut(nodes):
                 return
             self._states.popleft()
-            for old in [other for other in self._poses if other <= stamp and not at_rest]:
-                del self._poses[old]
+            if pose is None and not at_rest:
+                self._poses = {other: later for other, later in self._poses.items() if other > stamp}
             self._publish(*self._render(self._tissue.bound, nodes, camera), stamp)
 
-    def _lacks_pose(self, stamp: int, nodes: ControlNodeCloud) -> bool:
+    def _lacks_pose(self, stamp: int, nodes: ControlNodeCloud, pose: np.ndarray | None) -> bool:
         """Lockstep: whether a state still waits for its camera; the one at rest does not, as nobody sends one for it."""
-        return self._options.lockstep_camera and stamp != nodes.model_stamp_ns and stamp not in self._poses
+        wanted = self._options.lockstep_camera and stamp != nodes.model_stamp_ns
+        return wanted and pose is None and stamp not in self._poses
 
-    def _forget_waiting(self) -> None:
-        """Leave out the states whose cameras did not come before a reset: the first observation must not wait for them."""
-        waiting = [stamp for stamp, nodes in self._states if self._lacks_pose(stamp, nodes)]
-        self._states = deque(state for state in self._states if not self._lacks_pose(*state))
+    def _end_episode(self, last: int) -> None:
+        """A reset: states that still wait to be shown keep their poses, as the same stamps come again; those without are left out.
+
+        No state will want poses later than the last stamp.
+        """
+        waiting = [state[0] for state in self._states if self._lacks_pose(*state)]
+        states = [state for state in self._states if not self._lacks_pose(*state)]
+        self._states = deque((stamp, nodes, self._poses.pop(stamp, None) if pose is None else pose) for stamp, nodes, pose in states)
+        self._poses = {stamp: pose for stamp, pose in self._poses.items() if stamp <= last}
         if waiting:
             which = ", ".join(f"{stamp * 1e-9:.6f} s" for stamp in waiting)
             self.report_error(f"reset: what waited for its pose on {messages.CAMERA_POSE.name} is not shown, the state of {which}")
 
     def _leave_out(self, why: str) -> None:
-        stamp, _ = self._states.popleft()
+        stamp = self._states.popleft()[0]
         self.report_error(f"the state of {stamp * 1e-9:.6f} s is not shown: it {why}")
 
     def _build(self) -> None:

@@ -351,7 +351,7 @@ def test_small_islands_of_disparity_are_no_surface(large):
 
 def test_views_correct_each_others_depth(large):
     frames = with_depth_prior(list(large), NO_POINTS, options(depth="stereo"))
-    corrected, contradiction = agreed(frames, NO_POINTS)
+    corrected, contradiction = agreed(frames, NO_POINTS, matched=True)
     error = lambda views: np.median(np.concatenate([np.abs(v.depth - e.depth)[v.depth > 0] for v, e in zip(views, large)]))
     assert error(corrected) < 0.8 * error(frames)
     assert contradiction < 0.2
@@ -371,7 +371,7 @@ def test_scene_points_correct_the_depth_around_them(large):
     off = dataclasses.replace(frame, depth=frame.depth * np.float32(1.04), right=None, baseline=None)
     v, u = np.mgrid[8:512:16, 8:640:16].reshape(2, -1)
     positions = frame.camera.backproject(frame.depth)[v, u]
-    (corrected,), contradiction = agreed([off], ScenePoints(positions, np.zeros_like(positions), 0.002))
+    (corrected,), contradiction = agreed([off], ScenePoints(positions, np.zeros_like(positions), 0.002), matched=False)
     assert np.median(np.abs(corrected.depth / frame.depth - 1)) < 0.01
     assert np.isnan(contradiction)  # one view contradicts none
 

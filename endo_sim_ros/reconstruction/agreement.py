@@ -13,7 +13,7 @@ from endo_sim_ros.cameras import Camera
 from endo_sim_ros.device import map_in_threads
 from endo_sim_ros.reconstruction.depth import MATCHED
 from endo_sim_ros.reconstruction.surroundings import filled
-from endo_sim_ros.reconstruction.triangulation import ScenePoints
+from endo_sim_ros.reconstruction.triangulation import ScenePoints, neighbours
 from endo_sim_ros.sequences.frames import Frame
 
 _NEIGHBOURS = 4  # views that each view is compared with: the nearest in space
@@ -34,7 +34,7 @@ _REACH = 15  # side of the square that a scene point speaks for
 _SMOOTH = 12.0  # standard deviation over which corrections are carried to pixels without
 
 
-def agreed(frames: list[Frame], points: ScenePoints) -> tuple[list[Frame], float]:
+def agreed(frames: list[Frame], points: ScenePoints, matched: bool) -> tuple[list[Frame], float]:
     """The frames with depth corrected, in their holes as little as before, by scene points and by what neighbouring views show,
     and by how many pixels the views contradict each other all the same.
 
@@ -46,12 +46,13 @@ def agreed(frames: list[Frame], points: ScenePoints) -> tuple[list[Frame], float
     the same.
 
     Args:
-        frames: Views with a depth prior, of matching with the right image where there is one.
+        frames: Views with a depth prior.
         points: Scene points.
+        matched: Whether the prior is of matching with the right images, whose error is known, or of less.
     """
-    plain = [_plain(frame) for frame in frames]
     tissue = [np.ones(frame.image.shape[:2], np.float32) if frame.mask is None else np.float32(frame.mask > 0) for frame in frames]
-    centres = np.array([frame.camera.position for frame in frames])
+    plain = [_plain(frame, shown) for frame, shown in zip(frames, tissue)]
+    near = neighbours(frames, _NEIGHBOURS)
 
     def corrected(i: int) -> tuple[Frame, list[tuple[float, float]]]:
         frame, camera, contradictions = frames[i], frames[i].camera, []
@@ -60,14 +61,15 @@ def agreed(frames: list[Frame], points: ScenePoints) -> tuple[list[Frame], float
         known = frame.depth > 0
         inverse = filled((known / np.where(known, frame.depth, 1)).astype(np.float32)[..., None], known)[..., 0]
         total, weight = _of_points(frame, inverse, points)
-        for j in np.argsort(np.linalg.norm(centres - centres[i], axis=1), kind="stable")[: _NEIGHBOURS + 1]:
+        for j in near[i]:
             if j != i:
                 found = _of_view(camera, inverse, plain[i], tissue[i], frames[j].camera, plain[j], tissue[j])
                 if found is not None:
                     correction, precision, *contradiction = found
                     total, weight = total + precision * correction, weight + precision
                     contradictions.append(contradiction)
-        error = _GUESSED * inverse if frame.baseline is None else MATCHED / (camera.K[0, 0] * frame.baseline)
+        known_error = matched and frame.baseline is not None
+        error = MATCHED / (camera.K[0, 0] * frame.baseline) if known_error else _GUESSED * inverse
         correction, trust = total / np.maximum(weight, 1e-12), weight / (weight + 1 / error**2)
         blur = lambda values: cv2.GaussianBlur(values.astype(np.float32), (0, 0), _SMOOTH * camera.width / 640)
         around = blur(trust)
@@ -93,10 +95,9 @@ def _smooth(inverse: np.ndarray, width: int) -> np.ndarray:
     return np.float32(np.median(inverse)) * smooth
 
 
-def _plain(frame: Frame) -> np.ndarray:
-    """Grey image [H, W] uint8 freed of light and contrast, which differ between views."""
+def _plain(frame: Frame, tissue: np.ndarray) -> np.ndarray:
+    """Grey image [H, W] uint8, where there is tissue [H, W], freed of light and contrast, which differ between views."""
     grey = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    tissue = np.ones_like(grey) if frame.mask is None else np.float32(frame.mask > 0)
     blur = lambda values: cv2.GaussianBlur(values, (0, 0), _LOCAL * frame.camera.width / 640)
     share = np.maximum(blur(tissue), 1e-3)
     mean = blur(grey * tissue) / share

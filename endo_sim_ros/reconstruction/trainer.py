@@ -121,7 +121,7 @@ class Trainer:
         frames = [shrink(frame, config.image_width) for frame in frames]
         correcting = config.agreement and source not in ("topic", "none")
         if correcting or not config.iterations:
-            corrected, contradiction = agreed(frames, points)
+            corrected, contradiction = agreed(frames, points, matched=source == "stereo")
             if correcting:
                 frames = corrected
             if not config.iterations:

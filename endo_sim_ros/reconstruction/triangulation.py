@@ -233,11 +233,11 @@ def _distance_from_epipolar(first: Frame, second: Frame, uv1: np.ndarray, uv2: n
     return np.where((z_near > 0) & (z_far > 0), distance, np.inf)
 
 
-def neighbours(frames: list[Frame]) -> np.ndarray:
-    """Indices [V, up to 4] of the views nearest to each in space, mostly itself among them."""
+def neighbours(frames: list[Frame], count: int = _NEIGHBOURS) -> np.ndarray:
+    """Indices [V, up to count + 1] of the views nearest to each in space, mostly itself among them."""
     centres = np.array([frame.camera.position for frame in frames])
     distance = np.linalg.norm(centres[:, None] - centres, axis=2)
-    return np.argsort(distance, axis=1, kind="stable")[:, : _NEIGHBOURS + 1]
+    return np.argsort(distance, axis=1, kind="stable")[:, : count + 1]
 
 
 def _pairs(frames: list[Frame]) -> list[tuple[int, int]]:

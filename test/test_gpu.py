@@ -30,6 +30,16 @@ def sheet(count: int = 20_000) -> GaussianModel:
     return GaussianModel(points, quats, scales, torch.randn(count, generator=g), model.sh)
 
 
+def test_prepared_tissue_has_nothing_left_to_make_ready_when_it_is_first_touched(monkeypatch):
+    simulation = TissueSimulation(sheet(), np.zeros(3), PhysicsConfig(device="cuda", node_count=500))
+    simulation.prepare()
+    monkeypatch.setattr(mpm.wp, "load_module", lambda *_, **__: pytest.fail("kernels are loaded only now"))
+    monkeypatch.setattr(mpm.wp, "ScopedCapture", lambda *_, **__: pytest.fail("the step is recorded only now"))
+    assert simulation.set_wrench("pull", TIP, [0.0, 0.0, -0.3])
+    simulation.step()
+    assert np.abs(simulation.state().positions - simulation.nodes.rest).max() > 1e-6
+
+
 def test_rasteriser_images_and_gradients_agree():
     results = {}
     for device in ("cpu", "cuda"):

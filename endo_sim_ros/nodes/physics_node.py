@@ -536,8 +536,9 @@ def _poll(config: PhysicsConfig) -> float:
 
 
 def _tissue(model: GaussianModel, viewpoint: np.ndarray, config: PhysicsConfig, cameras: list[Camera]) -> TissueSimulation:
-    """Tissue that is ready for the first cut: that would make a step late otherwise."""
+    """Tissue that is ready for the first tool and the first cut: they would make a step late otherwise."""
     simulation = TissueSimulation(model, viewpoint, config, cameras)
+    simulation.prepare()
     if config.kinematics == "rest" and not config.dense:
         simulation.prepare_cutting()
     return simulation

@@ -332,10 +332,14 @@ class MpmSolver:
         with on_torch_stream(self.device):
             wp.launch(launch.kernel, launch.dim, launch.inputs, device=self.device, block_dim=launch.block)
 
-    def step(self) -> None:
-        """Take one step in every environment."""
+    def prepare(self) -> None:
+        """Make ready now what the next step would otherwise begin with: on a GPU its recording, and at first its kernels."""
         if self._advance is None:
             self._advance = self._prepare()
+
+    def step(self) -> None:
+        """Take one step in every environment."""
+        self.prepare()
         with on_torch_stream(self.device):
             self._advance()
 

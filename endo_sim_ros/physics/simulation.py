@@ -268,6 +268,10 @@ class TissueSimulation:
                 self.solver.set_cut(self._stencils.table())
             self._disturbed = True
 
+    def prepare(self) -> None:
+        """Make the first step ready now; a tool would otherwise wait for it (on a GPU, for seconds when kernels are compiled)."""
+        self.solver.prepare()
+
     def prepare_cutting(self) -> None:
         """Find the links between nodes now, which the first cut would otherwise wait for (a tenth of a second), and on a GPU load
         the kernels for tissue that cuts have divided too much for one launch (many seconds, when they are compiled).

@@ -1,5 +1,6 @@
 """A policy that works on a task over topics, in lockstep: the observations and actions are those of the environment in one process."""
 
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -15,6 +16,7 @@ from endo_sim_ros.learning.tasks import find_task, make_task
 from endo_sim_ros.nodes.base import OK, WARN, EndoNode, arm_names, run
 
 _OPEN, _CLOSED = 1.0, 0.0  # rad
+_PATIENCE = 30.0  # seconds; a request to a physics_node that was killed just now is never answered
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,8 @@ class PolicyNode(EndoNode):
         self._rows: list[tuple[np.ndarray, np.ndarray, float, bool, int]] = []
         self.subscribe(messages.CONTROL_NODES, self._on_nodes)
         self.subscribe(messages.tool_reaction(arm), self._on_reaction)
-        self._asked: Any = None  # the reset that was asked for last
+        self._asked: Any = None  # the reset that was asked for last, and when
+        self._asked_at = 0.0
         self._begin()
         self.every(0.5, self._ask)
 
@@ -85,7 +88,7 @@ class PolicyNode(EndoNode):
 
     def _ask(self) -> None:
         """Reset the tissue; again and again until its state at rest is heard, as there may be no model or no connection yet."""
-        if self._stamp != 0 or self._asked is not None and not self._asked.done():
+        if self._stamp != 0 or self._asked is not None and not self._asked.done() and time.monotonic() - self._asked_at < _PATIENCE:
             return
         listening = all(publisher.get_subscription_count() for publisher in (self._pose_pub, self._jaw_pub))
         if not (listening and self._resetting.service_is_ready()):
@@ -93,7 +96,7 @@ class PolicyNode(EndoNode):
             return
         self._state = "waiting for the tissue of the scene"
         self._heard.pop("reset", None)
-        self._asked = self._resetting.call_async(Trigger.Request())
+        self._asked, self._asked_at = self._resetting.call_async(Trigger.Request()), time.monotonic()
         self._asked.add_done_callback(self._on_reset)
 
     def _on_reset(self, future: Any) -> None:

@@ -11,6 +11,7 @@ from endo_sim_ros.cameras import Camera
 from endo_sim_ros.config import Range, StageConfig
 from endo_sim_ros.device import pick_device
 from endo_sim_ros.gaussians import SH_C0, GaussianModel
+from endo_sim_ros.light import Light
 from endo_sim_ros.physics.skinning import Skinning
 from endo_sim_ros.pictures import shade, to_bytes
 from endo_sim_ros.splatting import render, sh_basis
@@ -71,10 +72,16 @@ class DeformableRenderer:
 
     @torch.no_grad()
     def render(
-        self, camera: Camera, positions: np.ndarray | None = None, F: np.ndarray | None = None, *, depth: bool = True
+        self,
+        camera: Camera,
+        positions: np.ndarray | None = None,
+        F: np.ndarray | None = None,
+        *,
+        depth: bool = True,
+        light: Light | None = None,
     ) -> tuple[np.ndarray, np.ndarray | None]:
         """RGB image [H, W, 3] uint8 and, if asked for, depth [H, W] float32 (m, 0 = no surface) for nodes at positions [M, 3]
-        with F [M, 3, 3]."""
+        with F [M, 3, 3], in another light than the model's if one is given."""
         model, covars = self.model, None
         if positions is not None:
             means, covars = self.deform(positions, F)
@@ -82,8 +89,9 @@ class DeformableRenderer:
             model = GaussianModel(means, model.quats, model.log_scales, model.logit_opacities, sh)
         output = render(model, camera, background=self._background, covars=covars)
         colors, alpha = output.colors[0], output.alphas[0]
-        if self.model.light is not None:
-            colors = shade(self.model.light, colors, output.depths[0], alpha, camera)
+        light = light or self.model.light
+        if light is not None:
+            colors = shade(light, colors, output.depths[0], alpha, camera)
         image = to_bytes(colors).cpu().numpy()
         if not depth:
             return image, None

@@ -10,6 +10,7 @@ import signal
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from endo_sim_ros.cameras import Camera, look_at
 from endo_sim_ros.config import ConfigError
@@ -19,8 +20,11 @@ from endo_sim_ros.evaluation.evaluate import evaluate, open_named
 from endo_sim_ros.evaluation.held_out import FIGURES, measure, seen_pixels
 from endo_sim_ros.evaluation.page import write_page
 from endo_sim_ros.evaluation.splits import explain_split, right_views, split_views
+from endo_sim_ros.evaluation.touched import touched_psnr
 from endo_sim_ros.evaluation.workers import Finished, News, run_in_processes
+from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.sequences.frames import SequenceError
+from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
 SMALL = "phantom:0,frames=6,width=96,height=80"
 
@@ -310,3 +314,23 @@ def test_the_page_needs_nothing_else_and_sorts_and_slides(run, chromium):
 def test_a_folder_without_results_is_an_error(tmp_path):
     with pytest.raises(ValueError, match="no results of an evaluation .* give the --out of"):
         write_page(tmp_path)
+
+
+def test_layers_of_other_colours_come_apart_when_touched_and_a_surface_does_not():
+    (frame,) = phantom_sequence(PhantomConfig(frames=1, width=160, height=128, stereo=False))
+    points = torch.from_numpy(frame.camera.backproject(frame.depth).reshape(-1, 3)).float()
+    colors, radii = torch.from_numpy(frame.image.reshape(-1, 3) / 255.0).float(), torch.full((len(points),), 4e-4)
+    surface = GaussianModel.from_points(points, colors, radii, opacity=0.95)
+    ahead = torch.from_numpy(frame.camera.pose[:3, 2]).float()
+    striped = torch.sign(torch.sin(4e3 * points[:, :1]))
+    front, behind = (
+        GaussianModel.from_points(points + step * ahead, colors + shift * striped, radii, opacity=opacity)
+        for step, shift, opacity in ((0.0, 0.3, 0.3), (0.003, -0.2, 0.9))
+    )
+    layers = GaussianModel(**{name: torch.cat([tensor, behind.tensors()[name]]) for name, tensor in front.tensors().items()})
+    found = [touched_psnr(model, [frame.camera], "cpu") for model in (surface, layers)]
+    assert found[0] > 28 and found[1] < found[0] - 1
+    kilometres = dataclasses.replace(surface, means=1000 * surface.means, log_scales=surface.log_scales + np.log(1000))
+    pose = frame.camera.pose.copy()
+    pose[:3, 3] *= 1000
+    assert np.isnan(touched_psnr(kilometres, [frame.camera.at(pose)], "cpu"))

@@ -14,7 +14,7 @@ from endo_sim_ros.gaussians import GaussianModel, ModelError, load_ply, save_ply
 from endo_sim_ros.light import Light, directions, falloff, features, features_at, log_brightness
 from endo_sim_ros.messages import MessageError
 from endo_sim_ros.pictures import shade, to_bytes
-from endo_sim_ros.reconstruction.photometry import PRIOR, fit_exposure, fit_light, unlit
+from endo_sim_ros.reconstruction.photometry import PRIOR, Drift, fit_exposure, fit_light, unlit
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.frames import Frame
 
@@ -127,10 +127,28 @@ def test_without_two_views_of_a_point_the_prior_counts():
 def test_the_response_of_the_exposure_is_found_where_brightness_varies(response):
     brightness = np.linspace(-1, 1, 6)
     exposures = np.stack([0.2 * c - response * brightness for c in range(3)], 1)
-    found, levels = fit_exposure(exposures, brightness)
+    found, levels, residuals = fit_exposure(exposures, brightness)
     assert found == pytest.approx(response, abs=0.01)
     np.testing.assert_allclose(levels, [0, 0.2, 0.4], atol=1e-9)
+    np.testing.assert_allclose(residuals, 0, atol=0.01)
     assert fit_exposure(exposures[:1], brightness[:1])[0] == 0.9  # one view tells nothing
+
+
+def test_what_brightness_does_not_explain_of_the_exposures_is_taken_as_time_has_it():
+    brightness, darker = np.array([-0.5, 0.5, 0.0]), np.array([0.3, 0.0, -0.3])  # in the order of time: third, second, first
+    exposures = (darker - 0.9 * brightness)[:, None] + np.zeros(3)
+    response, levels, residuals = fit_exposure(exposures, brightness)
+    light = dataclasses.replace(LAMP, response=response, **dict(zip(("level_r", "level_g", "level_b"), levels)))
+    drift = Drift([30, 20, 10], residuals)
+    for stamp, own, seen in zip(drift.stamps_ns, exposures, brightness):
+        then = drift.at(light, stamp)
+        np.testing.assert_allclose(np.array([then.level_r, then.level_g, then.level_b]) - response * seen, own, atol=1e-9)
+    between = (drift.at(light, 10).level_g + drift.at(light, 20).level_g) / 2
+    assert drift.at(light, 15).level_g == pytest.approx(between)
+    assert drift.at(light, 5) == drift.at(light, 10) and drift.at(light, 99) == drift.at(light, 30)
+    assert drift.at(None, 15) is None
+    at_once = Drift([10, 10, 20], residuals)
+    assert at_once.at(light, 10).level_r == pytest.approx(light.level_r + residuals[:2, 0].mean())
 
 
 def test_the_light_travels_with_the_model(tmp_path):

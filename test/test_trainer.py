@@ -129,6 +129,40 @@ def test_steep_gaussians_are_split_or_doubled_and_dead_ones_go():
     assert len(limited) == 58
 
 
+def test_gaussians_are_to_have_the_colour_that_is_seen_where_they_lie():
+    K, viewmat = torch.tensor([[10.0, 0, 8], [0, 10, 8], [0, 0, 1]]), torch.eye(4)
+    points = torch.tensor([[0.0, 0, 1], [0, 0, 1.5], [3, 0, 1], [0.5, 0, 1], [0, 0, -1]])  # seen, hidden, outside, masked, behind
+    model = GaussianModel.from_points(points, torch.full((5, 3), 0.6), torch.full((5,), 0.01), opacity=0.5)
+    model.sh.requires_grad_()
+    target, mask = torch.full((16, 16, 3), 0.2), torch.ones(16, 16)
+    target[8, 8], mask[:, 12:] = torch.tensor([0.5, 1.0, 0.8]), 0
+    loss = losses.color_in_place(model, viewmat, K, target, torch.full((16, 16, 1), 2.0), torch.ones(16, 16), mask, 0.02)
+    assert float(loss.detach()) == pytest.approx(0.5 * np.mean([1.2 - 0.5, 1.2 - 1.0, 1.2 - 0.8]))
+    loss.backward()
+    assert (model.sh.grad[0] > 0).all() and not model.sh.grad[1:].any()
+
+
+def test_what_no_view_shows_is_left_as_it_was(views):
+    for confined in (True, False):
+        options = {"confined": confined, "iterations": 60, "max_gaussians": 2000, "refine_every": 1000, "depth": "topic"}
+        trainer = Trainer(views[:2], ReconstructionConfig(**options, device="cpu"))
+        before, unseen = trainer.model, ~trainer._shown.bool()
+        assert 0.05 < unseen.float().mean() < 0.5
+        trainer.run()
+        changed = (trainer.model.sh != before.sh).flatten(1).any(1)
+        assert changed[~unseen].float().mean() > 0.8
+        assert bool(changed[unseen].any()) != confined
+
+
+def test_exposures_and_colours_do_not_drift_against_each_other(views):
+    trainer = Trainer(views, ReconstructionConfig(iterations=40, max_gaussians=2000, depth="topic", device="cpu"))
+    before = trainer._light["exposures"].detach().clone()
+    trainer.run()
+    after = trainer._light["exposures"].detach()
+    assert (after - before).abs().max() > 1e-5
+    np.testing.assert_allclose(after.mean(0), before.mean(0), atol=1e-6)
+
+
 def test_unpooling_fills_gaps_halfway_to_the_neighbours():
     model = cloud()
     model.means[0] = torch.tensor([3.0, 3.0, 3.0])

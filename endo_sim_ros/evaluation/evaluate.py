@@ -31,6 +31,7 @@ from endo_sim_ros.evaluation.config import EvaluationConfig
 from endo_sim_ros.evaluation.held_out import difference, mean_figures, measure, model_renderer, seen_pixels
 from endo_sim_ros.evaluation.lpips import Lpips, WeightsError
 from endo_sim_ros.evaluation.splits import STEREO, Split, check_split, right_views, split_views
+from endo_sim_ros.evaluation.touched import touched_psnr
 from endo_sim_ros.evaluation.workers import Finished, News, ray_is_installed, run_in_processes, run_in_ray
 from endo_sim_ros.reconstruction import ReconstructionConfig, ScenePoints, Trainer, scene_points, shrink
 from endo_sim_ros.reconstruction.depth import with_depth_prior
@@ -390,7 +391,7 @@ def _job(argument: tuple, device: str, report: Callable[[Any], None]) -> dict[st
         training.update(_train(views, config, prepared.points, spread(held_out, _CURVE_VIEWS), cell.curve, report))
 
     memory = peak_megabytes(train, device)
-    model = training.pop("model")
+    model, drift = training.pop("model"), training.pop("drift")
     report((0, len(held_out), "measuring"))
     networks = [_network(name, weights, device) for name in cell.lpips]
     seen_by = [shrink(prepared.frames[index], config.image_width) for index in split.train]
@@ -407,11 +408,13 @@ def _job(argument: tuple, device: str, report: Callable[[Any], None]) -> dict[st
         row = {"view": number} | {name: value for name, value in found.items() if np.isfinite(value)}
         return row, _pictures(number, image, depth, frame) if index in shown else {}
 
+    touched = {"psnr_touched": touched_psnr(model, [view.camera for view in seen_by], device)}
+    touched = {name: value for name, value in touched.items() if np.isfinite(value)}
     rows, pictures = [], {}
     with ThreadPoolExecutor(cpu_threads()) as pool:  # measuring takes longer than drawing
         waiting = deque()
         for index, frame in enumerate(held_out):
-            waiting.append(pool.submit(of_view, index, *renderer.render(frame.camera)))
+            waiting.append(pool.submit(of_view, index, *renderer.render(frame.camera, light=drift.at(model.light, frame.stamp_ns))))
             while len(waiting) > 2 * cpu_threads() or waiting and index == len(held_out) - 1:
                 row, new = waiting.popleft().result()
                 rows.append(row)
@@ -429,7 +432,7 @@ def _job(argument: tuple, device: str, report: Callable[[Any], None]) -> dict[st
             *["recorded depth"] * any(view.depth is not None for view in views),
         ],
         "seen_by": "reference" if known else "model",
-        "figures": mean_figures(rows) | {"seconds": training["seconds"], "gaussians": len(model), "megabytes": memory},
+        "figures": mean_figures(rows) | touched | {"seconds": training["seconds"], "gaussians": len(model), "megabytes": memory},
         "views": rows,
         "curve": training["curve"],
         "pictures": pictures,
@@ -468,8 +471,10 @@ def _train(
         while due and progress.iteration >= due[0]:
             due.pop(0)
         paused = now()
-        renderer = model_renderer(trainer.model, config.device)
-        pairs = [(renderer.render(probe.camera)[0], probe.image, probe.mask) for probe in probes]
+        model, drift = trainer.model, trainer.drift
+        renderer = model_renderer(model, config.device)
+        drawn = lambda probe: renderer.render(probe.camera, light=drift.at(model.light, probe.stamp_ns))[0]
+        pairs = [(drawn(probe), probe.image, probe.mask) for probe in probes]
         curve.append(
             {
                 "iteration": progress.iteration,
@@ -481,7 +486,8 @@ def _train(
         away += now() - paused
 
     model = trainer.run(on_progress, every=max(min(20, iterations // 50), 1))
-    return {"model": model, "seconds": now() - start - away, "curve": curve}
+    seconds = now() - start - away
+    return {"model": model, "drift": trainer.drift, "seconds": seconds, "curve": curve}
 
 
 def _pictures(view: int, image: np.ndarray, depth: np.ndarray, frame: Frame) -> dict[str, bytes]:

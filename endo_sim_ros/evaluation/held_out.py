@@ -167,11 +167,11 @@ def reconstruct_and_measure(bag: Path, out: Path, config: ReconstructionConfig, 
     if not held_out:
         log.info("no view was held out that shows tissue%s", "; lower keyframes" if len(chosen) > 1 else "")
         return {}
-    renderer = model_renderer(model, config.device)
+    renderer, drift = model_renderer(model, config.device), trainer.drift
     rows, pictures = [], []
     shown = {int(i) for i in np.linspace(0, len(held_out) - 1, min(_STRIPS, len(held_out)))}
     for index, frame in enumerate(held_out):
-        image, depth = renderer.render(frame.camera)
+        image, depth = renderer.render(frame.camera, light=drift.at(model.light, frame.stamp_ns))
         rows.append(measure(image, depth, frame))
         if index in shown:
             pictures += [

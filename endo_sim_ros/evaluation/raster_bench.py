@@ -195,7 +195,7 @@ def _training(count: int, width: int, height: int, device: str, seconds: float) 
     """Iterations per second of a training, each with a training view and a virtual view, losses and optimiser."""
     frames = list(phantom_sequence(PhantomConfig(frames=8, width=width, height=height)))
     size = {"max_gaussians": count, "image_width": width, "growth": 1.0, "refine_every": 1}
-    config = ReconstructionConfig(**size, virtual_every=1, lambda_dist=0.1, device=device)
+    config = ReconstructionConfig(**size, virtual_every=1, lambda_dist=0.1, lambda_tv=0.5, device=device)
     trainer = Trainer(frames, config)
     while len(trainer.model) < count and trainer.iteration < 20:
         trainer.step()

@@ -166,7 +166,6 @@ def _touch_over_dds(
             image_width=width,
             iterations=iterations,
             max_gaussians=30_000,
-            virtual_every=2,
         )
         graph.start("physics_node", arms=[_ARM])
         graph.start("rendering_node", image_width=width, idle_rate=1.0)

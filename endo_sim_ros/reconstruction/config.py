@@ -37,6 +37,9 @@ class ReconstructionConfig(StageConfig):
     surroundings: Annotated[float, Range(0, 1)] = 0.3
     """How far tissue goes on, coarsely, beyond what the training views see, in widths of the image, so that other views do
     not look into the void; holes of the depth prior are filled likewise. 0 = neither."""
+    confined: bool = True
+    """Views change only Gaussians whose centres lie in one of them: others, which reach in from outside, would take on colours
+    that suit the views' edges alone, and which other views see as fringes."""
     depth_tolerance: Annotated[float, Range(0.001, 1)] = 0.05
     """Relative depth difference at which two views contradict each other."""
     still: bool = True
@@ -47,14 +50,18 @@ class ReconstructionConfig(StageConfig):
     """Weight of the depth loss, in units of the scene's median depth (paper eq. 4)."""
     lambda_dist: Annotated[float, Range(0, 1000)] = 0.0
     """Weight of the distortion loss, in units of the scene's median depth (paper eq. 5)."""
-    lambda_tv: Annotated[float, Range(0, 1000)] = 0.5
+    lambda_tv: Annotated[float, Range(0, 1000)] = 0.0
     """Weight of the total variation of the rendered depth, in units of the scene's median depth (paper eq. 6)."""
     lambda_pearson: Annotated[float, Range(0, 1000)] = 0.0
     """Weight of 1 − correlation of depth and prior, in training views and in virtual ones to which the prior is carried (FSGS)."""
     lambda_flat: Annotated[float, Range(0, 1000)] = 0.01
     """Weight of Gaussians being deeper than 1.5 times their width, which turns into streaks when the tissue is sheared."""
-    virtual_every: Annotated[int, Range(0, 1000)] = 4
-    """A virtual camera regularises every n-th iteration (paper eq. 8, 9); 0 = never."""
+    lambda_color: Annotated[float, Range(0, 1000)] = 0.3
+    """Weight of Gaussians having the colour that is seen where they lie, without which stretched tissue shows layers of
+    other colours."""
+    virtual_every: Annotated[int, Range(0, 1000)] = 0
+    """A virtual camera regularises every n-th iteration (paper eq. 8, 9), by what of the distortion, total variation and
+    correlation has a weight; 0 = never."""
     exposure: bool = True
     """Each view has an exposure of its own, from which that of unseen views is predicted as a camera's automatic one would be."""
     light: bool = True

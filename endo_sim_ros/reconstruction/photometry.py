@@ -1,13 +1,15 @@
 """The light at the camera and each view's exposure, from how bright the same points are in several views."""
 
 import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import torch
 
 from endo_sim_ros.gaussians import SH_C0, GaussianModel
-from endo_sim_ros.light import features_at
+from endo_sim_ros.light import Light, features_at
 from endo_sim_ros.sequences.frames import Frame
 
 PRIOR = np.array([0.9, 3.0, 0.0, 0.0])  # distance, angle, tilt: the inverse-square law at a gamma of 2.2, a usual spot
@@ -22,6 +24,29 @@ _BLUR = 1.5  # pixels
 _BRIGHTEST = 4.0  # colour that tissue in the corner of a picture may have in full light
 _RESPONSE, _RESPONSE_SPREAD = 0.9, 0.5  # of the automatic exposure: cameras even out most of the brightness
 _EXPOSURE_NOISE = 0.01, 0.04  # the least and the most that the logarithm of an exposure varies by itself
+
+
+@dataclass(frozen=True)
+class Drift:
+    """What of the exposures of the training views their brightness does not explain, which comes and goes with time.
+
+    Args:
+        stamps_ns: Of the views [V], when they were taken.
+        residuals: Logarithm of the exposure of each channel [V, 3] beyond that of the light.
+    """
+
+    stamps_ns: Sequence[int]
+    residuals: np.ndarray
+
+    def at(self, light: Light | None, stamp_ns: int) -> Light | None:
+        """The light at another time of the recording: in between views as time has it, before and after as in the nearest."""
+        if light is None:
+            return None
+        times = sorted(set(self.stamps_ns))
+        then = [self.residuals[np.equal(self.stamps_ns, time)].mean(0) for time in times]
+        ahead = [float(time - stamp_ns) for time in times]
+        levels = {f"level_{c}": np.interp(0.0, ahead, [residual[i] for residual in then]) for i, c in enumerate("rgb")}
+        return dataclasses.replace(light, **{name: getattr(light, name) + float(beyond) for name, beyond in levels.items()})
 
 
 def fit_light(
@@ -80,8 +105,9 @@ def unlit(
     return dataclasses.replace(model, sh=sh)
 
 
-def fit_exposure(exposures: np.ndarray, brightness: np.ndarray) -> tuple[float, np.ndarray]:
-    """Response and levels [3] of the automatic exposure from each view's log exposure [V, 3] and log brightness [V] without it.
+def fit_exposure(exposures: np.ndarray, brightness: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Response and levels [3] of the automatic exposure from each view's log exposure [V, 3] and log brightness [V] without it,
+    and what they leave of the exposures [V, 3].
 
     See `Light`. A camera that evens out most of the brightness is the prior, as brightness may be much the same in all views; exposures
     that hardly vary speak for a fixed one.
@@ -90,7 +116,8 @@ def fit_exposure(exposures: np.ndarray, brightness: np.ndarray) -> tuple[float, 
     trust, doubt = 1 / np.clip(mean.std(), *_EXPOSURE_NOISE) ** 2, 1 / _RESPONSE_SPREAD**2
     slope = (doubt * _RESPONSE - trust * centred @ mean) / (doubt + trust * centred @ centred)
     response = float(np.clip(slope, 0, 1))
-    return response, exposures.mean(0) + response * brightness.mean()
+    residuals = exposures - exposures.mean(0) + response * centred[:, None]
+    return response, exposures.mean(0) + response * brightness.mean(), residuals
 
 
 def _observations(frame: Frame, points: np.ndarray, reference: float, tolerance: float, raw: bool = False):

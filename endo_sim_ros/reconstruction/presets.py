@@ -9,9 +9,9 @@ from typing import Any
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 
 _PLAIN = {  # 3DGS as Kerbl et al. 2023 have it, and what the others build upon, for 3000 iterations
-    "iterations": 3000, "lambda_dist": 0.1, "virtual_every": 1,
-    "initialization": "points", "densification": "gradient", "lambda_flat": 0.0, "exposure": False, "light": False,
-    "agreement": False, "surroundings": 0.0, "still": False,
+    "iterations": 3000, "lambda_dist": 0.1, "lambda_tv": 0.5, "virtual_every": 1,
+    "initialization": "points", "densification": "gradient", "lambda_flat": 0.0, "lambda_color": 0.0, "exposure": False, "light": False,
+    "agreement": False, "surroundings": 0.0, "confined": False, "still": False,
 }  # fmt: skip
 
 PRESETS: dict[str, dict[str, Any]] = {
@@ -36,17 +36,18 @@ ABLATIONS: dict[str, dict[str, dict[str, Any]]] = {
         "without depth": {"lambda_depth": 0.0},
     },
     "default": {
-        "without virtual cameras": {"virtual_every": 0},
-        "a virtual camera in every iteration": {"virtual_every": 1},
         "with distortion": {"lambda_dist": 0.1},
-        "without total variation": {"lambda_tv": 0.0},
+        "with total variation": {"lambda_tv": 0.5},
+        "with total variation, virtual cameras too": {"lambda_tv": 0.5, "virtual_every": 1},
         "without depth": {"lambda_depth": 0.0},
         "3000 full steps whatever the views agree in": {"iterations": 3000},
         "without dense initialisation": {"initialization": "points"},
         "without agreement of depths": {"agreement": False},
         "without flat Gaussians": {"lambda_flat": 0.0},
+        "without colour in place": {"lambda_color": 0.0},
         "without light": {"light": False},
         "without light and exposure": {"light": False, "exposure": False},
+        "with Gaussians outside of all views": {"confined": False},
         "without surroundings": {"surroundings": 0.0},
         "with what moved": {"still": False},
         "without Markov chain": {"densification": "gradient"},

@@ -19,7 +19,7 @@ from torch import Tensor
 from endo_sim_ros.cameras import Camera, interpolate_pose
 from endo_sim_ros.device import pick_device
 from endo_sim_ros.gaussians import GaussianModel
-from endo_sim_ros.light import Light, directions, falloff, features, log_brightness
+from endo_sim_ros.light import NEAREST, Light, directions, falloff, features, log_brightness
 from endo_sim_ros.reconstruction import densification, losses, photometry
 from endo_sim_ros.reconstruction.agreement import agreed
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
@@ -60,6 +60,7 @@ _MOST_ITERATIONS, _LEAST_TRAINING = 3000, 1 / 3  # and the least share of them
 _SHARP = 0.15  # pixels: views that agree so well are worth all iterations
 _NARROWEST = 64  # pixels; images are not halved below when memory runs out
 _SELDOM = 4  # iterations between steps that may be taken seldom, and then are as much larger
+_ON_SURFACE = 0.02  # of its depth
 _EXPOSURE_RATE, _LIGHT_RATE = 1e-3, 2e-3  # learning rates of log exposures and of the light's four numbers
 
 
@@ -154,7 +155,9 @@ class Trainer:
         self._recordings: dict[tuple, Recording] = {}
         self._last_loss = torch.zeros(())
         self._light_prior = torch.tensor(light, dtype=torch.float32, device=self.device)
-        self._set_light(self._light_prior, torch.tensor(exposures, dtype=torch.float32, device=self.device))
+        exposures = torch.tensor(exposures, dtype=torch.float32, device=self.device)
+        self._exposure_level = exposures.mean(0)
+        self._set_light(self._light_prior, exposures)
         self._set_model(model.to(self.device))
 
     # ------------------------------------------------------------------ state
@@ -172,11 +175,23 @@ class Trainer:
         return self.config.light or self.config.exposure
 
     @property
-    @torch.no_grad()
     def light(self) -> Light | None:
         """The light, with the exposure that was learnt from the training views."""
+        return self._fitted_light()[0]
+
+    @property
+    def drift(self) -> photometry.Drift:
+        """How exposure changed in the course of the recording beyond what the light explains."""
+        return photometry.Drift(self._stamps, self._fitted_light()[1])
+
+    @torch.no_grad()
+    def _fitted_light(self) -> tuple[Light | None, np.ndarray]:
+        """The light and what it leaves of the views' exposures [V, 3]."""
+        unexplained = np.zeros((len(self._stamps), 3))
         if not self._lit:
-            return None
+            return None, unexplained
+        if not self.config.exposure:
+            return Light(*self._light["light"].tolist(), self.scene_depth), unexplained
         exposures = self._light["exposures"].cpu().numpy().astype(np.float64)
         brightness = []
         for view in self._views[: len(exposures)]:
@@ -187,8 +202,8 @@ class Trainer:
                 image = image * falloff(features(depth, alpha, rays, self.scene_depth), self._light["light"])[..., None]
             where = alpha > 0.5 if view.mask is None else (alpha > 0.5) & (view.mask > 0)
             brightness.append(float(log_brightness(image, where)))
-        response, levels = photometry.fit_exposure(exposures, np.array(brightness))
-        return Light(*self._light["light"].tolist(), self.scene_depth, *map(float, levels), response)
+        response, levels, residuals = photometry.fit_exposure(exposures, np.array(brightness))
+        return Light(*self._light["light"].tolist(), self.scene_depth, *map(float, levels), response), residuals
 
     @property
     def cameras(self) -> list[Camera]:
@@ -214,6 +229,7 @@ class Trainer:
             "model": self._detached().tensors(),
             "optimizer": self._optimizer.state,
             "gradients": self._gradients,
+            "shown": self._shown,
             "light": {name: value.detach() for name, value in self._light.items()},
             "light_optimizer": self._light_optimizer.state,
             "generator": self._generator.get_state(),
@@ -252,7 +268,7 @@ class Trainer:
             self._optimizer.state = state["optimizer"]
             self._set_light(**state["light"])
             self._light_optimizer.state = state["light_optimizer"]
-            self._gradients = state["gradients"]
+            self._gradients, self._shown = state["gradients"], state["shown"]
             self._generator, self._noise = generator, noise
             self.iteration, self._order = iteration, order
         except SequenceError:
@@ -300,8 +316,8 @@ class Trainer:
             virtual = self._virtual_camera(view.exposure)
         inputs = self._inputs(view, virtual)
         self._optimizer.set_rate("means", self._step_size)
-        flat = bool(config.lambda_flat) and self.iteration % _SELDOM == 0
-        self._last_loss = self._descend(flat, inputs)
+        seldom = bool(config.lambda_flat or config.lambda_color) and self.iteration % _SELDOM == 0
+        self._last_loss = self._descend(seldom, inputs)
         self.iteration += 1
         with torch.no_grad():
             refining = self.iteration <= _LAST_REFINEMENT * config.iterations
@@ -329,18 +345,18 @@ class Trainer:
         tensor = lambda matrices: torch.from_numpy(np.stack(matrices).astype(np.float32)).to(self.device, non_blocking=True)
         return tensor([camera.viewmat for camera in cameras]), tensor([camera.K for camera in cameras])
 
-    def _descend(self, flat: bool, inputs: _Inputs) -> Tensor:
-        """One step of the optimisers, ``flat`` with the seldom term in the loss that is returned; on a GPU replayed as one piece."""
-        function = functools.partial(self._descend_once, flat)
+    def _descend(self, seldom: bool, inputs: _Inputs) -> Tensor:
+        """One step of the optimisers, with or without the ``seldom`` terms in the loss that is returned; on a GPU replayed as one piece."""
+        function = functools.partial(self._descend_once, seldom)
         if self.device == "cpu":
             return function(*inputs)
-        key = (flat, *(None if x is None else x.shape for x in inputs))
+        key = (seldom, *(None if x is None else x.shape for x in inputs))
         if key not in self._recordings:
             self._recordings[key] = Recording(function)
         with torch.cuda.device(self.device):
             return self._recordings[key](*inputs)
 
-    def _descend_once(self, flat: bool, *inputs: Tensor | None) -> Tensor:
+    def _descend_once(self, seldom: bool, *inputs: Tensor | None) -> Tensor:
         config, view = self.config, _Inputs(*inputs)
         cameras, (height, width) = len(view.viewmats), view.image.shape[:2]
         wanted = {name: value for name, value in (self._parameters | self._light).items() if value.requires_grad}
@@ -354,20 +370,28 @@ class Trainer:
         loss = self._view_loss(output, view)
         if cameras > 1:
             loss = loss + self._virtual_loss(output, view)
-        if flat:
-            loss = loss + _SELDOM * config.lambda_flat * losses.depth_extent(self._current(), self._eye).mean()
+        if seldom:
+            loss = loss + _SELDOM * self._model_loss(output, view)
         if config.light:
             loss = loss + _LIGHT_ANCHOR * ((self._light["light"] - self._light_prior) ** 2).sum()
         gradients = dict(zip(wanted, torch.autograd.grad(loss, list(wanted.values()))))
+        if config.confined:
+            for name, values in self._parameters.items():
+                gradients[name] = gradients[name] * self._shown.view(-1, *[1] * (values.ndim - 1))
         if absgrad is not None:
             across, down = gradients["absgrad"][0].unbind(1)
             steepness = torch.hypot(across * (width / 2), down * (height / 2))
+            if config.confined:
+                steepness = steepness * self._shown
             self._gradients += torch.stack([steepness, (steepness > 0).to(steepness.dtype)])
         for optimizer in (self._optimizer, self._light_optimizer):
             optimizer.step({name: gradients[name] for name in optimizer.parameters})
         with torch.no_grad():
             # Nothing holds the size of Gaussians where every view is masked; one that grew would smear the deformed scene.
             self._parameters["log_scales"].clamp_(max=math.log(_LARGEST * self.scene_depth))
+            if config.exposure:
+                # All exposures up and all colours down is the same picture, except for tissue that no view sees.
+                self._light["exposures"] += self._exposure_level - self._light["exposures"].mean(0)
         return loss.detach()
 
     def _render(
@@ -388,16 +412,41 @@ class Trainer:
         """Paper eq. 7: photometric, depth, distortion and total variation of a training view, the first camera."""
         config = self.config
         image, depth, alpha, distortion = (images[0] for images in output[:4])
-        if config.light:
-            image = image * falloff(features(depth, alpha, view.rays, self.scene_depth), self._light["light"])[..., None]
-        if config.exposure:
-            image = image * self._light["exposures"].index_select(0, view.exposure).exp()
+        if (gain := self._gain(depth, alpha, view)) is not None:
+            image = image * gain
         total = losses.photometric(image, view.image, view.mask, config.lambda_ssim)
         if view.depth is not None and config.lambda_depth:
             total = total + config.lambda_depth / self.scene_depth * losses.depth_l1(depth, view.depth, view.mask)
         if view.depth is not None and config.lambda_pearson:
             total = total + config.lambda_pearson * losses.pearson(depth, view.depth, view.mask)
         return total + self._regularization(depth, distortion, view.mask)
+
+    def _gain(self, depth: Tensor, alpha: Tensor, view: _Inputs) -> Tensor | None:
+        """What light and exposure make of a training view's colours [H, W, 1 or 3]; None without them."""
+        gain = None
+        if self.config.light:
+            gain = falloff(features(depth, alpha, view.rays, self.scene_depth), self._light["light"])[..., None]
+        if self.config.exposure:
+            exposure = self._light["exposures"].index_select(0, view.exposure).exp()[None]
+            gain = exposure if gain is None else gain * exposure
+        return gain
+
+    def _model_loss(self, output: RenderOutput, view: _Inputs) -> Tensor:
+        """What the Gaussians are to be like so that the tissue can be deformed."""
+        config, model = self.config, self._current()
+        total = torch.zeros((), device=self.device)
+        if config.lambda_flat:
+            total = total + config.lambda_flat * losses.depth_extent(model, self._eye).mean()
+        if config.lambda_color:
+            depth, alpha = output.depths[0].detach(), output.alphas[0].detach()
+            with torch.no_grad():
+                gain = self._gain(depth, alpha, view)
+            gain = torch.ones_like(depth)[..., None] if gain is None else gain.expand(*depth.shape, -1)
+            surface = depth / alpha.clamp_min(NEAREST)
+            matrices = view.viewmats[0], view.Ks[0]
+            place = losses.color_in_place(model, *matrices, view.image, gain, surface, view.mask, _ON_SURFACE)
+            total = total + config.lambda_color * place
+        return total
 
     def _virtual_loss(self, output: RenderOutput, view: _Inputs) -> Tensor:
         """Paper eq. 9: distortion and total variation from a virtual camera, the second one."""
@@ -407,8 +456,12 @@ class Trainer:
         return total
 
     def _regularization(self, depth: Tensor, distortion: Tensor, mask: Tensor | None) -> Tensor:
-        distorted, varied = losses.masked_mean(distortion, mask), losses.total_variation(depth, mask)
-        return (self.config.lambda_dist * distorted + self.config.lambda_tv * varied) / self.scene_depth
+        total = depth.new_zeros(())
+        if self.config.lambda_dist:
+            total = total + self.config.lambda_dist * losses.masked_mean(distortion, mask)
+        if self.config.lambda_tv:
+            total = total + self.config.lambda_tv * losses.total_variation(depth, mask)
+        return total / self.scene_depth
 
     # --------------------------------------------------------------- Gaussians
 
@@ -418,8 +471,18 @@ class Trainer:
             recording.forget()
         self._parameters = {name: tensor.clone().requires_grad_() for name, tensor in _parameters(model).items()}
         self._optimizer = Adam(self._parameters, {name: self.config.learning_rate * rate for name, rate in _RATES.items()})
+        self._shown = self._shown_now()
         # Σ of image gradients and number of views that had any, since the last refinement.
         self._gradients = torch.zeros(2, len(model), device=self.device)
+
+    @torch.no_grad()
+    def _shown_now(self) -> Tensor:
+        """Which Gaussians' centres any view shows [N], 1 or 0."""
+        shown = torch.zeros(len(self._parameters["means"]), dtype=torch.bool, device=self.device)
+        for view in self._views:
+            (viewmat,), (K,) = self._matrices([view.camera])
+            shown |= losses.seen_at(self._parameters["means"], viewmat, K, view.mask, view.image.shape[:2])[1]
+        return shown.float()
 
     def _set_light(self, light: Tensor, exposures: Tensor) -> None:
         """Start optimising the light [4] and the logarithm of the exposures [V, 3], as far as there are any."""
@@ -513,15 +576,18 @@ def _read_checkpoint(path: Path, device: torch.device) -> dict:
         state = torch.load(path, map_location=device, weights_only=True)
     except pickle.UnpicklingError:  # whose text advises to load it all the same
         raise ValueError("it holds other objects than tensors and numbers") from None
+    if "shown" not in state:
+        raise ValueError("another version made it; start anew")
     moments, lights = state["optimizer"], state["light_optimizer"]  # of each parameter, by its name
-    tensors = [*state["model"].values(), *state["light"].values(), state["gradients"]]
+    tensors = [*state["model"].values(), *state["light"].values(), state["gradients"], state["shown"]]
     tensors += [value for values in [*moments.values(), *lights.values()] for value in values.values()]
     if sum(tensor.numel() * tensor.element_size() for tensor in tensors) > size:  # views of less
         raise ValueError("it claims more than it holds")
     if any(tensor.dtype != torch.float32 or tensor.is_meta or not tensor.isfinite().all() for tensor in tensors):
         raise ValueError("its tensors are not of finite float32 numbers")
     parameters = _parameters(GaussianModel(**state["model"]))  # none without Gaussians
-    if state["gradients"].shape != (2, len(parameters["means"])) if parameters else True:
+    count, shown = len(parameters["means"]) if parameters else 0, state["shown"]
+    if not count or state["gradients"].shape != (2, count) or shown.shape != (count,) or not ((shown == 0) | (shown == 1)).all():
         raise ValueError("the gradients do not fit the model")
     optimized = parameters | {name: state["light"][name] for name in lights}
     expected = {name: {"step": (), "exp_avg": x.shape, "exp_avg_sq": x.shape} for name, x in optimized.items()}
@@ -630,12 +696,9 @@ def _carried_depth(view: _View, viewmat: Tensor) -> Tensor:
     v, u = (view.depth > 0).nonzero(as_tuple=True)
     K, pose = (torch.from_numpy(matrix).to(viewmat) for matrix in (view.camera.K, view.camera.pose))
     z = view.depth[v, u]
-    local = torch.stack([(u + 0.5 - K[0, 2]) / K[0, 0] * z, (v + 0.5 - K[1, 2]) / K[1, 1] * z, z, torch.ones_like(z)], 1)
-    x, y, z = (local @ (viewmat @ pose)[:3].T).unbind(1)
-    u, v = (x / z * K[0, 0] + K[0, 2]).floor(), (y / z * K[1, 1] + K[1, 2]).floor()
-    inside = (z > 0) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
-    index = (v * width + u)[inside].long()
-    carried = torch.full((height * width,), math.inf, device=z.device).scatter_reduce(0, index, z[inside], "amin")
+    local = torch.stack([(u + 0.5 - K[0, 2]) / K[0, 0] * z, (v + 0.5 - K[1, 2]) / K[1, 1] * z, z], 1)
+    index, inside, z = losses.seen_at(local, viewmat @ pose, K, None, view.depth.shape)
+    carried = torch.full((height * width,), math.inf, device=z.device).scatter_reduce(0, index[inside], z[inside], "amin")
     return torch.where(carried.isfinite(), carried, 0).view(height, width)
 
 

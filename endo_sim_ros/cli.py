@@ -1,6 +1,8 @@
 """The command line: `endo-sim COMMAND --help`."""
 
+import dataclasses
 import logging
+import re
 import shutil
 import sys
 import time
@@ -20,6 +22,7 @@ from endo_sim_ros.learning.config import PPOConfig, Randomisation, TrainingConfi
 from endo_sim_ros.messages import MessageError
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
+from endo_sim_ros.reconstruction.presets import PRESETS, preset
 from endo_sim_ros.sequences.frames import Frame, SequenceError
 from endo_sim_ros.sequences.phantom import PhantomConfig
 from endo_sim_ros.viewer.config import ViewerConfig
@@ -110,6 +113,12 @@ class Phantom:
         print(f"{self.bag}: {write_bag(self.bag, _tracked(frames, 'rendering the patient'))} frames")
 
 
+def _named_preset() -> ReconstructionConfig:
+    """The options of the preset that the command line names, which are the defaults of those it does not give."""
+    named = re.search(r"--preset[= ](\S+)", " ".join(sys.argv))
+    return preset(named[1]) if named and named[1] in PRESETS else ReconstructionConfig()
+
+
 @dataclass(frozen=True)
 class Reconstruct:
     """Reconstruct a Gaussian model from a bag without ROS, and measure it on the views that were held out."""
@@ -120,12 +129,13 @@ class Reconstruct:
     """Folder for model.ply, cameras.json, checkpoint.pt and held_out.png."""
     resume: bool = False
     """Go on from the checkpoint.pt that an interrupted reconstruction of the same bag with the same options left in that folder."""
-    config: Annotated[ReconstructionConfig, tyro.conf.arg(name="")] = field(default_factory=ReconstructionConfig)
+    config: Annotated[ReconstructionConfig, tyro.conf.arg(name="")] = field(default_factory=_named_preset)
 
     def run(self) -> None:
         from endo_sim_ros.evaluation.held_out import reconstruct_and_measure
 
-        reconstruct_and_measure(self.bag, self.out, self.config, self.resume)
+        # All options are spelled out: the preset must not replace those given.
+        reconstruct_and_measure(self.bag, self.out, dataclasses.replace(self.config, preset="default"), self.resume)
 
 
 @dataclass(frozen=True)

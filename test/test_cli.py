@@ -14,9 +14,12 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
+from endo_sim_ros import cli
+from endo_sim_ros.evaluation import held_out
 from endo_sim_ros.evaluation.held_out import reconstruct_and_measure
 from endo_sim_ros.gaussians import load_ply
 from endo_sim_ros.reconstruction import ReconstructionConfig
+from endo_sim_ros.reconstruction.presets import preset, resolved
 from endo_sim_ros.sequences.bag import read_bag
 
 ROOT = Path(__file__).parents[1]
@@ -80,6 +83,16 @@ def test_a_killed_reconstruction_goes_on_to_the_same_model(bag, tmp_path, caplog
     assert re.search(r"going on after [1-9]\d* iterations", caplog.text)
     reconstruct_and_measure(bag, tmp_path / "whole", config)
     assert (tmp_path / "killed" / "model.ply").read_bytes() == (tmp_path / "whole" / "model.ply").read_bytes()
+
+
+def test_options_given_beside_a_preset_count_whatever_their_value(monkeypatch):
+    taken = []
+    monkeypatch.setattr(held_out, "reconstruct_and_measure", lambda *arguments: taken.append(arguments[2]))
+    for given in ("--preset paper --lambda-tv 0 --sh-degree 3", "--lambda-tv 0 --sh-degree 3 --preset=paper", ""):
+        monkeypatch.setattr(sys, "argv", f"endo-sim reconstruct bag out {given}".split())
+        assert cli.main() == 0
+    assert resolved(taken[0]) == taken[0] == taken[1] == preset("paper", lambda_tv=0.0, sh_degree=3)
+    assert taken[2] == ReconstructionConfig()
 
 
 def test_reconstruct_writes_a_model_and_measures_held_out_views(bag, tmp_path):

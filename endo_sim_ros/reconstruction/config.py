@@ -11,8 +11,8 @@ class ReconstructionConfig(StageConfig):
     """From sparse posed views to a Gaussian model."""
 
     preset: Literal["default", "laptop", "paper", "fsgs", "3dgs"] = "default"
-    """Method: ours, ours sized for a CPU, that of the paper as printed, FSGS, or 3DGS. Options left at their defaults take
-    its values."""
+    """Method: ours, ours sized for a CPU, that of the paper as printed, FSGS, or 3DGS. Options not given take its values; a ROS
+    parameter that has the default's value counts as not given."""
     keyframes: Annotated[int, Range(1, 1000)] = 8
     """Number of views to train on, spread over the camera path."""
     image_width: Annotated[int, Range(16, 8192, "pixels")] = 640

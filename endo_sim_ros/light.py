@@ -105,7 +105,8 @@ def features(depths: Tensor, alphas: Tensor, directions: Tensor, reference: floa
 
 def falloff(quantities: Tensor, theta: Tensor) -> Tensor:
     """Brightness [...] of quantities [4, ...] for the light's (distance, angle, tilt_x, tilt_y) [4]."""
-    return torch.einsum("f...,f->...", quantities, theta).exp()
+    # Not einsum: the gradient of a matrix product has other last bits with other numbers of threads.
+    return (quantities * theta.view(-1, *[1] * (quantities.ndim - 1))).sum(0).exp()
 
 
 def log_brightness(image: Tensor, where: Tensor) -> Tensor:

@@ -93,7 +93,8 @@ def seen_at(
         size: H and W.
     """
     height, width = size
-    x, y, z = (points @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(1)
+    # Without a matrix product: libraries give other last bits with other numbers of threads.
+    x, y, z = (sum(row[i] * points[:, i] for i in range(3)) + row[3] for row in viewmat[:3])
     ahead = z.clamp_min(1e-6)
     u, v = (x / ahead * K[0, 0] + K[0, 2]).floor(), (y / ahead * K[1, 1] + K[1, 2]).floor()
     inside = (z > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)

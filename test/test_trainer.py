@@ -11,9 +11,10 @@ from endo_sim_ros.config import ConfigError
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.reconstruction import ABLATIONS, PRESETS, ReconstructionConfig, Trainer, densification, losses, preset
+from endo_sim_ros.reconstruction.depth import right_view
 from endo_sim_ros.reconstruction.motion import without_motion
 from endo_sim_ros.reconstruction.presets import resolved
-from endo_sim_ros.reconstruction.trainer import right_view, shrink
+from endo_sim_ros.reconstruction.trainer import shrink
 from endo_sim_ros.reconstruction.triangulation import match_features, misposed, triangulate
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.frames import SequenceError

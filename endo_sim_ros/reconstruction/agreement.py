@@ -11,20 +11,23 @@ import numpy as np
 
 from endo_sim_ros.cameras import Camera
 from endo_sim_ros.device import map_in_threads
-from endo_sim_ros.reconstruction.depth import MATCHED
+from endo_sim_ros.reconstruction.depth import MATCHED, right_view
 from endo_sim_ros.reconstruction.surroundings import filled
 from endo_sim_ros.reconstruction.triangulation import ScenePoints, neighbours
 from endo_sim_ros.sequences.frames import Frame
 
 _NEIGHBOURS = 4  # views that each view is compared with: the nearest in space
 _LEAST_SHARED = 0.05  # of the picture, below which two views are not compared
+_REMATCHED = 0.15  # pixels, error of a disparity that flow between the eyes has corrected
 _GUESSED = 0.05  # relative error of a depth that no right image gave
 _FLOW = 1.0  # pixels, error of a displacement, that of the poses included
+_EYES = 0.3  # share of it between the eyes of one view
 _ALIKE = 0.5  # correlation from which on two pixels show the same tissue
 _LEAST_SEEN = 0.02  # share of the pixels with depth
 _TOO_FAR = 0.25  # relative difference from which on a point lies on another surface
 _EDGE = 0.05  # relative step of depth that is an edge
 # In pixels of an image 640 wide:
+_STEP = 1.0  # farthest that matching with the right image is believed to be off
 _RIPPLE = 10.0  # standard deviation over which depth is smoothed within edges
 _OFF_LINE = 2.0  # farthest beside the line on which depth alone can move a point
 _FARTHEST = 40.0  # longest displacement that optical flow is believed
@@ -60,6 +63,10 @@ def agreed(frames: list[Frame], points: ScenePoints, matched: bool) -> tuple[lis
             return frame, []
         known = frame.depth > 0
         inverse = filled((known / np.where(known, frame.depth, 1)).astype(np.float32)[..., None], known)[..., 0]
+        error = _GUESSED * inverse
+        if matched and frame.right is not None:
+            inverse = _rematched(frame, inverse, plain[i], tissue[i])
+            error = _REMATCHED / (camera.K[0, 0] * frame.baseline)
         total, weight = _of_points(frame, inverse, points)
         for j in near[i]:
             if j != i:
@@ -68,13 +75,7 @@ def agreed(frames: list[Frame], points: ScenePoints, matched: bool) -> tuple[lis
                     correction, precision, *contradiction = found
                     total, weight = total + precision * correction, weight + precision
                     contradictions.append(contradiction)
-        known_error = matched and frame.baseline is not None
-        error = MATCHED / (camera.K[0, 0] * frame.baseline) if known_error else _GUESSED * inverse
-        correction, trust = total / np.maximum(weight, 1e-12), weight / (weight + 1 / error**2)
-        blur = lambda values: cv2.GaussianBlur(values.astype(np.float32), (0, 0), _SMOOTH * camera.width / 640)
-        around = blur(trust)
-        carried = blur(trust * correction) / np.maximum(around, 1e-6) * np.minimum(4 * around, 1)
-        inverse = _smooth(inverse + trust * correction + (1 - trust) * carried, camera.width)
+        inverse = _corrected(inverse, total, weight, error, camera.width)
         good = known & np.isfinite(inverse) & (inverse > 0)
         depth = np.where(good, 1 / np.where(good, inverse, 1), 0).astype(np.float32)
         return dataclasses.replace(frame, depth=depth), contradictions
@@ -82,6 +83,34 @@ def agreed(frames: list[Frame], points: ScenePoints, matched: bool) -> tuple[lis
     results = map_in_threads(corrected, range(len(frames)))
     off, shares = np.array([pair for _, pairs in results for pair in pairs]).reshape(-1, 2).T
     return [frame for frame, _ in results], float((off * shares).sum() / shares.sum()) if shares.sum() else float("nan")
+
+
+def _rematched(frame: Frame, inverse: np.ndarray, image: np.ndarray, tissue: np.ndarray) -> np.ndarray:
+    """Inverse depth [H, W] (1/m) of matching with the right image, corrected by the flow that it leaves between the eyes.
+
+    Semi-global matching prefers whole pixels and goes in steps; optical flow does neither, but errs wildly where there is little to see.
+    """
+    camera, right, pixel = frame.camera, right_view(frame), frame.camera.K[0, 0] * frame.baseline
+    lit = np.ones(inverse.shape, np.float32) if right.mask is None else np.float32(right.mask > 0)
+    inverse = _smooth(inverse, camera.width)
+    found = _of_view(camera, inverse, image, tissue, right.camera, _plain(right, lit), lit)
+    if found is None:
+        return inverse
+    correction, precision, *_ = found
+    precision = np.where(np.abs(correction) * pixel < _STEP * camera.width / 640, precision / _EYES**2, 0)
+    return _corrected(inverse, precision * correction, precision, MATCHED / pixel, camera.width)
+
+
+def _corrected(inverse: np.ndarray, total: np.ndarray, weight: np.ndarray, error: np.ndarray | float, width: int) -> np.ndarray:
+    """Inverse depth [H, W] of the given error with corrections, of which Σ precision × correction and Σ precision are given.
+
+    Where there are none, those of the surroundings count; ripples within edges are smoothed.
+    """
+    correction, trust = total / np.maximum(weight, 1e-12), weight / (weight + 1 / error**2)
+    blur = lambda values: cv2.GaussianBlur(values.astype(np.float32), (0, 0), _SMOOTH * width / 640)
+    around = blur(trust)
+    carried = blur(trust * correction) / np.maximum(around, 1e-6) * np.minimum(4 * around, 1)
+    return _smooth(inverse + trust * correction + (1 - trust) * carried, width)
 
 
 def _smooth(inverse: np.ndarray, width: int) -> np.ndarray:

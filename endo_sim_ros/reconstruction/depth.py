@@ -8,11 +8,13 @@ import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import Delaunay
 
+from endo_sim_ros.cameras import Camera
 from endo_sim_ros.device import map_in_threads, pick_device
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.depth_network import cached_checkpoint, load_network, network_depth
 from endo_sim_ros.reconstruction.triangulation import ScenePoints, points_in_view
 from endo_sim_ros.sequences.frames import Frame, SequenceError
+from endo_sim_ros.sequences.recordings import lit_area
 
 log = logging.getLogger(__name__)
 
@@ -25,6 +27,7 @@ _ISLAND = 0.003  # share of the image, below which a patch of disparity that is 
 MATCHED = 0.5  # pixels, error of a disparity
 _SPARSE = 16  # pixels between stereo matches that a network's depth is held against
 _FEATURES = 3000  # matched to find by how much the right image lies too high or too low
+_WIDEST_PARALLAX = 0.1  # of the image's width, between the eyes
 _ROWS = 0.01  # of the image's height: the farthest that it may
 
 
@@ -67,6 +70,20 @@ def with_depth_prior(frames: list[Frame], points: ScenePoints, config: Reconstru
     offsets = disparity_offsets(frames, disparities, points)
     frames = [_with_depth(f, None if d is None else _to_depth(f, d, offset)) for f, d, offset in zip(frames, disparities, offsets)]
     return [frame if frame.right is None else _with_right_shifted(frame, offset) for frame, offset in zip(frames, offsets)]
+
+
+def right_view(frame: Frame) -> Frame:
+    """The right image of a stereo frame as a view of its own, without depth."""
+    pose = frame.camera.pose.copy()
+    pose[:3, 3] += frame.baseline * pose[:3, 0]
+    K = frame.camera.K if frame.right_K is None else frame.right_K
+    mask = lit_area([frame.right])
+    if frame.mask is not None:
+        # Tools of the left image lie farther to the left, by any of the disparities that there are.
+        tools = (frame.mask == 0) & (lit_area([frame.image]) > 0)
+        farthest = int(_WIDEST_PARALLAX * frame.camera.width)
+        mask[cv2.dilate(np.uint8(tools), np.ones((1, farthest + 1), np.uint8), anchor=(0, 0)) > 0] = 0
+    return Frame(frame.stamp_ns, frame.right, Camera(K, frame.camera.width, frame.camera.height, pose), mask=mask)
 
 
 def depth_source(frames: list[Frame], config: ReconstructionConfig) -> str:

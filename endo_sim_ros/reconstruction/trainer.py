@@ -23,7 +23,7 @@ from endo_sim_ros.light import NEAREST, Light, directions, falloff, features, lo
 from endo_sim_ros.reconstruction import densification, losses, photometry
 from endo_sim_ros.reconstruction.agreement import agreed
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
-from endo_sim_ros.reconstruction.depth import depth_source, with_depth_prior
+from endo_sim_ros.reconstruction.depth import depth_source, right_view, with_depth_prior
 from endo_sim_ros.reconstruction.initialization import initial_model
 from endo_sim_ros.reconstruction.motion import without_motion
 from endo_sim_ros.reconstruction.optimizer import Adam
@@ -31,7 +31,6 @@ from endo_sim_ros.reconstruction.presets import resolved
 from endo_sim_ros.reconstruction.surroundings import with_surroundings
 from endo_sim_ros.reconstruction.triangulation import ScenePoints, match_features, misposed, triangulate
 from endo_sim_ros.sequences.frames import Frame, SequenceError
-from endo_sim_ros.sequences.recordings import lit_area
 from endo_sim_ros.splatting import RenderOutput, rasterize
 from endo_sim_ros.splatting.recording import Recording
 
@@ -46,7 +45,6 @@ _NOISE = 5e5  # of 3DGS-MCMC, in units of the means' learning rate, for a scene 
 _LARGEST = 0.06  # standard deviation of a Gaussian, in units of the scene's depth
 _LAST_REFINEMENT = 0.8  # share of the iterations after which the number of Gaussians stays fixed
 _SEEN = 0.8  # share of the Gaussians that stand for what the training views see, at first
-_WIDEST_PARALLAX = 0.1  # of the image's width, between the eyes
 _LIGHT_ANCHOR = 1e-3  # weight of the light's changes in training
 _WHITE, _BLACK = 250, 8  # grey levels of all channels, from which on, and up to which, nothing is seen
 _MOSTLY = 0.5  # share of the tissue, from which on a white view is overexposed
@@ -700,20 +698,6 @@ def _carried_depth(view: _View, viewmat: Tensor) -> Tensor:
     index, inside, z = losses.seen_at(local, viewmat @ pose, K, None, view.depth.shape)
     carried = torch.full((height * width,), math.inf, device=z.device).scatter_reduce(0, index[inside], z[inside], "amin")
     return torch.where(carried.isfinite(), carried, 0).view(height, width)
-
-
-def right_view(frame: Frame) -> Frame:
-    """The right image of a stereo frame as a view of its own, without depth."""
-    pose = frame.camera.pose.copy()
-    pose[:3, 3] += frame.baseline * pose[:3, 0]
-    K = frame.camera.K if frame.right_K is None else frame.right_K
-    mask = lit_area([frame.right])
-    if frame.mask is not None:
-        # Tools of the left image lie farther to the left, by any of the disparities that there are.
-        tools = (frame.mask == 0) & (lit_area([frame.image]) > 0)
-        farthest = int(_WIDEST_PARALLAX * frame.camera.width)
-        mask[cv2.dilate(np.uint8(tools), np.ones((1, farthest + 1), np.uint8), anchor=(0, 0)) > 0] = 0
-    return Frame(frame.stamp_ns, frame.right, Camera(K, frame.camera.width, frame.camera.height, pose), mask=mask)
 
 
 def _nearest_views(frames: list[Frame]) -> list[int]:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import logging
-import re
 import shutil
 import sys
 import time
@@ -115,8 +114,12 @@ class Phantom:
 
 def _named_preset() -> ReconstructionConfig:
     """The options of the preset that the command line names, which are the defaults of those it does not give."""
-    named = re.search(r"--preset[= ](\S+)", " ".join(sys.argv))
-    return preset(named[1]) if named and named[1] in PRESETS else ReconstructionConfig()
+    name = "default"
+    for word, following in zip(sys.argv, [*sys.argv[1:], ""]):
+        if word == "--preset" or word.startswith("--preset="):
+            name = following if word == "--preset" else word.removeprefix("--preset=")
+    # What is wrong with another name the parser says.
+    return dataclasses.replace(preset(name), preset=name) if name in PRESETS else ReconstructionConfig()
 
 
 @dataclass(frozen=True)

@@ -88,7 +88,7 @@ def test_a_killed_reconstruction_goes_on_to_the_same_model(bag, tmp_path, caplog
 def test_options_given_beside_a_preset_count_whatever_their_value(monkeypatch):
     taken = []
     monkeypatch.setattr(held_out, "reconstruct_and_measure", lambda *arguments: taken.append(arguments[2]))
-    for given in ("--preset paper --lambda-tv 0 --sh-degree 3", "--lambda-tv 0 --sh-degree 3 --preset=paper", ""):
+    for given in ("--preset paper --lambda-tv 0 --sh-degree 3", "--preset laptop --lambda-tv 0 --sh-degree 3 --preset=paper", ""):
         monkeypatch.setattr(sys, "argv", f"endo-sim reconstruct bag out {given}".split())
         assert cli.main() == 0
     assert resolved(taken[0]) == taken[0] == taken[1] == preset("paper", lambda_tv=0.0, sh_degree=3)

@@ -124,9 +124,10 @@ class Bench:
         asked = []  # a killed node's service looks ready for 20 s more, and what is sent to it alone is lost: ask again
 
         def answered():
-            if not asked or time.monotonic() - asked[-1][0] > 5:
+            done = next((future for _, future in asked if future.done()), None)
+            if done is None and (not asked or time.monotonic() - asked[-1][0] > 8):
                 asked.append((time.monotonic(), client.call_async(kind.Request(**fields))))
-            return next((future for _, future in asked if future.done()), None)
+            return done
 
         future = self.until(answered, f"an answer of {name}")
         self.user.destroy_client(client)

@@ -96,6 +96,8 @@ class PolicyNode(EndoNode):
             return
         self._state = "waiting for the tissue of the scene"
         self._heard.pop("reset", None)
+        if self._asked is not None:  # an answer that comes after all is none to this request
+            self._resetting.remove_pending_request(self._asked)
         self._asked, self._asked_at = self._resetting.call_async(Trigger.Request()), time.monotonic()
         self._asked.add_done_callback(self._on_reset)
 

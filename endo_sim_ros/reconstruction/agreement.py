@@ -1,4 +1,4 @@
-"""Depth priors corrected by other views of the same tissue.
+"""Depth priors corrected by other images of the same tissue: the right one of the same view, and other views.
 
 The lenses of a stereo endoscope are millimetres apart, its views centimetres: by how many pixels tissue in one view
 lies beside where another view's depth and pose expect it tells that depth several times better than the pair of lenses.
@@ -44,7 +44,8 @@ def agreed(frames: list[Frame], points: ScenePoints, matched: bool) -> tuple[lis
     A view's image is predicted from each neighbour's with the view's depth; the optical flow between prediction and
     image, along the direction in which depth moves a pixel, is a correction of inverse depth that is the more precise the
     farther apart the views are. Corrections and prior are averaged by their precision; where there is none, that of
-    the surroundings counts; what ripples are left within edges is smoothed. What flow is left across that direction no
+    the surroundings counts; what ripples are left within edges is smoothed. Before it, the prior of matching with a view's
+    right image is corrected likewise by that image. What flow is left across that direction no
     depth explains: it is from poses, calibration or motion; its median is returned (pixels), NaN where no two views show
     the same.
 
@@ -65,8 +66,7 @@ def agreed(frames: list[Frame], points: ScenePoints, matched: bool) -> tuple[lis
         inverse = filled((known / np.where(known, frame.depth, 1)).astype(np.float32)[..., None], known)[..., 0]
         error = _GUESSED * inverse
         if matched and frame.right is not None:
-            inverse = _rematched(frame, inverse, plain[i], tissue[i])
-            error = _REMATCHED / (camera.K[0, 0] * frame.baseline)
+            inverse, error = _rematched(frame, inverse, plain[i], tissue[i])
         total, weight = _of_points(frame, inverse, points)
         for j in near[i]:
             if j != i:
@@ -85,20 +85,25 @@ def agreed(frames: list[Frame], points: ScenePoints, matched: bool) -> tuple[lis
     return [frame for frame, _ in results], float((off * shares).sum() / shares.sum()) if shares.sum() else float("nan")
 
 
-def _rematched(frame: Frame, inverse: np.ndarray, image: np.ndarray, tissue: np.ndarray) -> np.ndarray:
-    """Inverse depth [H, W] (1/m) of matching with the right image, corrected by the flow that it leaves between the eyes.
+def _rematched(frame: Frame, inverse: np.ndarray, image: np.ndarray, tissue: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Inverse depth [H, W] (1/m) of matching, corrected by the flow that it leaves between the eyes, and its error [H, W].
 
     Semi-global matching prefers whole pixels and goes in steps; optical flow does neither, but errs wildly where there is little to see.
     """
     camera, right, pixel = frame.camera, right_view(frame), frame.camera.K[0, 0] * frame.baseline
-    lit = np.ones(inverse.shape, np.float32) if right.mask is None else np.float32(right.mask > 0)
+    lit, matched = np.float32(right.mask > 0), np.full(inverse.shape, MATCHED / pixel, np.float32)
     inverse = _smooth(inverse, camera.width)
     found = _of_view(camera, inverse, image, tissue, right.camera, _plain(right, lit), lit)
     if found is None:
-        return inverse
+        return inverse, matched
     correction, precision, *_ = found
     precision = np.where(np.abs(correction) * pixel < _STEP * camera.width / 640, precision / _EYES**2, 0)
-    return _corrected(inverse, precision * correction, precision, MATCHED / pixel, camera.width)
+    correction = np.where(precision > 0, correction, 0)
+    rematched = _corrected(inverse, precision * correction, precision, matched, camera.width)
+    # Where flow tells nothing, far and wide, the error stays that of matching.
+    told = cv2.GaussianBlur((precision > 0).astype(np.float32), (0, 0), _SMOOTH * camera.width / 640)
+    error = (MATCHED + (_REMATCHED - MATCHED) * np.minimum(2 * told, 1)) / pixel
+    return np.maximum(rematched, 0.5 * inverse), error
 
 
 def _corrected(inverse: np.ndarray, total: np.ndarray, weight: np.ndarray, error: np.ndarray | float, width: int) -> np.ndarray:

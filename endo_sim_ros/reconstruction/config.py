@@ -33,7 +33,8 @@ class ReconstructionConfig(StageConfig):
     """network: folder of a Depth-Anything-V2 checkpoint (transformers) or ONNX file; nothing is ever downloaded. Empty:
     one that Hugging Face's cache holds."""
     agreement: bool = True
-    """Correct the depth of stereo, network or points by scene points and by how the other views show the same tissue."""
+    """Correct the depth of stereo, network or points by scene points and by how the right image and the other views show the
+    same tissue."""
     surroundings: Annotated[float, Range(0, 1)] = 0.3
     """How far tissue goes on, coarsely, beyond what the training views see, in widths of the image, so that other views do
     not look into the void; holes of the depth prior are filled likewise. 0 = neither."""

@@ -1,9 +1,9 @@
 """Which views of a sequence to train on and which to hold out."""
 
-import dataclasses
 import re
 from typing import NamedTuple
 
+from endo_sim_ros.reconstruction.depth import right_camera
 from endo_sim_ros.sequences.frames import Frame, SequenceError
 from endo_sim_ros.sequences.recordings import lit_area, spread
 
@@ -84,10 +84,4 @@ def right_views(frames: list[Frame]) -> list[Frame]:
     if not pairs:
         raise SequenceError("split stereo: the sequence has no right images")
     lit = lit_area(frame.right for frame in spread(pairs, 10))
-    views = []
-    for frame in pairs:
-        K, pose = frame.camera.K if frame.right_K is None else frame.right_K, frame.camera.pose.copy()
-        pose[:3, 3] += frame.baseline * pose[:3, 0]
-        camera = dataclasses.replace(frame.camera, K=K, pose=pose)
-        views.append(Frame(frame.stamp_ns, frame.right, camera, mask=lit))
-    return views
+    return [Frame(frame.stamp_ns, frame.right, right_camera(frame), mask=lit) for frame in pairs]

@@ -72,18 +72,22 @@ def with_depth_prior(frames: list[Frame], points: ScenePoints, config: Reconstru
     return [frame if frame.right is None else _with_right_shifted(frame, offset) for frame, offset in zip(frames, offsets)]
 
 
-def right_view(frame: Frame) -> Frame:
-    """The right image of a stereo frame as a view of its own, without depth."""
+def right_camera(frame: Frame) -> Camera:
+    """The camera of a stereo frame's right eye."""
     pose = frame.camera.pose.copy()
     pose[:3, 3] += frame.baseline * pose[:3, 0]
-    K = frame.camera.K if frame.right_K is None else frame.right_K
+    return dataclasses.replace(frame.camera, K=frame.camera.K if frame.right_K is None else frame.right_K, pose=pose)
+
+
+def right_view(frame: Frame) -> Frame:
+    """The right image of a stereo frame as a view of its own, without depth."""
     mask = lit_area([frame.right])
     if frame.mask is not None:
         # Tools of the left image lie farther to the left, by any of the disparities that there are.
         tools = (frame.mask == 0) & (lit_area([frame.image]) > 0)
         farthest = int(_WIDEST_PARALLAX * frame.camera.width)
         mask[cv2.dilate(np.uint8(tools), np.ones((1, farthest + 1), np.uint8), anchor=(0, 0)) > 0] = 0
-    return Frame(frame.stamp_ns, frame.right, Camera(K, frame.camera.width, frame.camera.height, pose), mask=mask)
+    return Frame(frame.stamp_ns, frame.right, right_camera(frame), mask=mask)
 
 
 def depth_source(frames: list[Frame], config: ReconstructionConfig) -> str:

@@ -349,13 +349,62 @@ def test_small_islands_of_disparity_are_no_surface(large):
 # ---------------------------------------------------------------------------------------- agreement of views
 
 
-def test_flow_between_the_eyes_corrects_what_matching_left(large):
-    (matched,) = with_depth_prior([large[0]], NO_POINTS, options(depth="stereo"))
+def plain_pair(frame):
+    return frame
+
+
+def dark_right(frame):
+    return dataclasses.replace(frame, right=frame.right // 2)
+
+
+def behind_a_tool(frame):
+    mask = np.full(frame.image.shape[:2], 255, np.uint8)
+    mask[200:300, 240:400] = 0
+    return dataclasses.replace(frame, mask=mask)
+
+
+def with_eyes_that_converge(frame):
+    K = frame.camera.K.copy()
+    K[0, 2] -= 12  # and the right image with it
+    moved = frame.right[:, np.clip(np.arange(frame.camera.width) + 12, 0, frame.camera.width - 1)]
+    return dataclasses.replace(frame, right=moved, right_K=K)
+
+
+@pytest.mark.parametrize("pair", [plain_pair, dark_right, behind_a_tool, with_eyes_that_converge])
+def test_flow_between_the_eyes_corrects_what_matching_left(large, pair):
+    (matched,) = with_depth_prior([pair(large[0])], NO_POINTS, options(depth="stereo"))
     (corrected,), contradiction = agreed([matched], NO_POINTS, matched=True)
     error = lambda view: np.abs(view.depth - large[0].depth)[(matched.depth > 0) & (view.depth > 0)]
     assert np.median(error(corrected)) < 0.6 * np.median(error(matched))
     assert np.sqrt((error(corrected) ** 2).mean()) < 0.8 * np.sqrt((error(matched) ** 2).mean())
     assert np.isnan(contradiction)  # one view contradicts none
+
+
+def test_flow_is_found_in_finer_pixels_than_are_trained_on(large):
+    wide = Trainer([dataclasses.replace(large[0], depth=None)], options(image_width=320))._frames[0]
+    (matched,) = with_depth_prior([dataclasses.replace(large[0], depth=None)], NO_POINTS, options())
+    (narrow,), _ = agreed([shrink(matched, 320)], NO_POINTS, matched=True)
+    exact = shrink(large[0], 320).depth
+    error = lambda depth: np.sqrt((((depth - exact)[(wide.depth > 0) & (narrow.depth > 0)]) ** 2).mean())
+    assert error(wide.depth) < 0.95 * error(narrow.depth)
+
+
+def test_reflections_of_the_light_do_not_spoil_the_depth_that_views_agree_on(large):
+    """A reflection is seen where the tissue is not: through another view's depth it lies beside where that view has it."""
+    frames = with_depth_prior(list(large[:2]), NO_POINTS, options(depth="stereo"))
+    centres = np.array([(x, y) for x in range(160, 500, 80) for y in range(120, 420, 80)])
+    lit, around = list(frames), np.zeros(frames[0].depth.shape, np.uint8)
+    for i, (frame, aside) in enumerate(zip(frames, ((0, 0), (10, 6)))):
+        image = frame.image.copy()
+        uv, _ = frame.camera.project(frames[0].camera.backproject(large[0].depth)[centres[:, 1], centres[:, 0]])
+        for place in uv + aside:
+            cv2.circle(image, tuple(int(c) for c in place), 7, (255, 255, 255), -1)
+        lit[i] = dataclasses.replace(frame, image=image)
+    for x, y in centres:
+        cv2.circle(around, (int(x), int(y)), 25, 1, -1)
+    where = (around > 0) & (frames[0].depth > 0)
+    error = lambda views: np.sqrt(((agreed(views, NO_POINTS, matched=False)[0][0].depth - large[0].depth)[where] ** 2).mean())
+    assert error(lit) < 1.6 * error(frames)
 
 
 def test_views_correct_each_others_depth(large):

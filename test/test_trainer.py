@@ -335,6 +335,26 @@ def test_a_checkpoint_of_any_preset_goes_on_as_if_never_interrupted(views, tmp_p
 # ---------------------------------------------------------------------------------------- surroundings
 
 
+def test_what_goes_on_beyond_a_picture_does_not_reach_into_it(views):
+    frame = bare(views[4])
+    exact, pixels = views[4].depth, np.column_stack([np.full(40, 175.0), np.linspace(5, 120, 40)])
+    known = dataclasses.replace(frame, depth=exact)
+    # Tissue that other views saw, beyond the right edge, and one point before it that is none.
+    K = frame.camera.K
+    depth = np.full(40, np.median(exact))
+    depth[20] *= 0.6
+    local = np.column_stack([(pixels - K[:2, 2]) / K[[0, 1], [0, 1]] * depth[:, None], depth])
+    points = frame.camera.position + local @ frame.camera.pose[:3, :3].T
+    trainer = Trainer([known], options(max_gaussians=8000, light=False, exposure=False), (points, np.full((40, 3), 0.5)))
+    rendered = DeformableRenderer(trainer.model, None, RenderingConfig(device="cpu")).render(frame.camera)[1]
+    plain = Trainer([known], options(max_gaussians=8000, light=False, exposure=False, surroundings=0.0)).model
+    alone = DeformableRenderer(plain, None, RenderingConfig(device="cpu")).render(frame.camera)[1]
+    border = np.ones(exact.shape, bool)
+    border[8:-8, 8:-8] = False
+    border &= (exact > 0) & (rendered > 0) & (alone > 0) & (True if frame.mask is None else frame.mask > 0)
+    assert np.quantile(np.abs(rendered[border] / alone[border] - 1), 0.98) < 0.02
+
+
 def test_tissue_goes_on_beyond_the_pictures_and_in_holes(views):
     frame = dataclasses.replace(bare(views[4]), depth=views[4].depth.copy())
     frame.depth[50:80, 60:100] = 0  # as at a glint

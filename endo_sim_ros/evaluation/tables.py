@@ -246,7 +246,8 @@ def _write_strips(summaries: list[Summary], out: Path) -> None:
                 keys = [("", reference), *((method, kind) for method in methods)]
                 images = [_small(out / paths[key]) if key in paths else None for key in keys]
                 blank = np.zeros_like(next(image for image in images if image is not None))
-                labels = [f"view {int(view)}" if kind == "rendered" else "its depth", *methods]
+                depth = "no depth to compare with" if images[0] is None else "its depth"
+                labels = [f"view {int(view)}" if kind == "rendered" else depth, *methods]
                 cells += [(label, blank if image is None else image) for label, image in zip(labels, images)]
         figures.write_png(out / "strips" / f"{figures.slug(f'{sequence}-{split}')}.png", figures.sheet(cells, len(methods) + 1))
 

@@ -26,7 +26,10 @@ _ALIKE = 0.5  # correlation from which on two pixels show the same tissue
 _LEAST_SEEN = 0.02  # share of the pixels with depth
 _TOO_FAR = 0.25  # relative difference from which on a point lies on another surface
 _EDGE = 0.05  # relative step of depth that is an edge
+_BRIGHT, _BRIGHTER = 200, 60  # grey levels of all channels, or so much above those around, from which on light is reflected
 # In pixels of an image 640 wide:
+_GLOW = 3.0  # around a reflection
+_AROUND = 15.0  # standard deviation of what is around one
 _STEP = 1.0  # farthest that matching with the right image is believed to be off
 _RIPPLE = 10.0  # standard deviation over which depth is smoothed within edges
 _OFF_LINE = 2.0  # farthest beside the line on which depth alone can move a point
@@ -45,7 +48,7 @@ def agreed(frames: list[Frame], points: ScenePoints, matched: bool) -> tuple[lis
     image, along the direction in which depth moves a pixel, is a correction of inverse depth that is the more precise the
     farther apart the views are. Corrections and prior are averaged by their precision; where there is none, that of
     the surroundings counts; what ripples are left within edges is smoothed. Before it, the prior of matching with a view's
-    right image is corrected likewise by that image. What flow is left across that direction no
+    right image is corrected likewise by that image. Reflections of the light count between the eyes alone. What flow is left across that direction no
     depth explains: it is from poses, calibration or motion; its median is returned (pixels), NaN where no two views show
     the same.
 
@@ -56,6 +59,7 @@ def agreed(frames: list[Frame], points: ScenePoints, matched: bool) -> tuple[lis
     """
     tissue = [np.ones(frame.image.shape[:2], np.float32) if frame.mask is None else np.float32(frame.mask > 0) for frame in frames]
     plain = [_plain(frame, shown) for frame, shown in zip(frames, tissue)]
+    matte = [shown * ~_glints(frame.image) for frame, shown in zip(frames, tissue)]
     near = neighbours(frames, _NEIGHBOURS)
 
     def corrected(i: int) -> tuple[Frame, list[tuple[float, float]]]:
@@ -70,7 +74,7 @@ def agreed(frames: list[Frame], points: ScenePoints, matched: bool) -> tuple[lis
         total, weight = _of_points(frame, inverse, points)
         for j in near[i]:
             if j != i:
-                found = _of_view(camera, inverse, plain[i], tissue[i], frames[j].camera, plain[j], tissue[j])
+                found = _of_view(camera, inverse, plain[i], matte[i], frames[j].camera, plain[j], matte[j])
                 if found is not None:
                     correction, precision, *contradiction = found
                     total, weight = total + precision * correction, weight + precision
@@ -137,6 +141,15 @@ def _plain(frame: Frame, tissue: np.ndarray) -> np.ndarray:
     mean = blur(grey * tissue) / share
     variance = np.maximum(blur(grey * grey * tissue) / share - mean * mean, 0)
     return np.uint8(np.clip(128 + 40 * (grey - mean) / np.sqrt(variance + 4), 0, 255))
+
+
+def _glints(image: np.ndarray) -> np.ndarray:
+    """Where an image [H, W, 3] shows reflections of the light, which lie deeper than the tissue and move with the camera [H, W]."""
+    unit = image.shape[1] / 640
+    least = image.min(2).astype(np.float32)
+    around = cv2.GaussianBlur(least, (0, 0), _AROUND * unit)
+    bright = np.uint8((least > _BRIGHT) | (least > around + _BRIGHTER))
+    return cv2.dilate(bright, np.ones((2 * round(_GLOW * unit) + 1,) * 2, np.uint8)) > 0
 
 
 def _of_points(frame: Frame, inverse: np.ndarray, points: ScenePoints) -> tuple[np.ndarray, np.ndarray]:

@@ -15,8 +15,12 @@ from endo_sim_ros.light import features_at
 from endo_sim_ros.reconstruction.triangulation import points_in_view
 from endo_sim_ros.sequences.frames import Frame
 
-_INSIDE, _BEYOND = 1 / 80, 1 / 27  # spacing in holes and beyond the picture, in widths of the image
-_OPACITY = 0.7
+# In widths of the image:
+_FINE, _COARSE = 1 / 80, 1 / 27  # spacing in holes and close around the picture, and farther out
+_CLOSE = 0.15  # how far around it; large Gaussians there would reach into the picture and cover what was seen
+_SIZE = 0.6  # standard deviation in spacings: the nearer ones of larger Gaussians hide the others where tissue is steep
+_OPACITY = 0.8
+_POINTS = 9  # neighbours among which a scene point's depth has to be the usual one
 _LEAST_SEEN = 0.02  # share of the pixels with depth, from which on its surroundings can be told
 _BRIGHTEST = 2.0
 
@@ -52,7 +56,8 @@ def with_surroundings(
         known = np.pad(frame.depth > 0, pad)
         inside = np.zeros(known.shape, bool)
         inside[pad : pad + height, pad : pad + width] = True if frame.mask is None else frame.mask > 0
-        for where, share in ((inside, _INSIDE), (~inside, _BEYOND)):
+        close = ~inside & (cv2.dilate(np.uint8(inside), np.ones((2 * int(_CLOSE * width) + 1,) * 2, np.uint8)) > 0)
+        for where, share in ((inside, _FINE), (close, _FINE), (~inside & ~close, _COARSE)):
             stride = max(round(share * width), 1)
             chosen = np.zeros(known.shape, bool)
             chosen[stride // 2 :: stride, stride // 2 :: stride] = True
@@ -67,7 +72,7 @@ def with_surroundings(
     count, room = sum(map(len, spacings)), limit - len(model)
     if not count or room <= 0:
         return model
-    arrays = np.concatenate(parts[1:]), np.concatenate(colors), np.concatenate(spacings)
+    arrays = np.concatenate(parts[1:]), np.concatenate(colors), _SIZE * np.concatenate(spacings)
     if count > room:  # fewer and larger ones
         kept = np.linspace(0, count - 1, room).astype(int)
         arrays = arrays[0][kept], arrays[1][kept], arrays[2][kept] * (count / room) ** 0.5
@@ -97,7 +102,10 @@ def _continued(
     columns, rows = np.floor(uv).astype(int).T
     beyond = ~known[rows, columns]
     columns, rows, there = columns[beyond], rows[beyond], 1 / z[beyond]
-    rest[rows, columns] = there - flat[rows, columns]
+    over = there - flat[rows, columns]
+    if len(over) >= _POINTS:  # one wrong point would stand like a pillar before the tissue
+        over = np.median(over[cKDTree(uv[beyond]).query(uv[beyond], k=_POINTS)[1]], 1)
+    rest[rows, columns] = over
     low, high = np.percentile(np.concatenate([inverse, there]), [1, 99])
     anchored = known.copy()
     anchored[rows, columns] = True

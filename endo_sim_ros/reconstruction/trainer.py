@@ -56,6 +56,7 @@ _NOTHING = {
 }
 _MOST_ITERATIONS, _LEAST_TRAINING = 3000, 1 / 3  # and the least share of them
 _SHARP = 0.15  # pixels: views that agree so well are worth all iterations
+_FINER = 2  # times the width trained on, at which depth is corrected where images are so fine
 _NARROWEST = 64  # pixels; images are not halved below when memory runs out
 _SELDOM = 4  # iterations between steps that may be taken seldom, and then are as much larger
 _ON_SURFACE = 0.02  # of its depth
@@ -117,14 +118,17 @@ class Trainer:
         self.device = pick_device(config.device)
         source = depth_source(frames, config)
         frames, points = _consistent(_showing(frames), config, None if points is None else _checked(ScenePoints(*points)))
-        frames = [shrink(frame, config.image_width) for frame in frames]
         correcting = config.agreement and source not in ("topic", "none")
         if correcting or not config.iterations:
-            corrected, contradiction = agreed(frames, points, matched=source == "stereo")
+            # Flow is the more precise the finer the pixels are, as matching is.
+            fine = [shrink(frame, _FINER * config.image_width) for frame in frames]
+            corrected, contradiction = agreed(fine, points, matched=source == "stereo")
             if correcting:
                 frames = corrected
             if not config.iterations:
-                self.config = config = _as_long_as_worth(config, contradiction)
+                coarser = min(config.image_width / fine[0].camera.width, 1)
+                self.config = config = _as_long_as_worth(config, contradiction * coarser)
+        frames = [shrink(frame, config.image_width) for frame in frames]
         if config.still:
             frames = without_motion(frames, config.depth_tolerance)
         seen = int(_SEEN * config.max_gaussians) if config.surroundings else config.max_gaussians
@@ -182,9 +186,14 @@ class Trainer:
         """How exposure changed in the course of the recording beyond what the light explains."""
         return photometry.Drift(self._stamps, self._fitted_light()[1])
 
-    @torch.no_grad()
     def _fitted_light(self) -> tuple[Light | None, np.ndarray]:
         """The light and what it leaves of the views' exposures [V, 3]."""
+        if self._fitted is None or self._fitted[0] != self.iteration:
+            self._fitted = self.iteration, *self._fit_light()
+        return self._fitted[1:]
+
+    @torch.no_grad()
+    def _fit_light(self) -> tuple[Light | None, np.ndarray]:
         unexplained = np.zeros((len(self._stamps), 3))
         if not self._lit:
             return None, unexplained
@@ -484,6 +493,7 @@ class Trainer:
 
     def _set_light(self, light: Tensor, exposures: Tensor) -> None:
         """Start optimising the light [4] and the logarithm of the exposures [V, 3], as far as there are any."""
+        self._fitted = None  # the iteration that light and drift were asked for last, and what they were
         self._light = {
             "light": light.clone().requires_grad_(self.config.light),
             "exposures": exposures.clone().requires_grad_(self.config.exposure),
@@ -534,7 +544,7 @@ class Trainer:
 
     def _load(self, frames: list[Frame]) -> None:
         """Train on these from now on."""
-        self._frames = frames
+        self._frames, self._fitted = frames, None
         self._views = [self._to_device(frame, i) for i, frame in enumerate(frames)]
         if self.config.right_views:
             self._views += [self._to_device(right_view(f), i) for i, f in enumerate(frames) if f.right is not None]

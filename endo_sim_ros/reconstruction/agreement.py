@@ -48,9 +48,9 @@ def agreed(frames: list[Frame], points: ScenePoints, matched: bool) -> tuple[lis
     image, along the direction in which depth moves a pixel, is a correction of inverse depth that is the more precise the
     farther apart the views are. Corrections and prior are averaged by their precision; where there is none, that of
     the surroundings counts; what ripples are left within edges is smoothed. Before it, the prior of matching with a view's
-    right image is corrected likewise by that image. Reflections of the light count between the eyes alone. What flow is left across that direction no
-    depth explains: it is from poses, calibration or motion; its median is returned (pixels), NaN where no two views show
-    the same.
+    right image is corrected likewise by that image. Reflections of the light count between the eyes alone. What flow is
+    left across that direction no depth explains: it is from poses, calibration or motion; its median is returned (pixels),
+    NaN where no two views show the same.
 
     Args:
         frames: Views with a depth prior.

@@ -1,6 +1,7 @@
 """Tissue goes on where no training view has seen it: coarse Gaussians in the holes of the depth prior and beyond the pictures.
 
-They keep other views from looking into the void. They are far apart, so that physics takes no control nodes from beyond the pictures.
+They keep other views from looking into the void. They are farther apart than what was seen, so that physics takes no control nodes
+from beyond the pictures.
 """
 
 import cv2

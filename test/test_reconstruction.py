@@ -407,6 +407,13 @@ def test_reflections_of_the_light_do_not_spoil_the_depth_that_views_agree_on(lar
     assert error(lit) < 1.6 * error(frames)
 
 
+def test_pale_tissue_is_no_reflection(large):
+    pale = [dataclasses.replace(frame, image=(180 + frame.image // 4).astype(np.uint8)) for frame in large[:2]]
+    off = [dataclasses.replace(frame, depth=frame.depth * np.float32(1.03), right=None, baseline=None) for frame in pale]
+    corrected, _ = agreed(off, NO_POINTS, matched=False)
+    assert all(np.median(np.abs(a.depth / b.depth - 1)) < 0.012 for a, b in zip(corrected, large))
+
+
 def test_views_correct_each_others_depth(large):
     frames = with_depth_prior(list(large), NO_POINTS, options(depth="stereo"))
     corrected, contradiction = agreed(frames, NO_POINTS, matched=True)

@@ -14,6 +14,7 @@ from endo_sim_ros.reconstruction import ABLATIONS, PRESETS, ReconstructionConfig
 from endo_sim_ros.reconstruction.depth import right_view
 from endo_sim_ros.reconstruction.motion import without_motion
 from endo_sim_ros.reconstruction.presets import resolved
+from endo_sim_ros.reconstruction.surroundings import _continued
 from endo_sim_ros.reconstruction.trainer import shrink
 from endo_sim_ros.reconstruction.triangulation import match_features, misposed, triangulate
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
@@ -353,6 +354,32 @@ def test_what_goes_on_beyond_a_picture_does_not_reach_into_it(views):
     border[8:-8, 8:-8] = False
     border &= (exact > 0) & (rendered > 0) & (alone > 0) & (True if frame.mask is None else frame.mask > 0)
     assert np.quantile(np.abs(rendered[border] / alone[border] - 1), 0.98) < 0.02
+
+
+def test_gaussians_around_a_picture_are_small_close_to_it_and_none_is_a_lone_scene_point(views):
+    frame = dataclasses.replace(bare(views[4]), depth=views[4].depth)
+    K, aside = frame.camera.K, np.array([[230.0, 20.0], [250.0, 60.0], [270.0, 100.0]])  # far beyond the right edge
+    local = np.column_stack([(aside - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones(3)]) * np.median(frame.depth)
+    points = frame.camera.position + local @ frame.camera.pose[:3, :3].T
+    model = Trainer([frame], options(max_gaussians=20_000, light=False, exposure=False), (points, np.full((3, 3), 0.5))).model
+    uv, _ = frame.camera.project(model.means.numpy().astype(np.float64))
+    out = np.maximum(-uv, uv - [frame.camera.width, frame.camera.height]).max(1)
+    sizes = model.scales.numpy().max(1)
+    assert sizes[(out > 0) & (out < 12)].max() < 0.6 * np.median(sizes[out > 30])
+    assert not (np.abs(model.means.numpy()[:, None] - points).max(2) < 1e-6).any()
+
+
+def test_noise_of_scene_points_does_not_make_the_tissue_beyond_rough(views):
+    frame = dataclasses.replace(bare(views[4]), depth=views[4].depth)
+    random, K = np.random.default_rng(0), frame.camera.K
+    pixels = random.uniform([170, 0], [200, 128], (400, 2))
+    flat = float(np.median(frame.depth[:, -20:]))
+    depth = flat * random.normal(1, 0.03, 400)
+    local = np.column_stack([(pixels - K[:2, 2]) / K[[0, 1], [0, 1]] * depth[:, None], depth])
+    points = frame.camera.position + local @ frame.camera.pose[:3, :3].T
+    _, continued, _ = _continued(frame, points, np.zeros(4), np.zeros(3), flat, 48)
+    around = continued[48 + 10 : 48 + 118, 48 + 175 : 48 + 195]
+    assert np.std(around / flat) < 0.012  # points alone: 0.017
 
 
 def test_tissue_goes_on_beyond_the_pictures_and_in_holes(views):

@@ -26,7 +26,7 @@ _ALIKE = 0.5  # correlation from which on two pixels show the same tissue
 _LEAST_SEEN = 0.02  # share of the pixels with depth
 _TOO_FAR = 0.25  # relative difference from which on a point lies on another surface
 _EDGE = 0.05  # relative step of depth that is an edge
-_BRIGHT, _BRIGHTER = 200, 60  # grey levels of all channels, or so much above those around, from which on light is reflected
+_WHITE, _BRIGHTER = 250, 60  # grey levels of all channels, or so much above those around, from which on light is reflected
 # In pixels of an image 640 wide:
 _GLOW = 3.0  # around a reflection
 _AROUND = 15.0  # standard deviation of what is around one
@@ -59,7 +59,7 @@ def agreed(frames: list[Frame], points: ScenePoints, matched: bool) -> tuple[lis
     """
     tissue = [np.ones(frame.image.shape[:2], np.float32) if frame.mask is None else np.float32(frame.mask > 0) for frame in frames]
     plain = [_plain(frame, shown) for frame, shown in zip(frames, tissue)]
-    matte = [shown * ~_glints(frame.image) for frame, shown in zip(frames, tissue)]
+    matte = [shown * ~_glints(frame.image, shown) for frame, shown in zip(frames, tissue)]
     near = neighbours(frames, _NEIGHBOURS)
 
     def corrected(i: int) -> tuple[Frame, list[tuple[float, float]]]:
@@ -143,12 +143,13 @@ def _plain(frame: Frame, tissue: np.ndarray) -> np.ndarray:
     return np.uint8(np.clip(128 + 40 * (grey - mean) / np.sqrt(variance + 4), 0, 255))
 
 
-def _glints(image: np.ndarray) -> np.ndarray:
+def _glints(image: np.ndarray, tissue: np.ndarray) -> np.ndarray:
     """Where an image [H, W, 3] shows reflections of the light, which lie deeper than the tissue and move with the camera [H, W]."""
     unit = image.shape[1] / 640
     least = image.min(2).astype(np.float32)
-    around = cv2.GaussianBlur(least, (0, 0), _AROUND * unit)
-    bright = np.uint8((least > _BRIGHT) | (least > around + _BRIGHTER))
+    blur = lambda values: cv2.GaussianBlur(values, (0, 0), _AROUND * unit)
+    around = blur(least * tissue) / np.maximum(blur(tissue), 1e-3)
+    bright = np.uint8(((least > _WHITE) | (least > around + _BRIGHTER)) & (tissue > 0))
     return cv2.dilate(bright, np.ones((2 * round(_GLOW * unit) + 1,) * 2, np.uint8)) > 0
 
 

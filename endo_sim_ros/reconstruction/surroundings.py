@@ -1,7 +1,6 @@
 """Tissue goes on where no training view has seen it: coarse Gaussians in the holes of the depth prior and beyond the pictures.
 
-They keep other views from looking into the void. They are farther apart than what was seen, so that physics takes no control nodes
-from beyond the pictures.
+They keep other views from looking into the void. Physics, which knows the training cameras, takes no control nodes from them.
 """
 
 import cv2

@@ -86,6 +86,11 @@ class Camera:
         uv = local[:, :2] / safe[:, None] * [self.K[0, 0], self.K[1, 1]] + self.K[:2, 2]
         return uv, z
 
+    def sees(self, points: np.ndarray) -> np.ndarray:
+        """Which points [N, 3] (m, world) lie in the picture [N], hidden or not."""
+        uv, z = self.project(points)
+        return (z > 0) & (uv >= 0).all(1) & (uv < [self.width, self.height]).all(1)
+
 
 def invert_pose(pose: np.ndarray) -> np.ndarray:
     """Inverse of a rigid transform [4, 4]."""

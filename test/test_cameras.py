@@ -110,3 +110,9 @@ def test_cameras_survive_a_file(tmp_path):
     (tmp_path / "cameras.json").write_text('{"K": 1}')
     with pytest.raises(ValueError, match="cameras.json: not a readable list of cameras"):
         load_cameras(tmp_path / "cameras.json")
+
+
+def test_a_camera_sees_what_lies_in_its_picture_and_before_it():
+    camera = Camera(np.array([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]]), 64, 48, np.eye(4))
+    points = np.array([[0, 0, 1], [0.31, 0.23, 1], [0.33, 0, 1], [0, -0.25, 1], [0, 0, -1]])
+    assert camera.sees(points).tolist() == [True, True, False, False, False]

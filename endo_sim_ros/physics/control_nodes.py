@@ -165,8 +165,7 @@ def _in_pictures(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
     """Which points [N, 3] (m, world) lie in the picture of some camera; all without any, or if hardly any does."""
     inside = np.zeros(len(points), bool)
     for camera in cameras:
-        uv, z = camera.project(points)
-        inside |= (z > 0) & (uv >= 0).all(1) & (uv < [camera.width, camera.height]).all(1)
+        inside |= camera.sees(points)
     return inside if inside.sum() > LEAST_IN_PICTURES * len(points) else np.ones(len(points), bool)
 
 

@@ -36,7 +36,7 @@ class ReconstructionConfig(StageConfig):
     """Correct the depth of stereo, network or points by scene points and by how the right image and the other views show the
     same tissue."""
     surroundings: Annotated[float, Range(0, 1)] = 0.3
-    """How far tissue goes on, coarsely, beyond what the training views see, in widths of the image, so that other views do
+    """How far tissue goes on beyond what the training views see, in widths of the image, so that other views do
     not look into the void; holes of the depth prior are filled likewise. 0 = neither."""
     confined: bool = True
     """Views change only Gaussians whose centres lie in one of them: others, which reach in from outside, would take on colours

@@ -46,7 +46,7 @@ def initial_model(
     parts = [_back_project(frames, i, pixels, stride, config.depth_tolerance) for i, pixels in enumerate(taken)]
     useful = ~_afloat(frames, points, config.depth_tolerance)
     if any(pixels.any() for pixels in chosen):  # lone points beyond the views would reach into them; see `with_surroundings`
-        useful &= _in_some_view(frames, points)
+        useful &= np.any([frame.camera.sees(points) for frame in frames], 0)
     parts.append(_in_holes(parts, points[useful], colors[useful]))
     positions, colors, spacing = (np.concatenate(arrays) for arrays in zip(*parts))
     if len(positions) < _MIN_POINTS:
@@ -140,15 +140,6 @@ def _afloat(frames: list[Frame], points: np.ndarray, tolerance: float) -> np.nda
         z, surface, _ = _seen(dataclasses.replace(frame, depth=np.maximum(beside, 0)), points)
         floats |= (surface > 0) & (z < surface)
     return floats
-
-
-def _in_some_view(frames: list[Frame], points: np.ndarray) -> np.ndarray:
-    """Which points [N] lie in a picture."""
-    inside = np.zeros(len(points), bool)
-    for frame in frames:
-        uv, z = frame.camera.project(points)
-        inside |= (z > 0) & (uv >= 0).all(1) & (uv < [frame.camera.width, frame.camera.height]).all(1)
-    return inside
 
 
 def _in_holes(parts: list[_Points], points: np.ndarray, colors: np.ndarray) -> _Points:

@@ -1,4 +1,4 @@
-"""Tissue goes on where no training view has seen it: coarse Gaussians in the holes of the depth prior and beyond the pictures.
+"""Tissue goes on where no training view has seen it: large Gaussians in the holes of the depth prior and beyond the pictures.
 
 They keep other views from looking into the void. Physics, which knows the training cameras, takes no control nodes from them.
 """

@@ -148,8 +148,11 @@ def test_masked_mean_counts_channels_and_survives_an_empty_mask():
 
 def test_depth_loss_by_hand():
     depth, prior = torch.tensor([[0.10, 0.20, 0.30]]), torch.tensor([[0.13, 0.0, 0.29]])
-    assert float(losses.depth_l1(depth, prior, None)) == pytest.approx(0.02)
-    assert float(losses.depth_l1(depth, prior, torch.tensor([[1.0, 1.0, 0.0]]))) == pytest.approx(0.03)
+    alpha = torch.tensor([[0.8, 1.0, 1.0]])
+    assert float(losses.depth_l1(depth, prior, None, alpha, 0.0)) == pytest.approx(0.02)
+    assert float(losses.depth_l1(depth, prior, torch.tensor([[1.0, 1.0, 0.0]]), alpha, 0.0)) == pytest.approx(0.03)
+    # Seen at 0.125 m, and a fifth of it is transparent.
+    assert float(losses.depth_l1(depth, prior, None, alpha, 0.5)) == pytest.approx((0.005 + 0.5 * 0.2 * 0.13 + 0.01) / 2)
 
 
 def test_total_variation_by_hand():
@@ -421,6 +424,15 @@ def test_views_correct_each_others_depth(large):
     assert error(corrected) < 0.5 * error(frames)
     assert contradiction < 0.2
     assert all(((a.depth > 0) == (b.depth > 0)).mean() > 0.999 for a, b in zip(corrected, frames))
+
+
+def test_the_right_eye_of_another_view_corrects_depth_where_its_left_one_sees_nothing(large):
+    off = bare(large[0], depth=large[0].depth * np.float32(1.03))
+    blind = dataclasses.replace(large[1], image=np.full_like(large[1].image, 90))
+    corrected, _ = agreed([off, blind], NO_POINTS, matched=True)
+    assert np.median(np.abs(corrected[0].depth / large[0].depth - 1)) < 0.012
+    unsure, _ = agreed([off, blind], NO_POINTS, matched=False)  # nobody knows then how the eyes stand
+    assert np.median(np.abs(unsure[0].depth / large[0].depth - 1)) > 0.025
 
 
 def test_ripples_of_wide_images_are_smoothed_and_edges_are_not():

@@ -14,7 +14,7 @@ from endo_sim_ros.reconstruction import ABLATIONS, PRESETS, ReconstructionConfig
 from endo_sim_ros.reconstruction.depth import right_view
 from endo_sim_ros.reconstruction.motion import without_motion
 from endo_sim_ros.reconstruction.presets import resolved
-from endo_sim_ros.reconstruction.surroundings import _continued
+from endo_sim_ros.reconstruction.surroundings import _continued, _continued_from
 from endo_sim_ros.reconstruction.trainer import shrink
 from endo_sim_ros.reconstruction.triangulation import match_features, misposed, triangulate
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
@@ -380,6 +380,27 @@ def test_noise_of_scene_points_does_not_make_the_tissue_beyond_rough(views):
     _, continued, _ = _continued(frame, points, np.zeros(4), np.zeros(3), flat, 48)
     around = continued[48 + 10 : 48 + 118, 48 + 175 : 48 + 195]
     assert np.std(around / flat) < 0.012  # points alone: 0.017
+
+
+def test_depth_beyond_is_that_of_kriging():
+    random, width = np.random.default_rng(0), 80  # one pixel a cell
+    known = np.zeros((12, width), bool)
+    known[2:6, 3:8] = True
+    values, uv, there = random.normal(0, 1, known.shape), random.uniform(0, [width, 12], (15, 2)), random.normal(0, 1, 15)
+    told = _continued_from(values, known, uv, there, width)
+    assert (told[known] == values[known]).all()
+    rows, columns = np.nonzero(known)
+    sources = np.concatenate([np.column_stack([columns, rows]) + 0.5, uv])
+    rows, columns = np.nonzero(~known)
+    targets = np.column_stack([columns, rows]) + 0.5
+    # Half the squared difference of what lies a distance apart is that distance, to which the variances of the sources come.
+    between = lambda a, b: -np.linalg.norm(a[:, None] - b, axis=2)
+    system = np.zeros((36, 36))
+    system[:35, :35] = between(sources, sources) + np.diag(np.repeat([width / 128, width / 8], [20, 15]))
+    system[35, :35] = system[:35, 35] = 1
+    weights = np.linalg.solve(system, np.column_stack([between(targets, sources), np.ones(len(targets))]).T)[:35]
+    expected = weights.T @ np.concatenate([values[known], there])
+    np.testing.assert_allclose(told[~known], expected, atol=1e-4)
 
 
 def test_tissue_goes_on_beyond_the_pictures_and_in_holes(views):

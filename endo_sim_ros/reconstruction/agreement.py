@@ -5,6 +5,7 @@ lies beside where another view's depth and pose expect it tells that depth sever
 """
 
 import dataclasses
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -20,8 +21,8 @@ _NEIGHBOURS = 4  # views that each view is compared with: the nearest in space
 _LEAST_SHARED = 0.05  # of the picture, below which two views are not compared
 _REMATCHED = 0.15  # pixels, error of a disparity that flow between the eyes has corrected
 _GUESSED = 0.05  # relative error of a depth that no right image gave
-_FLOW = 1.0  # pixels, error of a displacement, that of the poses included
-_EYES = 0.3  # share of it between the eyes of one view
+_FLOW = 0.5  # pixels, error of a displacement, that of the poses included
+_EYES = 0.6  # share of it between the eyes of one view
 _ALIKE = 0.5  # correlation from which on two pixels show the same tissue
 _LEAST_SEEN = 0.02  # share of the pixels with depth
 _TOO_FAR = 0.25  # relative difference from which on a point lies on another surface
@@ -40,11 +41,20 @@ _REACH = 15  # side of the square that a scene point speaks for
 _SMOOTH = 12.0  # standard deviation over which corrections are carried to pixels without
 
 
+class _Image(NamedTuple):
+    """What one eye of a view sees."""
+
+    camera: Camera
+    plain: np.ndarray  # grey [H, W] uint8, freed of light and contrast
+    tissue: np.ndarray  # [H, W] float32, 1 = there
+    matte: np.ndarray  # the same without reflections of the light
+
+
 def agreed(frames: list[Frame], points: ScenePoints, matched: bool) -> tuple[list[Frame], float]:
     """The frames with depth corrected, in their holes as little as before, by scene points and by what neighbouring views show,
     and by how many pixels the views contradict each other all the same.
 
-    A view's image is predicted from each neighbour's with the view's depth; the optical flow between prediction and
+    A view's image is predicted from each neighbour's, both its eyes', with the view's depth; the optical flow between prediction and
     image, along the direction in which depth moves a pixel, is a correction of inverse depth that is the more precise the
     farther apart the views are. Corrections and prior are averaged by their precision; where there is none, that of
     the surroundings counts; what ripples are left within edges is smoothed. Before it, the prior of matching with a view's
@@ -57,9 +67,7 @@ def agreed(frames: list[Frame], points: ScenePoints, matched: bool) -> tuple[lis
         points: Scene points.
         matched: Whether the prior is of matching with the right images, whose error is known, or of less.
     """
-    tissue = [np.ones(frame.image.shape[:2], np.float32) if frame.mask is None else np.float32(frame.mask > 0) for frame in frames]
-    plain = [_plain(frame, shown) for frame, shown in zip(frames, tissue)]
-    matte = [shown * ~_glints(frame.image, shown) for frame, shown in zip(frames, tissue)]
+    eyes = [[_seen(frame), *([_seen(right_view(frame))] if matched and frame.right is not None else [])] for frame in frames]
     near = neighbours(frames, _NEIGHBOURS)
 
     def corrected(i: int) -> tuple[Frame, list[tuple[float, float]]]:
@@ -70,15 +78,15 @@ def agreed(frames: list[Frame], points: ScenePoints, matched: bool) -> tuple[lis
         inverse = filled((known / np.where(known, frame.depth, 1)).astype(np.float32)[..., None], known)[..., 0]
         error = _GUESSED * inverse
         if matched and frame.right is not None:
-            inverse, error = _rematched(frame, inverse, plain[i], tissue[i])
+            inverse, error = _rematched(inverse, *eyes[i], camera.K[0, 0] * frame.baseline)
         total, weight = _of_points(frame, inverse, points)
         for j in near[i]:
-            if j != i:
-                found = _of_view(camera, inverse, plain[i], matte[i], frames[j].camera, plain[j], matte[j])
+            for eye in eyes[j] if j != i else []:
+                found = _of_image(inverse, eyes[i][0], eye)
                 if found is not None:
                     correction, precision, *contradiction = found
                     total, weight = total + precision * correction, weight + precision
-                    contradictions.append(contradiction)
+                    contradictions += [contradiction] if eye is eyes[j][0] else []
         inverse = _corrected(inverse, total, weight, error, camera.width)
         good = known & np.isfinite(inverse) & (inverse > 0)
         depth = np.where(good, 1 / np.where(good, inverse, 1), 0).astype(np.float32)
@@ -89,23 +97,23 @@ def agreed(frames: list[Frame], points: ScenePoints, matched: bool) -> tuple[lis
     return [frame for frame, _ in results], float((off * shares).sum() / shares.sum()) if shares.sum() else float("nan")
 
 
-def _rematched(frame: Frame, inverse: np.ndarray, image: np.ndarray, tissue: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _rematched(inverse: np.ndarray, left: _Image, right: _Image, pixel: float) -> tuple[np.ndarray, np.ndarray]:
     """Inverse depth [H, W] (1/m) of matching, corrected by the flow that it leaves between the eyes, and its error [H, W].
 
     Semi-global matching prefers whole pixels and goes in steps; optical flow does neither, but errs wildly where there is little to see.
     """
-    camera, right, pixel = frame.camera, right_view(frame), frame.camera.K[0, 0] * frame.baseline
-    lit, matched = np.float32(right.mask > 0), np.full(inverse.shape, MATCHED / pixel, np.float32)
-    inverse = _smooth(inverse, camera.width)
-    found = _of_view(camera, inverse, image, tissue, right.camera, _plain(right, lit), lit)
+    width, matched = left.camera.width, np.full(inverse.shape, MATCHED / pixel, np.float32)
+    inverse = _smooth(inverse, width)
+    # Between the eyes reflections hardly move.
+    found = _of_image(inverse, left._replace(matte=left.tissue), right._replace(matte=right.tissue))
     if found is None:
         return inverse, matched
     correction, precision, *_ = found
-    precision = np.where(np.abs(correction) * pixel < _STEP * camera.width / 640, precision / _EYES**2, 0)
+    precision = np.where(np.abs(correction) * pixel < _STEP * width / 640, precision / _EYES**2, 0)
     correction = np.where(precision > 0, correction, 0)
-    rematched = _corrected(inverse, precision * correction, precision, matched, camera.width)
+    rematched = _corrected(inverse, precision * correction, precision, matched, width)
     # Where flow tells nothing, far and wide, the error stays that of matching.
-    told = cv2.GaussianBlur((precision > 0).astype(np.float32), (0, 0), _SMOOTH * camera.width / 640)
+    told = cv2.GaussianBlur((precision > 0).astype(np.float32), (0, 0), _SMOOTH * width / 640)
     error = (MATCHED + (_REMATCHED - MATCHED) * np.minimum(2 * told, 1)) / pixel
     return np.maximum(rematched, 0.5 * inverse), error
 
@@ -131,6 +139,11 @@ def _smooth(inverse: np.ndarray, width: int) -> np.ndarray:
         part = np.ascontiguousarray(relative[row::stride, column::stride])
         smooth[row::stride, column::stride] = cv2.bilateralFilter(part, 0, _EDGE, _RIPPLE * width / 640 / stride)
     return np.float32(np.median(inverse)) * smooth
+
+
+def _seen(frame: Frame) -> _Image:
+    tissue = np.ones(frame.image.shape[:2], np.float32) if frame.mask is None else np.float32(frame.mask > 0)
+    return _Image(frame.camera, _plain(frame, tissue), tissue, tissue * ~_glints(frame.image, tissue))
 
 
 def _plain(frame: Frame, tissue: np.ndarray) -> np.ndarray:
@@ -172,35 +185,33 @@ def _of_points(frame: Frame, inverse: np.ndarray, points: ScenePoints) -> tuple[
     return total, weight
 
 
-def _of_view(
-    camera: Camera, inverse: np.ndarray, image: np.ndarray, tissue: np.ndarray,
-    other: Camera, other_image: np.ndarray, other_tissue: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, float, float] | None:  # fmt: skip
-    """Correction (1/m) of a view's inverse depth [H, W] by another view, and its precision (m²), 0 where it tells nothing.
+def _of_image(inverse: np.ndarray, own: _Image, other: _Image) -> tuple[np.ndarray, np.ndarray, float, float] | None:
+    """Correction (1/m) of a view's inverse depth [H, W] by another image, and its precision (m²), 0 where it tells nothing.
 
     Also the median of what no depth explains (pixels), and the share of the picture that it is of; None if they share too little.
     """
+    camera = own.camera
     unit = camera.width / 640
-    u, v, z = _projected(camera, inverse, other)
-    inside = (z > 0) & (_sampled(other_tissue, u, v, cv2.INTER_NEAREST) > 0)
+    u, v, z = _projected(camera, inverse, other.camera)
+    inside = (z > 0) & (_sampled(other.matte, u, v, cv2.INTER_NEAREST) > 0)
     if inside.mean() < _LEAST_SHARED:
         return None
-    predicted = np.where(inside, _sampled(other_image, u, v), image)
+    predicted = np.where(inside, _sampled(other.plain, u, v), own.plain)
     flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     flow.setFinestScale(0)
-    flow = flow.calc(image, predicted, None)
+    flow = flow.calc(own.plain, predicted, None)
     # A pixel is seen where the prediction took the pixel from that flow leads to.
     rows, columns = np.mgrid[: inverse.shape[0], : inverse.shape[1]].astype(np.float32) + np.float32(0.5)
     columns, rows = columns + flow[..., 0], rows + flow[..., 1]
     seen_u, seen_v = _sampled(u, columns, rows), _sampled(v, columns, rows)
     step = 0.01 * inverse
-    ahead_u, ahead_v, _ = _projected(camera, inverse + step, other)
+    ahead_u, ahead_v, _ = _projected(camera, inverse + step, other.camera)
     along_u, along_v = (ahead_u - u) / step, (ahead_v - v) / step
     speed = np.maximum(along_u**2 + along_v**2, 1e-9)  # squared pixels per 1/m
     off_u, off_v = seen_u - u, seen_v - v
     beside = np.abs(along_u * off_v - along_v * off_u) / np.sqrt(speed)
-    alike = _correlation(image, _sampled(other_image, seen_u, seen_v), _WINDOW)
-    good = inside & (_sampled(np.float32(inside), columns, rows, cv2.INTER_NEAREST) > 0) & (tissue > 0) & (alike > _ALIKE)
+    alike = _correlation(own.plain, _sampled(other.plain, seen_u, seen_v), _WINDOW)
+    good = inside & (_sampled(np.float32(inside), columns, rows, cv2.INTER_NEAREST) > 0) & (own.matte > 0) & (alike > _ALIKE)
     contradiction = float(np.median(beside[good])) if good.any() else 0.0, float(good.mean())
     good &= (beside < _OFF_LINE * unit) & (np.abs(flow).max(2) < _FARTHEST * unit)
     good &= np.hypot(off_u, off_v) < _FARTHEST * unit

@@ -16,6 +16,7 @@ from endo_sim_ros.reconstruction import losses_kernels as kernels
 from endo_sim_ros.splatting.launching import kernel_arguments
 
 _C1, _C2 = kernels.C1, kernels.C2
+_FAINT = 1e-3  # alpha, below which a pixel has no depth of its own
 
 
 def masked_mean(values: Tensor, mask: Tensor | None) -> Tensor:
@@ -41,10 +42,17 @@ def photometric(image: Tensor, target: Tensor, mask: Tensor | None, lambda_ssim:
     return (1 - lambda_ssim) * l1 + lambda_ssim * masked_mean(1 - ssim(image, target), mask)
 
 
-def depth_l1(depth: Tensor, prior: Tensor, mask: Tensor | None) -> Tensor:
-    """|D − D̂| where the prior has a measurement (> 0), metres (paper eq. 4)."""
+def depth_l1(depth: Tensor, prior: Tensor, mask: Tensor | None, alpha: Tensor, opaque: float) -> Tensor:
+    """|D − D̂| where the prior has a measurement (> 0), metres.
+
+    Paper eq. 4 has the composited depth Σ w z for D̂, in which transparent tissue counts as near and trained tissue lies the deeper.
+    With ``opaque`` above zero D̂ is the mean depth of what is seen, Σ w z / alpha, and transparency, (1 − alpha)·D, has that weight.
+    """
     valid = (prior > 0).to(depth.dtype)
-    return masked_mean((depth - prior).abs(), valid if mask is None else valid * mask)
+    valid = valid if mask is None else valid * mask
+    if not opaque:
+        return masked_mean((depth - prior).abs(), valid)
+    return masked_mean((depth / alpha.clamp_min(_FAINT) - prior).abs() + opaque * (1 - alpha) * prior, valid)
 
 
 def total_variation(depth: Tensor, mask: Tensor | None) -> Tensor:

@@ -10,7 +10,8 @@ from endo_sim_ros.reconstruction.config import ReconstructionConfig
 
 _PLAIN = {  # 3DGS as Kerbl et al. 2023 have it, and what the others build upon, for 3000 iterations
     "iterations": 3000, "lambda_dist": 0.1, "lambda_tv": 0.5, "virtual_every": 1,
-    "initialization": "points", "densification": "gradient", "lambda_flat": 0.0, "lambda_color": 0.0, "exposure": False, "light": False,
+    "initialization": "points", "densification": "gradient", "lambda_flat": 0.0, "lambda_color": 0.0, "lambda_opaque": 0.0,
+    "exposure": False, "light": False,
     "agreement": False, "surroundings": 0.0, "confined": False, "still": False,
 }  # fmt: skip
 
@@ -41,6 +42,7 @@ ABLATIONS: dict[str, dict[str, dict[str, Any]]] = {
         "with total variation, virtual cameras too": {"lambda_tv": 0.5, "virtual_every": 1},
         "without depth": {"lambda_depth": 0.0},
         "3000 full steps whatever the views agree in": {"iterations": 3000},
+        "with composited depth": {"lambda_opaque": 0.0},
         "without dense initialisation": {"initialization": "points"},
         "without agreement of depths": {"agreement": False},
         "without flat Gaussians": {"lambda_flat": 0.0},

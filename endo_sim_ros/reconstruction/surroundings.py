@@ -6,6 +6,7 @@ They keep other views from looking into the void. Physics, which knows the train
 import cv2
 import numpy as np
 import torch
+from scipy.interpolate import RBFInterpolator
 from scipy.spatial import cKDTree
 
 from endo_sim_ros.cameras import Camera
@@ -20,6 +21,9 @@ _FINE, _COARSE = 1 / 80, 1 / 27  # spacing in holes and close around the picture
 _CLOSE = 0.15  # how far around it; large Gaussians there would reach into the picture and cover what was seen
 _SIZE = 0.6  # standard deviation in spacings: the nearer ones of larger Gaussians hide the others where tissue is steep
 _OPACITY = 0.8
+_CELL = 1 / 80  # side of what depth is told for, and of what tells it
+_PIXELS_ERROR, _POINTS_ERROR = 1 / 128, 1 / 8  # how far away depth differs as much as that of pixels, of points errs
+_TELLING = 40  # neighbours that tell a cell's depth
 _POINTS = 9  # neighbours among which a scene point's depth has to be the usual one
 _LEAST_SEEN = 0.02  # share of the pixels with depth, from which on its surroundings can be told
 _BRIGHTEST = 2.0
@@ -105,17 +109,37 @@ def _continued(
     over = there - flat[rows, columns]
     if len(over) >= _POINTS:  # one wrong point would stand like a pillar before the tissue
         over = np.median(over[cKDTree(uv[beyond]).query(uv[beyond], k=_POINTS)[1]], 1)
-    rest[rows, columns] = over
     low, high = np.percentile(np.concatenate([inverse, there]), [1, 99])
-    anchored = known.copy()
-    anchored[rows, columns] = True
-    depth = 1 / np.clip(flat + filled(rest[..., None], anchored)[..., 0], 0.8 * low, 1.2 * high)
+    rest = _continued_from(rest, known, uv[beyond], over, frame.camera.width)
+    depth = 1 / np.clip(flat + rest, 0.8 * low, 1.2 * high)
     lit = np.exp((features_at(camera.backproject(depth).reshape(-1, 3), camera, reference) @ light)[:, None] + exposure)
     colors = np.clip(image.reshape(-1, 3) / lit, 0, _BRIGHTEST).reshape(image.shape).astype(np.float32)
     tissue = np.zeros(known.shape, bool)
     rows, columns = frame.depth.shape
     tissue[pad : pad + rows, pad : pad + columns] = True if frame.mask is None else frame.mask > 0
     return camera, depth, filled(colors, tissue)
+
+
+def _continued_from(values: np.ndarray, known: np.ndarray, uv: np.ndarray, there: np.ndarray, width: int) -> np.ndarray:
+    """Values [H, W] where known [H, W]; elsewhere the likeliest where known pixels and values at points uv [N, 2] err, and
+    squared differences grow with distance (kriging, a linear variogram)."""
+    side = max(round(_CELL * width), 1)
+    rows, columns = (-(-size // side) for size in known.shape)
+    fit = ((0, rows * side - known.shape[0]), (0, columns * side - known.shape[1]))
+    cells = lambda array: np.pad(array, fit).reshape(rows, side, columns, side).sum((1, 3), dtype=np.float64)
+    count = cells(known)
+    means = cells(np.where(known, values, 0)) / np.maximum(count, 1)
+    centres = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1) + 0.5
+    sources = np.concatenate([centres[count > 0], uv / side])
+    errors = np.repeat([_PIXELS_ERROR, _POINTS_ERROR], [(count > 0).sum(), len(uv)]) * width / side
+    told = RBFInterpolator(
+        sources, np.concatenate([means[count > 0], there]), neighbors=_TELLING, smoothing=errors, kernel="linear", degree=0
+    )
+    means[count == 0] = told(centres[count == 0])
+    v, u = ((np.arange(size) + 0.5) / side - 0.5 for size in known.shape)
+    u, v = np.meshgrid(u.astype(np.float32), v.astype(np.float32))
+    fine = cv2.remap(means.astype(np.float32), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.where(known, values, fine)
 
 
 def _unknown(points: np.ndarray, frames: list[Frame], beyond: bool) -> np.ndarray:

@@ -382,6 +382,16 @@ def test_noise_of_scene_points_does_not_make_the_tissue_beyond_rough(views):
     assert np.std(around / flat) < 0.012  # points alone: 0.017
 
 
+def test_reflections_are_not_the_colour_of_the_tissue(views, monkeypatch):
+    shiny = dataclasses.replace(bare(views[4]), depth=views[4].depth, image=views[4].image.copy())
+    shiny.image[60:66, 80:86] = 255
+    masks = []
+    monkeypatch.setattr(losses, "color_in_place", lambda *arguments: masks.append(arguments[-2]) or torch.zeros(()))
+    Trainer([shiny], options(image_width=160)).step()
+    (tissue,) = masks
+    assert not tissue[60:66, 80:86].any() and tissue.mean() > 0.6
+
+
 def test_depth_beyond_is_that_of_kriging():
     random, width = np.random.default_rng(0), 80  # one pixel a cell
     known = np.zeros((12, width), bool)

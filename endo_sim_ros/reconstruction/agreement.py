@@ -13,6 +13,7 @@ import numpy as np
 from endo_sim_ros.cameras import Camera
 from endo_sim_ros.device import map_in_threads
 from endo_sim_ros.reconstruction.depth import MATCHED, right_view
+from endo_sim_ros.reconstruction.photometry import reflections
 from endo_sim_ros.reconstruction.surroundings import filled
 from endo_sim_ros.reconstruction.triangulation import ScenePoints, neighbours
 from endo_sim_ros.sequences.frames import Frame
@@ -27,10 +28,7 @@ _ALIKE = 0.5  # correlation from which on two pixels show the same tissue
 _LEAST_SEEN = 0.02  # share of the pixels with depth
 _TOO_FAR = 0.25  # relative difference from which on a point lies on another surface
 _EDGE = 0.05  # relative step of depth that is an edge
-_WHITE, _BRIGHTER = 250, 60  # grey levels of all channels, or so much above those around, from which on light is reflected
 # In pixels of an image 640 wide:
-_GLOW = 3.0  # around a reflection
-_AROUND = 15.0  # standard deviation of what is around one
 _STEP = 1.0  # farthest that matching with the right image is believed to be off
 _RIPPLE = 10.0  # standard deviation over which depth is smoothed within edges
 _OFF_LINE = 2.0  # farthest beside the line on which depth alone can move a point
@@ -143,7 +141,7 @@ def _smooth(inverse: np.ndarray, width: int) -> np.ndarray:
 
 def _seen(frame: Frame) -> _Image:
     tissue = np.ones(frame.image.shape[:2], np.float32) if frame.mask is None else np.float32(frame.mask > 0)
-    return _Image(frame.camera, _plain(frame, tissue), tissue, tissue * ~_glints(frame.image, tissue))
+    return _Image(frame.camera, _plain(frame, tissue), tissue, tissue * ~reflections(frame.image, tissue))
 
 
 def _plain(frame: Frame, tissue: np.ndarray) -> np.ndarray:
@@ -154,16 +152,6 @@ def _plain(frame: Frame, tissue: np.ndarray) -> np.ndarray:
     mean = blur(grey * tissue) / share
     variance = np.maximum(blur(grey * grey * tissue) / share - mean * mean, 0)
     return np.uint8(np.clip(128 + 40 * (grey - mean) / np.sqrt(variance + 4), 0, 255))
-
-
-def _glints(image: np.ndarray, tissue: np.ndarray) -> np.ndarray:
-    """Where an image [H, W, 3] shows reflections of the light, which lie deeper than the tissue and move with the camera [H, W]."""
-    unit = image.shape[1] / 640
-    least = image.min(2).astype(np.float32)
-    blur = lambda values: cv2.GaussianBlur(values, (0, 0), _AROUND * unit)
-    around = blur(least * tissue) / np.maximum(blur(tissue), 1e-3)
-    bright = np.uint8(((least > _WHITE) | (least > around + _BRIGHTER)) & (tissue > 0))
-    return cv2.dilate(bright, np.ones((2 * round(_GLOW * unit) + 1,) * 2, np.uint8)) > 0
 
 
 def _of_points(frame: Frame, inverse: np.ndarray, points: ScenePoints) -> tuple[np.ndarray, np.ndarray]:

@@ -49,7 +49,7 @@ class ReconstructionConfig(StageConfig):
     """Share of 1 − SSIM in the photometric loss; the rest is L1."""
     lambda_depth: Annotated[float, Range(0, 1000)] = 1.0
     """Weight of the depth loss, in units of the scene's median depth (paper eq. 4)."""
-    lambda_opaque: Annotated[float, Range(0, 1000)] = 0.3
+    lambda_opaque: Annotated[float, Range(0, 1000)] = 0.01
     """Weight, within the depth loss, of transparency, depth being the mean of what is seen; 0 = that of the paper, Σ w z, in which
     what is transparent counts as near, so that tissue comes to lie a little too deep."""
     lambda_dist: Annotated[float, Range(0, 1000)] = 0.0

@@ -123,7 +123,7 @@ def color_in_place(
         viewmat, K: World-to-camera [4, 4] and intrinsics [3, 3] of the view.
         target: Its image [H, W, 3].
         gain: Of exposure and light there [H, W, 1 or 3].
-        depth, mask: Of the surface [H, W], metres, and where there is tissue.
+        depth, mask: Of the surface [H, W], metres, and where there is tissue that shows its own colour.
         tolerance: Relative difference of depth within which a Gaussian belongs to the surface.
     """
     with torch.no_grad():

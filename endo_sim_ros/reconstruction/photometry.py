@@ -23,6 +23,8 @@ _DARK, _BRIGHT = 12, 235  # grey levels between which a camera is not far from i
 _BLUR = 1.5  # pixels
 _BRIGHTEST = 4.0  # colour that tissue in the corner of a picture may have in full light
 _RESPONSE, _RESPONSE_SPREAD = 0.9, 0.5  # of the automatic exposure: cameras even out most of the brightness
+_WHITE, _BRIGHTER = 250, 60  # grey levels of all channels, or so much above those around, from which on light is reflected
+_GLOW, _AROUND = 3.0, 15.0  # around a reflection, and standard deviation of what is around one: pixels of an image 640 wide
 _EXPOSURE_NOISE = 0.01, 0.04  # the least and the most that the logarithm of an exposure varies by itself
 
 
@@ -103,6 +105,16 @@ def unlit(
     sh = model.sh.clone()
     sh[:, 0] = torch.where(torch.from_numpy(count) > 0, (colors - 0.5) / SH_C0, sh[:, 0])
     return dataclasses.replace(model, sh=sh)
+
+
+def reflections(image: np.ndarray, tissue: np.ndarray) -> np.ndarray:
+    """Where an image [H, W, 3] shows reflections of the light, which lie deeper than the tissue [H, W] and move with the camera [H, W]."""
+    unit = image.shape[1] / 640
+    least = image.min(2).astype(np.float32)
+    blur = lambda values: cv2.GaussianBlur(values, (0, 0), _AROUND * unit)
+    around = blur(least * tissue) / np.maximum(blur(tissue), 1e-3)
+    bright = np.uint8(((least > _WHITE) | (least > around + _BRIGHTER)) & (tissue > 0))
+    return cv2.dilate(bright, np.ones((2 * round(_GLOW * unit) + 1,) * 2, np.uint8)) > 0
 
 
 def fit_exposure(exposures: np.ndarray, brightness: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:

@@ -71,6 +71,7 @@ class _View:
     image: Tensor  # [H, W, 3] in [0, 1]
     depth: Tensor | None  # [H, W] m, 0 = none
     mask: Tensor | None  # [H, W] 1 = tissue
+    matte: Tensor  # [H, W] 1 = tissue in its own colour
     exposure: int  # whose exposure it has: its own, or that of the left view of its pair
     exposure_index: Tensor  # [1] the same
 
@@ -83,6 +84,7 @@ class _Inputs(NamedTuple):
     image: Tensor  # [H, W, 3] of the training view, and so on
     exposure: Tensor  # [1] int64
     mask: Tensor | None  # [H, W]
+    matte: Tensor  # [H, W]
     depth: Tensor | None  # [H, W]
     rays: Tensor | None  # [3, H, W], for the light
     carried: Tensor | None  # [H, W] depth prior as the virtual camera sees it
@@ -344,7 +346,7 @@ class Trainer:
         if virtual is not None and self.config.lambda_pearson and beside.depth is not None:
             carried = _carried_depth(beside, viewmats[1])
         rays = directions(view.camera, self.device) if self.config.light else None
-        return _Inputs(viewmats, Ks, view.image, view.exposure_index, view.mask, view.depth, rays, carried)
+        return _Inputs(viewmats, Ks, view.image, view.exposure_index, view.mask, view.matte, view.depth, rays, carried)
 
     def _matrices(self, cameras: list[Camera]) -> tuple[Tensor, Tensor]:
         """Of cameras, viewmats [C, 4, 4] and Ks [C, 3, 3]."""
@@ -451,7 +453,7 @@ class Trainer:
             gain = torch.ones_like(depth)[..., None] if gain is None else gain.expand(*depth.shape, -1)
             surface = depth / alpha.clamp_min(NEAREST)
             matrices = view.viewmats[0], view.Ks[0]
-            place = losses.color_in_place(model, *matrices, view.image, gain, surface, view.mask, _ON_SURFACE)
+            place = losses.color_in_place(model, *matrices, view.image, gain, surface, view.matte, _ON_SURFACE)
             total = total + config.lambda_color * place
         return total
 
@@ -551,12 +553,13 @@ class Trainer:
 
     def _to_device(self, frame: Frame, exposure: int) -> _View:
         tensor = lambda array: torch.tensor(array, dtype=torch.float32, device=self.device)
-        camera = frame.camera
+        tissue = np.ones(frame.image.shape[:2], np.float32) if frame.mask is None else np.float32(frame.mask > 0)
         return _View(
-            camera,
+            frame.camera,
             tensor(frame.image) / 255,
             None if frame.depth is None else tensor(frame.depth),
-            None if frame.mask is None or frame.mask.all() else tensor(frame.mask > 0),
+            None if tissue.all() else tensor(tissue),
+            tensor(tissue * ~photometry.reflections(frame.image, tissue)),
             exposure,
             torch.tensor([exposure], device=self.device),
         )

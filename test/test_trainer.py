@@ -392,6 +392,14 @@ def test_reflections_are_not_the_colour_of_the_tissue(views, monkeypatch):
     assert not tissue[60:66, 80:86].any() and tissue.mean() > 0.6
 
 
+@pytest.mark.parametrize(("name", "opaque"), [("default", 0.01), ("paper", 0.0)])
+def test_transparency_is_weighed_apart_by_default_and_not_as_printed(views, monkeypatch, name, opaque):
+    weights = []
+    monkeypatch.setattr(losses, "depth_l1", lambda *arguments: weights.append(arguments[-1]) or torch.zeros(()))
+    Trainer(views[:3], preset(name, **SHORT)).step()
+    assert weights == [opaque]
+
+
 def test_depth_beyond_is_that_of_kriging():
     random, width = np.random.default_rng(0), 80  # one pixel a cell
     known = np.zeros((12, width), bool)

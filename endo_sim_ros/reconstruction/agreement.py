@@ -52,7 +52,7 @@ def agreed(frames: list[Frame], points: ScenePoints, matched: bool) -> tuple[lis
     """The frames with depth corrected, in their holes as little as before, by scene points and by what neighbouring views show,
     and by how many pixels the views contradict each other all the same.
 
-    A view's image is predicted from each neighbour's, both its eyes', with the view's depth; the optical flow between prediction and
+    A view's image is predicted from each neighbour's with the view's depth; the optical flow between prediction and
     image, along the direction in which depth moves a pixel, is a correction of inverse depth that is the more precise the
     farther apart the views are. Corrections and prior are averaged by their precision; where there is none, that of
     the surroundings counts; what ripples are left within edges is smoothed. Before it, the prior of matching with a view's
@@ -65,7 +65,7 @@ def agreed(frames: list[Frame], points: ScenePoints, matched: bool) -> tuple[lis
         points: Scene points.
         matched: Whether the prior is of matching with the right images, whose error is known, or of less.
     """
-    eyes = [[_seen(frame), *([_seen(right_view(frame))] if matched and frame.right is not None else [])] for frame in frames]
+    images = [_seen(frame) for frame in frames]
     near = neighbours(frames, _NEIGHBOURS)
 
     def corrected(i: int) -> tuple[Frame, list[tuple[float, float]]]:
@@ -76,15 +76,15 @@ def agreed(frames: list[Frame], points: ScenePoints, matched: bool) -> tuple[lis
         inverse = filled((known / np.where(known, frame.depth, 1)).astype(np.float32)[..., None], known)[..., 0]
         error = _GUESSED * inverse
         if matched and frame.right is not None:
-            inverse, error = _rematched(inverse, *eyes[i], camera.K[0, 0] * frame.baseline)
+            inverse, error = _rematched(inverse, images[i], _seen(right_view(frame)), camera.K[0, 0] * frame.baseline)
         total, weight = _of_points(frame, inverse, points)
         for j in near[i]:
-            for eye in eyes[j] if j != i else []:
-                found = _of_image(inverse, eyes[i][0], eye)
+            if j != i:
+                found = _of_image(inverse, images[i], images[j])
                 if found is not None:
                     correction, precision, *contradiction = found
                     total, weight = total + precision * correction, weight + precision
-                    contradictions += [contradiction] if eye is eyes[j][0] else []
+                    contradictions.append(contradiction)
         inverse = _corrected(inverse, total, weight, error, camera.width)
         good = known & np.isfinite(inverse) & (inverse > 0)
         depth = np.where(good, 1 / np.where(good, inverse, 1), 0).astype(np.float32)
@@ -113,19 +113,20 @@ def _rematched(inverse: np.ndarray, left: _Image, right: _Image, pixel: float) -
     # Where flow tells nothing, far and wide, the error stays that of matching.
     told = cv2.GaussianBlur((precision > 0).astype(np.float32), (0, 0), _SMOOTH * width / 640)
     error = (MATCHED + (_REMATCHED - MATCHED) * np.minimum(2 * told, 1)) / pixel
-    return np.maximum(rematched, 0.5 * inverse), error
+    return rematched, error
 
 
 def _corrected(inverse: np.ndarray, total: np.ndarray, weight: np.ndarray, error: np.ndarray | float, width: int) -> np.ndarray:
     """Inverse depth [H, W] of the given error with corrections, of which Σ precision × correction and Σ precision are given.
 
-    Where there are none, those of the surroundings count; ripples within edges are smoothed.
+    Where there are none, those of the surroundings count; nothing moves to another surface; ripples within edges are smoothed.
     """
     correction, trust = total / np.maximum(weight, 1e-12), weight / (weight + 1 / error**2)
     blur = lambda values: cv2.GaussianBlur(values.astype(np.float32), (0, 0), _SMOOTH * width / 640)
     around = blur(trust)
     carried = blur(trust * correction) / np.maximum(around, 1e-6) * np.minimum(4 * around, 1)
-    return _smooth(inverse + trust * correction + (1 - trust) * carried, width)
+    added = np.clip(trust * correction + (1 - trust) * carried, -_TOO_FAR * inverse, _TOO_FAR * inverse)
+    return _smooth(inverse + added, width)
 
 
 def _smooth(inverse: np.ndarray, width: int) -> np.ndarray:

@@ -39,7 +39,7 @@ def with_surroundings(
     reach: float,
     limit: int,
 ) -> GaussianModel:
-    """The model and what may be around it: inverse depth and colour continue those of the nearest pixels.
+    """The model and what may be around it: inverse depth is the likeliest one, colour that of the nearest pixels.
 
     Args:
         model: What was seen.

@@ -425,7 +425,8 @@ class Trainer:
             image = image * gain
         total = losses.photometric(image, view.image, view.mask, config.lambda_ssim)
         if view.depth is not None and config.lambda_depth:
-            total = total + config.lambda_depth / self.scene_depth * losses.depth_l1(depth, view.depth, view.mask, alpha, config.lambda_opaque)
+            off = losses.depth_l1(depth, view.depth, view.mask, alpha, config.lambda_opaque)
+            total = total + config.lambda_depth / self.scene_depth * off
         if view.depth is not None and config.lambda_pearson:
             total = total + config.lambda_pearson * losses.pearson(depth, view.depth, view.mask)
         return total + self._regularization(depth, distortion, view.mask)

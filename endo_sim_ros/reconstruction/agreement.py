@@ -141,7 +141,7 @@ def _smooth(inverse: np.ndarray, width: int) -> np.ndarray:
 
 
 def _seen(frame: Frame) -> _Image:
-    tissue = np.ones(frame.image.shape[:2], np.float32) if frame.mask is None else np.float32(frame.mask > 0)
+    tissue = frame.tissue
     return _Image(frame.camera, _plain(frame, tissue), tissue, tissue * ~reflections(frame.image, tissue))
 
 

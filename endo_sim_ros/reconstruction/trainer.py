@@ -554,7 +554,7 @@ class Trainer:
 
     def _to_device(self, frame: Frame, exposure: int) -> _View:
         tensor = lambda array: torch.tensor(array, dtype=torch.float32, device=self.device)
-        tissue = np.ones(frame.image.shape[:2], np.float32) if frame.mask is None else np.float32(frame.mask > 0)
+        tissue = frame.tissue
         return _View(
             frame.camera,
             tensor(frame.image) / 255,

@@ -44,3 +44,8 @@ class Frame:
                     f"frame {self.stamp_ns}: {name} is {array.shape[1]}×{array.shape[0]}, "
                     f"but the camera says {shape[1]}×{shape[0]}"
                 )
+
+    @property
+    def tissue(self) -> np.ndarray:
+        """Where there is tissue to be used [H, W], float32, 1 or 0."""
+        return np.ones(self.image.shape[:2], np.float32) if self.mask is None else np.float32(self.mask > 0)

@@ -16,13 +16,14 @@ from endo_sim_ros.cameras import Camera, look_at
 from endo_sim_ros.config import ConfigError
 from endo_sim_ros.evaluation import paper, tables
 from endo_sim_ros.evaluation.config import EvaluationConfig
-from endo_sim_ros.evaluation.evaluate import evaluate, open_named
+from endo_sim_ros.evaluation.evaluate import _divided, evaluate, open_named
 from endo_sim_ros.evaluation.held_out import FIGURES, measure, seen_pixels
 from endo_sim_ros.evaluation.page import write_page
 from endo_sim_ros.evaluation.splits import explain_split, right_views, split_views
 from endo_sim_ros.evaluation.touched import touched_psnr
 from endo_sim_ros.evaluation.workers import Finished, News, run_in_processes
 from endo_sim_ros.gaussians import GaussianModel
+from endo_sim_ros.reconstruction import ScenePoints
 from endo_sim_ros.sequences.frames import SequenceError
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
@@ -117,6 +118,19 @@ def test_measures_of_what_was_seen_count_only_that(small_frames):
     assert row["depth_rmse"] == row["depth_rmse_scaled"] == 0
     assert row["seen_share"] == pytest.approx(100 * (frame.mask[:, :48] > 0).sum() / (frame.mask > 0).sum())
     assert set(row) <= set(FIGURES) and "psnr_unmasked" in row  # the recording has a border
+
+
+def test_depth_is_judged_by_scene_points_that_no_method_gets(small_frames):
+    frame = small_frames[0]
+    surface = frame.camera.backproject(frame.depth)[frame.depth > 0][::7]
+    points = ScenePoints(surface, np.zeros_like(surface), np.linspace(0.001, 0.002, len(surface)))
+    given, judging = _divided(points)
+    assert len(given.positions) == len(given.error) == len(surface) - len(judging) and len(judging) == -(-len(surface) // 10)
+    assert not (given.positions[:, None] == judging[::20]).all(2).any()
+    assert measure(frame.image, frame.depth, frame, points=judging)["points_depth"] < 1e-6
+    off = measure(frame.image, frame.depth + np.float32(0.002), frame, points=judging)
+    assert off["points_depth"] == pytest.approx(0.002, rel=1e-3)
+    assert "points_depth" not in measure(frame.image, frame.depth, frame)
 
 
 # -------------------------------------------------------------------------------------------------------------- workers

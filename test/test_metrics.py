@@ -71,6 +71,15 @@ def test_depth_rmse_counts_pixels_that_have_both_depths():
     assert np.isnan(metrics.depth_rmse(depth, np.zeros_like(depth)))
 
 
+def test_depth_at_points_is_the_usual_difference_where_there_is_depth():
+    depth = np.zeros((4, 4), np.float32)
+    depth[1, 2], depth[3, 0], depth[0, 3], depth[2, 2] = 0.1, 0.2, 0.3, 0.4
+    uv, z = np.array([[2.7, 1.2], [0.5, 3.5], [3.1, 0.0], [2.0, 2.0], [1.0, 1.0]]), np.array([0.101, 0.203, 0.9, 0.5, 0.7])
+    assert metrics.depth_at_points(depth, uv[:3], z[:3]) == pytest.approx(0.003, rel=1e-4)  # of 1, 3 and 600 mm
+    assert metrics.depth_at_points(depth, uv, z, np.uint8(depth < 0.3)) == pytest.approx(0.002, rel=1e-4)
+    assert np.isnan(metrics.depth_at_points(depth, uv[4:], z[4:]))
+
+
 def test_median_scaling_leaves_the_shape_of_the_error():
     reference = np.float32([[0.10, 0.12, 0.0], [0.14, 0.16, 0.2]])
     depth = np.where(reference > 0, 3 * reference, 5)

@@ -14,7 +14,7 @@ from endo_sim_ros.reconstruction import ABLATIONS, PRESETS, ReconstructionConfig
 from endo_sim_ros.reconstruction.depth import right_view
 from endo_sim_ros.reconstruction.motion import without_motion
 from endo_sim_ros.reconstruction.presets import resolved
-from endo_sim_ros.reconstruction.surroundings import _continued, _continued_from
+from endo_sim_ros.reconstruction.surroundings import _continued, _continued_from, _spread_from, with_surroundings
 from endo_sim_ros.reconstruction.trainer import shrink
 from endo_sim_ros.reconstruction.triangulation import match_features, misposed, triangulate
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
@@ -129,19 +129,6 @@ def test_steep_gaussians_are_split_or_doubled_and_dead_ones_go():
     assert (new.means[halves] != model.means[source[halves]]).any(1).all()
     limited, _, _ = densification.split_and_clone(model, gradients * torch.linspace(1, 2, 60), 1.0, 58, torch.Generator())
     assert len(limited) == 58
-
-
-def test_gaussians_are_to_have_the_colour_that_is_seen_where_they_lie():
-    K, viewmat = torch.tensor([[10.0, 0, 8], [0, 10, 8], [0, 0, 1]]), torch.eye(4)
-    points = torch.tensor([[0.0, 0, 1], [0, 0, 1.5], [3, 0, 1], [0.5, 0, 1], [0, 0, -1]])  # seen, hidden, outside, masked, behind
-    model = GaussianModel.from_points(points, torch.full((5, 3), 0.6), torch.full((5,), 0.01), opacity=0.5)
-    model.sh.requires_grad_()
-    target, mask = torch.full((16, 16, 3), 0.2), torch.ones(16, 16)
-    target[8, 8], mask[:, 12:] = torch.tensor([0.5, 1.0, 0.8]), 0
-    loss = losses.color_in_place(model, viewmat, K, target, torch.full((16, 16, 1), 2.0), torch.ones(16, 16), mask, 0.02)
-    assert float(loss.detach()) == pytest.approx(0.5 * np.mean([1.2 - 0.5, 1.2 - 1.0, 1.2 - 0.8]))
-    loss.backward()
-    assert (model.sh.grad[0] > 0).all() and not model.sh.grad[1:].any()
 
 
 def test_what_no_view_shows_is_left_as_it_was(views):
@@ -377,19 +364,9 @@ def test_noise_of_scene_points_does_not_make_the_tissue_beyond_rough(views):
     depth = flat * random.normal(1, 0.03, 400)
     local = np.column_stack([(pixels - K[:2, 2]) / K[[0, 1], [0, 1]] * depth[:, None], depth])
     points = frame.camera.position + local @ frame.camera.pose[:3, :3].T
-    _, continued, _ = _continued(frame, points, np.zeros(4), np.zeros(3), flat, 48)
+    _, continued, *_ = _continued(frame, points, np.zeros(4), np.zeros(3), flat, 48)
     around = continued[48 + 10 : 48 + 118, 48 + 175 : 48 + 195]
     assert np.std(around / flat) < 0.012  # points alone: 0.017
-
-
-def test_reflections_are_not_the_colour_of_the_tissue(views, monkeypatch):
-    shiny = dataclasses.replace(bare(views[4]), depth=views[4].depth, image=views[4].image.copy())
-    shiny.image[60:66, 80:86] = 255
-    masks = []
-    monkeypatch.setattr(losses, "color_in_place", lambda *arguments: masks.append(arguments[-2]) or torch.zeros(()))
-    Trainer([shiny], options(image_width=160)).step()
-    (tissue,) = masks
-    assert not tissue[60:66, 80:86].any() and tissue.mean() > 0.6
 
 
 @pytest.mark.parametrize(("name", "opaque"), [("default", 0.01), ("paper", 0.0)])
@@ -419,6 +396,36 @@ def test_depth_beyond_is_that_of_kriging():
     weights = np.linalg.solve(system, np.column_stack([between(targets, sources), np.ones(len(targets))]).T)[:35]
     expected = weights.T @ np.concatenate([values[known], there])
     np.testing.assert_allclose(told[~known], expected, atol=1e-4)
+
+
+def test_colour_beyond_is_the_mean_of_what_is_seen_by_distance():
+    random, width = np.random.default_rng(0), 80  # one pixel a cell
+    known = random.random((12, width)) < 0.2
+    values = random.random((*known.shape, 3))
+    spread = _spread_from(values, known, width)
+    assert (spread[known] == values[known]).all()
+    distance = np.linalg.norm(np.argwhere(~known)[:, None] - np.argwhere(known), axis=2)
+    weights = 1 / (distance**2 + 0.25) ** 2
+    expected = weights @ values[known] / weights.sum(1, keepdims=True)
+    np.testing.assert_allclose(spread[~known], expected, atol=1e-5)
+
+
+def test_what_lies_beyond_two_views_looks_as_in_the_nearer_one(views):
+    """Whichever of them comes first."""
+    frame = dataclasses.replace(bare(views[4]), mask=None, depth=np.full((128, 160), 0.1, np.float32))
+    # A view to the right of it, overlapping by half, green instead of red.
+    pose = frame.camera.pose.copy()
+    pose[:3, 3] += pose[:3, 0] * 80 * 0.1 / frame.camera.K[0, 0]
+    red, green = (np.full((128, 160, 3), color, np.uint8) for color in ((200, 0, 0), (0, 200, 0)))
+    left = dataclasses.replace(frame, image=red)
+    right = dataclasses.replace(frame, image=green, camera=frame.camera.at(pose))
+    nothing = GaussianModel.from_points(torch.zeros(1, 3), torch.zeros(1, 3), torch.full((1,), 1e-6), 0.5)
+    for pair in ([left, right], [right, left]):
+        around = with_surroundings(nothing, pair, np.zeros(4), np.zeros((2, 3)), 0.1, np.empty((0, 3)), 0.9, 60_000)
+        (u, v), colors = left.camera.project(around.means.numpy().astype(np.float64))[0].T, around.sh[:, 0].numpy()
+        beside = (v > 0) & (v < 128)
+        for where, nearer, farther in (((u > 250) & beside, 1, 0), ((u < -10) & beside, 0, 1)):
+            assert where.sum() > 20 and (colors[where, nearer] > colors[where, farther]).all()
 
 
 def test_tissue_goes_on_beyond_the_pictures_and_in_holes(views):

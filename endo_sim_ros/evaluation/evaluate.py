@@ -36,6 +36,7 @@ from endo_sim_ros.evaluation.workers import Finished, News, ray_is_installed, ru
 from endo_sim_ros.reconstruction import ReconstructionConfig, ScenePoints, Trainer, scene_points, shrink
 from endo_sim_ros.reconstruction.depth import with_depth_prior
 from endo_sim_ros.reconstruction.presets import ABLATIONS, preset
+from endo_sim_ros.reconstruction.triangulation import points_in_view
 from endo_sim_ros.sequences.bag import read_bag
 from endo_sim_ros.sequences.folder import read_points
 from endo_sim_ros.sequences.frames import Frame, SequenceError
@@ -48,6 +49,7 @@ log = logging.getLogger(__name__)
 _SHOWN = 3  # held-out views of a cell of which pictures are kept
 _CURVE_VIEWS = 8  # held-out views measured at each moment of a curve
 _POINT_VIEWS = 48  # views that structure from motion is done with
+_JUDGING = 10  # one scene point in so many judges depth where nothing better does
 _POINT_ERROR = 0.003  # relative error of the depth of points that a recording brings
 _PHANTOM = "phantom:"
 
@@ -78,6 +80,7 @@ class Prepared(NamedTuple):
     right: list[Frame]  # the right images as views, for the split of that name
     depth_source: str  # where the reference depth of the frames is from: recorded, stereo matching, or none
     points: ScenePoints  # of structure from motion with all views, like the poses
+    judging: np.ndarray | None  # [N, 3] those of them kept from the methods, where there is no exact depth
 
 
 def evaluate(sequences: Sequence[str], config: EvaluationConfig) -> dict[str, Any]:
@@ -254,16 +257,26 @@ def _prepare(cells: Sequence[Cell], bar: Progress) -> Prepared:
         task = bar.add_task(f"stereo matching of {cells[0].sequence}", total=None)
         matched = with_depth_prior(frames, points, ReconstructionConfig(depth="stereo"))
         bar.remove_task(task)
+    judging = None
     if recorded:
         depth_source = "recorded"
     elif matched is not frames:
         depth_source = "stereo matching"
         frames = [dataclasses.replace(frame, depth=_trusted(match)) for frame, match in zip(frames, matched)]
+    if not recorded:
+        points, judging = _divided(points)
     width = max(cell.options["image_width"] for cell in cells)
     paired = STEREO in splits and any(frame.right is not None for frame in frames)
     right = [shrink(frame, width) for frame in right_views(matched)] if paired else []
     small = lambda frame: shrink(dataclasses.replace(frame, right=None, baseline=None, right_K=None), width)
-    return Prepared([f if i in trained else small(f) for i, f in enumerate(frames)], right, depth_source, points)
+    return Prepared([f if i in trained else small(f) for i, f in enumerate(frames)], right, depth_source, points, judging)
+
+
+def _divided(points: ScenePoints) -> tuple[ScenePoints, np.ndarray]:
+    """What the methods get, and the positions [N, 3] of the scene points that their depth is judged by."""
+    kept = np.arange(len(points.positions)) % _JUDGING > 0
+    error = np.asarray(points.error)
+    return ScenePoints(points.positions[kept], points.colors[kept], error[kept] if error.ndim else points.error), points.positions[~kept]
 
 
 def _trusted(frame: Frame) -> np.ndarray | None:
@@ -404,7 +417,7 @@ def _job(argument: tuple, device: str, report: Callable[[Any], None]) -> dict[st
     def of_view(index: int, image: np.ndarray, depth: np.ndarray) -> tuple[dict[str, float], dict[str, bytes]]:
         frame, number = held_out[index], split.held_out[index]
         seen = seen_pixels(frame.camera, frame.depth if known else depth, surfaces)
-        found = measure(image, depth, frame, seen, networks)
+        found = measure(image, depth, frame, seen, networks, prepared.judging)
         row = {"view": number} | {name: value for name, value in found.items() if np.isfinite(value)}
         return row, _pictures(number, image, depth, frame) if index in shown else {}
 
@@ -431,6 +444,7 @@ def _job(argument: tuple, device: str, report: Callable[[Any], None]) -> dict[st
             *["right images"] * any(view.right is not None for view in views),
             *["recorded depth"] * any(view.depth is not None for view in views),
         ],
+        "reference_at_points": _reference_at_points(held_out, prepared.judging),
         "seen_by": "reference" if known else "model",
         "figures": mean_figures(rows) | touched | {"seconds": training["seconds"], "gaussians": len(model), "megabytes": memory},
         "views": rows,
@@ -445,6 +459,16 @@ def _held_out(prepared: Prepared, split: Split) -> list[Frame]:
     if not prepared.right:
         raise SequenceError("split stereo: the sequence has no right images")
     return prepared.right
+
+
+def _reference_at_points(held_out: list[Frame], judging: np.ndarray | None) -> float | None:
+    """How far the reference depth is off at the scene points that judge, metres; None if there are not both."""
+    if judging is None:
+        return None
+    judged = [frame for frame in held_out if frame.depth is not None]
+    off = [metrics.depth_at_points(frame.depth, *points_in_view(frame.camera, judging), frame.mask) for frame in judged]
+    off = [value for value in off if np.isfinite(value)]
+    return float(np.mean(off)) if off else None
 
 
 def _train(

@@ -14,6 +14,7 @@ from endo_sim_ros.evaluation import figures, metrics
 from endo_sim_ros.evaluation.lpips import Lpips
 from endo_sim_ros.gaussians import GaussianModel, save_ply
 from endo_sim_ros.reconstruction import Progress, ReconstructionConfig, Trainer, scene_points, select_keyframes, shrink
+from endo_sim_ros.reconstruction.triangulation import points_in_view
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.bag import read_bag
 from endo_sim_ros.sequences.frames import Frame
@@ -51,6 +52,7 @@ FIGURES: dict[str, Figure] = {
     "depth_rmse": Figure("depth RMSE", "m", 5),
     "depth_rmse_scaled": Figure("depth RMSE, median scaled", "m", 5),
     "seen_depth_rmse": Figure("depth RMSE, seen", "m", 5),
+    "points_depth": Figure("depth at scene points", "m", 5),
     "psnr_unmasked": Figure("PSNR, unmasked", "dB", 2),
     "ssim_unmasked": Figure("SSIM, unmasked", "", 3),
 }
@@ -59,7 +61,12 @@ of them that a training view saw."""
 
 
 def measure(
-    image: np.ndarray, depth: np.ndarray, frame: Frame, seen: np.ndarray | None = None, lpips: Sequence[Lpips] = ()
+    image: np.ndarray,
+    depth: np.ndarray,
+    frame: Frame,
+    seen: np.ndarray | None = None,
+    lpips: Sequence[Lpips] = (),
+    points: np.ndarray | None = None,
 ) -> dict[str, float]:
     """The figures of a rendered view that can be told; see FIGURES.
 
@@ -69,6 +76,7 @@ def measure(
         frame: What the camera saw there; its depth is the reference.
         seen: [H, W], not 0 where a training view saw what this view sees; None leaves these figures out.
         lpips: Networks to compare with.
+        points: On the surface [N, 3] (m, world), which nothing was trained with.
     """
     reference, mask = frame.image, frame.mask
     row = {}
@@ -90,6 +98,8 @@ def measure(
         row["depth_rmse_scaled"] = metrics.depth_rmse(scaled, frame.depth, mask)
         if seen is not None:
             row["seen_depth_rmse"] = metrics.depth_rmse(depth, frame.depth, masks[1][1])
+    if points is not None and len(points):
+        row["points_depth"] = metrics.depth_at_points(depth, *points_in_view(frame.camera, points), mask)
     if mask is not None and not mask.all():
         row["psnr_unmasked"], row["ssim_unmasked"] = metrics.psnr(image, reference), metrics.ssim(image, reference)
     return row

@@ -46,6 +46,17 @@ def depth_rmse(depth: np.ndarray, reference: np.ndarray, mask: np.ndarray | None
     return float(np.sqrt(((depth - reference)[valid].astype(np.float64) ** 2).mean())) if valid.any() else float("nan")
 
 
+def depth_at_points(depth: np.ndarray, uv: np.ndarray, z: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """Median difference, metres, of a depth [H, W] from that of points z [N] at pixels uv [N, 2] where it has a value (> 0).
+
+    The median, since some points of structure from motion are wrong matches.
+    """
+    u, v = np.floor(uv).astype(int).T
+    there = depth[v, u]
+    valid = (there > 0) & (True if mask is None else mask[v, u] > 0)
+    return float(np.median(np.abs(there - z)[valid])) if valid.any() else float("nan")
+
+
 def median_scaled(depth: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
     """The depth [H, W] times the one factor that makes its median that of the reference, over the pixels that `depth_rmse` takes.
 

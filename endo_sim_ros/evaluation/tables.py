@@ -105,6 +105,8 @@ def notes(results: dict[str, Any]) -> list[str]:
         pixels = "over the pixels of the mask (tissue); the others are black" if record["masked"] else "over all pixels, unmasked"
         given = f"; training views came with {' and '.join(record['given'])}" if record["given"] else ""
         lines.append(f"{name}: {width}×{height}, {pixels}; reference depth: {depths[record['depth_source']]}{given}.")
+        if (off := record.get("reference_at_points")) is not None:
+            lines.append(f"{name}: at the scene points that judge depth, that reference is itself off by {1e3 * off:.2f} mm.")
     models = any(record["seen_by"] == "model" for record in done)
     lines += [
         "PSNR, gain fitted: after one factor per colour channel and view, as exposure would. Means over the held-out views.",
@@ -113,6 +115,7 @@ def notes(results: dict[str, Any]) -> list[str]:
         "Seen: pixels with a depth whose surface a training view shows, too, visibility checked with the reference depth"
         + ("; without one, with the model's own." if models else "."),
         "Median scaled: depth times the factor that makes its median right. Depth stays in floating point throughout.",
+        "Depth at scene points: median difference from a tenth of them, kept from all methods, where no exact depth is recorded.",
         "Training: all that happens between the views and the model. Memory: what the training needed at most, more than before.",
     ]
     methods = dict.fromkeys(r["cell"]["method"] for r in done if r["cell"]["options"].get("initialization") == "points")

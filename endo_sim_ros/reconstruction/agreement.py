@@ -14,7 +14,6 @@ from endo_sim_ros.cameras import Camera
 from endo_sim_ros.device import map_in_threads
 from endo_sim_ros.reconstruction.depth import MATCHED, right_view
 from endo_sim_ros.reconstruction.photometry import reflections
-from endo_sim_ros.reconstruction.surroundings import filled
 from endo_sim_ros.reconstruction.triangulation import ScenePoints, neighbours
 from endo_sim_ros.sequences.frames import Frame
 
@@ -73,7 +72,7 @@ def agreed(frames: list[Frame], points: ScenePoints, matched: bool) -> tuple[lis
         if frame.depth is None or (frame.depth > 0).mean() < _LEAST_SEEN:
             return frame, []
         known = frame.depth > 0
-        inverse = filled((known / np.where(known, frame.depth, 1)).astype(np.float32)[..., None], known)[..., 0]
+        inverse = _filled((known / np.where(known, frame.depth, 1)).astype(np.float32)[..., None], known)[..., 0]
         error = _GUESSED * inverse
         if matched and frame.right is not None:
             inverse, error = _rematched(inverse, images[i], _seen(right_view(frame)), camera.K[0, 0] * frame.baseline)
@@ -232,3 +231,27 @@ def _correlation(a: np.ndarray, b: np.ndarray, side: int) -> np.ndarray:
     ma, mb = mean(a), mean(b)
     spread = np.maximum((mean(a * a) - ma * ma) * (mean(b * b) - mb * mb), 1e-3)
     return np.clip((mean(a * b) - ma * mb) / np.sqrt(spread), 0, 1)
+
+
+def _filled(values: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Values [H, W, C] where known [H, W]; elsewhere the mean over ever wider surroundings (pull-push)."""
+    weight = known.astype(np.float32)
+    levels = [(weight, values.astype(np.float32) * weight[..., None])]
+    while min(levels[-1][0].shape) > 1:
+        weight, total = (_halved(array) for array in levels[-1])
+        scale = np.maximum(weight, 1)
+        levels.append((weight / scale, total / scale[..., None]))
+    weight, total = levels[-1]
+    mean = sum(t.reshape(-1, t.shape[-1]).sum(0) for _, t in levels[-1:]) / max(float(weight.sum()), 1e-6)
+    whole = total + (1 - weight)[..., None] * mean
+    for weight, total in levels[-2::-1]:
+        coarse = cv2.resize(whole, weight.shape[::-1], interpolation=cv2.INTER_LINEAR).reshape(total.shape)
+        whole = total + (1 - weight)[..., None] * coarse
+    return whole
+
+
+def _halved(array: np.ndarray) -> np.ndarray:
+    """Sums of 2 × 2 pixels; an odd row or column is alone."""
+    rows, columns = array.shape[:2]
+    padded = np.pad(array, ((0, rows % 2), (0, columns % 2), *[(0, 0)] * (array.ndim - 2)))
+    return padded[::2, ::2] + padded[1::2, ::2] + padded[::2, 1::2] + padded[1::2, 1::2]

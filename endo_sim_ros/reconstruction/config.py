@@ -60,9 +60,6 @@ class ReconstructionConfig(StageConfig):
     """Weight of 1 − correlation of depth and prior, in training views and in virtual ones to which the prior is carried (FSGS)."""
     lambda_flat: Annotated[float, Range(0, 1000)] = 0.01
     """Weight of Gaussians being deeper than 1.5 times their width, which turns into streaks when the tissue is sheared."""
-    lambda_color: Annotated[float, Range(0, 1000)] = 0.3
-    """Weight of Gaussians having the colour that is seen where they lie, without which stretched tissue shows layers of
-    other colours."""
     virtual_every: Annotated[int, Range(0, 1000)] = 0
     """A virtual camera regularises every n-th iteration (paper eq. 8, 9), by what of the distortion, total variation and
     correlation has a weight; 0 = never."""
@@ -79,7 +76,7 @@ class ReconstructionConfig(StageConfig):
     """Iterations between relocations of dead Gaussians and growth."""
     growth: Annotated[float, Range(0, 1)] = 0.05
     """Share of new Gaussians added at each refinement until max_gaussians is reached."""
-    learning_rate: Annotated[float, Range(1e-3, 100)] = 1.0
+    learning_rate: Annotated[float, Range(1e-3, 100)] = 1.5
     """Factor on all learning rates."""
     seed: Annotated[int, Range(0, 2**31 - 1)] = 0
     """Seed of all random draws; the same seed gives the same model on a CPU, bit for bit."""

@@ -11,7 +11,7 @@ import warp as wp
 from torch import Tensor
 
 from endo_sim_ros.device import init_warp, warp_stream
-from endo_sim_ros.gaussians import SH_C0, GaussianModel
+from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.reconstruction import losses_kernels as kernels
 from endo_sim_ros.splatting.launching import kernel_arguments
 
@@ -108,31 +108,6 @@ def seen_at(
     inside = (z > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
     index = (v.clamp(0, height - 1) * width + u.clamp(0, width - 1)).long()
     return index, inside if mask is None else inside & (mask.flatten()[index] > 0), z
-
-
-def color_in_place(
-    model: GaussianModel, viewmat: Tensor, K: Tensor, target: Tensor, gain: Tensor, depth: Tensor, mask: Tensor | None, tolerance: float
-) -> Tensor:
-    """Mean difference between the colours of Gaussians and what a view shows where their centres lie; a gradient for colours alone.
-
-    A picture can be made of layers none of which has the colour of the tissue. It falls apart as soon as the tissue is
-    stretched, which moves them against each other.
-
-    Args:
-        model: The Gaussians.
-        viewmat, K: World-to-camera [4, 4] and intrinsics [3, 3] of the view.
-        target: Its image [H, W, 3].
-        gain: Of exposure and light there [H, W, 1 or 3].
-        depth, mask: Of the surface [H, W], metres, and where there is tissue that shows its own colour.
-        tolerance: Relative difference of depth within which a Gaussian belongs to the surface.
-    """
-    with torch.no_grad():
-        index, inside, z = seen_at(model.means, viewmat, K, mask, depth.shape)
-        surface = depth.flatten()[index]
-        weights = model.opacities * (inside & ((z - surface).abs() < tolerance * surface))
-        gain, target = gain.flatten(0, 1)[index], target.flatten(0, 1)[index]
-    differences = (gain * (model.sh[:, 0] * SH_C0 + 0.5) - target).abs().mean(1)
-    return (weights * differences).sum() / (weights > 0).sum().clamp_min(1)
 
 
 def ssim(image: Tensor, target: Tensor) -> Tensor:

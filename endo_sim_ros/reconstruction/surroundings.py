@@ -3,10 +3,13 @@
 They keep other views from looking into the void. Physics, which knows the training cameras, takes no control nodes from them.
 """
 
+import math
+
 import cv2
 import numpy as np
 import torch
 from scipy.interpolate import RBFInterpolator
+from scipy.signal import fftconvolve
 from scipy.spatial import cKDTree
 
 from endo_sim_ros.cameras import Camera
@@ -18,12 +21,13 @@ from endo_sim_ros.sequences.frames import Frame
 
 # In widths of the image:
 _FINE, _COARSE = 1 / 80, 1 / 27  # spacing in holes and close around the picture, and farther out
-_CLOSE = 0.15  # how far around it; large Gaussians there would reach into the picture and cover what was seen
+_RING, _CLOSE = 0.05, 3  # how much farther out at a time, and how often finely: large Gaussians would reach in and cover what was seen
 _SIZE = 0.6  # standard deviation in spacings: the nearer ones of larger Gaussians hide the others where tissue is steep
 _OPACITY = 0.8
 _CELL = 1 / 80  # side of what depth is told for, and of what tells it
 _PIXELS_ERROR, _POINTS_ERROR = 1 / 128, 1 / 8  # how far away depth differs as much as that of pixels, of points errs
 _TELLING = 40  # neighbours that tell a cell's depth
+_WITHIN = 0.25  # cells², how far away pixels of the same cell count
 _POINTS = 9  # neighbours among which a scene point's depth has to be the usual one
 _LEAST_SEEN = 0.02  # share of the pixels with depth, from which on its surroundings can be told
 _BRIGHTEST = 2.0
@@ -55,19 +59,19 @@ def with_surroundings(
     colors, spacings = [], []
     told = [(f, e) for f, e in zip(frames, exposures) if f.depth is not None and (f.depth > 0).mean() >= _LEAST_SEEN]
     continued = map_in_threads(lambda view: _continued(view[0], points, light, view[1], reference, int(reach * view[0].camera.width)), told)
-    for (frame, _), (camera, depth, picture) in zip(told, continued):
-        width, height, pad = frame.camera.width, frame.camera.height, (camera.width - frame.camera.width) // 2
-        known = np.pad(frame.depth > 0, pad)
-        inside = np.zeros(known.shape, bool)
-        inside[pad : pad + height, pad : pad + width] = True if frame.mask is None else frame.mask > 0
-        close = ~inside & (cv2.dilate(np.uint8(inside), np.ones((2 * int(_CLOSE * width) + 1,) * 2, np.uint8)) > 0)
-        for where, share in ((inside, _FINE), (close, _FINE), (~inside & ~close, _COARSE)):
+    rings = range(math.ceil(reach / _RING))
+    # Holes, then outwards around all views at a time, since what is close to one picture and far from another is told by the former.
+    for ring in (-1, *rings):
+        least, most = ring * _RING, np.inf if ring == rings[-1] else (ring + 1) * _RING
+        share = _FINE if ring < _CLOSE else _COARSE
+        for (frame, _), (camera, depth, picture, away) in zip(told, continued):
+            width, pad = frame.camera.width, (camera.width - frame.camera.width) // 2
             stride = max(round(share * width), 1)
-            chosen = np.zeros(known.shape, bool)
+            chosen = np.zeros(away.shape, bool)
             chosen[stride // 2 :: stride, stride // 2 :: stride] = True
-            chosen &= where & ~known
+            chosen &= (away > least * width) & (away <= most * width) & (np.pad(frame.depth, pad) <= 0)
             points, spacing = camera.backproject(depth)[chosen], stride * depth[chosen] / camera.K[0, 0]
-            new = _unknown(points, frames, where is not inside)
+            new = _unknown(points, frames, ring in rings)
             if new.any():
                 new[new] = cKDTree(np.concatenate(parts)).query(points[new])[0] > 0.7 * spacing[new]
             parts.append(points[new])
@@ -86,8 +90,9 @@ def with_surroundings(
 
 def _continued(
     frame: Frame, points: np.ndarray, light: np.ndarray, exposure: np.ndarray, reference: float, pad: int
-) -> tuple[Camera, np.ndarray, np.ndarray]:
-    """The view with a margin: its camera, depth [H', W'] (m) everywhere, and colours without light [H', W', 3]."""
+) -> tuple[Camera, np.ndarray, np.ndarray, np.ndarray]:
+    """The view with a margin: its camera, depth [H', W'] (m) everywhere, colours without light [H', W', 3], and how far away the
+    tissue in the picture is [H', W'] (pixels, 0 in it)."""
     K = frame.camera.K.copy()
     K[:2, 2] += pad
     camera = Camera(K, frame.camera.width + 2 * pad, frame.camera.height + 2 * pad, frame.camera.pose)
@@ -117,29 +122,53 @@ def _continued(
     tissue = np.zeros(known.shape, bool)
     rows, columns = frame.depth.shape
     tissue[pad : pad + rows, pad : pad + columns] = True if frame.mask is None else frame.mask > 0
-    return camera, depth, filled(colors, tissue)
+    away = cv2.distanceTransform(np.uint8(~tissue), cv2.DIST_C, cv2.DIST_MASK_3)
+    return camera, depth, _spread_from(colors, tissue, frame.camera.width), away
 
 
 def _continued_from(values: np.ndarray, known: np.ndarray, uv: np.ndarray, there: np.ndarray, width: int) -> np.ndarray:
     """Values [H, W] where known [H, W]; elsewhere the likeliest where known pixels and values at points uv [N, 2] err, and
     squared differences grow with distance (kriging, a linear variogram)."""
     side = max(round(_CELL * width), 1)
-    rows, columns = (-(-size // side) for size in known.shape)
-    fit = ((0, rows * side - known.shape[0]), (0, columns * side - known.shape[1]))
-    cells = lambda array: np.pad(array, fit).reshape(rows, side, columns, side).sum((1, 3), dtype=np.float64)
-    count = cells(known)
-    means = cells(np.where(known, values, 0)) / np.maximum(count, 1)
+    count, means = _in_cells(values[..., None], known, side)
+    there_is, means = count > 0, means[..., 0]
+    rows, columns = count.shape
     centres = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1) + 0.5
-    sources = np.concatenate([centres[count > 0], uv / side])
-    errors = np.repeat([_PIXELS_ERROR, _POINTS_ERROR], [(count > 0).sum(), len(uv)]) * width / side
-    told = RBFInterpolator(
-        sources, np.concatenate([means[count > 0], there]), neighbors=_TELLING, smoothing=errors, kernel="linear", degree=0
-    )
-    means[count == 0] = told(centres[count == 0])
-    v, u = ((np.arange(size) + 0.5) / side - 0.5 for size in known.shape)
-    u, v = np.meshgrid(u.astype(np.float32), v.astype(np.float32))
-    fine = cv2.remap(means.astype(np.float32), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.where(known, values, fine)
+    sources = np.concatenate([centres[there_is], uv / side])
+    errors = np.repeat([_PIXELS_ERROR, _POINTS_ERROR], [there_is.sum(), len(uv)]) * width / side
+    told = np.concatenate([means[there_is], there])
+    told = RBFInterpolator(sources, told, neighbors=_TELLING, smoothing=errors, kernel="linear", degree=0)
+    means[~there_is] = told(centres[~there_is])
+    return np.where(known, values, _in_pixels(means, side, known.shape))
+
+
+def _spread_from(values: np.ndarray, known: np.ndarray, width: int) -> np.ndarray:
+    """Values [H, W, C] where known [H, W]; elsewhere the mean of those known, each weighing by its distance to the power −4
+    (Shepard 1968): colour, unlike depth, does not go on the way it goes."""
+    side = max(round(_CELL * width), 1)
+    count, means = _in_cells(values, known, side)
+    rows, columns = (np.arange(1 - size, size, dtype=np.float64) for size in count.shape)
+    weights = 1 / (rows[:, None] ** 2 + columns**2 + _WITHIN) ** 2
+    about = lambda sums: fftconvolve(sums, weights, "valid")
+    padded = lambda array: np.pad(array, [(size - 1, size - 1) for size in count.shape])
+    total = about(padded(count))
+    spread = np.stack([about(padded(count * means[..., c])) / total for c in range(values.shape[2])], -1)
+    return np.where(known[..., None], values, _in_pixels(spread, side, known.shape))
+
+
+def _in_cells(values: np.ndarray, known: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of square cells, the number of known pixels [R, Q] and the mean of their values [H, W, C], [R, Q, C]; 0 for none."""
+    rows, columns = (-(-size // side) for size in known.shape)
+    fit = ((0, rows * side - known.shape[0]), (0, columns * side - known.shape[1]), (0, 0))
+    sums = lambda array: np.pad(array, fit).reshape(rows, side, columns, side, -1).sum((1, 3), dtype=np.float64)
+    count = sums(known[..., None])
+    return count[..., 0], sums(np.where(known[..., None], values, 0)) / np.maximum(count, 1)
+
+
+def _in_pixels(cells: np.ndarray, side: int, shape: tuple[int, int]) -> np.ndarray:
+    """Values of cells [R, Q, ...] in between their centres, of pixels [H, W, ...]."""
+    size = cells.shape[1] * side, cells.shape[0] * side
+    return cv2.resize(cells.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)[: shape[0], : shape[1]]
 
 
 def _unknown(points: np.ndarray, frames: list[Frame], beyond: bool) -> np.ndarray:
@@ -156,27 +185,3 @@ def _unknown(points: np.ndarray, frames: list[Frame], beyond: bool) -> np.ndarra
             known |= True if frame.mask is None else frame.mask[v, u] > 0
         unknown[inside[known]] = False
     return unknown
-
-
-def filled(values: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Values [H, W, C] where known [H, W]; elsewhere the mean over ever wider surroundings (pull-push)."""
-    weight = known.astype(np.float32)
-    levels = [(weight, values.astype(np.float32) * weight[..., None])]
-    while min(levels[-1][0].shape) > 1:
-        weight, total = (_halved(array) for array in levels[-1])
-        scale = np.maximum(weight, 1)
-        levels.append((weight / scale, total / scale[..., None]))
-    weight, total = levels[-1]
-    mean = sum(t.reshape(-1, t.shape[-1]).sum(0) for _, t in levels[-1:]) / max(float(weight.sum()), 1e-6)
-    filled = total + (1 - weight)[..., None] * mean
-    for weight, total in levels[-2::-1]:
-        coarse = cv2.resize(filled, weight.shape[::-1], interpolation=cv2.INTER_LINEAR).reshape(total.shape)
-        filled = total + (1 - weight)[..., None] * coarse
-    return filled
-
-
-def _halved(array: np.ndarray) -> np.ndarray:
-    """Sums of 2 × 2 pixels; an odd row or column is alone."""
-    rows, columns = array.shape[:2]
-    padded = np.pad(array, ((0, rows % 2), (0, columns % 2), *[(0, 0)] * (array.ndim - 2)))
-    return padded[::2, ::2] + padded[1::2, ::2] + padded[::2, 1::2] + padded[1::2, 1::2]

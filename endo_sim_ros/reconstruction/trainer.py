@@ -19,7 +19,7 @@ from torch import Tensor
 from endo_sim_ros.cameras import Camera, interpolate_pose
 from endo_sim_ros.device import pick_device
 from endo_sim_ros.gaussians import GaussianModel
-from endo_sim_ros.light import NEAREST, Light, directions, falloff, features, log_brightness
+from endo_sim_ros.light import Light, directions, falloff, features, log_brightness
 from endo_sim_ros.reconstruction import densification, losses, photometry
 from endo_sim_ros.reconstruction.agreement import agreed
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
@@ -59,7 +59,6 @@ _SHARP = 0.15  # pixels: views that agree so well are worth all iterations
 _FINER = 2  # times the width trained on, at which depth is corrected where images are so fine
 _NARROWEST = 64  # pixels; images are not halved below when memory runs out
 _SELDOM = 4  # iterations between steps that may be taken seldom, and then are as much larger
-_ON_SURFACE = 0.02  # of its depth
 _EXPOSURE_RATE, _LIGHT_RATE = 1e-3, 2e-3  # learning rates of log exposures and of the light's four numbers
 
 
@@ -71,7 +70,6 @@ class _View:
     image: Tensor  # [H, W, 3] in [0, 1]
     depth: Tensor | None  # [H, W] m, 0 = none
     mask: Tensor | None  # [H, W] 1 = tissue
-    matte: Tensor  # [H, W] 1 = tissue in its own colour
     exposure: int  # whose exposure it has: its own, or that of the left view of its pair
     exposure_index: Tensor  # [1] the same
 
@@ -84,7 +82,6 @@ class _Inputs(NamedTuple):
     image: Tensor  # [H, W, 3] of the training view, and so on
     exposure: Tensor  # [1] int64
     mask: Tensor | None  # [H, W]
-    matte: Tensor  # [H, W]
     depth: Tensor | None  # [H, W]
     rays: Tensor | None  # [3, H, W], for the light
     carried: Tensor | None  # [H, W] depth prior as the virtual camera sees it
@@ -325,7 +322,7 @@ class Trainer:
             virtual = self._virtual_camera(view.exposure)
         inputs = self._inputs(view, virtual)
         self._optimizer.set_rate("means", self._step_size)
-        seldom = bool(config.lambda_flat or config.lambda_color) and self.iteration % _SELDOM == 0
+        seldom = bool(config.lambda_flat) and self.iteration % _SELDOM == 0
         self._last_loss = self._descend(seldom, inputs)
         self.iteration += 1
         with torch.no_grad():
@@ -346,7 +343,7 @@ class Trainer:
         if virtual is not None and self.config.lambda_pearson and beside.depth is not None:
             carried = _carried_depth(beside, viewmats[1])
         rays = directions(view.camera, self.device) if self.config.light else None
-        return _Inputs(viewmats, Ks, view.image, view.exposure_index, view.mask, view.matte, view.depth, rays, carried)
+        return _Inputs(viewmats, Ks, view.image, view.exposure_index, view.mask, view.depth, rays, carried)
 
     def _matrices(self, cameras: list[Camera]) -> tuple[Tensor, Tensor]:
         """Of cameras, viewmats [C, 4, 4] and Ks [C, 3, 3]."""
@@ -380,7 +377,7 @@ class Trainer:
         if cameras > 1:
             loss = loss + self._virtual_loss(output, view)
         if seldom:
-            loss = loss + _SELDOM * self._model_loss(output, view)
+            loss = loss + _SELDOM * config.lambda_flat * losses.depth_extent(self._current(), self._eye).mean()
         if config.light:
             loss = loss + _LIGHT_ANCHOR * ((self._light["light"] - self._light_prior) ** 2).sum()
         gradients = dict(zip(wanted, torch.autograd.grad(loss, list(wanted.values()))))
@@ -440,23 +437,6 @@ class Trainer:
             exposure = self._light["exposures"].index_select(0, view.exposure).exp()[None]
             gain = exposure if gain is None else gain * exposure
         return gain
-
-    def _model_loss(self, output: RenderOutput, view: _Inputs) -> Tensor:
-        """What the Gaussians are to be like so that the tissue can be deformed."""
-        config, model = self.config, self._current()
-        total = torch.zeros((), device=self.device)
-        if config.lambda_flat:
-            total = total + config.lambda_flat * losses.depth_extent(model, self._eye).mean()
-        if config.lambda_color:
-            depth, alpha = output.depths[0].detach(), output.alphas[0].detach()
-            with torch.no_grad():
-                gain = self._gain(depth, alpha, view)
-            gain = torch.ones_like(depth)[..., None] if gain is None else gain.expand(*depth.shape, -1)
-            surface = depth / alpha.clamp_min(NEAREST)
-            matrices = view.viewmats[0], view.Ks[0]
-            place = losses.color_in_place(model, *matrices, view.image, gain, surface, view.matte, _ON_SURFACE)
-            total = total + config.lambda_color * place
-        return total
 
     def _virtual_loss(self, output: RenderOutput, view: _Inputs) -> Tensor:
         """Paper eq. 9: distortion and total variation from a virtual camera, the second one."""
@@ -560,7 +540,6 @@ class Trainer:
             tensor(frame.image) / 255,
             None if frame.depth is None else tensor(frame.depth),
             None if tissue.all() else tensor(tissue),
-            tensor(tissue * ~photometry.reflections(frame.image, tissue)),
             exposure,
             torch.tensor([exposure], device=self.device),
         )

@@ -13,7 +13,7 @@ from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.evaluation.held_out import reconstruct_and_measure
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer, densification, losses, select_keyframes, shrink
-from endo_sim_ros.reconstruction.agreement import _corrected, _smooth, agreed
+from endo_sim_ros.reconstruction.agreement import _BY_EYES, _IN_THE_END, _MATCHED, _corrected, _smooth, agreed
 from endo_sim_ros.reconstruction.depth import disparity_offsets, interpolated_depth, stereo_disparity, with_depth_prior
 from endo_sim_ros.reconstruction.initialization import initial_model
 from endo_sim_ros.reconstruction.optimizer import Adam
@@ -429,16 +429,22 @@ def test_views_correct_each_others_depth(large):
 def test_no_pixel_is_corrected_to_another_surface():
     inverse, weight = np.full((64, 80), 10, np.float32), np.zeros((64, 80), np.float32)
     weight[20:40, 20:40] = 1e6
-    corrected = _corrected(inverse, 9 * weight, weight, 0.1, 80)
+    corrected = _corrected(inverse, 9 * weight, weight, 0.1, 80, (10.0, 0.05))
     assert 12 < corrected.max() < 12.6 and corrected.min() > 9.9
 
 
 def test_ripples_of_wide_images_are_smoothed_and_edges_are_not():
     width, noise = 1920, np.random.default_rng(0).normal(0, 0.1, (160, 1920))
     step = np.where(np.arange(width) < 960, 8.0, 12.0) + np.zeros_like(noise)
-    error = _smooth((step + noise).astype(np.float32), width) - step
+    error = _smooth((step + noise).astype(np.float32), width, (10.0, 0.05)) - step
     assert error.std() < 0.1 * noise.std()
     assert np.abs(error[:, 950:970]).max() < 0.5 * noise.std()
+
+
+def test_of_depth_that_is_known_better_smaller_steps_are_kept():
+    step = np.where(np.arange(640) < 320, 10.0, 10.4) + np.zeros((64, 640))
+    off = [np.abs(_smooth(step.astype(np.float32), 640, ripples) - step)[:, 310:330].max() for ripples in (_MATCHED, _BY_EYES, _IN_THE_END)]
+    assert off[0] > 0.15 and off[0] > off[1] > off[2] and off[2] < 0.07
 
 
 def test_scene_points_correct_the_depth_around_them(large):

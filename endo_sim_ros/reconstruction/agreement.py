@@ -21,20 +21,22 @@ _NEIGHBOURS = 4  # views that each view is compared with: the nearest in space
 _LEAST_SHARED = 0.05  # of the picture, below which two views are not compared
 _REMATCHED = 0.15  # pixels, error of a disparity that flow between the eyes has corrected
 _GUESSED = 0.05  # relative error of a depth that no right image gave
-_FLOW = 0.5  # pixels, error of a displacement, that of the poses included
+_FLOW = 0.35  # pixels, error of a displacement, that of the poses included
 _EYES = 0.6  # share of it between the eyes of one view
 _ALIKE = 0.5  # correlation from which on two pixels show the same tissue
 _LEAST_SEEN = 0.02  # share of the pixels with depth
 _TOO_FAR = 0.25  # relative difference from which on a point lies on another surface
-_EDGE = 0.05  # relative step of depth that is an edge
 # In pixels of an image 640 wide:
 _STEP = 1.0  # farthest that matching with the right image is believed to be off
-_RIPPLE = 10.0  # standard deviation over which depth is smoothed within edges
+# Over how much depth is smoothed within edges (standard deviation), and how large a relative step is one: as matched, as corrected
+# between the eyes, and in the end. Of what is known better, smaller steps are edges.
+_MATCHED, _BY_EYES, _IN_THE_END = (24.0, 0.1), (10.0, 0.03), (10.0, 0.02)
+_FINELY = 8.0  # pixels, standard deviation up to which the filter takes all pixels
 _OFF_LINE = 2.0  # farthest beside the line on which depth alone can move a point
 _FARTHEST = 40.0  # longest displacement that optical flow is believed
 _LOCAL = 8.0  # standard deviation of the window that brightness is compared to
 _WINDOW = 9  # side of the window of the correlation
-_REACH = 15  # side of the square that a scene point speaks for
+_REACH = 11  # side of the square that a scene point speaks for
 _SMOOTH = 12.0  # standard deviation over which corrections are carried to pixels without
 
 
@@ -84,7 +86,7 @@ def agreed(frames: list[Frame], points: ScenePoints, matched: bool) -> tuple[lis
                     correction, precision, *contradiction = found
                     total, weight = total + precision * correction, weight + precision
                     contradictions.append(contradiction)
-        inverse = _corrected(inverse, total, weight, error, camera.width)
+        inverse = _corrected(inverse, total, weight, error, camera.width, _IN_THE_END)
         good = known & np.isfinite(inverse) & (inverse > 0)
         depth = np.where(good, 1 / np.where(good, inverse, 1), 0).astype(np.float32)
         return dataclasses.replace(frame, depth=depth), contradictions
@@ -100,7 +102,7 @@ def _rematched(inverse: np.ndarray, left: _Image, right: _Image, pixel: float) -
     Semi-global matching prefers whole pixels and goes in steps; optical flow does neither, but errs wildly where there is little to see.
     """
     width, matched = left.camera.width, np.full(inverse.shape, MATCHED / pixel, np.float32)
-    inverse = _smooth(inverse, width)
+    inverse = _smooth(inverse, width, _MATCHED)
     # Between the eyes reflections hardly move.
     found = _of_image(inverse, left._replace(matte=left.tissue), right._replace(matte=right.tissue))
     if found is None:
@@ -108,14 +110,16 @@ def _rematched(inverse: np.ndarray, left: _Image, right: _Image, pixel: float) -
     correction, precision, *_ = found
     precision = np.where(np.abs(correction) * pixel < _STEP * width / 640, precision / _EYES**2, 0)
     correction = np.where(precision > 0, correction, 0)
-    rematched = _corrected(inverse, precision * correction, precision, matched, width)
+    rematched = _corrected(inverse, precision * correction, precision, matched, width, _BY_EYES)
     # Where flow tells nothing, far and wide, the error stays that of matching.
     told = cv2.GaussianBlur((precision > 0).astype(np.float32), (0, 0), _SMOOTH * width / 640)
     error = (MATCHED + (_REMATCHED - MATCHED) * np.minimum(2 * told, 1)) / pixel
     return rematched, error
 
 
-def _corrected(inverse: np.ndarray, total: np.ndarray, weight: np.ndarray, error: np.ndarray | float, width: int) -> np.ndarray:
+def _corrected(
+    inverse: np.ndarray, total: np.ndarray, weight: np.ndarray, error: np.ndarray | float, width: int, ripples: tuple[float, float]
+) -> np.ndarray:
     """Inverse depth [H, W] of the given error with corrections, of which Σ precision × correction and Σ precision are given.
 
     Where there are none, those of the surroundings count; nothing moves to another surface; ripples within edges are smoothed.
@@ -125,17 +129,18 @@ def _corrected(inverse: np.ndarray, total: np.ndarray, weight: np.ndarray, error
     around = blur(trust)
     carried = blur(trust * correction) / np.maximum(around, 1e-6) * np.minimum(4 * around, 1)
     added = np.clip(trust * correction + (1 - trust) * carried, -_TOO_FAR * inverse, _TOO_FAR * inverse)
-    return _smooth(inverse + added, width)
+    return _smooth(inverse + added, width, ripples)
 
 
-def _smooth(inverse: np.ndarray, width: int) -> np.ndarray:
-    """Inverse depth [H, W] without the ripples of matching, its edges kept."""
+def _smooth(inverse: np.ndarray, width: int, ripples: tuple[float, float]) -> np.ndarray:
+    """Inverse depth [H, W] without ripples of so many pixels (in an image 640 wide), relative steps of such a size kept."""
     relative = (inverse / np.float32(np.median(inverse))).astype(np.float32)
-    smooth, stride = np.empty_like(relative), max(round(width / 640), 1)
-    # The filter takes as long as its window is large: of wide images every n-th pixel is filtered with others of its kind.
+    spread, edge = ripples[0] * width / 640, ripples[1]
+    smooth, stride = np.empty_like(relative), max(round(spread / _FINELY), 1)
+    # The filter takes as long as its window is large: of large ones every n-th pixel is filtered with others of its kind.
     for row, column in np.ndindex(min(stride, len(relative)), stride):
         part = np.ascontiguousarray(relative[row::stride, column::stride])
-        smooth[row::stride, column::stride] = cv2.bilateralFilter(part, 0, _EDGE, _RIPPLE * width / 640 / stride)
+        smooth[row::stride, column::stride] = cv2.bilateralFilter(part, 0, edge, spread / stride)
     return np.float32(np.median(inverse)) * smooth
 
 

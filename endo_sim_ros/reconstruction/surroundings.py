@@ -23,7 +23,7 @@ from endo_sim_ros.sequences.frames import Frame
 _FINE, _COARSE = 1 / 80, 1 / 54  # spacing in holes and close around the picture, and farther out
 _RING, _CLOSE = 0.05, 3  # how much farther out at a time, and how often finely: large Gaussians would reach in and cover what was seen
 _SIZE = 0.6  # standard deviation in spacings: the nearer ones of larger Gaussians hide the others where tissue is steep
-_OPACITY = 0.95
+_OPACITY = 0.8
 _CELL = 1 / 80  # side of what depth is told for, and of what tells it
 _PIXELS_ERROR, _POINTS_ERROR = 1 / 128, 1 / 8  # how far away depth differs as much as that of pixels, of points errs
 _TELLING = 40  # neighbours that tell a cell's depth

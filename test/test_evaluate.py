@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
 
 from endo_sim_ros.cameras import Camera, look_at
 from endo_sim_ros.config import ConfigError
@@ -123,10 +124,14 @@ def test_measures_of_what_was_seen_count_only_that(small_frames):
 def test_depth_is_judged_by_scene_points_that_no_method_gets(small_frames):
     frame = small_frames[0]
     surface = frame.camera.backproject(frame.depth)[frame.depth > 0][::7]
-    points = ScenePoints(surface, np.zeros_like(surface), np.linspace(0.001, 0.002, len(surface)))
+    repeated = np.concatenate([surface, surface[::2], surface[1::2] + 1e-6])  # as other pairs of views triangulate them again
+    points = ScenePoints(repeated, np.zeros_like(repeated), np.linspace(0.001, 0.002, len(repeated)))
     given, judging = _divided(points)
-    assert len(given.positions) == len(given.error) == len(surface) - len(judging) and len(judging) == -(-len(surface) // 10)
-    assert not (given.positions[:, None] == judging[::20]).all(2).any()
+    assert len(judging) == pytest.approx(len(np.unique(repeated, axis=0)) / 10, abs=1) and len(given.positions) == len(given.error)
+    assert len(repeated) - 4 * len(judging) < len(given.positions) < len(repeated) - len(judging)
+    assert cKDTree(judging).query(given.positions)[0].min() > 2e-6
+    few = ScenePoints(surface[:300], np.zeros_like(surface[:300]), 0.001)
+    assert _divided(few) == (few, None)
     assert measure(frame.image, frame.depth, frame, points=judging)["points_depth"] < 1e-6
     off = measure(frame.image, frame.depth + np.float32(0.002), frame, points=judging)
     assert off["points_depth"] == pytest.approx(0.002, rel=1e-3)

@@ -700,6 +700,10 @@ def test_checkpoints_that_do_not_fit_are_refused(small, tmp_path):
         Trainer([small[0]], options(seed=3)).load_checkpoint(path)
     with pytest.raises(SequenceError, match="other views"):
         Trainer([small[1]], options()).load_checkpoint(path)
+    state = torch.load(path, weights_only=True)
+    torch.save(state | {"config": state["config"] | {"lambda_gone": 0.3}}, path)  # of another version, which asked for more
+    with pytest.raises(SequenceError, match=r"other options \(lambda_gone\)"):
+        trainer.load_checkpoint(path)
     path.write_bytes(b"not a checkpoint")
     with pytest.raises(SequenceError, match="not a readable checkpoint"):
         trainer.load_checkpoint(path)

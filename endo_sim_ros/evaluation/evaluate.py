@@ -21,6 +21,7 @@ import numpy as np
 import torch
 import yaml
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from scipy.spatial import cKDTree
 
 from endo_sim_ros.cameras import Camera
 from endo_sim_ros.config import ConfigError
@@ -49,7 +50,8 @@ log = logging.getLogger(__name__)
 _SHOWN = 3  # held-out views of a cell of which pictures are kept
 _CURVE_VIEWS = 8  # held-out views measured at each moment of a curve
 _POINT_VIEWS = 48  # views that structure from motion is done with
-_JUDGING = 10  # one scene point in so many judges depth where nothing better does
+_JUDGING, _FEWEST_JUDGES = 10, 50  # one scene point in so many judges depth where nothing better does, if those are enough
+_SAME_POINT = 0.1  # of the distance between judging points, up to which another one is the same
 _POINT_ERROR = 0.003  # relative error of the depth of points that a recording brings
 _PHANTOM = "phantom:"
 
@@ -251,20 +253,20 @@ def _prepare(cells: Sequence[Cell], bar: Progress) -> Prepared:
     known = read_points(_place(source)[0])
     points = ScenePoints(*known, _POINT_ERROR) if known else scene_points(frames, _POINT_VIEWS)
     bar.remove_task(task)
-    depth_source, matched = "none", frames
+    depth_source, matched, judging = "none", frames, None
     recorded = any(frame.depth is not None and (frame.depth > 0).any() for frame in frames)
+    if not recorded:
+        points, judging = _divided(points)
     if any(frame.right is not None for frame in frames) and (STEREO in splits or not recorded):
         task = bar.add_task(f"stereo matching of {cells[0].sequence}", total=None)
         matched = with_depth_prior(frames, points, ReconstructionConfig(depth="stereo"))
         bar.remove_task(task)
-    judging = None
     if recorded:
         depth_source = "recorded"
     elif matched is not frames:
-        depth_source = "stereo matching"
         frames = [dataclasses.replace(frame, depth=_trusted(match)) for frame, match in zip(frames, matched)]
-    if not recorded:
-        points, judging = _divided(points)
+        if any(frame.depth is not None for frame in frames):
+            depth_source = "stereo matching"
     width = max(cell.options["image_width"] for cell in cells)
     paired = STEREO in splits and any(frame.right is not None for frame in frames)
     right = [shrink(frame, width) for frame in right_views(matched)] if paired else []
@@ -272,18 +274,27 @@ def _prepare(cells: Sequence[Cell], bar: Progress) -> Prepared:
     return Prepared([f if i in trained else small(f) for i, f in enumerate(frames)], right, depth_source, points, judging)
 
 
-def _divided(points: ScenePoints) -> tuple[ScenePoints, np.ndarray]:
-    """What the methods get, and the positions [N, 3] of the scene points that their depth is judged by."""
-    kept = np.arange(len(points.positions)) % _JUDGING > 0
+def _divided(points: ScenePoints) -> tuple[ScenePoints, np.ndarray | None]:
+    """What the methods get, and the positions [N, 3] of the scene points that their depth is judged by; None of too few.
+
+    A point that was triangulated twice does not count as two.
+    """
+    judging = np.unique(points.positions, axis=0)[::_JUDGING]
+    if len(judging) < _FEWEST_JUDGES:
+        return points, None
+    tree = cKDTree(judging)
+    apart = np.median(tree.query(judging, k=2)[0][:, 1])
+    kept = tree.query(points.positions)[0] > _SAME_POINT * apart
     error = np.asarray(points.error)
-    return ScenePoints(points.positions[kept], points.colors[kept], error[kept] if error.ndim else points.error), points.positions[~kept]
+    return ScenePoints(points.positions[kept], points.colors[kept], error[kept] if error.ndim else points.error), judging
 
 
 def _trusted(frame: Frame) -> np.ndarray | None:
-    """Matched depth [H, W] (m, 0 = none) where half a pixel of disparity is less than a twentieth of it."""
+    """Matched depth [H, W] (m, 0 = none) where half a pixel of disparity is less than a twentieth of it; None if that is nowhere."""
     if frame.depth is None or frame.baseline is None:
         return None
-    return np.where(frame.depth < frame.camera.K[0, 0] * frame.baseline / 10, frame.depth, 0)
+    trusted = np.where(frame.depth < frame.camera.K[0, 0] * frame.baseline / 10, frame.depth, 0)
+    return trusted if trusted.any() else None
 
 
 # ------------------------------------------------------------------------------------------------------------ running

@@ -4,6 +4,7 @@ They keep other views from looking into the void. Physics, which knows the train
 """
 
 import math
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -33,6 +34,15 @@ _LEAST_SEEN = 0.02  # share of the pixels with depth, from which on its surround
 _BRIGHTEST = 2.0
 
 
+class _Guess(NamedTuple):
+    """Tissue on a lattice of pixels that show none of known depth, in and around a picture."""
+
+    positions: np.ndarray  # [N, 3] m, world
+    colors: np.ndarray  # [N, 3] without light
+    spacing: np.ndarray  # [N] m, between neighbours
+    away: np.ndarray  # [N] from the tissue in the picture, 0 in it; widths of the picture
+
+
 def with_surroundings(
     model: GaussianModel,
     frames: list[Frame],
@@ -57,25 +67,21 @@ def with_surroundings(
     parts = [model.means.numpy().astype(np.float64)]
     points = np.concatenate([parts[0], points])
     colors, spacings = [], []
-    told = [(f, e) for f, e in zip(frames, exposures) if f.depth is not None and (f.depth > 0).mean() >= _LEAST_SEEN]
-    continued = map_in_threads(lambda view: _continued(view[0], points, light, view[1], reference, int(reach * view[0].camera.width)), told)
+    told = [(f, e) for f, e in zip(frames, exposures) if f.depth is not None and (f.depth > 0).mean() >= _LEAST_SEEN and f.tissue.any()]
+    around = map_in_threads(lambda view: _around(view[0], points, light, view[1], reference, reach), told)
     rings = range(math.ceil(reach / _RING))
     # Holes, then outwards around all views at a time, since what is close to one picture and far from another is told by the former.
     for ring in (-1, *rings):
         least, most = ring * _RING, np.inf if ring == rings[-1] else (ring + 1) * _RING
-        share = _FINE if ring < _CLOSE else _COARSE
-        for (frame, _), (camera, depth, picture, away) in zip(told, continued):
-            width, pad = frame.camera.width, (camera.width - frame.camera.width) // 2
-            stride = max(round(share * width), 1)
-            chosen = np.zeros(away.shape, bool)
-            chosen[stride // 2 :: stride, stride // 2 :: stride] = True
-            chosen &= (away > least * width) & (away <= most * width) & (np.pad(frame.depth, pad) <= 0)
-            points, spacing = camera.backproject(depth)[chosen], stride * depth[chosen] / camera.K[0, 0]
-            new = _unknown(points, frames, ring in rings)
+        for view in around:
+            guess = view[_FINE if ring < _CLOSE else _COARSE]
+            chosen = (guess.away > least) & (guess.away <= most)
+            positions, spacing = guess.positions[chosen], guess.spacing[chosen]
+            new = _unknown(positions, frames, ring in rings)
             if new.any():
-                new[new] = cKDTree(np.concatenate(parts)).query(points[new])[0] > 0.7 * spacing[new]
-            parts.append(points[new])
-            colors.append(picture[chosen][new])
+                new[new] = cKDTree(np.concatenate(parts)).query(positions[new])[0] > 0.7 * spacing[new]
+            parts.append(positions[new])
+            colors.append(guess.colors[chosen][new])
             spacings.append(spacing[new])
     count, room = sum(map(len, spacings)), limit - len(model)
     if not count or room <= 0:
@@ -84,8 +90,25 @@ def with_surroundings(
     if count > room:  # fewer and larger ones
         kept = np.linspace(0, count - 1, room).astype(int)
         arrays = arrays[0][kept], arrays[1][kept], arrays[2][kept] * (count / room) ** 0.5
-    around = GaussianModel.from_points(*(torch.from_numpy(a.astype(np.float32)) for a in arrays), _OPACITY, model.sh_degree)
-    return GaussianModel(**{name: torch.cat([value, around.tensors()[name]]) for name, value in model.tensors().items()})
+    added = GaussianModel.from_points(*(torch.from_numpy(a.astype(np.float32)) for a in arrays), _OPACITY, model.sh_degree)
+    return GaussianModel(**{name: torch.cat([value, added.tensors()[name]]) for name, value in model.tensors().items()})
+
+
+def _around(
+    frame: Frame, points: np.ndarray, light: np.ndarray, exposure: np.ndarray, reference: float, reach: float
+) -> dict[float, _Guess]:
+    """Where the view knows no depth, what may be there; by how fine the lattice is."""
+    width = frame.camera.width
+    pad = int(reach * width)
+    camera, depth, colors, away = _continued(frame, points, light, exposure, reference, pad)
+    positions, unknown, found = camera.backproject(depth), np.pad(frame.depth, pad) <= 0, {}
+    for share in (_FINE, _COARSE):
+        stride = max(round(share * width), 1)
+        lattice = np.zeros(away.shape, bool)
+        lattice[stride // 2 :: stride, stride // 2 :: stride] = True
+        lattice &= unknown
+        found[share] = _Guess(positions[lattice], colors[lattice], stride * depth[lattice] / camera.K[0, 0], away[lattice] / width)
+    return found
 
 
 def _continued(

@@ -256,7 +256,8 @@ class Trainer:
         try:
             state = _read_checkpoint(Path(path), self.device)
             mine = dataclasses.asdict(self.config)
-            differing = [name for name in mine if name != "device" and mine[name] != state["config"].get(name)]
+            theirs = state["config"]
+            differing = [name for name in {**mine, **theirs} if name != "device" and mine.get(name) != theirs.get(name)]
             if differing or state["stamps"] != self._stamps:
                 what = f"other options ({', '.join(differing)})" if differing else "other views"
                 raise SequenceError(f"{path}: the checkpoint was made with {what}; use the same or start anew")

@@ -123,10 +123,11 @@ def _continued(
     known = depth > 0
     v, u = np.nonzero(known)
     inverse = 1 / depth[known].astype(np.float64)
-    # A plane has inverse depth that is linear in the picture; what departs from it fades.
-    plane = np.column_stack([u, v, np.ones(len(u))])
+    # A plane has inverse depth that is linear in the picture; what departs from it fades. Sums instead of a library's least squares,
+    # whose last bits may hang on what its other threads do.
     step = max(len(u) // 20_000, 1)
-    slope = np.linalg.lstsq(plane[::step], inverse[::step], rcond=None)[0]
+    plane = np.stack([u, v, np.ones(len(u))])[:, ::step]
+    slope = np.linalg.solve((plane[:, None] * plane).sum(2), (plane * inverse[::step]).sum(1))
     flat = slope[0] * np.arange(camera.width) + slope[1] * np.arange(camera.height)[:, None] + slope[2]
     rest = np.zeros(depth.shape, np.float32)
     rest[known] = inverse - flat[known]

@@ -98,7 +98,7 @@ def measure(
         row["depth_rmse_scaled"] = metrics.depth_rmse(scaled, frame.depth, mask)
         if seen is not None:
             row["seen_depth_rmse"] = metrics.depth_rmse(depth, frame.depth, masks[1][1])
-    if points is not None and len(points):
+    if points is not None:
         row["points_depth"] = metrics.depth_at_points(depth, *points_in_view(frame.camera, points), mask)
     if mask is not None and not mask.all():
         row["psnr_unmasked"], row["ssim_unmasked"] = metrics.psnr(image, reference), metrics.ssim(image, reference)

@@ -108,7 +108,7 @@ def unlit(
 
 
 def reflections(image: np.ndarray, tissue: np.ndarray) -> np.ndarray:
-    """Where an image [H, W, 3] shows reflections of the light, which lie deeper than the tissue [H, W] and move with the camera [H, W]."""
+    """Where an image [H, W, 3] shows reflections of the light [H, W], which lie deeper than the tissue [H, W] and move with the camera."""
     unit = image.shape[1] / 640
     least = image.min(2).astype(np.float32)
     blur = lambda values: cv2.GaussianBlur(values, (0, 0), _AROUND * unit)

@@ -53,7 +53,7 @@ def with_surroundings(
     reach: float,
     limit: int,
 ) -> GaussianModel:
-    """The model and what may be around it: inverse depth is the likeliest one, colour that of the nearest pixels.
+    """The model and what may be around it: inverse depth is the likeliest one, colour the mean of what is seen, by its distance.
 
     Args:
         model: What was seen.
@@ -143,9 +143,7 @@ def _continued(
     depth = 1 / np.clip(flat + rest, 0.8 * low, 1.2 * high)
     lit = np.exp((features_at(camera.backproject(depth).reshape(-1, 3), camera, reference) @ light)[:, None] + exposure)
     colors = np.clip(image.reshape(-1, 3) / lit, 0, _BRIGHTEST).reshape(image.shape).astype(np.float32)
-    tissue = np.zeros(known.shape, bool)
-    rows, columns = frame.depth.shape
-    tissue[pad : pad + rows, pad : pad + columns] = True if frame.mask is None else frame.mask > 0
+    tissue = np.pad(frame.tissue > 0, pad)
     away = cv2.distanceTransform(np.uint8(~tissue), cv2.DIST_C, cv2.DIST_MASK_3)
     return camera, depth, _spread_from(colors, tissue, frame.camera.width), away
 
@@ -155,14 +153,14 @@ def _continued_from(values: np.ndarray, known: np.ndarray, uv: np.ndarray, there
     squared differences grow with distance (kriging, a linear variogram)."""
     side = max(round(_CELL * width), 1)
     count, means = _in_cells(values[..., None], known, side)
-    there_is, means = count > 0, means[..., 0]
+    given, means = count > 0, means[..., 0]
     rows, columns = count.shape
     centres = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1) + 0.5
-    sources = np.concatenate([centres[there_is], uv / side])
-    errors = np.repeat([_PIXELS_ERROR, _POINTS_ERROR], [there_is.sum(), len(uv)]) * width / side
-    told = np.concatenate([means[there_is], there])
-    told = RBFInterpolator(sources, told, neighbors=_TELLING, smoothing=errors, kernel="linear", degree=0)
-    means[~there_is] = told(centres[~there_is])
+    sources = np.concatenate([centres[given], uv / side])
+    errors = np.repeat([_PIXELS_ERROR, _POINTS_ERROR], [given.sum(), len(uv)]) * width / side
+    values_there = np.concatenate([means[given], there])
+    told = RBFInterpolator(sources, values_there, neighbors=_TELLING, smoothing=errors, kernel="linear", degree=0)
+    means[~given] = told(centres[~given])
     return np.where(known, values, _in_pixels(means, side, known.shape))
 
 

@@ -18,7 +18,7 @@ demo: setup
 
 test: setup
 	$(VENV)/bin/ruff check
-	$(VENV)/bin/python -m pytest test
+	$(VENV)/bin/python -m pytest -n 2 --dist loadgroup test
 
 setup: $(VENV)/.installed
 

@@ -46,7 +46,7 @@ setup(
         "report": ["matplotlib"],  # `endo-sim report`, `endo-sim plot`, plots of `endo-sim evaluate`
         "test": [
             *("gaussforge", "gymnasium", "hypothesis", "matplotlib", "mcap", "mcap-ros2-support", "plyfile", "pyarrow", "pytest"),
-            *("ruff", "torchmetrics", "viser>=1.1"),
+            *("pytest-xdist", "ruff", "torchmetrics", "viser>=1.1"),
         ],
     },
     entry_points={"console_scripts": ["endo-sim = endo_sim_ros.cli:main"]},

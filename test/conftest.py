@@ -6,7 +6,8 @@ import time
 
 # Set before anything starts ROS; processes that a test starts inherit it.
 os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+if "ROS_DOMAIN_ID" not in os.environ or "PYTEST_XDIST_WORKER" in os.environ:  # a worker has that of who started it
+    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
 os.environ.setdefault("FASTDDS_BUILTIN_TRANSPORTS", "DEFAULT")  # finds late joiners soonest; test messages are small
 
 import pytest  # noqa: E402
@@ -16,6 +17,13 @@ from endo_sim_ros.nodes.transport import prepare_transport  # noqa: E402
 
 prepare_transport()
 torch.set_num_threads(1)
+
+
+def pytest_collection_modifyitems(items):
+    """With workers side by side, one of them has the modules that start most processes, so that these do not meet."""
+    for item in items:
+        if item.path.stem in ("test_learning", "test_lockstep", "test_nodes", "test_robustness", "test_up"):
+            item.add_marker(pytest.mark.xdist_group("graphs"))
 
 
 def wait_until(condition, seconds, what, step=lambda: time.sleep(0.02)):

@@ -34,6 +34,7 @@ _MATCHED, _BY_EYES, _IN_THE_END = (24.0, 0.1), (10.0, 0.03), (10.0, 0.02)
 _FINELY = 8.0  # pixels, standard deviation up to which the filter takes all pixels
 _OFF_LINE = 2.0  # farthest beside the line on which depth alone can move a point
 _FARTHEST = 40.0  # longest displacement that optical flow is believed
+_NOT_BACK = 0.4  # by how much flow there and flow back may miss each other; they do where one image shows what the other hides
 _LOCAL = 8.0  # standard deviation of the window that brightness is compared to
 _WINDOW = 9  # side of the window of the correlation
 _REACH = 11  # side of the square that a scene point speaks for
@@ -190,9 +191,7 @@ def _of_image(inverse: np.ndarray, own: _Image, other: _Image) -> tuple[np.ndarr
     if inside.mean() < _LEAST_SHARED:
         return None
     predicted = np.where(inside, _sampled(other.plain, u, v), own.plain)
-    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    flow.setFinestScale(0)
-    flow = flow.calc(own.plain, predicted, None)
+    flow, back = _flow(own.plain, predicted), _flow(predicted, own.plain)
     # A pixel is seen where the prediction took the pixel from that flow leads to.
     rows, columns = np.mgrid[: inverse.shape[0], : inverse.shape[1]].astype(np.float32) + np.float32(0.5)
     columns, rows = columns + flow[..., 0], rows + flow[..., 1]
@@ -208,7 +207,15 @@ def _of_image(inverse: np.ndarray, own: _Image, other: _Image) -> tuple[np.ndarr
     contradiction = float(np.median(beside[good])) if good.any() else 0.0, float(good.mean())
     good &= (beside < _OFF_LINE * unit) & (np.abs(flow).max(2) < _FARTHEST * unit)
     good &= np.hypot(off_u, off_v) < _FARTHEST * unit
+    good &= np.hypot(*cv2.split(flow + _sampled(back, columns, rows))) < _NOT_BACK * unit
     return (along_u * off_u + along_v * off_v) / speed, np.where(good, speed * (alike / _FLOW) ** 2, 0), *contradiction
+
+
+def _flow(image: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """By how many pixels [H, W, 2] what an image shows lies elsewhere in another."""
+    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    flow.setFinestScale(0)
+    return flow.calc(image, other, None)
 
 
 def _projected(camera: Camera, inverse: np.ndarray, other: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -426,6 +426,22 @@ def test_views_correct_each_others_depth(large):
     assert all(((a.depth > 0) == (b.depth > 0)).mean() > 0.999 for a, b in zip(corrected, frames))
 
 
+def test_what_the_other_view_hides_stays_where_it_was():
+    """Far tissue beside near tissue, which hides a strip of it from a second camera 5 mm to the right; depths are exact."""
+    noise = np.random.default_rng(0).integers(0, 256, (2, 512, 700, 3)).astype(np.float32)
+    far, near = (np.uint8(np.clip(128 + 6 * (cv2.GaussianBlur(n, (0, 0), 3) - 127.5), 0, 255)) for n in noise)
+    K, views = np.array([[500.0, 0, 320], [0, 500, 256], [0, 0, 1]]), []
+    for i in range(2):  # the far is 100 mm away and moves by 25 pixels, the near 62.5 mm and 40
+        image, depth = far[:, 25 * i : 25 * i + 640].copy(), np.full((512, 640), 0.1, np.float32)
+        image[150:350, 240 - 40 * i : 400 - 40 * i], depth[150:350, 240 - 40 * i : 400 - 40 * i] = near[150:350, 240:400], 0.0625
+        pose = np.eye(4)
+        pose[0, 3] = 0.005 * i
+        views.append(Frame(image=image, camera=Camera(K, 640, 512, pose), stamp_ns=i, depth=depth))
+    corrected = agreed(views, NO_POINTS, matched=False)[0][0]
+    hidden = (corrected.depth - views[0].depth)[150:350, 225:240]
+    assert np.sqrt((hidden**2).mean()) < 0.0025  # twice as much where flow is believed that does not lead back
+
+
 def test_no_pixel_is_corrected_to_another_surface():
     inverse, weight = np.full((64, 80), 10, np.float32), np.zeros((64, 80), np.float32)
     weight[20:40, 20:40] = 1e6

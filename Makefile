@@ -18,7 +18,7 @@ demo: setup
 
 test: setup
 	$(VENV)/bin/ruff check
-	$(VENV)/bin/python -m pytest -n 2 --dist loadgroup test
+	$(VENV)/bin/python -m pytest -n 2 --dist worksteal test
 
 setup: $(VENV)/.installed
 

@@ -19,13 +19,6 @@ prepare_transport()
 torch.set_num_threads(1)
 
 
-def pytest_collection_modifyitems(items):
-    """With workers side by side, one of them has the modules that start most processes, so that these do not meet."""
-    for item in items:
-        if item.path.stem in ("test_learning", "test_lockstep", "test_nodes", "test_robustness", "test_up"):
-            item.add_marker(pytest.mark.xdist_group("graphs"))
-
-
 def wait_until(condition, seconds, what, step=lambda: time.sleep(0.02)):
     """Repeat a step until a condition is true and return its value; fail with `what` was awaited after some seconds."""
     deadline = time.monotonic() + seconds

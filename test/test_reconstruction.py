@@ -442,6 +442,30 @@ def test_what_the_other_view_hides_stays_where_it_was():
     assert np.sqrt((hidden**2).mean()) < 0.0025  # twice as much where flow is believed that does not lead back
 
 
+@pytest.mark.parametrize("kept", [np.s_[:6], np.s_[:, :9]])
+def test_images_too_small_for_optical_flow_keep_their_depth(small, kept):
+    cut = lambda array: np.ascontiguousarray(array[kept])
+    views = []
+    for frame in small[:2]:
+        image, depth = cut(frame.image), cut(frame.depth)
+        camera = dataclasses.replace(frame.camera, height=image.shape[0], width=image.shape[1])
+        views.append(dataclasses.replace(bare(frame), image=image, depth=depth, mask=None, camera=camera))
+    corrected, contradiction = agreed(views, NO_POINTS, matched=False)
+    assert np.isnan(contradiction)
+    assert all(np.abs(a.depth / b.depth - 1).max() < 0.02 for a, b in zip(corrected, views))
+
+
+@pytest.mark.parametrize("known", [np.s_[20:21], np.s_[:, 20:21]])
+def test_depth_in_one_line_is_continued_level_to_its_sides(known):
+    """Of how depth changes across the line nothing is known."""
+    (frame,) = film(40, 40, 1)
+    line = np.zeros_like(frame.depth)
+    line[known] = frame.depth[known]
+    model = Trainer([dataclasses.replace(bare(frame), depth=line)], options(depth="topic")).run()
+    _, depth = frame.camera.project(model.means.numpy())
+    assert len(model) > 100 and 0.7 * line[known].min() < depth.min() and depth.max() < 1.4 * line.max()
+
+
 def test_no_pixel_is_corrected_to_another_surface():
     inverse, weight = np.full((64, 80), 10, np.float32), np.zeros((64, 80), np.float32)
     weight[20:40, 20:40] = 1e6

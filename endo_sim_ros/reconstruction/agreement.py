@@ -18,10 +18,12 @@ from endo_sim_ros.reconstruction.triangulation import ScenePoints, neighbours
 from endo_sim_ros.sequences.frames import Frame
 
 _NEIGHBOURS = 4  # views that each view is compared with: the nearest in space
+_LEAST_SIDE = 16  # pixels, of images that optical flow can be found in
 _LEAST_SHARED = 0.05  # of the picture, below which two views are not compared
 _REMATCHED = 0.15  # pixels, error of a disparity that flow between the eyes has corrected
 _GUESSED = 0.05  # relative error of a depth that no right image gave
 _FLOW = 0.35  # pixels, error of a displacement, that of the poses included
+_NOT_BACK = 0.4  # pixels by which flow there and flow back may miss each other; they do where one image shows what the other hides
 _EYES = 0.6  # share of it between the eyes of one view
 _ALIKE = 0.5  # correlation from which on two pixels show the same tissue
 _LEAST_SEEN = 0.02  # share of the pixels with depth
@@ -34,7 +36,6 @@ _MATCHED, _BY_EYES, _IN_THE_END = (24.0, 0.1), (10.0, 0.03), (10.0, 0.02)
 _FINELY = 8.0  # pixels, standard deviation up to which the filter takes all pixels
 _OFF_LINE = 2.0  # farthest beside the line on which depth alone can move a point
 _FARTHEST = 40.0  # longest displacement that optical flow is believed
-_NOT_BACK = 0.4  # by how much flow there and flow back may miss each other; they do where one image shows what the other hides
 _LOCAL = 8.0  # standard deviation of the window that brightness is compared to
 _WINDOW = 9  # side of the window of the correlation
 _REACH = 11  # side of the square that a scene point speaks for
@@ -182,13 +183,13 @@ def _of_points(frame: Frame, inverse: np.ndarray, points: ScenePoints) -> tuple[
 def _of_image(inverse: np.ndarray, own: _Image, other: _Image) -> tuple[np.ndarray, np.ndarray, float, float] | None:
     """Correction (1/m) of a view's inverse depth [H, W] by another image, and its precision (m²), 0 where it tells nothing.
 
-    Also the median of what no depth explains (pixels), and the share of the picture that it is of; None if they share too little.
+    Also the median of what no depth explains (pixels), and the share of the picture that it is of; None where nothing can tell.
     """
     camera = own.camera
     unit = camera.width / 640
     u, v, z = _projected(camera, inverse, other.camera)
     inside = (z > 0) & (_sampled(other.matte, u, v, cv2.INTER_NEAREST) > 0)
-    if inside.mean() < _LEAST_SHARED:
+    if inside.mean() < _LEAST_SHARED or min(inside.shape) < _LEAST_SIDE:
         return None
     predicted = np.where(inside, _sampled(other.plain, u, v), own.plain)
     flow, back = _flow(own.plain, predicted), _flow(predicted, own.plain)
@@ -207,7 +208,7 @@ def _of_image(inverse: np.ndarray, own: _Image, other: _Image) -> tuple[np.ndarr
     contradiction = float(np.median(beside[good])) if good.any() else 0.0, float(good.mean())
     good &= (beside < _OFF_LINE * unit) & (np.abs(flow).max(2) < _FARTHEST * unit)
     good &= np.hypot(off_u, off_v) < _FARTHEST * unit
-    good &= np.hypot(*cv2.split(flow + _sampled(back, columns, rows))) < _NOT_BACK * unit
+    good &= np.hypot(*cv2.split(flow + _sampled(back, columns, rows))) < _NOT_BACK
     return (along_u * off_u + along_v * off_v) / speed, np.where(good, speed * (alike / _FLOW) ** 2, 0), *contradiction
 
 

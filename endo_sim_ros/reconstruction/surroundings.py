@@ -126,7 +126,8 @@ def _continued(
     # whose last bits may hang on what its other threads do.
     step = max(len(u) // 20_000, 1)
     plane = np.stack([u, v, np.ones(len(u))])[:, ::step]
-    slope = np.linalg.solve((plane[:, None] * plane).sum(2), (plane * inverse[::step]).sum(1))
+    level = np.diag([1.0, 1.0, 0.0])  # next to nothing, but makes slopes that nothing tells none
+    slope = np.linalg.solve((plane[:, None] * plane).sum(2) + level, (plane * inverse[::step]).sum(1))
     flat = slope[0] * np.arange(camera.width) + slope[1] * np.arange(camera.height)[:, None] + slope[2]
     rest = np.zeros(depth.shape, np.float32)
     rest[known] = inverse - flat[known]

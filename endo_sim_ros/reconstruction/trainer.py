@@ -686,7 +686,7 @@ def _carried_depth(view: _View, viewmat: Tensor) -> Tensor:
     """The prior of a view as another camera [4, 4] of its kind sees it [H, W], metres; 0 where nothing falls."""
     height, width = view.depth.shape
     v, u = (view.depth > 0).nonzero(as_tuple=True)
-    K, pose = (torch.from_numpy(matrix).to(viewmat) for matrix in (view.camera.K, view.camera.pose))
+    K, pose = (torch.tensor(matrix).to(viewmat) for matrix in (view.camera.K, view.camera.pose))
     z = view.depth[v, u]
     local = torch.stack([(u + 0.5 - K[0, 2]) / K[0, 0] * z, (v + 0.5 - K[1, 2]) / K[1, 1] * z, z], 1)
     index, inside, z = losses.seen_at(local, viewmat @ pose, K, None, view.depth.shape)

@@ -169,10 +169,10 @@ def _spread_from(values: np.ndarray, known: np.ndarray, width: int) -> np.ndarra
     (Shepard 1968): colour, unlike depth, does not go on the way it goes."""
     side = max(round(_CELL * width), 1)
     count, means = _in_cells(values, known, side)
-    around = tuple(2 * size for size in count.shape)  # so wide that nothing is reached the other way round
-    rows, columns = (np.fft.fftfreq(size, 1 / size) for size in around)  # 0, 1, ... and from the other end -1, -2, ...
+    period = tuple(2 * size for size in count.shape)  # so wide that nothing is reached the other way round
+    rows, columns = (np.fft.fftfreq(size, 1 / size) for size in period)  # 0, 1, ... and from the other end -1, -2, ...
     weights = np.fft.rfft2(1 / (rows[:, None] ** 2 + columns**2 + _WITHIN) ** 2)
-    about = lambda sums: np.fft.irfft2(np.fft.rfft2(sums, around) * weights, around)[: count.shape[0], : count.shape[1]]
+    about = lambda sums: np.fft.irfft2(np.fft.rfft2(sums, period) * weights, period)[: count.shape[0], : count.shape[1]]
     total = about(count)
     spread = np.stack([about(count * means[..., c]) / total for c in range(values.shape[2])], -1)
     return np.where(known[..., None], values, _in_pixels(spread, side, known.shape))

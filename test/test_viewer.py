@@ -332,6 +332,9 @@ def graph(bench):
     bench.viewer = bench.page.viewer
     bench.viewer.browsers[1] = FakeBrowser()
     bench.until(lambda: bench.viewer.state is not None and bench.viewer.tools is not None, "the state of the tissue")
+    hand = bench.page._pose_pub, bench.page._jaw_pub
+    bench.until(lambda: all(publisher.get_subscription_count() for publisher in hand), "physics to be found")
+    bench.spin(0.5)  # each side finds the other in its own time
     return bench
 
 

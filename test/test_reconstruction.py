@@ -497,6 +497,20 @@ def test_scene_points_correct_the_depth_around_them(large):
     assert np.isnan(contradiction)  # one view contradicts none
 
 
+def test_wrong_scene_points_among_good_ones_hardly_move_what_matching_knows(large):
+    (matched,) = with_depth_prior([dataclasses.replace(large[0], depth=None)], NO_POINTS, options(depth="stereo"))
+    v, u = np.mgrid[8:512:16, 8:640:16].reshape(2, -1)
+    wrong = np.arange(len(u)) % 10 == 0  # 15 % too far, and as sure of themselves as all
+    positions = large[0].camera.backproject(large[0].depth * np.float32(1.15))[v, u]
+    good = large[0].camera.backproject(large[0].depth)[v, u]
+
+    def error(positions):
+        (corrected,), _ = agreed([matched], ScenePoints(positions, np.zeros_like(positions), 0.003), matched=True)
+        return np.sqrt(((corrected.depth - large[0].depth)[matched.depth > 0] ** 2).mean())
+
+    assert error(good[~wrong]) < error(np.where(wrong[:, None], positions, good)) < 2.5 * error(good[~wrong])
+
+
 @pytest.mark.parametrize(
     "positions, error, said",
     [

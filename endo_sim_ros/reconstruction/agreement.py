@@ -27,6 +27,7 @@ _NOT_BACK = 0.4  # pixels by which flow there and flow back may miss each other;
 _EYES = 0.6  # share of it between the eyes of one view
 _ALIKE = 0.5  # correlation from which on two pixels show the same tissue
 _LEAST_SEEN = 0.02  # share of the pixels with depth
+_DOUBTED = 3.0  # errors of the prior by which a scene point may contradict it before it counts half
 _TOO_FAR = 0.25  # relative difference from which on a point lies on another surface
 # In pixels of an image 640 wide:
 _STEP = 1.0  # farthest that matching with the right image is believed to be off
@@ -80,7 +81,7 @@ def agreed(frames: list[Frame], points: ScenePoints, matched: bool) -> tuple[lis
         error = _GUESSED * inverse
         if matched and frame.right is not None:
             inverse, error = _rematched(inverse, images[i], _seen(right_view(frame)), camera.K[0, 0] * frame.baseline)
-        total, weight = _of_points(frame, inverse, points)
+        total, weight = _of_points(frame, inverse, error, points)
         for j in near[i]:
             if j != i:
                 found = _of_image(inverse, images[i], images[j])
@@ -161,8 +162,11 @@ def _plain(frame: Frame, tissue: np.ndarray) -> np.ndarray:
     return np.uint8(np.clip(128 + 40 * (grey - mean) / np.sqrt(variance + 4), 0, 255))
 
 
-def _of_points(frame: Frame, inverse: np.ndarray, points: ScenePoints) -> tuple[np.ndarray, np.ndarray]:
-    """Σ precision × correction and Σ precision [H, W] of inverse depth [H, W] (1/m) by the scene points around."""
+def _of_points(frame: Frame, inverse: np.ndarray, error: np.ndarray, points: ScenePoints) -> tuple[np.ndarray, np.ndarray]:
+    """Σ precision × correction and Σ precision [H, W] of inverse depth [H, W] (1/m) of an error [H, W] by the scene points around.
+
+    Some points are wrong, more than their own error tells: they count the less (Cauchy) the more their depth and the prior disagree.
+    """
     total, weight = np.zeros(inverse.shape, np.float32), np.zeros(inverse.shape, np.float32)
     if len(points.positions):
         uv, z = frame.camera.project(points.positions)
@@ -173,6 +177,7 @@ def _of_points(frame: Frame, inverse: np.ndarray, points: ScenePoints) -> tuple[
         near = np.abs(correction) < _TOO_FAR * there
         u, v, there, correction = u[near], v[near], there[near], correction[near]
         precision = 1 / (np.broadcast_to(points.error, z.shape)[inside][near] * there) ** 2
+        precision /= 1 + (correction / (_DOUBTED * error[v, u])) ** 2
         np.add.at(total, (v, u), precision * correction)
         np.add.at(weight, (v, u), precision)
         side = 2 * round(_REACH * frame.camera.width / 1280) + 1

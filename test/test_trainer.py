@@ -10,6 +10,7 @@ import torch
 from endo_sim_ros.config import ConfigError
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.gaussians import GaussianModel
+from endo_sim_ros.light import features_at
 from endo_sim_ros.reconstruction import ABLATIONS, PRESETS, ReconstructionConfig, Trainer, densification, losses, preset
 from endo_sim_ros.reconstruction.depth import right_view
 from endo_sim_ros.reconstruction.motion import without_motion
@@ -367,6 +368,22 @@ def test_noise_of_scene_points_does_not_make_the_tissue_beyond_rough(views):
     _, continued, *_ = _continued(frame, points, np.zeros(4), np.zeros(3), flat, 48)
     around = continued[48 + 10 : 48 + 118, 48 + 175 : 48 + 195]
     assert np.std(around / flat) < 0.012  # points alone: 0.017
+
+
+def test_a_picture_goes_on_as_bright_as_it_is_however_far_the_tissue_beyond_is_guessed(views):
+    """Tissue that rises towards the right edge and on beyond it; the light falls off with distance."""
+    camera, light, exposure = views[4].camera, np.array([0.9, 3.0, 0.1, 0.0]), np.full(3, 0.2)
+    depth = (0.1 / np.linspace(1.0, 1.6, 160) * np.ones((128, 1))).astype(np.float32)
+    shading = lambda camera, depth: (features_at(camera.backproject(depth).reshape(-1, 3), camera, 0.1) * light).reshape(*depth.shape, 4)
+    picture = lambda shaded: 100 * np.exp(shaded.sum(-1) - 0.9 * np.log(1.3))  # of tissue that is of one colour
+    image = np.repeat(picture(shading(camera, depth))[..., None], 3, 2).round().astype(np.uint8)
+    frame = dataclasses.replace(bare(views[4]), mask=None, image=image, depth=depth)
+    wide, continued, colors, _ = _continued(frame, np.empty((0, 3)), light, exposure, 0.1, 48)
+    assert continued[48:-48, -10:].max() < 0.95 * depth.min()
+    shaded = shading(wide, continued)
+    np.testing.assert_allclose(colors[48:-48, 48:-48, 0], colors[64, 64, 0], rtol=0.03)  # in the picture that of the tissue
+    without_distance = colors[..., 0] * np.exp(shaded[..., 0])
+    np.testing.assert_allclose(without_distance[48:-48, -10:], without_distance[48:-48, -60:-50], rtol=0.05)
 
 
 @pytest.mark.parametrize(("name", "opaque"), [("default", 0.01), ("paper", 0.0)])

@@ -141,11 +141,14 @@ def _continued(
     low, high = np.percentile(np.concatenate([inverse, there]), [1, 99])
     rest = _continued_from(rest, known, uv[beyond], over, frame.camera.width)
     depth = 1 / np.clip(flat + rest, 0.8 * low, 1.2 * high)
-    lit = np.exp((features_at(camera.backproject(depth).reshape(-1, 3), camera, reference) @ light)[:, None] + exposure)
-    colors = np.clip(image.reshape(-1, 3) / lit, 0, _BRIGHTEST).reshape(image.shape).astype(np.float32)
+    shading = features_at(camera.backproject(depth).reshape(-1, 3), camera, reference) * light
+    near, lit = np.exp(shading[:, 0]).reshape(depth.shape), np.exp(shading[:, 1:].sum(1)[:, None] + exposure).reshape(image.shape)
+    clear = lambda colors: np.clip(colors, 0, _BRIGHTEST).astype(np.float32)
     tissue = np.pad(frame.tissue > 0, pad)
     away = cv2.distanceTransform(np.uint8(~tissue), cv2.DIST_C, cv2.DIST_MASK_3)
-    return camera, depth, _spread_from(colors, tissue, frame.camera.width), away
+    # The picture goes on as bright as it is at its edges, however near or far the guess is: wrong, it would glare in other views.
+    colors = clear(_spread_from(clear(image / lit), tissue, frame.camera.width) / near[..., None])
+    return camera, depth, colors, away
 
 
 def _continued_from(values: np.ndarray, known: np.ndarray, uv: np.ndarray, there: np.ndarray, width: int) -> np.ndarray:

@@ -13,7 +13,7 @@ from endo_sim_ros.light import Light, features_at
 from endo_sim_ros.sequences.frames import Frame
 
 PRIOR = np.array([0.9, 3.0, 0.0, 0.0])  # distance, angle, tilt: the inverse-square law at a gamma of 2.2, a usual spot
-_PRIOR_SPREAD = np.array([0.1, 6.0, 0.3, 0.3])  # errors of depth pass for other falloffs than that of the law
+_PRIOR_SPREAD = np.array([0.3, 6.0, 0.3, 0.3])
 _GAIN_SPREAD = 0.7  # of the logarithm of a view's exposure
 _OFF = 1e-6  # spread of what is not to be fitted
 _NOISE = 0.05  # of the logarithm of a brightness

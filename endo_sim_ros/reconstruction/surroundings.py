@@ -143,11 +143,11 @@ def _continued(
     depth = 1 / np.clip(flat + rest, 0.8 * low, 1.2 * high)
     shading = features_at(camera.backproject(depth).reshape(-1, 3), camera, reference) * light
     near, lit = np.exp(shading[:, 0]).reshape(depth.shape), np.exp(shading[:, 1:].sum(1)[:, None] + exposure).reshape(image.shape)
-    clear = lambda colors: np.clip(colors, 0, _BRIGHTEST).astype(np.float32)
+    clipped = lambda colors: np.clip(colors, 0, _BRIGHTEST).astype(np.float32)
     tissue = np.pad(frame.tissue > 0, pad)
     away = cv2.distanceTransform(np.uint8(~tissue), cv2.DIST_C, cv2.DIST_MASK_3)
     # The picture goes on as bright as it is at its edges, however near or far the guess is: wrong, it would glare in other views.
-    colors = clear(_spread_from(clear(image / lit), tissue, frame.camera.width) / near[..., None])
+    colors = clipped(_spread_from(clipped(image / lit), tissue, frame.camera.width) / near[..., None])
     return camera, depth, colors, away
 
 

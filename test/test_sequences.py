@@ -18,7 +18,7 @@ from endo_sim_ros.sequences.endonerf import read_endonerf
 from endo_sim_ros.sequences.folder import read_folder, read_points
 from endo_sim_ros.sequences.frames import Frame, SequenceError
 from endo_sim_ros.sequences.readers import READERS, open_sequence
-from endo_sim_ros.sequences.recordings import Video, lit_area, numbered_files, read_poses, tool_is_white
+from endo_sim_ros.sequences.recordings import Video, lit_area, lit_now, numbered_files, read_poses, tool_is_white
 from endo_sim_ros.sequences.rectification import Rectification, StereoCalibration
 from endo_sim_ros.sequences.scared import read_scared
 from endo_sim_ros.sequences.stereomis import read_stereomis
@@ -625,7 +625,7 @@ def folder(tmp_path):
     for number, pose in poses.items():
         left, points = see_plane(K, NO_DISTORTION, pose)
         right, _ = see_plane(K, NO_DISTORTION, right_pose(pose, np.eye(3), np.array([-BASELINE, 0, 0])))
-        left[:, :12] = 3  # a rectification border
+        left[:, : 15 if number == 101 else 12] = 3  # a border, which wanders
         write_rgb(root / f"left/{number:05d}.png", left)
         write_rgb(root / f"right/{number:05d}.png", right)
         write_rgb(root / f"depth/{number:05d}.png", (1000 * points[..., 2]).round().astype(np.uint16))
@@ -645,6 +645,7 @@ def test_image_folder_frames(folder):
         assert not frame.mask[:, :12].any()
         assert_frame_agrees(frame)
     assert not frames[1].mask[:30].any() and frames[0].mask[10, 80] == frames[1].mask[60, 80] == 255
+    assert frames[0].mask[60, 14] == 255 and not frames[2].mask[:, :15].any()
 
 
 def test_points_of_a_folder_are_those_of_its_poses(folder):
@@ -799,6 +800,21 @@ def test_vignette_is_dark_and_dark_tissue_is_not():
     mask = lit_area(images)
     assert not mask[:, :20].any()
     assert mask[:, 24:].all()
+
+
+def test_edge_of_a_round_picture_may_wander():
+    rows, columns = np.mgrid[:120, :160]
+    tissue = [np.hypot(rows - 60, columns - 78 - shift) < 50 for shift in (0, 3)]
+    images = [np.where(inside, 120, 2).astype(np.uint8)[..., None].repeat(3, -1) for inside in tissue]
+    images[0][55:65, 70:90] = images[0][55:65, 31:36] = 2  # a hole, and a dark spot that begins inside
+    lit = lit_area(images)
+    for image, inside in zip(images, tissue):
+        mask = lit_now(lit, image)
+        assert not mask[~inside].any()
+        assert mask[cv2.erode(np.uint8(inside), np.ones((13, 13))) > 0].all()
+    assert lit[~tissue[0]].any()
+    whole = np.full_like(lit, 255)
+    assert lit_now(whole, images[0]) is whole
 
 
 def test_unknown_layouts_are_listed(tmp_path):

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from endo_sim_ros.reconstruction.depth import right_camera
 from endo_sim_ros.sequences.frames import Frame, SequenceError
-from endo_sim_ros.sequences.recordings import lit_area, spread
+from endo_sim_ros.sequences.recordings import lit_area, lit_now, spread
 
 STEREO, TWO_VIEWS = "stereo", "two-views"
 _RATIO = r"([1-9]\d*):([1-9]\d*)"
@@ -84,4 +84,4 @@ def right_views(frames: list[Frame]) -> list[Frame]:
     if not pairs:
         raise SequenceError("split stereo: the sequence has no right images")
     lit = lit_area(frame.right for frame in spread(pairs, 10))
-    return [Frame(frame.stamp_ns, frame.right, right_camera(frame), mask=lit) for frame in pairs]
+    return [Frame(frame.stamp_ns, frame.right, right_camera(frame), mask=lit_now(lit, frame.right)) for frame in pairs]

@@ -28,6 +28,7 @@ from endo_sim_ros.sequences.recordings import (
     intrinsic_matrix,
     keep_posed,
     lit_area,
+    lit_now,
     numbered_files,
     read_calibration,
     read_depth,
@@ -117,10 +118,11 @@ def read_folder(
         if mask_border:
             lit = lit_area(image_of(left[n]) for n in spread(numbers, 10))
         for number in numbers:
-            mask, depth = lit, None
+            image, depth = image_of(left[number]), None
+            mask = lit_now(lit, image)
             if number in masks:
                 tissue = tissue_mask(read_gray(masks[number]), white_is_tool=white_is_tool, size=size)
-                mask = cv2.bitwise_and(lit, tissue)
+                mask = cv2.bitwise_and(mask, tissue)
             if number in depths:
                 z = read_depth(depths[number], depth_scale)
                 check_size(z, size, depths[number])
@@ -128,7 +130,7 @@ def read_folder(
             pose = np.eye(4) if poses is None else poses[number]
             yield Frame(
                 stamp_ns=stamp_ns(number, fps),
-                image=rectification.left(image_of(left[number])),
+                image=rectification.left(image),
                 camera=Camera(rectification.K, *size, pose),
                 right=image_of(right[number]) if right else None,
                 baseline=baseline if right else None,

@@ -21,6 +21,7 @@ FIRST_STAMP_NS = 1_000_000_000  # a ROS stamp of 0 means "unset", so recordings 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg")
 POLARITIES = ("auto", "tool", "tissue")
+_RIM = 0.02  # of the width, how far the edge of a round picture may be from where it is in other frames
 
 
 class Recording:
@@ -358,6 +359,18 @@ def lit_area(images: Iterable[np.ndarray], threshold: int = 16) -> np.ndarray:
     outside = np.isin(labels, edge[edge > 0]).astype(np.uint8)
     outside = cv2.dilate(outside, np.ones((5, 5), np.uint8))  # the fall-off beside the border is not tissue colour
     return np.where(outside > 0, np.uint8(0), np.uint8(255))
+
+
+def lit_now(lit: np.ndarray, image: np.ndarray) -> np.ndarray:
+    """A recording's lit area [H, W] without the rim that is black in this RGB image [H, W, 3].
+
+    Round pictures wander on the sensor as the camera head turns on the endoscope, by a hundredth of the width or two;
+    what is farther inside and dark is tissue.
+    """
+    if lit.all():
+        return lit
+    rim = cv2.distanceTransform(lit, cv2.DIST_L2, 5) <= _RIM * lit.shape[1]
+    return np.where(rim & (lit_area([image]) == 0), np.uint8(0), lit)
 
 
 def spread(items: Sequence, count: int) -> list:

@@ -24,6 +24,7 @@ from endo_sim_ros.sequences.recordings import (
     intrinsic_matrix,
     keep_posed,
     lit_area,
+    lit_now,
     numbered_files,
     read_calibration,
     read_gray,
@@ -144,7 +145,7 @@ def read_video(
                 stamp_ns=stamp_ns(number, fps),
                 image=rectification.left(image),
                 camera=Camera(rectification.K, *size, placed[number]),
-                mask=rectification.mask(cv2.bitwise_and(lit, masks.of(number))),
+                mask=rectification.mask(cv2.bitwise_and(lit_now(lit, image), masks.of(number))),
             )
 
     return Recording(frames, len(numbers))

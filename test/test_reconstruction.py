@@ -376,7 +376,7 @@ def with_eyes_that_converge(frame):
 @pytest.mark.parametrize("pair", [plain_pair, dark_right, behind_a_tool, with_eyes_that_converge])
 def test_flow_between_the_eyes_corrects_what_matching_left(large, pair):
     (matched,) = with_depth_prior([pair(large[0])], NO_POINTS, options(depth="stereo"))
-    (corrected,), contradiction = agreed([matched], NO_POINTS, matched=True)
+    (corrected,), contradiction = agreed([matched], NO_POINTS, "stereo")
     error = lambda view: np.abs(view.depth - large[0].depth)[(matched.depth > 0) & (view.depth > 0)]
     assert np.median(error(corrected)) < 0.6 * np.median(error(matched))
     assert np.sqrt((error(corrected) ** 2).mean()) < 0.8 * np.sqrt((error(matched) ** 2).mean())
@@ -386,7 +386,7 @@ def test_flow_between_the_eyes_corrects_what_matching_left(large, pair):
 def test_flow_is_found_in_finer_pixels_than_are_trained_on(large):
     wide = Trainer([dataclasses.replace(large[0], depth=None)], options(image_width=320))._frames[0]
     (matched,) = with_depth_prior([dataclasses.replace(large[0], depth=None)], NO_POINTS, options())
-    (narrow,), _ = agreed([shrink(matched, 320)], NO_POINTS, matched=True)
+    (narrow,), _ = agreed([shrink(matched, 320)], NO_POINTS, "stereo")
     exact = shrink(large[0], 320).depth
     error = lambda depth: np.sqrt((((depth - exact)[(wide.depth > 0) & (narrow.depth > 0)]) ** 2).mean())
     assert error(wide.depth) < 0.95 * error(narrow.depth)
@@ -406,20 +406,20 @@ def test_reflections_of_the_light_do_not_spoil_the_depth_that_views_agree_on(lar
     for x, y in centres:
         cv2.circle(around, (int(x), int(y)), 25, 1, -1)
     where = (around > 0) & (frames[0].depth > 0)
-    error = lambda views: np.sqrt(((agreed(views, NO_POINTS, matched=False)[0][0].depth - large[0].depth)[where] ** 2).mean())
+    error = lambda views: np.sqrt(((agreed(views, NO_POINTS, "network")[0][0].depth - large[0].depth)[where] ** 2).mean())
     assert error(lit) < 1.6 * error(frames)
 
 
 def test_pale_tissue_is_no_reflection(large):
     pale = [dataclasses.replace(frame, image=(180 + frame.image // 4).astype(np.uint8)) for frame in large[:2]]
     off = [dataclasses.replace(frame, depth=frame.depth * np.float32(1.03), right=None, baseline=None) for frame in pale]
-    corrected, _ = agreed(off, NO_POINTS, matched=False)
+    corrected, _ = agreed(off, NO_POINTS, "network")
     assert all(np.median(np.abs(a.depth / b.depth - 1)) < 0.012 for a, b in zip(corrected, large))
 
 
 def test_views_correct_each_others_depth(large):
     frames = with_depth_prior(list(large), NO_POINTS, options(depth="stereo"))
-    corrected, contradiction = agreed(frames, NO_POINTS, matched=True)
+    corrected, contradiction = agreed(frames, NO_POINTS, "stereo")
     error = lambda views: np.median(np.concatenate([np.abs(v.depth - e.depth)[v.depth > 0] for v, e in zip(views, large)]))
     assert error(corrected) < 0.5 * error(frames)
     assert contradiction < 0.2
@@ -437,7 +437,7 @@ def test_what_the_other_view_hides_stays_where_it_was():
         pose = np.eye(4)
         pose[0, 3] = 0.005 * i
         views.append(Frame(image=image, camera=Camera(K, 640, 512, pose), stamp_ns=i, depth=depth))
-    corrected = agreed(views, NO_POINTS, matched=False)[0][0]
+    corrected = agreed(views, NO_POINTS, "network")[0][0]
     hidden = (corrected.depth - views[0].depth)[150:350, 225:240]
     assert np.sqrt((hidden**2).mean()) < 0.0025  # twice as much where flow is believed that does not lead back
 
@@ -450,7 +450,7 @@ def test_images_too_small_for_optical_flow_keep_their_depth(small, kept):
         image, depth = cut(frame.image), cut(frame.depth)
         camera = dataclasses.replace(frame.camera, height=image.shape[0], width=image.shape[1])
         views.append(dataclasses.replace(bare(frame), image=image, depth=depth, mask=None, camera=camera))
-    corrected, contradiction = agreed(views, NO_POINTS, matched=False)
+    corrected, contradiction = agreed(views, NO_POINTS, "network")
     assert np.isnan(contradiction)
     assert all(np.abs(a.depth / b.depth - 1).max() < 0.02 for a, b in zip(corrected, views))
 
@@ -492,7 +492,7 @@ def test_scene_points_correct_the_depth_around_them(large):
     off = dataclasses.replace(frame, depth=frame.depth * np.float32(1.04), right=None, baseline=None)
     v, u = np.mgrid[8:512:16, 8:640:16].reshape(2, -1)
     positions = frame.camera.backproject(frame.depth)[v, u]
-    (corrected,), contradiction = agreed([off], ScenePoints(positions, np.zeros_like(positions), 0.002), matched=False)
+    (corrected,), contradiction = agreed([off], ScenePoints(positions, np.zeros_like(positions), 0.002), "network")
     assert np.median(np.abs(corrected.depth / frame.depth - 1)) < 0.01
     assert np.isnan(contradiction)  # one view contradicts none
 
@@ -505,7 +505,7 @@ def test_wrong_scene_points_among_good_ones_hardly_move_what_matching_knows(larg
     good = large[0].camera.backproject(large[0].depth)[v, u]
 
     def error(positions):
-        (corrected,), _ = agreed([matched], ScenePoints(positions, np.zeros_like(positions), 0.003), matched=True)
+        (corrected,), _ = agreed([matched], ScenePoints(positions, np.zeros_like(positions), 0.003), "stereo")
         return np.sqrt(((corrected.depth - large[0].depth)[matched.depth > 0] ** 2).mean())
 
     assert error(good[~wrong]) < error(np.where(wrong[:, None], positions, good)) < 2.5 * error(good[~wrong])

@@ -13,9 +13,10 @@ from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.light import features_at
 from endo_sim_ros.reconstruction import ABLATIONS, PRESETS, ReconstructionConfig, Trainer, densification, losses, preset
 from endo_sim_ros.reconstruction.depth import right_view
+from endo_sim_ros.reconstruction.interpolation import inverse_distance_weighted, kriged
 from endo_sim_ros.reconstruction.motion import without_motion
 from endo_sim_ros.reconstruction.presets import resolved
-from endo_sim_ros.reconstruction.surroundings import _continued, _continued_from, _spread_from, with_surroundings
+from endo_sim_ros.reconstruction.surroundings import _continued, with_surroundings
 from endo_sim_ros.reconstruction.trainer import shrink
 from endo_sim_ros.reconstruction.triangulation import match_features, misposed, triangulate
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
@@ -399,7 +400,7 @@ def test_depth_beyond_is_that_of_kriging():
     known = np.zeros((12, width), bool)
     known[2:6, 3:8] = True
     values, uv, there = random.normal(0, 1, known.shape), random.uniform(0, [width, 12], (15, 2)), random.normal(0, 1, 15)
-    told = _continued_from(values, known, uv, there, width)
+    told = kriged(values, known, uv, there, width)
     assert (told[known] == values[known]).all()
     rows, columns = np.nonzero(known)
     sources = np.concatenate([np.column_stack([columns, rows]) + 0.5, uv])
@@ -419,12 +420,12 @@ def test_colour_beyond_is_the_mean_of_what_is_seen_by_distance():
     random, width = np.random.default_rng(0), 80  # one pixel a cell
     known = random.random((12, width)) < 0.2
     values = random.random((*known.shape, 3))
-    spread = _spread_from(values, known, width)
-    assert (spread[known] == values[known]).all()
+    carried = inverse_distance_weighted(values, known, width)
+    assert (carried[known] == values[known]).all()
     distance = np.linalg.norm(np.argwhere(~known)[:, None] - np.argwhere(known), axis=2)
     weights = 1 / (distance**2 + 0.25) ** 2
     expected = weights @ values[known] / weights.sum(1, keepdims=True)
-    np.testing.assert_allclose(spread[~known], expected, atol=1e-5)
+    np.testing.assert_allclose(carried[~known], expected, atol=1e-5)
 
 
 def test_what_lies_beyond_two_views_looks_as_in_the_nearer_one(views):

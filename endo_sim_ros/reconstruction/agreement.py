@@ -21,7 +21,7 @@ _NEIGHBOURS = 4  # views that each view is compared with: the nearest in space
 _LEAST_SIDE = 16  # pixels, of images that optical flow can be found in
 _LEAST_SHARED = 0.05  # of the picture, below which two views are not compared
 _REMATCHED = 0.15  # pixels, error of a disparity that flow between the eyes has corrected
-_GUESSED = 0.05  # relative error of a depth that no right image gave
+_OF_POINTS, _GUESSED = 0.015, 0.05  # relative error of depth between scene points, and of that of which none is known
 _FLOW = 0.35  # pixels, error of a displacement, that of the poses included
 _NOT_BACK = 0.4  # pixels by which flow there and flow back may miss each other; they do where one image shows what the other hides
 _EYES = 0.6  # share of it between the eyes of one view
@@ -52,7 +52,7 @@ class _Image(NamedTuple):
     matte: np.ndarray  # the same without reflections of the light
 
 
-def agreed(frames: list[Frame], points: ScenePoints, matched: bool) -> tuple[list[Frame], float]:
+def agreed(frames: list[Frame], points: ScenePoints, source: str) -> tuple[list[Frame], float]:
     """The frames with depth corrected, in their holes as little as before, by scene points and by what neighbouring views show,
     and by how many pixels the views contradict each other all the same.
 
@@ -67,7 +67,7 @@ def agreed(frames: list[Frame], points: ScenePoints, matched: bool) -> tuple[lis
     Args:
         frames: Views with a depth prior.
         points: Scene points.
-        matched: Whether the prior is of matching with the right images, whose error is known, or of less.
+        source: Where the prior is from, as `ReconstructionConfig.depth` names it, on which its error depends.
     """
     images = [_seen(frame) for frame in frames]
     near = neighbours(frames, _NEIGHBOURS)
@@ -78,8 +78,8 @@ def agreed(frames: list[Frame], points: ScenePoints, matched: bool) -> tuple[lis
             return frame, []
         known = frame.depth > 0
         inverse = _filled((known / np.where(known, frame.depth, 1)).astype(np.float32)[..., None], known)[..., 0]
-        error = _GUESSED * inverse
-        if matched and frame.right is not None:
+        error = (_OF_POINTS if source == "points" else _GUESSED) * inverse
+        if source == "stereo" and frame.right is not None:
             inverse, error = _rematched(inverse, images[i], _seen(right_view(frame)), camera.K[0, 0] * frame.baseline)
         total, weight = _of_points(frame, inverse, error, points)
         for j in near[i]:

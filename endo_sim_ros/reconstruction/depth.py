@@ -5,13 +5,12 @@ import logging
 
 import cv2
 import numpy as np
-from scipy.interpolate import LinearNDInterpolator
-from scipy.spatial import Delaunay
 
 from endo_sim_ros.cameras import Camera
 from endo_sim_ros.device import map_in_threads, pick_device
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.depth_network import cached_checkpoint, load_network, network_depth
+from endo_sim_ros.reconstruction.interpolation import kriged
 from endo_sim_ros.reconstruction.triangulation import ScenePoints, points_in_view
 from endo_sim_ros.sequences.frames import Frame, SequenceError
 from endo_sim_ros.sequences.recordings import lit_area
@@ -148,17 +147,17 @@ def _known_depths(frame: Frame, points: np.ndarray) -> np.ndarray:
 
 
 def interpolated_depth(frame: Frame, points: np.ndarray) -> np.ndarray | None:
-    """Depth [H, W] (m, 0 outside their hull) interpolated between the triangulated points seen in a view; None if few.
+    """Depth [H, W] (m, 0 outside their hull) between the triangulated points seen in a view, each of which errs; None if few.
 
-    Linear in inverse depth, which keeps planes flat.
+    Kriging of inverse depth, which is linear where tissue is plane.
     """
     uv, z = points_in_view(frame.camera, points)
-    inverse = 1 / z
     if len(uv) < _MIN_POINTS or np.linalg.matrix_rank(uv - uv.mean(0), tol=1.0) < 2:
         return None
-    v, u = np.mgrid[: frame.camera.height, : frame.camera.width] + 0.5
-    values = LinearNDInterpolator(Delaunay(uv), inverse, fill_value=np.inf)(u, v)
-    return (1 / values).astype(np.float32)
+    shape = frame.camera.height, frame.camera.width
+    inverse = kriged(np.zeros(shape, np.float32), np.zeros(shape, bool), uv, 1 / z, frame.camera.width)
+    hull = cv2.fillConvexPoly(np.zeros(shape, np.uint8), cv2.convexHull(np.floor(uv).astype(np.int32)), 1)
+    return np.where((hull > 0) & (inverse > 0), 1 / np.maximum(inverse, 1e-9), 0).astype(np.float32)
 
 
 def _with_depth(frame: Frame, depth: np.ndarray | None) -> Frame:

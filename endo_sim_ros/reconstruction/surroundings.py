@@ -9,13 +9,13 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
-from scipy.interpolate import RBFInterpolator
 from scipy.spatial import cKDTree
 
 from endo_sim_ros.cameras import Camera
 from endo_sim_ros.device import map_in_threads
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.light import features_at
+from endo_sim_ros.reconstruction.interpolation import inverse_distance_weighted, kriged
 from endo_sim_ros.reconstruction.triangulation import points_in_view
 from endo_sim_ros.sequences.frames import Frame
 
@@ -24,10 +24,6 @@ _FINE, _COARSE = 1 / 80, 1 / 54  # spacing in holes and close around the picture
 _RING, _CLOSE = 0.05, 3  # how much farther out at a time, and how often finely: large Gaussians would reach in and cover what was seen
 _SIZE = 0.6  # standard deviation in spacings: the nearer ones of larger Gaussians hide the others where tissue is steep
 _OPACITY = 0.8
-_CELL = 1 / 80  # side of what depth is told for, and of what tells it
-_PIXELS_ERROR, _POINTS_ERROR = 1 / 128, 1 / 8  # how far away depth differs as much as that of pixels, of points errs
-_TELLING = 40  # neighbours that tell a cell's depth
-_WITHIN = 0.25  # cells², how far away pixels of the same cell count
 _POINTS = 9  # neighbours among which a scene point's depth has to be the usual one
 _LEAST_SEEN = 0.02  # share of the pixels with depth, from which on its surroundings can be told
 _BRIGHTEST = 2.0
@@ -139,7 +135,7 @@ def _continued(
     if len(over) >= _POINTS:  # one wrong point would stand like a pillar before the tissue
         over = np.median(over[cKDTree(uv[beyond]).query(uv[beyond], k=_POINTS)[1]], 1)
     low, high = np.percentile(np.concatenate([inverse, there]), [1, 99])
-    rest = _continued_from(rest, known, uv[beyond], over, frame.camera.width)
+    rest = kriged(rest, known, uv[beyond], over, frame.camera.width)
     depth = 1 / np.clip(flat + rest, 0.8 * low, 1.2 * high)
     shading = features_at(camera.backproject(depth).reshape(-1, 3), camera, reference) * light
     near, lit = np.exp(shading[:, 0]).reshape(depth.shape), np.exp(shading[:, 1:].sum(1)[:, None] + exposure).reshape(image.shape)
@@ -147,53 +143,8 @@ def _continued(
     tissue = np.pad(frame.tissue > 0, pad)
     away = cv2.distanceTransform(np.uint8(~tissue), cv2.DIST_C, cv2.DIST_MASK_3)
     # The picture goes on as bright as it is at its edges, however near or far the guess is: wrong, it would glare in other views.
-    colors = clipped(_spread_from(clipped(image / lit), tissue, frame.camera.width) / near[..., None])
+    colors = clipped(inverse_distance_weighted(clipped(image / lit), tissue, frame.camera.width) / near[..., None])
     return camera, depth, colors, away
-
-
-def _continued_from(values: np.ndarray, known: np.ndarray, uv: np.ndarray, there: np.ndarray, width: int) -> np.ndarray:
-    """Values [H, W] where known [H, W]; elsewhere the likeliest where known pixels and values at points uv [N, 2] err, and
-    squared differences grow with distance (kriging, a linear variogram)."""
-    side = max(round(_CELL * width), 1)
-    count, means = _in_cells(values[..., None], known, side)
-    given, means = count > 0, means[..., 0]
-    rows, columns = count.shape
-    centres = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1) + 0.5
-    sources = np.concatenate([centres[given], uv / side])
-    errors = np.repeat([_PIXELS_ERROR, _POINTS_ERROR], [given.sum(), len(uv)]) * width / side
-    values_there = np.concatenate([means[given], there])
-    told = RBFInterpolator(sources, values_there, neighbors=_TELLING, smoothing=errors, kernel="linear", degree=0)
-    means[~given] = told(centres[~given])
-    return np.where(known, values, _in_pixels(means, side, known.shape))
-
-
-def _spread_from(values: np.ndarray, known: np.ndarray, width: int) -> np.ndarray:
-    """Values [H, W, C] where known [H, W]; elsewhere the mean of those known, each weighing by its distance to the power −4
-    (Shepard 1968): colour, unlike depth, does not go on the way it goes."""
-    side = max(round(_CELL * width), 1)
-    count, means = _in_cells(values, known, side)
-    period = tuple(2 * size for size in count.shape)  # so wide that nothing is reached the other way round
-    rows, columns = (np.fft.fftfreq(size, 1 / size) for size in period)  # 0, 1, ... and from the other end -1, -2, ...
-    weights = np.fft.rfft2(1 / (rows[:, None] ** 2 + columns**2 + _WITHIN) ** 2)
-    about = lambda sums: np.fft.irfft2(np.fft.rfft2(sums, period) * weights, period)[: count.shape[0], : count.shape[1]]
-    total = about(count)
-    spread = np.stack([about(count * means[..., c]) / total for c in range(values.shape[2])], -1)
-    return np.where(known[..., None], values, _in_pixels(spread, side, known.shape))
-
-
-def _in_cells(values: np.ndarray, known: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
-    """Of square cells, the number of known pixels [R, Q] and the mean of their values [H, W, C], [R, Q, C]; 0 for none."""
-    rows, columns = (-(-size // side) for size in known.shape)
-    fit = ((0, rows * side - known.shape[0]), (0, columns * side - known.shape[1]), (0, 0))
-    sums = lambda array: np.pad(array, fit).reshape(rows, side, columns, side, -1).sum((1, 3), dtype=np.float64)
-    count = sums(known[..., None])
-    return count[..., 0], sums(np.where(known[..., None], values, 0)) / np.maximum(count, 1)
-
-
-def _in_pixels(cells: np.ndarray, side: int, shape: tuple[int, int]) -> np.ndarray:
-    """Values of cells [R, Q, ...] in between their centres, of pixels [H, W, ...]."""
-    size = cells.shape[1] * side, cells.shape[0] * side
-    return cv2.resize(cells.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)[: shape[0], : shape[1]]
 
 
 def _unknown(points: np.ndarray, frames: list[Frame], beyond: bool) -> np.ndarray:

@@ -121,7 +121,7 @@ class Trainer:
         if correcting or not config.iterations:
             # Flow is the more precise the finer the pixels are, as matching is.
             fine = [shrink(frame, _FINER * config.image_width) for frame in frames]
-            corrected, contradiction = agreed(fine, points, matched=source == "stereo")
+            corrected, contradiction = agreed(fine, points, source)
             if correcting:
                 frames = corrected
             if not config.iterations:

@@ -303,6 +303,58 @@ def test_depth_between_points_is_interpolated_without_the_wrong_ones(large):
     assert interpolated_depth(dataclasses.replace(frame, camera=straight), line) is None
 
 
+def _seen_at(frame, depth_of, count, random):
+    """Points of a surface whose depth [N] (m) is given by pixels [N, 2], seen by an untilted camera."""
+    camera = frame.camera.at(np.eye(4))
+    uv = random.uniform(0, [camera.width, camera.height], (count, 2))
+    z = depth_of(uv)
+    rays = np.column_stack([(uv - camera.K[:2, 2]) / camera.K.diagonal()[:2], np.ones(count)])
+    return dataclasses.replace(frame, camera=camera), rays * z[:, None], z
+
+
+def test_depth_between_points_of_a_plane_is_the_plane(small):
+    plane = lambda uv: 1 / (20 - uv @ [0.04, 0.03])
+    frame, points, _ = _seen_at(small[0], plane, 400, np.random.default_rng(0))
+    depth = interpolated_depth(frame, points)
+    v, u = np.nonzero(depth)
+    assert len(v) > 0.9 * depth.size
+    np.testing.assert_allclose(depth[v, u], plane(np.column_stack([u, v]) + 0.5), rtol=1e-5)
+
+
+def test_depth_between_points_that_err_is_better_than_theirs(small):
+    random, surface = np.random.default_rng(0), lambda uv: 0.08 + 0.01 * np.sin(uv[:, 0] / 30) * np.cos(uv[:, 1] / 30)
+    frame, points, _ = _seen_at(small[0], surface, 1500, random)
+    points *= 1 + 0.02 * random.normal(size=(len(points), 1))
+    depth = interpolated_depth(frame, points)
+    v, u = np.nonzero(depth)
+    off = depth[v, u] / surface(np.column_stack([u, v]) + 0.5) - 1
+    assert np.sqrt((off**2).mean()) < 0.01
+
+
+def test_depth_between_points_stays_among_theirs(small):
+    random = np.random.default_rng(0)
+    slopes = lambda uv: 0.03 + 0.12 * np.abs(uv[:, 0] / small[0].camera.width - 0.5) ** 0.5
+    for towards in (slopes, lambda uv: 1 / slopes(uv) / 100):
+        frame, points, z = _seen_at(small[0], towards, 600, random)
+        gap = np.abs(frame.camera.project(points)[0][:, 0] / frame.camera.width - 0.5) < 0.2
+        depth = interpolated_depth(frame, points[~gap])
+        assert (depth > 0).mean() > 0.9
+        assert depth[depth > 0].min() > z[~gap].min() / 1.25 and depth.max() < z[~gap].max() * 1.3
+
+
+def test_views_that_see_few_points_are_told(small, caplog):
+    points = ScenePoints(np.array([[0.0, 0.0, 0.1]] * 5), np.zeros((5, 3)))
+    bare = [dataclasses.replace(frame, right=None, baseline=None, depth=None) for frame in small]
+    with_depth_prior(bare, points, ReconstructionConfig(depth="points"))
+    assert f"{len(small)} of {len(small)} views see fewer than 30 scene points" in caplog.text
+
+
+def test_depth_between_points_is_believed_more_than_a_guess(large):
+    off = [dataclasses.replace(frame, depth=frame.depth * np.float32(1.03)) for frame in large]
+    moved = [np.abs(agreed(off, NO_POINTS, source)[0][0].depth - off[0].depth).mean() for source in ("points", "network")]
+    assert moved[0] < moved[1]
+
+
 def test_depth_prior_is_clean(small):
     depth = small[0].depth.copy()
     depth[0, :4] = [np.nan, np.inf, -1, 0]
@@ -797,8 +849,9 @@ def test_one_view_is_enough_with_depth(small):
     assert finite(Trainer([small[0]], options()).run())
 
 
-def test_identical_views_train(small):
+def test_identical_views_train(small, caplog):
     assert finite(Trainer([small[0]] * 3, options()).run())
+    assert "contradict what they see" not in caplog.text
 
 
 def test_masking_everything_is_an_error(small):

@@ -802,6 +802,12 @@ def test_vignette_is_dark_and_dark_tissue_is_not():
     assert mask[:, 24:].all()
 
 
+def test_one_bright_image_does_not_hide_the_border():
+    rows, columns = np.mgrid[:60, :80]
+    picture = np.where(np.hypot(rows - 30, columns - 40) < 28, 120, 2).astype(np.uint8)[..., None].repeat(3, -1)
+    np.testing.assert_array_equal(lit_area([picture] * 9 + [np.full_like(picture, 255)]), lit_area([picture]))
+
+
 def test_edge_of_a_round_picture_may_wander():
     rows, columns = np.mgrid[:120, :160]
     tissue = [np.hypot(rows - 60, columns - 78 - shift) < 50 for shift in (0, 3)]

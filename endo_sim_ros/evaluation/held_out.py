@@ -149,8 +149,8 @@ def reconstruct_and_measure(bag: Path, out: Path, config: ReconstructionConfig, 
 
     A checkpoint is written every tenth of the way; ``resume`` goes on from it, to the same model.
     """
-    out.mkdir(parents=True, exist_ok=True)  # before the long work
     frames = list(read_bag(bag))
+    out.mkdir(parents=True, exist_ok=True)  # before the long work
     chosen = select_keyframes(frames, config.keyframes)
     log.info("%d views, training on %d", len(frames), len(chosen))
     points = scene_points(frames) if len(chosen) < len(frames) else None

@@ -67,7 +67,7 @@ def agreed(frames: list[Frame], points: ScenePoints, source: str) -> tuple[list[
     Args:
         frames: Views with a depth prior.
         points: Scene points.
-        source: Where the prior is from, as `ReconstructionConfig.depth` names it, on which its error depends.
+        source: Where the prior is from, as `depth_source` tells, on which its error depends.
     """
     images = [_seen(frame) for frame in frames]
     near = neighbours(frames, _NEIGHBOURS)

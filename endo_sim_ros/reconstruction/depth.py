@@ -10,7 +10,7 @@ from endo_sim_ros.cameras import Camera
 from endo_sim_ros.device import map_in_threads, pick_device
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.depth_network import cached_checkpoint, load_network, network_depth
-from endo_sim_ros.reconstruction.interpolation import kriged
+from endo_sim_ros.reconstruction.interpolation import kriged, plane_through, within
 from endo_sim_ros.reconstruction.triangulation import ScenePoints, points_in_view
 from endo_sim_ros.sequences.frames import Frame, SequenceError
 from endo_sim_ros.sequences.recordings import lit_area
@@ -53,7 +53,11 @@ def with_depth_prior(frames: list[Frame], points: ScenePoints, config: Reconstru
     if source == "none":
         return [dataclasses.replace(frame, depth=None) for frame in frames]
     if source == "points":
-        return map_in_threads(lambda frame: _with_depth(frame, interpolated_depth(frame, points.positions)), frames)
+        frames = map_in_threads(lambda frame: _with_depth(frame, interpolated_depth(frame, points.positions)), frames)
+        without = sum(frame.depth is None for frame in frames)
+        if without:
+            log.warning("%d of %d views see fewer than %d scene points that agree and go without depth", without, len(frames), _MIN_POINTS)
+        return frames
     if source == "topic":
         return [_with_depth(frame, frame.depth) for frame in frames]
     if source == "network":
@@ -147,17 +151,20 @@ def _known_depths(frame: Frame, points: np.ndarray) -> np.ndarray:
 
 
 def interpolated_depth(frame: Frame, points: np.ndarray) -> np.ndarray | None:
-    """Depth [H, W] (m, 0 outside their hull) between the triangulated points seen in a view, each of which errs; None if few.
+    """Depth [H, W] (m, 0 outside their hull) between the triangulated points seen in a view; None if few.
 
-    Kriging of inverse depth, which is linear where tissue is plane.
+    Kriging of how far inverse depth is from a plane's; all points err alike.
     """
     uv, z = points_in_view(frame.camera, points)
     if len(uv) < _MIN_POINTS or np.linalg.matrix_rank(uv - uv.mean(0), tol=1.0) < 2:
         return None
     shape = frame.camera.height, frame.camera.width
-    inverse = kriged(np.zeros(shape, np.float32), np.zeros(shape, bool), uv, 1 / z, frame.camera.width)
+    a, b, c = plane_through(*uv.T, 1 / z)
+    over = kriged(np.zeros(shape), np.zeros(shape, bool), uv, 1 / z - (a * uv[:, 0] + b * uv[:, 1] + c), frame.camera.width)
+    plane = a * (np.arange(shape[1]) + 0.5) + b * (np.arange(shape[0])[:, None] + 0.5) + c
+    inverse = within(plane + over, 1 / z)
     hull = cv2.fillConvexPoly(np.zeros(shape, np.uint8), cv2.convexHull(np.floor(uv).astype(np.int32)), 1)
-    return np.where((hull > 0) & (inverse > 0), 1 / np.maximum(inverse, 1e-9), 0).astype(np.float32)
+    return np.where(hull > 0, 1 / inverse, 0).astype(np.float32)
 
 
 def _with_depth(frame: Frame, depth: np.ndarray | None) -> Frame:

@@ -5,25 +5,43 @@ import numpy as np
 from scipy.interpolate import RBFInterpolator
 
 _CELL = 1 / 80  # of the picture's width, side of what values are told for, and of what tells them
-_PIXELS_ERROR, _POINTS_ERROR = 1 / 128, 1 / 8  # widths of the picture, how far away depth differs as much as that of pixels, of points errs
+# Widths of the picture, how far apart two places are whose values differ by as much as those of a pixel, of a point err.
+_PIXELS_ERR_AS, _POINTS_ERR_AS = 1 / 128, 1 / 8
+_ROOM = 0.2  # by how much of it kriged values may leave the range of most of those that tell
 _TELLING = 40  # neighbours that tell a cell's value
 _WITHIN = 0.25  # cells², how far away pixels of the same cell count
 
 
 def kriged(values: np.ndarray, known: np.ndarray, uv: np.ndarray, there: np.ndarray, width: int) -> np.ndarray:
     """Values [H, W] where known [H, W]; elsewhere the likeliest where known pixels and values at points uv [N, 2] err, and
-    squared differences grow with distance (kriging, a linear variogram)."""
+    squared differences grow with distance (kriging, a linear variogram). Pixels or points there must be."""
     side = max(round(_CELL * width), 1)
     count, means = _in_cells(values[..., None], known, side)
     given, means = count > 0, means[..., 0]
     rows, columns = count.shape
     centres = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1) + 0.5
     sources = np.concatenate([centres[given], uv / side])
-    errors = np.repeat([_PIXELS_ERROR, _POINTS_ERROR], [given.sum(), len(uv)]) * width / side
+    errors = np.repeat([_PIXELS_ERR_AS, _POINTS_ERR_AS], [given.sum(), len(uv)]) * width / side
     values_there = np.concatenate([means[given], there])
     told = RBFInterpolator(sources, values_there, neighbors=_TELLING, smoothing=errors, kernel="linear", degree=0)
     means[~given] = told(centres[~given])
     return np.where(known, values, _in_pixels(means, side, known.shape))
+
+
+def plane_through(u: np.ndarray, v: np.ndarray, values: np.ndarray) -> tuple[float, float, float]:
+    """a, b, c of a u + b v + c, the nearest to values [N] at pixels u, v [N]: as inverse depth, a plane in space."""
+    # Sums instead of a library's least squares, whose last bits may hang on what its other threads do.
+    step = max(len(u) // 20_000, 1)
+    terms = np.stack([u, v, np.ones(len(u))])[:, ::step]
+    level = np.diag([1.0, 1.0, 0.0])  # next to nothing, but makes slopes that nothing tells none
+    a, b, c = np.linalg.solve((terms[:, None] * terms).sum(2) + level, (terms * values[::step]).sum(1))
+    return a, b, c
+
+
+def within(values: np.ndarray, telling: np.ndarray) -> np.ndarray:
+    """The values, none far from the range of most of those (positive) that told them: kriging overshoots where slopes meet a gap."""
+    low, high = np.percentile(telling, [1, 99])
+    return np.clip(values, (1 - _ROOM) * low, (1 + _ROOM) * high)
 
 
 def inverse_distance_weighted(values: np.ndarray, known: np.ndarray, width: int) -> np.ndarray:

@@ -15,7 +15,7 @@ from endo_sim_ros.cameras import Camera
 from endo_sim_ros.device import map_in_threads
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.light import features_at
-from endo_sim_ros.reconstruction.interpolation import inverse_distance_weighted, kriged
+from endo_sim_ros.reconstruction.interpolation import inverse_distance_weighted, kriged, plane_through, within
 from endo_sim_ros.reconstruction.triangulation import points_in_view
 from endo_sim_ros.sequences.frames import Frame
 
@@ -118,13 +118,8 @@ def _continued(
     known = depth > 0
     v, u = np.nonzero(known)
     inverse = 1 / depth[known].astype(np.float64)
-    # A plane has inverse depth that is linear in the picture; what departs from it fades. Sums instead of a library's least squares,
-    # whose last bits may hang on what its other threads do.
-    step = max(len(u) // 20_000, 1)
-    plane = np.stack([u, v, np.ones(len(u))])[:, ::step]
-    level = np.diag([1.0, 1.0, 0.0])  # next to nothing, but makes slopes that nothing tells none
-    slope = np.linalg.solve((plane[:, None] * plane).sum(2) + level, (plane * inverse[::step]).sum(1))
-    flat = slope[0] * np.arange(camera.width) + slope[1] * np.arange(camera.height)[:, None] + slope[2]
+    a, b, c = plane_through(u, v, inverse)
+    flat = a * np.arange(camera.width) + b * np.arange(camera.height)[:, None] + c  # what departs from it fades
     rest = np.zeros(depth.shape, np.float32)
     rest[known] = inverse - flat[known]
     uv, z = points_in_view(camera, points)
@@ -134,9 +129,8 @@ def _continued(
     over = there - flat[rows, columns]
     if len(over) >= _POINTS:  # one wrong point would stand like a pillar before the tissue
         over = np.median(over[cKDTree(uv[beyond]).query(uv[beyond], k=_POINTS)[1]], 1)
-    low, high = np.percentile(np.concatenate([inverse, there]), [1, 99])
     rest = kriged(rest, known, uv[beyond], over, frame.camera.width)
-    depth = 1 / np.clip(flat + rest, 0.8 * low, 1.2 * high)
+    depth = 1 / within(flat + rest, np.concatenate([inverse, there]))
     shading = features_at(camera.backproject(depth).reshape(-1, 3), camera, reference) * light
     near, lit = np.exp(shading[:, 0]).reshape(depth.shape), np.exp(shading[:, 1:].sum(1)[:, None] + exposure).reshape(image.shape)
     clipped = lambda colors: np.clip(colors, 0, _BRIGHTEST).astype(np.float32)

@@ -27,6 +27,7 @@ _USUAL, _TIMES_USUAL = 0.2, 5.0  # the share of all groups of views that is take
 _MOST_NAMED = 5
 _AROUND = 8  # points around a point that it is compared with
 _DISAGREEMENT = 0.1  # largest relative difference from them
+_NO_BASELINE = 1e-6  # metres
 _NEAR, _FAR = 0.02, 1e3  # metres, between which a match may lie
 
 
@@ -206,6 +207,8 @@ def _tracks(matches: list[Matches]) -> list[tuple[tuple[int, int, int], list[np.
 def _off_in_three(frames: list[Frame], views: tuple[int, ...], pixels: list[np.ndarray]) -> float:
     """How far features [M, 2] of several views are from one point each, median of the worst view's in widths of the image."""
     cameras = [frames[view].camera for view in views]
+    if np.ptp([camera.position for camera in cameras], 0).max() < _NO_BASELINE:
+        return 0.0  # any point on a ray would do
     rows = []
     for camera, uv in zip(cameras, pixels):
         x, y = ((uv - camera.K[:2, 2]) / camera.K.diagonal()[:2]).T[..., None]

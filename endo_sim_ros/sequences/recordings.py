@@ -344,32 +344,32 @@ def tissue_mask(mask: np.ndarray, *, white_is_tool: bool, size: tuple[int, int])
 def lit_area(images: Iterable[np.ndarray], threshold: int = 16) -> np.ndarray:
     """Mask [H, W] (255 = seen, 0 = black) of what the optics show, from a sample of RGB images.
 
-    Black means dark in every image and connected to the image's edge: vignette or rectification border. Dark tissue
-    in the middle of the image stays in.
+    Black means dark in all images but one in ten (a title, a flash) and connected to the image's edge: vignette or
+    rectification border. Dark tissue in the middle of the image stays in.
     """
-    brightest: np.ndarray | None = None
-    for image in images:
-        value = image.max(-1)
-        brightest = value if brightest is None else np.maximum(brightest, value)
-    if brightest is None:
+    values = [image.max(-1) for image in images]
+    if not values:
         raise ValueError("lit_area: no images")
-    dark = (brightest < threshold).astype(np.uint8)
-    _, labels = cv2.connectedComponents(dark, connectivity=4)
-    edge = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
-    outside = np.isin(labels, edge[edge > 0]).astype(np.uint8)
-    outside = cv2.dilate(outside, np.ones((5, 5), np.uint8))  # the fall-off beside the border is not tissue colour
+    usual = len(values) - 1 - len(values) // 10
+    dark = (np.partition(values, usual, 0)[usual] < threshold).astype(np.uint8)
+    count, labels = cv2.connectedComponents(dark, connectivity=4)
+    border = np.zeros(count, np.uint8)
+    border[np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])] = 1
+    border[0] = 0  # what is not dark
+    outside = cv2.dilate(border[labels], np.ones((5, 5), np.uint8))  # the fall-off beside the border is not tissue colour
     return np.where(outside > 0, np.uint8(0), np.uint8(255))
 
 
 def lit_now(lit: np.ndarray, image: np.ndarray) -> np.ndarray:
     """A recording's lit area [H, W] without the rim that is black in this RGB image [H, W, 3].
 
-    Round pictures wander on the sensor as the camera head turns on the endoscope, by a hundredth of the width or two;
-    what is farther inside and dark is tissue.
+    Round pictures wander on the sensor as the camera head turns on the endoscope, by a hundredth of the width or two.
+    What is dark there, border or tissue, is left out; what is dark farther inside is tissue.
     """
     if lit.all():
         return lit
-    rim = cv2.distanceTransform(lit, cv2.DIST_L2, 5) <= _RIM * lit.shape[1]
+    side = 2 * max(round(_RIM * lit.shape[1]), 1) + 1
+    rim = cv2.erode(lit, np.ones((side, side), np.uint8)) == 0
     return np.where(rim & (lit_area([image]) == 0), np.uint8(0), lit)
 
 

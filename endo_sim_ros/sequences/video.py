@@ -134,7 +134,7 @@ def read_video(
                     video,
                     numbers,
                     rectification,
-                    lambda n: cv2.bitwise_and(lit, masks.of(n)),
+                    lambda n, image: cv2.bitwise_and(lit_now(lit, image), masks.of(n)),
                     scale=scale,
                     threads=threads,
                 )
@@ -158,7 +158,7 @@ def _estimate(video: Video, numbers: list[int], rectification, mask_of, *, scale
         result = estimate_poses(
             (undistort.left(image) for _, image in video.frames(numbers)),
             None if rectification is None else rectification.K,
-            masks=(undistort.mask(mask_of(number)) for number in numbers),
+            masks=(undistort.mask(mask_of(*numbered)) for numbered in video.frames(numbers)),
             scale=scale,
             threads=threads,
         )

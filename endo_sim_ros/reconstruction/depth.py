@@ -10,7 +10,7 @@ from endo_sim_ros.cameras import Camera
 from endo_sim_ros.device import map_in_threads, pick_device
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.depth_network import cached_checkpoint, load_network, network_depth
-from endo_sim_ros.reconstruction.interpolation import kriged, plane_through, within
+from endo_sim_ros.reconstruction.interpolation import kept_in_range, kriged, plane_through
 from endo_sim_ros.reconstruction.triangulation import ScenePoints, points_in_view
 from endo_sim_ros.sequences.frames import Frame, SequenceError
 from endo_sim_ros.sequences.recordings import lit_area
@@ -162,7 +162,7 @@ def interpolated_depth(frame: Frame, points: np.ndarray) -> np.ndarray | None:
     a, b, c = plane_through(*uv.T, 1 / z)
     over = kriged(np.zeros(shape), np.zeros(shape, bool), uv, 1 / z - (a * uv[:, 0] + b * uv[:, 1] + c), frame.camera.width)
     plane = a * (np.arange(shape[1]) + 0.5) + b * (np.arange(shape[0])[:, None] + 0.5) + c
-    inverse = within(plane + over, 1 / z)
+    inverse = kept_in_range(plane + over, 1 / z)
     hull = cv2.fillConvexPoly(np.zeros(shape, np.uint8), cv2.convexHull(np.floor(uv).astype(np.int32)), 1)
     return np.where(hull > 0, 1 / inverse, 0).astype(np.float32)
 

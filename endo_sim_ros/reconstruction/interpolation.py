@@ -38,7 +38,7 @@ def plane_through(u: np.ndarray, v: np.ndarray, values: np.ndarray) -> tuple[flo
     return a, b, c
 
 
-def within(values: np.ndarray, telling: np.ndarray) -> np.ndarray:
+def kept_in_range(values: np.ndarray, telling: np.ndarray) -> np.ndarray:
     """The values, none far from the range of most of those (positive) that told them: kriging overshoots where slopes meet a gap."""
     low, high = np.percentile(telling, [1, 99])
     return np.clip(values, (1 - _ROOM) * low, (1 + _ROOM) * high)

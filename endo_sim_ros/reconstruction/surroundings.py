@@ -15,7 +15,7 @@ from endo_sim_ros.cameras import Camera
 from endo_sim_ros.device import map_in_threads
 from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.light import features_at
-from endo_sim_ros.reconstruction.interpolation import inverse_distance_weighted, kriged, plane_through, within
+from endo_sim_ros.reconstruction.interpolation import inverse_distance_weighted, kept_in_range, kriged, plane_through
 from endo_sim_ros.reconstruction.triangulation import points_in_view
 from endo_sim_ros.sequences.frames import Frame
 
@@ -130,7 +130,7 @@ def _continued(
     if len(over) >= _POINTS:  # one wrong point would stand like a pillar before the tissue
         over = np.median(over[cKDTree(uv[beyond]).query(uv[beyond], k=_POINTS)[1]], 1)
     rest = kriged(rest, known, uv[beyond], over, frame.camera.width)
-    depth = 1 / within(flat + rest, np.concatenate([inverse, there]))
+    depth = 1 / kept_in_range(flat + rest, np.concatenate([inverse, there]))
     shading = features_at(camera.backproject(depth).reshape(-1, 3), camera, reference) * light
     near, lit = np.exp(shading[:, 0]).reshape(depth.shape), np.exp(shading[:, 1:].sum(1)[:, None] + exposure).reshape(image.shape)
     clipped = lambda colors: np.clip(colors, 0, _BRIGHTEST).astype(np.float32)

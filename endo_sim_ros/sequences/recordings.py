@@ -1,5 +1,6 @@
 """What the dataset readers share: lazy recordings, videos, images, pose files, masks and time stamps."""
 
+import functools
 import logging
 import math
 import re
@@ -347,7 +348,7 @@ def lit_area(images: Iterable[np.ndarray], threshold: int = 16) -> np.ndarray:
     Black means dark in all images but one in ten (a title, a flash) and connected to the image's edge: vignette or
     rectification border. Dark tissue in the middle of the image stays in.
     """
-    values = [image.max(-1) for image in images]
+    values = [functools.reduce(cv2.max, cv2.split(image)) for image in images]  # ten times as fast as image.max(-1)
     if not values:
         raise ValueError("lit_area: no images")
     usual = len(values) - 1 - len(values) // 10

@@ -7,6 +7,7 @@ endo.mp4, or a folder with
   mask.png            optional, one for all frames; or masks/%06d.png; 255 = tissue
 """
 
+import itertools
 import logging
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -154,11 +155,12 @@ def read_video(
 def _estimate(video: Video, numbers: list[int], rectification, mask_of, *, scale, threads):
     """Poses by frame number and the rectification, which is estimated too where it is None."""
     undistort = rectification or Rectification.mono(np.eye(3), (), (video.width, video.height))
+    for_images, for_masks = itertools.tee(video.frames(numbers))  # read side by side, so that each frame is decoded once
     try:
         result = estimate_poses(
-            (undistort.left(image) for _, image in video.frames(numbers)),
+            (undistort.left(image) for _, image in for_images),
             None if rectification is None else rectification.K,
-            masks=(undistort.mask(mask_of(*numbered)) for numbered in video.frames(numbers)),
+            masks=(undistort.mask(mask_of(*numbered)) for numbered in for_masks),
             scale=scale,
             threads=threads,
         )

@@ -14,15 +14,15 @@ import tyro
 from rich.progress import track
 
 from endo_sim_ros import hear_interrupts
-from endo_sim_ros.config import ConfigError
+from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.core.gaussians import ModelError
 from endo_sim_ros.evaluation.config import EvaluationConfig
-from endo_sim_ros.gaussians import ModelError
 from endo_sim_ros.learning.config import PPOConfig, Randomisation, TrainingConfig
 from endo_sim_ros.messages import MessageError
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.presets import PRESETS, preset
-from endo_sim_ros.sequences.frames import Frame, SequenceError
 from endo_sim_ros.sequences.phantom import PhantomConfig
 from endo_sim_ros.viewer.config import ViewerConfig
 
@@ -184,7 +184,7 @@ class Touch:
     config: Annotated[PhysicsConfig, tyro.conf.arg(name="")] = field(default_factory=PhysicsConfig)
 
     def run(self) -> None:
-        from endo_sim_ros.evaluation.touch_sheet import draw_touches
+        from endo_sim_ros.evaluation.interaction_sheet import draw_touches
 
         draw_touches(self.model, self.out, self.config)
 
@@ -211,7 +211,7 @@ class Demo:
     """Give up after this long, seconds."""
 
     def run(self) -> None:
-        from endo_sim_ros.nodes.demo import run_demo
+        from endo_sim_ros.graph.demo import run_demo
 
         run_demo(self.bag, self.out, self.seed, self.frames, self.width, self.iterations, self.force, self.timeout)
 
@@ -245,7 +245,7 @@ class Compress:
     """File to write; a name that ends in .compressed.ply makes it compressed, any other .ply whole again."""
 
     def run(self) -> None:
-        from endo_sim_ros.gaussians import load_ply, save_ply
+        from endo_sim_ros.core.gaussians import load_ply, save_ply
 
         if self.out.suffix != ".ply":
             raise ModelError(f"{self.out}: models are written as .compressed.ply or .ply; give such a name")
@@ -388,7 +388,7 @@ class Up:
     """Serve the page as well, on which tissue is seen and pulled with the mouse: http://localhost:8080."""
 
     def run(self) -> None:
-        from endo_sim_ros.nodes.up import run_up
+        from endo_sim_ros.graph.up import run_up
 
         run_up(self.bag, self.params_file, self.namespace, self.arms, self.model, self.logs, self.respawn, self.view)
 
@@ -420,7 +420,7 @@ class BenchRaster:
     """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""
 
     def run(self) -> None:
-        from endo_sim_ros.evaluation.raster_bench import bench_raster
+        from benchmarks.raster import bench_raster
 
         bench_raster(self.device, self.json)
 
@@ -440,7 +440,7 @@ class BenchPhysics:
     """Numbers of copies stepped together; default: 1 4 16 64, on a GPU also 256 1024."""
 
     def run(self) -> None:
-        from endo_sim_ros.evaluation.physics_bench import bench_physics
+        from benchmarks.physics import bench_physics
 
         bench_physics(self.device, self.json, self.model, self.environments)
 
@@ -469,7 +469,7 @@ class BenchGraph:
     """Deaths of each node whose recovery is timed; 0 = none."""
 
     def run(self) -> None:
-        from endo_sim_ros.nodes.graph_bench import bench_graph
+        from benchmarks.graph import bench_graph
 
         options = {name: value for name, value in vars(self).items() if name != "json"}
         bench_graph(self.json, **options)
@@ -489,7 +489,7 @@ class BenchEnvironments:
     """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""
 
     def run(self) -> None:
-        from endo_sim_ros.learning.bench import bench_environments
+        from benchmarks.environments import bench_environments
 
         bench_environments(self.json, self.task, self.environments, self.device)
 
@@ -508,7 +508,7 @@ class BenchSoak:
     """Other seeds give other traffic."""
 
     def run(self) -> None:
-        from endo_sim_ros.nodes.soak import soak
+        from endo_sim_ros.graph.soak import soak
 
         soak(self.json, self.minutes, self.rate, self.seed)
 
@@ -543,7 +543,7 @@ class Plot:
     """Over the picture, such as the name of the machine."""
 
     def run(self) -> None:
-        from endo_sim_ros.evaluation.bench_plot import plot_rows
+        from benchmarks.plot import plot_rows
 
         if not self.files:
             raise ValueError("no files to plot; give those that `endo-sim bench … --json FILE` wrote")

@@ -7,13 +7,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from endo_sim_ros.cameras import Camera
-from endo_sim_ros.config import Range, StageConfig
-from endo_sim_ros.device import pick_device
-from endo_sim_ros.gaussians import SH_C0, GaussianModel
-from endo_sim_ros.light import Light
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.config import Range, StageConfig
+from endo_sim_ros.core.device import pick_device
+from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
+from endo_sim_ros.core.light import Light
+from endo_sim_ros.core.shading import shade, to_bytes
 from endo_sim_ros.physics.skinning import Skinning
-from endo_sim_ros.pictures import shade, to_bytes
 from endo_sim_ros.splatting import render, sh_basis
 
 _MIN_ALPHA = 0.5  # below it there is no surface whose depth could be told

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from endo_sim_ros import messages
-from endo_sim_ros.cameras import make_pose
+from endo_sim_ros.core.cameras import make_pose
 from endo_sim_ros.nodes.arm import Arm
 
 TURNED = np.array([np.cos(0.3), 0.0, 0.0, np.sin(0.3)])  # 0.6 rad about z

@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from endo_sim_ros import messages
-from endo_sim_ros.gaussians import GaussianModel
+from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.messages import Topic, bag_types
 from endo_sim_ros.sequences.bag import LEFT_FRAME, BagReader, BagWriter, canonical_cdr, read_bag, write_bag
-from endo_sim_ros.sequences.frames import SequenceError
 
 STAMP = 1_000_000_000
 

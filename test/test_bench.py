@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from endo_sim_ros.cameras import look_at, save_cameras
-from endo_sim_ros.evaluation import physics_bench
-from endo_sim_ros.evaluation.bench import Row, machine, median_seconds, report
-from endo_sim_ros.evaluation.bench_plot import plot_rows
-from endo_sim_ros.evaluation.physics_bench import bench_physics, load_scene, phantom_scene
-from endo_sim_ros.evaluation.raster_bench import Plan, bench_raster, tissue
-from endo_sim_ros.gaussians import save_ply
+from benchmarks import physics
+from benchmarks.physics import bench_physics, load_scene, phantom_scene
+from benchmarks.plot import plot_rows
+from benchmarks.raster import Plan, bench_raster, tissue
+from endo_sim_ros.core.cameras import look_at, save_cameras
+from endo_sim_ros.core.gaussians import save_ply
+from endo_sim_ros.evaluation.measurement import Row, machine, median_seconds, report
 from endo_sim_ros.splatting import rasterize, render
 
 SMALL = Plan(
@@ -30,7 +30,7 @@ SMALL = Plan(
     seconds=0.0,
 )
 
-SMALL_PHYSICS = physics_bench.Plan(
+SMALL_PHYSICS = physics.Plan(
     gaussians=800,
     width=96,
     printed_nodes=100,
@@ -114,7 +114,7 @@ def rows_of_physics(tmp_path, **arguments) -> dict[tuple[str, str | None], dict]
 
 
 def test_the_physics_bench_reports_every_row(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(physics_bench.importlib.util, "find_spec", lambda name: None)  # no peer
+    monkeypatch.setattr(physics.importlib.util, "find_spec", lambda name: None)  # no peer
     threads = torch.get_num_threads()
     rows = rows_of_physics(tmp_path)
     assert torch.get_num_threads() == threads
@@ -166,8 +166,8 @@ def test_the_peer_is_measured_where_it_works_and_otherwise_noted(working, tmp_pa
     (tmp_path / "mpm_solver_warp.py").write_text(PEER if working else "import warp.no_such_module")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "mpm_solver_warp", raising=False)
-    only_the_peer = lambda scene, device, environments, *rest: [("", partial(physics_bench._beside_peer, scene, device, *rest))]
-    monkeypatch.setattr(physics_bench, "_stages", only_the_peer)
+    only_the_peer = lambda scene, device, environments, *rest: [("", partial(physics._beside_peer, scene, device, *rest))]
+    monkeypatch.setattr(physics, "_stages", only_the_peer)
     rows = rows_of_physics(tmp_path)
     monkeypatch.delitem(sys.modules, "mpm_solver_warp", raising=False)
     out = capsys.readouterr().out

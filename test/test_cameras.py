@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from endo_sim_ros.cameras import (
+from endo_sim_ros.core.cameras import (
     Camera,
     interpolate_pose,
     invert_pose,

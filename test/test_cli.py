@@ -15,9 +15,9 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from endo_sim_ros import cli
+from endo_sim_ros.core.gaussians import load_ply
 from endo_sim_ros.evaluation import held_out
 from endo_sim_ros.evaluation.held_out import reconstruct_and_measure
-from endo_sim_ros.gaussians import load_ply
 from endo_sim_ros.reconstruction import ReconstructionConfig
 from endo_sim_ros.reconstruction.presets import preset, resolved
 from endo_sim_ros.sequences.bag import read_bag

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from endo_sim_ros import cli
-from endo_sim_ros.config import ConfigError, Range, StageConfig, options
+from endo_sim_ros.core.config import ConfigError, Range, StageConfig, options
 from endo_sim_ros.nodes.parameter_file import NODE_CONFIGS, parameter_file
 
 ALL = [config for configs in NODE_CONFIGS.values() for config in configs]

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.reconstruction import ReconstructionConfig
-from endo_sim_ros.reconstruction.depth import with_depth_prior
-from endo_sim_ros.reconstruction.depth_network import align, load_network, network_depth
+from endo_sim_ros.reconstruction.priors.network import align, load_network, network_depth
+from endo_sim_ros.reconstruction.priors.sources import with_depth_prior
 from endo_sim_ros.reconstruction.triangulation import triangulate
-from endo_sim_ros.sequences.frames import SequenceError
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
 ONNX = Path(__file__).resolve().parents[2] / "shared/data/weights/tcmonodepth_tcsmallnet_192x320.onnx"

@@ -21,17 +21,18 @@ from conftest import wait_until
 from gymnasium.utils.env_checker import check_env
 from test_nodes import Bench
 
+from benchmarks.environments import bench_environments
 from endo_sim_ros import messages
-from endo_sim_ros.config import ConfigError
-from endo_sim_ros.learning import bench, environments
+from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.core.light import Light
+from endo_sim_ros.graph.processes import NodeGroup
+from endo_sim_ros.learning import environments
 from endo_sim_ros.learning.config import PPOConfig, Randomisation, TrainingConfig
 from endo_sim_ros.learning.policies import NetworkPolicy, make_policy, scripted_policy
 from endo_sim_ros.learning.scenes import Scene, load_scene, save_scene
 from endo_sim_ros.learning.task_batch import TaskBatch
 from endo_sim_ros.learning.tasks import TASKS
 from endo_sim_ros.learning.train import run_episodes, save_training, train
-from endo_sim_ros.light import Light
-from endo_sim_ros.nodes.graph import NodeGroup
 from endo_sim_ros.physics import TissueSimulation
 
 ROOT = Path(__file__).parents[1]
@@ -502,12 +503,12 @@ def test_without_gymnasium_one_sentence_says_what_to_install():
 
 
 def test_bench_gives_a_row_for_each_number_of_environments(tmp_path, capsys):
-    bench.bench_environments(tmp_path / "rows.json", "retraction", (1, 2), "cpu", repeats=1)
+    bench_environments(tmp_path / "rows.json", "retraction", (1, 2), "cpu", repeats=1)
     rows = json.loads((tmp_path / "rows.json").read_text())
     assert len(rows) == 4 and all(row["value"] > 0 and row["unit"] == "steps/s" for row in rows)
     assert rows[1]["ratio"] > 0 and rows[1]["peer"] == "1 environment"
     with pytest.raises(ValueError, match="numbers of environments of at least 1, got 4 0"):
-        bench.bench_environments(None, "retraction", (4, 0), "cpu")
+        bench_environments(None, "retraction", (4, 0), "cpu")
 
 
 def test_the_code_in_the_guide_runs(tmp_path):

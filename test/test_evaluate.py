@@ -13,19 +13,19 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from endo_sim_ros.cameras import Camera, look_at
-from endo_sim_ros.config import ConfigError
+from endo_sim_ros.core.cameras import Camera, look_at
+from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.evaluation import paper, tables
 from endo_sim_ros.evaluation.config import EvaluationConfig
+from endo_sim_ros.evaluation.deformed_views import touched_psnr
 from endo_sim_ros.evaluation.evaluate import _divided, evaluate, open_named
 from endo_sim_ros.evaluation.held_out import FIGURES, measure, seen_pixels
 from endo_sim_ros.evaluation.page import write_page
 from endo_sim_ros.evaluation.splits import explain_split, right_views, split_views
-from endo_sim_ros.evaluation.touched import touched_psnr
 from endo_sim_ros.evaluation.workers import Finished, News, run_in_processes
-from endo_sim_ros.gaussians import GaussianModel
 from endo_sim_ros.reconstruction import ScenePoints
-from endo_sim_ros.sequences.frames import SequenceError
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
 SMALL = "phantom:0,frames=6,width=96,height=80"

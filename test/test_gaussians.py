@@ -8,8 +8,8 @@ import torch
 from plyfile import PlyData
 from test_light import LAMP
 
+from endo_sim_ros.core.gaussians import GaussianModel, ModelError, load_ply, save_ply
 from endo_sim_ros.evaluation import metrics
-from endo_sim_ros.gaussians import GaussianModel, ModelError, load_ply, save_ply
 from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from endo_sim_ros.cameras import Camera
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.evaluation import metrics
-from endo_sim_ros.gaussians import GaussianModel
-from endo_sim_ros.physics import PhysicsConfig, Skinning, TissueBatch, TissueSimulation, build_control_nodes, mpm
+from endo_sim_ros.physics import PhysicsConfig, Skinning, TissueBatch, TissueSimulation, build_control_nodes, solver
 from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
@@ -33,8 +33,8 @@ def sheet(count: int = 20_000) -> GaussianModel:
 def test_prepared_tissue_has_nothing_left_to_make_ready_when_it_is_first_touched(monkeypatch):
     simulation = TissueSimulation(sheet(), np.zeros(3), PhysicsConfig(device="cuda", node_count=500))
     simulation.prepare()
-    monkeypatch.setattr(mpm.wp, "load_module", lambda *_, **__: pytest.fail("kernels are loaded only now"))
-    monkeypatch.setattr(mpm.wp, "ScopedCapture", lambda *_, **__: pytest.fail("the step is recorded only now"))
+    monkeypatch.setattr(solver.wp, "load_module", lambda *_, **__: pytest.fail("kernels are loaded only now"))
+    monkeypatch.setattr(solver.wp, "ScopedCapture", lambda *_, **__: pytest.fail("the step is recorded only now"))
     assert simulation.set_wrench("pull", TIP, [0.0, 0.0, -0.3])
     simulation.step()
     assert np.abs(simulation.state().positions - simulation.nodes.rest).max() > 1e-6
@@ -97,7 +97,7 @@ def test_physics_agrees_step_for_step(kinematics, material):
 @pytest.mark.parametrize("count", [700, 2000, 4000])
 def test_blocks_that_share_the_tissue_agree_with_launches_for_each_substep(count, monkeypatch):
     one, few = touch("cuda", node_count=count, relaxation=0.5)
-    monkeypatch.setattr(mpm.cluster, "divide", lambda *arguments: None)
+    monkeypatch.setattr(solver.cluster, "divide", lambda *arguments: None)
     many = touch("cuda", node_count=count, relaxation=0.5)[1]
     np.testing.assert_allclose(few["positions"], many["positions"], atol=2e-3 * np.abs(many["positions"] - one.nodes.rest).max())
     np.testing.assert_allclose(few["felt"], many["felt"], atol=2e-2 * np.abs(many["felt"]).max())

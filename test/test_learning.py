@@ -16,6 +16,7 @@ import pytest
 from conftest import wait_until
 
 from endo_sim_ros import messages
+from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.learning import lerobot
 from endo_sim_ros.learning.episodes import (
     JAW_OPEN,
@@ -29,7 +30,6 @@ from endo_sim_ros.learning.episodes import (
 from endo_sim_ros.learning.lerobot import IMAGE, export_lerobot
 from endo_sim_ros.messages import ControlNodeCloud, bag_types
 from endo_sim_ros.sequences.bag import BagReader, BagWriter
-from endo_sim_ros.sequences.frames import SequenceError
 
 ROOT = Path(__file__).parents[1]
 S = 1_000_000_000

@@ -9,14 +9,14 @@ import pytest
 import torch
 
 from endo_sim_ros import messages
-from endo_sim_ros.cameras import Camera, look_at
-from endo_sim_ros.gaussians import GaussianModel, ModelError, load_ply, save_ply
-from endo_sim_ros.light import Light, directions, falloff, features, features_at, log_brightness
+from endo_sim_ros.core.cameras import Camera, look_at
+from endo_sim_ros.core.frames import Frame
+from endo_sim_ros.core.gaussians import GaussianModel, ModelError, load_ply, save_ply
+from endo_sim_ros.core.light import Light, directions, falloff, features, features_at, log_brightness
+from endo_sim_ros.core.shading import shade, to_bytes
 from endo_sim_ros.messages import MessageError
-from endo_sim_ros.pictures import shade, to_bytes
 from endo_sim_ros.reconstruction.photometry import PRIOR, Drift, fit_exposure, fit_light, unlit
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
-from endo_sim_ros.sequences.frames import Frame
 
 CAMERA = Camera(np.array([[200.0, 0, 80], [0, 200.0, 64], [0, 0, 1]]), 160, 128)
 LAMP = Light(distance=1.2, angle=8.0, tilt_x=0.4, tilt_y=-0.3, reference=0.1, level_r=0.1, level_g=0.2, level_b=0.3, response=0.5)

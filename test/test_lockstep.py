@@ -15,10 +15,10 @@ from std_srvs.srv import SetBool, Trigger
 from test_nodes import HEIGHT, WIDTH, Bench, K, send_camera, send_model, sheet
 
 from endo_sim_ros import messages
-from endo_sim_ros.cameras import Camera, save_cameras
-from endo_sim_ros.gaussians import save_ply
+from endo_sim_ros.core.cameras import Camera, save_cameras
+from endo_sim_ros.core.gaussians import save_ply
+from endo_sim_ros.graph.processes import NodeGroup
 from endo_sim_ros.messages import ERROR, OK
-from endo_sim_ros.nodes.graph import NodeGroup
 from endo_sim_ros.nodes.physics_node import PhysicsNode
 from endo_sim_ros.nodes.rendering_node import RenderingNode
 from endo_sim_ros.sequences.bag import BagReader

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from endo_sim_ros import messages
-from endo_sim_ros.cameras import make_pose, quat_to_matrix
-from endo_sim_ros.gaussians import GaussianModel
+from endo_sim_ros.core.cameras import make_pose, quat_to_matrix
+from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.messages import ControlNodeCloud, MessageError, bag_types, ros_types
 
 STAMP = 12_345_678_901

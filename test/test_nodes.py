@@ -20,12 +20,12 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 
 from endo_sim_ros import messages
-from endo_sim_ros.cameras import Camera, make_pose
-from endo_sim_ros.gaussians import GaussianModel, load_ply, save_ply
+from endo_sim_ros.core.cameras import Camera, make_pose
+from endo_sim_ros.core.gaussians import GaussianModel, load_ply, save_ply
+from endo_sim_ros.graph.processes import NodeGroup
 from endo_sim_ros.messages import ERROR, OK, WARN
 from endo_sim_ros.nodes.base import _MOST_LOGGED, EndoNode
 from endo_sim_ros.nodes.executor import NodeExecutor
-from endo_sim_ros.nodes.graph import NodeGroup
 from endo_sim_ros.nodes.physics_node import PhysicsNode
 from endo_sim_ros.nodes.reconstruction_node import ReconstructionNode
 from endo_sim_ros.nodes.recorder_node import RecorderNode

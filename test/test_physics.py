@@ -12,9 +12,9 @@ import pytest
 import torch
 import warp as wp
 
-from endo_sim_ros.cameras import Camera
-from endo_sim_ros.config import ConfigError, options
-from endo_sim_ros.gaussians import GaussianModel, save_ply
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.config import ConfigError, options
+from endo_sim_ros.core.gaussians import GaussianModel, save_ply
 from endo_sim_ros.physics import (
     ControlNodes,
     MpmSolver,
@@ -26,12 +26,11 @@ from endo_sim_ros.physics import (
     TissueSimulation,
     build_control_nodes,
     lame_parameters,
-    mpm,
     plan_substeps,
     sample_farthest,
     sound_speed,
 )
-from endo_sim_ros.physics import mpm_cluster_kernels as cluster
+from endo_sim_ros.physics.backends import cluster_kernels as cluster
 from endo_sim_ros.physics.materials import MATERIALS, energy_density, kirchhoff_stress, rotation_of
 
 EYE = np.zeros(3)  # the camera of the test scene, looking along +z
@@ -492,7 +491,7 @@ def test_the_vectorised_step_agrees_with_the_kernels_of_the_gpu(kinematics, mate
     states = []
     for vectorised in (True, False):
         if not vectorised:
-            monkeypatch.setattr(mpm, "STRESSES", {})
+            monkeypatch.setattr(solver, "STRESSES", {})
         simulation = simulate(
             kinematics=kinematics, material=material, contact_radius=0.006, relaxation=0.5, gravity_z=0.5,
             regions=("sphere 0 0 0.12 0.02 young_modulus=20000",),
@@ -518,7 +517,7 @@ def test_inverted_tissue_recovers_in_both_implementations(monkeypatch):
     ends, chosen = [], np.random.default_rng(6).permutation(300)[:20]
     for vectorised in (True, False):
         if not vectorised:
-            monkeypatch.setattr(mpm, "STRESSES", {})
+            monkeypatch.setattr(solver, "STRESSES", {})
         simulation = simulate(node_count=300, damping=200.0)
         F = simulation.solver.deformation_gradients()
         F[chosen] = np.float32(np.diag([1.0, 1.0, -0.3]))
@@ -892,7 +891,7 @@ def pull_apart(simulation: TissueSimulation, force: float = 0.4) -> tuple[np.nda
 @pytest.mark.parametrize("vectorised", [True, False])
 def test_a_cut_separates_what_is_pulled_apart_and_heals_on_reset(vectorised, monkeypatch):
     if not vectorised:
-        monkeypatch.setattr(mpm, "STRESSES", {})
+        monkeypatch.setattr(solver, "STRESSES", {})
     gaps = []
     simulation = simulate(node_count=2400, layers=3, blade_length=0.03)
     for cut in (False, True, False):

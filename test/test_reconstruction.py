@@ -8,19 +8,20 @@ import pytest
 import torch
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from endo_sim_ros.cameras import Camera, look_at
+from endo_sim_ros.core.cameras import Camera, look_at
+from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.evaluation.held_out import reconstruct_and_measure
-from endo_sim_ros.gaussians import GaussianModel
-from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer, densification, losses, select_keyframes, shrink
-from endo_sim_ros.reconstruction.agreement import _BY_EYES, _IN_THE_END, _MATCHED, _corrected, _smooth, agreed
-from endo_sim_ros.reconstruction.depth import disparity_offsets, interpolated_depth, stereo_disparity, with_depth_prior
+from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer, losses, select_keyframes, shrink
 from endo_sim_ros.reconstruction.initialization import initial_model
 from endo_sim_ros.reconstruction.optimizer import Adam
+from endo_sim_ros.reconstruction.priors.multi_view import _BY_EYES, _IN_THE_END, _MATCHED, _corrected, _smooth, agreed
+from endo_sim_ros.reconstruction.priors.sources import disparity_offsets, interpolated_depth, stereo_disparity, with_depth_prior
+from endo_sim_ros.reconstruction.strategies import mcmc
 from endo_sim_ros.reconstruction.triangulation import ScenePoints, triangulate
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.bag import write_bag
-from endo_sim_ros.sequences.frames import Frame, SequenceError
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 from endo_sim_ros.splatting import render
 
@@ -642,7 +643,7 @@ def cloud(count=300, seed=0):
 
 def test_copies_share_opacity_and_size():
     opacities, scales = torch.tensor([0.3, 0.99, 0.5]), torch.ones(3, 3)
-    shared, smaller = densification.relocated(opacities, scales, torch.tensor([2, 50, 1]))
+    shared, smaller = mcmc.relocated(opacities, scales, torch.tensor([2, 50, 1]))
     torch.testing.assert_close(1 - (1 - shared) ** torch.tensor([2, 50, 1]), opacities)
     # Two copies by hand: 0.3 / (2 o − o² / √2) with o = 1 − √0.7.
     o = 1 - 0.7**0.5
@@ -658,10 +659,10 @@ def test_refinement_preserves_the_picture_moves_the_dead_and_respects_the_limit(
     model = dataclasses.replace(model, logit_opacities=logits)
     camera = Camera(np.array([[80.0, 0, 40], [0, 80, 40], [0, 0, 1]]), 80, 80)
     before = render(model, camera)
-    new, source, fresh = densification.refine(model, 0.05, 310, torch.Generator().manual_seed(0))
+    new, source, fresh = mcmc.refine(model, 0.05, 310, torch.Generator().manual_seed(0))
     after = render(new, camera)
     assert len(new) == len(source) == len(fresh) == 310
-    assert (new.opacities > densification.DEAD_OPACITY).all()
+    assert (new.opacities > mcmc.DEAD_OPACITY).all()
     assert not (source[:300:6] == torch.arange(0, 300, 6)).any()
     assert fresh[:300:6].all()
     assert fresh[300:].all()
@@ -673,7 +674,7 @@ def test_refinement_preserves_the_picture_moves_the_dead_and_respects_the_limit(
 
 def test_refinement_without_any_living_gaussian_changes_nothing():
     model = dataclasses.replace(cloud(20), logit_opacities=torch.full((20,), -9.0))
-    new, source, fresh = densification.refine(model, 0.5, 100, torch.Generator())
+    new, source, fresh = mcmc.refine(model, 0.5, 100, torch.Generator())
     assert equal(new, model)
     assert len(source) == len(fresh) == 20
     assert not fresh.any()
@@ -682,7 +683,7 @@ def test_refinement_without_any_living_gaussian_changes_nothing():
 def test_noise_moves_only_the_faint():
     model = cloud(50)
     model.logit_opacities[:25] = -7
-    noise = densification.exploration_noise(model, 1.0, torch.Generator().manual_seed(0))
+    noise = mcmc.exploration_noise(model, 1.0, torch.Generator().manual_seed(0))
     assert noise[:25].abs().min() > 0
     assert noise[25:].abs().max() < 1e-3 * noise[:25].abs().median()
 

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from endo_sim_ros.cameras import Camera, look_at, save_cameras
-from endo_sim_ros.config import ConfigError
+from endo_sim_ros.core.cameras import Camera, look_at, save_cameras
+from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.physics.regions import (
     TissueProperties,
     inside_box,

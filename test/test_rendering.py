@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from endo_sim_ros.cameras import Camera, make_pose
-from endo_sim_ros.gaussians import GaussianModel
+from endo_sim_ros.core.cameras import Camera, make_pose
+from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 
 CAMERA = Camera(np.array([[120.0, 0, 48], [0, 120, 40], [0, 0, 1]]), 96, 80)

@@ -22,15 +22,15 @@ from conftest import wait_until
 from test_nodes import Bench, S, send_model
 
 from endo_sim_ros import messages
-from endo_sim_ros.cameras import load_cameras
-from endo_sim_ros.gaussians import ModelError, load_ply, ply_fields
+from endo_sim_ros.core.cameras import load_cameras
+from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.core.gaussians import ModelError, load_ply, ply_fields
+from endo_sim_ros.graph.processes import NodeGroup
+from endo_sim_ros.graph.soak import soak
 from endo_sim_ros.messages import OK
-from endo_sim_ros.nodes.graph import NodeGroup
 from endo_sim_ros.nodes.reconstruction_node import ReconstructionNode
-from endo_sim_ros.nodes.soak import soak
 from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer
 from endo_sim_ros.sequences.bag import BagReader
-from endo_sim_ros.sequences.frames import SequenceError
 from endo_sim_ros.sequences.recordings import read_calibration
 
 # --------------------------------------------------------------------------------------------------------- files

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 import tifffile
 
-from endo_sim_ros.cameras import Camera, matrix_to_quat
+from endo_sim_ros.core.cameras import Camera, matrix_to_quat
+from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.endonerf import read_endonerf
 from endo_sim_ros.sequences.folder import read_folder, read_points
-from endo_sim_ros.sequences.frames import Frame, SequenceError
 from endo_sim_ros.sequences.readers import READERS, open_sequence
 from endo_sim_ros.sequences.recordings import Video, lit_area, lit_now, numbered_files, read_poses, tool_is_white
 from endo_sim_ros.sequences.rectification import Rectification, StereoCalibration

@@ -10,9 +10,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from endo_sim_ros.cameras import Camera, look_at
-from endo_sim_ros.gaussians import GaussianModel
-from endo_sim_ros.splatting import RenderOutput, _rasterize, rasterize, rasterizer, rasterizer_simd, rasterizer_tiled, render
+from endo_sim_ros.core.cameras import Camera, look_at
+from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.splatting import RenderOutput, _rasterize, api, cpu, cuda, rasterize, render
 
 DEVICES = ["cpu"] + (["cuda"] if torch.cuda.is_available() else [])
 WIDTH, HEIGHT = 70, 45  # no multiple of the tile
@@ -48,7 +48,7 @@ def random_like(images, seed=1):
 
 def covariances(quats, scales):
     """World covariances [N, 3, 3]."""
-    rotations = rasterizer._quat_to_matrix(quats)
+    rotations = api._quat_to_matrix(quats)
     return rotations @ torch.diag_embed(scales**2) @ rotations.mT
 
 
@@ -109,7 +109,7 @@ def one_torch_thread():
 @pytest.fixture(params=["vectors", "pixels"])
 def compositor(request):
     """Both ways to composite; the kernels made for GPUs run on the CPU too."""
-    with rasterizer.scalar_kernels() if request.param == "pixels" else contextlib.nullcontext():
+    with api.scalar_kernels() if request.param == "pixels" else contextlib.nullcontext():
         yield
 
 
@@ -198,8 +198,8 @@ def test_gradients_match_finite_differences_where_nothing_is_cut_off(monkeypatch
 
     leaves = [*gaussians, cameras[0], BACKGROUND]
     expected = loss(leaves)
-    monkeypatch.setattr(rasterizer, "ALPHA_MIN", 1e-9)
-    monkeypatch.setattr(rasterizer, "TRANSMITTANCE_MIN", 0.0)
+    monkeypatch.setattr(api, "ALPHA_MIN", 1e-9)
+    monkeypatch.setattr(api, "TRANSMITTANCE_MIN", 0.0)
     assert loss(leaves) == expected, "a cut-off has an effect"
     generator = torch.Generator().manual_seed(0)
     for index, name in enumerate(GAUSSIAN_NAMES):
@@ -557,7 +557,7 @@ def test_results_repeat_bit_for_bit_with_any_number_of_threads(monkeypatch):
     gaussians, cameras = make_gaussians(3000, 4, seed=11), make_cameras(2, 150, 90)
     results = []
     for threads in (1, 2, 2, 5):
-        monkeypatch.setattr(rasterizer_simd, "cpu_threads", lambda: threads)
+        monkeypatch.setattr(cpu, "cpu_threads", lambda: threads)
         absgrad = torch.zeros(2, 3000, 2, requires_grad=True)
         options = {"size": (150, 90), "absgrad": absgrad, "median": True}
         output, gradients = run(rasterize, gaussians, cameras, dtype=torch.float32, **options)
@@ -640,20 +640,20 @@ def test_pictures_for_whose_lists_there_is_no_room_are_the_same(device, monkeypa
     gaussians[0][:20, 2] = -1.0
     gaussians[0][20:40, 0] = 50.0
     cameras[0][1, 2, 3] = -100.0
-    with rasterizer.scalar_kernels():
+    with api.scalar_kernels():
         roomy = run(rasterize, gaussians, cameras, device=device, dtype=torch.float32)
-        monkeypatch.setattr(rasterizer_tiled, "_MOST", 0.01)
-        monkeypatch.setattr(rasterizer_tiled, "_ALWAYS", 0)
+        monkeypatch.setattr(cuda, "_MOST", 0.01)
+        monkeypatch.setattr(cuda, "_ALWAYS", 0)
         cramped = run(rasterize, gaussians, cameras, device=device, dtype=torch.float32)
         device = torch.device(f"{device}:0" if device == "cuda" else device)
-        scratch = rasterizer_tiled._scratch(device, rasterizer_tiled._stream(device))
+        scratch = cuda._scratch(device, cuda._stream(device))
     assert scratch.seen[0] > scratch.room
     for expected, actual in zip([*roomy[0][:4], *roomy[1]], [*cramped[0][:4], *cramped[1]]):
         assert_close("it", actual, expected.cpu(), 1e-5)
 
 
 def test_memory_that_runs_out_is_asked_for_again(monkeypatch):
-    scratch = rasterizer_tiled._Scratch(torch.device("cpu"))
+    scratch = cuda._Scratch(torch.device("cpu"))
     scratch.reserve_splats(10)
 
     def run_out(count, dtype=torch.int32):
@@ -675,44 +675,44 @@ def test_memory_that_runs_out_is_asked_for_again(monkeypatch):
 
 
 def test_the_first_picture_on_a_cpu_has_room():
-    rasterizer_tiled._scratch.cache_clear()
+    cuda._scratch.cache_clear()
     gaussians, cameras = make_gaussians(20, seed=33), make_cameras(1, 300, 200)
     gaussians[2] *= 10
-    with rasterizer.scalar_kernels():
+    with api.scalar_kernels():
         run(rasterize, gaussians, cameras, size=(300, 200), dtype=torch.float32)
-    scratch = rasterizer_tiled._scratch(torch.device("cpu"), 0)
-    assert rasterizer_tiled._FIRST_GUESS * 20 * 1.5 < scratch.seen[0] <= scratch.room
+    scratch = cuda._scratch(torch.device("cpu"), 0)
+    assert cuda._FIRST_GUESS * 20 * 1.5 < scratch.seen[0] <= scratch.room
 
 
 def test_room_follows_what_pictures_needed():
-    expectation = rasterizer_tiled._Expectation(torch.device("cpu"))
+    expectation = cuda._Expectation(torch.device("cpu"))
     assert 4000 <= expectation.room(1000) < 8000
     expectation.seen.copy_(torch.tensor([30_000, 1000]))
     assert 30_000 < expectation.room(1000) < 60_000
     assert 60_000 < expectation.room(2000) < 120_000
     expectation.seen.copy_(torch.tensor([100_000_000, 1000]))
-    assert expectation.room(1000) == rasterizer_tiled._ALWAYS
+    assert expectation.room(1000) == cuda._ALWAYS
     assert 64_000_000 <= expectation.room(1_000_000) < 100_000_000
 
 
 def test_recorded_pictures_know_whether_their_room_still_fits():
-    expectation = rasterizer_tiled._Expectation(torch.device("cpu"))
-    room = rasterizer_tiled.Room.for_picture(expectation, 1000, 40)
+    expectation = cuda._Expectation(torch.device("cpu"))
+    room = cuda.Room.for_picture(expectation, 1000, 40)
     assert room.fits()
     expectation.seen.copy_(torch.tensor([30_000, 1000]))
     assert not room.fits()  # too small
-    room = rasterizer_tiled.Room.for_picture(expectation, 1000, 40)
+    room = cuda.Room.for_picture(expectation, 1000, 40)
     assert room.fits()
     expectation.seen.copy_(torch.tensor([3000, 1000]))
     for _ in range(20):
         assert room.fits()
     while room.fits():  # in the end too large
         pass
-    assert rasterizer_tiled.Room.for_picture(expectation, 1000, 40).size < room.size / 2
+    assert cuda.Room.for_picture(expectation, 1000, 40).size < room.size / 2
 
 
 def test_pictures_in_inference_mode_do_not_disturb_later_gradients(compositor):
-    for cache in (rasterizer._black, rasterizer._all_tiles, rasterizer_tiled._scratch):
+    for cache in (api._black, api._all_tiles, cuda._scratch):
         cache.cache_clear()
     *gaussians, viewmats, Ks = (x.float() for x in (*make_gaussians(), *make_cameras()))
     with torch.inference_mode():
@@ -725,7 +725,7 @@ def test_pictures_in_inference_mode_do_not_disturb_later_gradients(compositor):
 
 def test_the_default_dtype_changes_nothing(compositor):
     gaussians, cameras = make_gaussians(), make_cameras()
-    rasterizer._black.cache_clear()
+    api._black.cache_clear()
     expected, _ = run(rasterize, gaussians, cameras, dtype=torch.float32)
     torch.set_default_dtype(torch.float64)
     try:
@@ -737,10 +737,10 @@ def test_the_default_dtype_changes_nothing(compositor):
 
 def test_pictures_drawn_in_several_threads_are_those_drawn_in_one(compositor):
     """Of different sizes, each with two forward passes before their backward passes."""
-    scalar, scenes = rasterizer._scalar.get(), [(make_gaussians(400, seed=31), (70, 45)), (make_gaussians(150, seed=32), (33, 60))]
+    scalar, scenes = api._scalar.get(), [(make_gaussians(400, seed=31), (70, 45)), (make_gaussians(150, seed=32), (33, 60))]
 
     def draw(turn):
-        with rasterizer.scalar_kernels() if scalar else contextlib.nullcontext():
+        with api.scalar_kernels() if scalar else contextlib.nullcontext():
             leaves, losses = [], []
             for gaussians, size in scenes[::turn]:
                 leaves.append([x.float().requires_grad_() for x in gaussians])

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.messages import CameraInfo
-from endo_sim_ros.sequences.frames import SequenceError
 from endo_sim_ros.sequences.synchronizer import LAG, MAX_OTHERS, MAX_PENDING, MAX_POSES, Synchronizer
 
 MS = 1_000_000

@@ -7,20 +7,21 @@ import numpy as np
 import pytest
 import torch
 
-from endo_sim_ros.config import ConfigError
+from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.core.light import features_at
 from endo_sim_ros.evaluation import metrics
-from endo_sim_ros.gaussians import GaussianModel
-from endo_sim_ros.light import features_at
-from endo_sim_ros.reconstruction import ABLATIONS, PRESETS, ReconstructionConfig, Trainer, densification, losses, preset
-from endo_sim_ros.reconstruction.depth import right_view
-from endo_sim_ros.reconstruction.interpolation import inverse_distance_weighted, kriged
-from endo_sim_ros.reconstruction.motion import without_motion
+from endo_sim_ros.reconstruction import ABLATIONS, PRESETS, ReconstructionConfig, Trainer, losses, preset
+from endo_sim_ros.reconstruction.dynamic_mask import without_motion
 from endo_sim_ros.reconstruction.presets import resolved
-from endo_sim_ros.reconstruction.surroundings import _continued, with_surroundings
+from endo_sim_ros.reconstruction.priors.extrapolation import _continued, with_surroundings
+from endo_sim_ros.reconstruction.priors.interpolation import inverse_distance_weighted, kriged
+from endo_sim_ros.reconstruction.priors.sources import right_view
+from endo_sim_ros.reconstruction.strategies import mcmc
 from endo_sim_ros.reconstruction.trainer import shrink
 from endo_sim_ros.reconstruction.triangulation import match_features, misposed, triangulate
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
-from endo_sim_ros.sequences.frames import SequenceError
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
 SHORT = {"iterations": 12, "max_gaussians": 2000, "refine_every": 5, "device": "cpu"}
@@ -122,14 +123,14 @@ def test_steep_gaussians_are_split_or_doubled_and_dead_ones_go():
     model.log_scales[10:15] = np.log(0.05)  # large
     gradients = torch.zeros(60)
     gradients[10:20] = 1.0
-    new, source, fresh = densification.split_and_clone(model, gradients, 1.0, 1000, torch.Generator().manual_seed(0))
+    new, source, fresh = mcmc.split_and_clone(model, gradients, 1.0, 1000, torch.Generator().manual_seed(0))
     assert len(new) == 60 - 5 + 5 + 5 == len(source) == len(fresh)
     assert not set(range(5)) & set(source.tolist())
     assert sorted(source[fresh].tolist()) == sorted([*range(15, 20), *range(10, 15), *range(10, 15)])
     halves = fresh & (source < 15)
     torch.testing.assert_close(new.log_scales[halves], torch.full((10, 3), np.log(0.05 / 1.6), dtype=torch.float32))
     assert (new.means[halves] != model.means[source[halves]]).any(1).all()
-    limited, _, _ = densification.split_and_clone(model, gradients * torch.linspace(1, 2, 60), 1.0, 58, torch.Generator())
+    limited, _, _ = mcmc.split_and_clone(model, gradients * torch.linspace(1, 2, 60), 1.0, 58, torch.Generator())
     assert len(limited) == 58
 
 
@@ -157,12 +158,12 @@ def test_exposures_and_colours_do_not_drift_against_each_other(views):
 def test_unpooling_fills_gaps_halfway_to_the_neighbours():
     model = cloud()
     model.means[0] = torch.tensor([3.0, 3.0, 3.0])
-    new, source, fresh = densification.unpool(model, 1000)
+    new, source, fresh = mcmc.unpool(model, 1000)
     assert len(new) > 60 and (~fresh).sum() == 60
     added = new.means[fresh]
     assert (added > 1.2).all(1).sum() == 3  # on the way to the lone one
-    assert len(densification.unpool(model, 61)[0]) == 61
-    assert len(densification.unpool(model, 60)[0]) == 60
+    assert len(mcmc.unpool(model, 61)[0]) == 61
+    assert len(mcmc.unpool(model, 60)[0]) == 60
 
 
 # --------------------------------------------------------------------------------------- views and poses

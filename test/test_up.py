@@ -18,18 +18,18 @@ from conftest import wait_until
 from rich.console import Console
 
 from endo_sim_ros import messages
-from endo_sim_ros.nodes import up as up_module
+from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.graph import up as up_module
+from endo_sim_ros.graph.processes import NodeGroup
+from endo_sim_ros.graph.up import UpError, _Supervisor, run_up
 from endo_sim_ros.nodes.bag_player_node import BagPlayerNode
 from endo_sim_ros.nodes.base import EndoNode
-from endo_sim_ros.nodes.graph import NodeGroup
 from endo_sim_ros.nodes.physics_node import PhysicsNode
 from endo_sim_ros.nodes.policy_node import PolicyNode
 from endo_sim_ros.nodes.reconstruction_node import ReconstructionNode
 from endo_sim_ros.nodes.rendering_node import RenderingNode
 from endo_sim_ros.nodes.scripted_tool_node import ScriptedToolNode
-from endo_sim_ros.nodes.up import UpError, _Supervisor, run_up
 from endo_sim_ros.nodes.viewer_node import ViewerNode
-from endo_sim_ros.sequences.frames import SequenceError
 
 CONFIG = Path(__file__).parents[1] / "config"
 TYPES = {topic.name.lstrip("/"): topic.type for topic in messages.all_topics()}

@@ -14,10 +14,10 @@ from conftest import wait_until
 from test_nodes import Bench, S, send_camera, send_model, sheet
 
 from endo_sim_ros import messages
-from endo_sim_ros.cameras import Camera, save_cameras
-from endo_sim_ros.config import ConfigError
-from endo_sim_ros.evaluation.figures import draw_points
-from endo_sim_ros.gaussians import save_ply
+from endo_sim_ros.core.cameras import Camera, save_cameras
+from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.core.drawing import draw_points
+from endo_sim_ros.core.gaussians import save_ply
 from endo_sim_ros.nodes.physics_node import PhysicsNode
 from endo_sim_ros.nodes.rendering_node import RenderingNode
 from endo_sim_ros.physics import PhysicsConfig

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from playwright.sync_api import sync_playwright
 
-from endo_sim_ros.cameras import load_cameras
-from endo_sim_ros.gaussians import load_ply
+from endo_sim_ros.core.cameras import load_cameras
+from endo_sim_ros.core.gaussians import load_ply
 from endo_sim_ros.physics import PhysicsConfig
 from endo_sim_ros.viewer.config import ViewerConfig
 from endo_sim_ros.viewer.standalone import Standalone, _camera_at_origin

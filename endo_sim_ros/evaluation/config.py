@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from endo_sim_ros.config import ConfigError
+from endo_sim_ros.core.config import ConfigError
 
 
 @dataclass(frozen=True)

@@ -23,24 +23,25 @@ import yaml
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from scipy.spatial import cKDTree
 
-from endo_sim_ros.cameras import Camera
-from endo_sim_ros.config import ConfigError
-from endo_sim_ros.device import cpu_threads, pick_device
-from endo_sim_ros.evaluation import figures, metrics, tables
-from endo_sim_ros.evaluation.bench import machine, peak_megabytes
+from endo_sim_ros.core import drawing
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.core.device import cpu_threads, pick_device
+from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.evaluation import metrics, tables
 from endo_sim_ros.evaluation.config import EvaluationConfig
+from endo_sim_ros.evaluation.deformed_views import touched_psnr
 from endo_sim_ros.evaluation.held_out import difference, mean_figures, measure, model_renderer, seen_pixels
 from endo_sim_ros.evaluation.lpips import Lpips, WeightsError
+from endo_sim_ros.evaluation.measurement import machine, peak_megabytes
 from endo_sim_ros.evaluation.splits import STEREO, Split, check_split, right_views, split_views
-from endo_sim_ros.evaluation.touched import touched_psnr
 from endo_sim_ros.evaluation.workers import Finished, News, ray_is_installed, run_in_processes, run_in_ray
 from endo_sim_ros.reconstruction import ReconstructionConfig, ScenePoints, Trainer, scene_points, shrink
-from endo_sim_ros.reconstruction.depth import with_depth_prior
 from endo_sim_ros.reconstruction.presets import ABLATIONS, preset
+from endo_sim_ros.reconstruction.priors.sources import with_depth_prior
 from endo_sim_ros.reconstruction.triangulation import points_in_view
 from endo_sim_ros.sequences.bag import read_bag
 from endo_sim_ros.sequences.folder import read_points
-from endo_sim_ros.sequences.frames import Frame, SequenceError
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 from endo_sim_ros.sequences.readers import open_sequence
 from endo_sim_ros.sequences.recordings import Recording, spread
@@ -72,7 +73,7 @@ class Cell(NamedTuple):
 
     @property
     def stem(self) -> str:
-        return figures.slug(f"{self.sequence}-{self.split}-{self.method}-{self.seed}")
+        return drawing.slug(f"{self.sequence}-{self.split}-{self.method}-{self.seed}")
 
 
 class Prepared(NamedTuple):
@@ -333,7 +334,7 @@ def _run(cells: list[Cell], config: EvaluationConfig) -> Iterator[tuple[Cell, Fi
                 shared = ray.put(prepared)
                 events = run_in_ray(_job, [(cell, config.weights, shared) for cell in ours], devices[0] != "cpu", config.workers)
             else:
-                file = Path(folder) / f"{figures.slug(sequence)}.pickle"
+                file = Path(folder) / f"{drawing.slug(sequence)}.pickle"
                 file.write_bytes(pickle.dumps(prepared))
                 events = run_in_processes(_job, [(cell, config.weights, file) for cell in ours], devices)
             del prepared
@@ -533,10 +534,10 @@ def _pictures(view: int, image: np.ndarray, depth: np.ndarray, frame: Frame) -> 
         "reference": frame.image,
         "rendered": image,
         "difference": difference(image, frame.image) * (1 if frame.mask is None else (frame.mask > 0)[..., None]),
-        "depth": figures.color_depth(depth, near, far),
+        "depth": drawing.color_depth(depth, near, far),
     }
     if frame.depth is not None:
-        pictures["reference_depth"] = figures.color_depth(frame.depth, near, far)
+        pictures["reference_depth"] = drawing.color_depth(frame.depth, near, far)
     quality = [cv2.IMWRITE_JPEG_QUALITY, 92]
     return {
         f"{view:04d}-{name}": cv2.imencode(".jpg", cv2.cvtColor(picture.astype(np.uint8), cv2.COLOR_RGB2BGR), quality)[1].tobytes()

@@ -9,15 +9,16 @@ import cv2
 import numpy as np
 from rich.progress import Progress as ProgressBar
 
-from endo_sim_ros.cameras import Camera, save_cameras
-from endo_sim_ros.evaluation import figures, metrics
+from endo_sim_ros.core import drawing
+from endo_sim_ros.core.cameras import Camera, save_cameras
+from endo_sim_ros.core.frames import Frame
+from endo_sim_ros.core.gaussians import GaussianModel, save_ply
+from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.evaluation.lpips import Lpips
-from endo_sim_ros.gaussians import GaussianModel, save_ply
 from endo_sim_ros.reconstruction import Progress, ReconstructionConfig, Trainer, scene_points, select_keyframes, shrink
 from endo_sim_ros.reconstruction.triangulation import points_in_view
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.bag import read_bag
-from endo_sim_ros.sequences.frames import Frame
 
 log = logging.getLogger(__name__)
 
@@ -188,9 +189,9 @@ def reconstruct_and_measure(bag: Path, out: Path, config: ReconstructionConfig, 
                 (f"held-out view {index}", frame.image),
                 (f"rendered, {rows[-1]['psnr']:.1f} dB", image),
                 ("difference × 3", difference(image, frame.image)),
-                ("rendered depth", figures.color_depth(depth)),
+                ("rendered depth", drawing.color_depth(depth)),
             ]
-    figures.write_png(out / "held_out.png", figures.sheet(pictures, columns=4))
+    drawing.write_png(out / "held_out.png", drawing.sheet(pictures, columns=4))
     found = mean_figures(rows)
     for name, value in found.items():
         log.info("%-30s %.4g", FIGURES[name].title, value)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from endo_sim_ros.evaluation.figures import slug
+from endo_sim_ros.core.drawing import slug
 
 log = logging.getLogger(__name__)
 

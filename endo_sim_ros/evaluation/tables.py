@@ -14,9 +14,10 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from endo_sim_ros.evaluation import figures, plots
-from endo_sim_ros.evaluation.bench import Row
+from endo_sim_ros.core import drawing
+from endo_sim_ros.evaluation import plots
 from endo_sim_ros.evaluation.held_out import FIGURES, Figure
+from endo_sim_ros.evaluation.measurement import Row
 from endo_sim_ros.evaluation.paper import PRINTED, Printed
 from endo_sim_ros.evaluation.splits import explain_split
 
@@ -256,7 +257,7 @@ def _write_strips(summaries: list[Summary], out: Path) -> None:
                 depth = "no depth to compare with" if images[0] is None else "its depth"
                 labels = [f"view {int(view)}" if kind == "rendered" else depth, *methods]
                 cells += [(label, blank if image is None else image) for label, image in zip(labels, images)]
-        figures.write_png(out / "strips" / f"{figures.slug(f'{sequence}-{split}')}.png", figures.sheet(cells, len(methods) + 1))
+        drawing.write_png(out / "strips" / f"{drawing.slug(f'{sequence}-{split}')}.png", drawing.sheet(cells, len(methods) + 1))
 
 
 def _small(path: Path) -> np.ndarray:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from endo_sim_ros.device import cpu_threads
+from endo_sim_ros.core.device import cpu_threads
 
 Job = Callable[[Any, str, Callable[[Any], None]], Any]  # (argument, device, report) → result
 

@@ -27,10 +27,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from endo_sim_ros import messages
-from endo_sim_ros.cameras import matrix_to_quat
+from endo_sim_ros.core.cameras import matrix_to_quat
+from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.messages import ControlNodeCloud, MessageError, Topic, stamp_to_ns
 from endo_sim_ros.sequences.bag import WORLD_FRAME, BagReader
-from endo_sim_ros.sequences.frames import SequenceError
 
 NEAREST = 8  # control nodes around a tip; averages over them do not jump when one takes another's place
 JAW_OPEN = 1.0  # rad, where no jaw was ever commanded; nothing is held then

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from rich.progress import track
 
+from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.learning.episodes import (
     Episode,
     Sampling,
@@ -27,7 +28,6 @@ from endo_sim_ros.learning.episodes import (
     state_names,
 )
 from endo_sim_ros.sequences.bag import WORLD_FRAME
-from endo_sim_ros.sequences.frames import SequenceError
 
 VERSION = "v3.0"
 IMAGE = "observation.images.endoscope"

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from endo_sim_ros.cameras import Camera, load_cameras, save_cameras
-from endo_sim_ros.gaussians import GaussianModel, ModelError, load_ply, save_ply
+from endo_sim_ros.core.cameras import Camera, load_cameras, save_cameras
+from endo_sim_ros.core.gaussians import GaussianModel, ModelError, load_ply, save_ply
 from endo_sim_ros.learning.tasks import find_task, make_task
 from endo_sim_ros.physics import ControlNodes, PhysicsConfig, build_control_nodes
 
@@ -95,7 +95,7 @@ def default_scene() -> Scene:
         return Scene(load_ply(path), (camera,))
     except ModelError:  # there is none yet, or it was damaged
         pass
-    from endo_sim_ros.evaluation.physics_bench import phantom_scene
+    from benchmarks.physics import phantom_scene
 
     model = phantom_scene(24_000, whole.width).model
     pixels, _ = camera.project(model.means.double().numpy())

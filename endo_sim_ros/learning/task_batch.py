@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from endo_sim_ros.cameras import Camera
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.shading import shade, to_bytes
 from endo_sim_ros.learning.config import Randomisation
 from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.learning.tasks import Outcome, find_task
 from endo_sim_ros.physics import Skinning, TissueBatch
-from endo_sim_ros.pictures import shade, to_bytes
 from endo_sim_ros.rendering import turned_colors
 from endo_sim_ros.splatting import rasterize
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from endo_sim_ros.cameras import interpolate_pose
+from endo_sim_ros.core.cameras import interpolate_pose
 
 _ROUNDED = 1 + 1e-9  # a way that takes a whole number of steps must not take one more
 JAW_AT_START = 1.0  # rad: open until told otherwise

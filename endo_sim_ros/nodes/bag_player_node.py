@@ -9,11 +9,11 @@ from typing import Annotated
 import rclpy
 from rclpy.duration import Duration
 
-from endo_sim_ros.config import Range, StageConfig
+from endo_sim_ros.core.config import Range, StageConfig
+from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.messages import DIAGNOSTICS, MessageError, Topic
 from endo_sim_ros.nodes.base import ERROR, OK, EndoNode, run, sentence
 from endo_sim_ros.sequences.bag import BagReader
-from endo_sim_ros.sequences.frames import SequenceError
 
 _DELIVERED_WITHIN = 10.0  # seconds that subscribers have, at the end, to ask again for what they missed
 _SETTLED = 3.5  # seconds without a new subscriber after which all are there: processes announce themselves every 3

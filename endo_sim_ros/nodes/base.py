@@ -29,14 +29,14 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from endo_sim_ros import hear_interrupts, messages
-from endo_sim_ros.config import ConfigError, StageConfig, options
-from endo_sim_ros.device import pick_device
-from endo_sim_ros.gaussians import ModelError
+from endo_sim_ros.core.config import ConfigError, StageConfig, options
+from endo_sim_ros.core.device import pick_device
+from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.core.gaussians import ModelError
+from endo_sim_ros.graph.processes import end_with_parent
 from endo_sim_ros.messages import ERROR, OK, WARN, MessageError, Topic
 from endo_sim_ros.nodes.executor import NodeExecutor
-from endo_sim_ros.nodes.graph import end_with_parent
 from endo_sim_ros.nodes.transport import prepare_transport
-from endo_sim_ros.sequences.frames import SequenceError
 
 _ERROR_SHOWN = 5.0  # seconds that an error stays on /diagnostics, and that its repetitions are not logged
 _MOST_LOGGED = 10  # different errors logged in that time: one whose text differs at 500 Hz must not flood the log

@@ -3,7 +3,7 @@
 import textwrap
 from collections.abc import Sequence
 
-from endo_sim_ros.config import StageConfig, options
+from endo_sim_ros.core.config import StageConfig, options
 from endo_sim_ros.nodes.bag_player_node import BagPlayerConfig
 from endo_sim_ros.nodes.physics_node import PhysicsNodeConfig
 from endo_sim_ros.nodes.policy_node import PolicyConfig

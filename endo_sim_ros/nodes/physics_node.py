@@ -10,9 +10,9 @@ import numpy as np
 from std_srvs.srv import SetBool, Trigger
 
 from endo_sim_ros import messages
-from endo_sim_ros.cameras import Camera
-from endo_sim_ros.config import ConfigError, Range, StageConfig
-from endo_sim_ros.gaussians import GaussianModel
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.config import ConfigError, Range, StageConfig
+from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.messages import ControlNodeCloud, MessageError
 from endo_sim_ros.nodes.arm import Arm
 from endo_sim_ros.nodes.base import ERROR, OK, STREAM_DEPTH, WARN, Background, EndoNode, WorldConfig, arm_names, run, sentence

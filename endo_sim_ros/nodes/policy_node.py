@@ -9,7 +9,7 @@ import numpy as np
 from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
-from endo_sim_ros.config import ConfigError, Range, StageConfig
+from endo_sim_ros.core.config import ConfigError, Range, StageConfig
 from endo_sim_ros.learning.policies import make_policy
 from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.learning.tasks import find_task, make_task

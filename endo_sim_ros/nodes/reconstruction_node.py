@@ -12,14 +12,14 @@ import torch
 from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
-from endo_sim_ros.cameras import Camera, load_cameras, save_cameras
-from endo_sim_ros.config import Range, StageConfig
-from endo_sim_ros.gaussians import GaussianModel, load_ply, save_ply
+from endo_sim_ros.core.cameras import Camera, load_cameras, save_cameras
+from endo_sim_ros.core.config import Range, StageConfig
+from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.core.gaussians import GaussianModel, load_ply, save_ply
 from endo_sim_ros.messages import Topic
 from endo_sim_ros.nodes.base import ERROR, OK, WARN, EndoNode, WorldConfig, run, sentence
 from endo_sim_ros.reconstruction import Progress, ReconstructionConfig, Trainer, scene_points, select_keyframes
 from endo_sim_ros.sequences.bag import LEFT_FRAME, feed
-from endo_sim_ros.sequences.frames import Frame, SequenceError
 from endo_sim_ros.sequences.synchronizer import Synchronizer
 
 _LEFT_IMAGES = (messages.LEFT_IMAGE, messages.LEFT_COMPRESSED)

@@ -14,12 +14,12 @@ from rich.live import Live
 from rich.text import Text
 
 from endo_sim_ros import messages
-from endo_sim_ros.config import ConfigError, StageConfig
+from endo_sim_ros.core.config import ConfigError, StageConfig
+from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.messages import Topic
 from endo_sim_ros.nodes.base import ERROR, OK, EndoNode, arm_names, quality, run, sentence
 from endo_sim_ros.nodes.transport import prepare_transport
 from endo_sim_ros.sequences.bag import BagWriter, canonical_cdr
-from endo_sim_ros.sequences.frames import SequenceError
 
 _MAX_WAITING = 256_000_000  # bytes that may wait for the disk before new messages are dropped, and counted
 _FLUSH_EVERY = 1.0  # seconds; what was heard longer ago outlives a killed recorder

@@ -8,12 +8,12 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from endo_sim_ros import messages
-from endo_sim_ros.cameras import Camera
-from endo_sim_ros.config import Range, StageConfig
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.config import Range, StageConfig
 from endo_sim_ros.messages import CameraInfo, ControlNodeCloud, MessageError
 from endo_sim_ros.nodes.base import ERROR, OK, STREAM_DEPTH, WARN, EndoNode, WorldConfig, run, sentence
+from endo_sim_ros.nodes.model_tracker import Bound, ShownTissue
 from endo_sim_ros.nodes.pacing import MOST_WAITING, Pacer
-from endo_sim_ros.nodes.shown_tissue import Bound, ShownTissue
 from endo_sim_ros.rendering import RenderingConfig
 from endo_sim_ros.sequences.bag import LEFT_FRAME
 

@@ -6,8 +6,8 @@ from typing import Annotated, Any
 import numpy as np
 
 from endo_sim_ros import messages
-from endo_sim_ros.cameras import Camera, invert_pose
-from endo_sim_ros.config import Range, StageConfig
+from endo_sim_ros.core.cameras import Camera, invert_pose
+from endo_sim_ros.core.config import Range, StageConfig
 from endo_sim_ros.messages import ControlNodeCloud
 from endo_sim_ros.nodes.base import OK, WARN, EndoNode, arm_names, run
 

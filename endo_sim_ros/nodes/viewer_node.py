@@ -11,11 +11,11 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 from std_srvs.srv import SetBool, Trigger
 
 from endo_sim_ros import messages
-from endo_sim_ros.cameras import Camera
-from endo_sim_ros.config import StageConfig
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.config import StageConfig
 from endo_sim_ros.messages import ControlNodeCloud
 from endo_sim_ros.nodes.base import OK, WARN, EndoNode, WorldConfig, arm_names, run
-from endo_sim_ros.nodes.shown_tissue import ShownTissue
+from endo_sim_ros.nodes.model_tracker import ShownTissue
 from endo_sim_ros.rendering import RenderingConfig
 from endo_sim_ros.viewer.config import ViewerConfig
 from endo_sim_ros.viewer.viewer import PARAMETERS, Tool, Viewer, plain_camera

@@ -3,10 +3,10 @@
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes, build_control_nodes, sample_farthest
 from endo_sim_ros.physics.materials import lame_parameters, sound_speed
-from endo_sim_ros.physics.mpm import MpmSolver, StabilityError, plan_substeps
 from endo_sim_ros.physics.regions import TissueProperties
 from endo_sim_ros.physics.simulation import NodeState, TissueBatch, TissueSimulation
 from endo_sim_ros.physics.skinning import Skinning
+from endo_sim_ros.physics.solver import MpmSolver, StabilityError, plan_substeps
 
 __all__ = [
     "ControlNodes",

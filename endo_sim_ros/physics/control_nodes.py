@@ -8,9 +8,9 @@ import torch
 import warp as wp
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
-from endo_sim_ros.cameras import Camera
-from endo_sim_ros.device import init_warp
-from endo_sim_ros.gaussians import GaussianModel
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.device import init_warp
+from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes_kernels import sample_farthest_points
 from endo_sim_ros.splatting import render

@@ -20,8 +20,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from endo_sim_ros.cameras import Camera, load_cameras
-from endo_sim_ros.config import ConfigError
+from endo_sim_ros.core.cameras import Camera, load_cameras
+from endo_sim_ros.core.config import ConfigError
 
 MAX_POISSON_RATIO = 0.49  # as PhysicsConfig has it; at 0.5 the sound speed is infinite
 ASPECT_TOLERANCE = 0.01

@@ -8,14 +8,14 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from endo_sim_ros.cameras import Camera
-from endo_sim_ros.gaussians import GaussianModel
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes, build_control_nodes
 from endo_sim_ros.physics.cutting import Blade, CutStencils
-from endo_sim_ros.physics.mpm import MpmSolver, capturing
 from endo_sim_ros.physics.regions import TissueProperties, paint_regions
 from endo_sim_ros.physics.skinning import Skinning
+from endo_sim_ros.physics.solver import MpmSolver, capturing
 from endo_sim_ros.physics.tools import Tools
 
 MAX_TOOLS = 8  # of a TissueSimulation

@@ -9,12 +9,12 @@ import warp as wp
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from endo_sim_ros.device import init_warp, on_torch_stream, pick_device, run_in_threads, shares
-from endo_sim_ros.gaussians import GaussianModel
+from endo_sim_ros.core.device import init_warp, on_torch_stream, pick_device, run_in_threads, shares
+from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.physics import skinning_cpu_kernels as simd_kernels
 from endo_sim_ros.physics import skinning_kernels as kernels
-from endo_sim_ros.physics import skinning_simd_kernels as simd_kernels
 from endo_sim_ros.physics.cutting import CutNeighbours, clip_to_sides
-from endo_sim_ros.physics.mpm import Launch
+from endo_sim_ros.physics.solver import Launch
 
 STRETCH_RANGE = (0.2, 4.0)  # of a Gaussian; beyond it the picture shows needles or holes, not tissue
 SHARED_FROM = 4096  # Gaussians; fewer are done before a second thread has begun

@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes
-from endo_sim_ros.physics.mpm import Launch, MpmSolver
+from endo_sim_ros.physics.solver import Launch, MpmSolver
 from endo_sim_ros.physics.tools_kernels import Commands, Holds, Reach, load_nodes, measure_reactions, take_hold
 
 # A capsule acts as at least this thick: of the distance between skin nodes, as a thinner one would part them and pass, and of

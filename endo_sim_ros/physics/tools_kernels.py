@@ -7,7 +7,7 @@ matters and a scene metres from the world's origin as accurate as one at it.
 
 import warp as wp
 
-from endo_sim_ros.physics.mpm_kernels import REDUCING, Loads, Nodes, RigidTools, State, block_sum
+from endo_sim_ros.physics.backends.warp_kernels import REDUCING, Loads, Nodes, RigidTools, State, block_sum
 
 wp.set_module_options({"enable_backward": False})
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from endo_sim_ros.config import Range, StageConfig
+from endo_sim_ros.core.config import Range, StageConfig
 
 
 @dataclass(frozen=True)

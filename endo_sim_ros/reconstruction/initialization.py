@@ -8,10 +8,10 @@ import torch
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
-from endo_sim_ros.device import map_in_threads
-from endo_sim_ros.gaussians import GaussianModel
+from endo_sim_ros.core.device import map_in_threads
+from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
-from endo_sim_ros.sequences.frames import Frame, SequenceError
 
 _OPACITY = 0.5
 _STEEPEST = 2.0  # slope of a surface across the line of sight, beyond which a point near it floats in front of it

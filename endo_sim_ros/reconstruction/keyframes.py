@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from endo_sim_ros.sequences.frames import Frame
+from endo_sim_ros.core.frames import Frame
 
 
 def select_keyframes(frames: list[Frame], count: int, scene_depth: float = 0.1) -> list[int]:

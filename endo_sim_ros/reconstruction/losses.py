@@ -10,10 +10,10 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from endo_sim_ros.device import init_warp, warp_stream
-from endo_sim_ros.gaussians import GaussianModel
+from endo_sim_ros.core.device import init_warp, warp_stream
+from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.reconstruction import losses_kernels as kernels
-from endo_sim_ros.splatting.launching import kernel_arguments
+from endo_sim_ros.splatting.backend import kernel_arguments
 
 _C1, _C2 = kernels.C1, kernels.C2
 _FAINT = 1e-3  # alpha, below which a pixel has no depth of its own

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import torch
 
-from endo_sim_ros.gaussians import SH_C0, GaussianModel
-from endo_sim_ros.light import Light, features_at
-from endo_sim_ros.sequences.frames import Frame
+from endo_sim_ros.core.frames import Frame
+from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
+from endo_sim_ros.core.light import Light, features_at
 
 PRIOR = np.array([0.9, 3.0, 0.0, 0.0])  # distance, angle, tilt: the inverse-square law at a gamma of 2.2, a usual spot
 _PRIOR_SPREAD = np.array([0.3, 6.0, 0.3, 0.3])

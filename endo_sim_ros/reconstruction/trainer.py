@@ -16,23 +16,24 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from endo_sim_ros.cameras import Camera, interpolate_pose
-from endo_sim_ros.device import pick_device
-from endo_sim_ros.gaussians import GaussianModel
-from endo_sim_ros.light import Light, directions, falloff, features, log_brightness
-from endo_sim_ros.reconstruction import densification, losses, photometry
-from endo_sim_ros.reconstruction.agreement import agreed
+from endo_sim_ros.core.cameras import Camera, interpolate_pose
+from endo_sim_ros.core.device import pick_device
+from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.core.light import Light, directions, falloff, features, log_brightness
+from endo_sim_ros.reconstruction import losses, photometry
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
-from endo_sim_ros.reconstruction.depth import depth_source, right_view, with_depth_prior
+from endo_sim_ros.reconstruction.dynamic_mask import without_motion
 from endo_sim_ros.reconstruction.initialization import initial_model
-from endo_sim_ros.reconstruction.motion import without_motion
 from endo_sim_ros.reconstruction.optimizer import Adam
 from endo_sim_ros.reconstruction.presets import resolved
-from endo_sim_ros.reconstruction.surroundings import with_surroundings
+from endo_sim_ros.reconstruction.priors.extrapolation import with_surroundings
+from endo_sim_ros.reconstruction.priors.multi_view import agreed
+from endo_sim_ros.reconstruction.priors.sources import depth_source, right_view, with_depth_prior
+from endo_sim_ros.reconstruction.strategies import mcmc
 from endo_sim_ros.reconstruction.triangulation import ScenePoints, match_features, misposed, triangulate
-from endo_sim_ros.sequences.frames import Frame, SequenceError
 from endo_sim_ros.splatting import RenderOutput, rasterize
-from endo_sim_ros.splatting.recording import Recording
+from endo_sim_ros.splatting.graph_capture import Recording
 
 log = logging.getLogger(__name__)
 
@@ -495,14 +496,14 @@ class Trainer:
         """Relocate and add Gaussians, carrying the optimiser's state of those that stay."""
         config, model = self.config, self._detached()
         if config.densification == "mcmc":
-            model, source, fresh = densification.refine(model, config.growth, config.max_gaussians, self._generator)
+            model, source, fresh = mcmc.refine(model, config.growth, config.max_gaussians, self._generator)
         else:
             total, count = self._gradients
-            model, source, fresh = densification.split_and_clone(
+            model, source, fresh = mcmc.split_and_clone(
                 model, total / count.clamp_min(1), self.scene_depth, config.max_gaussians, self._generator
             )
             if config.densification == "proximity":
-                model, others, added = densification.unpool(model, config.max_gaussians)
+                model, others, added = mcmc.unpool(model, config.max_gaussians)
                 source, fresh = source[others], fresh[others] | added
         states = self._optimizer.state
         self._set_model(model)
@@ -516,13 +517,13 @@ class Trainer:
         """Move faint Gaussians about at random."""
         model, faint = self._current(), slice(None)
         if self.device == "cpu":  # a GPU is sooner done with all than it has told how many they are
-            faint = (model.opacities < 10 * densification.DEAD_OPACITY).nonzero()[:, 0]
+            faint = (model.opacities < 10 * mcmc.DEAD_OPACITY).nonzero()[:, 0]
             if not len(faint):
                 return
             model = model.select(faint)
         # Variances are in m²: divided by the squared depth of the scene, steps are those of a scene of depth 1.
         scale = _SELDOM**0.5 * _NOISE * self._step_size / self.scene_depth**2
-        self._parameters["means"][faint] += densification.exploration_noise(model, scale, self._noise)
+        self._parameters["means"][faint] += mcmc.exploration_noise(model, scale, self._noise)
 
     # --------------------------------------------------------------- inputs
 

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from endo_sim_ros.cameras import Camera
-from endo_sim_ros.device import map_in_threads
-from endo_sim_ros.sequences.frames import Frame
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.device import map_in_threads
+from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.sequences.recordings import spread
 
 log = logging.getLogger(__name__)

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from endo_sim_ros.cameras import Camera
-from endo_sim_ros.sequences.frames import Frame, SequenceError
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.recordings import (
     DEFAULT_FPS,
     Recording,

@@ -19,11 +19,11 @@ import cv2
 import numpy as np
 import warp as wp
 
-from endo_sim_ros.cameras import Camera
-from endo_sim_ros.config import Range, StageConfig
-from endo_sim_ros.device import cpu_threads, init_warp
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.config import Range, StageConfig
+from endo_sim_ros.core.device import cpu_threads, init_warp
+from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.sequences import phantom_kernels as kernels
-from endo_sim_ros.sequences.frames import Frame
 
 
 @dataclass(frozen=True)

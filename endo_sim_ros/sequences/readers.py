@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences import endonerf, folder, scared, stereomis
 from endo_sim_ros.sequences.endonerf import read_endonerf
 from endo_sim_ros.sequences.folder import read_folder
-from endo_sim_ros.sequences.frames import Frame, SequenceError
 from endo_sim_ros.sequences.recordings import VIDEO_SUFFIXES
 from endo_sim_ros.sequences.scared import read_scared
 from endo_sim_ros.sequences.stereomis import read_stereomis

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import yaml
 
-from endo_sim_ros.cameras import make_pose
-from endo_sim_ros.sequences.frames import Frame, SequenceError
+from endo_sim_ros.core.cameras import make_pose
+from endo_sim_ros.core.frames import Frame, SequenceError
 
 logger = logging.getLogger(__name__)
 

@@ -1,7 +1,7 @@
 """Undistortion and stereo rectification.
 
 Calibrations on the way in follow OpenCV (pixel (0, 0) has its centre at (0, 0)); the rectified K on the way out
-follows `endo_sim_ros.cameras` (centre at (0.5, 0.5)).
+follows `endo_sim_ros.core.cameras` (centre at (0.5, 0.5)).
 """
 
 import dataclasses
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from endo_sim_ros.sequences.frames import SequenceError
+from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.sequences.recordings import clean_depth
 
 logger = logging.getLogger(__name__)

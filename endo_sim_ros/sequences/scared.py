@@ -25,8 +25,8 @@ import cv2
 import numpy as np
 import tifffile
 
-from endo_sim_ros.cameras import Camera, invert_pose
-from endo_sim_ros.sequences.frames import Frame, SequenceError
+from endo_sim_ros.core.cameras import Camera, invert_pose
+from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.recordings import (
     DEFAULT_FPS,
     Recording,

@@ -12,8 +12,8 @@ from pathlib import Path
 import cv2  # before pycolmap, whose own image library would otherwise break cv2.imwrite
 import numpy as np
 
-from endo_sim_ros.cameras import invert_pose
-from endo_sim_ros.sequences.frames import Frame, SequenceError
+from endo_sim_ros.core.cameras import invert_pose
+from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.recordings import Recording
 
 logger = logging.getLogger(__name__)

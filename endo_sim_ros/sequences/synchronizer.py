@@ -6,9 +6,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from endo_sim_ros.cameras import Camera
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.messages import CameraInfo
-from endo_sim_ros.sequences.frames import Frame, SequenceError
 
 STREAMS = ("image", "pose", "right", "depth", "mask")
 LAG = 2  # images to wait for streams that are just starting

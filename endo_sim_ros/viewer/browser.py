@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import cv2
 import numpy as np
 
-from endo_sim_ros.cameras import Camera, make_pose
-from endo_sim_ros.evaluation.figures import draw_points, write_video
+from endo_sim_ros.core.cameras import Camera, make_pose
+from endo_sim_ros.core.drawing import draw_points, write_video
 
 if TYPE_CHECKING:
     from endo_sim_ros.viewer.viewer import Viewer

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from endo_sim_ros.cameras import Camera, load_cameras, look_at
-from endo_sim_ros.gaussians import GaussianModel, load_ply
+from endo_sim_ros.core.cameras import Camera, load_cameras, look_at
+from endo_sim_ros.core.gaussians import GaussianModel, load_ply
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.viewer.config import ViewerConfig

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 import torch
 
-from endo_sim_ros.cameras import Camera
-from endo_sim_ros.config import ConfigError
-from endo_sim_ros.evaluation.figures import draw_force
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.core.drawing import draw_force
 from endo_sim_ros.physics import PhysicsConfig
 from endo_sim_ros.physics.stress import von_mises
 from endo_sim_ros.rendering import DeformableRenderer

@@ -1,0 +1,58 @@
+"""How fast the environments are: `endo-sim bench environments`."""
+
+from pathlib import Path
+
+import numpy as np
+
+from endo_sim_ros.core.device import pick_device
+from endo_sim_ros.evaluation.measurement import Row, machine, median_seconds, report
+from endo_sim_ros.learning.scenes import Scene, load_scene
+from endo_sim_ros.learning.task_batch import TaskBatch
+from endo_sim_ros.learning.train import single_threaded_torch
+
+_STEPS = 25  # of random actions in one measurement
+
+
+def bench_environments(
+    json_file: Path | None, task: str = "retraction", environments: tuple[int, ...] = (1, 64), device: str = "auto", repeats: int = 5
+) -> None:
+    """Print, and if asked for write, how many steps per second the environments take together.
+
+    Args:
+        json_file: Where to write the rows.
+        task: Name of the task.
+        environments: Numbers of environments stepped together.
+        device: Compute device.
+        repeats: Measurements, of which the median counts.
+
+    Raises:
+        ValueError: If a number of environments is not positive, or there is none.
+    """
+    if not environments or min(environments) < 1:
+        raise ValueError(f"give numbers of environments of at least 1, got {' '.join(map(str, environments)) or 'none'}")
+    device, scene, rows = pick_device(device), load_scene(), []
+    with single_threaded_torch():
+        for observations in ("state", "image"):
+            rates = [_rate(task, scene, count, observations, device, repeats) for count in environments]
+            peer = f"{environments[0]} environment{'s' * (environments[0] > 1)}"
+            for count, rate in zip(environments, rates):
+                first = count == environments[0]
+                name = f"{observations} observations, {count} environment{'s' * (count > 1)}"
+                rows.append(Row(name, rate, "steps/s", None if first else rate / rates[0], None if first else peer))
+    report(f"Environments: {task} on {machine(device)}", rows, json_file)
+
+
+def _rate(task: str, scene: Scene, count: int, observations: str, device: str, repeats: int) -> float:
+    """Steps per second of all environments together, the tools at work in the tissue."""
+    batch, rng = TaskBatch(task, scene, count, observations, device=device), np.random.default_rng(0)
+    everyone = range(count)
+
+    def episode() -> None:
+        batch.reset(everyone, [np.random.default_rng(b) for b in everyone])
+        batch.task.tip[:] = 0  # at the tissue
+        for _ in range(_STEPS):
+            actions = rng.uniform(-1, 1, (count, 4))
+            actions[:, 3] = 1 if task == "retraction" else -1
+            batch.step(actions)
+
+    return count * _STEPS / median_seconds(episode, repeats, device, warm_up=1)

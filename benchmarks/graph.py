@@ -1,0 +1,310 @@
+"""How fast the graph answers, wrench in to image out over DDS, each node in a process of its own; and how soon it does so
+again when a node was killed."""
+
+import os
+import signal
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import rclpy
+import torch
+from rclpy.executors import SingleThreadedExecutor
+from rich.progress import track
+
+from endo_sim_ros import messages
+from endo_sim_ros.core.cameras import Camera, save_cameras
+from endo_sim_ros.core.gaussians import GaussianModel, save_ply
+from endo_sim_ros.evaluation.measurement import Row, machine, report
+from endo_sim_ros.graph.processes import NodeGroup
+from endo_sim_ros.nodes.base import EndoNode
+from endo_sim_ros.physics.config import PhysicsConfig
+from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
+
+ARM = "PSM1"
+_WORLD = "world"
+_PATIENCE = 60.0  # seconds that anything may take
+_FORCE = 2.0  # N, towards the camera
+CHANGED = 60  # grey levels by which a picture must differ to show that the tissue moved; creeping tissue differs by 1-5
+_HOLD = 0.6  # seconds between one change of the force and the next
+_LIMIT = 50.0  # ms; what latencies are compared with
+
+
+class Client(EndoNode):
+    """A teleoperation stack: sends poses and wrenches of a tool, sees images."""
+
+    def __init__(self):
+        super().__init__("bench")
+        self.statuses: dict[str, tuple[int, str, dict[str, str]]] = {}
+        self.images: list[tuple[float, int, np.ndarray]] = []  # time of arrival, stamp, pixels
+        self.states: list[tuple[float, int]] = []  # time of arrival and stamp of control_nodes
+        self._state: Any = None  # the newest control_nodes
+        self._senders: dict[messages.Topic, Any] = {}
+        self.subscribe(messages.DIAGNOSTICS, self._on_diagnostics)
+        self.subscribe(messages.RENDERED_IMAGE, self._on_image)
+        self.subscribe(messages.CONTROL_NODES, self._on_state)
+        self._spinner = SingleThreadedExecutor()
+        self._spinner.add_node(self)
+
+    def _on_diagnostics(self, message: Any) -> None:
+        for name, *status in messages.decode_diagnostics(message):
+            self.statuses[name] = tuple(status)
+
+    def _on_image(self, message: Any) -> None:
+        stamp = messages.stamp_to_ns(message.header.stamp)
+        self.images.append((time.perf_counter(), stamp, messages.decode_image(message)))
+
+    def _on_state(self, message: Any) -> None:
+        self.states.append((time.perf_counter(), messages.stamp_to_ns(message.header.stamp)))
+        self._state = message
+
+    @property
+    def model_stamp(self) -> int:
+        """Stamp of the model of the newest control nodes, ns."""
+        return messages.decode_control_nodes(self._state).model_stamp_ns
+
+    def send(self, topic: messages.Topic, message: Any) -> None:
+        if topic not in self._senders:
+            publisher = self._senders[topic] = self.publisher(topic)
+            self.until(publisher.get_subscription_count, f"a subscriber of {topic.name}")
+        self._senders[topic].publish(message)
+
+    def command(self, tip: np.ndarray, force: np.ndarray, stamp: int) -> None:
+        pose = np.eye(4)
+        pose[:3, 3] = tip
+        self.send(messages.tool_pose(ARM), messages.encode_pose(pose, stamp, _WORLD))
+        self.send(messages.tool_wrench(ARM), messages.encode_wrench(force, np.zeros(3), stamp, _WORLD))
+
+    def until(self, done: Callable[[], Any], what: str, seconds: float = _PATIENCE) -> None:
+        deadline = time.monotonic() + seconds
+        while not done():
+            self._spinner.spin_once(timeout_sec=0.005)
+            if time.monotonic() > deadline:
+                raise RuntimeError(f"bench graph: waited {seconds:.0f} s in vain for {what}; the nodes said {self.statuses}")
+
+    def spin_until(self, moment: float) -> None:
+        while (left := moment - time.perf_counter()) > 0:
+            self._spinner.spin_once(timeout_sec=left)
+
+    def value(self, node: str, key: str) -> float:
+        return float(self.statuses[node][2][key])
+
+
+class Scene(NamedTuple):
+    """What is touched."""
+
+    model: GaussianModel
+    camera: Camera
+    tip: np.ndarray  # [3] m, world: tissue in the middle of the picture
+
+    @property
+    def towards_camera(self) -> np.ndarray:
+        offset = self.camera.position - self.tip
+        return offset / np.linalg.norm(offset)
+
+
+def tissue(gaussians: int, width: int, height: int) -> Scene:
+    """The synthetic patient as so many Gaussians."""
+    (frame,) = phantom_sequence(PhantomConfig(frames=1, width=width, height=height, stereo=False))
+    points, seen = frame.camera.backproject(frame.depth), frame.depth > 0
+    rng = np.random.default_rng(0)
+    chosen = rng.choice(np.flatnonzero(seen), gaussians, replace=gaussians > seen.sum())
+    radii = frame.depth.ravel()[chosen] / frame.camera.K[0, 0] * 0.5 * np.sqrt(seen.sum() / gaussians)
+    model = GaussianModel.from_points(
+        torch.from_numpy(points.reshape(-1, 3)[chosen]).float(),
+        torch.from_numpy(frame.image.reshape(-1, 3)[chosen] / 255.0).float(),
+        torch.from_numpy(radii).float(),
+        opacity=0.9,
+    )
+    return Scene(model, frame.camera, points[height // 2, width // 2])
+
+
+def _parameters(mode: str, rate: float, device: str) -> dict[str, dict[str, Any]]:
+    """What the nodes under test are started with."""
+    common = {"mode": mode, "device": device}
+    step = {"substep_dt": 1 / (PhysicsConfig.substeps * rate)}  # as many steps per second as images
+    return {"physics_node": {**common, **step, "arms": [ARM]}, "rendering_node": {**common, "rate": rate}}
+
+
+@contextmanager
+def _graph(mode: str, scene: Scene, rate: float, device: str, logs: Path) -> Iterator[tuple[Client, NodeGroup]]:
+    """Physics and rendering, each its own process, with a model and a camera, and a client that saw the first image."""
+    model, camera, _ = scene
+    with NodeGroup(logs) as group:
+        os.environ.update(group.environment)  # this process joins the same graph
+        rclpy.init()
+        client = Client()
+        try:
+            nodes = _parameters(mode, rate, device)
+            for node, parameters in nodes.items():
+                group.start(node, **parameters)
+            for node in nodes:
+                client.until(lambda: node in client.statuses, node)
+            info = messages.encode_camera_info(camera.K, camera.width, camera.height, 1, "endoscope_left")
+            client.send(messages.LEFT_INFO, info)
+            client.send(messages.CAMERA_POSE, messages.encode_pose(camera.pose, 1, _WORLD))
+            client.send(messages.TRAINING_CAMERA_INFO, info)  # latched like those below, for nodes that start again
+            client.send(messages.TRAINING_CAMERAS, messages.encode_poses([camera.pose], 1, _WORLD))
+            client.send(messages.GAUSSIANS, messages.encode_gaussians(model, 1, _WORLD))
+            following = lambda: client.statuses["rendering_node"][2].get("following control nodes") == "True"  # noqa: E731
+            client.until(lambda: client.images and following(), "the first image of the deformable tissue")
+            yield client, group
+        finally:
+            client.destroy_node()
+            rclpy.try_shutdown()
+
+
+def _realtime(client: Client, scene: Scene, rate: float, changes: int) -> list[Row]:
+    """Latency from a wrench that changes to the first image that shows it, while commands stream."""
+    client.until(lambda: "skipped steps" in client.statuses["physics_node"][2], "the first steps")
+    client.command(scene.tip, np.zeros(3), client.now_ns())  # what comes before all are connected arrives late
+    client.spin_until(time.perf_counter() + 1.0)
+    latencies, began = [], time.perf_counter()
+    skipped, first_state = client.value("physics_node", "skipped steps"), len(client.states)
+    pulling, due = False, began
+    rng = np.random.default_rng(0)
+    for _ in track(range(changes), description="real time"):
+        end = due + _HOLD + rng.uniform(0, 1 / rate)
+        sent, before = None, None
+        while due < end:
+            client.spin_until(due)
+            if sent is None:
+                pulling = not pulling
+                before, sent = client.images[-1][2].astype(np.int16), time.perf_counter()
+            client.command(scene.tip, _FORCE * pulling * scene.towards_camera, client.now_ns())
+            due += 1 / rate
+        shown = (t for t, _, image in client.images if t > sent and np.abs(image - before).max() > CHANGED)
+        latencies.append(1e3 * (next(shown, np.inf) - sent))
+        del client.images[:-1]
+    client.spin_until(time.perf_counter() + 1.5)  # for the last word of the nodes
+    elapsed = client.states[-1][0] - client.states[first_state][0]
+    states = len(client.states) - 1 - first_state
+    skipped = client.value("physics_node", "skipped steps") - skipped
+    missed = sum(not np.isfinite(value) for value in latencies)
+    return [
+        *_latency_rows(f"wrench to image, {rate:g} Hz", latencies),
+        Row("wrench changes never seen", missed, "of " + str(changes)),
+        Row("states received per second", states / elapsed, "1/s"),
+        Row("steps skipped", skipped, f"of {states + skipped:.0f}"),
+        Row("real-time factor", client.value("physics_node", "real-time factor"), ""),
+        Row("time of a step", client.value("physics_node", "milliseconds per step"), "ms"),
+        Row("time of an image", client.value("rendering_node", "milliseconds per image"), "ms"),
+    ]
+
+
+def _in_lockstep(client: Client, scene: Scene, commands: int) -> list[Row]:
+    """Latency from a command to its image, each sent when the last was answered."""
+    latencies, began = [], time.perf_counter()
+    first = len(client.states)
+    for k in track(range(1, commands + 1), description="lockstep"):
+        stamp, sent = 1 + k * 40_000_000, time.perf_counter()
+        client.command(scene.tip, _FORCE * np.sin(0.2 * k) * scene.towards_camera, stamp)
+        client.until(lambda: client.images[-1][1] == stamp, f"the image of command {k}", 10.0)
+        latencies.append(1e3 * (client.images[-1][0] - sent))
+        del client.images[:-1]
+    rate = commands / (time.perf_counter() - began)
+    lost = commands - len({stamp for _, stamp in client.states[first:]})
+    return [
+        *_latency_rows("command to image, lockstep", latencies),
+        Row("commands per second, lockstep", rate, "1/s"),
+        Row("steps lost, lockstep", lost, f"of {commands}"),
+    ]
+
+
+def _recovery(client: Client, group: NodeGroup, scene: Scene, rate: float, device: str, kills: int) -> list[Row]:
+    """Time from the death of a node, which is started again at once, to pictures that move with the tissue again."""
+    with tempfile.TemporaryDirectory() as folder:
+        save_ply(scene.model, Path(folder) / "model.ply")
+        save_cameras([scene.camera], Path(folder) / "cameras.json")
+        model_file = {"reconstruction_node": {"model_file": Path(folder) / "model.ply", "output_dir": folder}}
+        nodes = _parameters("realtime", rate, device) | model_file  # this last: from then on its model is the newest
+        group.start("reconstruction_node", output_dir=folder)
+        client.until(lambda: "reconstruction_node" in client.statuses, "reconstruction_node")
+        rows = []
+        for node, parameters in nodes.items():
+            seconds = []
+            for _ in track(range(kills), description=f"{node} killed"):
+                model = client.model_stamp
+                group.nodes[node].send_signal(signal.SIGKILL)
+                group.nodes[node].wait()
+                began = time.perf_counter()
+                group.start(node, **parameters)
+                client.spin_until(began + 0.2)  # what was on its way already does not count
+                if node in model_file:
+                    client.until(lambda: client.model_stamp > model, "control nodes of the model file")
+                seconds.append(_until_pictures_move(client, scene, rate) - began)
+            rows.append(Row(f"{node} killed: pictures move again after", float(np.median(seconds)), "s"))
+            rows.append(Row(f"{node} killed: at the latest after", max(seconds), "s"))
+    return rows
+
+
+def _until_pictures_move(client: Client, scene: Scene, rate: float) -> float:
+    """Pull and let go in turn until two pictures differ, and return when the second came."""
+    images = client.images
+    images.clear()
+    began = time.perf_counter()
+
+    def moved() -> bool:
+        del images[1:-1]
+        return len(images) > 1 and np.abs(images[-1][2].astype(np.int16) - images[0][2]).max() > CHANGED
+
+    while not moved():
+        now = time.perf_counter()
+        if now - began > _PATIENCE:
+            raise RuntimeError(f"bench graph: no picture moved within {_PATIENCE:.0f} s; the nodes said {client.statuses}")
+        pulling = int((now - began) / _HOLD) % 2 == 0
+        client.command(scene.tip, _FORCE * pulling * scene.towards_camera, client.now_ns())
+        client.spin_until(now + 1 / rate)
+    return images[-1][0]
+
+
+def _latency_rows(name: str, milliseconds: list[float]) -> list[Row]:
+    values = np.percentile(milliseconds, [50, 99], method="higher")
+    peer = f"a limit of {_LIMIT:g} ms"
+    return [Row(f"{name}, {label}", float(v), "ms", float(v) / _LIMIT, peer) for label, v in zip(("p50", "p99"), values)]
+
+
+def bench_graph(
+    json_file: Path | None,
+    gaussians: int = 30_000,
+    width: int = 640,
+    height: int = 512,
+    rate: float = 25.0,
+    changes: int = 60,
+    commands: int = 200,
+    device: str = "auto",
+    kills: int = 3,
+) -> None:
+    """Run the graph in real time and in lockstep, print the results and write them to a file.
+
+    Args:
+        json_file: Where to write the rows.
+        gaussians: Size of the model.
+        width, height: Size of the images, pixels.
+        rate: Commands and images per second, Hz.
+        changes: Changes of the wrench in real time whose way to the image is timed.
+        commands: Commands in lockstep.
+        device: Compute device.
+        kills: Deaths of each node whose recovery is timed.
+
+    Raises:
+        RuntimeError: If a node does not answer.
+    """
+    scene = tissue(gaussians, width, height)
+    rows = []
+    with tempfile.TemporaryDirectory() as logs:
+        with _graph("realtime", scene, rate, device, Path(logs)) as (client, group):
+            rows += _realtime(client, scene, rate, changes)
+            if kills:
+                rows += _recovery(client, group, scene, rate, device, kills)
+        with _graph("lockstep", scene, rate, device, Path(logs)) as (client, _):
+            rows += _in_lockstep(client, scene, commands)
+    report(f"graph, {gaussians} Gaussians, {width}×{height}, {machine(device if device != 'auto' else _device())}", rows, json_file)
+
+
+def _device() -> str:
+    return "cuda" if torch.cuda.is_available() else "cpu"

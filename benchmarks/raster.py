@@ -1,0 +1,277 @@
+"""Speed, memory and precision of the rasteriser on this machine, beside its peers: `endo-sim bench raster`."""
+
+import dataclasses
+import importlib.util
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from rich.progress import Progress
+from torch import Tensor
+
+from endo_sim_ros.core.device import pick_device
+from endo_sim_ros.evaluation.measurement import Row, machine, milliseconds, peak_megabytes, report, short
+from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer
+from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
+from endo_sim_ros.splatting import RenderOutput, _rasterize, api, rasterize
+
+DEPTH = 1.0  # of the scene's centre, metres: some peers do not draw what is nearer than 0.2
+
+
+class Plan(NamedTuple):
+    """What to measure; smaller in tests."""
+
+    counts: tuple[int, ...] = (30_000, 100_000, 300_000)
+    sizes: tuple[tuple[int, int], ...] = ((640, 512), (1280, 1024))
+    curve_counts: tuple[int, ...] = (1_000, 10_000, 100_000, 1_000_000)
+    curve_sizes: tuple[tuple[int, int], ...] = ((80, 64), (160, 128), (320, 256), (640, 512), (1280, 1024))
+    overlaps: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)
+    reference: tuple[int, int, int] = (1000, 96, 80)  # Gaussians, width, height
+    training: tuple[int, int, int] = (30_000, 320, 256)
+    seconds: float = 0.5  # for one median
+
+
+class Scene(NamedTuple):
+    """Arguments of a rasteriser."""
+
+    gaussians: list[Tensor]  # means, quats, scales, opacities, sh
+    viewmats: Tensor
+    Ks: Tensor
+    width: int
+    height: int
+
+
+def tissue(count: int, width: int, height: int, device: str = "cpu", overlap: float = 1.0) -> Scene:
+    """A curved sheet of flat random Gaussians that fills the image; float32.
+
+    Standard deviations along the sheet are about `overlap` times the distance between neighbours, so that a pixel sees
+    about 25 overlap² Gaussians.
+    """
+    generator = torch.Generator().manual_seed(0)
+    normal = lambda *shape: torch.randn(*shape, generator=generator)
+    focal = 0.94 * width  # pixels
+    extent = 1.05 * DEPTH / focal * torch.tensor([width, height])  # a little more than is seen, metres
+    xy = (torch.rand(count, 2, generator=generator) - 0.5) * extent
+    z = DEPTH + 0.5 / DEPTH * (xy**2).sum(1, keepdim=True) + 0.004 * DEPTH * normal(count, 1)
+    spacing = math.sqrt(float(extent.prod()) / count)
+    gaussians = [
+        torch.cat([xy * z / DEPTH, z], 1),
+        torch.cat([torch.ones(count, 1), 0.3 * normal(count, 3)], 1),
+        overlap * spacing * (0.3 * normal(count, 3)).exp() * torch.tensor([1.0, 1.0, 0.3]),
+        (1.5 * normal(count) + 0.5).sigmoid(),
+        0.6 * normal(count, 1, 3),
+    ]
+    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    return Scene([x.to(device) for x in gaussians], torch.eye(4, device=device)[None], K[None].to(device), width, height)
+
+
+def bench_raster(device: str, json_file: Path | None = None, plan: Plan = Plan()) -> None:
+    """Print the results on a device (see `pick_device`) and, if asked for, write them to a file.
+
+    Times are medians in milliseconds. "Forward" is colour, depth, alpha and distortion without gradients; "backward" the
+    gradients of means, quaternions, scales, opacities and colours from all of these. Peers compute colour and depth.
+    """
+    device = pick_device(device)
+    named = lambda count, size: f"{short(count)} {size[0]}x{size[1]}"
+    stages: list[tuple[str, Callable[[], list[Row]]]] = []
+    for size in plan.sizes:
+        for count in plan.counts:
+            stages.append((named(count, size), partial(_speed, named(count, size), count, size, device, plan.seconds)))
+    count, *size = plan.reference
+    stages.append(("torch reference", partial(_against_reference, named(count, size), count, size, device, plan.seconds)))
+    stages.append(("precision", partial(_precision, count, size, device)))
+    size, count = plan.sizes[0], plan.counts[0]
+    for n in plan.curve_counts:
+        stages.append(("time and Gaussians", partial(_curve, "over Gaussians", n, size, 1.0, device, plan.seconds)))
+    for s in plan.curve_sizes:
+        stages.append(("time and pixels", partial(_curve, "over pixels", count, s, 1.0, device, plan.seconds)))
+    for overlap in plan.overlaps:
+        stages.append(("time and overlap", partial(_curve, "over overlap", count, size, overlap, device, plan.seconds)))
+    stages.append(("training", partial(_training, *plan.training, device, plan.seconds)))
+    rows, threads = [], torch.get_num_threads()
+    torch.set_num_threads(1)  # as in the nodes: on a CPU the kernels bring their own threads
+    try:
+        with Progress(transient=True) as bar:
+            task = bar.add_task("", total=len(stages))
+            for name, stage in stages:
+                bar.update(task, description=name)
+                rows += stage()
+                bar.advance(task)
+    finally:
+        torch.set_num_threads(threads)
+    report(f"Rasteriser on {machine(device)}", rows, json_file)
+
+
+# ---------------------------------------------------------------- what is measured
+
+
+# What draws a scene: given its Gaussians, returns images, colours [1, H, W, 3] first. Made before time is taken.
+Draw = Callable[[list[Tensor]], Sequence[Tensor]]
+
+
+def _ours(scene: Scene) -> Draw:
+    return lambda gaussians: rasterize(*gaussians, *scene[1:])[:4]
+
+
+def _speed(name: str, count: int, size: tuple[int, int], device: str, seconds: float) -> list[Row]:
+    """Time forward, time forward and backward, and memory of the latter, each beside the peers that are there."""
+    scene = tissue(count, *size, device)
+    peers = {peer: prepare(scene) for peer, prepare in _peers(device).items()}
+    rows = _compare(name, scene, peers, device, seconds)
+    peaks = [peak_megabytes(_forward_and_backward(draw, scene), device) for draw in peers.values() if device != "cpu"]
+    ours = peak_megabytes(_forward_and_backward(_ours(scene), scene), device)
+    if ours is not None:
+        others = zip(peers, peaks) if peaks else [(None, None)]
+        rows += [Row(f"{name} peak memory", ours, "MB", ours / peak if peak else None, peer) for peer, peak in others]
+    return rows
+
+
+def _compare(name: str, scene: Scene, peers: dict[str, Draw], device: str, seconds: float) -> list[Row]:
+    """Our times, once for each peer, with the ratio to it, and how far its picture is from ours."""
+    draws = [_ours(scene), *peers.values()]
+    with torch.no_grad():
+        ours, *theirs = [draw(scene.gaussians)[0] for draw in draws]
+    rows = [Row(f"{name} mean colour difference", float((ours - x).abs().mean()), "", None, peer) for peer, x in zip(peers, theirs)]
+    for what, action in (("forward", _forward), ("forward + backward", _forward_and_backward)):
+        ours, *theirs = milliseconds([action(draw, scene) for draw in draws], device, seconds)
+        rows += [Row(f"{name} {what}", ours, "ms", ours / value, peer) for peer, value in zip(peers, theirs)]
+        if not peers:
+            rows.append(Row(f"{name} {what}", ours, "ms"))
+    return rows
+
+
+def _forward(draw: Draw, scene: Scene) -> Callable[[], object]:
+    """An action that draws a scene without gradients."""
+    return lambda: torch.no_grad()(draw)(scene.gaussians)
+
+
+def _forward_and_backward(draw: Draw, scene: Scene) -> Callable[[], object]:
+    """An action that draws a scene and computes gradients for fixed random gradients of its images."""
+    leaves = [x.detach().requires_grad_() for x in scene.gaussians]
+    differentiable = lambda: [image for image in draw(leaves) if image.requires_grad]
+    generator = torch.Generator().manual_seed(1)
+    cotangents = [torch.randn(image.shape, generator=generator).to(image) for image in differentiable()]
+    return lambda: torch.autograd.grad(differentiable(), leaves, cotangents)
+
+
+def _against_reference(name: str, count: int, size: tuple[int, int], device: str, seconds: float) -> list[Row]:
+    """The same small scene by the kernels and by plain torch, both float32."""
+    scene = tissue(count, *size, device)
+    return _compare(name, scene, {"torch reference": lambda gaussians: _rasterize(*gaussians, *scene[1:])[:4]}, device, seconds)
+
+
+def _precision(count: int, size: tuple[int, int], device: str) -> list[Row]:
+    """Errors relative to the largest value, of images and gradients, against the float64 reference on the CPU."""
+    scene = tissue(count, *size)
+    results = []
+    for function, where, dtype in ((rasterize, device, torch.float32), (_rasterize, "cpu", torch.float64)):
+        leaves = [x.detach().to(where, dtype).requires_grad_() for x in (*scene.gaussians, scene.viewmats)]
+        absgrad = torch.zeros(1, count, 2, dtype=dtype, device=where, requires_grad=True)
+        images = function(*leaves, scene.Ks.to(where, dtype), *size, absgrad=absgrad)[:4]
+        generator = torch.Generator().manual_seed(1)
+        cotangents = [torch.randn(image.shape, generator=generator).to(image) for image in images]
+        gradients = torch.autograd.grad(images, [*leaves, absgrad], cotangents)
+        results.append([x.detach().cpu().double() for x in (*images, *gradients)])
+    names = [*RenderOutput._fields[:4]] + [f"gradient of {x}" for x in ("means", "quats", "scales", "opacities", "sh", "viewmats")]
+    rows = []
+    for name, actual, expected in zip([*names, "absolute gradient of mean2d"], *results):
+        errors = ((actual - expected).abs() / expected.abs().max()).flatten()
+        rows.append(Row(f"error of {name}, 95 %", float(errors.quantile(0.95)), "relative"))
+        rows.append(Row(f"error of {name}, max", float(errors.max()), "relative"))
+    return rows
+
+
+def _curve(name: str, count: int, size: tuple[int, int], overlap: float, device: str, seconds: float) -> list[Row]:
+    """One point of a curve: forward and backward."""
+    scene = tissue(count, *size, device, overlap)
+    point = f"{short(count)} {size[0]}x{size[1]}" + (f" overlap x{overlap:g}" if "overlap" in name else "")
+    return [Row(f"{name}: {point}", *milliseconds([_forward_and_backward(_ours(scene), scene)], device, seconds), "ms")]
+
+
+def _training(count: int, width: int, height: int, device: str, seconds: float) -> list[Row]:
+    """Iterations per second of a training, each with a training view and a virtual view, losses and optimiser."""
+    frames = list(phantom_sequence(PhantomConfig(frames=8, width=width, height=height)))
+    size = {"max_gaussians": count, "image_width": width, "growth": 1.0, "refine_every": 1}
+    config = ReconstructionConfig(**size, virtual_every=1, lambda_dist=0.1, lambda_tv=0.5, device=device)
+    trainer = Trainer(frames, config)
+    while len(trainer.model) < count and trainer.iteration < 20:
+        trainer.step()
+    # Refinement is rare in a training; here it has done its part.
+    trainer.config = dataclasses.replace(trainer.config, refine_every=100)
+    name = f"training {short(len(trainer.model))} {width}x{height}"
+    return [Row(name, 1000 / milliseconds([trainer.step], device, 3 * seconds)[0], "iterations/s")]
+
+
+# ---------------------------------------------------------------- peers
+
+
+def _peers(device: str) -> dict[str, Callable[[Scene], Draw]]:
+    """What else could draw a scene here."""
+    if device == "cpu":
+        return {"plain scalar kernel, one thread": _scalar}
+    peers = {"gsplat": _gsplat, "gswarp": _gswarp}
+    return {name: prepare for name, prepare in peers.items() if importlib.util.find_spec(name)}
+
+
+def _scalar(scene: Scene) -> Draw:
+    """Our kernels for GPUs, one pixel at a time."""
+
+    def draw(gaussians):
+        with api.scalar_kernels():
+            return _ours(scene)(gaussians)
+
+    return draw
+
+
+def _gsplat(scene: Scene) -> Draw:
+    from gsplat import rasterization
+
+    def draw(gaussians):
+        options = {"sh_degree": 0, "packed": False, "render_mode": "RGB+ED"}
+        images, alphas, _ = rasterization(*gaussians, *scene[1:], **options)
+        return images[..., :3], images[..., 3], alphas
+
+    return draw
+
+
+def _gswarp(scene: Scene) -> Draw:
+    """Has the interface of the rasteriser of 3DGS: OpenGL's projection, matrices transposed."""
+    from gswarp import GaussianRasterizationSettings, GaussianRasterizer
+
+    width, height, viewmat = scene.width, scene.height, scene.viewmats[0]
+    fx, fy, near, far = float(scene.Ks[0, 0, 0]), float(scene.Ks[0, 1, 1]), 0.01, 100.0
+    projection = viewmat.new_tensor(
+        [
+            [2 * fx / width, 0, 0, 0],
+            [0, 2 * fy / height, 0, 0],
+            [0, 0, far / (far - near), -far * near / (far - near)],
+            [0, 0, 1, 0],
+        ]
+    )
+    rasterizer = GaussianRasterizer(
+        GaussianRasterizationSettings(
+            image_height=height,
+            image_width=width,
+            tanfovx=width / (2 * fx),
+            tanfovy=height / (2 * fy),
+            bg=viewmat.new_zeros(3),
+            scale_modifier=1.0,
+            viewmatrix=viewmat.T.contiguous(),
+            projmatrix=(projection @ viewmat).T.contiguous(),
+            sh_degree=0,
+            campos=viewmat.inverse()[:3, 3].contiguous(),
+            prefiltered=False,
+            auto_tune_verbose=False,
+        )
+    )
+
+    def draw(gaussians):
+        means, quats, scales, opacities, sh = gaussians
+        in_image = torch.zeros_like(means, requires_grad=True)
+        color, _, meta = rasterizer(means, in_image, opacities[:, None], shs=sh, scales=scales, rotations=quats)
+        return color.permute(1, 2, 0)[None], meta.depth
+
+    return draw

@@ -1,0 +1,51 @@
+"""The unit that flows from every recording into the reconstruction: one rectified, posed view."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from endo_sim_ros.core.cameras import Camera
+
+
+class SequenceError(ValueError):
+    """A recording that cannot be read; the message names the file and the field and says what to do."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One view of a sequence.
+
+    Args:
+        stamp_ns: Time of exposure, nanoseconds; unique and increasing within a sequence.
+        image: Rectified RGB image [H, W, 3], uint8.
+        camera: Left camera with its camera-to-world pose, metres.
+        right: Rectified right RGB image [H, W, 3], uint8, or None.
+        baseline: Distance from the left to the right camera along +x, metres, or None without a right image.
+        right_K: Intrinsics of the right camera [3, 3] after rectification, or None when equal to the left's.
+        depth: Depth along the optical axis [H, W], float32, metres; 0 = no measurement; or None.
+        mask: [H, W], uint8, 255 = tissue to be used, 0 = ignore; or None.
+    """
+
+    stamp_ns: int
+    image: np.ndarray
+    camera: Camera
+    right: np.ndarray | None = None
+    baseline: float | None = None
+    right_K: np.ndarray | None = None
+    depth: np.ndarray | None = None
+    mask: np.ndarray | None = None
+
+    def __post_init__(self):
+        shape = (self.camera.height, self.camera.width)
+        for name in ("image", "right", "depth", "mask"):
+            array = getattr(self, name)
+            if array is not None and array.shape[:2] != shape:
+                raise SequenceError(
+                    f"frame {self.stamp_ns}: {name} is {array.shape[1]}×{array.shape[0]}, "
+                    f"but the camera says {shape[1]}×{shape[0]}"
+                )
+
+    @property
+    def tissue(self) -> np.ndarray:
+        """Where there is tissue to be used [H, W], float32, 1 or 0."""
+        return np.ones(self.image.shape[:2], np.float32) if self.mask is None else np.float32(self.mask > 0)

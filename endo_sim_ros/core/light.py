@@ -1,0 +1,125 @@
+"""The light that travels with an endoscope, and the automatic exposure of its camera.
+
+A model's colours are those of tissue straight ahead at a reference distance. In an image the tissue is brighter near the
+camera and darker towards the edge, and the camera then brightens or dims the whole picture. Brightness is that of encoded
+(gamma-compressed) images, as cameras deliver and 3DGS models store them.
+"""
+
+import dataclasses
+import functools
+import json
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from endo_sim_ros.core.cameras import Camera
+
+FEATURES = 4
+_SHARPNESS = 6  # exponent of the mean that the exposure responds to: mostly to the brighter parts of a picture
+_STRIDE = 4  # pixels; an exposure needs no more
+SURFACE = 0.5  # alpha from which on there is tissue
+NEAREST = 1e-3  # metres
+
+
+@dataclass(frozen=True)
+class Light:
+    """Brightness of a point at distance d and slopes (x/z, y/z) = (x, y) in the camera, relative to the model's colour:
+    exp(−distance·log(d/reference) + angle·log(cos θ) + tilt_x·x + tilt_y·y), times the exposure.
+
+    The exposure of channel c is exp(level_c − response·log B), B the brightness of the picture without it: the mean of
+    the brightest channel to the power 6, to the power 1/6, over tissue.
+
+    Args:
+        distance: Exponent of the falloff with distance; 2 / 2.2 for the inverse-square law and a gamma of 2.2.
+        angle: Exponent of the falloff towards the edge, cos θ to this power, θ from the optical axis.
+        tilt_x, tilt_y: Slopes of the logarithm of brightness across the picture: a light beside the lens.
+        reference: Distance at which colours are the model's, metres.
+        level_r, level_g, level_b: Logarithm of the exposure at B = 1.
+        response: How far the camera evens out brightness: 1 holds it constant, 0 is a fixed exposure.
+    """
+
+    distance: float = 0.0
+    angle: float = 0.0
+    tilt_x: float = 0.0
+    tilt_y: float = 0.0
+    reference: float = 0.1
+    level_r: float = 0.0
+    level_g: float = 0.0
+    level_b: float = 0.0
+    response: float = 0.0
+
+    def __post_init__(self):
+        for name, value in dataclasses.asdict(self).items():
+            number = isinstance(value, (int, float)) and math.isfinite(value) and abs(value) < 1e3
+            if not number or name == "reference" and value <= 0:
+                raise ValueError(f"light: {name} is {value!r}; it must be a finite number{', above 0' * (name == 'reference')}")
+
+    def to_json(self) -> str:
+        """One line, for a file's comment or a message."""
+        return json.dumps(dataclasses.asdict(self))
+
+    @staticmethod
+    def from_json(text: str) -> "Light":
+        """Read what `to_json` wrote.
+
+        Raises:
+            ValueError: If it is something else; the message says what.
+        """
+        values = json.loads(text)
+        known = {field.name for field in dataclasses.fields(Light)}
+        if not isinstance(values, dict) or set(values) != known:
+            raise ValueError(f"light: expected the values {', '.join(sorted(known))}, got {text[:80]}")
+        return Light(**values)
+
+
+@functools.lru_cache(maxsize=64)
+def _directions(fx: float, fy: float, cx: float, cy: float, width: int, height: int, device: torch.device) -> Tensor:
+    x = (torch.arange(width, dtype=torch.float64) + 0.5 - cx) / fx
+    y = (torch.arange(height, dtype=torch.float64) + 0.5 - cy) / fy
+    y, x = torch.meshgrid(y, x, indexing="ij")
+    return torch.stack([-0.5 * (1 + x * x + y * y).log(), x, y]).to(device, torch.float32)
+
+
+def directions(camera: Camera, device: torch.device | str) -> Tensor:
+    """Logarithm of the cosine of the angle from the axis, and the slopes x and y, of a camera's pixels [3, H, W]."""
+    K = camera.K
+    return _directions(*(float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2])), camera.width, camera.height, torch.device(device))
+
+
+def features(depths: Tensor, alphas: Tensor, directions: Tensor, reference: float) -> Tensor:
+    """The four quantities [4, H, W] that brightness depends on: −log(d/reference), log cos θ, x and y. No gradient.
+
+    Args:
+        depths, alphas: Σ w z [H, W], metres, and Σ w [H, W].
+        directions: Those of the camera's pixels [3, H, W].
+        reference: Distance at which brightness is the tissue's own, metres.
+    """
+    depth = depths.detach() / alphas.detach().clamp_min(NEAREST)
+    # Where nothing is drawn there is nothing to be lit.
+    distance = torch.where(alphas > NEAREST, depth.clamp_min(NEAREST) / reference, 1).log() - directions[0]
+    return torch.cat([-distance[None], directions])
+
+
+def falloff(quantities: Tensor, theta: Tensor) -> Tensor:
+    """Brightness [...] of quantities [4, ...] for the light's (distance, angle, tilt_x, tilt_y) [4]."""
+    # Not einsum: the gradient of a matrix product has other last bits with other numbers of threads.
+    return (quantities * theta.view(-1, *[1] * (quantities.ndim - 1))).sum(0).exp()
+
+
+def log_brightness(image: Tensor, where: Tensor) -> Tensor:
+    """Logarithm of what an automatic exposure measures of an image [H, W, 3] over the pixels [H, W] that are True."""
+    peak = image[::_STRIDE, ::_STRIDE].amax(-1).clamp(1e-3, 10)
+    weights = where[::_STRIDE, ::_STRIDE].to(peak.dtype)
+    mean = (weights * peak**_SHARPNESS).sum() / weights.sum().clamp_min(1)
+    return mean.clamp_min(1e-12).log() / _SHARPNESS
+
+
+def features_at(points: np.ndarray, camera: Camera, reference: float) -> np.ndarray:
+    """The quantities of `features` [N, 4] at world points [N, 3] in front of a camera."""
+    local = (points - camera.position) @ camera.pose[:3, :3]
+    distance = np.linalg.norm(local, axis=1)
+    slopes = local[:, :2] / local[:, 2:]
+    return np.stack([-np.log(distance / reference), np.log(local[:, 2] / distance), *slopes.T], 1)

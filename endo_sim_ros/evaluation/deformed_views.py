@@ -1,0 +1,85 @@
+"""Whether a model is still a picture of tissue when the tissue is moved."""
+
+import dataclasses
+import logging
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import torch
+
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.evaluation import metrics
+from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
+from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
+
+log = logging.getLogger(__name__)
+
+_STEPS = 20  # of each move of the jaw
+_SHARE = 0.12  # of what is seen across: how far the jaw moves; half of it is its reach
+_FINER = 2  # pixels of the surface to one of the picture, each way
+_SPREAD, _OPACITY = 0.45, 0.99  # of the Gaussian of each of them, in its width
+_MOVED = 6  # grey levels, of 255
+_ROUND = 4  # pixels about what changed
+
+
+def touched_psnr(model: GaussianModel, cameras: Sequence[Camera], device: str) -> float:
+    """PSNR, dB, of pictures of the model while a jaw moves the tissue, over the pixels that change; NaN without tissue in the middle.
+
+    The reference is what the model shows at rest, laid onto the surface it has there and carried along by the same nodes: a
+    model all of whose Gaussians lie on the surface and have its colours is as good deformed as at rest. The jaw takes hold
+    in the middle of the middle camera's picture and moves towards the camera, to the left and upwards. Without light.
+
+    Args:
+        model: Gaussians at rest.
+        cameras: Those of the training views.
+        device: Compute device.
+    """
+    try:
+        return _touched_psnr(model, cameras, device)
+    except (ValueError, RuntimeError) as error:  # nothing that could be touched, not in metres, or too large: the other figures stand
+        log.warning("PSNR, touched, is left out: %s", error)
+        return float("nan")
+
+
+def _touched_psnr(model: GaussianModel, cameras: Sequence[Camera], device: str) -> float:
+    camera, options = cameras[len(cameras) // 2], RenderingConfig(device=device)
+    model = dataclasses.replace(model, light=None)
+    surface = _surface(model, camera, options)
+    _, depth = DeformableRenderer(model, None, options).render(camera)
+    v, u = depth.shape[0] // 2, depth.shape[1] // 2
+    if depth[v, u] <= 0 or not len(surface):
+        return float("nan")
+    middle, size = camera.backproject(depth)[v, u], _SHARE * float(depth[v, u]) * camera.width / camera.K[0, 0]
+    config = PhysicsConfig(device=device, force_radius=size / 2, travel=2 * size)
+    simulation = TissueSimulation(model, np.stack([each.position for each in cameras]), config, cameras)
+    ours, reference = (DeformableRenderer(each, simulation.nodes.rest, options) for each in (model, surface))
+    at_rest = reference.render(camera, depth=False)[0].astype(int)
+    right, down, ahead = camera.pose[:3, :3].T
+    found = []
+    for direction in (-ahead, -right - 0.3 * ahead, -down - 0.3 * ahead):
+        simulation.reset()
+        pose = camera.pose.copy()
+        for step in range(_STEPS):
+            pose[:3, 3] = middle + size * step / (_STEPS - 1) * direction
+            held = simulation.set_grasp("jaw", pose, True)
+            simulation.step()
+        if not held:
+            continue
+        state = simulation.state()
+        picture, expected = (each.render(camera, state.positions, state.F, depth=False)[0] for each in (ours, reference))
+        changed = np.uint8(np.abs(expected - at_rest).max(-1) > _MOVED)
+        if changed.any():
+            found.append(metrics.psnr(picture, expected, cv2.dilate(changed, np.ones((2 * _ROUND + 1,) * 2))))
+    return float(np.mean(found)) if found else float("nan")
+
+
+def _surface(model: GaussianModel, camera: Camera, options: RenderingConfig) -> GaussianModel:
+    """What a camera sees of the model as small opaque Gaussians, one for each pixel of a finer picture."""
+    camera = camera.resized(camera.width * _FINER, camera.height * _FINER)
+    image, depth = DeformableRenderer(model, None, options).render(camera)
+    shown = depth > 0
+    radii = _SPREAD / camera.K[0, 0] * depth[shown]
+    tensors = (torch.from_numpy(array).float() for array in (camera.backproject(depth)[shown], image[shown] / 255.0, radii))
+    return GaussianModel.from_points(*tensors, opacity=_OPACITY)

@@ -1,0 +1,129 @@
+"""Pictures of a recorded run in which a tool touched the tissue: video and contact sheet."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from endo_sim_ros import messages
+from endo_sim_ros.core import drawing
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.evaluation import metrics
+from endo_sim_ros.sequences.bag import BagReader
+
+_ARROW_PIXELS = 0.3  # length of the largest force's arrow, in image widths
+_MOMENTS = (0.33, 0.6, 0.9)  # of the time in which the tool acts
+
+
+class TouchReport:
+    """What a recorded run shows: rendered images with the tool's force at that time.
+
+    Args:
+        recording: Bag with the recording, rendered and tool topics.
+        arm: Name of the tool's arm.
+
+    Raises:
+        SequenceError: If nothing was rendered while the tool acted.
+    """
+
+    def __init__(self, recording: Path, arm: str):
+        tip, wrench = messages.tool_pose(arm), messages.tool_wrench(arm)
+        wanted = (messages.LEFT_IMAGE, messages.CAMERA_POSE, messages.MASK, *messages.RENDERED_TOPICS, tip, wrench)
+        self._inputs: dict[float, dict[str, np.ndarray]] = {}  # image, pose and mask of the recording by time
+        self._rendered: dict[float, dict[str, np.ndarray]] = {}  # image, pose, K and depth by time
+        tips, forces = [], []  # (time, vector), world
+        with BagReader(recording) as bag:
+            for topic, _, message in bag.messages(wanted):
+                # Times are those of the headers: the recorder may have been late.
+                time = messages.stamp_to_ns(message.header.stamp) * 1e-9
+                if topic == tip:
+                    tips.append((time, messages.decode_pose(message, "world", topic.name)[:3, 3]))
+                elif topic == wrench:
+                    forces.append((time, messages.decode_wrench(message, topic.name)[0]))
+                elif topic in messages.RENDERED_TOPICS:
+                    self._rendered.setdefault(time, {})[topic.name] = _decode(topic, message)
+                else:
+                    self._inputs.setdefault(time, {})[topic.name] = _decode(topic, message)
+        names = [topic.name for topic in messages.RENDERED_TOPICS]
+        self._times = [time for time in sorted(self._rendered) if all(name in self._rendered[time] for name in names)]
+        began = forces[0][0] if forces else np.inf
+        self._rest = max((time for time in self._times if time < began), default=None)
+        self._times = [time for time in self._times if time >= began]
+        if not self._times or self._rest is None or not tips:
+            raise SequenceError(f"{recording}: no images were rendered before and while the tool {arm} acted")
+        self._tips, self._forces = _Track(tips), _Track(forces)
+        camera = self._camera(self._times[0])
+        distance = float(camera.project(self._tips.at(self._times[0])[None])[1][0])
+        largest = max(np.linalg.norm(force) for _, force in forces)
+        # The largest force is drawn as long as a fixed share of the picture.
+        self._scale = _ARROW_PIXELS * camera.width * distance / camera.K[0, 0] / max(largest, 1e-9)
+
+    def _camera(self, time: float) -> Camera:
+        view = self._rendered[time]
+        height, width = view[messages.RENDERED_IMAGE.name].shape[:2]
+        return Camera(view[messages.RENDERED_INFO.name], width, height, view[messages.RENDERED_POSE.name])
+
+    def _picture(self, time: float) -> np.ndarray:
+        image = self._rendered[time][messages.RENDERED_IMAGE.name]
+        return drawing.draw_force(image, self._camera(time), self._tips.at(time), self._forces.at(time), self._scale)
+
+    def _newest(self, time: float) -> float:
+        """Time of the newest image at a time."""
+        return self._times[max(int(np.searchsorted(self._times, time, "right")) - 1, 0)]
+
+    def video(self, fps: float) -> Iterator[np.ndarray]:
+        """Frames at a constant rate; the newest image at each time."""
+        for time in np.arange(self._times[0], self._times[-1], 1 / fps):
+            yield self._picture(self._newest(time))
+
+    def moments(self) -> tuple[list[tuple[str, np.ndarray]], str]:
+        """The labelled pictures of the contact sheet and one line on the quality of the rendering at rest."""
+        image = self._rendered[self._rest][messages.RENDERED_IMAGE.name]
+        depth = self._rendered[self._rest][messages.RENDERED_DEPTH.name]
+        size = image.shape[1::-1]
+        pose = self._camera(self._rest).pose
+        whole = [view for view in self._inputs.values() if messages.LEFT_IMAGE.name in view and messages.CAMERA_POSE.name in view]
+        nearest = min(whole, key=lambda view: float(np.linalg.norm(view[messages.CAMERA_POSE.name] - pose)))
+        reference = cv2.resize(nearest[messages.LEFT_IMAGE.name], size, interpolation=cv2.INTER_AREA)
+        mask = nearest.get(messages.MASK.name)
+        mask = None if mask is None else cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)
+        quality = metrics.psnr(image, reference, mask)
+        acting = [time for time in self._times if self._forces.at(time).any()]
+        first, last = acting[0], acting[-1]
+        moments = [self._newest(first + share * (last - first)) for share in _MOMENTS]
+        near, far = np.percentile(depth[depth > 0], [1, 99])
+        pictures = [
+            ("input view", reference),
+            (f"rendered view, {quality:.1f} dB", image),
+            (f"rendered depth, {100 * near:.1f} to {100 * far:.1f} cm", drawing.color_depth(depth)),
+        ]
+        for time in moments:
+            text = f"{np.linalg.norm(self._forces.at(time)):.2f} N after {time - first:.1f} s"
+            pictures.append((text, self._picture(time)))
+        return pictures, f"rendered at rest against the input view: {quality:.1f} dB PSNR"
+
+
+class _Track:
+    """A vector that was published over time."""
+
+    def __init__(self, samples: list[tuple[float, np.ndarray]]):
+        self._times, self._values = zip(*sorted(samples, key=lambda sample: sample[0]))
+
+    def at(self, time: float) -> np.ndarray:
+        """The newest value at a time."""
+        return self._values[max(int(np.searchsorted(self._times, time, "right")) - 1, 0)]
+
+
+def _decode(topic: messages.Topic, message: Any) -> np.ndarray:
+    if topic in (messages.LEFT_IMAGE, messages.RENDERED_IMAGE):
+        return messages.decode_image(message, topic.name).copy()
+    if topic in (messages.CAMERA_POSE, messages.RENDERED_POSE):
+        return messages.decode_pose(message, "world", topic.name)
+    if topic == messages.RENDERED_INFO:
+        return messages.decode_camera_info(message, topic.name).P[:, :3]
+    if topic == messages.MASK:
+        return messages.decode_mask(message)
+    return messages.decode_depth(message, topic.name)

@@ -1,0 +1,287 @@
+"""The whole graph from one terminal, where `ros2 launch` is not installed, with a live view of what each node says."""
+
+import os
+import re
+import shlex
+import signal
+import threading
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from endo_sim_ros import messages
+from endo_sim_ros.graph.processes import NodeGroup
+from endo_sim_ros.messages import ERROR, OK, WARN
+from endo_sim_ros.nodes.base import EndoNode
+from endo_sim_ros.nodes.transport import prepare_transport
+from endo_sim_ros.sequences.bag import BagReader
+
+_CANNOT_START = 2  # exit status of a node that was given something it cannot use; see base.run
+_SILENT_AFTER = 5.0  # seconds without a word on /diagnostics after which a node counts as silent
+_REFRESH = 0.2  # seconds
+_FIRST_PAUSE = 1.0  # seconds before a node that crashed is started again; doubled each time it crashes soon
+_MOST_CRASHES = 4  # one soon after the other, after which a node stays down
+_SOON = 30.0  # seconds after its start
+_LEVELS = {OK: ("ok", "green"), WARN: ("warn", "yellow"), ERROR: ("error", "red")}
+# What a process must share with the graph to take part in it.
+_SHARED = (
+    "ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS", "ROS_LOCALHOST_ONLY", "ROS_DISCOVERY_SERVER",
+    "RMW_IMPLEMENTATION", "FASTDDS_BUILTIN_TRANSPORTS", "FASTRTPS_DEFAULT_PROFILES_FILE",
+)  # fmt: skip
+# The values shown of each node, beside its sentence.
+_VALUES = {
+    "reconstruction_node": ("views", "loss", "gaussians", "errors"),
+    "physics_node": ("nodes", "real-time factor", "milliseconds per step", "errors"),
+    "rendering_node": ("images", "milliseconds per image", "errors"),
+    "bag_player_node": ("messages", "of", "errors"),
+}
+_NODE_NAMES = {"bag_player_node": "bag_player"}  # where the node is not called like its module
+
+
+class UpError(RuntimeError):
+    """The graph cannot run; the message says which node ended and where its log is."""
+
+
+class _Row(NamedTuple):
+    """What is shown of one node."""
+
+    name: str
+    label: str  # of its level, or of what its process does
+    color: str
+    text: str
+    values: str
+
+
+class _Watcher(EndoNode):
+    """Listens to what the nodes say about themselves."""
+
+    def __init__(self):
+        super().__init__("up")
+        self.statuses: dict[str, tuple[float, int, str, dict[str, str]]] = {}  # by full name; the first is when
+        self.subscribe(messages.DIAGNOSTICS, self._on_diagnostics)
+
+    def _on_diagnostics(self, message: Any) -> None:
+        for name, level, text, values in messages.decode_diagnostics(message):
+            self.statuses[name] = (time.monotonic(), level, text, values)
+
+    def twins(self, names: Iterable[str]) -> list[str]:
+        """Those of these nodes that exist more than once, because another graph runs in the same domain."""
+        there = ["/".join((space.strip("/"), name)).lstrip("/") for name, space in self.get_node_names_and_namespaces()]
+        return [name for name in names if there.count(name) > 1]
+
+
+class _Supervisor:
+    """Starts the nodes, notices when one ends, and knows what to show of each."""
+
+    def __init__(self, graph: NodeGroup, namespace: str, console: Console, respawn: bool):
+        self._graph, self._namespace, self._console, self._respawn = graph, namespace.strip("/"), console, respawn
+        self._arguments: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {}
+        self._began: dict[str, float] = {}
+        self._crashes: dict[str, int] = {}  # of each node, one soon after the other
+        self._due: dict[str, float] = {}  # when those that crashed are started again
+        self.restarted: set[str] = set()
+        self._ended: set[str] = set()
+        self._said: dict[str, tuple[str, str]] = {}
+
+    def start(self, name: str, *ros_arguments: str, **parameters: Any) -> None:
+        self._arguments[name], self._began[name] = (ros_arguments, parameters), time.monotonic()
+        self._graph.start(name, *ros_arguments, **parameters)
+
+    def full_name(self, name: str) -> str:
+        return f"{self._namespace}/{_NODE_NAMES.get(name, name)}".lstrip("/")
+
+    @property
+    def full_names(self) -> list[str]:
+        return [self.full_name(name) for name in self._graph.nodes]
+
+    def check(self) -> None:
+        """Report nodes that ended; start those that crashed again after a pause, unless they crash again and again.
+
+        Raises:
+            UpError: If a node was given something it cannot use, or no node is left.
+        """
+        for name, node in list(self._graph.nodes.items()):
+            status = node.exit_status
+            if name in self._due and time.monotonic() >= self._due[name]:
+                del self._due[name]
+                ros_arguments, parameters = self._arguments[name]
+                self.start(name, *ros_arguments, **parameters)
+                continue
+            if status is None or name in self._ended or name in self._due:
+                continue
+            if status == 0:
+                self._ended.add(name)
+                continue
+            if status == _CANNOT_START:
+                raise UpError(f"{_last_line(node.log) or f'{name} cannot start'}; its log is {node.log}")
+            how = f"was ended by {signal.Signals(-status).name}" if status < 0 else f"ended with status {status}"
+            now = time.monotonic()
+            crashes = self._crashes[name] = self._crashes.get(name, 0) + 1 if now - self._began[name] < _SOON else 1
+            again = self._respawn and crashes < _MOST_CRASHES
+            log = node.log
+            if again:  # the new process would overwrite the log that tells what went wrong
+                log = node.log.replace(node.log.with_suffix(".crashed.log"))
+            pause = _FIRST_PAUSE * 2 ** (crashes - 1)
+            what = f"it is started again in {pause:g} s" if again else "it stays down"
+            if crashes == _MOST_CRASHES:
+                how += f", {crashes} times in a row within {_SOON:g} s of its start"
+            self._console.print(Text.assemble((f"{name} {how}", "red"), f"; {what}; its log is {log}"), soft_wrap=True)
+            if again:
+                self.restarted.add(name)
+                self._due[name] = now + pause
+            else:
+                self._ended.add(name)
+        if self._ended >= self._graph.nodes.keys() - {"bag_player_node"}:
+            raise UpError("no node is left")
+
+    def rows(self, statuses: dict[str, tuple[float, int, str, dict[str, str]]]) -> list[_Row]:
+        """The state of each node."""
+        rows = []
+        for name, node in self._graph.nodes.items():
+            heard, level, text, values = statuses.get(self.full_name(name), (0.0, OK, "", {}))
+            shown = ", ".join(f"{key} {values[key]}" for key in _VALUES.get(name, ()) if values.get(key, "0") != "0")
+            if node.exit_status is not None:  # what it said last is history unless it finished
+                done = node.exit_status == 0
+                rows.append(_Row(name, "ended" if done else "down", "dim" if done else "red", text if done else "", shown))
+            elif heard < self._began[name]:
+                rows.append(_Row(name, "starting", "dim", "", ""))
+            elif (silent := time.monotonic() - heard) > _SILENT_AFTER:
+                text = f"said nothing for {silent:.0f} s; before: {text}"
+                rows.append(_Row(name, "silent", "yellow", text, shown))
+            else:
+                label, color = _LEVELS.get(level, ("stale", "yellow"))
+                rows.append(_Row(name, label, color, text, shown))
+        return rows
+
+    def news(self, rows: list[_Row]) -> list[str]:
+        """A line for each node that says something new: for output that is not a terminal."""
+        lines = []
+        for row in rows:
+            said = (row.label, re.sub(r"\d+", "#", row.text))  # not every number on the way
+            if self._said.get(row.name) != said:
+                self._said[row.name] = said
+                lines.append(f"{row.name:<20} {row.label:<8} {row.text}")
+        return lines
+
+
+def run_up(
+    bag: Path | None,
+    params_file: Path | None,
+    namespace: str,
+    arms: tuple[str, ...],
+    model: str,
+    logs: Path,
+    respawn: bool,
+    view: bool = False,
+) -> None:
+    """Run reconstruction, physics and rendering, a bag player if there is a bag and the page if it is wanted, until interrupted.
+
+    Raises:
+        UpError, SequenceError: If something given cannot be used, or all nodes are down; one sentence.
+    """
+    console, logs = Console(), logs.expanduser() / namespace.strip("/")
+    if bag is not None:
+        with BagReader(bag.expanduser()) as reader:  # a bag that cannot do is reported before anything starts
+            reader.require_recording()
+    for path in (params_file, None if model in ("", "latest") else Path(model)):
+        if path is not None and not path.expanduser().is_file():
+            raise UpError(f"{path}: there is no such file")
+    common = ["-r", f"__ns:=/{namespace.strip('/')}"] if namespace.strip("/") else []
+    common += ["--params-file", str(params_file.expanduser())] if params_file else []
+    prepare_transport()
+    with _asked_to_end() as asked, NodeGroup(logs) as graph:
+        graph.environment = dict(os.environ)  # the user's own domain, which other terminals share
+        supervisor = _Supervisor(graph, namespace, console, respawn)
+        supervisor.start("reconstruction_node", *common, **({"model_file": model} if model else {}))
+        supervisor.start("physics_node", *common, **({"arms": list(arms)} if arms else {}))
+        supervisor.start("rendering_node", *common)
+        if view:
+            supervisor.start("viewer_node", *common, **({"arm": arms[0], "arms": list(arms)} if arms else {}))
+        if bag is not None:
+            supervisor.start("bag_player_node", *common, bag=bag.expanduser())
+        _introduce(console, logs)
+        _watch(supervisor, console, asked)
+        console.print("ending all nodes")
+
+
+def _watch(supervisor: _Supervisor, console: Console, asked: threading.Event) -> None:
+    """Show the nodes until asked to end."""
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)  # the signals are heard by the caller
+    watcher, executor = _Watcher(), SingleThreadedExecutor()
+    executor.add_node(watcher)
+    warned = False
+    live = Live(console=console, auto_refresh=False) if console.is_terminal else None
+    try:
+        if live is not None:
+            live.start()
+        while not asked.is_set():
+            deadline = time.monotonic() + _REFRESH
+            while (left := deadline - time.monotonic()) > 0 and not asked.is_set():
+                executor.spin_once(timeout_sec=left)
+            supervisor.check()
+            if not warned and not supervisor.restarted and (twins := watcher.twins(supervisor.full_names)):
+                warned = True  # after a restart the one that crashed is still known to others for a while
+                text = f"{', '.join(twins)}: there more than once; does another graph run in this ROS domain?"
+                console.print(text, style="yellow", highlight=False, soft_wrap=True)
+            rows = supervisor.rows(watcher.statuses)
+            if live is None:
+                for line in supervisor.news(rows):
+                    console.print(line, highlight=False, markup=False, soft_wrap=True)
+            else:
+                live.update(_table(rows), refresh=True)
+    finally:
+        if live is not None:
+            live.stop()
+        executor.shutdown()
+        watcher.destroy_node()
+        rclpy.try_shutdown()
+
+
+def _table(rows: list[_Row]) -> Table:
+    table = Table(caption="Ctrl-C ends all nodes", caption_justify="left", expand=True)
+    for title, width in (("node", 19), ("level", 8)):
+        table.add_column(title, width=width, no_wrap=True)
+    table.add_column("says", ratio=3)
+    table.add_column("values", ratio=2)
+    for row in rows:
+        table.add_row(row.name, Text(row.label, row.color), Text(row.text), Text(row.values))
+    return table
+
+
+def _introduce(console: Console, logs: Path) -> None:
+    """Say where the logs are and how other terminals join."""
+    console.print(f"logs: {logs}", highlight=False, soft_wrap=True)
+    settings = [f"{name}={shlex.quote(os.environ[name])}" for name in _SHARED if os.environ.get(name)]
+    console.print("other terminals join with", highlight=False)
+    console.print(f"  export {' '.join(settings)}", highlight=False, markup=False, soft_wrap=True)
+
+
+@contextmanager
+def _asked_to_end() -> Iterator[threading.Event]:
+    """An event that is set by the signals that end a program. They interrupt nothing, so that no node is left behind
+    half started or half stopped, however often Ctrl-C is pressed."""
+    asked = threading.Event()
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup has it ignored, to outlive its terminal
+        numbers.append(signal.SIGHUP)
+    before = {number: signal.signal(number, lambda *_: asked.set()) for number in numbers}
+    try:
+        yield asked
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _last_line(log: Path) -> str:
+    lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    return lines[-1] if lines else ""

@@ -1,0 +1,1 @@
+"""Kernels of the MPM solver, one set for each kind of device."""

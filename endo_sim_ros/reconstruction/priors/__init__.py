@@ -1,0 +1,1 @@
+"""Where depth comes from: sources, refinement between views, extrapolation beyond them."""

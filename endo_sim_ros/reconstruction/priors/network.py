@@ -1,0 +1,155 @@
+"""Depth from one image by a network such as Depth-Anything-V2, made metric by what is known of the scene.
+
+Networks of this kind see inverse depth up to a scale and a shift. Checkpoints are read from this machine and never downloaded.
+"""
+
+import logging
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from endo_sim_ros.core.frames import Frame, SequenceError
+
+log = logging.getLogger(__name__)
+
+_SIDE = 518  # pixels of the shorter side that Depth-Anything-V2 was trained at
+_PATCH = 14  # its sizes are multiples of this
+_MEAN, _STD = np.float32([0.485, 0.456, 0.406]), np.float32([0.229, 0.224, 0.225])  # of ImageNet
+_LEAST_POINTS = 12  # to fit a scale and a shift to
+_FARTHEST_OFF = 0.1  # median relative error of inverse depth from which on a fit has failed
+_LEAST_GAIN = 0.7  # of the error that one depth for all would leave, the most that may be left
+_SIZES = ("Large", "Base", "Small")  # in the order of preference
+
+Network = Callable[[np.ndarray], np.ndarray]
+
+
+def load_network(path: str, device: str) -> Network:
+    """A function from an RGB image [H, W, 3], uint8, to relative inverse depth [H, W], float32.
+
+    Args:
+        path: Folder of a transformers checkpoint, or ONNX file; empty looks into Hugging Face's cache.
+        device: Where transformers computes; ONNX Runtime picks its own.
+
+    Raises:
+        SequenceError: If there is no such checkpoint or it cannot be read; the message says where to put one.
+    """
+    place = Path(path).expanduser() if path else cached_checkpoint()
+    if place is None or not place.exists():
+        where = place or _cache()
+        raise SequenceError(
+            f"{where}: there is no Depth-Anything-V2 checkpoint; copy the folder Depth-Anything-V2-Small-hf (config.json and "
+            "model.safetensors) or an ONNX export of it to this machine and give its path as depth_model"
+        )
+    try:
+        return _onnx(place) if place.is_file() else _transformers(place, device)
+    except ImportError as error:
+        raise SequenceError(f"{place}: needs the package {error.name}; pip install 'endo_sim_ros[depth]'") from error
+    except Exception as error:  # whatever a damaged file makes the libraries raise
+        reason = next(iter(str(error).splitlines()), type(error).__name__)
+        raise SequenceError(f"{place}: not a readable depth network ({reason})") from error
+
+
+def cached_checkpoint() -> Path | None:
+    """The largest Depth-Anything-V2 checkpoint in Hugging Face's cache, if there is any."""
+    for size in _SIZES:
+        for found in sorted(_cache().glob(f"models--depth-anything--Depth-Anything-V2-{size}-hf/snapshots/*/config.json")):
+            return found.parent
+    return None
+
+
+def _cache() -> Path:
+    home = Path(os.environ.get("HF_HOME", "~/.cache/huggingface")).expanduser()
+    return Path(os.environ.get("HF_HUB_CACHE", home / "hub"))
+
+
+def _transformers(folder: Path, device: str) -> Network:
+    from transformers import AutoModelForDepthEstimation
+
+    model = AutoModelForDepthEstimation.from_pretrained(folder, local_files_only=True).eval().to(device)
+
+    def predict(image: np.ndarray) -> np.ndarray:
+        scale = _SIDE / min(image.shape[:2])
+        height, width = (max(round(side * scale / _PATCH), 1) * _PATCH for side in image.shape[:2])
+        with torch.no_grad():
+            output = model(pixel_values=torch.from_numpy(_normalised(image, width, height)).to(device))
+        return _enlarged(output.predicted_depth[0].float().cpu().numpy(), image)
+
+    return predict
+
+
+def _onnx(file: Path) -> Network:
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(str(file), providers=onnxruntime.get_available_providers())
+    entry = session.get_inputs()[0]
+    sides = [side if isinstance(side, int) else _SIDE for side in entry.shape[2:]]
+
+    def predict(image: np.ndarray) -> np.ndarray:
+        output = session.run(None, {entry.name: _normalised(image, sides[1], sides[0])})[0]
+        return _enlarged(output.reshape(output.shape[-2:]), image)
+
+    return predict
+
+
+def _normalised(image: np.ndarray, width: int, height: int) -> np.ndarray:
+    small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+    return np.ascontiguousarray(((small - _MEAN) / _STD).transpose(2, 0, 1)[None])
+
+
+def _enlarged(values: np.ndarray, image: np.ndarray) -> np.ndarray:
+    return cv2.resize(values.astype(np.float32), image.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+
+
+def network_depth(frame: Frame, network: Network, known: np.ndarray) -> np.ndarray | None:
+    """Metric depth [H, W] (m) of a view from the network, or None where it does not fit what is known.
+
+    Args:
+        known: Pixels u, v and depths z (m) of points seen in this view [N, 3], some of them wrong.
+    """
+    relative = network(frame.image)
+    u, v = np.floor(known[:, :2]).astype(int).T
+    fit = align(relative[v, u], 1 / known[:, 2])
+    if fit is None:
+        log.warning("view %d: the depth network does not fit the %d known depths; left out", frame.stamp_ns, len(known))
+        return None
+    scale, shift, error = fit
+    log.info("view %d: depth network aligned to %d known depths, median error %.1f %%", frame.stamp_ns, len(known), 100 * error)
+    inverse = scale * relative + shift
+    nearest, farthest = 1 / known[:, 2].min(), 1 / known[:, 2].max()
+    return (1 / np.clip(inverse, 0.5 * farthest, 2 * nearest)).astype(np.float32)
+
+
+def align(relative: np.ndarray, inverse: np.ndarray) -> tuple[float, float, float] | None:
+    """Scale and shift that take relative [N] to metric inverse depths [N] (1/m), and the median relative error left.
+
+    A consensus of random pairs, then reweighted least squares (Cauchy). None if too few points, no positive scale or too large an error
+    is left.
+    """
+    if len(relative) < _LEAST_POINTS or np.ptp(relative) < 1e-9:
+        return None
+    rng = np.random.default_rng(0)
+    first, second = rng.integers(0, len(relative), (2, 500))
+    rise = relative[first] - relative[second]
+    usable = np.abs(rise) > 1e-3 * np.ptp(relative)
+    scales = (inverse[first] - inverse[second])[usable] / rise[usable]
+    shifts = inverse[first][usable] - scales * relative[first][usable]
+    errors = np.median(np.abs(scales[:, None] * relative + shifts[:, None] - inverse), axis=1) if len(scales) else np.empty(0)
+    if not len(errors):
+        return None
+    scale, shift = scales[errors.argmin()], shifts[errors.argmin()]
+    for _ in range(20):
+        residual = scale * relative + shift - inverse
+        spread = max(1.4826 * float(np.median(np.abs(residual))), 1e-9)
+        weights = 1 / (1 + (residual / (2 * spread)) ** 2)
+        mean_x, mean_y = np.average(relative, weights=weights), np.average(inverse, weights=weights)
+        x = relative - mean_x
+        scale = (weights * x * (inverse - mean_y)).sum() / max((weights * x * x).sum(), 1e-12)
+        shift = mean_y - scale * mean_x
+    left = np.abs(scale * relative + shift - inverse)
+    error = float(np.median(left / inverse))
+    explains = np.median(left) < _LEAST_GAIN * np.median(np.abs(inverse - np.median(inverse)))
+    return (float(scale), float(shift), error) if scale > 0 and explains and error < _FARTHEST_OFF else None

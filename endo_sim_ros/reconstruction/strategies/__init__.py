@@ -1,0 +1,1 @@
+"""How Gaussians are added, moved and removed in training."""

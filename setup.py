@@ -34,6 +34,7 @@ setup(
         "scipy",
         "tifffile",
         "torch>=2.4",
+        "typing_extensions",
         "tyro",
         "warp-lang>=1.19",
     ],

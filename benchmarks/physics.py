@@ -335,9 +335,7 @@ def _over_gaussians(count: int, plan: Plan, device: str) -> list[Row]:
 
     name, seconds = short(count), plan.seconds
     rows = _against_plain(f"skin {name}", lambda vectorised: partial(skinning(vectorised).deform, positions, F), device, seconds)
-    rows += _against_plain(
-        f"step and skin {name}", lambda vectorised: _pulled_with_skin(scene, config, vectorised).step, device, seconds
-    )
+    rows += _against_plain(f"step and skin {name}", lambda vectorised: _pulled_with_skin(scene, config, vectorised).step, device, seconds)
     one, apart, skin = moving(), moving(), skinning()
     one.carry(skin)
     together, separate = milliseconds([one.step, lambda: (apart.step(), skin.deform(apart.positions()[0], apart.F[0]))], device, seconds)

@@ -51,9 +51,7 @@ class DeformableRenderer:
         self._background = torch.full((3,), config.background, device=self.device)
         self._skinning = None
         if node_rest is not None:
-            self._skinning = Skinning(
-                self.model, node_rest, neighbours=config.neighbours, weighting=config.skinning, device=self.device
-            )
+            self._skinning = Skinning(self.model, node_rest, neighbours=config.neighbours, weighting=config.skinning, device=self.device)
 
     def cut(self, triangles: np.ndarray) -> None:
         """Let the skin part where all these triangles [T, 3, 3] (m, world, in the tissue at rest) cut it."""

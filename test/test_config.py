@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from endo_sim_ros import cli
-from endo_sim_ros.core.config import ConfigError, Range, StageConfig, options
+from endo_sim_ros.core.config import ConfigError, Range, StageConfig, option_values, options
 from endo_sim_ros.nodes.parameter_file import NODE_CONFIGS, parameter_file
 
 ALL = [config for configs in NODE_CONFIGS.values() for config in configs]
@@ -55,6 +55,34 @@ def test_bad_values_are_refused_with_what_is_allowed(values, sentence):
 
 def test_whole_numbers_are_accepted_for_lengths():
     assert isinstance(Example(length=1).length, float)
+
+
+@dataclass(frozen=True)
+class Nested(StageConfig):
+    """A stage within another."""
+
+    renamed = {"size": "example.length"}
+    example: Example = Example(count=3)
+    last: int = 0
+    """The last one."""
+
+
+def test_options_of_a_nested_stage_are_dotted():
+    assert [option.name for option in options(Nested)] == ["example.count", "example.length", "example.kind", "example.on", "last"]
+    config = Nested.from_mapping({"example.length": 1, "last": 4})
+    assert config == Nested(Example(count=3, length=1.0), 4)
+    assert Nested.from_mapping({"example": {"length": 1}, "last": 4}) == config
+    assert Nested.from_mapping(option_values(config)) == config
+    assert option_values(config)["example.count"] == 3
+
+
+def test_options_of_a_nested_stage_are_checked_and_old_names_lead_to_the_new_ones():
+    with pytest.raises(ConfigError, match=r"Example.count must lie in \[1, 5\], got 9"):
+        Nested.from_mapping({"example.count": 9})
+    with pytest.raises(ConfigError, match="Example has no option size; it has count, length, kind, on"):
+        Nested.from_mapping({"example.size": 9})
+    with pytest.raises(ConfigError, match="Nested: the option size is now example.length"):
+        Nested.from_mapping({"size": 0.5})
 
 
 @pytest.mark.parametrize("config", ALL, ids=lambda config: config.__name__)

@@ -439,9 +439,7 @@ def test_recording_is_reconstructed_published_latched_and_saved(bench, reconstru
     assert messages.stamp_to_ns(models[-1].header.stamp) > messages.stamp_to_ns(models[count - 1].header.stamp)
 
 
-def test_stamps_that_jump_begin_a_new_recording_and_looping_does_not_reconstruct_again(
-    bench, reconstruction, small_frames, monkeypatch
-):
+def test_stamps_that_jump_begin_a_new_recording_and_looping_does_not_reconstruct_again(bench, reconstruction, small_frames, monkeypatch):
     # However long the training in between takes, the bag loops without a pause.
     monkeypatch.setattr(sys.modules[type(reconstruction).__module__], "_PAUSE", 60.0)
     long = [f.__class__(f.stamp_ns + i * S, f.image, f.camera, depth=f.depth) for i, f in enumerate(small_frames)]

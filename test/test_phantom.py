@@ -144,9 +144,7 @@ def test_poses_are_rigid_smooth_and_rest_at_both_ends():
     config = PhantomConfig()
     poses = phantom_poses(config)
     rotations, tips = poses[:, :3, :3], poses[:, :3, 3]
-    np.testing.assert_allclose(
-        rotations @ rotations.transpose(0, 2, 1), np.tile(np.eye(3), (len(poses), 1, 1)), atol=1e-12
-    )
+    np.testing.assert_allclose(rotations @ rotations.transpose(0, 2, 1), np.tile(np.eye(3), (len(poses), 1, 1)), atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(rotations), 1.0)
     speed = np.linalg.norm(np.diff(tips, axis=0), axis=1)
     assert speed[0] < 0.05 * speed.max() and speed[-1] < 0.05 * speed.max()

@@ -28,6 +28,7 @@ from endo_sim_ros.physics import (
     lame_parameters,
     plan_substeps,
     sample_farthest,
+    solver,
     sound_speed,
 )
 from endo_sim_ros.physics.backends import cluster_kernels as cluster

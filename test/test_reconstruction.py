@@ -750,9 +750,7 @@ def test_virtual_camera_lies_between_two_views(small, monkeypatch):
 
 def test_training_improves_views_it_has_not_seen(small):
     training, rest = [small[i] for i in (0, 2, 4, 6)], [small[i] for i in (1, 3, 5)]
-    noisy = [
-        dataclasses.replace(f, depth=f.depth * np.float32(1.03 if i % 2 else 0.97)) for i, f in enumerate(training)
-    ]
+    noisy = [dataclasses.replace(f, depth=f.depth * np.float32(1.03 if i % 2 else 0.97)) for i, f in enumerate(training)]
     trainer = Trainer(noisy, options(iterations=150, max_gaussians=8000, refine_every=50))
     psnr, _ = held_out(trainer.model, rest)
     given_error = 0.03 * np.mean([np.sqrt(np.mean(f.depth[f.depth > 0] ** 2)) for f in training])

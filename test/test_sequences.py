@@ -84,11 +84,7 @@ def plane_colours(frame) -> tuple[np.ndarray, np.ndarray]:
 def assert_frame_agrees(frame, tolerance=4.0, margin=4):
     """The image shows what K and pose say; the right image shows it shifted by fx·baseline/depth on the same row."""
     expected, depth = plane_colours(frame)
-    used = (
-        cv2.erode(frame.mask, np.ones((2 * margin + 1,) * 2)) > 0
-        if frame.mask is not None
-        else np.ones(depth.shape, bool)
-    )
+    used = cv2.erode(frame.mask, np.ones((2 * margin + 1,) * 2)) > 0 if frame.mask is not None else np.ones(depth.shape, bool)
     used[:margin] = used[-margin:] = False
     assert used.mean() > 0.3
     error = np.abs(frame.image.astype(float) - expected).max(-1)[used]
@@ -131,9 +127,7 @@ def write_poses(path: Path, poses: dict[int, np.ndarray], heading="# frame tx ty
 
 
 def trajectory(count: int) -> dict[int, np.ndarray]:
-    return {
-        n: pose_of((0.001 * n, -0.0005 * n, 0.0004 * n), x=0.004 * n, y=-0.006 * n, z=0.003 * n) for n in range(count)
-    }
+    return {n: pose_of((0.001 * n, -0.0005 * n, 0.0004 * n), x=0.004 * n, y=-0.006 * n, z=0.003 * n) for n in range(count)}
 
 
 # ---------------------------------------------------------------------------------------------------- rectification
@@ -142,9 +136,7 @@ def trajectory(count: int) -> dict[int, np.ndarray]:
 @pytest.mark.parametrize("distortion", [NO_DISTORTION, BARREL], ids=["undistorted", "barrel"])
 def test_rectified_eyes_share_rows_and_their_disparity_gives_depth(distortion):
     R, T = rotation(0.02, -0.03, 0.015), np.array([-BASELINE, 0.0003, -0.0002])
-    rectification = Rectification.stereo(
-        StereoCalibration("calibration", (WIDTH, HEIGHT), K_LEFT, distortion, K_RIGHT, distortion, R, T)
-    )
+    rectification = Rectification.stereo(StereoCalibration("calibration", (WIDTH, HEIGHT), K_LEFT, distortion, K_RIGHT, distortion, R, T))
     pose = pose_of((0.004, -0.002, 0.01), x=0.1, y=-0.15, z=0.2)
     left, points = see_plane(K_LEFT, distortion, pose)
     right, _ = see_plane(K_RIGHT, distortion, right_pose(pose, R, T))
@@ -274,9 +266,7 @@ def test_stereomis_counts_frames_without_pose_in_the_log(stereomis_source, caplo
     assert "white is taken for tools" in caplog.text
 
 
-@pytest.mark.parametrize(
-    ("split", "numbers"), [("train", [0, 1, 4, 5]), ("test", [6, 7]), (None, [0, 1, 2, 4, 5, 6, 7])]
-)
+@pytest.mark.parametrize(("split", "numbers"), [("train", [0, 1, 4, 5]), ("test", [6, 7]), (None, [0, 1, 2, 4, 5, 6, 7])])
 def test_stereomis_splits_are_inclusive_ranges(stereomis_source, split, numbers):
     frames = read_stereomis(stereomis_source, split=split)
     assert [(f.stamp_ns - 1_000_000_000) // 50_000_000 for f in frames] == numbers
@@ -870,9 +860,7 @@ def relief_images(poses, K_cv, size=(320, 240)):
         yield np.repeat(grey[..., None], 3, -1).round().astype(np.uint8)
 
 
-ORBIT = [
-    pose_of((0.05 * np.sin(a), 0.01 * np.cos(3 * a), 0.1 - 0.1 * np.cos(a)), y=-a) for a in np.linspace(-0.35, 0.35, 6)
-]
+ORBIT = [pose_of((0.05 * np.sin(a), 0.01 * np.cos(3 * a), 0.1 - 0.1 * np.cos(a)), y=-a) for a in np.linspace(-0.35, 0.35, 6)]
 K_RELIEF = np.array([[300.0, 0, 159.5], [0, 300.0, 119.5], [0, 0, 1]])
 
 
@@ -919,16 +907,12 @@ def test_structure_from_motion_that_fails_says_why(tmp_path):
         estimate_poses([np.zeros((120, 160, 3), np.uint8)])
 
 
-@pytest.mark.skipif(
-    not (SHARED / "gallbladder/endo.mp4").is_file(), reason="the gallbladder video is not at ../shared/data"
-)
+@pytest.mark.skipif(not (SHARED / "gallbladder/endo.mp4").is_file(), reason="the gallbladder video is not at ../shared/data")
 def test_structure_from_motion_on_a_real_video(tmp_path):
     reference = read_poses(SHARED / "gallbladder/poses.txt")
     video = Video(SHARED / "gallbladder/endo.mp4")
     numbers = list(range(0, 96, 12))
-    images = [
-        cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for _, image in video.frames(numbers)
-    ]
+    images = [cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for _, image in video.frames(numbers)]
     lit = lit_area(images)
     K, distortion = np.array([[453.7, 0, 320], [0, 453.7, 180], [0, 0, 1]]), [-0.083]
     rectification = Rectification.mono(K, distortion, (640, 360))

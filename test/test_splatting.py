@@ -52,9 +52,7 @@ def covariances(quats, scales):
     return rotations @ torch.diag_embed(scales**2) @ rotations.mT
 
 
-def run(
-    function, gaussians, cameras, size=(WIDTH, HEIGHT), device="cpu", dtype=torch.float64, cotangents=None, **options
-):
+def run(function, gaussians, cameras, size=(WIDTH, HEIGHT), device="cpu", dtype=torch.float64, cotangents=None, **options):
     """The output of a rasteriser and the gradients of gaussians, view matrices and background for random cotangents."""
     viewmats, Ks = cameras
     leaves = [x.detach().to(device, dtype).requires_grad_() for x in (*gaussians, viewmats, BACKGROUND)]
@@ -602,9 +600,7 @@ def test_hidden_gaussians_do_not_change_the_picture():
 
 
 def test_render_shows_a_model_through_a_camera():
-    model = GaussianModel.from_points(
-        torch.tensor([[0.0, 0, 0.1]]), torch.tensor([[0.9, 0.2, 0.1]]), torch.tensor([0.02]), opacity=0.99
-    )
+    model = GaussianModel.from_points(torch.tensor([[0.0, 0, 0.1]]), torch.tensor([[0.9, 0.2, 0.1]]), torch.tensor([0.02]), opacity=0.99)
     camera = Camera(np.array([[40.0, 0, 16.5], [0, 40, 12.5], [0, 0, 1]]), 33, 25)
     output = render(model, camera, background=torch.ones(3))
     assert output.colors.shape == (1, 25, 33, 3) and output.radii.shape == (1, 1)

@@ -106,9 +106,7 @@ def test_optional_streams_may_start_late_and_stop_early():
             frames += synchronizer.add("mask", number * 40 * MS, np.full((HEIGHT, WIDTH), 255, np.uint8))
     frames += synchronizer.flush()
     assert len(frames) == 12
-    assert [None if frame.depth is None else frame.depth[0, 0] for frame in frames] == [None] * 3 + [4, 5, 6, 7, 8] + [
-        None
-    ] * 4
+    assert [None if frame.depth is None else frame.depth[0, 0] for frame in frames] == [None] * 3 + [4, 5, 6, 7, 8] + [None] * 4
     assert [frame.mask is not None for frame in frames] == [bool(number % 2) for number in range(1, 13)]
 
 

@@ -53,9 +53,7 @@ class Up:
         params.write_text(SMALL.replace("OUT", str(folder / "models")))
         command = [sys.executable, "-m", "endo_sim_ros.cli", "up", "--logs", str(folder / "logs")]
         command += ["--params-file", str(params), *options]
-        self.process = subprocess.Popen(
-            command, stdout=self.output.open("w"), stderr=subprocess.STDOUT, start_new_session=True
-        )
+        self.process = subprocess.Popen(command, stdout=self.output.open("w"), stderr=subprocess.STDOUT, start_new_session=True)
 
     def says(self, pattern: str, seconds: float = 120.0) -> re.Match:
         found = lambda: re.search(pattern, self.output.read_text())  # noqa: E731

@@ -1,17 +1,21 @@
-"""Stage configurations: one frozen dataclass each is the single source of a stage's parameters.
+"""Stage configurations: one frozen dataclass each is the single source of a stage's options.
 
 The command line, the ROS 2 parameters and `config/*.yaml` are all derived from (or tested against) these classes.
 A field is declared as ``name: Annotated[float, Range(lo, hi, unit)] = default`` with a one-line docstring under it.
+A field whose type is another stage configuration nests its options; their names are then dotted: ``stage.option``.
 """
 
 import ast
 import dataclasses
 import inspect
 import math
+import operator
 import textwrap
 import typing
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
+
+from typing_extensions import Self
 
 
 class Range(NamedTuple):
@@ -23,9 +27,9 @@ class Range(NamedTuple):
 
 
 class Option(NamedTuple):
-    """Everything known about one field of a configuration."""
+    """Everything known about one option of a configuration."""
 
-    name: str
+    name: str  # dotted for an option of a nested stage
     type: type  # bool, int, float, str, or tuple of strings
     default: Any
     description: str
@@ -39,7 +43,7 @@ class ConfigError(ValueError):
 
 @cache
 def options(config_class: type) -> tuple[Option, ...]:
-    """All fields of a configuration dataclass, in order, with the docstring under each as its description."""
+    """All options of a configuration dataclass, in order; those of a nested stage follow under ``stage.option``."""
     hints = typing.get_type_hints(config_class, include_extras=True)
     docstrings = {}
     for each in filter(dataclasses.is_dataclass, reversed(config_class.__mro__)):
@@ -52,6 +56,9 @@ def options(config_class: type) -> tuple[Option, ...]:
     found = []
     for field in dataclasses.fields(config_class):
         hint, bounds, choices = hints[field.name], None, None
+        if _is_stage(hint):
+            found += [option._replace(name=f"{field.name}.{option.name}") for option in options(hint)]
+            continue
         if typing.get_origin(hint) is typing.Annotated:
             hint, *extras = typing.get_args(hint)
             bounds = next((extra for extra in extras if isinstance(extra, Range)), None)
@@ -63,9 +70,20 @@ def options(config_class: type) -> tuple[Option, ...]:
     return tuple(found)
 
 
+def _is_stage(hint: Any) -> bool:
+    return isinstance(hint, type) and issubclass(hint, StageConfig)
+
+
+def option_values(config: "StageConfig") -> dict[str, Any]:
+    """The value of every option by its (dotted) name, in the order of `options`."""
+    return {option.name: operator.attrgetter(option.name)(config) for option in options(type(config))}
+
+
 def validate(config: Any) -> None:
     """Raise :class:`ConfigError` unless every field has its declared type and lies within its declared bounds."""
     for option in options(type(config)):
+        if "." in option.name:
+            continue  # the nested stage has validated itself
         value = getattr(config, option.name)
         where = f"{type(config).__name__}.{option.name}"
         if option.type is float and isinstance(value, int) and not isinstance(value, bool):
@@ -90,14 +108,51 @@ def validate(config: Any) -> None:
 class StageConfig:
     """Base of the stage configurations: validates on construction and converts from plain mappings."""
 
+    renamed: ClassVar[dict[str, str]] = {}
+    """Options that had another name: the old name, and what to write instead."""
+
     def __post_init__(self):
         validate(self)
 
     @classmethod
-    def from_mapping(cls, values: dict[str, Any]):
-        """Build from a mapping such as a YAML section; unknown names are an error that lists the known ones."""
-        known = [option.name for option in options(cls)]
-        unknown = [name for name in values if name not in known]
+    def from_mapping(cls, values: dict[str, Any]) -> Self:
+        """Build from a mapping such as a YAML section; options that are not in it keep their defaults.
+
+        Args:
+            values: By option name; options of a nested stage are dotted (``stage.option``) or a mapping of their own.
+
+        Raises:
+            ConfigError: If a value cannot be used, or a name is unknown; the sentence then lists the known ones.
+        """
+        return cls().replaced(values)
+
+    def replaced(self, values: dict[str, Any]) -> Self:
+        """A copy in which the named options have other values; names as in `from_mapping`.
+
+        Raises:
+            ConfigError: As `from_mapping` does.
+        """
+        stages = {field.name for field in dataclasses.fields(self) if isinstance(getattr(self, field.name), StageConfig)}
+        own, nested, unknown = {}, {}, []
+        for name, value in values.items():
+            stage, _, rest = name.partition(".")
+            if stage in stages and rest:
+                nested.setdefault(stage, {})[rest] = value
+            elif stage in stages and isinstance(value, dict):
+                nested.setdefault(stage, {}).update(value)
+            elif name in {field.name for field in dataclasses.fields(self)}:
+                own[name] = value
+            else:
+                unknown.append(name)
         if unknown:
-            raise ConfigError(f"{cls.__name__} has no option {', '.join(unknown)}; it has {', '.join(known)}")
-        return cls(**values)
+            raise ConfigError(self._explain_unknown(unknown))
+        changed = {stage: getattr(self, stage).replaced(inner) for stage, inner in nested.items()}
+        return dataclasses.replace(self, **own, **changed)
+
+    @classmethod
+    def _explain_unknown(cls, names: list[str]) -> str:
+        for name in names:
+            if name in cls.renamed:
+                return f"{cls.__name__}: the option {name} is now {cls.renamed[name]}"
+        known = ", ".join(option.name for option in options(cls))
+        return f"{cls.__name__} has no option {', '.join(names)}; it has {known}"

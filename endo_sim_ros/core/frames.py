@@ -41,8 +41,7 @@ class Frame:
             array = getattr(self, name)
             if array is not None and array.shape[:2] != shape:
                 raise SequenceError(
-                    f"frame {self.stamp_ns}: {name} is {array.shape[1]}×{array.shape[0]}, "
-                    f"but the camera says {shape[1]}×{shape[0]}"
+                    f"frame {self.stamp_ns}: {name} is {array.shape[1]}×{array.shape[0]}, but the camera says {shape[1]}×{shape[0]}"
                 )
 
     @property

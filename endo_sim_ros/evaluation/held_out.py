@@ -112,9 +112,7 @@ def mean_figures(rows: Sequence[dict[str, float]]) -> dict[str, float]:
     return {name: float(np.nanmean(values)) for name, values in found.items() if np.isfinite(values).any()}
 
 
-def seen_pixels(
-    camera: Camera, depth: np.ndarray, views: Sequence[tuple[Camera, np.ndarray, np.ndarray | None]]
-) -> np.ndarray:
+def seen_pixels(camera: Camera, depth: np.ndarray, views: Sequence[tuple[Camera, np.ndarray, np.ndarray | None]]) -> np.ndarray:
     """Which pixels [H, W] of a view show a surface that one of the other views sees, too, and not hidden.
 
     Args:

@@ -95,9 +95,7 @@ class Lpips:
 def _trunk_layers(backbone: str, state: dict[str, Tensor]) -> list[tuple | None]:
     """Layers as in _TRUNKS, each number replaced by the weight and the bias."""
     state = {name.removeprefix("features."): tensor.float() for name, tensor in state.items()}
-    return [
-        layer and (state[f"{layer[0]}.weight"], state[f"{layer[0]}.bias"], *layer[1:]) for layer in _TRUNKS[backbone]
-    ]
+    return [layer and (state[f"{layer[0]}.weight"], state[f"{layer[0]}.bias"], *layer[1:]) for layer in _TRUNKS[backbone]]
 
 
 def _trunk_file(backbone: str, folder: Path | None) -> Path:

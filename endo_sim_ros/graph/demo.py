@@ -58,9 +58,7 @@ class _Watcher(EndoNode):
             self.statuses[name] = (level, text, values)
 
 
-def run_demo(
-    bag: Path | None, out: Path, seed: int, frames: int, width: int, iterations: int, force: float, timeout: float
-) -> None:
+def run_demo(bag: Path | None, out: Path, seed: int, frames: int, width: int, iterations: int, force: float, timeout: float) -> None:
     """Run the demo and leave video, contact sheet, model and recording in ``out``.
 
     Raises:

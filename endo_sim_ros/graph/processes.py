@@ -35,9 +35,7 @@ class NodeProcess:
         log.parent.mkdir(parents=True, exist_ok=True)
         with log.open("wb") as output:
             mine = environment | {_PARENT: str(os.getpid())}
-            self._process = subprocess.Popen(
-                arguments, env=mine, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
-            )
+            self._process = subprocess.Popen(arguments, env=mine, stdout=output, stderr=subprocess.STDOUT, start_new_session=True)
 
     @property
     def exit_status(self) -> int | None:

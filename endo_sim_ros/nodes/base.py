@@ -105,9 +105,7 @@ class EndoNode(Node):
             if option.choices:
                 descriptor.additional_constraints = "one of " + ", ".join(option.choices)
             if option.range and option.type is float:
-                bounds = FloatingPointRange(
-                    from_value=float(option.range.minimum), to_value=float(option.range.maximum)
-                )
+                bounds = FloatingPointRange(from_value=float(option.range.minimum), to_value=float(option.range.maximum))
                 descriptor.floating_point_range = [bounds]
             elif option.range:
                 bounds = IntegerRange(from_value=int(option.range.minimum), to_value=int(option.range.maximum), step=1)
@@ -173,9 +171,7 @@ class EndoNode(Node):
     def publisher(self, topic: Topic, depth: int = STREAM_DEPTH) -> Any:
         return self.create_publisher(messages.ros_class(topic.type), topic.name, quality(topic, depth))
 
-    def subscribe(
-        self, topic: Topic, callback: Callable[[Any], None], depth: int = STREAM_DEPTH, reliable: bool = True
-    ) -> None:
+    def subscribe(self, topic: Topic, callback: Callable[[Any], None], depth: int = STREAM_DEPTH, reliable: bool = True) -> None:
         """Subscribe with a callback whose errors are reported instead of raised."""
 
         def guarded(message: Any) -> None:

@@ -26,9 +26,7 @@ class _Points(NamedTuple):
     spacing: np.ndarray  # [N] m, distance to the neighbours
 
 
-def initial_model(
-    frames: list[Frame], points: np.ndarray, colors: np.ndarray, config: ReconstructionConfig
-) -> GaussianModel:
+def initial_model(frames: list[Frame], points: np.ndarray, colors: np.ndarray, config: ReconstructionConfig) -> GaussianModel:
     """Isotropic Gaussians at the back-projected depth of the views, and at triangulated points where no depth reaches.
 
     Args:

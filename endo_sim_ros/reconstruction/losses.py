@@ -89,9 +89,7 @@ def depth_extent(model: GaussianModel, eye: Tensor) -> Tensor:
     return torch.relu(0.5 * (deep / wide.clamp_min(1e-20)).log() - math.log(1.5))
 
 
-def seen_at(
-    points: Tensor, viewmat: Tensor, K: Tensor, mask: Tensor | None, size: tuple[int, int]
-) -> tuple[Tensor, Tensor, Tensor]:
+def seen_at(points: Tensor, viewmat: Tensor, K: Tensor, mask: Tensor | None, size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
     """Where a view sees points [N, 3] (m, world): index of the pixel [N], whether it lies in the picture's mask [N], and depth [N].
 
     Args:

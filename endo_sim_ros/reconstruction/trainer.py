@@ -635,9 +635,7 @@ def _showing(frames: list[Frame]) -> list[Frame]:
     return kept
 
 
-def _consistent(
-    frames: list[Frame], config: ReconstructionConfig, points: ScenePoints | None
-) -> tuple[list[Frame], ScenePoints]:
+def _consistent(frames: list[Frame], config: ReconstructionConfig, points: ScenePoints | None) -> tuple[list[Frame], ScenePoints]:
     """The views with their depth prior, without those whose poses contradict the others, and scene points: the given ones, or
     triangulated."""
     matches = match_features(frames)

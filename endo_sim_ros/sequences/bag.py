@@ -145,9 +145,7 @@ def _readable(path: str | Path) -> Iterator[None]:
         raise SequenceError(_no_bag(path)) from None
     except Exception as error:  # random bytes find every one that parsers and decompressors know
         reason = " ".join(str(error).split())
-        raise SequenceError(
-            f"{path}: the bag cannot be read ({type(error).__name__}: {reason}); record or convert it again"
-        ) from error
+        raise SequenceError(f"{path}: the bag cannot be read ({type(error).__name__}: {reason}); record or convert it again") from error
 
 
 def _no_bag(path: str | Path) -> str:
@@ -283,9 +281,7 @@ class BagReader:
         for raw in self.raw_messages(wanted):
             topic = wanted[raw.topic]
             if raw.type != topic.type:
-                raise SequenceError(
-                    f"{self.path}: {raw.topic} is a {raw.type}, expected a {topic.type}; remap or convert it"
-                )
+                raise SequenceError(f"{self.path}: {raw.topic} is a {raw.type}, expected a {topic.type}; remap or convert it")
             with _readable(self.path):
                 message = bag_types().typestore.deserialize_cdr(raw.data, raw.type)
             yield topic, raw.stamp_ns, message
@@ -302,9 +298,7 @@ def write_bag(path: str | Path, frames: Iterable[Frame]) -> int:
         for frame in frames:
             stamp, camera = frame.stamp_ns, frame.camera
             size = (camera.width, camera.height)
-            bag.write(
-                messages.LEFT_INFO, messages.encode_camera_info(camera.K, *size, stamp, LEFT_FRAME, types=types), stamp
-            )
+            bag.write(messages.LEFT_INFO, messages.encode_camera_info(camera.K, *size, stamp, LEFT_FRAME, types=types), stamp)
             bag.write(messages.CAMERA_POSE, messages.encode_pose(camera.pose, stamp, WORLD_FRAME, types), stamp)
             bag.write(messages.LEFT_IMAGE, messages.encode_image(frame.image, stamp, LEFT_FRAME, types), stamp)
             if frame.right is not None:
@@ -346,9 +340,7 @@ def read_bag(path: str | Path, tolerance: float = 0.01, world_frame: str = WORLD
         frames = synchronizer.flush()
     if not count + len(frames):
         reasons = ", ".join(f"{number} {reason}" for reason, number in synchronizer.dropped.items() if number)
-        raise SequenceError(
-            f"{path}: no view in the bag ({reasons or 'no images'}); are image and pose stamps within {tolerance} s?"
-        )
+        raise SequenceError(f"{path}: no view in the bag ({reasons or 'no images'}); are image and pose stamps within {tolerance} s?")
     yield from frames
 
 
@@ -361,9 +353,7 @@ def _located(path: str | Path) -> Iterator[None]:
         raise SequenceError(f"{path}: {error}") from error
 
 
-def feed(
-    synchronizer: Synchronizer, topic: Topic, message: Any, frames: str | Mapping[str, np.ndarray]
-) -> list[Frame]:
+def feed(synchronizer: Synchronizer, topic: Topic, message: Any, frames: str | Mapping[str, np.ndarray]) -> list[Frame]:
     """Decode one message of a recording topic into the synchroniser and return the frames that became complete."""
     stamp = messages.stamp_to_ns(message.header.stamp)
     if topic in (messages.LEFT_INFO, messages.RIGHT_INFO):

@@ -73,8 +73,7 @@ def read_endonerf(
     table = _read_table(root / POSES_FILE)
     if len(table) != len(images):
         raise SequenceError(
-            f"{root / POSES_FILE}: has {len(table)} poses, but {root / 'images'} has {len(images)} images; "
-            "each image needs one row"
+            f"{root / POSES_FILE}: has {len(table)} poses, but {root / 'images'} has {len(images)} images; each image needs one row"
         )
     rows = dict(zip(sorted(images), table, strict=True))
     numbers = select(images, root, start, stop, step)

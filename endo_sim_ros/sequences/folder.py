@@ -86,9 +86,7 @@ def read_folder(
     if right and baseline is None:
         raise SequenceError(f"{root / CALIBRATION_FILE}: baseline_m is missing, but there are right images")
     if right and any(calibration["distortion"]):
-        raise SequenceError(
-            f"{root / CALIBRATION_FILE}: stereo images must be rectified already; drop distortion or right/"
-        )
+        raise SequenceError(f"{root / CALIBRATION_FILE}: stereo images must be rectified already; drop distortion or right/")
     fps = fps or calibration.get("fps", DEFAULT_FPS)
 
     numbers = select(left, root / "left", start, stop, step)

@@ -70,9 +70,7 @@ CELL = 2 * HALF_WIDTH / CELLS
 SIDE = CELLS + 1  # vertices
 
 
-def _noise(
-    rng: np.random.Generator, scale: float, octaves: int = 1, stretch: tuple[float, float] = (1.0, 1.0)
-) -> np.ndarray:
+def _noise(rng: np.random.Generator, scale: float, octaves: int = 1, stretch: tuple[float, float] = (1.0, 1.0)) -> np.ndarray:
     """Smooth noise [SIDE, SIDE] of about zero mean and unit deviation.
 
     Args:
@@ -215,9 +213,7 @@ class _Anatomy:
         centre = self.apex + np.float32([math.cos(angle), math.sin(angle)]) * long * 0.62 + np.float32([0.0, 0.012])
         a = (x - centre[0]) * math.cos(angle) + (y - centre[1]) * math.sin(angle)
         b = -(x - centre[0]) * math.sin(angle) + (y - centre[1]) * math.cos(angle)
-        radius = (
-            (np.abs(a) / long) ** 2.3 + (np.abs(b) / (short * np.clip(1.0 + 0.28 * a / long, 0.5, 1.5))) ** 2.3
-        ) ** (1 / 2.3)
+        radius = ((np.abs(a) / long) ** 2.3 + (np.abs(b) / (short * np.clip(1.0 + 0.28 * a / long, 0.5, 1.5))) ** 2.3) ** (1 / 2.3)
         dome = np.maximum(1.0 - radius * radius, 0.0) ** 0.62
         height = rng.uniform(0.022, 0.027)
         relief = 0.0008 * _noise(rng, 0.022, 2) + 0.00018 * _noise(rng, 0.006, 2)
@@ -348,9 +344,7 @@ class _Paint:
         by_vertex = np.ascontiguousarray(np.moveaxis(anatomy.shares, 0, -1))
 
         def look(name):  # one property over the whole surface [SIDE, SIDE] or, a colour, [SIDE, SIDE, 3]
-            table = np.float32(
-                [_linear(v) if isinstance(v := getattr(tissue, name), tuple) else v for tissue in tissues]
-            )
+            table = np.float32([_linear(v) if isinstance(v := getattr(tissue, name), tuple) else v for tissue in tissues])
             return cv2.transform(by_vertex, table.reshape(len(tissues), -1).T)
 
         # Mottling: wide drifts between two colours, and patches with softly lobed outlines.
@@ -368,9 +362,7 @@ class _Paint:
         grain = 0.065 * _noise(rng, 0.0024, 3) + 0.065 * _noise(rng, 0.011, 3)
         # Crevices see little of the light that other tissue scatters: darken what lies behind its neighbourhood.
         z = anatomy.heights
-        hidden = sum(
-            strength * np.maximum(z - _blur(z, sigma), 0.0) for sigma, strength in ((0.0025, 200.0), (0.010, 60.0))
-        )
+        hidden = sum(strength * np.maximum(z - _blur(z, sigma), 0.0) for sigma, strength in ((0.0025, 200.0), (0.010, 60.0)))
         for c, tint in enumerate(((0.6, 0.75), (1.1, 1.1), (1.0, 1.1))):
             colour[..., c] *= np.exp(tint[0] * grain - tint[1] * hidden - _BLOOD[c] * red - _DEEP_BLOOD[c] * deep)
         self._veil(rng, anatomy, colour)
@@ -385,9 +377,7 @@ class _Paint:
     def _blood(self, rng, anatomy, vessels, capillaries):
         """Optical depth [SIDE, SIDE] of blood at the surface and of blood deeper down; raises large vessels, too."""
         shares = anatomy.shares
-        canvas = shares[anatomy.ORGAN] * self._organ_vessels(rng, anatomy) + shares[anatomy.LOBE] * self._lobe_vessels(
-            rng
-        )
+        canvas = shares[anatomy.ORGAN] * self._organ_vessels(rng, anatomy) + shares[anatomy.LOBE] * self._lobe_vessels(rng)
         canvas += (shares[anatomy.WALL] + shares[anatomy.LIGAMENT]) * self._wall_vessels(rng)
         fine, middle, large = canvas
         self.relief = 0.00025 * _blur(large + 0.6 * middle, 0.0005)
@@ -407,9 +397,7 @@ class _Paint:
             (45.0, 0.7),
             (110.0, 0.5),
         ):  # noise over the angle alone makes a fan of fibres
-            line = cv2.resize(
-                rng.standard_normal((1, 1024)).astype(np.float32), (8192, 1), interpolation=cv2.INTER_CUBIC
-            )[0]
+            line = cv2.resize(rng.standard_normal((1, 1024)).astype(np.float32), (8192, 1), interpolation=cv2.INTER_CUBIC)[0]
             position = (0.5 * count * angle + 30.0 * radius) * 8.0 + 4096.0
             fibres += amplitude * line[np.clip(position, 0, 8191).astype(np.int32)]
         edge = np.exp(-np.abs(angle - 1.0) * radius / 0.0010)
@@ -430,9 +418,7 @@ class _Paint:
         vessels = _Vessels(rng, 0.0017)
         for side in np.linspace(-0.6, 1.3, 6):  # from the hilum, left, fanning out across the body
             origin = anatomy.apex + np.float32([-0.026 - 0.002 * side, 0.022 + 0.024 * side])
-            vessels.grow(
-                origin, 0.55 * side + 0.2 + rng.normal(0.0, 0.1), rng.uniform(0.0005, 0.0009), wander=0.26, reach=2.0
-            )
+            vessels.grow(origin, 0.55 * side + 0.2 + rng.normal(0.0, 0.1), rng.uniform(0.0005, 0.0009), wander=0.26, reach=2.0)
         for _ in range(28):  # and smaller ones from all around
             origin = anatomy.apex + rng.uniform([0.0, -0.01], [0.12, 0.10])
             vessels.grow(origin, rng.uniform(0, 2 * math.pi), rng.uniform(0.00022, 0.00042), reach=1.3)
@@ -482,9 +468,7 @@ class Phantom:
         self.heights = np.ascontiguousarray(anatomy.heights - paint.relief, np.float32)
         """Depth coordinate z of the surface over the vertices of its grid [y, x], metres, world."""
 
-        slopes = np.stack(
-            [_slope(self.heights, 1), _slope(self.heights, 0), -_slope(paint.film, 1), -_slope(paint.film, 0)], -1
-        )
+        slopes = np.stack([_slope(self.heights, 1), _slope(self.heights, 0), -_slope(paint.film, 1), -_slope(paint.film, 0)], -1)
         colours = np.concatenate([paint.colour, paint.wetness[..., None]], -1)
         surface = kernels.Surface()
         surface.n, surface.cell = CELLS, CELL
@@ -520,9 +504,7 @@ def _minimum_pyramid(heights: np.ndarray) -> np.ndarray:
     level = np.minimum(np.minimum(heights[:-1, :-1], heights[:-1, 1:]), np.minimum(heights[1:, :-1], heights[1:, 1:]))
     levels = [level.ravel()]
     while len(level) > CELLS >> kernels.TOP_LEVEL:
-        level = np.minimum(
-            np.minimum(level[::2, ::2], level[::2, 1::2]), np.minimum(level[1::2, ::2], level[1::2, 1::2])
-        )
+        level = np.minimum(np.minimum(level[::2, ::2], level[::2, 1::2]), np.minimum(level[1::2, ::2], level[1::2, 1::2]))
         levels.append(level.ravel())
     return np.concatenate(levels)
 

@@ -98,9 +98,7 @@ def sample(texture: wp.array[wp.vec4], n: int, level: int, u: float, v: float):
 
 
 @wp.func
-def hit_in_cell(
-    surface: Surface, u: float, v: float, z: float, du: float, dv: float, dz: float, start: float, end: float
-):
+def hit_in_cell(surface: Surface, u: float, v: float, z: float, du: float, dv: float, dz: float, start: float, end: float):
     """First depth in [start, end], both in one cell, at which the ray is on the surface; negative if there is none."""
     half = 0.5 * (end - start)
     f0 = z + start * dz - height_at(surface, u + start * du, v + start * dv)

@@ -54,9 +54,7 @@ READERS: dict[str, Reader] = {
         f"the file {stereomis.CALIBRATION_FILE}",
     ),
     "scared": Reader(read_scared, _is_scared, f"the file {scared.CALIBRATION_FILE} or data/frame_data.tar.gz"),
-    "endonerf": Reader(
-        read_endonerf, lambda path: (path / endonerf.POSES_FILE).is_file(), f"the file {endonerf.POSES_FILE}"
-    ),
+    "endonerf": Reader(read_endonerf, lambda path: (path / endonerf.POSES_FILE).is_file(), f"the file {endonerf.POSES_FILE}"),
     "folder": Reader(
         read_folder,
         lambda path: (path / "left").is_dir(),

@@ -71,9 +71,7 @@ def keep_posed(numbers: list[int], poses: Container[int], pose_file: Path) -> li
     if not posed:
         raise SequenceError(f"{pose_file}: holds no pose for any of the {len(numbers)} chosen frames")
     if len(posed) < len(numbers):
-        logger.info(
-            "%s: %d of %d frames have no pose and are skipped", pose_file, len(numbers) - len(posed), len(numbers)
-        )
+        logger.info("%s: %d of %d frames have no pose and are skipped", pose_file, len(numbers) - len(posed), len(numbers))
     return posed
 
 
@@ -225,9 +223,7 @@ def read_poses(path: Path) -> dict[int, np.ndarray]:
                 continue  # a heading
             raise SequenceError(f"{path}: line {count} is not made of numbers: {raw_line.strip()!r}") from None
         if len(values) != 8:
-            raise SequenceError(
-                f"{path}: line {count} has {len(values)} numbers, expected 8: frame tx ty tz qx qy qz qw"
-            )
+            raise SequenceError(f"{path}: line {count} has {len(values)} numbers, expected 8: frame tx ty tz qx qy qz qw")
         number, position, quat = int(values[0]) if np.isfinite(values[0]) else -1, values[1:4], values[[7, 4, 5, 6]]
         if not np.isfinite(values).all() or abs(np.linalg.norm(quat) - 1) > 0.05 or number != values[0] or number < 0:
             raise SequenceError(

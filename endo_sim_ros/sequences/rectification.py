@@ -55,17 +55,13 @@ class StereoCalibration:
         if np.abs(self.R @ self.R.T - np.eye(3)).max() > 0.01 or np.linalg.det(self.R) < 0:
             raise SequenceError(f"{self.source}: R is not a rotation: {self.R.tolist()}")
         if not np.abs(self.T[0]) > 1e-5:
-            raise SequenceError(
-                f"{self.source}: T has no horizontal part ({self.T.tolist()} m), so there is no baseline"
-            )
+            raise SequenceError(f"{self.source}: T has no horizontal part ({self.T.tolist()} m), so there is no baseline")
         if not 0.5e-3 < np.abs(self.T[0]) < 0.05:
             logger.warning("%s: a baseline of %.3g m is unusual for an endoscope; T is read as millimetres",
                            self.source, abs(self.T[0]))  # fmt: skip
         if self.T[0] > 0:
             # Some tools write the pose of the right camera instead of the change of coordinates.
-            logger.warning(
-                "%s: T points to the right eye, so R and T are read as its pose in the left frame", self.source
-            )
+            logger.warning("%s: T points to the right eye, so R and T are read as its pose in the left frame", self.source)
             object.__setattr__(self, "T", -self.R.T @ self.T)
             object.__setattr__(self, "R", self.R.T.copy())
 
@@ -138,9 +134,7 @@ class Rectification:
             return cls(size, np.array(K, np.float64), np.eye(3), None)
         K_cv = K - HALF_PIXEL
         K_new, _ = cv2.getOptimalNewCameraMatrix(K_cv, coefficients, size, 0)
-        zoom = max(
-            K_new[0, 0] / K_cv[0, 0], K_new[1, 1] / K_cv[1, 1]
-        )  # one zoom for both axes: pixels stay as they are
+        zoom = max(K_new[0, 0] / K_cv[0, 0], K_new[1, 1] / K_cv[1, 1])  # one zoom for both axes: pixels stay as they are
         K_new[0, 0], K_new[1, 1] = zoom * K_cv[0, 0], zoom * K_cv[1, 1]
         maps = cv2.initUndistortRectifyMap(K_cv, coefficients, np.eye(3), K_new, size, cv2.CV_32FC1)
         return cls(size, K_new + HALF_PIXEL, np.eye(3), maps)
@@ -178,7 +172,5 @@ class Rectification:
 
     def _remap(self, image: np.ndarray, maps, interpolation: int) -> np.ndarray:
         if image.shape[1::-1] != tuple(self.size):
-            raise SequenceError(
-                f"image is {image.shape[1]}×{image.shape[0]}, but its calibration is for {self.size[0]}×{self.size[1]}"
-            )
+            raise SequenceError(f"image is {image.shape[1]}×{image.shape[0]}, but its calibration is for {self.size[0]}×{self.size[1]}")
         return image if maps is None else cv2.remap(image, *maps, interpolation)

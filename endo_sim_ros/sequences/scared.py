@@ -291,9 +291,7 @@ class _ScenePoints:
             if member is None:
                 return None
             if member.size > MAX_POINTS_BYTES:
-                raise SequenceError(
-                    f"{self._archive}: {member.name} has {member.size} bytes, more than an image can have"
-                )
+                raise SequenceError(f"{self._archive}: {member.name} has {member.size} bytes, more than an image can have")
             data = self._tar.extractfile(member).read()
         return _points(io.BytesIO(data), f"{self._archive}: {member.name}", size)
 
@@ -308,9 +306,7 @@ class _ScenePoints:
                     self._next = (found, member)
             if self._next[0] == number:
                 return self._next[1]
-            logger.warning(
-                "%s: frame %d is not in its place; indexing the archive, which is slow", self._archive, number
-            )
+            logger.warning("%s: frame %d is not in its place; indexing the archive, which is slow", self._archive, number)
             self._tar.close()
             self._tar = tarfile.open(self._archive, "r:gz")  # noqa: SIM115
             self._index = {_member_number(member, ".tiff"): member for member in self._tar}
@@ -333,9 +329,7 @@ def _points(file, source: str, size: tuple[int, int]) -> np.ndarray:
         with tifffile.TiffFile(file) as tiff:
             page = tiff.pages[0]
             if page.shape not in ((height, width, 3), (2 * height, width, 3)):
-                raise SequenceError(
-                    f"{source}: expected points of shape [{height} or {2 * height}, {width}, 3], got {list(page.shape)}"
-                )
+                raise SequenceError(f"{source}: expected points of shape [{height} or {2 * height}, {width}, 3], got {list(page.shape)}")
             points = page.asarray()
     except SequenceError:
         raise

@@ -188,9 +188,7 @@ class _ExtractedFrames:
 
     def read(self, numbers) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
         for number in numbers:
-            left, right = (
-                check_size(read_image(files[number]), self.size, files[number]) for files in (self._left, self._right)
-            )
+            left, right = (check_size(read_image(files[number]), self.size, files[number]) for files in (self._left, self._right))
             yield number, left, right
 
 

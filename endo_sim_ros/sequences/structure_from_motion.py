@@ -98,9 +98,7 @@ def estimate_poses(
     return _result(reconstruction, count, K, baseline=baseline, scale=scale)
 
 
-def with_estimated_poses(
-    frames: Iterable[Frame], count: int, source: Path, *, scale: float | None = None, threads: int = -1
-) -> Recording:
+def with_estimated_poses(frames: Iterable[Frame], count: int, source: Path, *, scale: float | None = None, threads: int = -1) -> Recording:
     """Frames of a calibrated camera with unknown poses, posed by structure from motion on first iteration.
 
     Args:
@@ -146,9 +144,7 @@ def _write_images(root: Path, images, masks, right_images) -> tuple[int, tuple[i
     for image, mask, right in zip(images, masks or absent, right_images or absent, strict=False):
         size = size or image.shape[1::-1]
         if image.shape[1::-1] != size:
-            raise SequenceError(
-                f"image {count} is {image.shape[1]}×{image.shape[0]}, but the first one is {size[0]}×{size[1]}"
-            )
+            raise SequenceError(f"image {count} is {image.shape[1]}×{image.shape[0]}, but the first one is {size[0]}×{size[1]}")
         name = f"{count:06d}.png"
         cv2.imwrite(str(root / "images/left" / name), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
         if right is not None:
@@ -166,9 +162,7 @@ def _write_images(root: Path, images, masks, right_images) -> tuple[int, tuple[i
     return count, size or (0, 0)
 
 
-def _run_colmap(
-    root: Path, K: np.ndarray | None, size: tuple[int, int], *, baseline, matching: str, seed: int, threads: int
-):
+def _run_colmap(root: Path, K: np.ndarray | None, size: tuple[int, int], *, baseline, matching: str, seed: int, threads: int):
     """COLMAP's largest model of the images under root; with a baseline, left and right move as one rig."""
     import pycolmap  # noqa: PLC0415  (a heavy import that only this function needs)
 
@@ -291,9 +285,7 @@ def _result(model, count: int, K: np.ndarray | None, *, baseline: float | None, 
     if K is None:
         f, cx, cy, k1 = next(iter(model.cameras.values())).params
         K, distortion = np.array([[f, 0, cx], [0, f, cy], [0, 0, 1]]), (float(k1),)
-        logger.warning(
-            "estimated a focal length of %.1f px and k1 %.3f, which may be wrong; pass the calibration if known", f, k1
-        )
+        logger.warning("estimated a focal length of %.1f px and k1 %.3f, which may be wrong; pass the calibration if known", f, k1)
     error = float(model.compute_mean_reprojection_error())
     logger.info("structure from motion placed %d of %d images, %d points, %.2f px", len(left), count, len(xyz), error)
     return StructureFromMotion(poses, np.asarray(K, np.float64), distortion, xyz * factor, error, metric)

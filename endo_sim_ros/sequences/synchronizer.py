@@ -154,9 +154,7 @@ class Synchronizer:
             raise SequenceError(str(error)) from error
 
 
-def _frame(
-    stamp: int, image: np.ndarray, info: CameraInfo, right_info: CameraInfo | None, parts: dict[str, Any]
-) -> Frame:
+def _frame(stamp: int, image: np.ndarray, info: CameraInfo, right_info: CameraInfo | None, parts: dict[str, Any]) -> Frame:
     for name, array in (("image", image), ("depth", parts.get("depth")), ("mask", parts.get("mask"))):
         if array is not None and array.shape[:2] != (info.height, info.width):
             raise SequenceError(

@@ -116,9 +116,7 @@ def scaled_rotation(quat: wp.vec4, scale: wp.vec3) -> wp.mat33:
 
 
 @wp.func
-def world_covariance(
-    n: int, quats: wp.array[wp.vec4], scales: wp.array[wp.vec3], covars: wp.array[wp.mat33], has_covars: int
-) -> wp.mat33:
+def world_covariance(n: int, quats: wp.array[wp.vec4], scales: wp.array[wp.vec3], covars: wp.array[wp.mat33], has_covars: int) -> wp.mat33:
     """Covariance of Gaussian n, m²: the symmetric part of the one given, or R S Sᵀ Rᵀ."""
     if has_covars != 0:
         return 0.5 * (covars[n] + wp.transpose(covars[n]))
@@ -255,9 +253,7 @@ def tile_rows(y: float, extent_y: float, tiles_y: int) -> wp.vec2i:
 
 
 @wp.func
-def tile_columns(
-    row: int, x: float, y: float, shear: wp.vec2, extent: wp.vec2, aspect: float, tiles_x: int
-) -> wp.vec2i:
+def tile_columns(row: int, x: float, y: float, shear: wp.vec2, extent: wp.vec2, aspect: float, tiles_x: int) -> wp.vec2i:
     """Columns [first, end) of tiles in one row that have a pixel centre in the x-range of ellipse ∩ row.
 
     Ellipse and row are convex, so the tiles met are exactly a range. At height dy the ellipse spans

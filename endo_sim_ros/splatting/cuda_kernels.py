@@ -410,9 +410,7 @@ def render_pixels(
     for first in range(start, end, BATCH):
         if block_any(live) == 0:
             break
-        batch = read_batch(
-            first, end, lane, camera, float(column0), float(row0), splats, counts, gaussian_count, splat_list
-        )
+        batch = read_batch(first, end, lane, camera, float(column0), float(row0), splats, counts, gaussian_count, splat_list)
         for word in range((wp.min(end - first, BATCH) + 31) // 32):
             if warp_any(live) == 0:
                 break
@@ -505,9 +503,7 @@ def render_pixels_backward(
     for first in range(start, end, BATCH):
         if block_any(live) == 0:
             break
-        batch = read_batch(
-            first, end, lane, camera, float(column0), float(row0), splats, counts, gaussian_count, splat_list
-        )
+        batch = read_batch(first, end, lane, camera, float(column0), float(row0), splats, counts, gaussian_count, splat_list)
         for word in range((wp.min(end - first, BATCH) + 31) // 32):
             if warp_any(live) == 0:
                 break

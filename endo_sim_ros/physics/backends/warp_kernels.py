@@ -443,9 +443,7 @@ def block_max(value: float) -> float:
 
 
 @wp.kernel
-def end_step(
-    threads: int, count: int, travel: float, backup: State, state: State, faults: wp.array[int], speed_sq: wp.array[float]
-):
+def end_step(threads: int, count: int, travel: float, backup: State, state: State, faults: wp.array[int], speed_sq: wp.array[float]):
     """Count nodes that are not finite or out of bounds (the comparisons are false for NaN) and find the largest v².
 
     Environments where there are any return to the state before the step, at rest there. Where the step before was bad as

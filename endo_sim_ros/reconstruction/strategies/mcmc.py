@@ -40,9 +40,7 @@ def relocated(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor
     return o.to(opacities), scales * (opacities / total)[:, None].to(scales)
 
 
-def refine(
-    model: GaussianModel, growth: float, limit: int, generator: torch.Generator
-) -> tuple[GaussianModel, Tensor, Tensor]:
+def refine(model: GaussianModel, growth: float, limit: int, generator: torch.Generator) -> tuple[GaussianModel, Tensor, Tensor]:
     """Move dead Gaussians onto live ones and add up to ``growth`` × N new ones, at most ``limit`` in all.
 
     Returns:

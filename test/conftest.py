@@ -2,7 +2,6 @@
 
 import os
 import shutil
-import time
 
 # Set before anything starts ROS; processes that a test starts inherit it.
 os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
@@ -17,16 +16,6 @@ from endo_sim_ros.nodes.transport import prepare_transport  # noqa: E402
 
 prepare_transport()
 torch.set_num_threads(1)
-
-
-def wait_until(condition, seconds, what, step=lambda: time.sleep(0.02)):
-    """Repeat a step until a condition is true and return its value; fail with `what` was awaited after some seconds."""
-    deadline = time.monotonic() + seconds
-    while not (value := condition()):
-        if time.monotonic() > deadline:
-            pytest.fail(f"waited {seconds} s in vain for {what() if callable(what) else what}")
-        step()
-    return value
 
 
 @pytest.fixture(scope="session")

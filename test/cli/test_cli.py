@@ -1,0 +1,139 @@
+"""The commands as a user types them."""
+
+import logging
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from endo_sim_command import endo_sim
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+from endo_sim_ros import cli
+from endo_sim_ros.core.gaussians import load_ply
+from endo_sim_ros.evaluation import held_out
+from endo_sim_ros.evaluation.held_out import reconstruct_and_measure
+from endo_sim_ros.reconstruction import ReconstructionConfig
+from endo_sim_ros.reconstruction.presets import preset, resolved
+from endo_sim_ros.sequences.bag import read_bag
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.dds
+@pytest.mark.parametrize("module", ["cli", "nodes.physics_node"])
+def test_an_interrupt_while_a_program_starts_ends_it_without_a_traceback(module):
+    heard = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)  # the tests may run where nobody hears it, in the background of a shell
+    command = [sys.executable, "-m", f"endo_sim_ros.{module}", "--help"]
+    program = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, preexec_fn=heard)
+    time.sleep(0.4)  # torch is being imported
+    program.send_signal(signal.SIGINT)
+    said, _ = program.communicate(timeout=30)
+    assert b"Traceback" not in said and program.returncode in (-signal.SIGINT, 130, 0)
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("bags") / "patient"
+    done = endo_sim("phantom", path, "--frames", 10, "--width", 128, "--height", 96)
+    assert done.returncode == 0, done.stderr
+    assert "10 frames" in done.stdout
+    return path
+
+
+@pytest.mark.dds
+def test_bag_is_read_by_the_authors_of_the_format(bag):
+    """The mcap library and its ROS 2 decoder see the same bytes as our reader."""
+    frame = next(iter(read_bag(bag)))
+    found = {}
+    with next(bag.glob("*.mcap")).open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        assert {chunk.compression for chunk in reader.get_summary().chunk_indexes} == {"zstd"}
+        for _, channel, _, message in reader.iter_decoded_messages():
+            found.setdefault(channel.topic, message)
+    image = found["/endoscope/left/image_raw"]
+    pixels = np.frombuffer(image.data, np.uint8).reshape(image.height, image.width, 3)
+    np.testing.assert_array_equal(pixels, frame.image)
+    assert found["/endoscope/right/camera_info"].p[3] == pytest.approx(-frame.camera.K[0, 0] * frame.baseline)
+    position = found["/ECM/measured_cp"].pose.position
+    np.testing.assert_allclose([position.x, position.y, position.z], frame.camera.position)
+
+
+@pytest.mark.dds
+def test_a_killed_reconstruction_goes_on_to_the_same_model(bag, tmp_path, caplog):
+    values = {"iterations": 120, "max_gaussians": 2000, "keyframes": 3, "image_width": 96, "device": "cpu"}
+    options = [word for name, value in values.items() for word in (f"--{name.replace('_', '-')}", str(value))]
+    command = [sys.executable, "-m", "endo_sim_ros.cli", "reconstruct", bag, tmp_path / "killed", *options]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        deadline = time.monotonic() + 100
+        while not (tmp_path / "killed" / "checkpoint.pt").exists() and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.005)
+        process.kill()
+    assert process.returncode == -9 and not (tmp_path / "killed" / "model.ply").exists()
+    config = ReconstructionConfig(**values)
+    with caplog.at_level(logging.INFO):
+        reconstruct_and_measure(bag, tmp_path / "killed", config, resume=True)
+    assert re.search(r"going on after [1-9]\d* iterations", caplog.text)
+    reconstruct_and_measure(bag, tmp_path / "whole", config)
+    assert (tmp_path / "killed" / "model.ply").read_bytes() == (tmp_path / "whole" / "model.ply").read_bytes()
+
+
+def test_options_given_beside_a_preset_count_whatever_their_value(monkeypatch):
+    taken = []
+    monkeypatch.setattr(held_out, "reconstruct_and_measure", lambda *arguments: taken.append(arguments[2]))
+    for given in ("--preset paper --lambda-tv 0 --sh-degree 3", "--preset laptop --lambda-tv 0 --sh-degree 3 --preset=paper", ""):
+        monkeypatch.setattr(sys, "argv", f"endo-sim reconstruct bag out {given}".split())
+        assert cli.main() == 0
+    assert resolved(taken[0]) == taken[0] == taken[1] == preset("paper", lambda_tv=0.0, sh_degree=3)
+    assert taken[2] == ReconstructionConfig()
+
+
+@pytest.mark.dds
+def test_reconstruct_writes_a_model_and_measures_held_out_views(bag, tmp_path):
+    out = tmp_path / "result"
+    done = endo_sim("reconstruct", bag, out, "--iterations", 80, "--max-gaussians", 4000, "--keyframes", 4, "--device", "cpu")
+    assert done.returncode == 0, done.stderr
+    psnr = float(next(line for line in done.stderr.splitlines() if line.startswith("PSNR [dB]")).split()[-1])
+    assert 18 < psnr < 45
+    assert 1000 < len(load_ply(out / "model.ply")) <= 4000
+    assert (out / "checkpoint.pt").is_file()
+    assert cv2.imread(str(out / "held_out.png")).std() > 10
+    touched = endo_sim("touch", out / "model.ply", "--out", out / "touch.png", "--node-count", 400, "--device", "cpu")
+    assert touched.returncode == 0 and "undone" not in touched.stderr, touched.stderr
+    picture = cv2.imread(str(out / "touch.png"))
+    assert picture.shape[1] == 3 * 128 and picture.std() > 10
+
+
+@pytest.mark.parametrize(
+    "arguments, sentence",
+    [
+        (("convert", "no/such/thing", "no_bag"), "no/such/thing: no such file or folder"),
+        (("convert", "launch", "no_bag"), "no known layout recognised"),
+        (("reconstruct", "no_bag", "out"), "no_bag: no such bag"),
+        (("phantom", "README.md"), "README.md exists already"),
+        (("phantom", "no_bag", "--frames", "0"), r"PhantomConfig.frames must lie in \[1, 100000\], got 0"),
+        (("demo", "--bag", "no_bag"), "no_bag: no such bag"),
+        (("train", "no_out", "--algorithm", "cem", "--ppo.steps", "5"), "options that begin with --ppo. are for ppo, the others for cem"),
+        (("plot",), "no files to plot; give those that `endo-sim bench … --json FILE` wrote"),
+        (("config", "policy_nod"), "no node is called policy_nod; there are reconstruction_node, "),
+    ],
+)
+def test_mistakes_are_one_sentence(arguments, sentence, tmp_path, monkeypatch, capsys):
+    extra = ("--out", tmp_path) if arguments[0] == "demo" else ()
+    monkeypatch.setattr(sys, "argv", ["endo-sim", *map(str, arguments + extra)])
+    monkeypatch.chdir(ROOT)
+    try:
+        status = cli.main()
+    except SystemExit as end:  # of the parser of arguments
+        status = end.code
+    said = capsys.readouterr()
+    assert status not in (0, None) and "Traceback" not in said.err
+    text = " ".join((said.err + said.out).replace("│", " ").split())
+    assert re.search(sentence, text), text
+    assert not (ROOT / "out" / "metadata.yaml").exists()

@@ -1,0 +1,113 @@
+"""Configurations: one source for defaults, ranges and words."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import pytest
+import yaml
+
+from endo_sim_ros import cli
+from endo_sim_ros.core.config import ConfigError, Range, StageConfig, option_values, options
+from endo_sim_ros.nodes.parameter_file import NODE_CONFIGS, parameter_file
+
+ALL = [config for configs in NODE_CONFIGS.values() for config in configs]
+FILE = Path(__file__).parents[2] / "config" / "endo_sim.yaml"
+
+
+@dataclass(frozen=True)
+class Example(StageConfig):
+    """An example."""
+
+    count: Annotated[int, Range(1, 5)] = 2
+    """How many."""
+    length: Annotated[float, Range(0, 1, "m")] = 0.5
+    """How long."""
+    kind: Literal["a", "b"] = "a"
+    """Which."""
+    on: bool = True
+    """Whether
+    or not."""
+
+
+def test_options_know_type_default_range_and_words():
+    count, length, kind, on = options(Example)
+    assert count == ("count", int, 2, "How many.", Range(1, 5), None)
+    assert (length.type, length.range.unit, kind.choices, on.description) == (float, "m", ("a", "b"), "Whether or not.")
+
+
+@pytest.mark.parametrize(
+    "values, sentence",
+    [
+        ({"count": 6}, r"Example.count must lie in \[1, 5\], got 6"),
+        ({"length": -1.0}, r"Example.length must lie in \[0, 1\] m, got -1"),
+        ({"length": float("nan")}, "Example.length must be finite"),
+        ({"kind": "c"}, "Example.kind must be one of a, b, got 'c'"),
+        ({"count": True}, "Example.count must be a int"),
+        ({"count": "2"}, "Example.count must be a int"),
+        ({"size": 1}, "Example has no option size; it has count, length, kind, on"),
+    ],
+)
+def test_bad_values_are_refused_with_what_is_allowed(values, sentence):
+    with pytest.raises(ConfigError, match=sentence):
+        Example.from_mapping(values)
+
+
+def test_whole_numbers_are_accepted_for_lengths():
+    assert isinstance(Example(length=1).length, float)
+
+
+@dataclass(frozen=True)
+class Nested(StageConfig):
+    """A stage within another."""
+
+    renamed = {"size": "example.length"}
+    example: Example = Example(count=3)
+    last: int = 0
+    """The last one."""
+
+
+def test_options_of_a_nested_stage_are_dotted():
+    assert [option.name for option in options(Nested)] == ["example.count", "example.length", "example.kind", "example.on", "last"]
+    config = Nested.from_mapping({"example.length": 1, "last": 4})
+    assert config == Nested(Example(count=3, length=1.0), 4)
+    assert Nested.from_mapping({"example": {"length": 1}, "last": 4}) == config
+    assert Nested.from_mapping(option_values(config)) == config
+    assert option_values(config)["example.count"] == 3
+
+
+def test_options_of_a_nested_stage_are_checked_and_old_names_lead_to_the_new_ones():
+    with pytest.raises(ConfigError, match=r"Example.count must lie in \[1, 5\], got 9"):
+        Nested.from_mapping({"example.count": 9})
+    with pytest.raises(ConfigError, match="Example has no option size; it has count, length, kind, on"):
+        Nested.from_mapping({"example.size": 9})
+    with pytest.raises(ConfigError, match="Nested: the option size is now example.length"):
+        Nested.from_mapping({"size": 0.5})
+
+
+@pytest.mark.parametrize("config", ALL, ids=lambda config: config.__name__)
+def test_every_option_is_described_and_its_default_is_valid(config):
+    config()
+    for option in options(config):
+        assert option.description.endswith((".", "one.")), option.name
+        if option.type in (int, float):
+            assert option.range is not None, option.name
+
+
+def test_parameter_file_in_the_repository_is_the_generated_one():
+    assert FILE.read_text() == parameter_file(), "run: endo-sim config > config/endo_sim.yaml"
+
+
+def test_parameter_file_gives_every_node_its_defaults():
+    sections = yaml.safe_load(FILE.read_text())
+    for node, configs in NODE_CONFIGS.items():
+        values = sections[f"/**/{node}"]["ros__parameters"]
+        for config in configs:
+            mine = {option.name: values.pop(option.name) for option in options(config)}
+            assert config.from_mapping(mine) == config()
+        assert not values
+
+
+def test_parameters_are_found_by_the_name_of_the_executable_too(capsys):
+    cli.Config(("policy_node", "viewer_node")).run()
+    assert capsys.readouterr().out == parameter_file(("policy", "viewer_node"))

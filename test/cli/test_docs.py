@@ -1,0 +1,67 @@
+"""What the pages say: links lead somewhere, commands have these options, nodes these parameters, and code runs."""
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import tyro
+import yaml
+
+from endo_sim_ros.cli import COMMANDS
+from endo_sim_ros.sequences.bag import write_bag
+
+ROOT = Path(__file__).parents[2]
+PAGES = sorted([ROOT / "README.md", ROOT / "msg_conventions.md", *(ROOT / "docs").glob("*.md")])
+NAMES = [page.name for page in PAGES]
+
+
+def shell_lines(page: Path) -> list[list[str]]:
+    """The commands in blocks of shell, as words; lines that end in a backslash are one."""
+    blocks = re.findall(r"```sh\n(.+?)```", page.read_text(), re.S)
+    lines = "\n".join(blocks).replace("\\\n", " ").splitlines()
+    return [words for line in lines if (words := shlex.split(line, comments=True))]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)]+)\)", page.read_text()):
+        if "://" not in target:
+            assert (page.parent / target.split("#")[0]).exists(), target
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_commands_have_these_options(page):
+    """Each is parsed but not run; tyro exits where it does not understand one."""
+    inline = [shlex.split(text) for text in re.findall(r"`(endo-sim [^`|…{]+)`", page.read_text()) if " --" in text]
+    for words in [*shell_lines(page), *inline]:
+        if words[0].endswith("endo-sim") and "--help" not in words:
+            tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="endo-sim", args=[word for word in words[1:] if word != "&"])
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_nodes_and_their_parameters_exist(page):
+    sections = yaml.safe_load((ROOT / "config" / "endo_sim.yaml").read_text())
+    known = {name: set(values["ros__parameters"]) for name, values in sections.items()}
+    for words in shell_lines(page):
+        if words[:2] != ["ros2", "run"] or words[2] != "endo_sim_ros":
+            continue
+        node = words[3]
+        assert (ROOT / "scripts" / node).is_file(), node
+        section = next(values for name, values in known.items() if name.rsplit("/", 1)[-1] in (node, node.removesuffix("_node")))
+        for flag, value in zip(words, words[1:]):
+            if flag == "-p":
+                assert value.split(":=")[0] in section, (node, value)
+
+
+@pytest.mark.dds
+def test_the_code_of_the_library_page_runs(small_frames, tmp_path):
+    (code,) = re.findall(r"```python\n(.+?)```", (ROOT / "docs" / "library.md").read_text(), re.S)
+    write_bag(tmp_path / "my_bag", small_frames)
+    code = code.replace("iterations=1500, image_width=320", "iterations=40, max_gaussians=3000")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, timeout=120)
+    assert done.returncode == 0, done.stderr
+    force = [float(value) for value in re.findall(r"-?\d[\d.e-]*", done.stdout)]
+    assert force == pytest.approx([0.0, 1.5, 1.0], abs=1e-6)

@@ -1,0 +1,101 @@
+"""The light at the camera: what it does to a picture, and how it travels with a model."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from lit_wall import CAMERA, LAMP, wall
+
+from endo_sim_ros import messages
+from endo_sim_ros.core.cameras import look_at
+from endo_sim_ros.core.gaussians import ModelError, load_ply, save_ply
+from endo_sim_ros.core.light import Light, directions, falloff, features, features_at, log_brightness
+from endo_sim_ros.core.shading import shade, to_bytes
+from endo_sim_ros.messages import MessageError
+from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
+
+
+def test_brightness_falls_with_distance_and_angle_as_written():
+    one = torch.ones(CAMERA.height, CAMERA.width)
+    fixed = dataclasses.replace(LAMP, level_r=0.0, level_g=0.0, level_b=0.0, response=0.0)
+    image = shade(fixed, torch.ones(CAMERA.height, CAMERA.width, 3), 0.2 * one, one, CAMERA)
+    v, u = 100, 30
+    x, y = (u + 0.5 - 80) / 200, (v + 0.5 - 64) / 200
+    cosine = 1 / math.sqrt(1 + x * x + y * y)
+    expected = (0.2 / cosine / 0.1) ** -1.2 * cosine**8 * math.exp(0.4 * x - 0.3 * y)
+    assert image[v, u].tolist() == pytest.approx([expected] * 3, rel=1e-5)
+
+
+def test_kernels_of_the_cpu_shade_and_round_as_written_whatever_the_size():
+    g = torch.Generator().manual_seed(0)
+    for height, width in ((37, 41), (1, 3)):
+        camera = dataclasses.replace(CAMERA, width=width, height=height)
+        colors = 1.4 * torch.rand(height, width, 3, generator=g) - 0.2
+        alphas = torch.rand(height, width, generator=g).round(decimals=1)  # some are 0
+        depths = alphas * (0.4 * torch.rand(height, width, generator=g)).round(decimals=1)
+        theta = torch.tensor([LAMP.distance, LAMP.angle, LAMP.tilt_x, LAMP.tilt_y])
+        lit = colors * falloff(features(depths, alphas, directions(camera, "cpu"), LAMP.reference), theta)[..., None]
+        level = torch.tensor([LAMP.level_r, LAMP.level_g, LAMP.level_b])
+        expected = lit * (level - LAMP.response * log_brightness(lit, alphas > 0.5)).exp()
+        torch.testing.assert_close(shade(LAMP, colors, depths, alphas, camera), expected, rtol=3e-6, atol=0)
+        assert torch.equal(to_bytes(colors), (colors.clamp(0, 1) * 255 + 0.5).to(torch.uint8))
+
+
+def test_points_and_pixels_have_the_same_quantities():
+    camera = CAMERA.at(look_at(np.array([0.02, -0.01, 0.0]), np.array([0.0, 0.0, 0.1])))
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(0.08, 0.2, (128, 160)).astype(np.float32)
+    alpha = np.full_like(depth, 0.7)
+    image = features(torch.from_numpy(depth * alpha), torch.from_numpy(alpha), directions(camera, "cpu"), 0.1)
+    points = camera.backproject(depth).reshape(-1, 3)
+    np.testing.assert_allclose(image.reshape(4, -1).T.numpy(), features_at(points, camera, 0.1), atol=1e-5)
+
+
+def test_a_full_response_holds_the_brightness_whatever_the_light():
+    light = dataclasses.replace(LAMP, level_r=-0.4, level_g=-0.4, level_b=-0.4, response=1.0)
+    one = torch.ones(CAMERA.height, CAMERA.width)
+    for factor in (0.2, 1.0, 5.0):
+        image = shade(light, factor * torch.rand(128, 160, 3, generator=torch.Generator().manual_seed(1)), 0.1 * one, one, CAMERA)
+        peak = float((image[::4, ::4].amax(-1) ** 6).mean() ** (1 / 6))
+        assert peak == pytest.approx(math.exp(-0.4), rel=1e-4)
+
+
+def test_the_light_travels_with_the_model(tmp_path):
+    model = dataclasses.replace(wall(50), light=Light(*np.float32(dataclasses.astuple(LAMP)).tolist()))
+    save_ply(model, tmp_path / "lit.ply")
+    assert load_ply(tmp_path / "lit.ply").light == model.light
+    assert model.select(torch.arange(20)).detach().to("cpu").light == model.light
+    assert messages.decode_gaussians(messages.encode_gaussians(model, 1, "world")).light == model.light
+    save_ply(dataclasses.replace(model, light=None), tmp_path / "plain.ply")
+    assert load_ply(tmp_path / "plain.ply").light is None
+
+
+def test_a_light_that_cannot_be_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="reference is 0"):
+        Light(reference=0)
+    with pytest.raises(ValueError, match="expected the values"):
+        Light.from_json('{"distance": 1.0}')
+    path = tmp_path / "lit.ply"
+    save_ply(dataclasses.replace(wall(50), light=LAMP), path)
+    path.write_bytes(path.read_bytes().replace(b'"angle": 8.0', b'"angle": NaN'))
+    with pytest.raises(ModelError, match="angle is nan"):
+        load_ply(path)
+    message = messages.encode_gaussians(dataclasses.replace(wall(50), light=LAMP), 1, "world")
+    points = messages.decode_cloud(message, "gaussians").copy()
+    points["light"][1] = np.inf
+    message.data = messages.ros_types().sequence(points.view(np.uint8))
+    with pytest.raises(MessageError, match="angle is inf"):
+        messages.decode_gaussians(message)
+
+
+def test_the_renderer_shades_deformed_tissue_too():
+    model = dataclasses.replace(wall(), light=dataclasses.replace(LAMP, response=0.0))
+    rest = model.means[::50].numpy()
+    renderer = DeformableRenderer(model, rest, RenderingConfig(device="cpu"))
+    F = np.tile(np.eye(3, dtype=np.float32), (len(rest), 1, 1))
+    near, _ = renderer.render(CAMERA, rest - np.float32([0, 0, 0.03]), F)
+    far, _ = renderer.render(CAMERA, rest, F)
+    centre = (slice(54, 74), slice(70, 90))
+    assert near[centre].mean() / far[centre].mean() == pytest.approx((0.07 / 0.1) ** -1.2, rel=0.03)

@@ -1,0 +1,189 @@
+"""Evaluations: cells that fail or are finished already, tables, the page."""
+
+import csv
+import json
+import re
+
+import cv2
+import numpy as np
+import pytest
+
+from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.evaluation import paper, tables
+from endo_sim_ros.evaluation.config import EvaluationConfig
+from endo_sim_ros.evaluation.evaluate import evaluate, open_named
+from endo_sim_ros.evaluation.page import write_page
+
+SMALL = "phantom:0,frames=6,width=96,height=80"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Options of a small evaluation, its results, and its folder; one of its two sequences cannot be read."""
+    out = tmp_path_factory.mktemp("evaluation")
+    (out / "damaged.mcap").write_bytes(b"no bag")
+    values = {"out": out, "splits": ("two-views",), "presets": ("default",), "seeds": 2, "device": "cpu", "curve": 3, "lpips": ()}
+    settings = ("iterations=20", "max_gaussians=600", "image_width=96", "depth=stereo")
+    config = EvaluationConfig(**values, set=settings, json=out / "rows.json")
+    sequences = [str(out / "damaged.mcap"), SMALL]
+    return sequences, config, evaluate(sequences, config)
+
+
+@pytest.mark.dds
+def test_every_held_out_view_is_measured_and_shown(run):
+    _, config, results = run
+    good = [cell for cell in results["cells"] if cell["error"] is None]
+    assert [cell["cell"]["seed"] for cell in good] == [0, 1]
+    for cell in good:
+        assert [row["view"] for row in cell["views"]] == [1, 2, 3, 4]
+        assert cell["figures"]["psnr"] == pytest.approx(np.mean([row["psnr"] for row in cell["views"]]))
+        assert 12 < cell["figures"]["psnr"] < 45
+        assert 50 < cell["figures"]["seen_share"] <= 100 and cell["figures"]["depth_rmse"] < 0.03
+        assert 0 < cell["figures"]["gaussians"] <= 600
+        assert [moment["iteration"] for moment in cell["curve"]][-1] == 20 and len(cell["curve"]) == 3
+        assert all((config.out / path).stat().st_size > 500 for path in cell["pictures"].values())
+    assert good[0]["figures"]["psnr"] != good[1]["figures"]["psnr"]
+    assert (config.out / "strips/phantom_0-two-views.png").stat().st_size > 1000
+
+
+@pytest.mark.dds
+def test_what_cannot_be_read_loses_its_own_cells_only(run):
+    sequences, config, results = run
+    bad = [cell for cell in results["cells"] if cell["error"] is not None]
+    assert [cell["cell"]["sequence"] for cell in bad] == ["damaged.mcap"] * 2
+    assert all("the bag cannot be read" in cell["error"] for cell in bad)
+    assert "| damaged.mcap | default | failed: " in (config.out / "table.md").read_text()
+
+
+@pytest.mark.dds
+def test_a_split_that_a_sequence_has_not_loses_its_own_cells_only(tmp_path):
+    config = EvaluationConfig(
+        out=tmp_path, splits=("two-views", "stereo", "9:1"), presets=("default",), device="cpu", lpips=(),
+        set=("iterations=2", "max_gaussians=300", "image_width=96"),
+    )  # fmt: skip
+    errors = [cell["error"] for cell in evaluate([f"{SMALL},stereo=false"], config)["cells"]]
+    assert errors[:2] == [None, "split stereo: the sequence has no right images"]
+    assert "leaves" in errors[2] and "0 to hold out" in errors[2]
+
+
+@pytest.mark.dds
+def test_finished_cells_are_not_done_again(run):
+    sequences, config, results = run
+    kept, gone = (config.out / f"cells/phantom_0-two-views-default-{seed}.json" for seed in (0, 1))
+    before = kept.stat().st_mtime_ns
+    gone.unlink()
+    again = evaluate(sequences, config)
+    assert kept.stat().st_mtime_ns == before
+    repeatable = lambda cell: {name: value for name, value in cell["figures"].items() if name not in ("seconds", "megabytes")}
+    first, second = ([repeatable(cell) for cell in each["cells"] if cell["error"] is None] for each in (results, again))
+    assert first == second  # the one that was done again, too, to the last bit
+
+
+@pytest.mark.dds
+def test_the_table_tells_means_spreads_and_the_paper(run):
+    _, config, results = run
+    text = (config.out / "table.md").read_text()
+    row = next(line for line in text.splitlines() if line.startswith("| phantom:0 | default |"))
+    values = [cell["figures"]["psnr"] for cell in results["cells"] if cell["error"] is None]
+    assert f"| {np.mean(values):.2f} ± {np.std(values, ddof=1):.2f} |" in row and row.endswith("| 2 |")
+    assert "| the paper's, SCARED | paper | 22.94 | – | 0.769 | " in text
+    assert "0.184‡" in text and "96×80, over all pixels, unmasked; reference depth: the recorded depth" in text
+    rows = list(csv.DictReader((config.out / "table.csv").open()))
+    ours = next(row for row in rows if row["sequence"] == "phantom:0")
+    assert float(ours["psnr"]) == pytest.approx(np.mean(values)) and ours["source"] == "measured"
+    assert {row["sequence"] for row in rows if row["source"] == "printed in the paper"} == {"SCARED", "StereoMIS"}
+    assert len(list(csv.DictReader((config.out / "views.csv").open()))) == 8
+
+
+@pytest.mark.dds
+def test_rows_for_machines_have_a_name_value_unit_and_ratio(run):
+    _, config, results = run
+    rows = json.loads(config.json.read_text())
+    assert all(set(row) == {"name", "value", "unit", "ratio", "peer"} for row in rows)
+    psnr = next(row for row in rows if row["name"] == "phantom:0, two-views, default: PSNR")
+    assert psnr["unit"] == "dB" and psnr["ratio"] is None  # no 3dgs in this run
+    record = next(cell for cell in results["cells"] if cell["error"] is None)
+    peer = {**record, "cell": record["cell"] | {"method": "3dgs"}, "figures": record["figures"] | {"depth_rmse": 0.5}}
+    both = tables.machine_rows(tables.summarise({"cells": [record, peer]}))
+    depth = next(row for row in both if row.name == "phantom:0, two-views, default: depth RMSE")
+    assert depth.ratio == pytest.approx(record["figures"]["depth_rmse"] / 0.5) and depth.peer == "3dgs"
+
+
+@pytest.mark.dds
+def test_lpips_without_weights_says_so_in_its_column(run, tmp_path):
+    _, _, results = run
+    text = tables.markdown(results | {"missing": {"lpips_vgg": "LPIPS vgg: no weights in here"}}, tables.summarise(results))
+    assert "| LPIPS vgg |" in text and "| no weights |" in text and "- LPIPS vgg: no weights in here." in text
+
+
+@pytest.mark.dds
+def test_what_is_not_there_is_told_before_any_work(tmp_path):
+    with pytest.raises(SequenceError, match="no/such: no such file or folder"):
+        evaluate(["no/such"], EvaluationConfig(out=tmp_path))
+    with pytest.raises(SequenceError, match="there is no split 'half'"):
+        evaluate([SMALL], EvaluationConfig(out=tmp_path, splits=("half",)))
+    with pytest.raises(ConfigError, match="give name=value with a name of .*iterations"):
+        evaluate([SMALL], EvaluationConfig(out=tmp_path, set=("iteration=3",)))
+    with pytest.raises(ConfigError, match="methods are named with --presets"):
+        evaluate([SMALL], EvaluationConfig(out=tmp_path, set=("preset=paper",)))
+    with pytest.raises(ConfigError, match="workers must be 1 or more, got 0"):
+        EvaluationConfig(workers=0)
+    with pytest.raises(SequenceError, match="the synthetic patients have numbers"):
+        open_named("phantom:liver")
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_reader_takes_its_options_from_the_name(small_bag, small_frames, tmp_path):
+    assert [f.stamp_ns for f in open_named(f"{small_bag},start=2,step=4")] == [f.stamp_ns for f in small_frames[2::4]]
+    with pytest.raises(SequenceError, match="a bag has no option fps"):
+        open_named(f"{small_bag},fps=3")
+    assert len(open_named(SMALL)) == 6
+    assert open_named("phantom:2,frames=3,border=0.1") is not None
+
+
+def test_the_papers_numbers_are_complete():
+    assert len(paper.PRINTED) == 30 and len({row[:3] for row in paper.PRINTED}) == 30
+    assert all(15 < row.psnr < 30 and 0.6 < row.ssim < 0.9 and 0.2 < row.lpips < 0.5 for row in paper.PRINTED)
+
+
+@pytest.mark.dds
+def test_the_page_needs_nothing_else_and_sorts_and_slides(run, chromium):
+    pytest.importorskip("matplotlib")
+    _, config, _ = run
+    page = write_page(config.out)
+    tab = chromium.new_page(viewport={"width": 1200, "height": 900})
+    asked, errors = [], []
+    tab.on("request", lambda request: asked.append(request.url))
+    tab.on("pageerror", lambda error: errors.append(error))
+    tab.goto(page.as_uri())
+    column = tab.locator("thead th", has_text=re.compile(r"^PSNR \[dB\]$"))
+    order = lambda: [cells.split("\t")[1] for cells in tab.locator("tbody").all_inner_texts()[0].splitlines() if "StereoMIS" in cells]
+    assert order() == ["3dgs", "fsgs", "paper"]
+    column.click()
+    assert order() == ["fsgs", "3dgs", "paper"]
+    column.click()
+    assert order() == ["paper", "3dgs", "fsgs"]
+    assert tab.get_by_text("The first and the last view train, all others are held out.").is_visible()
+    texts = tab.locator("tbody").inner_text()
+    assert "failed: " in texts and "22.94" in texts and "0.184‡" in texts
+
+    stage = tab.locator(".stage")
+    stage.scroll_into_view_if_needed()
+    picture = lambda: cv2.imdecode(np.frombuffer(stage.screenshot(), np.uint8), cv2.IMREAD_COLOR).astype(float)
+    tab.locator("select[aria-label=right]").select_option("default, depth")
+    at = lambda percent: (tab.locator("input[type=range]").fill(str(percent)), picture())[1]
+    depth, half, reference = at(0), at(50), at(100)
+    middle = depth.shape[1] // 2
+    assert np.abs(depth - reference).mean() > 20  # coloured depth is unlike a picture
+    assert np.abs(half - reference)[:, : middle - 5].mean() < 2 and np.abs(half - depth)[:, middle + 5 :].mean() < 2
+    tab.locator("summary").click()
+    loaded = tab.evaluate("[...document.images].every(image => image.naturalWidth == 96)")
+    assert loaded and tab.locator(".plots svg").count() == 2
+    assert not errors and all(url.startswith(("file:", "data:")) for url in asked)
+    tab.close()
+
+
+def test_a_folder_without_results_is_an_error(tmp_path):
+    with pytest.raises(ValueError, match="no results of an evaluation .* give the --out of"):
+        write_page(tmp_path)

@@ -1,0 +1,64 @@
+"""Who saw what, and how it is measured."""
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from endo_sim_ros.core.cameras import Camera, look_at
+from endo_sim_ros.evaluation.evaluate import _divided
+from endo_sim_ros.evaluation.held_out import FIGURES, measure, seen_pixels
+from endo_sim_ros.reconstruction import ScenePoints
+
+CAMERA = Camera(np.array([[50, 0, 32], [0, 50, 24], [0, 0, 1.0]]), 64, 48)
+
+
+def box_depth(camera):
+    """Depth of a wall at z = 0.2 m with a post in front of it, |x| < 1 cm at z = 0.1 m, seen along +z."""
+    rays = camera.rays()
+    at_post = camera.position[0] + rays[..., 0] * (0.1 - camera.position[2])
+    return np.where(np.abs(at_post) < 0.01, 0.1, 0.2).astype(np.float32) - np.float32(camera.position[2])
+
+
+def test_a_pixel_is_seen_where_another_view_sees_its_surface():
+    left = CAMERA.at(look_at([-0.03, 0, 0], [-0.03, 0, 1]))
+    here, there = box_depth(CAMERA), box_depth(left)
+    seen = seen_pixels(CAMERA, here, [(left, there, None)])
+    # By hand: each surface point of this view is in the other's image, and not behind the post.
+    x = CAMERA.backproject(here)[..., 0]
+    u = (x + 0.03) / here * 50 + 32
+    crossing = -0.03 + (x + 0.03) / 2  # of the other view's ray to the wall with the plane of the post
+    expected = (u < 64) & ((here < 0.15) | (np.abs(crossing) > 0.01))
+    assert expected.any() and not expected.all()
+    assert (seen != expected).mean() < 0.03  # pixels on an edge
+    assert not seen_pixels(CAMERA, here, [(left, there, np.zeros_like(there))]).any()
+    assert not seen_pixels(CAMERA, 0 * here, [(left, there, None)]).any()
+    assert seen_pixels(CAMERA, here, [(left, there, None), (CAMERA, here, None)]).all()
+
+
+def test_measures_of_what_was_seen_count_only_that(small_frames):
+    frame, seen = small_frames[0], np.zeros((80, 96), np.uint8)
+    seen[:, :48] = 255
+    image = frame.image.copy()
+    image[:, 60:] = 0
+    row = measure(image, frame.depth, frame, seen)
+    assert row["seen_psnr"] > 100 > row["psnr"]
+    assert row["depth_rmse"] == row["depth_rmse_scaled"] == 0
+    assert row["seen_share"] == pytest.approx(100 * (frame.mask[:, :48] > 0).sum() / (frame.mask > 0).sum())
+    assert set(row) <= set(FIGURES) and "psnr_unmasked" in row  # the recording has a border
+
+
+def test_depth_is_judged_by_scene_points_that_no_method_gets(small_frames):
+    frame = small_frames[0]
+    surface = frame.camera.backproject(frame.depth)[frame.depth > 0][::7]
+    repeated = np.concatenate([surface, surface[::2], surface[1::2] + 1e-6])  # as other pairs of views triangulate them again
+    points = ScenePoints(repeated, np.zeros_like(repeated), np.linspace(0.001, 0.002, len(repeated)))
+    given, judging = _divided(points)
+    assert len(judging) == pytest.approx(len(np.unique(repeated, axis=0)) / 10, abs=1) and len(given.positions) == len(given.error)
+    assert len(repeated) - 4 * len(judging) < len(given.positions) < len(repeated) - len(judging)
+    assert cKDTree(judging).query(given.positions)[0].min() > 2e-6
+    few = ScenePoints(surface[:300], np.zeros_like(surface[:300]), 0.001)
+    assert _divided(few) == (few, None)
+    assert measure(frame.image, frame.depth, frame, points=judging)["points_depth"] < 1e-6
+    off = measure(frame.image, frame.depth + np.float32(0.002), frame, points=judging)
+    assert off["points_depth"] == pytest.approx(0.002, rel=1e-3)
+    assert "points_depth" not in measure(frame.image, frame.depth, frame)

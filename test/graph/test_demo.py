@@ -1,0 +1,29 @@
+"""`endo-sim demo` as a user runs it."""
+
+import cv2
+import numpy as np
+import pytest
+from endo_sim_command import endo_sim
+from mcap.reader import make_reader
+
+from endo_sim_ros.core.gaussians import load_ply
+
+pytestmark = pytest.mark.dds
+
+
+def test_demo_runs_the_whole_graph_and_leaves_its_results(tmp_path):
+    options = {"--frames": 14, "--width": 128, "--iterations": 60, "--timeout": 240, "--force": 1.0}
+    done = endo_sim("demo", "--out", tmp_path, *(word for pair in options.items() for word in pair), timeout=280)
+    assert done.returncode == 0, done.stderr + done.stdout
+    video = cv2.VideoCapture(str(tmp_path / "touch.mp4"))
+    assert video.get(cv2.CAP_PROP_FRAME_COUNT) > 100 and video.get(cv2.CAP_PROP_FPS) == 25
+    frames = [video.read()[1].astype(int) for _ in range(100)]
+    assert np.abs(frames[0] - frames[60]).mean() > 1  # the tissue moved
+    sheet = cv2.imread(str(tmp_path / "contact_sheet.png"))
+    assert sheet.shape[1] == 3 * 128 and sheet.std() > 10
+    assert len(load_ply(tmp_path / "model.ply")) > 1000
+    with next((tmp_path / "recording").glob("*.mcap")).open("rb") as file:
+        summary = make_reader(file).get_summary()
+        counts = {summary.channels[i].topic: n for i, n in summary.statistics.channel_message_counts.items()}
+    for topic in ("gaussians", "control_nodes", "PSM1/body/servo_cf", "PSM1/body/measured_cf", "rendered/image_raw", "diagnostics"):
+        assert counts[f"/{topic}"] > 0, topic

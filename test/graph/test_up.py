@@ -1,0 +1,159 @@
+"""`endo-sim up` as a user runs it."""
+
+import io
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+from waiting import wait_until
+
+from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.graph import up as up_module
+from endo_sim_ros.graph.processes import NodeGroup
+from endo_sim_ros.graph.up import UpError, _Supervisor, run_up
+
+SMALL = """
+/**/reconstruction_node:
+  ros__parameters: {iterations: 30, max_gaussians: 1000, image_width: 96, output_dir: OUT}
+/**/physics_node:
+  ros__parameters: {node_count: 300, arms: [PSM1]}
+"""
+
+
+class Up:
+    """`endo-sim up` with its output in a file."""
+
+    def __init__(self, folder: Path, *options: str):
+        self.folder, self.output = folder, folder / "output.txt"
+        params = folder / "params.yaml"
+        params.write_text(SMALL.replace("OUT", str(folder / "models")))
+        command = [sys.executable, "-m", "endo_sim_ros.cli", "up", "--logs", str(folder / "logs")]
+        command += ["--params-file", str(params), *options]
+        self.process = subprocess.Popen(command, stdout=self.output.open("w"), stderr=subprocess.STDOUT, start_new_session=True)
+
+    def says(self, pattern: str, seconds: float = 120.0) -> re.Match:
+        found = lambda: re.search(pattern, self.output.read_text())  # noqa: E731
+        return wait_until(found, seconds, lambda: f"{pattern!r} in: {self.output.read_text()}")
+
+    def processes(self) -> dict[str, int]:
+        """Process number of each node."""
+        listing = subprocess.run(["ps", "-ww", "-eo", "pid,args"], capture_output=True, text=True).stdout
+        mine = [line.split() for line in listing.splitlines() if str(self.folder) in line and "endo_sim_ros.nodes." in line]
+        return {re.search(r"endo_sim_ros\.nodes\.(\w+)", " ".join(words))[1]: int(words[0]) for words in mine}
+
+    def end(self, number: int = signal.SIGINT) -> tuple[int, float]:
+        """Exit status and the seconds that it took."""
+        began = time.monotonic()
+        self.process.send_signal(number)
+        return self.process.wait(60), time.monotonic() - began
+
+
+@pytest.fixture
+def up(tmp_path):
+    started = []
+
+    def start(*options: str) -> Up:
+        started.append(Up(tmp_path, *options))
+        return started[-1]
+
+    yield start
+    for one in started:
+        if one.process.poll() is None:
+            one.end(signal.SIGTERM)
+        for number in one.processes().values():  # only when a test failed
+            os.kill(number, signal.SIGKILL)
+
+
+@pytest.mark.dds
+def test_up_runs_the_graph_and_ends_cleanly(up, small_bag):
+    """All nodes in a namespace reach their work, and Ctrl-C, even pressed twice, ends all of them."""
+    run = up("--bag", str(small_bag), "--namespace", "left", "--arms", "PSM1", "PSM2")
+    run.says(rf"export ROS_DOMAIN_ID={os.environ['ROS_DOMAIN_ID']} ")
+    run.says(r"bag_player_node +ended +finished")
+    run.says(r"reconstruction_node +ok +finished")
+    run.says(r"physics_node +ok +running")
+    run.says(r"rendering_node +ok +rendering")
+    assert set(run.processes()) == {"reconstruction_node", "physics_node", "rendering_node"}
+    run.process.send_signal(signal.SIGINT)
+    status, seconds = run.end()
+    assert status == 0 and seconds < 15, run.output.read_text()
+    assert not run.processes()
+    assert "Traceback" not in run.output.read_text()
+    for log in (run.folder / "logs" / "left").iterdir():
+        assert "Traceback" not in log.read_text(), log.read_text()
+
+
+@pytest.mark.dds
+def test_up_reports_a_node_that_dies_and_starts_it_again(up):
+    run = up()
+    run.says(r"rendering_node +warn")
+    run.says(r"physics_node +warn")
+    first = run.processes()["rendering_node"]
+    os.kill(first, signal.SIGKILL)
+    said = run.says(r"rendering_node was ended by SIGKILL; it is started again in 1 s; its log is (\S+)")
+    assert Path(said[1]).is_file()
+    second = wait_until(lambda: run.processes().get("rendering_node"), 30, "a new rendering_node")
+    assert second != first
+    assert run.process.poll() is None and "physics_node" in run.processes(), "the others go on"
+    assert run.end(signal.SIGTERM)[0] == 0
+
+
+@pytest.mark.dds
+def test_a_node_that_crashes_again_and_again_stays_down_after_the_fourth_time(tmp_path, monkeypatch):
+    monkeypatch.setattr(up_module, "_FIRST_PAUSE", 0.01)
+    console = Console(file=io.StringIO(), width=200)
+    with NodeGroup(tmp_path) as graph:
+        supervisor = _Supervisor(graph, "", console, respawn=True)
+        supervisor.start("no_such_node")
+        with pytest.raises(UpError, match="no node is left"):
+            wait_until(supervisor.check, 30, "the end")
+    said = [line.split(";")[:2] for line in console.file.getvalue().splitlines()]
+    ended = "no_such_node ended with status 1"
+    assert said[:3] == [[ended, f" it is started again in {pause} s"] for pause in (0.01, 0.02, 0.04)]
+    assert said[3:] == [[f"{ended}, 4 times in a row within 30 s of its start", " it stays down"]]
+
+
+@pytest.mark.dds
+def test_up_without_respawn_leaves_a_dead_node_down(up):
+    run = up("--no-respawn")
+    run.says(r"rendering_node +warn")
+    os.kill(run.processes()["rendering_node"], signal.SIGKILL)
+    run.says(r"rendering_node was ended by SIGKILL; it stays down")
+    assert run.end()[0] == 0
+
+
+@pytest.mark.dds
+def test_up_refuses_what_a_node_cannot_use(up):
+    """A node that cannot start would fail again: all end, with its reason."""
+    run = up("--arms", "not/a name")
+    assert run.process.wait(120) == 1
+    assert re.search(r"endo-sim: .*'not/a name' cannot name topics.*; its log is \S+physics_node\.log", run.output.read_text())
+    assert not run.processes()
+
+
+@pytest.mark.dds
+@pytest.mark.parametrize("when", [r"physics_node +starting", r"rendering_node +warn"], ids=["starting", "running"])
+def test_nodes_do_not_outlive_a_killed_up(up, when):
+    run = up()
+    run.says(when)
+    assert len(run.processes()) == 3
+    run.process.kill()
+    run.process.wait(10)
+    wait_until(lambda: not run.processes(), 40, lambda: f"the end of {run.processes()}")  # importing alone may take 10 s
+    for log in (run.folder / "logs").iterdir():
+        assert "Traceback" not in log.read_text(), log.read_text()
+
+
+@pytest.mark.parametrize("given", ["bag", "params_file", "model"])
+def test_up_refuses_missing_files_before_it_starts_anything(tmp_path, given):
+    options = {"bag": None, "params_file": None, "model": ""}
+    options[given] = "/does/not/exist" if given == "model" else Path("/does/not/exist")
+    with pytest.raises((UpError, SequenceError), match="/does/not/exist"):
+        run_up(**options, namespace="", arms=(), logs=tmp_path / "logs", respawn=True)
+    assert not (tmp_path / "logs").exists()

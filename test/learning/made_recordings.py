@@ -1,0 +1,105 @@
+"""Recordings made by hand, in lockstep and in real time."""
+
+import numpy as np
+
+from endo_sim_ros import messages
+from endo_sim_ros.messages import ControlNodeCloud, bag_types
+from endo_sim_ros.sequences.bag import BagWriter
+
+S = 1_000_000_000
+STEP = S // 25
+BEGIN = 1000 * S
+WIDTH, HEIGHT = 96, 80
+TURNED = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])  # a quarter turn about z
+
+
+def picture(number):
+    """An image that tells its number in its brightness."""
+    image = np.full((HEIGHT, WIDTH, 3), 40, np.uint8)
+    image[..., 0] = 2 * number % 256
+    image[:, : WIDTH // 2, 1] = 200
+    return image
+
+
+REST = np.stack(np.meshgrid(*[np.linspace(-0.02, 0.02, 4)] * 2, [0.1], indexing="ij"), -1).reshape(-1, 3).astype(np.float32)
+
+
+def nodes(number):
+    """Control nodes that moved by a tenth of a millimetre per number along x; one of them twice as far."""
+    moved = np.zeros_like(REST)
+    moved[:, 0] = 1e-4 * number
+    moved[3, 0] *= 2
+    return ControlNodeCloud(REST, REST + moved, np.tile(np.eye(3, dtype=np.float32), (len(REST), 1, 1)), S)
+
+
+def tip(number, arm="PSM1"):
+    pose = TURNED.copy()
+    pose[:3, 3] = (0.001 * number, 0.01 if arm == "PSM1" else -0.01, 0.1)
+    return pose
+
+
+class Recording:
+    """Writes messages of a graph; times in nanoseconds since the beginning."""
+
+    def __init__(self, path):
+        self.bag, self.types, self.clock = BagWriter(path), bag_types(), 7 * S
+
+    def __enter__(self):
+        self.bag.__enter__()
+        return self
+
+    def __exit__(self, *error):
+        self.bag.__exit__(*error)
+
+    def observe(self, time_ns, number, arms=("PSM1",), leave_out=()):
+        """What the graph says in a step."""
+        stamp = BEGIN + time_ns
+        said = [
+            (messages.CONTROL_NODES, messages.encode_control_nodes(nodes(number), stamp, "world", self.types)),
+            (messages.RENDERED_IMAGE, messages.encode_image(picture(number), stamp, "camera", self.types)),
+        ]
+        for arm in arms:
+            reaction = messages.encode_wrench((number, 0, 0), (0, 0, number), stamp, arm, self.types)  # in axes of the tip
+            said.append((messages.tool_reaction(arm), reaction))
+        self.write(said, leave_out)
+
+    def act(self, time_ns, number, arms=("PSM1",), leave_out=(), frame="world", base=None):
+        """What a policy says; poses in the world, or in the frame of a robot's base with its pose in the world."""
+        stamp = BEGIN + time_ns
+        name, pose_of_base = base or ("world", np.eye(4))
+        said = []
+        for arm in arms:
+            pose = np.linalg.inv(pose_of_base) @ tip(number, arm)
+            said.append((messages.tool_pose(arm), messages.encode_pose(pose, stamp, name, self.types)))
+            wrench = messages.encode_wrench((0, 0, -number), (0, number, 0), stamp, frame, self.types)
+            said.append((messages.tool_wrench(arm), wrench))
+            said.append((messages.tool_jaw(arm), messages.encode_jaw(0.01 * number, stamp, self.types)))
+        self.write(said, leave_out)
+
+    def write(self, said, leave_out=()):
+        for topic, message in said:
+            if topic not in leave_out:
+                self.clock += S // 1000  # when it was recorded means nothing
+                self.bag.write(topic, message, self.clock)
+
+
+def lockstep(path, steps=12, missing=(), step=STEP, **options):
+    """A first observation, then commands with the observations that they lead to, with equal stamps."""
+    with Recording(path) as recording:
+        recording.act(0, 0, **options)
+        recording.observe(0, 0)
+        for number in range(1, steps):
+            if number not in missing:
+                recording.act(step * number, number, **options)
+                recording.observe(step * number, number)
+    return path
+
+
+def realtime(path, seconds=2.0, leave_out=(), arms=("PSM1",), **options):
+    """Observations at 25 Hz, commands at 100 Hz, out of phase; both count up from 0 at 0 s."""
+    with Recording(path) as recording:
+        for tick in range(int(seconds * 100)):
+            recording.act(tick * S // 100 + 1_000_000, tick, arms, leave_out, **options)
+            if tick % 4 == 0:
+                recording.observe(tick * S // 100 + 3_000_000, tick // 4, arms, leave_out)
+    return path

@@ -1,0 +1,41 @@
+"""Tasks, made and played."""
+
+import gymnasium
+import numpy as np
+
+from endo_sim_ros.learning.policies import NetworkPolicy
+from endo_sim_ros.learning.tasks import TASKS
+
+IDS = {name: f"endo_sim_ros/{name.capitalize()}-v0" for name in TASKS}
+VARIED = {"stiffness": 0.4, "light": 0.5, "texture": 0.5, "camera_position": 0.005, "camera_angle": 5.0}
+
+
+def make(task="retraction", **options):
+    return gymnasium.make(IDS[task], device="cpu", **options)
+
+
+def play(environment, policy, seed, steps=200):
+    """Observations, and rewards, of one episode."""
+    observation, info = environment.reset(seed=seed)
+    policy.reset([0])
+    seen, rewards = [observation], []
+    for _ in range(steps):
+        state = observation["state"] if isinstance(observation, dict) else observation
+        observation, reward, terminated, truncated, info = environment.step(policy.act(state[None])[0])
+        seen.append(observation)
+        rewards.append(reward)
+        if terminated or truncated:
+            break
+    return seen, rewards, info
+
+
+def linear_policy():
+    """Weights by hand that solve retraction: towards the spot, closed when near, up until it is raised."""
+    names = TASKS["retraction"].observation_names
+    weights = np.zeros((len(names) + 1, 4))
+    for axis, name in enumerate("xyz"):
+        weights[names.index(f"spot_from_tip_{name}"), axis] = 10
+    weights[names.index("jaw"), 2] = weights[-1, 2] = 1.5
+    weights[names.index("spot_moved_z"), 2] = -2.3
+    weights[names.index("distance"), 3], weights[-1, 3] = -10, 2
+    return NetworkPolicy("retraction", [weights])

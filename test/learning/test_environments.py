@@ -1,0 +1,277 @@
+"""Tasks as Gymnasium environments, one and many at once."""
+
+import os
+import re
+import subprocess
+import sys
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from played_tasks import IDS, VARIED, make, play
+
+from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.core.light import Light
+from endo_sim_ros.learning import environments
+from endo_sim_ros.learning.config import Randomisation
+from endo_sim_ros.learning.policies import scripted_policy
+from endo_sim_ros.learning.scenes import Scene, load_scene
+from endo_sim_ros.learning.task_batch import TaskBatch
+from endo_sim_ros.learning.tasks import TASKS
+from endo_sim_ros.physics import TissueSimulation
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.parametrize("observations", ["state", "image", "both"])
+@pytest.mark.parametrize("task", TASKS)
+def test_gymnasium_finds_nothing_to_complain_about(task, observations):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(make(task, observations=observations, render_mode="rgb_array", randomisation=VARIED).unwrapped)
+
+
+def test_observations_have_names_and_units():
+    environment = make()
+    names = environment.unwrapped.batch.task.observation_names
+    assert environment.observation_space.shape == (len(names),) and len(set(names)) == len(names)
+    observation, _ = environment.reset(seed=1)
+    o = dict(zip(names, observation))
+    np.testing.assert_allclose(o["distance"], np.linalg.norm([o[f"spot_from_tip_{axis}"] for axis in "xyz"]), rtol=1e-5)
+    assert o["time_left"] == 1 and o["jaw"] == -1 and o["force"] == 0
+    tip = 0.02 * np.array([o[f"tip_{axis}"] for axis in "xyz"])
+    after = dict(zip(names, environment.step(np.array([1, -0.5, -1, -1], np.float32))[0]))
+    expected = np.clip(tip + [0.002, -0.001, -0.002], environment.unwrapped.batch.task.low, environment.unwrapped.batch.task.high)
+    np.testing.assert_allclose([0.02 * after[f"tip_{axis}"] for axis in "xyz"], expected, atol=1e-7)
+
+
+@pytest.mark.dds
+def test_the_same_seed_and_actions_give_the_same_bytes_whatever_the_threads():
+    code = f"""
+import hashlib, sys
+sys.path.insert(0, {str(ROOT / "test/learning")!r})
+from played_tasks import TASKS, VARIED, make, play
+from endo_sim_ros.learning.policies import scripted_policy
+for task in TASKS:
+    seen, rewards, _ = play(make(task, observations="both", randomisation=VARIED), scripted_policy(task), 3, 40)
+    print(hashlib.sha256(b"".join(o[k].tobytes() for o in seen for k in o) + repr(rewards).encode()).hexdigest())
+"""
+    runs = []
+    for threads in ("1", "2"):
+        variables = os.environ | {"ENDO_SIM_THREADS": threads}
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=variables, cwd=ROOT)
+        assert done.returncode == 0, done.stderr
+        runs.append(done.stdout)
+    assert runs[0] == runs[1] and len(set(runs[0].split())) == len(TASKS)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_each_of_many_environments_is_the_single_one_with_its_seed(task):
+    count, seed, steps = 3, 20, 60
+    options = {"observations": "both", "randomisation": VARIED, "device": "cpu"}
+    many = gymnasium.make_vec(IDS[task], num_envs=count, vectorization_mode="vector_entry_point", **options)
+    policy = scripted_policy(task, count)
+    observations, _ = many.reset(seed=seed)
+    recorded = []
+    for _ in range(steps):
+        observations, rewards, terminated, truncated, _ = many.step(policy.act(observations["state"]))
+        recorded.append((observations, rewards, terminated | truncated))
+        if (terminated | truncated).any():
+            break
+    assert len(recorded) > 10
+    single = make(task, observations="both", randomisation=VARIED)
+    seen, rewards, _ = play(single, scripted_policy(task), seed + 1, len(recorded))
+    for k, reward in enumerate(rewards):
+        for kind in ("state", "image"):
+            np.testing.assert_array_equal(recorded[k][0][kind][1], seen[k + 1][kind])
+        assert recorded[k][1][1] == reward
+
+
+def test_many_environments_begin_anew_one_by_one_and_count_their_seeds():
+    many = gymnasium.make_vec(IDS["retraction"], num_envs=2, vectorization_mode="vector_entry_point", device="cpu")
+    first, _ = many.reset(seed=np.array([5, 8]))
+    np.testing.assert_array_equal(first[1], many.reset(seed=7)[0][1])
+    moved = many.step(np.ones((2, 4)))[0]
+    again, _ = many.reset(seed=[3, 5], options={"reset_mask": np.array([False, True])})
+    np.testing.assert_array_equal(again[0], moved[0])
+    np.testing.assert_array_equal(again[1], first[0])
+    with pytest.raises(ValueError, match="2 environments need as many seeds, got 1"):
+        many.reset(seed=[1])
+    with pytest.raises(ValueError, match="as many places in reset_mask, got 3"):
+        many.reset(options={"reset_mask": np.ones(3, bool)})
+
+
+def test_ended_environments_begin_anew_at_the_next_step_and_others_go_on():
+    many = gymnasium.make_vec(IDS["retraction"], num_envs=2, vectorization_mode="vector_entry_point", device="cpu")
+    policy = scripted_policy("retraction")
+    observations, _ = many.reset(seed=0)
+    idle = np.array([0, 0, 0, -1.0])
+    for _ in range(60):
+        actions = policy.act(observations)
+        actions[1] = idle
+        observations, _, terminated, truncated, info = many.step(actions)
+        if terminated[0]:
+            break
+    assert terminated.tolist() == [True, False] and info["success"].tolist() == [True, False]
+    before = observations[1]
+    observations, rewards, terminated, truncated, _ = many.step(np.tile(idle, (2, 1)))
+    assert rewards[0] == 0 and not (terminated | truncated).any()
+    o = dict(zip(many.unwrapped.batch.task.observation_names, observations.T))
+    assert o["time_left"][0] == 1 and o["force"][0] == 0 and o["spot_moved_z"][0] == 0
+    assert o["time_left"][1] < before[-1]
+
+
+def test_pulling_too_hard_ends_the_episode(monkeypatch):
+    monkeypatch.setattr(TASKS["retraction"], "force_limit", 0.3)
+    environment = make()
+    _, rewards, info = play(environment, scripted_policy("retraction"), 0, 60)
+    assert len(rewards) < 60 and not info["success"] and info["force"] > 0.3 and rewards[-1] < 0
+
+
+def test_an_inclusion_is_the_region_that_physics_node_would_paint():
+    """A factor on each node's moduli gives the bits of painted properties: pins, contact and all."""
+    batch = TaskBatch("palpation", load_scene(), 2, device="cpu")
+    batch.reset([0, 1], [np.random.default_rng(s) for s in (5, 6)])
+    regions = batch.task.regions()
+    painted = TissueSimulation.from_nodes(batch.task.nodes, replace(batch.task.physics("cpu"), regions=regions))
+    policy, observations = scripted_policy("palpation", 2), batch.observe()
+    for _ in range(25):
+        observations, _ = batch.step(policy.act(observations))
+        pose = np.eye(4)
+        pose[:3, 3] = batch.tissue.tools.tips[0, 0].numpy()
+        painted.set_grasp("PSM1", pose, False)
+        painted.step()
+        np.testing.assert_array_equal(batch.tissue.displacements[0].numpy(), painted.solver.displacements())
+    assert np.abs(painted.solver.displacements()).max() > 1e-4
+    assert not np.array_equal(batch.task.stiffness(0), batch.task.stiffness(1))
+
+
+def test_stiffness_beyond_what_the_substeps_were_planned_for_is_refused():
+    solver = TaskBatch("palpation", load_scene(), 1, device="cpu").tissue.solver
+    with pytest.raises(ValueError, match="not above 8"):
+        solver.set_stiffness(slice(None), np.full((1, solver.node_count), 9.0))
+
+
+def test_randomisation_changes_what_it_names_and_nothing_else():
+    scene = load_scene()
+
+    def first(**kinds):
+        batch = TaskBatch("retraction", scene, 1, "both", Randomisation(**kinds), device="cpu")
+        batch.reset([0], [np.random.default_rng(3)])
+        return batch, batch.observe()
+
+    plain, observed = first()
+    for kinds in ({"light": 0.5}, {"texture": 0.8}, {"camera_position": 0.01}, {"camera_angle": 10.0}):
+        _, other = first(**kinds)
+        assert np.abs(other["image"].astype(int) - observed["image"]).mean() > 1, kinds
+        np.testing.assert_array_equal(other["state"], observed["state"])
+    soft, other = first(stiffness=1.0)
+    np.testing.assert_array_equal(other["image"], observed["image"])
+    factors = soft.tissue.solver._scale.numpy()
+    assert np.ptp(factors) == 0 and factors[0] != 1 and np.exp(-1) <= factors[0] <= np.e
+    with pytest.raises(ConfigError, match="Randomisation has no option stifness; it has stiffness, "):
+        make("retraction", randomisation={"stifness": 0.1})
+    with pytest.raises(ConfigError, match=r"Randomisation.light must lie in \[0, 0.9\]"):
+        make(randomisation={"light": 2.0})
+
+
+@pytest.mark.parametrize("light, degree", [(None, 0), (None, 1), (Light(distance=0.9, angle=0.4, response=0.3), 0)])
+def test_images_are_those_of_the_renderer(light, degree):
+    from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
+
+    scene = load_scene()
+    sh = torch.cat([scene.model.sh, torch.randn(len(scene.model), 3, 3, generator=torch.Generator().manual_seed(0))], 1)
+    scene = replace(scene, model=replace(scene.model, light=light, sh=sh[:, : (degree + 1) ** 2]))
+    environment = make(observations="image", scene=scene)
+    batch = environment.unwrapped.batch
+    script = scripted_policy("retraction")
+    image, _ = environment.reset(seed=0)
+    for _ in range(16):
+        image, *_ = environment.step(script.act(batch._state())[0])
+    renderer = DeformableRenderer(scene.model, batch.task.nodes.rest, RenderingConfig(device="cpu"))
+    pinned = torch.from_numpy(batch.task.nodes.pinned)[:, None, None]
+    F = torch.where(pinned, torch.eye(3), batch.tissue.F[0])  # as on control_nodes
+    expected, _ = renderer.render(batch.camera, batch.tissue.positions()[0], F)
+    assert batch.tissue.displacements.abs().max() > 1e-3
+    np.testing.assert_array_equal(image, expected)
+
+
+def test_a_task_is_seen_by_the_view_in_the_middle_as_in_the_graph():
+    scene = load_scene()
+    poses = [np.eye(4), scene.camera.pose, np.eye(4)]
+    poses[0][0, 3], poses[2][1, 3] = 0.01, 0.02
+    assert np.array_equal(Scene(scene.model, tuple(scene.camera.at(pose) for pose in poses)).camera.pose, poses[1])
+
+
+def test_what_was_felt_most_is_remembered():
+    batch = TaskBatch("palpation", load_scene(), 2, device="cpu")
+    batch.reset([0, 1], [np.random.default_rng(s) for s in (5, 6)])
+    policy, observations = scripted_policy("palpation", 2), batch.observe()
+    rows, tips = [], []
+    for _ in range(60):
+        observations, _ = batch.step(policy.act(observations))
+        rows.append(dict(zip(batch.task.observation_names, observations[0].astype(np.float64))))
+        tips.append(0.02 * np.array([rows[-1]["tip_x"], rows[-1]["tip_y"]]))
+    forces = [row["force"] for row in rows]
+    assert max(forces) > 0.3 and forces[-1] < max(forces)
+    np.testing.assert_allclose(rows[-1]["most"], max(forces))
+    where = tips[-1] + 0.02 * np.array([rows[-1]["most_from_tip_x"], rows[-1]["most_from_tip_y"]])
+    np.testing.assert_allclose(where, tips[int(np.argmax(forces))], atol=1e-8)
+
+
+def test_a_report_is_ten_steps_that_say_so():
+    environment = make("palpation")
+    environment.reset(seed=0)
+    ended = [environment.step(np.array([0, 0, 0, sign]))[2] for sign in [1] * 9 + [-1] + [1] * 10]
+    assert ended == [False] * 19 + [True]
+
+
+@pytest.mark.parametrize(
+    "options, sentence",
+    [
+        ({"task": "suturing"}, "there is no task 'suturing'; there are retraction, palpation"),
+        ({"observations": "smell"}, "observations must be state, image or both, got 'smell'"),
+        ({"render_mode": "human"}, "render_mode must be rgb_array or None, got 'human'"),
+        ({"scene": "no/such/model.ply"}, "no/such/model.ply: no such file"),
+        ({"device": "abacus"}, "unknown device 'abacus'"),
+        ({"observations": "image", "image_width": 0}, "image_width must be at least 1, got 0"),
+    ],
+)
+def test_mistakes_are_one_sentence(options, sentence):
+    with pytest.raises(ValueError, match=re.escape(sentence)):
+        environments.TaskEnvironment(**{"task": "retraction", "device": "cpu", **options})
+
+
+@pytest.mark.parametrize(
+    "actions, sentence",
+    [
+        (np.zeros((1, 4)), "retraction: actions must be 2 × 4 numbers, got the shape (1, 4)"),
+        (np.array([[0, 0, 0, 1], [0, np.nan, 0, 1]]), "retraction: the action of episode 1 is not finite: [0.0, nan, 0.0, 1.0]"),
+    ],
+)
+def test_a_wrong_action_is_one_sentence_and_changes_nothing(actions, sentence):
+    environment = environments.VectorTaskEnvironment("retraction", 2, device="cpu")
+    before, _ = environment.reset(seed=1)
+    with pytest.raises(ValueError, match=re.escape(sentence)):
+        environment.step(actions)
+    np.testing.assert_array_equal(environment.batch.observe(), before)
+
+
+def test_a_model_too_small_for_the_task_is_refused():
+    scene = load_scene()
+    near = (scene.model.means[:, :2].abs() < 0.012).all(1)
+    small = Scene(scene.model.select(near), scene.cameras)
+    with pytest.raises(ValueError, match="palpation: no skin node is 0.02 m from where tissue is held; the model is too small"):
+        TaskBatch("palpation", small, 1, device="cpu")
+
+
+@pytest.mark.dds
+def test_without_gymnasium_one_sentence_says_what_to_install():
+    code = "import sys; sys.modules['gymnasium'] = None; import endo_sim_ros.learning.train, endo_sim_ros.learning.environments"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert done.stderr.rstrip().endswith("the environments need gymnasium, which is not installed; pip install 'endo_sim_ros[learning]'")

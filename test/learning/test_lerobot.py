@@ -1,0 +1,201 @@
+"""Datasets in LeRobot's layout, and the command that exports them."""
+
+import json
+import sys
+
+import av
+import cv2
+import numpy as np
+import pytest
+from endo_sim_command import endo_sim
+from made_recordings import BEGIN, HEIGHT, STEP, WIDTH, Recording, lockstep, picture, realtime
+
+from endo_sim_ros import messages
+from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.learning import lerobot
+from endo_sim_ros.learning.episodes import action_names, environment_names, read_episode, state_names
+from endo_sim_ros.learning.lerobot import IMAGE, export_lerobot
+
+S = 1_000_000_000
+
+
+def read_tables(root, pattern):
+    import pyarrow.parquet as pq
+
+    return [pq.read_table(path) for path in sorted(root.glob(pattern))]
+
+
+@pytest.fixture(scope="module")
+def dataset(bag, tmp_path_factory):
+    """Two episodes of different length, as video."""
+    longer = realtime(tmp_path_factory.mktemp("recordings") / "longer", 3.0)
+    out = tmp_path_factory.mktemp("datasets") / "video"
+    assert export_lerobot([bag, longer], out, "pull the tissue") == (2, 49 + 74)
+    return out
+
+
+def test_the_layout_is_that_of_lerobot(dataset):
+    info = json.loads((dataset / "meta/info.json").read_text())
+    assert info["codebase_version"] == "v3.0" and info["fps"] == 25 and info["splits"] == {"train": "0:2"}
+    assert (info["total_episodes"], info["total_frames"], info["total_tasks"]) == (2, 123, 1)
+    features = info["features"]
+    assert features[IMAGE]["dtype"] == "video" and features[IMAGE]["shape"] == [HEIGHT, WIDTH, 3]
+    for key, names in (
+        ("observation.state", state_names), ("action", action_names), ("observation.environment_state", environment_names),
+    ):  # fmt: skip
+        assert features[key] == {"dtype": "float32", "shape": [len(names(("PSM1",)))], "names": names(("PSM1",))}
+    for number, length in ((0, 49), (1, 74)):
+        place = {"chunk_index": 0, "file_index": number}
+        (table,) = read_tables(dataset, info["data_path"].format(**place))
+        assert set(table.column_names) == set(features) - {IMAGE} and table.num_rows == length
+        assert table.column("frame_index").to_pylist() == list(range(length))
+        assert table.column("index").to_pylist() == list(range(number * 49, number * 49 + length))
+        assert set(table.column("episode_index").to_pylist()) == {number}
+        np.testing.assert_allclose(table.column("timestamp").to_numpy(), np.arange(length) / 25, atol=1e-5)
+        for key, feature in features.items():
+            if key != IMAGE:
+                kind = str(table.schema.field(key).type).replace("fixed_size_list<element: ", "").replace("float", "float32")
+                assert feature["dtype"].replace("float32", "float") in kind.replace("float32", "float"), (key, kind)
+        video = dataset / info["video_path"].format(video_key=IMAGE, **place)
+        with av.open(str(video)) as container:
+            shown = list(container.decode(video=0))
+        assert len(shown) == length
+        np.testing.assert_allclose([frame.time for frame in shown], np.arange(length) / 25, atol=1e-6)
+        brightness = [frame.to_ndarray(format="rgb24")[..., 0].mean() for frame in shown]
+        np.testing.assert_allclose(brightness, [2 * n % 256 for n in range(length)], atol=4)
+
+
+def test_episodes_and_tasks_are_described(dataset):
+    (episodes,) = read_tables(dataset, "meta/episodes/*/*.parquet")
+    rows = episodes.to_pylist()
+    assert [row["length"] for row in rows] == [49, 74]
+    assert [(row["dataset_from_index"], row["dataset_to_index"]) for row in rows] == [(0, 49), (49, 123)]
+    assert [row["data/file_index"] for row in rows] == [row[f"videos/{IMAGE}/file_index"] for row in rows] == [0, 1]
+    assert rows[1]["tasks"] == ["pull the tissue"] and rows[1][f"videos/{IMAGE}/to_timestamp"] == pytest.approx(74 / 25)
+    (tasks,) = read_tables(dataset, "meta/tasks.parquet")
+    assert tasks.to_pylist() == [{"task_index": 0, "__index_level_0__": "pull the tissue"}]
+    assert json.loads(tasks.schema.metadata[b"pandas"])["index_columns"] == ["__index_level_0__"]
+
+
+def test_statistics_are_those_of_the_data(dataset):
+    statistics = json.loads((dataset / "meta/stats.json").read_text())
+    tables = read_tables(dataset, "data/*/*.parquet")
+    for key in ("action", "observation.state", "observation.environment_state"):
+        values = np.vstack([np.array(table.column(key).to_pylist()) for table in tables])
+        for name, expected in (
+            ("min", values.min(0)), ("max", values.max(0)), ("mean", values.mean(0)), ("std", values.std(0)),
+            ("q50", np.median(values, 0)), ("q99", np.quantile(values, 0.99, axis=0)), ("count", [123]),
+        ):  # fmt: skip
+            np.testing.assert_allclose(statistics[key][name], expected, rtol=1e-6, atol=1e-9, err_msg=f"{key} {name}")
+    pixels = np.stack([picture(number) for length in (49, 74) for number in range(length)]) / 255
+    for name in ("min", "max", "mean", "std"):
+        expected = getattr(pixels, name)((0, 1, 2)).reshape(3, 1, 1)
+        np.testing.assert_allclose(statistics[IMAGE][name], expected, atol=1e-6)
+
+
+def test_png_images_are_exact(bag, tmp_path):
+    export_lerobot([bag], tmp_path / "out", "t", images="png")
+    info = json.loads((tmp_path / "out/meta/info.json").read_text())
+    assert info["features"][IMAGE]["dtype"] == "image" and info["video_path"] is None
+    assert not (tmp_path / "out/videos").exists()
+    (table,) = read_tables(tmp_path / "out", "data/*/*.parquet")
+    for number, cell in enumerate(table.column(IMAGE).to_pylist()):
+        image = cv2.imdecode(np.frombuffer(cell["bytes"], np.uint8), cv2.IMREAD_COLOR)
+        np.testing.assert_array_equal(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), picture(number))
+
+
+def test_episodes_that_do_not_agree_are_refused_before_anything_is_written(bag, two_arms, tmp_path):
+    steps = lockstep(tmp_path / "steps", step=S // 10)
+    with pytest.raises(SequenceError, match=r"two has arms \('PSM1', 'PSM2'\), .*realtime \('PSM1',\); .* must agree"):
+        export_lerobot([bag, two_arms], tmp_path / "out", "t")
+    with pytest.raises(SequenceError, match="steps has fps 10, .*realtime 25; the episodes of one dataset must agree"):
+        export_lerobot([bag, steps], tmp_path / "out", "t")
+    assert export_lerobot([bag, two_arms], tmp_path / "out", "t", arms=("PSM1",))[0] == 2
+
+
+def test_a_dataset_is_not_overwritten_nor_left_in_halves(bag, dataset, tmp_path, monkeypatch):
+    with pytest.raises(SequenceError, match="video exists already; choose another name"):
+        export_lerobot([bag], dataset, "t")
+    with pytest.raises(SequenceError, match="no recording to export"):
+        export_lerobot([], tmp_path / "out", "t")
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(lerobot, "_write_video", full)
+    with pytest.raises(OSError):
+        export_lerobot([bag], tmp_path / "out", "t")
+    assert not (tmp_path / "out").exists()
+
+
+def test_odd_images_make_no_video(tmp_path):
+    with Recording(tmp_path / "bag") as recording:
+        for number in range(4):
+            recording.act(STEP * number, number)
+            recording.observe(STEP * number, number, leave_out=(messages.RENDERED_IMAGE,))
+            stamp = BEGIN + STEP * number
+            message = messages.encode_image(picture(number)[:, 1:], stamp, "camera", recording.types)
+            recording.write([(messages.RENDERED_IMAGE, message)])
+    with pytest.raises(SequenceError, match="95×80 images make no video, which needs even sides; export them as png"):
+        export_lerobot([tmp_path / "bag"], tmp_path / "out", "t")
+    assert export_lerobot([tmp_path / "bag"], tmp_path / "out", "t", images="png") == (1, 3)
+
+
+def test_without_pyarrow_it_is_said_what_to_install(bag, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(RuntimeError, match=r"needs pyarrow, which is not installed; pip install 'endo_sim_ros\[lerobot\]'"):
+        export_lerobot([bag], tmp_path / "out", "t")
+
+
+@pytest.mark.parametrize("images", ["video", "png"])
+def test_lerobot_itself_reads_the_dataset(bag, tmp_path, images, monkeypatch):
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    monkeypatch.setenv("HF_HOME", str(tmp_path / "home"))
+    loader = pytest.importorskip(
+        "lerobot.datasets.lerobot_dataset", reason="lerobot is not installed; it wants other versions of torch and numpy"
+    )
+    export_lerobot([bag, bag], tmp_path / "out", "pull", images=images)
+    data = loader.LeRobotDataset("local/out", root=tmp_path / "out", video_backend="pyav")
+    assert data.num_episodes == 2 and len(data) == 98 and data.fps == 25
+    episode = read_episode(bag)
+    for index in (0, 20, 48, 49, 97):
+        item, row = data[index], index % 49
+        assert item["task"] == "pull" and item["episode_index"] == index // 49 and item["frame_index"] == row
+        np.testing.assert_array_equal(item["observation.state"], episode.state[row])
+        np.testing.assert_array_equal(item["observation.environment_state"], episode.environment_state[row])
+        np.testing.assert_array_equal(item["action"], episode.action[row])
+        assert item[IMAGE].shape == (3, HEIGHT, WIDTH)
+        np.testing.assert_allclose(255 * item[IMAGE].permute(1, 2, 0), picture(row), atol=0.01 if images == "png" else 12)
+    times = {IMAGE: [-1 / 25, 0.0], "action": [0.0, 1 / 25, 2 / 25]}
+    data = loader.LeRobotDataset("local/out", root=tmp_path / "out", delta_timestamps=times, video_backend="pyav")
+    item = data[48]
+    assert item[IMAGE].shape == (2, 3, HEIGHT, WIDTH) and item["action_is_pad"].tolist() == [False, True, True]
+    only = loader.LeRobotDataset("local/out", root=tmp_path / "out", episodes=[1], video_backend="pyav")
+    assert len(only) == 49 and only[0]["index"] == 49
+
+
+@pytest.mark.dds
+def test_export_is_a_command(bag, tmp_path):
+    out = tmp_path / "out"
+    done = endo_sim("export", bag, bag, out, "--format", "lerobot", "--fps", 10, "--arm", "PSM1", "--task", "pull it")
+    assert done.returncode == 0, done.stderr
+    assert f"{out}: 2 episodes, 38 frames" in done.stdout
+    assert json.loads((out / "meta/info.json").read_text())["fps"] == 10
+
+
+@pytest.mark.dds
+@pytest.mark.parametrize(
+    "arguments, sentence",
+    [
+        (("export", "no_bag", "OUT"), "no_bag: no such bag"),
+        (("export", "no_bag"), "give one recording or more, then the folder of the dataset"),
+        (("record", "README.md"), "README.md exists already"),
+        (("record", "OUT", "--topics", "rendered/image"), "topics: the contract has no 'rendered/image' for the arms PSM1"),
+        (("record", "OUT", "--arms", "PSM 1"), "arms: 'PSM 1' cannot name topics"),
+    ],
+)
+def test_mistakes_are_one_sentence(arguments, sentence, tmp_path):
+    done = endo_sim(*(tmp_path / "out" if word == "OUT" else word for word in arguments))
+    assert done.returncode == 1 and "Traceback" not in done.stderr
+    assert sentence in done.stderr and len(done.stderr.strip().splitlines()) == 1, done.stderr
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,88 @@
+"""Scripted and learned policies, and their training."""
+
+import importlib.util
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from played_tasks import linear_policy
+
+from endo_sim_ros.learning.config import Randomisation, TrainingConfig
+from endo_sim_ros.learning.policies import NetworkPolicy, make_policy, scripted_policy
+from endo_sim_ros.learning.scenes import load_scene
+from endo_sim_ros.learning.task_batch import TaskBatch
+from endo_sim_ros.learning.train import run_episodes, save_training, train
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.parametrize("task, count", [("retraction", 48), ("palpation", 8)])
+def test_scripted_policies_solve_their_tasks(task, count):
+    batch = TaskBatch(task, load_scene(), count, device="cpu")
+    returns, success, lengths = run_episodes(batch, scripted_policy(task, count), np.arange(count))
+    assert success.mean() > 0.8 and returns.mean() > 1
+    if task == "retraction":
+        assert run_episodes(batch, linear_policy(), np.arange(count))[1].mean() > 0.8
+    idle = NetworkPolicy.from_vectors(task, [], np.zeros(4 * (len(batch.task.observation_names) + 1)))
+    assert not run_episodes(batch, idle, np.arange(count))[1].any()
+
+
+def test_a_network_is_saved_and_loaded_and_nothing_else_is(tmp_path):
+    rng = np.random.default_rng(0)
+    size = sum(a * b for a, b in NetworkPolicy.sizes("retraction", [5]))
+    policy = NetworkPolicy.from_vectors("retraction", [5], rng.standard_normal(size))
+    policy.save(tmp_path / "p.npz")
+    observations = rng.standard_normal((3, 16)).astype(np.float32)
+    loaded = make_policy(str(tmp_path / "p.npz"), "retraction")
+    np.testing.assert_array_equal(loaded.act(observations), policy.act(observations))
+    np.testing.assert_array_equal(loaded.act(observations[:1]), policy.act(observations)[:1])
+    with pytest.raises(ValueError, match="trained for retraction, not for palpation"):
+        make_policy(str(tmp_path / "p.npz"), "palpation")
+    (tmp_path / "no.npz").write_text("no")
+    np.savez(tmp_path / "evil.npz", task=np.array("retraction"), layer0=np.array([print], dtype=object))
+    np.savez(tmp_path / "small.npz", task=np.array("retraction"), layer0=np.zeros((3, 4)))
+    for name in ("no", "evil", "small", "missing"):
+        with pytest.raises(ValueError, match=f"{name}.npz: not a readable policy"):
+            NetworkPolicy.load(tmp_path / f"{name}.npz")
+
+
+def test_training_learns_and_leaves_its_curve(tmp_path):
+    config = TrainingConfig(generations=2, population=24, episodes=1, test_episodes=8)
+    policy, curve = train("retraction", load_scene(), config, device="cpu")
+    again, _ = train("retraction", load_scene(), config, device="cpu")
+    np.testing.assert_array_equal(policy.layers[0], again.layers[0])
+    assert [point["episodes"] for point in curve] == [0, 24, 48]
+    assert curve[-1]["test_return"] > curve[0]["test_return"]
+    save_training(tmp_path, policy, curve, config)
+    assert json.loads((tmp_path / "curve.json").read_text())["curve"] == curve
+    assert (tmp_path / "curve.png").stat().st_size > 1000 and NetworkPolicy.load(tmp_path / "policy.npz").task == "retraction"
+
+
+@pytest.mark.dds
+def test_the_code_in_the_guide_runs(tmp_path):
+    guide = (ROOT / "docs" / "learning.md").read_text()
+    blocks = re.findall(r"```python\n(.+?)```", guide, re.S)
+    if importlib.util.find_spec("stable_baselines3") is None:
+        blocks = [block for block in blocks if "stable_baselines3" not in block]
+    code = "\n".join(blocks)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert "solved: 1.0" in done.stdout
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_on_a_gpu_the_scripts_solve_as_on_a_cpu_and_images_are_alike():
+    for task, count in (("retraction", 256), ("palpation", 64)):
+        batch = TaskBatch(task, load_scene(), count, randomisation=Randomisation(stiffness=0.1), images=True, device="cuda")
+        _, success, _ = run_episodes(batch, scripted_policy(task, count), np.arange(count))
+        assert success.mean() > 0.9, task
+    gpu, cpu = (TaskBatch("retraction", load_scene(), 2, "image", device=device) for device in ("cuda", "cpu"))
+    for batch in (gpu, cpu):
+        batch.reset([0, 1], [np.random.default_rng(s) for s in (0, 1)])
+    assert np.abs(gpu.observe().astype(int) - cpu.observe()).mean() < 0.5

@@ -1,0 +1,48 @@
+"""The loop of a node."""
+
+import threading
+
+import numpy as np
+import pytest
+from ros_bench import S, send_camera
+from std_srvs.srv import Trigger
+
+from endo_sim_ros import messages
+from endo_sim_ros.nodes.base import EndoNode
+from endo_sim_ros.nodes.executor import NodeExecutor
+
+pytestmark = pytest.mark.dds
+
+
+def test_the_loop_of_a_node_serves_what_is_there_and_what_is_added_or_removed_meanwhile(bench):
+    node, executor, ticks = EndoNode("loop"), NodeExecutor(), []
+    heard = {topic: [] for topic in (messages.CAMERA_POSE, messages.LEFT_INFO)}
+    node.subscribe(messages.CAMERA_POSE, heard[messages.CAMERA_POSE].append)
+
+    def exchange(_):
+        node.destroy_subscription(next(s for s in node.subscriptions if s.topic_name.endswith("measured_cp")))
+        node.subscribe(messages.LEFT_INFO, heard[messages.LEFT_INFO].append)
+        node.every(0.02, lambda: ticks.append(0))
+        return True, "exchanged"
+
+    node.service(Trigger, "~/exchange", exchange)
+    executor.add_node(node)
+    thread = threading.Thread(target=executor.spin)
+    thread.start()
+    try:
+        for stamp in (1, 2, 3):
+            bench.publish(messages.CAMERA_POSE, messages.encode_pose(np.eye(4), stamp * S, "world"))
+        bench.until(lambda: [m.header.stamp.sec for m in heard[messages.CAMERA_POSE]] == [1, 2, 3], "poses")
+        assert bench.call(Trigger, "/loop/exchange").message == "exchanged" and bench.set("loop", use_sim_time=False)[0]
+        send_camera(bench, stamp=4 * S)
+        bench.until(lambda: heard[messages.LEFT_INFO] and len(ticks) > 3, "what was added")
+        assert len(heard[messages.CAMERA_POSE]) == 3 and thread.is_alive()
+        answered = []
+        for i in range(5):  # at once, as callbacks of several answers
+            executor.create_task(answered.append, i)
+        bench.until(lambda: sorted(answered) == [0, 1, 2, 3, 4], "all of them")
+    finally:
+        executor.shutdown()
+        thread.join(5)
+        node.destroy_node()
+    assert not thread.is_alive()

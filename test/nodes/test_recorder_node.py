@@ -1,0 +1,49 @@
+"""recorder_node in this process."""
+
+import errno
+import shutil
+
+import pytest
+from ros_bench import S, send_wrench
+
+from endo_sim_ros import messages
+from endo_sim_ros.messages import ERROR
+from endo_sim_ros.nodes.recorder_node import RecorderNode
+from endo_sim_ros.sequences.bag import BagReader, BagWriter
+
+pytestmark = pytest.mark.dds
+
+
+@pytest.fixture
+def recording(ros):
+    """Where a recorder in this process writes."""
+    shutil.rmtree(ros, ignore_errors=True)
+    return ros
+
+
+def test_a_recorder_on_a_full_disk_says_so_and_keeps_no_messages(bench, recording, monkeypatch):
+    def full(self, *_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(BagWriter, "write_raw", full)
+    recorder = bench.add(RecorderNode)
+    bench.refused("recorder", "recording stopped", "No space left on device")
+    for number in range(50):
+        send_wrench(bench, (0, 0, 1.0), stamp=S + number)
+        bench.executor.spin_once(timeout_sec=0.01)
+    bench.until(lambda: recorder._dropped >= 50, "messages to be dropped")
+    assert recorder._queue.qsize() < 3 and recorder.status()[0] == ERROR
+
+
+def test_a_recorder_keeps_what_was_said_and_refuses_to_overwrite(bench, recording):
+    recorder = bench.add(RecorderNode)
+    send_wrench(bench, (1.0, 2.0, 3.0))
+    bench.until(lambda: recorder._written >= 2, "messages to be written")
+    bench.executor.remove_node(recorder)
+    bench.nodes.remove(recorder)
+    recorder.destroy_node()
+    with BagReader(recording) as bag:
+        ((topic, _, message),) = bag.messages([messages.tool_wrench("PSM1")])
+    assert message.wrench.force.y == 2.0
+    bench.add(RecorderNode)
+    bench.refused("recorder", "exists already")

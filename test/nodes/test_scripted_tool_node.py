@@ -1,0 +1,24 @@
+"""scripted_tool_node: waits, pulls and lets go."""
+
+import numpy as np
+import pytest
+from ros_bench import S, await_nodes, moved, send_camera, send_model
+
+from endo_sim_ros.messages import OK, WARN
+from endo_sim_ros.nodes.scripted_tool_node import ScriptedToolNode
+
+pytestmark = pytest.mark.dds
+
+
+def test_scripted_tool_waits_then_pulls_and_lets_go(bench, physics, rendering):
+    tool = bench.add(ScriptedToolNode)
+    bench.status("scripted_tool", "waiting for the rendered depth", WARN)
+    assert bench.set("scripted_tool", pull=0.5, swing=0.5, release=0.2, force=1.0)[0]
+    assert not bench.set("scripted_tool", arm="PSM2")[0]
+    send_model(bench)
+    send_camera(bench)
+    await_nodes(bench, 5 * S)
+    bench.until(lambda: moved(bench) > 1e-3, "the tool to move tissue")
+    bench.status("scripted_tool", "finished", OK)
+    assert np.linalg.norm(tool._tip - [0, 0, 0.1]) < 0.01
+    bench.until(lambda: moved(bench) < 1e-4, "the tissue to be released")

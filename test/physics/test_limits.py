@@ -1,0 +1,108 @@
+"""Stability and faults: substeps, absurd forces and sizes."""
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+from tissue_scene import TIP, depth_of_dent, pose_at, simulate, specimen, steps
+
+from endo_sim_ros.physics import ControlNodes, MpmSolver, PhysicsConfig, StabilityError, TissueProperties, plan_substeps
+
+
+def test_substeps_adapt_to_the_material_and_add_up_to_the_step():
+    stiff = plan_substeps(PhysicsConfig(young_modulus=1e6, poisson_ratio=0.45), 0.00875)
+    soft = plan_substeps(PhysicsConfig(young_modulus=1e3), 0.00875)
+    assert stiff.count > 80 > soft.count >= 1
+    for plan in (stiff, soft):
+        assert plan.cfl <= 0.5 and plan.count * plan.dt == pytest.approx(PhysicsConfig().step_duration)
+    printed = plan_substeps(PhysicsConfig(adapt_substeps=False), 0.00875)  # as the paper has it
+    assert (printed.count, printed.dt) == (80, pytest.approx(0.0005))
+
+
+def test_few_adapted_substeps_settle_where_many_do():
+    dents = []
+    for adapt in (True, False):
+        simulation = simulate(adapt_substeps=adapt)
+        simulation.set_wrench("probe", TIP, [0.0, 0.0, 0.5])
+        steps(simulation, 30)
+        dents.append(depth_of_dent(simulation))
+    assert dents[0] == pytest.approx(dents[1], rel=0.06)  # transfer dissipation slows the last bit down
+
+
+def test_stiff_material_is_refused_with_the_numbers_when_substeps_may_not_adapt():
+    numbers = r"young_modulus 1e\+06 Pa.*0\.3.*1000 kg.*0\.00875 m.*use \d+ substeps of"
+    with pytest.raises(StabilityError, match=numbers):
+        plan_substeps(PhysicsConfig(young_modulus=1e6, adapt_substeps=False), 0.00875)
+    # Where no number of substeps is allowed that would do, the stiffness that would.
+    with pytest.raises(StabilityError, match=r"use young_modulus \S+ Pa or less") as refusal:
+        plan_substeps(PhysicsConfig(young_modulus=1e9, density=1.0), 0.00875)
+    largest = float(re.search(r"use young_modulus (\S+)", str(refusal.value))[1])
+    assert plan_substeps(PhysicsConfig(young_modulus=largest, density=1.0), 0.00875).count > 90_000
+
+
+@pytest.mark.parametrize("kinematics", ["rest", "current"])
+def test_absurd_force_is_caught_and_the_last_good_state_restored(kinematics):
+    simulation = simulate(kinematics=kinematics)
+    simulation.set_wrench("probe", TIP, [0.0, 0.0, 0.1])
+    steps(simulation, 3)
+    good = simulation.state()
+    simulation.set_wrench("probe", TIP, [0.0, 0.0, -1e7])
+    simulation.step()
+    bad = simulation.state()
+    assert simulation.faults == 1 and "undone" in simulation.last_fault and "1e+07 N" in simulation.last_fault
+    np.testing.assert_array_equal(bad.positions, good.positions)
+    np.testing.assert_array_equal(bad.F, good.F)
+    assert not np.any(simulation.solver.momentum()[0])
+    simulation.set_wrench("probe", TIP, [0.0, 0.0, 0.1])
+    steps(simulation, 2)
+    assert simulation.faults == 1 and np.isfinite(simulation.state().positions).all()
+
+
+@pytest.mark.parametrize(("material", "relaxation"), [("neo_hookean", 0.0), ("fixed_corotated", 5.0)])
+def test_tissue_crushed_until_no_step_goes_on_comes_back_when_the_tool_has_gone(material, relaxation):
+    simulation = simulate(material=material, relaxation=relaxation, contact_radius=0.05)
+    simulation.set_grasp("ball", pose_at(TIP), False)
+    steps(simulation, 20)
+    crushed = depth_of_dent(simulation)
+    simulation.set_grasp("ball", pose_at(TIP - [0, 0, 0.2]), False)
+    steps(simulation, 60)
+    faults = simulation.faults
+    steps(simulation, 190)
+    assert faults > 0 and simulation.faults == faults and "ball pushing" in simulation.last_fault
+    assert crushed > 0.03 and depth_of_dent(simulation) < 0.03 * crushed
+
+
+@pytest.mark.parametrize("offset", [1e5, 1e30])
+def test_tissue_too_far_away_for_its_nodes_to_be_told_apart_is_refused(offset):
+    nodes = specimen((3, 3, 3), 0.01, lambda X: np.zeros(len(X), bool), lambda X: np.ones(len(X), bool))
+    far = dataclasses.replace(nodes, rest=nodes.rest + np.float32([offset, 0, 0]))
+    with pytest.raises(ValueError, match="from the world's origin, too far to tell its nodes 0.01 m apart"):
+        MpmSolver(far, PhysicsConfig(device="cpu"))
+
+
+@pytest.mark.parametrize("spacing", [1e-42, 1e-9, 1e6])
+def test_tissue_of_an_absurd_size_is_refused(spacing):
+    nodes = specimen((3, 3, 3), spacing, lambda X: np.zeros(len(X), bool), lambda X: np.ones(len(X), bool))
+    with pytest.raises(ValueError, match="grid cells would be .* m wide.*metres"):
+        MpmSolver(nodes, PhysicsConfig(device="cpu"))
+
+
+def test_nodes_without_volume_and_properties_of_other_nodes_are_refused():
+    nodes = specimen((3, 3, 3), 0.01, lambda X: np.zeros(len(X), bool), lambda X: np.ones(len(X), bool))
+    config = PhysicsConfig(device="cpu")
+    with pytest.raises(ValueError, match="properties of 5 nodes, but the tissue has 27"):
+        MpmSolver(nodes, config, TissueProperties.uniform(5, 1e4, 0.3, 1e3))
+    for volume in (0.0, np.nan):
+        with pytest.raises(ValueError, match="volume of node 4 is"):
+            MpmSolver(dataclasses.replace(nodes, volumes=np.where(np.arange(27) == 4, volume, nodes.volumes)), config)
+    with pytest.raises(ValueError, match=r"stiffness has shape \(1, 5\), expected \[K, 27\]"):
+        MpmSolver(nodes, config).set_stiffness(slice(None), np.ones((1, 5)))
+
+
+@pytest.mark.parametrize("size", [100, 1e15, 2.0**61, 1e30])  # in integers the larger ones would wrap around
+def test_a_grid_beyond_memory_is_refused(size):
+    ends = np.array([[0, 0, 0], [size, size, size]], np.float32)
+    nodes = ControlNodes(ends, np.zeros(2, bool), np.full(2, 1e-9, np.float32), np.ones(2, bool), 1e-3)
+    with pytest.raises(ValueError, match="simulation grid would have|from the world.s origin"):
+        MpmSolver(nodes, PhysicsConfig(device="cpu"))

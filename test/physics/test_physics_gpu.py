@@ -1,0 +1,121 @@
+"""Physics and skinning on a GPU as on the CPU. Skipped where there is none."""
+
+import numpy as np
+import pytest
+import torch
+from dense_sheet import sheet
+
+from endo_sim_ros.physics import PhysicsConfig, Skinning, TissueBatch, TissueSimulation, build_control_nodes, solver
+
+pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")]
+TIP = np.array([0.0, 0.0, 0.12])
+
+
+def test_prepared_tissue_has_nothing_left_to_make_ready_when_it_is_first_touched(monkeypatch):
+    simulation = TissueSimulation(sheet(), np.zeros(3), PhysicsConfig(device="cuda", node_count=500))
+    simulation.prepare()
+    monkeypatch.setattr(solver.wp, "load_module", lambda *_, **__: pytest.fail("kernels are loaded only now"))
+    monkeypatch.setattr(solver.wp, "ScopedCapture", lambda *_, **__: pytest.fail("the step is recorded only now"))
+    assert simulation.set_wrench("pull", TIP, [0.0, 0.0, -0.3])
+    simulation.step()
+    assert np.abs(simulation.state().positions - simulation.nodes.rest).max() > 1e-6
+
+
+def touch(device: str, **overrides) -> tuple[TissueSimulation, dict[str, np.ndarray]]:
+    """Pull with a wrench, lift with a jaw, press with a rod and cut, all at once; the end, and all that was felt."""
+    config = PhysicsConfig(**{"device": device, "node_count": 2000, "contact_radius": 0.006, "blade_length": 0.03, **overrides})
+    simulation, felt = TissueSimulation(sheet(), np.zeros(3), config), []
+    pose = np.eye(4)
+    assert simulation.set_wrench("pull", TIP - [0.04, 0, 0], [0.1, 0.0, -0.3])
+    for step in range(10):
+        pose[:3, 3] = TIP + [0.04, 0, -0.0008 * step]
+        assert simulation.set_grasp("grip", pose, True)
+        pose[:3, 3] = TIP + [0, 0, -0.006 + 0.0005 * step]
+        simulation.set_grasp("press", pose, False)
+        pose[:3, 3] = 0.02, -0.03 + 0.005 * step, 0.15
+        if config.kinematics == "rest":
+            simulation.set_cut("knife", pose, True)
+        simulation.step()
+        felt.append(np.concatenate([simulation.reaction(tool) for tool in ("pull", "grip", "press")]))
+    assert simulation.faults == 0 and (len(simulation.cuts) > 0) == (config.kinematics == "rest")
+    state = simulation.state()
+    return simulation, {"positions": state.positions, "F": state.F, "felt": np.array(felt)}
+
+
+@pytest.mark.parametrize("kinematics", ["rest", "current"])
+@pytest.mark.parametrize("material", ["fixed_corotated", "neo_hookean"])
+def test_physics_agrees_step_for_step(kinematics, material):
+    options = {"kinematics": kinematics, "material": material, "relaxation": 0.5}
+    (simulation, cpu), (_, cuda) = touch("cpu", **options), touch("cuda", **options)
+    moved = np.abs(cpu["positions"] - simulation.nodes.rest).max()
+    assert moved > 2e-3
+    np.testing.assert_allclose(cuda["positions"], cpu["positions"], atol=2e-3 * moved)
+    np.testing.assert_allclose(cuda["F"], cpu["F"], atol=5e-3)
+    np.testing.assert_allclose(cuda["felt"], cpu["felt"], atol=0.01 * np.abs(cpu["felt"]).max())
+
+
+@pytest.mark.parametrize("count", [700, 2000, 4000])
+def test_blocks_that_share_the_tissue_agree_with_launches_for_each_substep(count, monkeypatch):
+    one, few = touch("cuda", node_count=count, relaxation=0.5)
+    monkeypatch.setattr(solver.cluster, "divide", lambda *arguments: None)
+    many = touch("cuda", node_count=count, relaxation=0.5)[1]
+    np.testing.assert_allclose(few["positions"], many["positions"], atol=2e-3 * np.abs(many["positions"] - one.nodes.rest).max())
+    np.testing.assert_allclose(few["felt"], many["felt"], atol=2e-2 * np.abs(many["felt"]).max())
+
+
+def test_the_same_touches_give_the_same_bits_twice():
+    (_, first), (_, second) = touch("cuda"), touch("cuda")
+    for name, values in first.items():
+        np.testing.assert_array_equal(second[name], values, err_msg=name)
+
+
+def test_many_environments_agree_with_one_and_faults_stay_in_theirs():
+    config, count = PhysicsConfig(device="cuda", node_count=1000), 64
+    nodes = build_control_nodes(sheet(), np.zeros(3), config)
+    batch = TissueBatch(nodes, config, environments=count, tools=2)
+    skinning = Skinning(sheet(), nodes.rest, device="cuda")
+    means, covars = batch.carry(skinning)
+    batch.tools.reaches[:, 0] = torch.from_numpy(TIP)
+    batch.tools.forces[:, 0, 2] = torch.linspace(0.0, 0.3, count, dtype=torch.float64)
+    batch.tools.forces[7, 0, 2] = 1e7
+    for _ in range(5):
+        batch.step()
+    assert batch.tools.faults.tolist() == [5 * (b == 7) for b in range(count)]
+    assert batch.displacements.isfinite().all() and not batch.displacements[0].any()
+    depths = batch.displacements.norm(dim=2).amax(1)
+    assert bool((depths[8:] > depths[7:-1]).all())
+    single = TissueBatch(nodes, config, environments=1, tools=2)
+    single.tools.reaches[:, 0] = torch.from_numpy(TIP)
+    single.tools.forces[:, 0, 2] = 0.3
+    for _ in range(5):
+        single.step()
+    assert torch.equal(single.displacements[0], batch.displacements[-1])
+    pinned = torch.from_numpy(nodes.pinned).cuda()[:, None, None]
+    expected = skinning.deform(batch.positions()[-1], torch.where(pinned, torch.eye(3, device="cuda"), batch.F[-1]))
+    torch.testing.assert_close(means[-1], expected[0], atol=1e-7, rtol=0)
+    torch.testing.assert_close(covars[-1], expected[1], atol=1e-10, rtol=1e-4)
+    batch.reset(torch.arange(0, count, 2, device="cuda"))
+    assert not batch.displacements[::2].any() and bool(batch.displacements[9].any())
+
+
+def test_commands_written_on_a_side_stream_reach_the_next_step():
+    config = PhysicsConfig(device="cuda", node_count=400)
+    batch = TissueBatch(build_control_nodes(sheet(), np.zeros(3), config), config, environments=4)
+    with torch.cuda.stream(torch.cuda.Stream()):
+        for step in range(20):
+            batch.tools.reaches[:, 0] = torch.from_numpy(TIP)
+            batch.tools.forces[:, 0, 2] = 0.01 * (step + 1)
+            batch.step()
+            reactions = batch.tools.reaction_forces[:, 0, 2].clone()
+            torch.testing.assert_close(reactions, torch.full_like(reactions, -0.01 * (step + 1)), atol=1e-9, rtol=0)
+
+
+def test_skinning_agrees():
+    model, rng = sheet(), np.random.default_rng(0)
+    rest = model.means[::10].numpy()
+    positions = (rest + rng.normal(0, 1e-3, rest.shape)).astype(np.float32)
+    F = (np.eye(3) + rng.normal(0, 0.1, (len(rest), 3, 3))).astype(np.float32)
+    for weighting in ("compact", "softmax"):
+        (m1, c1), (m2, c2) = (Skinning(model, rest, weighting=weighting, device=d).deform(positions, F) for d in ("cpu", "cuda"))
+        torch.testing.assert_close(m2.cpu(), m1, atol=1e-6, rtol=1e-5)
+        torch.testing.assert_close(c2.cpu(), c1, atol=1e-9, rtol=1e-3)

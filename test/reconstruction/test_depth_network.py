@@ -1,0 +1,97 @@
+"""Depth by a network: tiny ones built here go through the real loading code; what they see is made metric."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.reconstruction import ReconstructionConfig
+from endo_sim_ros.reconstruction.priors.network import align, load_network, network_depth
+from endo_sim_ros.reconstruction.priors.sources import with_depth_prior
+from endo_sim_ros.reconstruction.triangulation import triangulate
+from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
+
+ONNX = Path(__file__).resolve().parents[3] / "shared/data/weights/tcmonodepth_tcsmallnet_192x320.onnx"
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory):
+    """A checkpoint of Depth-Anything's architecture with random weights."""
+    transformers = pytest.importorskip("transformers")
+    backbone = transformers.Dinov2Config(
+        hidden_size=16, num_hidden_layers=4, num_attention_heads=2, intermediate_size=32, image_size=70, patch_size=14,
+        out_features=["stage1", "stage2", "stage3", "stage4"], reshape_hidden_states=False, apply_layernorm=True,
+    )  # fmt: skip
+    config = transformers.DepthAnythingConfig(
+        backbone_config=backbone, reassemble_hidden_size=16, neck_hidden_sizes=[8, 8, 16, 16], fusion_hidden_size=8, head_hidden_size=8,
+        reassemble_factors=[4, 2, 1, 0.5], patch_size=14, head_in_index=-1,
+    )  # fmt: skip
+    folder = tmp_path_factory.mktemp("hub") / "models--depth-anything--Depth-Anything-V2-Small-hf/snapshots/0123"
+    transformers.DepthAnythingForDepthEstimation(config).save_pretrained(folder)
+    return folder
+
+
+def test_a_checkpoint_is_read_from_a_folder_or_the_cache(tiny, monkeypatch):
+    image = np.random.default_rng(0).integers(0, 255, (60, 83, 3), np.uint8)
+    depth = load_network(str(tiny), "cpu")(image)
+    assert depth.shape == (60, 83) and depth.dtype == np.float32 and np.isfinite(depth).all()
+    monkeypatch.setenv("HF_HUB_CACHE", str(tiny.parents[2]))
+    np.testing.assert_array_equal(load_network("", "cpu")(image), depth)
+
+
+def test_an_absent_or_damaged_network_is_one_clear_error(tmp_path, monkeypatch):
+    pytest.importorskip("transformers"), pytest.importorskip("onnxruntime")
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path))
+    with pytest.raises(SequenceError, match="no Depth-Anything-V2 checkpoint; copy the folder"):
+        load_network("", "cpu")
+    with pytest.raises(SequenceError, match=r"nowhere.*give its path as depth_model"):
+        load_network(str(tmp_path / "nowhere"), "cpu")
+    (tmp_path / "bad.onnx").write_bytes(b"nothing")
+    with pytest.raises(SequenceError, match=r"bad.onnx: not a readable depth network"):
+        load_network(str(tmp_path / "bad.onnx"), "cpu")
+
+
+def test_alignment_survives_outliers_and_refuses_what_does_not_fit():
+    rng = np.random.default_rng(0)
+    inverse = rng.uniform(5, 15, 200)
+    relative = (inverse - 2) / 7
+    wrong = inverse.copy()
+    wrong[:60] = rng.uniform(2, 30, 60)
+    scale, shift, error = align(relative, wrong)
+    assert scale == pytest.approx(7, rel=0.02) and shift == pytest.approx(2, abs=0.15) and error < 0.02
+    assert align(rng.random(200), inverse) is None  # nothing to do with it
+    assert align(-relative, inverse) is None  # depth instead of inverse depth
+    assert align(relative[:5], inverse[:5]) is None
+    assert align(np.ones(200), inverse) is None
+
+
+@pytest.fixture(scope="module")
+def views():
+    return list(phantom_sequence(PhantomConfig(width=320, height=256, frames=3, stereo=False)))
+
+
+def test_a_networks_depth_becomes_metric(views):
+    """A network that sees the exact shape, up to scale and shift, gives the exact depth."""
+    frame = views[0]
+    points = triangulate(views).positions
+    uv, z = frame.camera.project(points)
+    inside = (uv >= 0).all(1) & (uv < [320, 256]).all(1)
+    known = np.column_stack([uv, z])[inside]
+    depth = network_depth(frame, lambda image: (1 / frame.depth - 3) / 11, known)
+    assert np.median(np.abs(depth / frame.depth - 1)) < 0.01
+    assert network_depth(frame, lambda image: np.random.default_rng(0).random((256, 320)), known) is None
+
+
+def test_views_that_do_not_fit_are_dropped_and_none_at_all_is_an_error(views, tiny):
+    points = triangulate(views)
+    with pytest.raises(SequenceError, match="no view's depth fits"):
+        with_depth_prior(views, points, ReconstructionConfig(depth="network", depth_model=str(tiny), device="cpu"))
+
+
+@pytest.mark.skipif(not ONNX.is_file(), reason="no ONNX depth network at ../shared/data/weights")
+def test_a_real_network_gives_depth_that_correlates(views):
+    pytest.importorskip("onnxruntime")
+    relative = load_network(str(ONNX), "cpu")(views[0].image)
+    assert relative.shape == (256, 320) and np.isfinite(relative).all()
+    assert abs(np.corrcoef(relative.ravel(), 1 / views[0].depth.ravel())[0, 1]) > 0.3

@@ -1,0 +1,103 @@
+"""Presets of the trainer, what they are made of, and where they break."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from short_training import SHORT, bare, finite, options
+
+from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.evaluation import metrics
+from endo_sim_ros.reconstruction import ABLATIONS, PRESETS, ReconstructionConfig, Trainer, preset
+from endo_sim_ros.reconstruction.presets import resolved
+from endo_sim_ros.reconstruction.trainer import shrink
+from endo_sim_ros.reconstruction.triangulation import triangulate
+from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
+from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
+
+
+def quality(model, frames) -> tuple[float, float]:
+    """Mean PSNR and gain-fitted PSNR, dB."""
+    renderer = DeformableRenderer(model, None, RenderingConfig(device="cpu"))
+    pairs = [(renderer.render(frame.camera)[0], frame.image, frame.mask) for frame in frames]
+    fitted = [metrics.psnr(metrics.gain_fitted(*pair), *pair[1:]) for pair in pairs]
+    return float(np.mean([metrics.psnr(*pair) for pair in pairs])), float(np.mean(fitted))
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_trains(views, name):
+    points = triangulate(views)[:2]
+    model = Trainer(views[::4], preset(name, **SHORT), points).run()
+    assert finite(model) and len(model) <= 2000
+    assert (model.light is None) == (name in ("paper", "fsgs", "3dgs"))
+
+
+def test_options_beside_a_preset_count_and_resolving_twice_changes_nothing():
+    config = preset("paper", lambda_tv=0.5, initialization="depth")
+    assert (config.initialization, config.lambda_tv, config.light, config.preset) == ("depth", 0.5, False, "default")
+    assert resolved(config) == config
+    chosen = ReconstructionConfig(preset="3dgs", iterations=7)
+    assert resolved(chosen) == preset("3dgs", iterations=7)
+    with pytest.raises(ConfigError, match="must be one of"):
+        preset("nerf")
+
+
+def test_every_ablation_changes_its_preset():
+    for name, parts in ABLATIONS.items():
+        for part, changes in parts.items():
+            assert preset(name, **changes) != preset(name), (name, part)
+
+
+def test_the_default_beats_the_paper_on_two_views(views):
+    ends, rest = [views[0], views[-1]], views[1:-1]
+    short = {"iterations": 60, "max_gaussians": 6000, "refine_every": 20, "device": "cpu"}
+    points = triangulate(views)[:2]
+    paper = quality(Trainer(ends, preset("paper", **short), points).run(), rest)
+    ours = quality(Trainer(ends, preset("default", **short)).run(), rest)
+    assert ours[0] > paper[0] + 1.5 and ours[1] > paper[1] + 1.5
+
+
+@pytest.mark.parametrize("size", [(161, 97), (3840, 2160)])
+def test_odd_and_large_pictures_train(size):
+    frame = next(iter(phantom_sequence(PhantomConfig(width=160, height=96, frames=1))))
+    camera = frame.camera.resized(*size)
+    enlarged = lambda image: cv2.resize(image, size, interpolation=cv2.INTER_NEAREST)
+    large = dataclasses.replace(bare(frame), camera=camera, image=enlarged(frame.image), depth=enlarged(frame.depth), mask=None)
+    trainer = Trainer([large], options(image_width=75, iterations=3))
+    assert trainer.cameras[0].width == 75 and finite(trainer.run())
+
+
+def test_out_of_memory_goes_on_at_half_the_size(views, monkeypatch, caplog):
+    trainer = Trainer(views[::4], options())
+    draw, widths = trainer._render, []
+
+    def short_of_memory(viewmats, Ks, size, *arguments):
+        widths.append(size[0])
+        if size[0] > 80:
+            raise torch.OutOfMemoryError("CUDA out of memory")
+        return draw(viewmats, Ks, size, *arguments)
+
+    monkeypatch.setattr(trainer, "_render", short_of_memory)
+    assert finite(trainer.run()) and trainer.iteration == 12
+    assert widths[:2] == [160, 80] and trainer.cameras[0].width == 80
+    assert "80 pixels wide" in caplog.text
+    tiny = Trainer([shrink(view, 80) for view in views[::4]], options())
+    monkeypatch.setattr(tiny, "_render", lambda *_: (_ for _ in ()).throw(torch.OutOfMemoryError("CUDA out of memory")))
+    with pytest.raises(torch.OutOfMemoryError):
+        tiny.run()
+
+
+@pytest.mark.parametrize("name", ["default", "3dgs", "fsgs"])
+def test_a_checkpoint_of_any_preset_goes_on_as_if_never_interrupted(views, tmp_path, name):
+    make = lambda: Trainer(views[::4], preset(name, **SHORT), triangulate(views)[:2])
+    whole, first = make().run(), make()
+    for _ in range(7):
+        first.step()
+    first.save_checkpoint(tmp_path / "checkpoint.pt")
+    second = make()
+    second.load_checkpoint(tmp_path / "checkpoint.pt")
+    resumed = second.run()
+    assert all(torch.equal(a, b) for a, b in zip(resumed.tensors().values(), whole.tensors().values()))
+    assert resumed.light == whole.light

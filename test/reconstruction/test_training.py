@@ -1,0 +1,150 @@
+"""Short trainings on the phantom: quality, repeatability, checkpoints."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from short_training import equal, options
+
+from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.evaluation import metrics
+from endo_sim_ros.evaluation.held_out import reconstruct_and_measure
+from endo_sim_ros.reconstruction import Trainer
+from endo_sim_ros.reconstruction.optimizer import Adam
+from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
+from endo_sim_ros.sequences.bag import write_bag
+
+
+def held_out(model, frames):
+    """Mean PSNR (dB) and depth error (m) over frames."""
+    renderer = DeformableRenderer(model, None, RenderingConfig(device="cpu"))
+    rows = []
+    for frame in frames:
+        image, depth = renderer.render(frame.camera)
+        rows.append([metrics.psnr(image, frame.image), metrics.depth_rmse(depth, frame.depth)])
+    return np.mean(rows, 0)
+
+
+def test_adam_is_that_of_torch():
+    g = torch.Generator().manual_seed(0)
+    start = {name: torch.randn(shape, generator=g) for name, shape in (("means", (20, 3)), ("logit_opacities", (20,)))}
+    rates = {"means": 1e-3, "logit_opacities": 0.05}
+    ours, theirs = ({name: x.clone().requires_grad_() for name, x in start.items()} for _ in range(2))
+    optimizer = Adam(ours, rates)
+    reference = torch.optim.Adam([{"params": [x], "lr": rates[name]} for name, x in theirs.items()], eps=1e-15)
+    for step in range(5):
+        optimizer.set_rate("means", 1e-3 / (step + 1))
+        reference.param_groups[0]["lr"] = 1e-3 / (step + 1)
+        for name, x in theirs.items():
+            x.grad = torch.randn(x.shape, generator=g)
+        optimizer.step({name: x.grad for name, x in theirs.items()})
+        reference.step()
+    for name, x in ours.items():
+        torch.testing.assert_close(x, theirs[name])
+        assert not torch.equal(x, start[name])
+
+
+def test_virtual_camera_lies_between_two_views(small, monkeypatch):
+    trainer = Trainer([small[0], small[4]], options(virtual_every=1))
+    first, second = (small[i].camera.position for i in (0, 4))
+    seen = []
+    draw = trainer._render
+
+    def spy(viewmats, *arguments):
+        seen.extend(viewmats.double().inverse()[:, :3, 3].numpy())
+        return draw(viewmats, *arguments)
+
+    monkeypatch.setattr(trainer, "_render", spy)
+    for _ in range(3):
+        trainer.step()
+    virtual = seen[1::2]
+    assert len(virtual) == 3
+    for position in virtual:
+        alpha = np.dot(position - first, second - first) / np.dot(second - first, second - first)
+        assert 0 < alpha < 1
+        np.testing.assert_allclose(position, (1 - alpha) * first + alpha * second, atol=1e-7)
+
+
+def test_training_improves_views_it_has_not_seen(small):
+    training, rest = [small[i] for i in (0, 2, 4, 6)], [small[i] for i in (1, 3, 5)]
+    noisy = [dataclasses.replace(f, depth=f.depth * np.float32(1.03 if i % 2 else 0.97)) for i, f in enumerate(training)]
+    trainer = Trainer(noisy, options(iterations=150, max_gaussians=8000, refine_every=50))
+    psnr, _ = held_out(trainer.model, rest)
+    given_error = 0.03 * np.mean([np.sqrt(np.mean(f.depth[f.depth > 0] ** 2)) for f in training])
+    reports = []
+    model = trainer.run(lambda progress: reports.append(progress), every=50)
+    trained_psnr, trained_error = held_out(model, rest)
+    assert trained_psnr > psnr + 2.5
+    assert trained_error < 0.85 * given_error
+    assert [report.iteration for report in reports] == [50, 100, 150]
+    assert reports[-1].gaussians == len(model) <= 8000
+
+
+def test_progress_can_stop_the_training(small):
+    trainer = Trainer([small[0]], options())
+    trainer.run(lambda progress: False, every=2)
+    assert trainer.iteration == 2
+
+
+def test_same_seed_gives_the_same_bits_whatever_the_threads(small, monkeypatch):
+    models = []
+    for threads in ("1", "2", "3"):
+        monkeypatch.setenv("ENDO_SIM_THREADS", threads)
+        torch.set_num_threads(int(threads))
+        try:
+            models.append(Trainer(list(small[::4]), options(max_gaussians=15_000)).run())
+        finally:
+            torch.set_num_threads(1)
+    assert equal(models[0], models[1])
+    assert equal(models[0], models[2])
+    other = Trainer(list(small[::4]), options(max_gaussians=15_000, seed=1)).run()
+    assert not equal(models[0], other)
+
+
+def test_a_checkpoint_goes_on_as_if_never_interrupted(small, tmp_path):
+    views = list(small[::4])
+    whole = Trainer(views, options()).run()
+    first = Trainer(views, options())
+    for _ in range(7):
+        first.step()
+    first.save_checkpoint(tmp_path / "a" / "checkpoint.pt")
+    second = Trainer(views, options())
+    second.load_checkpoint(tmp_path / "a" / "checkpoint.pt")
+    assert second.iteration == 7
+    assert equal(second.run(), whole)
+
+
+def test_checkpoints_that_do_not_fit_are_refused(small, tmp_path):
+    path = tmp_path / "checkpoint.pt"
+    trainer = Trainer([small[0]], options())
+    trainer.save_checkpoint(path)
+    with pytest.raises(SequenceError, match=r"other options \(seed\)"):
+        Trainer([small[0]], options(seed=3)).load_checkpoint(path)
+    with pytest.raises(SequenceError, match="other views"):
+        Trainer([small[1]], options()).load_checkpoint(path)
+    state = torch.load(path, weights_only=True)
+    torch.save(state | {"config": state["config"] | {"lambda_gone": 0.3}}, path)  # of another version, which asked for more
+    with pytest.raises(SequenceError, match=r"other options \(lambda_gone\)"):
+        trainer.load_checkpoint(path)
+    path.write_bytes(b"not a checkpoint")
+    with pytest.raises(SequenceError, match="not a readable checkpoint"):
+        trainer.load_checkpoint(path)
+    with pytest.raises(SequenceError, match="not a readable checkpoint"):
+        trainer.load_checkpoint(tmp_path / "absent.pt")
+
+
+def test_higher_harmonics_are_trained(small):
+    model = Trainer([small[0], small[8]], options(sh_degree=3)).run()
+    assert model.sh_degree == 3
+    assert model.sh[:, 1:].abs().max() > 0
+
+
+def test_reconstruction_of_a_bag_is_measured(tmp_path, small):
+    write_bag(tmp_path / "bag", small)
+    found = reconstruct_and_measure(tmp_path / "bag", tmp_path / "out", options(keyframes=4, image_width=80))
+    assert found["held_out_views"] == 5
+    assert found["psnr"] > 15
+    assert found["depth_rmse"] < 0.010
+    for name in ("model.ply", "checkpoint.pt", "held_out.png"):
+        assert (tmp_path / "out" / name).stat().st_size > 0

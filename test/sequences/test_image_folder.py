@@ -1,0 +1,102 @@
+"""The reader of image folders."""
+
+import shutil
+
+import numpy as np
+import pytest
+from plane_scene import (
+    BASELINE,
+    HEIGHT,
+    NO_DISTORTION,
+    WIDTH,
+    assert_frame_agrees,
+    right_pose,
+    see_plane,
+    trajectory,
+    write_poses,
+    write_rgb,
+)
+
+from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.sequences.folder import read_folder, read_points
+from endo_sim_ros.sequences.readers import open_sequence
+
+CALIBRATION = f"width: {WIDTH}\nheight: {HEIGHT}\nfx: 150\nfy: 150\ncx: {WIDTH / 2}\ncy: {HEIGHT / 2}\n"
+
+
+@pytest.fixture
+def folder(tmp_path):
+    root = tmp_path / "recording"
+    root.mkdir()
+    K = np.array([[150.0, 0, WIDTH / 2 - 0.5], [0, 150.0, HEIGHT / 2 - 0.5], [0, 0, 1]])
+    poses = dict(zip((1, 51, 101), trajectory(3).values(), strict=True))
+    for number, pose in poses.items():
+        left, points = see_plane(K, NO_DISTORTION, pose)
+        right, _ = see_plane(K, NO_DISTORTION, right_pose(pose, np.eye(3), np.array([-BASELINE, 0, 0])))
+        left[:, : 15 if number == 101 else 12] = 3  # a border, which wanders
+        write_rgb(root / f"left/{number:05d}.png", left)
+        write_rgb(root / f"right/{number:05d}.png", right)
+        write_rgb(root / f"depth/{number:05d}.png", (1000 * points[..., 2]).round().astype(np.uint16))
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[:30] = 0
+    write_rgb(root / "masks/00051.png", mask)
+    (root / "calibration.yaml").write_text(CALIBRATION + f"baseline_m: {BASELINE}\n")
+    write_poses(root / "poses_left.txt", poses)
+    return root
+
+
+def test_image_folder_frames(folder):
+    frames = list(open_sequence(folder))
+    assert [f.stamp_ns for f in frames] == [1_040_000_000, 3_040_000_000, 5_040_000_000]
+    for frame in frames:
+        assert frame.baseline == BASELINE
+        assert not frame.mask[:, :12].any()
+        assert_frame_agrees(frame)
+    assert not frames[1].mask[:30].any() and frames[0].mask[10, 80] == frames[1].mask[60, 80] == 255
+    assert frames[0].mask[60, 14] == 255 and not frames[2].mask[:, :15].any()
+
+
+def test_points_of_a_folder_are_those_of_its_poses(folder):
+    assert read_points(folder) is None
+    (folder / "points.txt").write_text("# x y z r g b track\n0.01 0.02 0.1 255 0 51 7\n0 0 0.2 0 0 0 2\n")
+    points, colors = read_points(folder)
+    np.testing.assert_allclose(points, [[0.01, 0.02, 0.1], [0, 0, 0.2]])
+    np.testing.assert_allclose(colors, [[1, 0, 0.2], [0, 0, 0]])
+    for text, reason in (("1 2 3\n", "not lines of x y z r g b"), ("0 0 nan 1 1 1\n", "finite"), ("0 0 1 300 1 1\n", "0 to 255")):
+        (folder / "points.txt").write_text(text)
+        with pytest.raises(SequenceError, match=f"points.txt: .*{reason}"):
+            read_points(folder)
+    (folder / "poses_left.txt").unlink()
+    assert read_points(folder) is None
+
+
+def test_image_folder_with_left_images_only(folder):
+    shutil.rmtree(folder / "right")
+    shutil.rmtree(folder / "depth")
+    (folder / "calibration.yaml").write_text(CALIBRATION)
+    frames = list(read_folder(folder, step=2, mask_border=False))
+    assert len(frames) == 2
+    assert frames[0].right is None and frames[0].baseline is None and frames[0].depth is None
+    assert frames[0].mask.all()
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("calibration.yaml", None, "calibration.yaml: file is missing"),
+        ("calibration.yaml", "fx: [", "calibration.yaml: not a readable YAML"),
+        ("calibration.yaml", "fx: 1\n", "calibration.yaml: fy must be a positive number, got None"),
+        ("calibration.yaml", "fx: -1\n", "calibration.yaml: fx must be a positive number, got -1"),
+        ("calibration.yaml", CALIBRATION, "calibration.yaml: baseline_m is missing"),
+        ("calibration.yaml", CALIBRATION.replace("160", "320") + "baseline_m: 1\n", "width and height are 320×128"),
+        ("right/00051.png", None, "right image of 00051.png is missing"),
+        ("left/00001.png", "x", "left/00001.png: not a readable image"),
+        ("left/a00001.png", "x", "have the same number"),
+    ],
+)
+def test_damaged_image_folder_is_refused_by_name(folder, name, text, message):
+    (folder / name).unlink(missing_ok=True)
+    if text is not None:
+        (folder / name).write_text(text)
+    with pytest.raises(SequenceError, match=message):
+        list(read_folder(folder))

@@ -1,0 +1,82 @@
+"""What readers share: poses, numbers, masks, the lit area."""
+
+import cv2
+import numpy as np
+import pytest
+from plane_scene import pose_of, write_poses
+
+from endo_sim_ros.core.cameras import matrix_to_quat
+from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.sequences.readers import READERS, open_sequence
+from endo_sim_ros.sequences.recordings import lit_area, lit_now, numbered_files, read_poses, tool_is_white
+
+
+def test_pose_file_is_xyzw_and_camera_to_world(tmp_path):
+    expected = pose_of((0.1, 0.2, 0.3), x=0.3, y=-0.2, z=0.5)
+    write_poses(tmp_path / "poses.txt", {7: expected})
+    np.testing.assert_allclose(read_poses(tmp_path / "poses.txt")[7], expected, atol=1e-9)
+    w, x, y, z = matrix_to_quat(expected[:3, :3])
+    (tmp_path / "poses.csv").write_text(f"frame,tx,ty,tz,qx,qy,qz,qw\n7,.1,.2,.3,{x},{y},{z},{w}\n")
+    np.testing.assert_allclose(read_poses(tmp_path / "poses.csv")[7], expected, atol=1e-9)
+
+
+def test_numbers_in_file_names(tmp_path):
+    for name in ("000012l.png", "000012r.png", "frame-000003.mask.png", "notes.txt", "nothing.png"):
+        (tmp_path / name).touch()
+    assert numbered_files(tmp_path, ending="l") == {12: tmp_path / "000012l.png"}
+    assert numbered_files(tmp_path, ending="mask") == {3: tmp_path / "frame-000003.mask.png"}
+    assert numbered_files(tmp_path / "absent") == {}
+
+
+def test_masks_without_tools_keep_all_tissue(tmp_path):
+    assert tool_is_white([np.zeros((4, 4), np.uint8)], tmp_path)
+    assert not tool_is_white([np.full((4, 4), 255, np.uint8)], tmp_path)
+
+
+def test_near_balance_of_mask_colours_is_a_warning(tmp_path, caplog):
+    half = np.zeros((4, 4), np.uint8)
+    half[:2] = 255
+    tool_is_white([half], tmp_path)
+    assert "this is close" in caplog.text
+
+
+def test_vignette_is_dark_and_dark_tissue_is_not():
+    images = [np.full((60, 80, 3), 100, np.uint8) for _ in range(2)]
+    for image in images:
+        image[:, :20] = 2
+        image[25:35, 50:60] = 2  # a hole in the tissue
+    images[1][10:20, 40:50] = 0
+    mask = lit_area(images)
+    assert not mask[:, :20].any()
+    assert mask[:, 24:].all()
+
+
+def test_one_bright_image_does_not_hide_the_border():
+    rows, columns = np.mgrid[:60, :80]
+    picture = np.where(np.hypot(rows - 30, columns - 40) < 28, 120, 2).astype(np.uint8)[..., None].repeat(3, -1)
+    np.testing.assert_array_equal(lit_area([picture] * 9 + [np.full_like(picture, 255)]), lit_area([picture]))
+
+
+def test_edge_of_a_round_picture_may_wander():
+    rows, columns = np.mgrid[:120, :160]
+    tissue = [np.hypot(rows - 60, columns - 78 - shift) < 50 for shift in (0, 3)]
+    images = [np.where(inside, 120, 2).astype(np.uint8)[..., None].repeat(3, -1) for inside in tissue]
+    images[0][55:65, 70:90] = images[0][55:65, 31:36] = 2  # a hole, and a dark spot that begins inside
+    lit = lit_area(images)
+    for image, inside in zip(images, tissue):
+        mask = lit_now(lit, image)
+        assert not mask[~inside].any()
+        assert mask[cv2.erode(np.uint8(inside), np.ones((13, 13))) > 0].all()
+    assert lit[~tissue[0]].any()
+    whole = np.full_like(lit, 255)
+    assert lit_now(whole, images[0]) is whole
+
+
+def test_unknown_layouts_are_listed(tmp_path):
+    with pytest.raises(SequenceError, match="StereoCalibration.ini.*poses_bounds.npy.*left/.*mp4") as error:
+        open_sequence(tmp_path)
+    assert all(name in str(error.value) for name in READERS)
+    with pytest.raises(SequenceError, match="unknown kind 'nerf'; choose auto, stereomis"):
+        open_sequence(tmp_path, kind="nerf")
+    with pytest.raises(SequenceError, match="no such file or folder"):
+        open_sequence(tmp_path / "absent")

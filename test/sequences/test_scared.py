@@ -1,0 +1,197 @@
+"""The reader of SCARED, on small exact copies of its layout."""
+
+import io
+import json
+import logging
+import tarfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+from plane_scene import (
+    BARREL,
+    K_LEFT,
+    K_RIGHT,
+    R_EYES,
+    T_EYES,
+    assert_frame_agrees,
+    plane_colours,
+    pose_of,
+    right_pose,
+    see_plane,
+    stereo_images,
+    write_rgb,
+    write_video,
+)
+
+from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.sequences.readers import open_sequence
+from endo_sim_ros.sequences.scared import read_scared
+
+
+def add_member(tar, name: str, data: bytes):
+    info = tarfile.TarInfo(name)
+    info.size = len(data)
+    tar.addfile(info, io.BytesIO(data))
+
+
+def tiff_bytes(points: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    tifffile.imwrite(buffer, points.astype(np.float32), photometric="rgb")
+    return buffer.getvalue()
+
+
+def write_scared(root: Path, *, world_to_camera=True, order=None, yaml=True, count=6):
+    poses = {n: pose_of((0.0025 * n, -0.0015 * n, 0.0), z=0.02 * n) for n in range(count)}
+    left, points = see_plane(K_LEFT, BARREL, poses[0])
+    right, _ = see_plane(K_RIGHT, BARREL, right_pose(poses[0], R_EYES, T_EYES))
+    write_rgb(root / "Left_Image.png", left)
+    write_rgb(root / "Right_Image.png", right)
+    points = 1000 * points
+    points[:10] = np.nan
+    tifffile.imwrite(root / "left_depth_map.tiff", points.astype(np.float32), photometric="rgb")
+    if yaml:
+        storage = cv2.FileStorage(str(root / "endoscope_calibration.yaml"), cv2.FILE_STORAGE_WRITE)
+        for name, value in (("M1", K_LEFT), ("D1", BARREL[None]), ("M2", K_RIGHT), ("D2", BARREL[None])):
+            storage.write(name, value)
+        storage.write("R", R_EYES)
+        storage.write("T", 1000 * T_EYES[:, None])
+        storage.release()
+    write_video(root / "data/rgb.mp4", (np.vstack(pair) for pair in stereo_images(poses)))
+    calibration = {"KL": K_LEFT.tolist(), "KR": K_RIGHT.tolist(), "DL": [BARREL.tolist()], "DR": [BARREL.tolist()]}
+    calibration |= {"R": R_EYES.tolist(), "T": (1000 * T_EYES[:, None]).tolist()}
+    with tarfile.open(root / "data/frame_data.tar.gz", "w:gz") as tar:
+        for number, pose in poses.items():
+            matrix = np.linalg.inv(pose) if world_to_camera else pose.copy()
+            matrix[:3, 3] *= 1000
+            document = {"camera-pose": matrix.tolist(), "camera-calibration": calibration, "timestamp": 0}
+            add_member(tar, f"frame_data{number:06d}.json", json.dumps(document).encode())
+    with tarfile.open(root / "data/scene_points.tar.gz", "w:gz") as tar:
+        for number in order or range(count):
+            _, points = see_plane(K_LEFT, BARREL, poses[number])
+            add_member(tar, f"./scene_points{number:06d}.tiff", tiff_bytes(1000 * np.vstack([points, points])))
+    return root
+
+
+@pytest.fixture
+def scared(tmp_path):
+    root = tmp_path / "keyframe_1"
+    root.mkdir()
+    return root
+
+
+@pytest.mark.parametrize("world_to_camera", [True, False], ids=["world_to_camera", "camera_to_world"])
+def test_scared_finds_which_way_its_poses_point(scared, world_to_camera, caplog):
+    write_scared(scared, world_to_camera=world_to_camera)
+    with caplog.at_level(logging.INFO):
+        frames = list(read_scared(scared))
+    assert f"camera-pose is {'world_to_camera' if world_to_camera else 'camera_to_world'}" in caplog.text
+    assert len(frames) == 6
+    for frame in frames:
+        assert frame.baseline == pytest.approx(np.linalg.norm(T_EYES), rel=1e-6)
+        assert_frame_agrees(frame, tolerance=12)
+
+
+def test_scared_pose_direction_can_be_stated(scared):
+    write_scared(scared)
+    wrong = list(read_scared(scared, pose_direction="camera_to_world"))[-1]
+    expected, _ = plane_colours(wrong)
+    assert np.median(np.abs(wrong.image - expected)) > 15
+
+
+def test_scared_scene_points_in_any_order(scared, caplog):
+    write_scared(scared, order=[3, 1, 5, 0, 2])  # frame 4 has none
+    frames = list(read_scared(scared, start=1))
+    assert [frame.depth is not None for frame in frames] == [True, True, True, False, True]
+    for frame in frames:
+        assert_frame_agrees(frame, tolerance=12)
+    assert "not in its place" in caplog.text
+
+
+def test_scared_depth_choices(scared):
+    write_scared(scared)
+    keyframe = list(read_scared(scared, depth="keyframe"))
+    assert [f.depth is not None for f in keyframe] == [True] + 5 * [False]
+    assert (keyframe[0].depth == 0).any()  # where the keyframe has NaN
+    assert_frame_agrees(keyframe[0], tolerance=12)
+    assert all(f.depth is None for f in read_scared(scared, depth="none"))
+
+
+def test_scared_keyframe_alone(scared):
+    write_scared(scared)
+    (scared / "data/rgb.mp4").unlink()
+    frames = list(open_sequence(scared))
+    assert len(frames) == 1 and frames[0].stamp_ns == 1_000_000_000
+    assert_frame_agrees(frames[0])
+
+
+def test_scared_calibration_from_frame_data(scared):
+    write_scared(scared, yaml=False)
+    for frame in read_scared(scared, stop=2):
+        assert_frame_agrees(frame, tolerance=12)
+
+
+def test_scared_warns_when_the_camera_does_not_move(scared, caplog):
+    write_scared(scared, count=1)
+    assert len(list(read_scared(scared))) == 1
+    assert "moves too little" in caplog.text
+
+
+def damage_json(root: Path, data: bytes):
+    with tarfile.open(root / "data/frame_data.tar.gz", "w:gz") as tar:
+        add_member(tar, "frame_data000000.json", data)
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (
+            lambda r: (r / "endoscope_calibration.yaml").write_text("%YAML:1.0\n---\nM1: 3\n"),
+            "endoscope_calibration.yaml: ",
+        ),
+        (lambda r: (r / "endoscope_calibration.yaml").write_text("nonsense"), "endoscope_calibration.yaml: "),
+        (lambda r: (r / "data/frame_data.tar.gz").write_bytes(b"no archive"), "frame_data.tar.gz: not a readable"),
+        (lambda r: damage_json(r, b"{"), "frame_data000000.json is not valid JSON"),
+        (lambda r: damage_json(r, b"[]"), "camera-pose of frame 0 is missing"),
+        (lambda r: damage_json(r, b'{"camera-pose": [[1]]}'), "camera-pose of frame 0: expected a finite 4×4"),
+        (lambda r: damage_json(r, b" " * (2 << 20)), "far more than a camera needs"),
+        (lambda r: (r / "data/scene_points.tar.gz").write_bytes(b"no archive"), "scene_points.tar.gz: not a readable"),
+        (lambda r: (r / "left_depth_map.tiff").write_bytes(b"no tiff"), "left_depth_map.tiff: not a readable TIFF"),
+        (
+            lambda r: tifffile.imwrite(r / "left_depth_map.tiff", np.zeros((8, 8, 3), np.float32), photometric="rgb"),
+            "expected points of shape",
+        ),
+        (lambda r: (r / "data/rgb.mp4").write_bytes(b"no video"), "rgb.mp4: not a readable video"),
+    ],
+)
+def test_damaged_scared_is_refused_by_name(scared, damage, message):
+    write_scared(scared, count=2)
+    damage(scared)
+    with pytest.raises(SequenceError, match=message):
+        list(read_scared(scared))
+
+
+def test_truncated_scene_points_are_refused_by_name(scared):
+    write_scared(scared, count=3)
+    archive = scared / "data/scene_points.tar.gz"
+    archive.write_bytes(archive.read_bytes()[: archive.stat().st_size // 2])
+    with pytest.raises(SequenceError, match=r"scene_points.tar.gz: not a readable"):
+        list(read_scared(scared))
+
+
+def test_links_in_archives_are_not_followed(scared):
+    write_scared(scared, count=1)
+    link = tarfile.TarInfo("frame_data000000.json")
+    link.type, link.linkname = tarfile.SYMTYPE, "/etc/passwd"
+    with tarfile.open(scared / "data/frame_data.tar.gz", "w:gz") as tar:
+        tar.addfile(link)
+    with pytest.raises(SequenceError, match="holds no frame_data"):
+        read_scared(scared)
+
+
+def test_scared_dataset_folder_lists_its_keyframes(scared):
+    write_scared(scared, count=1)
+    with pytest.raises(SequenceError, match="pass one of its keyframes: keyframe_1"):
+        open_sequence(scared.parent)

@@ -1,0 +1,130 @@
+"""Structure from motion, on a relief and on real recordings."""
+
+import itertools
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from plane_scene import BASELINE, pose_of, write_rgb
+
+from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.sequences.folder import read_folder
+from endo_sim_ros.sequences.recordings import Video, lit_area, read_poses
+from endo_sim_ros.sequences.rectification import Rectification
+from endo_sim_ros.sequences.structure_from_motion import estimate_poses
+
+SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
+
+
+def similarity_error(estimated: np.ndarray, reference: np.ndarray) -> float:
+    """Root mean square distance of positions [N, 3] after the best similarity, relative to the path length."""
+    a, b = estimated - estimated.mean(0), reference - reference.mean(0)
+    u, s, vt = np.linalg.svd(b.T @ a)
+    sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
+    scale = np.trace(np.diag(s) @ sign) / (a**2).sum()
+    error = np.sqrt((((scale * a @ (u @ sign @ vt).T) - b) ** 2).sum(1).mean())
+    return error / np.linalg.norm(np.diff(reference, axis=0), axis=1).sum()
+
+
+def relief_images(poses, K_cv, size=(320, 240)):
+    """Views of a bumpy, finely textured surface, ray-marched."""
+    rng = np.random.default_rng(3)
+    noise = sum(
+        cv2.resize(rng.uniform(0, 1, (n, n)).astype(np.float32), (1024, 1024), interpolation=cv2.INTER_CUBIC) / 2**i
+        for i, n in enumerate((32, 96, 256))
+    )
+    noise = cv2.normalize(noise, None, 10, 245, cv2.NORM_MINMAX)
+    u, v = np.meshgrid(np.arange(size[0], dtype=float), np.arange(size[1], dtype=float))
+    rays = np.stack([(u - K_cv[0, 2]) / K_cv[0, 0], (v - K_cv[1, 2]) / K_cv[1, 1], np.ones_like(u)], -1)
+    for pose in poses:
+        turned, origin = rays @ pose[:3, :3].T, pose[:3, 3]
+        depth = np.full(u.shape, 0.1)
+        for _ in range(30):  # fixed point of a gentle height field
+            points = origin + turned * depth[..., None]
+            height = 0.1 + 0.012 * np.sin(points[..., 0] / 0.012) * np.cos(points[..., 1] / 0.015)
+            depth = (height - origin[2]) / turned[..., 2]
+        points = origin + turned * depth[..., None]
+        columns = ((points[..., 0] / 0.16 + 0.5) * 1024).astype(np.float32)
+        rows = ((points[..., 1] / 0.16 + 0.5) * 1024).astype(np.float32)
+        grey = cv2.remap(noise, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+        yield np.repeat(grey[..., None], 3, -1).round().astype(np.uint8)
+
+
+ORBIT = [pose_of((0.05 * np.sin(a), 0.01 * np.cos(3 * a), 0.1 - 0.1 * np.cos(a)), y=-a) for a in np.linspace(-0.35, 0.35, 6)]
+K_RELIEF = np.array([[300.0, 0, 159.5], [0, 300.0, 119.5], [0, 0, 1]])
+
+
+def test_structure_from_motion_on_stereo_is_metric():
+    pytest.importorskip("pycolmap")
+    offset = pose_of((BASELINE, 0, 0))
+    result = estimate_poses(
+        relief_images(ORBIT, K_RELIEF),
+        K_RELIEF + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]],
+        right_images=relief_images([pose @ offset for pose in ORBIT], K_RELIEF),
+        baseline=BASELINE,
+        threads=1,
+    )
+    assert sorted(result.poses) == list(range(6)) and result.metric and not result.distortion
+    np.testing.assert_allclose(result.poses[0], np.eye(4), atol=1e-9)
+    for number, pose in result.poses.items():
+        expected = np.linalg.inv(ORBIT[0]) @ ORBIT[number]
+        assert np.linalg.norm(pose[:3, 3] - expected[:3, 3]) < 1e-3
+        assert np.abs(pose[:3, :3] - expected[:3, :3]).max() < 0.01
+
+
+def test_folder_without_poses_is_posed_and_the_guessed_scale_is_announced(tmp_path, caplog):
+    pytest.importorskip("pycolmap")
+    for number, image in enumerate(relief_images(ORBIT, K_RELIEF)):
+        write_rgb(tmp_path / f"left/{number:06d}.png", image)
+    (tmp_path / "calibration.yaml").write_text("fx: 300\nfy: 300\ncx: 160\ncy: 120\n")
+    recording = read_folder(tmp_path)
+    frames = list(recording)
+    assert len(frames) == 6
+    positions = np.array([frame.camera.position for frame in frames])
+    assert similarity_error(positions, np.array([pose[:3, 3] for pose in ORBIT])) < 0.01
+    assert "THE SCALE IS A GUESS" in caplog.text
+    caplog.clear()
+    assert [f.stamp_ns for f in recording] == [f.stamp_ns for f in frames]
+    assert "SCALE" not in caplog.text  # estimated once
+
+
+def test_structure_from_motion_that_fails_says_why(tmp_path):
+    pytest.importorskip("pycolmap")
+    flat = itertools.repeat(np.full((120, 160, 3), 128, np.uint8), 3)
+    with pytest.raises(SequenceError, match="found no pair of images"):
+        estimate_poses(flat)
+    with pytest.raises(SequenceError, match="needs at least 2 images, got 1"):
+        estimate_poses([np.zeros((120, 160, 3), np.uint8)])
+
+
+@pytest.mark.skipif(not (SHARED / "gallbladder/endo.mp4").is_file(), reason="the gallbladder video is not at ../shared/data")
+def test_structure_from_motion_on_a_real_video(tmp_path):
+    reference = read_poses(SHARED / "gallbladder/poses.txt")
+    video = Video(SHARED / "gallbladder/endo.mp4")
+    numbers = list(range(0, 96, 12))
+    images = [cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for _, image in video.frames(numbers)]
+    lit = lit_area(images)
+    K, distortion = np.array([[453.7, 0, 320], [0, 453.7, 180], [0, 0, 1]]), [-0.083]
+    rectification = Rectification.mono(K, distortion, (640, 360))
+    masks = [rectification.mask(lit)] * len(images)
+    result = estimate_poses((rectification.left(i) for i in images), rectification.K, masks=masks, scale=0.01)
+    assert len(result.poses) >= len(numbers) - 1
+    assert result.reprojection_error < 2.0
+    placed = sorted(result.poses)
+    estimated = np.array([result.poses[n][:3, 3] for n in placed])
+    # Loose: the tissue moves and the camera hardly does, so a few frames of one eye leave the relief open.
+    assert similarity_error(estimated, np.array([reference[numbers[n]][:3, 3] for n in placed])) < 0.25
+
+
+@pytest.mark.skipif(not (SHARED / "hamlyn06/left").is_dir(), reason="the hamlyn06 recording is not at ../shared/data")
+def test_structure_from_motion_on_real_stereo_is_metric(tmp_path):
+    source = SHARED / "hamlyn06"
+    for name in ("left", "right", "calibration.yaml"):
+        (tmp_path / name).symlink_to(source / name)
+    reference = [frame.camera.position for frame in read_folder(source, stop=400, step=2)]
+    estimated = [frame.camera.position for frame in read_folder(tmp_path, stop=400, step=2)]
+    assert len(estimated) == len(reference) == 4
+    assert similarity_error(np.array(estimated), np.array(reference)) < 0.02
+    travel = [np.linalg.norm(np.diff(positions, axis=0), axis=1).sum() for positions in (estimated, reference)]
+    assert travel[0] == pytest.approx(travel[1], rel=0.08)  # the reference's own scale is good to 3 %

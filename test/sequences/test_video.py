@@ -1,0 +1,72 @@
+"""The reader of videos."""
+
+import numpy as np
+import pytest
+from plane_scene import BARREL, HEIGHT, K_LEFT, WIDTH, assert_frame_agrees, see_plane, trajectory, write_poses, write_rgb, write_video
+
+from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.sequences.readers import open_sequence
+from endo_sim_ros.sequences.recordings import Video
+from endo_sim_ros.sequences.video import read_video
+
+
+@pytest.fixture
+def video(tmp_path):
+    root = tmp_path / "recording"
+    poses = trajectory(8)
+    write_video(root / "endo.mp4", (see_plane(K_LEFT, BARREL, pose)[0] for pose in poses.values()), fps=50.0)
+    write_poses(root / "poses.txt", {n: poses[n] for n in range(0, 8, 3)})
+    return root
+
+
+INTRINSICS = {"fx": 150.0, "fy": 152.0, "cx": 78.5, "cy": 65.5, "distortion": BARREL.tolist()}
+
+
+def test_video_with_poses_beside_it(video):
+    frames = list(open_sequence(video, **INTRINSICS))
+    assert [f.stamp_ns for f in frames] == [1_000_000_000, 1_060_000_000, 1_120_000_000]
+    for frame in frames:
+        assert frame.right is None and frame.depth is None
+        assert_frame_agrees(frame, tolerance=12)
+
+
+def test_video_pose_scale_and_calibration_file(video):
+    (video / "calibration.yaml").write_text("fx: 150\nfy: 152\ncx: 78.5\ncy: 65.5\ndistortion: [-0.2, 0.03]\n")
+    frames = list(read_video(video, scale=0.1))
+    np.testing.assert_allclose(frames[1].camera.position, 0.1 * trajectory(4)[3][:3, 3], atol=1e-9)
+
+
+def test_video_mask_for_all_frames_and_per_frame(video):
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[:, :80] = 255
+    write_rgb(video / "mask.png", mask)
+    assert all(f.mask[60, 20] == 255 and f.mask[60, 140] == 0 for f in read_video(video, **INTRINSICS))
+    write_rgb(video / "tools/000003.png", mask)
+    frames = list(read_video(video, mask=video / "tools", mask_polarity="tool", **INTRINSICS))
+    assert [f.mask[60, 20] for f in frames] == [255, 0, 255]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "poses are given .* but no intrinsics; pass fx"),
+        ({"fy": 3.0}, "need fx as well"),
+        ({"fx": -3.0}, "fx and fy must be positive"),
+        ({"fx": 150.0, "step": 0}, "step must be 1 or more"),
+        ({"fx": 150.0, "start": 100}, "no frame between start=100"),
+        ({"fx": 150.0, "poses": "absent.txt"}, "absent.txt: file is missing"),
+        ({"fx": 150.0, "mask": "absent.png"}, "absent.png: file is missing"),
+        ({"fx": 150.0, "colour": 1}, "video layout has no option 'colour'"),
+    ],
+)
+def test_wrong_video_options_are_explained(video, options, message):
+    with pytest.raises(SequenceError, match=message):
+        open_sequence(video, **options)
+
+
+def test_video_that_ends_early_is_reported(video, caplog):
+    source = Video(video / "endo.mp4")
+    assert [number for number, _ in source.frames([6, 7, 8, 9])] == [6, 7]
+    assert "ends before frame 8; 2 frames are missing" in caplog.text
+    with pytest.raises(SequenceError, match="frame 50 cannot be decoded"):
+        list(source.frames([50]))

@@ -12,10 +12,10 @@ import torch
 
 from benchmarks import physics
 from benchmarks.physics import bench_physics, load_scene, phantom_scene
-from benchmarks.plot import plot_rows
 from benchmarks.raster import Plan, bench_raster, tissue
 from endo_sim_ros.core.cameras import look_at, save_cameras
 from endo_sim_ros.core.gaussians import save_ply
+from endo_sim_ros.evaluation.bars import plot_rows
 from endo_sim_ros.evaluation.measurement import Row, machine, median_seconds, report
 from endo_sim_ros.splatting import rasterize, render
 

@@ -38,6 +38,22 @@ def test_an_interrupt_while_a_program_starts_ends_it_without_a_traceback(module)
     assert b"Traceback" not in said and program.returncode in (-signal.SIGINT, 130, 0)
 
 
+def test_help_names_every_command_and_imports_none():
+    code = "import sys; sys.argv = ['endo-sim', '--help']; from endo_sim_ros.cli import main; main(); print(*sys.modules, file=sys.stderr)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    for name in cli.COMMANDS:
+        assert re.search(rf"^  {name} +[A-Z]", done.stdout, re.M), name
+    assert not {"torch", "warp", "rclpy", "numpy", "cv2", "tyro", "rich"} & set(done.stderr.split())
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_every_command_explains_its_options(name, capsys):
+    with pytest.raises(SystemExit) as end:
+        cli.parse(name, ["--help"])
+    assert end.value.code == 0 and cli.summary(name).split()[0] in capsys.readouterr().out
+
+
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("bags") / "patient"
@@ -120,6 +136,7 @@ def test_reconstruct_writes_a_model_and_measures_held_out_views(bag, tmp_path):
         (("phantom", "no_bag", "--frames", "0"), r"PhantomConfig.frames must lie in \[1, 100000\], got 0"),
         (("demo", "--bag", "no_bag"), "no_bag: no such bag"),
         (("train", "no_out", "--algorithm", "cem", "--ppo.steps", "5"), "options that begin with --ppo. are for ppo, the others for cem"),
+        (("reconstrut", "bag"), "there is no command reconstrut; the commands are demo, view, "),
         (("plot",), "no files to plot; give those that `endo-sim bench … --json FILE` wrote"),
         (("config", "policy_nod"), "no node is called policy_nod; there are reconstruction_node, "),
     ],

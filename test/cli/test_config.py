@@ -109,5 +109,5 @@ def test_parameter_file_gives_every_node_its_defaults():
 
 
 def test_parameters_are_found_by_the_name_of_the_executable_too(capsys):
-    cli.Config(("policy_node", "viewer_node")).run()
+    cli.parse("config", ["policy_node", "viewer_node"]).run()
     assert capsys.readouterr().out == parameter_file(("policy", "viewer_node"))

@@ -120,7 +120,7 @@ class Hide:
         if name.split('.')[0] in ('rclpy', 'sensor_msgs', 'geometry_msgs', 'std_msgs', 'diagnostic_msgs', 'builtin_interfaces'):
             raise ImportError(name)
 sys.meta_path.insert(0, Hide())
-import endo_sim_ros.cli, endo_sim_ros.rendering, endo_sim_ros.physics, endo_sim_ros.evaluation.held_out
+import endo_sim_ros.cli.reconstruct, endo_sim_ros.rendering, endo_sim_ros.physics, endo_sim_ros.evaluation.held_out
 import endo_sim_ros.sequences.readers, endo_sim_ros.sequences.bag
 from endo_sim_ros import messages
 messages.encode_pose(__import__('numpy').eye(4), 1, 'world', messages.bag_types())

@@ -1,0 +1,72 @@
+"""The command line `endo-sim`. Each command is one file here, with a dataclass `Command`: its fields are the options.
+
+Only the file of the command that runs is imported, and nothing heavy before its `run`.
+"""
+
+import ast
+import importlib
+import logging
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+from endo_sim_ros import hear_interrupts
+
+# In the order of a user's way through the package.
+COMMANDS = (
+    *("demo", "view", "up", "convert", "phantom", "reconstruct", "compress", "touch", "record", "export", "scene", "train"),
+    *("config", "evaluate", "report", "bench", "plot"),
+)
+DESCRIPTION = "Endoscope recordings become tissue that a robot can touch."
+
+
+def load_command(name: str) -> type:
+    """The dataclass whose fields are a command's options, and whose `run` is what it does."""
+    return importlib.import_module(f"endo_sim_ros.cli.{name}").Command
+
+
+def summary(name: str) -> str:
+    """The docstring of a command, which is not imported for it."""
+    tree = ast.parse(Path(__file__).with_name(f"{name}.py").read_text())
+    command = next(node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == "Command")
+    return ast.get_docstring(command) or ""
+
+
+def overview() -> str:
+    """What `endo-sim --help` prints."""
+    lines = ["usage: endo-sim COMMAND [OPTIONS]", "", DESCRIPTION, "", "commands:"]
+    for name in COMMANDS:
+        lines += textwrap.wrap(f"{summary(name)}", 100, initial_indent=f"  {name:13}", subsequent_indent=" " * 15)
+    return "\n".join([*lines, "", "`endo-sim COMMAND --help` tells the options of a command."])
+
+
+def parse(name: str, words: list[str]) -> object:
+    """The command with its options as the words give them; what is wrong with them ends the program with a sentence."""
+    import tyro
+
+    return tyro.cli(load_command(name), prog=f"endo-sim {name}", description=summary(name), args=words)
+
+
+def main() -> int:
+    """Run the command line; returns the exit status."""
+    hear_interrupts()
+    words = sys.argv[1:]
+    if not words or words[0] in ("-h", "--help"):
+        print(overview())
+        return 0 if words else 2
+    name, *words = words
+    if name not in COMMANDS:
+        print(f"endo-sim: there is no command {name}; the commands are {', '.join(COMMANDS)}", file=sys.stderr)
+        return 2
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    start = time.monotonic()
+    try:
+        parse(name, words).run()
+    except KeyboardInterrupt:
+        return 130
+    except (ImportError, RuntimeError, ValueError, OSError) as error:
+        print(f"endo-sim: {str(error) or type(error).__name__}", file=sys.stderr)
+        return 1
+    logging.getLogger(__name__).info("done in %.0f s", time.monotonic() - start)
+    return 0

@@ -1,0 +1,140 @@
+"""`endo-sim bench`: finds and runs the benchmarks, which are no part of the installed package."""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+import endo_sim_ros
+
+
+def find_benchmarks() -> None:
+    """Make the repository's folder `benchmarks` importable.
+
+    Raises:
+        RuntimeError: If the package runs neither from a checkout nor in one.
+    """
+    for root in (Path(endo_sim_ros.__file__).parents[1], Path.cwd()):
+        if (root / "benchmarks" / "raster.py").is_file():
+            if str(root) not in sys.path:
+                sys.path.insert(0, str(root))
+            return
+    raise RuntimeError("the benchmarks are not installed with the package; run this command in a checkout of the repository")
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What benchmarks have in common."""
+
+    json: Path | None = None
+    """File for the results as a list of rows."""
+    device: str = "auto"
+    """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""
+
+
+@dataclass(frozen=True)
+class BenchRaster(Measured):
+    """The rasteriser: forward, forward and backward, memory, and how time grows."""
+
+    def run(self) -> None:
+        find_benchmarks()
+        from benchmarks.raster import bench_raster
+
+        bench_raster(self.device, self.json)
+
+
+@dataclass(frozen=True)
+class BenchPhysics(Measured):
+    """The simulation: the paper's comparison of every Gaussian with sparse nodes, the cost of a step, and many copies of a tissue."""
+
+    model: Path | None = None
+    """PLY model of the tissue, in metres, seen by the first camera of the cameras.json beside it, else from the world's
+    origin; default: a piece of the synthetic patient."""
+    environments: tuple[int, ...] = ()
+    """Numbers of copies stepped together; default: 1 4 16 64, on a GPU also 256 1024."""
+
+    def run(self) -> None:
+        find_benchmarks()
+        from benchmarks.physics import bench_physics
+
+        bench_physics(self.device, self.json, self.model, self.environments)
+
+
+@dataclass(frozen=True)
+class BenchGraph(Measured):
+    """The node graph over DDS, each node its own process: latency from wrench to image, rates and losses."""
+
+    gaussians: int = 30_000
+    """Size of the model."""
+    width: int = 640
+    """Width of the images, pixels."""
+    height: int = 512
+    """Height of the images, pixels."""
+    rate: float = 25.0
+    """Commands and images per second, Hz."""
+    changes: int = 200
+    """Changes of the wrench in real time whose way to the image is timed."""
+    commands: int = 200
+    """Commands in lockstep."""
+    kills: int = 3
+    """Deaths of each node whose recovery is timed; 0 = none."""
+
+    def run(self) -> None:
+        find_benchmarks()
+        from benchmarks.graph import bench_graph
+
+        options = {name: value for name, value in vars(self).items() if name != "json"}
+        bench_graph(self.json, **options)
+
+
+@dataclass(frozen=True)
+class BenchEnvironments(Measured):
+    """The environments to learn in: steps per second, with states and with images."""
+
+    task: str = "retraction"
+    """retraction or palpation."""
+    environments: tuple[int, ...] = (1, 64)
+    """Numbers of environments stepped together."""
+
+    def run(self) -> None:
+        find_benchmarks()
+        from benchmarks.environments import bench_environments
+
+        bench_environments(self.json, self.task, self.environments, self.device)
+
+
+@dataclass(frozen=True)
+class BenchSoak:
+    """The node graph under random traffic, half of it spoilt: who dies, whose memory grows, does it still work."""
+
+    json: Path | None = None
+    """File for the results as a list of rows."""
+    minutes: float = 10.0
+    """Duration of the traffic."""
+    rate: float = 500.0
+    """Messages per second on all topics together."""
+    seed: int = 0
+    """Other seeds give other traffic."""
+
+    def run(self) -> None:
+        from endo_sim_ros.graph.soak import soak
+
+        soak(self.json, self.minutes, self.rate, self.seed)
+
+
+@dataclass(frozen=True)
+class Command:
+    """Measure speed on this machine, beside peers where they are installed; medians and ratios."""
+
+    what: tyro.conf.OmitArgPrefixes[
+        Annotated[BenchRaster, tyro.conf.subcommand("raster", prefix_name=False)]
+        | Annotated[BenchPhysics, tyro.conf.subcommand("physics", prefix_name=False)]
+        | Annotated[BenchGraph, tyro.conf.subcommand("graph", prefix_name=False)]
+        | Annotated[BenchEnvironments, tyro.conf.subcommand("environments", prefix_name=False)]
+        | Annotated[BenchSoak, tyro.conf.subcommand("soak", prefix_name=False)]
+    ]
+
+    def run(self) -> None:
+        self.what.run()

@@ -1,0 +1,24 @@
+"""`endo-sim config`."""
+
+from dataclasses import dataclass
+
+from tyro.conf import Positional
+
+from endo_sim_ros.core.config import ConfigError
+
+
+@dataclass(frozen=True)
+class Command:
+    """Print the parameters of all nodes, or of some, with their defaults as a ROS parameter file."""
+
+    nodes: Positional[tuple[str, ...]] = ()
+    """Names of nodes; default: all."""
+
+    def run(self) -> None:
+        from endo_sim_ros.nodes.parameter_file import NODE_CONFIGS, parameter_file
+
+        nodes = [name if name in NODE_CONFIGS else name.removesuffix("_node") for name in self.nodes]  # executables end in _node
+        unknown = [name for name in nodes if name not in NODE_CONFIGS]
+        if unknown:
+            raise ConfigError(f"no node is called {', '.join(unknown)}; there are {', '.join(NODE_CONFIGS)}")
+        print(parameter_file(nodes or tuple(NODE_CONFIGS)), end="")

@@ -1,0 +1,78 @@
+"""`endo-sim convert`."""
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from tyro.conf import Positional
+
+from endo_sim_ros.cli.progress import tracked
+from endo_sim_ros.core.frames import SequenceError
+
+
+@dataclass(frozen=True)
+class Command:
+    """Turn a recording (StereoMIS, SCARED, EndoNeRF, folder of images, video) into a rosbag2."""
+
+    source: Positional[Path]
+    """Folder or file of the recording."""
+    bag: Positional[Path]
+    """Folder of the new bag; it must not exist."""
+    kind: Literal["auto", "stereomis", "scared", "endonerf", "folder", "video"] = "auto"
+    """Layout; auto recognises it."""
+    start: int | None = None
+    """First frame number."""
+    stop: int | None = None
+    """Frame number to stop before."""
+    step: int | None = None
+    """Take every n-th frame."""
+    fps: float | None = None
+    """Frame rate, Hz; default: that of the recording."""
+    split: Literal["train", "test"] | None = None
+    """StereoMIS: only the frame ranges of this split."""
+    mask_polarity: Literal["auto", "tool", "tissue"] | None = None
+    """StereoMIS, EndoNeRF, folder, video: what white means in the masks."""
+    depth_scale: float | None = None
+    """EndoNeRF, folder: metres per unit of the depth images (default 0.001)."""
+    pose_direction: Literal["auto", "world_to_camera", "camera_to_world"] | None = None
+    """SCARED: direction of the poses; auto finds it by comparing images."""
+    poses: Path | None = None
+    """Video: file of camera poses (frame tx ty tz qx qy qz qw, camera-to-world). Without one poses.txt beside the video
+    is taken, and without that, or with "sfm", they are estimated by structure from motion."""
+    scale: float | None = None
+    """Video: metres per unit of the poses."""
+    sfm_step: int | None = None
+    """Video: structure from motion uses every n-th frame (default 6)."""
+    calibration: Path | None = None
+    """Video: YAML file with fx, fy, cx, cy and optional distortion."""
+    fx: float | None = None
+    """Video: focal length, pixels, instead of a file; fy, cx and cy follow from it where not given."""
+    fy: float | None = None
+    """Video: vertical focal length, pixels."""
+    cx: float | None = None
+    """Video: principal point, pixels."""
+    cy: float | None = None
+    """Video: principal point, pixels."""
+    distortion: tuple[float, ...] | None = None
+    """Video: coefficients k1 [k2 [p1 p2 [k3]]]."""
+    mask: Path | None = None
+    """Video: image of one mask for all frames, or a folder of numbered ones."""
+
+    def run(self) -> None:
+        from endo_sim_ros.sequences.bag import write_bag
+        from endo_sim_ros.sequences.readers import open_sequence
+
+        if self.bag.exists():  # before any work
+            raise SequenceError(f"{self.bag} exists already; choose another name or remove it first")
+        if self.fps is not None and not self.fps > 0:
+            raise SequenceError(f"--fps must be positive, got {self.fps:g}")
+        fixed = ("source", "bag", "kind")
+        options = {name: value for name, value in vars(self).items() if name not in fixed and value is not None}
+        frames = open_sequence(self.source, self.kind, **options)
+        try:
+            count = write_bag(self.bag, tracked(frames, f"converting {self.source.name}"))
+        except BaseException:  # half a conversion would only be in the way of the next try
+            shutil.rmtree(self.bag, ignore_errors=True)
+            raise
+        print(f"{self.bag}: {count} frames")

@@ -1,0 +1,28 @@
+"""`endo-sim evaluate`."""
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import tyro
+from tyro.conf import Positional
+
+from endo_sim_ros.evaluation.config import EvaluationConfig
+
+
+@dataclass(frozen=True)
+class Command:
+    """Train methods on few views of sequences, measure each on the views held out, and compare, beside the paper's figures."""
+
+    sequences: Annotated[Positional[tuple[str, ...]], tyro.conf.arg(metavar="SEQ [SEQ ...]")]
+    """Bags, recordings as for convert, or phantom:0 (synthetic patients); options of the reader follow as ,name=value:
+    phantom:1,frames=100 my_bag,step=2 video.mp4,fx=907."""
+    config: Annotated[EvaluationConfig, tyro.conf.arg(name="")] = field(default_factory=EvaluationConfig)
+
+    def run(self) -> None:
+        from endo_sim_ros.evaluation.evaluate import evaluate
+
+        cells = evaluate(self.sequences, self.config)["cells"]
+        print(f"{self.config.out}: table.md, table.csv, results.json, views.csv, strips/, plots/")
+        failed = sum(cell["error"] is not None for cell in cells)
+        if failed:
+            raise RuntimeError(f"{failed} of {len(cells)} cells failed, as the table says; the same command tries them again")

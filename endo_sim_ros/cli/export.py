@@ -1,0 +1,46 @@
+"""`endo-sim export`."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from tyro.conf import Positional
+
+from endo_sim_ros.core.frames import SequenceError
+
+
+@dataclass(frozen=True)
+class Command:
+    """Turn recordings of the graph into a dataset to learn from; each is one episode."""
+
+    paths: Annotated[Positional[tuple[Path, ...]], tyro.conf.arg(metavar="BAG [BAG ...] OUT")]
+    """Recordings with rendered images, control nodes, and poses and reactions of tools; then the folder of the new dataset."""
+    format: Literal["lerobot"] = "lerobot"
+    """lerobot: a LeRobotDataset v3.0."""
+    fps: int | None = None
+    """Frames per second; default: those of the steps of a recording in lockstep, else 25."""
+    arm: tuple[str, ...] = ()
+    """Names of the tool arms; default: all in the recording."""
+    task: str = "manipulate the tissue"
+    """What was done, in words."""
+    sampling: Literal["auto", "rate", "lockstep"] = "auto"
+    """rate: the last message of each topic, at a fixed rate; lockstep: messages with equal stamps; auto: lockstep where there
+    are such messages and no other fps is asked for."""
+    images: Literal["video", "png"] = "video"
+    """video: small (H.264); png: exact."""
+    world_frame: str = "world"
+    """Frame of the poses in the recording."""
+    frames: tuple[str, ...] = ()
+    """Other frames of poses and wrenches in the recording, as the nodes' parameter: 'PSM1_base x y z qx qy qz qw' each."""
+
+    def run(self) -> None:
+        from endo_sim_ros.learning.lerobot import export_lerobot
+
+        if len(self.paths) < 2:
+            raise SequenceError("give one recording or more, then the folder of the dataset")
+        *bags, out = self.paths
+        episodes, frames = export_lerobot(
+            bags, out, self.task, self.fps, self.arm, self.sampling, self.images, self.world_frame, self.frames
+        )
+        print(f"{out}: {episodes} episode{'s' * (episodes != 1)}, {frames} frames")

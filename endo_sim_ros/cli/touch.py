@@ -1,0 +1,26 @@
+"""`endo-sim touch`."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import Positional
+
+from endo_sim_ros.physics.config import PhysicsConfig
+
+
+@dataclass(frozen=True)
+class Command:
+    """Poke, pull, grasp and cut a reconstructed model without ROS, and draw what it looks like."""
+
+    model: Positional[Path]
+    """PLY model, with the cameras.json that is saved beside it."""
+    out: Path = Path("touch.png")
+    """Picture to write."""
+    config: Annotated[PhysicsConfig, tyro.conf.arg(name="")] = field(default_factory=PhysicsConfig)
+
+    def run(self) -> None:
+        from endo_sim_ros.evaluation.interaction_sheet import draw_touches
+
+        draw_touches(self.model, self.out, self.config)

@@ -1,0 +1,48 @@
+"""`endo-sim train`."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from tyro.conf import Positional
+
+from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.learning.config import PPOConfig, Randomisation, TrainingConfig
+
+
+@dataclass(frozen=True)
+class Command:
+    """Train a small policy on a task, and draw its learning curve."""
+
+    out: Positional[Path]
+    """Folder for policy.npz, curve.json and curve.png."""
+    task: str = "retraction"
+    """retraction or palpation."""
+    algorithm: Literal["cem", "ppo"] = "cem"
+    """cem: the cross-entropy method, by the options below; ppo: proximal policy optimisation, by those that begin with ppo; it
+    needs stable-baselines3."""
+    model: Path | None = None
+    """PLY model with its cameras.json; default: a piece of the synthetic patient."""
+    device: str = "auto"
+    """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""
+    config: Annotated[TrainingConfig, tyro.conf.arg(name="")] = field(default_factory=TrainingConfig)
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    vary: Randomisation = field(default_factory=Randomisation)
+
+    def run(self) -> None:
+        from endo_sim_ros.learning.scenes import load_scene
+        from endo_sim_ros.learning.train import save_training, train
+
+        config, unused = self.config, self.ppo
+        if self.algorithm == "ppo":
+            from endo_sim_ros.learning.ppo import train_ppo as train
+
+            config, unused = unused, config
+        if unused != type(unused)():
+            raise ConfigError(f"options that begin with --ppo. are for ppo, the others for cem; --algorithm is {self.algorithm}")
+        self.out.mkdir(parents=True, exist_ok=True)  # before the long work
+        policy, curve = train(self.task, load_scene(self.model), config, self.vary, self.device)
+        save_training(self.out, policy, curve, config)
+        last = curve[-1]
+        print(f"{self.out}: {last['test_success']:.0%} of test episodes solved after {last['episodes']} episodes")

@@ -1,0 +1,30 @@
+"""`endo-sim view`."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import Positional
+
+from endo_sim_ros.physics.config import PhysicsConfig
+from endo_sim_ros.viewer.config import ViewerConfig
+
+
+@dataclass(frozen=True)
+class Command:
+    """Show a model in the browser and pull it with the mouse; needs no ROS."""
+
+    model: Positional[Path]
+    """PLY model, in metres; seen by the cameras in the cameras.json beside it, else from the world's origin."""
+    config: Annotated[ViewerConfig, tyro.conf.arg(name="")] = field(default_factory=ViewerConfig)
+    node_count: int | None = None
+    """Number of control nodes; default: that of the physics."""
+    device: str = "auto"
+    """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""
+
+    def run(self) -> None:
+        from endo_sim_ros.viewer.standalone import view
+
+        count = {} if self.node_count is None else {"node_count": self.node_count}
+        view(self.model, PhysicsConfig(device=self.device, **count), self.config)

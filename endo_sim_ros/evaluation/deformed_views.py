@@ -24,7 +24,7 @@ _MOVED = 6  # grey levels, of 255
 _ROUND = 4  # pixels about what changed
 
 
-def touched_psnr(model: GaussianModel, cameras: Sequence[Camera], device: str) -> float:
+def deformed_view_psnr(model: GaussianModel, cameras: Sequence[Camera], device: str) -> float:
     """PSNR, dB, of pictures of the model while a jaw moves the tissue, over the pixels that change; NaN without tissue in the middle.
 
     The reference is what the model shows at rest, laid onto the surface it has there and carried along by the same nodes: a
@@ -37,13 +37,13 @@ def touched_psnr(model: GaussianModel, cameras: Sequence[Camera], device: str) -
         device: Compute device.
     """
     try:
-        return _touched_psnr(model, cameras, device)
+        return _deformed_view_psnr(model, cameras, device)
     except (ValueError, RuntimeError) as error:  # nothing that could be touched, not in metres, or too large: the other figures stand
-        log.warning("PSNR, touched, is left out: %s", error)
+        log.warning("PSNR, deformed, is left out: %s", error)
         return float("nan")
 
 
-def _touched_psnr(model: GaussianModel, cameras: Sequence[Camera], device: str) -> float:
+def _deformed_view_psnr(model: GaussianModel, cameras: Sequence[Camera], device: str) -> float:
     camera, options = cameras[len(cameras) // 2], RenderingConfig(device=device)
     model = dataclasses.replace(model, light=None)
     surface = _surface(model, camera, options)

@@ -30,7 +30,7 @@ from endo_sim_ros.core.device import cpu_threads, pick_device
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.evaluation import metrics, tables
 from endo_sim_ros.evaluation.config import EvaluationConfig
-from endo_sim_ros.evaluation.deformed_views import touched_psnr
+from endo_sim_ros.evaluation.deformed_views import deformed_view_psnr
 from endo_sim_ros.evaluation.held_out import difference, mean_figures, measure, model_renderer, seen_pixels
 from endo_sim_ros.evaluation.lpips import Lpips, WeightsError
 from endo_sim_ros.evaluation.measurement import machine, peak_megabytes
@@ -433,8 +433,8 @@ def _job(argument: tuple, device: str, report: Callable[[Any], None]) -> dict[st
         row = {"view": number} | {name: value for name, value in found.items() if np.isfinite(value)}
         return row, _pictures(number, image, depth, frame) if index in shown else {}
 
-    touched = {"psnr_touched": touched_psnr(model, [view.camera for view in seen_by], device)}
-    touched = {name: value for name, value in touched.items() if np.isfinite(value)}
+    deformed = {"psnr_deformed": deformed_view_psnr(model, [view.camera for view in seen_by], device)}
+    deformed = {name: value for name, value in deformed.items() if np.isfinite(value)}
     rows, pictures = [], {}
     with ThreadPoolExecutor(cpu_threads()) as pool:  # measuring takes longer than drawing
         waiting = deque()
@@ -458,7 +458,7 @@ def _job(argument: tuple, device: str, report: Callable[[Any], None]) -> dict[st
         ],
         "reference_at_points": _reference_at_points(held_out, prepared.judging),
         "seen_by": "reference" if known else "model",
-        "figures": mean_figures(rows) | touched | {"seconds": training["seconds"], "gaussians": len(model), "megabytes": memory},
+        "figures": mean_figures(rows) | deformed | {"seconds": training["seconds"], "gaussians": len(model), "megabytes": memory},
         "views": rows,
         "curve": training["curve"],
         "pictures": pictures,

@@ -22,7 +22,7 @@ from endo_sim_ros.evaluation.paper import PRINTED, Printed
 from endo_sim_ros.evaluation.splits import explain_split
 
 COLUMNS = FIGURES | {
-    "psnr_touched": Figure("PSNR, touched", "dB", 2),
+    "psnr_deformed": Figure("PSNR, deformed", "dB", 2),
     "seconds": Figure("training", "s", 1),
     "gaussians": Figure("Gaussians", "", 0),
     "megabytes": Figure("peak memory", "MB", 0),
@@ -115,7 +115,7 @@ def notes(results: dict[str, Any]) -> list[str]:
     lines += [
         "PSNR, gain fitted: after one factor per colour channel and view, as exposure would. Means over the held-out views.",
         "Methods with an exposure take that of a held-out view from its brightness as rendered and from when it was taken.",
-        "PSNR, touched: of what changes while a jaw moves the tissue, to the model's own picture carried along on its surface.",
+        "PSNR, deformed: of what changes while a jaw moves the tissue, to the model's own picture carried along on its surface.",
         "Seen: pixels with a depth whose surface a training view shows, too, visibility checked with the reference depth"
         + ("; without one, with the model's own." if models else "."),
         "Median scaled: depth times the factor that makes its median right. Depth stays in floating point throughout.",

@@ -2,12 +2,12 @@
 
 import contextlib
 import json
+import logging
 import time
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from rich.progress import Progress
@@ -16,6 +16,8 @@ from endo_sim_ros.learning.config import PPOConfig, Randomisation, TrainingConfi
 from endo_sim_ros.learning.policies import NetworkPolicy, Policy
 from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.learning.task_batch import TaskBatch
+
+log = logging.getLogger(__name__)
 
 _TESTED_FROM = 1_000_000  # seeds of episodes that are only tested on
 
@@ -111,25 +113,19 @@ def save_training(folder: Path, policy: NetworkPolicy, curve: list[dict[str, flo
     folder.mkdir(parents=True, exist_ok=True)
     policy.save(folder / "policy.npz")
     (folder / "curve.json").write_text(json.dumps({"task": policy.task, "config": asdict(config), "curve": curve}, indent=1) + "\n")
-    cv2.imwrite(str(folder / "curve.png"), draw_curve(policy.task, curve))
+    draw_curve(folder / "curve.png", policy.task, curve)
 
 
-def draw_curve(task: str, curve: list[dict[str, float]], width: int = 640, height: int = 400) -> np.ndarray:
-    """Success rate over training episodes, as an image [H, W, 3] BGR."""
-    image = np.full((height, width, 3), 255, np.uint8)
-    left, right, top, bottom = 60, width - 20, 40, height - 50
-    last = max(curve[-1]["episodes"], 1)
-
-    def write(text: str, x: int, y: int) -> None:
-        cv2.putText(image, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (60, 60, 60), 1, cv2.LINE_AA)
-
-    for part in (0.0, 0.25, 0.5, 0.75, 1.0):
-        y, x = round(bottom + part * (top - bottom)), round(left + part * (right - left))
-        cv2.line(image, (left, y), (right, y), (225, 225, 225), 1)
-        write(f"{part:.0%}", 12, y + 5)
-        write(f"{part * last:.0f}", x - 15, bottom + 20)
-    points = [(left + p["episodes"] / last * (right - left), bottom + p["test_success"] * (top - bottom)) for p in curve]
-    cv2.polylines(image, [np.rint(points).astype(np.int32)], False, (180, 90, 20), 2, cv2.LINE_AA)
-    write(f"{task}: test episodes solved", left, 25)
-    write("training episodes", (left + right) // 2 - 60, height - 10)
-    return image
+def draw_curve(path: Path, task: str, curve: list[dict[str, float]]) -> None:
+    """Write the success rate over training episodes as a picture, where matplotlib is installed."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        log.info("%s is not drawn without matplotlib; pip install 'endo_sim_ros[report]'", path)
+        return
+    figure = Figure(figsize=(6.4, 4), layout="constrained")
+    axes = figure.subplots()
+    axes.plot([point["episodes"] for point in curve], [point["test_success"] for point in curve])
+    axes.set(title=task, xlabel="training episodes", ylabel="test episodes solved", ylim=(-0.02, 1.02))
+    axes.grid(alpha=0.3)
+    figure.savefig(path, dpi=100)

@@ -6,16 +6,13 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from queue import SimpleQueue
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
 from endo_sim_ros.core.cameras import Camera, make_pose
 from endo_sim_ros.core.drawing import draw_points, write_video
-
-if TYPE_CHECKING:
-    from endo_sim_ros.viewer.viewer import Viewer
 
 CENTIMETRES = 100.0  # units of the page in a metre: its covariances are half floats, which would vanish in m²
 SPLATS, RENDERED, ENDOSCOPE = VIEWS = ("orbit", "orbit, rendered here", "endoscope")
@@ -24,6 +21,10 @@ _PLAIN = (90, 230, 140)  # colour of nodes
 _LARGEST = 640, 512  # pixels of rendered pictures
 _ROOM = 20.0  # size of the invisible box around the tissue in which the mouse is heard, in sizes of the tissue
 _JPEG_QUALITY = 85
+
+
+Render = Callable[[Camera], np.ndarray]
+DrawTools = Callable[[np.ndarray, Camera], np.ndarray]
 
 
 class Pointer(NamedTuple):
@@ -45,7 +46,7 @@ class Browser:
         self._splats = self._points = self._room = None
         self._camera_shown: tuple | None = None  # of the newest rendered picture
         self._endoscope_shown: tuple[np.ndarray | None, float] = None, 0.0  # its picture, and the aspect that it was shown in
-        self._recording: Recording | None = None
+        self._video: VideoRecorder | None = None
         gui = client.gui
         with gui.add_folder("view"):
             self._view = gui.add_dropdown(
@@ -96,20 +97,25 @@ class Browser:
 
     # ----------------------------------------------------------------- mouse
 
-    def show_model(self, viewer: "Viewer") -> None:
-        """A new model: other Gaussians, other nodes, and a look at it from the endoscope."""
+    def show_model(self, means: np.ndarray, camera: Camera) -> None:
+        """Show a new model, at first as the endoscope sees it.
+
+        Args:
+            means: Centres of its Gaussians [N, 3], metres, world.
+            camera: The endoscope's.
+        """
         for handle in (self._splats, self._points, self._room):
             if handle is not None:
                 handle.remove()
         self._splats = self._points = None
-        means = CENTIMETRES * viewer.renderer.model.means.cpu().numpy()
+        means = CENTIMETRES * means
         low, high = means.min(0), means.max(0)
         size = _ROOM * float((high - low).max())
         self._room = self.client.scene.add_box(
             "/room", dimensions=(size, size, size), position=(low + high) / 2, opacity=0.0, side="back", cast_shadow=False
         )  # seen from inside only, so that it hides nothing
         self._listen()
-        self.look_from(viewer.camera)
+        self.look_from(camera)
         self._camera_shown, self._endoscope_shown = None, (None, 0.0)
 
     def _listen(self) -> None:
@@ -176,11 +182,18 @@ class Browser:
             )
         self._points.visible, self._points.points, self._points.colors = True, points, colors
 
-    def show_picture(self, viewer: "Viewer", dirty: bool) -> None:
-        """The picture behind the scene, where one is wanted and is not there yet; and one for the video."""
+    def show_picture(self, render: Render, endoscope: tuple[np.ndarray, Camera] | None, draw_tools: DrawTools, changed: bool) -> None:
+        """Show a picture behind the splats where the chosen view has one, and add one to the video.
+
+        Args:
+            render: Draws the tissue as a camera sees it, [H, W, 3] uint8.
+            endoscope: The endoscope's newest picture [H, W, 3] uint8, and its camera.
+            draw_tools: Draws the tools onto a picture of a camera.
+            changed: Whether the tissue looks different from the last call.
+        """
         picture = None
-        if self.view == ENDOSCOPE and viewer.endoscope is not None:
-            picture = viewer.endoscope
+        if self.view == ENDOSCOPE and endoscope is not None:
+            picture = endoscope
             self.look_from(picture[1])
             aspect = self.client.camera.image_width / max(self.client.camera.image_height, 1)
             image, shown_aspect = self._endoscope_shown
@@ -190,22 +203,22 @@ class Browser:
         elif self.view == RENDERED and self._tissue.value:
             camera = _small(self.camera())
             shown = (camera.width, camera.height, camera.K[0, 0], camera.pose.tobytes())
-            if dirty or shown != self._camera_shown:
+            if changed or shown != self._camera_shown:
                 self._camera_shown = shown
-                picture = viewer.renderer.render(camera, *(viewer.state or ()))[0], camera
+                picture = render(camera), camera
                 self._send(picture[0])
-        if self._recording is not None and self._recording.due:
+        if self._video is not None and self._video.due:
             if picture is None:
                 camera = _small(self.camera())
-                picture = viewer.renderer.render(camera, *(viewer.state or ()))[0], camera
-            self._recording.add(self._drawn_on(viewer, *picture))
+                picture = render(camera), camera
+            self._video.add(draw_tools(self._with_nodes(picture[0], picture[1]), picture[1]))
 
-    def _drawn_on(self, viewer: "Viewer", image: np.ndarray, camera: Camera) -> np.ndarray:
-        """A picture with all that the browser draws over it."""
+    def _with_nodes(self, image: np.ndarray, camera: Camera) -> np.ndarray:
+        """The picture with the control nodes over it, where the browser shows them."""
         image, points = image if self._tissue.value else np.zeros_like(image), self._points
         if points is not None and self.wants_nodes:
             image = draw_points(image, camera, points.points / CENTIMETRES, points.colors, points.point_size / CENTIMETRES)
-        return viewer.draw_tools_on(image, camera)
+        return image
 
     def _send(self, image: np.ndarray) -> None:
         self.client.scene.set_background_image(image, "jpeg", jpeg_quality=_JPEG_QUALITY)
@@ -214,26 +227,26 @@ class Browser:
 
     def record(self, folder: Path, fps: float) -> None:
         """Begin a video of this view, or end it and offer it for download."""
-        if self._recording is None:
+        if self._video is None:
             folder.mkdir(parents=True, exist_ok=True)
             name = time.strftime("tissue_%Y%m%d_%H%M%S") + f"_{self.client.client_id}.mp4"
-            self._recording, self._button.label = Recording(folder / name, fps), "stop recording"
+            self._video, self._button.label = VideoRecorder(folder / name, fps), "stop recording"
             return
-        recording, self._recording = self._recording, None
+        video, self._video = self._video, None
         try:
-            recording.close()
+            video.close()
         finally:
             self._button.label = "record"
-        self.client.send_file_download(recording.path.name, recording.path.read_bytes())
+        self.client.send_file_download(video.path.name, video.path.read_bytes())
 
     def close(self) -> None:
         """The browser is gone."""
-        if self._recording is not None:
+        if self._video is not None:
             with suppress(OSError):
-                self._recording.close()
+                self._video.close()
 
 
-class Recording:
+class VideoRecorder:
     """A video at a constant rate: pictures that come late are repeated, those that come early are left out."""
 
     def __init__(self, path: Path, fps: float):

@@ -157,7 +157,7 @@ class Viewer:
         start.fov = 2 * np.arctan(camera.height / 2 / camera.K[1, 1])
         for browser in self.browsers.values():
             if not same:
-                browser.show_model(self)
+                self._show_model_in(browser)
         self._dirty = True
 
     def show_state(self, positions: np.ndarray, F: np.ndarray, age: float = 0.0) -> bool:
@@ -297,7 +297,7 @@ class Viewer:
                 if browser.wants_stress and colors is None:
                     colors = self.stress_colors()
                 browser.show_nodes(self.state[0], colors, self._node_size)
-            browser.show_picture(self, dirty)
+            browser.show_picture(self._render, self.endoscope, self._tools_on, dirty)
         self._pictures += dirty
         if self._asked is not None and self._begun >= self._asked:
             if dirty:  # else the tissue cannot follow
@@ -323,7 +323,7 @@ class Viewer:
         levels = (255 * np.minimum(stress / self._stress_scale, 1)).astype(np.uint8)
         return cv2.applyColorMap(levels[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1]
 
-    def draw_tools_on(self, image: np.ndarray, camera: Camera) -> np.ndarray:
+    def _tools_on(self, image: np.ndarray, camera: Camera) -> np.ndarray:
         """A picture with the tools' forces."""
         for tool in self.tools.values():
             image = draw_force(image, camera, tool.position, tool.force, _ARROW / CENTIMETRES)
@@ -407,12 +407,21 @@ class Viewer:
         self._server.on_client_connect(lambda client: self.post(lambda: self._join(client)))
         self._server.on_client_disconnect(lambda client: self.post(lambda: self._leave(client.client_id)))
 
+    def _show_model_in(self, browser: Browser) -> None:
+        if self.renderer is not None and self.camera is not None:
+            browser.show_model(self.renderer.model.means.cpu().numpy(), self.camera)
+
+    def _render(self, camera: Camera) -> np.ndarray:
+        """The tissue as it is now [H, W, 3] uint8, seen by a camera."""
+        if self.renderer is None:
+            return np.zeros((camera.height, camera.width, 3), np.uint8)
+        return self.renderer.render(camera, *(self.state or ()))[0]
+
     def _join(self, client: Any) -> None:
         browser = self.browsers[client.client_id] = Browser(client, self.post, self.point)
         browser.on_record(lambda: browser.record(Path(self.config.videos).expanduser(), self.config.rate))
         browser.on_changed(lambda: setattr(self, "_dirty", True))
-        if self.renderer is not None:
-            browser.show_model(self)
+        self._show_model_in(browser)
         self._dirty = True
 
     def _leave(self, client: int) -> None:

@@ -26,7 +26,7 @@ class FakeBrowser:
         local = np.linalg.solve(CAMERA.K, [x * CAMERA.width, y * CAMERA.height, 1.0])
         return np.zeros(3), local, CAMERA
 
-    def show_model(self, viewer):
+    def show_model(self, means, camera):
         self.models += 1
 
     def show_splats(self, *splats):
@@ -35,7 +35,7 @@ class FakeBrowser:
     def show_nodes(self, positions, colors, size):
         self.colors.append(colors)
 
-    def show_picture(self, viewer, dirty):
+    def show_picture(self, render, endoscope, draw_tools, changed):
         pass
 
     def close(self):

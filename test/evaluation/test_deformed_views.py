@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from endo_sim_ros.core.gaussians import GaussianModel
-from endo_sim_ros.evaluation.deformed_views import touched_psnr
+from endo_sim_ros.evaluation.deformed_views import deformed_view_psnr
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
 
@@ -22,9 +22,9 @@ def test_layers_of_other_colours_come_apart_when_touched_and_a_surface_does_not(
         for step, shift, opacity in ((0.0, 0.3, 0.3), (0.003, -0.2, 0.9))
     )
     layers = GaussianModel(**{name: torch.cat([tensor, behind.tensors()[name]]) for name, tensor in front.tensors().items()})
-    found = [touched_psnr(model, [frame.camera], "cpu") for model in (surface, layers)]
+    found = [deformed_view_psnr(model, [frame.camera], "cpu") for model in (surface, layers)]
     assert found[0] > 28 and found[1] < found[0] - 1
     kilometres = dataclasses.replace(surface, means=1000 * surface.means, log_scales=surface.log_scales + np.log(1000))
     pose = frame.camera.pose.copy()
     pose[:3, 3] *= 1000
-    assert np.isnan(touched_psnr(kilometres, [frame.camera.at(pose)], "cpu"))
+    assert np.isnan(deformed_view_psnr(kilometres, [frame.camera.at(pose)], "cpu"))

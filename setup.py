@@ -36,7 +36,7 @@ setup(
         "tifffile>=2023.7.10",
         "torch>=2.4",
         "typing_extensions>=4.12",
-        "tyro>=0.9",
+        "tyro>=0.9.2",
         "warp-lang>=1.19,<1.20",  # private parts: endo_sim_ros/core/warp_private.py
     ],
     extras_require={

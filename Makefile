@@ -1,34 +1,55 @@
-# make demo    set everything up and run the main job; BAG=path takes your own bag, results are in out/
-# make test    set everything up and run the tests
-# make clean   remove the environment and the results
+# make demo          set everything up and run the main job; BAG=path takes your own bag, results are in out/
+# make check         lint, types and the fast tests; about a minute
+# make test          lint, types and all tests
+# make test-minimum  the fast tests with the oldest dependencies that setup.py allows
+# make api           the API reference, built from the docstrings, in out/api/
+# make clean         remove the environments and the results
 
 PYTHON ?= python3
 VENV ?= .venv
 BAG ?=
 OUT ?= out
+# constraints.txt takes the versions that the tests last passed with; empty takes the newest.
+CONSTRAINTS ?=
+FAST = not slow and not dds and not gpu
 
 # PyTorch with CUDA where there is an NVIDIA GPU, the ten times smaller CPU build where there is none.
 TORCH ?= torch==2.13.0
 TORCH_INDEX ?= $(shell command -v nvidia-smi >/dev/null 2>&1 || echo --extra-index-url https://download.pytorch.org/whl/cpu)
+PIP_INSTALL = python -m pip install --quiet $(if $(CONSTRAINTS),-c $(CONSTRAINTS))
 
-.PHONY: demo test setup clean
+.PHONY: demo lint check test test-minimum api setup clean
 
 demo: setup
 	$(VENV)/bin/endo-sim demo --out $(OUT) $(if $(BAG),--bag $(BAG))
 
-test: setup
+lint: setup
 	$(VENV)/bin/ruff check
-	$(VENV)/bin/python -m pytest -n 2 --dist worksteal test
+	$(VENV)/bin/ruff format --check
+	$(VENV)/bin/pyright
+
+check: lint
+	$(VENV)/bin/python -m pytest -n 2 --dist worksteal -q -m "$(FAST)"
+
+test: lint
+	$(VENV)/bin/python -m pytest -n 2 --dist worksteal
+
+test-minimum:
+	$(MAKE) setup VENV=.venv-minimum CONSTRAINTS=constraints-minimum.txt
+	.venv-minimum/bin/python -m pytest -n 2 --dist worksteal -q -m "$(FAST)"
+
+api: setup
+	$(VENV)/bin/pdoc --docformat google --output-directory $(OUT)/api endo_sim_ros
 
 setup: $(VENV)/.installed
 
-$(VENV)/.installed: setup.py setup.cfg package.xml
+$(VENV)/.installed: setup.py setup.cfg package.xml $(CONSTRAINTS)
 	@echo "setting up $(VENV), about a minute ..."
 	$(PYTHON) -m venv $(VENV)
 	$(VENV)/bin/python -m pip install --quiet --upgrade pip
-	$(VENV)/bin/python -m pip install --quiet --retries 0 $(TORCH_INDEX) '$(TORCH)'
-	$(VENV)/bin/python -m pip install --quiet -e '.[test]'
+	$(VENV)/bin/$(PIP_INSTALL) --retries 0 $(TORCH_INDEX) '$(TORCH)'
+	$(VENV)/bin/$(PIP_INSTALL) -e '.[test]'
 	touch $@
 
 clean:
-	rm -rf $(VENV) $(OUT)
+	rm -rf .venv .venv-minimum $(OUT)

@@ -11,7 +11,8 @@ HERE = Path(__file__).parent
 VERSION = re.search(r"<version>(.+)</version>", (HERE / "package.xml").read_text()).group(1)
 
 # A sourced ROS 2 brings its own rclpy and messages; a second copy from PyPI would shadow them.
-ROS = [] if os.environ.get("AMENT_PREFIX_PATH") else ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"]
+# Private parts of rclpy: endo_sim_ros/nodes/rclpy_private.py.
+ROS = [] if os.environ.get("AMENT_PREFIX_PATH") else ["ros-jazzy-rclpy[fastrtps]>=7.1,<7.2", "ros-jazzy-common-interfaces>=5.3,<6"]
 
 setup(
     name=NAME,
@@ -24,19 +25,19 @@ setup(
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
     install_requires=[
         *ROS,
-        "av",
-        "numpy",
-        "opencv-python-headless",
-        "pycolmap",
-        "pyyaml",
-        "rich",
-        "rosbags>=0.11",
-        "scipy",
-        "tifffile",
+        "av>=12",
+        "numpy>=1.26",
+        "opencv-python-headless>=4.9",
+        "pycolmap>=3.10",
+        "pyyaml>=6",
+        "rich>=13.4",
+        "rosbags>=0.11,<0.12",  # private parts of its mcap reader: endo_sim_ros/sequences/bag_private.py
+        "scipy>=1.11",
+        "tifffile>=2023.7.10",
         "torch>=2.4",
-        "typing_extensions",
-        "tyro",
-        "warp-lang>=1.19",
+        "typing_extensions>=4.12",
+        "tyro>=0.9.2",
+        "warp-lang>=1.19,<1.20",  # private parts: endo_sim_ros/core/warp_private.py
     ],
     extras_require={
         "depth": ["onnxruntime", "transformers"],  # reconstruction with depth:=network

@@ -102,15 +102,6 @@ def test_package_xml_names_what_the_code_imports():
     assert ros <= declared, ros - declared
 
 
-def test_only_nodes_and_messages_know_ros():
-    for path in (ROOT / "endo_sim_ros").rglob("*.py"):
-        if {"nodes", "graph", "messages"} & set(path.parts):
-            continue
-        for line in path.read_text().splitlines():
-            assert not line.strip().startswith(("import rclpy", "from rclpy", "from sensor_msgs", "from geometry_msgs")), path
-
-
-@pytest.mark.dds
 def test_library_works_without_ros():
     """Everything but the nodes imports with the ROS packages hidden."""
     code = """

@@ -16,7 +16,26 @@ from endo_sim_ros.messages.clouds import (
     encode_cut_surface,
     encode_gaussians,
 )
-from endo_sim_ros.messages.diagnostics import ERROR, OK, WARN, decode_diagnostics, encode_diagnostics
+from endo_sim_ros.messages.diagnostics import (
+    ERROR,
+    NODE_STATES,
+    OK,
+    STATE,
+    WARN,
+    BagPlayerState,
+    ClientState,
+    NodeState,
+    NodeStatus,
+    PhysicsState,
+    PolicyState,
+    ReconstructionState,
+    RecorderState,
+    RenderingState,
+    ScriptedToolState,
+    ViewerState,
+    decode_diagnostics,
+    encode_diagnostics,
+)
 from endo_sim_ros.messages.errors import MessageError
 from endo_sim_ros.messages.headers import check_frame, encode_clock, stamp_to_ns
 from endo_sim_ros.messages.images import decode_depth, decode_image, decode_mask, encode_image
@@ -89,14 +108,16 @@ from endo_sim_ros.messages.types import (
 )
 
 __all__ = [
-    "BagTypes", "CAMERA_POSE", "CLOCK", "CONTROL_NODES", "CUT_SURFACE", "CameraInfo", "ControlNodeCloud", "DEPTH", "DIAGNOSTICS",
-    "ERROR", "GAUSSIANS", "LEFT_COMPRESSED", "LEFT_IMAGE", "LEFT_INFO", "MASK", "MESSAGE_PACKAGES", "METRES_PER_NEWTON",
-    "MODEL_TOPICS", "Message", "MessageError", "MessageTypes", "OK", "RECORDING_TOPICS", "RENDERED_DEPTH", "RENDERED_IMAGE",
-    "RENDERED_INFO", "RENDERED_POSE", "RENDERED_TOPICS", "RIGHT_COMPRESSED", "RIGHT_IMAGE", "RIGHT_INFO", "RosTypes",
-    "TOOL_MARKERS", "TOOL_TOPICS", "TRAINING_CAMERAS", "TRAINING_CAMERA_INFO", "ToolDisplay", "Topic", "WARN", "all_topics",
-    "bag_types", "check_frame", "crtk_type", "cut_number", "decode_camera_info", "decode_cloud", "decode_control_nodes",
-    "decode_cut", "decode_cut_surface", "decode_depth", "decode_diagnostics", "decode_gaussians", "decode_image", "decode_jaw",
-    "decode_mask", "decode_pose", "decode_poses", "decode_state_command", "decode_wrench", "encode_camera_info", "encode_clock",
+    "BagPlayerState", "BagTypes", "CAMERA_POSE", "CLOCK", "CONTROL_NODES", "CUT_SURFACE", "CameraInfo", "ClientState",
+    "ControlNodeCloud", "DEPTH", "DIAGNOSTICS", "ERROR", "GAUSSIANS", "LEFT_COMPRESSED", "LEFT_IMAGE", "LEFT_INFO", "MASK",
+    "MESSAGE_PACKAGES", "METRES_PER_NEWTON", "MODEL_TOPICS", "Message", "MessageError", "MessageTypes", "NODE_STATES",
+    "NodeState", "NodeStatus", "OK", "PhysicsState", "PolicyState", "RECORDING_TOPICS", "RENDERED_DEPTH", "RENDERED_IMAGE",
+    "RENDERED_INFO", "RENDERED_POSE", "RENDERED_TOPICS", "RIGHT_COMPRESSED", "RIGHT_IMAGE", "RIGHT_INFO", "ReconstructionState",
+    "RecorderState", "RenderingState", "RosTypes", "STATE", "ScriptedToolState", "TOOL_MARKERS", "TOOL_TOPICS",
+    "TRAINING_CAMERAS", "TRAINING_CAMERA_INFO", "ToolDisplay", "Topic", "ViewerState", "WARN", "all_topics", "bag_types",
+    "check_frame", "crtk_type", "cut_number", "decode_camera_info", "decode_cloud", "decode_control_nodes", "decode_cut",
+    "decode_cut_surface", "decode_depth", "decode_diagnostics", "decode_gaussians", "decode_image", "decode_jaw", "decode_mask",
+    "decode_pose", "decode_poses", "decode_state_command", "decode_wrench", "encode_camera_info", "encode_clock",
     "encode_control_nodes", "encode_cut", "encode_cut_surface", "encode_diagnostics", "encode_gaussians", "encode_image",
     "encode_jaw", "encode_operating_state", "encode_pose", "encode_poses", "encode_tool_markers", "encode_wrench", "parse_frames",
     "ros_class", "ros_types", "stamp_to_ns", "tool_cut", "tool_jaw", "tool_jaw_move", "tool_jaw_setpoint", "tool_jaw_state",

@@ -5,122 +5,28 @@ import os
 import signal
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import rclpy
 import torch
-from rclpy.executors import SingleThreadedExecutor
 from rich.progress import track
 
 from endo_sim_ros import messages
-from endo_sim_ros.core.cameras import Camera, save_cameras
-from endo_sim_ros.core.gaussians import GaussianModel, save_ply
+from endo_sim_ros.core.cameras import save_cameras
+from endo_sim_ros.core.gaussians import save_ply
 from endo_sim_ros.evaluation.measurement import Row, machine, report
+from endo_sim_ros.graph.client import ARM, CHANGED, PATIENCE, WORLD, Client, Scene, tissue
 from endo_sim_ros.graph.processes import NodeGroup
-from endo_sim_ros.nodes.base import EndoNode
+from endo_sim_ros.messages import PhysicsState
 from endo_sim_ros.physics.config import PhysicsConfig
-from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
-ARM = "PSM1"
-_WORLD = "world"
-_PATIENCE = 60.0  # seconds that anything may take
 _FORCE = 2.0  # N, towards the camera
-CHANGED = 60  # grey levels by which a picture must differ to show that the tissue moved; creeping tissue differs by 1-5
 _HOLD = 0.6  # seconds between one change of the force and the next
 _LIMIT = 50.0  # ms; what latencies are compared with
-
-
-class Client(EndoNode):
-    """A teleoperation stack: sends poses and wrenches of a tool, sees images."""
-
-    def __init__(self):
-        super().__init__("bench")
-        self.statuses: dict[str, tuple[int, str, dict[str, str]]] = {}
-        self.images: list[tuple[float, int, np.ndarray]] = []  # time of arrival, stamp, pixels
-        self.states: list[tuple[float, int]] = []  # time of arrival and stamp of control_nodes
-        self._state: Any = None  # the newest control_nodes
-        self._senders: dict[messages.Topic, Any] = {}
-        self.subscribe(messages.DIAGNOSTICS, self._on_diagnostics)
-        self.subscribe(messages.RENDERED_IMAGE, self._on_image)
-        self.subscribe(messages.CONTROL_NODES, self._on_state)
-        self._spinner = SingleThreadedExecutor()
-        self._spinner.add_node(self)
-
-    def _on_diagnostics(self, message: Any) -> None:
-        for name, *status in messages.decode_diagnostics(message):
-            self.statuses[name] = tuple(status)
-
-    def _on_image(self, message: Any) -> None:
-        stamp = messages.stamp_to_ns(message.header.stamp)
-        self.images.append((time.perf_counter(), stamp, messages.decode_image(message)))
-
-    def _on_state(self, message: Any) -> None:
-        self.states.append((time.perf_counter(), messages.stamp_to_ns(message.header.stamp)))
-        self._state = message
-
-    @property
-    def model_stamp(self) -> int:
-        """Stamp of the model of the newest control nodes, ns."""
-        return messages.decode_control_nodes(self._state).model_stamp_ns
-
-    def send(self, topic: messages.Topic, message: Any) -> None:
-        if topic not in self._senders:
-            publisher = self._senders[topic] = self.publisher(topic)
-            self.until(publisher.get_subscription_count, f"a subscriber of {topic.name}")
-        self._senders[topic].publish(message)
-
-    def command(self, tip: np.ndarray, force: np.ndarray, stamp: int) -> None:
-        pose = np.eye(4)
-        pose[:3, 3] = tip
-        self.send(messages.tool_pose(ARM), messages.encode_pose(pose, stamp, _WORLD))
-        self.send(messages.tool_wrench(ARM), messages.encode_wrench(force, np.zeros(3), stamp, _WORLD))
-
-    def until(self, done: Callable[[], Any], what: str, seconds: float = _PATIENCE) -> None:
-        deadline = time.monotonic() + seconds
-        while not done():
-            self._spinner.spin_once(timeout_sec=0.005)
-            if time.monotonic() > deadline:
-                raise RuntimeError(f"bench graph: waited {seconds:.0f} s in vain for {what}; the nodes said {self.statuses}")
-
-    def spin_until(self, moment: float) -> None:
-        while (left := moment - time.perf_counter()) > 0:
-            self._spinner.spin_once(timeout_sec=left)
-
-    def value(self, node: str, key: str) -> float:
-        return float(self.statuses[node][2][key])
-
-
-class Scene(NamedTuple):
-    """What is touched."""
-
-    model: GaussianModel
-    camera: Camera
-    tip: np.ndarray  # [3] m, world: tissue in the middle of the picture
-
-    @property
-    def towards_camera(self) -> np.ndarray:
-        offset = self.camera.position - self.tip
-        return offset / np.linalg.norm(offset)
-
-
-def tissue(gaussians: int, width: int, height: int) -> Scene:
-    """The synthetic patient as so many Gaussians."""
-    (frame,) = phantom_sequence(PhantomConfig(frames=1, width=width, height=height, stereo=False))
-    points, seen = frame.camera.backproject(frame.depth), frame.depth > 0
-    rng = np.random.default_rng(0)
-    chosen = rng.choice(np.flatnonzero(seen), gaussians, replace=gaussians > seen.sum())
-    radii = frame.depth.ravel()[chosen] / frame.camera.K[0, 0] * 0.5 * np.sqrt(seen.sum() / gaussians)
-    model = GaussianModel.from_points(
-        torch.from_numpy(points.reshape(-1, 3)[chosen]).float(),
-        torch.from_numpy(frame.image.reshape(-1, 3)[chosen] / 255.0).float(),
-        torch.from_numpy(radii).float(),
-        opacity=0.9,
-    )
-    return Scene(model, frame.camera, points[height // 2, width // 2])
 
 
 def _parameters(mode: str, rate: float, device: str) -> dict[str, dict[str, Any]]:
@@ -146,12 +52,11 @@ def _graph(mode: str, scene: Scene, rate: float, device: str, logs: Path) -> Ite
                 client.until(lambda: node in client.statuses, node)
             info = messages.encode_camera_info(camera.K, camera.width, camera.height, 1, "endoscope_left")
             client.send(messages.LEFT_INFO, info)
-            client.send(messages.CAMERA_POSE, messages.encode_pose(camera.pose, 1, _WORLD))
+            client.send(messages.CAMERA_POSE, messages.encode_pose(camera.pose, 1, WORLD))
             client.send(messages.TRAINING_CAMERA_INFO, info)  # latched like those below, for nodes that start again
-            client.send(messages.TRAINING_CAMERAS, messages.encode_poses([camera.pose], 1, _WORLD))
-            client.send(messages.GAUSSIANS, messages.encode_gaussians(model, 1, _WORLD))
-            following = lambda: client.statuses["rendering_node"][2].get("following control nodes") == "True"  # noqa: E731
-            client.until(lambda: client.images and following(), "the first image of the deformable tissue")
+            client.send(messages.TRAINING_CAMERAS, messages.encode_poses([camera.pose], 1, WORLD))
+            client.send(messages.GAUSSIANS, messages.encode_gaussians(model, 1, WORLD))
+            client.until(lambda: client.images and client.renders_control_nodes(), "the first image of the deformable tissue")
             yield client, group
         finally:
             client.destroy_node()
@@ -160,11 +65,11 @@ def _graph(mode: str, scene: Scene, rate: float, device: str, logs: Path) -> Ite
 
 def _realtime(client: Client, scene: Scene, rate: float, changes: int) -> list[Row]:
     """Latency from a wrench that changes to the first image that shows it, while commands stream."""
-    client.until(lambda: "skipped steps" in client.statuses["physics_node"][2], "the first steps")
+    client.until(lambda: client.in_state("physics_node", PhysicsState.RUNNING), "the first steps")
     client.command(scene.tip, np.zeros(3), client.now_ns())  # what comes before all are connected arrives late
     client.spin_until(time.perf_counter() + 1.0)
     latencies, began = [], time.perf_counter()
-    skipped, first_state = client.value("physics_node", "skipped steps"), len(client.states)
+    skipped, first_state = client.number("physics_node", "skipped steps"), len(client.states)
     pulling, due = False, began
     rng = np.random.default_rng(0)
     for _ in track(range(changes), description="real time"):
@@ -183,16 +88,16 @@ def _realtime(client: Client, scene: Scene, rate: float, changes: int) -> list[R
     client.spin_until(time.perf_counter() + 1.5)  # for the last word of the nodes
     elapsed = client.states[-1][0] - client.states[first_state][0]
     states = len(client.states) - 1 - first_state
-    skipped = client.value("physics_node", "skipped steps") - skipped
+    skipped = client.number("physics_node", "skipped steps") - skipped
     missed = sum(not np.isfinite(value) for value in latencies)
     return [
         *_latency_rows(f"wrench to image, {rate:g} Hz", latencies),
         Row("wrench changes never seen", missed, "of " + str(changes)),
         Row("states received per second", states / elapsed, "1/s"),
         Row("steps skipped", skipped, f"of {states + skipped:.0f}"),
-        Row("real-time factor", client.value("physics_node", "real-time factor"), ""),
-        Row("time of a step", client.value("physics_node", "milliseconds per step"), "ms"),
-        Row("time of an image", client.value("rendering_node", "milliseconds per image"), "ms"),
+        Row("real-time factor", client.number("physics_node", "real-time factor"), ""),
+        Row("time of a step", client.number("physics_node", "milliseconds per step"), "ms"),
+        Row("time of an image", client.number("rendering_node", "milliseconds per image"), "ms"),
     ]
 
 
@@ -254,8 +159,8 @@ def _until_pictures_move(client: Client, scene: Scene, rate: float) -> float:
 
     while not moved():
         now = time.perf_counter()
-        if now - began > _PATIENCE:
-            raise RuntimeError(f"bench graph: no picture moved within {_PATIENCE:.0f} s; the nodes said {client.statuses}")
+        if now - began > PATIENCE:
+            raise RuntimeError(f"bench graph: no picture moved within {PATIENCE:.0f} s; the nodes reported {client.statuses}")
         pulling = int((now - began) / _HOLD) % 2 == 0
         client.command(scene.tip, _FORCE * pulling * scene.towards_camera, client.now_ns())
         client.spin_until(now + 1 / rate)

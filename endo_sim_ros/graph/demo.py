@@ -13,13 +13,12 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from std_srvs.srv import Trigger
 
-from endo_sim_ros import messages
 from endo_sim_ros.core import drawing
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.evaluation.interaction_report import TouchReport
+from endo_sim_ros.graph.client import Watcher
 from endo_sim_ros.graph.processes import NodeGroup
-from endo_sim_ros.messages import ERROR
-from endo_sim_ros.nodes.base import EndoNode
+from endo_sim_ros.messages import ERROR, ReconstructionState, ScriptedToolState
 from endo_sim_ros.sequences.bag import BagReader, write_bag
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
@@ -31,31 +30,19 @@ class DemoError(RuntimeError):
     """The demo cannot go on; the message says which stage and where its log is."""
 
 
-class _Watcher(EndoNode):
-    """Listens to what the other nodes say about themselves."""
+def _request(watcher: Watcher, service: str, executor: SingleThreadedExecutor) -> None:
+    """Call a Trigger service.
 
-    def __init__(self):
-        super().__init__("demo")
-        self.statuses: dict[str, tuple[int, str, dict[str, str]]] = {}
-        self.subscribe(messages.DIAGNOSTICS, self._on_diagnostics)
-
-    def request(self, service: str, executor: SingleThreadedExecutor) -> None:
-        """Call a Trigger service.
-
-        Raises:
-            DemoError: If it does not answer, or refuses.
-        """
-        client = self.create_client(Trigger, service)
-        if not client.wait_for_service(timeout_sec=20.0):
-            raise DemoError(f"the service {service} is not there; see the log of its node")
-        future = client.call_async(Trigger.Request())
-        executor.spin_until_future_complete(future, timeout_sec=60.0)
-        if not future.done() or not future.result().success:
-            raise DemoError(f"{service}: {future.result().message if future.done() else 'no answer'}")
-
-    def _on_diagnostics(self, message) -> None:
-        for name, level, text, values in messages.decode_diagnostics(message):
-            self.statuses[name] = (level, text, values)
+    Raises:
+        DemoError: If it does not answer, or refuses.
+    """
+    client = watcher.create_client(Trigger, service)
+    if not client.wait_for_service(timeout_sec=20.0):
+        raise DemoError(f"the service {service} is not there; see the log of its node")
+    future = client.call_async(Trigger.Request())
+    executor.spin_until_future_complete(future, timeout_sec=60.0)
+    if not future.done() or not future.result().success:
+        raise DemoError(f"{service}: {future.result().message if future.done() else 'no answer'}")
 
 
 def run_demo(bag: Path | None, out: Path, seed: int, frames: int, width: int, iterations: int, force: float, timeout: float) -> None:
@@ -125,15 +112,16 @@ def _touch_over_dds(
     """Run the nodes until the tool has let go."""
     os.environ.update(graph.environment)  # this process joins the same graph
     rclpy.init()
-    watcher, executor = _Watcher(), SingleThreadedExecutor()
+    watcher, executor = Watcher("demo"), SingleThreadedExecutor()
     executor.add_node(watcher)
     deadline = time.monotonic() + timeout
 
-    def wait(stage: str, done: Callable[[dict], bool], note: Callable[[dict], tuple[str, float, float]]) -> None:
+    def wait(stage: str, done: Callable[[], bool], shown: str) -> None:
+        """Show the progress of a node until a condition is true."""
         task = progress.add_task(stage, total=None, note="")
-        while not done(watcher.statuses):
+        while not done():
             executor.spin_once(timeout_sec=0.1)
-            text, completed, total = note(watcher.statuses)
+            text, completed, total = progress_of(shown)
             progress.update(task, note=text, completed=completed, total=total or None)
             for node in graph.dead():
                 raise DemoError(f"{node.name} ended with status {node.exit_status}; its log is {node.log}")
@@ -142,18 +130,15 @@ def _touch_over_dds(
                 raise DemoError(f"{late}; logs are in {out / 'logs'}")
         progress.update(task, completed=1, total=1)
 
-    def text_of(name: str) -> Callable[[dict], tuple[str, float, float]]:
-        def note(statuses: dict) -> tuple[str, float, float]:
-            level, text, values = statuses.get(name, (0, "starting", {}))
-            if level == ERROR:
-                raise DemoError(f"{name}: {text}")
-            completed = values.get("iteration", values.get("messages", 0))
-            return text, float(completed), float(values.get("iterations", values.get("of", 0)))
-
-        return note
-
-    def says(name: str, begin: str) -> Callable[[dict], bool]:
-        return lambda statuses: name in statuses and statuses[name][1].startswith(begin)
+    def progress_of(name: str) -> tuple[str, float, float]:
+        """What a node says, and how much it has done of how much."""
+        if name not in watcher.statuses:
+            return "starting", 0.0, 0.0
+        _, level, text, values = watcher.statuses[name]
+        if level == ERROR:
+            raise DemoError(f"{name}: {text}")
+        completed = values.get("iteration", values.get("messages", 0))
+        return text, float(completed), float(values.get("iterations", values.get("of", 0)))
 
     try:
         graph.start("recorder_node", bag=recording, arms=[_ARM])
@@ -168,16 +153,16 @@ def _touch_over_dds(
         graph.start("physics_node", arms=[_ARM])
         graph.start("rendering_node", image_width=width, idle_rate=1.0)
         names = {"recorder", "reconstruction_node", "physics_node", "rendering_node"}
-        wait("starting", names.issubset, text_of("recorder"))
+        wait("starting", lambda: names <= watcher.statuses.keys(), "recorder")
         player = graph.start("bag_player_node", bag=bag)
-        wait("replaying", lambda _: player.exit_status == 0, text_of("bag_player"))
-        watcher.request("reconstruction_node/reconstruct", executor)
-        wait("reconstructing", says("reconstruction_node", "finished"), text_of("reconstruction_node"))
-        final = lambda s: s.get("rendering_node", (0, "", {}))[2].get("following control nodes") == "True"  # noqa: E731
+        wait("replaying", lambda: player.exit_status == 0, "bag_player")
+        _request(watcher, "reconstruction_node/reconstruct", executor)
+        done = lambda: watcher.in_state("reconstruction_node", ReconstructionState.DONE)  # noqa: E731
+        wait("reconstructing", done, "reconstruction_node")
         settled = itertools.count()  # the final model reaches physics and rendering a moment after it is finished
-        wait("binding", lambda s: final(s) and next(settled) > 20, text_of("physics_node"))
+        wait("binding", lambda: watcher.renders_control_nodes() and next(settled) > 20, "physics_node")
         graph.start("scripted_tool_node", arm=_ARM, force=force, listeners=2)  # physics and the recorder
-        wait("touching", says("scripted_tool", "finished"), text_of("scripted_tool"))
+        wait("touching", lambda: watcher.in_state("scripted_tool", ScriptedToolState.DONE), "scripted_tool")
     except ExternalShutdownException:  # ROS heard the signal to stop before Python did
         raise KeyboardInterrupt from None
     finally:

@@ -13,11 +13,11 @@ import numpy as np
 import rclpy
 from rich.progress import Progress
 
-from benchmarks.graph import ARM, CHANGED, Client, tissue
 from endo_sim_ros import messages
 from endo_sim_ros.evaluation.measurement import Row, report
+from endo_sim_ros.graph.client import ARM, CHANGED, Client, tissue
 from endo_sim_ros.graph.processes import NodeGroup
-from endo_sim_ros.messages import OK, Topic
+from endo_sim_ros.messages import OK, ReconstructionState, Topic
 from endo_sim_ros.sequences.bag import LEFT_FRAME
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
@@ -197,14 +197,19 @@ def _send(client: Client, group: NodeGroup, traffic: _Traffic, rng: random.Rando
     for name in _NODES:
         settled, last = max(used[name][: int(_SETTLED * len(used[name])) + 1]), np.median(used[name][-3:])
         rows.append(Row(f"{name}: memory at the end", last, "MB", last / settled, "most in the first quarter"))
-        rows.append(Row(f"{name}: errors told", client.value(name, "errors"), ""))
+        rows.append(Row(f"{name}: errors told", client.number(name, "errors"), ""))
     return rows
 
 
 def _still_works(client: Client, group: NodeGroup, traffic: _Traffic) -> list[Row]:
     """A good recording must become a model, and a good push must give pictures that move."""
     begin, scene = time.perf_counter(), traffic.scene
-    start = client.now_ns()
+    start, before = client.now_ns(), client.value("reconstruction_node", "saved")
+
+    def reconstructed() -> bool:
+        node = "reconstruction_node"
+        return client.in_state(node, ReconstructionState.DONE) and client.value(node, "saved") != before
+
     for frame in traffic.recording:
         stamp, camera = start + frame.stamp_ns, frame.camera
         info = messages.encode_camera_info(camera.K, camera.width, camera.height, stamp, LEFT_FRAME)
@@ -213,21 +218,21 @@ def _still_works(client: Client, group: NodeGroup, traffic: _Traffic) -> list[Ro
         client.send(messages.DEPTH, messages.encode_image(frame.depth, stamp, LEFT_FRAME))
         client.send(messages.LEFT_IMAGE, messages.encode_image(frame.image, stamp, LEFT_FRAME))
         client.spin_until(time.perf_counter() + 0.05)
-    client.until(lambda: client.statuses["reconstruction_node"][1].startswith("finished"), "a reconstruction")
+    client.until(reconstructed, "a reconstruction")
     stamp = client.now_ns()
     for topic in (messages.LEFT_INFO, messages.CAMERA_POSE, messages.TRAINING_CAMERAS, messages.GAUSSIANS):
         client.send(topic, traffic.message(topic, stamp))
     for name in _NODES:
-        client.until(lambda: client.statuses[name][0] == OK, f"{name} to be well again")
-    client.until(lambda: client.statuses["rendering_node"][2].get("following control nodes") == "True", "the renderer to follow")
+        client.until(lambda: client.statuses[name].level == OK, f"{name} to be well again")
+    client.until(client.renders_control_nodes, "the renderer to follow")
     client.images.clear()
     client.until(lambda: client.images, "an image")
-    before = client.images[-1][2].astype(int)
+    at_rest = client.images[-1][2].astype(int)
 
     def pushed() -> bool:
         client.command(scene.tip, 3 * scene.towards_camera, client.now_ns())
         client.spin_until(time.perf_counter() + 0.04)
-        return np.abs(client.images[-1][2].astype(int) - before).max() > CHANGED
+        return np.abs(client.images[-1][2].astype(int) - at_rest).max() > CHANGED
 
     client.until(pushed, "pictures that move")
     return [

@@ -4,18 +4,24 @@ import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import rclpy
 from rclpy.duration import Duration
 
 from endo_sim_ros.core.config import Range, StageConfig
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.messages import DIAGNOSTICS, MessageError, Topic
+from endo_sim_ros.messages import DIAGNOSTICS, STATE, BagPlayerState, MessageError, Topic
 from endo_sim_ros.nodes.base import ERROR, OK, EndoNode, run, sentence
 from endo_sim_ros.sequences.bag import BagReader
 
 _DELIVERED_WITHIN = 10.0  # seconds that subscribers have, at the end, to ask again for what they missed
+_MESSAGES = {  # for people
+    BagPlayerState.WAITING: "waiting for subscribers",
+    BagPlayerState.PLAYING: "playing",
+    BagPlayerState.DELIVERING: "waiting until everything is received",
+    BagPlayerState.DONE: "finished",
+}
 _SETTLED = 3.5  # seconds without a new subscriber after which all are there: processes announce themselves every 3
 
 
@@ -41,8 +47,8 @@ class BagPlayerNode(EndoNode):
     def __init__(self):
         super().__init__("bag_player")
         self._config = self.declare(BagPlayerConfig)
-        self._sent, self._total, self._state = 0, 0, "starting"
-        self._failed = False
+        self._sent, self._total = 0, 0
+        self._state, self._failure = BagPlayerState.WAITING, ""
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._play, daemon=True)
         self._thread.start()
@@ -50,9 +56,10 @@ class BagPlayerNode(EndoNode):
     def config_changed(self, config: BagPlayerConfig) -> None:
         self._config = config
 
-    def status(self):
-        values = {"bag": self._config.bag, "messages": self._sent, "of": self._total}
-        return (ERROR if self._failed else OK), self._state, values
+    def status(self) -> tuple[int, str, dict[str, Any]]:
+        """Level, message and values: the bag, and how many of its messages were published."""
+        values = {STATE: self._state, "bag": self._config.bag, "messages": self._sent, "of": self._total}
+        return (ERROR, self._failure, values) if self._failure else (OK, _MESSAGES[self._state], values)
 
     def destroy_node(self) -> None:
         self._stop.set()
@@ -66,12 +73,12 @@ class BagPlayerNode(EndoNode):
             if self._stopped:
                 return
             # Stay alive and keep saying so: a launch file should show the reason, not a missing node.
-            self._failed, self._state = True, sentence(self._config.bag, error)
-            self.report_error(self._state)
+            self._state, self._failure = BagPlayerState.FAILED, sentence(self._config.bag, error)
+            self.report_error(self._failure)
             return
         if self._stopped:
             return
-        self._state = "finished"
+        self._state = BagPlayerState.DONE
         self.publish_diagnostics()
         self.get_logger().info(f"finished: {self._sent} messages")
         rclpy.try_shutdown(context=self.context)
@@ -96,7 +103,7 @@ class BagPlayerNode(EndoNode):
             if not publishers:
                 raise SequenceError(f"{self._config.bag}: the bag has no topic that can be replayed")
             self._await_subscribers(publishers)
-            self._state = "playing"
+            self._state = BagPlayerState.PLAYING
             while not self._stopped:
                 self._total += bag.message_count
                 self._publish(bag, publishers)
@@ -107,7 +114,6 @@ class BagPlayerNode(EndoNode):
     def _await_subscribers(self, publishers: dict) -> None:
         """Wait for somebody to listen, and then until nobody new has come for a while: discovery takes its time, and
         the topics of one listener are found one after another."""
-        self._state = "waiting for subscribers"
         deadline = time.monotonic() + self._config.wait_for_subscribers
         counts, since = None, 0.0
         while not self._stopped and time.monotonic() < deadline:
@@ -120,7 +126,7 @@ class BagPlayerNode(EndoNode):
 
     def _await_delivery(self, publishers: dict) -> None:
         """A lost message is repeated when its subscriber asks, which it can only while the publisher exists."""
-        self._state = "waiting until everything is received"
+        self._state = BagPlayerState.DELIVERING
         deadline = time.monotonic() + _DELIVERED_WITHIN
         for publisher in publishers.values():
             while not self._stopped and time.monotonic() < deadline:

@@ -34,7 +34,7 @@ from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import ModelError
 from endo_sim_ros.graph.processes import end_with_parent
-from endo_sim_ros.messages import ERROR, OK, WARN, MessageError, Topic
+from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ClientState, MessageError, Topic
 from endo_sim_ros.nodes.executor import NodeExecutor
 from endo_sim_ros.nodes.transport import prepare_transport
 
@@ -215,8 +215,8 @@ class EndoNode(Node):
             self.publish_diagnostics()
 
     def status(self) -> tuple[int, str, dict[str, Any]]:
-        """Level, sentence and values of the node's normal state; override."""
-        return OK, "running", {}
+        """Level, message and values of the node; override. The value of the key `state` is one of a `NodeState`."""
+        return OK, "running", {STATE: ClientState.RUNNING}
 
     def publish_diagnostics(self) -> None:
         try:

@@ -13,7 +13,7 @@ from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.config import ConfigError, Range, StageConfig
 from endo_sim_ros.core.gaussians import GaussianModel
-from endo_sim_ros.messages import ControlNodeCloud, MessageError
+from endo_sim_ros.messages import STATE, ControlNodeCloud, MessageError, PhysicsState
 from endo_sim_ros.nodes.arm import Arm
 from endo_sim_ros.nodes.base import ERROR, OK, STREAM_DEPTH, WARN, Background, EndoNode, WorldConfig, arm_names, run, sentence
 from endo_sim_ros.nodes.pacing import MOST_WAITING, CommandQueue, Pacer
@@ -485,21 +485,27 @@ class PhysicsNode(EndoNode):
 
     # ------------------------------------------------------------ diagnostics
 
-    def status(self):
-        simulation = self._simulation
+    @property
+    def _state(self) -> PhysicsState:
+        if self._simulation is not None:
+            return PhysicsState.PAUSED if self._paused else PhysicsState.RUNNING
+        if self._model is not None and self._background.busy:
+            return PhysicsState.BUILDING
+        return PhysicsState.FAILED if self._failure else PhysicsState.WAITING
+
+    def status(self) -> tuple[int, str, dict[str, Any]]:
+        """Level, message and values: the mode, and once there is tissue how its simulation goes."""
+        simulation, state = self._simulation, self._state
+        values = {STATE: state, "mode": self._options.mode}
         if simulation is None:
+            if state is PhysicsState.BUILDING:
+                return OK, "building control nodes", values
+            if state is PhysicsState.FAILED:
+                return ERROR, self._failure, values
             if self._model is None:
-                return WARN, "waiting for a model on gaussians", {}
-            if self._background.busy:
-                return OK, "building control nodes", {}
-            if self._failure:
-                return ERROR, self._failure, {}
-            return (
-                WARN,
-                "waiting for training_cameras or ECM/measured_cp to know from which side the tissue is seen",
-                {},
-            )
-        values = {
+                return WARN, "waiting for a model on gaussians", values
+            return WARN, "waiting for training_cameras or ECM/measured_cp to know from which side the tissue is seen", values
+        values |= {
             "nodes": len(simulation.nodes.rest),
             "steps": self._steps,
             "substeps": simulation.solver.substepping.count,
@@ -513,7 +519,7 @@ class PhysicsNode(EndoNode):
         }
         if self._failure:
             return ERROR, f"{self._failure}; the model before goes on", values
-        if self._paused:
+        if state is PhysicsState.PAUSED:
             return OK, "paused", values
         if self._lockstep:
             waiting = self._commands.missing()

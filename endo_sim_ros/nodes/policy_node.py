@@ -13,6 +13,7 @@ from endo_sim_ros.core.config import ConfigError, Range, StageConfig
 from endo_sim_ros.learning.policies import make_policy
 from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.learning.tasks import find_task, make_task
+from endo_sim_ros.messages import STATE, PolicyState
 from endo_sim_ros.nodes.base import OK, WARN, EndoNode, arm_names, run
 
 _OPEN, _CLOSED = 1.0, 0.0  # rad
@@ -66,7 +67,8 @@ class PolicyNode(EndoNode):
         self._pose_pub = self.publisher(messages.tool_pose_command(arm))
         self._jaw_pub = self.publisher(messages.tool_jaw(arm))
         self._resetting = self.create_client(Trigger, f"{config.physics_node}/reset")
-        self._state, self._doing, self._solved, self._done = "starting", "", 0, 0
+        self._state, self._missing = PolicyState.WAITING, ""  # and what for
+        self._solved, self._done = 0, 0
         self._stamp = 0  # of the command whose answer is awaited; 0 = the state at rest
         self._heard: dict[str, Any] = {}  # parts of that answer
         self._rows: list[tuple[np.ndarray, np.ndarray, float, bool, int]] = []
@@ -83,7 +85,7 @@ class PolicyNode(EndoNode):
         """Set up the next episode and ask for the tissue at rest."""
         self._task.reset(0, np.random.default_rng(self._config.seed + self._done))
         self._policy.reset([0])
-        self._stamp, self._heard, self._doing = 0, {}, ""
+        self._stamp, self._heard, self._state = 0, {}, PolicyState.WAITING
         self._ask()
 
     def _ask(self) -> None:
@@ -92,9 +94,9 @@ class PolicyNode(EndoNode):
             return
         listening = all(publisher.get_subscription_count() for publisher in (self._pose_pub, self._jaw_pub))
         if not (listening and self._resetting.service_is_ready()):
-            self._state = "waiting for physics_node with arm_source commanded"
+            self._missing = "physics_node with arm_source commanded"
             return
-        self._state = "waiting for the tissue of the scene"
+        self._missing = "the tissue of the scene"
         self._heard.pop("reset", None)
         if self._asked is not None:  # an answer that comes after all is none to this request
             self._resetting.remove_pending_request(self._asked)
@@ -147,8 +149,7 @@ class PolicyNode(EndoNode):
         self._stamp, self._heard = self._stamp + self._step_ns, {}
         pose = np.eye(4)
         pose[:3, 3] = tips[0]
-        self._doing = f"step {self._task.steps[0]} of episode {self._done + 1}"
-        self._state = f"working on {self._config.task}"
+        self._state = PolicyState.WORKING
         self._pose_pub.publish(messages.encode_pose(pose, self._stamp, self._config.world_frame))
         self._jaw_pub.publish(messages.encode_jaw(_CLOSED if closed[0] else _OPEN, self._stamp))
 
@@ -160,7 +161,7 @@ class PolicyNode(EndoNode):
         if self._done < self._config.episodes:
             self._begin()
             return
-        self._state, self._doing = "finished", ""
+        self._state = PolicyState.DONE
         if self._config.record:
             names, path = ("observations", "actions", "rewards", "success", "episode"), Path(self._config.record)
             partial = path.with_name(path.name + ".part")
@@ -169,11 +170,16 @@ class PolicyNode(EndoNode):
             partial.replace(path)  # there whole or not at all
         self.publish_diagnostics()
 
-    def status(self):
-        working = self._state == "finished" or bool(self._doing)
-        text = f"{self._state}, {self._doing}" if self._doing else self._state
-        values = {"episodes": self._done, "solved": self._solved, "steps": len(self._rows)}
-        return (OK if working else WARN), f"{text}, {self._solved} of {self._done} solved" if self._done else text, values
+    def status(self) -> tuple[int, str, dict[str, Any]]:
+        """Level, message and values: how many episodes ended and were solved, and the steps of all."""
+        values = {STATE: self._state, "episodes": self._done, "solved": self._solved, "steps": len(self._rows)}
+        text = {
+            PolicyState.WAITING: f"waiting for {self._missing}",
+            PolicyState.WORKING: f"working on {self._config.task}, step {self._task.steps[0]} of episode {self._done + 1}",
+            PolicyState.DONE: "finished",
+        }[self._state]
+        solved = f", {self._solved} of {self._done} solved" if self._done else ""
+        return (WARN if self._state is PolicyState.WAITING else OK), text + solved, values
 
 
 def main() -> int:

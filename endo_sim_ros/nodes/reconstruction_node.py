@@ -16,7 +16,7 @@ from endo_sim_ros.core.cameras import Camera, load_cameras, save_cameras
 from endo_sim_ros.core.config import Range, StageConfig
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel, load_ply, save_ply
-from endo_sim_ros.messages import Topic
+from endo_sim_ros.messages import STATE, ReconstructionState, Topic
 from endo_sim_ros.nodes.base import ERROR, OK, WARN, EndoNode, WorldConfig, run, sentence
 from endo_sim_ros.reconstruction import Progress, ReconstructionConfig, Trainer, scene_points, select_keyframes
 from endo_sim_ros.sequences.bag import LEFT_FRAME, feed
@@ -282,20 +282,30 @@ class ReconstructionNode(EndoNode):
 
     # ------------------------------------------------------------ diagnostics
 
-    def status(self):
-        dropped = self._synchronizer.dropped
-        counts = {f"images {reason}": count for reason, count in dropped.items()}
-        values = {"views": len(self._frames), **counts, "saved": self._saved}
+    @property
+    def _state(self) -> ReconstructionState:
+        if self._failure:
+            return ReconstructionState.FAILED
+        if self._finished:
+            return ReconstructionState.DONE
         if self._training:
-            progress = self._progress
-            if progress is None:
-                return OK, "preparing views", values
+            return ReconstructionState.PREPARING if self._progress is None else ReconstructionState.TRAINING
+        return ReconstructionState.COLLECTING if self._frames else ReconstructionState.WAITING
+
+    def status(self) -> tuple[int, str, dict[str, Any]]:
+        """Level, message and values: counts of views and of images that were left out, and the progress of the training."""
+        dropped, state, progress = self._synchronizer.dropped, self._state, self._progress
+        counts = {f"images {reason}": count for reason, count in dropped.items()}
+        values = {STATE: state, "views": len(self._frames), **counts, "saved": self._saved}
+        if state is ReconstructionState.PREPARING:
+            return OK, "preparing views", values
+        if state is ReconstructionState.TRAINING:
             values |= {"iteration": progress.iteration, "iterations": progress.iterations}
             values |= {"loss": f"{progress.loss:.4f}", "gaussians": progress.gaussians}
             return OK, f"training, iteration {progress.iteration} of {progress.iterations}", values
-        if self._failure:
+        if state is ReconstructionState.FAILED:
             return ERROR, self._failure, values
-        if self._finished:
+        if state is ReconstructionState.DONE:
             return OK, f"finished, model saved in {self._saved}", values
         if self._file is not None and not self._frames and not any(dropped.values()):
             values["gaussians"] = len(self._published)

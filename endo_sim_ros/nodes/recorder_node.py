@@ -7,6 +7,7 @@ import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -16,7 +17,7 @@ from rich.text import Text
 from endo_sim_ros import messages
 from endo_sim_ros.core.config import ConfigError, StageConfig
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.messages import Topic
+from endo_sim_ros.messages import STATE, RecorderState, Topic
 from endo_sim_ros.nodes.base import ERROR, OK, EndoNode, arm_names, quality, run, sentence
 from endo_sim_ros.nodes.transport import prepare_transport
 from endo_sim_ros.sequences.bag import BagWriter, canonical_cdr
@@ -112,8 +113,10 @@ class RecorderNode(EndoNode):
         written = f"{self._written} messages of {len(self._heard)} topics"
         return f"{self._config.bag}: {written}, {self._bytes / 1e6:.1f} MB{dropped}"
 
-    def status(self):
-        values = {"bag": self._config.bag, "messages": self._written, "dropped": self._dropped}
+    def status(self) -> tuple[int, str, dict[str, Any]]:
+        """Level, message and values: the bag, and how many messages were written and dropped."""
+        state = RecorderState.FAILED if self.failure else RecorderState.RECORDING
+        values = {STATE: state, "bag": self._config.bag, "messages": self._written, "dropped": self._dropped}
         return (ERROR, self.failure, values) if self.failure else (OK, "recording", values)
 
     def destroy_node(self) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.config import Range, StageConfig
-from endo_sim_ros.messages import CameraInfo, ControlNodeCloud, MessageError
+from endo_sim_ros.messages import STATE, CameraInfo, ControlNodeCloud, MessageError, RenderingState
 from endo_sim_ros.nodes.base import ERROR, OK, STREAM_DEPTH, WARN, EndoNode, WorldConfig, run, sentence
 from endo_sim_ros.nodes.model_tracker import Bound, ShownTissue
 from endo_sim_ros.nodes.pacing import MOST_WAITING, Pacer
@@ -278,12 +278,23 @@ class RenderingNode(EndoNode):
 
     # ------------------------------------------------------------ diagnostics
 
-    def status(self):
+    @property
+    def _state(self) -> RenderingState:
+        if self._tissue.model is None or self._camera() is None:
+            return RenderingState.WAITING
+        if self._tissue.bound is not None:
+            return RenderingState.RENDERING
+        return RenderingState.FAILED if self._failure else RenderingState.BUILDING
+
+    def status(self) -> tuple[int, str, dict[str, Any]]:
+        """Level, message and values: the mode, and once there is something to show how the rendering goes."""
+        state = self._state
+        values = {STATE: state, "mode": self._options.mode}
         if self._tissue.model is None:
-            return WARN, "waiting for a model on gaussians", {}
-        if self._camera() is None:
-            return WARN, "waiting for a camera on ECM/measured_cp and endoscope/left/camera_info", {}
-        values = {
+            return WARN, "waiting for a model on gaussians", values
+        if state is RenderingState.WAITING:
+            return WARN, "waiting for a camera on ECM/measured_cp and endoscope/left/camera_info", values
+        values |= {
             "gaussians": len(self._tissue.model),
             "images": self._images,
             "milliseconds per image": f"{1e3 * self._seconds_per_image:.1f}",
@@ -291,6 +302,8 @@ class RenderingNode(EndoNode):
         }
         if self._failure:
             return ERROR, self._failure, values
+        if state is RenderingState.BUILDING:
+            return OK, "preparing the model", values
         if self._lockstep:
             waiting = f", {len(self._states)} states wait" if self._states else ""
             if self._states and self._lacks_pose(*self._states[0]):

@@ -8,7 +8,7 @@ import numpy as np
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera, invert_pose
 from endo_sim_ros.core.config import Range, StageConfig
-from endo_sim_ros.messages import ControlNodeCloud
+from endo_sim_ros.messages import STATE, ControlNodeCloud, ScriptedToolState
 from endo_sim_ros.nodes.base import OK, WARN, EndoNode, arm_names, run
 
 _FOLLOWED = 8  # nodes around the grasped point whose movement carries the tip
@@ -59,7 +59,7 @@ class ScriptedToolNode(EndoNode):
         self._near_stamp = 0
         self._tip = self._towards_camera = self._across = np.zeros(3)
         self._began: float | None = None
-        self._state = "waiting for the rendered depth"
+        self._state, self._missing = ScriptedToolState.WAITING, "waiting for the rendered depth"  # and what for
         self.subscribe(messages.RENDERED_POSE, self._on_camera, depth=1)
         self.subscribe(messages.RENDERED_INFO, self._on_info, depth=1)
         self.subscribe(messages.RENDERED_DEPTH, self._on_depth, depth=1)
@@ -95,14 +95,14 @@ class ScriptedToolNode(EndoNode):
         if any(part is None for part in (self._camera_pose, self._info, self._depth, self._nodes)):
             return False
         if self._wrench_pub.get_subscription_count() < self._config.listeners:
-            self._state = "waiting for somebody to feel the tool"
+            self._missing = "waiting for somebody to feel the tool"
             return False
         height, width = self._depth.shape
         camera = Camera(self._info.P[:, :3], width, height, self._camera_pose)
         row, column = min(int(self._config.v * height), height - 1), min(int(self._config.u * width), width - 1)
         seen = np.argwhere(self._depth > 0)
         if not len(seen):
-            self._state = "no tissue in the picture"
+            self._missing = "no tissue in the picture"
             return False
         row, column = seen[((seen - [row, column]) ** 2).sum(1).argmin()]  # the nearest pixel with tissue
         self._tip = camera.backproject(self._depth)[row, column]
@@ -132,13 +132,14 @@ class ScriptedToolNode(EndoNode):
         """Force on the tissue [3], N, world."""
         config = self._config
         if elapsed < config.pull:
-            self._state = "pulling"
+            self._state = ScriptedToolState.PULLING
             return config.force * elapsed / config.pull * self._direction(0.0)
         if elapsed < config.pull + config.swing:
-            self._state = "swinging"
+            self._state = ScriptedToolState.SWINGING
             angle = 2 * np.pi * (elapsed - config.pull) / config.swing
             return config.force * self._direction(angle)
-        self._state = "released" if elapsed < config.pull + config.swing + config.release else "finished"
+        released = elapsed < config.pull + config.swing + config.release
+        self._state = ScriptedToolState.RELEASED if released else ScriptedToolState.DONE
         return np.zeros(3)
 
     def _direction(self, angle: float) -> np.ndarray:
@@ -147,8 +148,12 @@ class ScriptedToolNode(EndoNode):
         direction = self._towards_camera + np.cos(angle) * up + np.sin(angle) * self._across
         return direction / np.linalg.norm(direction)
 
-    def status(self):
-        return (WARN if self._began is None else OK), self._state, {"tip": np.round(self._tip, 4).tolist()}
+    def status(self) -> tuple[int, str, dict[str, Any]]:
+        """Level, message and values: where the tool took hold, metres, world."""
+        values = {STATE: self._state, "tip": np.round(self._tip, 4).tolist()}
+        if self._state is ScriptedToolState.WAITING:
+            return WARN, self._missing, values
+        return OK, "finished" if self._state is ScriptedToolState.DONE else str(self._state), values
 
 
 def main() -> int:

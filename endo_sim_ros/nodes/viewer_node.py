@@ -13,7 +13,7 @@ from std_srvs.srv import SetBool, Trigger
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.config import StageConfig
-from endo_sim_ros.messages import ControlNodeCloud
+from endo_sim_ros.messages import STATE, ControlNodeCloud, NodeStatus, PhysicsState, ViewerState
 from endo_sim_ros.nodes.base import OK, WARN, EndoNode, WorldConfig, arm_names, run
 from endo_sim_ros.nodes.model_tracker import ShownTissue
 from endo_sim_ros.rendering import RenderingConfig
@@ -69,7 +69,7 @@ class ViewerNode(EndoNode):
         self._infos: dict[str, messages.CameraInfo] = {}  # by topic
         self._rendered: dict[str, tuple[int, Any]] = {}  # stamp and content of the newest rendered messages
         self._nodes: ControlNodeCloud | None = None
-        self._said: dict[str, tuple[float, str, dict[str, str]]] = {}  # when, sentence and values of each node
+        self._statuses: dict[str, tuple[float, NodeStatus]] = {}  # the newest of each node, and when it came
         self._asked, self._closed, self._lockstep = 0.0, False, False
         self._paused, self._paused_until = False, 0.0  # as a service said, which counts more than diagnostics before it
         self.viewer = Viewer(config, self)
@@ -162,15 +162,15 @@ class ViewerNode(EndoNode):
         self._arms[name].heard = time.monotonic()
 
     def _on_diagnostics(self, message: Any) -> None:
-        for name, _, text, values in messages.decode_diagnostics(message):
-            self._said[name] = time.monotonic(), text, values
-            if name == self._physics and time.monotonic() > self._paused_until:
-                self._paused = text == "paused"
-                self._lockstep = text.startswith("in lockstep")
+        for status in messages.decode_diagnostics(message):
+            self._statuses[status.name] = time.monotonic(), status
+            if status.name == self._physics and time.monotonic() > self._paused_until:
+                self._paused = status.state(PhysicsState) is PhysicsState.PAUSED
+                self._lockstep = status.values.get("mode") == "lockstep"
 
     def _value(self, key: str, default: str) -> str:
-        """What physics last said about itself."""
-        return self._said.get(self._physics, (0.0, "", {}))[2].get(key, default)
+        """A value that physics last reported."""
+        return self._statuses[self._physics][1].values.get(key, default) if self._physics in self._statuses else default
 
     def _full_name(self, name: str) -> str:
         """The name of a node on /diagnostics."""
@@ -215,9 +215,9 @@ class ViewerNode(EndoNode):
             lines.append(f"{len(bound.renderer.model)} Gaussians, {count} nodes")
         lines.append(f"{self._value('simulated time', '0')} s, real time × {self._value('real-time factor', '0')}")
         for name in dict.fromkeys((self._options.physics_node, *_SHOWN)):
-            heard, sentence, _ = self._said.get(self._full_name(name), (0.0, "not heard yet", {}))
-            silent = " (silent)" if heard and now - heard > _SILENT else ""
-            lines.append(f"{name.lstrip('/')}: {sentence}{silent}")
+            heard, status = self._statuses.get(self._full_name(name), (now, None))
+            silent = " (silent)" if now - heard > _SILENT else ""
+            lines.append(f"{name.lstrip('/')}: {status.message if status else 'not heard yet'}{silent}")
         return lines
 
     def _ask_parameters(self) -> None:
@@ -284,15 +284,17 @@ class ViewerNode(EndoNode):
 
     # ------------------------------------------------------------- diagnostics
 
-    def status(self):
-        viewer = self.viewer
+    def status(self) -> tuple[int, str, dict[str, Any]]:
+        """Level, message and values: browsers, pictures per second, latency, and whether the mouse holds tissue."""
+        viewer, waiting = self.viewer, self._tissue.model is None
         values = {
+            STATE: ViewerState.WAITING if waiting else ViewerState.SHOWING,
             "browsers": len(viewer.browsers),
             "pictures per second": f"{viewer.pictures_per_second:.1f}",
             "milliseconds from mouse to picture": f"{1e3 * viewer.latency:.0f}",
             "holding": viewer.holding,
         }
-        if self._tissue.model is None:
+        if waiting:
             return WARN, f"waiting for a model on gaussians; the page is at {viewer.url}", values
         return OK, f"showing the tissue at {viewer.url}", values
 

@@ -170,7 +170,7 @@ def _frame(stamp: int, image: np.ndarray, info: CameraInfo, right_info: CameraIn
         )
     mask = None if "mask" not in parts else info.rectify(parts["mask"], nearest=True)
     if not info.rectified:
-        mask = info.seen if mask is None else np.minimum(mask, info.seen)
+        mask = info.valid if mask is None else np.minimum(mask, info.valid)
     return Frame(
         stamp_ns=stamp,
         image=info.rectify(image),

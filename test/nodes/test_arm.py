@@ -104,10 +104,10 @@ def crtk(monkeypatch):
     package.msg.OperatingState, package.msg.StringStamped = OperatingState, StringStamped
     monkeypatch.setitem(sys.modules, "crtk_msgs", package)
     monkeypatch.setitem(sys.modules, "crtk_msgs.msg", package.msg)
-    for cached in (messages._crtk_type, messages.ros_class):
+    for cached in (messages.crtk_type, messages.ros_class):
         cached.cache_clear()
     yield package.msg
-    for cached in (messages._crtk_type, messages.ros_class):
+    for cached in (messages.crtk_type, messages.ros_class):
         cached.cache_clear()
 
 

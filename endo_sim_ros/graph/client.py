@@ -1,0 +1,142 @@
+"""Clients of a running graph: one that hears what the nodes report, one that is a teleoperation stack, and tissue to touch."""
+
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from rclpy.executors import SingleThreadedExecutor
+
+from endo_sim_ros import messages
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.messages import NodeState, NodeStatus, Topic
+from endo_sim_ros.nodes.base import EndoNode
+from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
+
+ARM = "PSM1"
+WORLD = "world"
+PATIENCE = 60.0  # s that anything may take
+CHANGED = 60  # grey levels by which an image must differ to show that the tissue moved; creeping tissue differs by 1-5
+
+
+class Watcher(EndoNode):
+    """Hears what the nodes report on /diagnostics. ``statuses`` has the newest of each node, by full name."""
+
+    def __init__(self, name: str):
+        super().__init__(name)
+        self.statuses: dict[str, NodeStatus] = {}
+        self.subscribe(messages.DIAGNOSTICS, self._on_diagnostics)
+
+    def _on_diagnostics(self, message: messages.Message) -> None:
+        self.statuses.update((status.name, status) for status in messages.decode_diagnostics(message))
+
+    def in_state(self, node: str, state: NodeState) -> bool:
+        """Whether a node reports this state. A state that is missing or unknown is none."""
+        return node in self.statuses and self.statuses[node].state(type(state)) is state
+
+    def value(self, node: str, key: str, default: str = "") -> str:
+        """A value that a node reports, or a default."""
+        return self.statuses[node].values.get(key, default) if node in self.statuses else default
+
+    def renders_control_nodes(self) -> bool:
+        """Whether the renderer shows the tissue as the control nodes deform it."""
+        return self.value("rendering_node", "following control nodes") == "True"
+
+
+class Client(Watcher):
+    """A teleoperation stack: sends poses and wrenches of a tool, receives images and states."""
+
+    def __init__(self):
+        super().__init__("bench")
+        self.images: list[tuple[float, int, np.ndarray]] = []  # time of arrival s, stamp ns, pixels [H, W, 3]
+        self.states: list[tuple[float, int]] = []  # time of arrival s and stamp ns of control_nodes
+        self._newest: Any = None  # control_nodes
+        self._senders: dict[Topic, Any] = {}
+        self.subscribe(messages.RENDERED_IMAGE, self._on_image)
+        self.subscribe(messages.CONTROL_NODES, self._on_control_nodes)
+        self._spinner = SingleThreadedExecutor()
+        self._spinner.add_node(self)
+
+    def _on_image(self, message: messages.Message) -> None:
+        stamp = messages.stamp_to_ns(message.header.stamp)
+        self.images.append((time.perf_counter(), stamp, messages.decode_image(message)))
+
+    def _on_control_nodes(self, message: messages.Message) -> None:
+        self.states.append((time.perf_counter(), messages.stamp_to_ns(message.header.stamp)))
+        self._newest = message
+
+    @property
+    def model_stamp(self) -> int:
+        """Stamp of the model of the newest control nodes, ns."""
+        return messages.decode_control_nodes(self._newest).model_stamp_ns
+
+    def send(self, topic: Topic, message: messages.Message) -> None:
+        """Publish a message. The first on a topic waits for a subscriber.
+
+        Raises:
+            RuntimeError: If nobody subscribes.
+        """
+        if topic not in self._senders:
+            publisher = self._senders[topic] = self.publisher(topic)
+            self.until(publisher.get_subscription_count, f"a subscriber of {topic.name}")
+        self._senders[topic].publish(message)
+
+    def command(self, tip: np.ndarray, force: np.ndarray, stamp: int) -> None:
+        """Send the tip's position [3] (m) and the force on the tissue [3] (N), world, with a stamp in ns."""
+        pose = np.eye(4)
+        pose[:3, 3] = tip
+        self.send(messages.tool_pose(ARM), messages.encode_pose(pose, stamp, WORLD))
+        self.send(messages.tool_wrench(ARM), messages.encode_wrench(force, np.zeros(3), stamp, WORLD))
+
+    def until(self, done: Callable[[], Any], what: str, seconds: float = PATIENCE) -> None:
+        """Receive messages until a condition is true.
+
+        Raises:
+            RuntimeError: If that takes longer than some seconds; it names what was awaited.
+        """
+        deadline = time.monotonic() + seconds
+        while not done():
+            self._spinner.spin_once(timeout_sec=0.005)
+            if time.monotonic() > deadline:
+                raise RuntimeError(f"waited {seconds:.0f} s in vain for {what}; the nodes reported {self.statuses}")
+
+    def spin_until(self, moment: float) -> None:
+        """Receive messages until a time of ``time.perf_counter``, s."""
+        while (left := moment - time.perf_counter()) > 0:
+            self._spinner.spin_once(timeout_sec=left)
+
+    def number(self, node: str, key: str) -> float:
+        """A number that a node reports; not a number where it reports none."""
+        return float(self.value(node, key, "nan"))
+
+
+class Scene(NamedTuple):
+    """Tissue to touch, and the camera that sees it."""
+
+    model: GaussianModel
+    camera: Camera
+    tip: np.ndarray  # [3] m, world: tissue in the middle of the image
+
+    @property
+    def towards_camera(self) -> np.ndarray:
+        """Unit vector [3] from the tip to the camera, world."""
+        offset = self.camera.position - self.tip
+        return offset / np.linalg.norm(offset)
+
+
+def tissue(gaussians: int, width: int, height: int) -> Scene:
+    """The synthetic patient as so many Gaussians, in an image of this size in pixels."""
+    (frame,) = phantom_sequence(PhantomConfig(frames=1, width=width, height=height, stereo=False))
+    points, valid = frame.camera.backproject(frame.depth), frame.depth > 0
+    rng = np.random.default_rng(0)
+    chosen = rng.choice(np.flatnonzero(valid), gaussians, replace=gaussians > valid.sum())
+    radii = frame.depth.ravel()[chosen] / frame.camera.K[0, 0] * 0.5 * np.sqrt(valid.sum() / gaussians)
+    model = GaussianModel.from_points(
+        torch.from_numpy(points.reshape(-1, 3)[chosen]).float(),
+        torch.from_numpy(frame.image.reshape(-1, 3)[chosen] / 255.0).float(),
+        torch.from_numpy(radii).float(),
+        opacity=0.9,
+    )
+    return Scene(model, frame.camera, points[height // 2, width // 2])

@@ -1,0 +1,215 @@
+"""Point clouds: Gaussian models, control nodes and cut surfaces."""
+
+import dataclasses
+import zlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from endo_sim_ros.messages.errors import MessageError
+from endo_sim_ros.messages.headers import NANOSECONDS, make_header
+from endo_sim_ros.messages.topics import CONTROL_NODES, CUT_SURFACE, GAUSSIANS
+from endo_sim_ros.messages.types import Message, MessageTypes, ros_types
+
+if TYPE_CHECKING:  # it takes torch, which most users of this package do not need
+    from endo_sim_ros.core.gaussians import GaussianModel
+
+_POINT_FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # PointField.datatype
+_POINT_DATATYPES = {name: number for number, name in _POINT_FORMATS.items()}
+
+
+def decode_cloud(message: Message, topic: str) -> np.ndarray:
+    """Structured array [N] of a PointCloud2, by field name, whatever its offsets and byte order.
+
+    Raises:
+        MessageError: If rows are padded, or the layout and the data disagree.
+    """
+    order = ">" if message.is_bigendian else "<"
+    fields = [field for field in message.fields if field.datatype in _POINT_FORMATS]
+    count, data = message.width * message.height, np.frombuffer(message.data, np.uint8)
+    if any(field.offset + np.dtype(_POINT_FORMATS[field.datatype]).itemsize > message.point_step for field in fields):
+        raise MessageError(f"{topic}: a field's offset lies beyond the point step of {message.point_step} bytes")
+    if message.height > 1 and message.row_step != message.width * message.point_step:
+        raise MessageError(f"{topic}: clouds with padded rows are not supported (row step {message.row_step})")
+    if data.size < count * message.point_step:
+        raise MessageError(f"{topic}: the cloud is truncated: {data.size} bytes for {count} points of {message.point_step} bytes")
+    dtype = np.dtype(
+        {
+            "names": [field.name for field in fields],
+            "formats": [order + _POINT_FORMATS[field.datatype] for field in fields],
+            "offsets": [field.offset for field in fields],
+            "itemsize": max(message.point_step, 1),
+        }
+    )
+    return data[: count * message.point_step].view(dtype)
+
+
+def _columns(points: np.ndarray, names: tuple[str, ...] | str) -> np.ndarray:
+    """Fields of a structured array [N] as columns [N, len(names)] float32."""
+    return np.stack([points[name].astype(np.float32) for name in names], 1)
+
+
+def _encode_cloud(points: np.ndarray, stamp_ns: int, frame_id: str, types: MessageTypes | None) -> Message:
+    """PointCloud2 of a structured array [N]."""
+    types = types or ros_types()
+    fields = [
+        types.PointField(name=name, offset=offset, datatype=_POINT_DATATYPES[dtype.str[1:]], count=1)
+        for name, (dtype, offset) in ((name, points.dtype.fields[name][:2]) for name in points.dtype.names)
+    ]
+    return types.PointCloud2(
+        header=make_header(types, stamp_ns, frame_id),
+        height=1,
+        width=len(points),
+        fields=fields,
+        is_bigendian=False,
+        point_step=points.itemsize,
+        row_step=points.itemsize * len(points),
+        data=types.sequence(points.view(np.uint8).reshape(-1)),
+        is_dense=True,
+    )
+
+
+def encode_gaussians(model: "GaussianModel", stamp_ns: int, frame_id: str, types: MessageTypes | None = None) -> Message:
+    """PointCloud2 of a model: INRIA's field names (float32), packed `rgb`, and `light` where the model has one.
+
+    Args:
+        model: The model, metres, world.
+        stamp_ns: Time, nanoseconds. It identifies the model.
+        frame_id: The world frame.
+        types: Message classes to build; those of ROS by default.
+
+    Raises:
+        MessageError: If a model with a light has fewer Gaussians than the light has values.
+    """
+    from endo_sim_ros.core.gaussians import ply_fields, to_columns
+
+    r, g, b = (model.base_colors.detach().cpu().numpy() * 255 + 0.5).astype(np.uint32).T
+    columns, names = [to_columns(model), (r << 16 | g << 8 | b).view(np.float32)[:, None]], [*ply_fields(model.sh_degree), "rgb"]
+    if model.light is not None:
+        numbers = np.float32(dataclasses.astuple(model.light))
+        if len(model) < len(numbers):
+            raise MessageError(f"{GAUSSIANS.name}: a model with a light needs {len(numbers)} Gaussians, got {len(model)}")
+        columns.append(np.pad(numbers, (0, len(model) - len(numbers)))[:, None])
+        names.append("light")
+    points = np.concatenate(columns, 1)
+    return _encode_cloud(points.view([(name, "<f4") for name in names]).reshape(-1), stamp_ns, frame_id, types)
+
+
+def decode_gaussians(message: Message, topic: str = GAUSSIANS.name) -> "GaussianModel":
+    """Gaussian model of a PointCloud2, decoded by field name.
+
+    Raises:
+        MessageError: If the cloud is damaged or empty, a field is missing, or a value cannot be used.
+    """
+    from endo_sim_ros.core.gaussians import ModelError, from_columns
+    from endo_sim_ros.core.light import Light
+
+    points = decode_cloud(message, topic)
+    if not len(points):
+        raise MessageError(f"{topic}: the model is empty; reconstruct a scene first")
+    try:
+        model = from_columns({name: points[name] for name in points.dtype.names}, topic)
+        if "light" in points.dtype.names:
+            numbers = points["light"][: len(dataclasses.fields(Light))].tolist()
+            model = dataclasses.replace(model, light=Light(*numbers))
+        return model
+    except (ModelError, ValueError, TypeError) as error:
+        raise MessageError(str(error)) from error
+
+
+@dataclass(frozen=True)
+class ControlNodeCloud:
+    """State of the control nodes at one time."""
+
+    rest: np.ndarray  # [M, 3] float32, m, world
+    positions: np.ndarray  # [M, 3] float32, m, world
+    F: np.ndarray  # [M, 3, 3] float32, deformation gradient
+    model_stamp_ns: int  # stamp of the model that the nodes were sampled from
+    cut: int = 0  # number of the cut surface of this state, see `cut_number`; 0 = whole tissue
+
+
+_NODE_DTYPE = np.dtype(
+    [(name, "<f4") for name in ("x", "y", "z", "rest_x", "rest_y", "rest_z")]
+    + [(f"f_{row}{column}", "<f4") for row in range(3) for column in range(3)]
+    + [("model_sec", "<u4"), ("model_nanosec", "<u4"), ("cut", "<u4")]
+)
+
+
+def encode_control_nodes(state: ControlNodeCloud, stamp_ns: int, frame_id: str, types: MessageTypes | None = None) -> Message:
+    """PointCloud2 of a state: position, rest position, F row by row, stamp of the model, number of the cut surface.
+
+    Args:
+        state: The state.
+        stamp_ns: Its time, nanoseconds.
+        frame_id: The world frame.
+        types: Message classes to build; those of ROS by default.
+    """
+    points = np.empty(len(state.rest), _NODE_DTYPE)
+    floats = points.view(np.float32).reshape(len(points), -1)
+    floats[:, 0:3] = state.positions
+    floats[:, 3:6] = state.rest
+    floats[:, 6:15] = state.F.reshape(-1, 9)
+    points["model_sec"], points["model_nanosec"] = divmod(state.model_stamp_ns, NANOSECONDS)
+    points["cut"] = state.cut
+    return _encode_cloud(points, stamp_ns, frame_id, types)
+
+
+def decode_control_nodes(message: Message, topic: str = CONTROL_NODES.name) -> ControlNodeCloud:
+    """State of the control nodes of a PointCloud2, decoded by field name. Without the field `cut` the tissue is whole.
+
+    Raises:
+        MessageError: If the cloud is damaged or empty, a field is missing, or a number is not finite.
+    """
+    points = decode_cloud(message, topic)
+    names = points.dtype.names or ()
+    missing = [name for name in _NODE_DTYPE.names if name not in (*names, "cut")]
+    if missing:
+        raise MessageError(f"{topic}: missing field {', '.join(missing[:4])}; see control_nodes in msg_conventions.md")
+    if not len(points):
+        raise MessageError(f"{topic}: there are no control nodes")
+    state = ControlNodeCloud(
+        _columns(points, ("rest_x", "rest_y", "rest_z")),
+        _columns(points, "xyz"),
+        _columns(points, _NODE_DTYPE.names[6:15]).reshape(-1, 3, 3),
+        int(points["model_sec"][0]) * NANOSECONDS + int(points["model_nanosec"][0]),
+        int(points["cut"][0]) if "cut" in names else 0,
+    )
+    if not (np.isfinite(state.rest).all() and np.isfinite(state.positions).all() and np.isfinite(state.F).all()):
+        raise MessageError(f"{topic}: a control node is not finite; the state was ignored")
+    return state
+
+
+def cut_number(triangles: np.ndarray) -> int:
+    """Number of a cut surface: the CRC-32 of its corners [T, 3, 3] as little-endian float32. 0 = no cut."""
+    return zlib.crc32(np.ascontiguousarray(triangles, "<f4").tobytes()) if len(triangles) else 0
+
+
+def encode_cut_surface(triangles: np.ndarray, model_stamp_ns: int, frame_id: str, types: MessageTypes | None = None) -> Message:
+    """PointCloud2 of the triangles of all cuts, three points each.
+
+    Args:
+        triangles: Corners [T, 3, 3], metres, world, in the tissue at rest.
+        model_stamp_ns: Stamp of the model, nanoseconds.
+        frame_id: The world frame.
+        types: Message classes to build; those of ROS by default.
+    """
+    points = np.ascontiguousarray(triangles, "<f4").reshape(-1, 3)
+    return _encode_cloud(points.view([(name, "<f4") for name in "xyz"]).reshape(-1), model_stamp_ns, frame_id, types)
+
+
+def decode_cut_surface(message: Message, topic: str = CUT_SURFACE.name) -> np.ndarray:
+    """Triangles [T, 3, 3] float32 of all cuts, metres, world, in the tissue at rest.
+
+    Raises:
+        MessageError: If the points are not triangles, or a number is not finite.
+    """
+    points = decode_cloud(message, topic)
+    missing = [name for name in "xyz" if name not in (points.dtype.names or ())]
+    if missing or len(points) % 3:
+        lacking = f" without {', '.join(missing)}" if missing else ""
+        raise MessageError(f"{topic}: expected three points with x, y and z for each triangle, got {len(points)} points{lacking}")
+    triangles = _columns(points, "xyz").reshape(-1, 3, 3)
+    if not np.isfinite(triangles).all():
+        raise MessageError(f"{topic}: a corner is not finite; the cut was ignored")
+    return triangles

@@ -1,0 +1,52 @@
+"""Stamps and frames of headers, and the clock."""
+
+from collections.abc import Iterable
+
+from endo_sim_ros.messages.errors import MessageError
+from endo_sim_ros.messages.types import Message, MessageTypes, ros_types
+
+NANOSECONDS = 1_000_000_000  # in a second
+
+
+def stamp_to_ns(stamp: Message) -> int:
+    """Nanoseconds of a builtin_interfaces/Time."""
+    return stamp.sec * NANOSECONDS + stamp.nanosec
+
+
+def make_time(types: MessageTypes, stamp_ns: int) -> Message:
+    """builtin_interfaces/Time of a time in nanoseconds."""
+    sec, nanosec = divmod(int(stamp_ns), NANOSECONDS)
+    return types.Time(sec=sec, nanosec=nanosec)
+
+
+def make_header(types: MessageTypes, stamp_ns: int, frame_id: str) -> Message:
+    """std_msgs/Header of a time in nanoseconds and a frame."""
+    return types.Header(stamp=make_time(types, stamp_ns), frame_id=frame_id)
+
+
+def check_frame(message: Message, allowed: Iterable[str], topic: str) -> str:
+    """Return the frame of a message's header, without a leading slash.
+
+    Args:
+        message: The message.
+        allowed: Names of the frames that can be used.
+        topic: For the error.
+
+    Raises:
+        MessageError: If the frame is not among the allowed ones.
+    """
+    frame = message.header.frame_id.lstrip("/")
+    allowed = [name.lstrip("/") for name in allowed]
+    if frame not in allowed:
+        names = " or ".join(repr(name) for name in allowed)
+        raise MessageError(
+            f"{topic}: unknown frame {frame!r}; this graph knows {names} (set the parameter world_frame, name it in the"
+            " parameter frames, or republish in that frame)"
+        )
+    return frame
+
+
+def encode_clock(stamp_ns: int, types: MessageTypes | None = None) -> Message:
+    """Clock of a simulated time in nanoseconds."""
+    types = types or ros_types()
+    return types.Clock(clock=make_time(types, stamp_ns))

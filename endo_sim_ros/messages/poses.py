@@ -1,0 +1,90 @@
+"""Rigid poses, and the frames in which they are given."""
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from endo_sim_ros.core.cameras import make_pose, matrix_to_quat
+from endo_sim_ros.messages.errors import MessageError
+from endo_sim_ros.messages.headers import check_frame, make_header
+from endo_sim_ros.messages.topics import TRAINING_CAMERAS
+from endo_sim_ros.messages.types import Message, MessageTypes, ros_types
+
+
+def _decode_pose(pose: Message, topic: str) -> np.ndarray:
+    """Pose [4, 4] of a geometry_msgs/Pose."""
+    p, q = pose.position, pose.orientation
+    position, quat = np.array([p.x, p.y, p.z]), np.array([q.w, q.x, q.y, q.z])
+    if not (np.isfinite(position).all() and np.isfinite(quat).all()):
+        raise MessageError(f"{topic}: the pose is not finite (position {position}, quaternion wxyz {quat})")
+    norm = np.linalg.norm(quat)
+    if abs(norm - 1) > 0.01:
+        raise MessageError(f"{topic}: the orientation's quaternion has length {norm:.3g}, not 1; normalise it before publishing")
+    return make_pose(position, quat)
+
+
+def decode_pose(message: Message, frames: str | Mapping[str, np.ndarray], topic: str) -> np.ndarray:
+    """Pose [4, 4] of a PoseStamped, metres, in the world.
+
+    Args:
+        message: The message.
+        frames: Name of the world frame, or the poses [4, 4] of known frames in the world, by name.
+        topic: For errors.
+
+    Raises:
+        MessageError: If the frame is unknown, a number is not finite, or the quaternion's length is not 1 within 1 %.
+    """
+    frame = check_frame(message, (frames,) if isinstance(frames, str) else frames, topic)
+    pose = _decode_pose(message.pose, topic)
+    return pose if isinstance(frames, str) else frames[frame] @ pose
+
+
+def decode_poses(message: Message, topic: str = TRAINING_CAMERAS.name) -> np.ndarray:
+    """Poses [V, 4, 4] of a PoseArray, metres, in the frame of its header.
+
+    Raises:
+        MessageError: If a number is not finite, or a quaternion's length is not 1 within 1 %.
+    """
+    return np.array([_decode_pose(pose, topic) for pose in message.poses]).reshape(-1, 4, 4)
+
+
+def _encode_pose(types: MessageTypes, pose: np.ndarray) -> Message:
+    w, x, y, z = (float(value) for value in matrix_to_quat(pose[:3, :3]))
+    px, py, pz = (float(value) for value in pose[:3, 3])
+    return types.Pose(position=types.Point(x=px, y=py, z=pz), orientation=types.Quaternion(x=x, y=y, z=z, w=w))
+
+
+def encode_pose(pose: np.ndarray, stamp_ns: int, frame_id: str, types: MessageTypes | None = None) -> Message:
+    """PoseStamped of a rigid transform [4, 4], metres."""
+    types = types or ros_types()
+    return types.PoseStamped(header=make_header(types, stamp_ns, frame_id), pose=_encode_pose(types, pose))
+
+
+def encode_poses(poses: Iterable[np.ndarray], stamp_ns: int, frame_id: str, types: MessageTypes | None = None) -> Message:
+    """PoseArray of rigid transforms [4, 4], metres."""
+    types = types or ros_types()
+    return types.PoseArray(header=make_header(types, stamp_ns, frame_id), poses=[_encode_pose(types, pose) for pose in poses])
+
+
+def parse_frames(world_frame: str, frames: Iterable[str]) -> dict[str, np.ndarray]:
+    """Poses [4, 4] in the world of the world frame and of further frames, by name.
+
+    Args:
+        world_frame: Name of the world frame.
+        frames: Further frames, each as ``name x y z qx qy qz qw`` (metres, unit quaternion). Empty strings are skipped.
+
+    Raises:
+        ValueError: If a frame is not a name and a finite pose with a unit quaternion.
+    """
+    poses = {world_frame.lstrip("/"): np.eye(4)}
+    for text in filter(None, frames):
+        name, *numbers = text.split() or [""]
+        try:
+            x, y, z, qx, qy, qz, qw = map(float, numbers)
+        except ValueError:
+            raise ValueError(f"frames: {text!r} is not a name and seven numbers, as in 'PSM1_base 0.1 0 0 0 0 0 1'") from None
+        position, quat = np.array([x, y, z]), np.array([qw, qx, qy, qz])
+        if not np.isfinite(position).all() or not abs(np.linalg.norm(quat) - 1) < 0.01:
+            raise ValueError(f"frames: {text!r} has no finite position and unit quaternion (x y z qx qy qz qw)")
+        poses[name.lstrip("/")] = make_pose(position, quat)
+    return poses

@@ -1,0 +1,153 @@
+"""Wrenches, jaws, cuts, arm states, and the markers that show tools."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from endo_sim_ros.messages.errors import MessageError
+from endo_sim_ros.messages.headers import make_header
+from endo_sim_ros.messages.types import Message, MessageTypes, crtk_type, ros_class, ros_types
+
+
+def decode_wrench(message: Message, topic: str) -> tuple[np.ndarray, np.ndarray]:
+    """Force [3] (N) and torque [3] (N·m) of a WrenchStamped, in the axes of its frame.
+
+    Raises:
+        MessageError: If a number is not finite.
+    """
+    f, t = message.wrench.force, message.wrench.torque
+    force, torque = np.array([f.x, f.y, f.z]), np.array([t.x, t.y, t.z])
+    if not (np.isfinite(force).all() and np.isfinite(torque).all()):
+        raise MessageError(f"{topic}: the wrench is not finite (force {force}, torque {torque}); it was ignored")
+    return force, torque
+
+
+def encode_wrench(force: np.ndarray, torque: np.ndarray, stamp_ns: int, frame_id: str, types: MessageTypes | None = None) -> Message:
+    """WrenchStamped of a force [3] (N) and a torque [3] (N·m), in the axes of the frame."""
+    types = types or ros_types()
+    vector = lambda v: types.Vector3(x=float(v[0]), y=float(v[1]), z=float(v[2]))  # noqa: E731
+    wrench = types.Wrench(force=vector(force), torque=vector(torque))
+    return types.WrenchStamped(header=make_header(types, stamp_ns, frame_id), wrench=wrench)
+
+
+def decode_jaw(message: Message, topic: str) -> float:
+    """Opening angle of a jaw, radians, of a JointState with one position.
+
+    Raises:
+        MessageError: If there is not one finite position.
+    """
+    positions = np.asarray(message.position, np.float64)
+    if positions.size != 1 or not np.isfinite(positions).all():
+        raise MessageError(f"{topic}: expected one finite jaw angle in position, got {positions.tolist()}")
+    return float(positions[0])
+
+
+def encode_jaw(angle: float, stamp_ns: int, types: MessageTypes | None = None) -> Message:
+    """JointState of a jaw's opening angle, radians."""
+    types = types or ros_types()
+    empty = types.sequence(np.zeros(0))
+    return types.JointState(
+        header=make_header(types, stamp_ns, ""),
+        name=["jaw"],
+        position=types.sequence(np.array([angle], np.float64)),
+        velocity=empty,
+        effort=empty,
+    )
+
+
+def decode_cut(message: Message, topic: str) -> bool:
+    """Whether the first button of a Joy is pressed: the edge of the tool cuts.
+
+    Raises:
+        MessageError: If there is no button.
+    """
+    if not len(message.buttons):
+        raise MessageError(f"{topic}: expected a button, 1 = cuts, got none")
+    return bool(message.buttons[0])
+
+
+def encode_cut(cutting: bool, stamp_ns: int, types: MessageTypes | None = None) -> Message:
+    """Joy with one button, pressed while the edge of a tool cuts."""
+    types = types or ros_types()
+    return types.Joy(
+        header=make_header(types, stamp_ns, ""),
+        axes=types.sequence(np.zeros(0, np.float32)),
+        buttons=types.sequence(np.array([cutting], np.int32)),
+    )
+
+
+def encode_operating_state(state: str, homed: bool, busy: bool, stamp_ns: int) -> Message:
+    """CRTK OperatingState. Without crtk_msgs it is a String of the state, followed by `` BUSY`` during a move."""
+    kind = ros_class(crtk_type("OperatingState"))
+    if kind.__name__ == "String":
+        return kind(data=f"{state} BUSY" if busy else state)
+    return kind(header=make_header(ros_types(), stamp_ns, ""), state=state, is_homed=homed, is_busy=busy)
+
+
+def decode_state_command(message: Message) -> str:
+    """Command in a CRTK StringStamped or a String."""
+    return (message.data if hasattr(message, "data") else message.string).strip()
+
+
+@dataclass(frozen=True)
+class ToolDisplay:
+    """What `encode_tool_markers` shows of one tool, in world axes."""
+
+    arm: str
+    tip: np.ndarray  # [3] m
+    force: np.ndarray  # [3] N, on the tissue
+    reaction: np.ndarray  # [3] N, on the tool
+    held: np.ndarray  # [K, 3] m, control nodes in the tool's grasp
+
+
+METRES_PER_NEWTON = 0.01  # length of the arrows
+_MARKER_RADIUS = 0.0015  # m
+_SPHERE, _ARROW, _POINTS = 2, 0, 8  # Marker.type
+_ADD, _DELETE = 0, 2  # Marker.action
+
+
+def encode_tool_markers(tools: Iterable[ToolDisplay], stamp_ns: int, frame_id: str, types: MessageTypes | None = None) -> Message:
+    """MarkerArray for RViz and Foxglove. The namespace of a marker is its arm.
+
+    Ids of each arm: 0 the tip, 1 the force on the tissue, 2 the reaction, 3 the held control nodes. Arrows are 1 cm per newton.
+    A marker with nothing to show is deleted.
+    """
+    types = types or ros_types()
+    point = lambda p: types.Point(x=float(p[0]), y=float(p[1]), z=float(p[2]))  # noqa: E731
+    markers = []
+
+    def add(tool: ToolDisplay, kind: int, points: list, size: tuple, color: tuple, visible: bool) -> None:
+        position = tool.tip if kind == _SPHERE else np.zeros(3)
+        orientation = types.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
+        marker = types.Marker(
+            header=make_header(types, stamp_ns, frame_id),
+            ns=tool.arm,
+            id=len(markers) % 4,
+            type=kind,
+            action=_ADD if visible else _DELETE,
+            pose=types.Pose(position=point(position), orientation=orientation),
+            scale=types.Vector3(**dict(zip("xyz", size))),
+            color=types.ColorRGBA(**dict(zip("rgba", color))),
+            lifetime=types.Duration(sec=0, nanosec=0),
+            frame_locked=False,
+            points=[point(p) for p in points],
+            colors=[],
+            texture_resource="",
+            texture=types.CompressedImage(header=make_header(types, 0, ""), format="", data=types.sequence(np.zeros(0, np.uint8))),
+            uv_coordinates=[],
+            text="",
+            mesh_resource="",
+            mesh_file=types.MeshFile(filename="", data=types.sequence(np.zeros(0, np.uint8))),
+            mesh_use_embedded_materials=False,
+        )
+        markers.append(marker)
+
+    r = _MARKER_RADIUS
+    for tool in tools:
+        add(tool, _SPHERE, [], (2 * r, 2 * r, 2 * r), (0.9, 0.9, 0.9, 1.0), True)
+        for vector, color in ((tool.force, (1.0, 0.55, 0.1, 1.0)), (tool.reaction, (0.2, 0.6, 1.0, 1.0))):
+            end = tool.tip + METRES_PER_NEWTON * vector
+            add(tool, _ARROW, [tool.tip, end], (r / 2, r, 2 * r), color, bool(np.any(vector)))
+        add(tool, _POINTS, list(tool.held), (r, r, 0.0), (0.3, 1.0, 0.4, 1.0), len(tool.held) > 0)
+    return types.MarkerArray(markers=markers)

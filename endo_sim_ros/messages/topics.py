@@ -1,0 +1,119 @@
+"""Topics of the contract: name, type and quality of service of each, as in msg_conventions.md."""
+
+from typing import NamedTuple
+
+from endo_sim_ros.messages.types import crtk_type
+
+
+class Topic(NamedTuple):
+    """A topic: relative name, full name of the message type, and quality of service (``stream`` or ``latched``)."""
+
+    name: str
+    type: str
+    qos: str = "stream"
+
+
+LEFT_IMAGE = Topic("endoscope/left/image_raw", "sensor_msgs/msg/Image")
+LEFT_COMPRESSED = Topic("endoscope/left/image_raw/compressed", "sensor_msgs/msg/CompressedImage")
+LEFT_INFO = Topic("endoscope/left/camera_info", "sensor_msgs/msg/CameraInfo")
+RIGHT_IMAGE = Topic("endoscope/right/image_raw", "sensor_msgs/msg/Image")
+RIGHT_COMPRESSED = Topic("endoscope/right/image_raw/compressed", "sensor_msgs/msg/CompressedImage")
+RIGHT_INFO = Topic("endoscope/right/camera_info", "sensor_msgs/msg/CameraInfo")
+DEPTH = Topic("endoscope/left/depth", "sensor_msgs/msg/Image")
+MASK = Topic("endoscope/left/mask", "sensor_msgs/msg/Image")
+CAMERA_POSE = Topic("ECM/measured_cp", "geometry_msgs/msg/PoseStamped")
+
+GAUSSIANS = Topic("gaussians", "sensor_msgs/msg/PointCloud2", "latched")
+TRAINING_CAMERAS = Topic("training_cameras", "geometry_msgs/msg/PoseArray", "latched")
+TRAINING_CAMERA_INFO = Topic("training_camera_info", "sensor_msgs/msg/CameraInfo", "latched")
+CONTROL_NODES = Topic("control_nodes", "sensor_msgs/msg/PointCloud2")
+CUT_SURFACE = Topic("cut_surface", "sensor_msgs/msg/PointCloud2", "latched")
+RENDERED_IMAGE = Topic("rendered/image_raw", "sensor_msgs/msg/Image")
+RENDERED_INFO = Topic("rendered/camera_info", "sensor_msgs/msg/CameraInfo")
+RENDERED_POSE = Topic("rendered/camera_pose", "geometry_msgs/msg/PoseStamped")
+RENDERED_DEPTH = Topic("rendered/depth/image", "sensor_msgs/msg/Image")
+TOOL_MARKERS = Topic("tool_markers", "visualization_msgs/msg/MarkerArray")
+DIAGNOSTICS = Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
+CLOCK = Topic("/clock", "rosgraph_msgs/msg/Clock")
+
+
+def tool_pose(arm: str) -> Topic:
+    """Measured pose of an arm's tip."""
+    return Topic(f"{arm}/measured_cp", "geometry_msgs/msg/PoseStamped")
+
+
+def tool_pose_command(arm: str) -> Topic:
+    """Commanded pose of an arm's tip, reached at once."""
+    return Topic(f"{arm}/servo_cp", "geometry_msgs/msg/PoseStamped")
+
+
+def tool_move(arm: str) -> Topic:
+    """Goal to which an arm's tip moves."""
+    return Topic(f"{arm}/move_cp", "geometry_msgs/msg/PoseStamped")
+
+
+def tool_setpoint(arm: str) -> Topic:
+    """Current setpoint of an arm's tip."""
+    return Topic(f"{arm}/setpoint_cp", "geometry_msgs/msg/PoseStamped")
+
+
+def tool_wrench(arm: str) -> Topic:
+    """Commanded wrench, tool on tissue."""
+    return Topic(f"{arm}/body/servo_cf", "geometry_msgs/msg/WrenchStamped")
+
+
+def tool_reaction(arm: str) -> Topic:
+    """Measured wrench, tissue on tool."""
+    return Topic(f"{arm}/body/measured_cf", "geometry_msgs/msg/WrenchStamped")
+
+
+def tool_jaw(arm: str) -> Topic:
+    """Commanded angle of an arm's jaw, reached at once."""
+    return Topic(f"{arm}/jaw/servo_jp", "sensor_msgs/msg/JointState")
+
+
+def tool_jaw_move(arm: str) -> Topic:
+    """Goal to which an arm's jaw moves."""
+    return Topic(f"{arm}/jaw/move_jp", "sensor_msgs/msg/JointState")
+
+
+def tool_jaw_state(arm: str) -> Topic:
+    """Measured angle of an arm's jaw."""
+    return Topic(f"{arm}/jaw/measured_js", "sensor_msgs/msg/JointState")
+
+
+def tool_jaw_setpoint(arm: str) -> Topic:
+    """Current setpoint of an arm's jaw."""
+    return Topic(f"{arm}/jaw/setpoint_js", "sensor_msgs/msg/JointState")
+
+
+def tool_cut(arm: str) -> Topic:
+    """Whether an arm's edge cuts."""
+    return Topic(f"{arm}/cut", "sensor_msgs/msg/Joy")
+
+
+def tool_state(arm: str) -> Topic:
+    """CRTK operating state of an arm."""
+    return Topic(f"{arm}/operating_state", crtk_type("OperatingState"), "latched")
+
+
+def tool_state_command(arm: str) -> Topic:
+    """CRTK state command to an arm."""
+    return Topic(f"{arm}/state_command", crtk_type("StringStamped"))
+
+
+RECORDING_TOPICS = (
+    LEFT_IMAGE, LEFT_COMPRESSED, LEFT_INFO, RIGHT_IMAGE, RIGHT_COMPRESSED, RIGHT_INFO, DEPTH, MASK, CAMERA_POSE,
+)  # fmt: skip
+MODEL_TOPICS = (GAUSSIANS, TRAINING_CAMERAS, TRAINING_CAMERA_INFO)
+TOOL_TOPICS = (  # of one arm; without its operating state, whose type is not installed everywhere
+    tool_pose, tool_pose_command, tool_move, tool_setpoint, tool_wrench, tool_jaw, tool_jaw_move, tool_jaw_state, tool_jaw_setpoint,
+    tool_cut, tool_reaction,
+)  # fmt: skip
+RENDERED_TOPICS = (RENDERED_INFO, RENDERED_POSE, RENDERED_DEPTH, RENDERED_IMAGE)
+
+
+def all_topics(arms: tuple[str, ...] = ("PSM1",)) -> tuple[Topic, ...]:
+    """Every topic of the contract that is recorded, for the given arms."""
+    tools = tuple(make(arm) for arm in arms for make in TOOL_TOPICS)
+    return RECORDING_TOPICS + MODEL_TOPICS + (CONTROL_NODES, CUT_SURFACE) + RENDERED_TOPICS + tools + (TOOL_MARKERS, DIAGNOSTICS, CLOCK)

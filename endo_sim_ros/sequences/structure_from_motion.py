@@ -14,7 +14,7 @@ import numpy as np
 
 from endo_sim_ros.core.cameras import invert_pose
 from endo_sim_ros.core.frames import Frame, SequenceError
-from endo_sim_ros.sequences.recordings import Recording
+from endo_sim_ros.sequences.recording import Recording
 
 logger = logging.getLogger(__name__)
 

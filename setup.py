@@ -25,6 +25,7 @@ setup(
     install_requires=[
         *ROS,
         "av",
+        "mcap>=1.2",
         "numpy",
         "opencv-python-headless",
         "pycolmap",
@@ -46,7 +47,7 @@ setup(
         "viewer": ["viser>=1.1"],  # `endo-sim view`, viewer_node
         "report": ["matplotlib"],  # `endo-sim report`, `endo-sim plot`, plots of `endo-sim evaluate`
         "test": [
-            *("gaussforge", "gymnasium", "hypothesis", "matplotlib", "mcap", "mcap-ros2-support", "plyfile", "pyarrow", "pytest"),
+            *("gaussforge", "gymnasium", "hypothesis", "matplotlib", "mcap-ros2-support", "plyfile", "pyarrow", "pytest"),
             *("pytest-xdist", "ruff", "torchmetrics", "viser>=1.1"),
         ],
     },

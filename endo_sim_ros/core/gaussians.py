@@ -210,8 +210,10 @@ def save_ply(model: GaussianModel, path: str | Path) -> None:
         lines += [f"element {name} {len(array)}", *(f"property {kind} {field}" for field in fields)]
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".part")
-    header = "\n".join([*lines, "end_header", ""]).encode()
-    partial.write_bytes(header + b"".join(array.tobytes() for *_, array in elements))
+    with partial.open("wb") as file:
+        file.write("\n".join([*lines, "end_header", ""]).encode())
+        for *_, array in elements:
+            file.write(np.ascontiguousarray(array).data)
     partial.replace(path)
 
 

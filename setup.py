@@ -26,12 +26,13 @@ setup(
     install_requires=[
         *ROS,
         "av>=12",
+        "mcap>=1.2",
         "numpy>=1.26",
         "opencv-python-headless>=4.9",
         "pycolmap>=3.10",
         "pyyaml>=6",
         "rich>=13.4",
-        "rosbags>=0.11,<0.12",  # private parts of its mcap reader: endo_sim_ros/sequences/bag_private.py
+        "rosbags>=0.11,<0.12",
         "scipy>=1.11",
         "tifffile>=2023.7.10",
         "torch>=2.4",
@@ -47,7 +48,7 @@ setup(
         "viewer": ["viser>=1.1"],  # `endo-sim view`, viewer_node
         "report": ["matplotlib"],  # `endo-sim report`, `endo-sim plot`, plots of `endo-sim evaluate`
         "test": [
-            *("gaussforge", "gymnasium", "hypothesis", "matplotlib", "mcap", "mcap-ros2-support", "plyfile", "pyarrow", "pytest"),
+            *("gaussforge", "gymnasium", "hypothesis", "matplotlib", "mcap-ros2-support", "plyfile", "pyarrow", "pytest"),
             *("pytest-xdist", "ruff", "torchmetrics", "viser>=1.1"),
         ],
     },

@@ -16,16 +16,16 @@ import numpy as np
 import torch
 import warp as wp
 from rich.progress import Progress
-from scipy.spatial.transform import Rotation
 
 from endo_sim_ros.core.cameras import Camera, load_cameras, look_at
 from endo_sim_ros.core.device import pick_device
-from endo_sim_ros.core.gaussians import SH_C0, GaussianModel, load_ply
+from endo_sim_ros.core.gaussians import GaussianModel, load_ply
 from endo_sim_ros.evaluation.measurement import Row, machine, median_seconds, milliseconds, peak_megabytes, report, short
 from endo_sim_ros.physics import ControlNodes, MpmSolver, PhysicsConfig, Skinning, TissueBatch, TissueSimulation, build_control_nodes
 from endo_sim_ros.physics.tools import Tools
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
-from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_camera, render_phantom
+from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_camera
+from endo_sim_ros.sequences.phantom_model import phantom_model
 
 PLAIN = "plain Warp kernels"  # ours for GPUs, on a CPU: the same maths without vectors
 DENSE = "dense"
@@ -109,29 +109,10 @@ def _stages(
 
 # ---------------------------------------------------------------- scenes
 
-_STEEPEST = 4.0  # pixels that a Gaussian of the synthetic patient may span; beyond it lies another surface
-
 
 def phantom_scene(count: int, width: int) -> Scene:
     """About `count` Gaussians on what an endoscope sees of the synthetic patient, in an image of a width in pixels."""
-    camera = phantom_camera(PhantomConfig(width=width, height=round(0.8 * width)))
-    columns = max(round(math.sqrt(1.25 * count)), 2)
-    grid = camera.resized(columns, max(round(count / columns), 2))
-    image, depth = render_phantom(PhantomConfig(), grid)
-    seen = depth > 0
-    points, pixel = grid.backproject(depth), depth[..., None] / grid.K[0, 0]  # [H, W, 3] m, [H, W, 1] m
-    # Ellipses that reach their neighbours, also where the surface is steep.
-    right, down = np.gradient(points, axis=1), np.gradient(points, axis=0)
-    x = right / np.linalg.norm(right, axis=2, keepdims=True).clip(1e-12)
-    z = np.cross(x, down)
-    z /= np.linalg.norm(z, axis=2, keepdims=True).clip(1e-12)
-    axes = np.stack([x, np.cross(z, x), z], 3)  # [H, W, 3, 3]
-    sizes = [np.abs((axes[..., i] * side).sum(2, keepdims=True)) for i, side in enumerate((right, down))]
-    sizes = np.concatenate([*(size.clip(pixel, _STEEPEST * pixel) for size in sizes), 0.3 * pixel], 2)
-    quats = np.roll(Rotation.from_matrix(axes[seen]).as_quat(), 1, axis=1)  # wxyz
-    colors = (image[seen] / 255 - 0.5) / SH_C0
-    arrays = points[seen], quats, np.log(0.7 * sizes[seen]), np.full(seen.sum(), 2.2), colors[:, None]  # opacity 0.9
-    return _seen(GaussianModel(*[torch.from_numpy(array).float() for array in arrays]), camera)
+    return _seen(*phantom_model(count, width))
 
 
 def load_scene(path: Path, width: int) -> Scene:

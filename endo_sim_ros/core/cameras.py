@@ -4,12 +4,16 @@ Conventions: optical frames (x right, y down, z forward), poses are camera-to-wo
 quaternions are wxyz. Pixel (0, 0) has its centre at (0.5, 0.5), so that scaling an image scales its intrinsics.
 """
 
+from __future__ import annotations
+
 import dataclasses
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 _MOST_BYTES = 64_000_000  # of a file of cameras; one takes 600
 _LONGEST_SIDE = 65_535  # pixels
@@ -57,11 +61,11 @@ class Camera:
         """Optical centre in the world [3], metres."""
         return self.pose[:3, 3]
 
-    def at(self, pose: np.ndarray) -> "Camera":
-        """The same camera at another camera-to-world pose."""
+    def at(self, pose: np.ndarray) -> Camera:
+        """The same camera at another camera-to-world pose [4, 4], metres."""
         return dataclasses.replace(self, pose=pose)
 
-    def resized(self, width: int, height: int) -> "Camera":
+    def resized(self, width: int, height: int) -> Camera:
         """The camera that sees the same field of view in an image of width × height pixels."""
         scale = np.diag([width / self.width, height / self.height, 1.0])
         return dataclasses.replace(self, K=scale @ self.K, width=width, height=height)
@@ -100,7 +104,7 @@ def invert_pose(pose: np.ndarray) -> np.ndarray:
     return inverse
 
 
-def quat_to_matrix(quat: np.ndarray) -> np.ndarray:
+def quat_to_matrix(quat: ArrayLike) -> np.ndarray:
     """Rotation matrices [..., 3, 3] of quaternions wxyz [..., 4], which need not be normalised."""
     quat = np.asarray(quat, np.float64)
     w, x, y, z = np.moveaxis(quat / np.linalg.norm(quat, axis=-1, keepdims=True), -1, 0)
@@ -114,7 +118,7 @@ def quat_to_matrix(quat: np.ndarray) -> np.ndarray:
     ).reshape(quat.shape[:-1] + (3, 3))  # fmt: skip
 
 
-def matrix_to_quat(matrix: np.ndarray) -> np.ndarray:
+def matrix_to_quat(matrix: ArrayLike) -> np.ndarray:
     """Quaternion wxyz [4] with w >= 0 of a rotation matrix [3, 3] (Bar-Itzhack: exact for rotations, nearest otherwise)."""
     m = np.asarray(matrix, np.float64)
     K = np.array(
@@ -130,17 +134,17 @@ def matrix_to_quat(matrix: np.ndarray) -> np.ndarray:
     return -quat if w < 0 else quat
 
 
-def make_pose(position: np.ndarray, quat: np.ndarray) -> np.ndarray:
-    """Rigid transform [4, 4] from a position [3] and a quaternion wxyz [4]."""
+def make_pose(position: ArrayLike, quat: ArrayLike) -> np.ndarray:
+    """Rigid transform [4, 4] of a position [3], metres, and a quaternion wxyz [4], which need not be normalised."""
     pose = np.eye(4)
     pose[:3, :3] = quat_to_matrix(quat)
     pose[:3, 3] = position
     return pose
 
 
-def look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray = (0.0, -1.0, 0.0)) -> np.ndarray:
+def look_at(position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, -1.0, 0.0)) -> np.ndarray:
     """Camera-to-world pose [4, 4] at a position [3] whose optical axis passes through a target [3]."""
-    z = np.asarray(target, np.float64) - position
+    z = np.asarray(target, np.float64) - np.asarray(position, np.float64)
     z /= np.linalg.norm(z)
     x = np.cross(-np.asarray(up, np.float64), z)
     x /= np.linalg.norm(x)
@@ -151,7 +155,7 @@ def look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray = (0.0, -1.
 
 
 def slerp(q1: np.ndarray, q2: np.ndarray, alpha: float) -> np.ndarray:
-    """Spherical interpolation between unit quaternions wxyz [4] along the shorter arc."""
+    """Unit quaternion wxyz [4] at a fraction alpha of the shorter arc from one to another [4]."""
     q1, q2 = np.asarray(q1, np.float64), np.asarray(q2, np.float64)
     dot = float(q1 @ q2)
     if dot < 0:
@@ -164,12 +168,12 @@ def slerp(q1: np.ndarray, q2: np.ndarray, alpha: float) -> np.ndarray:
 
 
 def interpolate_pose(pose1: np.ndarray, pose2: np.ndarray, alpha: float) -> np.ndarray:
-    """Pose between two poses [4, 4]: slerp of rotations, lerp of translations (paper eq. 8)."""
+    """Pose [4, 4] at a fraction alpha of the way between two: slerp of rotations, lerp of translations (paper eq. 7)."""
     quat = slerp(matrix_to_quat(pose1[:3, :3]), matrix_to_quat(pose2[:3, :3]), alpha)
     return make_pose((1 - alpha) * pose1[:3, 3] + alpha * pose2[:3, 3], quat)
 
 
-def save_cameras(cameras: list[Camera], path: str | Path) -> None:
+def save_cameras(cameras: Sequence[Camera], path: str | Path) -> None:
     """Write cameras as JSON: a list of K, width, height and camera-to-world pose."""
     entries = [{"K": c.K.tolist(), "width": c.width, "height": c.height, "pose": c.pose.tolist()} for c in cameras]
     Path(path).write_text(json.dumps(entries, indent=1))

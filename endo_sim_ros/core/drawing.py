@@ -47,15 +47,15 @@ def color_depth(depth: np.ndarray, near: float | None = None, far: float | None 
     valid = depth > 0
     if not valid.any():
         return np.zeros((*depth.shape, 3), np.uint8)
-    near = np.percentile(depth[valid], 1) if near is None else near
-    far = np.percentile(depth[valid], 99) if far is None else far
-    scaled = np.clip((depth - near) / max(far - near, 1e-9), 0, 1)
+    low = float(np.percentile(depth[valid], 1)) if near is None else near
+    high = float(np.percentile(depth[valid], 99)) if far is None else far
+    scaled = np.clip((depth - low) / max(high - low, 1e-9), 0, 1)
     colors = cv2.applyColorMap((255 - scaled * 255).astype(np.uint8), cv2.COLORMAP_TURBO)
     return np.where(valid[..., None], cv2.cvtColor(colors, cv2.COLOR_BGR2RGB), 0).astype(np.uint8)
 
 
 def label(image: np.ndarray, text: str) -> np.ndarray:
-    """The image under a strip with a line of text."""
+    """The RGB image [H, W, 3] uint8 under a strip with a line of text."""
     height = max(image.shape[1] // 16, 18)
     strip = np.full((height, image.shape[1], 3), 24, np.uint8)
     scale = height / 34
@@ -67,7 +67,7 @@ def label(image: np.ndarray, text: str) -> np.ndarray:
 
 
 def sheet(pictures: list[tuple[str, np.ndarray]], columns: int = 3) -> np.ndarray:
-    """Labelled RGB pictures of one size in rows."""
+    """One picture of labelled RGB pictures [H, W, 3] uint8 in rows, all resized to the first."""
     height, width = pictures[0][1].shape[:2]
     cells = [label(cv2.resize(image, (width, height)), text) for text, image in pictures]
     cells += [np.zeros_like(cells[0])] * (-len(cells) % columns)
@@ -80,7 +80,11 @@ def slug(text: str) -> str:
 
 
 def write_png(path: str | Path, image: np.ndarray) -> None:
-    """Write an RGB image."""
+    """Write an RGB image [H, W, 3] uint8.
+
+    Raises:
+        OSError: If it cannot be written.
+    """
     if not cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)):
         raise OSError(f"{path}: the picture cannot be written; does the folder exist?")
 

@@ -47,4 +47,4 @@ class Frame:
     @property
     def tissue(self) -> np.ndarray:
         """Where there is tissue to be used [H, W], float32, 1 or 0."""
-        return np.ones(self.image.shape[:2], np.float32) if self.mask is None else np.float32(self.mask > 0)
+        return np.ones(self.image.shape[:2], np.float32) if self.mask is None else (self.mask > 0).astype(np.float32)

@@ -1,5 +1,7 @@
 """The Gaussian model (structure of arrays) and its PLY files, in the INRIA layout and in SuperSplat's compressed one."""
 
+from __future__ import annotations
+
 import dataclasses
 import re
 from dataclasses import dataclass
@@ -62,6 +64,7 @@ class GaussianModel:
 
     @property
     def sh_degree(self) -> int:
+        """Degree of the spherical harmonics, 0 to 3."""
         return int(round(self.sh.shape[1] ** 0.5)) - 1
 
     @property
@@ -103,18 +106,20 @@ class GaussianModel:
         """The five arrays by field name."""
         return {name: getattr(self, name) for name in ("means", "quats", "log_scales", "logit_opacities", "sh")}
 
-    def to(self, device: str | torch.device) -> "GaussianModel":
+    def to(self, device: str | torch.device) -> GaussianModel:
+        """The model on another device."""
         return dataclasses.replace(self, **{name: value.to(device) for name, value in self.tensors().items()})
 
-    def detach(self) -> "GaussianModel":
+    def detach(self) -> GaussianModel:
+        """The model without gradients."""
         return dataclasses.replace(self, **{name: value.detach() for name, value in self.tensors().items()})
 
-    def select(self, index: Tensor) -> "GaussianModel":
+    def select(self, index: Tensor | np.ndarray) -> GaussianModel:
         """The Gaussians at an index or boolean mask."""
         return dataclasses.replace(self, **{name: value[index] for name, value in self.tensors().items()})
 
     @staticmethod
-    def from_points(points: Tensor, colors: Tensor, scales: Tensor, opacity: float = 0.5, sh_degree: int = 0) -> "GaussianModel":
+    def from_points(points: Tensor, colors: Tensor, scales: Tensor, opacity: float = 0.5, sh_degree: int = 0) -> GaussianModel:
         """Isotropic Gaussians at points [N, 3] (m) with RGB colours [N, 3] in [0, 1] and standard deviations [N] (m)."""
         n = len(points)
         sh = points.new_zeros(n, (sh_degree + 1) ** 2, 3)
@@ -210,8 +215,10 @@ def save_ply(model: GaussianModel, path: str | Path) -> None:
         lines += [f"element {name} {len(array)}", *(f"property {kind} {field}" for field in fields)]
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".part")
-    header = "\n".join([*lines, "end_header", ""]).encode()
-    partial.write_bytes(header + b"".join(array.tobytes() for *_, array in elements))
+    with partial.open("wb") as file:
+        file.write("\n".join([*lines, "end_header", ""]).encode())
+        for *_, array in elements:
+            file.write(np.ascontiguousarray(array).data)
     partial.replace(path)
 
 
@@ -244,7 +251,8 @@ def _read_elements(file: BinaryIO, size: int) -> tuple[dict[str, dict[str, np.nd
     end = re.search(rb"\nend_header[ \t\r]*\n", head)
     if not head.startswith(b"ply") or end is None:
         raise ValueError(f"no PLY header within {_LONGEST_HEADER} bytes")
-    order, elements, light = "", {}, None
+    order, light, fields = "", None, []
+    elements: dict[str, tuple[int, list[tuple[str, str]]]] = {}
     for line in head[: end.start()].decode("ascii", "replace").splitlines()[1:]:
         match line.split():
             case ["format", layout, "1.0"] if layout in _ORDERS:
@@ -277,7 +285,7 @@ def _read_elements(file: BinaryIO, size: int) -> tuple[dict[str, dict[str, np.nd
 
 def _read_rows(file: BinaryIO, start: int, room: int, name: str, count: int, dtype: np.dtype, text: bool) -> np.ndarray:
     """Rows of an element as a structured array [count], from where they start, of so many bytes as there are."""
-    least = 2 * len(dtype) if text else dtype.itemsize  # bytes of a row; as text a digit and a blank, the last one optional
+    least = 2 * len(dtype.names or ()) if text else dtype.itemsize  # bytes of a row; as text a digit and a blank, the last one optional
     if not 0 <= count <= (room + text) // least:
         what = "vertices" if name == "vertex" else f"rows of {name}"
         raise ValueError(f"its header claims {count} {what} of {least} bytes or more, {room} bytes follow")

@@ -44,7 +44,7 @@ from endo_sim_ros.sequences.bag import read_bag
 from endo_sim_ros.sequences.folder import read_points
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 from endo_sim_ros.sequences.readers import open_sequence
-from endo_sim_ros.sequences.recordings import Recording, spread
+from endo_sim_ros.sequences.recording import Recording, spread
 
 log = logging.getLogger(__name__)
 

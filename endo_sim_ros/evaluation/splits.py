@@ -5,7 +5,8 @@ from typing import NamedTuple
 
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.reconstruction.priors.sources import right_camera
-from endo_sim_ros.sequences.recordings import lit_area, lit_now, spread
+from endo_sim_ros.sequences.masks import lit_area, lit_now
+from endo_sim_ros.sequences.recording import spread
 
 STEREO, TWO_VIEWS = "stereo", "two-views"
 _RATIO = r"([1-9]\d*):([1-9]\d*)"

@@ -95,9 +95,9 @@ def default_scene() -> Scene:
         return Scene(load_ply(path), (camera,))
     except ModelError:  # there is none yet, or it was damaged
         pass
-    from benchmarks.physics import phantom_scene
+    from endo_sim_ros.sequences.phantom_model import phantom_model
 
-    model = phantom_scene(24_000, whole.width).model
+    model, _ = phantom_model(24_000, whole.width)
     pixels, _ = camera.project(model.means.double().numpy())
     inside = ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(1)
     model = model.select(np.flatnonzero(inside))

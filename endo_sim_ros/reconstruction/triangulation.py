@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import map_in_threads
 from endo_sim_ros.core.frames import Frame
-from endo_sim_ros.sequences.recordings import spread
+from endo_sim_ros.sequences.recording import spread
 
 log = logging.getLogger(__name__)
 

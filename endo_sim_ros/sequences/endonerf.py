@@ -15,23 +15,11 @@ import numpy as np
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame, SequenceError
-from endo_sim_ros.sequences.recordings import (
-    DEFAULT_FPS,
-    Recording,
-    check_folder,
-    check_size,
-    intrinsic_matrix,
-    numbered_files,
-    read_depth,
-    read_gray,
-    read_image,
-    rigid,
-    select,
-    spread,
-    stamp_ns,
-    tissue_mask,
-    tool_is_white,
-)
+from endo_sim_ros.sequences.calibration_files import intrinsic_matrix
+from endo_sim_ros.sequences.images import check_size, image_size, numbered_files, read_depth, read_image
+from endo_sim_ros.sequences.masks import MaskFiles
+from endo_sim_ros.sequences.pose_files import rigid
+from endo_sim_ros.sequences.recording import DEFAULT_FPS, Recording, check_folder, select, stamp_ns
 
 logger = logging.getLogger(__name__)
 
@@ -77,15 +65,12 @@ def read_endonerf(
         )
     rows = dict(zip(sorted(images), table, strict=True))
     numbers = select(images, root, start, stop, step)
-    depths, masks = numbered_files(root / "depth"), numbered_files(root / "masks")
-    for name, files in (("depth", depths), ("masks", masks)):
+    depths, mask_files = numbered_files(root / "depth"), numbered_files(root / "masks")
+    for name, files in (("depth", depths), ("masks", mask_files)):
         lacking = [n for n in numbers if n not in files]
         if files and lacking:
             logger.warning("%s: %d of %d frames have no image there", root / name, len(lacking), len(numbers))
-    white_is_tool = False
-    if masks:
-        sample = (read_gray(masks[n]) for n in spread(sorted(masks), 20))
-        white_is_tool = tool_is_white(sample, root / "masks", mask_polarity)
+    masks = MaskFiles(mask_files, root / "masks", mask_polarity)
     pose_scale = depth_scale if pose_scale is None else pose_scale
 
     def depth_of(number: int, size: tuple[int, int]) -> np.ndarray | None:
@@ -93,22 +78,17 @@ def read_endonerf(
             return None
         return check_size(read_depth(depths[number], depth_scale), size, depths[number])
 
-    def mask_of(number: int, size: tuple[int, int]) -> np.ndarray | None:
-        if number not in masks:
-            return None
-        return tissue_mask(read_gray(masks[number]), white_is_tool=white_is_tool, size=size)
-
     def frames() -> Iterator[Frame]:
         for number in numbers:
             image = read_image(images[number])
-            size = image.shape[1::-1]
+            size = image_size(image)
             source = f"{root / POSES_FILE}: row of frame {number}"
             yield Frame(
                 stamp_ns=stamp_ns(number, fps or DEFAULT_FPS),
                 image=image,
                 camera=_camera(rows[number], size, pose_scale, source),
                 depth=depth_of(number, size),
-                mask=mask_of(number, size),
+                mask=masks.of(number, size),
             )
 
     return Recording(frames, len(numbers))

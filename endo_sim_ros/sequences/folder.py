@@ -19,28 +19,11 @@ import numpy as np
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame, SequenceError
-from endo_sim_ros.sequences.recordings import (
-    DEFAULT_FPS,
-    Recording,
-    check_calibrated_size,
-    check_folder,
-    check_size,
-    intrinsic_matrix,
-    keep_posed,
-    lit_area,
-    lit_now,
-    numbered_files,
-    read_calibration,
-    read_depth,
-    read_gray,
-    read_image,
-    read_poses,
-    select,
-    spread,
-    stamp_ns,
-    tissue_mask,
-    tool_is_white,
-)
+from endo_sim_ros.sequences.calibration_files import check_calibrated_size, intrinsic_matrix, read_calibration
+from endo_sim_ros.sequences.images import check_size, image_size, numbered_files, read_depth, read_image
+from endo_sim_ros.sequences.masks import MaskFiles, lit_area, lit_now
+from endo_sim_ros.sequences.pose_files import read_poses
+from endo_sim_ros.sequences.recording import DEFAULT_FPS, Recording, check_folder, keep_posed, select, spread, stamp_ns
 from endo_sim_ros.sequences.rectification import Rectification
 from endo_sim_ros.sequences.structure_from_motion import with_estimated_poses
 
@@ -99,14 +82,11 @@ def read_folder(
     if missing:
         raise SequenceError(f"{root / 'right'}: the right image of {left[missing[0]].name} is missing")
 
-    size = read_image(left[numbers[0]]).shape[1::-1]
+    size = image_size(read_image(left[numbers[0]]))
     check_calibrated_size(calibration, size, root / CALIBRATION_FILE)
     rectification = Rectification.mono(K, calibration["distortion"], size)
-    masks, depths = numbered_files(root / "masks"), numbered_files(root / "depth")
-    white_is_tool = False
-    if masks:
-        sample = (read_gray(masks[n]) for n in spread(sorted(masks), 20))
-        white_is_tool = tool_is_white(sample, root / "masks", mask_polarity)
+    depths = numbered_files(root / "depth")
+    masks = MaskFiles(numbered_files(root / "masks"), root / "masks", mask_polarity)
 
     def image_of(file: Path) -> np.ndarray:
         return check_size(read_image(file), size, file)
@@ -118,8 +98,8 @@ def read_folder(
         for number in numbers:
             image, depth = image_of(left[number]), None
             mask = lit_now(lit, image)
-            if number in masks:
-                tissue = tissue_mask(read_gray(masks[number]), white_is_tool=white_is_tool, size=size)
+            tissue = masks.of(number, size)
+            if tissue is not None:
                 mask = cv2.bitwise_and(mask, tissue)
             if number in depths:
                 z = read_depth(depths[number], depth_scale)

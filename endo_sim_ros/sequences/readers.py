@@ -11,10 +11,10 @@ from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences import endonerf, folder, scared, stereomis
 from endo_sim_ros.sequences.endonerf import read_endonerf
 from endo_sim_ros.sequences.folder import read_folder
-from endo_sim_ros.sequences.recordings import VIDEO_SUFFIXES
 from endo_sim_ros.sequences.scared import read_scared
 from endo_sim_ros.sequences.stereomis import read_stereomis
 from endo_sim_ros.sequences.video import read_video
+from endo_sim_ros.sequences.video_files import VIDEO_SUFFIXES
 
 
 @dataclass(frozen=True)

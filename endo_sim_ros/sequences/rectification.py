@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.sequences.recordings import clean_depth
+from endo_sim_ros.sequences.images import clean_depth
 
 logger = logging.getLogger(__name__)
 

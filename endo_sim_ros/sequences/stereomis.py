@@ -11,34 +11,20 @@ P1/
 import configparser
 import csv
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame, SequenceError
-from endo_sim_ros.sequences.recordings import (
-    DEFAULT_FPS,
-    Recording,
-    Video,
-    check_folder,
-    check_size,
-    find_video,
-    keep_posed,
-    numbered_files,
-    read_gray,
-    read_image,
-    read_poses,
-    select,
-    split_stacked,
-    spread,
-    stamp_ns,
-    tissue_mask,
-    tool_is_white,
-)
+from endo_sim_ros.sequences.images import check_size, numbered_files, read_image
+from endo_sim_ros.sequences.masks import MaskFiles
+from endo_sim_ros.sequences.pose_files import read_poses
+from endo_sim_ros.sequences.recording import DEFAULT_FPS, Recording, check_folder, keep_posed, select, stamp_ns
 from endo_sim_ros.sequences.rectification import Rectification, StereoCalibration
 from endo_sim_ros.sequences.structure_from_motion import with_estimated_poses
+from endo_sim_ros.sequences.video_files import Video, find_video, split_stacked
 
 logger = logging.getLogger(__name__)
 
@@ -90,21 +76,17 @@ def read_stereomis(
     else:
         logger.warning("%s: no groundtruth.txt, so poses come from structure from motion", root)
 
-    masks = numbered_files(root / "masks", ending="l") or numbered_files(root / "masks")
-    mask_of = _nearest_masks(numbers, masks, max_mask_gap)
-    white_is_tool = False
-    if masks:
-        sample = (read_gray(masks[n]) for n in spread(sorted(masks), 20))
-        white_is_tool = tool_is_white(sample, root / "masks", mask_polarity)
+    mask_files = numbered_files(root / "masks", ending="l") or numbered_files(root / "masks")
+    masks = MaskFiles(mask_files, root / "masks", mask_polarity)
+    mask_of = _nearest_masks(numbers, mask_files, max_mask_gap)
+    if mask_files:
         bare = sum(n not in mask_of for n in numbers)
         if bare:
             logger.warning("%s: %d of %d frames have no mask; tools stay visible in them", root, bare, len(numbers))
 
     def frames() -> Iterator[Frame]:
         for number, left, right in images.read(numbers):
-            mask = None
-            if number in mask_of:
-                mask = tissue_mask(read_gray(mask_of[number]), white_is_tool=white_is_tool, size=images.size)
+            mask = masks.of(mask_of[number], images.size) if number in mask_of else None
             pose = np.eye(4) if poses is None else rectification.pose(poses[number])
             yield Frame(
                 stamp_ns=stamp_ns(number, fps),
@@ -217,12 +199,12 @@ def _in_ranges(number: int, ranges: list[tuple[int, int]]) -> bool:
     return any(first <= number <= last for first, last in ranges)
 
 
-def _nearest_masks(numbers: list[int], masks: dict[int, Path], max_gap: int) -> dict[int, Path]:
-    """For each frame its own mask, or the nearest within max_gap frames."""
+def _nearest_masks(numbers: list[int], masks: Iterable[int], max_gap: int) -> dict[int, int]:
+    """Number of the mask of each frame: its own, or the nearest within max_gap frames."""
     available = np.array(sorted(masks), np.int64)
     nearest = {}
     for number in numbers if len(available) else ():
         closest = int(available[np.argmin(np.abs(available - number))])
         if abs(closest - number) <= max_gap:
-            nearest[number] = masks[closest]
+            nearest[number] = closest
     return nearest

@@ -8,20 +8,19 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2  # before pycolmap, whose own image library would otherwise break cv2.imwrite
 import numpy as np
 
 from endo_sim_ros.core.cameras import invert_pose
 from endo_sim_ros.core.frames import Frame, SequenceError
-from endo_sim_ros.sequences.recordings import Recording
+from endo_sim_ros.sequences.images import image_size
+from endo_sim_ros.sequences.recording import Recording
 
 logger = logging.getLogger(__name__)
 
-GUESSED_MEDIAN_DEPTH = 0.1  # m, a usual working distance of a laparoscope
-EXHAUSTIVE_LIMIT = 60  # images; beyond, each is matched with its neighbours in time only
-PEAK_THRESHOLD = 0.002  # of SIFT; tissue has little contrast, and the usual 0.0067 finds a third of the features
-LONG_RUN = 300  # images, from which on a run takes tens of minutes
+_LONG_RUN = 300  # images, from which on a run takes tens of minutes and a warning says so
 
 
 @dataclass(frozen=True)
@@ -51,10 +50,13 @@ def estimate_poses(
     K: np.ndarray | None = None,
     *,
     masks: Iterable[np.ndarray | None] | None = None,
-    right_images: Iterable[np.ndarray] | None = None,
+    right_images: Iterable[np.ndarray | None] | None = None,
     baseline: float | None = None,
     scale: float | None = None,
     matching: str = "auto",
+    exhaustive_limit: int = 60,
+    peak_threshold: float = 0.002,
+    guessed_depth: float = 0.1,
     seed: int = 0,
     threads: int = -1,
 ) -> StructureFromMotion:
@@ -70,6 +72,10 @@ def estimate_poses(
         baseline: Distance from left to right camera, metres; makes the result metric.
         scale: Metres per unit of the reconstruction, as a last resort where no baseline is known.
         matching: `exhaustive` (all pairs), `sequential` (neighbours in time), or `auto` by the number of images.
+        exhaustive_limit: Images up to which `auto` matches all pairs, whose number grows with their square.
+        peak_threshold: Contrast of a SIFT feature; tissue has little, and COLMAP's 0.0067 finds a third of the features.
+        guessed_depth: Median depth of the points where neither baseline nor scale is known, metres; the default is a
+            usual working distance of a laparoscope.
         seed: For random sampling.
         threads: -1 uses all cores; 1 makes a run repeatable to the last bit.
 
@@ -90,12 +96,12 @@ def estimate_poses(
         count, size = _write_images(root, images, masks, right_images)
         if count < 2:
             raise SequenceError(f"structure from motion needs at least 2 images, got {count}; select more frames")
-        if count > LONG_RUN:
+        if count > _LONG_RUN:
             logger.warning("structure from motion on %d images takes long; a larger step would do as well", count)
         if matching == "auto":
-            matching = "exhaustive" if count <= EXHAUSTIVE_LIMIT else "sequential"
-        reconstruction = _run_colmap(root, K, size, baseline=baseline, matching=matching, seed=seed, threads=threads)
-    return _result(reconstruction, count, K, baseline=baseline, scale=scale)
+            matching = "exhaustive" if count <= exhaustive_limit else "sequential"
+        model = _run_colmap(root, K, size, baseline=baseline, matching=matching, peak_threshold=peak_threshold, seed=seed, threads=threads)
+    return _result(model, count, K, baseline=baseline, scale=scale, guessed_depth=guessed_depth)
 
 
 def with_estimated_poses(frames: Iterable[Frame], count: int, source: Path, *, scale: float | None = None, threads: int = -1) -> Recording:
@@ -135,15 +141,20 @@ def with_estimated_poses(frames: Iterable[Frame], count: int, source: Path, *, s
     return Recording(posed, count)
 
 
-def _write_images(root: Path, images, masks, right_images) -> tuple[int, tuple[int, int]]:
+def _write_images(
+    root: Path,
+    images: Iterable[np.ndarray],
+    masks: Iterable[np.ndarray | None] | None,
+    right_images: Iterable[np.ndarray | None] | None,
+) -> tuple[int, tuple[int, int]]:
     """Lay the images out as COLMAP reads them: `left/000000.png`, its mask `masks/left/000000.png.png`."""
     for folder in ("images/left", "images/right", "masks/left", "masks/right"):
         (root / folder).mkdir(parents=True)
     count, size, masked = 0, None, False
     absent = itertools.repeat(None)
     for image, mask, right in zip(images, masks or absent, right_images or absent, strict=False):
-        size = size or image.shape[1::-1]
-        if image.shape[1::-1] != size:
+        size = size or image_size(image)
+        if image_size(image) != size:
             raise SequenceError(f"image {count} is {image.shape[1]}×{image.shape[0]}, but the first one is {size[0]}×{size[1]}")
         name = f"{count:06d}.png"
         cv2.imwrite(str(root / "images/left" / name), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
@@ -162,7 +173,17 @@ def _write_images(root: Path, images, masks, right_images) -> tuple[int, tuple[i
     return count, size or (0, 0)
 
 
-def _run_colmap(root: Path, K: np.ndarray | None, size: tuple[int, int], *, baseline, matching: str, seed: int, threads: int):
+def _run_colmap(
+    root: Path,
+    K: np.ndarray | None,
+    size: tuple[int, int],
+    *,
+    baseline: float | None,
+    matching: str,
+    peak_threshold: float,
+    seed: int,
+    threads: int,
+) -> Any:
     """COLMAP's largest model of the images under root; with a baseline, left and right move as one rig."""
     import pycolmap  # noqa: PLC0415  (a heavy import that only this function needs)
 
@@ -178,7 +199,7 @@ def _run_colmap(root: Path, K: np.ndarray | None, size: tuple[int, int], *, base
         if (root / "masks").is_dir():
             reader.mask_path = root / "masks"
         extraction = pycolmap.FeatureExtractionOptions(num_threads=threads)
-        extraction.sift.peak_threshold = PEAK_THRESHOLD
+        extraction.sift.peak_threshold = peak_threshold
         pycolmap.extract_features(
             database, root / "images", camera_mode=pycolmap.CameraMode.PER_FOLDER,
             reader_options=reader, extraction_options=extraction, device=pycolmap.Device.cpu,
@@ -211,7 +232,7 @@ def _run_colmap(root: Path, K: np.ndarray | None, size: tuple[int, int], *, base
     return max(models.values(), key=lambda model: model.num_reg_images())
 
 
-def _tie_eyes(pycolmap, database: Path, baseline: float):
+def _tie_eyes(pycolmap: Any, database: Path, baseline: float) -> None:
     """Make each stereo pair one rigid body, which starts rectified and is refined as one for all pairs.
 
     Pairs placed one by one would drift, because the parallax between the eyes is only a degree or two.
@@ -228,8 +249,8 @@ def _tie_eyes(pycolmap, database: Path, baseline: float):
 
 
 @contextlib.contextmanager
-def _quiet(pycolmap):
-    """Keeps COLMAP's progress off the terminal; its errors still show."""
+def _quiet(pycolmap: Any) -> Iterator[None]:
+    """Keep COLMAP's progress off the terminal; its errors still show."""
     level = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
     try:
@@ -238,7 +259,9 @@ def _quiet(pycolmap):
         pycolmap.logging.minloglevel = level
 
 
-def _result(model, count: int, K: np.ndarray | None, *, baseline: float | None, scale: float | None):
+def _result(
+    model: Any, count: int, K: np.ndarray | None, *, baseline: float | None, scale: float | None, guessed_depth: float
+) -> StructureFromMotion:
     """Scale a COLMAP model to metres and put the world into its first camera."""
     eyes: dict[str, dict[int, np.ndarray]] = {"left": {}, "right": {}}
     depths = []
@@ -268,10 +291,10 @@ def _result(model, count: int, K: np.ndarray | None, *, baseline: float | None, 
         factor = scale
     else:
         metric = False
-        factor = GUESSED_MEDIAN_DEPTH / np.median(depths)
+        factor = guessed_depth / np.median(depths)
         logger.warning(
             "THE SCALE IS A GUESS: one eye cannot tell size, so the median depth is set to %g m; "
-            "pass scale, or a stereo recording, where sizes and forces matter", GUESSED_MEDIAN_DEPTH,
+            "pass scale, or a stereo recording, where sizes and forces matter", guessed_depth,
         )  # fmt: skip
 
     to_first = invert_pose(next(iter(left.values())))

@@ -11,9 +11,6 @@ from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.messages import CameraInfo
 
 STREAMS = ("image", "pose", "right", "depth", "mask")
-LAG = 2  # images to wait for streams that are just starting
-MAX_PENDING = 40  # images kept while another stream is silent
-MAX_POSES, MAX_OTHERS = 10_000, 128  # messages of another stream kept while no image comes
 
 
 class _Stream:
@@ -57,12 +54,17 @@ class Synchronizer:
 
     Args:
         tolerance: Largest difference between matched stamps, seconds.
+        lag: Images for which the first ones wait, so that streams that are just starting can join them.
+        max_pending: Images kept while another stream is silent; their memory is what bounds it.
+        max_poses: Poses kept while no image comes: they are small, and robots send up to a thousand a second.
+        max_others: Messages of each other stream kept while no image comes; they are images too.
     """
 
-    def __init__(self, tolerance: float = 0.01):
+    def __init__(self, tolerance: float = 0.01, *, lag: int = 2, max_pending: int = 40, max_poses: int = 10_000, max_others: int = 128):
         self.tolerance_ns = int(tolerance * 1e9)
+        self._lag, self._max_pending = lag, max_pending
         self._infos: dict[str, CameraInfo] = {}
-        self._streams = {name: _Stream(MAX_POSES if name == "pose" else MAX_OTHERS) for name in STREAMS}
+        self._streams = {name: _Stream(max_poses if name == "pose" else max_others) for name in STREAMS}
         self._emitted = 0  # stamp of the last image that left
         self._complete: list[Frame] = []
         self.dropped = {"without pose": 0, "without camera_info": 0, "out of order": 0, "repeated": 0, "invalid": 0, "without right eye": 0}
@@ -116,7 +118,7 @@ class Synchronizer:
 
     def _may_leave(self, stamp: int, newer: int) -> bool:
         """Whether an image need wait no longer, given the number of newer ones."""
-        return newer >= MAX_PENDING or newer >= LAG and "left" in self._infos and self._settled(stamp)
+        return newer >= self._max_pending or newer >= self._lag and "left" in self._infos and self._settled(stamp)
 
     def _settled(self, stamp: int) -> bool:
         """Whether every stream that is needed or has spoken has matched this stamp or moved past it."""
@@ -139,9 +141,8 @@ class Synchronizer:
         for name in STREAMS[1:]:  # what lies further back can match no later image
             self._streams[name].drop_before(stamp - self.tolerance_ns)
         info = self._infos.get("left")
-        missing = "camera_info" if info is None else "pose" if "pose" not in parts else None
-        if missing:
-            self.dropped[f"without {missing}"] += 1
+        if info is None or "pose" not in parts:
+            self.dropped["without camera_info" if info is None else "without pose"] += 1
             return None
         right_info = self._infos.get("right")
         if "right" in parts and (right_info is None or right_info.baseline <= 0):  # P[0, 3] must be −fx·B
@@ -161,13 +162,16 @@ def _frame(stamp: int, image: np.ndarray, info: CameraInfo, right_info: CameraIn
                 f"endoscope/left: the {name} is {array.shape[1]}×{array.shape[0]} but camera_info says "
                 f"{info.width}×{info.height}; publish both at the same size"
             )
-    right = parts.get("right")
-    if right is not None and not right.shape[:2] == image.shape[:2] == (right_info.height, right_info.width):
-        raise SequenceError(
-            f"endoscope/right: the image is {right.shape[1]}×{right.shape[0]}, its camera_info says "
-            f"{right_info.width}×{right_info.height} and the left image is {image.shape[1]}×{image.shape[0]}; "
-            "publish all at the same size"
-        )
+    right, baseline, right_K = parts.get("right"), None, None
+    if right is not None and right_info is not None:
+        if not right.shape[:2] == image.shape[:2] == (right_info.height, right_info.width):
+            raise SequenceError(
+                f"endoscope/right: the image is {right.shape[1]}×{right.shape[0]}, its camera_info says "
+                f"{right_info.width}×{right_info.height} and the left image is {image.shape[1]}×{image.shape[0]}; "
+                "publish all at the same size"
+            )
+        right, baseline = right_info.rectify(right), right_info.baseline
+        right_K = None if np.allclose(right_info.P[:, :3], info.P[:, :3]) else right_info.P[:, :3]
     mask = None if "mask" not in parts else info.rectify(parts["mask"], nearest=True)
     if not info.rectified:
         mask = info.valid if mask is None else np.minimum(mask, info.valid)
@@ -175,9 +179,9 @@ def _frame(stamp: int, image: np.ndarray, info: CameraInfo, right_info: CameraIn
         stamp_ns=stamp,
         image=info.rectify(image),
         camera=Camera(info.P[:, :3], info.width, info.height, parts["pose"]),
-        right=None if right is None else right_info.rectify(right),
-        baseline=None if right is None else right_info.baseline,
-        right_K=None if right is None or np.allclose(right_info.P[:, :3], info.P[:, :3]) else right_info.P[:, :3],
+        right=right,
+        baseline=baseline,
+        right_K=right_K,
         depth=None if "depth" not in parts else info.rectify(parts["depth"], nearest=True),
         mask=mask,
     )

@@ -9,7 +9,7 @@ endo.mp4, or a folder with
 
 import itertools
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -17,27 +17,14 @@ import numpy as np
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame, SequenceError
-from endo_sim_ros.sequences.recordings import (
-    Recording,
-    Video,
-    check_calibrated_size,
-    find_video,
-    intrinsic_matrix,
-    keep_posed,
-    lit_area,
-    lit_now,
-    numbered_files,
-    read_calibration,
-    read_gray,
-    read_poses,
-    select,
-    spread,
-    stamp_ns,
-    tissue_mask,
-    tool_is_white,
-)
+from endo_sim_ros.sequences.calibration_files import check_calibrated_size, intrinsic_matrix, read_calibration
+from endo_sim_ros.sequences.images import numbered_files, read_gray
+from endo_sim_ros.sequences.masks import MaskFiles, lit_area, lit_now, tissue_mask, tool_is_white
+from endo_sim_ros.sequences.pose_files import read_poses
+from endo_sim_ros.sequences.recording import Recording, keep_posed, select, spread, stamp_ns
 from endo_sim_ros.sequences.rectification import Rectification
 from endo_sim_ros.sequences.structure_from_motion import estimate_poses
+from endo_sim_ros.sequences.video_files import Video, find_video
 
 logger = logging.getLogger(__name__)
 
@@ -103,7 +90,7 @@ def read_video(
     fps = fps or video.fps
     K, distortion = _intrinsics(path, calibration, (fx, fy, cx, cy), distortion, size)
     numbers = select(range(video.frame_count), path, start, stop, step)
-    masks = _Masks(mask, mask_polarity, size)
+    mask_of = _mask_reader(mask, mask_polarity, size)
 
     known = None
     if poses is not None and str(poses) != STRUCTURE_FROM_MOTION:
@@ -135,7 +122,7 @@ def read_video(
                     video,
                     numbers,
                     rectification,
-                    lambda n, image: cv2.bitwise_and(lit_now(lit, image), masks.of(n)),
+                    lambda n, image: cv2.bitwise_and(lit_now(lit, image), mask_of(n)),
                     scale=scale,
                     threads=threads,
                 )
@@ -146,7 +133,7 @@ def read_video(
                 stamp_ns=stamp_ns(number, fps),
                 image=rectification.left(image),
                 camera=Camera(rectification.K, *size, placed[number]),
-                mask=rectification.mask(cv2.bitwise_and(lit_now(lit, image), masks.of(number))),
+                mask=rectification.mask(cv2.bitwise_and(lit_now(lit, image), mask_of(number))),
             )
 
     return Recording(frames, len(numbers))
@@ -190,31 +177,26 @@ def _intrinsics(path: Path, calibration, values, distortion, size):
     return intrinsic_matrix(fx, fy, cx, cy), distortion
 
 
-class _Masks:
-    """One mask for all frames, one per frame, or none."""
+def _mask_reader(source: Path | str | None, polarity: str, size: tuple[int, int]) -> Callable[[int], np.ndarray]:
+    """What gives the mask [H, W] of a frame number, 255 = tissue; all of it is tissue where there is no mask."""
+    constant = np.full(size[::-1], 255, np.uint8)
+    if source is None:
+        return lambda number: constant
+    source = Path(source)
+    if not source.is_dir():
+        image = read_gray(source)
+        constant = tissue_mask(image, white_is_tool=tool_is_white([image], source, polarity), size=size)
+        return lambda number: constant
+    files = numbered_files(source)
+    if not files:
+        raise SequenceError(f"{source}: holds no masks named like 000000.png")
+    masks = MaskFiles(files, source, polarity)
 
-    def __init__(self, source: Path | str | None, polarity: str, size: tuple[int, int]):
-        self._size = size
-        self._files: dict[int, Path] = {}
-        self._constant = np.full(size[::-1], 255, np.uint8)
-        if source is None:
-            return
-        source = Path(source)
-        if source.is_dir():
-            self._files = numbered_files(source)
-            if not self._files:
-                raise SequenceError(f"{source}: holds no masks named like 000000.png")
-            sample = [read_gray(self._files[n]) for n in spread(sorted(self._files), 20)]
-            self._white_is_tool = tool_is_white(sample, source, polarity)
-        else:
-            image = read_gray(source)
-            self._constant = tissue_mask(image, white_is_tool=tool_is_white([image], source, polarity), size=size)
+    def mask_of(number: int) -> np.ndarray:
+        mask = masks.of(number, size)
+        return constant if mask is None else mask
 
-    def of(self, number: int) -> np.ndarray:
-        """Mask [H, W] of a frame, 255 = tissue; all tissue where a folder has none."""
-        if number not in self._files:
-            return self._constant
-        return tissue_mask(read_gray(self._files[number]), white_is_tool=self._white_is_tool, size=self._size)
+    return mask_of
 
 
 def _scaled(pose: np.ndarray, factor: float) -> np.ndarray:

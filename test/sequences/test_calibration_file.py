@@ -3,7 +3,7 @@
 import pytest
 
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.sequences.recordings import read_calibration
+from endo_sim_ros.sequences.calibration_files import read_calibration
 
 
 def test_a_calibration_file_runs_no_code(tmp_path):

@@ -7,8 +7,10 @@ from plane_scene import pose_of, write_poses
 
 from endo_sim_ros.core.cameras import matrix_to_quat
 from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.sequences.images import numbered_files
+from endo_sim_ros.sequences.masks import lit_area, lit_now, tool_is_white
+from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.readers import READERS, open_sequence
-from endo_sim_ros.sequences.recordings import lit_area, lit_now, numbered_files, read_poses, tool_is_white
 
 
 def test_pose_file_is_xyzw_and_camera_to_world(tmp_path):

@@ -10,9 +10,11 @@ from plane_scene import BASELINE, pose_of, write_rgb
 
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.sequences.folder import read_folder
-from endo_sim_ros.sequences.recordings import Video, lit_area, read_poses
+from endo_sim_ros.sequences.masks import lit_area
+from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.rectification import Rectification
 from endo_sim_ros.sequences.structure_from_motion import estimate_poses
+from endo_sim_ros.sequences.video_files import Video
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 

@@ -5,7 +5,7 @@ import pytest
 
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.messages import CameraInfo
-from endo_sim_ros.sequences.synchronizer import LAG, MAX_OTHERS, MAX_PENDING, MAX_POSES, Synchronizer
+from endo_sim_ros.sequences.synchronizer import Synchronizer
 
 MS = 1_000_000
 WIDTH, HEIGHT = 8, 6
@@ -27,8 +27,8 @@ def pose(x=0.0):
     return matrix
 
 
-def ready(tolerance=0.01):
-    synchronizer = Synchronizer(tolerance)
+def ready(tolerance=0.01, **limits):
+    synchronizer = Synchronizer(tolerance, **limits)
     synchronizer.add_info("left", info())
     return synchronizer
 
@@ -65,7 +65,7 @@ def test_the_tolerance_is_inclusive_and_no_wider(offset, matched):
 
 def test_an_image_waits_for_the_pose_that_is_late():
     synchronizer = ready()
-    for number in range(1, LAG + 6):
+    for number in range(1, 8):
         assert synchronizer.add("image", number * 40 * MS, image()) == []
     frames = synchronizer.add("pose", 40 * MS, pose())
     assert [frame.stamp_ns for frame in frames] == [40 * MS]
@@ -74,11 +74,11 @@ def test_an_image_waits_for_the_pose_that_is_late():
 
 
 def test_images_without_any_pose_are_counted_and_do_not_pile_up():
-    synchronizer = ready()
+    synchronizer = ready(max_pending=40)
     for number in range(1, 201):
         assert synchronizer.add("image", number * 40 * MS, image()) == []
-    assert synchronizer.pending == MAX_PENDING
-    assert synchronizer.dropped["without pose"] == 200 - MAX_PENDING
+    assert synchronizer.pending == 40
+    assert synchronizer.dropped["without pose"] == 200 - 40
     assert synchronizer.flush() == [] and synchronizer.pending == 0
     assert synchronizer.dropped["without pose"] == 200
 
@@ -218,12 +218,12 @@ def test_a_pose_from_the_far_future_spoils_nothing():
 
 
 def test_streams_without_images_keep_a_bounded_number_of_messages():
-    synchronizer = ready()
-    for number in range(1, MAX_POSES + 501):
+    synchronizer = ready(max_poses=200, max_others=30)
+    for number in range(1, 701):
         synchronizer.add("pose", number * 2 * MS, pose(number))
-    for number in range(1, 2 * MAX_OTHERS):
+    for number in range(1, 60):
         synchronizer.add("depth", number * 40 * MS, np.ones((HEIGHT, WIDTH), np.float32))
-    assert len(synchronizer._streams["pose"].stamps) == MAX_POSES
-    assert len(synchronizer._streams["depth"].stamps) == MAX_OTHERS
-    synchronizer.add("image", (MAX_POSES + 500) * 2 * MS, image())
-    assert synchronizer.flush()[0].camera.pose[0, 3] == MAX_POSES + 500  # the newest are kept
+    assert len(synchronizer._streams["pose"].stamps) == 200
+    assert len(synchronizer._streams["depth"].stamps) == 30
+    synchronizer.add("image", 700 * 2 * MS, image())
+    assert synchronizer.flush()[0].camera.pose[0, 3] == 700  # the newest are kept

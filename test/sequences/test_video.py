@@ -6,8 +6,8 @@ from plane_scene import BARREL, HEIGHT, K_LEFT, WIDTH, assert_frame_agrees, see_
 
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.sequences.readers import open_sequence
-from endo_sim_ros.sequences.recordings import Video
 from endo_sim_ros.sequences.video import read_video
+from endo_sim_ros.sequences.video_files import Video
 
 
 @pytest.fixture

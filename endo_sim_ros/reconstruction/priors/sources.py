@@ -13,7 +13,7 @@ from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.priors.interpolation import kept_in_range, kriged, plane_through
 from endo_sim_ros.reconstruction.priors.network import cached_checkpoint, load_network, network_depth
 from endo_sim_ros.reconstruction.triangulation import ScenePoints, points_in_view
-from endo_sim_ros.sequences.recordings import lit_area
+from endo_sim_ros.sequences.masks import lit_area
 
 log = logging.getLogger(__name__)
 

@@ -1,0 +1,58 @@
+"""The calibration file of image folders and videos."""
+
+import math
+import reprlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from endo_sim_ros.core.frames import SequenceError
+
+_MOST_BYTES = 65_536  # of a calibration file; one takes 200
+
+
+def read_calibration(path: Path) -> dict[str, Any]:
+    """The calibration file of image folders and videos: YAML with fx, fy, cx, cy in pixels.
+
+    Pixel (0, 0) has its centre at (0.5, 0.5), as everywhere in this package and in COLMAP; add 0.5 to cx and cy of an
+    OpenCV calibration. Optional: width, height, baseline_m (metres), fps, distortion (OpenCV order k1 k2 p1 p2 k3).
+    """
+    if path.is_file() and path.stat().st_size > _MOST_BYTES:
+        raise SequenceError(f"{path}: it has {path.stat().st_size} bytes, far more than a calibration needs")
+    try:
+        fields = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise SequenceError(f"{path}: file is missing; it must give fx, fy, cx, cy in pixels") from None
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
+        raise SequenceError(f"{path}: not a readable YAML file ({str(error).splitlines()[0]})") from None
+    if not isinstance(fields, dict):
+        raise SequenceError(f"{path}: expected `name: value` lines with fx, fy, cx, cy in pixels")
+    for name in ("fx", "fy", "cx", "cy", *(n for n in ("width", "height", "baseline_m", "fps") if n in fields)):
+        value = fields.get(name)
+        if not isinstance(value, int | float) or isinstance(value, bool) or not 0 < value < 1e9:
+            shown = reprlib.repr(value) if isinstance(value, int | float | str | None) else f"a {type(value).__name__}"  # lists may nest
+            raise SequenceError(f"{path}: {name} must be a positive number, got {shown}")
+    try:
+        fields["distortion"] = [float(k) for k in fields.get("distortion") or ()]
+    except (TypeError, ValueError, OverflowError):
+        raise SequenceError(f"{path}: distortion must be a list of numbers") from None
+    if not all(map(math.isfinite, fields["distortion"])):
+        raise SequenceError(f"{path}: distortion must be finite, got {fields['distortion']}")
+    return fields
+
+
+def check_calibrated_size(calibration: dict[str, Any], size: tuple[int, int], path: Path) -> None:
+    """Raise SequenceError if a calibration file states another image size than (width, height)."""
+    stated = calibration.get("width", size[0]), calibration.get("height", size[1])
+    if stated != size:
+        raise SequenceError(
+            f"{path}: width and height are {stated[0]}×{stated[1]}, but the images are {size[0]}×{size[1]}; "
+            "scale fx, fy, cx, cy or the images"
+        )
+
+
+def intrinsic_matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
+    """Intrinsics [3, 3] of focal lengths and a principal point, pixels."""
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)

@@ -1,0 +1,77 @@
+"""Image files: colour, grey and depth images, and folders of numbered files."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from endo_sim_ros.core.frames import SequenceError
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+
+
+def read_image(path: Path) -> np.ndarray:
+    """An RGB image [H, W, 3], uint8."""
+    return cv2.cvtColor(_decode(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+
+
+def read_gray(path: Path) -> np.ndarray:
+    """A single-channel image [H, W], uint8."""
+    return _decode(path, cv2.IMREAD_GRAYSCALE)
+
+
+def read_depth(path: Path, depth_scale: float) -> np.ndarray:
+    """A depth image [H, W], float32, metres, 0 = none; integers are multiplied by depth_scale, floats are metres."""
+    raw = _decode(path, cv2.IMREAD_UNCHANGED)
+    raw = raw[..., 0] if raw.ndim == 3 else raw
+    depth = raw.astype(np.float32) * (depth_scale if np.issubdtype(raw.dtype, np.integer) else 1.0)
+    return clean_depth(depth)
+
+
+def image_size(image: np.ndarray) -> tuple[int, int]:
+    """Width and height of an image [H, W, ...], pixels."""
+    return image.shape[1], image.shape[0]
+
+
+def check_size(image: np.ndarray, size: tuple[int, int], path: Path) -> np.ndarray:
+    """The image, if it has the recording's size (width, height)."""
+    if image_size(image) != tuple(size):
+        raise SequenceError(f"{path}: is {image.shape[1]}×{image.shape[0]}, but the recording is {size[0]}×{size[1]}")
+    return image
+
+
+def clean_depth(depth: np.ndarray) -> np.ndarray:
+    """Depth as float32 with every value that is not finite and positive set to 0."""
+    with np.errstate(invalid="ignore"):
+        return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
+
+
+def _decode(path: Path, flags: int) -> np.ndarray:
+    if not path.is_file():
+        raise SequenceError(f"{path}: file is missing")
+    image = cv2.imread(str(path), flags)
+    if image is None:
+        raise SequenceError(f"{path}: not a readable image; the file is damaged, copy it again")
+    return image
+
+
+def numbered_files(folder: Path, suffixes: Sequence[str] = IMAGE_SUFFIXES, ending: str = "") -> dict[int, Path]:
+    """Files by the last number in their name: `000012.png` and `frame-000012.mask.png` are both 12.
+
+    Args:
+        folder: Where to look; a folder that does not exist holds no files.
+        suffixes: File name extensions to accept, lower case.
+        ending: What the name before the extension must end with, such as `l` for left images.
+    """
+    files: dict[int, Path] = {}
+    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+        digits = re.findall(r"\d+", path.stem)
+        if path.suffix.lower() not in suffixes or not path.stem.endswith(ending) or not digits:
+            continue
+        number = int(digits[-1])
+        if number in files:
+            raise SequenceError(f"{folder}: {files[number].name} and {path.name} have the same number; remove one")
+        files[number] = path
+    return files

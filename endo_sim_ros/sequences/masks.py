@@ -1,0 +1,116 @@
+"""Masks of the tissue: instruments left out, and the black border that optics and rectification leave."""
+
+import functools
+import logging
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.sequences.images import read_gray
+from endo_sim_ros.sequences.recording import spread
+
+logger = logging.getLogger(__name__)
+
+POLARITIES = ("auto", "tool", "tissue")
+
+
+def tool_is_white(masks: Iterable[np.ndarray], source: Path, polarity: str = "auto") -> bool:
+    """Whether white in these masks means instrument rather than tissue.
+
+    Instruments cover less of an image than tissue does, so the colour in the minority over all masks is taken for
+    the instruments. The decision is logged, because it cannot be checked.
+
+    Args:
+        masks: A sample of the masks [H, W], uint8.
+        source: Their folder, for messages.
+        polarity: `auto`, or what white is known to be: `tool` or `tissue`.
+    """
+    if polarity not in POLARITIES:
+        raise SequenceError(f"{source}: mask polarity must be one of {', '.join(POLARITIES)}, got {polarity!r}")
+    if polarity != "auto":
+        return polarity == "tool"
+    white = float(np.mean([np.mean(mask > 127) for mask in masks]))
+    tool = white <= 0.5
+    unsure = 0.4 < white < 0.6
+    logger.log(
+        logging.WARNING if unsure else logging.INFO,
+        "%s: white covers %.0f %% of the masks, so white is taken for %s%s",
+        source, 100 * white, "tools" if tool else "tissue",
+        "; this is close, state the polarity if it is wrong" if unsure else "",
+    )  # fmt: skip
+    return tool
+
+
+def tissue_mask(mask: np.ndarray, *, white_is_tool: bool, size: tuple[int, int]) -> np.ndarray:
+    """A mask [H, W] with 255 = tissue and 0 = ignore at the image's size (width, height)."""
+    white = mask > 127
+    tissue = np.where(white ^ white_is_tool, np.uint8(255), np.uint8(0))
+    return tissue if tissue.shape[::-1] == size else cv2.resize(tissue, size, interpolation=cv2.INTER_NEAREST)
+
+
+class MaskFiles:
+    """Masks in files, one per frame; not every frame need have one.
+
+    Args:
+        files: Image files by frame number.
+        source: Their folder, for messages.
+        polarity: What white means in them: `tool`, `tissue`, or `auto` to find out from 20 of them.
+    """
+
+    def __init__(self, files: Mapping[int, Path], source: Path, polarity: str):
+        self._files = files
+        sample = (read_gray(files[number]) for number in spread(sorted(files), 20))
+        self._white_is_tool = bool(files) and tool_is_white(sample, source, polarity)
+
+    def of(self, number: int, size: tuple[int, int]) -> np.ndarray | None:
+        """Mask [H, W] of a frame at an image's size (width, height), 255 = tissue; None where it has no file."""
+        if number not in self._files:
+            return None
+        return tissue_mask(read_gray(self._files[number]), white_is_tool=self._white_is_tool, size=size)
+
+
+def lit_area(images: Iterable[np.ndarray], threshold: int = 16) -> np.ndarray:
+    """Mask [H, W] (255 = seen, 0 = black) of what the optics show, from a sample of RGB images.
+
+    Black means dark in all images but one in ten (a title, a flash) and connected to the image's edge: vignette or
+    rectification border. Dark tissue in the middle of the image stays in.
+
+    Args:
+        images: RGB images [H, W, 3] of one size, uint8.
+        threshold: Grey level below which a pixel is dark; compression and stray light lift a black border to about ten.
+
+    Raises:
+        ValueError: If there are no images.
+    """
+    values = [functools.reduce(cv2.max, cv2.split(image)) for image in images]  # ten times as fast as image.max(-1)
+    if not values:
+        raise ValueError("lit_area: no images")
+    usual = len(values) - 1 - len(values) // 10
+    dark = (np.partition(values, usual, 0)[usual] < threshold).astype(np.uint8)
+    count, labels = cv2.connectedComponents(dark, connectivity=4)
+    border = np.zeros(count, np.uint8)
+    border[np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])] = 1
+    border[0] = 0  # what is not dark
+    outside = cv2.dilate(border[labels], np.ones((5, 5), np.uint8))  # the fall-off beside the border is not tissue colour
+    return np.where(outside > 0, np.uint8(0), np.uint8(255))
+
+
+def lit_now(lit: np.ndarray, image: np.ndarray, rim: float = 0.02) -> np.ndarray:
+    """A recording's lit area [H, W] without the rim that is black in this RGB image [H, W, 3].
+
+    Round pictures wander on the sensor as the camera head turns on the endoscope, by a hundredth of the width or two.
+    What is dark there, border or tissue, is left out; what is dark farther inside is tissue.
+
+    Args:
+        lit: `lit_area` of the recording, uint8.
+        image: One of its images.
+        rim: How far the edge of the picture may be from where it is in other frames, as a fraction of the width.
+    """
+    if lit.all():
+        return lit
+    side = 2 * max(round(rim * lit.shape[1]), 1) + 1
+    rim = cv2.erode(lit, np.ones((side, side), np.uint8)) == 0
+    return np.where(rim & (lit_area([image]) == 0), np.uint8(0), lit)

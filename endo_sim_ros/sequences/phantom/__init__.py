@@ -1,0 +1,14 @@
+"""A procedural patient: wet, vessel-covered organs in front of a peritoneal wall, filmed by an endoscope.
+
+Everything is a deterministic function of the seed and known exactly: poses, depth, stereo, calibration. `anatomy` makes
+the surface, `paint` its texture, `rendering` the images and `path` the endoscope's way.
+
+World frame: the wall is around z = 0.14 m and faces the endoscope, whose tip moves about the origin and looks along +z.
+"""
+
+from endo_sim_ros.sequences.phantom.config import PhantomConfig
+from endo_sim_ros.sequences.phantom.path import phantom_camera, phantom_poses
+from endo_sim_ros.sequences.phantom.rendering import Phantom, build_phantom, render_phantom
+from endo_sim_ros.sequences.phantom.sequence import phantom_sequence
+
+__all__ = ["Phantom", "PhantomConfig", "build_phantom", "phantom_camera", "phantom_poses", "phantom_sequence", "render_phantom"]

@@ -1,0 +1,42 @@
+"""Options of the synthetic patient and of the endoscope that films it."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from endo_sim_ros.core.config import Range, StageConfig
+
+
+@dataclass(frozen=True)
+class PhantomConfig(StageConfig):
+    """The synthetic patient and the endoscope that films it."""
+
+    seed: Annotated[int, Range(0, 2**31 - 1)] = 0
+    """Patient: anatomy, colours, vessels and camera path all follow from it."""
+    frames: Annotated[int, Range(1, 100_000)] = 250
+    """Length of the sequence."""
+    fps: Annotated[float, Range(0.1, 1000.0, "Hz")] = 25.0
+    """Frame rate."""
+    width: Annotated[int, Range(8, 4096, "px")] = 640
+    """Image width."""
+    height: Annotated[int, Range(8, 4096, "px")] = 512
+    """Image height."""
+    fov_deg: Annotated[float, Range(20.0, 90.0, "deg")] = 60.0
+    """Horizontal field of view."""
+    travel: Annotated[float, Range(0.0, 0.06, "m")] = 0.03
+    """How far the tip of the endoscope moves sideways, end to end; it dives in and out by half as much."""
+    rounds: Annotated[float, Range(0.05, 10.0)] = 1.0
+    """How often it goes round its path; after whole rounds it is back where it began."""
+    lever: Annotated[float, Range(0.05, 0.5, "m")] = 0.14
+    """Distance from the trocar, about which the endoscope pivots, to its tip."""
+    stereo: bool = True
+    """Also render the right image."""
+    baseline: Annotated[float, Range(0.0005, 0.05, "m")] = 0.0054
+    """Distance between the lenses of the stereo endoscope."""
+    exposure: Annotated[float, Range(0.1, 10.0)] = 1.0
+    """Brightness of the light source."""
+    auto_exposure: bool = False
+    """Let the camera hold its mean brightness, as endoscopes do, instead of keeping the exposure fixed."""
+    noise: Annotated[float, Range(0.0, 20.0, "grey levels")] = 1.2
+    """Standard deviation of the sensor noise in 8-bit grey levels."""
+    border: Annotated[float, Range(0.0, 0.3)] = 0.0
+    """Black frame with round corners, as a fraction of the image height; masked out, without depth."""

@@ -1,0 +1,64 @@
+"""The grid of vertices on which the surface is built, and smooth noise over it."""
+
+import math
+
+import cv2
+import numpy as np
+
+CELLS = 2048  # of the height field, a side: a power of two
+HALF_WIDTH = 0.16  # metres from the centre to where the surface is mirrored
+CELL = 2 * HALF_WIDTH / CELLS
+SIDE = CELLS + 1  # vertices
+
+
+def noise(rng: np.random.Generator, scale: float, octaves: int = 1, stretch: tuple[float, float] = (1.0, 1.0)) -> np.ndarray:
+    """Smooth noise [SIDE, SIDE] of about zero mean and unit deviation.
+
+    Args:
+        rng: Where the randomness comes from.
+        scale: Size of the largest features, metres.
+        octaves: How often finer noise, half in size and strength, is added.
+        stretch: Factors on the size along x and y.
+    """
+    finest = scale * min(stretch) * 0.5 ** (octaves - 1)
+    factor = max(int(finest / (8 * CELL)), 1)
+    side = math.ceil(SIDE / factor)  # drawn small, with eight samples per finest feature, and enlarged
+    total, power = np.zeros((side, side), np.float32), 0.0
+    for octave in range(octaves):
+        amplitude = 0.5**octave
+        across, down = (side * scale * s * amplitude / (2 * HALF_WIDTH) for s in stretch)  # samples per feature
+        columns, rows = math.ceil(side / across) + 3, math.ceil(side / down) + 3
+        grid = rng.standard_normal((rows, columns)).astype(np.float32)
+        wide = cv2.resize(grid, (math.ceil(columns * across), math.ceil(rows * down)), interpolation=cv2.INTER_CUBIC)
+        left, top = int(rng.uniform(1.0, 2.0) * across), int(rng.uniform(1.0, 2.0) * down)  # any phase, off the border
+        total += amplitude * wide[top : top + side, left : left + side]
+        power += amplitude**2
+    total /= np.float32(0.65 * math.sqrt(power))
+    if factor == 1:
+        return total
+    # Linear interpolation and two running means make a cubic B-spline: glints would betray any kink in the slope.
+    total = cv2.resize(total, (SIDE, SIDE), interpolation=cv2.INTER_LINEAR)
+    box = (factor | 1, factor | 1)
+    return cv2.blur(cv2.blur(total, box, borderType=cv2.BORDER_REFLECT_101), box, borderType=cv2.BORDER_REFLECT_101)
+
+
+def smoothstep(x: np.ndarray, low: float, high: float) -> np.ndarray:
+    t = np.clip((x - low) / (high - low), 0.0, 1.0)
+    return t * t * (3.0 - 2.0 * t)
+
+
+def blur(image: np.ndarray, sigma: float) -> np.ndarray:
+    """Gaussian blur with a standard deviation in metres; wide ones work on a reduced image."""
+    pixels = sigma / CELL
+    if pixels < 8:
+        return cv2.GaussianBlur(image, (0, 0), pixels, borderType=cv2.BORDER_REFLECT_101)
+    factor = 2 ** int(math.log2(pixels / 3))
+    small = cv2.resize(image, (SIDE // factor, SIDE // factor), interpolation=cv2.INTER_AREA)
+    small = cv2.GaussianBlur(small, (0, 0), pixels / factor, borderType=cv2.BORDER_REFLECT_101)
+    return cv2.resize(small, (SIDE, SIDE), interpolation=cv2.INTER_CUBIC)
+
+
+def vertices() -> tuple[np.ndarray, np.ndarray]:
+    """World x and y of every vertex, each [SIDE, SIDE], metres."""
+    axis = np.linspace(-HALF_WIDTH, HALF_WIDTH, SIDE, dtype=np.float32)
+    return np.meshgrid(axis, axis)

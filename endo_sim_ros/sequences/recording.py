@@ -1,0 +1,79 @@
+"""A recording, read lazily: which of its frames are taken, and when each was exposed."""
+
+import logging
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from endo_sim_ros.core.frames import Frame, SequenceError
+
+logger = logging.getLogger(__name__)
+
+DEFAULT_FPS = 25.0  # of the datasets whose files do not state it
+FIRST_STAMP_NS = 1_000_000_000  # a ROS stamp of 0 means "unset", so recordings begin at one second
+
+T = TypeVar("T")
+
+
+class Recording:
+    """A sequence of frames read lazily: every `iter()` reads the files again from the beginning.
+
+    `len()` is the number of frames expected, for progress bars; a damaged video or a frame that structure from
+    motion could not place makes the iteration shorter.
+    """
+
+    def __init__(self, frames: Callable[[], Iterator[Frame]], count: int):
+        self._frames = frames
+        self._count = count
+
+    def __iter__(self) -> Iterator[Frame]:
+        return self._frames()
+
+    def __len__(self) -> int:
+        return self._count
+
+
+def stamp_ns(number: int, fps: float) -> int:
+    """Time of exposure of a frame number, nanoseconds; frame 0 is at one second."""
+    return round(number / fps * 1e9) + FIRST_STAMP_NS
+
+
+def check_folder(path: Path | str) -> Path:
+    """The path of a folder.
+
+    Raises:
+        SequenceError: If there is none.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        raise SequenceError(f"{path}: no such folder; pass the folder of the recording")
+    return path
+
+
+def select(numbers: Iterable[int], source: Path, start: int | None, stop: int | None, step: int) -> list[int]:
+    """Every step-th of the frame numbers in [start, stop), in increasing order."""
+    if step < 1:
+        raise SequenceError(f"{source}: step must be 1 or more, got {step}")
+    inside = sorted(n for n in numbers if (start is None or n >= start) and (stop is None or n < stop))
+    if not inside:
+        raise SequenceError(f"{source}: no frame between start={start} and stop={stop}; widen the range")
+    return inside[::step]
+
+
+def keep_posed(numbers: list[int], poses: Container[int], pose_file: Path) -> list[int]:
+    """The frame numbers that have a pose; the others are counted in the log."""
+    posed = [n for n in numbers if n in poses]
+    if not posed:
+        raise SequenceError(f"{pose_file}: holds no pose for any of the {len(numbers)} chosen frames")
+    if len(posed) < len(numbers):
+        logger.info("%s: %d of %d frames have no pose and are skipped", pose_file, len(numbers) - len(posed), len(numbers))
+    return posed
+
+
+def spread(items: Sequence[T], count: int) -> list[T]:
+    """At most count items, evenly spread from the first to the last."""
+    if len(items) <= count:
+        return list(items)
+    return [items[round(i)] for i in np.linspace(0, len(items) - 1, count)]

@@ -1,0 +1,119 @@
+"""Whether SCARED's published poses are world-to-camera or camera-to-world."""
+
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from endo_sim_ros.core.cameras import invert_pose
+from endo_sim_ros.sequences.recording import spread
+from endo_sim_ros.sequences.rectification import StereoCalibration
+from endo_sim_ros.sequences.video_files import Video, split_stacked
+
+logger = logging.getLogger(__name__)
+
+USUAL_DIRECTION = "world_to_camera"  # what the published re-implementations found
+
+
+def find_pose_direction(
+    points: np.ndarray,
+    image: np.ndarray,
+    video: Video,
+    published: Mapping[int, np.ndarray],
+    calibration: StereoCalibration,
+    source: Path,
+    *,
+    checked_frames: int = 400,
+    least_motion: float = 2.0,
+    least_difference: float = 0.01,
+) -> str:
+    """`world_to_camera` or `camera_to_world`, whichever fits the images; the usual one where neither fits better.
+
+    The keyframe's measured points, coloured by its image, are projected into later frames under both readings; the
+    right one lands on pixels that look alike (higher correlation of brightness).
+
+    Args:
+        points: Points of the keyframe [H, W, 3], metres, in its raw left camera.
+        image: Its left RGB image [H, W, 3], uint8.
+        video: The recording, left eye stacked on top of right.
+        published: Poses [4, 4] by frame number, translation in metres.
+        calibration: Of the raw images.
+        source: The recording's folder, for messages.
+        checked_frames: How far into the video to look: later, tissue has moved and the keyframe's points are wrong.
+        least_motion: Median distance of the two readings, pixels, from which on a frame tells them apart; the
+            kinematics' own error is of this size.
+        least_difference: Of the two mean correlations, below which they count as alike.
+    """
+    default = USUAL_DIRECTION
+    size = video.width, video.height // 2
+    points, colours = _sparse_points(points, _brightness(image))
+    later = [n for n in sorted(published) if 0 < n < min(video.frame_count, checked_frames)]
+    moved = []
+    for number in spread(later, 24):
+        forward, backward = (_project(points, pose, calibration) for pose in _readings(published[number]))
+        if np.median(np.linalg.norm(forward - backward, axis=1)) > least_motion:
+            moved.append(number)
+    scores = []
+    for number, image in video.frames(spread(moved, 6)) if moved else ():
+        brightness = _brightness(split_stacked(image, video.path)[0])
+        pixels = [_project(points, pose, calibration) for pose in _readings(published[number])]
+        inside = np.all([((uv >= 0) & (uv <= np.array(size) - 1)).all(1) for uv in pixels], axis=0)
+        if inside.sum() < 50:
+            continue
+        scores.append([_correlation(colours[inside], _sample(brightness, uv[inside])) for uv in pixels])
+    if not scores:
+        logger.warning("%s: the camera moves too little to verify the pose direction; assuming %s", source, default)
+        return default
+    world_to_camera, camera_to_world = np.mean(scores, 0)
+    if abs(world_to_camera - camera_to_world) < least_difference:
+        logger.warning(
+            "%s: both pose directions fit alike (correlation %.3f and %.3f); assuming %s, pass pose_direction if wrong",
+            source, world_to_camera, camera_to_world, default,
+        )  # fmt: skip
+        return default
+    found = "world_to_camera" if world_to_camera > camera_to_world else "camera_to_world"
+    logger.info(
+        "%s: camera-pose is %s (the keyframe's points correlate by %.3f as world-to-camera and %.3f as "
+        "camera-to-world over %d frames)", source, found, world_to_camera, camera_to_world, len(scores),
+    )  # fmt: skip
+    return found
+
+
+def _readings(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """World-to-camera transforms of a published pose, read as world-to-camera and as camera-to-world."""
+    return pose, invert_pose(pose)
+
+
+def _brightness(image: np.ndarray) -> np.ndarray:
+    """Blurred grey image [H, W], float32; the blur forgives the kinematics' few pixels of error."""
+    sigma = max(0.5, image.shape[1] / 400)
+    return cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), sigma)
+
+
+def _sparse_points(points: np.ndarray, brightness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Some 20 000 measured points [N, 3] and their brightness [N]."""
+    with np.errstate(invalid="ignore"):
+        rows, columns = np.nonzero(np.isfinite(points).all(-1) & (points[..., 2] > 0))
+    keep = slice(None, None, max(1, len(rows) // 20_000))
+    rows, columns = rows[keep], columns[keep]
+    return points[rows, columns].astype(np.float64), brightness[rows, columns]
+
+
+def _project(points: np.ndarray, view: np.ndarray, calibration: StereoCalibration) -> np.ndarray:
+    """Pixels [N, 2] of points [N, 3] in the raw left image of a camera with a world-to-camera transform."""
+    local = points @ view[:3, :3].T + view[:3, 3]
+    uv, _ = cv2.projectPoints(local, np.zeros(3), np.zeros(3), calibration.K_left, calibration.D_left)
+    return np.where(local[:, 2:] > 0, uv[:, 0], -1.0)
+
+
+def _sample(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """Bilinear samples [N] of an image [H, W] at pixels [N, 2]."""
+    columns = np.ascontiguousarray(uv.astype(np.float32).reshape(-1, 1, 2))
+    # remap takes at most 32767 rows
+    return np.concatenate([cv2.remap(image, part, None, cv2.INTER_LINEAR)[:, 0] for part in np.array_split(columns, 4)])
+
+
+def _correlation(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.corrcoef(a, b)[0, 1]) if a.std() > 0 and b.std() > 0 else 0.0

@@ -1,0 +1,78 @@
+"""Video files as recordings have them: decoded forwards, of one eye or with the eyes stacked."""
+
+import logging
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.sequences.recording import DEFAULT_FPS
+
+logger = logging.getLogger(__name__)
+
+VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg")
+
+
+def find_video(folder: Path) -> Path | None:
+    """The only video of a folder, or None when there is none."""
+    videos = sorted(p for p in folder.iterdir() if p.suffix.lower() in VIDEO_SUFFIXES)
+    if len(videos) > 1:
+        names = ", ".join(p.name for p in videos)
+        raise SequenceError(f"{folder}: more than one video ({names}); keep one or pass the file itself")
+    return videos[0] if videos else None
+
+
+class Video:
+    """A video file, decoded forwards only, because seeking is inexact in most containers."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        if not path.is_file():
+            raise SequenceError(f"{path}: file is missing")
+        capture = self._open()
+        self.frame_count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        self.width = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
+        self.height = int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        fps = capture.get(cv2.CAP_PROP_FPS)
+        capture.release()
+        self.fps = fps if math.isfinite(fps) and 0 < fps <= 1000 else DEFAULT_FPS
+        if self.frame_count < 1 or self.width < 1 or self.height < 1:
+            raise SequenceError(f"{path}: holds no video frames; the file is damaged, copy it again")
+
+    def _open(self) -> cv2.VideoCapture:
+        capture = cv2.VideoCapture(str(self.path))
+        if not capture.isOpened():
+            raise SequenceError(f"{self.path}: not a readable video; the file is damaged or its codec is unknown")
+        return capture
+
+    def frames(self, numbers: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
+        """RGB images [H, W, 3] of the given frame numbers, which must increase."""
+        capture, position = self._open(), 0
+        try:
+            for done, number in enumerate(numbers):
+                while position < number and capture.grab():
+                    position += 1
+                ok, image = capture.read() if position == number else (False, None)
+                if not ok:
+                    if not done:
+                        raise SequenceError(f"{self.path}: frame {number} cannot be decoded; the video is damaged")
+                    logger.warning(
+                        "%s: the video ends before frame %d; %d frames are missing",
+                        self.path, number, len(numbers) - done,
+                    )  # fmt: skip
+                    return
+                position += 1
+                yield number, cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+        finally:
+            capture.release()
+
+
+def split_stacked(image: np.ndarray, source: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Left and right image of a frame with the left eye stacked on top of the right."""
+    height = image.shape[0]
+    if height % 2:
+        raise SequenceError(f"{source}: a stacked stereo video must have an even height, got {height}")
+    return image[: height // 2], image[height // 2 :]

@@ -30,6 +30,7 @@ def run(tmp_path_factory):
     return sequences, config, evaluate(sequences, config)
 
 
+@pytest.mark.slow
 @pytest.mark.dds
 def test_every_held_out_view_is_measured_and_shown(run):
     _, config, results = run
@@ -47,6 +48,7 @@ def test_every_held_out_view_is_measured_and_shown(run):
     assert (config.out / "strips/phantom_0-two-views.png").stat().st_size > 1000
 
 
+@pytest.mark.slow
 @pytest.mark.dds
 def test_what_cannot_be_read_loses_its_own_cells_only(run):
     sequences, config, results = run
@@ -67,6 +69,7 @@ def test_a_split_that_a_sequence_has_not_loses_its_own_cells_only(tmp_path):
     assert "leaves" in errors[2] and "0 to hold out" in errors[2]
 
 
+@pytest.mark.slow
 @pytest.mark.dds
 def test_finished_cells_are_not_done_again(run):
     sequences, config, results = run
@@ -80,6 +83,7 @@ def test_finished_cells_are_not_done_again(run):
     assert first == second  # the one that was done again, too, to the last bit
 
 
+@pytest.mark.slow
 @pytest.mark.dds
 def test_the_table_tells_means_spreads_and_the_paper(run):
     _, config, results = run
@@ -96,6 +100,7 @@ def test_the_table_tells_means_spreads_and_the_paper(run):
     assert len(list(csv.DictReader((config.out / "views.csv").open()))) == 8
 
 
+@pytest.mark.slow
 @pytest.mark.dds
 def test_rows_for_machines_have_a_name_value_unit_and_ratio(run):
     _, config, results = run
@@ -110,6 +115,7 @@ def test_rows_for_machines_have_a_name_value_unit_and_ratio(run):
     assert depth.ratio == pytest.approx(record["figures"]["depth_rmse"] / 0.5) and depth.peer == "3dgs"
 
 
+@pytest.mark.slow
 @pytest.mark.dds
 def test_lpips_without_weights_says_so_in_its_column(run, tmp_path):
     _, _, results = run
@@ -147,6 +153,7 @@ def test_the_papers_numbers_are_complete():
     assert all(15 < row.psnr < 30 and 0.6 < row.ssim < 0.9 and 0.2 < row.lpips < 0.5 for row in paper.PRINTED)
 
 
+@pytest.mark.slow
 @pytest.mark.dds
 def test_the_page_needs_nothing_else_and_sorts_and_slides(run, chromium):
     pytest.importorskip("matplotlib")

@@ -25,6 +25,7 @@ def _temperamental(argument, device, report):
     return argument * 2, os.environ["ENDO_SIM_THREADS"]
 
 
+@pytest.mark.slow
 def test_a_job_that_crashes_loses_only_itself():
     arguments = ["a", "raise", "exit", "b", "kill", "refuse", "c"]
     events = list(run_in_processes(_temperamental, arguments, ["cpu", "cpu"]))

@@ -16,6 +16,7 @@ from endo_sim_ros.sequences.bag import BagReader
 pytestmark = pytest.mark.dds
 
 
+@pytest.mark.slow
 def test_two_graphs_in_two_domains_do_not_hear_each_other(bench, tmp_path):
     mine = int(os.environ["ROS_DOMAIN_ID"])
     heard = bench.hear(messages.CONTROL_NODES)

@@ -87,6 +87,7 @@ def read_stamps(path, topic):
         return [messages.stamp_to_ns(message.header.stamp) for _, _, message in bag.messages([topic])]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL], ids=lambda number: number.name)
 def test_what_was_recorded_outlives_the_recorder(graph, tmp_path, number):
     path = tmp_path / "my récording"  # a name that must be quoted

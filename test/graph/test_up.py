@@ -70,6 +70,7 @@ def up(tmp_path):
             os.kill(number, signal.SIGKILL)
 
 
+@pytest.mark.slow
 @pytest.mark.dds
 def test_up_runs_the_graph_and_ends_cleanly(up, small_bag):
     """All nodes in a namespace reach their work, and Ctrl-C, even pressed twice, ends all of them."""

@@ -21,6 +21,7 @@ from endo_sim_ros.learning.train import run_episodes, save_training, train
 ROOT = Path(__file__).parents[2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task, count", [("retraction", 48), ("palpation", 8)])
 def test_scripted_policies_solve_their_tasks(task, count):
     batch = TaskBatch(task, load_scene(), count, device="cpu")
@@ -51,6 +52,7 @@ def test_a_network_is_saved_and_loaded_and_nothing_else_is(tmp_path):
             NetworkPolicy.load(tmp_path / f"{name}.npz")
 
 
+@pytest.mark.slow
 def test_training_learns_and_leaves_its_curve(tmp_path):
     config = TrainingConfig(generations=2, population=24, episodes=1, test_episodes=8)
     policy, curve = train("retraction", load_scene(), config, device="cpu")

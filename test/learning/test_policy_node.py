@@ -49,6 +49,7 @@ def user():
     rclpy.try_shutdown()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task, episodes", [("retraction", 2), ("palpation", 1)])
 def test_over_topics_observations_images_and_actions_are_bit_for_bit_those_of_the_environment(task, episodes, user, tmp_path):
     save_scene(load_scene(), tmp_path, task, seed=4)

@@ -36,6 +36,7 @@ def with_eyes_that_converge(frame):
     return dataclasses.replace(frame, right=moved, right_K=K)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pair", [plain_pair, dark_right, behind_a_tool, with_eyes_that_converge])
 def test_flow_between_the_eyes_corrects_what_matching_left(large, pair):
     (matched,) = with_depth_prior([pair(large[0])], NO_POINTS, options(depth="stereo"))
@@ -55,6 +56,7 @@ def test_flow_is_found_in_finer_pixels_than_are_trained_on(large):
     assert error(wide.depth) < 0.95 * error(narrow.depth)
 
 
+@pytest.mark.slow
 def test_reflections_of_the_light_do_not_spoil_the_depth_that_views_agree_on(large):
     """A reflection is seen where the tissue is not: through another view's depth it lies beside where that view has it."""
     frames = with_depth_prior(list(large[:2]), NO_POINTS, options(depth="stereo"))
@@ -80,6 +82,7 @@ def test_pale_tissue_is_no_reflection(large):
     assert all(np.median(np.abs(a.depth / b.depth - 1)) < 0.012 for a, b in zip(corrected, large))
 
 
+@pytest.mark.slow
 def test_views_correct_each_others_depth(large):
     frames = with_depth_prior(list(large), NO_POINTS, options(depth="stereo"))
     corrected, contradiction = agreed(frames, NO_POINTS, "stereo")
@@ -160,6 +163,7 @@ def test_scene_points_correct_the_depth_around_them(large):
     assert np.isnan(contradiction)  # one view contradicts none
 
 
+@pytest.mark.slow
 def test_wrong_scene_points_among_good_ones_hardly_move_what_matching_knows(large):
     (matched,) = with_depth_prior([dataclasses.replace(large[0], depth=None)], NO_POINTS, options(depth="stereo"))
     v, u = np.mgrid[8:512:16, 8:640:16].reshape(2, -1)
@@ -188,6 +192,7 @@ def test_scene_points_that_are_none_are_refused(large, positions, error, said):
         Trainer(list(large[:1]), options(iterations=1), (positions, np.ones((len(positions), positions.shape[1])), error))
 
 
+@pytest.mark.slow
 def test_views_that_contradict_each_other_are_trained_on_for_less_long(large):
     views = [dataclasses.replace(frame, right=None, baseline=None, right_K=None) for frame in large]
     turned = views[0].camera.pose.copy()

@@ -22,6 +22,7 @@ def test_stereo_depth_is_near_the_exact_depth(large):
         assert valid[:, :100].mean() > 0.3  # the columns that a matcher by itself would skip
 
 
+@pytest.mark.slow
 def test_a_wrong_principal_point_of_the_right_eye_is_found(large):
     points = triangulate(list(large))
     right = [np.ascontiguousarray(np.roll(frame.right, -3, axis=1)) for frame in large]  # as if cx were 3 pixels less
@@ -97,6 +98,7 @@ def test_views_that_see_few_points_are_told(small, caplog):
     assert f"{len(small)} of {len(small)} views see fewer than 30 scene points" in caplog.text
 
 
+@pytest.mark.slow
 def test_depth_between_points_is_believed_more_than_a_guess(large):
     off = [dataclasses.replace(frame, depth=frame.depth * np.float32(1.03)) for frame in large]
     moved = [np.abs(agreed(off, NO_POINTS, source)[0][0].depth - off[0].depth).mean() for source in ("points", "network")]

@@ -57,6 +57,7 @@ ORBIT = [pose_of((0.05 * np.sin(a), 0.01 * np.cos(3 * a), 0.1 - 0.1 * np.cos(a))
 K_RELIEF = np.array([[300.0, 0, 159.5], [0, 300.0, 119.5], [0, 0, 1]])
 
 
+@pytest.mark.slow
 def test_structure_from_motion_on_stereo_is_metric():
     pytest.importorskip("pycolmap")
     offset = pose_of((BASELINE, 0, 0))

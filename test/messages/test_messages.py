@@ -1,4 +1,4 @@
-"""What a graph must bear: hostile files, disturbed recordings, two machines, neighbours, random traffic."""
+"""Every layout of msg_conventions.md, there and back, for a running graph and for bag files."""
 
 import array
 import re

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import rclpy
 import torch
+from rclpy.utilities import try_shutdown
 from rich.progress import track
 
 from endo_sim_ros import messages
@@ -60,7 +61,7 @@ def _graph(mode: str, scene: Scene, rate: float, device: str, logs: Path) -> Ite
             yield client, group
         finally:
             client.destroy_node()
-            rclpy.try_shutdown()
+            try_shutdown()
 
 
 def _realtime(client: Client, scene: Scene, rate: float, changes: int) -> list[Row]:
@@ -74,12 +75,11 @@ def _realtime(client: Client, scene: Scene, rate: float, changes: int) -> list[R
     rng = np.random.default_rng(0)
     for _ in track(range(changes), description="real time"):
         end = due + _HOLD + rng.uniform(0, 1 / rate)
-        sent, before = None, None
+        pulling = not pulling
+        client.spin_until(due)
+        before, sent = client.images[-1][2].astype(np.int16), time.perf_counter()
         while due < end:
             client.spin_until(due)
-            if sent is None:
-                pulling = not pulling
-                before, sent = client.images[-1][2].astype(np.int16), time.perf_counter()
             client.command(scene.tip, _FORCE * pulling * scene.towards_camera, client.now_ns())
             due += 1 / rate
         shown = (t for t, _, image in client.images if t > sent and np.abs(image - before).max() > CHANGED)

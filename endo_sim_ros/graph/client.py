@@ -10,6 +10,7 @@ from rclpy.executors import SingleThreadedExecutor
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.messages import NodeState, NodeStatus, Topic
 from endo_sim_ros.nodes.base import EndoNode
@@ -126,13 +127,20 @@ class Scene(NamedTuple):
         return offset / np.linalg.norm(offset)
 
 
+def depth_of(frame: Frame) -> np.ndarray:
+    """Depth [H, W], metres, of a frame of the synthetic patient, which has it in every frame."""
+    assert frame.depth is not None
+    return frame.depth
+
+
 def tissue(gaussians: int, width: int, height: int) -> Scene:
     """The synthetic patient as so many Gaussians, in an image of this size in pixels."""
     (frame,) = phantom_sequence(PhantomConfig(frames=1, width=width, height=height, stereo=False))
-    points, valid = frame.camera.backproject(frame.depth), frame.depth > 0
+    depth = depth_of(frame)
+    points, valid = frame.camera.backproject(depth), depth > 0
     rng = np.random.default_rng(0)
     chosen = rng.choice(np.flatnonzero(valid), gaussians, replace=gaussians > valid.sum())
-    radii = frame.depth.ravel()[chosen] / frame.camera.K[0, 0] * 0.5 * np.sqrt(valid.sum() / gaussians)
+    radii = depth.ravel()[chosen] / frame.camera.K[0, 0] * 0.5 * np.sqrt(valid.sum() / gaussians)
     model = GaussianModel.from_points(
         torch.from_numpy(points.reshape(-1, 3)[chosen]).float(),
         torch.from_numpy(frame.image.reshape(-1, 3)[chosen] / 255.0).float(),

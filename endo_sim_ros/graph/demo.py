@@ -9,6 +9,7 @@ from pathlib import Path
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.utilities import try_shutdown
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from std_srvs.srv import Trigger
@@ -41,8 +42,9 @@ def _request(watcher: Watcher, service: str, executor: SingleThreadedExecutor) -
         raise DemoError(f"the service {service} is not there; see the log of its node")
     future = client.call_async(Trigger.Request())
     executor.spin_until_future_complete(future, timeout_sec=60.0)
-    if not future.done() or not future.result().success:
-        raise DemoError(f"{service}: {future.result().message if future.done() else 'no answer'}")
+    answer = future.result() if future.done() else None
+    if answer is None or not answer.success:
+        raise DemoError(f"{service}: {answer.message if answer else 'no answer'}")
 
 
 def run_demo(bag: Path | None, out: Path, seed: int, frames: int, width: int, iterations: int, force: float, timeout: float) -> None:
@@ -168,7 +170,7 @@ def _touch_over_dds(
     finally:
         executor.shutdown()
         watcher.destroy_node()
-        rclpy.try_shutdown()
+        try_shutdown()
 
 
 __all__ = ["DemoError", "SequenceError", "run_demo"]

@@ -11,11 +11,12 @@ from typing import Any
 import cv2
 import numpy as np
 import rclpy
+from rclpy.utilities import try_shutdown
 from rich.progress import Progress
 
 from endo_sim_ros import messages
 from endo_sim_ros.evaluation.measurement import Row, report
-from endo_sim_ros.graph.client import ARM, CHANGED, Client, tissue
+from endo_sim_ros.graph.client import ARM, CHANGED, Client, depth_of, tissue
 from endo_sim_ros.graph.processes import NodeGroup
 from endo_sim_ros.messages import OK, ReconstructionState, Topic
 from endo_sim_ros.sequences.bag import LEFT_FRAME
@@ -51,14 +52,14 @@ def spoil(message: Any, rng: random.Random) -> None:
             value = value.copy()
             value[rng.randrange(len(value))] = rng.choice(_FLOATS)
             setattr(message, name, value)
-        elif hasattr(value, "frombytes"):  # uint8[] and other sequences of numbers
+        elif isinstance(value, array.array):  # uint8[] and other sequences of numbers
             keep = rng.choice((0, 1, len(value) // 2, max(len(value) - 1, 0), len(value)))
             value = value[:keep]
             if len(value) and rng.random() < 0.5:
                 data = bytearray(value.tobytes())
                 for _ in range(min(len(data), 16)):
                     data[rng.randrange(len(data))] = rng.randrange(256)
-                value = type(value)(value.typecode, bytes(data))
+                value = array.array(value.typecode, bytes(data))
             setattr(message, name, value)
         elif isinstance(value, list) and value:
             value = value[: rng.randint(0, len(value))]
@@ -87,11 +88,11 @@ class _Traffic:
             jpeg = cv2.imencode(".jpg", frame.image)[1].tobytes()
             return messages.ros_class(topic.type)(format="jpeg", data=array.array("B", jpeg), header=self._header(stamp))
         if topic in (messages.LEFT_INFO, messages.RIGHT_INFO, messages.TRAINING_CAMERA_INFO):
-            return messages.encode_camera_info(camera.K, camera.width, camera.height, stamp, LEFT_FRAME, frame.baseline)
+            return messages.encode_camera_info(camera.K, camera.width, camera.height, stamp, LEFT_FRAME, frame.baseline or 0.0)
         if topic == messages.DEPTH:
-            return messages.encode_image(frame.depth, stamp, LEFT_FRAME)
+            return messages.encode_image(depth_of(frame), stamp, LEFT_FRAME)
         if topic == messages.MASK:
-            return messages.encode_image(np.full(frame.depth.shape, 255, np.uint8), stamp, LEFT_FRAME)
+            return messages.encode_image(np.full(frame.image.shape[:2], 255, np.uint8), stamp, LEFT_FRAME)
         if topic == messages.CAMERA_POSE:
             return messages.encode_pose(camera.pose, stamp, "world")
         if topic == messages.GAUSSIANS:
@@ -167,7 +168,7 @@ def soak(json_file: Path | None, minutes: float = 10.0, rate: float = 500.0, see
             rows += _still_works(client, group, traffic)
         finally:
             client.destroy_node()
-            rclpy.try_shutdown()
+            try_shutdown()
             report(f"{minutes:g} minutes of random traffic", rows, json_file)
     return rows
 
@@ -215,7 +216,7 @@ def _still_works(client: Client, group: NodeGroup, traffic: _Traffic) -> list[Ro
         info = messages.encode_camera_info(camera.K, camera.width, camera.height, stamp, LEFT_FRAME)
         client.send(messages.LEFT_INFO, info)
         client.send(messages.CAMERA_POSE, messages.encode_pose(camera.pose, stamp, "world"))
-        client.send(messages.DEPTH, messages.encode_image(frame.depth, stamp, LEFT_FRAME))
+        client.send(messages.DEPTH, messages.encode_image(depth_of(frame), stamp, LEFT_FRAME))
         client.send(messages.LEFT_IMAGE, messages.encode_image(frame.image, stamp, LEFT_FRAME))
         client.spin_until(time.perf_counter() + 0.05)
     client.until(reconstructed, "a reconstruction")

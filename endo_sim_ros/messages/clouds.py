@@ -45,7 +45,12 @@ def decode_cloud(message: Message, topic: str) -> np.ndarray:
     return data[: count * message.point_step].view(dtype)
 
 
-def _columns(points: np.ndarray, names: tuple[str, ...] | str) -> np.ndarray:
+def _names(points: np.ndarray) -> tuple[str, ...]:
+    """Names of the fields of a structured array."""
+    return points.dtype.names or ()
+
+
+def _columns(points: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
     """Fields of a structured array [N] as columns [N, len(names)] float32."""
     return np.stack([points[name].astype(np.float32) for name in names], 1)
 
@@ -53,9 +58,10 @@ def _columns(points: np.ndarray, names: tuple[str, ...] | str) -> np.ndarray:
 def _encode_cloud(points: np.ndarray, stamp_ns: int, frame_id: str, types: MessageTypes | None) -> Message:
     """PointCloud2 of a structured array [N]."""
     types = types or ros_types()
+    layout = points.dtype.fields or {}
     fields = [
         types.PointField(name=name, offset=offset, datatype=_POINT_DATATYPES[dtype.str[1:]], count=1)
-        for name, (dtype, offset) in ((name, points.dtype.fields[name][:2]) for name in points.dtype.names)
+        for name, (dtype, offset, *_) in layout.items()
     ]
     return types.PointCloud2(
         header=make_header(types, stamp_ns, frame_id),
@@ -87,7 +93,7 @@ def encode_gaussians(model: "GaussianModel", stamp_ns: int, frame_id: str, types
     r, g, b = (model.base_colors.detach().cpu().numpy() * 255 + 0.5).astype(np.uint32).T
     columns, names = [to_columns(model), (r << 16 | g << 8 | b).view(np.float32)[:, None]], [*ply_fields(model.sh_degree), "rgb"]
     if model.light is not None:
-        numbers = np.float32(dataclasses.astuple(model.light))
+        numbers = np.array(dataclasses.astuple(model.light), np.float32)
         if len(model) < len(numbers):
             raise MessageError(f"{GAUSSIANS.name}: a model with a light needs {len(numbers)} Gaussians, got {len(model)}")
         columns.append(np.pad(numbers, (0, len(model) - len(numbers)))[:, None])
@@ -109,8 +115,8 @@ def decode_gaussians(message: Message, topic: str = GAUSSIANS.name) -> "Gaussian
     if not len(points):
         raise MessageError(f"{topic}: the model is empty; reconstruct a scene first")
     try:
-        model = from_columns({name: points[name] for name in points.dtype.names}, topic)
-        if "light" in points.dtype.names:
+        model = from_columns({name: points[name] for name in _names(points)}, topic)
+        if "light" in _names(points):
             numbers = points["light"][: len(dataclasses.fields(Light))].tolist()
             model = dataclasses.replace(model, light=Light(*numbers))
         return model
@@ -129,11 +135,10 @@ class ControlNodeCloud:
     cut: int = 0  # number of the cut surface of this state, see `cut_number`; 0 = whole tissue
 
 
-_NODE_DTYPE = np.dtype(
-    [(name, "<f4") for name in ("x", "y", "z", "rest_x", "rest_y", "rest_z")]
-    + [(f"f_{row}{column}", "<f4") for row in range(3) for column in range(3)]
-    + [("model_sec", "<u4"), ("model_nanosec", "<u4"), ("cut", "<u4")]
-)
+_POSITION, _REST = ("x", "y", "z"), ("rest_x", "rest_y", "rest_z")
+_F = tuple(f"f_{row}{column}" for row in range(3) for column in range(3))
+_NUMBERS = ("model_sec", "model_nanosec", "cut")
+_NODE_DTYPE = np.dtype([(name, "<f4") for name in (*_POSITION, *_REST, *_F)] + [(name, "<u4") for name in _NUMBERS])
 
 
 def encode_control_nodes(state: ControlNodeCloud, stamp_ns: int, frame_id: str, types: MessageTypes | None = None) -> Message:
@@ -162,16 +167,16 @@ def decode_control_nodes(message: Message, topic: str = CONTROL_NODES.name) -> C
         MessageError: If the cloud is damaged or empty, a field is missing, or a number is not finite.
     """
     points = decode_cloud(message, topic)
-    names = points.dtype.names or ()
-    missing = [name for name in _NODE_DTYPE.names if name not in (*names, "cut")]
+    names = _names(points)
+    missing = [name for name in (*_POSITION, *_REST, *_F, *_NUMBERS) if name not in (*names, "cut")]
     if missing:
         raise MessageError(f"{topic}: missing field {', '.join(missing[:4])}; see control_nodes in msg_conventions.md")
     if not len(points):
         raise MessageError(f"{topic}: there are no control nodes")
     state = ControlNodeCloud(
-        _columns(points, ("rest_x", "rest_y", "rest_z")),
-        _columns(points, "xyz"),
-        _columns(points, _NODE_DTYPE.names[6:15]).reshape(-1, 3, 3),
+        _columns(points, _REST),
+        _columns(points, _POSITION),
+        _columns(points, _F).reshape(-1, 3, 3),
         int(points["model_sec"][0]) * NANOSECONDS + int(points["model_nanosec"][0]),
         int(points["cut"][0]) if "cut" in names else 0,
     )
@@ -195,7 +200,7 @@ def encode_cut_surface(triangles: np.ndarray, model_stamp_ns: int, frame_id: str
         types: Message classes to build; those of ROS by default.
     """
     points = np.ascontiguousarray(triangles, "<f4").reshape(-1, 3)
-    return _encode_cloud(points.view([(name, "<f4") for name in "xyz"]).reshape(-1), model_stamp_ns, frame_id, types)
+    return _encode_cloud(points.view([(name, "<f4") for name in _POSITION]).reshape(-1), model_stamp_ns, frame_id, types)
 
 
 def decode_cut_surface(message: Message, topic: str = CUT_SURFACE.name) -> np.ndarray:
@@ -205,11 +210,11 @@ def decode_cut_surface(message: Message, topic: str = CUT_SURFACE.name) -> np.nd
         MessageError: If the points are not triangles, or a number is not finite.
     """
     points = decode_cloud(message, topic)
-    missing = [name for name in "xyz" if name not in (points.dtype.names or ())]
+    missing = [name for name in _POSITION if name not in _names(points)]
     if missing or len(points) % 3:
         lacking = f" without {', '.join(missing)}" if missing else ""
         raise MessageError(f"{topic}: expected three points with x, y and z for each triangle, got {len(points)} points{lacking}")
-    triangles = _columns(points, "xyz").reshape(-1, 3, 3)
+    triangles = _columns(points, _POSITION).reshape(-1, 3, 3)
     if not np.isfinite(triangles).all():
         raise MessageError(f"{topic}: a corner is not finite; the cut was ignored")
     return triangles

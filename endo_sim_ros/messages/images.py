@@ -15,8 +15,8 @@ _ENCODINGS = {("uint8", 3): "rgb8", ("uint8", 1): "mono8", ("float32", 1): "32FC
 
 def _pixels(message: Message, dtype: DTypeLike, channels: int, topic: str) -> np.ndarray:
     """View of the pixel data [H, W, channels]. Honours row padding and byte order."""
-    dtype = np.dtype(dtype).newbyteorder(">" if message.is_bigendian else "<")
-    height, width, row = message.height, message.width, message.width * channels * dtype.itemsize
+    kind = np.dtype(dtype).newbyteorder(">" if message.is_bigendian else "<")
+    height, width, row = message.height, message.width, message.width * channels * kind.itemsize
     data = np.frombuffer(message.data, np.uint8)
     if height == 0 or width == 0:
         raise MessageError(f"{topic}: the image is empty ({width}×{height})")
@@ -26,7 +26,7 @@ def _pixels(message: Message, dtype: DTypeLike, channels: int, topic: str) -> np
             f"which needs {row} bytes a row; the publisher's size and data disagree"
         )
     rows = data[: message.step * height].reshape(height, message.step)[:, :row]
-    return np.ascontiguousarray(rows).view(dtype).reshape(height, width, channels)
+    return np.ascontiguousarray(rows).view(kind).reshape(height, width, channels)
 
 
 def decode_image(message: Message, topic: str = LEFT_IMAGE.name) -> np.ndarray:

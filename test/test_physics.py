@@ -33,6 +33,7 @@ from endo_sim_ros.physics import (
 )
 from endo_sim_ros.physics.backends import cluster_kernels as cluster
 from endo_sim_ros.physics.materials import MATERIALS, energy_density, kirchhoff_stress, rotation_of
+from endo_sim_ros.rendering import render_depth
 
 EYE = np.zeros(3)  # the camera of the test scene, looking along +z
 TIP = np.array([0.0, 0.0, 0.12])  # on the sheet, in front of the camera
@@ -171,7 +172,9 @@ def test_tissue_is_carved_where_a_camera_sees_through_it_and_only_there():
     cameras = [Camera(K, 320, 256, pose_at([x, 0.0, 0.0])) for x in (-0.06, 0.0, 0.06)]
     config = PhysicsConfig(node_count=6000)
     whole = build_control_nodes(model, EYE, dataclasses.replace(config, carve=False), cameras)
-    carved = build_control_nodes(model, EYE, config, cameras)
+    carved = build_control_nodes(model, EYE, config, cameras, render_depth)
+    with pytest.raises(ValueError, match="pass render_depth"):
+        build_control_nodes(model, EYE, config, cameras)
     left = {tuple(position) for position in carved.rest.tolist()}
     gone = np.array([position for position in whole.rest.tolist() if tuple(position) not in left])
     assert len(gone) > 20 and len(whole) - len(carved) == len(gone)

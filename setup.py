@@ -62,6 +62,6 @@ setup(
         # `ros2 run` looks for executables here; console scripts would land in bin/ under pip.
         (f"lib/{NAME}", sorted(map(str, Path("scripts").glob("*_node")))),
     ],
-    package_data={f"{NAME}.evaluation": ["page.html"], f"{NAME}.nodes": ["fastdds.xml"]},
+    package_data={NAME: ["*/native/*.h"], f"{NAME}.evaluation": ["page.html"], f"{NAME}.nodes": ["fastdds.xml"]},
     zip_safe=False,
 )

@@ -13,10 +13,11 @@ from rich.progress import Progress
 from torch import Tensor
 
 from endo_sim_ros.core.device import pick_device
+from endo_sim_ros.core.kernels import plain_kernels
 from endo_sim_ros.evaluation.measurement import Row, machine, milliseconds, peak_megabytes, report, short
 from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
-from endo_sim_ros.splatting import RenderOutput, _rasterize, api, rasterize
+from endo_sim_ros.splatting import RenderOutput, _rasterize, rasterize
 
 DEPTH = 1.0  # of the scene's centre, metres: some peers do not draw what is nearer than 0.2
 
@@ -211,16 +212,16 @@ def _training(count: int, width: int, height: int, device: str, seconds: float) 
 def _peers(device: str) -> dict[str, Callable[[Scene], Draw]]:
     """What else could draw a scene here."""
     if device == "cpu":
-        return {"plain scalar kernel, one thread": _scalar}
+        return {"plain scalar kernel, one thread": _plain}
     peers = {"gsplat": _gsplat, "gswarp": _gswarp}
     return {name: prepare for name, prepare in peers.items() if importlib.util.find_spec(name)}
 
 
-def _scalar(scene: Scene) -> Draw:
-    """Our kernels for GPUs, one pixel at a time."""
+def _plain(scene: Scene) -> Draw:
+    """Our kernels for GPUs, on the CPU, one pixel after the other."""
 
     def draw(gaussians):
-        with api.scalar_kernels():
+        with plain_kernels():
             return _ours(scene)(gaussians)
 
     return draw

@@ -1,4 +1,4 @@
-"""A Gaussian model that follows its control nodes, seen by a camera."""
+"""Images and depth of a Gaussian model, at rest or as it follows its control nodes, in a camera."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -11,12 +11,10 @@ from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.config import Range, StageConfig
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
-from endo_sim_ros.core.light import Light
+from endo_sim_ros.core.light import SURFACE, Light
 from endo_sim_ros.core.shading import shade, to_bytes
 from endo_sim_ros.physics.skinning import Skinning
 from endo_sim_ros.splatting import render, sh_basis
-
-_MIN_ALPHA = 0.5  # below it there is no surface whose depth could be told
 
 
 @dataclass(frozen=True)
@@ -42,6 +40,9 @@ class DeformableRenderer:
         model: Gaussians at rest, world.
         node_rest: Control nodes at rest [M, 3], metres, world; None renders the model at rest only.
         config: Options.
+
+    Raises:
+        ValueError: If the device is not there, there are no nodes, or positions are not finite.
     """
 
     def __init__(self, model: GaussianModel, node_rest: np.ndarray | None, config: RenderingConfig):
@@ -49,23 +50,33 @@ class DeformableRenderer:
         self.model = model.detach().to(self.device)
         self.config = config
         self._background = torch.full((3,), config.background, device=self.device)
-        self._skinning = None
+        self._skinning: Skinning | None = None
         if node_rest is not None:
             self._skinning = Skinning(self.model, node_rest, neighbours=config.neighbours, weighting=config.skinning, device=self.device)
 
     def cut(self, triangles: np.ndarray) -> None:
-        """Let the skin part where all these triangles [T, 3, 3] (m, world, in the tissue at rest) cut it."""
+        """Part the tissue along all cuts so far, triangles [T, 3, 3], metres, world, in the tissue at rest."""
         if self._skinning is not None and not np.array_equal(triangles, self._skinning.cuts):
             self._skinning.cut(triangles)
 
     def camera(self, camera: Camera) -> Camera:
-        """The camera at the configured image width."""
+        """Return the camera at the configured image width, with the height in proportion."""
         width = self.config.image_width
         return camera.resized(width, max(round(camera.height * width / camera.width), 1)) if width else camera
 
     @torch.no_grad()
     def deform(self, positions: np.ndarray, F: np.ndarray) -> tuple[Tensor, Tensor]:
-        """Centres [N, 3], m, and covariances [N, 3, 3], m², world, of the Gaussians for nodes at positions [M, 3] with F [M, 3, 3]."""
+        """Return centres [N, 3] (m) and covariances [N, 3, 3] (m²) of the Gaussians, world.
+
+        Args:
+            positions: Control nodes now [M, 3], metres, world.
+            F: Their deformation gradients [M, 3, 3].
+
+        Raises:
+            ValueError: If the renderer has no control nodes, or shapes disagree.
+        """
+        if self._skinning is None:
+            raise ValueError("this renderer has no control nodes and shows the model at rest only; give it node_rest")
         return self._skinning.deform(positions, F)
 
     @torch.no_grad()
@@ -78,10 +89,22 @@ class DeformableRenderer:
         depth: bool = True,
         light: Light | None = None,
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """RGB image [H, W, 3] uint8 and, if asked for, depth [H, W] float32 (m, 0 = no surface) for nodes at positions [M, 3]
-        with F [M, 3, 3], in another light than the model's if one is given."""
+        """Return an RGB image [H, W, 3], uint8, and the depth [H, W] that goes with it, float32, metres, 0 = no surface.
+
+        Args:
+            camera: Intrinsics, pose and image size.
+            positions: Control nodes now [M, 3], metres, world; None renders the model at rest.
+            F: Their deformation gradients [M, 3, 3]; given with positions.
+            depth: Whether to return depth; None otherwise.
+            light: Light in place of the model's.
+
+        Raises:
+            ValueError: If the renderer has no control nodes, F is missing, or shapes disagree.
+        """
         model, covars = self.model, None
         if positions is not None:
+            if F is None:
+                raise ValueError("render: positions of control nodes go with their deformation gradients F; F is None")
             means, covars = self.deform(positions, F)
             sh = turned_colors(model.sh, self._skinning, means, F, camera) if model.sh_degree else model.sh
             model = GaussianModel(means, model.quats, model.log_scales, model.logit_opacities, sh)
@@ -93,18 +116,25 @@ class DeformableRenderer:
         image = to_bytes(colors).cpu().numpy()
         if not depth:
             return image, None
-        return image, torch.where(alpha > _MIN_ALPHA, output.depths[0] / alpha.clamp_min(1e-6), 0.0).cpu().numpy()
+        return image, torch.where(alpha > SURFACE, output.depths[0] / alpha.clamp_min(1e-6), 0.0).cpu().numpy()
+
+
+@torch.no_grad()
+def render_depth(model: GaussianModel, camera: Camera) -> np.ndarray:
+    """Return the median depth [H, W] of a model at rest in a camera, float32, metres, 0 = no surface."""
+    output = render(model, camera, median=True)
+    return torch.where(output.alphas[0] > SURFACE, output.medians[0], 0.0).cpu().numpy()
 
 
 def turned_colors(sh: Tensor, skinning: Skinning, means: Tensor, F: Tensor | np.ndarray, camera: Camera) -> Tensor:
-    """Degree 0 coefficients [N, 1, 3] of what a camera sees of colours sh [N, K, 3]: view directions turn back with the tissue.
+    """Return coefficients of degree 0 [N, 1, 3] of the colours that a camera sees, as view directions turn back with the tissue.
 
     Args:
-        sh: Of the Gaussians at rest.
-        skinning: How they follow the nodes.
-        means: Their centres now [N, 3], m, world.
-        F: Deformation gradients of the nodes [M, 3, 3].
-        camera: Where they are seen from.
+        sh: Spherical harmonic coefficients [N, K, 3] of the Gaussians at rest.
+        skinning: How the Gaussians follow the control nodes.
+        means: Centres of the Gaussians now [N, 3], metres, world.
+        F: Deformation gradients of the control nodes [M, 3, 3].
+        camera: Where the Gaussians are seen from.
     """
     position = torch.as_tensor(camera.position, dtype=torch.float32, device=means.device)
     directions = torch.nn.functional.normalize(means - position, dim=1)

@@ -1,7 +1,7 @@
-"""The light that travels with an endoscope, and the automatic exposure of its camera.
+"""The light that travels with an endoscope, its falloff, and the automatic exposure of the camera.
 
-A model's colours are those of tissue straight ahead at a reference distance. In an image the tissue is brighter near the
-camera and darker towards the edge, and the camera then brightens or dims the whole picture. Brightness is that of encoded
+A model's colours are those of tissue on the optical axis at a reference distance. In an image the tissue is brighter near
+the camera and darker towards the edge, and the exposure scales the whole picture. Brightness is that of encoded
 (gamma-compressed) images, as cameras deliver and 3DGS models store them.
 """
 
@@ -19,9 +19,9 @@ from endo_sim_ros.core.cameras import Camera
 
 FEATURES = 4
 _SHARPNESS = 6  # exponent of the mean that the exposure responds to: mostly to the brighter parts of a picture
-_STRIDE = 4  # pixels; an exposure needs no more
-SURFACE = 0.5  # alpha from which on there is tissue
-NEAREST = 1e-3  # metres
+_STRIDE = 4  # pixels from one that the exposure measures to the next
+SURFACE = 0.5  # alpha above which a pixel shows a surface
+NEAREST = 1e-3  # least depth of lit tissue, metres, and alpha above which a pixel has a depth
 
 
 @dataclass(frozen=True)
@@ -58,15 +58,15 @@ class Light:
                 raise ValueError(f"light: {name} is {value!r}; it must be a finite number{', above 0' * (name == 'reference')}")
 
     def to_json(self) -> str:
-        """One line, for a file's comment or a message."""
+        """Return the values as one line, for a file's comment or a message."""
         return json.dumps(dataclasses.asdict(self))
 
     @staticmethod
     def from_json(text: str) -> "Light":
-        """Read what `to_json` wrote.
+        """Return the light that `to_json` wrote.
 
         Raises:
-            ValueError: If it is something else; the message says what.
+            ValueError: If the text is not JSON, values are missing or unknown, or one of them is out of range.
         """
         values = json.loads(text)
         known = {field.name for field in dataclasses.fields(Light)}
@@ -84,18 +84,19 @@ def _directions(fx: float, fy: float, cx: float, cy: float, width: int, height: 
 
 
 def directions(camera: Camera, device: torch.device | str) -> Tensor:
-    """Logarithm of the cosine of the angle from the axis, and the slopes x and y, of a camera's pixels [3, H, W]."""
+    """Return of a camera's pixels [3, H, W]: the logarithm of the cosine of the angle from the axis, and the slopes x/z and y/z."""
     K = camera.K
     return _directions(*(float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2])), camera.width, camera.height, torch.device(device))
 
 
 def features(depths: Tensor, alphas: Tensor, directions: Tensor, reference: float) -> Tensor:
-    """The four quantities [4, H, W] that brightness depends on: −log(d/reference), log cos θ, x and y. No gradient.
+    """Return the four features [4, H, W] that brightness depends on: −log(d/reference), log cos θ, x/z and y/z; no gradient.
 
     Args:
-        depths, alphas: Σ w z [H, W], metres, and Σ w [H, W].
-        directions: Those of the camera's pixels [3, H, W].
-        reference: Distance at which brightness is the tissue's own, metres.
+        depths: Composited depths Σ w z [H, W], metres.
+        alphas: Opacities Σ w [H, W].
+        directions: The `directions` of the camera's pixels [3, H, W].
+        reference: Distance at which colours are the model's, metres.
     """
     depth = depths.detach() / alphas.detach().clamp_min(NEAREST)
     # Where nothing is drawn there is nothing to be lit.
@@ -103,22 +104,27 @@ def features(depths: Tensor, alphas: Tensor, directions: Tensor, reference: floa
     return torch.cat([-distance[None], directions])
 
 
-def falloff(quantities: Tensor, theta: Tensor) -> Tensor:
-    """Brightness [...] of quantities [4, ...] for the light's (distance, angle, tilt_x, tilt_y) [4]."""
+def falloff(features: Tensor, theta: Tensor) -> Tensor:
+    """Return brightness [...] of features [4, ...] for the exponents (distance, angle, tilt_x, tilt_y) [4] of a light."""
     # Not einsum: the gradient of a matrix product has other last bits with other numbers of threads.
-    return (quantities * theta.view(-1, *[1] * (quantities.ndim - 1))).sum(0).exp()
+    return (features * theta.view(-1, *[1] * (features.ndim - 1))).sum(0).exp()
 
 
-def log_brightness(image: Tensor, where: Tensor) -> Tensor:
-    """Logarithm of what an automatic exposure measures of an image [H, W, 3] over the pixels [H, W] that are True."""
+def log_brightness(image: Tensor, valid: Tensor) -> Tensor:
+    """Return the logarithm, a scalar, of the brightness that an automatic exposure measures in an image.
+
+    Args:
+        image: Colours [H, W, 3].
+        valid: Pixels that are measured, True or 1 [H, W].
+    """
     peak = image[::_STRIDE, ::_STRIDE].amax(-1).clamp(1e-3, 10)
-    weights = where[::_STRIDE, ::_STRIDE].to(peak.dtype)
+    weights = valid[::_STRIDE, ::_STRIDE].to(peak.dtype)
     mean = (weights * peak**_SHARPNESS).sum() / weights.sum().clamp_min(1)
     return mean.clamp_min(1e-12).log() / _SHARPNESS
 
 
 def features_at(points: np.ndarray, camera: Camera, reference: float) -> np.ndarray:
-    """The quantities of `features` [N, 4] at world points [N, 3] in front of a camera."""
+    """Return the `features` [N, 4] of points [N, 3], metres, world, in front of a camera."""
     local = (points - camera.position) @ camera.pose[:3, :3]
     distance = np.linalg.norm(local, axis=1)
     slopes = local[:, :2] / local[:, 2:]

@@ -12,7 +12,7 @@ from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
-from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
+from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig, render_depth
 
 log = logging.getLogger(__name__)
 
@@ -53,7 +53,7 @@ def _deformed_view_psnr(model: GaussianModel, cameras: Sequence[Camera], device:
         return float("nan")
     middle, size = camera.backproject(depth)[v, u], _SHARE * float(depth[v, u]) * camera.width / camera.K[0, 0]
     config = PhysicsConfig(device=device, force_radius=size / 2, travel=2 * size)
-    simulation = TissueSimulation(model, np.stack([each.position for each in cameras]), config, cameras)
+    simulation = TissueSimulation(model, np.stack([each.position for each in cameras]), config, cameras, render_depth)
     ours, reference = (DeformableRenderer(each, simulation.nodes.rest, options) for each in (model, surface))
     at_rest = reference.render(camera, depth=False)[0].astype(int)
     right, down, ahead = camera.pose[:3, :3].T

@@ -11,7 +11,7 @@ from endo_sim_ros.core import drawing
 from endo_sim_ros.core.cameras import Camera, load_cameras
 from endo_sim_ros.core.gaussians import load_ply
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
-from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
+from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig, render_depth
 
 log = logging.getLogger(__name__)
 
@@ -45,7 +45,7 @@ def draw_touches(model_path: Path, out: Path, config: PhysicsConfig) -> None:
     rod = dataclasses.replace(config, contact_radius=0.5 * size, contact_length=4 * size)
     pictures = [("at rest", picture)]
     for touch in track((_poke, _pull, _let_go, _grasp, _cut), description="touching the tissue"):
-        simulation = TissueSimulation(model, views, rod if touch is _poke else config, cameras)
+        simulation = TissueSimulation(model, views, rod if touch is _poke else config, cameras, render_depth)
         renderer = DeformableRenderer(model, simulation.nodes.rest, RenderingConfig(device=config.device))
         text, tip, force = touch(simulation, camera, middle, size)
         renderer.cut(simulation.cuts)

@@ -12,6 +12,7 @@ from endo_sim_ros.core.cameras import Camera, load_cameras, save_cameras
 from endo_sim_ros.core.gaussians import GaussianModel, ModelError, load_ply, save_ply
 from endo_sim_ros.learning.tasks import find_task, make_task
 from endo_sim_ros.physics import ControlNodes, PhysicsConfig, build_control_nodes
+from endo_sim_ros.rendering import render_depth
 
 _CACHED = "phantom-1.ply"  # another number when the default scene becomes another
 _PIECE = 0.5  # of the synthetic patient's picture, about its middle
@@ -32,7 +33,7 @@ class Scene:
     def nodes(self, config: PhysicsConfig) -> ControlNodes:
         """The tissue's nodes: those that physics_node makes of the same files, whose cameras all have the same intrinsics."""
         cameras = [self.camera.at(camera.pose) for camera in self.cameras]
-        return build_control_nodes(self.model, np.stack([camera.position for camera in cameras]), config, cameras)
+        return build_control_nodes(self.model, np.stack([camera.position for camera in cameras]), config, cameras, render_depth)
 
 
 def load_scene(path: str | Path | None = None) -> Scene:

@@ -19,6 +19,7 @@ from endo_sim_ros.nodes.base import ERROR, OK, STREAM_DEPTH, WARN, Background, E
 from endo_sim_ros.nodes.pacing import MOST_WAITING, CommandQueue, Pacer
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
 from endo_sim_ros.physics.regions import read_regions
+from endo_sim_ros.rendering import render_depth
 
 _SLOW = 0.5  # real-time factor below which the node warns
 _CAMERAS_LATE = 1.0  # seconds after a model in which its training cameras may still be on their way
@@ -543,7 +544,7 @@ def _poll(config: PhysicsConfig) -> float:
 
 def _tissue(model: GaussianModel, viewpoint: np.ndarray, config: PhysicsConfig, cameras: list[Camera]) -> TissueSimulation:
     """Tissue that is ready for the first tool and the first cut: they would make a step late otherwise."""
-    simulation = TissueSimulation(model, viewpoint, config, cameras)
+    simulation = TissueSimulation(model, viewpoint, config, cameras, render_depth)
     simulation.prepare()
     if config.kinematics == "rest" and not config.dense:
         simulation.prepare_cutting()

@@ -1,10 +1,9 @@
 """Control nodes: the sparse material points that stand for the tissue behind a reconstructed skin."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 import warp as wp
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
@@ -13,7 +12,6 @@ from endo_sim_ros.core.device import init_warp
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes_kernels import sample_farthest_points
-from endo_sim_ros.splatting import render
 
 OUTLIER_FACTOR = 5.0  # a Gaussian this many times farther from its neighbours than the median one floats
 OUTLIER_NEIGHBOURS = 8
@@ -22,6 +20,8 @@ RIM_WIDTH = 0.4  # spacings from the border; a free node between pinned ones wou
 CARVING_VIEWS = 8  # that look for free space, spread over the cameras
 CARVING_WIDTH = 160  # pixels
 GAP_FACTOR = 3.0  # a triangle with an edge this many spacings long bridges a gap and is not skin
+
+RenderDepth = Callable[[GaussianModel, Camera], np.ndarray]  # depth [H, W] of a model's surface in a camera, m, 0 = none
 
 
 @dataclass(frozen=True)
@@ -135,23 +135,24 @@ def measure_skin(points: np.ndarray, viewpoint: np.ndarray) -> Skin:
     return Skin(areas, rim, spacing)
 
 
-@torch.no_grad()
-def in_free_space(points: np.ndarray, model: GaussianModel, cameras: Sequence[Camera], margin: float) -> np.ndarray:
-    """Points [N, 3] (m, world) that some camera sees through: those that lie over a margin (m) in front of the surface behind them.
+def in_free_space(
+    points: np.ndarray, model: GaussianModel, cameras: Sequence[Camera], margin: float, render_depth: RenderDepth
+) -> np.ndarray:
+    """Return which points [N, 3] (m, world) some camera sees through: those over a margin (m) in front of the surface behind them.
 
     Args:
         points: Candidates.
         model: What the cameras see.
-        cameras: Where it was seen from; a few of them, spread over all, look.
+        cameras: Where it was seen from; a few of them, spread over all, are looked through.
         margin: How far in front of the surface counts, m.
+        render_depth: Renders the model's depth, e.g. `endo_sim_ros.rendering.render_depth`.
     """
     free = np.zeros(len(points), bool)
     for index in np.unique(np.linspace(0, len(cameras) - 1, min(CARVING_VIEWS, len(cameras))).round().astype(int)):
         camera = cameras[index]
         width = min(CARVING_WIDTH, camera.width)
         camera = camera.resized(width, max(round(camera.height * width / camera.width), 1))
-        output = render(model, camera, median=True)
-        depth = torch.where(output.alphas[0] > 0.5, output.medians[0], 0.0).cpu().numpy()
+        depth = render_depth(model, camera)
         uv, z = camera.project(points)
         column, row = np.floor(uv[:, 0]), np.floor(uv[:, 1])
         seen = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
@@ -169,7 +170,13 @@ def _in_pictures(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
     return inside if inside.sum() > LEAST_IN_PICTURES * len(points) else np.ones(len(points), bool)
 
 
-def build_control_nodes(model: GaussianModel, viewpoint: np.ndarray, config: PhysicsConfig, cameras: Sequence[Camera] = ()) -> ControlNodes:
+def build_control_nodes(
+    model: GaussianModel,
+    viewpoint: np.ndarray,
+    config: PhysicsConfig,
+    cameras: Sequence[Camera] = (),
+    render_depth: RenderDepth | None = None,
+) -> ControlNodes:
     """Nodes of the tissue behind a model's skin.
 
     The skin is sampled from the opaque Gaussians by farthest points and extruded along the viewing rays: layer l of L
@@ -183,10 +190,15 @@ def build_control_nodes(model: GaussianModel, viewpoint: np.ndarray, config: Phy
         config: Node count, layers, thickness and what is pinned.
         cameras: Those that the model was seen from, for carving; without any nothing is carved. Gaussians beyond the pictures
             of all of them, which nobody has seen, give no nodes.
+        render_depth: Renders the model's depth in these cameras, for carving, e.g. `endo_sim_ros.rendering.render_depth`.
 
     Raises:
-        ValueError: If the viewpoint or means are not finite, or too few opaque Gaussians span a surface.
+        ValueError: If the viewpoint or means are not finite, too few opaque Gaussians span a surface, or carving lacks
+            ``render_depth``.
     """
+    carves = config.carve and config.layers > 0 and len(cameras) > 0 and not config.dense
+    if carves and render_depth is None:
+        raise ValueError("carving needs the model's depth: pass render_depth, e.g. that of endo_sim_ros.rendering, or set carve=False")
     eye = np.asarray(viewpoint, np.float64).reshape(-1, 3)
     means = model.means.detach().cpu().double().numpy()
     opacities = model.opacities.detach().cpu().double().numpy()
@@ -225,8 +237,8 @@ def build_control_nodes(model: GaussianModel, viewpoint: np.ndarray, config: Phy
     if config.pin_back and config.layers:
         pinned |= layer_of == config.layers
     positions, kept = np.concatenate(rest) + eye, np.ones(len(pinned), bool)
-    if config.carve and config.layers and len(cameras):
-        free = in_free_space(positions[len(skin) :], model, cameras, gap / 2).reshape(config.layers, -1)
+    if carves and render_depth is not None:
+        free = in_free_space(positions[len(skin) :], model, cameras, gap / 2, render_depth).reshape(config.layers, -1)
         kept[len(skin) :] = ~np.logical_or.accumulate(free, axis=0).ravel()  # nor does tissue go on behind free space
     return ControlNodes(
         positions[kept].astype(np.float32),

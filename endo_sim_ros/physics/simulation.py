@@ -11,7 +11,7 @@ from torch import Tensor
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.physics.config import PhysicsConfig
-from endo_sim_ros.physics.control_nodes import ControlNodes, build_control_nodes
+from endo_sim_ros.physics.control_nodes import ControlNodes, RenderDepth, build_control_nodes
 from endo_sim_ros.physics.cutting import Blade, CutStencils
 from endo_sim_ros.physics.regions import TissueProperties, paint_regions
 from endo_sim_ros.physics.skinning import Skinning
@@ -127,13 +127,21 @@ class TissueSimulation:
         viewpoint: Camera position [3] or positions [V, 3], metres, world; the tissue extends away from it.
         config: Parameters.
         cameras: Those that the model was seen from; where they see through the extruded tissue it is left out.
+        render_depth: Renders the model's depth in these cameras, see `build_control_nodes`.
 
     Raises:
         ValueError: If no tissue can be built from the model, or (:class:`StabilityError`) the substeps are too long.
     """
 
-    def __init__(self, model: GaussianModel, viewpoint: np.ndarray, config: PhysicsConfig, cameras: Sequence[Camera] = ()):
-        self._start(build_control_nodes(model, viewpoint, config, cameras), config)
+    def __init__(
+        self,
+        model: GaussianModel,
+        viewpoint: np.ndarray,
+        config: PhysicsConfig,
+        cameras: Sequence[Camera] = (),
+        render_depth: RenderDepth | None = None,
+    ):
+        self._start(build_control_nodes(model, viewpoint, config, cameras, render_depth), config)
 
     @classmethod
     def from_nodes(cls, nodes: ControlNodes, config: PhysicsConfig, properties: TissueProperties | None = None) -> "TissueSimulation":

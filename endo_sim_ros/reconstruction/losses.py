@@ -5,17 +5,12 @@ Images are [H, W, 3] in [0, 1], depths [H, W] in metres, masks [H, W] in {0, 1}.
 
 import math
 
-import cv2
 import torch
-import warp as wp
 from torch import Tensor
 
-from endo_sim_ros.core.device import init_warp, warp_stream
 from endo_sim_ros.core.gaussians import GaussianModel
-from endo_sim_ros.reconstruction import losses_kernels as kernels
-from endo_sim_ros.splatting.backend import kernel_arguments
+from endo_sim_ros.reconstruction.ssim import ssim
 
-_C1, _C2 = kernels.C1, kernels.C2
 _FAINT = 1e-3  # alpha, below which a pixel has no depth of its own
 
 
@@ -106,67 +101,3 @@ def seen_at(points: Tensor, viewmat: Tensor, K: Tensor, mask: Tensor | None, siz
     inside = (z > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
     index = (v.clamp(0, height - 1) * width + u.clamp(0, width - 1)).long()
     return index, inside if mask is None else inside & (mask.flatten()[index] > 0), z
-
-
-def ssim(image: Tensor, target: Tensor) -> Tensor:
-    """Structural similarity map [H, W, 3] (Wang et al. 2004; 11×11, σ 1.5, zeros around); gradient in ``image``."""
-    return (_SsimOnGpu if image.is_cuda else _Ssim).apply(image, target)
-
-
-def _blur(image: Tensor) -> Tensor:
-    """Gaussian window over [H, W, C] with zero padding; symmetric, hence its own adjoint."""
-    # OpenCV's separable filter is 10 times faster than a convolution here.
-    blurred = cv2.sepFilter2D(image.numpy(), -1, kernels.gaussian, kernels.gaussian, borderType=cv2.BORDER_CONSTANT)
-    return torch.from_numpy(blurred.reshape(image.shape))
-
-
-class _Ssim(torch.autograd.Function):
-    """SSIM = (2 μx μy + C1)(2 σxy + C2) / ((μx² + μy² + C1)(σx² + σy² + C2)) with its gradient in x by hand."""
-
-    @staticmethod
-    def forward(ctx, x: Tensor, y: Tensor) -> Tensor:
-        x, y = x.detach().contiguous(), y.detach().contiguous()
-        mu_x, mu_y, xx, yy, xy = _blur(torch.cat([x, y, x * x, y * y, x * y], 2)).split(x.shape[2], 2)
-        var_x, var_y, cov = xx - mu_x**2, yy - mu_y**2, xy - mu_x * mu_y
-        ctx.save_for_backward(x, y, mu_x, mu_y, var_x, var_y, cov)
-        return (2 * mu_x * mu_y + _C1) * (2 * cov + _C2) / ((mu_x**2 + mu_y**2 + _C1) * (var_x + var_y + _C2))
-
-    @staticmethod
-    def backward(ctx, v: Tensor) -> tuple[Tensor, None]:
-        x, y, mu_x, mu_y, var_x, var_y, cov = ctx.saved_tensors
-        A, B = 2 * mu_x * mu_y + _C1, 2 * cov + _C2
-        C, D = mu_x**2 + mu_y**2 + _C1, var_x + var_y + _C2
-        s = A * B / (C * D)
-        v_var, v_cov = -v * s / D, v * 2 * A / (C * D)
-        v_mu = v * (2 * mu_y * B / (C * D) - 2 * mu_x * s / C) - 2 * mu_x * v_var - mu_y * v_cov
-        v_mu, v_var, v_cov = _blur(torch.cat([v_mu, v_var, v_cov], 2)).split(x.shape[2], 2)
-        return v_mu + 2 * x * v_var + y * v_cov, None
-
-
-class _SsimOnGpu(torch.autograd.Function):
-    """The same by kernels, on any device."""
-
-    @staticmethod
-    def forward(ctx, x: Tensor, y: Tensor) -> Tensor:
-        x, y = x.detach().contiguous(), y.detach().contiguous()
-        moments, slopes, values = x.new_empty(5, x.numel()), x.new_empty(3, x.numel()), torch.empty_like(x)
-        _launch(kernels.moments_across, [x, y, *x.shape[1:], moments], x)
-        _launch(kernels.similarity_down, [moments, x[0].numel(), values, slopes], x)
-        ctx.save_for_backward(x, y, slopes)
-        return values
-
-    @staticmethod
-    def backward(ctx, v: Tensor) -> tuple[Tensor, None]:
-        x, y, slopes = ctx.saved_tensors
-        sums, v_x = torch.empty_like(slopes), torch.empty_like(x)
-        _launch(kernels.gradient_across, [v.contiguous(), slopes, *x.shape[1:], sums], x)
-        _launch(kernels.gradient_down, [sums, x, y, x[0].numel(), v_x], x)
-        return v_x, None
-
-
-def _launch(kernel, arguments: list, image: Tensor) -> None:
-    """Launch a kernel for each value of an image."""
-    init_warp()
-    arguments = kernel_arguments(kernel, [a.view(-1) if isinstance(a, Tensor) and a.ndim == 3 else a for a in arguments])
-    stream = warp_stream(torch.cuda.current_stream(image.device)) if image.is_cuda else None
-    wp.launch(kernel, image.numel(), arguments, device=str(image.device), stream=stream)

@@ -33,7 +33,7 @@ from endo_sim_ros.reconstruction.priors.sources import depth_source, right_view,
 from endo_sim_ros.reconstruction.strategies import mcmc
 from endo_sim_ros.reconstruction.triangulation import ScenePoints, match_features, misposed, triangulate
 from endo_sim_ros.splatting import RenderOutput, rasterize
-from endo_sim_ros.splatting.graph_capture import Recording
+from endo_sim_ros.splatting.graph_capture import GraphCapture
 
 log = logging.getLogger(__name__)
 
@@ -154,7 +154,7 @@ class Trainer:
         # Drawn where it is needed: a GPU that waits for numbers stands still.
         self._noise = self._generator if self.device == "cpu" else torch.Generator(self.device).manual_seed(config.seed)
         self._order: list[int] = []
-        self._recordings: dict[tuple, Recording] = {}
+        self._captures: dict[tuple, GraphCapture] = {}
         self._last_loss = torch.zeros(())
         self._light_prior = torch.tensor(light, dtype=torch.float32, device=self.device)
         exposures = torch.tensor(exposures, dtype=torch.float32, device=self.device)
@@ -309,7 +309,7 @@ class Trainer:
         """Go on with images of half the size."""
         width = self._frames[0].camera.width // 2
         log.warning("out of memory: going on with images %d pixels wide; fewer max_gaussians may help, too", width)
-        self._recordings, self._views = {}, []
+        self._captures, self._views = {}, []
         torch.cuda.empty_cache()
         self._load([shrink(frame, width) for frame in self._frames])
 
@@ -359,10 +359,10 @@ class Trainer:
         if self.device == "cpu":
             return function(*inputs)
         key = (seldom, *(None if x is None else x.shape for x in inputs))
-        if key not in self._recordings:
-            self._recordings[key] = Recording(function)
+        if key not in self._captures:
+            self._captures[key] = GraphCapture(function)
         with torch.cuda.device(self.device):
-            return self._recordings[key](*inputs)
+            return self._captures[key](*inputs)
 
     def _descend_once(self, seldom: bool, *inputs: Tensor | None) -> Tensor:
         config, view = self.config, _Inputs(*inputs)
@@ -459,8 +459,8 @@ class Trainer:
 
     def _set_model(self, model: GaussianModel) -> None:
         """Start optimising a model with a fresh optimiser."""
-        for recording in self._recordings.values():
-            recording.forget()
+        for capture in self._captures.values():
+            capture.invalidate()
         self._parameters = {name: tensor.clone().requires_grad_() for name, tensor in _parameters(model).items()}
         self._optimizer = Adam(self._parameters, {name: self.config.learning_rate * rate for name, rate in _RATES.items()})
         self._shown = self._shown_now()

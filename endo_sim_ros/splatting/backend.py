@@ -1,105 +1,63 @@
-"""What both ways to rasterise take, and how tensors become arguments of Warp kernels."""
+"""Where splats are drawn: one backend for each kind of device."""
 
-from typing import NamedTuple
+import types
+from collections.abc import Sequence
+from typing import Any, Protocol
 
 import torch
-import warp as wp
 from torch import Tensor
 
-from endo_sim_ros.splatting.common_kernels import TILE
+from endo_sim_ros.core.kernels import load_kernels, vectorised
+from endo_sim_ros.splatting import cpu, cuda
+from endo_sim_ros.splatting.scene import Gradients, Scene, Settings
 
 
-class Scene(NamedTuple):
-    """N Gaussians, or as many for each camera, and C cameras: float32, contiguous, on one device. As in `rasterize`."""
+class RasterBackend(Protocol):
+    """How a kind of device draws a scene; a module is one."""
 
-    means: Tensor
-    quats: Tensor | None
-    scales: Tensor | None
-    covars: Tensor | None
-    opacities: Tensor
-    sh: Tensor
-    viewmats: Tensor
-    Ks: Tensor
-    background: Tensor
+    modules: tuple[types.ModuleType, ...]  # of Warp kernels
 
-    @property
-    def gaussian_count(self) -> int:
-        """N."""
-        return self.means.shape[-2]
+    def forward(self, scene: Scene, tile_mask: Tensor, settings: Settings) -> tuple[list[Tensor], Tensor, Tensor, Any]:
+        """Draw a scene.
 
-    @property
-    def splat_count(self) -> int:
-        return len(self.viewmats) * self.gaussian_count
+        Args:
+            scene: Gaussians and cameras.
+            tile_mask: 1 for tiles that are drawn, 0 for those that show the background only, uint8 [C · tiles].
+            settings: Image size and options.
 
-    @property
-    def apart(self) -> int:
-        """Whether each camera has means and covariances of its own."""
-        return int(self.means.ndim == 3)
+        Returns:
+            Images, see `empty_images`.
+            Radii of splats, int32 [C, N], pixels; 0 = not in the image.
+            Owners of median depths: number of the splat, c·N + n, or −1, int32 [C, H, W]; [0] if not wanted.
+            What `backward` needs.
+        """
+        ...
 
-    def gaussian_arguments(self) -> list:
-        """With these `project` and `project_backward` begin."""
-        return [self.means, self.quats, self.scales, self.covars, int(self.covars is not None)]
+    def backward(
+        self,
+        scene: Scene,
+        state: Any,
+        settings: Settings,
+        images: Sequence[Tensor],
+        v_images: Sequence[Tensor],
+        wants_pose: bool,
+        wants_absolute: bool,
+    ) -> Gradients:
+        """Return the gradients of a scene.
 
-
-class Settings(NamedTuple):
-    """How to draw it."""
-
-    width: int
-    height: int
-    near: float
-    eps2d: float
-    median: bool
-
-    @property
-    def tiles_x(self) -> int:
-        return -(-self.width // TILE)
-
-    @property
-    def tiles_y(self) -> int:
-        return -(-self.height // TILE)
+        Args:
+            scene, settings: Those of the forward pass.
+            state: What the forward pass returned for it.
+            images: The images of the forward pass.
+            v_images: Their gradients, float32, contiguous.
+            wants_pose: Whether to compute `Gradients.camera_shares`.
+            wants_absolute: Whether to compute `Gradients.absolutes`.
+        """
+        ...
 
 
-class Gradients(NamedTuple):
-    """Of a scene; None where there is nothing to differentiate, or nobody asked."""
-
-    means: Tensor
-    quats: Tensor | None
-    scales: Tensor | None
-    covars: Tensor | None
-    opacities: Tensor
-    sh: Tensor
-    camera_shares: Tensor | None  # [C, N, 4, 4] what each Gaussian adds to the gradient of each camera's viewmat
-    absolutes: Tensor | None  # [C, N, 2]
-
-    @classmethod
-    def empty(cls, scene: Scene, wants_pose: bool, wants_absolute: bool) -> "Gradients":
-        """Room for them."""
-        room = [None if x is None else torch.empty_like(x) for x in scene[:6]]
-        size = (len(scene.viewmats), scene.gaussian_count)
-        shares = scene.means.new_empty(*size, 4, 4) if wants_pose else None
-        return cls(*room, shares, scene.means.new_empty(*size, 2) if wants_absolute else None)
-
-
-def empty_images(scene: Scene, settings: Settings) -> tuple[list[Tensor], Tensor]:
-    """Room for colours, depths, alphas and distortions, and for the owners of median depths, if those are wanted."""
-    size = (len(scene.viewmats), settings.height, settings.width)
-    images = [scene.means.new_empty(*size, 3)] + [scene.means.new_empty(size) for _ in range(3)]
-    owners = torch.empty(size if settings.median else 0, dtype=torch.int32, device=scene.means.device)
-    return images, owners
-
-
-def kernel_arguments(kernel, arguments: list, offset: int = 0) -> list:
-    """Arguments of a kernel from the one at an offset on, tensors among them as arrays of the kernel's types, not copied.
-
-    None becomes an array that must not be read.
-    """
-    types = [argument.type for argument in kernel.adj.args[offset:]]
-    return [_array(kind, x) if isinstance(x, Tensor) else x for kind, x in zip(types, arguments, strict=True)]
-
-
-def _array(kind, tensor: Tensor):
-    tensor = tensor.detach()
-    dims = kind.ndim + len(getattr(kind.dtype, "_shape_", ()))
-    if tensor.ndim > dims:  # the kernel counts through the first ones
-        tensor = tensor.view(-1, *tensor.shape[tensor.ndim - dims + 1 :])
-    return wp.from_torch(tensor, dtype=kind.dtype, requires_grad=False, return_ctype=True)
+def backend_for(device: torch.device) -> RasterBackend:
+    """Return the backend of a device, its kernels loaded."""
+    backend = cpu if vectorised(device) else cuda
+    load_kernels(backend.modules, str(device))
+    return backend

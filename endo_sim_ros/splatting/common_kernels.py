@@ -33,11 +33,10 @@ tiles add to one row per splat. The absolute gradients of the mean, Σ_pixels |�
 
 import warp as wp
 
-wp.set_module_options({"enable_backward": False})
+from endo_sim_ros.splatting.constants import ALPHA_MIN, LOG_ALPHA_SLACK, PIXEL_SLACK, TILE
+from endo_sim_ros.splatting.headers import headers
 
-TILE = 16  # pixels, width and height of a tile
-SPLAT_SIZE = 16  # floats per splat
-RECORD_SIZE = 12  # floats per gradient record
+wp.set_module_options({"enable_backward": False, "extra_build_options": headers("blending.h")})
 
 # Columns of a splat.
 X, Y = wp.constant(0), wp.constant(1)  # mean, pixels
@@ -52,16 +51,7 @@ SHEAR_X, SHEAR_Y = wp.constant(14), wp.constant(15)  # B/A and B/C
 # absolute gradients of columns 0 and 1.
 ABSOLUTE = wp.constant(10)
 
-ALPHA_MIN = wp.constant(1.0 / 255.0)
-ALPHA_MAX = wp.constant(0.999)
-TRANSMITTANCE_MIN = wp.constant(1e-4)
-MEDIAN = wp.constant(0.5)
-# Slack that keeps the tile test on the safe side of float32 rounding.
-LOG_ALPHA_SLACK = wp.constant(0.01)
-PIXEL_SLACK = wp.constant(0.01)
-
-TILE_SIZE = wp.constant(TILE)
-LOOK_AHEAD = wp.constant(8)
+LOOK_AHEAD = wp.constant(8)  # items, to ask memory for
 TILE_LAST = wp.constant(float(TILE - 1))
 
 mat23 = wp.types.matrix(shape=(2, 3), dtype=wp.float32)
@@ -245,11 +235,20 @@ def image_covariance(
 @wp.func
 def tile_rows(y: float, extent_y: float, tiles_y: int) -> wp.vec2i:
     """Rows [first, end) of tiles that have a pixel centre within extent_y of y."""
-    size = float(TILE_SIZE)
+    size = float(TILE)
     first = wp.ceil((y - extent_y - PIXEL_SLACK - TILE_LAST - 0.5) / size)
     last = wp.floor((y + extent_y + PIXEL_SLACK - 0.5) / size)
     end = float(tiles_y)
     return wp.vec2i(int(wp.clamp(first, 0.0, end)), int(wp.clamp(last + 1.0, 0.0, end)))
+
+
+@wp.func_native("""
+    const endo_sim::Span span = endo_sim::ellipse_span(center, low, high, widest, shear, aspect, extent);
+    return {span.low, span.high};
+""")
+def ellipse_span(center: float, low: float, high: float, widest: float, shear: float, aspect: float, extent: float) -> wp.vec2:
+    """First and last coordinate of an ellipse along one axis, between low and high on the other; see the header."""
+    ...
 
 
 @wp.func
@@ -259,15 +258,11 @@ def tile_columns(row: int, x: float, y: float, shear: wp.vec2, extent: wp.vec2, 
     Ellipse and row are convex, so the tiles met are exactly a range. At height dy the ellipse spans
     −(B/A) dy ± aspect √(extent_y² − dy²); it is widest to the right at dy = −(B/C) extent_x.
     """
-    size = float(TILE_SIZE)
-    low = wp.max(float(row * TILE_SIZE) + 0.5 - y - PIXEL_SLACK, -extent[1])
-    high = wp.min(float(row * TILE_SIZE) + 0.5 + TILE_LAST - y + PIXEL_SLACK, extent[1])
-    widest = -shear[1] * extent[0]
-    dy_right = wp.clamp(widest, low, high)
-    dy_left = wp.clamp(-widest, low, high)
-    square = extent[1] * extent[1]
-    right = x - shear[0] * dy_right + aspect * wp.sqrt(wp.max(square - dy_right * dy_right, 0.0)) + PIXEL_SLACK
-    left = x - shear[0] * dy_left - aspect * wp.sqrt(wp.max(square - dy_left * dy_left, 0.0)) - PIXEL_SLACK
+    size = float(TILE)
+    low = wp.max(float(row * TILE) + 0.5 - y - PIXEL_SLACK, -extent[1])
+    high = wp.min(float(row * TILE) + 0.5 + TILE_LAST - y + PIXEL_SLACK, extent[1])
+    span = ellipse_span(x, low, high, -shear[1] * extent[0], shear[0], aspect, extent[1])
+    left, right = span[0] - PIXEL_SLACK, span[1] + PIXEL_SLACK
     first = wp.ceil((left - TILE_LAST - 0.5) / size)
     last = wp.floor((right - 0.5) / size)
     end = float(tiles_x)
@@ -290,7 +285,7 @@ def project(
     height: int,
     near: float,
     eps2d: float,
-    apart: int,  # whether means and covars are those of each camera, one after the other; sh may be, too
+    per_camera: int,  # whether means and covars are those of each camera, one after the other; sh may be, too
     tile_mask: wp.array[wp.uint8],  # [C · tiles], 0 = nobody looks at this tile
     splats: wp.array2d[float],  # out
     radii: wp.array[int],  # out, pixels, 0 = not in the image
@@ -302,7 +297,7 @@ def project(
     gaussian_count = opacities.shape[0]
     camera = splat // gaussian_count
     n = splat - camera * gaussian_count
-    own = n + apart * camera * gaussian_count
+    own = n + per_camera * camera * gaussian_count
     radii[splat] = 0
     depth_keys[splat] = 0
     order[splat] = splat
@@ -359,8 +354,8 @@ def project(
     radii[splat] = int(wp.min(wp.ceil(wp.max(extent[0], extent[1])), 1.0e6))
     depth_keys[splat] = wp.cast(p[2], wp.int32)  # the bits of positive floats order as the floats do
 
-    tiles_x = (width + TILE_SIZE - 1) // TILE_SIZE
-    tiles_y = (height + TILE_SIZE - 1) // TILE_SIZE
+    tiles_x = (width + TILE - 1) // TILE
+    tiles_y = (height + TILE - 1) // TILE
     rows = tile_rows(y, extent[1], tiles_y)
     count = int(0)
     for row in range(rows[0], rows[1]):
@@ -370,14 +365,8 @@ def project(
     counts[splat] = count
 
 
-@wp.func_native("""
-#if !defined(__CUDA_ARCH__)
-    __builtin_prefetch(rows.data + (size_t)row * rows.shape[1]);
-#endif
-""")
-def prefetch_row(rows: wp.array2d[float], row: int):
-    """Ask a CPU's memory for a row that is needed soon; rows are read in an order that it cannot guess."""
-    ...
+@wp.func_native("endo_sim::prefetch(rows.data + (size_t)row * rows.shape[1]);")
+def prefetch_row(rows: wp.array2d[float], row: int): ...
 
 
 @wp.kernel
@@ -391,18 +380,18 @@ def emit_intersections(
     tile_mask: wp.array[wp.uint8],
     tiles_x: int,
     tiles_y: int,
-    room: int,
+    capacity: int,  # of the lists
     by_splat: int,  # whether values are splats, rather than numbers of intersections with the two arrays after them
     tiles: wp.array[int],  # out, tile of each intersection (the first half is used)
     values: wp.array[int],  # out, what is sorted with it (the first half is used)
     firsts: wp.array[int],  # out, first intersection of each splat
     owners: wp.array[int],  # out, splat of each intersection
 ):
-    """List the intersections; does nothing if there is no room for all."""
+    """List the intersections; does nothing if there are more than the lists can hold."""
     rank = offset + wp.tid()
     prefetch_row(splats, order[wp.min(rank + LOOK_AHEAD, ends.shape[0] - 1)])
     splat = order[rank]
-    if counts[splat] == 0 or ends[ends.shape[0] - 1] > wp.int64(room):
+    if counts[splat] == 0 or ends[ends.shape[0] - 1] > wp.int64(capacity):
         return
     end = int(ends[rank])
     i = end - counts[splat]

@@ -1,4 +1,4 @@
-"""Runs the kernels made for CPUs, in as many threads as there are cores."""
+"""The backend of CPUs: kernels of vectors of 16 pixels, in as many threads as there are cores."""
 
 import functools
 from typing import NamedTuple
@@ -7,16 +7,18 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from endo_sim_ros.core.device import cpu_threads, run_in_threads, shares
+from endo_sim_ros.core.device import cpu_threads, run_in_threads
+from endo_sim_ros.core.kernels import kernel_arguments, launch_in_shares
 from endo_sim_ros.splatting import common_kernels as kernels
-from endo_sim_ros.splatting import cpu_kernels as simd_kernels
-from endo_sim_ros.splatting.backend import Gradients, Scene, Settings, empty_images, kernel_arguments
+from endo_sim_ros.splatting import cpu_kernels
+from endo_sim_ros.splatting.constants import RECORD_SIZE, SPLAT_SIZE
+from endo_sim_ros.splatting.scene import Gradients, Scene, Settings, empty_images
 
-MODULES = (kernels, simd_kernels)
+modules = (kernels, cpu_kernels)
 
 
 class State(NamedTuple):
-    """Which splat meets which tile; the header of the kernels defines the terms."""
+    """Which splat meets which tile; `common_kernels` defines the terms."""
 
     splats: Tensor  # [C·N, 16]
     counts: Tensor  # [C·N] intersections of each splat
@@ -27,31 +29,31 @@ class State(NamedTuple):
 
 
 def forward(scene: Scene, tile_mask: Tensor, settings: Settings) -> tuple[list[Tensor], Tensor, Tensor, State]:
-    """Images, radii, owners of median depths, and what `backward` needs."""
+    """Draw a scene, as `RasterBackend` says."""
     s, splat_count = settings, scene.splat_count
     integers = functools.partial(scene.means.new_empty, dtype=torch.int32)
     images, owners = empty_images(scene, settings)
-    splats, counts = scene.means.new_empty(splat_count, kernels.SPLAT_SIZE), integers(splat_count)
+    splats, counts = scene.means.new_empty(splat_count, SPLAT_SIZE), integers(splat_count)
     radii, depth_keys, order = integers((len(scene.viewmats), scene.gaussian_count)), integers(2 * splat_count), integers(2 * splat_count)
     arguments = [*scene.gaussian_arguments(), scene.opacities, scene.sh, scene.viewmats, scene.Ks, s.width, s.height, s.near, s.eps2d]
-    _launch(kernels.project, splat_count, [*arguments, scene.apart, tile_mask, splats, radii, depth_keys, order, counts])
+    launch_in_shares(kernels.project, splat_count, [*arguments, scene.per_camera, tile_mask, splats, radii, depth_keys, order, counts])
     state = _intersect(splats, depth_keys, order, counts, tile_mask, scene.gaussian_count, settings)
     arguments = [*_image_arguments(state, scene, settings, images), int(settings.median), owners]
-    _launch_tiles(simd_kernels.render_tiles, len(tile_mask), arguments)
+    _launch_tiles(cpu_kernels.render_tiles, len(tile_mask), arguments)
     return images, radii, owners, state
 
 
 def backward(
     scene: Scene, state: State, settings: Settings, images: list[Tensor], v_images: list[Tensor], wants_pose: bool, wants_absolute: bool
 ) -> Gradients:
-    """The gradients of the scene, from those of the images."""
+    """Return gradients of a scene, as `RasterBackend` says."""
     gradients = Gradients.empty(scene, wants_pose, wants_absolute)
-    records = scene.means.new_empty(len(state.owners), kernels.RECORD_SIZE)
+    records = scene.means.new_empty(len(state.owners), RECORD_SIZE)
     arguments = [*_image_arguments(state, scene, settings, images), *v_images, int(wants_absolute), records]
-    _launch_tiles(simd_kernels.render_tiles_backward, len(state.starts) - 1, arguments)
+    _launch_tiles(cpu_kernels.render_tiles_backward, len(state.starts) - 1, arguments)
     arguments = [*scene.gaussian_arguments(), scene.sh, scene.viewmats, scene.Ks, settings.width, settings.height, settings.eps2d]
     arguments += [state.counts, 0, state.firsts, records, int(wants_pose), int(wants_absolute), *gradients]
-    _launch(kernels.project_backward, len(scene.means), arguments)
+    launch_in_shares(kernels.project_backward, len(scene.means), arguments)
     return gradients
 
 
@@ -65,10 +67,10 @@ def _intersect(splats, depth_keys, order, counts, tile_mask, gaussian_count, set
     firsts, tiles, slots = torch.empty_like(counts), *counts.new_empty(2, 2 * count)
     owners, starts = counts.new_empty(count), counts.new_empty(tile_count + 1)
     arguments = [order, ends, counts, gaussian_count, splats, tile_mask, settings.tiles_x, settings.tiles_y, count, 0]
-    _launch(kernels.emit_intersections, splat_count if count else 0, [*arguments, tiles, slots, firsts, owners])
+    launch_in_shares(kernels.emit_intersections, splat_count if count else 0, [*arguments, tiles, slots, firsts, owners])
     if count:
         _sort_pairs(tiles, slots, count, (tile_count + 1).bit_length())
-    _launch(simd_kernels.find_tile_starts, count + 1, [tiles, count, starts])
+    launch_in_shares(cpu_kernels.find_tile_starts, count + 1, [tiles, count, starts])
     return State(splats, counts, firsts, owners, slots, starts)
 
 
@@ -78,21 +80,9 @@ def _sort_pairs(keys: Tensor, values: Tensor, count: int, bits: int) -> None:
 
 
 def _image_arguments(state: State, scene: Scene, settings: Settings, images: list[Tensor]) -> list:
-    """With these both kernels that composite begin."""
+    """Return the first arguments, after the counter, of both kernels that composite."""
     lists = [state.splats, state.owners, state.slots, state.starts]
     return [*lists, scene.background, settings.width, settings.height, *images]
-
-
-def _launch(kernel, count: int, arguments: list) -> None:
-    """Launch a kernel whose first argument is an offset over count items, in shares."""
-    if count == 0:
-        return
-    arguments = kernel_arguments(kernel, arguments, 1)
-
-    def share(first, size):
-        wp.launch(kernel, dim=size, inputs=[first, *arguments], device="cpu")
-
-    run_in_threads([functools.partial(share, *pair) for pair in shares(count, 1024)])
 
 
 def _launch_tiles(kernel, tile_count: int, arguments: list) -> None:

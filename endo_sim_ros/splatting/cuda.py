@@ -1,4 +1,4 @@
-"""Runs the kernels made for GPUs. Nothing here waits for the GPU, and little is done in Python while it waits for us."""
+"""The backend of GPUs: a thread for each pixel. The host never waits for the GPU, and does little in Python that the GPU would wait for."""
 
 import collections
 import contextlib
@@ -6,6 +6,7 @@ import contextvars
 import functools
 import math
 import threading
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -13,17 +14,19 @@ import warp as wp
 from torch import Tensor
 
 from endo_sim_ros.core.device import on_torch_stream
+from endo_sim_ros.core.kernels import kernel_arguments
 from endo_sim_ros.splatting import common_kernels as kernels
-from endo_sim_ros.splatting import cuda_kernels as tiled_kernels
-from endo_sim_ros.splatting.backend import Gradients, Scene, Settings, empty_images, kernel_arguments
+from endo_sim_ros.splatting import cuda_kernels
+from endo_sim_ros.splatting.constants import RECORD_SIZE, SPLAT_SIZE
+from endo_sim_ros.splatting.scene import Gradients, Scene, Settings, empty_images
 
-MODULES = (kernels, tiled_kernels)
-_FIRST_GUESS = 4.0  # intersections of a splat, on average
-_MOST = 64.0  # of them that lists have room for
-_ALWAYS = 2**24  # that lists have room for however few splats there are; pictures that need more are drawn without lists
-_SPARE = 1.25  # room, relative to what is expected
-_FORGETTING = 0.98  # of what was needed once, at every picture
-_COMMANDS = 512  # recorded launches kept
+modules = (kernels, cuda_kernels)
+_FIRST_GUESS = 4.0  # intersections of a splat, on average, before any picture has told
+_MOST = 64.0  # intersections of a splat, on average, that lists have room for
+_ALWAYS = 2**24  # intersections that lists have room for, however few splats there are; with more a picture is drawn without lists
+_SPARE = 1.25  # capacity of lists, relative to the expected number of intersections
+_FORGETTING = 0.98  # factor on the largest number of intersections so far, at every picture
+_COMMANDS = 512  # recorded launches that are kept
 
 
 class State(NamedTuple):
@@ -36,50 +39,50 @@ class State(NamedTuple):
 
 
 def forward(scene: Scene, tile_mask: Tensor, settings: Settings) -> tuple[list[Tensor], Tensor, Tensor, State]:
-    """Images, radii, owners of median depths, and what `backward` needs."""
+    """Draw a scene, as `RasterBackend` says."""
     device, splat_count, tile_count = scene.means.device, scene.splat_count, len(tile_mask)
     integers = functools.partial(torch.empty, dtype=torch.int32, device=device)
     images, owners = empty_images(scene, settings)
     radii = integers((len(scene.viewmats), scene.gaussian_count))
-    splats, counts, ranges = scene.means.new_empty(splat_count, kernels.SPLAT_SIZE), integers(splat_count), integers((tile_count, 2))
+    splats, counts, ranges = scene.means.new_empty(splat_count, SPLAT_SIZE), integers(splat_count), integers((tile_count, 2))
     with _lock, on_torch_stream(device):  # the scratch memory serves one picture after the other, and Warp has one stream
         if splat_count:
             scratch = _scratch(device, _stream(device))
             if device.type == "cuda" and torch.cuda.is_current_stream_capturing():
                 scratch = scratch.anew()
             scratch.reserve_splats(splat_count)
-            arguments = [*scene.gaussian_arguments(), *_cameras(scene, settings), settings.near, settings.eps2d, scene.apart, tile_mask]
+            arguments = [*scene.gaussian_arguments(), *_cameras(scene, settings), settings.near, settings.eps2d, scene.per_camera]
             outputs = [splats, radii, scratch.depth_keys, scratch.order, counts]
-            _launch(kernels.project, splat_count, [0, *arguments, *outputs])
+            _launch(kernels.project, splat_count, [0, *arguments, tile_mask, *outputs])
             scratch.sort_by_depth()
-            _launch(tiled_kernels.gather_counts, splat_count, [scratch.order, counts, scratch.sorted_counts])
+            _launch(cuda_kernels.gather_counts, splat_count, [scratch.order, counts, scratch.sorted_counts])
             scratch.sum_counts()
-            room = scratch.reserve_lists(tile_count)
-            splat_list = integers(room)
-            _launch(tiled_kernels.clear_lists, room, [tile_count, ranges, scratch.tiles])
+            capacity = scratch.reserve_lists(tile_count)
+            splat_list = integers(capacity)
+            _launch(cuda_kernels.clear_lists, capacity, [tile_count, ranges, scratch.tiles])
             arguments = [scratch.order, scratch.ends, counts, scene.gaussian_count, splats, tile_mask, settings.tiles_x, settings.tiles_y]
-            _launch(kernels.emit_intersections, splat_count, [0, *arguments, room, 1, scratch.tiles, scratch.values, None, None])
+            _launch(kernels.emit_intersections, splat_count, [0, *arguments, capacity, 1, scratch.tiles, scratch.values, None, None])
             scratch.sort_by_tile(tile_count)
             arguments = [scratch.tiles, scratch.values, scratch.order, scratch.ends, tile_mask]
-            _launch(tiled_kernels.find_ranges, room, [*arguments, splat_list, ranges, scratch.seen])
+            _launch(cuda_kernels.find_ranges, capacity, [*arguments, splat_list, ranges, scratch.seen])
         else:
             splat_list = integers(0)
             ranges.zero_()
         state = State(splats, counts, splat_list, ranges)
         arguments = [*_image_arguments(state, scene, settings, images), int(settings.median), owners]
-        _launch(tiled_kernels.render_pixels, tile_count * tiled_kernels.BLOCK, arguments)
+        _launch(cuda_kernels.render_pixels, tile_count * cuda_kernels.BLOCK, arguments)
     return images, radii, owners, state
 
 
 def backward(
     scene: Scene, state: State, settings: Settings, images: list[Tensor], v_images: list[Tensor], wants_pose: bool, wants_absolute: bool
 ) -> Gradients:
-    """The gradients of the scene, from those of the images."""
+    """Return gradients of a scene, as `RasterBackend` says."""
     gradients = Gradients.empty(scene, wants_pose, wants_absolute)
-    records = scene.means.new_zeros(scene.splat_count, kernels.RECORD_SIZE)
+    records = scene.means.new_zeros(scene.splat_count, RECORD_SIZE)
     with _lock, on_torch_stream(scene.means.device):
         arguments = [*_image_arguments(state, scene, settings, images), *v_images, int(wants_absolute), records]
-        _launch(tiled_kernels.render_pixels_backward, len(state.ranges) * tiled_kernels.BLOCK, arguments)
+        _launch(cuda_kernels.render_pixels_backward, len(state.ranges) * cuda_kernels.BLOCK, arguments)
         arguments = [0, *scene.gaussian_arguments(), *_cameras(scene, settings)[1:], settings.eps2d, state.counts, 1, None, records]
         _launch(kernels.project_backward, len(scene.means), [*arguments, int(wants_pose), int(wants_absolute), *gradients])
     return gradients
@@ -90,7 +93,7 @@ def _cameras(scene: Scene, settings: Settings) -> list:
 
 
 def _image_arguments(state: State, scene: Scene, settings: Settings, images: list[Tensor]) -> list:
-    """With these both kernels that composite begin."""
+    """Return the first arguments of both kernels that composite."""
     lists = [state.splats, state.counts, scene.gaussian_count, state.splat_list, state.ranges]
     return [*lists, scene.background, settings.width, settings.height, *images]
 
@@ -101,9 +104,9 @@ def _image_arguments(state: State, scene: Scene, settings: Settings, images: lis
 class _Expectation:
     """How many intersections a splat has on average, in pictures of one size.
 
-    The host learns it later and without asking: the GPU writes it into the host's memory. A picture that needs more room
-    than it got comes out right all the same (see the kernels), only slower, and the next one finds room. On a CPU there is
-    nothing to wait for, and it is known at once.
+    The host does not ask for the number, which would stall it: the GPU writes it into the host's memory. A picture that
+    needs longer lists than it got is drawn without them, slowly (see the kernels), and the next one gets longer lists. On a
+    CPU there is nothing to wait for, and the number is known at once.
     """
 
     def __init__(self, device: torch.device):
@@ -111,8 +114,8 @@ class _Expectation:
         self.numbers = self.seen.numpy()
         self._mean = _FIRST_GUESS
 
-    def room(self, splat_count: int) -> int:
-        """Of how many intersections the next picture should have room, in steps of √2."""
+    def capacity(self, splat_count: int) -> int:
+        """Return for how many intersections the next picture should have lists, in steps of √2."""
         intersections, splats = self.numbers.tolist()
         if splats:
             self._mean = max(_FORGETTING * self._mean, intersections / splats)
@@ -120,8 +123,8 @@ class _Expectation:
         return math.ceil(2 ** (math.ceil(2 * math.log2(wanted)) / 2))
 
 
-class Room(NamedTuple):
-    """What recorded work has for the lists of a picture."""
+class Capacity(NamedTuple):
+    """How long the lists of a picture are, and for what."""
 
     expectation: _Expectation
     splat_count: int
@@ -129,40 +132,40 @@ class Room(NamedTuple):
     size: int
 
     @classmethod
-    def for_picture(cls, expectation: _Expectation, splat_count: int, tile_count: int) -> "Room":
-        """Room as it should be now."""
-        return cls(expectation, splat_count, tile_count, max(expectation.room(splat_count), splat_count, tile_count))
+    def for_picture(cls, expectation: _Expectation, splat_count: int, tile_count: int) -> "Capacity":
+        """Return the capacity that a picture should have now."""
+        return cls(expectation, splat_count, tile_count, max(expectation.capacity(splat_count), splat_count, tile_count))
 
     def fits(self) -> bool:
-        """Whether it is neither too small nor much too large by now."""
-        wanted = Room.for_picture(*self[:3]).size
+        """Return whether it is neither too small nor much too large by now."""
+        wanted = Capacity.for_picture(*self[:3]).size
         return wanted <= self.size <= 2 * wanted
 
 
-_noted: contextvars.ContextVar[list[Room] | None] = contextvars.ContextVar("noted", default=None)
+_noted: contextvars.ContextVar[list[Capacity] | None] = contextvars.ContextVar("noted", default=None)
 
 
 @contextlib.contextmanager
-def noting_rooms():
-    """Within it, work is recorded: the list that it gives is of the room that the recorded pictures have."""
-    rooms: list[Room] = []
-    token = _noted.set(rooms)
+def noted_capacities() -> Iterator[list[Capacity]]:
+    """Within it, the list that it gives receives the capacity of each picture that is drawn, e.g. while a graph is captured."""
+    capacities: list[Capacity] = []
+    token = _noted.set(capacities)
     try:
-        yield rooms
+        yield capacities
     finally:
         _noted.reset(token)
 
 
 class _Scratch:
-    """What is written and read within one picture, in one stream of a device."""
+    """Memory that is written and read within one picture, in one stream of a device."""
 
     def __init__(self, device: torch.device, expectations: dict[int, _Expectation] | None = None):
         self._device = device
-        self._splat_count, self._room, self.room = 0, 0, 0
+        self._splat_count, self._reserved, self.capacity = 0, 0, 0
         self._expectations = collections.defaultdict(functools.partial(_Expectation, device)) if expectations is None else expectations
 
     def anew(self) -> "_Scratch":
-        """Memory of its own for a picture that is recorded, which shall be there whenever it is replayed."""
+        """Return memory for a picture that is captured in a graph; it must be there whenever the graph is replayed."""
         return _Scratch(self._device, self._expectations)
 
     def reserve_splats(self, splat_count: int) -> None:
@@ -176,21 +179,21 @@ class _Scratch:
             self._splat_count = splat_count
 
     def reserve_lists(self, tile_count: int) -> int:
-        """Make the memory for lists of intersections, which are counted by now, and return the room for them."""
+        """Make the memory for lists of intersections, which are counted by now, and return their capacity."""
         expectation = self._expectations[tile_count]
         self.seen = expectation.seen
         if self._device.type == "cpu":  # no need to wait
             expectation.numbers[:] = int(self.ends[-1]), self._splat_count
-        room = Room.for_picture(expectation, self._splat_count, tile_count)
-        self.room = room.size
+        capacity = Capacity.for_picture(expectation, self._splat_count, tile_count)
+        self.capacity = capacity.size
         if (noted := _noted.get()) is not None:
-            noted.append(room)
-        if self.room > self._room:
-            self._room = 0
-            self.tiles, self.values = self._integers(2 * self.room), self._integers(2 * self.room)
+            noted.append(capacity)
+        if self.capacity > self._reserved:
+            self._reserved = 0
+            self.tiles, self.values = self._integers(2 * self.capacity), self._integers(2 * self.capacity)
             self._by_tile = wp.from_torch(self.tiles), wp.from_torch(self.values)
-            self._room = self.room
-        return self.room
+            self._reserved = self.capacity
+        return self.capacity
 
     def sort_by_depth(self) -> None:
         wp.utils.radix_sort_pairs(*self._by_depth, self._splat_count, 0, 31)
@@ -199,7 +202,7 @@ class _Scratch:
         wp.utils.array_scan(*self._sums)
 
     def sort_by_tile(self, tile_count: int) -> None:
-        wp.utils.radix_sort_pairs(*self._by_tile, self.room, 0, tile_count.bit_length())
+        wp.utils.radix_sort_pairs(*self._by_tile, self.capacity, 0, tile_count.bit_length())
 
     def _integers(self, count: int, dtype: torch.dtype = torch.int32) -> Tensor:
         return torch.empty(count, dtype=dtype, device=self._device)
@@ -220,10 +223,10 @@ _lock = threading.Lock()
 
 
 def _launch(kernel, count: int, arguments: list) -> None:
-    """Launch a kernel in some threads.
+    """Launch a kernel over count items.
 
-    Packing the arguments takes longer than many a kernel runs. So launches are recorded, and a launch of the same kind as an
-    earlier one only tells where its tensors lie.
+    Packing the arguments takes longer than many kernels run. So launches are recorded, and a launch of the same kind as an
+    earlier one only gets the addresses of its tensors.
     """
     if not count:
         return

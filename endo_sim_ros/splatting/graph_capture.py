@@ -1,4 +1,4 @@
-"""Work on a GPU that draws pictures, recorded once and then replayed: hundreds of launches take the host the time of one."""
+"""CUDA graphs of work that draws pictures, captured once and replayed: hundreds of launches then take the host the time of one."""
 
 import contextlib
 import functools
@@ -13,14 +13,14 @@ from endo_sim_ros.core.device import warp_stream
 from endo_sim_ros.splatting import cuda
 
 
-class Recording:
-    """A function whose work on a GPU is recorded at its second call.
+class GraphCapture:
+    """A function whose work on a GPU is captured as a graph at its second call and replayed from then on.
 
-    It is recorded anew when its pictures turn out to need more room, or much less.
+    The graph is captured anew when its pictures need longer lists than they have, or much shorter ones.
 
     Args:
         function: Takes tensors or None, and launches the same work at every call, without waiting for the GPU. Other tensors
-            that it reads or writes must stay where they are: `forget` tells when they moved.
+            that it reads or writes must stay where they are: call `invalidate` when they have moved.
     """
 
     def __init__(self, function: Callable[..., Tensor]):
@@ -29,20 +29,24 @@ class Recording:
         self._graph: torch.cuda.CUDAGraph | None = None  # kept until there is another: its memory serves that, too
         self._valid = False
 
-    def forget(self) -> None:
-        """Record anew at the next call."""
+    def invalidate(self) -> None:
+        """Capture anew at the next call."""
         self._valid = False
 
     def __call__(self, *inputs: Tensor | None) -> Tensor:
-        """What the function returns, of inputs as large as at the first call and on a GPU; the next call overwrites it."""
-        if self._inputs is None:  # whatever is loaded or made at first use must not be recorded
+        """Return what the function returns; the next call overwrites it.
+
+        Args:
+            inputs: As large as at the first call, and on the same GPU.
+        """
+        if self._inputs is None:  # whatever is loaded or made at first use must not be captured
             self._inputs = [None if x is None else x.clone() for x in inputs]
             return self._first()
         for mine, given in zip(self._inputs, inputs):
             if mine is not None:
                 mine.copy_(given)
-        if not (self._valid and all(room.fits() for room in self._rooms)):
-            self._record()
+        if not (self._valid and all(capacity.fits() for capacity in self._capacities)):
+            self._capture()
         self._graph.replay()
         return self._result
 
@@ -55,23 +59,23 @@ class Recording:
         current.wait_stream(self._stream)
         return result
 
-    def _record(self) -> None:
+    def _capture(self) -> None:
         graph = torch.cuda.CUDAGraph()
-        # Other threads may go on using the GPU. Warp has to know, for the memory that it takes.
-        recording = torch.cuda.graph(graph, self._pool, self._stream, capture_error_mode="thread_local")
+        # Other threads may go on using the GPU. Warp has to know of the capture, for the memory that it takes.
+        capture = torch.cuda.graph(graph, self._pool, self._stream, capture_error_mode="thread_local")
         with (
             _no_garbage_collection(),
-            cuda.noting_rooms() as rooms,
-            recording,
+            cuda.noted_capacities() as capacities,
+            capture,
             wp.ScopedCapture(stream=warp_stream(self._stream), external=True),
         ):
             result = self._function(*self._inputs)
-        self._graph, self._result, self._rooms, self._valid = graph, result, rooms, True
+        self._graph, self._result, self._capacities, self._valid = graph, result, capacities, True
 
 
 @contextlib.contextmanager
 def _no_garbage_collection() -> Iterator[None]:
-    """What the collector finds may be tensors and recordings, and to free their memory on the GPU would end a recording."""
+    """Within it, no garbage is collected: freeing tensors or graphs on the GPU would end a capture."""
     enabled = gc.isenabled()
     gc.disable()
     try:

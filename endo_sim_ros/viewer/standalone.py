@@ -10,7 +10,7 @@ import numpy as np
 from endo_sim_ros.core.cameras import Camera, load_cameras, look_at
 from endo_sim_ros.core.gaussians import GaussianModel, load_ply
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
-from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
+from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig, render_depth
 from endo_sim_ros.viewer.config import ViewerConfig
 from endo_sim_ros.viewer.viewer import PARAMETERS, Tool, Viewer, plain_camera
 
@@ -43,7 +43,7 @@ class Standalone:
 
     def _simulate(self, physics: PhysicsConfig) -> TissueSimulation:
         viewpoint = np.stack([camera.position for camera in self._cameras])
-        return TissueSimulation(self._model, viewpoint, physics, self._cameras)
+        return TissueSimulation(self._model, viewpoint, physics, self._cameras, render_depth)
 
     def _show_model(self) -> None:
         rest = self.simulation.nodes.rest

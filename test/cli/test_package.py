@@ -80,6 +80,12 @@ def test_installed_executable_starts_its_node(prefix, node):
     assert name in done.stderr and "Traceback" not in done.stderr
 
 
+def test_headers_of_kernels_are_installed(prefix):
+    installed = next(prefix.glob("lib/python*/site-packages/endo_sim_ros"))
+    headers = {path.relative_to(ROOT / "endo_sim_ros") for path in (ROOT / "endo_sim_ros").rglob("*.h")}
+    assert headers and headers == {path.relative_to(installed) for path in installed.rglob("*.h")}
+
+
 @pytest.mark.dds
 def test_command_line_is_installed(prefix):
     assert os.access(prefix / "bin" / "endo-sim", os.X_OK)

@@ -32,6 +32,7 @@ from endo_sim_ros.nodes.base import _MOST_LOGGED
 from endo_sim_ros.nodes.physics_node import PhysicsNode
 from endo_sim_ros.nodes.rendering_node import RenderingNode
 from endo_sim_ros.physics.control_nodes import build_control_nodes
+from endo_sim_ros.rendering import render_depth
 
 pytestmark = pytest.mark.dds
 
@@ -229,7 +230,7 @@ def test_tissue_is_left_out_where_the_training_cameras_see_through_it(bench, phy
     bench.publish(messages.TRAINING_CAMERA_INFO, messages.encode_camera_info(K, WIDTH, HEIGHT, 5 * S, "endoscope_left"))
     send_model(bench, model, cameras=poses)
     cameras = [Camera(K, WIDTH, HEIGHT, pose) for pose in poses]
-    carved, whole = (build_control_nodes(model, np.stack(poses)[:, :3, 3], physics._config, seen) for seen in (cameras, ()))
+    carved, whole = (build_control_nodes(model, np.stack(poses)[:, :3, 3], physics._config, seen, render_depth) for seen in (cameras, ()))
     assert len(carved) < len(whole)
     np.testing.assert_array_equal(await_nodes(bench, 5 * S).rest, carved.rest.astype(np.float32))
 

@@ -10,6 +10,7 @@ from tissue_scene import EYE, curved_sheet, pose_at
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.physics import PhysicsConfig, build_control_nodes, sample_farthest
+from endo_sim_ros.rendering import render_depth
 
 
 def test_farthest_points_agree_with_brute_force():
@@ -95,7 +96,9 @@ def test_tissue_is_carved_where_a_camera_sees_through_it_and_only_there():
     cameras = [Camera(K, 320, 256, pose_at([x, 0.0, 0.0])) for x in (-0.06, 0.0, 0.06)]
     config = PhysicsConfig(node_count=6000)
     whole = build_control_nodes(model, EYE, dataclasses.replace(config, carve=False), cameras)
-    carved = build_control_nodes(model, EYE, config, cameras)
+    carved = build_control_nodes(model, EYE, config, cameras, render_depth)
+    with pytest.raises(ValueError, match="pass render_depth"):
+        build_control_nodes(model, EYE, config, cameras)
     left = {tuple(position) for position in carved.rest.tolist()}
     gone = np.array([position for position in whole.rest.tolist() if tuple(position) not in left])
     assert len(gone) > 20 and len(whole) - len(carved) == len(gone)

@@ -5,7 +5,7 @@ import contextlib
 import pytest
 import torch
 
-from endo_sim_ros.splatting import api
+from endo_sim_ros.core.kernels import plain_kernels
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -19,6 +19,6 @@ def one_torch_thread():
 
 @pytest.fixture(params=["vectors", "pixels"])
 def compositor(request):
-    """Both ways to composite; the kernels made for GPUs run on the CPU too."""
-    with api.scalar_kernels() if request.param == "pixels" else contextlib.nullcontext():
+    """The backend of CPUs, and that of GPUs, which runs on the CPU too."""
+    with plain_kernels() if request.param == "pixels" else contextlib.nullcontext():
         yield

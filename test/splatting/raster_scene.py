@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from endo_sim_ros.core.cameras import look_at
-from endo_sim_ros.splatting import RenderOutput, _rasterize, api, rasterize
+from endo_sim_ros.splatting import RenderOutput, _rasterize, rasterize, reference
 
 DEVICES = ["cpu", *([pytest.param("cuda", marks=pytest.mark.gpu)] if torch.cuda.is_available() else [])]
 WIDTH, HEIGHT = 70, 45  # no multiple of the tile
@@ -41,7 +41,7 @@ def random_like(images, seed=1):
 
 def covariances(quats, scales):
     """World covariances [N, 3, 3]."""
-    rotations = api._quat_to_matrix(quats)
+    rotations = reference._quat_to_matrix(quats)
     return rotations @ torch.diag_embed(scales**2) @ rotations.mT
 
 

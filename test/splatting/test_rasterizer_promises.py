@@ -26,7 +26,8 @@ from raster_scene import (
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.gaussians import GaussianModel
-from endo_sim_ros.splatting import RenderOutput, _rasterize, api, cpu, cuda, rasterize, render
+from endo_sim_ros.core.kernels import plain_kernels, vectorised
+from endo_sim_ros.splatting import RenderOutput, _rasterize, api, cuda, rasterize, render
 
 scenes = st.fixed_dictionaries(
     {
@@ -85,7 +86,7 @@ def test_results_repeat_bit_for_bit_with_any_number_of_threads(monkeypatch):
     gaussians, cameras = make_gaussians(3000, 4, seed=11), make_cameras(2, 150, 90)
     results = []
     for threads in (1, 2, 2, 5):
-        monkeypatch.setattr(cpu, "cpu_threads", lambda: threads)
+        monkeypatch.setenv("ENDO_SIM_THREADS", str(threads))
         absgrad = torch.zeros(2, 3000, 2, requires_grad=True)
         options = {"size": (150, 90), "absgrad": absgrad, "median": True}
         output, gradients = run(rasterize, gaussians, cameras, dtype=torch.float32, **options)
@@ -159,25 +160,6 @@ def test_gradient_descent_recovers_a_moved_gaussian():
     assert torch.allclose(mean, torch.tensor([0.01, -0.005, 0.12]), atol=2e-3)
 
 
-@pytest.mark.parametrize("device", DEVICES)
-def test_pictures_for_whose_lists_there_is_no_room_are_the_same(device, monkeypatch):
-    """Two cameras, one of which sees nothing, and Gaussians behind the camera and beside the image."""
-    gaussians, cameras = make_gaussians(300, 4, seed=13), make_cameras()
-    gaussians[0][:20, 2] = -1.0
-    gaussians[0][20:40, 0] = 50.0
-    cameras[0][1, 2, 3] = -100.0
-    with api.scalar_kernels():
-        roomy = run(rasterize, gaussians, cameras, device=device, dtype=torch.float32)
-        monkeypatch.setattr(cuda, "_MOST", 0.01)
-        monkeypatch.setattr(cuda, "_ALWAYS", 0)
-        cramped = run(rasterize, gaussians, cameras, device=device, dtype=torch.float32)
-        device = torch.device(f"{device}:0" if device == "cuda" else device)
-        scratch = cuda._scratch(device, cuda._stream(device))
-    assert scratch.seen[0] > scratch.room
-    for expected, actual in zip([*roomy[0][:4], *roomy[1]], [*cramped[0][:4], *cramped[1]]):
-        assert_close("it", actual, expected.cpu(), 1e-5)
-
-
 def test_memory_that_runs_out_is_asked_for_again(monkeypatch):
     scratch = cuda._Scratch(torch.device("cpu"))
     scratch.reserve_splats(10)
@@ -196,45 +178,8 @@ def test_memory_that_runs_out_is_asked_for_again(monkeypatch):
         patch.setattr(scratch, "_integers", run_out)
         with pytest.raises(torch.OutOfMemoryError):
             scratch.reserve_lists(1)
-    room = scratch.reserve_lists(1)
-    assert room >= 1000 and len(scratch.tiles) == len(scratch.values) == 2 * room
-
-
-def test_the_first_picture_on_a_cpu_has_room():
-    cuda._scratch.cache_clear()
-    gaussians, cameras = make_gaussians(20, seed=33), make_cameras(1, 300, 200)
-    gaussians[2] *= 10
-    with api.scalar_kernels():
-        run(rasterize, gaussians, cameras, size=(300, 200), dtype=torch.float32)
-    scratch = cuda._scratch(torch.device("cpu"), 0)
-    assert cuda._FIRST_GUESS * 20 * 1.5 < scratch.seen[0] <= scratch.room
-
-
-def test_room_follows_what_pictures_needed():
-    expectation = cuda._Expectation(torch.device("cpu"))
-    assert 4000 <= expectation.room(1000) < 8000
-    expectation.seen.copy_(torch.tensor([30_000, 1000]))
-    assert 30_000 < expectation.room(1000) < 60_000
-    assert 60_000 < expectation.room(2000) < 120_000
-    expectation.seen.copy_(torch.tensor([100_000_000, 1000]))
-    assert expectation.room(1000) == cuda._ALWAYS
-    assert 64_000_000 <= expectation.room(1_000_000) < 100_000_000
-
-
-def test_recorded_pictures_know_whether_their_room_still_fits():
-    expectation = cuda._Expectation(torch.device("cpu"))
-    room = cuda.Room.for_picture(expectation, 1000, 40)
-    assert room.fits()
-    expectation.seen.copy_(torch.tensor([30_000, 1000]))
-    assert not room.fits()  # too small
-    room = cuda.Room.for_picture(expectation, 1000, 40)
-    assert room.fits()
-    expectation.seen.copy_(torch.tensor([3000, 1000]))
-    for _ in range(20):
-        assert room.fits()
-    while room.fits():  # in the end too large
-        pass
-    assert cuda.Room.for_picture(expectation, 1000, 40).size < room.size / 2
+    capacity = scratch.reserve_lists(1)
+    assert capacity >= 1000 and len(scratch.tiles) == len(scratch.values) == 2 * capacity
 
 
 def test_pictures_in_inference_mode_do_not_disturb_later_gradients(compositor):
@@ -263,10 +208,10 @@ def test_the_default_dtype_changes_nothing(compositor):
 
 def test_pictures_drawn_in_several_threads_are_those_drawn_in_one(compositor):
     """Of different sizes, each with two forward passes before their backward passes."""
-    scalar, scenes = api._scalar.get(), [(make_gaussians(400, seed=31), (70, 45)), (make_gaussians(150, seed=32), (33, 60))]
+    plain, scenes = not vectorised("cpu"), [(make_gaussians(400, seed=31), (70, 45)), (make_gaussians(150, seed=32), (33, 60))]
 
     def draw(turn):
-        with api.scalar_kernels() if scalar else contextlib.nullcontext():
+        with plain_kernels() if plain else contextlib.nullcontext():
             leaves, losses = [], []
             for gaussians, size in scenes[::turn]:
                 leaves.append([x.float().requires_grad_() for x in gaussians])
@@ -332,3 +277,73 @@ def test_gaussians_of_each_camera_need_covariances_of_each_and_have_no_gradients
         rasterize(own(means), None, None, opacities, sh.expand(3, *sh.shape), viewmats, Ks, 8, 8, covars=own(covars))
     with pytest.raises(ValueError, match="have no gradients"):
         rasterize(own(means).requires_grad_(), None, None, opacities, own(sh), viewmats, Ks, 8, 8, covars=own(covars))
+
+
+def test_capacity_follows_what_pictures_needed():
+    expectation = cuda._Expectation(torch.device("cpu"))
+    assert 4000 <= expectation.capacity(1000) < 8000
+    expectation.seen.copy_(torch.tensor([30_000, 1000]))
+    assert 30_000 < expectation.capacity(1000) < 60_000
+    assert 60_000 < expectation.capacity(2000) < 120_000
+    expectation.seen.copy_(torch.tensor([100_000_000, 1000]))
+    assert expectation.capacity(1000) == cuda._ALWAYS
+    assert 64_000_000 <= expectation.capacity(1_000_000) < 100_000_000
+
+
+def test_the_first_picture_on_a_cpu_has_lists():
+    cuda._scratch.cache_clear()
+    gaussians, cameras = make_gaussians(20, seed=33), make_cameras(1, 300, 200)
+    gaussians[2] *= 10
+    with plain_kernels():
+        run(rasterize, gaussians, cameras, size=(300, 200), dtype=torch.float32)
+    scratch = cuda._scratch(torch.device("cpu"), 0)
+    assert cuda._FIRST_GUESS * 20 * 1.5 < scratch.seen[0] <= scratch.capacity
+
+
+@pytest.mark.parametrize("count,opacity", [(60, 0.0), (1500, 0.9)])
+def test_vectors_and_plain_numbers_draw_the_same_bits(count, opacity):
+    """The maths of compositing is written once; tile rows that are left out hold no pixel of a splat."""
+    gaussians, cameras = make_gaussians(count, 4, seed=34), make_cameras(2, 150, 90)
+    gaussians[2] *= torch.tensor([3.0, 1.0, 0.1])
+    gaussians[3] = opacity + (1 - opacity) * gaussians[3]
+    expected, _ = run(rasterize, gaussians, cameras, size=(150, 90), dtype=torch.float32, median=True)
+    with plain_kernels():
+        output, _ = run(rasterize, gaussians, cameras, size=(150, 90), dtype=torch.float32, median=True)
+    assert bool((expected.alphas > 0.999).any()) == (count > 60) and expected.alphas.max() > 0.5
+    for name, actual, image in zip(RenderOutput._fields, output, expected):
+        assert torch.equal(actual, image), name
+
+
+def test_captured_pictures_know_whether_their_capacity_still_fits():
+    expectation = cuda._Expectation(torch.device("cpu"))
+    capacity = cuda.Capacity.for_picture(expectation, 1000, 40)
+    assert capacity.fits()
+    expectation.seen.copy_(torch.tensor([30_000, 1000]))
+    assert not capacity.fits()  # too small
+    capacity = cuda.Capacity.for_picture(expectation, 1000, 40)
+    assert capacity.fits()
+    expectation.seen.copy_(torch.tensor([3000, 1000]))
+    for _ in range(20):
+        assert capacity.fits()
+    while capacity.fits():  # in the end too large
+        pass
+    assert cuda.Capacity.for_picture(expectation, 1000, 40).size < capacity.size / 2
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_pictures_without_lists_of_tiles_are_the_same(device, monkeypatch):
+    """Two cameras, one of which sees nothing, and Gaussians behind the camera and beside the image."""
+    gaussians, cameras = make_gaussians(300, 4, seed=13), make_cameras()
+    gaussians[0][:20, 2] = -1.0
+    gaussians[0][20:40, 0] = 50.0
+    cameras[0][1, 2, 3] = -100.0
+    with plain_kernels():
+        listed = run(rasterize, gaussians, cameras, device=device, dtype=torch.float32)
+        monkeypatch.setattr(cuda, "_MOST", 0.01)
+        monkeypatch.setattr(cuda, "_ALWAYS", 0)
+        unlisted = run(rasterize, gaussians, cameras, device=device, dtype=torch.float32)
+        device = torch.device(f"{device}:0" if device == "cuda" else device)
+        scratch = cuda._scratch(device, cuda._stream(device))
+    assert scratch.seen[0] > scratch.capacity
+    for expected, actual in zip([*listed[0][:4], *listed[1]], [*unlisted[0][:4], *unlisted[1]]):
+        assert_close("it", actual, expected.cpu(), 1e-5)

@@ -19,7 +19,7 @@ from raster_scene import (
     run,
 )
 
-from endo_sim_ros.splatting import RenderOutput, _rasterize, api, rasterize
+from endo_sim_ros.splatting import RenderOutput, _rasterize, rasterize, reference
 
 
 @pytest.mark.parametrize("sh_count", [1, 4, 9, 16])
@@ -107,8 +107,8 @@ def test_gradients_match_finite_differences_where_nothing_is_cut_off(monkeypatch
 
     leaves = [*gaussians, cameras[0], BACKGROUND]
     expected = loss(leaves)
-    monkeypatch.setattr(api, "ALPHA_MIN", 1e-9)
-    monkeypatch.setattr(api, "TRANSMITTANCE_MIN", 0.0)
+    monkeypatch.setattr(reference, "ALPHA_MIN", 1e-9)
+    monkeypatch.setattr(reference, "TRANSMITTANCE_MIN", 0.0)
     assert loss(leaves) == expected, "a cut-off has an effect"
     generator = torch.Generator().manual_seed(0)
     for index, name in enumerate(GAUSSIAN_NAMES):

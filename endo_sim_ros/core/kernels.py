@@ -1,0 +1,107 @@
+"""What all rooms with kernels share: where kernels run, and how they are loaded and launched.
+
+A room has a `typing.Protocol` of what a backend does, and one function ``backend_for(device)`` that returns the backend of a
+device with its kernels loaded. Nothing else in the room looks at the kind of the device.
+"""
+
+import contextlib
+import contextvars
+import functools
+import types
+from collections.abc import Iterator, Sequence
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from endo_sim_ros.core.device import init_warp, run_in_threads, shares, warp_stream
+
+_plain = contextvars.ContextVar("plain", default=False)
+
+
+@contextlib.contextmanager
+def plain_kernels() -> Iterator[None]:
+    """Within it, every ``backend_for`` returns for a CPU what it returns for GPUs, which runs there plainly: to compare with.
+
+    It holds for the thread that entered it.
+    """
+    token = _plain.set(True)
+    try:
+        yield
+    finally:
+        _plain.reset(token)
+
+
+def vectorised(device: torch.device | str) -> bool:
+    """Return whether a device has the backend made for CPUs: every CPU has, except within `plain_kernels`."""
+    return torch.device(device).type == "cpu" and not _plain.get()
+
+
+@functools.cache
+def load_kernels(modules: tuple[types.ModuleType, ...], device: str) -> None:
+    """Compile and load modules of kernels for a device, once, before several threads ask for them.
+
+    Args:
+        modules: Python modules that define kernels.
+        device: Name of the device, e.g. ``cpu`` or ``cuda:0``.
+    """
+    init_warp()
+    for module in modules:
+        wp.load_module(module, device)
+
+
+def kernel_arguments(kernel: wp.Kernel, arguments: Sequence, offset: int = 0) -> list:
+    """Return arguments of a kernel with tensors as arrays of the kernel's types, which share the tensors' memory.
+
+    Args:
+        kernel: The kernel.
+        arguments: Its arguments from the one at ``offset`` on: contiguous tensors, numbers, or None for an array that the
+            kernel does not read. Where a tensor has more dimensions than the kernel's array, the first ones become one.
+        offset: Number of arguments that are left out at the front.
+
+    Raises:
+        ValueError: If there are more or fewer arguments than the kernel takes.
+    """
+    kinds = [argument.type for argument in kernel.adj.args[offset:]]
+    return [_array(kind, x) if isinstance(x, Tensor) else x for kind, x in zip(kinds, arguments, strict=True)]
+
+
+def _array(kind, tensor: Tensor):
+    tensor = tensor.detach()
+    dims = kind.ndim + len(getattr(kind.dtype, "_shape_", ()))
+    if tensor.ndim > dims:
+        tensor = tensor.view(-1, *tensor.shape[tensor.ndim - dims + 1 :])
+    return wp.from_torch(tensor, dtype=kind.dtype, requires_grad=False, return_ctype=True)
+
+
+def launch(kernel: wp.Kernel, count: int, arguments: Sequence, device: torch.device | str) -> None:
+    """Launch a kernel over count items on a device, in order with torch's own work there.
+
+    Args:
+        kernel: The kernel.
+        count: Number of its threads.
+        arguments: As for `kernel_arguments`.
+        device: That of all tensors.
+    """
+    device = torch.device(device)
+    stream = warp_stream(torch.cuda.current_stream(device)) if device.type == "cuda" else None
+    wp.launch(kernel, count, kernel_arguments(kernel, arguments), device=str(device), stream=stream)
+
+
+def launch_in_shares(kernel: wp.Kernel, count: int, arguments: Sequence, least: int = 1024) -> None:
+    """Launch a kernel over count items on the CPU, in as many threads as there are cores.
+
+    Args:
+        kernel: Its first argument is the number of the first item of a share; a thread adds `wp.tid()`.
+        count: Number of items.
+        arguments: The other arguments, as for `kernel_arguments`.
+        least: Fewer items are left to one thread.
+    """
+    if not count:
+        return
+    arguments = kernel_arguments(kernel, arguments, 1)
+
+    def share(first: int, size: int) -> None:
+        wp.launch(kernel, size, [first, *arguments], device="cpu")
+
+    run_in_threads([functools.partial(share, *own) for own in shares(count, least)])

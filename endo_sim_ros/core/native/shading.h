@@ -1,0 +1,66 @@
+// What a camera makes of a rendered picture, on a CPU, 16 pixels or numbers at a time; `shading_kernels.py` has the formula.
+#pragma once
+#include "core/native/vector.h"
+
+#if !defined(__CUDA_ARCH__)
+
+namespace endo_sim {
+
+// The first count of 16 items of a size; a copy of constant size is a single instruction.
+ENDO_SIM_INLINE void copy_items(void* to, const void* from, size_t size, size_t count)
+{
+    if (count >= 16)
+        __builtin_memcpy(to, from, 16 * size);
+    else
+        __builtin_memcpy(to, from, count * size);
+}
+
+// Light 16 pixels, or the last ones of count, from the one at 16 block on.
+ENDO_SIM_INLINE void light_pixels(int block, size_t count, const float* colors, const float* depths, const float* alphas,
+    const float* fixed, float distance, float reference, float nearest, float* out)
+{
+    ENDO_SIM_FUSE(off)
+    const size_t start = 16 * (size_t)block;
+    count -= start;
+    vfloat z{}, w{}, gain{}, rgb[3]{};
+    copy_items(&z, depths + start, sizeof(float), count);
+    copy_items(&w, alphas + start, sizeof(float), count);
+    copy_items(&gain, fixed + start, sizeof(float), count);
+    copy_items(rgb, colors + 3 * start, 3 * sizeof(float), count);
+    const vint drawn = w > nearest;
+    vfloat depth = z / (drawn ? w : broadcast(nearest));
+    depth = depth > nearest ? depth : broadcast(nearest);
+    const vfloat x = drawn ? depth / reference : broadcast(1.0f);
+
+    // log2 of x: its exponent, and of the mantissa m from 0.7 to 1.4 the series in t = (m - 1) / (m + 1).
+    const vint bits = bits_of(x), exponent = (bits - 0x3f3504f3) >> 23;
+    const vfloat m = of_bits(bits - (exponent << 23)), t = (m - 1.0f) / (m + 1.0f), s = t * t;
+    const vfloat series = 1.0f + s * (1.0f / 3 + s * (1.0f / 5 + s * (1.0f / 7 + s * (1.0f / 9))));
+    const vfloat log2 = __builtin_convertvector(exponent, vfloat) + 2.88539008f * t * series;
+
+    const vfloat y = -distance * log2;
+    gain *= exp2<false>(y < -126.0f ? broadcast(-126.0f) : y > 126.0f ? broadcast(126.0f) : y);
+    rgb[0] *= __builtin_shufflevector(gain, gain, 0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 4, 4, 4, 5);
+    rgb[1] *= __builtin_shufflevector(gain, gain, 5, 5, 6, 6, 6, 7, 7, 7, 8, 8, 8, 9, 9, 9, 10, 10);
+    rgb[2] *= __builtin_shufflevector(gain, gain, 10, 11, 11, 11, 12, 12, 12, 13, 13, 13, 14, 14, 14, 15, 15, 15);
+    copy_items(out + 3 * start, rgb, 3 * sizeof(float), count);
+}
+
+// Make bytes of 16 numbers from 0 to 1, or of the last ones of count, from the one at 16 block on.
+ENDO_SIM_INLINE void round_values(int block, size_t count, const float* values, unsigned char* out)
+{
+    ENDO_SIM_FUSE(off)  // rounds like torch
+    typedef unsigned char vbyte __attribute__((vector_size(16)));
+    const size_t start = 16 * (size_t)block;
+    count -= start;
+    vfloat x{};
+    copy_items(&x, values + start, sizeof(float), count);
+    x = x > 0.0f ? x : vfloat{};
+    x = x < 1.0f ? x : broadcast(1.0f);
+    const vbyte bytes = __builtin_convertvector(__builtin_convertvector(x * 255.0f + 0.5f, vint), vbyte);
+    copy_items(out + start, &bytes, 1, count);
+}
+
+}  // namespace endo_sim
+
+#endif

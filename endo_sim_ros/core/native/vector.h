@@ -1,0 +1,92 @@
+// Vectors of 16 numbers for CPUs, of the vector types of Clang and GCC, which become whatever the processor has (AVX-512,
+// AVX2, SSE, NEON), and what code that is written once needs for a vector (vfloat) and for a number (float). GPUs have the
+// numbers only. A condition is a bool for a number and a vint, all bits or none, for a vector: `c ? x : y`, `|` and `&`
+// take both.
+#pragma once
+#include "core/native/warp.h"
+
+namespace endo_sim {
+
+ENDO_SIM_INLINE float negative(float x) { return -fabsf(x); }
+
+#if !defined(__CUDA_ARCH__)
+
+typedef float vfloat __attribute__((vector_size(64)));
+typedef int vint __attribute__((vector_size(64)));
+
+ENDO_SIM_INLINE vfloat broadcast(float x) { return vfloat{} + x; }
+
+// -|x|.
+ENDO_SIM_INLINE vfloat negative(vfloat x) { return (vfloat)((vint)x | (vint{} + (int)0x80000000)); }
+
+ENDO_SIM_INLINE vfloat absolute(vfloat x) { return (vfloat)((vint)x & (vint{} + 0x7fffffff)); }
+
+ENDO_SIM_INLINE bool any(vint condition)
+{
+#if defined(__clang__)
+    return __builtin_reduce_or(condition) != 0;
+#else
+    int bits = 0;
+    for (int lane = 0; lane < 16; ++lane)
+        bits |= condition[lane];
+    return bits != 0;
+#endif
+}
+
+ENDO_SIM_INLINE float sum(vfloat x)
+{
+    typedef float half __attribute__((vector_size(32)));
+    typedef float quarter __attribute__((vector_size(16)));
+    half h = __builtin_shufflevector(x, x, 0, 1, 2, 3, 4, 5, 6, 7) + __builtin_shufflevector(x, x, 8, 9, 10, 11, 12, 13, 14, 15);
+    quarter q = __builtin_shufflevector(h, h, 0, 1, 2, 3) + __builtin_shufflevector(h, h, 4, 5, 6, 7);
+    return (q[0] + q[2]) + (q[1] + q[3]);
+}
+
+ENDO_SIM_INLINE vint bits_of(vfloat x) { return (vint)x; }
+ENDO_SIM_INLINE vfloat of_bits(vint x) { return (vfloat)x; }
+
+ENDO_SIM_INLINE int bits_of(float x)
+{
+    int bits;
+    __builtin_memcpy(&bits, &x, 4);
+    return bits;
+}
+
+ENDO_SIM_INLINE float of_bits(int bits)
+{
+    float x;
+    __builtin_memcpy(&x, &bits, 4);
+    return x;
+}
+
+// a b + c, rounded once or twice.
+template <bool fused, class F> ENDO_SIM_INLINE F multiply_add(F a, F b, float c)
+{
+    if constexpr (fused) {
+        ENDO_SIM_FUSE(on)
+        return a * b + c;
+    } else {
+        ENDO_SIM_FUSE(off)
+        return a * b + c;
+    }
+}
+
+// 2^x for x from -126 to 126, to 2e-7 relative: 2^n times a polynomial for 2^f, |f| <= 1/2 (that of Cephes' exp2f).
+template <bool fused, class F> ENDO_SIM_INLINE F exp2(F x)
+{
+    const float round = 12582912.0f;  // adding 1.5 2^23 leaves no fraction bits, and n in the lowest
+    const F n = x + round;
+    const F f = x - (n - round);
+    F p = F{} + 1.535336188319500e-4f;
+    p = multiply_add<fused>(p, f, 1.339887440266574e-3f);
+    p = multiply_add<fused>(p, f, 9.618437357674640e-3f);
+    p = multiply_add<fused>(p, f, 5.550332471162809e-2f);
+    p = multiply_add<fused>(p, f, 2.402264791363012e-1f);
+    p = multiply_add<fused>(p, f, 6.931472028550421e-1f);
+    p = multiply_add<fused>(p, f, 1.0f);
+    return of_bits(bits_of(p) + (bits_of(n) << 23));
+}
+
+#endif
+
+}  // namespace endo_sim

@@ -1,0 +1,13 @@
+"""The headers of this folder, with the numbers that Python shares with them."""
+
+import warp as wp
+
+from endo_sim_ros.core.native import native
+from endo_sim_ros.splatting import constants
+
+_SHARED = ("ALPHA_MAX", "ALPHA_MIN", "MEDIAN", "PIXEL_SLACK", "RECORD_SIZE", "SPLAT_SIZE", "TILE", "TRANSMITTANCE_MIN")
+
+
+def headers(name: str) -> wp.ModuleBuildOptions:
+    """Return `native` of a header of ``native/``."""
+    return native(f"splatting/native/{name}", **{constant: getattr(constants, constant) for constant in _SHARED})

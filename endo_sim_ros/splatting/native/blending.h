@@ -1,0 +1,208 @@
+// Compositing of splats, front to back, and its gradients, for one pixel (F = float) or for 16 of them (F = vfloat).
+// `common_kernels.py` has the formulas and defines the terms.
+#pragma once
+#include "core/native/vector.h"
+
+namespace endo_sim {
+
+constexpr int TILE = 16;
+constexpr float ALPHA_MIN = 1.0f / 255.0f, ALPHA_MAX = 0.999f, TRANSMITTANCE_MIN = 1e-4f, MEDIAN = 0.5f, PIXEL_SLACK = 0.01f;
+
+// A row of `splats`, as its columns.
+struct Splat {
+    float x, y, a, b, c, opacity, z, red, green, blue, extent_x, extent_y, aspect_x, aspect_y, shear_x, shear_y;
+};
+constexpr int SPLAT_SIZE = sizeof(Splat) / sizeof(float);
+
+// A row of `records`.
+struct Record {
+    float x, y, a, b, c, opacity, z, red, green, blue, absolute_x, absolute_y;
+};
+constexpr int RECORD_SIZE = sizeof(Record) / sizeof(float);
+
+struct Images {
+    float *colors, *depths, *alphas, *distortions;
+};
+
+struct ConstImages {
+    const float *colors, *depths, *alphas, *distortions;
+};
+
+// Of what makes pixels finish, a product and a sum must round alike in both passes: they have to draw the same splats.
+// Clang fuses within a statement wherever that is inlined; other compilers are told.
+#if defined(__CUDA_ARCH__)
+
+ENDO_SIM_INLINE float minus_product(float a, float b, float c) { return __fmaf_rn(-a, b, c); }
+
+ENDO_SIM_INLINE float divide(float x, float y) { return __fdividef(x, y); }
+
+// exp(-sigma) at an offset from the mean (pixels), to a few units in the last place. Sigma as a sum of squares: far from
+// the mean of a needle the terms of the other form cancel.
+ENDO_SIM_INLINE float falloff(float dx, float dy, float a, float shear, float aspect)
+{
+    const float run = __fmaf_rn(shear, dy, dx), rise = __fmul_rn(aspect, dy);
+    return __expf(__fmul_rn(__fmul_rn(-0.5f, a), __fmaf_rn(run, run, __fmul_rn(rise, rise))));
+}
+
+#else
+
+// c - a b.
+template <class F> ENDO_SIM_INLINE F minus_product(F a, F b, F c)
+{
+    ENDO_SIM_FUSE(on)
+    return c - a * b;
+}
+
+template <class F> ENDO_SIM_INLINE F divide(F x, F y) { return x / y; }
+
+template <class F> ENDO_SIM_INLINE F falloff(F dx, float dy, float a, float shear, float aspect)
+{
+    ENDO_SIM_FUSE(on)
+    const float rise = aspect * dy, slope = shear * dy;
+    const F run = dx + slope;
+    const F exponent = -0.5f * 1.44269504f * a * (run * run + rise * rise);
+    return exp2<true>(exponent < -126.0f ? F{} - 126.0f : exponent);
+}
+
+#endif
+
+template <class F> ENDO_SIM_INLINE F limited(F alpha) { return alpha < ALPHA_MAX ? alpha : F{} + ALPHA_MAX; }
+
+template <class F> struct Layer {
+    F before, after, weight;  // transmittances T_i and T_{i+1}, and alpha_i T_i
+    decltype(F{} < F{}) ends;  // whether it finishes the pixel, or finds it finished
+};
+
+// Let light through a splat. A pixel whose transmittance would drop below the least one is finished, which its sign tells.
+template <class F> ENDO_SIM_INLINE Layer<F> pass(F& transmittance, F alpha)
+{
+    const F before = transmittance;
+    const F after = minus_product(before, alpha, before);
+    const auto ends = after < TRANSMITTANCE_MIN;  // always true of a finished pixel
+    const F weight = ends ? F{} : before * alpha;
+    transmittance = ends ? negative(before) : after;
+    return {before, after, weight, ends};
+}
+
+// What pixels have gathered from the splats so far. Depths are relative to the first splat of the tile.
+template <class F> struct Pixel {
+    F transmittance, depth, distortion, red, green, blue;
+
+    ENDO_SIM_INLINE Layer<F> add(F alpha, float z, float splat_red, float splat_green, float splat_blue)
+    {
+        ENDO_SIM_FUSE(on)
+        const Layer<F> layer = pass(transmittance, alpha);
+        const F weight = layer.weight;
+        distortion += 2.0f * weight * (z * (1.0f - layer.before) - depth);
+        depth += weight * z;
+        red += weight * splat_red;
+        green += weight * splat_green;
+        blue += weight * splat_blue;
+        return layer;
+    }
+};
+
+// Whether the transmittance reaches a half here. One splat does not finish a pixel above that, as ALPHA_MAX is below 1.
+template <class F> ENDO_SIM_INLINE auto crosses_median(const Layer<F>& layer) { return (layer.before > MEDIAN) & (layer.after <= MEDIAN); }
+
+// Write one pixel's images.
+ENDO_SIM_INLINE void finish(const Pixel<float>& pixel, size_t index, const float* background, float reference, const Images& images)
+{
+    ENDO_SIM_FUSE(on)
+    const float seen_through = fabsf(pixel.transmittance);
+    images.colors[3 * index] = pixel.red + seen_through * background[0];
+    images.colors[3 * index + 1] = pixel.green + seen_through * background[1];
+    images.colors[3 * index + 2] = pixel.blue + seen_through * background[2];
+    images.depths[index] = pixel.depth + reference * (1.0f - seen_through);
+    images.alphas[index] = 1.0f - seen_through;
+    images.distortions[index] = pixel.distortion;
+}
+
+// Gradients of the pixels' images, their totals W and D, what is left of S = sum of w_i g_i, and T_i and D_i so far.
+template <class F> struct PixelGradient {
+    F v_red, v_green, v_blue, v_depth, v_alpha, twice_v_distortion;
+    F total_weight, total_depth, remaining, transmittance, depth;
+
+    struct Share {
+        F weight;  // w_i; times v_red, v_green and v_blue the gradient of the colour
+        F v_z_by_weight;
+        F minus_v_alpha;  // of alpha before it is limited
+        decltype(F{} < F{}) ends;
+    };
+
+    ENDO_SIM_INLINE Share add(F splat_alpha, float z, float red, float green, float blue)
+    {
+        ENDO_SIM_FUSE(on)
+        const Layer<F> layer = pass(transmittance, splat_alpha);
+        const F weight = layer.weight;
+        const F spread = 2.0f - layer.before - layer.after - total_weight;  // W_i + W_{i+1} - W
+        const F new_depth = depth + weight * z;
+        const F v_weight = v_red * red + v_green * green + v_blue * blue + v_depth * z + v_alpha
+            + twice_v_distortion * (z * spread + total_depth - depth - new_depth);
+        depth = new_depth;
+        const F rest = remaining - weight * v_weight;
+        remaining = rest;
+        const F minus_v_alpha = divide(rest, 1.0f - splat_alpha) - layer.before * v_weight;
+        return {weight, v_depth + twice_v_distortion * spread, minus_v_alpha, layer.ends};
+    }
+};
+
+// A pixel before its first splat, on the way back.
+ENDO_SIM_INLINE PixelGradient<float>
+begin(size_t index, const float* background, float reference, const ConstImages& images, const ConstImages& v_images)
+{
+    ENDO_SIM_FUSE(on)
+    const float *v_color = v_images.colors + 3 * index, *color = images.colors + 3 * index;
+    const float weight = images.alphas[index], seen_through = 1.0f - weight;
+    const float depth = images.depths[index] - reference * weight;
+    const float vd = v_images.depths[index], vl = 2.0f * v_images.distortions[index];
+    // The background is seen through the transmittance 1 - alpha, and depths count from the reference.
+    float va = v_images.alphas[index] + vd * reference, rest = vd * depth + vl * images.distortions[index];
+    for (int k = 0; k < 3; ++k) {
+        va -= v_color[k] * background[k];
+        rest += v_color[k] * (color[k] - seen_through * background[k]);
+    }
+    return {v_color[0], v_color[1], v_color[2], vd, va, vl, weight, depth, rest + va * weight, 1.0f, 0.0f};
+}
+
+// Ask a CPU's memory for what is needed soon, from places that it cannot guess.
+ENDO_SIM_INLINE void prefetch([[maybe_unused]] const void* address)
+{
+#if !defined(__CUDA_ARCH__)
+    __builtin_prefetch(address);
+#endif
+}
+
+struct Span {
+    float low, high;
+};
+
+// From where to where an ellipse reaches along one axis between two places on the other, all relative to its centre:
+// at place d it spans -shear d -+ aspect sqrt(extent^2 - d^2), and reaches highest at d = widest.
+ENDO_SIM_INLINE Span ellipse_span(float center, float low, float high, float widest, float shear, float aspect, float extent)
+{
+    ENDO_SIM_FUSE(on)
+    const float at_high = widest < low ? low : widest > high ? high : widest;
+    const float at_low = -widest < low ? low : -widest > high ? high : -widest;
+    const float square = extent * extent;
+    const float under = square - at_low * at_low, over = square - at_high * at_high;
+    return {center - shear * at_low - aspect * sqrtf(under > 0.0f ? under : 0.0f),
+        center - shear * at_high + aspect * sqrtf(over > 0.0f ? over : 0.0f)};
+}
+
+// The tile of a picture of the cameras one below the other.
+struct Place {
+    int camera, column0, row0;  // its first pixel
+    size_t pixel0;  // index of that
+
+    ENDO_SIM_INLINE Place(int tile, int width, int height)
+    {
+        const int tiles_x = (width + TILE - 1) / TILE, tiles_y = (height + TILE - 1) / TILE;
+        camera = tile / (tiles_x * tiles_y);
+        column0 = tile % tiles_x * TILE;
+        row0 = tile / tiles_x % tiles_y * TILE;
+        pixel0 = ((size_t)camera * height + row0) * width + column0;
+    }
+};
+
+}  // namespace endo_sim

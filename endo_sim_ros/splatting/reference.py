@@ -1,0 +1,168 @@
+"""What `rasterize` computes, in plain torch, as its formulas are written: every Gaussian at every pixel."""
+
+import torch
+from torch import Tensor
+
+from endo_sim_ros.splatting.api import RenderOutput, check_inputs, median_depths
+from endo_sim_ros.splatting.constants import ALPHA_MAX, ALPHA_MIN, LOG_ALPHA_SLACK, MEDIAN, TRANSMITTANCE_MIN
+
+
+def _rasterize(
+    means: Tensor,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    opacities: Tensor,
+    sh: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    *,
+    covars: Tensor | None = None,
+    background: Tensor | None = None,
+    masks: Tensor | None = None,
+    absgrad: Tensor | None = None,
+    median: bool = False,
+    near: float = 1e-3,
+    eps2d: float = 0.3,
+) -> RenderOutput:
+    """Return what `rasterize` returns, in plain torch and in the dtype of means, for small scenes.
+
+    Arguments and errors are those of `rasterize`; masks are checked, but nothing is skipped.
+    """
+    options = {"covars": covars, "background": background, "masks": masks, "absgrad": absgrad}
+    check_inputs("_rasterize", means, quats, scales, opacities, sh, viewmats, Ks, width, height, near, eps2d, **options)
+    if covars is None:
+        rotations = _quat_to_matrix(quats)
+        covars = rotations @ torch.diag_embed(scales**2) @ rotations.mT
+    covars = (covars + covars.mT) / 2
+    if background is None:
+        background = means.new_zeros(3)
+    count = means.shape[-2]
+    if absgrad is None:
+        absgrad = means.new_zeros(len(viewmats), count, 2)
+    shared = means.ndim == 2
+    cameras = [
+        _render_reference(
+            *((means, covars) if shared else (means[c], covars[c])), opacities, sh if sh.ndim == 3 else sh[c],
+            viewmat, K, width, height, background, absgrad[c], near, eps2d,
+        )
+        for c, (viewmat, K) in enumerate(zip(viewmats, Ks))
+    ]  # fmt: skip
+    *images, owners = (torch.stack(images) for images in zip(*cameras))
+    first = count * torch.arange(len(viewmats), device=means.device)[:, None, None]
+    owners = torch.where(owners >= 0, owners + first, -1)
+    return RenderOutput(*images, median_depths(owners, means, viewmats) if median else None)
+
+
+def _quat_to_matrix(quats: Tensor) -> Tensor:
+    """Return rotation matrices [N, 3, 3] of quaternions wxyz [N, 4]; zero means no rotation."""
+    norms = quats.norm(dim=1, keepdim=True)
+    identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0]).expand_as(quats)
+    zero = norms < 1e-12
+    w, x, y, z = torch.where(zero, identity, quats / norms.where(~zero, 1)).unbind(1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def sh_basis(directions: Tensor, count: int) -> Tensor:
+    """Return the first 1, 4, 9 or 16 real spherical harmonics [N, count] in unit directions [N, 3], ordered and signed as in 3DGS files."""
+    x, y, z = directions.unbind(1)
+    xx, yy, zz = x * x, y * y, z * z
+    basis = [
+        torch.full_like(x, 0.28209479177387814),
+        -0.4886025119029199 * y,
+        0.4886025119029199 * z,
+        -0.4886025119029199 * x,
+        1.0925484305920792 * x * y,
+        -1.0925484305920792 * y * z,
+        0.31539156525252005 * (2 * zz - xx - yy),
+        -1.0925484305920792 * x * z,
+        0.5462742152960396 * (xx - yy),
+        -0.5900435899266435 * y * (3 * xx - yy),
+        2.890611442640554 * x * y * z,
+        -0.4570457994644658 * y * (4 * zz - xx - yy),
+        0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
+        -0.4570457994644658 * x * (4 * zz - xx - yy),
+        1.445305721320277 * z * (xx - yy),
+        -0.5900435899266435 * x * (xx - 3 * yy),
+    ]
+    return torch.stack(basis[:count], 1)
+
+
+class _SumOfAbsolutes(torch.autograd.Function):
+    """Returns the first argument [N, H, W]; the gradient of the second [N] is the sum of its gradient's absolute values."""
+
+    @staticmethod
+    def forward(ctx, x, probe):
+        return x.clone()
+
+    @staticmethod
+    def backward(ctx, v):
+        return v, v.abs().sum((1, 2))
+
+
+def _render_reference(means, covars, opacities, sh, viewmat, K, width, height, background, absgrad, near, eps2d):
+    """Return images of one camera, radii [N] and, per pixel, the Gaussian at the median depth or −1 [H, W]."""
+    rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    points = means @ rotation.T + translation
+    drawn = (points[:, 2] >= near) & (opacities >= ALPHA_MIN)
+    radii = torch.zeros(len(means), dtype=torch.int32, device=means.device)
+
+    # The Gaussians that are drawn, front to back.
+    index = drawn.nonzero()[:, 0]
+    index = index[points[index, 2].argsort(stable=True)]
+    points, covars, opacities, sh = points[index], covars[index], opacities[index], sh[index]
+    x, y, z = points.unbind(1)
+    slope_x = (x / z).clamp(-cx / fx - 0.15 * width / fx, (width - cx) / fx + 0.15 * width / fx)
+    slope_y = (y / z).clamp(-cy / fy - 0.15 * height / fy, (height - cy) / fy + 0.15 * height / fy)
+    zero = torch.zeros_like(z)
+    jacobian = torch.stack([fx / z, zero, -fx * slope_x / z, zero, fy / z, -fy * slope_y / z], 1).view(-1, 2, 3)
+    to_image = jacobian @ rotation
+    cov = to_image @ covars @ to_image.mT + eps2d * torch.eye(2, dtype=means.dtype, device=means.device)
+    xx, xy, yy = cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
+    det = xx * yy - xy * xy
+    center_x, center_y = fx * x / z + cx, fy * y / z + cy
+
+    level = 2 * ((255 * opacities).log() + LOG_ALPHA_SLACK)
+    extent_x, extent_y = (level * xx).sqrt(), (level * yy).sqrt()
+    inside = (center_x + extent_x >= 0) & (center_x - extent_x <= width)
+    inside &= (center_y + extent_y >= 0) & (center_y - extent_y <= height)
+    radii[index] = torch.where(inside, torch.maximum(extent_x, extent_y).ceil(), 0).detach().to(torch.int32)
+
+    directions = torch.nn.functional.normalize(means[index] + translation @ rotation, dim=1)
+    colors = ((sh_basis(directions, sh.shape[1])[..., None] * sh).sum(1) + 0.5).clamp_min(0)
+
+    rows = torch.arange(height, dtype=means.dtype, device=means.device) + 0.5
+    columns = torch.arange(width, dtype=means.dtype, device=means.device) + 0.5
+    shape = (len(index), height, width)
+    dx = _SumOfAbsolutes.apply((columns - center_x[:, None])[:, None, :].expand(shape), absgrad[index, 0])
+    dy = _SumOfAbsolutes.apply((rows - center_y[:, None])[:, :, None].expand(shape), absgrad[index, 1])
+    a, b, c = (x[:, None, None] for x in (yy / det, -xy / det, xx / det))
+    sigma = (a * dx**2 + c * dy**2) / 2 + b * dx * dy
+    alpha = (opacities[:, None, None] * (-sigma).exp()).clamp_max(ALPHA_MAX)
+    alpha = torch.where(alpha >= ALPHA_MIN, alpha, 0)
+    after = (1 - alpha).cumprod(0)
+    alpha = torch.where(after < TRANSMITTANCE_MIN, 0, alpha)  # a product of factors up to one never rises again
+    after = (1 - alpha).cumprod(0)
+    before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
+    weights = alpha * before
+
+    z = z[:, None, None]
+    before_depth = (weights * z).cumsum(0) - weights * z
+    before_weight = weights.cumsum(0) - weights
+    alphas = weights.sum(0)
+    images = (
+        torch.einsum("nhw,nc->hwc", weights, colors) + (1 - alphas)[..., None] * background,
+        (weights * z).sum(0),
+        alphas,
+        (2 * weights * (z * before_weight - before_depth)).sum(0),
+    )
+    crosses = (before > MEDIAN) & (after <= MEDIAN)  # once, as transmittance only falls
+    owners = torch.where(crosses, index[:, None, None] + 1, 0).sum(0) - 1
+    return *images, radii, owners

@@ -1,0 +1,95 @@
+"""What backends take and return: a scene, the settings of a picture, and gradients."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from endo_sim_ros.splatting.constants import TILE
+
+
+class Scene(NamedTuple):
+    """N Gaussians, or as many for each camera, and C cameras; float32, contiguous, on one device. The terms are those of `rasterize`."""
+
+    means: Tensor  # [N, 3] or [C, N, 3] m, world
+    quats: Tensor | None  # [N, 4] wxyz
+    scales: Tensor | None  # [N, 3] m
+    covars: Tensor | None  # [N, 3, 3] or [C, N, 3, 3] m², world
+    opacities: Tensor  # [N]
+    sh: Tensor  # [N, K, 3] or [C, N, K, 3]
+    viewmats: Tensor  # [C, 4, 4] world to camera
+    Ks: Tensor  # [C, 3, 3] pixels
+    background: Tensor  # [3]
+
+    @property
+    def gaussian_count(self) -> int:
+        """Number of Gaussians N that each camera sees."""
+        return self.means.shape[-2]
+
+    @property
+    def splat_count(self) -> int:
+        """Number of splats C·N."""
+        return len(self.viewmats) * self.gaussian_count
+
+    @property
+    def per_camera(self) -> int:
+        """Whether each camera has means and covariances of its own, 0 or 1."""
+        return int(self.means.ndim == 3)
+
+    def gaussian_arguments(self) -> list:
+        """Return the first arguments of the kernels `project` and `project_backward`."""
+        return [self.means, self.quats, self.scales, self.covars, int(self.covars is not None)]
+
+
+class Settings(NamedTuple):
+    """How a scene is drawn."""
+
+    width: int  # pixels
+    height: int  # pixels
+    near: float  # m
+    eps2d: float  # pixel²
+    median: bool  # whether medians are computed
+
+    @property
+    def tiles_x(self) -> int:
+        """Number of tiles in a row."""
+        return -(-self.width // TILE)
+
+    @property
+    def tiles_y(self) -> int:
+        """Number of rows of tiles."""
+        return -(-self.height // TILE)
+
+
+class Gradients(NamedTuple):
+    """Gradients of a scene's tensors, shaped as those; None where there is no tensor, or the gradient is not wanted."""
+
+    means: Tensor
+    quats: Tensor | None
+    scales: Tensor | None
+    covars: Tensor | None
+    opacities: Tensor
+    sh: Tensor
+    camera_shares: Tensor | None  # [C, N, 4, 4] what each Gaussian adds to the gradient of each camera's viewmat
+    absolutes: Tensor | None  # [C, N, 2] Σ_pixels |∂L/∂mean2d|, 1/pixel
+
+    @classmethod
+    def empty(cls, scene: Scene, wants_pose: bool, wants_absolute: bool) -> "Gradients":
+        """Return memory for the gradients of a scene, not initialised."""
+        gradients = [None if x is None else torch.empty_like(x) for x in scene[:6]]
+        size = (len(scene.viewmats), scene.gaussian_count)
+        shares = scene.means.new_empty(*size, 4, 4) if wants_pose else None
+        return cls(*gradients, shares, scene.means.new_empty(*size, 2) if wants_absolute else None)
+
+
+def empty_images(scene: Scene, settings: Settings) -> tuple[list[Tensor], Tensor]:
+    """Return memory for images, not initialised.
+
+    Returns:
+        Colours [C, H, W, 3], depths, alphas and distortions [C, H, W], float32.
+        Owners of the median depths, int32 [C, H, W], or [0] if medians are not wanted.
+    """
+    size = (len(scene.viewmats), settings.height, settings.width)
+    images = [scene.means.new_empty(*size, 3)] + [scene.means.new_empty(size) for _ in range(3)]
+    owners = torch.empty(size if settings.median else 0, dtype=torch.int32, device=scene.means.device)
+    return images, owners

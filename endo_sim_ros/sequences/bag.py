@@ -37,7 +37,7 @@ def write_bag(path: str | Path, frames: Iterable[Frame]) -> int:
             bag.write(messages.LEFT_INFO, messages.encode_camera_info(camera.K, *size, stamp, LEFT_FRAME, types=types), stamp)
             bag.write(messages.CAMERA_POSE, messages.encode_pose(camera.pose, stamp, WORLD_FRAME, types), stamp)
             bag.write(messages.LEFT_IMAGE, messages.encode_image(frame.image, stamp, LEFT_FRAME, types), stamp)
-            if frame.right is not None:
+            if frame.right is not None and frame.baseline is not None:
                 K = camera.K if frame.right_K is None else frame.right_K
                 info = messages.encode_camera_info(K, *size, stamp, RIGHT_FRAME, frame.baseline, types)
                 bag.write(messages.RIGHT_INFO, info, stamp)

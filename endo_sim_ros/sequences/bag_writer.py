@@ -86,7 +86,7 @@ class BagWriter:
         """
         self.write_raw(topic, bag_types().typestore.serialize_cdr(message, topic.type), stamp_ns)
 
-    def write_raw(self, topic: Topic, data: bytes, stamp_ns: int) -> None:
+    def write_raw(self, topic: Topic, data: bytes | memoryview, stamp_ns: int) -> None:
         """Append a serialised message (CDR); see `write`."""
         name = topic.name if topic.name.startswith("/") else f"/{topic.name}"
         if name not in self._connections:

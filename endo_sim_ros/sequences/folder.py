@@ -56,6 +56,9 @@ def read_folder(
         mask_border: Ignore the black border that rectification or a round vignette leaves.
         fps: Frames per second that frame numbers count in; None takes the calibration's, or 25.
 
+    Returns:
+        Undistorted frames, of both eyes where there is right/; those without a pose are skipped.
+
     Raises:
         SequenceError: If a file is missing or wrong.
     """
@@ -70,7 +73,7 @@ def read_folder(
         raise SequenceError(f"{root / CALIBRATION_FILE}: baseline_m is missing, but there are right images")
     if right and any(calibration["distortion"]):
         raise SequenceError(f"{root / CALIBRATION_FILE}: stereo images must be rectified already; drop distortion or right/")
-    fps = fps or calibration.get("fps", DEFAULT_FPS)
+    rate: float = fps or calibration.get("fps", DEFAULT_FPS)
 
     numbers = select(left, root / "left", start, stop, step)
     poses = None
@@ -107,7 +110,7 @@ def read_folder(
                 depth = rectification.depth(np.dstack([np.zeros_like(z)] * 2 + [z]))
             pose = np.eye(4) if poses is None else poses[number]
             yield Frame(
-                stamp_ns=stamp_ns(number, fps),
+                stamp_ns=stamp_ns(number, rate),
                 image=rectification.left(image),
                 camera=Camera(rectification.K, *size, pose),
                 right=image_of(right[number]) if right else None,

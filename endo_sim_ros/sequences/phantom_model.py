@@ -36,5 +36,6 @@ def phantom_model(count: int, width: int) -> tuple[GaussianModel, Camera]:
     sizes = np.concatenate([*(side.clip(pixel, _STEEPEST * pixel) for side in sides), 0.3 * pixel], 2)
     quats = np.roll(Rotation.from_matrix(axes[seen]).as_quat(), 1, axis=1)  # wxyz
     colors = (image[seen] / 255 - 0.5) / SH_C0
-    arrays = points[seen], quats, np.log(0.7 * sizes[seen]), np.full(seen.sum(), 2.2), colors[:, None]  # opacity 0.9
-    return GaussianModel(*[torch.from_numpy(array).float() for array in arrays]), camera
+    tensor = lambda array: torch.from_numpy(array).float()
+    opacity = tensor(np.full(seen.sum(), 2.2))  # of 0.9
+    return GaussianModel(tensor(points[seen]), tensor(quats), tensor(np.log(0.7 * sizes[seen])), opacity, tensor(colors[:, None])), camera

@@ -4,8 +4,11 @@ Calibrations on the way in follow OpenCV (pixel (0, 0) has its centre at (0, 0))
 follows `endo_sim_ros.core.cameras` (centre at (0.5, 0.5)).
 """
 
+from __future__ import annotations
+
 import dataclasses
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -16,6 +19,7 @@ from endo_sim_ros.sequences.images import clean_depth
 
 logger = logging.getLogger(__name__)
 
+Maps = Sequence[np.ndarray]  # raw column and row [H, W] of every rectified pixel, float32
 HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 
 
@@ -65,7 +69,7 @@ class StereoCalibration:
             object.__setattr__(self, "T", -self.R.T @ self.T)
             object.__setattr__(self, "R", self.R.T.copy())
 
-    def resized(self, width: int, height: int) -> "StereoCalibration":
+    def resized(self, width: int, height: int) -> StereoCalibration:
         """The calibration for images of another size with the same field of view."""
         if (width, height) == self.size:
             return self
@@ -91,7 +95,15 @@ class Rectification:
         valid: Mask [H, W], uint8: 255 where the raw left image has the pixel, 0 on the black border.
     """
 
-    def __init__(self, size, K, rotation, left_maps, right_maps=None, baseline=None):
+    def __init__(
+        self,
+        size: tuple[int, int],
+        K: np.ndarray,
+        rotation: np.ndarray,
+        left_maps: Maps | None,
+        right_maps: Maps | None = None,
+        baseline: float | None = None,
+    ):
         self.size = size
         self.K = K
         self.rotation = rotation
@@ -106,7 +118,7 @@ class Rectification:
             self.valid = np.where(inside, np.uint8(255), np.uint8(0))
 
     @classmethod
-    def stereo(cls, calibration: StereoCalibration) -> "Rectification":
+    def stereo(cls, calibration: StereoCalibration) -> Rectification:
         """Rows aligned, one K and no disparity at infinity for both eyes, no larger border than needed (alpha 0)."""
         c, size = calibration, calibration.size
         R_left, R_right, P_left, P_right, *_ = cv2.stereoRectify(
@@ -120,7 +132,7 @@ class Rectification:
         return cls(size, P_left[:, :3] + HALF_PIXEL, R_left, left, right, float(baseline))
 
     @classmethod
-    def mono(cls, K: np.ndarray, distortion: np.ndarray, size: tuple[int, int]) -> "Rectification":
+    def mono(cls, K: np.ndarray, distortion: Sequence[float] | np.ndarray, size: tuple[int, int]) -> Rectification:
         """Undistortion of one eye.
 
         Args:
@@ -170,7 +182,7 @@ class Rectification:
         turned[:3, :3] = pose[:3, :3] @ self.rotation.T
         return turned
 
-    def _remap(self, image: np.ndarray, maps, interpolation: int) -> np.ndarray:
+    def _remap(self, image: np.ndarray, maps: Maps | None, interpolation: int) -> np.ndarray:
         if image.shape[1::-1] != tuple(self.size):
             raise SequenceError(f"image is {image.shape[1]}×{image.shape[0]}, but its calibration is for {self.size[0]}×{self.size[1]}")
-        return image if maps is None else cv2.remap(image, *maps, interpolation)
+        return image if maps is None else cv2.remap(image, maps[0], maps[1], interpolation)

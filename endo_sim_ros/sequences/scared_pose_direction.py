@@ -110,9 +110,8 @@ def _project(points: np.ndarray, view: np.ndarray, calibration: StereoCalibratio
 
 def _sample(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
     """Bilinear samples [N] of an image [H, W] at pixels [N, 2]."""
-    columns = np.ascontiguousarray(uv.astype(np.float32).reshape(-1, 1, 2))
-    # remap takes at most 32767 rows
-    return np.concatenate([cv2.remap(image, part, None, cv2.INTER_LINEAR)[:, 0] for part in np.array_split(columns, 4)])
+    parts = np.array_split(uv.astype(np.float32), 4)  # remap takes at most 32767 rows
+    return np.concatenate([cv2.remap(image, part[:, :1], part[:, 1:], cv2.INTER_LINEAR)[:, 0] for part in parts])
 
 
 def _correlation(a: np.ndarray, b: np.ndarray) -> float:

@@ -11,7 +11,7 @@ P1/
 import configparser
 import csv
 import logging
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -102,7 +102,11 @@ def read_stereomis(
 
 
 def read_stereo_ini(path: Path) -> StereoCalibration:
-    """The calibration of a da Vinci endoscope as StereoMIS writes it."""
+    """The calibration of a da Vinci endoscope as StereoMIS writes it.
+
+    Raises:
+        SequenceError: If the file cannot be read or lacks a number.
+    """
     if not path.is_file():
         raise SequenceError(f"{path}: file is missing; it holds the calibration of both cameras")
     parser = configparser.ConfigParser()
@@ -146,7 +150,7 @@ class _StackedVideo:
         self.numbers = list(range(self._video.frame_count))
         self.size = self._video.width, self._video.height // 2
 
-    def read(self, numbers) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+    def read(self, numbers: Sequence[int]) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
         for number, image in self._video.frames(numbers):
             yield number, *split_stacked(image, self._video.path)
 
@@ -168,7 +172,7 @@ class _ExtractedFrames:
         height, width = read_image(self._left[self.numbers[0]]).shape[:2]
         self.size = width, height
 
-    def read(self, numbers) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+    def read(self, numbers: Sequence[int]) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
         for number in numbers:
             left, right = (check_size(read_image(files[number]), self.size, files[number]) for files in (self._left, self._right))
             yield number, left, right

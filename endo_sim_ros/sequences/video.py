@@ -7,9 +7,10 @@ endo.mp4, or a folder with
   mask.png            optional, one for all frames; or masks/%06d.png; 255 = tissue
 """
 
+import functools
 import itertools
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -74,14 +75,18 @@ def read_video(
         fps: Frames per second; None takes the video's.
         threads: For structure from motion: -1 = all cores, 1 = repeatable to the last bit.
 
+    Returns:
+        Undistorted frames of one eye; those without a pose are skipped.
+
     Raises:
         SequenceError: If a file is missing or wrong, or poses are given without intrinsics.
     """
     path = Path(path)
     if path.is_dir():
-        folder, path = path, find_video(path)
-        if path is None:
+        folder, found = path, find_video(path)
+        if found is None:
             raise SequenceError(f"{folder}: holds no video; pass a video file or a folder with one")
+        path = found
         poses = poses or _existing(folder / "poses.txt")
         calibration = calibration or (_existing(folder / "calibration.yaml") if fx is None else None)
         mask = mask or _existing(folder / "mask.png") or _existing(folder / "masks")
@@ -108,26 +113,27 @@ def read_video(
         numbers = numbers[::sfm_step]
         logger.info("%s: poses of every %d-th frame come from structure from motion", path, step * sfm_step)
 
-    cache: dict[str, object] = {}  # what takes a pass over the video is found once, on first iteration
+    @functools.cache
+    def prepare() -> tuple[np.ndarray, Rectification, Mapping[int, np.ndarray]]:
+        """Lit area, rectification and poses: what takes a pass over the video is found once, on first iteration."""
+        lit = np.full(size[::-1], 255, np.uint8)
+        if mask_border:
+            lit = lit_area(image for _, image in video.frames(spread(numbers, 10)))
+        rectification = None if K is None else Rectification.mono(K, distortion, size)
+        if known is not None and rectification is not None:
+            return lit, rectification, known
+        placed, rectification = _estimate(
+            video,
+            numbers,
+            rectification,
+            lambda n, image: cv2.bitwise_and(lit_now(lit, image), mask_of(n)),
+            scale=scale,
+            threads=threads,
+        )
+        return lit, rectification, placed
 
     def frames() -> Iterator[Frame]:
-        if not cache:
-            sample = spread(numbers, 10)
-            whole = np.full(size[::-1], 255, np.uint8)
-            lit = lit_area(image for _, image in video.frames(sample)) if mask_border else whole
-            rectification = None if K is None else Rectification.mono(K, distortion, size)
-            placed = known
-            if placed is None:
-                placed, rectification = _estimate(
-                    video,
-                    numbers,
-                    rectification,
-                    lambda n, image: cv2.bitwise_and(lit_now(lit, image), mask_of(n)),
-                    scale=scale,
-                    threads=threads,
-                )
-            cache.update(lit=lit, rectification=rectification, poses=placed)
-        lit, rectification, placed = cache["lit"], cache["rectification"], cache["poses"]
+        lit, rectification, placed = prepare()
         for number, image in video.frames([n for n in numbers if n in placed]):
             yield Frame(
                 stamp_ns=stamp_ns(number, fps),
@@ -139,7 +145,15 @@ def read_video(
     return Recording(frames, len(numbers))
 
 
-def _estimate(video: Video, numbers: list[int], rectification, mask_of, *, scale, threads):
+def _estimate(
+    video: Video,
+    numbers: list[int],
+    rectification: Rectification | None,
+    mask_of: Callable[[int, np.ndarray], np.ndarray],
+    *,
+    scale: float | None,
+    threads: int,
+) -> tuple[dict[int, np.ndarray], Rectification]:
     """Poses by frame number and the rectification, which is estimated too where it is None."""
     undistort = rectification or Rectification.mono(np.eye(3), (), (video.width, video.height))
     for_images, for_masks = itertools.tee(video.frames(numbers))  # read side by side, so that each frame is decoded once
@@ -158,7 +172,13 @@ def _estimate(video: Video, numbers: list[int], rectification, mask_of, *, scale
     return {numbers[position]: pose for position, pose in result.poses.items()}, rectification
 
 
-def _intrinsics(path: Path, calibration, values, distortion, size):
+def _intrinsics(
+    path: Path,
+    calibration: Path | str | None,
+    values: tuple[float | None, ...],
+    distortion: Sequence[float],
+    size: tuple[int, int],
+) -> tuple[np.ndarray | None, Sequence[float]]:
     """K [3, 3] and distortion from a file or from arguments; K is None when neither is given."""
     fx, fy, cx, cy = values
     if calibration is not None:

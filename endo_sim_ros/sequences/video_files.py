@@ -56,7 +56,7 @@ class Video:
                 while position < number and capture.grab():
                     position += 1
                 ok, image = capture.read() if position == number else (False, None)
-                if not ok:
+                if not ok or image is None:
                     if not done:
                         raise SequenceError(f"{self.path}: frame {number} cannot be decoded; the video is damaged")
                     logger.warning(

@@ -23,7 +23,7 @@ class Anatomy:
         bent_x, bent_y = x + bend_x, y + bend_y
 
         # where the ligament holds the organ
-        self.apex = np.float32([rng.uniform(-0.030, -0.005), rng.uniform(-0.020, -0.008)])
+        self.apex = np.array([rng.uniform(-0.030, -0.005), rng.uniform(-0.020, -0.008)], np.float32)
         wall = self._wall(rng, x, y)
         organ = self._organ(rng, bent_x, bent_y)
         lobe = self._lobe(rng, bent_x, bent_y)
@@ -51,7 +51,7 @@ class Anatomy:
         """A rounded body, hung from its apex, that turns away steeply at its outline."""
         angle = rng.uniform(0.35, 0.75)  # its long axis runs down and to the right
         long, short = rng.uniform(0.066, 0.078), rng.uniform(0.036, 0.043)
-        centre = self.apex + np.float32([math.cos(angle), math.sin(angle)]) * long * 0.62 + np.float32([0.0, 0.012])
+        centre = self.apex + np.array([math.cos(angle), math.sin(angle)], np.float32) * long * 0.62 + np.array([0.0, 0.012], np.float32)
         a = (x - centre[0]) * math.cos(angle) + (y - centre[1]) * math.sin(angle)
         b = -(x - centre[0]) * math.sin(angle) + (y - centre[1]) * math.cos(angle)
         radius = ((np.abs(a) / long) ** 2.3 + (np.abs(b) / (short * np.clip(1.0 + 0.28 * a / long, 0.5, 1.5))) ** 2.3) ** (1 / 2.3)

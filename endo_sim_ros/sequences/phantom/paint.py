@@ -27,7 +27,7 @@ class Paint:
         by_vertex = np.ascontiguousarray(np.moveaxis(anatomy.shares, 0, -1))
 
         def look(name):  # one property over the whole surface [SIDE, SIDE] or, a colour, [SIDE, SIDE, 3]
-            table = np.float32([linear(v) if isinstance(v := getattr(tissue, name), tuple) else v for tissue in tissues])
+            table = np.array([linear(v) if isinstance(v := getattr(tissue, name), tuple) else v for tissue in tissues], np.float32)
             return cv2.transform(by_vertex, table.reshape(len(tissues), -1).T)
 
         # Mottling: wide drifts between two colours, and patches with softly lobed outlines.
@@ -100,7 +100,7 @@ class Paint:
     def _organ_vessels(self, rng, anatomy):
         vessels = Vessels(rng, 0.0017)
         for side in np.linspace(-0.6, 1.3, 6):  # from the hilum, left, fanning out across the body
-            origin = anatomy.apex + np.float32([-0.026 - 0.002 * side, 0.022 + 0.024 * side])
+            origin = anatomy.apex + np.array([-0.026 - 0.002 * side, 0.022 + 0.024 * side], np.float32)
             vessels.grow(origin, 0.55 * side + 0.2 + rng.normal(0.0, 0.1), rng.uniform(0.0005, 0.0009), wander=0.26, reach=2.0)
         for _ in range(28):  # and smaller ones from all around
             origin = anatomy.apex + rng.uniform([0.0, -0.01], [0.12, 0.10])

@@ -33,10 +33,10 @@ LOBES = (
     Tissue((124, 50, 46), (94, 32, 34), (146, 74, 66), 0.30, 0.45, 0.7, 1.0),  # liver
     Tissue((136, 62, 54), (104, 42, 42), (150, 88, 76), 0.35, 0.50, 0.7, 1.0),
 )
-BLOOD = np.float32([0.50, 1.50, 1.30])  # absorption per unit of blood, red to blue, of a soft red vessel
-DEEP_BLOOD = np.float32([1.05, 1.20, 0.95])  # of veins seen through tissue, which scatters blue back
+BLOOD = np.array([0.50, 1.50, 1.30], np.float32)  # absorption per unit of blood, red to blue, of a soft red vessel
+DEEP_BLOOD = np.array([1.05, 1.20, 0.95], np.float32)  # of veins seen through tissue, which scatters blue back
 
 
 def linear(display: tuple[int, int, int]) -> np.ndarray:
     """Albedo [3] that a display colour (0-255) stands for."""
-    return (np.float32(display) / 255.0) ** np.float32(2.2)
+    return (np.array(display, np.float32) / 255.0) ** np.float32(2.2)

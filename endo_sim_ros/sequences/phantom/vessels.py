@@ -4,6 +4,7 @@ import math
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 
 from endo_sim_ros.sequences.phantom.height_field import CELL, HALF_WIDTH, SIDE
 
@@ -23,7 +24,16 @@ class Vessels:
         self._rng, self._room, self._count = rng, room, 0
         self._owners = np.zeros((int(2 * HALF_WIDTH / room) + 1,) * 2, np.int64)
 
-    def grow(self, origin, heading, radius, *, wander=0.3, reach=1.0, smallest=0.00010) -> None:
+    def grow(
+        self,
+        origin: ArrayLike,
+        heading: float,
+        radius: float,
+        *,
+        wander: float = 0.3,
+        reach: float = 1.0,
+        smallest: float = 0.00010,
+    ) -> None:
         """Draw one tree. A vessel keeps its course but wanders, tapers, and forks by Murray's law r³ = r1³ + r2³.
 
         Args:
@@ -35,7 +45,8 @@ class Vessels:
             smallest: Radius at which branches end, metres.
         """
         rng = self._rng
-        branches, strokes = [(np.float64(origin), heading, radius, 0)], []
+        branches: list[tuple[np.ndarray, float, float, int]] = [(np.asarray(origin, np.float64), heading, radius, 0)]
+        strokes: list[tuple[list[np.ndarray], float]] = []
         while branches:
             point, course, r, parent = branches.pop(0)  # the large ones first, so that they find room
             self._count += 1
@@ -69,7 +80,7 @@ class Vessels:
             for points, r in strokes:
                 self._stroke(points, r)
 
-    def _claim(self, point, name, parent) -> bool:
+    def _claim(self, point: np.ndarray, name: int, parent: int) -> bool:
         """Take the place at a point unless it is outside or another vessel's, the parent's excepted."""
         if np.abs(point).max() > HALF_WIDTH:
             return False
@@ -79,7 +90,7 @@ class Vessels:
             self._owners[place] = name
         return owner in (0, name, parent)
 
-    def _stroke(self, points, r) -> None:
+    def _stroke(self, points: list[np.ndarray], r: float) -> None:
         level = sum(r > calibre for calibre in self.CALIBRES)
         thickness = 2.0 * r / CELL
         # A line is at least one cell wide: thinner ones are drawn fainter instead.

@@ -9,7 +9,8 @@ import yaml
 
 from endo_sim_ros import cli
 from endo_sim_ros.core.config import ConfigError, Range, StageConfig, option_values, options
-from endo_sim_ros.nodes.parameter_file import NODE_CONFIGS, parameter_file
+from endo_sim_ros.nodes.configs import NODE_CONFIGS
+from endo_sim_ros.nodes.parameter_file import parameter_file
 
 ALL = [config for configs in NODE_CONFIGS.values() for config in configs]
 FILE = Path(__file__).parents[1] / "config" / "endo_sim.yaml"

@@ -452,26 +452,6 @@ def decode_pose(message: Any, frames: str | Mapping[str, np.ndarray], topic: str
     return pose if isinstance(frames, str) else frames[frame] @ pose
 
 
-def parse_frames(world_frame: str, frames: Iterable[str]) -> dict[str, np.ndarray]:
-    """Poses [4, 4] in the world of the frames given as ``name x y z qx qy qz qw``, and of the world itself.
-
-    Raises:
-        ValueError: If one is not a name and a pose in metres with a unit quaternion.
-    """
-    poses = {world_frame.lstrip("/"): np.eye(4)}
-    for text in filter(None, frames):
-        name, *numbers = text.split() or [""]
-        try:
-            x, y, z, qx, qy, qz, qw = map(float, numbers)
-        except ValueError:
-            raise ValueError(f"frames: {text!r} is not a name and seven numbers, as in 'PSM1_base 0.1 0 0 0 0 0 1'") from None
-        position, quat = np.array([x, y, z]), np.array([qw, qx, qy, qz])
-        if not np.isfinite(position).all() or not abs(np.linalg.norm(quat) - 1) < 0.01:
-            raise ValueError(f"frames: {text!r} has no finite position and unit quaternion (x y z qx qy qz qw)")
-        poses[name.lstrip("/")] = make_pose(position, quat)
-    return poses
-
-
 def _encode_pose(types: Any, pose: np.ndarray) -> Any:
     w, x, y, z = (float(value) for value in matrix_to_quat(pose[:3, :3]))
     px, py, pz = (float(value) for value in pose[:3, 3])

@@ -5,18 +5,15 @@ import difflib
 import functools
 import gc
 import os
-import re
 import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
 import rclpy
 import torch
 import yaml
@@ -33,9 +30,10 @@ from endo_sim_ros.core.config import ConfigError, StageConfig, options
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import ModelError
-from endo_sim_ros.graph.processes import end_with_parent
 from endo_sim_ros.messages import ERROR, OK, WARN, MessageError, Topic
+from endo_sim_ros.nodes.configs import NODE_CONFIGS
 from endo_sim_ros.nodes.executor import NodeExecutor
+from endo_sim_ros.nodes.process import end_with_parent
 from endo_sim_ros.nodes.transport import prepare_transport
 
 _ERROR_SHOWN = 5.0  # seconds that an error stays on /diagnostics, and that its repetitions are not logged
@@ -45,32 +43,6 @@ _END_WITHIN = 3.0  # seconds that worker threads have to end before the process 
 STREAM_DEPTH = 20
 
 Config = TypeVar("Config", bound=StageConfig)
-
-
-@dataclass(frozen=True)
-class WorldConfig(StageConfig):
-    """Where poses are given."""
-
-    world_frame: str = "world"
-    """Frame of camera poses, tool poses, the model and the control nodes."""
-    frames: tuple[str, ...] = ("",)  # ROS has no typed empty list
-    """Other frames in which camera and tool poses may come, such as the bases of robot arms: each the name and the pose
-    in the world, 'PSM1_base x y z qx qy qz qw', metres."""
-
-    def __post_init__(self):
-        super().__post_init__()
-        try:
-            messages.parse_frames(self.world_frame, self.frames)
-        except ValueError as error:
-            raise ConfigError(str(error)) from error
-
-    @property
-    def frame_poses(self) -> dict[str, np.ndarray]:
-        """Poses [4, 4] of all known frames in the world, by name."""
-        return _frame_poses(self.world_frame, self.frames)
-
-
-_frame_poses = functools.cache(messages.parse_frames)
 
 
 class EndoNode(Node):
@@ -241,8 +213,6 @@ class EndoNode(Node):
 
 def _meant_for_others() -> set[str]:
     """Parameters of our other nodes that a file gives to all nodes, under /**."""
-    from endo_sim_ros.nodes.parameter_file import NODE_CONFIGS  # imports all nodes
-
     ours, general = {option.name for configs in NODE_CONFIGS.values() for config in configs for option in options(config)}, set()
     for flag, path in zip(sys.argv, sys.argv[1:]):
         if flag == "--params-file":
@@ -305,19 +275,6 @@ def sentence(where: str, error: Exception) -> str:
     if isinstance(error, (ValueError, OSError)):
         return f"{where}: {error}"
     return f"{where}: unexpected {type(error).__name__}: {error}"
-
-
-def arm_names(names: Iterable[str]) -> tuple[str, ...]:
-    """The names in the parameter `arms`, each once.
-
-    Raises:
-        ConfigError: If one cannot be part of a topic's name.
-    """
-    names = tuple(dict.fromkeys(name.strip() for name in names))
-    for name in names:
-        if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*", name):
-            raise ConfigError(f"arms: {name!r} cannot name topics; use letters, digits and _")
-    return names
 
 
 def _checked(config_class: type[Config], values: dict[str, Any]) -> Config:
@@ -384,4 +341,4 @@ def _one_line(error: Exception) -> str:
     return " ".join(str(error).split())
 
 
-__all__ = ["ERROR", "OK", "WARN", "Background", "EndoNode", "arm_names", "run", "sentence"]
+__all__ = ["ERROR", "OK", "WARN", "Background", "EndoNode", "run", "sentence"]

@@ -3,30 +3,8 @@
 import textwrap
 from collections.abc import Sequence
 
-from endo_sim_ros.core.config import StageConfig, options
-from endo_sim_ros.nodes.bag_player_node import BagPlayerConfig
-from endo_sim_ros.nodes.physics_node import PhysicsNodeConfig
-from endo_sim_ros.nodes.policy_node import PolicyConfig
-from endo_sim_ros.nodes.reconstruction_node import ReconstructionNodeConfig
-from endo_sim_ros.nodes.recorder_node import RecorderConfig
-from endo_sim_ros.nodes.rendering_node import RenderingNodeConfig
-from endo_sim_ros.nodes.scripted_tool_node import ScriptedToolConfig
-from endo_sim_ros.nodes.viewer_node import ViewerNodeConfig
-from endo_sim_ros.physics import PhysicsConfig
-from endo_sim_ros.reconstruction import ReconstructionConfig
-from endo_sim_ros.rendering import RenderingConfig
-from endo_sim_ros.viewer.config import ViewerConfig
-
-NODE_CONFIGS: dict[str, tuple[type[StageConfig], ...]] = {
-    "reconstruction_node": (ReconstructionNodeConfig, ReconstructionConfig),
-    "physics_node": (PhysicsNodeConfig, PhysicsConfig),
-    "rendering_node": (RenderingNodeConfig, RenderingConfig),
-    "bag_player": (BagPlayerConfig,),
-    "recorder": (RecorderConfig,),
-    "scripted_tool": (ScriptedToolConfig,),
-    "policy": (PolicyConfig,),
-    "viewer_node": (ViewerNodeConfig, ViewerConfig, RenderingConfig),
-}
+from endo_sim_ros.core.config import options
+from endo_sim_ros.nodes.configs import NODE_CONFIGS
 
 
 def parameter_file(nodes: Sequence[str] = tuple(NODE_CONFIGS)) -> str:

@@ -2,40 +2,23 @@
 
 import time
 from collections import deque
-from dataclasses import dataclass, replace
-from typing import Annotated, Any, Literal
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.core.config import Range, StageConfig
+from endo_sim_ros.core.config import StageConfig
 from endo_sim_ros.messages import CameraInfo, ControlNodeCloud, MessageError
-from endo_sim_ros.nodes.base import ERROR, OK, STREAM_DEPTH, WARN, EndoNode, WorldConfig, run, sentence
+from endo_sim_ros.nodes.base import ERROR, OK, STREAM_DEPTH, WARN, EndoNode, run, sentence
+from endo_sim_ros.nodes.configs import RenderingNodeConfig
 from endo_sim_ros.nodes.model_tracker import Bound, ShownTissue
 from endo_sim_ros.nodes.pacing import MOST_WAITING, Pacer
 from endo_sim_ros.rendering import RenderingConfig
-from endo_sim_ros.sequences.bag import LEFT_FRAME
 
 _MAX_SIDE = 8192  # pixels; a damaged camera_info must not make the node ask for all memory
 _POLLS = 4  # times per image that the timer asks whether one is due
-
-
-@dataclass(frozen=True)
-class RenderingNodeConfig(WorldConfig):
-    """Parameters of the node beside those of the rendering."""
-
-    mode: Literal["realtime", "lockstep"] = "realtime"
-    """realtime: the newest state is shown as soon as it comes, at most at the rate. lockstep: each state on control_nodes
-    gives one image with its stamp, and none is left out."""
-    lockstep_camera: bool = False
-    """lockstep: wait for the camera pose with the stamp of the state; otherwise the newest pose is used."""
-    rate: Annotated[float, Range(0.1, 240, "Hz")] = 25.0
-    """Images published per second; input that arrives faster is dropped, the newest is kept."""
-    idle_rate: Annotated[float, Range(0.1, 240, "Hz")] = 5.0
-    """Images published per second while nothing in the picture changes."""
-    camera_frame: str = LEFT_FRAME
-    """Frame written into the headers of rendered images."""
 
 
 class RenderingNode(EndoNode):

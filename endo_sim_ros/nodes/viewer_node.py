@@ -3,7 +3,7 @@
 import time
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from rcl_interfaces.srv import GetParameters, SetParameters
@@ -14,7 +14,8 @@ from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.config import StageConfig
 from endo_sim_ros.messages import ControlNodeCloud
-from endo_sim_ros.nodes.base import OK, WARN, EndoNode, WorldConfig, arm_names, run
+from endo_sim_ros.nodes.base import OK, WARN, EndoNode, run
+from endo_sim_ros.nodes.configs import ViewerNodeConfig, arm_names
 from endo_sim_ros.nodes.model_tracker import ShownTissue
 from endo_sim_ros.rendering import RenderingConfig
 from endo_sim_ros.viewer.config import ViewerConfig
@@ -27,20 +28,6 @@ _STALE = 1.5  # s in which diagnostics may be older than the answer of a service
 _ASK_EVERY = 2.0  # s between two looks at the parameters of the physics
 _JAW_OPEN, _JAW_CLOSED = 1.0, 0.0  # rad
 _SHOWN = ("physics_node", "rendering_node", "reconstruction_node")  # whose diagnostics are on the page
-
-
-@dataclass(frozen=True)
-class ViewerNodeConfig(WorldConfig):
-    """Parameters of the node beside those of the page."""
-
-    arm: str = "PSM1"
-    """Name of the arm that the mouse moves while it holds tissue; its topics are published only then."""
-    arm_source: Literal["measured", "commanded"] = "measured"
-    """As that of physics_node. measured: the mouse publishes measured_cp. commanded: it publishes servo_cp."""
-    arms: tuple[str, ...] = ("PSM1",)
-    """Names of the arms that are shown with their forces."""
-    physics_node: str = "physics_node"
-    """Name of the node whose parameters and services the page uses."""
 
 
 @dataclass

@@ -14,11 +14,9 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StorageP
 from rosbags.rosbag2.storage_mcap import ChunkInfo, McapReader
 
 from endo_sim_ros import messages
-from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.core.frames import LEFT_FRAME, RIGHT_FRAME, WORLD_FRAME, Frame, SequenceError
 from endo_sim_ros.messages import Topic, bag_types
 from endo_sim_ros.sequences.synchronizer import Synchronizer
-
-LEFT_FRAME, RIGHT_FRAME, WORLD_FRAME = "endoscope_left", "endoscope_right", "world"
 
 
 class RawMessage(NamedTuple):

@@ -1,6 +1,5 @@
 """The command line: `endo-sim COMMAND --help`."""
 
-import dataclasses
 import logging
 import shutil
 import sys
@@ -14,7 +13,7 @@ import tyro
 from rich.progress import track
 
 from endo_sim_ros import hear_interrupts
-from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.core.config import ConfigError, refuse_renamed_flags
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.gaussians import ModelError
 from endo_sim_ros.evaluation.config import EvaluationConfig
@@ -22,7 +21,7 @@ from endo_sim_ros.learning.config import PPOConfig, Randomisation, TrainingConfi
 from endo_sim_ros.messages import MessageError
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
-from endo_sim_ros.reconstruction.presets import PRESETS, preset
+from endo_sim_ros.reconstruction.presets import PRESETS, Preset, preset
 from endo_sim_ros.sequences.phantom import PhantomConfig
 from endo_sim_ros.viewer.config import ViewerConfig
 
@@ -113,13 +112,12 @@ class Phantom:
 
 
 def _named_preset() -> ReconstructionConfig:
-    """The options of the preset that the command line names, which are the defaults of those it does not give."""
+    """The options of the preset that the command line names: the defaults of options that it does not give."""
     name = "default"
     for word, following in zip(sys.argv, [*sys.argv[1:], ""]):
         if word == "--preset" or word.startswith("--preset="):
             name = following if word == "--preset" else word.removeprefix("--preset=")
-    # What is wrong with another name the parser says.
-    return dataclasses.replace(preset(name), preset=name) if name in PRESETS else ReconstructionConfig()
+    return preset(name if name in PRESETS else "default")  # the parser refuses other names
 
 
 @dataclass(frozen=True)
@@ -132,13 +130,15 @@ class Reconstruct:
     """Folder for model.ply, cameras.json, checkpoint.pt and held_out.png."""
     resume: bool = False
     """Go on from the checkpoint.pt that an interrupted reconstruction of the same bag with the same options left in that folder."""
+    preset: Preset = "default"
+    """Method: ours, ours sized for a CPU, that of the paper as printed, FSGS, or 3DGS. Options that are not given have the
+    values of the preset."""
     config: Annotated[ReconstructionConfig, tyro.conf.arg(name="")] = field(default_factory=_named_preset)
 
     def run(self) -> None:
         from endo_sim_ros.evaluation.held_out import reconstruct_and_measure
 
-        # All options are spelled out: the preset must not replace those given.
-        reconstruct_and_measure(self.bag, self.out, dataclasses.replace(self.config, preset="default"), self.resume)
+        reconstruct_and_measure(self.bag, self.out, self.config, self.resume)
 
 
 @dataclass(frozen=True)
@@ -594,6 +594,8 @@ def main() -> int:
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     start = time.monotonic()
     try:
+        if sys.argv[1:2] and sys.argv[1] in COMMANDS:
+            refuse_renamed_flags(sys.argv[2:], COMMANDS[sys.argv[1]])
         command = tyro.extras.subcommand_cli_from_dict(
             COMMANDS, prog="endo-sim", description="Endoscope recordings become tissue that a robot can touch."
         )

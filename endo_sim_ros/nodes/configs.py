@@ -14,6 +14,7 @@ from endo_sim_ros.core.frames import LEFT_FRAME
 from endo_sim_ros.nodes.pacing import MOST_WAITING
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
+from endo_sim_ros.reconstruction.presets import Preset
 from endo_sim_ros.rendering.config import RenderingConfig
 from endo_sim_ros.viewer.config import ViewerConfig
 
@@ -51,6 +52,9 @@ _frame_poses = functools.cache(parse_frames)
 class ReconstructionNodeConfig(WorldConfig):
     """Options of reconstruction_node beside those of the reconstruction."""
 
+    preset: Preset = "default"
+    """Method: ours, ours sized for a CPU, that of the paper as printed, FSGS, or 3DGS. Options that are not given have the
+    values of the preset."""
     mode: Literal["realtime", "lockstep"] = "realtime"
     """realtime: intermediate models are published while they train, stamped by the clock. lockstep: the final model only,
     stamped by the newest image (models read from files: from one nanosecond on): one bag gives the same bytes in every run."""

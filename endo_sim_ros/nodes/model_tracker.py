@@ -8,7 +8,8 @@ import numpy as np
 from endo_sim_ros import messages
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.messages import ControlNodeCloud
-from endo_sim_ros.nodes.base import STREAM_DEPTH, Background
+from endo_sim_ros.nodes.background import Background
+from endo_sim_ros.nodes.base import STREAM_DEPTH
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 
 

@@ -14,7 +14,8 @@ from endo_sim_ros.core.config import StageConfig
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.messages import ControlNodeCloud, MessageError
 from endo_sim_ros.nodes.arm import Arm
-from endo_sim_ros.nodes.base import ERROR, OK, STREAM_DEPTH, WARN, Background, EndoNode, run, sentence
+from endo_sim_ros.nodes.background import Background
+from endo_sim_ros.nodes.base import ERROR, OK, STREAM_DEPTH, WARN, EndoNode, run, sentence
 from endo_sim_ros.nodes.configs import COMMAND_PARTS, PhysicsNodeConfig, arm_names
 from endo_sim_ros.nodes.pacing import MOST_WAITING, CommandQueue, Pacer
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation

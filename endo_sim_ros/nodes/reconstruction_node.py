@@ -3,6 +3,7 @@
 import logging
 import threading
 import time
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,13 +13,13 @@ from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera, load_cameras, save_cameras
-from endo_sim_ros.core.config import StageConfig
+from endo_sim_ros.core.config import StageConfig, option_values
 from endo_sim_ros.core.frames import LEFT_FRAME, Frame, SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel, load_ply, save_ply
 from endo_sim_ros.messages import Topic
 from endo_sim_ros.nodes.base import ERROR, OK, WARN, EndoNode, run, sentence
 from endo_sim_ros.nodes.configs import ReconstructionNodeConfig
-from endo_sim_ros.reconstruction import Progress, ReconstructionConfig, Trainer, scene_points, select_keyframes
+from endo_sim_ros.reconstruction import PRESETS, Progress, ReconstructionConfig, Trainer, preset, scene_points, select_keyframes
 from endo_sim_ros.sequences.bag import feed
 from endo_sim_ros.sequences.synchronizer import Synchronizer
 
@@ -37,7 +38,7 @@ class ReconstructionNode(EndoNode):
     def __init__(self):
         super().__init__("reconstruction_node")
         self._options = self.declare(ReconstructionNodeConfig)
-        self._config = self.declare(ReconstructionConfig)
+        self._config = self.declare(ReconstructionConfig, option_values(preset(self._options.preset)))
         logging.basicConfig(level=logging.INFO, format="%(name)s: %(message)s")
         self._frames: list[Frame] = []
         self._synchronizer = Synchronizer(self._options.sync_tolerance)
@@ -73,6 +74,10 @@ class ReconstructionNode(EndoNode):
             self._options = config
         else:
             self._config = config  # used by the next reconstruction
+
+    def implied_values(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        name = values.get("preset")
+        return option_values(preset(name)) if isinstance(name, str) and name in PRESETS else {}
 
     # ------------------------------------------------------------------ views
 

@@ -11,7 +11,7 @@ HERE = Path(__file__).parent
 VERSION = re.search(r"<version>(.+)</version>", (HERE / "package.xml").read_text()).group(1)
 
 # A sourced ROS 2 brings its own rclpy and messages; a second copy from PyPI would shadow them.
-ROS = [] if os.environ.get("AMENT_PREFIX_PATH") else ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"]
+ROS = [] if os.environ.get("AMENT_PREFIX_PATH") else ["ros-jazzy-rclpy[fastrtps]>=7.1.4", "ros-jazzy-common-interfaces"]
 
 setup(
     name=NAME,

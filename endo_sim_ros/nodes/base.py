@@ -22,9 +22,9 @@ from endo_sim_ros import hear_interrupts, messages
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.messages import ERROR, OK, WARN, Topic
 from endo_sim_ros.nodes.errors import sentence
-from endo_sim_ros.nodes.executor import NodeExecutor
 from endo_sim_ros.nodes.parameters import ConfiguredNode
 from endo_sim_ros.nodes.process import end_with_parent
+from endo_sim_ros.nodes.rclpy_private import spin
 from endo_sim_ros.nodes.transport import prepare_transport
 
 _ERROR_SHOWN = 5.0  # seconds that an error stays on /diagnostics, and that its repetitions are not logged
@@ -161,9 +161,7 @@ def run(node_class: Callable[[], EndoNode]) -> int:
     try:
         node = node_class()
         gc.freeze()  # looking through all that was imported takes 0.15 s, in which nothing else happens
-        executor = NodeExecutor()
-        executor.add_node(node)
-        executor.spin()
+        spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except (ConfigError, NameValidationException) as error:

@@ -16,7 +16,7 @@ from endo_sim_ros.core.config import StageConfig
 from endo_sim_ros.messages import ControlNodeCloud
 from endo_sim_ros.nodes.base import OK, WARN, EndoNode, run
 from endo_sim_ros.nodes.configs import ViewerNodeConfig, arm_names
-from endo_sim_ros.nodes.model_tracker import ShownTissue
+from endo_sim_ros.nodes.model_tracker import ModelTracker
 from endo_sim_ros.rendering import RenderingConfig
 from endo_sim_ros.viewer.config import ViewerConfig
 from endo_sim_ros.viewer.viewer import PARAMETERS, Tool, Viewer, plain_camera
@@ -51,7 +51,7 @@ class ViewerNode(EndoNode):
         (arm,) = arm_names([self._options.arm])
         self._arms = {name: _Arm() for name in arm_names((*self._options.arms, arm))}
         self._hand = arm
-        self._tissue = ShownTissue()
+        self._tissue = ModelTracker()
         self._cameras: np.ndarray | None = None  # [V, 4, 4], of the training views
         self._infos: dict[str, messages.CameraInfo] = {}  # by topic
         self._rendered: dict[str, tuple[int, Any]] = {}  # stamp and content of the newest rendered messages
@@ -95,7 +95,7 @@ class ViewerNode(EndoNode):
     # ------------------------------------------------------------------ input
 
     def _on_model(self, message: Any) -> None:
-        self._tissue.take_model(message, self._options.world_frame)
+        self._tissue.receive_model(message, self._options.world_frame)
 
     def _on_training_cameras(self, message: Any) -> None:
         messages.check_frame(message, (self._options.world_frame,), messages.TRAINING_CAMERAS.name)
@@ -118,7 +118,7 @@ class ViewerNode(EndoNode):
         self.viewer.show_state(self._nodes.positions, self._nodes.F, age)
 
     def _on_cut_surface(self, message: Any) -> None:
-        self._tissue.take_cut_surface(message, self._options.world_frame)
+        self._tissue.receive_cut_surface(message, self._options.world_frame)
 
     def _on_rendered_pose(self, message: Any) -> None:
         pose = messages.decode_pose(message, self._options.world_frame, messages.RENDERED_POSE.name)

@@ -12,7 +12,7 @@ VERSION = re.search(r"<version>(.+)</version>", (HERE / "package.xml").read_text
 
 # A sourced ROS 2 brings its own rclpy and messages; a second copy from PyPI would shadow them.
 # Private parts of rclpy: endo_sim_ros/nodes/rclpy_private.py.
-ROS = [] if os.environ.get("AMENT_PREFIX_PATH") else ["ros-jazzy-rclpy[fastrtps]>=7.1,<7.2", "ros-jazzy-common-interfaces>=5.3,<6"]
+ROS = [] if os.environ.get("AMENT_PREFIX_PATH") else ["ros-jazzy-rclpy[fastrtps]>=7.1.4,<7.2", "ros-jazzy-common-interfaces>=5.3,<6"]
 
 setup(
     name=NAME,

@@ -45,7 +45,11 @@ def parse(name: str, words: list[str]) -> object:
     """The command with its options as the words give them; what is wrong with them ends the program with a sentence."""
     import tyro
 
-    return tyro.cli(load_command(name), prog=f"endo-sim {name}", description=summary(name), args=words)
+    from endo_sim_ros.core.config import refuse_renamed_flags
+
+    command = load_command(name)
+    refuse_renamed_flags(words, command)
+    return tyro.cli(command, prog=f"endo-sim {name}", description=summary(name), args=words)
 
 
 def main() -> int:

@@ -15,7 +15,8 @@ class Command:
     """Names of nodes; default: all."""
 
     def run(self) -> None:
-        from endo_sim_ros.nodes.parameter_file import NODE_CONFIGS, parameter_file
+        from endo_sim_ros.nodes.configs import NODE_CONFIGS
+        from endo_sim_ros.nodes.parameter_file import parameter_file
 
         nodes = [name if name in NODE_CONFIGS else name.removesuffix("_node") for name in self.nodes]  # executables end in _node
         unknown = [name for name in nodes if name not in NODE_CONFIGS]

@@ -1,6 +1,5 @@
 """`endo-sim reconstruct`."""
 
-import dataclasses
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,17 +9,16 @@ import tyro
 from tyro.conf import Positional
 
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
-from endo_sim_ros.reconstruction.presets import PRESETS, preset
+from endo_sim_ros.reconstruction.presets import PRESETS, Preset, preset
 
 
 def _named_preset() -> ReconstructionConfig:
-    """The options of the preset that the command line names, which are the defaults of those it does not give."""
+    """The options of the preset that the command line names: the defaults of options that it does not give."""
     name = "default"
     for word, following in zip(sys.argv, [*sys.argv[1:], ""]):
         if word == "--preset" or word.startswith("--preset="):
             name = following if word == "--preset" else word.removeprefix("--preset=")
-    # What is wrong with another name the parser says.
-    return dataclasses.replace(preset(name), preset=name) if name in PRESETS else ReconstructionConfig()
+    return preset(name if name in PRESETS else "default")  # the parser refuses other names
 
 
 @dataclass(frozen=True)
@@ -33,10 +31,12 @@ class Command:
     """Folder for model.ply, cameras.json, checkpoint.pt and held_out.png."""
     resume: bool = False
     """Go on from the checkpoint.pt that an interrupted reconstruction of the same bag with the same options left in that folder."""
+    preset: Preset = "default"
+    """Method: ours, ours sized for a CPU, that of the paper as printed, FSGS, or 3DGS. Options that are not given have the
+    values of the preset."""
     config: Annotated[ReconstructionConfig, tyro.conf.arg(name="")] = field(default_factory=_named_preset)
 
     def run(self) -> None:
         from endo_sim_ros.evaluation.held_out import reconstruct_and_measure
 
-        # All options are spelled out: the preset must not replace those given.
-        reconstruct_and_measure(self.bag, self.out, dataclasses.replace(self.config, preset="default"), self.resume)
+        reconstruct_and_measure(self.bag, self.out, self.config, self.resume)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -200,3 +200,23 @@ def load_cameras(path: str | Path) -> list[Camera]:
         return cameras
     except (OSError, KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise ValueError(f"{path}: not a readable list of cameras ({error})") from error
+
+
+def parse_frames(world_frame: str, frames: Iterable[str]) -> dict[str, np.ndarray]:
+    """Poses [4, 4] in the world, metres, by name, of frames given as ``name x y z qx qy qz qw`` and of the world itself.
+
+    Raises:
+        ValueError: If a frame is not a name and a pose with a unit quaternion.
+    """
+    poses = {world_frame.lstrip("/"): np.eye(4)}
+    for text in filter(None, frames):
+        name, *numbers = text.split() or [""]
+        try:
+            x, y, z, qx, qy, qz, qw = map(float, numbers)
+        except ValueError:
+            raise ValueError(f"frames: {text!r} is not a name and seven numbers, as in 'PSM1_base 0.1 0 0 0 0 0 1'") from None
+        position, quat = np.array([x, y, z]), np.array([qw, qx, qy, qz])
+        if not np.isfinite(position).all() or not abs(np.linalg.norm(quat) - 1) < 0.01:
+            raise ValueError(f"frames: {text!r} has no finite position and unit quaternion (x y z qx qy qz qw)")
+        poses[name.lstrip("/")] = make_pose(position, quat)
+    return poses

@@ -12,6 +12,7 @@ import math
 import operator
 import textwrap
 import typing
+from collections.abc import Sequence
 from functools import cache
 from typing import Any, ClassVar, NamedTuple
 
@@ -57,7 +58,9 @@ def options(config_class: type) -> tuple[Option, ...]:
     for field in dataclasses.fields(config_class):
         hint, bounds, choices = hints[field.name], None, None
         if _is_stage(hint):
-            found += [option._replace(name=f"{field.name}.{option.name}") for option in options(hint)]
+            stage = field.default if field.default is not dataclasses.MISSING else field.default_factory()
+            defaults = option_values(stage)  # which may differ from those of the class
+            found += [option._replace(name=f"{field.name}.{option.name}", default=defaults[option.name]) for option in options(hint)]
             continue
         if typing.get_origin(hint) is typing.Annotated:
             hint, *extras = typing.get_args(hint)
@@ -77,6 +80,39 @@ def _is_stage(hint: Any) -> bool:
 def option_values(config: "StageConfig") -> dict[str, Any]:
     """The value of every option by its (dotted) name, in the order of `options`."""
     return {option.name: operator.attrgetter(option.name)(config) for option in options(type(config))}
+
+
+def renamed_options(config_class: type["StageConfig"]) -> dict[str, str]:
+    """What to write instead of each old name of an option; those of nested stages are dotted."""
+    renamed = dict(config_class.renamed)
+    for stage, hint in typing.get_type_hints(config_class).items():
+        if _is_stage(hint):
+            renamed |= {f"{stage}.{old}": f"{stage}.{new}" for old, new in renamed_options(hint).items()}
+    return renamed
+
+
+def refuse_renamed_flags(words: Sequence[str], command: type) -> None:
+    """Raise a sentence with the new name if a command line gives an option by a name that it had before.
+
+    Args:
+        words: The command line after the name of the command.
+        command: Dataclass of the command, as tyro has it: a field with a stage configuration adds the options of that, under
+            ``--field.option``, or ``--option`` where the field is annotated with the name "".
+
+    Raises:
+        ConfigError: If there is one.
+    """
+    renamed = {}
+    for field, hint in typing.get_type_hints(command, include_extras=True).items():
+        stage, *extras = typing.get_args(hint) if typing.get_origin(hint) is typing.Annotated else (hint,)
+        if _is_stage(stage):
+            prefix = "" if any(getattr(extra, "name", None) == "" for extra in extras) else f"{field}."
+            renamed |= {prefix + old: new if " " in new else f"--{prefix}{new}" for old, new in renamed_options(stage).items()}
+    for flag in (word.partition("=")[0] for word in words if word.startswith("--")):
+        stage, dot, option = flag.removeprefix("--").replace("-", "_").rpartition(".")
+        new = renamed.get(stage + dot + option) or renamed.get(stage + dot + option.removeprefix("no_"))
+        if new:
+            raise ConfigError(f"{flag} is now {new.replace('_', '-') if new.startswith('--') else new}")
 
 
 def validate(config: Any) -> None:
@@ -109,7 +145,7 @@ class StageConfig:
     """Base of the stage configurations: validates on construction and converts from plain mappings."""
 
     renamed: ClassVar[dict[str, str]] = {}
-    """Options that had another name: the old name, and what to write instead."""
+    """Options that had another name: the old name, and the new one, or what to write instead in words."""
 
     def __post_init__(self):
         validate(self)
@@ -138,8 +174,8 @@ class StageConfig:
             stage, _, rest = name.partition(".")
             if stage in stages and rest:
                 nested.setdefault(stage, {})[rest] = value
-            elif stage in stages and isinstance(value, dict):
-                nested.setdefault(stage, {}).update(value)
+            elif stage in stages:
+                nested.setdefault(stage, {}).update(value if isinstance(value, dict) else option_values(value))
             elif name in {field.name for field in dataclasses.fields(self)}:
                 own[name] = value
             else:

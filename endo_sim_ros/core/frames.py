@@ -6,6 +6,8 @@ import numpy as np
 
 from endo_sim_ros.core.cameras import Camera
 
+LEFT_FRAME, RIGHT_FRAME, WORLD_FRAME = "endoscope_left", "endoscope_right", "world"  # names of coordinate frames
+
 
 class SequenceError(ValueError):
     """A recording that cannot be read; the message names the file and the field and says what to do."""

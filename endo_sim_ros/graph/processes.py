@@ -4,15 +4,14 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 from typing import Any
 
+from endo_sim_ros.nodes.process import PARENT
 from endo_sim_ros.nodes.transport import graph_environment
 
 _STOP_AFTER = 15.0  # seconds that a node has to end after an interrupt
-_PARENT = "ENDO_SIM_PARENT"  # environment variable: number of the process that a node must not outlive
 
 
 class NodeProcess:
@@ -34,7 +33,7 @@ class NodeProcess:
             arguments += ["-p", f"{key}:={_yaml(value)}"]
         log.parent.mkdir(parents=True, exist_ok=True)
         with log.open("wb") as output:
-            mine = environment | {_PARENT: str(os.getpid())}
+            mine = environment | {PARENT: str(os.getpid())}
             self._process = subprocess.Popen(arguments, env=mine, stdout=output, stderr=subprocess.STDOUT, start_new_session=True)
 
     @property
@@ -60,19 +59,6 @@ class NodeProcess:
         except subprocess.TimeoutExpired:
             self._process.kill()
             return self._process.wait()
-
-
-def end_with_parent() -> None:
-    """Called by a node at its start: end it when the process that started it as a `NodeProcess` is gone, even killed."""
-    parent = int(os.environ.get(_PARENT, "0"))
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(0.5)
-        os.kill(os.getpid(), signal.SIGTERM)
-
-    if parent:
-        threading.Thread(target=watch, daemon=True).start()
 
 
 def _yaml(value: Any) -> str:

@@ -15,11 +15,11 @@ from rclpy.utilities import try_shutdown
 from rich.progress import Progress
 
 from endo_sim_ros import messages
+from endo_sim_ros.core.frames import LEFT_FRAME
 from endo_sim_ros.evaluation.measurement import Row, report
 from endo_sim_ros.graph.client import ARM, CHANGED, Client, depth_of, tissue
 from endo_sim_ros.graph.processes import NodeGroup
 from endo_sim_ros.messages import OK, ReconstructionState, Topic
-from endo_sim_ros.sequences.bag import LEFT_FRAME
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
 _NODES = ("reconstruction_node", "physics_node", "rendering_node")

@@ -27,7 +27,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from endo_sim_ros import messages
-from endo_sim_ros.core.cameras import matrix_to_quat
+from endo_sim_ros.core.cameras import matrix_to_quat, parse_frames
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.messages import ControlNodeCloud, MessageError, Topic, stamp_to_ns
 from endo_sim_ros.sequences.bag import WORLD_FRAME, BagReader
@@ -114,7 +114,7 @@ def read_episode(
         SequenceError: If the recording is damaged, empty or too short, or lacks a topic; the sentence names it.
         ValueError: If one of the frames is not a name and a pose.
     """
-    bag, known = Path(bag), messages.parse_frames(world_frame, frames)
+    bag, known = Path(bag), parse_frames(world_frame, frames)
     if fps is not None and fps <= 0:
         raise SequenceError(f"fps must be positive, got {fps}")
     with BagReader(bag) as reader:

@@ -39,7 +39,7 @@ from endo_sim_ros.messages.diagnostics import (
 from endo_sim_ros.messages.errors import MessageError
 from endo_sim_ros.messages.headers import check_frame, encode_clock, stamp_to_ns
 from endo_sim_ros.messages.images import decode_depth, decode_image, decode_mask, encode_image
-from endo_sim_ros.messages.poses import decode_pose, decode_poses, encode_pose, encode_poses, parse_frames
+from endo_sim_ros.messages.poses import decode_pose, decode_poses, encode_pose, encode_poses
 from endo_sim_ros.messages.tools import (
     METRES_PER_NEWTON,
     ToolDisplay,
@@ -119,7 +119,7 @@ __all__ = [
     "decode_cut_surface", "decode_depth", "decode_diagnostics", "decode_gaussians", "decode_image", "decode_jaw", "decode_mask",
     "decode_pose", "decode_poses", "decode_state_command", "decode_wrench", "encode_camera_info", "encode_clock",
     "encode_control_nodes", "encode_cut", "encode_cut_surface", "encode_diagnostics", "encode_gaussians", "encode_image",
-    "encode_jaw", "encode_operating_state", "encode_pose", "encode_poses", "encode_tool_markers", "encode_wrench", "parse_frames",
+    "encode_jaw", "encode_operating_state", "encode_pose", "encode_poses", "encode_tool_markers", "encode_wrench",
     "ros_class", "ros_types", "stamp_to_ns", "tool_cut", "tool_jaw", "tool_jaw_move", "tool_jaw_setpoint", "tool_jaw_state",
     "tool_move", "tool_pose", "tool_pose_command", "tool_reaction", "tool_setpoint", "tool_state", "tool_state_command",
     "tool_wrench",

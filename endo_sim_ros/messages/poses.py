@@ -64,27 +64,3 @@ def encode_poses(poses: Iterable[np.ndarray], stamp_ns: int, frame_id: str, type
     """PoseArray of rigid transforms [4, 4], metres."""
     types = types or ros_types()
     return types.PoseArray(header=make_header(types, stamp_ns, frame_id), poses=[_encode_pose(types, pose) for pose in poses])
-
-
-def parse_frames(world_frame: str, frames: Iterable[str]) -> dict[str, np.ndarray]:
-    """Poses [4, 4] in the world of the world frame and of further frames, by name.
-
-    Args:
-        world_frame: Name of the world frame.
-        frames: Further frames, each as ``name x y z qx qy qz qw`` (metres, unit quaternion). Empty strings are skipped.
-
-    Raises:
-        ValueError: If a frame is not a name and a finite pose with a unit quaternion.
-    """
-    poses = {world_frame.lstrip("/"): np.eye(4)}
-    for text in filter(None, frames):
-        name, *numbers = text.split() or [""]
-        try:
-            x, y, z, qx, qy, qz, qw = map(float, numbers)
-        except ValueError:
-            raise ValueError(f"frames: {text!r} is not a name and seven numbers, as in 'PSM1_base 0.1 0 0 0 0 0 1'") from None
-        position, quat = np.array([x, y, z]), np.array([qw, qx, qy, qz])
-        if not np.isfinite(position).all() or not abs(np.linalg.norm(quat) - 1) < 0.01:
-            raise ValueError(f"frames: {text!r} has no finite position and unit quaternion (x y z qx qy qz qw)")
-        poses[name.lstrip("/")] = make_pose(position, quat)
-    return poses

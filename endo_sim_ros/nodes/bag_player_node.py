@@ -2,17 +2,16 @@
 
 import threading
 import time
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import rclpy
 from rclpy.duration import Duration
 
-from endo_sim_ros.core.config import Range, StageConfig
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.messages import DIAGNOSTICS, STATE, BagPlayerState, MessageError, Topic
 from endo_sim_ros.nodes.base import ERROR, OK, EndoNode, run, sentence
+from endo_sim_ros.nodes.configs import BagPlayerConfig
 from endo_sim_ros.sequences.bag import BagReader
 
 _DELIVERED_WITHIN = 10.0  # seconds that subscribers have, at the end, to ask again for what they missed
@@ -23,20 +22,6 @@ _MESSAGES = {  # for people
     BagPlayerState.DONE: "finished",
 }
 _SETTLED = 3.5  # seconds without a new subscriber after which all are there: processes announce themselves every 3
-
-
-@dataclass(frozen=True)
-class BagPlayerConfig(StageConfig):
-    """Parameters of the bag player."""
-
-    bag: str = ""
-    """Path of a rosbag2 folder or an .mcap file."""
-    rate: Annotated[float, Range(0.01, 100)] = 1.0
-    """Playback speed relative to the recording."""
-    loop: bool = False
-    """Start again at the end."""
-    wait_for_subscribers: Annotated[float, Range(0, 3600, "s")] = 10.0
-    """Longest wait for somebody to listen before playing."""
 
 
 class BagPlayerNode(EndoNode):

@@ -1,41 +1,30 @@
-"""What all nodes share: parameters from configurations, diagnostics, guarded callbacks, start and stop."""
+"""What all ROS nodes share: topics, services, diagnostics, guarded callbacks, start and stop."""
 
 import contextlib
-import difflib
-import functools
 import gc
 import os
-import re
 import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, TypeVar
+from collections.abc import Callable
+from typing import Any
 
-import numpy as np
 import rclpy
 import torch
-import yaml
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
-from rclpy.exceptions import InvalidParameterTypeException, NameValidationException
+from rclpy.context import Context
+from rclpy.exceptions import NameValidationException
 from rclpy.executors import ExternalShutdownException
-from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from endo_sim_ros import hear_interrupts, messages
-from endo_sim_ros.core.config import ConfigError, StageConfig, options
-from endo_sim_ros.core.device import pick_device
-from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.core.gaussians import ModelError
-from endo_sim_ros.graph.processes import end_with_parent
-from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ClientState, MessageError, Topic
-from endo_sim_ros.nodes.executor import NodeExecutor
+from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ClientState, Topic
+from endo_sim_ros.nodes.errors import sentence
+from endo_sim_ros.nodes.parameters import ConfiguredNode
+from endo_sim_ros.nodes.process import end_with_parent
+from endo_sim_ros.nodes.rclpy_private import spin
 from endo_sim_ros.nodes.transport import prepare_transport
 
 _ERROR_SHOWN = 5.0  # seconds that an error stays on /diagnostics, and that its repetitions are not logged
@@ -44,44 +33,13 @@ _LONGEST_ERROR = 1000  # characters; a sentence may quote what came, and that ma
 _END_WITHIN = 3.0  # seconds that worker threads have to end before the process ends without them
 STREAM_DEPTH = 20
 
-Config = TypeVar("Config", bound=StageConfig)
 
+class EndoNode(ConfiguredNode):
+    """A ROS node that survives errors in its callbacks: each becomes one sentence on /diagnostics."""
 
-@dataclass(frozen=True)
-class WorldConfig(StageConfig):
-    """Where poses are given."""
-
-    world_frame: str = "world"
-    """Frame of camera poses, tool poses, the model and the control nodes."""
-    frames: tuple[str, ...] = ("",)  # ROS has no typed empty list
-    """Other frames in which camera and tool poses may come, such as the bases of robot arms: each the name and the pose
-    in the world, 'PSM1_base x y z qx qy qz qw', metres."""
-
-    def __post_init__(self):
-        super().__post_init__()
-        try:
-            messages.parse_frames(self.world_frame, self.frames)
-        except ValueError as error:
-            raise ConfigError(str(error)) from error
-
-    @property
-    def frame_poses(self) -> dict[str, np.ndarray]:
-        """Poses [4, 4] of all known frames in the world, by name."""
-        return _frame_poses(self.world_frame, self.frames)
-
-
-_frame_poses = functools.cache(messages.parse_frames)
-
-
-class EndoNode(Node):
-    """A node whose callbacks may fail without taking it down: what went wrong is one sentence on /diagnostics."""
-
-    read_at_start: frozenset[str] = frozenset()  # parameters that act at start only; all others act when they are set
-
-    def __init__(self, name: str):
-        super().__init__(name)
+    def __init__(self, name: str, context: Context | None = None):
+        super().__init__(name, context)
         torch.set_num_threads(1)  # the kernels bring their own threads
-        self._configs: dict[type, StageConfig] = {}
         self._diagnostics = self.publisher(messages.DIAGNOSTICS)
         self._error_text, self._error_until, self.error_count = "", 0.0, 0
         self._logged: dict[str, float] = {}
@@ -90,81 +48,6 @@ class EndoNode(Node):
     def every(self, seconds: float, callback: Callable[[], None]) -> Any:
         """A timer of wall time, which also runs while a simulated clock stands still."""
         return self.create_timer(seconds, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
-
-    # ------------------------------------------------------------- parameters
-
-    def declare(self, config_class: type[Config]) -> Config:
-        """Declare every field of a configuration as a parameter and return the configuration that they give.
-
-        Raises:
-            ConfigError: If a value given at start cannot be used.
-        """
-        values = {}
-        for option in options(config_class):
-            descriptor = ParameterDescriptor(description=option.description)
-            if option.choices:
-                descriptor.additional_constraints = "one of " + ", ".join(option.choices)
-            if option.range and option.type is float:
-                bounds = FloatingPointRange(from_value=float(option.range.minimum), to_value=float(option.range.maximum))
-                descriptor.floating_point_range = [bounds]
-            elif option.range:
-                bounds = IntegerRange(from_value=int(option.range.minimum), to_value=int(option.range.maximum), step=1)
-                descriptor.integer_range = [bounds]
-            try:
-                # ROS takes an empty list for one of bytes.
-                default = (list(option.default) or Parameter.Type.STRING_ARRAY) if option.type is tuple else option.default
-                value = self.declare_parameter(option.name, default, descriptor).value
-                values[option.name] = () if value is None else value
-            except InvalidParameterTypeException as error:
-                kind = {float: "float, with a decimal point", tuple: "list such as [PSM1, PSM2]"}
-                kind = kind.get(option.type, option.type.__name__)
-                raise ConfigError(f"parameter {option.name} must be a {kind}: {error}") from error
-            except Exception as error:  # rclpy has one exception type for each way a value can be wrong
-                raise ConfigError(f"parameter {option.name}: {error} ({option.description})") from error
-        self._configs[config_class] = _checked(config_class, values)
-        if len(self._configs) == 1:
-            self.add_on_set_parameters_callback(self._on_set_parameters)
-        return self._configs[config_class]
-
-    @functools.cached_property
-    def _unknown(self) -> str:
-        """What was given at start but is no parameter of this node, in words; ROS itself says nothing about it."""
-        known, unknown = self.get_parameters_by_prefix(""), []
-        missing = self._parameter_overrides.keys() - known.keys()
-        for name in sorted(missing - _meant_for_others() if missing else missing):
-            if not name.startswith("qos_overrides."):  # rclpy's own; it declares those that act
-                near = difflib.get_close_matches(name, known, 1)
-                unknown.append(f"{name} (did you mean {near[0]}?)" if near else name)
-        text = f"unknown parameter{'s' * (len(unknown) > 1)} {', '.join(unknown)}" if unknown else ""
-        if text:
-            self.get_logger().warning(text)
-        return text
-
-    def config_changed(self, config: StageConfig) -> None:
-        """Called with a whole, valid configuration after one of its parameters was set; override to use it.
-
-        Raises:
-            ValueError: If the values cannot be used after all; the parameters then keep their old ones.
-        """
-
-    def _on_set_parameters(self, parameters: list) -> SetParametersResult:
-        new = {parameter.name: parameter.value for parameter in parameters}
-        try:
-            changed = []
-            for config_class, config in self._configs.items():
-                candidate = _checked(config_class, vars(config) | {key: new[key] for key in vars(config) if key in new})
-                names = {key for key, value in vars(config).items() if getattr(candidate, key) != value}
-                if names & self.read_at_start:
-                    fixed = ", ".join(sorted(names & self.read_at_start))
-                    raise ConfigError(f"{fixed}: read at start only; restart the node with the new value")
-                if names:
-                    changed.append(candidate)
-            for config in changed:
-                self.config_changed(config)
-                self._configs[type(config)] = config
-        except Exception as error:
-            return SetParametersResult(successful=False, reason=sentence("parameters", error))
-        return SetParametersResult(successful=True)
 
     # ----------------------------------------------------------------- topics
 
@@ -239,18 +122,6 @@ class EndoNode(Node):
                 raise
 
 
-def _meant_for_others() -> set[str]:
-    """Parameters of our other nodes that a file gives to all nodes, under /**."""
-    from endo_sim_ros.nodes.parameter_file import NODE_CONFIGS  # imports all nodes
-
-    ours, general = {option.name for configs in NODE_CONFIGS.values() for config in configs for option in options(config)}, set()
-    for flag, path in zip(sys.argv, sys.argv[1:]):
-        if flag == "--params-file":
-            nodes = yaml.safe_load(Path(path).read_text())  # which ROS has read without complaint
-            general |= (nodes.get("/**") or {}).get("ros__parameters", {}).keys()
-    return ours & general
-
-
 class _Guard:
     def __init__(self, node: EndoNode, where: str):
         self._node, self._where = node, where
@@ -264,71 +135,6 @@ class _Guard:
         if self._node.context.ok():  # what fails because the node is being shut down is no error
             self._node.report_error(sentence(self._where, error))
         return True
-
-
-class Background:
-    """Builds what is wanted in a thread of its own, one thing at a time; only the newest wish counts.
-
-    A wish is known by its key: anything that compares equal only for equal wishes.
-    """
-
-    def __init__(self):
-        self._executor = ThreadPoolExecutor(1)
-        self._key: Any = None
-        self._future: Future | None = None
-
-    @property
-    def busy(self) -> bool:
-        return self._future is not None
-
-    def want(self, key: Any, build: Callable[[], Any]) -> None:
-        """Begin to build, unless that was the last wish already; call again and again while busy."""
-        if self._future is None and key != self._key:
-            self._key, self._future = key, self._executor.submit(build)
-
-    def take(self) -> tuple[Any, Any] | None:
-        """Key and result once when a wish has been fulfilled, else None. Raises what the building raised."""
-        if self._future is None or not self._future.done():
-            return None
-        future, self._future = self._future, None
-        return self._key, future.result()
-
-    def stop(self) -> None:
-        """Begin nothing more."""
-        self._executor.shutdown(wait=False, cancel_futures=True)
-
-
-def sentence(where: str, error: Exception) -> str:
-    """What to tell the user about an error."""
-    if isinstance(error, (MessageError, SequenceError, ModelError, ConfigError)):
-        return str(error)  # written for the user, with the place in it
-    if isinstance(error, (ValueError, OSError)):
-        return f"{where}: {error}"
-    return f"{where}: unexpected {type(error).__name__}: {error}"
-
-
-def arm_names(names: Iterable[str]) -> tuple[str, ...]:
-    """The names in the parameter `arms`, each once.
-
-    Raises:
-        ConfigError: If one cannot be part of a topic's name.
-    """
-    names = tuple(dict.fromkeys(name.strip() for name in names))
-    for name in names:
-        if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*", name):
-            raise ConfigError(f"arms: {name!r} cannot name topics; use letters, digits and _")
-    return names
-
-
-def _checked(config_class: type[Config], values: dict[str, Any]) -> Config:
-    """A configuration whose device exists."""
-    config = config_class.from_mapping(values)
-    if hasattr(config, "device"):
-        try:
-            pick_device(config.device)
-        except ValueError as error:
-            raise ConfigError(str(error)) from error
-    return config
 
 
 def quality(topic: Topic, depth: int = STREAM_DEPTH, reliable: bool = True) -> QoSProfile:
@@ -354,10 +160,8 @@ def run(node_class: Callable[[], EndoNode]) -> int:
     node, status = None, 0
     try:
         node = node_class()
-        executor = NodeExecutor()
-        executor.add_node(node)
         gc.freeze()  # looking through all that was imported takes 0.15 s, in which nothing else happens
-        executor.spin()
+        spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except (ConfigError, NameValidationException) as error:
@@ -384,4 +188,4 @@ def _one_line(error: Exception) -> str:
     return " ".join(str(error).split())
 
 
-__all__ = ["ERROR", "OK", "WARN", "Background", "EndoNode", "arm_names", "run", "sentence"]
+__all__ = ["ERROR", "OK", "WARN", "EndoNode", "run", "sentence"]

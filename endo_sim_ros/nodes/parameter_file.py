@@ -3,49 +3,49 @@
 import textwrap
 from collections.abc import Sequence
 
-from endo_sim_ros.core.config import StageConfig, options
-from endo_sim_ros.nodes.bag_player_node import BagPlayerConfig
-from endo_sim_ros.nodes.physics_node import PhysicsNodeConfig
-from endo_sim_ros.nodes.policy_node import PolicyConfig
-from endo_sim_ros.nodes.reconstruction_node import ReconstructionNodeConfig
-from endo_sim_ros.nodes.recorder_node import RecorderConfig
-from endo_sim_ros.nodes.rendering_node import RenderingNodeConfig
-from endo_sim_ros.nodes.scripted_tool_node import ScriptedToolConfig
-from endo_sim_ros.nodes.viewer_node import ViewerNodeConfig
-from endo_sim_ros.physics import PhysicsConfig
-from endo_sim_ros.reconstruction import ReconstructionConfig
-from endo_sim_ros.rendering import RenderingConfig
-from endo_sim_ros.viewer.config import ViewerConfig
+from endo_sim_ros.core.config import Option, options
+from endo_sim_ros.nodes.configs import NODE_CONFIGS
+from endo_sim_ros.reconstruction.config import ReconstructionConfig
+from endo_sim_ros.reconstruction.presets import PRESETS
 
-NODE_CONFIGS: dict[str, tuple[type[StageConfig], ...]] = {
-    "reconstruction_node": (ReconstructionNodeConfig, ReconstructionConfig),
-    "physics_node": (PhysicsNodeConfig, PhysicsConfig),
-    "rendering_node": (RenderingNodeConfig, RenderingConfig),
-    "bag_player": (BagPlayerConfig,),
-    "recorder": (RecorderConfig,),
-    "scripted_tool": (ScriptedToolConfig,),
-    "policy": (PolicyConfig,),
-    "viewer_node": (ViewerNodeConfig, ViewerConfig, RenderingConfig),
-}
+_OF_PRESETS = frozenset(name for values in PRESETS.values() for name in values)
+_WIDTH = 110  # characters of a line of text
+_ABOUT_PRESETS = """\
+A parameter with a value in this file has that value, whatever the preset. Parameters that some preset changes are
+therefore commented out below, with the value of the preset default: remove the # to give one a value of your own."""
 
 
 def parameter_file(nodes: Sequence[str] = tuple(NODE_CONFIGS)) -> str:
-    """A YAML file with every parameter of the nodes at its default, each under its description and range."""
+    """A YAML file with every parameter of some nodes at its default, each under its description and range.
+
+    Parameters whose values come from the preset are commented out: given in a file they would outweigh it.
+
+    Args:
+        nodes: Names of ROS nodes, keys of `NODE_CONFIGS`.
+    """
     lines = []
     for node in nodes:
         lines += [f"/**/{node}:", "  ros__parameters:"]
         for config_class in NODE_CONFIGS[node]:
+            of_presets = _OF_PRESETS if config_class is ReconstructionConfig else ()
+            if of_presets:
+                lines += ["", *(f"    # {line}" for line in textwrap.wrap(_ABOUT_PRESETS, _WIDTH)), ""]
             for option in options(config_class):
-                text = option.description
-                if option.range:
-                    low, high, unit = option.range
-                    text += f" [{low:g} to {high:g}{' ' + unit if unit else ''}]"
-                if option.choices:
-                    text += f" [{', '.join(option.choices)}]"
-                lines += [f"    # {line}" for line in textwrap.wrap(text, 110)]
-                lines.append(f"    {option.name}: {_yaml(option.default)}")
+                lines += [f"    # {line}" for line in textwrap.wrap(_description(option), _WIDTH)]
+                lines.append(f"    {'#' * (option.name in of_presets)}{option.name}: {_yaml(option.default)}")
         lines.append("")
     return "\n".join(lines)
+
+
+def _description(option: Option) -> str:
+    """What an option is, with its range or its choices."""
+    text = option.description
+    if option.range:
+        low, high, unit = option.range
+        text += f" [{low:g} to {high:g}{' ' + unit if unit else ''}]"
+    if option.choices:
+        text += f" [{', '.join(option.choices)}]"
+    return text
 
 
 def _yaml(value: bool | int | float | str | tuple[str, ...]) -> str:

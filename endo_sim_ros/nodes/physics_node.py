@@ -2,20 +2,21 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 from std_srvs.srv import SetBool, Trigger
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.core.config import ConfigError, Range, StageConfig
+from endo_sim_ros.core.config import StageConfig
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.messages import STATE, ControlNodeCloud, MessageError, PhysicsState
 from endo_sim_ros.nodes.arm import Arm
-from endo_sim_ros.nodes.base import ERROR, OK, STREAM_DEPTH, WARN, Background, EndoNode, WorldConfig, arm_names, run, sentence
+from endo_sim_ros.nodes.background import Background
+from endo_sim_ros.nodes.base import ERROR, OK, STREAM_DEPTH, WARN, EndoNode, run, sentence
+from endo_sim_ros.nodes.configs import COMMAND_PARTS, PhysicsNodeConfig, arm_names
 from endo_sim_ros.nodes.pacing import MOST_WAITING, CommandQueue, Pacer
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
 from endo_sim_ros.physics.regions import read_regions
@@ -26,44 +27,6 @@ _CAMERAS_LATE = 1.0  # seconds after a model in which its training cameras may s
 _POLLS = 4  # times per step that the timer asks whether a step is due
 _LONGEST_POLL = 0.1  # seconds; models and parameters must not wait for steps that take minutes
 _WINDOW = 1.0  # seconds over which the real-time factor is measured
-_INPUTS = ("pose", "wrench", "jaw", "cut")  # parts of a command in lockstep
-
-
-@dataclass(frozen=True)
-class PhysicsNodeConfig(WorldConfig):
-    """Parameters of the node beside those of the physics."""
-
-    mode: Literal["realtime", "lockstep"] = "realtime"
-    """realtime: steps follow the clock (the wall's, or /clock with use_sim_time) and meet the commands that come; what
-    cannot be kept up with is skipped. lockstep: each command takes one step, and state, reaction and /clock bear its stamp."""
-    lockstep_inputs: tuple[str, ...] = ("pose", "wrench")
-    """lockstep: what a command consists of (pose, wrench, jaw, cut); a step is taken when all of it, for all arms and with the
-    same stamp, has come. What is not named here acts when it comes."""
-    step_count: Annotated[int, Range(1, MOST_WAITING)] = 1
-    """Steps that one call of ~/step takes."""
-    arms: tuple[str, ...] = ("PSM1",)
-    """Names of the tool arms; each has its topics under its name."""
-    arm_source: Literal["measured", "commanded"] = "measured"
-    """measured: tips follow measured_cp, as robots and their simulators publish it. commanded: there is no other robot;
-    tips follow servo_cp at once and move_cp in their time, and this node publishes measured_cp and jaw/measured_js as an arm would."""
-    move_speed: Annotated[float, Range(1e-4, 10, "m/s")] = 0.05
-    """Speed of a tip on its way to the goal of move_cp."""
-    turn_speed: Annotated[float, Range(1e-2, 100, "rad/s")] = 1.5
-    """Speed at which a tip turns on its way, and at which a jaw goes to the goal of jaw/move_jp."""
-    command_timeout: Annotated[float, Range(0, 3600, "s")] = 0.5
-    """A wrench that is not repeated for this long is dropped; 0 = held until changed."""
-    jaw_closed: Annotated[float, Range(-3.2, 3.2, "rad")] = 0.1
-    """A jaw at or below this angle holds the tissue at its tip."""
-    jaw_open: Annotated[float, Range(-3.2, 3.2, "rad")] = 0.2
-    """A jaw at or above this angle lets go; between the two it stays as it is."""
-
-    def __post_init__(self):
-        super().__post_init__()
-        if self.jaw_closed >= self.jaw_open:
-            raise ConfigError(f"jaw_closed, {self.jaw_closed:g} rad, must be less than jaw_open, {self.jaw_open:g} rad")
-        unknown = set(self.lockstep_inputs) - set(_INPUTS)
-        if unknown or not self.lockstep_inputs:
-            raise ConfigError(f"lockstep_inputs: {list(self.lockstep_inputs)} must be some of {', '.join(_INPUTS)}")
 
 
 class PhysicsNode(EndoNode):
@@ -328,7 +291,7 @@ class PhysicsNode(EndoNode):
 
         while self._simulation is not None and (command := self._commands.take(give_up)):
             stamp, parts = command
-            for part in sorted(parts, key=lambda part: (_INPUTS.index(part[1]), part[0])):  # poses before what needs them
+            for part in sorted(parts, key=lambda part: (COMMAND_PARTS.index(part[1]), part[0])):  # poses before what needs them
                 with self.guard("command"):
                     parts[part]()
             self._step(self._simulation)

@@ -1,48 +1,23 @@
 """A policy that works on a task over topics, in lockstep: the observations and actions are those of the environment in one process."""
 
 import time
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
-from endo_sim_ros.core.config import ConfigError, Range, StageConfig
+from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.learning.policies import make_policy
 from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.learning.tasks import find_task, make_task
 from endo_sim_ros.messages import STATE, PolicyState
-from endo_sim_ros.nodes.base import OK, WARN, EndoNode, arm_names, run
+from endo_sim_ros.nodes.base import OK, WARN, EndoNode, run
+from endo_sim_ros.nodes.configs import PolicyConfig, arm_names
 
 _OPEN, _CLOSED = 1.0, 0.0  # rad
 _PATIENCE = 30.0  # seconds; a request to a physics_node that was killed just now is never answered
-
-
-@dataclass(frozen=True)
-class PolicyConfig(StageConfig):
-    """Parameters of the policy; physics_node needs mode lockstep, arm_source commanded, lockstep_inputs [pose, jaw] and the task's
-    tissue: `endo-sim scene` writes them to a file."""
-
-    task: Literal["retraction", "palpation"] = "retraction"
-    """What is to be done."""
-    policy: str = "scripted"
-    """scripted, or the .npz file of a trained policy."""
-    scene: str = ""
-    """Folder of the model.ply and cameras.json that the graph runs on; empty = the piece of the synthetic patient."""
-    seed: Annotated[int, Range(0, 2**31 - 1)] = 0
-    """Of the first episode; each following one has the next."""
-    episodes: Annotated[int, Range(1, 1_000_000)] = 1
-    """How many episodes; palpation has one, as the inclusion is part of physics_node's parameters."""
-    record: str = ""
-    """File (.npz) for observations, actions, rewards and success of all steps; empty = none."""
-    arm: str = "PSM1"
-    """Name of the arm that acts."""
-    world_frame: str = "world"
-    """Frame of the tool's pose."""
-    physics_node: str = "physics_node"
-    """Name of the node to reset."""
 
 
 class PolicyNode(EndoNode):

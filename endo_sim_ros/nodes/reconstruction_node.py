@@ -3,23 +3,24 @@
 import logging
 import threading
 import time
-from dataclasses import dataclass
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import torch
 from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera, load_cameras, save_cameras
-from endo_sim_ros.core.config import Range, StageConfig
-from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.core.config import StageConfig, option_values
+from endo_sim_ros.core.frames import LEFT_FRAME, Frame, SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel, load_ply, save_ply
 from endo_sim_ros.messages import STATE, ReconstructionState, Topic
-from endo_sim_ros.nodes.base import ERROR, OK, WARN, EndoNode, WorldConfig, run, sentence
-from endo_sim_ros.reconstruction import Progress, ReconstructionConfig, Trainer, scene_points, select_keyframes
-from endo_sim_ros.sequences.bag import LEFT_FRAME, feed
+from endo_sim_ros.nodes.base import ERROR, OK, WARN, EndoNode, run, sentence
+from endo_sim_ros.nodes.configs import ReconstructionNodeConfig
+from endo_sim_ros.reconstruction import PRESETS, Progress, ReconstructionConfig, Trainer, preset, scene_points, select_keyframes
+from endo_sim_ros.sequences.bag import feed
 from endo_sim_ros.sequences.synchronizer import Synchronizer
 
 _LEFT_IMAGES = (messages.LEFT_IMAGE, messages.LEFT_COMPRESSED)
@@ -27,35 +28,6 @@ _LEFT_IMAGES = (messages.LEFT_IMAGE, messages.LEFT_COMPRESSED)
 _JUMP_BACK, _JUMP_AHEAD, _PAUSE = 1.0, 60.0, 1.0
 
 _LATEST, _CAMERAS = "latest", "cameras.json"
-
-
-@dataclass(frozen=True)
-class ReconstructionNodeConfig(WorldConfig):
-    """Parameters of the node beside those of the reconstruction."""
-
-    mode: Literal["realtime", "lockstep"] = "realtime"
-    """realtime: intermediate models are published while they train, stamped by the clock. lockstep: the final model only,
-    stamped by the newest image (models read from files: from one nanosecond on), so that one bag gives the same bytes in every run."""
-    sync_tolerance: Annotated[float, Range(0, 10, "s")] = 0.01
-    """Largest difference between the stamps of an image and its pose, depth, mask and right image."""
-    reliable: bool = True
-    """Ask for reliable delivery; set to false for cameras that publish best effort."""
-    start_after: Annotated[float, Range(0, 3600, "s")] = 1.5
-    """Reconstruct when no image came for this long, or for three times the longest gap between images so far; 0 = only
-    when the service ~/reconstruct is called."""
-    start_views: Annotated[int, Range(0, 100_000)] = 0
-    """Reconstruct once as soon as this many views arrived (for a live camera, whose stream does not end); 0 = off."""
-    max_views: Annotated[int, Range(2, 100_000)] = 300
-    """Views kept in memory; above it every second one is dropped."""
-    image_timeout: Annotated[float, Range(0.1, 3600, "s")] = 10.0
-    """Warn when no view arrived for this long; also the longest wait for a slow recording to go on."""
-    publish_period: Annotated[float, Range(0.1, 3600, "s")] = 5.0
-    """Time between intermediate models during training."""
-    output_dir: str = "~/.ros/endo_sim_ros"
-    """Where each reconstruction's model.ply, cameras.json and checkpoint.pt are saved, in a folder named by the time."""
-    model_file: str = ""
-    """PLY model to publish at start, before any reconstruction, or when this is set; latest = the newest in output_dir.
-    Cameras saved beside it (cameras.json) are published with it."""
 
 
 class ReconstructionNode(EndoNode):
@@ -66,7 +38,7 @@ class ReconstructionNode(EndoNode):
     def __init__(self):
         super().__init__("reconstruction_node")
         self._options = self.declare(ReconstructionNodeConfig)
-        self._config = self.declare(ReconstructionConfig)
+        self._config = self.declare(ReconstructionConfig, option_values(preset(self._options.preset)))
         logging.basicConfig(level=logging.INFO, format="%(name)s: %(message)s")
         self._frames: list[Frame] = []
         self._synchronizer = Synchronizer(self._options.sync_tolerance)
@@ -102,6 +74,10 @@ class ReconstructionNode(EndoNode):
             self._options = config
         else:
             self._config = config  # used by the next reconstruction
+
+    def implied_values(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        name = values.get("preset")
+        return option_values(preset(name)) if isinstance(name, str) and name in PRESETS else {}
 
     # ------------------------------------------------------------------ views
 

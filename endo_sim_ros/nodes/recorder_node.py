@@ -5,7 +5,6 @@ import queue
 import signal
 import threading
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,31 +14,16 @@ from rich.live import Live
 from rich.text import Text
 
 from endo_sim_ros import messages
-from endo_sim_ros.core.config import ConfigError, StageConfig
+from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.messages import STATE, RecorderState, Topic
-from endo_sim_ros.nodes.base import ERROR, OK, EndoNode, arm_names, quality, run, sentence
+from endo_sim_ros.nodes.base import ERROR, OK, EndoNode, quality, run, sentence
+from endo_sim_ros.nodes.configs import ALL_TOPICS, RecorderConfig, arm_names
 from endo_sim_ros.nodes.transport import prepare_transport
 from endo_sim_ros.sequences.bag import BagWriter, canonical_cdr
 
 _MAX_WAITING = 256_000_000  # bytes that may wait for the disk before new messages are dropped, and counted
 _FLUSH_EVERY = 1.0  # seconds; what was heard longer ago outlives a killed recorder
-_ALL = "all"
-
-
-@dataclass(frozen=True)
-class RecorderConfig(StageConfig):
-    """Parameters of the recorder."""
-
-    bag: str = "recording"
-    """Folder of the new bag; it must not exist."""
-    arms: tuple[str, ...] = ("PSM1",)
-    """Names of the tool arms."""
-    topics: tuple[str, ...] = (_ALL,)
-    """Names of the topics to record, of those of the contract; all records every one."""
-    canonical: bool = True
-    """Writes zeros into the gaps between the fields of a message, where senders leave anything: equal messages then have
-    equal bytes."""
 
 
 class RecorderNode(EndoNode):
@@ -132,7 +116,7 @@ def _chosen(names: tuple[str, ...], arms: tuple[str, ...]) -> list[Topic]:
         ConfigError: If there is no such topic.
     """
     known = {topic.name.lstrip("/"): topic for topic in messages.all_topics(arms)}
-    if _ALL in names:
+    if ALL_TOPICS in names:
         return list(known.values())
     wanted = dict.fromkeys(name.strip().lstrip("/") for name in names)
     unknown = [name for name in wanted if name not in known]

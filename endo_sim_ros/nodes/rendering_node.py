@@ -2,40 +2,23 @@
 
 import time
 from collections import deque
-from dataclasses import dataclass, replace
-from typing import Annotated, Any, Literal
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.core.config import Range, StageConfig
+from endo_sim_ros.core.config import StageConfig
 from endo_sim_ros.messages import STATE, CameraInfo, ControlNodeCloud, MessageError, RenderingState
-from endo_sim_ros.nodes.base import ERROR, OK, STREAM_DEPTH, WARN, EndoNode, WorldConfig, run, sentence
-from endo_sim_ros.nodes.model_tracker import Bound, ShownTissue
+from endo_sim_ros.nodes.base import ERROR, OK, STREAM_DEPTH, WARN, EndoNode, run, sentence
+from endo_sim_ros.nodes.configs import RenderingNodeConfig
+from endo_sim_ros.nodes.model_tracker import BoundModel, ModelTracker
 from endo_sim_ros.nodes.pacing import MOST_WAITING, Pacer
 from endo_sim_ros.rendering import RenderingConfig
-from endo_sim_ros.sequences.bag import LEFT_FRAME
 
 _MAX_SIDE = 8192  # pixels; a damaged camera_info must not make the node ask for all memory
 _POLLS = 4  # times per image that the timer asks whether one is due
-
-
-@dataclass(frozen=True)
-class RenderingNodeConfig(WorldConfig):
-    """Parameters of the node beside those of the rendering."""
-
-    mode: Literal["realtime", "lockstep"] = "realtime"
-    """realtime: the newest state is shown as soon as it comes, at most at the rate. lockstep: each state on control_nodes
-    gives one image with its stamp, and none is left out."""
-    lockstep_camera: bool = False
-    """lockstep: wait for the camera pose with the stamp of the state; otherwise the newest pose is used."""
-    rate: Annotated[float, Range(0.1, 240, "Hz")] = 25.0
-    """Images published per second; input that arrives faster is dropped, the newest is kept."""
-    idle_rate: Annotated[float, Range(0.1, 240, "Hz")] = 5.0
-    """Images published per second while nothing in the picture changes."""
-    camera_frame: str = LEFT_FRAME
-    """Frame written into the headers of rendered images."""
 
 
 class RenderingNode(EndoNode):
@@ -49,7 +32,7 @@ class RenderingNode(EndoNode):
         self._config = self.declare(RenderingConfig)
         self._lockstep = self._options.mode == "lockstep"
         depth = MOST_WAITING if self._lockstep else 1
-        self._tissue = ShownTissue(max(depth, STREAM_DEPTH))
+        self._tissue = ModelTracker(max(depth, STREAM_DEPTH))
         self._nodes: ControlNodeCloud | None = None
         self._nodes_stamp = self._last_stamp = 0  # of that state, and of the newest image in real time, ns
         self._failure = ""  # why the newest model is not shown
@@ -85,7 +68,7 @@ class RenderingNode(EndoNode):
     # ------------------------------------------------------------------ input
 
     def _on_model(self, message: Any) -> None:
-        self._tissue.take_model(message, self._options.world_frame)
+        self._tissue.receive_model(message, self._options.world_frame)
 
     def _on_training_cameras(self, message: Any) -> None:
         messages.check_frame(message, (self._options.world_frame,), messages.TRAINING_CAMERAS.name)
@@ -122,7 +105,7 @@ class RenderingNode(EndoNode):
             self._show_if_due()
 
     def _on_cut_surface(self, message: Any) -> None:
-        self._tissue.take_cut_surface(message, self._options.world_frame)
+        self._tissue.receive_cut_surface(message, self._options.world_frame)
         if self._lockstep:
             self._show_states()
         else:
@@ -187,7 +170,7 @@ class RenderingNode(EndoNode):
         self._last_stamp = self._stamp(self._tissue.bound)
         self._publish(*self._output, self._last_stamp)
 
-    def _stamp(self, bound: Bound) -> int:
+    def _stamp(self, bound: BoundModel) -> int:
         """Real time: when the state that is shown was so; now, if there was an image of that time already."""
         now = self.now_ns()
         return self._nodes_stamp if bound.follows(self._nodes) and self._last_stamp < self._nodes_stamp <= now else now
@@ -208,7 +191,7 @@ class RenderingNode(EndoNode):
             at_rest = stamp == nodes.model_stamp_ns  # the first observation
             if self._options.lockstep_camera and not at_rest:
                 camera = camera and replace(camera, pose=self._poses[stamp] if pose is None else pose)
-            if not self._tissue.bound.follows(nodes) or not camera or not self._tissue.knows_cut(nodes):
+            if not self._tissue.bound.follows(nodes) or not camera or not self._tissue.has_cut(nodes):
                 return
             self._states.popleft()
             if pose is None and not at_rest:
@@ -255,7 +238,7 @@ class RenderingNode(EndoNode):
     def _wants_depth(self) -> bool:
         return self._depth_pub.get_subscription_count() > 0  # else a megabyte would only delay the next image
 
-    def _render(self, bound: Bound, nodes: ControlNodeCloud | None, camera: Camera) -> tuple[np.ndarray, np.ndarray | None, Camera]:
+    def _render(self, bound: BoundModel, nodes: ControlNodeCloud | None, camera: Camera) -> tuple[np.ndarray, np.ndarray | None, Camera]:
         start, camera = time.monotonic(), bound.renderer.camera(camera)
         if max(camera.width, camera.height) > _MAX_SIDE:
             raise MessageError(f"images of {camera.width}×{camera.height} are too large; set image_width")

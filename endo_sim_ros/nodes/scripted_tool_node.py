@@ -1,43 +1,16 @@
 """A tool that takes hold of the tissue in the middle of the picture, pulls, swings and lets go."""
 
-from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera, invert_pose
-from endo_sim_ros.core.config import Range, StageConfig
 from endo_sim_ros.messages import STATE, ControlNodeCloud, ScriptedToolState
-from endo_sim_ros.nodes.base import OK, WARN, EndoNode, arm_names, run
+from endo_sim_ros.nodes.base import OK, WARN, EndoNode, run
+from endo_sim_ros.nodes.configs import ScriptedToolConfig, arm_names
 
 _FOLLOWED = 8  # nodes around the grasped point whose movement carries the tip
-
-
-@dataclass(frozen=True)
-class ScriptedToolConfig(StageConfig):
-    """Parameters of the scripted tool."""
-
-    arm: str = "PSM1"
-    """Name of the arm whose topics are published."""
-    world_frame: str = "world"
-    """Frame of the tool's pose."""
-    force: Annotated[float, Range(0, 100, "N")] = 2.0
-    """Largest force."""
-    u: Annotated[float, Range(0, 1)] = 0.5
-    """Where the tool takes hold, as a fraction of the image width."""
-    v: Annotated[float, Range(0, 1)] = 0.5
-    """Where the tool takes hold, as a fraction of the image height."""
-    listeners: Annotated[int, Range(0, 100)] = 1
-    """Subscribers of the wrench to wait for, so that none misses the beginning."""
-    rate: Annotated[float, Range(1, 1000, "Hz")] = 50.0
-    """Commands per second."""
-    pull: Annotated[float, Range(0, 600, "s")] = 2.0
-    """Time in which the force grows, aslant towards the camera."""
-    swing: Annotated[float, Range(0, 600, "s")] = 4.0
-    """Time in which the force circles around that direction."""
-    release: Annotated[float, Range(0, 600, "s")] = 2.5
-    """Time watched after letting go."""
 
 
 class ScriptedToolNode(EndoNode):

@@ -3,7 +3,7 @@
 import time
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from rcl_interfaces.srv import GetParameters, SetParameters
@@ -14,8 +14,9 @@ from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.config import StageConfig
 from endo_sim_ros.messages import STATE, ControlNodeCloud, NodeStatus, PhysicsState, ViewerState
-from endo_sim_ros.nodes.base import OK, WARN, EndoNode, WorldConfig, arm_names, run
-from endo_sim_ros.nodes.model_tracker import ShownTissue
+from endo_sim_ros.nodes.base import OK, WARN, EndoNode, run
+from endo_sim_ros.nodes.configs import ViewerNodeConfig, arm_names
+from endo_sim_ros.nodes.model_tracker import ModelTracker
 from endo_sim_ros.rendering import RenderingConfig
 from endo_sim_ros.viewer.config import ViewerConfig
 from endo_sim_ros.viewer.viewer import PARAMETERS, Tool, Viewer, plain_camera
@@ -27,20 +28,6 @@ _STALE = 1.5  # s in which diagnostics may be older than the answer of a service
 _ASK_EVERY = 2.0  # s between two looks at the parameters of the physics
 _JAW_OPEN, _JAW_CLOSED = 1.0, 0.0  # rad
 _SHOWN = ("physics_node", "rendering_node", "reconstruction_node")  # whose diagnostics are on the page
-
-
-@dataclass(frozen=True)
-class ViewerNodeConfig(WorldConfig):
-    """Parameters of the node beside those of the page."""
-
-    arm: str = "PSM1"
-    """Name of the arm that the mouse moves while it holds tissue; its topics are published only then."""
-    arm_source: Literal["measured", "commanded"] = "measured"
-    """As that of physics_node. measured: the mouse publishes measured_cp. commanded: it publishes servo_cp."""
-    arms: tuple[str, ...] = ("PSM1",)
-    """Names of the arms that are shown with their forces."""
-    physics_node: str = "physics_node"
-    """Name of the node whose parameters and services the page uses."""
 
 
 @dataclass
@@ -64,7 +51,7 @@ class ViewerNode(EndoNode):
         (arm,) = arm_names([self._options.arm])
         self._arms = {name: _Arm() for name in arm_names((*self._options.arms, arm))}
         self._hand = arm
-        self._tissue = ShownTissue()
+        self._tissue = ModelTracker()
         self._cameras: np.ndarray | None = None  # [V, 4, 4], of the training views
         self._infos: dict[str, messages.CameraInfo] = {}  # by topic
         self._rendered: dict[str, tuple[int, Any]] = {}  # stamp and content of the newest rendered messages
@@ -108,7 +95,7 @@ class ViewerNode(EndoNode):
     # ------------------------------------------------------------------ input
 
     def _on_model(self, message: Any) -> None:
-        self._tissue.take_model(message, self._options.world_frame)
+        self._tissue.receive_model(message, self._options.world_frame)
 
     def _on_training_cameras(self, message: Any) -> None:
         messages.check_frame(message, (self._options.world_frame,), messages.TRAINING_CAMERAS.name)
@@ -131,7 +118,7 @@ class ViewerNode(EndoNode):
         self.viewer.show_state(self._nodes.positions, self._nodes.F, age)
 
     def _on_cut_surface(self, message: Any) -> None:
-        self._tissue.take_cut_surface(message, self._options.world_frame)
+        self._tissue.receive_cut_surface(message, self._options.world_frame)
 
     def _on_rendered_pose(self, message: Any) -> None:
         pose = messages.decode_pose(message, self._options.world_frame, messages.RENDERED_POSE.name)

@@ -1,4 +1,4 @@
-"""Options of the reconstruction stage."""
+"""Options of the reconstruction stage; `presets` names sets of them."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -10,9 +10,6 @@ from endo_sim_ros.core.config import Range, StageConfig
 class ReconstructionConfig(StageConfig):
     """From sparse posed views to a Gaussian model."""
 
-    preset: Literal["default", "laptop", "paper", "fsgs", "3dgs"] = "default"
-    """Method: ours, ours sized for a CPU, that of the paper as printed, FSGS, or 3DGS. Options not given take its values; a ROS
-    parameter that has the default's value counts as not given."""
     keyframes: Annotated[int, Range(1, 1000)] = 8
     """Number of views to train on, spread over the camera path."""
     image_width: Annotated[int, Range(16, 8192, "pixels")] = 640

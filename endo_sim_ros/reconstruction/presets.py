@@ -3,10 +3,12 @@
 A preset is the set of options in which it differs from the defaults; `default` is the best we know.
 """
 
-import dataclasses
-from typing import Any
+from typing import Any, Literal
 
+from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
+
+Preset = Literal["default", "laptop", "paper", "fsgs", "3dgs"]
 
 _PLAIN = {  # 3DGS as Kerbl et al. 2023 have it, and what the others build upon, for 3000 iterations
     "iterations": 3000, "virtual_every": 1,
@@ -15,7 +17,7 @@ _PLAIN = {  # 3DGS as Kerbl et al. 2023 have it, and what the others build upon,
     "agreement": False, "surroundings": 0.0, "confined": False, "still": False,
 }  # fmt: skip
 
-PRESETS: dict[str, dict[str, Any]] = {
+PRESETS: dict[Preset, dict[str, Any]] = {
     "default": {},
     # The same in a minute or two on a CPU.
     "laptop": {"image_width": 320, "iterations": 600, "learning_rate": 0.3, "max_gaussians": 15_000, "refine_every": 50},
@@ -28,7 +30,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "3dgs": _PLAIN | {"lambda_depth": 0.0, "virtual_every": 0},
 }
 
-ABLATIONS: dict[str, dict[str, dict[str, Any]]] = {
+ABLATIONS: dict[Preset, dict[str, dict[str, Any]]] = {
     "paper": {
         "without virtual cameras": {"virtual_every": 0},
         "without frequency": {"sh_degree": 3},
@@ -57,17 +59,16 @@ ABLATIONS: dict[str, dict[str, dict[str, Any]]] = {
 """Of each preset, the options without one of its parts at a time, by name."""
 
 
-def preset(name: str, **overrides: Any) -> ReconstructionConfig:
-    """The options of a preset, some of them replaced.
+def preset(name: str, **given: Any) -> ReconstructionConfig:
+    """The options of a preset: those given, else those of the preset, else the defaults.
+
+    Args:
+        name: Name of the preset, a key of `PRESETS`.
+        given: Options by name, whatever their values; those of a nested stage are dotted, ``**{"stage.option": value}``.
 
     Raises:
         ConfigError: If there is no such preset or option, or a value is out of range.
     """
-    return dataclasses.replace(resolved(ReconstructionConfig(preset=name)), **overrides)
-
-
-def resolved(config: ReconstructionConfig) -> ReconstructionConfig:
-    """The options spelled out: those left at their defaults take the values of the preset that is named."""
-    usual = ReconstructionConfig()
-    values = {key: value for key, value in PRESETS[config.preset].items() if getattr(config, key) == getattr(usual, key)}
-    return dataclasses.replace(config, preset="default", **values)
+    if name not in PRESETS:
+        raise ConfigError(f"preset must be one of {', '.join(PRESETS)}, got {name!r}")
+    return ReconstructionConfig.from_mapping(PRESETS[name] | given)

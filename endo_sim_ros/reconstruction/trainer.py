@@ -26,7 +26,6 @@ from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.dynamic_mask import without_motion
 from endo_sim_ros.reconstruction.initialization import initial_model
 from endo_sim_ros.reconstruction.optimizer import Adam
-from endo_sim_ros.reconstruction.presets import resolved
 from endo_sim_ros.reconstruction.priors.extrapolation import with_surroundings
 from endo_sim_ros.reconstruction.priors.multi_view import agreed
 from endo_sim_ros.reconstruction.priors.sources import depth_source, right_view, with_depth_prior
@@ -102,7 +101,7 @@ class Trainer:
 
     Args:
         frames: Training views; every one is used (see `select_keyframes`).
-        config: Options.
+        config: Options; `preset` makes those of a named method.
         points: Scene points: positions [N, 3] (m, world), RGB [N, 3] in [0, 1] and, if known, error (see `ScenePoints`), for
             instance of structure from motion with more views than these; None triangulates these views.
 
@@ -114,7 +113,7 @@ class Trainer:
     def __init__(self, frames: list[Frame], config: ReconstructionConfig, points: ScenePoints | tuple | None = None):
         if not frames:
             raise SequenceError("there are no views to reconstruct from; check the image, camera_info and pose topics")
-        self.config = config = resolved(config)
+        self.config = config
         self.device = pick_device(config.device)
         source = depth_source(frames, config)
         frames, points = _consistent(_showing(frames), config, None if points is None else _checked(ScenePoints(*points)))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from endo_sim_ros import messages
-from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.core.frames import LEFT_FRAME, RIGHT_FRAME, WORLD_FRAME, Frame, SequenceError
 from endo_sim_ros.messages import Topic, bag_types
 from endo_sim_ros.sequences.bag_reader import BagReader, RawMessage
 from endo_sim_ros.sequences.bag_writer import BagWriter, canonical_cdr
@@ -19,8 +19,6 @@ __all__ = [
     "LEFT_FRAME", "RIGHT_FRAME", "WORLD_FRAME", "BagReader", "BagWriter", "RawMessage",
     "canonical_cdr", "feed", "read_bag", "write_bag",
 ]  # fmt: skip
-
-LEFT_FRAME, RIGHT_FRAME, WORLD_FRAME = "endoscope_left", "endoscope_right", "world"
 
 
 def write_bag(path: str | Path, frames: Iterable[Frame]) -> int:

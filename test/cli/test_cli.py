@@ -20,7 +20,7 @@ from endo_sim_ros.core.gaussians import load_ply
 from endo_sim_ros.evaluation import held_out
 from endo_sim_ros.evaluation.held_out import reconstruct_and_measure
 from endo_sim_ros.reconstruction import ReconstructionConfig
-from endo_sim_ros.reconstruction.presets import preset, resolved
+from endo_sim_ros.reconstruction.presets import preset
 from endo_sim_ros.sequences.bag import read_bag
 
 ROOT = Path(__file__).parents[2]
@@ -106,8 +106,15 @@ def test_options_given_beside_a_preset_count_whatever_their_value(monkeypatch):
     for given in ("--preset paper --lambda-tv 0 --sh-degree 3", "--preset laptop --lambda-tv 0 --sh-degree 3 --preset=paper", ""):
         monkeypatch.setattr(sys, "argv", f"endo-sim reconstruct bag out {given}".split())
         assert cli.main() == 0
-    assert resolved(taken[0]) == taken[0] == taken[1] == preset("paper", lambda_tv=0.0, sh_degree=3)
+    assert taken[0] == taken[1] == preset("paper", lambda_tv=0.0, sh_degree=3)
     assert taken[2] == ReconstructionConfig()
+
+
+def test_an_old_flag_is_refused_with_the_new_one(monkeypatch, capsys):
+    monkeypatch.setattr(ReconstructionConfig, "renamed", {"views": "keyframes"})
+    monkeypatch.setattr(sys, "argv", "endo-sim reconstruct bag out --views 3".split())
+    assert cli.main() == 1
+    assert capsys.readouterr().err == "endo-sim: --views is now --keyframes\n"
 
 
 @pytest.mark.dds

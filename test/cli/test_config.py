@@ -1,15 +1,20 @@
 """Configurations: one source for defaults, ranges and words."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 import pytest
+import tyro
 import yaml
 
 from endo_sim_ros import cli
-from endo_sim_ros.core.config import ConfigError, Range, StageConfig, option_values, options
-from endo_sim_ros.nodes.parameter_file import NODE_CONFIGS, parameter_file
+from endo_sim_ros.core.config import ConfigError, Range, StageConfig, option_values, options, refuse_renamed_flags, renamed_options
+from endo_sim_ros.nodes.configs import NODE_CONFIGS
+from endo_sim_ros.nodes.parameter_file import parameter_file
+from endo_sim_ros.reconstruction.config import ReconstructionConfig
+from endo_sim_ros.reconstruction.presets import PRESETS, Preset, preset
 
 ALL = [config for configs in NODE_CONFIGS.values() for config in configs]
 FILE = Path(__file__).parents[2] / "config" / "endo_sim.yaml"
@@ -69,6 +74,7 @@ class Nested(StageConfig):
 
 def test_options_of_a_nested_stage_are_dotted():
     assert [option.name for option in options(Nested)] == ["example.count", "example.length", "example.kind", "example.on", "last"]
+    assert options(Nested)[0].default == 3, "that of the field, not of the class"
     config = Nested.from_mapping({"example.length": 1, "last": 4})
     assert config == Nested(Example(count=3, length=1.0), 4)
     assert Nested.from_mapping({"example": {"length": 1}, "last": 4}) == config
@@ -85,6 +91,58 @@ def test_options_of_a_nested_stage_are_checked_and_old_names_lead_to_the_new_one
         Nested.from_mapping({"size": 0.5})
 
 
+@dataclass(frozen=True)
+class Outer(StageConfig):
+    """A stage within a stage within a stage."""
+
+    renamed = {"mode": "kind a or b of the example"}
+    nested: Nested = Nested()
+
+
+def test_old_names_are_known_at_every_depth():
+    assert renamed_options(Outer) == {"mode": "kind a or b of the example", "nested.size": "nested.example.length"}
+
+
+@dataclass
+class Command:
+    """A command with two stages, one of them without a prefix, as tyro has it."""
+
+    out: str
+    stage: Annotated[Nested, tyro.conf.arg(name="")]
+    other: Nested
+
+
+@pytest.mark.parametrize(
+    "words, sentence",
+    [
+        ("--size 1", r"^--size is now --example\.length$"),
+        ("--size=1", r"^--size is now --example\.length$"),
+        ("--last 1 --no-size", r"^--no-size is now --example\.length$"),
+        ("--other.size 1", r"^--other.size is now --other\.example\.length$"),
+    ],
+)
+def test_old_flags_are_refused_with_the_new_ones(words, sentence):
+    with pytest.raises(ConfigError, match=sentence):
+        refuse_renamed_flags(words.split(), Command)
+
+
+def test_other_words_are_not_taken_for_old_flags():
+    refuse_renamed_flags(["size", "--out", "size", "--example.size", "--example.length", "3", "--", "-s"], Command)
+
+
+def test_a_configuration_takes_the_place_of_a_nested_stage():
+    config = Nested().replaced({"example": Example(count=5), "last": 4})
+    assert config == Nested(Example(count=5), 4)
+    assert Nested().replaced({"example": Example(count=5), "example.count": 1}).example.count == 1
+
+
+@pytest.mark.parametrize("node", NODE_CONFIGS)
+def test_no_old_name_is_an_option_of_the_same_node(node):
+    known = {option.name for config in NODE_CONFIGS[node] for option in options(config)}
+    for config in NODE_CONFIGS[node]:
+        assert not known & renamed_options(config).keys()
+
+
 @pytest.mark.parametrize("config", ALL, ids=lambda config: config.__name__)
 def test_every_option_is_described_and_its_default_is_valid(config):
     config()
@@ -98,14 +156,30 @@ def test_parameter_file_in_the_repository_is_the_generated_one():
     assert FILE.read_text() == parameter_file(), "run: endo-sim config > config/endo_sim.yaml"
 
 
-def test_parameter_file_gives_every_node_its_defaults():
-    sections = yaml.safe_load(FILE.read_text())
+UNCOMMENTED = re.sub(r"^    #(?=\w)", "    ", FILE.read_text(), flags=re.M)
+
+
+@pytest.mark.parametrize("text", [FILE.read_text(), UNCOMMENTED], ids=["as it is", "with what is commented out"])
+def test_parameter_file_gives_every_node_its_defaults(text):
+    sections = yaml.safe_load(text)
     for node, configs in NODE_CONFIGS.items():
         values = sections[f"/**/{node}"]["ros__parameters"]
         for config in configs:
-            mine = {option.name: values.pop(option.name) for option in options(config)}
+            mine = {option.name: values.pop(option.name) for option in options(config) if option.name in values}
             assert config.from_mapping(mine) == config()
+            assert len(mine) == len(options(config)) or (config is ReconstructionConfig and text != UNCOMMENTED)
         assert not values
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_beside_the_parameter_file_has_its_values(name):
+    values = yaml.safe_load(FILE.read_text())["/**/reconstruction_node"]["ros__parameters"]
+    given = {key: value for key, value in values.items() if key in option_values(ReconstructionConfig())}
+    assert preset(name, **given) == preset(name)
+
+
+def test_presets_have_the_names_that_options_allow():
+    assert get_args(Preset) == tuple(PRESETS)
 
 
 def test_parameters_are_found_by_the_name_of_the_executable_too(capsys):

@@ -7,9 +7,10 @@ import sys
 from pathlib import Path
 
 import pytest
-import yaml
 
 from endo_sim_ros.cli import parse
+from endo_sim_ros.core.config import options
+from endo_sim_ros.nodes.configs import NODE_CONFIGS
 from endo_sim_ros.sequences.bag import write_bag
 
 ROOT = Path(__file__).parents[2]
@@ -43,14 +44,13 @@ def test_commands_have_these_options(page):
 
 @pytest.mark.parametrize("page", PAGES, ids=NAMES)
 def test_nodes_and_their_parameters_exist(page):
-    sections = yaml.safe_load((ROOT / "config" / "endo_sim.yaml").read_text())
-    known = {name: set(values["ros__parameters"]) for name, values in sections.items()}
+    known = {node: {option.name for config in configs for option in options(config)} for node, configs in NODE_CONFIGS.items()}
     for words in shell_lines(page):
         if words[:2] != ["ros2", "run"] or words[2] != "endo_sim_ros":
             continue
         node = words[3]
         assert (ROOT / "scripts" / node).is_file(), node
-        section = next(values for name, values in known.items() if name.rsplit("/", 1)[-1] in (node, node.removesuffix("_node")))
+        section = known.get(node) or known[node.removesuffix("_node")]
         for flag, value in zip(words, words[1:]):
             if flag == "-p":
                 assert value.split(":=")[0] in section, (node, value)

@@ -1,5 +1,6 @@
 """The package as users install it: what lies where, and that it starts."""
 
+import ast
 import importlib.util
 import os
 import subprocess
@@ -11,7 +12,7 @@ from xml.etree import ElementTree
 import pytest
 
 from endo_sim_ros.core.config import options
-from endo_sim_ros.nodes.parameter_file import NODE_CONFIGS
+from endo_sim_ros.nodes.configs import NODE_CONFIGS
 
 ROOT = Path(__file__).parents[2]
 NODES = ("reconstruction_node", "physics_node", "rendering_node", "bag_player_node")
@@ -106,6 +107,34 @@ def test_package_xml_names_what_the_code_imports():
 
     ros = {name for name in imported if name == "rclpy" or name.endswith(("_msgs", "_srvs", "_interfaces"))} | set(MESSAGE_PACKAGES)
     assert ros <= declared, ros - declared
+
+
+@pytest.mark.parametrize("module", ["endo_sim_ros.nodes.configs", "endo_sim_ros.nodes.parameter_file"])
+def test_options_of_all_nodes_need_neither_ros_nor_torch(module):
+    code = f"import sys, {module}; print(sorted({{'rclpy', 'torch', 'warp'}} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert done.stdout.strip() == "[]", done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("package", ["physics", "reconstruction", "rendering"])
+def test_names_of_a_package_are_those_that_type_checkers_see(package):
+    """What is imported on first use is written twice in such a package; each name leads to the same thing."""
+    lazy = importlib.import_module(f"endo_sim_ros.{package}")
+    (block,) = (node for node in ast.parse(Path(lazy.__file__).read_text()).body if isinstance(node, ast.If))
+    seen = {alias.name: each.module for each in block.body for alias in each.names}
+    for name, module in seen.items():
+        assert getattr(lazy, name) is getattr(importlib.import_module(module), name)
+    offered = {name for keyword in _call(lazy).keywords for name in ast.literal_eval(keyword.value)}
+    assert offered == set(seen)
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = lazy.nothing
+
+
+def _call(package: types.ModuleType) -> ast.Call:
+    """The call of `lazy_names` in a package."""
+    tree = ast.parse(Path(package.__file__).read_text())
+    (assignment,) = (node for node in tree.body if isinstance(node, ast.Assign))
+    return assignment.value
 
 
 def test_library_works_without_ros():

@@ -8,10 +8,10 @@ import pytest
 import torch
 from short_training import SHORT, bare, finite, options
 
-from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.core.config import ConfigError, option_values
+from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.reconstruction import ABLATIONS, PRESETS, ReconstructionConfig, Trainer, preset
-from endo_sim_ros.reconstruction.presets import resolved
 from endo_sim_ros.reconstruction.trainer import shrink
 from endo_sim_ros.reconstruction.triangulation import triangulate
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
@@ -32,16 +32,6 @@ def test_every_preset_trains(views, name):
     model = Trainer(views[::4], preset(name, **SHORT), points).run()
     assert finite(model) and len(model) <= 2000
     assert (model.light is None) == (name in ("paper", "fsgs", "3dgs"))
-
-
-def test_options_beside_a_preset_count_and_resolving_twice_changes_nothing():
-    config = preset("paper", lambda_tv=0.5, initialization="depth")
-    assert (config.initialization, config.lambda_tv, config.light, config.preset) == ("depth", 0.5, False, "default")
-    assert resolved(config) == config
-    chosen = ReconstructionConfig(preset="3dgs", iterations=7)
-    assert resolved(chosen) == preset("3dgs", iterations=7)
-    with pytest.raises(ConfigError, match="must be one of"):
-        preset("nerf")
 
 
 def test_every_ablation_changes_its_preset():
@@ -101,3 +91,26 @@ def test_a_checkpoint_of_any_preset_goes_on_as_if_never_interrupted(views, tmp_p
     resumed = second.run()
     assert all(torch.equal(a, b) for a, b in zip(resumed.tensors().values(), whole.tensors().values()))
     assert resumed.light == whole.light
+
+
+def test_options_beside_a_preset_count_even_if_they_are_the_defaults():
+    config = preset("paper", lambda_tv=0.0, initialization="depth")
+    assert (config.initialization, config.lambda_tv, config.light) == ("depth", 0.0, False)
+    assert preset("default", lambda_tv=0.0) == ReconstructionConfig()
+    with pytest.raises(ConfigError, match="preset must be one of default, .*, got 'nerf'"):
+        preset("nerf")
+    with pytest.raises(ConfigError, match="has no option preset"):
+        preset("paper", preset="3dgs")
+
+
+def test_a_checkpoint_knows_the_options_and_not_the_preset_that_they_came_from(views, tmp_path):
+    config = preset("paper", lambda_dist=0.0, **SHORT)
+    points = triangulate(views)[:2]
+    trainer = Trainer(views[::4], config, points)
+    trainer.step()
+    trainer.save_checkpoint(tmp_path / "checkpoint.pt")
+    spelled_out = Trainer(views[::4], ReconstructionConfig.from_mapping(option_values(config)), points)
+    spelled_out.load_checkpoint(tmp_path / "checkpoint.pt")
+    assert spelled_out.iteration == 1
+    with pytest.raises(SequenceError, match=r"other options \(lambda_dist\)"):
+        Trainer(views[::4], preset("paper", **SHORT), points).load_checkpoint(tmp_path / "checkpoint.pt")

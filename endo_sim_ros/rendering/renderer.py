@@ -1,36 +1,17 @@
 """Images and depth of a Gaussian model, at rest or as it follows its control nodes, in a camera."""
 
-from dataclasses import dataclass
-from typing import Annotated, Literal
-
 import numpy as np
 import torch
 from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.core.config import Range, StageConfig
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
 from endo_sim_ros.core.light import SURFACE, Light
 from endo_sim_ros.core.shading import shade, to_bytes
 from endo_sim_ros.physics.skinning import Skinning
+from endo_sim_ros.rendering.config import RenderingConfig
 from endo_sim_ros.splatting import render, sh_basis
-
-
-@dataclass(frozen=True)
-class RenderingConfig(StageConfig):
-    """From a Gaussian model and the state of its control nodes to camera images."""
-
-    image_width: Annotated[int, Range(0, 8192, "pixels")] = 0
-    """Width of the rendered image; 0 = that of the camera. The height follows."""
-    background: Annotated[float, Range(0, 1)] = 0.0
-    """Grey level where there is no tissue."""
-    skinning: Literal["compact", "softmax"] = "compact"
-    """Weights from nodes to Gaussians: compact (1 - (d/d5)²)² with F, or the paper's printed softmax(d) with R."""
-    neighbours: Annotated[int, Range(1, 32)] = 4
-    """Number of nodes that move one Gaussian."""
-    device: str = "auto"
-    """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""
 
 
 class DeformableRenderer:

@@ -1,0 +1,253 @@
+"""The options of all ROS nodes. This module imports no node and neither rclpy nor torch: `endo-sim config` needs it alone."""
+
+import functools
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+
+from endo_sim_ros.core.cameras import parse_frames
+from endo_sim_ros.core.config import ConfigError, Range, StageConfig
+from endo_sim_ros.core.frames import LEFT_FRAME
+from endo_sim_ros.nodes.pacing import MOST_WAITING
+from endo_sim_ros.physics.config import PhysicsConfig
+from endo_sim_ros.reconstruction.config import ReconstructionConfig
+from endo_sim_ros.reconstruction.presets import Preset
+from endo_sim_ros.rendering.config import RenderingConfig
+from endo_sim_ros.viewer.config import ViewerConfig
+
+COMMAND_PARTS = ("pose", "wrench", "jaw", "cut")  # of a tool, in the order in which they act
+ALL_TOPICS = "all"
+
+
+@dataclass(frozen=True)
+class WorldConfig(StageConfig):
+    """Where poses are given."""
+
+    world_frame: str = "world"
+    """Frame of camera poses, tool poses, the model and the control nodes."""
+    frames: tuple[str, ...] = ("",)  # ROS has no typed empty list
+    """Other frames of camera and tool poses, such as the bases of robot arms: the name and the pose in the world of each,
+    'PSM1_base x y z qx qy qz qw', metres."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        try:
+            parse_frames(self.world_frame, self.frames)
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
+
+    @property
+    def frame_poses(self) -> dict[str, np.ndarray]:
+        """Poses [4, 4] of all known frames in the world, by name."""
+        return _frame_poses(self.world_frame, self.frames)
+
+
+_frame_poses = functools.cache(parse_frames)
+
+
+@dataclass(frozen=True)
+class ReconstructionNodeConfig(WorldConfig):
+    """Options of reconstruction_node beside those of the reconstruction."""
+
+    preset: Preset = "default"
+    """Method: ours, ours sized for a CPU, that of the paper as printed, FSGS, or 3DGS. Options that are not given have the
+    values of the preset."""
+    mode: Literal["realtime", "lockstep"] = "realtime"
+    """realtime: intermediate models are published while they train, stamped by the clock. lockstep: the final model only,
+    stamped by the newest image (models read from files: from one nanosecond on): one bag gives the same bytes in every run."""
+    sync_tolerance: Annotated[float, Range(0, 10, "s")] = 0.01
+    """Largest difference between the stamps of an image and its pose, depth, mask and right image."""
+    reliable: bool = True
+    """Ask for reliable delivery; set to false for cameras that publish best effort."""
+    start_after: Annotated[float, Range(0, 3600, "s")] = 1.5
+    """Reconstruct when no image came for this long, or for three times the longest gap between images so far; 0 = only
+    on a call of the service ~/reconstruct."""
+    start_views: Annotated[int, Range(0, 100_000)] = 0
+    """Reconstruct once when this many views arrived (for a live camera, whose stream does not end); 0 = off."""
+    max_views: Annotated[int, Range(2, 100_000)] = 300
+    """Views kept in memory; above it every second one is dropped."""
+    image_timeout: Annotated[float, Range(0.1, 3600, "s")] = 10.0
+    """Warn when no view arrived for this long; also the longest wait for a slow recording to go on."""
+    publish_period: Annotated[float, Range(0.1, 3600, "s")] = 5.0
+    """Time between intermediate models during training."""
+    output_dir: str = "~/.ros/endo_sim_ros"
+    """Where each reconstruction's model.ply, cameras.json and checkpoint.pt are saved, in a folder named by the time."""
+    model_file: str = ""
+    """PLY model to publish at start, before any reconstruction, or when this is set; latest = the newest in output_dir.
+    Cameras saved beside it (cameras.json) are published with it."""
+
+
+@dataclass(frozen=True)
+class PhysicsNodeConfig(WorldConfig):
+    """Options of physics_node beside those of the physics."""
+
+    mode: Literal["realtime", "lockstep"] = "realtime"
+    """realtime: steps follow the clock (the wall clock, or /clock with use_sim_time) and use the newest commands; steps that
+    would be late are skipped. lockstep: each command takes one step; state, reaction and /clock have its stamp."""
+    lockstep_inputs: tuple[str, ...] = ("pose", "wrench")
+    """lockstep: the parts of a command (pose, wrench, jaw, cut). A step is taken when all parts, of all arms and with the same
+    stamp, have arrived. Parts that are not listed act on arrival."""
+    step_count: Annotated[int, Range(1, MOST_WAITING)] = 1
+    """Steps that one call of ~/step takes."""
+    arms: tuple[str, ...] = ("PSM1",)
+    """Names of the tool arms; the topics of an arm are under its name."""
+    arm_source: Literal["measured", "commanded"] = "measured"
+    """measured: tool tips follow measured_cp, as robots and their simulators publish it. commanded: there is no robot; tips
+    follow servo_cp at once and move_cp at move_speed, and this node publishes measured_cp and jaw/measured_js as an arm does."""
+    move_speed: Annotated[float, Range(1e-4, 10, "m/s")] = 0.05
+    """Speed of a tool tip that moves to the goal of move_cp."""
+    turn_speed: Annotated[float, Range(1e-2, 100, "rad/s")] = 1.5
+    """Speed at which a tool tip turns to the goal of move_cp, and at which a jaw turns to the goal of jaw/move_jp."""
+    command_timeout: Annotated[float, Range(0, 3600, "s")] = 0.5
+    """A wrench that is not repeated for this long is dropped; 0 = held until changed."""
+    jaw_closed: Annotated[float, Range(-3.2, 3.2, "rad")] = 0.1
+    """A jaw at or below this angle grasps the tissue at its tip."""
+    jaw_open: Annotated[float, Range(-3.2, 3.2, "rad")] = 0.2
+    """A jaw at or above this angle releases; between the two angles nothing changes."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.jaw_closed >= self.jaw_open:
+            raise ConfigError(f"jaw_closed, {self.jaw_closed:g} rad, must be less than jaw_open, {self.jaw_open:g} rad")
+        unknown = set(self.lockstep_inputs) - set(COMMAND_PARTS)
+        if unknown or not self.lockstep_inputs:
+            raise ConfigError(f"lockstep_inputs: {list(self.lockstep_inputs)} must be some of {', '.join(COMMAND_PARTS)}")
+
+
+@dataclass(frozen=True)
+class RenderingNodeConfig(WorldConfig):
+    """Options of rendering_node beside those of the rendering."""
+
+    mode: Literal["realtime", "lockstep"] = "realtime"
+    """realtime: the newest state is rendered when it arrives, at most at the rate. lockstep: each state on control_nodes
+    gives one image with its stamp."""
+    lockstep_camera: bool = False
+    """lockstep: wait for the camera pose with the stamp of the state; off, the newest pose is used."""
+    rate: Annotated[float, Range(0.1, 240, "Hz")] = 25.0
+    """Images published per second; of input that arrives faster the newest is used."""
+    idle_rate: Annotated[float, Range(0.1, 240, "Hz")] = 5.0
+    """Images published per second while nothing in the image changes."""
+    camera_frame: str = LEFT_FRAME
+    """Frame in the headers of rendered images."""
+
+
+@dataclass(frozen=True)
+class BagPlayerConfig(StageConfig):
+    """Options of the bag player."""
+
+    bag: str = ""
+    """Path of a rosbag2 folder or an .mcap file."""
+    rate: Annotated[float, Range(0.01, 100)] = 1.0
+    """Playback speed relative to the recording."""
+    loop: bool = False
+    """Start again at the end."""
+    wait_for_subscribers: Annotated[float, Range(0, 3600, "s")] = 10.0
+    """Longest wait for a subscriber before playing."""
+
+
+@dataclass(frozen=True)
+class RecorderConfig(StageConfig):
+    """Options of the recorder."""
+
+    bag: str = "recording"
+    """Folder of the new bag; it must not exist."""
+    arms: tuple[str, ...] = ("PSM1",)
+    """Names of the tool arms."""
+    topics: tuple[str, ...] = (ALL_TOPICS,)
+    """Names of the topics to record, of those in msg_conventions.md; all records every one."""
+    canonical: bool = True
+    """Write zeros into the padding between the fields of a message, so that equal messages have equal bytes."""
+
+
+@dataclass(frozen=True)
+class ScriptedToolConfig(StageConfig):
+    """Options of the scripted tool."""
+
+    arm: str = "PSM1"
+    """Name of the arm whose topics are published."""
+    world_frame: str = "world"
+    """Frame of the tool's pose."""
+    force: Annotated[float, Range(0, 100, "N")] = 2.0
+    """Largest force."""
+    u: Annotated[float, Range(0, 1)] = 0.5
+    """Column of the pixel at which the tool grasps, as a fraction of the image width."""
+    v: Annotated[float, Range(0, 1)] = 0.5
+    """Row of the pixel at which the tool grasps, as a fraction of the image height."""
+    listeners: Annotated[int, Range(0, 100)] = 1
+    """Subscribers of the wrench to wait for before the first command."""
+    rate: Annotated[float, Range(1, 1000, "Hz")] = 50.0
+    """Commands per second."""
+    pull: Annotated[float, Range(0, 600, "s")] = 2.0
+    """Time in which the force grows, obliquely towards the camera."""
+    swing: Annotated[float, Range(0, 600, "s")] = 4.0
+    """Time in which the force circles around the direction to the camera."""
+    release: Annotated[float, Range(0, 600, "s")] = 2.5
+    """Time after the release until the tool is finished."""
+
+
+@dataclass(frozen=True)
+class PolicyConfig(StageConfig):
+    """Options of the policy. physics_node must have mode lockstep, arm_source commanded, lockstep_inputs [pose, jaw] and the
+    tissue of the task: `endo-sim scene` writes these parameters to a file."""
+
+    task: Literal["retraction", "palpation"] = "retraction"
+    """Task to solve."""
+    policy: str = "scripted"
+    """scripted, or the .npz file of a trained policy."""
+    scene: str = ""
+    """Folder of the model.ply and cameras.json that the graph runs on; empty = a piece of the synthetic patient."""
+    seed: Annotated[int, Range(0, 2**31 - 1)] = 0
+    """Seed of the first episode; each following episode has the next seed."""
+    episodes: Annotated[int, Range(1, 1_000_000)] = 1
+    """Number of episodes; palpation has one, as the inclusion is part of the parameters of physics_node."""
+    record: str = ""
+    """File (.npz) for observations, actions, rewards and success of all steps; empty = none."""
+    arm: str = "PSM1"
+    """Name of the arm that acts."""
+    world_frame: str = "world"
+    """Frame of the tool's pose."""
+    physics_node: str = "physics_node"
+    """Name of the physics node, which is reset before each episode."""
+
+
+@dataclass(frozen=True)
+class ViewerNodeConfig(WorldConfig):
+    """Options of viewer_node beside those of the page."""
+
+    arm: str = "PSM1"
+    """Name of the arm that the mouse moves while it grasps tissue; its topics are published only then."""
+    arm_source: Literal["measured", "commanded"] = "measured"
+    """The same as that of physics_node. measured: the mouse publishes measured_cp. commanded: it publishes servo_cp."""
+    arms: tuple[str, ...] = ("PSM1",)
+    """Names of the arms that are shown with their forces."""
+    physics_node: str = "physics_node"
+    """Name of the physics node, whose parameters and services the page uses."""
+
+
+NODE_CONFIGS: dict[str, tuple[type[StageConfig], ...]] = {
+    "reconstruction_node": (ReconstructionNodeConfig, ReconstructionConfig),
+    "physics_node": (PhysicsNodeConfig, PhysicsConfig),
+    "rendering_node": (RenderingNodeConfig, RenderingConfig),
+    "bag_player": (BagPlayerConfig,),
+    "recorder": (RecorderConfig,),
+    "scripted_tool": (ScriptedToolConfig,),
+    "policy": (PolicyConfig,),
+    "viewer_node": (ViewerNodeConfig, ViewerConfig, RenderingConfig),
+}
+"""The configurations whose options are the parameters of each node, by the name of the ROS node."""
+
+
+def arm_names(names: Iterable[str]) -> tuple[str, ...]:
+    """The names in the parameter `arms` without spaces and repetitions.
+
+    Raises:
+        ConfigError: If a name cannot be part of the name of a topic.
+    """
+    names = tuple(dict.fromkeys(name.strip() for name in names))
+    for name in names:
+        if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*", name):
+            raise ConfigError(f"arms: {name!r} cannot name topics; use letters, digits and _")
+    return names

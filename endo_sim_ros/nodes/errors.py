@@ -1,0 +1,15 @@
+"""Errors as sentences for people."""
+
+from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.core.gaussians import ModelError
+from endo_sim_ros.messages import MessageError
+
+
+def sentence(where: str, error: Exception) -> str:
+    """What to tell the user about an error."""
+    if isinstance(error, (MessageError, SequenceError, ModelError, ConfigError)):
+        return str(error)  # written for the user, with the place in it
+    if isinstance(error, (ValueError, OSError)):
+        return f"{where}: {error}"
+    return f"{where}: unexpected {type(error).__name__}: {error}"

@@ -1,0 +1,189 @@
+"""ROS parameters from configurations: declared, checked, and set later."""
+
+import difflib
+import functools
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.context import Context
+from rclpy.exceptions import InvalidParameterTypeException, ParameterNotDeclaredException
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from endo_sim_ros.core.config import ConfigError, Option, StageConfig, option_values, options, renamed_options
+from endo_sim_ros.core.device import pick_device
+from endo_sim_ros.nodes.configs import NODE_CONFIGS
+from endo_sim_ros.nodes.errors import sentence
+from endo_sim_ros.nodes.rclpy_private import given_parameters
+
+Config = TypeVar("Config", bound=StageConfig)
+
+
+class ConfiguredNode(Node):
+    """A ROS node whose parameters are the options of configurations.
+
+    A parameter that somebody gave a value, at start or later, keeps it, even if that is the default.
+    """
+
+    read_at_start: frozenset[str] = frozenset()
+    """Parameters that act at start only; all others act when they are set."""
+
+    def __init__(self, name: str, context: Context | None = None):
+        super().__init__(name, context=context)
+        self._configs: dict[type[StageConfig], StageConfig] = {}
+        self._given = set(given_parameters(self))  # parameters that somebody gave a value
+        self._requested: set[str] = set()  # those that are being set now
+
+    def declare(self, config_class: type[Config], defaults: Mapping[str, Any] | None = None) -> Config:
+        """Declare every option of a configuration as a parameter and return the configuration that they give.
+
+        Args:
+            config_class: The configuration; options of its nested stages are dotted.
+            defaults: Values of options that nobody gives, instead of the defaults of the class.
+
+        Raises:
+            ConfigError: If a value given at start cannot be used, or is given for an old name of an option.
+        """
+        for old, new in renamed_options(config_class).items():
+            if old in self._given and not self.has_parameter(old):
+                raise ConfigError(f"the parameter {old} is now {new}")
+        values = {}
+        for option in options(config_class):
+            default = (defaults or {}).get(option.name, option.default)
+            try:
+                # ROS takes an empty list for one of bytes.
+                default = (list(default) or Parameter.Type.STRING_ARRAY) if option.type is tuple else default
+                value = self.declare_parameter(option.name, default, _descriptor(option)).value
+                values[option.name] = () if value is None else value
+            except InvalidParameterTypeException as error:
+                kind = {float: "float, with a decimal point", tuple: "list such as [PSM1, PSM2]"}
+                kind = kind.get(option.type, option.type.__name__)
+                raise ConfigError(f"parameter {option.name} must be a {kind}: {error}") from error
+            except Exception as error:  # rclpy has one exception type for each way a value can be wrong
+                raise ConfigError(f"parameter {option.name}: {error} ({option.description})") from error
+        config = config_class.from_mapping(values)
+        _require_device(config)
+        self._configs[config_class] = config
+        if len(self._configs) == 1:
+            self.add_pre_set_parameters_callback(self._before_set)
+            self.add_on_set_parameters_callback(self._on_set)
+        return config
+
+    def config_changed(self, config: StageConfig) -> None:
+        """Called with a whole, valid configuration after one of its parameters was set; override to use it.
+
+        Raises:
+            ValueError: If the values cannot be used after all; the parameters then keep their old ones.
+        """
+
+    def implied_values(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """What else to set when parameters are set, unless somebody gave it a value; override.
+
+        Args:
+            values: The parameters that are being set; they are not checked yet.
+        """
+        return {}
+
+    @functools.cached_property
+    def _unknown(self) -> str:
+        """What was given at start but is no parameter of this node, in words; ROS itself says nothing about it."""
+        unknown = {name for name in given_parameters(self) if not self.has_parameter(name)}
+        if unknown:
+            unknown -= _meant_for_others()
+        # rclpy declares those of its own qos_overrides that act.
+        names = [self._suggestion(name) for name in sorted(unknown) if not name.startswith("qos_overrides.")]
+        text = f"unknown parameter{'s' * (len(names) > 1)} {', '.join(names)}" if names else ""
+        if text:
+            self.get_logger().warning(text)
+        return text
+
+    def _suggestion(self, name: str) -> str:
+        """A name, and the parameter that is spelled like it."""
+        near = difflib.get_close_matches(name, self.get_parameters_by_prefix(""), 1)
+        return f"{name} (did you mean {near[0]}?)" if near else name
+
+    def _before_set(self, parameters: list[Parameter]) -> list[Parameter]:
+        """Refuse names that are not declared; add the parameters that are implied."""
+        renamed = {old: new for config_class in self._configs for old, new in renamed_options(config_class).items()}
+        for name in (parameter.name for parameter in parameters if not self.has_parameter(parameter.name)):
+            raise _NotDeclared(f"{name} is now {renamed[name]}" if name in renamed else f"unknown parameter {self._suggestion(name)}")
+        self._requested = {parameter.name for parameter in parameters}
+        implied = self.implied_values({parameter.name: parameter.value for parameter in parameters})
+        free = sorted(implied.keys() - self._given - self._requested)
+        return [*parameters, *(Parameter(name, value=implied[name]) for name in free if implied[name] != self.get_parameter(name).value)]
+
+    def _on_set(self, parameters: list[Parameter]) -> SetParametersResult:
+        new = {parameter.name: parameter.value for parameter in parameters}
+        requested, self._requested = self._requested, set()
+        try:
+            changed = []
+            for config in self._configs.values():
+                old = option_values(config)
+                candidate = config.replaced({name: new[name] for name in old.keys() & new.keys()})
+                names = {name for name, value in option_values(candidate).items() if value != old[name]}
+                if names & self.read_at_start:
+                    fixed = ", ".join(sorted(names & self.read_at_start))
+                    raise ConfigError(f"{fixed}: read at start only; restart the node with the new value")
+                if names:
+                    _require_device(candidate)
+                    changed.append(candidate)
+            for config in changed:
+                self.config_changed(config)
+                self._configs[type(config)] = config
+        except Exception as error:
+            return SetParametersResult(successful=False, reason=sentence("parameters", error))
+        self._given |= requested
+        return SetParametersResult(successful=True)
+
+
+class _NotDeclared(ParameterNotDeclaredException):
+    """A parameter that does not exist; rclpy tells the text to whoever wanted to set it."""
+
+    def __init__(self, text: str):
+        Exception.__init__(self, text)
+
+
+def _descriptor(option: Option) -> ParameterDescriptor:
+    descriptor = ParameterDescriptor(description=option.description)
+    if option.choices:
+        descriptor.additional_constraints = "one of " + ", ".join(option.choices)
+    if option.range and option.type is float:
+        bounds = FloatingPointRange(from_value=float(option.range.minimum), to_value=float(option.range.maximum))
+        descriptor.floating_point_range = [bounds]
+    elif option.range:
+        bounds = IntegerRange(from_value=int(option.range.minimum), to_value=int(option.range.maximum), step=1)
+        descriptor.integer_range = [bounds]
+    return descriptor
+
+
+def _require_device(config: StageConfig) -> None:
+    """Raise ConfigError if the device of a configuration does not exist."""
+    if hasattr(config, "device"):
+        try:
+            pick_device(config.device)
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
+
+
+def _meant_for_others() -> set[str]:
+    """Parameters of our other nodes that a file gives to all nodes, under /**."""
+    configs = {config_class for each in NODE_CONFIGS.values() for config_class in each}
+    ours = {name for each in configs for name in (*(option.name for option in options(each)), *renamed_options(each))}
+    general: set[str] = set()
+    for flag, path in zip(sys.argv, sys.argv[1:]):
+        if flag == "--params-file":
+            nodes = yaml.safe_load(Path(path).read_text())  # which ROS has read without complaint
+            general |= _dotted((nodes.get("/**") or {}).get("ros__parameters", {}))
+    return ours & general
+
+
+def _dotted(values: Mapping[str, Any], prefix: str = "") -> set[str]:
+    """The names of parameters in a mapping, in which those with dots may be mappings of their own."""
+    names = set()
+    for name, value in values.items():
+        names |= _dotted(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name}
+    return names

@@ -1,0 +1,22 @@
+"""Options of the rendering stage."""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from endo_sim_ros.core.config import Range, StageConfig
+
+
+@dataclass(frozen=True)
+class RenderingConfig(StageConfig):
+    """From a Gaussian model and the state of its control nodes to camera images."""
+
+    image_width: Annotated[int, Range(0, 8192, "pixels")] = 0
+    """Width of the rendered image; 0 = that of the camera. The height follows."""
+    background: Annotated[float, Range(0, 1)] = 0.0
+    """Grey level where there is no tissue."""
+    skinning: Literal["compact", "softmax"] = "compact"
+    """Weights from nodes to Gaussians: compact (1 - (d/d5)²)² with F, or the paper's printed softmax(d) with R."""
+    neighbours: Annotated[int, Range(1, 32)] = 4
+    """Number of nodes that move one Gaussian."""
+    device: str = "auto"
+    """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""

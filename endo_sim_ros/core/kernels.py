@@ -1,7 +1,7 @@
 """What all rooms with kernels share: where kernels run, and how they are loaded and launched.
 
 A room has a `typing.Protocol` of what a backend does, and one function ``backend_for(device)`` that returns the backend of a
-device with its kernels loaded. Nothing else in the room looks at the kind of the device.
+device with its kernels loaded. Nothing else decides where the room's work runs.
 """
 
 import contextlib
@@ -9,6 +9,7 @@ import contextvars
 import functools
 import types
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import torch
 import warp as wp
@@ -50,11 +51,11 @@ def load_kernels(modules: tuple[types.ModuleType, ...], device: str) -> None:
         wp.load_module(module, device)
 
 
-def kernel_arguments(kernel: wp.Kernel, arguments: Sequence, offset: int = 0) -> list:
+def kernel_arguments(kernel: Any, arguments: Sequence, offset: int = 0) -> list:
     """Return arguments of a kernel with tensors as arrays of the kernel's types, which share the tensors' memory.
 
     Args:
-        kernel: The kernel.
+        kernel: A Warp kernel.
         arguments: Its arguments from the one at ``offset`` on: contiguous tensors, numbers, or None for an array that the
             kernel does not read. Where a tensor has more dimensions than the kernel's array, the first ones become one.
         offset: Number of arguments that are left out at the front.
@@ -74,11 +75,11 @@ def _array(kind, tensor: Tensor):
     return wp.from_torch(tensor, dtype=kind.dtype, requires_grad=False, return_ctype=True)
 
 
-def launch(kernel: wp.Kernel, count: int, arguments: Sequence, device: torch.device | str) -> None:
+def launch(kernel: Any, count: int, arguments: Sequence, device: torch.device | str) -> None:
     """Launch a kernel over count items on a device, in order with torch's own work there.
 
     Args:
-        kernel: The kernel.
+        kernel: A Warp kernel.
         count: Number of its threads.
         arguments: As for `kernel_arguments`.
         device: That of all tensors.
@@ -88,11 +89,11 @@ def launch(kernel: wp.Kernel, count: int, arguments: Sequence, device: torch.dev
     wp.launch(kernel, count, kernel_arguments(kernel, arguments), device=str(device), stream=stream)
 
 
-def launch_in_shares(kernel: wp.Kernel, count: int, arguments: Sequence, least: int = 1024) -> None:
+def launch_in_shares(kernel: Any, count: int, arguments: Sequence, least: int = 1024) -> None:
     """Launch a kernel over count items on the CPU, in as many threads as there are cores.
 
     Args:
-        kernel: Its first argument is the number of the first item of a share; a thread adds `wp.tid()`.
+        kernel: A Warp kernel. Its first argument is the number of the first item of a share; a thread adds `wp.tid()`.
         count: Number of items.
         arguments: The other arguments, as for `kernel_arguments`.
         least: Fewer items are left to one thread.

@@ -1,4 +1,4 @@
-"""What both ways to rasterise have in common: the mathematics of a splat, projection and its gradients, tile lists.
+"""What the backends have in common: the mathematics of a splat, projection and its gradients, tile lists.
 
 Notation. A splat is one Gaussian n seen by one camera c; splats are numbered c·N + n. With mean position p in the
 camera frame, J the Jacobian of the pinhole projection (x/z and y/z clamped to 1.3 fields of view), R the camera
@@ -28,7 +28,7 @@ touches the tiles whose pixel centres its ellipse α ≥ 1/255 meets. Those (spl
 numbered in depth order of their splats, so that the intersections of a splat are consecutive, and listed by tile, within
 a tile by depth. On a CPU the backward pass writes one gradient row of 12 per intersection, and `project_backward` adds
 up the consecutive rows of a splat: no two threads write to the same place, so results repeat bit for bit. On a GPU all
-tiles add to one row per splat. The absolute gradients of the mean, Σ_pixels |∂L/∂mean|, take the same way.
+tiles add to one row per splat. The absolute gradients of the mean, Σ_pixels |∂L/∂mean|, are added up alike.
 """
 
 import warp as wp
@@ -38,7 +38,7 @@ from endo_sim_ros.splatting.headers import headers
 
 wp.set_module_options({"enable_backward": False, "extra_build_options": headers("blending.h")})
 
-# Columns of a splat.
+# Columns of a splat: the fields of Splat in native/blending.h.
 X, Y = wp.constant(0), wp.constant(1)  # mean, pixels
 A, B, C = wp.constant(2), wp.constant(3), wp.constant(4)  # conic, 1/pixel²
 OPACITY = wp.constant(5)
@@ -47,11 +47,11 @@ RED = wp.constant(7)  # and green, blue
 EXTENT_X, EXTENT_Y = wp.constant(10), wp.constant(11)  # half size of the ellipse's bounding box, pixels
 ASPECT_X, ASPECT_Y = wp.constant(12), wp.constant(13)  # half width on the row through the centre / EXTENT_Y, and vice versa
 SHEAR_X, SHEAR_Y = wp.constant(14), wp.constant(15)  # B/A and B/C
-# A gradient record has the gradients of columns 0 to 9 in the same order, then, if wanted, the sums over pixels of the
+# A gradient record, Record there, has the gradients of columns 0 to 9 in the same order, then, if wanted, the sums over pixels of the
 # absolute gradients of columns 0 and 1.
 ABSOLUTE = wp.constant(10)
 
-LOOK_AHEAD = wp.constant(8)  # items, to ask memory for
+LOOK_AHEAD = wp.constant(8)  # items from one to that whose memory is asked for
 TILE_LAST = wp.constant(float(TILE - 1))
 
 mat23 = wp.types.matrix(shape=(2, 3), dtype=wp.float32)

@@ -1,7 +1,8 @@
 """The backend of CPUs: kernels of vectors of 16 pixels, in as many threads as there are cores."""
 
 import functools
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import torch
 import warp as wp
@@ -44,7 +45,13 @@ def forward(scene: Scene, tile_mask: Tensor, settings: Settings) -> tuple[list[T
 
 
 def backward(
-    scene: Scene, state: State, settings: Settings, images: list[Tensor], v_images: list[Tensor], wants_pose: bool, wants_absolute: bool
+    scene: Scene,
+    state: State,
+    settings: Settings,
+    images: Sequence[Tensor],
+    v_images: Sequence[Tensor],
+    wants_pose: bool,
+    wants_absolute: bool,
 ) -> Gradients:
     """Return gradients of a scene, as `RasterBackend` says."""
     gradients = Gradients.empty(scene, wants_pose, wants_absolute)
@@ -57,8 +64,10 @@ def backward(
     return gradients
 
 
-def _intersect(splats, depth_keys, order, counts, tile_mask, gaussian_count, settings) -> State:
-    """List the splats of every tile in depth order."""
+def _intersect(
+    splats: Tensor, depth_keys: Tensor, order: Tensor, counts: Tensor, tile_mask: Tensor, gaussian_count: int, settings: Settings
+) -> State:
+    """Return lists of the splats of every tile in depth order."""
     splat_count, tile_count = len(counts), len(tile_mask)
     _sort_pairs(depth_keys, order, splat_count, 31)
     ends = counts[order[:splat_count]].cumsum(0)
@@ -79,7 +88,7 @@ def _sort_pairs(keys: Tensor, values: Tensor, count: int, bits: int) -> None:
     wp.utils.radix_sort_pairs(wp.from_torch(keys), wp.from_torch(values), count, 0, bits)
 
 
-def _image_arguments(state: State, scene: Scene, settings: Settings, images: list[Tensor]) -> list:
+def _image_arguments(state: State, scene: Scene, settings: Settings, images: Sequence[Tensor]) -> list:
     """Return the first arguments, after the counter, of both kernels that composite."""
     lists = [state.splats, state.owners, state.slots, state.starts]
     return [*lists, scene.background, settings.width, settings.height, *images]
@@ -88,5 +97,5 @@ def _image_arguments(state: State, scene: Scene, settings: Settings, images: lis
 def _launch_tiles(kernel, tile_count: int, arguments: list) -> None:
     """Launch a kernel that draws tiles from a counter, its first argument, in all threads."""
     inputs = kernel_arguments(kernel, [torch.zeros(1, dtype=torch.int32, device="cpu"), *arguments])
-    command = wp.launch(kernel, dim=tile_count, inputs=inputs, device="cpu", record_cmd=True)
+    command: Any = wp.launch(kernel, dim=tile_count, inputs=inputs, device="cpu", record_cmd=True)
     run_in_threads([command.launch] * min(cpu_threads(), tile_count))

@@ -6,8 +6,8 @@ import contextvars
 import functools
 import math
 import threading
-from collections.abc import Iterator
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import torch
 import warp as wp
@@ -75,7 +75,13 @@ def forward(scene: Scene, tile_mask: Tensor, settings: Settings) -> tuple[list[T
 
 
 def backward(
-    scene: Scene, state: State, settings: Settings, images: list[Tensor], v_images: list[Tensor], wants_pose: bool, wants_absolute: bool
+    scene: Scene,
+    state: State,
+    settings: Settings,
+    images: Sequence[Tensor],
+    v_images: Sequence[Tensor],
+    wants_pose: bool,
+    wants_absolute: bool,
 ) -> Gradients:
     """Return gradients of a scene, as `RasterBackend` says."""
     gradients = Gradients.empty(scene, wants_pose, wants_absolute)
@@ -92,7 +98,7 @@ def _cameras(scene: Scene, settings: Settings) -> list:
     return [scene.opacities, scene.sh, scene.viewmats, scene.Ks, settings.width, settings.height]
 
 
-def _image_arguments(state: State, scene: Scene, settings: Settings, images: list[Tensor]) -> list:
+def _image_arguments(state: State, scene: Scene, settings: Settings, images: Sequence[Tensor]) -> list:
     """Return the first arguments of both kernels that composite."""
     lists = [state.splats, state.counts, scene.gaussian_count, state.splat_list, state.ranges]
     return [*lists, scene.background, settings.width, settings.height, *images]
@@ -232,19 +238,23 @@ def _launch(kernel, count: int, arguments: list) -> None:
         return
     tensors = [x for x in arguments if isinstance(x, Tensor)]
     kind = (kernel, count, tensors[0].device, *[x.shape if isinstance(x, Tensor) else x for x in arguments])
-    command, places = _commands.get(kind, (None, None))
-    if command is None:
-        device = str(tensors[0].device)
-        command = wp.launch(kernel, dim=count, inputs=kernel_arguments(kernel, arguments), device=device, record_cmd=True)
-        places = [command.params[1 + i] for i, x in enumerate(arguments) if isinstance(x, Tensor)]
-        for place in places:
-            place._ref = None  # Warp's hold on the tensor, whose memory would never be free again
-        while len(_commands) >= _COMMANDS:
-            del _commands[next(iter(_commands))]
-        _commands[kind] = command, places
+    if kind not in _recorded:
+        while len(_recorded) >= _COMMANDS:
+            del _recorded[next(iter(_recorded))]
+        _recorded[kind] = _record(kernel, count, arguments, str(tensors[0].device))
+    command, places = _recorded[kind]
     for place, tensor in zip(places, tensors):
         place.data = tensor.data_ptr()
     command.launch()
 
 
-_commands: dict[tuple, tuple[wp.Launch, list]] = {}
+def _record(kernel, count: int, arguments: list, device: str) -> tuple[Any, list]:
+    """Return a launch, not made yet, and its array arguments, whose addresses are to be filled in."""
+    command: Any = wp.launch(kernel, dim=count, inputs=kernel_arguments(kernel, arguments), device=device, record_cmd=True)
+    places = [command.params[1 + i] for i, x in enumerate(arguments) if isinstance(x, Tensor)]
+    for place in places:
+        place._ref = None  # Warp's hold on the tensor, whose memory would never be free again
+    return command, places
+
+
+_recorded: dict[tuple, tuple[Any, list]] = {}

@@ -26,7 +26,8 @@ class GraphCapture:
     def __init__(self, function: Callable[..., Tensor]):
         self._function, self._pool = function, torch.cuda.graph_pool_handle()
         self._inputs: list[Tensor | None] | None = None
-        self._graph: torch.cuda.CUDAGraph | None = None  # kept until there is another: its memory serves that, too
+        # Kept until there is another graph: its memory serves that, too.
+        self._captured: tuple[torch.cuda.CUDAGraph, Tensor, list[cuda.Capacity]] | None = None
         self._valid = False
 
     def invalidate(self) -> None:
@@ -41,36 +42,43 @@ class GraphCapture:
         """
         if self._inputs is None:  # whatever is loaded or made at first use must not be captured
             self._inputs = [None if x is None else x.clone() for x in inputs]
-            return self._first()
+            return self._first(self._inputs)
         for mine, given in zip(self._inputs, inputs):
-            if mine is not None:
+            if mine is not None and given is not None:
                 mine.copy_(given)
-        if not (self._valid and all(capacity.fits() for capacity in self._capacities)):
-            self._capture()
-        self._graph.replay()
-        return self._result
-
-    def _first(self) -> Tensor:
-        device = next(x.device for x in self._inputs if x is not None)
-        self._stream, current = _side_stream(device), torch.cuda.current_stream(device)
-        self._stream.wait_stream(current)
-        with torch.cuda.stream(self._stream):
-            result = self._function(*self._inputs)
-        current.wait_stream(self._stream)
+        if not (self._valid and self._captured and all(capacity.fits() for capacity in self._captured[2])):
+            self._captured, self._valid = self._capture(self._inputs), True
+        graph, result, _ = self._captured
+        graph.replay()
         return result
 
-    def _capture(self) -> None:
+    def _first(self, inputs: list[Tensor | None]) -> Tensor:
+        stream = _side_stream(_device_of(inputs))
+        current = torch.cuda.current_stream(stream.device)
+        stream.wait_stream(current)
+        with torch.cuda.stream(stream):
+            result = self._function(*inputs)
+        current.wait_stream(stream)
+        return result
+
+    def _capture(self, inputs: list[Tensor | None]) -> tuple[torch.cuda.CUDAGraph, Tensor, list[cuda.Capacity]]:
+        """Return a graph of the function's work, what it returns, and the capacity that its pictures have."""
+        stream = _side_stream(_device_of(inputs))
         graph = torch.cuda.CUDAGraph()
         # Other threads may go on using the GPU. Warp has to know of the capture, for the memory that it takes.
-        capture = torch.cuda.graph(graph, self._pool, self._stream, capture_error_mode="thread_local")
+        capture = torch.cuda.graph(graph, self._pool, stream, capture_error_mode="thread_local")
         with (
             _no_garbage_collection(),
             cuda.noted_capacities() as capacities,
             capture,
-            wp.ScopedCapture(stream=warp_stream(self._stream), external=True),
+            wp.ScopedCapture(stream=warp_stream(stream), external=True),
         ):
-            result = self._function(*self._inputs)
-        self._graph, self._result, self._capacities, self._valid = graph, result, capacities, True
+            result = self._function(*inputs)
+        return graph, result, capacities
+
+
+def _device_of(inputs: list[Tensor | None]) -> torch.device:
+    return next(x.device for x in inputs if x is not None)
 
 
 @contextlib.contextmanager

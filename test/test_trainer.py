@@ -172,7 +172,7 @@ def test_unpooling_fills_gaps_halfway_to_the_neighbours():
 def test_the_right_image_is_a_view_of_the_same_scene(views):
     frame = views[4]
     right = right_view(frame)
-    model = Trainer(views, options(iterations=40, max_gaussians=8000, surroundings=0.0, learning_rate=1.0)).run()
+    model = Trainer(views, options(iterations=40, max_gaussians=8000, extrapolation=0.0, learning_rate=1.0)).run()
     image, _ = DeformableRenderer(model, None, RenderingConfig(device="cpu")).render(right.camera)
     wrong, _ = DeformableRenderer(model, None, RenderingConfig(device="cpu")).render(frame.camera)
     assert metrics.psnr(image, right.image, right.mask) > metrics.psnr(wrong, right.image, right.mask) + 3
@@ -275,7 +275,7 @@ def test_an_instrument_in_one_of_several_views_is_left_out(views, caplog):
     assert without_motion([*still, shallow], 0.05)[4] is shallow and "check its depth and pose" in caplog.text
     for choice in (False, True):
         caplog.clear()
-        assert finite(Trainer([*still, held], options(still=choice)).run())
+        assert finite(Trainer([*still, held], options(dynamic_mask=choice)).run())
         assert ("something moved" in caplog.text) == choice
 
 
@@ -338,7 +338,7 @@ def test_what_goes_on_beyond_a_picture_does_not_reach_into_it(views):
     points = frame.camera.position + local @ frame.camera.pose[:3, :3].T
     trainer = Trainer([known], options(max_gaussians=8000, light=False, exposure=False), (points, np.full((40, 3), 0.5)))
     rendered = DeformableRenderer(trainer.model, None, RenderingConfig(device="cpu")).render(frame.camera)[1]
-    plain = Trainer([known], options(max_gaussians=8000, light=False, exposure=False, surroundings=0.0)).model
+    plain = Trainer([known], options(max_gaussians=8000, light=False, exposure=False, extrapolation=0.0)).model
     alone = DeformableRenderer(plain, None, RenderingConfig(device="cpu")).render(frame.camera)[1]
     border = np.ones(exact.shape, bool)
     border[8:-8, 8:-8] = False
@@ -450,8 +450,8 @@ def test_what_lies_beyond_two_views_looks_as_in_the_nearer_one(views):
 def test_tissue_goes_on_beyond_the_pictures_and_in_holes(views):
     frame = dataclasses.replace(bare(views[4]), depth=views[4].depth.copy())
     frame.depth[50:80, 60:100] = 0  # as at a glint
-    known = Trainer([frame], options(max_gaussians=4000, surroundings=0.0)).model
-    wider = Trainer([frame], options(max_gaussians=4000, surroundings=0.3))
+    known = Trainer([frame], options(max_gaussians=4000, extrapolation=0.0)).model
+    wider = Trainer([frame], options(max_gaussians=4000, extrapolation=0.3))
     camera = dataclasses.replace(frame.camera, K=frame.camera.K + np.array([[0, 0, 40], [0, 0, 30], [0, 0, 0]]), width=240, height=188)
     renderer = lambda model: DeformableRenderer(model, None, RenderingConfig(device="cpu")).render(camera)[1]
     before, after = renderer(known), renderer(wider.model)

@@ -1,9 +1,20 @@
 """Options of the reconstruction stage."""
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from endo_sim_ros.core.config import Range, StageConfig
+from endo_sim_ros.reconstruction.stage_configs import (
+    DepthPriorConfig,
+    DynamicMaskConfig,
+    ExtrapolationConfig,
+    InitialModelConfig,
+    MatchingConfig,
+    MultiViewConfig,
+    PhotometryConfig,
+    PosesConfig,
+    UsableViewsConfig,
+)
 
 
 @dataclass(frozen=True)
@@ -32,10 +43,10 @@ class ReconstructionConfig(StageConfig):
     depth_model: str = ""
     """network: folder of a Depth-Anything-V2 checkpoint (transformers) or ONNX file; nothing is ever downloaded. Empty:
     one that Hugging Face's cache holds."""
-    agreement: bool = True
+    multi_view_refinement: bool = True
     """Correct the depth of stereo, network or points by scene points and by how the right image and the other views show the
     same tissue."""
-    surroundings: Annotated[float, Range(0, 1)] = 0.3
+    extrapolation: Annotated[float, Range(0, 1)] = 0.3
     """How far tissue goes on beyond what the training views see, in widths of the image, so that other views do
     not look into the void; holes of the depth prior are filled likewise. 0 = neither."""
     confined: bool = True
@@ -43,7 +54,7 @@ class ReconstructionConfig(StageConfig):
     that suit the views' edges alone, and which other views see as fringes."""
     depth_tolerance: Annotated[float, Range(0.001, 1)] = 0.05
     """Relative depth difference at which two views contradict each other."""
-    still: bool = True
+    dynamic_mask: bool = True
     """Leave out of a view what contradicts two others: an instrument that is there in it alone, for instance."""
     lambda_ssim: Annotated[float, Range(0, 1)] = 0.2
     """Share of 1 − SSIM in the photometric loss; the rest is L1."""
@@ -82,3 +93,20 @@ class ReconstructionConfig(StageConfig):
     """Seed of all random draws; the same seed gives the same model on a CPU, bit for bit."""
     device: str = "auto"
     """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""
+
+    # Of the stages that prepare the scene, in their order.
+    views: UsableViewsConfig = UsableViewsConfig()
+    matching: MatchingConfig = MatchingConfig()
+    poses: PosesConfig = PosesConfig()
+    depth_prior: DepthPriorConfig = DepthPriorConfig()
+    multi_view: MultiViewConfig = MultiViewConfig()
+    motion: DynamicMaskConfig = DynamicMaskConfig()
+    initial: InitialModelConfig = InitialModelConfig()
+    photometry: PhotometryConfig = PhotometryConfig()
+    extrapolated: ExtrapolationConfig = ExtrapolationConfig()
+
+    renamed: ClassVar[dict[str, str]] = {
+        "agreement": "multi_view_refinement",
+        "surroundings": "extrapolation",
+        "still": "dynamic_mask",
+    }

@@ -118,7 +118,7 @@ class Trainer:
         self.device = pick_device(config.device)
         source = depth_source(frames, config)
         frames, points = _consistent(_showing(frames), config, None if points is None else _checked(ScenePoints(*points)))
-        correcting = config.agreement and source not in ("topic", "none")
+        correcting = config.multi_view_refinement and source not in ("topic", "none")
         if correcting or not config.iterations:
             # Flow is the more precise the finer the pixels are, as matching is.
             fine = [shrink(frame, _FINER * config.image_width) for frame in frames]
@@ -129,9 +129,9 @@ class Trainer:
                 coarser = min(config.image_width / fine[0].camera.width, 1)
                 self.config = config = _as_long_as_worth(config, contradiction * coarser)
         frames = [shrink(frame, config.image_width) for frame in frames]
-        if config.still:
+        if config.dynamic_mask:
             frames = without_motion(frames, config.depth_tolerance)
-        seen = int(_SEEN * config.max_gaussians) if config.surroundings else config.max_gaussians
+        seen = int(_SEEN * config.max_gaussians) if config.extrapolation else config.max_gaussians
         model = initial_model(frames, points.positions, points.colors, dataclasses.replace(config, max_gaussians=max(seen, 1)))
         self.scene_depth = _median_depth(frames, model)
         light, exposures = np.zeros(4), np.zeros((len(frames), 3))
@@ -141,9 +141,9 @@ class Trainer:
                 frames, means, self.scene_depth, config.depth_tolerance, light=config.light, exposure=config.exposure
             )
             model = photometry.unlit(model, frames, light, exposures, self.scene_depth, config.depth_tolerance)
-        if config.surroundings:
+        if config.extrapolation:
             about = light, exposures, self.scene_depth, points.positions
-            model = with_surroundings(model, frames, *about, config.surroundings, config.max_gaussians)
+            model = with_surroundings(model, frames, *about, config.extrapolation, config.max_gaussians)
         self._load(frames)
         eye = np.mean([view.camera.position for view in self._views], 0)
         self._eye = torch.as_tensor(eye, dtype=torch.float32, device=self.device)

@@ -7,18 +7,21 @@ import numpy as np
 import pytest
 import torch
 from torchmetrics.functional.image import structural_similarity_index_measure
+from trained import trainer_of
 
 from endo_sim_ros.core.cameras import Camera, look_at
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.evaluation.held_out import reconstruct_and_measure
-from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer, losses, select_keyframes, shrink
+from endo_sim_ros.reconstruction import ReconstructionConfig, losses, select_keyframes, shrink
+from endo_sim_ros.reconstruction.config import McmcConfig
 from endo_sim_ros.reconstruction.initialization import initial_model
 from endo_sim_ros.reconstruction.optimizer import Adam
 from endo_sim_ros.reconstruction.priors.multi_view import _BY_EYES, _IN_THE_END, _MATCHED, _corrected, _smooth, agreed
 from endo_sim_ros.reconstruction.priors.sources import disparity_offsets, interpolated_depth, stereo_disparity, with_depth_prior
-from endo_sim_ros.reconstruction.strategies import mcmc
+from endo_sim_ros.reconstruction.strategies import STRATEGIES
+from endo_sim_ros.reconstruction.strategies.mcmc import exploration_noise, relocated
 from endo_sim_ros.reconstruction.triangulation import ScenePoints, triangulate
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.bag import write_bag
@@ -437,12 +440,12 @@ def test_flow_between_the_eyes_corrects_what_matching_left(large, pair):
 
 
 def test_flow_is_found_in_finer_pixels_than_are_trained_on(large):
-    wide = Trainer([dataclasses.replace(large[0], depth=None)], options(image_width=320))._frames[0]
+    wide = trainer_of([dataclasses.replace(large[0], depth=None)], options(image_width=320))._frames[0]
     (matched,) = with_depth_prior([dataclasses.replace(large[0], depth=None)], NO_POINTS, options())
     (narrow,), _ = agreed([shrink(matched, 320)], NO_POINTS, "stereo")
     exact = shrink(large[0], 320).depth
-    error = lambda depth: np.sqrt((((depth - exact)[(wide.depth > 0) & (narrow.depth > 0)]) ** 2).mean())
-    assert error(wide.depth) < 0.95 * error(narrow.depth)
+    error = lambda depth: np.sqrt((((depth - exact)[(wide.depth_prior > 0) & (narrow.depth > 0)]) ** 2).mean())
+    assert error(wide.depth_prior) < 0.95 * error(narrow.depth)
 
 
 def test_reflections_of_the_light_do_not_spoil_the_depth_that_views_agree_on(large):
@@ -514,7 +517,7 @@ def test_depth_in_one_line_is_continued_level_to_its_sides(known):
     (frame,) = film(40, 40, 1)
     line = np.zeros_like(frame.depth)
     line[known] = frame.depth[known]
-    model = Trainer([dataclasses.replace(bare(frame), depth=line)], options(depth="topic")).run()
+    model = trainer_of([dataclasses.replace(bare(frame), depth=line)], options(depth="topic")).run()
     _, depth = frame.camera.project(model.means.numpy())
     assert len(model) > 100 and 0.7 * line[known].min() < depth.min() and depth.max() < 1.4 * line.max()
 
@@ -575,7 +578,7 @@ def test_wrong_scene_points_among_good_ones_hardly_move_what_matching_knows(larg
 )
 def test_scene_points_that_are_none_are_refused(large, positions, error, said):
     with pytest.raises(SequenceError, match=said):
-        Trainer(list(large[:1]), options(iterations=1), (positions, np.ones((len(positions), positions.shape[1])), error))
+        trainer_of(list(large[:1]), options(iterations=1), (positions, np.ones((len(positions), positions.shape[1])), error))
 
 
 def test_views_that_contradict_each_other_are_trained_on_for_less_long(large):
@@ -583,11 +586,11 @@ def test_views_that_contradict_each_other_are_trained_on_for_less_long(large):
     turned = views[0].camera.pose.copy()
     turned[:3, :3] = turned[:3, :3] @ cv2.Rodrigues(np.radians([0.15, 0, 0]))[0]
     wrong = [dataclasses.replace(views[0], camera=views[0].camera.at(turned)), *views[1:]]
-    iterations = lambda frames: Trainer(frames, options(iterations=0, image_width=320)).config.iterations
+    iterations = lambda frames: trainer_of(frames, options(iterations=0, image_width=320)).iterations
     assert iterations(views) == 3000
     assert 1000 <= iterations(wrong) < 2500
     assert iterations(views[:1]) == 1000
-    assert Trainer(views, options(iterations=7)).config.iterations == 7
+    assert trainer_of(views, options(iterations=7)).iterations == 7
 
 
 # ----------------------------------------------------------------------------------------- initial model
@@ -643,7 +646,7 @@ def cloud(count=300, seed=0):
 
 def test_copies_share_opacity_and_size():
     opacities, scales = torch.tensor([0.3, 0.99, 0.5]), torch.ones(3, 3)
-    shared, smaller = mcmc.relocated(opacities, scales, torch.tensor([2, 50, 1]))
+    shared, smaller = relocated(opacities, scales, torch.tensor([2, 50, 1]), 50)
     torch.testing.assert_close(1 - (1 - shared) ** torch.tensor([2, 50, 1]), opacities)
     # Two copies by hand: 0.3 / (2 o − o² / √2) with o = 1 − √0.7.
     o = 1 - 0.7**0.5
@@ -659,10 +662,10 @@ def test_refinement_preserves_the_picture_moves_the_dead_and_respects_the_limit(
     model = dataclasses.replace(model, logit_opacities=logits)
     camera = Camera(np.array([[80.0, 0, 40], [0, 80, 40], [0, 0, 1]]), 80, 80)
     before = render(model, camera)
-    new, source, fresh = mcmc.refine(model, 0.05, 310, torch.Generator().manual_seed(0))
+    new, source, fresh = STRATEGIES["mcmc"](McmcConfig(), 310, 0.1).refine(model, {}, torch.Generator().manual_seed(0))
     after = render(new, camera)
     assert len(new) == len(source) == len(fresh) == 310
-    assert (new.opacities > mcmc.DEAD_OPACITY).all()
+    assert (new.opacities > McmcConfig().dead_opacity).all()
     assert not (source[:300:6] == torch.arange(0, 300, 6)).any()
     assert fresh[:300:6].all()
     assert fresh[300:].all()
@@ -674,7 +677,7 @@ def test_refinement_preserves_the_picture_moves_the_dead_and_respects_the_limit(
 
 def test_refinement_without_any_living_gaussian_changes_nothing():
     model = dataclasses.replace(cloud(20), logit_opacities=torch.full((20,), -9.0))
-    new, source, fresh = mcmc.refine(model, 0.5, 100, torch.Generator())
+    new, source, fresh = STRATEGIES["mcmc"](McmcConfig(growth=0.5), 100, 0.1).refine(model, {}, torch.Generator())
     assert equal(new, model)
     assert len(source) == len(fresh) == 20
     assert not fresh.any()
@@ -683,13 +686,13 @@ def test_refinement_without_any_living_gaussian_changes_nothing():
 def test_noise_moves_only_the_faint():
     model = cloud(50)
     model.logit_opacities[:25] = -7
-    noise = mcmc.exploration_noise(model, 1.0, torch.Generator().manual_seed(0))
+    noise = exploration_noise(model, 1.0, 0.005, torch.Generator().manual_seed(0))
     assert noise[:25].abs().min() > 0
     assert noise[25:].abs().max() < 1e-3 * noise[:25].abs().median()
 
 
 def test_optimiser_state_follows_its_gaussians(small):
-    trainer = Trainer([small[0], small[8]], options(refine_every=1000, max_gaussians=1500))
+    trainer = trainer_of([small[0], small[8]], options(refine_every=1000, max_gaussians=1500))
     for _ in range(3):
         trainer.step()
     with torch.no_grad():
@@ -728,7 +731,7 @@ def test_adam_is_that_of_torch():
 
 
 def test_virtual_camera_lies_between_two_views(small, monkeypatch):
-    trainer = Trainer([small[0], small[4]], options(virtual_every=1))
+    trainer = trainer_of([small[0], small[4]], options(virtual_every=1))
     first, second = (small[i].camera.position for i in (0, 4))
     seen = []
     draw = trainer._render
@@ -751,7 +754,7 @@ def test_virtual_camera_lies_between_two_views(small, monkeypatch):
 def test_training_improves_views_it_has_not_seen(small):
     training, rest = [small[i] for i in (0, 2, 4, 6)], [small[i] for i in (1, 3, 5)]
     noisy = [dataclasses.replace(f, depth=f.depth * np.float32(1.03 if i % 2 else 0.97)) for i, f in enumerate(training)]
-    trainer = Trainer(noisy, options(iterations=150, max_gaussians=8000, refine_every=50))
+    trainer = trainer_of(noisy, options(iterations=150, max_gaussians=8000, refine_every=50))
     psnr, _ = held_out(trainer.model, rest)
     given_error = 0.03 * np.mean([np.sqrt(np.mean(f.depth[f.depth > 0] ** 2)) for f in training])
     reports = []
@@ -764,7 +767,7 @@ def test_training_improves_views_it_has_not_seen(small):
 
 
 def test_progress_can_stop_the_training(small):
-    trainer = Trainer([small[0]], options())
+    trainer = trainer_of([small[0]], options())
     trainer.run(lambda progress: False, every=2)
     assert trainer.iteration == 2
 
@@ -775,23 +778,23 @@ def test_same_seed_gives_the_same_bits_whatever_the_threads(small, monkeypatch):
         monkeypatch.setenv("ENDO_SIM_THREADS", threads)
         torch.set_num_threads(int(threads))
         try:
-            models.append(Trainer(list(small[::4]), options(max_gaussians=15_000)).run())
+            models.append(trainer_of(list(small[::4]), options(max_gaussians=15_000)).run())
         finally:
             torch.set_num_threads(1)
     assert equal(models[0], models[1])
     assert equal(models[0], models[2])
-    other = Trainer(list(small[::4]), options(max_gaussians=15_000, seed=1)).run()
+    other = trainer_of(list(small[::4]), options(max_gaussians=15_000, seed=1)).run()
     assert not equal(models[0], other)
 
 
 def test_a_checkpoint_goes_on_as_if_never_interrupted(small, tmp_path):
     views = list(small[::4])
-    whole = Trainer(views, options()).run()
-    first = Trainer(views, options())
+    whole = trainer_of(views, options()).run()
+    first = trainer_of(views, options())
     for _ in range(7):
         first.step()
     first.save_checkpoint(tmp_path / "a" / "checkpoint.pt")
-    second = Trainer(views, options())
+    second = trainer_of(views, options())
     second.load_checkpoint(tmp_path / "a" / "checkpoint.pt")
     assert second.iteration == 7
     assert equal(second.run(), whole)
@@ -799,12 +802,12 @@ def test_a_checkpoint_goes_on_as_if_never_interrupted(small, tmp_path):
 
 def test_checkpoints_that_do_not_fit_are_refused(small, tmp_path):
     path = tmp_path / "checkpoint.pt"
-    trainer = Trainer([small[0]], options())
+    trainer = trainer_of([small[0]], options())
     trainer.save_checkpoint(path)
     with pytest.raises(SequenceError, match=r"other options \(seed\)"):
-        Trainer([small[0]], options(seed=3)).load_checkpoint(path)
+        trainer_of([small[0]], options(seed=3)).load_checkpoint(path)
     with pytest.raises(SequenceError, match="other views"):
-        Trainer([small[1]], options()).load_checkpoint(path)
+        trainer_of([small[1]], options()).load_checkpoint(path)
     state = torch.load(path, weights_only=True)
     torch.save(state | {"config": state["config"] | {"lambda_gone": 0.3}}, path)  # of another version, which asked for more
     with pytest.raises(SequenceError, match=r"other options \(lambda_gone\)"):
@@ -817,7 +820,7 @@ def test_checkpoints_that_do_not_fit_are_refused(small, tmp_path):
 
 
 def test_higher_harmonics_are_trained(small):
-    model = Trainer([small[0], small[8]], options(sh_degree=3)).run()
+    model = trainer_of([small[0], small[8]], options(sh_degree=3)).run()
     assert model.sh_degree == 3
     assert model.sh[:, 1:].abs().max() > 0
 
@@ -841,55 +844,55 @@ def finite(model):
 
 def test_no_views_is_one_clear_error():
     with pytest.raises(SequenceError, match="no views"):
-        Trainer([], options())
+        trainer_of([], options())
 
 
 def test_one_view_is_enough_with_depth(small):
-    assert finite(Trainer([small[0]], options()).run())
+    assert finite(trainer_of([small[0]], options()).run())
 
 
 def test_identical_views_train(small, caplog):
-    assert finite(Trainer([small[0]] * 3, options()).run())
+    assert finite(trainer_of([small[0]] * 3, options()).run())
     assert "contradict what they see" not in caplog.text
 
 
 def test_masking_everything_is_an_error(small):
     hidden = dataclasses.replace(small[0], mask=np.zeros_like(small[0].mask))
     with pytest.raises(SequenceError, match="masked"):
-        Trainer([hidden], options())
-    assert finite(Trainer([small[4], hidden], options()).run())  # one of them is no obstacle
+        trainer_of([hidden], options())
+    assert finite(trainer_of([small[4], hidden], options()).run())  # one of them is no obstacle
 
 
 def test_depth_with_holes_trains(small):
     depth = small[0].depth.copy()
     depth[:, :60], depth[:40] = np.nan, 0
     empty = dataclasses.replace(small[4], depth=np.zeros_like(depth))
-    assert finite(Trainer([dataclasses.replace(small[0], depth=depth), empty], options()).run())
+    assert finite(trainer_of([dataclasses.replace(small[0], depth=depth), empty], options()).run())
 
 
 def test_nothing_to_see_is_an_error(small):
     flat = np.full_like(small[0].image, 128)
     with pytest.raises(SequenceError, match="only 0 scene points"):
-        Trainer([bare(small[0], image=flat), bare(small[4], image=flat)], options())
+        trainer_of([bare(small[0], image=flat), bare(small[4], image=flat)], options())
     with pytest.raises(SequenceError, match="only 0 scene points"):
-        Trainer([dataclasses.replace(bare(small[0]), depth=np.zeros_like(small[0].depth))], options())
+        trainer_of([dataclasses.replace(bare(small[0]), depth=np.zeros_like(small[0].depth))], options())
 
 
 def test_views_that_face_away_from_each_other_train(small):
     away = small[4].camera.pose @ np.diag([-1.0, 1, -1, 1])
     other = dataclasses.replace(small[4], camera=small[4].camera.at(away))
-    assert finite(Trainer([small[0], other], options()).run())
+    assert finite(trainer_of([small[0], other], options()).run())
 
 
 def test_points_alone_are_enough(large):
-    model = Trainer([bare(frame) for frame in large[:3]], options(image_width=160)).run()
+    model = trainer_of([bare(frame) for frame in large[:3]], options(image_width=160)).run()
     assert finite(model)
     assert len(model) > 100
 
 
 def test_odd_sizes_train():
     frames = film(161, 97, 3)
-    model = Trainer(list(frames[::2]), options(image_width=75)).run()
+    model = trainer_of(list(frames[::2]), options(image_width=75)).run()
     assert finite(model)
 
 
@@ -900,7 +903,7 @@ def test_depth_extent_sees_needles_along_the_line_of_sight_only():
     scales = torch.tensor([[1.0, 1, 1], [4, 4, 1], [1, 1, 6], [1, 1, 6]]) * 1e-3
     model = GaussianModel(torch.zeros(4, 3), quats, scales.log(), torch.zeros(4), torch.zeros(4, 1, 3))
     model.log_scales.requires_grad_()
-    extent = losses.depth_extent(model, eye)
+    extent = losses.depth_extent(model, eye, 1.5)
     # A sphere and a disc across the view are fine; a needle along it is 6 times as deep as wide, a turned one less.
     deep, wide = (1 + 36) / 2, (1 + (1 + 36) / 2) / 2
     expected = [0, 0, np.log(6 / 1.5), 0.5 * np.log(deep / wide) - np.log(1.5)]
@@ -911,7 +914,7 @@ def test_depth_extent_sees_needles_along_the_line_of_sight_only():
 
 def test_no_gaussian_outgrows_the_scene():
     frames = list(phantom_sequence(PhantomConfig(frames=4, width=96, height=80, border=0.1)))
-    trainer = Trainer(frames, ReconstructionConfig(iterations=60, max_gaussians=1000, device="cpu", learning_rate=5.0))
+    trainer = trainer_of(frames, ReconstructionConfig(iterations=60, max_gaussians=1000, device="cpu", learning_rate=5.0))
     trainer.run()
     assert trainer.model.scales.max() <= 0.06 * trainer.scene_depth * 1.001
 

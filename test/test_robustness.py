@@ -20,6 +20,7 @@ import rclpy
 import torch
 from conftest import wait_until
 from test_nodes import Bench, S, send_model
+from trained import trainer_of
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import load_cameras
@@ -29,7 +30,7 @@ from endo_sim_ros.graph.processes import NodeGroup
 from endo_sim_ros.graph.soak import soak
 from endo_sim_ros.messages import OK
 from endo_sim_ros.nodes.reconstruction_node import ReconstructionNode
-from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer
+from endo_sim_ros.reconstruction import ReconstructionConfig
 from endo_sim_ros.sequences.bag import BagReader
 from endo_sim_ros.sequences.recordings import read_calibration
 
@@ -107,7 +108,7 @@ class Payload:
 def trainer(small_frames):
     """A training that has begun."""
     config = ReconstructionConfig(iterations=20, max_gaussians=500, image_width=48, device="cpu")
-    trainer = Trainer(list(small_frames[:1]), config)
+    trainer = trainer_of(list(small_frames[:1]), config)
     trainer.step()
     return trainer
 

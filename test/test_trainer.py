@@ -6,20 +6,22 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from trained import trainer_of
 
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import features_at
 from endo_sim_ros.evaluation import metrics
-from endo_sim_ros.reconstruction import ABLATIONS, PRESETS, ReconstructionConfig, Trainer, losses, preset
+from endo_sim_ros.reconstruction import ABLATIONS, PRESETS, ReconstructionConfig, losses, preset
+from endo_sim_ros.reconstruction.config import GradientConfig, ProximityConfig
 from endo_sim_ros.reconstruction.dynamic_mask import without_motion
 from endo_sim_ros.reconstruction.presets import resolved
 from endo_sim_ros.reconstruction.priors.extrapolation import _continued, with_surroundings
 from endo_sim_ros.reconstruction.priors.interpolation import inverse_distance_weighted, kriged
 from endo_sim_ros.reconstruction.priors.sources import right_view
-from endo_sim_ros.reconstruction.strategies import mcmc
-from endo_sim_ros.reconstruction.trainer import shrink
+from endo_sim_ros.reconstruction.scene import shrink
+from endo_sim_ros.reconstruction.strategies import STRATEGIES
 from endo_sim_ros.reconstruction.triangulation import match_features, misposed, triangulate
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
@@ -65,7 +67,7 @@ def quality(model, frames) -> tuple[float, float]:
 @pytest.mark.parametrize("name", PRESETS)
 def test_every_preset_trains(views, name):
     points = triangulate(views)[:2]
-    model = Trainer(views[::4], preset(name, **SHORT), points).run()
+    model = trainer_of(views[::4], preset(name, **SHORT), points).run()
     assert finite(model) and len(model) <= 2000
     assert (model.light is None) == (name in ("paper", "fsgs", "3dgs"))
 
@@ -90,8 +92,8 @@ def test_the_default_beats_the_paper_on_two_views(views):
     ends, rest = [views[0], views[-1]], views[1:-1]
     short = {"iterations": 60, "max_gaussians": 6000, "refine_every": 20, "device": "cpu"}
     points = triangulate(views)[:2]
-    paper = quality(Trainer(ends, preset("paper", **short), points).run(), rest)
-    ours = quality(Trainer(ends, preset("default", **short)).run(), rest)
+    paper = quality(trainer_of(ends, preset("paper", **short), points).run(), rest)
+    ours = quality(trainer_of(ends, preset("default", **short)).run(), rest)
     assert ours[0] > paper[0] + 1.5 and ours[1] > paper[1] + 1.5
 
 
@@ -117,28 +119,38 @@ def cloud(count: int = 60) -> GaussianModel:
     return GaussianModel.from_points(torch.rand(count, 3, generator=g), torch.rand(count, 3, generator=g), torch.full((count,), 0.004))
 
 
+def split_and_clone(model, gradients, limit):
+    """What the strategy of 3DGS makes of Gaussians with such mean gradients."""
+    state = {"gradients": torch.stack([gradients, torch.ones_like(gradients)])}
+    return STRATEGIES["gradient"](GradientConfig(), limit, 1.0).refine(model, state, torch.Generator().manual_seed(0))
+
+
+def unpool(model, limit):
+    return STRATEGIES["proximity"](ProximityConfig(), limit, 1.0).unpool(model)
+
+
 def test_steep_gaussians_are_split_or_doubled_and_dead_ones_go():
     model = cloud()
     model.logit_opacities[:5] = -9
     model.log_scales[10:15] = np.log(0.05)  # large
     gradients = torch.zeros(60)
     gradients[10:20] = 1.0
-    new, source, fresh = mcmc.split_and_clone(model, gradients, 1.0, 1000, torch.Generator().manual_seed(0))
+    new, source, fresh = split_and_clone(model, gradients, 1000)
     assert len(new) == 60 - 5 + 5 + 5 == len(source) == len(fresh)
     assert not set(range(5)) & set(source.tolist())
     assert sorted(source[fresh].tolist()) == sorted([*range(15, 20), *range(10, 15), *range(10, 15)])
     halves = fresh & (source < 15)
     torch.testing.assert_close(new.log_scales[halves], torch.full((10, 3), np.log(0.05 / 1.6), dtype=torch.float32))
     assert (new.means[halves] != model.means[source[halves]]).any(1).all()
-    limited, _, _ = mcmc.split_and_clone(model, gradients * torch.linspace(1, 2, 60), 1.0, 58, torch.Generator())
+    limited, _, _ = split_and_clone(model, gradients * torch.linspace(1, 2, 60), 58)
     assert len(limited) == 58
 
 
 def test_what_no_view_shows_is_left_as_it_was(views):
     for confined in (True, False):
         options = {"confined": confined, "iterations": 60, "max_gaussians": 2000, "refine_every": 1000, "depth": "topic"}
-        trainer = Trainer(views[:2], ReconstructionConfig(**options, device="cpu"))
-        before, unseen = trainer.model, ~trainer._shown.bool()
+        trainer = trainer_of(views[:2], ReconstructionConfig(**options, device="cpu"))
+        before, unseen = trainer.model, ~trainer._visible.bool()
         assert 0.05 < unseen.float().mean() < 0.5
         trainer.run()
         changed = (trainer.model.sh != before.sh).flatten(1).any(1)
@@ -147,10 +159,10 @@ def test_what_no_view_shows_is_left_as_it_was(views):
 
 
 def test_exposures_and_colours_do_not_drift_against_each_other(views):
-    trainer = Trainer(views, ReconstructionConfig(iterations=40, max_gaussians=2000, depth="topic", device="cpu"))
-    before = trainer._light["exposures"].detach().clone()
+    trainer = trainer_of(views, ReconstructionConfig(iterations=40, max_gaussians=2000, depth="topic", device="cpu"))
+    before = trainer._appearance.tensors["exposures"].detach().clone()
     trainer.run()
-    after = trainer._light["exposures"].detach()
+    after = trainer._appearance.tensors["exposures"].detach()
     assert (after - before).abs().max() > 1e-5
     np.testing.assert_allclose(after.mean(0), before.mean(0), atol=1e-6)
 
@@ -158,12 +170,12 @@ def test_exposures_and_colours_do_not_drift_against_each_other(views):
 def test_unpooling_fills_gaps_halfway_to_the_neighbours():
     model = cloud()
     model.means[0] = torch.tensor([3.0, 3.0, 3.0])
-    new, source, fresh = mcmc.unpool(model, 1000)
+    new, source, fresh = unpool(model, 1000)
     assert len(new) > 60 and (~fresh).sum() == 60
     added = new.means[fresh]
     assert (added > 1.2).all(1).sum() == 3  # on the way to the lone one
-    assert len(mcmc.unpool(model, 61)[0]) == 61
-    assert len(mcmc.unpool(model, 60)[0]) == 60
+    assert len(unpool(model, 61)[0]) == 61
+    assert len(unpool(model, 60)[0]) == 60
 
 
 # --------------------------------------------------------------------------------------- views and poses
@@ -172,11 +184,11 @@ def test_unpooling_fills_gaps_halfway_to_the_neighbours():
 def test_the_right_image_is_a_view_of_the_same_scene(views):
     frame = views[4]
     right = right_view(frame)
-    model = Trainer(views, options(iterations=40, max_gaussians=8000, extrapolation=0.0, learning_rate=1.0)).run()
+    model = trainer_of(views, options(iterations=40, max_gaussians=8000, extrapolation=0.0, learning_rate=1.0)).run()
     image, _ = DeformableRenderer(model, None, RenderingConfig(device="cpu")).render(right.camera)
     wrong, _ = DeformableRenderer(model, None, RenderingConfig(device="cpu")).render(frame.camera)
     assert metrics.psnr(image, right.image, right.mask) > metrics.psnr(wrong, right.image, right.mask) + 3
-    assert finite(Trainer(views[::4], options(right_views=True)).run())
+    assert finite(trainer_of(views[::4], options(right_views=True)).run())
 
 
 FAULTS = {  # of view 2 of five: a rotation vector of its camera, and a movement along its axes in metres
@@ -202,7 +214,7 @@ def test_a_wrong_pose_among_good_ones_is_found(large, fault, caplog):
     frames[2] = misplaced(frames[2], fault)
     assert misposed(frames, match_features(frames)) == [2]
     if fault == "moved":
-        trainer = Trainer(frames, options(image_width=160, depth="points"))
+        trainer = trainer_of(frames, options(image_width=160, depth="points"))
         assert len(trainer.cameras) == 4 and "left out" in caplog.text
 
 
@@ -210,10 +222,10 @@ def test_with_stereo_a_wrong_pose_among_three_is_left_out(caplog):
     views = list(phantom_sequence(PhantomConfig(width=320, height=256, frames=3, travel=0.02)))
     views = [dataclasses.replace(view, depth=None) for view in views]
     short = options(image_width=80, iterations=1)
-    assert len(Trainer(views, short).cameras) == 3 and "left out" not in caplog.text
-    trainer = Trainer([views[0], misplaced(views[1], "farther"), views[2]], short)
+    assert len(trainer_of(views, short).cameras) == 3 and "left out" not in caplog.text
+    trainer = trainer_of([views[0], misplaced(views[1], "farther"), views[2]], short)
     assert len(trainer.cameras) == 2 and f"{views[1].stamp_ns * 1e-9:.3f} s left out" in caplog.text
-    Trainer([views[0], misplaced(views[1], "farther")], short)
+    trainer_of([views[0], misplaced(views[1], "farther")], short)
     assert "the poses of views 0 and 1 contradict" in caplog.text
 
 
@@ -240,9 +252,9 @@ def test_pure_rotation_trains_with_depth_and_is_an_error_without(views):
         warp = lambda image, H=H: cv2.warpPerspective(image, H, (160, 128))
         images = {name: warp(getattr(frame, name)) for name in ("image", "mask", "depth")}
         turned.append(dataclasses.replace(frame, right=None, camera=frame.camera.at(pose), **images))
-    assert finite(Trainer(turned, options()).run())
+    assert finite(trainer_of(turned, options()).run())
     with pytest.raises(SequenceError, match="scene points could be found in 2 views"):
-        Trainer([bare(frame) for frame in turned], options())
+        trainer_of([bare(frame) for frame in turned], options())
 
 
 @pytest.mark.parametrize("reason, change", {
@@ -252,10 +264,10 @@ def test_pure_rotation_trains_with_depth_and_is_an_error_without(views):
 }.items())  # fmt: skip
 def test_a_view_that_shows_nothing_is_left_out(views, caplog, reason, change):
     blind = dataclasses.replace(views[4], **change(views[4]))
-    trainer = Trainer([views[0], blind, views[8]], options())
+    trainer = trainer_of([views[0], blind, views[8]], options())
     assert len(trainer.cameras) == 2 and f"left out: {reason}" in caplog.text
     with pytest.raises(SequenceError, match=f"every (view|pixel of every view) is {reason}"):
-        Trainer([blind], options())
+        trainer_of([blind], options())
 
 
 def test_an_instrument_in_one_of_several_views_is_left_out(views, caplog):
@@ -275,7 +287,7 @@ def test_an_instrument_in_one_of_several_views_is_left_out(views, caplog):
     assert without_motion([*still, shallow], 0.05)[4] is shallow and "check its depth and pose" in caplog.text
     for choice in (False, True):
         caplog.clear()
-        assert finite(Trainer([*still, held], options(dynamic_mask=choice)).run())
+        assert finite(trainer_of([*still, held], options(dynamic_mask=choice)).run())
         assert ("something moved" in caplog.text) == choice
 
 
@@ -285,12 +297,12 @@ def test_odd_and_large_pictures_train(size):
     camera = frame.camera.resized(*size)
     enlarged = lambda image: cv2.resize(image, size, interpolation=cv2.INTER_NEAREST)
     large = dataclasses.replace(bare(frame), camera=camera, image=enlarged(frame.image), depth=enlarged(frame.depth), mask=None)
-    trainer = Trainer([large], options(image_width=75, iterations=3))
+    trainer = trainer_of([large], options(image_width=75, iterations=3))
     assert trainer.cameras[0].width == 75 and finite(trainer.run())
 
 
 def test_out_of_memory_goes_on_at_half_the_size(views, monkeypatch, caplog):
-    trainer = Trainer(views[::4], options())
+    trainer = trainer_of(views[::4], options())
     draw, widths = trainer._render, []
 
     def short_of_memory(viewmats, Ks, size, *arguments):
@@ -303,7 +315,7 @@ def test_out_of_memory_goes_on_at_half_the_size(views, monkeypatch, caplog):
     assert finite(trainer.run()) and trainer.iteration == 12
     assert widths[:2] == [160, 80] and trainer.cameras[0].width == 80
     assert "80 pixels wide" in caplog.text
-    tiny = Trainer([shrink(view, 80) for view in views[::4]], options())
+    tiny = trainer_of([shrink(view, 80) for view in views[::4]], options())
     monkeypatch.setattr(tiny, "_render", lambda *_: (_ for _ in ()).throw(torch.OutOfMemoryError("CUDA out of memory")))
     with pytest.raises(torch.OutOfMemoryError):
         tiny.run()
@@ -311,7 +323,7 @@ def test_out_of_memory_goes_on_at_half_the_size(views, monkeypatch, caplog):
 
 @pytest.mark.parametrize("name", ["default", "3dgs", "fsgs"])
 def test_a_checkpoint_of_any_preset_goes_on_as_if_never_interrupted(views, tmp_path, name):
-    make = lambda: Trainer(views[::4], preset(name, **SHORT), triangulate(views)[:2])
+    make = lambda: trainer_of(views[::4], preset(name, **SHORT), triangulate(views)[:2])
     whole, first = make().run(), make()
     for _ in range(7):
         first.step()
@@ -336,9 +348,9 @@ def test_what_goes_on_beyond_a_picture_does_not_reach_into_it(views):
     depth[20] *= 0.6
     local = np.column_stack([(pixels - K[:2, 2]) / K[[0, 1], [0, 1]] * depth[:, None], depth])
     points = frame.camera.position + local @ frame.camera.pose[:3, :3].T
-    trainer = Trainer([known], options(max_gaussians=8000, light=False, exposure=False), (points, np.full((40, 3), 0.5)))
+    trainer = trainer_of([known], options(max_gaussians=8000, light=False, exposure=False), (points, np.full((40, 3), 0.5)))
     rendered = DeformableRenderer(trainer.model, None, RenderingConfig(device="cpu")).render(frame.camera)[1]
-    plain = Trainer([known], options(max_gaussians=8000, light=False, exposure=False, extrapolation=0.0)).model
+    plain = trainer_of([known], options(max_gaussians=8000, light=False, exposure=False, extrapolation=0.0)).model
     alone = DeformableRenderer(plain, None, RenderingConfig(device="cpu")).render(frame.camera)[1]
     border = np.ones(exact.shape, bool)
     border[8:-8, 8:-8] = False
@@ -351,7 +363,7 @@ def test_gaussians_around_a_picture_are_small_close_to_it_and_none_is_a_lone_sce
     K, aside = frame.camera.K, np.array([[230.0, 20.0], [250.0, 60.0], [270.0, 100.0]])  # far beyond the right edge
     local = np.column_stack([(aside - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones(3)]) * np.median(frame.depth)
     points = frame.camera.position + local @ frame.camera.pose[:3, :3].T
-    model = Trainer([frame], options(max_gaussians=20_000, light=False, exposure=False), (points, np.full((3, 3), 0.5))).model
+    model = trainer_of([frame], options(max_gaussians=20_000, light=False, exposure=False), (points, np.full((3, 3), 0.5))).model
     uv, _ = frame.camera.project(model.means.numpy().astype(np.float64))
     out = np.maximum(-uv, uv - [frame.camera.width, frame.camera.height]).max(1)
     sizes = model.scales.numpy().max(1)
@@ -392,7 +404,7 @@ def test_a_picture_goes_on_as_bright_as_it_is_however_far_the_tissue_beyond_is_g
 def test_transparency_is_weighed_apart_by_default_and_not_as_printed(views, monkeypatch, name, opaque):
     weights = []
     monkeypatch.setattr(losses, "depth_l1", lambda *arguments: weights.append(arguments[-1]) or torch.zeros(()))
-    Trainer(views[:3], preset(name, **SHORT)).step()
+    trainer_of(views[:3], preset(name, **SHORT)).step()
     assert weights == [opaque]
 
 
@@ -450,8 +462,8 @@ def test_what_lies_beyond_two_views_looks_as_in_the_nearer_one(views):
 def test_tissue_goes_on_beyond_the_pictures_and_in_holes(views):
     frame = dataclasses.replace(bare(views[4]), depth=views[4].depth.copy())
     frame.depth[50:80, 60:100] = 0  # as at a glint
-    known = Trainer([frame], options(max_gaussians=4000, extrapolation=0.0)).model
-    wider = Trainer([frame], options(max_gaussians=4000, extrapolation=0.3))
+    known = trainer_of([frame], options(max_gaussians=4000, extrapolation=0.0)).model
+    wider = trainer_of([frame], options(max_gaussians=4000, extrapolation=0.3))
     camera = dataclasses.replace(frame.camera, K=frame.camera.K + np.array([[0, 0, 40], [0, 0, 30], [0, 0, 0]]), width=240, height=188)
     renderer = lambda model: DeformableRenderer(model, None, RenderingConfig(device="cpu")).render(camera)[1]
     before, after = renderer(known), renderer(wider.model)

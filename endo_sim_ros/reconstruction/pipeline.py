@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.reconstruction import photometry
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.dynamic_mask import without_motion
@@ -22,6 +23,7 @@ from endo_sim_ros.reconstruction.priors.multi_view import agreed
 from endo_sim_ros.reconstruction.priors.sources import depth_source, with_depth_prior
 from endo_sim_ros.reconstruction.progress import OnProgress, StageProgress
 from endo_sim_ros.reconstruction.scene import PreparedScene, ScenePoints, TrainingView, shrink
+from endo_sim_ros.reconstruction.trainer import Trainer
 from endo_sim_ros.reconstruction.triangulation import match_features, misposed, triangulate
 
 _UNUSABLE = {
@@ -73,6 +75,17 @@ def prepare(
         progress.check()
         scene = stage.run(scene, config, progress)
     return scene
+
+
+def reconstruct(
+    frames: Sequence[Frame],
+    config: ReconstructionConfig,
+    points: ScenePoints | tuple | None = None,
+    on_progress: OnProgress | None = None,
+) -> GaussianModel:
+    """The trained model of posed frames; `prepare` and `Trainer` in one. Arguments and errors are those of `prepare`."""
+    trainer = Trainer(prepare(frames, config, points, on_progress), config)
+    return trainer.run(on_progress and (lambda progress: on_progress("training", progress.iteration, progress.iterations)))
 
 
 # ------------------------------------------------------------------------------------------------------------- stages

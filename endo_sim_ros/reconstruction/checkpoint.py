@@ -11,7 +11,7 @@ from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.reconstruction.optimizer import parameters_of
 
 _KEYS = {"config", "stamps", "iteration", "order", "generator", "noise"}
-_KEYS |= {"model", "optimizer", "visible", "strategy", "light", "light_optimizer"}
+_KEYS |= {"model", "optimizer", "strategy", "light", "light_optimizer"}
 
 
 def write_checkpoint(state: dict[str, Any], path: str | Path) -> None:
@@ -43,18 +43,15 @@ def read_checkpoint(path: str | Path, device: str) -> dict[str, Any]:
     if set(state) != _KEYS:
         raise ValueError("another version made it; start anew")
     moments, lights = state["optimizer"], state["light_optimizer"]  # of each parameter, by its name
-    tensors = [*state["model"].values(), *state["light"].values(), *state["strategy"].values(), state["visible"]]
+    tensors = [*state["model"].values(), *state["light"].values(), *state["strategy"].values()]
     tensors += [value for values in [*moments.values(), *lights.values()] for value in values.values()]
     if sum(tensor.numel() * tensor.element_size() for tensor in tensors) > size:  # views of less
         raise ValueError("it claims more than it holds")
     if any(tensor.dtype != torch.float32 or tensor.is_meta or not tensor.isfinite().all() for tensor in tensors):
         raise ValueError("its tensors are not of finite float32 numbers")
     parameters = parameters_of(GaussianModel(**state["model"]))  # none without Gaussians
-    count, visible = len(parameters["means"]) if parameters else 0, state["visible"]
-    if not count or visible.shape != (count,) or not ((visible == 0) | (visible == 1)).all():
-        raise ValueError("what is visible does not fit the model")
     optimized = parameters | {name: state["light"][name] for name in lights}
     expected = {name: {"step": (), "exp_avg": x.shape, "exp_avg_sq": x.shape} for name, x in optimized.items()}
-    if {name: {key: value.shape for key, value in values.items()} for name, values in (moments | lights).items()} != expected:
+    if not parameters or {name: {key: x.shape for key, x in values.items()} for name, values in (moments | lights).items()} != expected:
         raise ValueError("the state of the optimiser does not fit the model")
     return state

@@ -113,9 +113,6 @@ class ReconstructionConfig(StageConfig):
     extrapolation: Annotated[float, Range(0, 1)] = 0.3
     """How far tissue goes on beyond what the training views see, in widths of the image, so that other views do
     not look into the void; holes of the depth prior are filled likewise. 0 = neither."""
-    confined: bool = True
-    """Views change only Gaussians whose centres lie in one of them: others, which reach in from outside, would take on colours
-    that suit the views' edges alone, and which other views see as fringes."""
     depth_tolerance: Annotated[float, Range(0.001, 1)] = 0.05
     """Relative depth difference at which two views contradict each other."""
     dynamic_mask: bool = True
@@ -148,8 +145,6 @@ class ReconstructionConfig(StageConfig):
     """The light travels with the camera: brightness falls off with distance and angle."""
     light_anchor: Annotated[float, Range(0, 1000)] = 1e-3
     """Weight of squared changes of the light in training: where views hardly differ in distance, colours could explain all of it."""
-    right_views: bool = False
-    """Train on the right images as well."""
     densification: Literal["mcmc", "gradient", "proximity"] = "mcmc"
     """How Gaussians are added: a Markov chain up to max_gaussians, where image gradients are large (3DGS), or there and
     between those that lie alone (FSGS)."""

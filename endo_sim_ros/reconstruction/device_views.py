@@ -9,8 +9,6 @@ import torch
 from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.core.frames import Frame
-from endo_sim_ros.reconstruction import losses
 from endo_sim_ros.reconstruction.scene import TrainingView
 
 
@@ -22,21 +20,21 @@ class DeviceView:
     image: Tensor  # [H, W, 3] in [0, 1]
     prior: Tensor | None  # [H, W] depth prior, m, 0 = none
     mask: Tensor | None  # [H, W] 1 = tissue; None = all of it
-    exposure: int  # whose exposure it has: its own, or that of the left view of its pair
-    exposure_index: Tensor  # [1] the same
+    index: int  # among the training views
+    index_tensor: Tensor  # [1] the same
 
     @classmethod
-    def of(cls, view: Frame, exposure: int, device: str) -> "DeviceView":
-        """A view, with or without depth prior, on a device."""
+    def of(cls, view: TrainingView, index: int, device: str) -> "DeviceView":
+        """A view on a device."""
         tensor = lambda array: torch.tensor(array, dtype=torch.float32, device=device)
-        tissue, prior = view.tissue, view.depth_prior if isinstance(view, TrainingView) else None
+        tissue, prior = view.tissue, view.depth_prior
         return cls(
             view.camera,
             tensor(view.image) / 255,
             None if prior is None else tensor(prior),
             None if tissue.all() else tensor(tissue),
-            exposure,
-            torch.tensor([exposure], device=device),
+            index,
+            torch.tensor([index], device=device),
         )
 
 
@@ -53,9 +51,14 @@ def reprojected_prior(view: DeviceView, viewmat: Tensor) -> Tensor:
     v, u = (view.prior > 0).nonzero(as_tuple=True)
     K, pose = (torch.tensor(matrix).to(viewmat) for matrix in (view.camera.K, view.camera.pose))
     z = view.prior[v, u]
-    local = torch.stack([(u + 0.5 - K[0, 2]) / K[0, 0] * z, (v + 0.5 - K[1, 2]) / K[1, 1] * z, z], 1)
-    index, inside, z = losses.seen_at(local, viewmat @ pose, K, None, view.prior.shape)
-    nearest = torch.full((height * width,), math.inf, device=z.device).scatter_reduce(0, index[inside], z[inside], "amin")
+    points = torch.stack([(u + 0.5 - K[0, 2]) / K[0, 0] * z, (v + 0.5 - K[1, 2]) / K[1, 1] * z, z], 1)
+    # Without a matrix product: libraries give other last bits with other numbers of threads.
+    x, y, z = (sum(row[i] * points[:, i] for i in range(3)) + row[3] for row in (viewmat @ pose)[:3])
+    ahead = z.clamp_min(1e-6)
+    u, v = (x / ahead * K[0, 0] + K[0, 2]).floor(), (y / ahead * K[1, 1] + K[1, 2]).floor()
+    inside = (z > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    pixels = (v * width + u).long()[inside]
+    nearest = torch.full((height * width,), math.inf, device=z.device).scatter_reduce(0, pixels, z[inside], "amin")
     return torch.where(nearest.isfinite(), nearest, 0).view(height, width)
 
 

@@ -135,25 +135,6 @@ def depth_extent(model: GaussianModel, eye: Tensor, ratio: float) -> Tensor:
     return torch.relu(0.5 * (deep / wide.clamp_min(1e-20)).log() - math.log(ratio))
 
 
-def seen_at(points: Tensor, viewmat: Tensor, K: Tensor, mask: Tensor | None, size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
-    """Where a view sees points [N, 3] (m, world): index of the pixel [N], whether it lies in the picture's mask [N], and depth [N].
-
-    Args:
-        points: Positions.
-        viewmat, K: World-to-camera [4, 4] and intrinsics [3, 3].
-        mask: [H, W] 1 = tissue; None = all of it.
-        size: H and W.
-    """
-    height, width = size
-    # Without a matrix product: libraries give other last bits with other numbers of threads.
-    x, y, z = (sum(row[i] * points[:, i] for i in range(3)) + row[3] for row in viewmat[:3])
-    ahead = z.clamp_min(1e-6)
-    u, v = (x / ahead * K[0, 0] + K[0, 2]).floor(), (y / ahead * K[1, 1] + K[1, 2]).floor()
-    inside = (z > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    index = (v.clamp(0, height - 1) * width + u.clamp(0, width - 1)).long()
-    return index, inside if mask is None else inside & (mask.flatten()[index] > 0), z
-
-
 def ssim(image: Tensor, target: Tensor) -> Tensor:
     """Structural similarity map [H, W, 3] (Wang et al. 2004; 11×11, σ 1.5, zeros around); gradient in ``image``."""
     return (_SsimOnGpu if image.is_cuda else _Ssim).apply(image, target)

@@ -12,7 +12,7 @@ _PLAIN = {  # 3DGS as Kerbl et al. 2023 have it, and what the others build upon,
     "iterations": 3000, "virtual_every": 1,
     "initialization": "points", "densification": "gradient", "exposure": False, "light": False,
     "learning_rate": 1.0, "lambda_flat": 0.0, "lambda_opaque": 0.0,
-    "multi_view_refinement": False, "extrapolation": 0.0, "confined": False, "dynamic_mask": False,
+    "multi_view_refinement": False, "extrapolation": 0.0, "dynamic_mask": False,
 }  # fmt: skip
 
 PRESETS: dict[str, dict[str, Any]] = {
@@ -48,7 +48,6 @@ ABLATIONS: dict[str, dict[str, dict[str, Any]]] = {
         "without flat Gaussians": {"lambda_flat": 0.0},
         "without light": {"light": False},
         "without light and exposure": {"light": False, "exposure": False},
-        "with Gaussians outside of all views": {"confined": False},
         "without extrapolation": {"extrapolation": 0.0},
         "without dynamic mask": {"dynamic_mask": False},
         "without Markov chain": {"densification": "gradient"},

@@ -25,7 +25,6 @@ from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.device_views import DeviceView, matrices, nearest_views, reprojected_prior
 from endo_sim_ros.reconstruction.optimizer import PARAMETERS, Adam, model_of, parameters_of
 from endo_sim_ros.reconstruction.presets import resolved
-from endo_sim_ros.reconstruction.priors.sources import right_view
 from endo_sim_ros.reconstruction.scene import PreparedScene, TrainingView, shrink
 from endo_sim_ros.reconstruction.strategies import STRATEGIES
 from endo_sim_ros.splatting import RenderOutput, rasterize
@@ -106,8 +105,8 @@ class Trainer:
 
     @property
     def cameras(self) -> list[Camera]:
-        """The training cameras at training size, without right ones."""
-        return [view.camera for view in self._views[: len(self.stamps)]]
+        """The training cameras at training size."""
+        return [view.camera for view in self._views]
 
     @property
     def progress(self) -> Progress:
@@ -122,7 +121,6 @@ class Trainer:
             "order": self._order,
             "model": self._detached().tensors(),
             "optimizer": self._optimizer.state,
-            "visible": self._visible,
             "strategy": self._strategy_state,
             "light": {name: value.detach() for name, value in self._appearance.tensors.items()},
             "light_optimizer": self._appearance.optimizer.state,
@@ -150,7 +148,7 @@ class Trainer:
             shapes = lambda tensors: {name: value.shape for name, value in tensors.items()}
             if shapes(state["light"]) != shapes(self._appearance.tensors):
                 raise ValueError("its light is not that of these views")
-            if shapes(state["strategy"]) != shapes(self._strategy.initialize_state(len(state["visible"]), "meta")):
+            if shapes(state["strategy"]) != shapes(self._strategy.initialize_state(len(state["model"]["means"]), "meta")):
                 raise ValueError("the state of the strategy does not fit the model")
             generator = torch.Generator()
             generator.set_state(state["generator"].cpu())
@@ -158,7 +156,7 @@ class Trainer:
             if noise is not generator:
                 noise.set_state(state["noise"].cpu())
             self._set_model(GaussianModel(**state["model"]))  # what is refused was so before: a training goes on as it was
-            self._optimizer.state, self._strategy_state, self._visible = state["optimizer"], state["strategy"], state["visible"]
+            self._optimizer.state, self._strategy_state = state["optimizer"], state["strategy"]
             self._appearance.set(**state["light"])
             self._appearance.optimizer.state = state["light_optimizer"]
             self._generator, self._noise = generator, noise
@@ -180,7 +178,7 @@ class Trainer:
         """The light and what it leaves of the views' exposures [V, 3]."""
         if self._fitted is None or self._fitted[0] != self.iteration:
             look = lambda view: self._render(*matrices([view.camera], self.device), (view.camera.width, view.camera.height))[1]
-            self._fitted = self.iteration, *self._appearance.fitted(self._views[: len(self.stamps)], look)
+            self._fitted = self.iteration, *self._appearance.fitted(self._views, look)
         return self._fitted[1:]
 
     # --------------------------------------------------------------- training
@@ -220,7 +218,7 @@ class Trainer:
         terms = losses.active_terms(config, self.iteration)
         virtual = None
         if config.virtual_every and self.iteration % config.virtual_every == 0 and len(self.stamps) > 1:
-            virtual = self._virtual_camera(view.exposure)
+            virtual = self._virtual_camera(view.index)
         self._optimizer.set_rate("means", self._step_size)
         self._last_loss = self._descend(terms, self._inputs(view, virtual, terms))
         self.iteration += 1
@@ -243,11 +241,11 @@ class Trainer:
 
     def _inputs(self, view: DeviceView, virtual: Camera | None, terms: tuple[losses.Term, ...]) -> _Inputs:
         viewmats, Ks = matrices([view.camera] if virtual is None else [view.camera, virtual], self.device)
-        virtual_prior, beside = None, self._views[view.exposure]
-        if virtual is not None and beside.prior is not None and any(term.of_virtual and term.needs_prior for term in terms):
-            virtual_prior = reprojected_prior(beside, viewmats[1])
+        virtual_prior = None
+        if virtual is not None and view.prior is not None and any(term.of_virtual and term.needs_prior for term in terms):
+            virtual_prior = reprojected_prior(view, viewmats[1])
         rays = directions(view.camera, self.device) if self.config.light else None
-        return _Inputs(viewmats, Ks, view.image, view.exposure_index, view.mask, view.prior, rays, virtual_prior)
+        return _Inputs(viewmats, Ks, view.image, view.index_tensor, view.mask, view.prior, rays, virtual_prior)
 
     def _descend(self, terms: tuple[losses.Term, ...], inputs: _Inputs) -> Tensor:
         """One step of the optimisers, and the loss before it; on a GPU replayed as one piece."""
@@ -272,13 +270,10 @@ class Trainer:
             masks = torch.stack([view.mask > 0, *[torch.ones_like(view.mask, dtype=torch.bool)] * (cameras - 1)])
         loss = self._loss(terms, view, *self._render(view.viewmats, view.Ks, (width, height), masks, absgrad))
         gradients = dict(zip(wanted, torch.autograd.grad(loss, list(wanted.values()))))
-        if config.confined:
-            for name, values in self._parameters.items():
-                gradients[name] = gradients[name] * self._visible.view(-1, *[1] * (values.ndim - 1))
         if absgrad is not None:
             across, down = gradients["absgrad"][0].unbind(1)
             steepness = torch.hypot(across * (width / 2), down * (height / 2))
-            self._strategy.step_post_backward(self._strategy_state, steepness * self._visible if config.confined else steepness)
+            self._strategy.step_post_backward(self._strategy_state, steepness)
         for optimizer in (self._optimizer, appearance.optimizer):
             optimizer.step({name: gradients[name] for name in optimizer.parameters})
         with torch.no_grad():
@@ -316,17 +311,7 @@ class Trainer:
             capture.forget()
         self._parameters = {name: tensor.clone().requires_grad_() for name, tensor in parameters_of(model).items()}
         self._optimizer = Adam(self._parameters, {name: self._rate * getattr(self.config.rates, name) for name in PARAMETERS})
-        self._visible = self._visible_now()
         self._strategy_state = self._strategy.initialize_state(len(model), self.device)
-
-    @torch.no_grad()
-    def _visible_now(self) -> Tensor:
-        """Which Gaussians' centres any view shows [N], 1 or 0."""
-        visible = torch.zeros(len(self._parameters["means"]), dtype=torch.bool, device=self.device)
-        for view in self._views:
-            (viewmat,), (K,) = matrices([view.camera], self.device)
-            visible |= losses.seen_at(self._parameters["means"], viewmat, K, view.mask, view.image.shape[:2])[1]
-        return visible.float()
 
     def _refine(self) -> None:
         """Add, move and remove Gaussians, keeping the optimiser's state of those that stay."""
@@ -342,6 +327,4 @@ class Trainer:
     def _load(self, views: Sequence[TrainingView]) -> None:
         """Train on these from now on."""
         self._frames, self._fitted = views, None  # and the light that was asked for last, with its iteration
-        self._views = [DeviceView.of(view, i, self.device) for i, view in enumerate(views)]
-        if self.config.right_views:
-            self._views += [DeviceView.of(right_view(view), i, self.device) for i, view in enumerate(views) if view.right is not None]
+        self._views = [DeviceView.of(view, index, self.device) for index, view in enumerate(views)]

@@ -581,18 +581,6 @@ def test_scene_points_that_are_none_are_refused(large, positions, error, said):
         trainer_of(list(large[:1]), options(iterations=1), (positions, np.ones((len(positions), positions.shape[1])), error))
 
 
-def test_views_that_contradict_each_other_are_trained_on_for_less_long(large):
-    views = [dataclasses.replace(frame, right=None, baseline=None, right_K=None) for frame in large]
-    turned = views[0].camera.pose.copy()
-    turned[:3, :3] = turned[:3, :3] @ cv2.Rodrigues(np.radians([0.15, 0, 0]))[0]
-    wrong = [dataclasses.replace(views[0], camera=views[0].camera.at(turned)), *views[1:]]
-    iterations = lambda frames: trainer_of(frames, options(iterations=0, image_width=320)).iterations
-    assert iterations(views) == 3000
-    assert 1000 <= iterations(wrong) < 2500
-    assert iterations(views[:1]) == 1000
-    assert trainer_of(views, options(iterations=7)).iterations == 7
-
-
 # ----------------------------------------------------------------------------------------- initial model
 
 

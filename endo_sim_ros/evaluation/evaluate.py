@@ -495,7 +495,7 @@ def _train(
 
     curve, start, away = [], now(), 0.0
     trainer = Trainer(prepare(views, config, points, lambda stage, done, total: report((done, max(total, 1), stage))), config)
-    iterations = trainer.iterations
+    iterations = trainer.config.iterations
     # Quality changes fastest in the beginning.
     due = sorted({round(iterations * 50 ** (i / max(moments - 1, 1) - 1)) for i in range(moments)})
 

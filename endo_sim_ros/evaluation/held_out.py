@@ -163,7 +163,7 @@ def reconstruct_and_measure(bag: Path, out: Path, config: ReconstructionConfig, 
     if resume:
         trainer.load_checkpoint(out / "checkpoint.pt")
         log.info("going on after %d iterations", trainer.iteration)
-    iterations = trainer.iterations
+    iterations = trainer.config.iterations
     with ProgressBar() as bar:
         task = bar.add_task("reconstructing", total=iterations)
 

@@ -92,9 +92,8 @@ class ReconstructionConfig(StageConfig):
     """Number of views to train on, spread over the camera path."""
     image_width: Annotated[int, Range(16, 8192, "pixels")] = 640
     """Views wider than this are shrunk to it before training."""
-    iterations: Annotated[int, Range(0, 1_000_000)] = 0
-    """Optimisation steps; 0 = 3000, and down to a third of them, which are as much smaller, the more the views contradict each
-    other in what no depth explains: poses, calibration, motion."""
+    iterations: Annotated[int, Range(1, 1_000_000)] = 3000
+    """Optimisation steps."""
     max_gaussians: Annotated[int, Range(1, 10_000_000)] = 60_000
     """Largest number of Gaussians."""
     sh_degree: Annotated[int, Range(0, 3)] = 0

@@ -4,7 +4,6 @@ Every stage is a function of a scene, the options and a `StageProgress`; it retu
 recording do not ask for it. Inside, a stage gives the algorithm views, its own options and the progress to report to.
 """
 
-import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -33,8 +32,6 @@ _UNUSABLE = {
 }
 _FINER = 2  # times the width trained on, at which depth is corrected where images are so fine
 _SEEN = 0.8  # share of the Gaussians that stand for what the training views see, at first
-_MOST_ITERATIONS, _LEAST_TRAINING = 3000, 1 / 3  # and the least share of them
-_SHARP = 0.15  # pixels: views that agree so well are worth all iterations
 
 
 class Stage(NamedTuple):
@@ -153,30 +150,8 @@ def refine_across_views(scene: PreparedScene, config: ReconstructionConfig, prog
         return scene
     # Flow is the more precise the finer the pixels are, as matching is.
     fine = [shrink(view, _FINER * config.image_width) for view in scene.views]
-    refined, contradiction = agreed(_disguised(fine), scene.points, scene.depth_source)
-    coarser = min(config.image_width / fine[0].camera.width, 1)
-    return scene.replaced(views=_restored(fine, refined), contradiction=contradiction * coarser)
-
-
-def choose_length(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
-    """How long to train: fewer and smaller steps where views contradict each other.
-
-    Details that contradict each other can only be learnt by heart, one view by one, and make other views worse.
-    """
-    if config.iterations:
-        return scene.replaced(iterations=config.iterations)
-    if scene.contradiction is None:
-        fine = [shrink(view, _FINER * config.image_width) for view in scene.views]
-        _, contradiction = agreed(_disguised(fine), scene.points, scene.depth_source)
-        scene = scene.replaced(contradiction=contradiction * min(config.image_width / fine[0].camera.width, 1))
-    off = scene.contradiction
-    share = float(np.clip(_SHARP / max(off, 1e-9), _LEAST_TRAINING, 1)) if np.isfinite(off) else _LEAST_TRAINING
-    scene = scene.replaced(iterations=max(round(_MOST_ITERATIONS * share), 1), rate=share)
-    if np.isfinite(off):
-        why = f"views contradict each other by {off:.2f} pixels that no depth explains"
-    else:
-        why = "no two views with depth show the same, so nobody can tell how well views agree"
-    return scene.decided(f"{why}: {scene.iterations} iterations", logging.INFO)
+    refined, _ = agreed(_disguised(fine), scene.points, scene.depth_source)
+    return scene.replaced(views=_restored(fine, refined))
 
 
 def shrink_views(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
@@ -228,7 +203,6 @@ STAGES = (
     Stage("depth prior", estimate_depth),
     Stage("checking poses by stereo", check_poses_by_stereo),
     Stage("multi-view refinement", refine_across_views),
-    Stage("length of training", choose_length),
     Stage("shrinking views", shrink_views),
     Stage("dynamic mask", mask_motion),
     Stage("initial model", place_gaussians),

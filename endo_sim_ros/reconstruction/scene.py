@@ -62,10 +62,6 @@ class PreparedScene:
         given_points: Whether the caller gave them.
         matches: Features that the frames share.
         depth_source: Where the depth prior is from: topic, stereo, network, points or none.
-        contradiction: By how many pixels (of training width) views contradict each other in what no depth explains; NaN = nobody can
-            tell, None = not asked yet.
-        iterations: Length of the training.
-        rate: Factor on the learning rates that goes with this length.
         model: Gaussians to start from.
         depth: Median depth of the scene, metres.
         light: Of the light at the camera (distance, angle, tilt_x, tilt_y) [4].
@@ -79,9 +75,6 @@ class PreparedScene:
     given_points: bool = False
     matches: tuple[Matches, ...] = ()
     depth_source: str = "none"
-    contradiction: float | None = None
-    iterations: int = 0
-    rate: float = 1.0
     model: GaussianModel | None = None
     depth: float = 0.0
     light: np.ndarray = field(default_factory=lambda: np.zeros(4))
@@ -92,9 +85,9 @@ class PreparedScene:
         """A copy with other values."""
         return dataclasses.replace(self, **changes)
 
-    def decided(self, sentence: str, level: int = logging.WARNING) -> Self:
+    def decided(self, sentence: str) -> Self:
         """A copy that knows of a decision, which is logged."""
-        log.log(level, "%s", sentence)
+        log.warning("%s", sentence)
         return dataclasses.replace(self, decisions=(*self.decisions, sentence))
 
 

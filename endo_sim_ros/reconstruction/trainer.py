@@ -65,12 +65,11 @@ class Trainer:
 
     def __init__(self, scene: PreparedScene, config: ReconstructionConfig):
         self.config = config = resolved(config)
-        self.iterations, self.scene_depth = scene.iterations, scene.depth
+        self.scene_depth = scene.depth
         self.device = pick_device(config.device)
         self.stamps = [view.stamp_ns for view in scene.views]
         """When the views were taken that are trained on, nanoseconds; views that were left out are not among them."""
         self.iteration = 0
-        self._rate = config.learning_rate * scene.rate
         self._nearest = nearest_views([view.camera for view in scene.views])
         self._load(scene.views)
         eye = np.mean([view.camera.position for view in self._views], 0)
@@ -110,7 +109,7 @@ class Trainer:
 
     @property
     def progress(self) -> Progress:
-        return Progress(self.iteration, self.iterations, float(self._last_loss), len(self._parameters["means"]))
+        return Progress(self.iteration, self.config.iterations, float(self._last_loss), len(self._parameters["means"]))
 
     def save_checkpoint(self, path: str | Path) -> None:
         """Write model, optimiser and random state; a training that loads them goes on as if never interrupted."""
@@ -169,7 +168,7 @@ class Trainer:
 
     def _identity(self) -> dict[str, Any]:
         """The options that a training with the same views must have to go on from a checkpoint."""
-        return {name: value for name, value in option_values(self.config).items() if name != "device"} | {"iterations": self.iterations}
+        return {name: value for name, value in option_values(self.config).items() if name != "device"}
 
     def _detached(self) -> GaussianModel:
         return GaussianModel(**{name: tensor.detach().clone() for name, tensor in model_of(self._parameters).tensors().items()})
@@ -188,7 +187,7 @@ class Trainer:
 
         Out of memory, training goes on with images of half the size, as long as they are not tiny.
         """
-        while self.iteration < self.iterations:
+        while self.iteration < self.config.iterations:
             try:
                 self.step()
             except torch.OutOfMemoryError:
@@ -196,7 +195,7 @@ class Trainer:
                     raise
                 self._halve()
                 continue
-            due = self.iteration % every == 0 or self.iteration == self.iterations
+            due = self.iteration % every == 0 or self.iteration == self.config.iterations
             if on_progress and due and on_progress(self.progress) is False:
                 break
         return self.model
@@ -223,15 +222,15 @@ class Trainer:
         self._last_loss = self._descend(terms, self._inputs(view, virtual, terms))
         self.iteration += 1
         with torch.no_grad():
-            if self.iteration <= config.refine_until * self.iterations and self.iteration % config.refine_every == 0:
+            if self.iteration <= config.refine_until * config.iterations and self.iteration % config.refine_every == 0:
                 self._refine()
             self._strategy.perturb(self._parameters, self.iteration, self._step_size, self._noise)
 
     @property
     def _step_size(self) -> float:
         """Learning rate of the means, metres."""
-        rates = self.config.rates
-        return rates.means * self.scene_depth * self._rate * rates.means_decay ** (self.iteration / self.iterations)
+        config, rates = self.config, self.config.rates
+        return rates.means * self.scene_depth * config.learning_rate * rates.means_decay ** (self.iteration / config.iterations)
 
     def _virtual_camera(self, index: int) -> Camera:
         """Paper eq. 7: a random camera between a view and its nearest view."""
@@ -310,7 +309,9 @@ class Trainer:
         for capture in self._captures.values():
             capture.forget()
         self._parameters = {name: tensor.clone().requires_grad_() for name, tensor in parameters_of(model).items()}
-        self._optimizer = Adam(self._parameters, {name: self._rate * getattr(self.config.rates, name) for name in PARAMETERS})
+        self._optimizer = Adam(
+            self._parameters, {name: self.config.learning_rate * getattr(self.config.rates, name) for name in PARAMETERS}
+        )
         self._strategy_state = self._strategy.initialize_state(len(model), self.device)
 
     def _refine(self) -> None:

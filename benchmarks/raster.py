@@ -15,7 +15,7 @@ from torch import Tensor
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.kernels import plain_kernels
 from endo_sim_ros.evaluation.measurement import Row, machine, milliseconds, peak_megabytes, report, short
-from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer
+from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer, prepare
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 from endo_sim_ros.splatting import RenderOutput, _rasterize, rasterize
 
@@ -195,9 +195,10 @@ def _curve(name: str, count: int, size: tuple[int, int], overlap: float, device:
 def _training(count: int, width: int, height: int, device: str, seconds: float) -> list[Row]:
     """Iterations per second of a training, each with a training view and a virtual view, losses and optimiser."""
     frames = list(phantom_sequence(PhantomConfig(frames=8, width=width, height=height)))
-    size = {"max_gaussians": count, "image_width": width, "growth": 1.0, "refine_every": 1}
-    config = ReconstructionConfig(**size, virtual_every=1, lambda_dist=0.1, lambda_tv=0.5, device=device)
-    trainer = Trainer(frames, config)
+    size = {"max_gaussians": count, "image_width": width, "mcmc.growth": 1.0, "refine_every": 1}
+    terms = {"virtual_every": 1, "lambda_dist": 0.1, "lambda_tv": 0.5}
+    config = ReconstructionConfig.from_mapping(size | terms | {"device": device})
+    trainer = Trainer(prepare(frames, config), config)
     while len(trainer.model) < count and trainer.iteration < 20:
         trainer.step()
     # Refinement is rare in a training; here it has done its part.

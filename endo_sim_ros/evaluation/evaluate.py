@@ -36,7 +36,7 @@ from endo_sim_ros.evaluation.lpips import Lpips, WeightsError
 from endo_sim_ros.evaluation.measurement import machine, peak_megabytes
 from endo_sim_ros.evaluation.splits import STEREO, Split, check_split, right_views, split_views
 from endo_sim_ros.evaluation.workers import Finished, News, ray_is_installed, run_in_processes, run_in_ray
-from endo_sim_ros.reconstruction import ReconstructionConfig, ScenePoints, Trainer, scene_points, shrink
+from endo_sim_ros.reconstruction import ReconstructionConfig, ScenePoints, Trainer, prepare, reconstruct, scene_points, shrink
 from endo_sim_ros.reconstruction.presets import ABLATIONS, preset
 from endo_sim_ros.reconstruction.priors.sources import with_depth_prior
 from endo_sim_ros.reconstruction.triangulation import points_in_view
@@ -392,7 +392,7 @@ def _warm_up(device: str) -> None:
     poses[1, 0, 3] = 0.005
     frames = [Frame(i, image, camera.at(pose), depth=np.full((48, 64), 0.1, np.float32)) for i, pose in enumerate(poses)]
     with contextlib.suppress(SequenceError):  # they need not make a scene
-        Trainer(frames, ReconstructionConfig(iterations=3, max_gaussians=500, depth="topic", device=device)).run()
+        reconstruct(frames, ReconstructionConfig(iterations=3, max_gaussians=500, depth="topic", device=device))
 
 
 def _job(argument: tuple, device: str, report: Callable[[Any], None]) -> dict[str, Any]:
@@ -494,7 +494,7 @@ def _train(
         return time.perf_counter()
 
     curve, start, away = [], now(), 0.0
-    trainer = Trainer(views, config, points)
+    trainer = Trainer(prepare(views, config, points, lambda stage, done, total: report((done, max(total, 1), stage))), config)
     iterations = trainer.config.iterations
     # Quality changes fastest in the beginning.
     due = sorted({round(iterations * 50 ** (i / max(moments - 1, 1) - 1)) for i in range(moments)})

@@ -19,7 +19,17 @@ from endo_sim_ros.core.gaussians import GaussianModel, load_ply, save_ply
 from endo_sim_ros.messages import STATE, ReconstructionState, Topic
 from endo_sim_ros.nodes.base import ERROR, OK, WARN, EndoNode, run, sentence
 from endo_sim_ros.nodes.configs import ReconstructionNodeConfig
-from endo_sim_ros.reconstruction import PRESETS, Progress, ReconstructionConfig, Trainer, preset, scene_points, select_keyframes
+from endo_sim_ros.reconstruction import (
+    PRESETS,
+    Cancelled,
+    Progress,
+    ReconstructionConfig,
+    Trainer,
+    prepare,
+    preset,
+    scene_points,
+    select_keyframes,
+)
 from endo_sim_ros.sequences.bag import feed
 from endo_sim_ros.sequences.synchronizer import Synchronizer
 
@@ -50,6 +60,7 @@ class ReconstructionNode(EndoNode):
         self._thread: threading.Thread | None = None
         self._cancel = threading.Event()
         self._lock = threading.Lock()
+        self._stage = ("", 0, 0)  # what the worker does, how much of it is done, and how much there is
         self._progress: Progress | None = None
         self._outbox: tuple[GaussianModel, list[Camera]] | None = None  # newest model of the worker, to be published
         self._published: GaussianModel | None = None
@@ -168,15 +179,16 @@ class ReconstructionNode(EndoNode):
 
     def _train(self, views: list[Frame], frames: list[Frame], config: ReconstructionConfig) -> None:
         try:
+            self._on_stage("scene points", 0, 0)
             points = scene_points(frames) if len(views) < len(frames) else None
-            trainer, lockstep = Trainer(views, config, points), self._options.mode == "lockstep"
+            trainer, lockstep = Trainer(prepare(views, config, points, self._on_stage), config), self._options.mode == "lockstep"
             if not lockstep:
                 self._offer(trainer)
             published = time.monotonic()
 
             def on_progress(progress: Progress) -> bool:
                 nonlocal published
-                self._progress = progress
+                self._progress, self._stage = progress, ("training", progress.iteration, progress.iterations)
                 if not lockstep and time.monotonic() - published > self._options.publish_period:
                     published = time.monotonic()
                     self._offer(trainer)
@@ -188,11 +200,19 @@ class ReconstructionNode(EndoNode):
             self._finished = True
             done = f"{len(trainer.model)} Gaussians after {trainer.iteration} iterations"
             self.get_logger().info(f"reconstruction finished: {done}, saved in {self._saved}")
+        except Cancelled:
+            self.get_logger().info("reconstruction cancelled")
         except Exception as error:
             self._failure = sentence("reconstruction", error)
             if isinstance(error, (MemoryError, torch.OutOfMemoryError)):
                 self._failure = f"out of memory: lower max_gaussians, image_width or keyframes ({error})"
             self.report_error(self._failure)
+
+    def _on_stage(self, stage: str, done: int, total: int) -> None:
+        """Note how far the preparation is; called from several threads."""
+        if self._cancel.is_set():
+            raise Cancelled
+        self._stage = stage, done, total
 
     def _offer(self, trainer: Trainer) -> None:
         with self._lock:
@@ -274,7 +294,8 @@ class ReconstructionNode(EndoNode):
         counts = {f"images {reason}": count for reason, count in dropped.items()}
         values = {STATE: state, "views": len(self._frames), **counts, "saved": self._saved}
         if state is ReconstructionState.PREPARING:
-            return OK, "preparing views", values
+            stage, done, total = self._stage
+            return OK, f"preparing views: {stage}", values | {"stage": stage, "progress": f"{done / max(total, 1):.2f}"}
         if state is ReconstructionState.TRAINING:
             values |= {"iteration": progress.iteration, "iterations": progress.iterations}
             values |= {"loss": f"{progress.loss:.4f}", "gaussians": progress.gaussians}

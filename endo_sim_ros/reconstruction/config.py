@@ -1,9 +1,84 @@
 """Options of the reconstruction stage; `presets` names sets of them."""
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from endo_sim_ros.core.config import Range, StageConfig
+from endo_sim_ros.reconstruction.stage_configs import (
+    DepthPriorConfig,
+    DynamicMaskConfig,
+    ExtrapolationConfig,
+    InitialModelConfig,
+    MatchingConfig,
+    MultiViewConfig,
+    PhotometryConfig,
+    PosesConfig,
+    UsableViewsConfig,
+)
+
+
+@dataclass(frozen=True)
+class LearningRatesConfig(StageConfig):
+    """Learning rates of Adam: those of 3DGS, of sizes and colours raised for a tenth of its iterations."""
+
+    means: Annotated[float, Range(0, 1, "scene depths")] = 1.6e-4
+    """Of the positions, at first."""
+    means_decay: Annotated[float, Range(1e-6, 1)] = 0.01
+    """Factor on that of the positions at the last iteration; it falls exponentially."""
+    quats: Annotated[float, Range(0, 1)] = 1e-3
+    """Of the rotations."""
+    log_scales: Annotated[float, Range(0, 1)] = 2e-2
+    """Of the logarithm of the sizes."""
+    logit_opacities: Annotated[float, Range(0, 1)] = 5e-2
+    """Of the opacities, before the sigmoid."""
+    sh_base: Annotated[float, Range(0, 1)] = 1e-2
+    """Of the colours."""
+    sh_rest: Annotated[float, Range(0, 1)] = 1.25e-4
+    """Of the higher spherical harmonics."""
+    light: Annotated[float, Range(0, 1)] = 2e-3
+    """Of the four numbers of the light; `learning_rate` is no factor on it."""
+    exposures: Annotated[float, Range(0, 1)] = 1e-3
+    """Of the logarithm of the exposures; `learning_rate` is no factor on it."""
+
+
+@dataclass(frozen=True)
+class McmcConfig(StageConfig):
+    """Densification as a Markov chain (3DGS-MCMC)."""
+
+    growth: Annotated[float, Range(0, 1)] = 0.05
+    """Share of new Gaussians added at each refinement until max_gaussians is reached."""
+    dead_opacity: Annotated[float, Range(0, 1)] = 0.005
+    """Opacity up to which a Gaussian is dead and moves to a live one; that of 3DGS."""
+    most_copies: Annotated[int, Range(1, 1000)] = 50
+    """Copies of one Gaussian at a refinement, above which more share its opacity as so many would; sums of more terms lose digits."""
+    noise: Annotated[float, Range(0, 1e9)] = 5e5
+    """Size of random steps of faint Gaussians, in units of the learning rate of the means, for a scene of depth 1; that of 3DGS-MCMC."""
+    noise_every: Annotated[int, Range(1, 1000)] = 4
+    """Iterations between such steps, which are larger by its square root: seldom is cheaper, and diffuses as far."""
+
+
+@dataclass(frozen=True)
+class GradientConfig(StageConfig):
+    """Densification by image gradients (3DGS, AbsGS)."""
+
+    dead_opacity: Annotated[float, Range(0, 1)] = 0.005
+    """Opacity up to which a Gaussian is removed; that of 3DGS."""
+    threshold: Annotated[float, Range(0, 1, "per half image")] = 8e-4
+    """Mean absolute gradient by its position in the image of a Gaussian that becomes two; that of AbsGS."""
+    large: Annotated[float, Range(0, 1, "scene depths")] = 0.01
+    """Standard deviation above which a Gaussian is split, up to which it is doubled; that of 3DGS."""
+    shrink: Annotated[float, Range(1, 10)] = 1.6
+    """Factor by which the halves of a split Gaussian are smaller; that of 3DGS."""
+
+
+@dataclass(frozen=True)
+class ProximityConfig(GradientConfig):
+    """Densification by image gradients and by how lonely Gaussians are (FSGS)."""
+
+    neighbours: Annotated[int, Range(1, 100)] = 3
+    """Number of nearest neighbours that tell how lonely a Gaussian is, and halfway to which new ones come; that of FSGS."""
+    far: Annotated[float, Range(1, 100)] = 2.0
+    """Mean distance from them above which a Gaussian is lonely, in medians over all, so that it fits scenes of any size."""
 
 
 @dataclass(frozen=True)
@@ -14,9 +89,8 @@ class ReconstructionConfig(StageConfig):
     """Number of views to train on, spread over the camera path."""
     image_width: Annotated[int, Range(16, 8192, "pixels")] = 640
     """Views wider than this are shrunk to it before training."""
-    iterations: Annotated[int, Range(0, 1_000_000)] = 0
-    """Optimisation steps; 0 = 3000, and down to a third of them, which are as much smaller, the more the views contradict each
-    other in what no depth explains: poses, calibration, motion."""
+    iterations: Annotated[int, Range(1, 1_000_000)] = 3000
+    """Optimisation steps."""
     max_gaussians: Annotated[int, Range(1, 10_000_000)] = 60_000
     """Largest number of Gaussians."""
     sh_degree: Annotated[int, Range(0, 3)] = 0
@@ -29,18 +103,15 @@ class ReconstructionConfig(StageConfig):
     depth_model: str = ""
     """network: folder of a Depth-Anything-V2 checkpoint (transformers) or ONNX file; nothing is ever downloaded. Empty:
     one that Hugging Face's cache holds."""
-    agreement: bool = True
+    multi_view_refinement: bool = True
     """Correct the depth of stereo, network or points by scene points and by how the right image and the other views show the
     same tissue."""
-    surroundings: Annotated[float, Range(0, 1)] = 0.3
+    extrapolation: Annotated[float, Range(0, 1)] = 0.3
     """How far tissue goes on beyond what the training views see, in widths of the image, so that other views do
     not look into the void; holes of the depth prior are filled likewise. 0 = neither."""
-    confined: bool = True
-    """Views change only Gaussians whose centres lie in one of them: others, which reach in from outside, would take on colours
-    that suit the views' edges alone, and which other views see as fringes."""
     depth_tolerance: Annotated[float, Range(0.001, 1)] = 0.05
     """Relative depth difference at which two views contradict each other."""
-    still: bool = True
+    dynamic_mask: bool = True
     """Leave out of a view what contradicts two others: an instrument that is there in it alone, for instance."""
     lambda_ssim: Annotated[float, Range(0, 1)] = 0.2
     """Share of 1 − SSIM in the photometric loss; the rest is L1."""
@@ -56,7 +127,11 @@ class ReconstructionConfig(StageConfig):
     lambda_pearson: Annotated[float, Range(0, 1000)] = 0.0
     """Weight of 1 − correlation of depth and prior, in training views and in virtual ones to which the prior is carried (FSGS)."""
     lambda_flat: Annotated[float, Range(0, 1000)] = 0.01
-    """Weight of Gaussians being deeper than 1.5 times their width, which turns into streaks when the tissue is sheared."""
+    """Weight of Gaussians being deeper than they are wide, which turns into streaks when the tissue is sheared."""
+    flat_ratio: Annotated[float, Range(0.01, 100)] = 1.5
+    """Ratio of depth to width above which that counts: somewhat deeper is still no streak."""
+    flat_every: Annotated[int, Range(1, 1000)] = 4
+    """Iterations between those that count it, so many times as much: it takes time for every Gaussian, seen or not."""
     virtual_every: Annotated[int, Range(0, 1000)] = 0
     """A virtual camera regularises every n-th iteration (paper eq. 8, 9), by what of the distortion, total variation and
     correlation has a weight; 0 = never."""
@@ -64,18 +139,46 @@ class ReconstructionConfig(StageConfig):
     """Each view has an exposure of its own, from which that of unseen views is predicted as a camera's automatic one would be."""
     light: bool = True
     """The light travels with the camera: brightness falls off with distance and angle."""
-    right_views: bool = False
-    """Train on the right images as well."""
+    light_anchor: Annotated[float, Range(0, 1000)] = 1e-3
+    """Weight of squared changes of the light in training: where views hardly differ in distance, colours could explain all of it."""
     densification: Literal["mcmc", "gradient", "proximity"] = "mcmc"
     """How Gaussians are added: a Markov chain up to max_gaussians, where image gradients are large (3DGS), or there and
     between those that lie alone (FSGS)."""
     refine_every: Annotated[int, Range(1, 100_000)] = 100
     """Iterations between relocations of dead Gaussians and growth."""
-    growth: Annotated[float, Range(0, 1)] = 0.05
-    """Share of new Gaussians added at each refinement until max_gaussians is reached."""
+    refine_until: Annotated[float, Range(0, 1)] = 0.8
+    """Share of the iterations after which the number of Gaussians stays, so that the last ones settle."""
+    largest: Annotated[float, Range(1e-4, 100, "scene depths")] = 0.06
+    """Largest standard deviation of a Gaussian. Nothing else limits those where every view is masked, and a large one smears the
+    deformed scene."""
     learning_rate: Annotated[float, Range(1e-3, 100)] = 1.5
-    """Factor on all learning rates."""
+    """Factor on the learning rates of the Gaussians."""
+    smallest_width: Annotated[int, Range(1, 8192, "pixels")] = 64
+    """Out of memory, training goes on with images of half the width, but none below this."""
     seed: Annotated[int, Range(0, 2**31 - 1)] = 0
     """Seed of all random draws; the same seed gives the same model on a CPU, bit for bit."""
     device: str = "auto"
     """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""
+
+    # Of the stages that prepare the scene, in their order.
+    views: UsableViewsConfig = UsableViewsConfig()
+    matching: MatchingConfig = MatchingConfig()
+    poses: PosesConfig = PosesConfig()
+    depth_prior: DepthPriorConfig = DepthPriorConfig()
+    multi_view: MultiViewConfig = MultiViewConfig()
+    motion: DynamicMaskConfig = DynamicMaskConfig()
+    initial: InitialModelConfig = InitialModelConfig()
+    photometry: PhotometryConfig = PhotometryConfig()
+    extrapolated: ExtrapolationConfig = ExtrapolationConfig()
+    # Of the training.
+    rates: LearningRatesConfig = LearningRatesConfig()
+    mcmc: McmcConfig = McmcConfig()
+    gradient: GradientConfig = GradientConfig()
+    proximity: ProximityConfig = ProximityConfig()
+
+    renamed: ClassVar[dict[str, str]] = {
+        "agreement": "multi_view_refinement",
+        "surroundings": "extrapolation",
+        "still": "dynamic_mask",
+        "growth": "mcmc.growth",
+    }

@@ -1,17 +1,61 @@
-"""Loss terms of the reconstruction. Each returns an unreduced map or a scalar; the trainer weighs them.
+"""Loss terms of the reconstruction: each is a function here, a line in TERMS, and a weight in `ReconstructionConfig`.
 
 Images are [H, W, 3] in [0, 1], depths [H, W] in metres, masks [H, W] in {0, 1}.
 """
 
 import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.ssim import ssim
 
-_FAINT = 1e-3  # alpha, below which a pixel has no depth of its own
+
+class Rendering(NamedTuple):
+    """What terms are computed from: one image of the Gaussians, and what it should look like."""
+
+    model: GaussianModel
+    depth: Tensor  # [H, W] Σ w z, metres
+    alpha: Tensor  # [H, W]
+    distortion: Tensor  # [H, W] metres
+    mask: Tensor | None  # [H, W] 1 = tissue; None = all of it
+    prior: Tensor | None  # [H, W] depth prior, metres, 0 = none
+    eye: Tensor  # [3] centre of the training cameras, metres, world
+    scene_depth: float  # metres
+
+
+class Term(NamedTuple):
+    """A term of the loss."""
+
+    weight: str  # option that weighs it; without a weight nothing is computed
+    weighted: Callable[[Rendering, ReconstructionConfig], Tensor]  # a scalar
+    of_virtual: bool = False  # whether virtual cameras have it, too
+    needs_prior: bool = False
+    every: str | None = None  # option that says in which iterations it is computed, and by how much it then counts more
+
+
+def active_terms(config: ReconstructionConfig, iteration: int) -> tuple[Term, ...]:
+    """The terms that have a weight and their turn in an iteration."""
+    due = lambda term: term.every is None or iteration % getattr(config, term.every) == 0
+    return tuple(term for term in TERMS if getattr(config, term.weight) > 0 and due(term))
+
+
+def regularized(
+    loss: Tensor | None, terms: Sequence[Term], rendering: Rendering, config: ReconstructionConfig, virtual: bool = False
+) -> Tensor | None:
+    """The loss so far, None for none, plus the terms of an image of a training or a virtual camera."""
+    for term in terms:
+        if (virtual and not term.of_virtual) or (term.needs_prior and rendering.prior is None):
+            continue
+        value = term.weighted(rendering, config)
+        if term.every is not None:
+            value = getattr(config, term.every) * value
+        loss = value if loss is None else loss + value
+    return loss
 
 
 def masked_mean(values: Tensor, mask: Tensor | None) -> Tensor:
@@ -47,7 +91,8 @@ def depth_l1(depth: Tensor, prior: Tensor, mask: Tensor | None, alpha: Tensor, o
     valid = valid if mask is None else valid * mask
     if not opaque:
         return masked_mean((depth - prior).abs(), valid)
-    return masked_mean((depth / alpha.clamp_min(_FAINT) - prior).abs() + opaque * (1 - alpha) * prior, valid)
+    # What is fainter than the thousandth part has no depth of its own.
+    return masked_mean((depth / alpha.clamp_min(1e-3) - prior).abs() + opaque * (1 - alpha) * prior, valid)
 
 
 def total_variation(depth: Tensor, mask: Tensor | None) -> Tensor:
@@ -67,8 +112,8 @@ def pearson(depth: Tensor, prior: Tensor, mask: Tensor | None) -> Tensor:
     return 1 - (a * b).sum() / ((a * a).sum() * (b * b).sum()).clamp_min(1e-20).sqrt()
 
 
-def depth_extent(model: GaussianModel, eye: Tensor) -> Tensor:
-    """How far each Gaussian is deeper than 1.5 times its width seen from a point ``eye`` [3] (m, world), log ratio [N].
+def depth_extent(model: GaussianModel, eye: Tensor, ratio: float) -> Tensor:
+    """How far each Gaussian is deeper than ``ratio`` times its width seen from a point ``eye`` [3] (m, world), log ratio [N].
 
     Depth along the line of sight cannot be seen in the training views, but it becomes a streak across the picture as soon
     as the tissue is sheared. (PhysGaussian's anisotropy regulariser, Xie et al. 2024, serves the same end but also
@@ -81,23 +126,18 @@ def depth_extent(model: GaussianModel, eye: Tensor) -> Tensor:
     variances = (2 * model.log_scales).exp()
     deep = (local * local * variances).sum(1)
     wide = (variances.sum(1) - deep) / 2
-    return torch.relu(0.5 * (deep / wide.clamp_min(1e-20)).log() - math.log(1.5))
+    return torch.relu(0.5 * (deep / wide.clamp_min(1e-20)).log() - math.log(ratio))
 
 
-def seen_at(points: Tensor, viewmat: Tensor, K: Tensor, mask: Tensor | None, size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
-    """Where a view sees points [N, 3] (m, world): index of the pixel [N], whether it lies in the picture's mask [N], and depth [N].
-
-    Args:
-        points: Positions.
-        viewmat, K: World-to-camera [4, 4] and intrinsics [3, 3].
-        mask: [H, W] 1 = tissue; None = all of it.
-        size: H and W.
-    """
-    height, width = size
-    # Without a matrix product: libraries give other last bits with other numbers of threads.
-    x, y, z = (sum(row[i] * points[:, i] for i in range(3)) + row[3] for row in viewmat[:3])
-    ahead = z.clamp_min(1e-6)
-    u, v = (x / ahead * K[0, 0] + K[0, 2]).floor(), (y / ahead * K[1, 1] + K[1, 2]).floor()
-    inside = (z > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    index = (v.clamp(0, height - 1) * width + u.clamp(0, width - 1)).long()
-    return index, inside if mask is None else inside & (mask.flatten()[index] > 0), z
+TERMS = (
+    Term(
+        "lambda_depth",
+        lambda of, c: c.lambda_depth / of.scene_depth * depth_l1(of.depth, of.prior, of.mask, of.alpha, c.lambda_opaque),
+        needs_prior=True,
+    ),
+    Term("lambda_pearson", lambda of, c: c.lambda_pearson * pearson(of.depth, of.prior, of.mask), of_virtual=True, needs_prior=True),
+    Term("lambda_dist", lambda of, c: c.lambda_dist * masked_mean(of.distortion, of.mask) / of.scene_depth, of_virtual=True),
+    Term("lambda_tv", lambda of, c: c.lambda_tv * total_variation(of.depth, of.mask) / of.scene_depth, of_virtual=True),
+    Term("lambda_flat", lambda of, c: c.lambda_flat * depth_extent(of.model, of.eye, c.flat_ratio).mean(), every="flat_every"),
+)
+"""What the photometric loss of a training view is added to, in this order."""

@@ -1,8 +1,25 @@
-"""Adam with a rate for each tensor, nothing of whose step waits for a GPU: it can be recorded."""
+"""The tensors of a model that are optimised, and Adam with a rate for each, nothing of whose step waits for a GPU: it can be captured."""
 
 import torch
 from torch import Tensor
 from torch.optim.adam import adam
+
+from endo_sim_ros.core.gaussians import GaussianModel
+
+PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh_base", "sh_rest")
+
+
+def parameters_of(model: GaussianModel) -> dict[str, Tensor]:
+    """The tensors of a model that are optimised, by name; none that are empty."""
+    tensors = model.tensors() | {"sh_base": model.sh[:, :1], "sh_rest": model.sh[:, 1:]}
+    return {name: tensors[name] for name in PARAMETERS if tensors[name].numel()}
+
+
+def model_of(parameters: dict[str, Tensor]) -> GaussianModel:
+    """The model made of such tensors; gradients flow through it."""
+    p = parameters
+    sh = torch.cat([p["sh_base"], p["sh_rest"]], 1) if "sh_rest" in p else p["sh_base"]
+    return GaussianModel(p["means"], p["quats"], p["log_scales"], p["logit_opacities"], sh)
 
 
 class Adam:
@@ -17,7 +34,7 @@ class Adam:
 
     def __init__(self, parameters: dict[str, Tensor], rates: dict[str, float]):
         self.parameters = parameters
-        # Where a GPU finds them, a recorded step reads what they are by then.
+        # Where a GPU finds them, a captured step reads what they are by then.
         self.rates = {name: x.new_tensor(rates[name]) if x.is_cuda else rates[name] for name, x in parameters.items()}
         self.state = {
             name: {"step": x.new_zeros(()), "exp_avg": torch.zeros_like(x), "exp_avg_sq": torch.zeros_like(x)}

@@ -10,11 +10,11 @@ from endo_sim_ros.reconstruction.config import ReconstructionConfig
 
 Preset = Literal["default", "laptop", "paper", "fsgs", "3dgs"]
 
-_PLAIN = {  # 3DGS as Kerbl et al. 2023 have it, and what the others build upon, for 3000 iterations
-    "iterations": 3000, "virtual_every": 1,
+_PLAIN = {  # 3DGS as Kerbl et al. 2023 have it, and what the others build upon
+    "virtual_every": 1,
     "initialization": "points", "densification": "gradient", "exposure": False, "light": False,
     "learning_rate": 1.0, "lambda_flat": 0.0, "lambda_opaque": 0.0,
-    "agreement": False, "surroundings": 0.0, "confined": False, "still": False,
+    "multi_view_refinement": False, "extrapolation": 0.0, "dynamic_mask": False,
 }  # fmt: skip
 
 PRESETS: dict[Preset, dict[str, Any]] = {
@@ -43,16 +43,14 @@ ABLATIONS: dict[Preset, dict[str, dict[str, Any]]] = {
         "with total variation": {"lambda_tv": 0.1},
         "with total variation, virtual cameras too": {"lambda_tv": 0.1, "virtual_every": 1},
         "without depth": {"lambda_depth": 0.0},
-        "3000 full steps whatever the views agree in": {"iterations": 3000},
         "with composited depth": {"lambda_opaque": 0.0},
         "without dense initialisation": {"initialization": "points"},
-        "without agreement of depths": {"agreement": False},
+        "without multi-view refinement": {"multi_view_refinement": False},
         "without flat Gaussians": {"lambda_flat": 0.0},
         "without light": {"light": False},
         "without light and exposure": {"light": False, "exposure": False},
-        "with Gaussians outside of all views": {"confined": False},
-        "without surroundings": {"surroundings": 0.0},
-        "with what moved": {"still": False},
+        "without extrapolation": {"extrapolation": 0.0},
+        "without dynamic mask": {"dynamic_mask": False},
         "without Markov chain": {"densification": "gradient"},
     },
 }

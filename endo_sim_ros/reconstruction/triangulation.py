@@ -2,7 +2,6 @@
 
 import logging
 from itertools import combinations
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -11,6 +10,7 @@ from scipy.spatial import cKDTree
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import map_in_threads
 from endo_sim_ros.core.frames import Frame
+from endo_sim_ros.reconstruction.scene import Matches, ScenePoints
 from endo_sim_ros.sequences.recording import spread
 
 log = logging.getLogger(__name__)
@@ -29,26 +29,6 @@ _AROUND = 8  # points around a point that it is compared with
 _DISAGREEMENT = 0.1  # largest relative difference from them
 _NO_BASELINE = 1e-6  # metres
 _NEAR, _FAR = 0.02, 1e3  # metres, between which a match may lie
-
-
-class Matches(NamedTuple):
-    """Features that two views share."""
-
-    views: tuple[int, int]
-    first: np.ndarray  # [M, 2] pixels
-    second: np.ndarray  # [M, 2] pixels
-
-
-class ScenePoints(NamedTuple):
-    """Points on the tissue, as structure from motion gives them."""
-
-    positions: np.ndarray  # [N, 3] m, world
-    colors: np.ndarray  # [N, 3] RGB in [0, 1]
-    error: np.ndarray | float = 0.01  # [N] of the depth, relative, that a pixel's error makes
-
-    @classmethod
-    def none(cls) -> "ScenePoints":
-        return cls(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
 
 
 def triangulate(frames: list[Frame], matches: list[Matches] | None = None) -> ScenePoints:

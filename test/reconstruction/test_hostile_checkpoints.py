@@ -7,9 +7,10 @@ import zipfile
 import numpy as np
 import pytest
 import torch
+from trained import trainer_of
 
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer
+from endo_sim_ros.reconstruction import ReconstructionConfig
 
 
 class Payload:
@@ -26,7 +27,7 @@ class Payload:
 def trainer(small_frames):
     """A training that has begun."""
     config = ReconstructionConfig(iterations=20, max_gaussians=500, image_width=48, device="cpu")
-    trainer = Trainer(list(small_frames[:1]), config)
+    trainer = trainer_of(list(small_frames[:1]), config)
     trainer.step()
     return trainer
 

@@ -5,9 +5,10 @@ import dataclasses
 import numpy as np
 import torch
 from short_training import NO_POINTS, options
+from trained import trainer_of
 
 from endo_sim_ros.core.gaussians import GaussianModel
-from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer, losses
+from endo_sim_ros.reconstruction import ReconstructionConfig, losses
 from endo_sim_ros.reconstruction.initialization import initial_model
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
@@ -54,7 +55,7 @@ def test_depth_extent_sees_needles_along_the_line_of_sight_only():
     scales = torch.tensor([[1.0, 1, 1], [4, 4, 1], [1, 1, 6], [1, 1, 6]]) * 1e-3
     model = GaussianModel(torch.zeros(4, 3), quats, scales.log(), torch.zeros(4), torch.zeros(4, 1, 3))
     model.log_scales.requires_grad_()
-    extent = losses.depth_extent(model, eye)
+    extent = losses.depth_extent(model, eye, 1.5)
     # A sphere and a disc across the view are fine; a needle along it is 6 times as deep as wide, a turned one less.
     deep, wide = (1 + 36) / 2, (1 + (1 + 36) / 2) / 2
     expected = [0, 0, np.log(6 / 1.5), 0.5 * np.log(deep / wide) - np.log(1.5)]
@@ -65,7 +66,7 @@ def test_depth_extent_sees_needles_along_the_line_of_sight_only():
 
 def test_no_gaussian_outgrows_the_scene():
     frames = list(phantom_sequence(PhantomConfig(frames=4, width=96, height=80, border=0.1)))
-    trainer = Trainer(frames, ReconstructionConfig(iterations=60, max_gaussians=1000, device="cpu", learning_rate=5.0))
+    trainer = trainer_of(frames, ReconstructionConfig(iterations=60, max_gaussians=1000, device="cpu", learning_rate=5.0))
     trainer.run()
     assert trainer.model.scales.max() <= 0.06 * trainer.scene_depth * 1.001
 

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 from short_training import bare, finite, options
+from trained import trainer_of
 
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.evaluation import metrics
-from endo_sim_ros.reconstruction import Trainer
 from endo_sim_ros.reconstruction.dynamic_mask import without_motion
 from endo_sim_ros.reconstruction.priors.sources import right_view
 from endo_sim_ros.reconstruction.triangulation import match_features, misposed
@@ -26,11 +26,10 @@ def large():
 def test_the_right_image_is_a_view_of_the_same_scene(views):
     frame = views[4]
     right = right_view(frame)
-    model = Trainer(views, options(iterations=40, max_gaussians=8000, surroundings=0.0, learning_rate=1.0)).run()
+    model = trainer_of(views, options(iterations=40, max_gaussians=8000, extrapolation=0.0, learning_rate=1.0)).run()
     image, _ = DeformableRenderer(model, None, RenderingConfig(device="cpu")).render(right.camera)
     wrong, _ = DeformableRenderer(model, None, RenderingConfig(device="cpu")).render(frame.camera)
     assert metrics.psnr(image, right.image, right.mask) > metrics.psnr(wrong, right.image, right.mask) + 3
-    assert finite(Trainer(views[::4], options(right_views=True)).run())
 
 
 FAULTS = {  # of view 2 of five: a rotation vector of its camera, and a movement along its axes in metres
@@ -56,7 +55,7 @@ def test_a_wrong_pose_among_good_ones_is_found(large, fault, caplog):
     frames[2] = misplaced(frames[2], fault)
     assert misposed(frames, match_features(frames)) == [2]
     if fault == "moved":
-        trainer = Trainer(frames, options(image_width=160, depth="points"))
+        trainer = trainer_of(frames, options(image_width=160, depth="points"))
         assert len(trainer.cameras) == 4 and "left out" in caplog.text
 
 
@@ -64,10 +63,10 @@ def test_with_stereo_a_wrong_pose_among_three_is_left_out(caplog):
     views = list(phantom_sequence(PhantomConfig(width=320, height=256, frames=3, travel=0.02)))
     views = [dataclasses.replace(view, depth=None) for view in views]
     short = options(image_width=80, iterations=1)
-    assert len(Trainer(views, short).cameras) == 3 and "left out" not in caplog.text
-    trainer = Trainer([views[0], misplaced(views[1], "farther"), views[2]], short)
+    assert len(trainer_of(views, short).cameras) == 3 and "left out" not in caplog.text
+    trainer = trainer_of([views[0], misplaced(views[1], "farther"), views[2]], short)
     assert len(trainer.cameras) == 2 and f"{views[1].stamp_ns * 1e-9:.3f} s left out" in caplog.text
-    Trainer([views[0], misplaced(views[1], "farther")], short)
+    trainer_of([views[0], misplaced(views[1], "farther")], short)
     assert "the poses of views 0 and 1 contradict" in caplog.text
 
 
@@ -94,9 +93,9 @@ def test_pure_rotation_trains_with_depth_and_is_an_error_without(views):
         warp = lambda image, H=H: cv2.warpPerspective(image, H, (160, 128))
         images = {name: warp(getattr(frame, name)) for name in ("image", "mask", "depth")}
         turned.append(dataclasses.replace(frame, right=None, camera=frame.camera.at(pose), **images))
-    assert finite(Trainer(turned, options()).run())
+    assert finite(trainer_of(turned, options()).run())
     with pytest.raises(SequenceError, match="scene points could be found in 2 views"):
-        Trainer([bare(frame) for frame in turned], options())
+        trainer_of([bare(frame) for frame in turned], options())
 
 
 @pytest.mark.parametrize("reason, change", {
@@ -106,10 +105,10 @@ def test_pure_rotation_trains_with_depth_and_is_an_error_without(views):
 }.items())  # fmt: skip
 def test_a_view_that_shows_nothing_is_left_out(views, caplog, reason, change):
     blind = dataclasses.replace(views[4], **change(views[4]))
-    trainer = Trainer([views[0], blind, views[8]], options())
+    trainer = trainer_of([views[0], blind, views[8]], options())
     assert len(trainer.cameras) == 2 and f"left out: {reason}" in caplog.text
     with pytest.raises(SequenceError, match=f"every (view|pixel of every view) is {reason}"):
-        Trainer([blind], options())
+        trainer_of([blind], options())
 
 
 def test_an_instrument_in_one_of_several_views_is_left_out(views, caplog):
@@ -129,5 +128,5 @@ def test_an_instrument_in_one_of_several_views_is_left_out(views, caplog):
     assert without_motion([*still, shallow], 0.05)[4] is shallow and "check its depth and pose" in caplog.text
     for choice in (False, True):
         caplog.clear()
-        assert finite(Trainer([*still, held], options(still=choice)).run())
+        assert finite(trainer_of([*still, held], options(dynamic_mask=choice)).run())
         assert ("something moved" in caplog.text) == choice

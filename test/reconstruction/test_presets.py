@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 import torch
 from short_training import SHORT, bare, finite, options
+from trained import trainer_of
 
 from endo_sim_ros.core.config import ConfigError, option_values
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.reconstruction import ABLATIONS, PRESETS, ReconstructionConfig, Trainer, preset
-from endo_sim_ros.reconstruction.trainer import shrink
+from endo_sim_ros.reconstruction.scene import shrink
 from endo_sim_ros.reconstruction.triangulation import triangulate
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
@@ -29,7 +30,7 @@ def quality(model, frames) -> tuple[float, float]:
 @pytest.mark.parametrize("name", PRESETS)
 def test_every_preset_trains(views, name):
     points = triangulate(views)[:2]
-    model = Trainer(views[::4], preset(name, **SHORT), points).run()
+    model = trainer_of(views[::4], preset(name, **SHORT), points).run()
     assert finite(model) and len(model) <= 2000
     assert (model.light is None) == (name in ("paper", "fsgs", "3dgs"))
 
@@ -44,8 +45,8 @@ def test_the_default_beats_the_paper_on_two_views(views):
     ends, rest = [views[0], views[-1]], views[1:-1]
     short = {"iterations": 60, "max_gaussians": 6000, "refine_every": 20, "device": "cpu"}
     points = triangulate(views)[:2]
-    paper = quality(Trainer(ends, preset("paper", **short), points).run(), rest)
-    ours = quality(Trainer(ends, preset("default", **short)).run(), rest)
+    paper = quality(trainer_of(ends, preset("paper", **short), points).run(), rest)
+    ours = quality(trainer_of(ends, preset("default", **short)).run(), rest)
     assert ours[0] > paper[0] + 1.5 and ours[1] > paper[1] + 1.5
 
 
@@ -55,12 +56,12 @@ def test_odd_and_large_pictures_train(size):
     camera = frame.camera.resized(*size)
     enlarged = lambda image: cv2.resize(image, size, interpolation=cv2.INTER_NEAREST)
     large = dataclasses.replace(bare(frame), camera=camera, image=enlarged(frame.image), depth=enlarged(frame.depth), mask=None)
-    trainer = Trainer([large], options(image_width=75, iterations=3))
+    trainer = trainer_of([large], options(image_width=75, iterations=3))
     assert trainer.cameras[0].width == 75 and finite(trainer.run())
 
 
 def test_out_of_memory_goes_on_at_half_the_size(views, monkeypatch, caplog):
-    trainer = Trainer(views[::4], options())
+    trainer = trainer_of(views[::4], options())
     draw, widths = trainer._render, []
 
     def short_of_memory(viewmats, Ks, size, *arguments):
@@ -73,7 +74,7 @@ def test_out_of_memory_goes_on_at_half_the_size(views, monkeypatch, caplog):
     assert finite(trainer.run()) and trainer.iteration == 12
     assert widths[:2] == [160, 80] and trainer.cameras[0].width == 80
     assert "80 pixels wide" in caplog.text
-    tiny = Trainer([shrink(view, 80) for view in views[::4]], options())
+    tiny = trainer_of([shrink(view, 80) for view in views[::4]], options())
     monkeypatch.setattr(tiny, "_render", lambda *_: (_ for _ in ()).throw(torch.OutOfMemoryError("CUDA out of memory")))
     with pytest.raises(torch.OutOfMemoryError):
         tiny.run()
@@ -81,7 +82,7 @@ def test_out_of_memory_goes_on_at_half_the_size(views, monkeypatch, caplog):
 
 @pytest.mark.parametrize("name", ["default", "3dgs", "fsgs"])
 def test_a_checkpoint_of_any_preset_goes_on_as_if_never_interrupted(views, tmp_path, name):
-    make = lambda: Trainer(views[::4], preset(name, **SHORT), triangulate(views)[:2])
+    make = lambda: trainer_of(views[::4], preset(name, **SHORT), triangulate(views)[:2])
     whole, first = make().run(), make()
     for _ in range(7):
         first.step()

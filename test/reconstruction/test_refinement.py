@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 import torch
 from short_training import equal, options
+from trained import trainer_of
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.gaussians import GaussianModel
-from endo_sim_ros.reconstruction import Trainer
-from endo_sim_ros.reconstruction.strategies import mcmc
+from endo_sim_ros.reconstruction.config import McmcConfig
+from endo_sim_ros.reconstruction.strategies import STRATEGIES
+from endo_sim_ros.reconstruction.strategies.mcmc import exploration_noise, relocated
 from endo_sim_ros.splatting import render
 
 
@@ -26,7 +28,7 @@ def cloud(count=300, seed=0):
 
 def test_copies_share_opacity_and_size():
     opacities, scales = torch.tensor([0.3, 0.99, 0.5]), torch.ones(3, 3)
-    shared, smaller = mcmc.relocated(opacities, scales, torch.tensor([2, 50, 1]))
+    shared, smaller = relocated(opacities, scales, torch.tensor([2, 50, 1]), 50)
     torch.testing.assert_close(1 - (1 - shared) ** torch.tensor([2, 50, 1]), opacities)
     # Two copies by hand: 0.3 / (2 o − o² / √2) with o = 1 − √0.7.
     o = 1 - 0.7**0.5
@@ -42,10 +44,10 @@ def test_refinement_preserves_the_picture_moves_the_dead_and_respects_the_limit(
     model = dataclasses.replace(model, logit_opacities=logits)
     camera = Camera(np.array([[80.0, 0, 40], [0, 80, 40], [0, 0, 1]]), 80, 80)
     before = render(model, camera)
-    new, source, fresh = mcmc.refine(model, 0.05, 310, torch.Generator().manual_seed(0))
+    new, source, fresh = STRATEGIES["mcmc"](McmcConfig(), 310, 0.1).refine(model, {}, torch.Generator().manual_seed(0))
     after = render(new, camera)
     assert len(new) == len(source) == len(fresh) == 310
-    assert (new.opacities > mcmc.DEAD_OPACITY).all()
+    assert (new.opacities > McmcConfig().dead_opacity).all()
     assert not (source[:300:6] == torch.arange(0, 300, 6)).any()
     assert fresh[:300:6].all()
     assert fresh[300:].all()
@@ -57,7 +59,7 @@ def test_refinement_preserves_the_picture_moves_the_dead_and_respects_the_limit(
 
 def test_refinement_without_any_living_gaussian_changes_nothing():
     model = dataclasses.replace(cloud(20), logit_opacities=torch.full((20,), -9.0))
-    new, source, fresh = mcmc.refine(model, 0.5, 100, torch.Generator())
+    new, source, fresh = STRATEGIES["mcmc"](McmcConfig(growth=0.5), 100, 0.1).refine(model, {}, torch.Generator())
     assert equal(new, model)
     assert len(source) == len(fresh) == 20
     assert not fresh.any()
@@ -66,13 +68,13 @@ def test_refinement_without_any_living_gaussian_changes_nothing():
 def test_noise_moves_only_the_faint():
     model = cloud(50)
     model.logit_opacities[:25] = -7
-    noise = mcmc.exploration_noise(model, 1.0, torch.Generator().manual_seed(0))
+    noise = exploration_noise(model, 1.0, 0.005, torch.Generator().manual_seed(0))
     assert noise[:25].abs().min() > 0
     assert noise[25:].abs().max() < 1e-3 * noise[:25].abs().median()
 
 
 def test_optimiser_state_follows_its_gaussians(small):
-    trainer = Trainer([small[0], small[8]], options(refine_every=1000, max_gaussians=1500))
+    trainer = trainer_of([small[0], small[8]], options(refine_every=1000, max_gaussians=1500))
     for _ in range(3):
         trainer.step()
     with torch.no_grad():

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 from short_training import SHORT, bare, options
+from trained import trainer_of
 
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import features_at
-from endo_sim_ros.reconstruction import Trainer, losses, preset
+from endo_sim_ros.reconstruction import losses, preset
 from endo_sim_ros.reconstruction.priors.extrapolation import _continued, with_surroundings
 from endo_sim_ros.reconstruction.priors.interpolation import inverse_distance_weighted, kriged
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
@@ -25,9 +26,9 @@ def test_what_goes_on_beyond_a_picture_does_not_reach_into_it(views):
     depth[20] *= 0.6
     local = np.column_stack([(pixels - K[:2, 2]) / K[[0, 1], [0, 1]] * depth[:, None], depth])
     points = frame.camera.position + local @ frame.camera.pose[:3, :3].T
-    trainer = Trainer([known], options(max_gaussians=8000, light=False, exposure=False), (points, np.full((40, 3), 0.5)))
+    trainer = trainer_of([known], options(max_gaussians=8000, light=False, exposure=False), (points, np.full((40, 3), 0.5)))
     rendered = DeformableRenderer(trainer.model, None, RenderingConfig(device="cpu")).render(frame.camera)[1]
-    plain = Trainer([known], options(max_gaussians=8000, light=False, exposure=False, surroundings=0.0)).model
+    plain = trainer_of([known], options(max_gaussians=8000, light=False, exposure=False, extrapolation=0.0)).model
     alone = DeformableRenderer(plain, None, RenderingConfig(device="cpu")).render(frame.camera)[1]
     border = np.ones(exact.shape, bool)
     border[8:-8, 8:-8] = False
@@ -40,7 +41,7 @@ def test_gaussians_around_a_picture_are_small_close_to_it_and_none_is_a_lone_sce
     K, aside = frame.camera.K, np.array([[230.0, 20.0], [250.0, 60.0], [270.0, 100.0]])  # far beyond the right edge
     local = np.column_stack([(aside - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones(3)]) * np.median(frame.depth)
     points = frame.camera.position + local @ frame.camera.pose[:3, :3].T
-    model = Trainer([frame], options(max_gaussians=20_000, light=False, exposure=False), (points, np.full((3, 3), 0.5))).model
+    model = trainer_of([frame], options(max_gaussians=20_000, light=False, exposure=False), (points, np.full((3, 3), 0.5))).model
     uv, _ = frame.camera.project(model.means.numpy().astype(np.float64))
     out = np.maximum(-uv, uv - [frame.camera.width, frame.camera.height]).max(1)
     sizes = model.scales.numpy().max(1)
@@ -81,7 +82,7 @@ def test_a_picture_goes_on_as_bright_as_it_is_however_far_the_tissue_beyond_is_g
 def test_transparency_is_weighed_apart_by_default_and_not_as_printed(views, monkeypatch, name, opaque):
     weights = []
     monkeypatch.setattr(losses, "depth_l1", lambda *arguments: weights.append(arguments[-1]) or torch.zeros(()))
-    Trainer(views[:3], preset(name, **SHORT)).step()
+    trainer_of(views[:3], preset(name, **SHORT)).step()
     assert weights == [opaque]
 
 
@@ -139,8 +140,8 @@ def test_what_lies_beyond_two_views_looks_as_in_the_nearer_one(views):
 def test_tissue_goes_on_beyond_the_pictures_and_in_holes(views):
     frame = dataclasses.replace(bare(views[4]), depth=views[4].depth.copy())
     frame.depth[50:80, 60:100] = 0  # as at a glint
-    known = Trainer([frame], options(max_gaussians=4000, surroundings=0.0)).model
-    wider = Trainer([frame], options(max_gaussians=4000, surroundings=0.3))
+    known = trainer_of([frame], options(max_gaussians=4000, extrapolation=0.0)).model
+    wider = trainer_of([frame], options(max_gaussians=4000, extrapolation=0.3))
     camera = dataclasses.replace(frame.camera, K=frame.camera.K + np.array([[0, 0, 40], [0, 0, 30], [0, 0, 0]]), width=240, height=188)
     renderer = lambda model: DeformableRenderer(model, None, RenderingConfig(device="cpu")).render(camera)[1]
     before, after = renderer(known), renderer(wider.model)

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 from short_training import equal, options
+from trained import trainer_of
 
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.evaluation.held_out import reconstruct_and_measure
-from endo_sim_ros.reconstruction import Trainer
 from endo_sim_ros.reconstruction.optimizer import Adam
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.bag import write_bag
@@ -46,7 +46,7 @@ def test_adam_is_that_of_torch():
 
 
 def test_virtual_camera_lies_between_two_views(small, monkeypatch):
-    trainer = Trainer([small[0], small[4]], options(virtual_every=1))
+    trainer = trainer_of([small[0], small[4]], options(virtual_every=1))
     first, second = (small[i].camera.position for i in (0, 4))
     seen = []
     draw = trainer._render
@@ -69,7 +69,7 @@ def test_virtual_camera_lies_between_two_views(small, monkeypatch):
 def test_training_improves_views_it_has_not_seen(small):
     training, rest = [small[i] for i in (0, 2, 4, 6)], [small[i] for i in (1, 3, 5)]
     noisy = [dataclasses.replace(f, depth=f.depth * np.float32(1.03 if i % 2 else 0.97)) for i, f in enumerate(training)]
-    trainer = Trainer(noisy, options(iterations=150, max_gaussians=8000, refine_every=50))
+    trainer = trainer_of(noisy, options(iterations=150, max_gaussians=8000, refine_every=50))
     psnr, _ = held_out(trainer.model, rest)
     given_error = 0.03 * np.mean([np.sqrt(np.mean(f.depth[f.depth > 0] ** 2)) for f in training])
     reports = []
@@ -82,7 +82,7 @@ def test_training_improves_views_it_has_not_seen(small):
 
 
 def test_progress_can_stop_the_training(small):
-    trainer = Trainer([small[0]], options())
+    trainer = trainer_of([small[0]], options())
     trainer.run(lambda progress: False, every=2)
     assert trainer.iteration == 2
 
@@ -93,23 +93,23 @@ def test_same_seed_gives_the_same_bits_whatever_the_threads(small, monkeypatch):
         monkeypatch.setenv("ENDO_SIM_THREADS", threads)
         torch.set_num_threads(int(threads))
         try:
-            models.append(Trainer(list(small[::4]), options(max_gaussians=15_000)).run())
+            models.append(trainer_of(list(small[::4]), options(max_gaussians=15_000)).run())
         finally:
             torch.set_num_threads(1)
     assert equal(models[0], models[1])
     assert equal(models[0], models[2])
-    other = Trainer(list(small[::4]), options(max_gaussians=15_000, seed=1)).run()
+    other = trainer_of(list(small[::4]), options(max_gaussians=15_000, seed=1)).run()
     assert not equal(models[0], other)
 
 
 def test_a_checkpoint_goes_on_as_if_never_interrupted(small, tmp_path):
     views = list(small[::4])
-    whole = Trainer(views, options()).run()
-    first = Trainer(views, options())
+    whole = trainer_of(views, options()).run()
+    first = trainer_of(views, options())
     for _ in range(7):
         first.step()
     first.save_checkpoint(tmp_path / "a" / "checkpoint.pt")
-    second = Trainer(views, options())
+    second = trainer_of(views, options())
     second.load_checkpoint(tmp_path / "a" / "checkpoint.pt")
     assert second.iteration == 7
     assert equal(second.run(), whole)
@@ -117,12 +117,12 @@ def test_a_checkpoint_goes_on_as_if_never_interrupted(small, tmp_path):
 
 def test_checkpoints_that_do_not_fit_are_refused(small, tmp_path):
     path = tmp_path / "checkpoint.pt"
-    trainer = Trainer([small[0]], options())
+    trainer = trainer_of([small[0]], options())
     trainer.save_checkpoint(path)
     with pytest.raises(SequenceError, match=r"other options \(seed\)"):
-        Trainer([small[0]], options(seed=3)).load_checkpoint(path)
+        trainer_of([small[0]], options(seed=3)).load_checkpoint(path)
     with pytest.raises(SequenceError, match="other views"):
-        Trainer([small[1]], options()).load_checkpoint(path)
+        trainer_of([small[1]], options()).load_checkpoint(path)
     state = torch.load(path, weights_only=True)
     torch.save(state | {"config": state["config"] | {"lambda_gone": 0.3}}, path)  # of another version, which asked for more
     with pytest.raises(SequenceError, match=r"other options \(lambda_gone\)"):
@@ -135,7 +135,7 @@ def test_checkpoints_that_do_not_fit_are_refused(small, tmp_path):
 
 
 def test_higher_harmonics_are_trained(small):
-    model = Trainer([small[0], small[8]], options(sh_degree=3)).run()
+    model = trainer_of([small[0], small[8]], options(sh_degree=3)).run()
     assert model.sh_degree == 3
     assert model.sh[:, 1:].abs().max() > 0
 

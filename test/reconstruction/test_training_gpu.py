@@ -2,9 +2,10 @@
 
 import pytest
 import torch
+from trained import trainer_of
 
 from endo_sim_ros.evaluation import metrics
-from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer
+from endo_sim_ros.reconstruction import ReconstructionConfig
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
@@ -17,7 +18,7 @@ def test_training_reaches_the_same_quality(sh_degree):
     quality = {}
     for device in ("cpu", "cuda"):
         config = ReconstructionConfig(iterations=150, max_gaussians=8000, image_width=160, sh_degree=sh_degree, device=device)
-        model = Trainer(frames[::2], config).run()
+        model = trainer_of(frames[::2], config).run()
         image, _ = DeformableRenderer(model, None, RenderingConfig(device="cpu")).render(frames[1].camera)
         quality[device] = metrics.psnr(image, frames[1].image)
     assert quality["cpu"] > 20

@@ -1,0 +1,92 @@
+"""Light and exposures that are learnt beside the Gaussians."""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from endo_sim_ros.core.light import SURFACE, Light, directions, falloff, features, log_brightness
+from endo_sim_ros.reconstruction import photometry
+from endo_sim_ros.reconstruction.config import ReconstructionConfig
+from endo_sim_ros.reconstruction.device_views import DeviceView
+from endo_sim_ros.reconstruction.optimizer import Adam
+from endo_sim_ros.splatting import RenderOutput
+
+
+class Appearance:
+    """The light at the camera and the exposure of each view, as far as the options ask for them.
+
+    Args:
+        light: (distance, angle, tilt_x, tilt_y) [4] at first, which the light is anchored to.
+        exposures: Logarithm of each view's exposure [V, 3] at first; their mean stays.
+        reference: Distance at which colours are the tissue's own, metres.
+        config: Options of the reconstruction.
+        device: Where to compute.
+    """
+
+    def __init__(self, light: np.ndarray, exposures: np.ndarray, reference: float, config: ReconstructionConfig, device: str):
+        self._config, self._reference, self._device = config, reference, device
+        self._prior = torch.tensor(light, dtype=torch.float32, device=device)
+        exposures = torch.tensor(exposures, dtype=torch.float32, device=device)
+        self._level = exposures.mean(0)
+        self.set(self._prior, exposures)
+
+    def set(self, light: Tensor, exposures: Tensor) -> None:
+        """Start optimising these, as far as there is such a thing."""
+        config = self._config
+        self.tensors = {
+            "light": light.clone().requires_grad_(config.light),
+            "exposures": exposures.clone().requires_grad_(config.exposure),
+        }
+        learnt = {name: value for name, value in self.tensors.items() if value.requires_grad}
+        self.optimizer = Adam(learnt, {"light": config.rates.light, "exposures": config.rates.exposures})
+
+    def gain(self, depth: Tensor, alpha: Tensor, rays: Tensor | None, view: Tensor) -> Tensor | None:
+        """What light and exposure make of a training view's colours [H, W, 1 or 3]; None without them.
+
+        Args:
+            depth, alpha: Rendered Σ w z (m) and Σ w [H, W].
+            rays: `directions` of the camera [3, H, W].
+            view: Index of the exposure [1].
+        """
+        gain = None
+        if self._config.light:
+            gain = falloff(features(depth, alpha, rays, self._reference), self.tensors["light"])[..., None]
+        if self._config.exposure:
+            exposure = self.tensors["exposures"].index_select(0, view).exp()[None]
+            gain = exposure if gain is None else gain * exposure
+        return gain
+
+    def changes(self) -> Tensor:
+        """Sum of the squared changes of the light."""
+        return ((self.tensors["light"] - self._prior) ** 2).sum()
+
+    @torch.no_grad()
+    def hold_level(self) -> None:
+        """Bring the mean exposure back to where it was: all exposures up and all colours down is the same picture, except for tissue
+        that no view sees."""
+        if self._config.exposure:
+            self.tensors["exposures"] += self._level - self.tensors["exposures"].mean(0)
+
+    @torch.no_grad()
+    def fitted(self, views: list[DeviceView], render: Callable[[DeviceView], RenderOutput]) -> tuple[Light | None, np.ndarray]:
+        """The light with an automatic exposure like that of the views, and what it leaves of their log exposures [V, 3]."""
+        light, exposures = self.tensors["light"], self.tensors["exposures"]
+        unexplained = np.zeros(exposures.shape)
+        if not (self._config.light or self._config.exposure):
+            return None, unexplained
+        if not self._config.exposure:
+            return Light(*light.tolist(), self._reference), unexplained
+        brightness = []
+        for view in views:
+            output = render(view)
+            image, depth, alpha = output.colors[0], output.depths[0], output.alphas[0]
+            if self._config.light:
+                rays = directions(view.camera, self._device)
+                image = image * falloff(features(depth, alpha, rays, self._reference), light)[..., None]
+            where = alpha > SURFACE if view.mask is None else (alpha > SURFACE) & (view.mask > 0)
+            brightness.append(float(log_brightness(image, where)))
+        exposures = exposures.cpu().numpy().astype(np.float64)
+        response, levels, residuals = photometry.fit_exposure(exposures, np.array(brightness))
+        return Light(*light.tolist(), self._reference, *map(float, levels), response), residuals

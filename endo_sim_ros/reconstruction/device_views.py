@@ -1,0 +1,70 @@
+"""Training views on the compute device."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.reconstruction.scene import TrainingView
+
+
+@dataclass(frozen=True)
+class DeviceView:
+    """A training view as tensors."""
+
+    camera: Camera
+    image: Tensor  # [H, W, 3] in [0, 1]
+    prior: Tensor | None  # [H, W] depth prior, m, 0 = none
+    mask: Tensor | None  # [H, W] 1 = tissue; None = all of it
+    index: int  # among the training views
+    index_tensor: Tensor  # [1] the same
+
+    @classmethod
+    def of(cls, view: TrainingView, index: int, device: str) -> "DeviceView":
+        """A view on a device."""
+        tensor = lambda array: torch.tensor(array, dtype=torch.float32, device=device)
+        tissue, prior = view.tissue, view.depth_prior
+        return cls(
+            view.camera,
+            tensor(view.image) / 255,
+            None if prior is None else tensor(prior),
+            None if tissue.all() else tensor(tissue),
+            index,
+            torch.tensor([index], device=device),
+        )
+
+
+def matrices(cameras: Sequence[Camera], device: str) -> tuple[Tensor, Tensor]:
+    """Of cameras, viewmats [C, 4, 4] and Ks [C, 3, 3]."""
+    # Without waiting for what the GPU still does.
+    tensor = lambda arrays: torch.from_numpy(np.stack(arrays).astype(np.float32)).to(device, non_blocking=True)
+    return tensor([camera.viewmat for camera in cameras]), tensor([camera.K for camera in cameras])
+
+
+def reprojected_prior(view: DeviceView, viewmat: Tensor) -> Tensor:
+    """The prior of a view as another camera [4, 4] of its kind sees it [H, W], metres; 0 where nothing falls."""
+    height, width = view.prior.shape
+    v, u = (view.prior > 0).nonzero(as_tuple=True)
+    K, pose = (torch.tensor(matrix).to(viewmat) for matrix in (view.camera.K, view.camera.pose))
+    z = view.prior[v, u]
+    points = torch.stack([(u + 0.5 - K[0, 2]) / K[0, 0] * z, (v + 0.5 - K[1, 2]) / K[1, 1] * z, z], 1)
+    # Without a matrix product: libraries give other last bits with other numbers of threads.
+    x, y, z = (sum(row[i] * points[:, i] for i in range(3)) + row[3] for row in (viewmat @ pose)[:3])
+    ahead = z.clamp_min(1e-6)
+    u, v = (x / ahead * K[0, 0] + K[0, 2]).floor(), (y / ahead * K[1, 1] + K[1, 2]).floor()
+    inside = (z > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    pixels = (v * width + u).long()[inside]
+    nearest = torch.full((height * width,), math.inf, device=z.device).scatter_reduce(0, pixels, z[inside], "amin")
+    return torch.where(nearest.isfinite(), nearest, 0).view(height, width)
+
+
+def nearest_views(cameras: Sequence[Camera]) -> list[int]:
+    """Index of each camera's nearest other one (by optical centre); its own for a single one."""
+    centres = np.array([camera.position for camera in cameras])
+    distance = np.linalg.norm(centres[:, None] - centres, axis=2)
+    np.fill_diagonal(distance, math.inf)
+    return distance.argmin(1).tolist()

@@ -1,0 +1,262 @@
+"""From posed frames to a scene that can be trained on, by named stages.
+
+Every stage is a function of a scene, the options and a `StageProgress`; it returns a scene, and does nothing where the options or the
+recording do not ask for it. Inside, a stage gives the algorithm views, its own options and the progress to report to.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.reconstruction import photometry
+from endo_sim_ros.reconstruction.config import ReconstructionConfig
+from endo_sim_ros.reconstruction.dynamic_mask import without_motion
+from endo_sim_ros.reconstruction.initialization import initial_model
+from endo_sim_ros.reconstruction.presets import resolved
+from endo_sim_ros.reconstruction.priors.extrapolation import with_surroundings
+from endo_sim_ros.reconstruction.priors.multi_view import agreed
+from endo_sim_ros.reconstruction.priors.sources import depth_source, with_depth_prior
+from endo_sim_ros.reconstruction.progress import OnProgress, StageProgress
+from endo_sim_ros.reconstruction.scene import PreparedScene, ScenePoints, TrainingView, shrink
+from endo_sim_ros.reconstruction.trainer import Trainer
+from endo_sim_ros.reconstruction.triangulation import match_features, misposed, triangulate
+
+_UNUSABLE = {
+    "masked": "every pixel of every view is masked; a mask has 255 where there is tissue",
+    "overexposed": "every view is overexposed; lower the light or the camera's exposure",
+    "black": "every view is black; switch on the light, or check the camera",
+}
+_FINER = 2  # times the width trained on, at which depth is corrected where images are so fine
+_SEEN = 0.8  # share of the Gaussians that stand for what the training views see, at first
+
+
+class Stage(NamedTuple):
+    """A step of the preparation."""
+
+    name: str
+    run: Callable[[PreparedScene, ReconstructionConfig, StageProgress], PreparedScene]
+
+
+def prepare(
+    frames: Sequence[Frame],
+    config: ReconstructionConfig,
+    points: ScenePoints | tuple | None = None,
+    on_progress: OnProgress | None = None,
+) -> PreparedScene:
+    """Everything that a training needs, of posed frames.
+
+    Args:
+        frames: Training views; every one is used (see `select_keyframes`).
+        config: Options.
+        points: Scene points: positions [N, 3] (m, world), RGB [N, 3] in [0, 1] and, if known, error (see `ScenePoints`), for
+            instance of structure from motion with more views than these; None triangulates these views.
+        on_progress: Called as ``on_progress(stage, done, total)``, several times a second and from several threads; it cancels by
+            raising `Cancelled`.
+
+    Raises:
+        SequenceError: If there are no views, all pixels are masked or white, the views give no scene points to start from, or
+            those given are not finite.
+        Cancelled: If the callback raised it.
+    """
+    if not frames:
+        raise SequenceError("there are no views to reconstruct from; check the image, camera_info and pose topics")
+    config = resolved(config)
+    given = None if points is None else _checked(ScenePoints(*points))
+    scene = PreparedScene(tuple(frames), points=given, given_points=given is not None)
+    for stage in STAGES:
+        progress = StageProgress(stage.name, on_progress)
+        progress.check()
+        scene = stage.run(scene, config, progress)
+    return scene
+
+
+def reconstruct(
+    frames: Sequence[Frame],
+    config: ReconstructionConfig,
+    points: ScenePoints | tuple | None = None,
+    on_progress: OnProgress | None = None,
+) -> GaussianModel:
+    """The trained model of posed frames; `prepare` and `Trainer` in one. Arguments and errors are those of `prepare`."""
+    trainer = Trainer(prepare(frames, config, points, on_progress), config)
+    return trainer.run(on_progress and (lambda progress: on_progress("training", progress.iteration, progress.iterations)))
+
+
+# ------------------------------------------------------------------------------------------------------------- stages
+
+
+def select_usable(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
+    """Leave out views that show no tissue: those masked whole, mostly white, or black."""
+    options = config.views
+    kept, out = [], {}
+    for frame in scene.frames:
+        pixels = frame.image.reshape(-1, 3) if frame.mask is None else frame.image[frame.mask > 0]
+        if not len(pixels):
+            out.setdefault("masked", []).append(frame)
+        elif (pixels.min(-1) >= options.white).mean() > options.overexposed_share:
+            out.setdefault("overexposed", []).append(frame)
+        elif (pixels.max(-1) <= options.black).mean() > options.black_share:
+            out.setdefault("black", []).append(frame)
+        else:
+            kept.append(frame)
+        progress.check()
+    if not kept:
+        raise SequenceError(_UNUSABLE[max(out, key=lambda reason: len(out[reason]))])
+    for reason, frames in out.items():
+        scene = scene.decided(f"views at {_stamps(frames)} left out: {reason}")
+    return _of_frames(scene, kept)
+
+
+def match_views(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
+    """Match features between near views."""
+    return scene.replaced(matches=tuple(match_features(list(scene.frames))))
+
+
+def check_poses(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
+    """Leave out views whose poses contradict the others, with measured depth if there is any."""
+    while not _judged_by_stereo(scene, config) and (wrong := misposed(list(scene.frames), list(scene.matches))):
+        scene = match_views(_without(scene, wrong), config, progress)
+    return scene
+
+
+def find_points(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
+    """Triangulate scene points, unless they are given."""
+    if scene.given_points:
+        return scene
+    return scene.replaced(points=triangulate(list(scene.frames), list(scene.matches)))
+
+
+def estimate_depth(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
+    """Give each view its depth prior, and a right image that is rectified well."""
+    found = with_depth_prior(list(scene.frames), scene.points, config)
+    return scene.replaced(views=_restored(scene.frames, found), depth_source=depth_source(list(scene.frames), config))
+
+
+def check_poses_by_stereo(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
+    """As `check_poses`, with the depth that each view's own pair of images tells, which does not depend on the poses."""
+    while _judged_by_stereo(scene, config) and (wrong := misposed(_disguised(scene.views), list(scene.matches))):
+        scene = _without(scene, wrong)
+        for stage in (match_views, check_poses, find_points, estimate_depth):
+            scene = stage(scene, config, progress)
+    return scene
+
+
+def refine_across_views(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
+    """Correct the depth prior by scene points and the other images of the same tissue."""
+    if not config.multi_view_refinement or scene.depth_source in ("topic", "none"):
+        return scene
+    # Flow is the more precise the finer the pixels are, as matching is.
+    fine = [shrink(view, _FINER * config.image_width) for view in scene.views]
+    refined, _ = agreed(_disguised(fine), scene.points, scene.depth_source)
+    return scene.replaced(views=_restored(fine, refined))
+
+
+def shrink_views(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
+    """Bring the views to the width that is trained on."""
+    return scene.replaced(views=tuple(shrink(view, config.image_width) for view in scene.views))
+
+
+def mask_motion(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
+    """Mask what moved between the views."""
+    if not config.dynamic_mask:
+        return scene
+    return scene.replaced(views=_restored(scene.views, without_motion(_disguised(scene.views), config.depth_tolerance)))
+
+
+def place_gaussians(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
+    """Place the Gaussians that training starts from, and measure the depth of the scene."""
+    most = max(int(_SEEN * config.max_gaussians) if config.extrapolation else config.max_gaussians, 1)
+    views = _disguised(scene.views)
+    model = initial_model(views, scene.points.positions, scene.points.colors, replace(config, max_gaussians=most))
+    positions = model.means.numpy().astype(np.float64)
+    depths = np.concatenate([view.camera.project(positions)[1] for view in views])
+    return scene.replaced(model=model, depth=float(np.median(depths[depths > 0])), exposures=np.zeros((len(views), 3)))
+
+
+def fit_light(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
+    """Fit the light and each view's exposure, and take both out of the Gaussians' colours."""
+    if not (config.light or config.exposure):
+        return scene
+    views, about = _disguised(scene.views), (scene.depth, config.depth_tolerance)
+    means = scene.model.means.numpy().astype(np.float64)
+    light, exposures = photometry.fit_light(views, means, *about, light=config.light, exposure=config.exposure)
+    return scene.replaced(model=photometry.unlit(scene.model, views, light, exposures, *about), light=light, exposures=exposures)
+
+
+def extrapolate_tissue(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
+    """Add Gaussians in the holes of the depth prior and beyond the pictures."""
+    if not config.extrapolation:
+        return scene
+    about = scene.light, scene.exposures, scene.depth, scene.points.positions
+    views = _disguised(scene.views)
+    return scene.replaced(model=with_surroundings(scene.model, views, *about, config.extrapolation, config.max_gaussians))
+
+
+STAGES = (
+    Stage("usable views", select_usable),
+    Stage("matching features", match_views),
+    Stage("checking poses", check_poses),
+    Stage("scene points", find_points),
+    Stage("depth prior", estimate_depth),
+    Stage("checking poses by stereo", check_poses_by_stereo),
+    Stage("multi-view refinement", refine_across_views),
+    Stage("shrinking views", shrink_views),
+    Stage("dynamic mask", mask_motion),
+    Stage("initial model", place_gaussians),
+    Stage("light and exposure", fit_light),
+    Stage("extrapolation", extrapolate_tissue),
+)
+"""What `prepare` does, in this order."""
+
+
+# ------------------------------------------------------------------------------------------------------------ helpers
+
+
+def _checked(points: ScenePoints) -> ScenePoints:
+    """Scene points that somebody gave."""
+    shape, error = np.shape(points.positions), np.asarray(points.error)
+    if len(shape) != 2 or shape[1] != 3 or np.shape(points.colors) != shape or error.shape not in ((), shape[:1]):
+        raise SequenceError("scene points: give positions and colours as arrays [N, 3], and errors [N] or one for all")
+    if not (np.isfinite(points.positions).all() and np.isfinite(points.colors).all()):
+        raise SequenceError("scene points: some positions or colours are not finite; leave those out")
+    if not (np.isfinite(error) & (error > 0)).all():
+        raise SequenceError("scene points: errors are relative and above zero; leave points without one out")
+    return points
+
+
+def _of_frames(scene: PreparedScene, frames: Sequence[Frame]) -> PreparedScene:
+    """The scene with other frames, and nothing found in them yet."""
+    views = tuple(TrainingView.of(frame) for frame in frames)
+    points = scene.points if scene.given_points else None
+    return scene.replaced(frames=tuple(frames), views=views, matches=(), points=points)
+
+
+def _without(scene: PreparedScene, wrong: Sequence[int]) -> PreparedScene:
+    """The scene without the views of these indices, whose poses are wrong."""
+    stamps = _stamps([scene.frames[index] for index in wrong])
+    why = "their poses contradict what they share with the others, or much of the tissue moved"
+    scene = scene.decided(f"views at {stamps} left out: {why}")
+    return _of_frames(scene, [frame for index, frame in enumerate(scene.frames) if index not in wrong])
+
+
+def _stamps(frames: Sequence[Frame]) -> str:
+    return ", ".join(f"{frame.stamp_ns * 1e-9:.3f} s" for frame in frames)
+
+
+def _judged_by_stereo(scene: PreparedScene, config: ReconstructionConfig) -> bool:
+    """Whether poses are judged with the depth of stereo matching."""
+    return config.depth in ("auto", "stereo") and any(frame.right is not None for frame in scene.frames)
+
+
+# Until every stage takes views, their prior is shown to it as the depth of frames.
+
+
+def _disguised(views: Sequence[TrainingView]) -> list[Frame]:
+    return [replace(view, depth=view.depth_prior) for view in views]
+
+
+def _restored(views: Sequence[Frame], found: Sequence[Frame]) -> tuple[TrainingView, ...]:
+    return tuple(replace(TrainingView.of(new), depth=old.depth, depth_prior=new.depth) for old, new in zip(views, found))

@@ -1,0 +1,118 @@
+"""What a reconstruction is made from: training views with their depth prior, scene points, and the scene that stages prepare."""
+
+import dataclasses
+import logging
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, TypeVar
+
+import cv2
+import numpy as np
+from typing_extensions import Self
+
+from endo_sim_ros.core.frames import Frame
+from endo_sim_ros.core.gaussians import GaussianModel
+
+log = logging.getLogger(__name__)
+
+
+class ScenePoints(NamedTuple):
+    """Points on the tissue, as structure from motion gives them."""
+
+    positions: np.ndarray  # [N, 3] m, world
+    colors: np.ndarray  # [N, 3] RGB in [0, 1]
+    error: np.ndarray | float = 0.01  # [N] of the depth, relative, that a pixel's error makes
+
+    @classmethod
+    def none(cls) -> "ScenePoints":
+        return cls(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
+
+
+class Matches(NamedTuple):
+    """Features that two views share."""
+
+    views: tuple[int, int]
+    first: np.ndarray  # [M, 2] pixels
+    second: np.ndarray  # [M, 2] pixels
+
+
+@dataclass(frozen=True)
+class TrainingView(Frame):
+    """A view to train on: a frame, whose `depth` is what was measured, and the depth that training starts from and is held to.
+
+    Args:
+        depth_prior: Depth along the optical axis [H, W], float32, metres; 0 = none; None = none anywhere.
+    """
+
+    depth_prior: np.ndarray | None = None
+
+    @classmethod
+    def of(cls, frame: Frame) -> Self:
+        """The view of a frame, without a prior."""
+        return cls(**{item.name: getattr(frame, item.name) for item in dataclasses.fields(Frame)})
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedScene:
+    """What the stages of a preparation have found so far; after the last one, what a training needs.
+
+    Args:
+        frames: Usable frames, as they were recorded.
+        views: The same as they are trained on: shrunk, with depth prior, rectified right image and mask of what is still.
+        points: Scene points; None before they are found.
+        given_points: Whether the caller gave them.
+        matches: Features that the frames share.
+        depth_source: Where the depth prior is from: topic, stereo, network, points or none.
+        model: Gaussians to start from.
+        depth: Median depth of the scene, metres.
+        light: Of the light at the camera (distance, angle, tilt_x, tilt_y) [4].
+        exposures: Logarithm of each view's exposure [V, 3].
+        decisions: What the stages decided, a sentence each.
+    """
+
+    frames: tuple[Frame, ...]
+    views: tuple[TrainingView, ...] = ()
+    points: ScenePoints | None = None
+    given_points: bool = False
+    matches: tuple[Matches, ...] = ()
+    depth_source: str = "none"
+    model: GaussianModel | None = None
+    depth: float = 0.0
+    light: np.ndarray = field(default_factory=lambda: np.zeros(4))
+    exposures: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    decisions: tuple[str, ...] = ()
+
+    def replaced(self, **changes: Any) -> Self:
+        """A copy with other values."""
+        return dataclasses.replace(self, **changes)
+
+    def decided(self, sentence: str) -> Self:
+        """A copy that knows of a decision, which is logged."""
+        log.warning("%s", sentence)
+        return dataclasses.replace(self, decisions=(*self.decisions, sentence))
+
+
+AnyFrame = TypeVar("AnyFrame", bound=Frame)
+
+
+def shrink(frame: AnyFrame, width: int) -> AnyFrame:
+    """The frame or view at the given width (pixels), if it is wider; the intrinsics follow.
+
+    Colours are averaged; depth is that at the pixel's centre; a pixel is tissue if all that it averages is.
+    """
+    camera = frame.camera
+    if camera.width <= width:
+        return frame
+    size = (width, max(round(camera.height * width / camera.width), 1))
+    average = lambda image: None if image is None else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    # Plain INTER_NEAREST takes the corner instead of the centre.
+    nearest = lambda depth: None if depth is None else cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT)
+    scale = np.diag([size[0] / camera.width, size[1] / camera.height, 1])
+    return dataclasses.replace(
+        frame,
+        image=average(frame.image),
+        camera=camera.resized(*size),
+        right=average(frame.right),
+        right_K=None if frame.right_K is None else scale @ frame.right_K,
+        mask=None if frame.mask is None else np.uint8(255) * (average(np.float32(frame.mask > 0)) > 0.999),
+        **{name: nearest(getattr(frame, name)) for name in ("depth", "depth_prior") if hasattr(frame, name)},
+    )

@@ -1,0 +1,52 @@
+"""The strategy of 3DGS (Kerbl et al. 2023), with the gradients of AbsGS (Ye et al. 2024)."""
+
+import dataclasses
+import math
+
+import torch
+from torch import Tensor
+
+from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.reconstruction.strategies.base import Refined, Strategy
+
+
+class Default(Strategy):
+    """Where image gradients are large, large Gaussians are split and small ones doubled; options: `GradientConfig`."""
+
+    wants_absgrad = True
+
+    def initialize_state(self, count: int, device: torch.device | str) -> dict[str, Tensor]:
+        # Σ of image gradients and number of views that had any.
+        return {"gradients": torch.zeros(2, count, device=device)}
+
+    def step_post_backward(self, state: dict[str, Tensor], steepness: Tensor) -> None:
+        state["gradients"] += torch.stack([steepness, (steepness > 0).to(steepness.dtype)])
+
+    def refine(self, model: GaussianModel, state: dict[str, Tensor], generator: torch.Generator) -> Refined:
+        """Remove dead Gaussians; where images ask for more, split the large ones in two and double the small ones.
+
+        Above the limit, the steepest come first.
+        """
+        options, scales, device = self.options, model.scales, model.means.device
+        total, count = state["gradients"]
+        gradients = total / count.clamp_min(1)
+        alive = model.opacities > options.dead_opacity
+        if not alive.any():
+            alive[:] = True  # nothing would be left
+        hot = (gradients > options.threshold) & alive
+        room = max(0, self.limit - int(alive.sum()))
+        if int(hot.sum()) > room:
+            hot &= gradients > gradients[hot].sort(descending=True).values[room] if room else hot.new_zeros(())
+        split = hot & (scales.amax(1) > options.large * self.scene_depth)
+        indices = [mask.nonzero()[:, 0] for mask in (alive & ~split, hot & ~split, split, split)]
+        source = torch.cat(indices)
+        new = model.select(source)
+        halves = len(source) - 2 * len(indices[2])
+        moved = new.select(slice(halves, None))
+        noise = torch.randn(len(moved), 3, generator=generator).to(device)
+        steps = (moved.rotations @ (moved.scales * noise)[..., None])[..., 0]
+        means, log_scales = new.means.clone(), new.log_scales.clone()
+        means[halves:] += steps
+        log_scales[halves:] -= math.log(options.shrink)
+        fresh = torch.arange(len(source), device=device) >= len(indices[0])
+        return Refined(dataclasses.replace(new, means=means, log_scales=log_scales), source, fresh)

@@ -1,0 +1,164 @@
+"""A scene is prepared in stages, each of which reports its progress, can be cancelled, and leaves what was recorded alone."""
+
+import dataclasses
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.reconstruction import Cancelled, ReconstructionConfig, Trainer, prepare, reconstruct
+from endo_sim_ros.reconstruction.pipeline import STAGES
+from endo_sim_ros.reconstruction.progress import StageProgress
+from endo_sim_ros.reconstruction.scene import PreparedScene
+from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
+
+
+@pytest.fixture(scope="module")
+def frames():
+    """Four frames with stereo and exact depth."""
+    return list(phantom_sequence(PhantomConfig(width=160, height=128, frames=4, travel=0.02)))
+
+
+@pytest.fixture(scope="module")
+def stereo(frames):
+    """The same without depth."""
+    return [dataclasses.replace(frame, depth=None) for frame in frames]
+
+
+def options(**changes):
+    return ReconstructionConfig(**({"max_gaussians": 1500, "image_width": 80, "device": "cpu", "iterations": 5} | changes))
+
+
+def bits(scene: PreparedScene) -> list[bytes]:
+    tensors = [tensor.numpy().tobytes() for tensor in scene.model.tensors().values()]
+    return [*tensors, *(view.depth_prior.tobytes() for view in scene.views), scene.light.tobytes(), scene.exposures.tobytes()]
+
+
+# --------------------------------------------------------------------------------------------- the whole pipeline
+
+
+def test_what_was_measured_stays_and_the_prior_is_another_field(frames):
+    scene = prepare(frames, options(depth="stereo"))
+    assert all(kept is given for kept, given in zip(scene.frames, frames))
+    for view, frame in zip(scene.views, frames):
+        assert view.depth_prior.shape == view.depth.shape == view.image.shape[:2] == (64, 80)
+        exact = frame.depth[1::2, 1::2]
+        assert np.abs(view.depth - exact).max() < 0.01 * exact.max()
+        assert np.abs(view.depth_prior - view.depth)[view.depth_prior > 0].max() > 1e-5
+
+
+def test_stages_report_in_order(stereo):
+    reports = []
+    prepare(stereo, options(), on_progress=lambda *report: reports.append(report))
+    assert list(dict.fromkeys(stage for stage, _, _ in reports)) == [stage.name for stage in STAGES]
+
+
+def test_preparing_twice_gives_the_same_bits_and_a_trainer_changes_nothing(stereo):
+    config = options()
+    first, second = prepare(stereo, config), prepare(stereo, config)
+    assert bits(first) == bits(second)
+    Trainer(first, config).run()
+    assert bits(first) == bits(second)
+
+
+def test_reconstructing_is_preparing_and_training_with_progress_and_cancellation(frames):
+    config, stages = options(), []
+    model = reconstruct(frames, config, on_progress=lambda *report: stages.append(report))
+    assert stages[-1] == ("training", 5, 5) and stages[0][0] == STAGES[0].name
+    other = Trainer(prepare(frames, config), config).run()
+    assert all((a == b).all() for a, b in zip(model.tensors().values(), other.tensors().values()))
+
+    def cancel_training(stage, *_):
+        if stage == "training":
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        reconstruct(frames, config, on_progress=cancel_training)
+
+
+# ------------------------------------------------------------------------------------------------------- decisions
+
+
+def test_decisions_are_told(frames):
+    blind = dataclasses.replace(frames[1], mask=np.zeros((128, 160), np.uint8))
+    scene = prepare([frames[0], blind, *frames[2:]], options())
+    assert len(scene.views) == 3
+    (left_out,) = scene.decisions
+    assert f"{blind.stamp_ns * 1e-9:.3f} s left out: masked" in left_out
+
+
+def test_thresholds_of_usable_views_are_options(frames):
+    dim = [dataclasses.replace(frame, image=(frame.image // 20).astype(np.uint8)) for frame in frames]
+    with pytest.raises(SequenceError, match="every view is black"):
+        prepare(dim, options().replaced({"views.black": 20}))
+    assert len(prepare(dim, options().replaced({"views.black": 0})).views) == 4
+
+
+# ----------------------------------------------------------------------------------------------------------- progress
+
+
+def test_cancelling_reaches_all_threads_and_begins_nothing_more(monkeypatch):
+    monkeypatch.setenv("ENDO_SIM_THREADS", "2")
+    begun, ended, both = [], [], threading.Barrier(2)
+    progress = StageProgress("work", lambda *_: cancel())
+
+    def cancel():
+        if len(begun) == 2 and threading.current_thread() is threading.main_thread():
+            raise Cancelled
+
+    def work(item):
+        begun.append(item)
+        both.wait(10)
+        try:
+            while True:
+                progress.check()
+                time.sleep(0.001)
+        except Cancelled:
+            ended.append(item)
+            raise
+
+    with pytest.raises(Cancelled):
+        progress.map(work, range(9))
+    assert sorted(begun) == sorted(ended) == [0, 1]
+
+
+def test_an_interrupt_reaches_the_threads():
+    """Ctrl-C arrives in the main thread, while others work."""
+    running = threading.Event()
+    progress = StageProgress("work", lambda *_: interrupt())
+
+    def interrupt():
+        if running.is_set() and threading.current_thread() is threading.main_thread():
+            raise KeyboardInterrupt
+
+    def work(item):
+        running.set()
+        while True:
+            progress.check()
+            time.sleep(0.001)
+
+    with pytest.raises(KeyboardInterrupt):
+        progress.map(work, range(2))
+
+
+def test_an_error_of_one_item_ends_the_others():
+    progress = StageProgress()
+
+    def work(item):
+        if item == 0:
+            raise ValueError("the first one")
+        while True:
+            progress.check()
+            time.sleep(0.001)
+
+    with pytest.raises(ValueError, match="the first one"):
+        progress.map(work, range(4))
+
+
+def test_results_come_in_order():
+    seen = []
+    progress = StageProgress("squares", lambda *report: seen.append(report))
+    assert progress.map(lambda x: x * x, range(5)) == [0, 1, 4, 9, 16]
+    assert seen[0] == ("squares", 0, 5) and seen[-1] == ("squares", 5, 5)

@@ -16,7 +16,6 @@ from endo_sim_ros.reconstruction import photometry
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.dynamic_mask import without_motion
 from endo_sim_ros.reconstruction.initialization import initial_model
-from endo_sim_ros.reconstruction.presets import resolved
 from endo_sim_ros.reconstruction.priors.extrapolation import with_surroundings
 from endo_sim_ros.reconstruction.priors.multi_view import agreed
 from endo_sim_ros.reconstruction.priors.sources import depth_source, with_depth_prior
@@ -64,7 +63,7 @@ def prepare(
     """
     if not frames:
         raise SequenceError("there are no views to reconstruct from; check the image, camera_info and pose topics")
-    config = resolved(config)
+
     given = None if points is None else _checked(ScenePoints(*points))
     scene = PreparedScene(tuple(frames), points=given, given_points=given is not None)
     for stage in STAGES:

@@ -12,7 +12,7 @@ from trained import trainer_of
 from endo_sim_ros.core.config import ConfigError, option_values
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.evaluation import metrics
-from endo_sim_ros.reconstruction import ABLATIONS, PRESETS, ReconstructionConfig, Trainer, preset
+from endo_sim_ros.reconstruction import ABLATIONS, PRESETS, ReconstructionConfig, preset
 from endo_sim_ros.reconstruction.scene import shrink
 from endo_sim_ros.reconstruction.triangulation import triangulate
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
@@ -107,11 +107,11 @@ def test_options_beside_a_preset_count_even_if_they_are_the_defaults():
 def test_a_checkpoint_knows_the_options_and_not_the_preset_that_they_came_from(views, tmp_path):
     config = preset("paper", lambda_dist=0.0, **SHORT)
     points = triangulate(views)[:2]
-    trainer = Trainer(views[::4], config, points)
+    trainer = trainer_of(views[::4], config, points)
     trainer.step()
     trainer.save_checkpoint(tmp_path / "checkpoint.pt")
-    spelled_out = Trainer(views[::4], ReconstructionConfig.from_mapping(option_values(config)), points)
+    spelled_out = trainer_of(views[::4], ReconstructionConfig.from_mapping(option_values(config)), points)
     spelled_out.load_checkpoint(tmp_path / "checkpoint.pt")
     assert spelled_out.iteration == 1
     with pytest.raises(SequenceError, match=r"other options \(lambda_dist\)"):
-        Trainer(views[::4], preset("paper", **SHORT), points).load_checkpoint(tmp_path / "checkpoint.pt")
+        trainer_of(views[::4], preset("paper", **SHORT), points).load_checkpoint(tmp_path / "checkpoint.pt")

@@ -32,6 +32,7 @@ class BagPlayerNode(EndoNode):
         self._thread.start()
 
     def config_changed(self, config: BagPlayerConfig) -> None:
+        """The next message uses the new options."""
         self._config = config
 
     def status(self):
@@ -39,6 +40,7 @@ class BagPlayerNode(EndoNode):
         return (ERROR if self._failed else OK), self._state, values
 
     def destroy_node(self) -> None:
+        """Stop playing, then destroy the node."""
         self._stop.set()
         self._thread.join()
         super().destroy_node()
@@ -125,6 +127,7 @@ class BagPlayerNode(EndoNode):
 
 
 def main() -> int:
+    """Run the node until it is told to stop, and return the exit status of the process."""
     return run(BagPlayerNode)
 
 

@@ -67,6 +67,7 @@ class ReconstructionNode(EndoNode):
             self._publish_file(self._options.model_file)
 
     def config_changed(self, config: StageConfig) -> None:
+        """New options of the reconstruction count from the next one on; a new model_file is published now."""
         if isinstance(config, ReconstructionNodeConfig):
             if config.model_file != self._options.model_file:
                 self._publish_file(config.model_file)
@@ -76,6 +77,7 @@ class ReconstructionNode(EndoNode):
             self._config = config  # used by the next reconstruction
 
     def implied_values(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """A preset implies its options."""
         name = values.get("preset")
         return option_values(preset(name)) if isinstance(name, str) and name in PRESETS else {}
 
@@ -286,6 +288,7 @@ class ReconstructionNode(EndoNode):
         return OK, f"collecting views, {len(self._frames)} so far", values
 
     def destroy_node(self) -> None:
+        """Cancel the training, then destroy the node."""
         self._cancel.set()
         if self._thread is not None:
             self._thread.join(timeout=2.0)
@@ -293,6 +296,7 @@ class ReconstructionNode(EndoNode):
 
 
 def main() -> int:
+    """Run the node until it is told to stop, and return the exit status of the process."""
     return run(ReconstructionNode)
 
 

@@ -59,6 +59,7 @@ class RenderingNode(EndoNode):
         self._timer = self.every(1.0 / self._options.rate / _POLLS, self._on_timer)
 
     def config_changed(self, config: StageConfig) -> None:
+        """New options of the rendering: the model is bound anew in the background."""
         if isinstance(config, RenderingNodeConfig):
             self._options = config
             self._timer.timer_period_ns = int(1e9 / config.rate / _POLLS)
@@ -282,6 +283,7 @@ class RenderingNode(EndoNode):
         return OK, "rendering", values
 
     def destroy_node(self) -> None:
+        """Bind no more models, and destroy the node."""
         self._tissue.stop()
         super().destroy_node()
 
@@ -294,6 +296,7 @@ def _decode_info(message: Any, topic: str) -> CameraInfo:
 
 
 def main() -> int:
+    """Run the node until it is told to stop, and return the exit status of the process."""
     return run(RenderingNode)
 
 

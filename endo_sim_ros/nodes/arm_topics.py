@@ -81,8 +81,8 @@ class ArmTopics:
         frame = messages.check_frame(message, ("", name, *frames), topic)
 
         def act() -> None:
-            self._require_pose(name, topic, "wrench")
-            R = frames.get(frame, arm.pose)[:3, :3]  # any other is the tool's own
+            pose = self._require_pose(name, topic, "wrench")
+            R = frames.get(frame, pose)[:3, :3]  # any other is the tool's own
             arm.force, arm.torque, arm.heard = R @ force, R @ torque, self._node.now_ns() * 1e-9
 
         self._deliver(name, "wrench", message, topic, act)
@@ -124,11 +124,14 @@ class ArmTopics:
         finally:
             self.publish_operating_states(name)
 
-    def _require_pose(self, name: str, topic: str, what: str) -> None:
-        _require_enabled(self._arms[name], topic)
-        if self._arms[name].pose is None:
+    def _require_pose(self, name: str, topic: str, what: str) -> np.ndarray:
+        """The pose of an arm that may move; MessageError if it has none or may not."""
+        arm = self._arms[name]
+        _require_enabled(arm, topic)
+        if arm.pose is None:
             pose_topic = self._pose_topic(name).name
             raise MessageError(f"{topic}: a {what} came before any pose on {pose_topic}; publish the tip's pose")
+        return arm.pose
 
     # ------------------------------------------------------------------ states
 
@@ -146,21 +149,22 @@ class ArmTopics:
                 self._told[name] = state
                 publisher.publish(messages.encode_operating_state(*state, self._node.now_ns()))
 
-    def publish(self, arm: Arm, reaction: np.ndarray, torque: np.ndarray, stamp: int) -> None:
-        """Publish what an arm with a pose feels and, if it is commanded, where it is.
+    def publish(self, arm: Arm, pose: np.ndarray, reaction: np.ndarray, torque: np.ndarray, stamp: int) -> None:
+        """Publish what an arm feels and, if it is commanded, where it is.
 
         Args:
             arm: The arm.
+            pose: Pose [4, 4] of its tip, m, world.
             reaction: Force [3] of the tissue on the tool, N, world.
             torque: Torque [3] about the tip, N·m, world.
             stamp: Time of the state, ns.
         """
-        axes = arm.pose[:3, :3].T  # the reaction is given in the axes of the tool
+        axes = pose[:3, :3].T  # the reaction is given in the axes of the tool
         self._reactions[arm.name].publish(messages.encode_wrench(axes @ reaction, axes @ torque, stamp, arm.name))
         if arm.name in self._publishers:
             *poses, jaw_state, jaw_setpoint, _ = self._publishers[arm.name]
             for publisher in poses:  # an ideal arm is where it is told to be
-                publisher.publish(messages.encode_pose(arm.pose, stamp, self.options.world_frame))
+                publisher.publish(messages.encode_pose(pose, stamp, self.options.world_frame))
             for publisher in (jaw_state, jaw_setpoint):
                 publisher.publish(messages.encode_jaw(arm.angle, stamp))
 

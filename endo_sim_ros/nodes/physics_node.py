@@ -8,7 +8,6 @@ import numpy as np
 from std_srvs.srv import SetBool, Trigger
 
 from endo_sim_ros import messages
-from endo_sim_ros.core.config import StageConfig
 from endo_sim_ros.messages import ControlNodeCloud, MessageError
 from endo_sim_ros.nodes.arm import Arm
 from endo_sim_ros.nodes.arm_topics import ArmTopics
@@ -64,7 +63,7 @@ class PhysicsNode(EndoNode):
         self.service(SetBool, "~/pause", self._on_pause)
         self._timer = self.every(_poll(self._config), self._on_timer)
 
-    def config_changed(self, config: StageConfig) -> None:
+    def config_changed(self, config: PhysicsConfig | PhysicsNodeConfig) -> None:
         """New options of the physics: a simulation is built for them in the background."""
         if isinstance(config, PhysicsConfig):
             if config.regions != self._config.regions:
@@ -82,8 +81,8 @@ class PhysicsNode(EndoNode):
             built = self._builder.take()
             if built is not None:
                 (stamp, simulation), old = built, self._simulation
-                same_model = old is not None and stamp == self._simulated_stamp
-                continued = same_model and simulation.continue_from(old)  # only its material has changed
+                same_model = stamp == self._simulated_stamp
+                continued = old is not None and same_model and simulation.continue_from(old)  # only its material has changed
                 self._simulated_stamp, self._simulation, self._failure = stamp, simulation, ""
                 self._start_timing()
                 if not continued:
@@ -143,7 +142,7 @@ class PhysicsNode(EndoNode):
             except ValueError as error:
                 arm.cutting = False
                 self.report_error(sentence(f"{name}: cut", error))
-            if arm.force is None:
+            if arm.force is None or arm.torque is None:
                 continue
             timeout = self._options.command_timeout
             stale = not self._lockstep and 0 < timeout < self._seconds() - arm.heard
@@ -233,7 +232,7 @@ class PhysicsNode(EndoNode):
             if arm.pose is None:
                 continue
             reaction, torque = simulation.reaction(name)
-            self._arm_topics.publish(arm, reaction, torque, stamp)
+            self._arm_topics.publish(arm, arm.pose, reaction, torque, stamp)
             force = arm.force if arm.acting and arm.force is not None else np.zeros(3)
             shown.append(messages.ToolDisplay(name, arm.pose[:3, 3], force, reaction, simulation.held(name)))
         if shown and self._markers_pub.get_subscription_count():
@@ -253,7 +252,7 @@ class PhysicsNode(EndoNode):
         self._publish(self._simulation, self._simulated_stamp if self._lockstep else self.now_ns(), at_rest=True)
         return True, "at rest"
 
-    def _on_step(self, _: Trigger.Request) -> tuple[bool, str]:
+    def _on_step(self, request: Trigger.Request) -> tuple[bool, str]:
         simulation = self._simulation
         if simulation is None:
             return False, "there is no model yet"

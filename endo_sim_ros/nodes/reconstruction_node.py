@@ -13,7 +13,7 @@ from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera, load_cameras, save_cameras
-from endo_sim_ros.core.config import StageConfig, option_values
+from endo_sim_ros.core.config import option_values
 from endo_sim_ros.core.frames import LEFT_FRAME, Frame, SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel, load_ply, save_ply
 from endo_sim_ros.messages import Topic
@@ -66,7 +66,7 @@ class ReconstructionNode(EndoNode):
         with self.guard("model_file"):
             self._publish_file(self._options.model_file)
 
-    def config_changed(self, config: StageConfig) -> None:
+    def config_changed(self, config: ReconstructionConfig | ReconstructionNodeConfig) -> None:
         """New options of the reconstruction count from the next one on; a new model_file is published now."""
         if isinstance(config, ReconstructionNodeConfig):
             if config.model_file != self._options.model_file:

@@ -106,7 +106,7 @@ class TissueBuilder:
         whole = own and (not self._views_given or self._own_cameras())
         if not whole and time.monotonic() - self._model_came < _CAMERAS_LATE:
             return "", None
-        if own and self._views_given:
+        if own and self._views_given and self._views is not None:
             return "own cameras", self._views[:, :3, 3]
         if self._camera_position is not None:
             return "camera", self._camera_position
@@ -114,7 +114,7 @@ class TissueBuilder:
 
     def _own_cameras(self) -> list[Camera]:
         """The cameras of the newest model, if all about them has arrived."""
-        if self._views_stamp != self._model_stamp or not self._views_given or self._view_info is None:
+        if self._views_stamp != self._model_stamp or not self._views_given or self._views is None or self._view_info is None:
             return []
         stamp, info = self._view_info
         if stamp != self._model_stamp:

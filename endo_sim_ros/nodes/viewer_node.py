@@ -12,7 +12,6 @@ from std_srvs.srv import SetBool, Trigger
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.core.config import StageConfig
 from endo_sim_ros.messages import ControlNodeCloud
 from endo_sim_ros.nodes.base import OK, WARN, EndoNode, run
 from endo_sim_ros.nodes.configs import ViewerNodeConfig, arm_names
@@ -84,7 +83,7 @@ class ViewerNode(EndoNode):
         self.every(_PERIOD, self._on_timer)
         self.get_logger().info(f"open {self.viewer.url} in a browser")
 
-    def config_changed(self, config: StageConfig) -> None:
+    def config_changed(self, config: ViewerConfig | RenderingConfig | ViewerNodeConfig) -> None:
         """New options of the rendering: the model is bound anew in the background."""
         if isinstance(config, ViewerConfig):
             self.viewer.config = config
@@ -168,8 +167,7 @@ class ViewerNode(EndoNode):
 
     def _on_timer(self) -> None:
         with self.guard("viewer"):
-            if self._tissue.bind(self._nodes, self._rendering):
-                bound = self._tissue.bound
+            if self._tissue.bind(self._nodes, self._rendering) and (bound := self._tissue.bound) is not None:
                 self.viewer.show_model(bound.renderer, bound.node_rest, self._camera())
             now = time.monotonic()
             tools = {

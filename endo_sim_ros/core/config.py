@@ -47,18 +47,15 @@ def options(config_class: type) -> tuple[Option, ...]:
     """All options of a configuration dataclass, in order; those of a nested stage follow under ``stage.option``."""
     hints = typing.get_type_hints(config_class, include_extras=True)
     docstrings = {}
-    for each in filter(dataclasses.is_dataclass, reversed(config_class.__mro__)):
-        body = ast.parse(textwrap.dedent(inspect.getsource(each))).body[0].body
-        docstrings |= {
-            field.target.id: " ".join(doc.value.value.split())
-            for field, doc in zip(body, body[1:])
-            if isinstance(field, ast.AnnAssign) and isinstance(doc, ast.Expr) and isinstance(doc.value, ast.Constant)
-        }
+    for each in reversed(config_class.__mro__):
+        if "__dataclass_fields__" in vars(each):
+            docstrings |= _field_docstrings(each)
     found = []
     for field in dataclasses.fields(config_class):
         hint, bounds, choices = hints[field.name], None, None
         if _is_stage(hint):
-            stage = field.default if field.default is not dataclasses.MISSING else field.default_factory()
+            factory = field.default_factory
+            stage: Any = field.default if factory is dataclasses.MISSING else factory()
             defaults = option_values(stage)  # which may differ from those of the class
             found += [option._replace(name=f"{field.name}.{option.name}", default=defaults[option.name]) for option in options(hint)]
             continue
@@ -71,6 +68,18 @@ def options(config_class: type) -> tuple[Option, ...]:
         hint = typing.get_origin(hint) or hint
         found.append(Option(field.name, hint, field.default, docstrings.get(field.name, ""), bounds, choices))
     return tuple(found)
+
+
+def _field_docstrings(config_class: type) -> dict[str, str]:
+    """The strings under the fields of a class, which Python itself forgets."""
+    (definition,) = ast.parse(textwrap.dedent(inspect.getsource(config_class))).body
+    body = definition.body if isinstance(definition, ast.ClassDef) else []
+    found = {}
+    for field, doc in zip(body, body[1:]):
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(doc, ast.Expr):
+            if isinstance(doc.value, ast.Constant) and isinstance(doc.value.value, str):
+                found[field.target.id] = " ".join(doc.value.value.split())
+    return found
 
 
 def _is_stage(hint: Any) -> bool:
@@ -120,18 +129,13 @@ def validate(config: Any) -> None:
     for option in options(type(config)):
         if "." in option.name:
             continue  # the nested stage has validated itself
-        value = getattr(config, option.name)
+        value = _converted(option, getattr(config, option.name))
+        object.__setattr__(config, option.name, value)
         where = f"{type(config).__name__}.{option.name}"
-        if option.type is float and isinstance(value, int) and not isinstance(value, bool):
-            value = float(value)
-            object.__setattr__(config, option.name, value)
-        if option.type is tuple and isinstance(value, (list, tuple)):
-            value = tuple(value)
-            object.__setattr__(config, option.name, value)
-            if not all(isinstance(item, str) for item in value):
-                raise ConfigError(f"{where} must be a list of names, got {value!r}")
         if not isinstance(value, option.type) or (option.type is int and isinstance(value, bool)):
             raise ConfigError(f"{where} must be a {option.type.__name__}, got {value!r}")
+        if option.type is tuple and not all(isinstance(item, str) for item in value):
+            raise ConfigError(f"{where} must be a list of names, got {value!r}")
         if option.type is float and not math.isfinite(value):
             raise ConfigError(f"{where} must be finite, got {value}")
         if option.choices and value not in option.choices:
@@ -141,6 +145,14 @@ def validate(config: Any) -> None:
             raise ConfigError(f"{where} must lie in [{low:g}, {high:g}] {unit}, got {value:g}".replace(" ,", ","))
 
 
+def _converted(option: Option, value: Any) -> Any:
+    """A value in the type of an option, where nothing is lost: a whole number for a float, a list for a tuple."""
+    if option.type is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    return tuple(value) if option.type is tuple and isinstance(value, list) else value
+
+
+@dataclasses.dataclass(frozen=True)
 class StageConfig:
     """Base of the stage configurations: validates on construction and converts from plain mappings."""
 

@@ -43,13 +43,16 @@ class NodeProcess:
 
     @property
     def pid(self) -> int:
+        """Number of the process."""
         return self._process.pid
 
     def send_signal(self, number: int) -> None:
+        """Send a signal to the process, if it runs."""
         if self.exit_status is None:
             self._process.send_signal(number)
 
     def interrupt(self) -> None:
+        """Ask the node to end, as Ctrl-C does."""
         self.send_signal(signal.SIGINT)
 
     def wait(self, seconds: float = _STOP_AFTER) -> int:

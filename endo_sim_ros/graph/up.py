@@ -94,14 +94,17 @@ class _Supervisor:
         self._said: dict[str, tuple[str, str]] = {}
 
     def start(self, name: str, *ros_arguments: str, **parameters: Any) -> None:
+        """Start a node, and remember its arguments for when it crashes."""
         self._arguments[name], self._began[name] = (ros_arguments, parameters), time.monotonic()
         self._graph.start(name, *ros_arguments, **parameters)
 
     def full_name(self, name: str) -> str:
+        """Name of a node on /diagnostics."""
         return f"{self._namespace}/{_NODE_NAMES.get(name, name)}".lstrip("/")
 
     @property
     def full_names(self) -> list[str]:
+        """Names of all nodes on /diagnostics."""
         return [self.full_name(name) for name in self._graph.nodes]
 
     def check(self) -> None:

@@ -78,7 +78,7 @@ class Arm:
                 self.pose = self.pose_goal
             turn = self.pose[:3, :3].T @ self.pose_goal[:3, :3]
             angle = np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))
-            needed = max(np.linalg.norm(self.pose_goal[:3, 3] - self.pose[:3, 3]) / speed, angle / turn_speed)
+            needed = float(max(np.linalg.norm(self.pose_goal[:3, 3] - self.pose[:3, 3]) / speed, angle / turn_speed))
             if needed <= seconds * _ROUNDED:
                 self.pose, self.pose_goal = self.pose_goal, None
             else:

@@ -18,6 +18,7 @@ class Background:
 
     @property
     def busy(self) -> bool:
+        """Whether something is being built, or was built and not taken yet."""
         return self._future is not None
 
     def want(self, key: Any, build: Callable[[], Any]) -> None:

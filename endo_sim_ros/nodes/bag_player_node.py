@@ -39,6 +39,7 @@ class BagPlayerNode(EndoNode):
         self._thread.start()
 
     def config_changed(self, config: BagPlayerConfig) -> None:
+        """The next message uses the new options."""
         self._config = config
 
     def status(self) -> tuple[int, str, dict[str, Any]]:
@@ -47,6 +48,7 @@ class BagPlayerNode(EndoNode):
         return (ERROR, self._failure, values) if self._failure else (OK, _MESSAGES[self._state], values)
 
     def destroy_node(self) -> None:
+        """Stop playing, then destroy the node."""
         self._stop.set()
         self._thread.join()
         super().destroy_node()
@@ -132,6 +134,7 @@ class BagPlayerNode(EndoNode):
 
 
 def main() -> int:
+    """Run the node until it is told to stop, and return the exit status of the process."""
     return run(BagPlayerNode)
 
 

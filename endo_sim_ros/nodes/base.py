@@ -52,10 +52,26 @@ class EndoNode(ConfiguredNode):
     # ----------------------------------------------------------------- topics
 
     def publisher(self, topic: Topic, depth: int = STREAM_DEPTH) -> Any:
+        """A publisher of a topic.
+
+        Args:
+            topic: The topic.
+            depth: Messages that are kept for subscribers that are slow.
+
+        Raises:
+            MessageError: If the type of the topic is not installed.
+        """
         return self.create_publisher(messages.ros_class(topic.type), topic.name, quality(topic, depth))
 
     def subscribe(self, topic: Topic, callback: Callable[[Any], None], depth: int = STREAM_DEPTH, reliable: bool = True) -> None:
-        """Subscribe with a callback whose errors are reported instead of raised."""
+        """Subscribe with a callback whose errors are reported instead of raised.
+
+        Args:
+            topic: The topic.
+            callback: Called with each message.
+            depth: Messages that wait while a callback runs; the oldest is dropped.
+            reliable: Have lost messages repeated.
+        """
 
         def guarded(message: Any) -> None:
             with self.guard(topic.name):
@@ -64,7 +80,7 @@ class EndoNode(ConfiguredNode):
         self.create_subscription(messages.ros_class(topic.type), topic.name, guarded, quality(topic, depth, reliable))
 
     def service(self, kind: type, name: str, callback: Callable[[Any], tuple[bool, str]]) -> None:
-        """Offer a service whose callback takes the request and returns (success, message)."""
+        """Offer a service whose callback takes the request and returns (success, message); its errors are answers, too."""
 
         def answer(request: Any, response: Any) -> Any:
             try:
@@ -77,6 +93,7 @@ class EndoNode(ConfiguredNode):
         self.create_service(kind, name, answer)
 
     def now_ns(self) -> int:
+        """Time of the clock of the node, ns: that of /clock with use_sim_time, 0 until one arrives."""
         return self.get_clock().now().nanoseconds
 
     # ------------------------------------------------------------ diagnostics
@@ -102,6 +119,7 @@ class EndoNode(ConfiguredNode):
         return OK, "running", {STATE: ClientState.RUNNING}
 
     def publish_diagnostics(self) -> None:
+        """Publish the status of the node now, or the newest error for a while; also called once a second."""
         try:
             level, text, values = self.status()
         except Exception as error:  # a fault in describing the state must not end the node

@@ -1,7 +1,7 @@
 """When periodic work is due: at the pace of a clock, or at the pace of commands."""
 
 from collections.abc import Callable, Hashable
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 MOST_WAITING = 1000  # commands; beyond it the oldest is given up, so that nothing grows without bound
 
@@ -59,7 +59,10 @@ class Pacer:
         self._due = None
 
 
-class CommandQueue:
+Part = TypeVar("Part", bound=Hashable)
+
+
+class CommandQueue(Generic[Part]):
     """Commands made of parts that come on topics of their own, tied together by their stamp.
 
     Each topic keeps its order, but one may overtake another; a command is complete when all its parts are there. When a
@@ -69,12 +72,12 @@ class CommandQueue:
         needed: The parts of a command.
     """
 
-    def __init__(self, needed: frozenset[Hashable]):
+    def __init__(self, needed: frozenset[Part]):
         self.needed = needed
         self.last_stamp = 0  # ns, of the last command taken
-        self._waiting: dict[int, dict[Hashable, Any]] = {}
+        self._waiting: dict[int, dict[Part, Any]] = {}
 
-    def put(self, stamp_ns: int, part: Hashable, value: Any) -> None:
+    def put(self, stamp_ns: int, part: Part, value: Any) -> None:
         """Add one part of the command with this stamp.
 
         Raises:
@@ -91,7 +94,7 @@ class CommandQueue:
             del self._waiting[first]
             raise ValueError(f"over {MOST_WAITING} commands wait; the oldest, of {first * 1e-9:.6f} s, is dropped")
 
-    def take(self, on_incomplete: Callable[[int, set], None]) -> tuple[int, dict[Hashable, Any]] | None:
+    def take(self, on_incomplete: Callable[[int, set[Part]], None]) -> tuple[int, dict[Part, Any]] | None:
         """The earliest complete command, as its stamp in ns and its parts, or None.
 
         Args:
@@ -106,7 +109,7 @@ class CommandQueue:
         self.last_stamp = stamp
         return stamp, self._waiting.pop(stamp)
 
-    def missing(self) -> tuple[int, set] | None:
+    def missing(self) -> tuple[int, set[Part]] | None:
         """Stamp and missing parts of the earliest command that waits."""
         if not self._waiting:
             return None

@@ -73,7 +73,7 @@ class ConfiguredNode(Node):
             self.add_on_set_parameters_callback(self._on_set)
         return config
 
-    def config_changed(self, config: StageConfig) -> None:
+    def config_changed(self, config: Any) -> None:
         """Called with a whole, valid configuration after one of its parameters was set; override to use it.
 
         Raises:
@@ -162,9 +162,10 @@ def _descriptor(option: Option) -> ParameterDescriptor:
 
 def _require_device(config: StageConfig) -> None:
     """Raise ConfigError if the device of a configuration does not exist."""
-    if hasattr(config, "device"):
+    device = getattr(config, "device", None)
+    if device is not None:
         try:
-            pick_device(config.device)
+            pick_device(device)
         except ValueError as error:
             raise ConfigError(str(error)) from error
 

@@ -2,28 +2,23 @@
 
 import time
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import numpy as np
 from std_srvs.srv import SetBool, Trigger
 
 from endo_sim_ros import messages
-from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.core.config import StageConfig
-from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.messages import STATE, ControlNodeCloud, MessageError, PhysicsState
 from endo_sim_ros.nodes.arm import Arm
-from endo_sim_ros.nodes.background import Background
+from endo_sim_ros.nodes.arm_topics import ArmTopics
 from endo_sim_ros.nodes.base import ERROR, OK, STREAM_DEPTH, WARN, EndoNode, run, sentence
 from endo_sim_ros.nodes.configs import COMMAND_PARTS, PhysicsNodeConfig, arm_names
 from endo_sim_ros.nodes.pacing import MOST_WAITING, CommandQueue, Pacer
+from endo_sim_ros.nodes.tissue_builder import TissueBuilder
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
 from endo_sim_ros.physics.regions import read_regions
-from endo_sim_ros.rendering import render_depth
 
 _SLOW = 0.5  # real-time factor below which the node warns
-_CAMERAS_LATE = 1.0  # seconds after a model in which its training cameras may still be on their way
 _POLLS = 4  # times per step that the timer asks whether a step is due
 _LONGEST_POLL = 0.1  # seconds; models and parameters must not wait for steps that take minutes
 _WINDOW = 1.0  # seconds over which the real-time factor is measured
@@ -38,16 +33,9 @@ class PhysicsNode(EndoNode):
         super().__init__("physics_node")
         self._options = self.declare(PhysicsNodeConfig)
         self._config = self.declare(PhysicsConfig)
+        self._builder = TissueBuilder()
         self._simulation: TissueSimulation | None = None
-        self._simulated_stamp = 0  # stamp of the simulated model
-        self._model: GaussianModel | None = None  # the newest; its stamp, number, and time of arrival:
-        self._model_stamp, self._model_number, self._model_came = 0, 0, 0.0
-        self._views: np.ndarray | None = None  # poses [V, 4, 4] of the newest training cameras that were any
-        self._views_stamp: int | None = None  # stamp of the newest training_cameras, and whether there were any:
-        self._views_given = False
-        self._view_info: tuple[int, messages.CameraInfo] | None = None  # stamp and intrinsics of the newest training cameras
-        self._camera_position: np.ndarray | None = None
-        self._background = Background()
+        self._simulated_stamp = 0  # stamp of the simulated model, ns
         self._failure = ""  # why the newest model is not simulated
         self._paused, self._steps, self._seconds_per_step = False, 0, 0.0
         self._window: tuple[float, float] | None = None  # clock and simulated time where the real-time factor begins
@@ -62,95 +50,39 @@ class PhysicsNode(EndoNode):
         self._cut_pub = self.publisher(messages.CUT_SURFACE, depth)
         self._published_cut = 0  # number of the newest surface that was published
         self._markers_pub = self.publisher(messages.TOOL_MARKERS)
-        self._reaction_pubs = {name: self.publisher(messages.tool_reaction(name)) for name in self._arms}
-        commanded = self._options.arm_source == "commanded"
-        shown = messages.tool_pose, messages.tool_setpoint, messages.tool_jaw_state, messages.tool_jaw_setpoint, messages.tool_state
-        self._arm_pubs = {name: [self.publisher(topic(name)) for topic in shown] for name in self._arms if commanded}
-        self._told: dict[str, tuple[str, bool, bool]] = {}  # what was last said on operating_state
-        self._pose_topic = messages.tool_pose_command if commanded else messages.tool_pose
         self._clock_pub = self.publisher(messages.CLOCK) if self._lockstep else None
-        self.subscribe(messages.GAUSSIANS, self._on_model)
-        self.subscribe(messages.TRAINING_CAMERAS, self._on_training_cameras)
-        self.subscribe(messages.TRAINING_CAMERA_INFO, self._on_training_info)
-        self.subscribe(messages.CAMERA_POSE, self._on_camera)
-        for name in self._arms:
-            self.subscribe(self._pose_topic(name), partial(self._on_tool_pose, name), depth)
-            self.subscribe(messages.tool_wrench(name), partial(self._on_wrench, name), depth)
-            several = max(depth, STREAM_DEPTH)  # some come once
-            self.subscribe(messages.tool_jaw(name), partial(self._on_jaw, name), several)
-            self.subscribe(messages.tool_jaw_move(name), partial(self._on_jaw_move, name), several)
-            self.subscribe(messages.tool_cut(name), partial(self._on_cut, name), several)
-            if commanded:
-                self.subscribe(messages.tool_move(name), partial(self._on_move, name), several)
-                self.subscribe(messages.tool_state_command(name), partial(self._on_state_command, name))
-        self._tell_states()
+        self.subscribe(messages.GAUSSIANS, lambda message: self._builder.receive_model(message, self._options.world_frame))
+        self.subscribe(
+            messages.TRAINING_CAMERAS, lambda message: self._builder.receive_training_cameras(message, self._options.world_frame)
+        )
+        self.subscribe(messages.TRAINING_CAMERA_INFO, self._builder.receive_training_info)
+        self.subscribe(messages.CAMERA_POSE, lambda message: self._builder.receive_camera_pose(message, self._options.frame_poses))
+        self._arm_topics = ArmTopics(self, self._arms, self._options, depth, self._on_command)
         self.service(Trigger, "~/reset", self._on_reset)
         self.service(Trigger, "~/step", self._on_step)
         self.service(SetBool, "~/pause", self._on_pause)
         self._timer = self.every(_poll(self._config), self._on_timer)
 
-    def config_changed(self, config: StageConfig) -> None:
+    def config_changed(self, config: PhysicsConfig | PhysicsNodeConfig) -> None:
+        """New options of the physics: a simulation is built for them in the background."""
         if isinstance(config, PhysicsConfig):
             if config.regions != self._config.regions:
                 read_regions(config.regions)  # what cannot be read is refused
             self._config = config  # the timer builds a simulation for it
             self._timer.timer_period_ns = int(_poll(config) * 1e9)
         else:
-            self._options = config
+            self._options = self._arm_topics.options = config
 
     # ------------------------------------------------------------------ model
-
-    def _on_model(self, message: Any) -> None:
-        messages.check_frame(message, (self._options.world_frame,), messages.GAUSSIANS.name)
-        self._model = messages.decode_gaussians(message)
-        self._model_stamp = messages.stamp_to_ns(message.header.stamp)
-        self._model_number, self._model_came = self._model_number + 1, time.monotonic()
-
-    def _on_training_cameras(self, message: Any) -> None:
-        messages.check_frame(message, (self._options.world_frame,), messages.TRAINING_CAMERAS.name)
-        poses = messages.decode_poses(message)
-        self._views_stamp, self._views_given = messages.stamp_to_ns(message.header.stamp), len(poses) > 0
-        if self._views_given:
-            self._views = poses
-
-    def _on_training_info(self, message: Any) -> None:
-        info = messages.decode_camera_info(message, messages.TRAINING_CAMERA_INFO.name)
-        self._view_info = messages.stamp_to_ns(message.header.stamp), info
-
-    def _on_camera(self, message: Any) -> None:
-        pose = messages.decode_pose(message, self._options.frame_poses, messages.CAMERA_POSE.name)
-        self._camera_position = pose[:3, 3]
-
-    def _viewpoint(self) -> tuple[str, np.ndarray | None]:
-        """Where the tissue was seen from, and whose place that is: the model's own cameras, else wherever the camera is
-        now, else the cameras of an earlier model."""
-        own = self._views_stamp == self._model_stamp
-        whole = own and (not self._views_given or self._own_cameras())
-        if not whole and time.monotonic() - self._model_came < _CAMERAS_LATE:
-            return "", None
-        if own and self._views_given:
-            return "own cameras", self._views[:, :3, 3]
-        if self._camera_position is not None:
-            return "camera", self._camera_position
-        return "earlier cameras", None if self._views is None else self._views[:, :3, 3]
-
-    def _own_cameras(self) -> list[Camera]:
-        """The cameras that the newest model was seen from, if all about them has come."""
-        if self._views_stamp != self._model_stamp or not self._views_given or self._view_info is None:
-            return []
-        stamp, info = self._view_info
-        if stamp != self._model_stamp:
-            return []
-        return [Camera(info.P[:, :3], info.width, info.height, pose) for pose in self._views]
 
     def _build(self) -> None:
         """Build a simulation of the newest model in the background; the old one goes on meanwhile."""
         try:
-            built = self._background.take()
+            built = self._builder.take()
             if built is not None:
-                (stamp, simulation), old = built[1], self._simulation
-                same_model = old is not None and stamp == self._simulated_stamp
-                continued = same_model and simulation.continue_from(old)  # only its material has changed
+                (stamp, simulation), old = built, self._simulation
+                same_model = stamp == self._simulated_stamp
+                continued = old is not None and same_model and simulation.continue_from(old)  # only its material has changed
                 self._simulated_stamp, self._simulation, self._failure = stamp, simulation, ""
                 self._start_timing()
                 if not continued:
@@ -161,126 +93,26 @@ class PhysicsNode(EndoNode):
         except Exception as error:
             self._failure = sentence("physics", error)
             self.report_error(self._failure)
-        origin, viewpoint = self._viewpoint()
-        if self._model is not None and viewpoint is not None:
-            model, stamp, config, cameras = self._model, self._model_stamp, self._config, self._own_cameras()
-            key = self._model_number, origin, bool(cameras), config
-            self._background.want(key, lambda: (stamp, _tissue(model, viewpoint, config, cameras)))
+        self._builder.want(self._config)
 
     # ------------------------------------------------------------------ tools
 
-    def _receive(self, name: str, kind: str, message: Any, topic: str, act: Callable[[], None]) -> None:
-        """Let a command act now or, in lockstep, in the step that its stamp names."""
-        if not self._lockstep or kind not in self._options.lockstep_inputs:
-            act()
+    def _on_command(self, name: str, kind: str, message: Any, topic: str, act: Callable[[], None]) -> None:
+        """Let a part of a command act now or, in lockstep, in the step that its stamp names."""
+        if self._lockstep and kind in self._options.lockstep_inputs:
+            stamp = messages.stamp_to_ns(message.header.stamp)
+            if stamp <= 0:
+                raise MessageError(f"{topic}: a stamp of zero; in lockstep all parts of a command bear its stamp")
+            try:
+                self._commands.put(stamp, (name, kind), act)
+            except ValueError as error:
+                raise MessageError(f"{topic}: {error}") from error
+            self._run_commands()
             return
-        stamp = messages.stamp_to_ns(message.header.stamp)
-        if stamp <= 0:
-            raise MessageError(f"{topic}: a stamp of zero; in lockstep all parts of a command bear its stamp")
-        try:
-            self._commands.put(stamp, (name, kind), act)
-        except ValueError as error:
-            raise MessageError(f"{topic}: {error}") from error
-        self._run_commands()
-
-    def _decode_tip(self, name: str, message: Any, topic: str) -> np.ndarray:
-        frames = self._options.frame_poses
-        unnamed = frames.get(f"{name}_base", np.eye(4))  # clients of CRTK leave the frame empty
-        return messages.decode_pose(message, frames | {"": unnamed}, topic)
-
-    def _on_tool_pose(self, name: str, message: Any) -> None:
-        arm, topic = self._arms[name], self._pose_topic(name).name
-        pose = self._decode_tip(name, message, topic)
-
-        def act() -> None:
-            self._require_enabled(arm, topic)
-            arm.pose, arm.pose_goal = pose, None
-            self._tell_states()
-
-        self._receive(name, "pose", message, topic, act)
-
-    def _on_move(self, name: str, message: Any) -> None:
-        arm, topic = self._arms[name], messages.tool_move(name).name
-        goal = self._decode_tip(name, message, topic)
-        self._require_enabled(arm, topic)
-        arm.pose_goal = goal
-        self._tell_states(name)
-
-    def _on_jaw_move(self, name: str, message: Any) -> None:
-        arm, topic = self._arms[name], messages.tool_jaw_move(name).name
-        goal = messages.decode_jaw(message, topic)
-        self._require_pose(name, topic, "jaw command")
-        arm.angle_goal = goal
-        self._tell_states(name)
-
-    def _on_state_command(self, name: str, message: Any) -> None:
-        try:
-            self._arms[name].command_state(messages.decode_state_command(message))
-        except ValueError as error:
-            raise MessageError(f"{messages.tool_state_command(name).name}: {error}") from error
-        finally:
-            self._tell_states(name)
-
-    def _tell_states(self, asked: str = "") -> None:
-        """Publish the operating state of each commanded arm when it has changed, and of the one that was asked for
-        something: clients of CRTK wait for a message after their command, even if it changes nothing."""
-        for name, (*_, publisher) in self._arm_pubs.items():
-            arm = self._arms[name]
-            state = arm.state, arm.homed, arm.busy
-            if name == asked or self._told.get(name) != state:
-                self._told[name] = state
-                publisher.publish(messages.encode_operating_state(*state, self.now_ns()))
-
-    def _on_wrench(self, name: str, message: Any) -> None:
-        topic, arm = messages.tool_wrench(name).name, self._arms[name]
-        force, torque = messages.decode_wrench(message, topic)
-        frames = self._options.frame_poses
-        frame = messages.check_frame(message, ("", name, *frames), topic)
-
-        def act() -> None:
-            self._require_pose(name, topic, "wrench")
-            R = frames.get(frame, arm.pose)[:3, :3]  # any other is the tool's own
-            arm.force, arm.torque, arm.heard = R @ force, R @ torque, self._seconds()
-
-        self._receive(name, "wrench", message, topic, act)
-        if not self._lockstep:
+        act()
+        if kind == "wrench" and not self._lockstep:
             self._pacer.note_input(self._seconds(), name)
             self._step_if_due()
-
-    def _on_jaw(self, name: str, message: Any) -> None:
-        topic, arm = messages.tool_jaw(name).name, self._arms[name]
-        angle = messages.decode_jaw(message, topic)
-
-        def act() -> None:
-            self._require_pose(name, topic, "jaw command")
-            arm.angle, arm.angle_goal = angle, None
-            arm.hold(self._options.jaw_closed, self._options.jaw_open)
-            self._tell_states()
-
-        self._receive(name, "jaw", message, topic, act)
-
-    def _on_cut(self, name: str, message: Any) -> None:
-        topic, arm = messages.tool_cut(name).name, self._arms[name]
-        cutting = messages.decode_cut(message, topic)
-
-        def act() -> None:
-            self._require_pose(name, topic, "cut")
-            arm.cutting = cutting
-
-        self._receive(name, "cut", message, topic, act)
-
-    @staticmethod
-    def _require_enabled(arm: Arm, topic: str) -> None:
-        try:
-            arm.require_enabled()
-        except ValueError as error:
-            raise MessageError(f"{topic}: {error}") from error
-
-    def _require_pose(self, name: str, topic: str, what: str) -> None:
-        self._require_enabled(self._arms[name], topic)
-        if self._arms[name].pose is None:
-            pose_topic = self._pose_topic(name).name
-            raise MessageError(f"{topic}: a {what} came before any pose on {pose_topic}; publish the tip's pose")
 
     def _run_commands(self) -> None:
         """Lockstep: one step for each complete command."""
@@ -303,14 +135,14 @@ class PhysicsNode(EndoNode):
                 continue
             where = f"at {np.round(arm.pose[:3, 3], 4).tolist()}"
             if not simulation.set_grasp(name, arm.pose, arm.closed):
-                self.report_error(f"{name}: the jaw closed on nothing {where}; {self._reach(simulation)}")
+                self.report_error(f"{name}: the jaw closed on nothing {where}; {self._out_of_reach(simulation)}")
                 arm.closed = False
             try:
                 simulation.set_cut(name, arm.pose, arm.cutting)
             except ValueError as error:
                 arm.cutting = False
                 self.report_error(sentence(f"{name}: cut", error))
-            if arm.force is None:
+            if arm.force is None or arm.torque is None:
                 continue
             timeout = self._options.command_timeout
             stale = not self._lockstep and 0 < timeout < self._seconds() - arm.heard
@@ -319,11 +151,11 @@ class PhysicsNode(EndoNode):
             if wanted or arm.acting:
                 reached = simulation.set_wrench(name, arm.pose[:3, 3], force, torque)
                 if wanted and not reached:
-                    self.report_error(f"{name}: the wrench {where} has no effect; {self._reach(simulation)}")
+                    self.report_error(f"{name}: the wrench {where} has no effect; {self._out_of_reach(simulation)}")
             arm.acting = wanted
 
     @staticmethod
-    def _reach(simulation: TissueSimulation) -> str:
+    def _out_of_reach(simulation: TissueSimulation) -> str:
         return f"no movable tissue lies within force_radius = {simulation.config.force_radius:g} m of the tip"
 
     # ------------------------------------------------------------------ steps
@@ -371,7 +203,7 @@ class PhysicsNode(EndoNode):
             arm.move(simulation.step_duration, self._options.move_speed, self._options.turn_speed)
             if turning:  # else a jaw that tissue slipped out of would close again
                 arm.hold(self._options.jaw_closed, self._options.jaw_open)
-        self._tell_states()
+        self._arm_topics.publish_operating_states()
         self._apply_tools(simulation)
         simulation.step()
         if simulation.slips > slips:
@@ -400,14 +232,7 @@ class PhysicsNode(EndoNode):
             if arm.pose is None:
                 continue
             reaction, torque = simulation.reaction(name)
-            axes = arm.pose[:3, :3].T  # the reaction is given in the axes of the tool
-            self._reaction_pubs[name].publish(messages.encode_wrench(axes @ reaction, axes @ torque, stamp, name))
-            if name in self._arm_pubs:
-                *pose_pubs, jaw_pub, jaw_setpoint_pub, _ = self._arm_pubs[name]
-                for publisher in pose_pubs:  # an ideal arm is where it is told to be
-                    publisher.publish(messages.encode_pose(arm.pose, stamp, world))
-                for publisher in (jaw_pub, jaw_setpoint_pub):
-                    publisher.publish(messages.encode_jaw(arm.angle, stamp))
+            self._arm_topics.publish(arm, arm.pose, reaction, torque, stamp)
             force = arm.force if arm.acting and arm.force is not None else np.zeros(3)
             shown.append(messages.ToolDisplay(name, arm.pose[:3, 3], force, reaction, simulation.held(name)))
         if shown and self._markers_pub.get_subscription_count():
@@ -423,11 +248,11 @@ class PhysicsNode(EndoNode):
         self._start_timing()
         for arm in self._arms.values():
             arm.reset()
-        self._tell_states()
+        self._arm_topics.publish_operating_states()
         self._publish(self._simulation, self._simulated_stamp if self._lockstep else self.now_ns(), at_rest=True)
         return True, "at rest"
 
-    def _on_step(self, _: Trigger.Request) -> tuple[bool, str]:
+    def _on_step(self, request: Trigger.Request) -> tuple[bool, str]:
         simulation = self._simulation
         if simulation is None:
             return False, "there is no model yet"
@@ -453,7 +278,7 @@ class PhysicsNode(EndoNode):
     def _state(self) -> PhysicsState:
         if self._simulation is not None:
             return PhysicsState.PAUSED if self._paused else PhysicsState.RUNNING
-        if self._model is not None and self._background.busy:
+        if self._builder.model is not None and self._builder.busy:
             return PhysicsState.BUILDING
         return PhysicsState.FAILED if self._failure else PhysicsState.WAITING
 
@@ -466,7 +291,7 @@ class PhysicsNode(EndoNode):
                 return OK, "building control nodes", values
             if state is PhysicsState.FAILED:
                 return ERROR, self._failure, values
-            if self._model is None:
+            if self._builder.model is None:
                 return WARN, "waiting for a model on gaussians", values
             return WARN, "waiting for training_cameras or ECM/measured_cp to know from which side the tissue is seen", values
         values |= {
@@ -496,7 +321,8 @@ class PhysicsNode(EndoNode):
         return OK, "running", values
 
     def destroy_node(self) -> None:
-        self._background.stop()
+        """Build no more tissue, and destroy the node."""
+        self._builder.stop()
         super().destroy_node()
 
 
@@ -505,16 +331,8 @@ def _poll(config: PhysicsConfig) -> float:
     return min(config.step_duration / _POLLS, _LONGEST_POLL)
 
 
-def _tissue(model: GaussianModel, viewpoint: np.ndarray, config: PhysicsConfig, cameras: list[Camera]) -> TissueSimulation:
-    """Tissue that is ready for the first tool and the first cut: they would make a step late otherwise."""
-    simulation = TissueSimulation(model, viewpoint, config, cameras, render_depth)
-    simulation.prepare()
-    if config.kinematics == "rest" and not config.dense:
-        simulation.prepare_cutting()
-    return simulation
-
-
 def main() -> int:
+    """Run the node until it is told to stop, and return the exit status of the process."""
     return run(PhysicsNode)
 
 

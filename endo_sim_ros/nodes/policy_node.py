@@ -158,6 +158,7 @@ class PolicyNode(EndoNode):
 
 
 def main() -> int:
+    """Run the node until it is told to stop, and return the exit status of the process."""
     return run(PolicyNode)
 
 

@@ -13,7 +13,7 @@ from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera, load_cameras, save_cameras
-from endo_sim_ros.core.config import StageConfig, option_values
+from endo_sim_ros.core.config import option_values
 from endo_sim_ros.core.frames import LEFT_FRAME, Frame, SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel, load_ply, save_ply
 from endo_sim_ros.messages import STATE, ReconstructionState, Topic
@@ -77,7 +77,8 @@ class ReconstructionNode(EndoNode):
         with self.guard("model_file"):
             self._publish_file(self._options.model_file)
 
-    def config_changed(self, config: StageConfig) -> None:
+    def config_changed(self, config: ReconstructionConfig | ReconstructionNodeConfig) -> None:
+        """New options of the reconstruction count from the next one on; a new model_file is published now."""
         if isinstance(config, ReconstructionNodeConfig):
             if config.model_file != self._options.model_file:
                 self._publish_file(config.model_file)
@@ -87,6 +88,7 @@ class ReconstructionNode(EndoNode):
             self._config = config  # used by the next reconstruction
 
     def implied_values(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """A preset implies its options."""
         name = values.get("preset")
         return option_values(preset(name)) if isinstance(name, str) and name in PRESETS else {}
 
@@ -317,6 +319,7 @@ class ReconstructionNode(EndoNode):
         return OK, f"collecting views, {len(self._frames)} so far", values
 
     def destroy_node(self) -> None:
+        """Cancel the training, then destroy the node."""
         self._cancel.set()
         if self._thread is not None:
             self._thread.join(timeout=2.0)
@@ -324,6 +327,7 @@ class ReconstructionNode(EndoNode):
 
 
 def main() -> int:
+    """Run the node until it is told to stop, and return the exit status of the process."""
     return run(ReconstructionNode)
 
 

@@ -104,6 +104,7 @@ class RecorderNode(EndoNode):
         return (ERROR, self.failure, values) if self.failure else (OK, "recording", values)
 
     def destroy_node(self) -> None:
+        """Write what was received, then destroy the node."""
         self._queue.put(None)
         self._thread.join()  # what was heard before the end is kept, even if the disk takes its time
         super().destroy_node()
@@ -164,6 +165,7 @@ def record(bag: Path, arms: tuple[str, ...], topics: tuple[str, ...], namespace:
 
 
 def main() -> int:
+    """Run the node until it is told to stop, and return the exit status of the process."""
     return run(RecorderNode)
 
 

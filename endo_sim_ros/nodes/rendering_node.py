@@ -9,7 +9,6 @@ import numpy as np
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.core.config import StageConfig
 from endo_sim_ros.messages import STATE, CameraInfo, ControlNodeCloud, MessageError, RenderingState
 from endo_sim_ros.nodes.base import ERROR, OK, STREAM_DEPTH, WARN, EndoNode, run, sentence
 from endo_sim_ros.nodes.configs import RenderingNodeConfig
@@ -58,7 +57,8 @@ class RenderingNode(EndoNode):
         self.subscribe(messages.LEFT_INFO, self._on_info, depth=1)
         self._timer = self.every(1.0 / self._options.rate / _POLLS, self._on_timer)
 
-    def config_changed(self, config: StageConfig) -> None:
+    def config_changed(self, config: RenderingConfig | RenderingNodeConfig) -> None:
+        """New options of the rendering: the model is bound anew in the background."""
         if isinstance(config, RenderingNodeConfig):
             self._options = config
             self._timer.timer_period_ns = int(1e9 / config.rate / _POLLS)
@@ -243,7 +243,7 @@ class RenderingNode(EndoNode):
         if max(camera.width, camera.height) > _MAX_SIDE:
             raise MessageError(f"images of {camera.width}×{camera.height} are too large; set image_width")
         state = ()
-        if bound.follows(nodes):
+        if nodes is not None and bound.follows(nodes):
             state = (nodes.positions, nodes.F)
             self._tissue.cut(bound, nodes)
         image, depth = bound.renderer.render(camera, *state, depth=self._wants_depth())
@@ -295,6 +295,7 @@ class RenderingNode(EndoNode):
         return OK, "rendering", values
 
     def destroy_node(self) -> None:
+        """Bind no more models, and destroy the node."""
         self._tissue.stop()
         super().destroy_node()
 
@@ -307,6 +308,7 @@ def _decode_info(message: Any, topic: str) -> CameraInfo:
 
 
 def main() -> int:
+    """Run the node until it is told to stop, and return the exit status of the process."""
     return run(RenderingNode)
 
 

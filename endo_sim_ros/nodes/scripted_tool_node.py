@@ -40,6 +40,7 @@ class ScriptedToolNode(EndoNode):
         self.create_timer(1 / config.rate, self._on_timer)
 
     def config_changed(self, config: ScriptedToolConfig) -> None:
+        """The next command uses the new options."""
         self._config = config
 
     def _on_camera(self, message: Any) -> None:
@@ -130,6 +131,7 @@ class ScriptedToolNode(EndoNode):
 
 
 def main() -> int:
+    """Run the node until it is told to stop, and return the exit status of the process."""
     return run(ScriptedToolNode)
 
 

@@ -12,7 +12,6 @@ from std_srvs.srv import SetBool, Trigger
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.core.config import StageConfig
 from endo_sim_ros.messages import STATE, ControlNodeCloud, NodeStatus, PhysicsState, ViewerState
 from endo_sim_ros.nodes.base import OK, WARN, EndoNode, run
 from endo_sim_ros.nodes.configs import ViewerNodeConfig, arm_names
@@ -84,7 +83,8 @@ class ViewerNode(EndoNode):
         self.every(_PERIOD, self._on_timer)
         self.get_logger().info(f"open {self.viewer.url} in a browser")
 
-    def config_changed(self, config: StageConfig) -> None:
+    def config_changed(self, config: ViewerConfig | RenderingConfig | ViewerNodeConfig) -> None:
+        """New options of the rendering: the model is bound anew in the background."""
         if isinstance(config, ViewerConfig):
             self.viewer.config = config
         elif isinstance(config, RenderingConfig):
@@ -167,8 +167,7 @@ class ViewerNode(EndoNode):
 
     def _on_timer(self) -> None:
         with self.guard("viewer"):
-            if self._tissue.bind(self._nodes, self._rendering):
-                bound = self._tissue.bound
+            if self._tissue.bind(self._nodes, self._rendering) and (bound := self._tissue.bound) is not None:
                 self.viewer.show_model(bound.renderer, bound.node_rest, self._camera())
             now = time.monotonic()
             tools = {
@@ -222,6 +221,7 @@ class ViewerNode(EndoNode):
     # ----------------------------------------------------------------- actions
 
     def hold(self, pose: np.ndarray, closed: bool) -> None:
+        """Publish the pose [4, 4] (m, world) of the tool that the mouse moves, and close its jaw."""
         if self._lockstep:
             self.viewer.notify("in lockstep only the policy moves the arms")
             self.viewer.release()
@@ -232,22 +232,27 @@ class ViewerNode(EndoNode):
             self._closed = True
 
     def let_go(self) -> None:
+        """Open the jaw, if it was closed here."""
         if self._closed:  # else it may be somebody else's
             self._jaw_pub.publish(messages.encode_jaw(_JAW_OPEN, self.now_ns()))
             self._closed = False
 
     def set_parameters(self, values: dict[str, float]) -> None:
+        """Ask the physics node to change parameters; a refusal is shown on the page."""
         parameters = [Parameter(name, value=float(value)).to_parameter_msg() for name, value in values.items()]
         self._call(self._set, SetParameters.Request(parameters=parameters), "parameters")
         self._asked = time.monotonic()  # the old values must not come back to the sliders before the answer
 
     def reset(self) -> None:
+        """Ask the physics node to bring the tissue to rest."""
         self._call(self._calls["reset"], Trigger.Request(), "reset")
 
     def pause(self, paused: bool) -> None:
+        """Ask the physics node to pause or to go on."""
         self._call(self._calls["pause"], SetBool.Request(data=paused), "pause")
 
     def step(self) -> None:
+        """Ask the physics node for a step while it is paused."""
         self._call(self._calls["step"], Trigger.Request(), "step")
 
     def _call(self, client: Any, request: Any, what: str) -> None:
@@ -286,12 +291,14 @@ class ViewerNode(EndoNode):
         return OK, f"showing the tissue at {viewer.url}", values
 
     def destroy_node(self) -> None:
+        """Stop serving the page, then destroy the node."""
         self._tissue.stop()
         self.viewer.stop()
         super().destroy_node()
 
 
 def main() -> int:
+    """Run the node until it is told to stop, and return the exit status of the process."""
     return run(ViewerNode)
 
 

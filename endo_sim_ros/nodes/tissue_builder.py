@@ -1,0 +1,132 @@
+"""What physics_node receives about the tissue, and the simulation that it becomes."""
+
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from endo_sim_ros import messages
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.nodes.background import Background
+from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
+from endo_sim_ros.rendering import render_depth
+
+_CAMERAS_LATE = 1.0  # seconds after a model in which its training cameras may still be on their way
+
+
+class TissueBuilder:
+    """Builds the simulation of the newest model in the background, as soon as it is known from where the tissue was seen.
+
+    Attributes:
+        model: The newest model, or None.
+    """
+
+    def __init__(self):
+        self.model: GaussianModel | None = None
+        self._model_stamp, self._model_number, self._model_came = 0, 0, 0.0  # ns; in order of arrival; when it arrived, seconds
+        self._views: np.ndarray | None = None  # poses [V, 4, 4] of the newest training cameras that were any
+        self._views_stamp: int | None = None  # stamp of the newest training_cameras, and whether there were any:
+        self._views_given = False
+        self._view_info: tuple[int, messages.CameraInfo] | None = None  # stamp and intrinsics of the newest training cameras
+        self._camera_position: np.ndarray | None = None  # [3] m, world
+        self._background = Background()
+
+    @property
+    def busy(self) -> bool:
+        """Whether a simulation is being built."""
+        return self._background.busy
+
+    def receive_model(self, message: Any, world_frame: str) -> None:
+        """Decode and keep a message of the topic gaussians.
+
+        Raises:
+            MessageError: If it cannot be used.
+        """
+        messages.check_frame(message, (world_frame,), messages.GAUSSIANS.name)
+        self.model = messages.decode_gaussians(message)
+        self._model_stamp = messages.stamp_to_ns(message.header.stamp)
+        self._model_number, self._model_came = self._model_number + 1, time.monotonic()
+
+    def receive_training_cameras(self, message: Any, world_frame: str) -> None:
+        """Decode and keep a message of the topic training_cameras.
+
+        Raises:
+            MessageError: If it cannot be used.
+        """
+        messages.check_frame(message, (world_frame,), messages.TRAINING_CAMERAS.name)
+        poses = messages.decode_poses(message)
+        self._views_stamp, self._views_given = messages.stamp_to_ns(message.header.stamp), len(poses) > 0
+        if self._views_given:
+            self._views = poses
+
+    def receive_training_info(self, message: Any) -> None:
+        """Decode and keep a message of the topic training_camera_info.
+
+        Raises:
+            MessageError: If it cannot be used.
+        """
+        info = messages.decode_camera_info(message, messages.TRAINING_CAMERA_INFO.name)
+        self._view_info = messages.stamp_to_ns(message.header.stamp), info
+
+    def receive_camera_pose(self, message: Any, frames: Mapping[str, np.ndarray]) -> None:
+        """Decode and keep a message of the topic of the camera's pose.
+
+        Args:
+            message: The message.
+            frames: Poses [4, 4] of known frames in the world, by name.
+
+        Raises:
+            MessageError: If it cannot be used.
+        """
+        pose = messages.decode_pose(message, frames, messages.CAMERA_POSE.name)
+        self._camera_position = pose[:3, 3]
+
+    def take(self) -> tuple[int, TissueSimulation] | None:
+        """The stamp of a model, ns, and its simulation, once when it is built, else None. Raises what the building raised."""
+        built = self._background.take()
+        return None if built is None else built[1]
+
+    def want(self, config: PhysicsConfig) -> None:
+        """Build what was received last with these options, unless that was done; call it periodically."""
+        origin, viewpoint = self._viewpoint()
+        if self.model is not None and viewpoint is not None:
+            model, stamp, cameras = self.model, self._model_stamp, self._own_cameras()
+            key = self._model_number, origin, bool(cameras), config
+            self._background.want(key, lambda: (stamp, _tissue(model, viewpoint, config, cameras)))
+
+    def stop(self) -> None:
+        """Build nothing more."""
+        self._background.stop()
+
+    def _viewpoint(self) -> tuple[str, np.ndarray | None]:
+        """Whose position the tissue was seen from, and that position or positions [V, 3], m, world, or None as long as it
+        may still arrive: the model's own cameras, else the camera now, else the cameras of an earlier model."""
+        own = self._views_stamp == self._model_stamp
+        whole = own and (not self._views_given or self._own_cameras())
+        if not whole and time.monotonic() - self._model_came < _CAMERAS_LATE:
+            return "", None
+        if own and self._views_given and self._views is not None:
+            return "own cameras", self._views[:, :3, 3]
+        if self._camera_position is not None:
+            return "camera", self._camera_position
+        return "earlier cameras", None if self._views is None else self._views[:, :3, 3]
+
+    def _own_cameras(self) -> list[Camera]:
+        """The cameras of the newest model, if all about them has arrived."""
+        if self._views_stamp != self._model_stamp or not self._views_given or self._views is None or self._view_info is None:
+            return []
+        stamp, info = self._view_info
+        if stamp != self._model_stamp:
+            return []
+        return [Camera(info.P[:, :3], info.width, info.height, pose) for pose in self._views]
+
+
+def _tissue(model: GaussianModel, viewpoint: np.ndarray, config: PhysicsConfig, cameras: list[Camera]) -> TissueSimulation:
+    """A simulation that is prepared for the first tool and the first cut, which would make a step late otherwise."""
+    simulation = TissueSimulation(model, viewpoint, config, cameras, render_depth)
+    simulation.prepare()
+    if config.kinematics == "rest" and not config.dense:
+        simulation.prepare_cutting()
+    return simulation

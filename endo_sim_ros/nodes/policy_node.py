@@ -3,7 +3,7 @@
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 from std_srvs.srv import Trigger
@@ -25,8 +25,8 @@ class PolicyConfig(StageConfig):
     """Parameters of the policy; physics_node needs mode lockstep, arm_source commanded, lockstep_inputs [pose, jaw] and the task's
     tissue: `endo-sim scene` writes them to a file."""
 
-    task: Literal["retraction", "palpation"] = "retraction"
-    """What is to be done."""
+    task: str = "retraction"
+    """Name of the task; an unknown one is answered with the list."""
     policy: str = "scripted"
     """scripted, or the .npz file of a trained policy."""
     scene: str = ""
@@ -34,7 +34,7 @@ class PolicyConfig(StageConfig):
     seed: Annotated[int, Range(0, 2**31 - 1)] = 0
     """Of the first episode; each following one has the next."""
     episodes: Annotated[int, Range(1, 1_000_000)] = 1
-    """How many episodes; palpation has one, as the inclusion is part of physics_node's parameters."""
+    """How many episodes; a task whose tissue is part of physics_node's parameters (palpation: the inclusion) has one."""
     record: str = ""
     """File (.npz) for observations, actions, rewards and success of all steps; empty = none."""
     arm: str = "PSM1"

@@ -15,6 +15,7 @@ class Command:
     """Names of nodes; default: all."""
 
     def run(self) -> None:
+        """Print the parameter file; raises ConfigError if a ROS node is unknown."""
         from endo_sim_ros.nodes.parameter_file import NODE_CONFIGS, parameter_file
 
         nodes = [name if name in NODE_CONFIGS else name.removesuffix("_node") for name in self.nodes]  # executables end in _node

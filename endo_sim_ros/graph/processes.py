@@ -44,13 +44,16 @@ class NodeProcess:
 
     @property
     def pid(self) -> int:
+        """Process id."""
         return self._process.pid
 
     def send_signal(self, number: int) -> None:
+        """Send a signal to the ROS node if it still runs."""
         if self.exit_status is None:
             self._process.send_signal(number)
 
     def interrupt(self) -> None:
+        """Ask the ROS node to end, as Ctrl-C does."""
         self.send_signal(signal.SIGINT)
 
     def wait(self, seconds: float = _STOP_AFTER) -> int:

@@ -26,7 +26,7 @@ demo: setup
 lint: setup
 	$(VENV)/bin/ruff check
 	$(VENV)/bin/ruff format --check
-	$(VENV)/bin/pyright
+	$(VENV)/bin/pyright --pythonpath $(VENV)/bin/python
 
 check: lint
 	$(VENV)/bin/python -m pytest -n 2 --dist worksteal -q -m "$(FAST)"

@@ -52,7 +52,7 @@ def _rate(task: str, scene: Scene, count: int, observations: str, device: str, r
         batch.task.tip[:] = 0  # at the tissue
         for _ in range(_STEPS):
             actions = rng.uniform(-1, 1, (count, 4))
-            actions[:, 3] = 1 if task == "retraction" else -1
+            actions[:, 3] = batch.task.working_fourth
             batch.step(actions)
 
     return count * _STEPS / median_seconds(episode, repeats, device, warm_up=1)

@@ -221,7 +221,7 @@ def _peers(device: str) -> dict[str, Callable[[Scene], Draw]]:
 def _plain(scene: Scene) -> Draw:
     """Our kernels for GPUs, on the CPU, one pixel after the other."""
 
-    def draw(gaussians):
+    def draw(gaussians: list[Tensor]) -> Sequence[Tensor]:
         with plain_kernels():
             return _ours(scene)(gaussians)
 
@@ -231,7 +231,7 @@ def _plain(scene: Scene) -> Draw:
 def _gsplat(scene: Scene) -> Draw:
     from gsplat import rasterization
 
-    def draw(gaussians):
+    def draw(gaussians: list[Tensor]) -> Sequence[Tensor]:
         options = {"sh_degree": 0, "packed": False, "render_mode": "RGB+ED"}
         images, alphas, _ = rasterization(*gaussians, *scene[1:], **options)
         return images[..., :3], images[..., 3], alphas
@@ -270,7 +270,7 @@ def _gswarp(scene: Scene) -> Draw:
         )
     )
 
-    def draw(gaussians):
+    def draw(gaussians: list[Tensor]) -> Sequence[Tensor]:
         means, quats, scales, opacities, sh = gaussians
         in_image = torch.zeros_like(means, requires_grad=True)
         color, _, meta = rasterizer(means, in_image, opacities[:, None], shs=sh, scales=scales, rotations=quats)

@@ -39,6 +39,7 @@ class BenchRaster(Measured):
     """The rasteriser: forward, forward and backward, memory, and how time grows."""
 
     def run(self) -> None:
+        """Measure the rasteriser."""
         find_benchmarks()
         from benchmarks.raster import bench_raster
 
@@ -56,6 +57,7 @@ class BenchPhysics(Measured):
     """Numbers of copies stepped together; default: 1 4 16 64, on a GPU also 256 1024."""
 
     def run(self) -> None:
+        """Measure the simulation."""
         find_benchmarks()
         from benchmarks.physics import bench_physics
 
@@ -82,6 +84,7 @@ class BenchGraph(Measured):
     """Deaths of each node whose recovery is timed; 0 = none."""
 
     def run(self) -> None:
+        """Measure the node graph."""
         find_benchmarks()
         from benchmarks.graph import bench_graph
 
@@ -94,11 +97,12 @@ class BenchEnvironments(Measured):
     """The environments to learn in: steps per second, with states and with images."""
 
     task: str = "retraction"
-    """retraction or palpation."""
+    """Name of the task, such as retraction or palpation; an unknown one is answered with the list."""
     environments: tuple[int, ...] = (1, 64)
     """Numbers of environments stepped together."""
 
     def run(self) -> None:
+        """Measure the environments."""
         find_benchmarks()
         from benchmarks.environments import bench_environments
 
@@ -119,6 +123,7 @@ class BenchSoak:
     """Other seeds give other traffic."""
 
     def run(self) -> None:
+        """Put the node graph under random traffic."""
         from endo_sim_ros.graph.soak import soak
 
         soak(self.json, self.minutes, self.rate, self.seed)
@@ -137,4 +142,5 @@ class Command:
     ]
 
     def run(self) -> None:
+        """Run the chosen benchmark."""
         self.what.run()

@@ -16,6 +16,7 @@ class Command:
     """File to write; a name that ends in .compressed.ply makes it compressed, any other .ply whole again."""
 
     def run(self) -> None:
+        """Write the model in the layout that the name of the file asks for; raises ModelError for another name."""
         from endo_sim_ros.core.gaussians import ModelError, load_ply, save_ply
 
         if self.out.suffix != ".ply":

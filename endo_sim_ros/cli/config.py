@@ -15,6 +15,7 @@ class Command:
     """Names of nodes; default: all."""
 
     def run(self) -> None:
+        """Print the parameter file; raises ConfigError if a ROS node is unknown."""
         from endo_sim_ros.nodes.configs import NODE_CONFIGS
         from endo_sim_ros.nodes.parameter_file import parameter_file
 

@@ -60,6 +60,7 @@ class Command:
     """Video: image of one mask for all frames, or a folder of numbered ones."""
 
     def run(self) -> None:
+        """Write the bag; raises SequenceError if it exists or the recording cannot be read."""
         from endo_sim_ros.sequences.bag import write_bag
         from endo_sim_ros.sequences.readers import open_sequence
 

@@ -19,6 +19,7 @@ class Command:
     config: Annotated[EvaluationConfig, tyro.conf.arg(name="")] = field(default_factory=EvaluationConfig)
 
     def run(self) -> None:
+        """Run the evaluation; raises RuntimeError at the end if a cell failed."""
         from endo_sim_ros.evaluation.evaluate import evaluate
 
         cells = evaluate(self.sequences, self.config)["cells"]

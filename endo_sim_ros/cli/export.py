@@ -35,6 +35,7 @@ class Command:
     """Other frames of poses and wrenches in the recording, as the nodes' parameter: 'PSM1_base x y z qx qy qz qw' each."""
 
     def run(self) -> None:
+        """Write the dataset; raises SequenceError if a recording cannot be used."""
         from endo_sim_ros.learning.lerobot import export_lerobot
 
         if len(self.paths) < 2:

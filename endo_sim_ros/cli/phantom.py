@@ -20,6 +20,7 @@ class Command:
     config: Annotated[PhantomConfig, tyro.conf.arg(name="")] = field(default_factory=PhantomConfig)
 
     def run(self) -> None:
+        """Render the patient into the bag."""
         from endo_sim_ros.sequences.bag import write_bag
         from endo_sim_ros.sequences.phantom import phantom_sequence
 

@@ -20,6 +20,7 @@ class Command:
     """Over the picture, such as the name of the machine."""
 
     def run(self) -> None:
+        """Draw the picture; raises ValueError without files."""
         from endo_sim_ros.evaluation.bars import plot_rows
 
         if not self.files:

@@ -37,6 +37,7 @@ class Command:
     config: Annotated[ReconstructionConfig, tyro.conf.arg(name="")] = field(default_factory=_named_preset)
 
     def run(self) -> None:
+        """Write model, cameras, checkpoint and the picture of held-out views."""
         from endo_sim_ros.evaluation.held_out import reconstruct_and_measure
 
         reconstruct_and_measure(self.bag, self.out, self.config, self.resume)

@@ -18,7 +18,7 @@ class Command:
     out: Positional[Path]
     """Folder for policy.npz, curve.json and curve.png."""
     task: str = "retraction"
-    """retraction or palpation."""
+    """Name of the task, such as retraction or palpation; an unknown one is answered with the list."""
     algorithm: Literal["cem", "ppo"] = "cem"
     """cem: the cross-entropy method, by the options below; ppo: proximal policy optimisation, by those that begin with ppo; it
     needs stable-baselines3."""
@@ -31,6 +31,7 @@ class Command:
     vary: Randomisation = field(default_factory=Randomisation)
 
     def run(self) -> None:
+        """Train and save; raises ConfigError if options of the other algorithm are given."""
         from endo_sim_ros.learning.scenes import load_scene
         from endo_sim_ros.learning.train import save_training, train
 

@@ -24,6 +24,7 @@ class Command:
     """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""
 
     def run(self) -> None:
+        """Serve the page until interrupted."""
         from endo_sim_ros.viewer.standalone import view
 
         count = {} if self.node_count is None else {"node_count": self.node_count}

@@ -1,0 +1,1 @@
+"""Measurement: held-out and deformed views, benchmarks' rows, and comparisons of methods."""

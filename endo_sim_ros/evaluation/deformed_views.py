@@ -1,4 +1,4 @@
-"""Whether a model is still a picture of tissue when the tissue is moved."""
+"""Deformed-view PSNR: whether a model still looks like tissue when the tissue is moved."""
 
 import dataclasses
 import logging
@@ -17,7 +17,7 @@ from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig, render_d
 log = logging.getLogger(__name__)
 
 _STEPS = 20  # of each move of the jaw
-_SHARE = 0.12  # of what is seen across: how far the jaw moves; half of it is its reach
+_SHARE = 0.12  # of what is seen across: how far the jaw moves; half of it is the radius in which it holds control nodes
 _FINER = 2  # pixels of the surface to one of the picture, each way
 _SPREAD, _OPACITY = 0.45, 0.99  # of the Gaussian of each of them, in its width
 _MOVED = 6  # grey levels, of 255
@@ -27,7 +27,7 @@ _ROUND = 4  # pixels about what changed
 def deformed_view_psnr(model: GaussianModel, cameras: Sequence[Camera], device: str) -> float:
     """PSNR, dB, of pictures of the model while a jaw moves the tissue, over the pixels that change; NaN without tissue in the middle.
 
-    The reference is what the model shows at rest, laid onto the surface it has there and carried along by the same nodes: a
+    The reference is what the model shows at rest, laid onto the surface it has there and moved by the same control nodes: a
     model all of whose Gaussians lie on the surface and have its colours is as good deformed as at rest. The jaw takes hold
     in the middle of the middle camera's picture and moves towards the camera, to the left and upwards. Without light.
 

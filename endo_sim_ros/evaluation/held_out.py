@@ -36,6 +36,7 @@ class Figure(NamedTuple):
 
     @property
     def title(self) -> str:
+        """Heading with the unit."""
         return f"{self.heading} [{self.unit}]" if self.unit else self.heading
 
 

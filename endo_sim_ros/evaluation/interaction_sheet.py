@@ -17,6 +17,9 @@ log = logging.getLogger(__name__)
 
 _STEPS = 25  # of each touch
 
+Touched = tuple[str, np.ndarray, np.ndarray]
+"""What is written below a picture, where the tip is [3], m, world, and the force on the tissue [3], N, world."""
+
 
 def draw_touches(model_path: Path, out: Path, config: PhysicsConfig) -> None:
     """Touch a model in the middle of its middle camera's picture, in five ways, and write a sheet of what that camera sees.
@@ -67,7 +70,7 @@ def _tool(camera: Camera, tip: np.ndarray, turn: float = 0.0) -> np.ndarray:
     return pose
 
 
-def _poke(simulation: TissueSimulation, camera: Camera, middle: np.ndarray, size: float):
+def _poke(simulation: TissueSimulation, camera: Camera, middle: np.ndarray, size: float) -> Touched:
     ahead = camera.pose[:3, 2]
     for step in range(_STEPS):
         tip = middle + (min(step / (_STEPS - 8), 1) * size - simulation.contact_radius) * ahead
@@ -77,7 +80,7 @@ def _poke(simulation: TissueSimulation, camera: Camera, middle: np.ndarray, size
     return f"poked {1e3 * size:.0f} mm deep by a rod: {np.linalg.norm(force):.2f} N", tip, force
 
 
-def _pull(simulation: TissueSimulation, camera: Camera, middle: np.ndarray, size: float):
+def _pull(simulation: TissueSimulation, camera: Camera, middle: np.ndarray, size: float) -> Touched:
     """Pull, ever harder, until the tissue has moved by `size`."""
     direction, force = -camera.pose[:3, 2] + 0.7 * camera.pose[:3, 0], 0.02
     for _ in range(4 * _STEPS):
@@ -91,7 +94,7 @@ def _pull(simulation: TissueSimulation, camera: Camera, middle: np.ndarray, size
     return f"pulled by {np.linalg.norm(force * direction):.2f} N", middle + moved, force * direction
 
 
-def _let_go(simulation: TissueSimulation, camera: Camera, middle: np.ndarray, size: float):
+def _let_go(simulation: TissueSimulation, camera: Camera, middle: np.ndarray, size: float) -> Touched:
     _pull(simulation, camera, middle, size)
     simulation.set_wrench("tool", middle, np.zeros(3))
     for _ in range(_STEPS):
@@ -101,7 +104,7 @@ def _let_go(simulation: TissueSimulation, camera: Camera, middle: np.ndarray, si
     return f"let go: {1e3 * left:.2f} mm from rest after {seconds:g} s", middle, np.zeros(3)
 
 
-def _grasp(simulation: TissueSimulation, camera: Camera, middle: np.ndarray, size: float):
+def _grasp(simulation: TissueSimulation, camera: Camera, middle: np.ndarray, size: float) -> Touched:
     simulation.set_grasp("tool", _tool(camera, middle), True)
     for step in range(_STEPS):
         share = step / (_STEPS - 1)
@@ -112,7 +115,7 @@ def _grasp(simulation: TissueSimulation, camera: Camera, middle: np.ndarray, siz
     return f"grasped, lifted and turned: {np.linalg.norm(force):.2f} N", tip, force
 
 
-def _cut(simulation: TissueSimulation, camera: Camera, middle: np.ndarray, size: float):
+def _cut(simulation: TissueSimulation, camera: Camera, middle: np.ndarray, size: float) -> Touched:
     """Cut right through, across the picture, then pull the edges apart."""
     right, down, ahead = camera.pose[:3, :3].T
     for step in range(2 * _STEPS):

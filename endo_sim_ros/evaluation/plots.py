@@ -14,6 +14,7 @@ _IN_THE_PLOT = 6  # methods that a legend has room for beside the lines
 
 
 def available() -> bool:
+    """Whether matplotlib is installed."""
     return importlib.util.find_spec("matplotlib") is not None
 
 

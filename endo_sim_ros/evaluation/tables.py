@@ -48,6 +48,7 @@ class Summary(NamedTuple):
 
     @property
     def seeds(self) -> str:
+        """How many seeds succeeded, and of how many if one failed."""
         return str(len(self.cells)) if not self.errors else f"{len(self.cells)} of {len(self.cells) + len(self.errors)}"
 
     def text(self, name: str, missing: Iterable[str] = ()) -> str:
@@ -115,7 +116,8 @@ def notes(results: dict[str, Any]) -> list[str]:
     lines += [
         "PSNR, gain fitted: after one factor per colour channel and view, as exposure would. Means over the held-out views.",
         "Methods with an exposure take that of a held-out view from its brightness as rendered and from when it was taken.",
-        "PSNR, deformed: of what changes while a jaw moves the tissue, to the model's own picture carried along on its surface.",
+        "PSNR, deformed: over the pixels that change while a jaw moves the tissue; the reference is the model's own picture at rest, "
+        "deformed with its surface.",
         "Seen: pixels with a depth whose surface a training view shows, too, visibility checked with the reference depth"
         + ("; without one, with the model's own." if models else "."),
         "Median scaled: depth times the factor that makes its median right. Depth stays in floating point throughout.",

@@ -32,6 +32,7 @@ class News(NamedTuple):
 
 
 def ray_is_installed() -> bool:
+    """Whether Ray can be imported."""
     return importlib.util.find_spec("ray") is not None
 
 
@@ -147,7 +148,7 @@ def run_in_ray(job: Job, arguments: Sequence[Any], on_gpu: bool, at_once: int) -
     threads = int(share["num_cpus"])
 
     @ray.remote(max_calls=1, max_retries=0, **share)  # a process each: a crash loses no other job
-    def attempt(*argument):
+    def attempt(*argument: Any) -> tuple[str, Any]:
         os.environ["ENDO_SIM_THREADS"] = str(threads)
         torch.set_num_threads(threads)
         return _attempt(job, argument, "cuda:0" if on_gpu else "cpu", lambda message: None)

@@ -52,7 +52,7 @@ class NodeProcess:
             self._process.send_signal(number)
 
     def interrupt(self) -> None:
-        """Ask the node to end, as Ctrl-C does."""
+        """Ask the ROS node to end, as Ctrl-C does."""
         self.send_signal(signal.SIGINT)
 
     def wait(self, seconds: float = _STOP_AFTER) -> int:

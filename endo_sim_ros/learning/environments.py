@@ -1,4 +1,4 @@
-"""The tasks as Gymnasium environments: importing this module registers ``endo_sim_ros/Retraction-v0`` and ``endo_sim_ros/Palpation-v0``.
+"""The tasks as Gymnasium environments; importing this module registers each, such as ``endo_sim_ros/Retraction-v0``.
 
 ``gymnasium.make`` gives one environment, ``gymnasium.make_vec(id, num_envs, vectorization_mode="vector_entry_point")`` many in
 one batched simulation. Environment i of those, with seed s + i, is the single one with that seed. Both take the arguments of
@@ -22,6 +22,9 @@ except ImportError as error:
     raise ImportError("the environments need gymnasium, which is not installed; pip install 'endo_sim_ros[learning]'") from error
 
 FPS = 25
+"""Steps and images of an episode per second."""
+Observed = np.ndarray | dict[str, np.ndarray]
+"""Observations: state or image, or both in a dict."""
 
 
 def _make(
@@ -63,7 +66,7 @@ class TaskEnvironment(gymnasium.Env):
     """One episode at a time.
 
     Args:
-        task: retraction or palpation, see :mod:`endo_sim_ros.learning.tasks`.
+        task: Name of the task, one of :data:`endo_sim_ros.learning.tasks.TASKS`.
         scene: A PLY model with its cameras.json, or the folder of a model.ply, or a :class:`Scene`; default: a piece of the
             synthetic patient.
         observations: ``state``, ``image`` (the endoscope's, without the tool), or ``both`` in a dict.
@@ -91,17 +94,20 @@ class TaskEnvironment(gymnasium.Env):
         self.batch, self.observation_space = _make(task, scene, 1, observations, randomisation, image_width, device, render_mode)
         self.action_space, self.render_mode = _ACTIONS, render_mode
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observed, dict[str, Any]]:
+        """Begin an episode; return its first observation and its info. A seed makes it repeatable."""
         super().reset(seed=seed)
         self.batch.reset([0], [self.np_random])
         return _first(self.batch.observe()), _first(_info(self.batch))
 
-    def step(self, action: np.ndarray):
+    def step(self, action: np.ndarray) -> tuple[Observed, float, bool, bool, dict[str, Any]]:
+        """Return observation, reward, terminated, truncated and info after an action [4] in -1 … 1."""
         observations, outcome = self.batch.step(np.asarray(action)[None])
         ended = bool(outcome.terminated[0]), bool(outcome.truncated[0])
         return _first(observations), float(outcome.reward[0]), *ended, _first(_info(self.batch, outcome))
 
     def render(self) -> np.ndarray | None:
+        """The endoscope's image [H, W, 3], uint8; None without a render mode."""
         return self.batch.images()[0] if self.render_mode else None
 
 
@@ -136,7 +142,18 @@ class VectorTaskEnvironment(gymnasium.vector.VectorEnv):
         self._generators = [np.random.default_rng() for _ in range(num_envs)]
         self._ended = np.zeros(num_envs, bool)
 
-    def reset(self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None):
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observed, dict[str, np.ndarray]]:
+        """Begin episodes; return the observations [B, …] and infos of all.
+
+        Args:
+            seed: One seed s, with which environment i has s + i, or a list with one for each; None goes on with the generators.
+            options: `reset_mask` [B] bool: which episodes begin anew; default: all.
+
+        Raises:
+            ValueError: If there are more or fewer seeds or places in the mask than environments.
+        """
         seeds = [None if seed is None else seed + i for i in range(self.num_envs)] if seed is None or np.isscalar(seed) else list(seed)
         chosen = np.array((options or {}).get("reset_mask", np.ones(self.num_envs)), bool)
         for what, given in (("seeds", seeds), ("places in reset_mask", chosen)):
@@ -147,19 +164,21 @@ class VectorTaskEnvironment(gymnasium.vector.VectorEnv):
                 self._generators[i] = np.random.default_rng(each)
         return self.renew(np.flatnonzero(chosen)), _info(self.batch)
 
-    def step(self, actions: np.ndarray):
+    def step(self, actions: np.ndarray) -> tuple[Observed, np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+        """Return observations, rewards, terminated, truncated [B, …] and infos after actions [B, 4]; ended episodes begin anew."""
         renew = np.flatnonzero(self._ended)
         observations, outcome = self.batch.step(actions, renew.tolist(), [self._generators[i] for i in renew])
         self._ended = outcome.terminated | outcome.truncated
         return observations, outcome.reward, outcome.terminated, outcome.truncated, _info(self.batch, outcome)
 
-    def renew(self, episodes: np.ndarray) -> np.ndarray | dict[str, np.ndarray]:
+    def renew(self, episodes: np.ndarray) -> Observed:
         """Begin these anew at once instead of at the next step, and observe all: for learners that count on it."""
         self.batch.reset(episodes.tolist(), [self._generators[i] for i in episodes])
         self._ended[episodes] = False
         return self.batch.observe()
 
     def render(self) -> tuple[np.ndarray, ...] | None:
+        """The endoscope's images [H, W, 3], uint8, one for each environment; None without a render mode."""
         return tuple(self.batch.images()) if self.render_mode else None
 
 

@@ -6,9 +6,12 @@ from typing import Protocol
 
 import numpy as np
 
-from endo_sim_ros.learning.tasks import LENGTH, Palpation, Retraction, Task, find_task
+from endo_sim_ros.learning.tasks import LENGTH, Palpation, Retraction, find_task
 
-_MOST_WEIGHTS = 10_000_000
+_MOST_WEIGHTS = 10_000_000  # read from a file
+
+Moves = Generator[np.ndarray, dict[str, float], None]
+"""Yields actions [4], and is sent the state observation, by its names, after each."""
 
 
 class Policy(Protocol):
@@ -27,9 +30,11 @@ class RetractionScript:
     grasp, beyond = 0.002, 1.15  # m from the spot at which the jaw closes; how far to lift, in parts of the goal
 
     def reset(self, episodes: Sequence[int]) -> None:
+        """Nothing to do: the script has no memory."""
         pass
 
     def act(self, observations: np.ndarray) -> np.ndarray:
+        """Actions [B, 4] for state observations [B, n]."""
         names = Retraction.observation_names
         o = {name: observations[:, i].astype(np.float64) for i, name in enumerate(names)}
         holding = (o["jaw"] > 0) & (o["distance"] < 4 * self.grasp / LENGTH)
@@ -48,24 +53,26 @@ class PalpationScript:
     deep, further = 0.003, 0.002  # m: of the tip over the skin at last; by how much that is deeper than before
 
     def __init__(self, count: int = 1):
-        self._runs: list[Generator[np.ndarray, dict[str, float], None]] = [iter(()) for _ in range(count)]
+        self._runs: list[Moves] = [iter(()) for _ in range(count)]
         self.reset(range(count))
 
     def reset(self, episodes: Sequence[int]) -> None:
+        """Begin the search of these episodes anew."""
         for b in episodes:
             self._runs[b] = self._search()
             next(self._runs[b])
 
     def act(self, observations: np.ndarray) -> np.ndarray:
+        """Actions [B, 4] for state observations [B, n]."""
         names = Palpation.observation_names
         rows = [dict(zip(names, row)) for row in observations.astype(np.float64)]
         return np.stack([run.send(row) for run, row in zip(self._runs, rows)])
 
-    def _search(self) -> Generator[np.ndarray, dict[str, float], None]:
+    def _search(self) -> Moves:
         step, felt = Palpation.step_length, {}
         o = yield np.zeros(4)
 
-        def to(goal: Callable[[dict[str, float]], np.ndarray], near: float = 5e-4):
+        def to(goal: Callable[[dict[str, float]], np.ndarray], near: float = 5e-4) -> Moves:
             """Move until the remaining way [3], m, is short."""
             nonlocal o
             for _ in range(40):
@@ -74,10 +81,10 @@ class PalpationScript:
                     return
                 o = yield np.array([*np.clip(way / step, -1, 1), -1.0])
 
-        def over(x: float, y: float, height: float):
+        def over(x: float, y: float, height: float) -> Callable[[dict[str, float]], np.ndarray]:
             return lambda o: np.array([x - LENGTH * o["tip_x"], y - LENGTH * o["tip_y"], height - LENGTH * o["height"]])
 
-        def press(x: float, y: float):
+        def press(x: float, y: float) -> Moves:
             yield from to(over(x, y, self.above), 1.5e-3)
             yield from to(over(x, y, self.deep + self.further))
             shallow = o["force"]
@@ -137,9 +144,11 @@ class NetworkPolicy:
         return cls(task, [part.reshape(*vectors.shape[:-1], *size) for part, size in zip(parts, sizes)])
 
     def reset(self, episodes: Sequence[int]) -> None:
+        """Nothing to do: the network has no memory."""
         pass
 
     def act(self, observations: np.ndarray) -> np.ndarray:
+        """Actions [B, 4], not clipped, for state observations [B, n]."""
         values = observations.astype(np.float64)
         for number, layer in enumerate(self.layers):
             values = np.tanh(values) if number else values
@@ -172,16 +181,30 @@ class NetworkPolicy:
             raise ValueError(f"{path}: not a readable policy ({error})") from error
 
 
+SCRIPTS: dict[str, Callable[[int], Policy]] = {
+    Retraction.name: lambda count: RetractionScript(),
+    Palpation.name: PalpationScript,
+}
+"""Makers of scripted policies for a number of episodes, by the names of the tasks that have one."""
+
+
 def scripted_policy(task: str, count: int = 1) -> Policy:
-    """The scripted policy that solves a task."""
-    return PalpationScript(count) if find_task(task) is Palpation else RetractionScript()
+    """The scripted policy that solves a task, for a number of episodes.
+
+    Raises:
+        ValueError: If there is no such task, or no script for it.
+    """
+    find_task(task)
+    if task not in SCRIPTS:
+        raise ValueError(f"there is no scripted policy for {task}; name the .npz file of a trained one")
+    return SCRIPTS[task](count)
 
 
 def make_policy(policy: str, task: str, count: int = 1) -> Policy:
     """``scripted``, or the policy in a .npz file.
 
     Raises:
-        ValueError: If the file cannot be read or is for another task.
+        ValueError: If there is no such task or script, or the file cannot be read or is for another task.
     """
     if policy == "scripted":
         return scripted_policy(task, count)
@@ -189,6 +212,3 @@ def make_policy(policy: str, task: str, count: int = 1) -> Policy:
     if loaded.task != task:
         raise ValueError(f"{policy} was trained for {loaded.task}, not for {task}")
     return loaded
-
-
-__all__ = ["NetworkPolicy", "PalpationScript", "Policy", "RetractionScript", "Task", "make_policy", "scripted_policy"]

@@ -1,13 +1,16 @@
 """Proximal policy optimisation by stable-baselines3, on many episodes at once: `endo-sim train --algorithm ppo`."""
 
 import time
+from collections.abc import Sequence
+from typing import Any
 
+import gymnasium
 import numpy as np
 import torch
 from rich.progress import Progress
 
 from endo_sim_ros.learning.config import PPOConfig, Randomisation
-from endo_sim_ros.learning.environments import VectorTaskEnvironment
+from endo_sim_ros.learning.environments import Observed, VectorTaskEnvironment
 from endo_sim_ros.learning.policies import NetworkPolicy
 from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.learning.task_batch import TaskBatch
@@ -17,6 +20,7 @@ try:
     from stable_baselines3 import PPO
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.vec_env import VecEnv
+    from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 except ImportError as error:
     raise ImportError("PPO needs stable-baselines3, which is not installed; pip install 'endo_sim_ros[rl]'") from error
 
@@ -32,15 +36,18 @@ class StableEnvironments(VecEnv):
         self.environment = environment
         super().__init__(environment.num_envs, environment.single_observation_space, environment.single_action_space)
 
-    def reset(self):
+    def reset(self) -> VecEnvObs:
+        """First observations [B, n] of all environments, by the seeds that were set."""
         observations, _ = self.environment.reset(seed=list(self._seeds))
         self._reset_seeds()
         return observations
 
     def step_async(self, actions: np.ndarray) -> None:
+        """Keep actions [B, 4] for `step_wait`."""
         self._actions = actions
 
-    def step_wait(self):
+    def step_wait(self) -> VecEnvStepReturn:
+        """Observations [B, n], rewards [B], ends [B] and infos after the step with the kept actions."""
         observations, rewards, terminated, truncated, info = self.environment.step(self._actions)
         ended = np.flatnonzero(terminated | truncated)
         infos = [{name: values[i] for name, values in info.items()} for i in range(self.num_envs)]
@@ -52,31 +59,45 @@ class StableEnvironments(VecEnv):
         return observations, rewards.astype(np.float32), terminated | truncated, infos
 
     def close(self) -> None:
+        """Close the environments."""
         self.environment.close()
 
-    def get_images(self):
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """Images [H, W, 3], uint8, of all environments."""
         return self.environment.render()
 
-    def get_attr(self, attr_name, indices=None):
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """An attribute of the environments, once for each index."""
         return [getattr(self.environment, attr_name)] * len(list(self._get_indices(indices)))
 
-    def set_attr(self, attr_name, value, indices=None):
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """Set an attribute of all environments.
+
+        Raises:
+            ValueError: If the indices are not those of all environments.
+        """
         self._all(indices)
         setattr(self.environment, attr_name, value)
 
-    def env_method(self, method_name, *method_args, indices=None, **method_kwargs):
+    def env_method(self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any) -> list[Any]:
+        """Results of a method of all environments.
+
+        Raises:
+            ValueError: If the indices are not those of all environments.
+        """
         self._all(indices)
         return [getattr(self.environment, method_name)(*method_args, **method_kwargs)] * self.num_envs
 
-    def _all(self, indices) -> None:
+    def _all(self, indices: VecEnvIndices) -> None:
         if sorted(self._get_indices(indices)) != list(range(self.num_envs)):
             raise ValueError(f"the {self.num_envs} environments are one object; set or call all of them, without indices")
 
-    def env_is_wrapped(self, wrapper_class, indices=None):
+    def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
+        """False for each index: there are no wrappers."""
         return [False] * len(list(self._get_indices(indices)))
 
 
-def _of(observations, i: int):
+def _of(observations: Observed, i: int) -> Observed:
     """A copy of environment i's observation."""
     if isinstance(observations, dict):
         return {name: values[i].copy() for name, values in observations.items()}

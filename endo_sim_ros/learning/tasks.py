@@ -7,6 +7,10 @@ simulation, so that the same task runs over topics.
 All lengths of a task are in its own frame: the origin on the skin, z towards the endoscope, x and y across. An action
 [4] in -1 … 1 is how far the tip moves in this step along x, y and z, in parts of `step_length`, and a fourth number that each
 task explains.
+To add a task, write a subclass of :class:`Task` and append it to :data:`TASKS`: environments, training, `endo-sim scene` and
+`endo-sim bench environments`, the policy's ROS node and every message that lists the tasks read it from there. A scripted policy
+is optional: an entry in `policies.SCRIPTS`.
+
 Sums are written out, term by term, so that their bits do not depend on B.
 """
 
@@ -45,6 +49,7 @@ class Task(ABC):
     observation_names: tuple[str, ...]
     horizon: int  # steps of an episode
     step_length = 0.002  # m in one step, per axis
+    working_fourth = -1.0  # fourth action of a tool at work in the tissue, as benchmarks give it
     force_limit: float  # N; above it tissue is hurt, and the episode lost
     low: tuple[float, float, float]  # where the tip may be, m, task frame
     high: tuple[float, float, float]
@@ -199,13 +204,17 @@ class Retraction(Task):
         *(f"force_{axis}" for axis in "xyz"), "force", "time_left",
     )  # fmt: skip
     horizon, force_limit = 60, 3.0
+    working_fourth = 1.0
     low, high = (-0.02, -0.02, -0.004), (0.02, 0.02, 0.025)
     lift, hold = 0.006, 3  # m, steps
-    reach = 0.008  # m, of the jaw
+    grasp_radius = 0.008  # m; the jaw holds control nodes within it
 
     @staticmethod
     def physics(device: str = "auto") -> PhysicsConfig:
-        return PhysicsConfig(node_count=800, layers=2, thickness=0.015, young_modulus=4e3, force_radius=Retraction.reach, device=device)
+        """Soft tissue, and a jaw that holds control nodes within `grasp_radius`."""
+        return PhysicsConfig(
+            node_count=800, layers=2, thickness=0.015, young_modulus=4e3, force_radius=Retraction.grasp_radius, device=device
+        )
 
     def __init__(self, nodes: ControlNodes, viewpoint: np.ndarray, count: int):
         super().__init__(nodes, viewpoint, count)
@@ -228,7 +237,7 @@ class Retraction(Task):
 
     def _value(self) -> np.ndarray:
         distance = _norm(self._spot)
-        grasped = (self.fourth > 0) & (distance <= self.reach)
+        grasped = (self.fourth > 0) & (distance <= self.grasp_radius)
         return np.minimum(self._moved[:, 2] / self.lift, 1.0) * 2 - distance / LENGTH + 0.5 * grasped
 
     def _solved(self) -> np.ndarray:
@@ -262,6 +271,7 @@ class Palpation(Task):
 
     @staticmethod
     def physics(device: str = "auto") -> PhysicsConfig:
+        """Soft tissue, and a ball that pushes."""
         tool = {"contact_radius": 0.008, "friction": 0.1}
         return PhysicsConfig(node_count=1000, layers=3, thickness=0.02, young_modulus=4e3, **tool, device=device)
 
@@ -307,14 +317,17 @@ class Palpation(Task):
         return self._ended() & (self._off(self.tip[:, :2]) <= self.tolerance)
 
     def stiffness(self, b: int) -> np.ndarray:
+        """Factor on the moduli of each node [M] in episode b: `ratio` inside the inclusion."""
         return np.where(inside_sphere(self.nodes.rest, self.place[b], self.radius), self.ratio, 1.0)
 
     def regions(self) -> tuple[str, ...]:
+        """The inclusion of the first episode as physics_node's parameter `regions`."""
         x, y, z = self.place[0].tolist()
         return (f"sphere {x!r} {y!r} {z!r} {self.radius!r} young_modulus={self.ratio * self.physics().young_modulus!r}",)
 
 
 TASKS: dict[str, type[Task]] = {task.name: task for task in (Retraction, Palpation)}
+"""All tasks by their names."""
 
 
 def make_task(name: str, nodes: ControlNodes, viewpoint: np.ndarray, count: int = 1) -> Task:

@@ -69,7 +69,9 @@ def train(
         return _train(task, scene, config, randomisation, device)
 
 
-def _train(task, scene, config, randomisation, device):
+def _train(
+    task: str, scene: Scene, config: TrainingConfig, randomisation: Randomisation, device: str
+) -> tuple[NetworkPolicy, list[dict[str, float]]]:
     hidden = [config.hidden] if config.hidden else []
     rng = np.random.default_rng([config.seed, 0xCE])
     batch = TaskBatch(task, scene, config.population, randomisation=randomisation, device=device)

@@ -55,30 +55,36 @@ class Browser:
             self._tissue = gui.add_checkbox("tissue", True, hint="Show the Gaussians.")
             self._nodes = gui.add_dropdown("nodes", _NODES, hint="Show the control nodes, coloured by their stress or not.")
             self._mouse = gui.add_dropdown("drag", ("turns", "pulls"), hint="What dragging without Shift does.")
-            self._button = gui.add_button("record")
+            self._button = gui.add_button("record video")
         for element in (self._view, self._tissue, self._nodes, self._mouse):
             element.on_update(lambda _: post(self._choose))
 
     def on_changed(self, call: Callable[[], None]) -> None:
+        """Call this when the user has chosen something else to see."""
         self._changed = call
 
     def on_record(self, call: Callable[[], None]) -> None:
+        """Call this, in the viewer's thread, when the user presses the button of the video."""
         self._button.on_click(lambda _: self._post(call))
 
     @property
     def view(self) -> str:
+        """The chosen view, one of `VIEWS`."""
         return self._view.value
 
     @property
     def wants_splats(self) -> bool:
+        """Whether the browser draws the Gaussians itself."""
         return self.view == SPLATS and self._tissue.value
 
     @property
     def wants_nodes(self) -> bool:
+        """Whether control nodes are shown."""
         return self._nodes.value != _NODES[0]
 
     @property
     def wants_stress(self) -> bool:
+        """Whether control nodes are coloured by their stress."""
         return self._nodes.value == _NODES[2]
 
     def _choose(self) -> None:
@@ -230,13 +236,13 @@ class Browser:
         if self._video is None:
             folder.mkdir(parents=True, exist_ok=True)
             name = time.strftime("tissue_%Y%m%d_%H%M%S") + f"_{self.client.client_id}.mp4"
-            self._video, self._button.label = VideoRecorder(folder / name, fps), "stop recording"
+            self._video, self._button.label = VideoRecorder(folder / name, fps), "stop video"
             return
         video, self._video = self._video, None
         try:
             video.close()
         finally:
-            self._button.label = "record"
+            self._button.label = "record video"
         self.client.send_file_download(video.path.name, video.path.read_bytes())
 
     def close(self) -> None:

@@ -20,12 +20,12 @@ class Grasp:
         pose: Pose of the tip [4, 4] on the tissue, m, world.
         max_force: N.
         max_speed: m/s.
-        reach: Longest pull, m.
+        longest_pull: Longest pull, m.
     """
 
-    def __init__(self, pose: np.ndarray, max_force: float, max_speed: float, reach: float):
+    def __init__(self, pose: np.ndarray, max_force: float, max_speed: float, longest_pull: float):
         self.start = np.array(pose, np.float64)
-        self._max_force, self._max_speed, self._reach = max_force, max_speed, reach
+        self._max_force, self._max_speed, self._longest_pull = max_force, max_speed, longest_pull
         self._target = self._pull = np.zeros(3)
         self._age = 0.0
 
@@ -43,7 +43,7 @@ class Grasp:
 
     def aim(self, target: np.ndarray) -> None:
         """Where the tip [3] shall go, m, world."""
-        self._target = _shortened(np.asarray(target, np.float64) - self.start[:3, 3], self._reach)
+        self._target = _shortened(np.asarray(target, np.float64) - self.start[:3, 3], self._longest_pull)
 
     def advance(self, seconds: float, reaction: float) -> np.ndarray:
         """Pose of the tip after some time in which the tissue resisted with a force, N."""

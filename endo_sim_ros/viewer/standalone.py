@@ -59,6 +59,7 @@ class Standalone:
     # ---------------------------------------------------------------- actions
 
     def hold(self, pose: np.ndarray, closed: bool) -> None:
+        """Grasp tissue at a pose [4, 4], m, world, or move what is held; say so where nothing can be held."""
         if not closed:
             return
         if self.simulation.set_grasp(_HAND, pose, True):
@@ -68,11 +69,13 @@ class Standalone:
             self.viewer.release()
 
     def let_go(self) -> None:
+        """Open the jaw."""
         if self._pose is not None:
             self.simulation.set_grasp(_HAND, self._pose, False)
         self._pose = None
 
     def set_parameters(self, values: dict[str, float]) -> None:
+        """Rebuild the simulation with new values, SI units, and go on from its state; keep the old one if they are refused."""
         try:
             physics = dataclasses.replace(self._physics, **values)
             simulation = self._simulate(physics)
@@ -90,15 +93,18 @@ class Standalone:
         self._restart_clock()
 
     def reset(self) -> None:
+        """Return the tissue to rest."""
         self.simulation.reset()
         self._restart_clock()
         self._show()
 
     def pause(self, paused: bool) -> None:
+        """Stop time, or let it go on."""
         self.viewer.show_text(*self._text(), paused=paused)
         self._restart_clock()
 
     def step(self) -> None:
+        """Advance one step while time stands still."""
         if self.viewer.paused:
             self._step()
 

@@ -130,6 +130,7 @@ class Viewer:
 
     @property
     def url(self) -> str:
+        """Address of the page, as a browser on this machine reaches it."""
         host = "localhost" if self.config.host in ("0.0.0.0", "::") else self.config.host
         return f"http://{host}:{self._server.get_port()}"
 
@@ -233,8 +234,8 @@ class Viewer:
         origin, _, camera = browser.ray(*pointer.began_at)
         pose = camera.pose.copy()
         pose[:3, 3] = point
-        reach = _TRAVEL * self._parameters["travel"]
-        self._grasp = Grasp(pose, self.config.max_force, self.config.max_speed, reach)
+        longest_pull = _TRAVEL * self._parameters["travel"]
+        self._grasp = Grasp(pose, self.config.max_force, self.config.max_speed, longest_pull)
         self._holder, self._resistance = pointer.client, 0.0
         depth = (point - origin) @ camera.pose[:3, 2]
         self._plane = point, camera.pose[:3, 2], depth * camera.height / camera.K[1, 1]  # the last: height of the view there

@@ -12,8 +12,9 @@ from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.evaluation import paper, tables
 from endo_sim_ros.evaluation.config import EvaluationConfig
-from endo_sim_ros.evaluation.evaluate import evaluate, open_named
+from endo_sim_ros.evaluation.evaluate import evaluate
 from endo_sim_ros.evaluation.page import write_page
+from endo_sim_ros.evaluation.sources import open_named
 
 SMALL = "phantom:0,frames=6,width=96,height=80"
 

@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial import cKDTree
 
 from endo_sim_ros.core.cameras import Camera, look_at
-from endo_sim_ros.evaluation.evaluate import _divided
 from endo_sim_ros.evaluation.held_out import FIGURES, measure, seen_pixels
+from endo_sim_ros.evaluation.preparation import divide_points
 from endo_sim_ros.reconstruction import ScenePoints
 
 CAMERA = Camera(np.array([[50, 0, 32], [0, 50, 24], [0, 0, 1.0]]), 64, 48)
@@ -52,12 +52,12 @@ def test_depth_is_judged_by_scene_points_that_no_method_gets(small_frames):
     surface = frame.camera.backproject(frame.depth)[frame.depth > 0][::7]
     repeated = np.concatenate([surface, surface[::2], surface[1::2] + 1e-6])  # as other pairs of views triangulate them again
     points = ScenePoints(repeated, np.zeros_like(repeated), np.linspace(0.001, 0.002, len(repeated)))
-    given, judging = _divided(points)
+    given, judging = divide_points(points)
     assert len(judging) == pytest.approx(len(np.unique(repeated, axis=0)) / 10, abs=1) and len(given.positions) == len(given.error)
     assert len(repeated) - 4 * len(judging) < len(given.positions) < len(repeated) - len(judging)
     assert cKDTree(judging).query(given.positions)[0].min() > 2e-6
     few = ScenePoints(surface[:300], np.zeros_like(surface[:300]), 0.001)
-    assert _divided(few) == (few, None)
+    assert divide_points(few) == (few, None)
     assert measure(frame.image, frame.depth, frame, points=judging)["points_depth"] < 1e-6
     off = measure(frame.image, frame.depth + np.float32(0.002), frame, points=judging)
     assert off["points_depth"] == pytest.approx(0.002, rel=1e-3)

@@ -67,7 +67,7 @@ def test_in_a_browser_tissue_is_seen_dragged_and_reset(chromium, tmp_path):
         wait_until(lambda: difference(seen(second), rest) < 2, 30, "the second browser to show the same")
 
         recorded = lambda: next((b._recording._count for b in page.viewer.browsers.values() if b._recording is not None), 0)
-        first.get_by_role("button", name="record").click()
+        first.get_by_role("button", name="record video").click()
         wait_until(recorded, 20, "a recording")
         first.keyboard.down("Shift")
         first.mouse.move(200, 250)
@@ -79,7 +79,7 @@ def test_in_a_browser_tissue_is_seen_dragged_and_reset(chromium, tmp_path):
         assert page.viewer.tools["mouse"].force[0] > 0
         first.mouse.up()
         first.keyboard.up("Shift")
-        first.get_by_role("button", name="stop recording").click()
+        first.get_by_role("button", name="stop video").click()
         with first.expect_download() as download:
             first.get_by_role("link", name=".mp4").click()
         first.get_by_role("alert").filter(has_text=".mp4").get_by_role("button").last.click()  # it covers tissue

@@ -8,7 +8,7 @@ from endo_sim_ros.viewer.grasp import Grasp
 
 def pulled(target, stiffness, seconds=4.0, late=3, max_force=2.0, **options):
     """Where a grasp ends up whose tissue is a spring [N/m] that is felt some turns late, and all forces on the way."""
-    options = {"max_force": max_force, "max_speed": 0.5, "reach": 0.04} | options
+    options = {"max_force": max_force, "max_speed": 0.5, "longest_pull": 0.04} | options
     grasp, forces = Grasp(np.eye(4), **options), [0.0] * late
     grasp.aim(np.asarray(target, float))
     for _ in range(int(seconds / 0.02)):

@@ -1,0 +1,137 @@
+"""Cells of an evaluation: which trainings there are, under which names, and their records in the folder of results."""
+
+import dataclasses
+import json
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from endo_sim_ros.core import drawing
+from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.evaluation.config import EvaluationConfig
+from endo_sim_ros.evaluation.lpips import Lpips, WeightsError
+from endo_sim_ros.evaluation.sources import PHANTOM, parse_values, split_source
+from endo_sim_ros.evaluation.splits import check_split
+from endo_sim_ros.evaluation.workers import Finished
+from endo_sim_ros.reconstruction import ReconstructionConfig
+from endo_sim_ros.reconstruction.presets import ABLATIONS, preset
+
+log = logging.getLogger(__name__)
+
+
+class Cell(NamedTuple):
+    """One training and its measurement."""
+
+    sequence: str
+    split: str
+    method: str
+    seed: int
+    options: dict[str, Any]  # of the reconstruction, all of them
+    source: str
+    train_depth: bool
+    mono: bool
+    lpips: tuple[str, ...]  # networks whose weights are there
+    curve: int
+
+    @property
+    def stem(self) -> str:
+        """Name of the cell's files, without an ending."""
+        return drawing.slug(f"{self.sequence}-{self.split}-{self.method}-{self.seed}")
+
+
+def list_cells(sequences: Sequence[str], config: EvaluationConfig) -> tuple[list[Cell], dict[str, str]]:
+    """Return all cells of an evaluation, and why figures are missing, by their names.
+
+    Args:
+        sequences: Sequences as named on the command line.
+        config: What to compare.
+
+    Raises:
+        SequenceError, ConfigError: If a sequence, a split or an option is not there.
+    """
+    names = _names(sequences)
+    for split in config.splits:
+        check_split(split)
+    networks, missing = _networks(config)
+    methods = _methods(config)
+    given = {"train_depth": config.train_depth, "mono": config.mono, "lpips": networks, "curve": config.curve}
+    cells = [
+        Cell(name, split, method, seed, options | {"seed": options["seed"] + seed}, source, **given)
+        for name, source in names.items()
+        for split in config.splits
+        for method, options in methods.items()
+        for seed in range(config.seeds)
+    ]
+    return cells, missing
+
+
+def finished_record(out: Path, cell: Cell) -> dict[str, Any] | None:
+    """The record of a cell that was finished with the same options."""
+    try:
+        record = json.loads((out / "cells" / f"{cell.stem}.json").read_text())
+        return record if record["error"] is None and record["cell"] == json.loads(json.dumps(cell._asdict())) else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def save_record(out: Path, cell: Cell, outcome: Finished) -> dict[str, Any]:
+    """Write what a cell gave, and return its record."""
+    result = outcome.result or {}
+    pictures = {}
+    for name, data in result.pop("pictures", {}).items():
+        pictures[name] = f"pictures/{cell.stem}-{name}.jpg"
+        (out / pictures[name]).write_bytes(data)
+    record = {"cell": cell._asdict(), "error": outcome.error, "pictures": pictures, **result}
+    file = out / "cells" / f"{cell.stem}.json"
+    partial = file.with_suffix(".part")
+    partial.write_text(json.dumps(record, indent=1) + "\n")
+    partial.replace(file)
+    return json.loads(file.read_text())
+
+
+def _names(sequences: Sequence[str]) -> dict[str, str]:
+    """A short name for each sequence."""
+    if not sequences:
+        raise SequenceError(f"give one sequence or more: a bag, a folder, or {PHANTOM}0")
+    names: dict[str, str] = {}
+    for source in sequences:
+        place = split_source(source)[0]
+        if not place.startswith(PHANTOM) and not Path(place).exists():
+            raise SequenceError(f"{place}: no such file or folder; give a bag, a recording, or {PHANTOM}0")
+        parts = [place] if place.startswith(PHANTOM) else list(Path(place).resolve().parts)
+        for length in range(1, len(parts) + 1):
+            name = "/".join(parts[-length:])
+            if name not in names:
+                break
+        else:
+            raise SequenceError(f"{source}: the same sequence twice")
+        names[name] = source
+    return names
+
+
+def _methods(config: EvaluationConfig) -> dict[str, dict[str, Any]]:
+    """All options of each method, by its name."""
+    common = {"device": "auto"} | parse_values(config.set, "--set", ReconstructionConfig)
+    if "preset" in common:
+        raise ConfigError("--set preset: methods are named with --presets")
+    unlike = {name: dataclasses.asdict(preset(name, **common)) for name in config.presets}
+    if config.ablation:
+        for name in config.presets:
+            for part, overrides in ABLATIONS.get(name, {}).items():
+                unlike[f"{name} {part}"] = dataclasses.asdict(preset(name, **{**common, **overrides}))
+    return unlike
+
+
+def _networks(config: EvaluationConfig) -> tuple[tuple[str, ...], dict[str, str]]:
+    """The networks of LPIPS that can be used, and why the others cannot."""
+    usable, missing = [], {}
+    for name in config.lpips:
+        try:
+            Lpips(name, config.weights)
+            usable.append(name)
+        except WeightsError as error:
+            log.warning("%s", error)
+            missing[f"lpips_{name}"] = str(error)
+    return tuple(usable), missing

@@ -1,0 +1,64 @@
+"""Sequences as they are named on the command line: a path or `phantom:SEED`, then options of the reader as `,name=value`."""
+
+import dataclasses
+import re
+import typing
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.sequences.bag import read_bag
+from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
+from endo_sim_ros.sequences.readers import open_sequence
+from endo_sim_ros.sequences.recording import Recording
+
+PHANTOM = "phantom:"
+"""Prefix of the synthetic patients; a seed follows."""
+
+
+def split_source(source: str) -> tuple[str, list[str]]:
+    """The path or name of a sequence, and its options."""
+    place, *options = re.split(r",(?=\w+=)", source)
+    return place, options
+
+
+def parse_values(items: Iterable[str], where: str, of: type) -> dict[str, Any]:
+    """name=value texts as the options of a configuration."""
+    known, values = {field.name: field for field in dataclasses.fields(of)}, {}
+    for item in items:
+        name, equals, text = item.partition("=")
+        if not equals or name not in known:
+            raise ConfigError(f"{where} {item}: give name=value with a name of {', '.join(known)}")
+        values[name] = text if typing.get_type_hints(of)[name] is str else yaml.safe_load(text)
+    return values
+
+
+def open_named(source: str) -> Iterable[Frame]:
+    """The frames of a sequence as it is named on the command line.
+
+    Raises:
+        SequenceError: If there is no such sequence or option.
+    """
+    place, texts = split_source(source)
+    if place.startswith(PHANTOM):
+        seed = place.removeprefix(PHANTOM)
+        if not seed.isdecimal():
+            raise SequenceError(f"{place}: the synthetic patients have numbers, as {PHANTOM}0")
+        # Half a round: after a whole one the last view would be the first again, and two views one.
+        config = PhantomConfig(**{"seed": int(seed), "rounds": 0.5} | parse_values(texts, place, PhantomConfig))
+        return Recording(lambda: phantom_sequence(config), config.frames)
+    options = {name: yaml.safe_load(value) for name, _, value in (text.partition("=") for text in texts)}
+    if "distortion" in options:
+        options["distortion"] = tuple(np.atleast_1d(options["distortion"]).tolist())
+    path = Path(place)
+    if path.suffix == ".mcap" or (path / "metadata.yaml").is_file() or path.is_dir() and any(path.glob("*.mcap")):
+        unknown = set(options) - {"start", "stop", "step"}
+        if unknown:
+            raise SequenceError(f"{place}: a bag has no option {', '.join(sorted(unknown))}; it has start, stop and step")
+        return list(read_bag(path))[slice(*(options.get(name) for name in ("start", "stop", "step")))]
+    return open_sequence(path, **options)

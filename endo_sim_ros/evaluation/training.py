@@ -1,0 +1,215 @@
+"""One cell in the process of its training: `train_and_measure`."""
+
+import contextlib
+import dataclasses
+import functools
+import pickle
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from endo_sim_ros.core import drawing
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.device import cpu_threads
+from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.evaluation import metrics
+from endo_sim_ros.evaluation.cells import Cell
+from endo_sim_ros.evaluation.deformed_views import deformed_view_psnr
+from endo_sim_ros.evaluation.held_out import difference, mean_figures, measure, model_renderer, seen_pixels
+from endo_sim_ros.evaluation.lpips import Lpips
+from endo_sim_ros.evaluation.measurement import machine, peak_megabytes
+from endo_sim_ros.evaluation.preparation import Prepared
+from endo_sim_ros.evaluation.splits import Split, split_views
+from endo_sim_ros.reconstruction import Progress, ReconstructionConfig, ScenePoints, Trainer, prepare, reconstruct, shrink
+from endo_sim_ros.reconstruction.triangulation import points_in_view
+from endo_sim_ros.sequences.recording import spread
+
+_SHOWN = 3  # held-out views of a cell of which pictures are kept
+_CURVE_VIEWS = 8  # held-out views measured at each moment of a curve
+
+
+@functools.lru_cache(maxsize=1)
+def _load(file: Path) -> Prepared:
+    return pickle.loads(file.read_bytes())
+
+
+@functools.lru_cache(maxsize=2)
+def _network(name: str, weights: Path | None, device: str) -> Lpips:
+    return Lpips(name, weights, device)
+
+
+@functools.lru_cache(maxsize=1)
+def _warm_up(device: str) -> None:
+    """Load or compile every kernel, which is no part of the time of a training."""
+    image = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
+    camera, poses = Camera(np.array([[60, 0, 32], [0, 60, 24], [0, 0, 1]]), 64, 48), np.tile(np.eye(4), (2, 1, 1))
+    poses[1, 0, 3] = 0.005
+    frames = [Frame(i, image, camera.at(pose), depth=np.full((48, 64), 0.1, np.float32)) for i, pose in enumerate(poses)]
+    with contextlib.suppress(SequenceError):  # they need not make a scene
+        reconstruct(frames, ReconstructionConfig(iterations=3, max_gaussians=500, depth="topic", device=device))
+
+
+def train_and_measure(argument: tuple[Cell, Path | None, Prepared | Path], device: str, report: Callable[[Any], None]) -> dict[str, Any]:
+    """Return the record of one cell, trained and measured here; the process that asked for it, maybe on another host, writes it.
+
+    Args:
+        argument: The cell, the folder of the weights of LPIPS (None: torch's cache), and its sequence or a pickle file of that.
+        device: Compute device: cpu or cuda:N.
+        report: Takes (done, total, text) while the cell runs.
+
+    Raises:
+        SequenceError: If the split needs views that the sequence lacks.
+    """
+    cell, weights, prepared = argument
+    if isinstance(prepared, Path):
+        prepared = _load(prepared)
+    config = ReconstructionConfig.from_mapping(cell.options | {"device": device})
+    split = split_views(cell.split, len(prepared.frames))
+    views = [prepared.frames[index] for index in split.train]
+    if not (cell.train_depth and prepared.depth_source == "recorded"):
+        views = [dataclasses.replace(view, depth=None) for view in views]
+    if cell.mono or split.right:
+        views = [dataclasses.replace(view, right=None, baseline=None, right_K=None) for view in views]
+    held_out = [shrink(frame, config.image_width) for frame in _held_out(prepared, split)]
+    report((0, 1, "warming up"))
+    _warm_up(device)
+    training: dict[str, Any] = {}
+
+    def train() -> None:
+        training.update(_train(views, config, prepared.points, spread(held_out, _CURVE_VIEWS), cell.curve, report))
+
+    memory = peak_megabytes(train, device)
+    model, drift = training.pop("model"), training.pop("drift")
+    report((0, len(held_out), "measuring"))
+    networks = [_network(name, weights, device) for name in cell.lpips]
+    seen_by = [shrink(prepared.frames[index], config.image_width) for index in split.train]
+    renderer = model_renderer(model, device)
+    shown = set(spread(range(len(held_out)), _SHOWN))
+    # Without reference depth that of the model tells what was seen.
+    known = all(frame.depth is not None for frame in [*held_out, *seen_by])
+    surfaces = [(view.camera, view.depth if known else renderer.render(view.camera)[1], view.mask) for view in seen_by]
+
+    def of_view(index: int, image: np.ndarray, depth: np.ndarray) -> tuple[dict[str, float], dict[str, bytes]]:
+        frame, number = held_out[index], split.held_out[index]
+        seen = seen_pixels(frame.camera, frame.depth if known else depth, surfaces)
+        found = measure(image, depth, frame, seen, networks, prepared.judging)
+        row = {"view": number} | {name: value for name, value in found.items() if np.isfinite(value)}
+        return row, _pictures(number, image, depth, frame) if index in shown else {}
+
+    deformed = {"psnr_deformed": deformed_view_psnr(model, [view.camera for view in seen_by], device)}
+    deformed = {name: value for name, value in deformed.items() if np.isfinite(value)}
+    rows, pictures = [], {}
+    with ThreadPoolExecutor(cpu_threads()) as pool:  # measuring takes longer than drawing
+        waiting = deque()
+        for index, frame in enumerate(held_out):
+            waiting.append(pool.submit(of_view, index, *renderer.render(frame.camera, light=drift.at(model.light, frame.stamp_ns))))
+            while len(waiting) > 2 * cpu_threads() or waiting and index == len(held_out) - 1:
+                row, new = waiting.popleft().result()
+                rows.append(row)
+                pictures |= new
+                report((len(rows), len(held_out), "measuring"))
+    return {
+        "machine": machine(device),
+        "size": [held_out[0].camera.width, held_out[0].camera.height],
+        "train": split.train,
+        "held_out": len(held_out),
+        "masked": any(frame.mask is not None and not frame.mask.all() for frame in held_out),
+        "depth_source": "none" if split.right else prepared.depth_source,
+        "given": [
+            *["right images"] * any(view.right is not None for view in views),
+            *["recorded depth"] * any(view.depth is not None for view in views),
+        ],
+        "reference_at_points": _reference_at_points(held_out, prepared.judging),
+        "seen_by": "reference" if known else "model",
+        "figures": mean_figures(rows) | deformed | {"seconds": training["seconds"], "gaussians": len(model), "megabytes": memory},
+        "views": rows,
+        "curve": training["curve"],
+        "pictures": pictures,
+    }
+
+
+def _held_out(prepared: Prepared, split: Split) -> list[Frame]:
+    if not split.right:
+        return [prepared.frames[index] for index in split.held_out]
+    if not prepared.right:
+        raise SequenceError("split stereo: the sequence has no right images")
+    return prepared.right
+
+
+def _reference_at_points(held_out: list[Frame], judging: np.ndarray | None) -> float | None:
+    """How far the reference depth is off at the scene points that judge, metres; None if there are not both."""
+    if judging is None:
+        return None
+    judged = [frame for frame in held_out if frame.depth is not None]
+    off = [metrics.depth_at_points(frame.depth, *points_in_view(frame.camera, judging), frame.mask) for frame in judged]
+    off = [value for value in off if np.isfinite(value)]
+    return float(np.mean(off)) if off else None
+
+
+def _train(
+    views: list[Frame], config: ReconstructionConfig, points: ScenePoints, probes: list[Frame], moments: int, report: Callable[[Any], None]
+) -> dict[str, Any]:
+    """Train; the seconds that it took, without those of the measurements for the curve."""
+
+    def now() -> float:
+        if config.device != "cpu":
+            torch.cuda.synchronize(config.device)
+        return time.perf_counter()
+
+    curve, start, away = [], now(), 0.0
+    trainer = Trainer(prepare(views, config, points, lambda stage, done, total: report((done, max(total, 1), stage))), config)
+    iterations = trainer.config.iterations
+    # Quality changes fastest in the beginning.
+    due = sorted({round(iterations * 50 ** (i / max(moments - 1, 1) - 1)) for i in range(moments)})
+
+    def on_progress(progress: Progress) -> None:
+        nonlocal away
+        report((progress.iteration, iterations, f"{progress.gaussians} Gaussians"))
+        if not due or progress.iteration < due[0]:
+            return
+        while due and progress.iteration >= due[0]:
+            due.pop(0)
+        paused = now()
+        model, drift = trainer.model, trainer.drift
+        renderer = model_renderer(model, config.device)
+        drawn = lambda probe: renderer.render(probe.camera, light=drift.at(model.light, probe.stamp_ns))[0]
+        pairs = [(drawn(probe), probe.image, probe.mask) for probe in probes]
+        curve.append(
+            {
+                "iteration": progress.iteration,
+                "seconds": paused - start - away,
+                "psnr": float(np.nanmean([metrics.psnr(*pair) for pair in pairs])),
+                "psnr_gain": float(np.nanmean([metrics.psnr(metrics.gain_fitted(*p), *p[1:]) for p in pairs])),
+            }
+        )
+        away += now() - paused
+
+    model = trainer.run(on_progress, every=max(min(20, iterations // 50), 1))
+    seconds = now() - start - away
+    return {"model": model, "drift": trainer.drift, "seconds": seconds, "curve": curve}
+
+
+def _pictures(view: int, image: np.ndarray, depth: np.ndarray, frame: Frame) -> dict[str, bytes]:
+    """Pictures of a held-out view as JPEG files, by name."""
+    reference = depth if frame.depth is None else frame.depth
+    near, far = np.percentile(reference[reference > 0], [1, 99]) if (reference > 0).any() else (0.0, 1.0)
+    pictures = {
+        "reference": frame.image,
+        "rendered": image,
+        "difference": difference(image, frame.image) * (1 if frame.mask is None else (frame.mask > 0)[..., None]),
+        "depth": drawing.color_depth(depth, near, far),
+    }
+    if frame.depth is not None:
+        pictures["reference_depth"] = drawing.color_depth(frame.depth, near, far)
+    quality = [cv2.IMWRITE_JPEG_QUALITY, 92]
+    return {
+        f"{view:04d}-{name}": cv2.imencode(".jpg", cv2.cvtColor(picture.astype(np.uint8), cv2.COLOR_RGB2BGR), quality)[1].tobytes()
+        for name, picture in pictures.items()
+    }

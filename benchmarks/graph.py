@@ -23,7 +23,6 @@ from endo_sim_ros.evaluation.measurement import Row, machine, report
 from endo_sim_ros.graph.client import ARM, CHANGED, PATIENCE, WORLD, Client, Scene, tissue
 from endo_sim_ros.graph.processes import NodeGroup
 from endo_sim_ros.messages import PhysicsState
-from endo_sim_ros.physics.config import PhysicsConfig
 
 _FORCE = 2.0  # N, towards the camera
 _HOLD = 0.6  # seconds between one change of the force and the next
@@ -33,7 +32,7 @@ _LIMIT = 50.0  # ms; what latencies are compared with
 def _parameters(mode: str, rate: float, device: str) -> dict[str, dict[str, Any]]:
     """What the nodes under test are started with."""
     common = {"mode": mode, "device": device}
-    step = {"substep_dt": 1 / (PhysicsConfig.substeps * rate)}  # as many steps per second as images
+    step = {"step_duration": 1 / rate}  # as many steps per second as images
     return {"physics_node": {**common, **step, "arms": [ARM]}, "rendering_node": {**common, "rate": rate}}
 
 

@@ -27,6 +27,7 @@ from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_camera
 from endo_sim_ros.sequences.phantom_model import phantom_model
 
+PAPER_SUBSTEPS = 80
 PLAIN = "plain Warp kernels"  # ours for GPUs, on a CPU: the same maths without vectors
 DENSE = "dense"
 PULL = np.array([0.6, 0.0, -0.8])  # where a tool drags the tissue: aside and to the camera, in camera axes
@@ -191,7 +192,7 @@ def _paper(scene: Scene, device: str, plan: Plan) -> list[Row]:
     differently, decides how far it moves. The default's tissue is 2 cm thick and pinned behind, that of the others a bare
     skin held at its rim: their images differ because the tissue does.
     """
-    common = {"adapt_substeps": False, "device": device}
+    common = {"substeps": PAPER_SUBSTEPS, "device": device}
     printed = PhysicsConfig(node_count=plan.printed_nodes, layers=0, kinematics="current", **common)
     softmax = RenderingConfig(skinning="softmax", device=device)
     compact = RenderingConfig(device=device)
@@ -273,7 +274,7 @@ def _over_nodes(scene: Scene, count: int, device: str, seconds: float) -> list[R
     The printed method's tissue is softened, which costs the same, so that 80 substeps are stable at any spacing.
     """
     common = {"node_count": count, "device": device}
-    printed = PhysicsConfig(layers=0, kinematics="current", adapt_substeps=False, young_modulus=100.0, **common)
+    printed = PhysicsConfig(layers=0, kinematics="current", substeps=PAPER_SUBSTEPS, young_modulus=100.0, **common)
     return [
         *_step_rows(f"over nodes: {short(count)}, printed, 80 substeps", scene, printed, device, seconds),
         *_step_rows(f"over nodes: {short(count)}, default", scene, PhysicsConfig(**common), device, seconds),
@@ -281,8 +282,8 @@ def _over_nodes(scene: Scene, count: int, device: str, seconds: float) -> list[R
 
 
 def _over_substeps(scene: Scene, substeps: int, nodes: int, device: str, seconds: float) -> list[Row]:
-    """The default method in steps of so many substeps."""
-    config = PhysicsConfig(node_count=nodes, substeps=substeps, adapt_substeps=False, device=device)
+    """The default method in steps of so many substeps of half a millisecond, the paper's."""
+    config = PhysicsConfig(node_count=nodes, step_duration=0.0005 * substeps, substeps=substeps, device=device)
     return _step_rows(f"over substeps: {substeps}, {short(nodes)} nodes", scene, config, device, seconds)
 
 
@@ -401,9 +402,9 @@ def _beside_peer(scene: Scene, device: str, plan: Plan, notes: list[str]) -> lis
     """
     if not importlib.util.find_spec("mpm_solver_warp"):
         return []
-    sparse = PhysicsConfig(node_count=plan.printed_nodes, layers=0, adapt_substeps=False, device=device)
+    sparse = PhysicsConfig(node_count=plan.printed_nodes, layers=0, substeps=PAPER_SUBSTEPS, device=device)
     ours = {f"{sparse.substeps} substeps": sparse, "default": PhysicsConfig(node_count=plan.printed_nodes, device=device)}
-    dense = PhysicsConfig.baseline(adapt_substeps=False, device=device)
+    dense = PhysicsConfig.baseline(substeps=PAPER_SUBSTEPS, device=device)
     nodes = short(plan.printed_nodes)
     tried = [(scene, sparse, f"{nodes} nodes", {f"{nodes} nodes, {name}": _pulled(scene, config).step for name, config in ours.items()})]
     for each in [scene, *([] if device == "cpu" else [phantom_scene(PEER_GAUSSIANS, plan.width)])] if plan.peer_dense else []:

@@ -20,7 +20,7 @@ K = np.array([[90.0, 0, 48], [0, 90.0, 40], [0, 0, 1]])
 WIDTH, HEIGHT = 96, 80
 SMALL = {
     "reconstruction_node": {"iterations": 30, "max_gaussians": 1500, "image_width": WIDTH, "start_after": 0.0},
-    "physics_node": {"node_count": 300, "arms": "[PSM1, PSM2]", "substeps": 40, "force_radius": 0.02},
+    "physics_node": {"node_count": 300, "arms": "[PSM1, PSM2]", "step_duration": 0.02, "force_radius": 0.02},
     "rendering_node": {"rate": 20.0},
 }
 

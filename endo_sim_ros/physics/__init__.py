@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from endo_sim_ros.physics.simulation import TissueSimulation as TissueSimulation
     from endo_sim_ros.physics.skinning import Skinning as Skinning
     from endo_sim_ros.physics.solver import MpmSolver as MpmSolver
-    from endo_sim_ros.physics.solver import StabilityError as StabilityError
-    from endo_sim_ros.physics.solver import plan_substeps as plan_substeps
+    from endo_sim_ros.physics.substeps import StabilityError as StabilityError
+    from endo_sim_ros.physics.substeps import plan_substeps as plan_substeps
 
 __getattr__ = lazy_names(
     __name__,
@@ -28,5 +28,6 @@ __getattr__ = lazy_names(
     regions=("TissueProperties",),
     simulation=("NodeState", "TissueBatch", "TissueSimulation"),
     skinning=("Skinning",),
-    solver=("MpmSolver", "StabilityError", "plan_substeps"),
+    solver=("MpmSolver",),
+    substeps=("StabilityError", "plan_substeps"),
 )

@@ -1,7 +1,7 @@
 """Parameters of the tissue simulation."""
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from endo_sim_ros.core.config import Range, StageConfig
 
@@ -30,7 +30,7 @@ class PhysicsConfig(StageConfig):
     """Stiffness of the tissue."""
     poisson_ratio: Annotated[float, Range(0.0, 0.49)] = 0.3
     """Compressibility. Wet tissue is nearer 0.49, but there the sound speed multiplies the substeps by four and
-    the coarse grid locks; 0.3 keeps the paper's substep stable."""
+    the coarse grid locks; at 0.3 the paper's 80 substeps are stable."""
     relaxation: Annotated[float, Range(0.0, 20.0)] = 0.0
     """Visco-elasticity: a Maxwell branch this many times as stiff as the material beside it. Fast motion meets all of it, held
     tissue relaxes; liver has about 1, 0 = none."""
@@ -42,13 +42,11 @@ class PhysicsConfig(StageConfig):
     """Regions that are made of something else, later ones over earlier ones: "box x0 y0 z0 x1 y1 z1", "sphere x y z radius" (m, world)
     or "mask IMAGE CAMERAS N" (what camera N of a cameras.json sees in the white of an image), then young_modulus=, poisson_ratio=
     or density=, e.g. "sphere 0 0 0.12 0.01 young_modulus=40000". [""] is none, as [] is, which `ros2 param set` does not know."""
-    substeps: Annotated[int, Range(1, 100_000)] = 80
-    """Substeps in one step, as the paper has them; see adapt_substeps."""
-    substep_dt: Annotated[float, Range(1e-7, 0.1, "s")] = 0.0005
-    """Duration of one substep; one step lasts substeps × substep_dt."""
-    adapt_substeps: bool = True
-    """Divide the step into as few substeps as the material and the grid safely allow; off, the configured ones are taken,
-    as the paper does, or refused where they would blow up."""
+    step_duration: Annotated[float, Range(1e-5, 10.0, "s")] = 0.04
+    """What physics advances in one step, from one published state to the next."""
+    substeps: Annotated[int, Range(0, 100_000)] = 0
+    """Number of integration substeps in a step; 0 = as few as the material and the grid safely allow. The paper takes 80.
+    A number that is too small for the material is refused with one that works."""
     damping: Annotated[float, Range(0.0, 1000.0, "1/s")] = 50.0
     """Rate c at which velocities decay, exp(-c t)."""
     gravity_x: Annotated[float, Range(-100.0, 100.0, "m/s²")] = 0.0
@@ -84,15 +82,15 @@ class PhysicsConfig(StageConfig):
     device: str = "auto"
     """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""
 
+    renamed: ClassVar[dict[str, str]] = {
+        "substep_dt": "step_duration, the duration of all substeps together",
+        "adapt_substeps": "substeps, where 0 means as few as are safe",
+    }
+
     @classmethod
     def baseline(cls, **overrides) -> "PhysicsConfig":
         """PhysGaussian's way through the same solver: every Gaussian a material point, skin only, current weights."""
         return cls(**{"dense": True, "layers": 0, "kinematics": "current", "grid_ratio": 1.0, **overrides})
-
-    @property
-    def step_duration(self) -> float:
-        """Simulated time of one step, seconds."""
-        return self.substeps * self.substep_dt
 
     @property
     def gravity(self) -> tuple[float, float, float]:

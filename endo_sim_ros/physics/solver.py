@@ -31,11 +31,10 @@ from endo_sim_ros.physics.backends.warp_kernels import (
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes
 from endo_sim_ros.physics.cutting import CutTable, first_nodes
-from endo_sim_ros.physics.materials import energy_density, lame_parameters, sound_speed
+from endo_sim_ros.physics.materials import energy_density, lame_parameters
 from endo_sim_ros.physics.regions import TissueProperties
+from endo_sim_ros.physics.substeps import plan_substeps
 
-CFL_LIMIT = 0.7  # c Δt / h; measured: 0.7 runs, 0.9 blows up
-CFL_CHOSEN = 0.5  # leaves room for tissue that stiffens where it is compressed
 # Springs that hold nodes, over the stiffness (λ + 2μ) V/h² of a cell's tissue, so that all springs in a cell together are as stiff
 # however many nodes share it. Stiffer ones lock tissue that is few cells thick; softer ones let tissue lag behind its jaw.
 PIN_STIFFNESS = 100.0
@@ -45,63 +44,10 @@ MIN_CELL, MAX_CELL = 1e-6, 1e3  # m; beyond these float32 no longer holds masses
 MAX_GRID_NODES = 64_000_000  # 28 bytes each
 BLOCK = 64  # threads of a GPU's block: a few thousand nodes then reach many multiprocessors
 STENCIL = np.stack(np.meshgrid(*[np.arange(3)] * 3, indexing="ij"), -1).reshape(27, 3)  # grid nodes around a node, k fastest
-MAX_SUBSTEPS = 100_000  # beyond it a step of the default tissue takes a minute
 
 
 # Held while a graph is captured on a GPU: what another thread launches there meanwhile would become part of it.
 capturing = threading.Lock()
-
-
-class StabilityError(ValueError):
-    """A material that the chosen substep cannot follow; the message names the numbers and the substep that could."""
-
-
-@dataclass(frozen=True)
-class Substepping:
-    """How one step is divided."""
-
-    count: int
-    dt: float  # s
-    cfl: float  # c Δt / h
-
-
-def plan_substeps(config: PhysicsConfig, cell_size: float, properties: TissueProperties | None = None, factor: float = 1.0) -> Substepping:
-    """Divide a step so that the Courant number c Δt/h is stable: as few substeps as are safe, or those configured.
-
-    Args:
-        config: Material and substeps asked for; with ``adapt_substeps`` these give the duration of the step only.
-        cell_size: Grid cell size h, metres.
-        properties: Of each node; default: those of the config everywhere.
-        factor: Largest factor on all moduli.
-
-    Raises:
-        StabilityError: If the substeps are too long and ``adapt_substeps`` is off, or there would be too many of them.
-    """
-    if properties is None:
-        properties = TissueProperties.uniform(1, config.young_modulus, config.poisson_ratio, config.density)
-    # A wave faster than the relaxation meets the elastic law and the Maxwell branch.
-    young = factor * (1 + config.relaxation) * properties.young_modulus
-    limits = np.array([sound_speed(*each) for each in zip(young, properties.poisson_ratio, properties.density)])
-    worst = int(limits.argmax())
-    limit = float(limits[worst])
-    count = config.substeps
-    if config.adapt_substeps:
-        count = max(math.ceil(config.step_duration * limit / (CFL_CHOSEN * cell_size)), 1)
-    dt = config.step_duration / count
-    cfl = limit * dt / cell_size
-    if cfl > CFL_LIMIT or count > MAX_SUBSTEPS:
-        fitting = math.ceil(count * cfl / CFL_LIMIT)
-        fit = f"use {fitting} substeps of {config.step_duration / fitting:.3g} s, adapt_substeps, or a softer material"
-        if fitting > MAX_SUBSTEPS:
-            largest = young[worst] / (1 + config.relaxation) * (MAX_SUBSTEPS * CFL_CHOSEN / (count * cfl)) ** 2
-            fit = f"use young_modulus {0.99 * largest:.3g} Pa or less with adapt_substeps, or shorter steps"
-        raise StabilityError(
-            f"young_modulus {young[worst] / (1 + config.relaxation):g} Pa, poisson_ratio {properties.poisson_ratio[worst]:g}"
-            + f", relaxation {config.relaxation:g}" * (config.relaxation > 0)
-            + f" and density {properties.density[worst]:g} kg/m³ on a grid of {cell_size:.3g} m give a Courant number of"
-            f" {cfl:.2f} with {count} substeps of {dt:.3g} s (limits {CFL_LIMIT} and {MAX_SUBSTEPS}); {fit}"
-        )
-    return Substepping(count, dt, cfl)
 
 
 @dataclass(frozen=True)
@@ -133,7 +79,7 @@ class MpmSolver:
         vectorised: Use the CPU's own kernel where there is one; False runs the kernels of the GPU on it, to compare.
 
     Raises:
-        StabilityError: If the substeps are too long for the material and may not be adapted.
+        StabilityError: If the substeps are too long for the material.
         ValueError: If the grid would be absurdly large, or nodes, properties and stiffness do not fit together.
     """
 

@@ -354,10 +354,10 @@ def test_parameters_act_or_are_refused_with_the_reason(bench, physics):
     bench.until(lambda: physics._simulation.config.regions == tuple(painted), "a stiffer region")
     assert bench.set("physics_node", regions=[""])[0]
     bench.until(lambda: physics._simulation.config.regions == ("",), "no region")
-    assert bench.set("physics_node", adapt_substeps=False, substeps=100_000, substep_dt=0.1)[0]  # far too long for the material
+    assert bench.set("physics_node", substeps=1)[0]  # far too long for the material
     bench.refused("physics_node", "substep")
     count = len(bench.heard["control_nodes"])
-    assert bench.set("physics_node", adapt_substeps=True, substeps=80, substep_dt=0.0005)[0]
+    assert bench.set("physics_node", substeps=0)[0]
     bench.until(lambda: len(bench.heard["control_nodes"]) > count + 5 and not physics._failure, "steps to go on")
 
 

@@ -7,38 +7,8 @@ import numpy as np
 import pytest
 from tissue_scene import TIP, depth_of_dent, pose_at, simulate, specimen, steps
 
+from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.physics import ControlNodes, MpmSolver, PhysicsConfig, StabilityError, TissueProperties, plan_substeps
-
-
-def test_substeps_adapt_to_the_material_and_add_up_to_the_step():
-    stiff = plan_substeps(PhysicsConfig(young_modulus=1e6, poisson_ratio=0.45), 0.00875)
-    soft = plan_substeps(PhysicsConfig(young_modulus=1e3), 0.00875)
-    assert stiff.count > 80 > soft.count >= 1
-    for plan in (stiff, soft):
-        assert plan.cfl <= 0.5 and plan.count * plan.dt == pytest.approx(PhysicsConfig().step_duration)
-    printed = plan_substeps(PhysicsConfig(adapt_substeps=False), 0.00875)  # as the paper has it
-    assert (printed.count, printed.dt) == (80, pytest.approx(0.0005))
-
-
-def test_few_adapted_substeps_settle_where_many_do():
-    dents = []
-    for adapt in (True, False):
-        simulation = simulate(adapt_substeps=adapt)
-        simulation.set_wrench("probe", TIP, [0.0, 0.0, 0.5])
-        steps(simulation, 30)
-        dents.append(depth_of_dent(simulation))
-    assert dents[0] == pytest.approx(dents[1], rel=0.06)  # transfer dissipation slows the last bit down
-
-
-def test_stiff_material_is_refused_with_the_numbers_when_substeps_may_not_adapt():
-    numbers = r"young_modulus 1e\+06 Pa.*0\.3.*1000 kg.*0\.00875 m.*use \d+ substeps of"
-    with pytest.raises(StabilityError, match=numbers):
-        plan_substeps(PhysicsConfig(young_modulus=1e6, adapt_substeps=False), 0.00875)
-    # Where no number of substeps is allowed that would do, the stiffness that would.
-    with pytest.raises(StabilityError, match=r"use young_modulus \S+ Pa or less") as refusal:
-        plan_substeps(PhysicsConfig(young_modulus=1e9, density=1.0), 0.00875)
-    largest = float(re.search(r"use young_modulus (\S+)", str(refusal.value))[1])
-    assert plan_substeps(PhysicsConfig(young_modulus=largest, density=1.0), 0.00875).count > 90_000
 
 
 @pytest.mark.parametrize("kinematics", ["rest", "current"])
@@ -106,3 +76,41 @@ def test_a_grid_beyond_memory_is_refused(size):
     nodes = ControlNodes(ends, np.zeros(2, bool), np.full(2, 1e-9, np.float32), np.ones(2, bool), 1e-3)
     with pytest.raises(ValueError, match="simulation grid would have|from the world.s origin"):
         MpmSolver(nodes, PhysicsConfig(device="cpu"))
+
+
+def test_few_substeps_settle_where_many_do():
+    dents = []
+    for count in (0, 80):
+        simulation = simulate(substeps=count)
+        simulation.set_wrench("probe", TIP, [0.0, 0.0, 0.5])
+        steps(simulation, 30)
+        dents.append(depth_of_dent(simulation))
+    assert dents[0] == pytest.approx(dents[1], rel=0.06)  # transfer dissipation slows the last bit down
+
+
+def test_too_few_substeps_for_stiff_material_are_refused_with_a_number_that_works():
+    numbers = r"young_modulus 1e\+06 Pa.*0\.3.*1000 kg.*0\.00875 m.*set substeps to \d+ or to 0"
+    with pytest.raises(StabilityError, match=numbers):
+        plan_substeps(PhysicsConfig(young_modulus=1e6, substeps=80), 0.00875)
+    # Where no number of substeps is allowed that would do, the stiffness that would.
+    with pytest.raises(StabilityError, match=r"use young_modulus \S+ Pa or less") as refusal:
+        plan_substeps(PhysicsConfig(young_modulus=1e9, density=1.0), 0.00875)
+    largest = float(re.search(r"use young_modulus (\S+)", str(refusal.value))[1])
+    assert plan_substeps(PhysicsConfig(young_modulus=largest, density=1.0), 0.00875).count > 90_000
+
+
+@pytest.mark.parametrize("old, new", [("substep_dt", "step_duration"), ("adapt_substeps", "substeps")])
+def test_an_option_of_another_name_is_refused_with_the_new_one(old, new):
+    with pytest.raises(ConfigError, match=f"{old} is now {new}"):
+        PhysicsConfig.from_mapping({old: 1})
+
+
+def test_substeps_follow_from_the_material_and_add_up_to_the_step():
+    stiff = plan_substeps(PhysicsConfig(young_modulus=1e6, poisson_ratio=0.45), 0.00875)
+    soft = plan_substeps(PhysicsConfig(young_modulus=1e3), 0.00875)
+    assert stiff.count > 80 > soft.count >= 1
+    for plan in (stiff, soft):
+        assert plan.cfl <= 0.5 and plan.count * plan.dt == pytest.approx(PhysicsConfig().step_duration)
+    for duration in (0.04, 0.02):  # a number is taken as it is, whatever the duration of the step; the paper has 80
+        printed = plan_substeps(PhysicsConfig(substeps=80, step_duration=duration), 0.00875)
+        assert (printed.count, printed.dt) == (80, pytest.approx(duration / 80))

@@ -47,7 +47,7 @@ def test_copies_feel_their_own_stiffness_whatever_that_of_the_others():
     nodes = build_control_nodes(curved_sheet(), EYE, PhysicsConfig(node_count=400))
     felt = []
     for other in (1.0, 4.0):
-        config = PhysicsConfig(device="cpu", node_count=400, adapt_substeps=False)
+        config = PhysicsConfig(device="cpu", node_count=400, substeps=80)
         batch = TissueBatch(nodes, config, environments=2, stiffness=[1.0, other])
         batch.tools.present[:], batch.tools.closed[:] = 1, 1
         batch.tools.rotations[:] = torch.eye(3)

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.dds
 @pytest.fixture(scope="module")
 def ros():
     arguments = ["--ros-args", "-p", f"viewer_node:port:={PORT}", "-p", "viewer_node:rate:=30.0", "-p", f"viewer_node:max_force:={MOST}"]
-    for name, value in {"node_count": 300, "substeps": 40, "force_radius": 0.02, "device": "cpu"}.items():
+    for name, value in {"node_count": 300, "step_duration": 0.02, "force_radius": 0.02, "device": "cpu"}.items():
         arguments += ["-p", f"physics_node:{name}:={value}"]
     rclpy.init(args=arguments)
     yield

@@ -1,4 +1,4 @@
-"""Kernels that carry Gaussians along with control nodes (paper eq. 10, 11).
+"""Kernels that carry Gaussians along with control nodes (paper eq. 9, 10).
 
     μ' = Σ w (A_k (μ − p_k) + p_k')      Σ' = F Σ Fᵀ,  F = Σ w F_k
 

@@ -123,7 +123,7 @@ class ReconstructionConfig(StageConfig):
     lambda_dist: Annotated[float, Range(0, 1000)] = 0.0
     """Weight of the distortion loss, in units of the scene's median depth (paper eq. 5)."""
     lambda_tv: Annotated[float, Range(0, 1000)] = 0.0
-    """Weight of the total variation of the rendered depth, in units of the scene's median depth (paper eq. 6)."""
+    """Weight of the total variation of the rendered depth, in units of the scene's median depth (paper eq. 6, third term)."""
     lambda_pearson: Annotated[float, Range(0, 1000)] = 0.0
     """Weight of 1 − correlation of depth and prior, in training views and in virtual ones to which the prior is carried (FSGS)."""
     lambda_flat: Annotated[float, Range(0, 1000)] = 0.01
@@ -133,7 +133,7 @@ class ReconstructionConfig(StageConfig):
     flat_every: Annotated[int, Range(1, 1000)] = 4
     """Iterations between those that count it, so many times as much: it takes time for every Gaussian, seen or not."""
     virtual_every: Annotated[int, Range(0, 1000)] = 0
-    """A virtual camera regularises every n-th iteration (paper eq. 8, 9), by what of the distortion, total variation and
+    """A virtual camera regularises every n-th iteration (paper eq. 7, 8), by what of the distortion, total variation and
     correlation has a weight; 0 = never."""
     exposure: bool = True
     """Each view has an exposure of its own, from which that of unseen views is predicted as a camera's automatic one would be."""

@@ -11,18 +11,14 @@ from trained import trainer_of
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
-from endo_sim_ros.core.light import features_at
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.reconstruction import ABLATIONS, PRESETS, ReconstructionConfig, losses, preset
 from endo_sim_ros.reconstruction.config import GradientConfig, ProximityConfig
-from endo_sim_ros.reconstruction.dynamic_mask import without_motion
 from endo_sim_ros.reconstruction.presets import resolved
-from endo_sim_ros.reconstruction.priors.extrapolation import _continued, with_surroundings
-from endo_sim_ros.reconstruction.priors.interpolation import inverse_distance_weighted, kriged
-from endo_sim_ros.reconstruction.priors.sources import right_view
+from endo_sim_ros.reconstruction.priors.stereo import right_view
 from endo_sim_ros.reconstruction.scene import shrink
 from endo_sim_ros.reconstruction.strategies import STRATEGIES
-from endo_sim_ros.reconstruction.triangulation import match_features, misposed, triangulate
+from endo_sim_ros.reconstruction.triangulation import triangulate
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
@@ -178,58 +174,6 @@ def test_the_right_image_is_a_view_of_the_same_scene(views):
     assert metrics.psnr(image, right.image, right.mask) > metrics.psnr(wrong, right.image, right.mask) + 3
 
 
-FAULTS = {  # of view 2 of five: a rotation vector of its camera, and a movement along its axes in metres
-    "turned": ([0.1, -0.08, 0.0], [0.0, 0.0, 0.0]),
-    "rolled": ([0.0, 0.0, 0.1], [0.0, 0.0, 0.0]),
-    "moved": ([0.0, 0.0, 0.0], [0.03, 0.02, 0.0]),
-    "nearer": ([0.0, 0.0, 0.0], [0.0, 0.0, 0.01]),  # as a zoom would
-    "farther": ([0.0, 0.0, 0.0], [0.0, 0.0, -0.01]),
-}
-
-
-def misplaced(frame, fault):
-    pose, (rotation, movement) = frame.camera.pose.copy(), FAULTS[fault]
-    pose[:3, 3] += pose[:3, :3] @ np.array(movement)
-    pose[:3, :3] = pose[:3, :3] @ cv2.Rodrigues(np.array(rotation))[0]
-    return dataclasses.replace(frame, camera=frame.camera.at(pose))
-
-
-@pytest.mark.parametrize("fault", FAULTS)
-def test_a_wrong_pose_among_good_ones_is_found(large, fault, caplog):
-    frames = [bare(frame) for frame in large]
-    assert misposed(frames, match_features(frames)) == [] and not caplog.text
-    frames[2] = misplaced(frames[2], fault)
-    assert misposed(frames, match_features(frames)) == [2]
-    if fault == "moved":
-        trainer = trainer_of(frames, options(image_width=160, depth="points"))
-        assert len(trainer.cameras) == 4 and "left out" in caplog.text
-
-
-def test_with_stereo_a_wrong_pose_among_three_is_left_out(caplog):
-    views = list(phantom_sequence(PhantomConfig(width=320, height=256, frames=3, travel=0.02)))
-    views = [dataclasses.replace(view, depth=None) for view in views]
-    short = options(image_width=80, iterations=1)
-    assert len(trainer_of(views, short).cameras) == 3 and "left out" not in caplog.text
-    trainer = trainer_of([views[0], misplaced(views[1], "farther"), views[2]], short)
-    assert len(trainer.cameras) == 2 and f"{views[1].stamp_ns * 1e-9:.3f} s left out" in caplog.text
-    trainer_of([views[0], misplaced(views[1], "farther")], short)
-    assert "the poses of views 0 and 1 contradict" in caplog.text
-
-
-def test_swapped_poses_of_two_views_are_found(large):
-    frames = [bare(frame) for frame in large]
-    frames[1], frames[3] = (dataclasses.replace(frames[i], camera=frames[j].camera) for i, j in ((1, 3), (3, 1)))
-    assert misposed(frames, match_features(frames)) == [1, 3]
-
-
-def test_of_two_views_neither_is_left_out(large, caplog):
-    for first, second, fault in ((bare(large[0]), bare(large[1]), "turned"), (large[0], large[1], "nearer")):  # the latter takes depth
-        frames = [first, misplaced(second, fault)]
-        caplog.clear()
-        assert misposed(frames, match_features(frames)) == []
-        assert "the poses of views 0 and 1 contradict" in caplog.text
-
-
 def test_pure_rotation_trains_with_depth_and_is_an_error_without(views):
     turned = []
     for frame, angle in ((views[0], 0.0), (views[0], 0.04)):
@@ -255,27 +199,6 @@ def test_a_view_that_shows_nothing_is_left_out(views, caplog, reason, change):
     assert len(trainer.cameras) == 2 and f"left out: {reason}" in caplog.text
     with pytest.raises(SequenceError, match=f"every (view|pixel of every view) is {reason}"):
         trainer_of([blind], options())
-
-
-def test_an_instrument_in_one_of_several_views_is_left_out(views, caplog):
-    frame, tool = views[4], np.zeros((128, 160), np.uint8)
-    cv2.line(tool, (60, 100), (110, 50), 1, 14)
-    shown = (tool > 0) & (frame.depth > 0)
-    image = np.where(shown[..., None], np.uint8(150), frame.image)
-    held = dataclasses.replace(frame, image=image, depth=np.where(shown, 0.6 * frame.depth, frame.depth).astype(np.float32))
-    still = [views[0], views[2], views[6], views[8]]
-    assert all(a is b for a, b in zip(without_motion([*still, frame], 0.05), [*still, frame])) and not caplog.text
-    found = without_motion([*still, held], 0.05)
-    assert all(a is b for a, b in zip(found[:4], still)) and f"{frame.stamp_ns * 1e-9:.3f} s: " in caplog.text
-    hidden = (found[4].mask == 0) & (frame.mask > 0)
-    assert hidden[shown].mean() > 0.8 and hidden[~shown].mean() < 0.05
-    assert without_motion([views[0], held], 0.05)[1] is held  # nobody can tell which of two is right
-    shallow = dataclasses.replace(frame, depth=0.6 * frame.depth)
-    assert without_motion([*still, shallow], 0.05)[4] is shallow and "check its depth and pose" in caplog.text
-    for choice in (False, True):
-        caplog.clear()
-        assert finite(trainer_of([*still, held], options(dynamic_mask=choice)).run())
-        assert ("something moved" in caplog.text) == choice
 
 
 @pytest.mark.parametrize("size", [(161, 97), (3840, 2160)])
@@ -325,136 +248,9 @@ def test_a_checkpoint_of_any_preset_goes_on_as_if_never_interrupted(views, tmp_p
 # ---------------------------------------------------------------------------------------- surroundings
 
 
-def test_what_goes_on_beyond_a_picture_does_not_reach_into_it(views):
-    frame = bare(views[4])
-    exact, pixels = views[4].depth, np.column_stack([np.full(40, 175.0), np.linspace(5, 120, 40)])
-    known = dataclasses.replace(frame, depth=exact)
-    # Tissue that other views saw, beyond the right edge, and one point before it that is none.
-    K = frame.camera.K
-    depth = np.full(40, np.median(exact))
-    depth[20] *= 0.6
-    local = np.column_stack([(pixels - K[:2, 2]) / K[[0, 1], [0, 1]] * depth[:, None], depth])
-    points = frame.camera.position + local @ frame.camera.pose[:3, :3].T
-    trainer = trainer_of([known], options(max_gaussians=8000, light=False, exposure=False), (points, np.full((40, 3), 0.5)))
-    rendered = DeformableRenderer(trainer.model, None, RenderingConfig(device="cpu")).render(frame.camera)[1]
-    plain = trainer_of([known], options(max_gaussians=8000, light=False, exposure=False, extrapolation=0.0)).model
-    alone = DeformableRenderer(plain, None, RenderingConfig(device="cpu")).render(frame.camera)[1]
-    border = np.ones(exact.shape, bool)
-    border[8:-8, 8:-8] = False
-    border &= (exact > 0) & (rendered > 0) & (alone > 0) & (True if frame.mask is None else frame.mask > 0)
-    assert np.quantile(np.abs(rendered[border] / alone[border] - 1), 0.98) < 0.02
-
-
-def test_gaussians_around_a_picture_are_small_close_to_it_and_none_is_a_lone_scene_point(views):
-    frame = dataclasses.replace(bare(views[4]), depth=views[4].depth)
-    K, aside = frame.camera.K, np.array([[230.0, 20.0], [250.0, 60.0], [270.0, 100.0]])  # far beyond the right edge
-    local = np.column_stack([(aside - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones(3)]) * np.median(frame.depth)
-    points = frame.camera.position + local @ frame.camera.pose[:3, :3].T
-    model = trainer_of([frame], options(max_gaussians=20_000, light=False, exposure=False), (points, np.full((3, 3), 0.5))).model
-    uv, _ = frame.camera.project(model.means.numpy().astype(np.float64))
-    out = np.maximum(-uv, uv - [frame.camera.width, frame.camera.height]).max(1)
-    sizes = model.scales.numpy().max(1)
-    assert sizes[(out > 0) & (out < 12)].max() < 0.75 * np.median(sizes[out > 30])
-    assert not (np.abs(model.means.numpy()[:, None] - points).max(2) < 1e-6).any()
-
-
-def test_noise_of_scene_points_does_not_make_the_tissue_beyond_rough(views):
-    frame = dataclasses.replace(bare(views[4]), depth=views[4].depth)
-    random, K = np.random.default_rng(0), frame.camera.K
-    pixels = random.uniform([170, 0], [200, 128], (400, 2))
-    flat = float(np.median(frame.depth[:, -20:]))
-    depth = flat * random.normal(1, 0.03, 400)
-    local = np.column_stack([(pixels - K[:2, 2]) / K[[0, 1], [0, 1]] * depth[:, None], depth])
-    points = frame.camera.position + local @ frame.camera.pose[:3, :3].T
-    _, continued, *_ = _continued(frame, points, np.zeros(4), np.zeros(3), flat, 48)
-    around = continued[48 + 10 : 48 + 118, 48 + 175 : 48 + 195]
-    assert np.std(around / flat) < 0.012  # points alone: 0.017
-
-
-def test_a_picture_goes_on_as_bright_as_it_is_however_far_the_tissue_beyond_is_guessed(views):
-    """Tissue that rises towards the right edge and on beyond it; the light falls off with distance."""
-    camera, light, exposure = views[4].camera, np.array([0.9, 3.0, 0.1, 0.0]), np.full(3, 0.2)
-    depth = (0.1 / np.linspace(1.0, 1.6, 160) * np.ones((128, 1))).astype(np.float32)
-    shading = lambda camera, depth: (features_at(camera.backproject(depth).reshape(-1, 3), camera, 0.1) * light).reshape(*depth.shape, 4)
-    picture = lambda shaded: 100 * np.exp(shaded.sum(-1) - 0.9 * np.log(1.3))  # of tissue that is of one colour
-    image = np.repeat(picture(shading(camera, depth))[..., None], 3, 2).round().astype(np.uint8)
-    frame = dataclasses.replace(bare(views[4]), mask=None, image=image, depth=depth)
-    wide, continued, colors, _ = _continued(frame, np.empty((0, 3)), light, exposure, 0.1, 48)
-    assert continued[48:-48, -10:].max() < 0.95 * depth.min()
-    shaded = shading(wide, continued)
-    np.testing.assert_allclose(colors[48:-48, 48:-48, 0], colors[64, 64, 0], rtol=0.03)  # in the picture that of the tissue
-    without_distance = colors[..., 0] * np.exp(shaded[..., 0])
-    np.testing.assert_allclose(without_distance[48:-48, -10:], without_distance[48:-48, -60:-50], rtol=0.05)
-
-
 @pytest.mark.parametrize(("name", "opaque"), [("default", 0.01), ("paper", 0.0)])
 def test_transparency_is_weighed_apart_by_default_and_not_as_printed(views, monkeypatch, name, opaque):
     weights = []
     monkeypatch.setattr(losses, "depth_l1", lambda *arguments: weights.append(arguments[-1]) or torch.zeros(()))
     trainer_of(views[:3], preset(name, **SHORT)).step()
     assert weights == [opaque]
-
-
-def test_depth_beyond_is_that_of_kriging():
-    random, width = np.random.default_rng(0), 80  # one pixel a cell
-    known = np.zeros((12, width), bool)
-    known[2:6, 3:8] = True
-    values, uv, there = random.normal(0, 1, known.shape), random.uniform(0, [width, 12], (15, 2)), random.normal(0, 1, 15)
-    told = kriged(values, known, uv, there, width)
-    assert (told[known] == values[known]).all()
-    rows, columns = np.nonzero(known)
-    sources = np.concatenate([np.column_stack([columns, rows]) + 0.5, uv])
-    rows, columns = np.nonzero(~known)
-    targets = np.column_stack([columns, rows]) + 0.5
-    # Half the squared difference of what lies a distance apart is that distance, to which the variances of the sources come.
-    between = lambda a, b: -np.linalg.norm(a[:, None] - b, axis=2)
-    system = np.zeros((36, 36))
-    system[:35, :35] = between(sources, sources) + np.diag(np.repeat([width / 128, width / 8], [20, 15]))
-    system[35, :35] = system[:35, 35] = 1
-    weights = np.linalg.solve(system, np.column_stack([between(targets, sources), np.ones(len(targets))]).T)[:35]
-    expected = weights.T @ np.concatenate([values[known], there])
-    np.testing.assert_allclose(told[~known], expected, atol=1e-4)
-
-
-def test_colour_beyond_is_the_mean_of_what_is_seen_by_distance():
-    random, width = np.random.default_rng(0), 80  # one pixel a cell
-    known = random.random((12, width)) < 0.2
-    values = random.random((*known.shape, 3))
-    carried = inverse_distance_weighted(values, known, width)
-    assert (carried[known] == values[known]).all()
-    distance = np.linalg.norm(np.argwhere(~known)[:, None] - np.argwhere(known), axis=2)
-    weights = 1 / (distance**2 + 0.25) ** 2
-    expected = weights @ values[known] / weights.sum(1, keepdims=True)
-    np.testing.assert_allclose(carried[~known], expected, atol=1e-5)
-
-
-def test_what_lies_beyond_two_views_looks_as_in_the_nearer_one(views):
-    """Whichever of them comes first."""
-    frame = dataclasses.replace(bare(views[4]), mask=None, depth=np.full((128, 160), 0.1, np.float32))
-    # A view to the right of it, overlapping by half, green instead of red.
-    pose = frame.camera.pose.copy()
-    pose[:3, 3] += pose[:3, 0] * 80 * 0.1 / frame.camera.K[0, 0]
-    red, green = (np.full((128, 160, 3), color, np.uint8) for color in ((200, 0, 0), (0, 200, 0)))
-    left = dataclasses.replace(frame, image=red)
-    right = dataclasses.replace(frame, image=green, camera=frame.camera.at(pose))
-    nothing = GaussianModel.from_points(torch.zeros(1, 3), torch.zeros(1, 3), torch.full((1,), 1e-6), 0.5)
-    for pair in ([left, right], [right, left]):
-        around = with_surroundings(nothing, pair, np.zeros(4), np.zeros((2, 3)), 0.1, np.empty((0, 3)), 0.9, 60_000)
-        (u, v), colors = left.camera.project(around.means.numpy().astype(np.float64))[0].T, around.sh[:, 0].numpy()
-        beside = (v > 0) & (v < 128)
-        for where, nearer, farther in (((u > 250) & beside, 1, 0), ((u < -10) & beside, 0, 1)):
-            assert where.sum() > 20 and (colors[where, nearer] > colors[where, farther]).all()
-
-
-def test_tissue_goes_on_beyond_the_pictures_and_in_holes(views):
-    frame = dataclasses.replace(bare(views[4]), depth=views[4].depth.copy())
-    frame.depth[50:80, 60:100] = 0  # as at a glint
-    known = trainer_of([frame], options(max_gaussians=4000, extrapolation=0.0)).model
-    wider = trainer_of([frame], options(max_gaussians=4000, extrapolation=0.3))
-    camera = dataclasses.replace(frame.camera, K=frame.camera.K + np.array([[0, 0, 40], [0, 0, 30], [0, 0, 0]]), width=240, height=188)
-    renderer = lambda model: DeformableRenderer(model, None, RenderingConfig(device="cpu")).render(camera)[1]
-    before, after = renderer(known), renderer(wider.model)
-    assert (before > 0).mean() < 0.6 and (after > 0).mean() > 0.95
-    hole = after[30 + 55 : 30 + 75, 40 + 65 : 40 + 95]
-    exact = views[4].depth[55:75, 65:95]
-    assert np.median(np.abs(hole / exact - 1)) < 0.03

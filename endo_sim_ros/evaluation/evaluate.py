@@ -38,7 +38,8 @@ from endo_sim_ros.evaluation.splits import STEREO, Split, check_split, right_vie
 from endo_sim_ros.evaluation.workers import Finished, News, ray_is_installed, run_in_processes, run_in_ray
 from endo_sim_ros.reconstruction import ReconstructionConfig, ScenePoints, Trainer, prepare, reconstruct, scene_points, shrink
 from endo_sim_ros.reconstruction.presets import ABLATIONS, preset
-from endo_sim_ros.reconstruction.priors.sources import with_depth_prior
+from endo_sim_ros.reconstruction.priors.sources import estimate_depth
+from endo_sim_ros.reconstruction.scene import TrainingView
 from endo_sim_ros.reconstruction.triangulation import points_in_view
 from endo_sim_ros.sequences.bag import read_bag
 from endo_sim_ros.sequences.folder import read_points
@@ -260,7 +261,8 @@ def _prepare(cells: Sequence[Cell], bar: Progress) -> Prepared:
         points, judging = _divided(points)
     if any(frame.right is not None for frame in frames) and (STEREO in splits or not recorded):
         task = bar.add_task(f"stereo matching of {cells[0].sequence}", total=None)
-        matched = with_depth_prior(frames, points, ReconstructionConfig(depth="stereo"))
+        views = estimate_depth([TrainingView.of(frame) for frame in frames], points, ReconstructionConfig(depth="stereo"))
+        matched = [dataclasses.replace(view, depth=view.depth_prior) for view in views]
         bar.remove_task(task)
     if recorded:
         depth_source = "recorded"

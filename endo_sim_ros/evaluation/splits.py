@@ -4,7 +4,7 @@ import re
 from typing import NamedTuple
 
 from endo_sim_ros.core.frames import Frame, SequenceError
-from endo_sim_ros.reconstruction.priors.sources import right_camera
+from endo_sim_ros.reconstruction.priors.stereo import right_camera
 from endo_sim_ros.sequences.recordings import lit_area, lit_now, spread
 
 STEREO, TWO_VIEWS = "stereo", "two-views"

@@ -1,0 +1,130 @@
+"""Tissue beyond the pictures and in holes."""
+
+import dataclasses
+
+import numpy as np
+import torch
+from short_training import bare, options
+from training_views import with_prior
+
+from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.core.light import features_at
+from endo_sim_ros.reconstruction import prepare
+from endo_sim_ros.reconstruction.priors.extrapolation import continue_view, extrapolate
+from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
+
+
+def initial(frame, points=None, **changes):
+    """What a training of one view starts from, without light, and with grey scene points [N, 3]."""
+    points = None if points is None else (points, np.full((len(points), 3), 0.5))
+    return prepare([frame], options(max_gaussians=8000, light=False, exposure=False, **changes), points).model
+
+
+def test_what_goes_on_beyond_a_picture_does_not_reach_into_it(views):
+    frame = bare(views[4])
+    exact, pixels = views[4].depth, np.column_stack([np.full(40, 175.0), np.linspace(5, 120, 40)])
+    known = dataclasses.replace(frame, depth=exact)
+    # Tissue that other views saw, beyond the right edge, and one point before it that is none.
+    K = frame.camera.K
+    depth = np.full(40, np.median(exact))
+    depth[20] *= 0.6
+    local = np.column_stack([(pixels - K[:2, 2]) / K[[0, 1], [0, 1]] * depth[:, None], depth])
+    points = frame.camera.position + local @ frame.camera.pose[:3, :3].T
+    depth_of = lambda model: DeformableRenderer(model, None, RenderingConfig(device="cpu")).render(frame.camera)[1]
+    rendered, alone = depth_of(initial(known, points)), depth_of(initial(known, extrapolation=0.0))
+    border = np.ones(exact.shape, bool)
+    border[8:-8, 8:-8] = False
+    border &= (exact > 0) & (rendered > 0) & (alone > 0) & (True if frame.mask is None else frame.mask > 0)
+    assert np.quantile(np.abs(rendered[border] / alone[border] - 1), 0.98) < 0.02
+
+
+def test_gaussians_around_a_picture_are_small_close_to_it_and_none_is_a_lone_scene_point(views):
+    frame = dataclasses.replace(bare(views[4]), depth=views[4].depth)
+    K, aside = frame.camera.K, np.array([[230.0, 20.0], [250.0, 60.0], [270.0, 100.0]])  # far beyond the right edge
+    local = np.column_stack([(aside - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones(3)]) * np.median(frame.depth)
+    points = frame.camera.position + local @ frame.camera.pose[:3, :3].T
+    config = options(max_gaussians=20_000, light=False, exposure=False)
+    model = prepare([frame], config, (points, np.full((3, 3), 0.5))).model
+    uv, _ = frame.camera.project(model.means.numpy().astype(np.float64))
+    out = np.maximum(-uv, uv - [frame.camera.width, frame.camera.height]).max(1)
+    sizes = model.scales.numpy().max(1)
+    assert sizes[(out > 0) & (out < 12)].max() < 0.75 * np.median(sizes[out > 30])
+    assert not (np.abs(model.means.numpy()[:, None] - points).max(2) < 1e-6).any()
+
+
+def test_noise_of_scene_points_does_not_make_the_tissue_beyond_rough(views):
+    (frame,) = with_prior(views[4:5])
+    random, K = np.random.default_rng(0), frame.camera.K
+    pixels = random.uniform([170, 0], [200, 128], (400, 2))
+    flat = float(np.median(frame.depth_prior[:, -20:]))
+    depth = flat * random.normal(1, 0.03, 400)
+    local = np.column_stack([(pixels - K[:2, 2]) / K[[0, 1], [0, 1]] * depth[:, None], depth])
+    points = frame.camera.position + local @ frame.camera.pose[:3, :3].T
+    continued = continue_view(frame, points, np.zeros(4), np.zeros(3), flat, 48)
+    around = continued.depth[48 + 10 : 48 + 118, 48 + 175 : 48 + 195]
+    assert np.std(around / flat) < 0.012  # points alone: 0.017
+
+
+def test_a_picture_goes_on_as_bright_as_it_is_however_far_the_tissue_beyond_is_guessed(views):
+    """Tissue that rises towards the right edge and on beyond it; the light falls off with distance."""
+    camera, light, exposure = views[4].camera, np.array([0.9, 3.0, 0.1, 0.0]), np.full(3, 0.2)
+    depth = (0.1 / np.linspace(1.0, 1.6, 160) * np.ones((128, 1))).astype(np.float32)
+    shading = lambda camera, depth: (features_at(camera.backproject(depth).reshape(-1, 3), camera, 0.1) * light).reshape(*depth.shape, 4)
+    picture = lambda shaded: 100 * np.exp(shaded.sum(-1) - 0.9 * np.log(1.3))  # of tissue that is of one colour
+    image = np.repeat(picture(shading(camera, depth))[..., None], 3, 2).round().astype(np.uint8)
+    (view,) = with_prior([dataclasses.replace(bare(views[4]), mask=None, image=image, depth=depth)])
+    wide, continued, colors, _ = continue_view(view, np.empty((0, 3)), light, exposure, 0.1, 48)
+    assert continued[48:-48, -10:].max() < 0.95 * depth.min()
+    shaded = shading(wide, continued)
+    np.testing.assert_allclose(colors[48:-48, 48:-48, 0], colors[64, 64, 0], rtol=0.03)  # in the picture that of the tissue
+    without_distance = colors[..., 0] * np.exp(shaded[..., 0])
+    np.testing.assert_allclose(without_distance[48:-48, -10:], without_distance[48:-48, -60:-50], rtol=0.05)
+
+
+def test_what_lies_beyond_two_views_looks_as_in_the_nearer_one(views):
+    """Whichever of them comes first."""
+    frame = dataclasses.replace(bare(views[4]), mask=None, depth=np.full((128, 160), 0.1, np.float32))
+    # A view to the right of it, overlapping by half, green instead of red.
+    pose = frame.camera.pose.copy()
+    pose[:3, 3] += pose[:3, 0] * 80 * 0.1 / frame.camera.K[0, 0]
+    red, green = (np.full((128, 160, 3), color, np.uint8) for color in ((200, 0, 0), (0, 200, 0)))
+    left = dataclasses.replace(frame, image=red)
+    right = dataclasses.replace(frame, image=green, camera=frame.camera.at(pose))
+    nothing = GaussianModel.from_points(torch.zeros(1, 3), torch.zeros(1, 3), torch.full((1,), 1e-6), 0.5)
+    for pair in ([left, right], [right, left]):
+        around = extrapolate(nothing, with_prior(pair), np.empty((0, 3)), np.zeros(4), np.zeros((2, 3)), 0.1, 0.9, 60_000)
+        (u, v), colors = left.camera.project(around.means.numpy().astype(np.float64))[0].T, around.sh[:, 0].numpy()
+        beside = (v > 0) & (v < 128)
+        for where, nearer, farther in (((u > 250) & beside, 1, 0), ((u < -10) & beside, 0, 1)):
+            assert where.sum() > 20 and (colors[where, nearer] > colors[where, farther]).all()
+
+
+def test_tissue_goes_on_beyond_the_pictures_and_in_holes(views):
+    frame = dataclasses.replace(bare(views[4]), depth=views[4].depth.copy())
+    frame.depth[50:80, 60:100] = 0  # as at a glint
+    known, wider = (prepare([frame], options(max_gaussians=4000, extrapolation=reach)).model for reach in (0.0, 0.3))
+    camera = dataclasses.replace(frame.camera, K=frame.camera.K + np.array([[0, 0, 40], [0, 0, 30], [0, 0, 0]]), width=240, height=188)
+    renderer = lambda model: DeformableRenderer(model, None, RenderingConfig(device="cpu")).render(camera)[1]
+    before, after = renderer(known), renderer(wider)
+    assert (before > 0).mean() < 0.6 and (after > 0).mean() > 0.95
+    hole = after[30 + 55 : 30 + 75, 40 + 65 : 40 + 95]
+    exact = views[4].depth[55:75, 65:95]
+    assert np.median(np.abs(hole / exact - 1)) < 0.03
+
+
+def test_no_more_gaussians_than_asked_for_and_larger_ones_instead(views):
+    (view,) = with_prior(views[4:5])
+    nothing = GaussianModel.from_points(torch.zeros(1, 3), torch.zeros(1, 3), torch.full((1,), 1e-6), 0.5)
+    around = lambda most: extrapolate(nothing, [view], np.empty((0, 3)), np.zeros(4), np.zeros((1, 3)), 0.1, 0.3, most)
+    many, few = around(60_000), around(201)
+    assert len(few) == 201 < len(many)
+    assert few.scales[1:].median() > 1.5 * many.scales[1:].median()
+    assert len(around(1)) == 1
+
+
+def test_a_view_that_knows_next_to_no_depth_tells_nothing_of_its_surroundings(views):
+    depth = np.zeros_like(views[4].depth)
+    depth[60:62, 80:90] = views[4].depth[60:62, 80:90]
+    seen = with_prior([dataclasses.replace(views[4], depth=depth), bare(views[0])])
+    nothing = GaussianModel.from_points(torch.zeros(1, 3), torch.zeros(1, 3), torch.full((1,), 1e-6), 0.5)
+    assert extrapolate(nothing, seen, np.empty((0, 3)), np.zeros(4), np.zeros((2, 3)), 0.1, 0.3, 60_000) is nothing

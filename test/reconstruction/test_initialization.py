@@ -1,0 +1,82 @@
+"""The initial model: on the surface, within limits, without what floats."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from short_training import NO_POINTS
+from training_views import with_prior
+
+from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.reconstruction.initialization import initial_model
+
+TOLERANCE = 0.05
+
+
+def placed(frames, count=2000, points=NO_POINTS.positions):
+    """The initial model of frames by their depth, and grey points."""
+    return initial_model(with_prior(frames), points, np.full(points.shape, 0.5), TOLERANCE, count)
+
+
+def test_initial_model_lies_on_the_surface_within_the_limit(small):
+    model = placed(small[::4], 3000)
+    assert 2000 < len(model) <= 3000
+    errors = []
+    for frame in small[::4]:
+        uv, z = frame.camera.project(model.means.numpy().astype(np.float64))
+        u, v = np.floor(uv).astype(int).T
+        inside = (u >= 0) & (v >= 0) & (u < 160) & (v < 128) & (z > 0)
+        # Never in front of what a view sees by more than the tolerance.
+        assert (z[inside] > frame.depth[v[inside], u[inside]] * 0.949).all()
+        errors.append(np.abs(z[inside] / frame.depth[v[inside], u[inside]] - 1))
+    assert np.median(np.concatenate(errors)) < 0.01
+
+
+def test_depth_floating_in_front_of_another_view_is_left_out(small):
+    first, second = small[0], small[4]
+    depth = first.depth.copy()
+    depth[50:70, 60:90] *= 0.6  # a floating patch
+    model = placed([dataclasses.replace(first, depth=depth), second], 50_000)
+    uv, z = second.camera.project(model.means.numpy().astype(np.float64))
+    u, v = np.floor(uv).astype(int).T
+    inside = (u >= 0) & (v >= 0) & (u < 160) & (v < 128)
+    assert (z[inside] > 0.94 * second.depth[v[inside], u[inside]]).all()
+    alone = placed([dataclasses.replace(first, depth=depth)], 50_000)
+    assert float(alone.means[:, 2].min()) < 0.7 * first.depth.min() + first.camera.position[2]
+
+
+def test_masked_pixels_give_no_gaussians(small):
+    mask = np.zeros_like(small[0].mask)
+    mask[:, :80] = 255
+    model = placed([dataclasses.replace(small[0], mask=mask)])
+    uv, _ = small[0].camera.project(model.means.numpy().astype(np.float64))
+    assert uv[:, 0].max() < 80
+
+
+def test_points_that_float_before_the_surface_or_before_a_hole_of_it_do_not_become_gaussians(small):
+    frame, camera = small[0], small[0].camera
+    depth = frame.depth.copy()
+    row, column = camera.height // 2, camera.width // 2
+    true = float(depth[row, column])
+    depth[row - 10 : row + 11, column - 10 : column + 11] = 0  # a highlight: no depth there
+    ray = camera.backproject(np.ones_like(depth))[row, column] - camera.position
+    points = camera.position + ray * np.array([[0.5 * true], [true], [0.98 * true]])
+    points = np.concatenate([points, points + 1e-4])
+    model = placed([dataclasses.replace(frame, depth=depth)], 50_000, points)
+    z = camera.project(model.means.double().numpy())[1]
+    assert z.min() > 0.9 * frame.depth[frame.depth > 0].min()
+    near = np.linalg.norm(model.means.double().numpy()[:, None] - points, axis=2).min(0)
+    assert (near[[1, 2, 4, 5]] < 1e-6).all() and (near[[0, 3]] > 0.01).all()
+
+
+def test_the_colours_are_the_mean_of_the_views_that_see_the_surface(small):
+    dark = dataclasses.replace(small[0], image=small[0].image // 2)
+    alone, both = (placed(frames, 3000).base_colors.mean() for frames in ([small[0]], [small[0], dark]))
+    assert float(both / alone) == pytest.approx(0.75, abs=0.02)
+
+
+def test_too_few_points_are_one_clear_error(small):
+    empty = dataclasses.replace(small[0], depth=np.zeros_like(small[0].depth))
+    with pytest.raises(SequenceError, match="only 9 scene points could be found in 1 views; give depth"):
+        placed([empty], points=np.random.default_rng(0).random((9, 3)))
+    assert len(placed([empty], points=np.random.default_rng(0).random((10, 3)))) == 10

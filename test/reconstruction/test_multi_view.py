@@ -1,0 +1,171 @@
+"""Depth refined by the right image, other views and scene points."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+from short_training import NO_POINTS, bare, options
+from training_views import unknown, with_prior
+
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.frames import Frame
+from endo_sim_ros.reconstruction import prepare
+from endo_sim_ros.reconstruction.priors.inverse_depth import correct, smooth
+from endo_sim_ros.reconstruction.priors.multi_view import refine_depth
+from endo_sim_ros.reconstruction.priors.sources import estimate_depth
+from endo_sim_ros.reconstruction.scene import ScenePoints, shrink
+
+
+def matched(frames):
+    """Views whose prior is from stereo matching."""
+    return estimate_depth(unknown(frames), NO_POINTS, options(depth="stereo"))
+
+
+def plain_pair(frame):
+    return frame
+
+
+def dark_right(frame):
+    return dataclasses.replace(frame, right=frame.right // 2)
+
+
+def behind_a_tool(frame):
+    mask = np.full(frame.image.shape[:2], 255, np.uint8)
+    mask[200:300, 240:400] = 0
+    return dataclasses.replace(frame, mask=mask)
+
+
+def with_eyes_that_converge(frame):
+    K = frame.camera.K.copy()
+    K[0, 2] -= 12  # and the right image with it
+    moved = frame.right[:, np.clip(np.arange(frame.camera.width) + 12, 0, frame.camera.width - 1)]
+    return dataclasses.replace(frame, right=moved, right_K=K)
+
+
+@pytest.mark.parametrize("pair", [plain_pair, dark_right, behind_a_tool, with_eyes_that_converge])
+def test_flow_between_the_eyes_corrects_what_matching_left(large, pair):
+    (prior,) = matched([pair(large[0])])
+    (corrected,) = refine_depth([prior], NO_POINTS, "stereo")
+    error = lambda view: np.abs(view.depth_prior - large[0].depth)[(prior.depth_prior > 0) & (view.depth_prior > 0)]
+    assert np.median(error(corrected)) < 0.6 * np.median(error(prior))
+    assert np.sqrt((error(corrected) ** 2).mean()) < 0.8 * np.sqrt((error(prior) ** 2).mean())
+
+
+def test_flow_is_found_in_finer_pixels_than_are_trained_on(large):
+    (wide,) = prepare([dataclasses.replace(large[0], depth=None)], options(image_width=320)).views
+    (narrow,) = refine_depth([shrink(view, 320) for view in matched(large[:1])], NO_POINTS, "stereo")
+    exact = shrink(large[0], 320).depth
+    error = lambda view: np.sqrt((((view.depth_prior - exact)[(wide.depth_prior > 0) & (narrow.depth_prior > 0)]) ** 2).mean())
+    assert error(wide) < 0.95 * error(narrow)
+
+
+def test_reflections_of_the_light_do_not_spoil_the_depth_that_views_agree_on(large):
+    """A reflection is seen where the tissue is not: through another view's depth it lies beside where that view has it."""
+    frames = matched(large[:2])
+    centres = np.array([(x, y) for x in range(160, 500, 80) for y in range(120, 420, 80)])
+    lit, around = list(frames), np.zeros((512, 640), np.uint8)
+    for i, (frame, aside) in enumerate(zip(frames, ((0, 0), (10, 6)))):
+        image = frame.image.copy()
+        uv, _ = frame.camera.project(frames[0].camera.backproject(large[0].depth)[centres[:, 1], centres[:, 0]])
+        for place in uv + aside:
+            cv2.circle(image, tuple(int(c) for c in place), 7, (255, 255, 255), -1)
+        lit[i] = dataclasses.replace(frame, image=image)
+    for x, y in centres:
+        cv2.circle(around, (int(x), int(y)), 25, 1, -1)
+    where = (around > 0) & (frames[0].depth_prior > 0)
+    error = lambda views: np.sqrt(((refine_depth(views, NO_POINTS, "network")[0].depth_prior - large[0].depth)[where] ** 2).mean())
+    assert error(lit) < 1.6 * error(frames)
+
+
+def test_pale_tissue_is_no_reflection(large):
+    pale = [dataclasses.replace(frame, image=(180 + frame.image // 4).astype(np.uint8)) for frame in large[:2]]
+    off = [dataclasses.replace(frame, depth=frame.depth * np.float32(1.03), right=None, baseline=None) for frame in pale]
+    corrected = refine_depth(with_prior(off), NO_POINTS, "network")
+    assert all(np.median(np.abs(a.depth_prior / b.depth - 1)) < 0.012 for a, b in zip(corrected, large))
+
+
+def test_views_correct_each_others_depth(large):
+    views = matched(large)
+    corrected = refine_depth(views, NO_POINTS, "stereo")
+    errors = lambda views: [np.abs(view.depth_prior - exact.depth)[view.depth_prior > 0] for view, exact in zip(views, large)]
+    assert np.median(np.concatenate(errors(corrected))) < 0.5 * np.median(np.concatenate(errors(views)))
+    assert all(((a.depth_prior > 0) == (b.depth_prior > 0)).mean() > 0.999 for a, b in zip(corrected, views))
+
+
+def test_depth_between_points_is_believed_more_than_a_guess(large):
+    off = with_prior(dataclasses.replace(frame, depth=frame.depth * np.float32(1.03)) for frame in large)
+    moved = lambda source: np.abs(refine_depth(off, NO_POINTS, source)[0].depth_prior - off[0].depth_prior).mean()
+    assert moved("points") < moved("network")
+
+
+def test_what_the_other_view_hides_stays_where_it_was():
+    """Far tissue beside near tissue, which hides a strip of it from a second camera 5 mm to the right; depths are exact."""
+    noise = np.random.default_rng(0).integers(0, 256, (2, 512, 700, 3)).astype(np.float32)
+    far, near = (np.uint8(np.clip(128 + 6 * (cv2.GaussianBlur(n, (0, 0), 3) - 127.5), 0, 255)) for n in noise)
+    K, views = np.array([[500.0, 0, 320], [0, 500, 256], [0, 0, 1]]), []
+    for i in range(2):  # the far is 100 mm away and moves by 25 pixels, the near 62.5 mm and 40
+        image, depth = far[:, 25 * i : 25 * i + 640].copy(), np.full((512, 640), 0.1, np.float32)
+        image[150:350, 240 - 40 * i : 400 - 40 * i], depth[150:350, 240 - 40 * i : 400 - 40 * i] = near[150:350, 240:400], 0.0625
+        pose = np.eye(4)
+        pose[0, 3] = 0.005 * i
+        views.append(Frame(image=image, camera=Camera(K, 640, 512, pose), stamp_ns=i, depth=depth))
+    corrected, _ = refine_depth(with_prior(views), NO_POINTS, "network")
+    hidden = (corrected.depth_prior - views[0].depth)[150:350, 225:240]
+    assert np.sqrt((hidden**2).mean()) < 0.0025  # twice as much where flow is believed that does not lead back
+
+
+@pytest.mark.parametrize("kept", [np.s_[:6], np.s_[:, :9]])
+def test_images_too_small_for_optical_flow_keep_their_depth(small, kept):
+    cut = lambda array: np.ascontiguousarray(array[kept])
+    views = []
+    for frame in small[:2]:
+        image, depth = cut(frame.image), cut(frame.depth)
+        camera = dataclasses.replace(frame.camera, height=image.shape[0], width=image.shape[1])
+        views.append(dataclasses.replace(bare(frame), image=image, depth=depth, mask=None, camera=camera))
+    corrected = refine_depth(with_prior(views), NO_POINTS, "network")
+    assert all(np.abs(a.depth_prior / b.depth - 1).max() < 0.02 for a, b in zip(corrected, views))
+
+
+def test_no_pixel_is_corrected_to_another_surface():
+    inverse, weight = np.full((64, 80), 10, np.float32), np.zeros((64, 80), np.float32)
+    weight[20:40, 20:40] = 1e6
+    corrected = correct(inverse, 9 * weight, weight, np.full_like(inverse, 0.1), reach=12, limit=0.25)
+    assert 12 < corrected.max() < 12.6 and corrected.min() > 9.9
+
+
+def test_ripples_of_wide_images_are_smoothed_and_edges_are_not():
+    width, noise = 1920, np.random.default_rng(0).normal(0, 0.1, (160, 1920))
+    step = np.where(np.arange(width) < 960, 8.0, 12.0) + np.zeros_like(noise)
+    error = smooth((step + noise).astype(np.float32), 10, 0.05) - step
+    assert error.std() < 0.1 * noise.std()
+    assert np.abs(error[:, 950:970]).max() < 0.5 * noise.std()
+
+
+def test_larger_relative_steps_than_an_edge_are_kept():
+    step = np.where(np.arange(640) < 320, 10.0, 10.4) + np.zeros((64, 640))
+    off = [np.abs(smooth(step.astype(np.float32), 10, edge) - step)[:, 310:330].max() for edge in (0.1, 0.03, 0.02)]
+    assert off[0] > 0.15 and off[0] > off[1] > off[2] and off[2] < 0.07
+
+
+def test_scene_points_correct_the_depth_around_them(large):
+    frame = large[0]
+    off = with_prior([dataclasses.replace(frame, depth=frame.depth * np.float32(1.04), right=None, baseline=None)])
+    v, u = np.mgrid[8:512:16, 8:640:16].reshape(2, -1)
+    positions = frame.camera.backproject(frame.depth)[v, u]
+    (corrected,) = refine_depth(off, ScenePoints(positions, np.zeros_like(positions), 0.002), "network")
+    assert np.median(np.abs(corrected.depth_prior / frame.depth - 1)) < 0.01
+
+
+def test_wrong_scene_points_among_good_ones_hardly_move_what_matching_knows(large):
+    (prior,) = matched(large[:1])
+    v, u = np.mgrid[8:512:16, 8:640:16].reshape(2, -1)
+    wrong = np.arange(len(u)) % 10 == 0  # 15 % too far, and as sure of themselves as all
+    positions = large[0].camera.backproject(large[0].depth * np.float32(1.15))[v, u]
+    good = large[0].camera.backproject(large[0].depth)[v, u]
+
+    def error(positions):
+        (corrected,) = refine_depth([prior], ScenePoints(positions, np.zeros_like(positions), 0.003), "stereo")
+        return np.sqrt(((corrected.depth_prior - large[0].depth)[prior.depth_prior > 0] ** 2).mean())
+
+    assert error(good[~wrong]) < error(np.where(wrong[:, None], positions, good)) < 2.5 * error(good[~wrong])

@@ -1,0 +1,115 @@
+"""Light and exposures found from views."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from lit_wall import CAMERA, LAMP, wall
+
+from endo_sim_ros.core.cameras import look_at
+from endo_sim_ros.core.light import Light
+from endo_sim_ros.reconstruction.photometry import Drift, fit_exposure, fit_light, remove_light
+from endo_sim_ros.reconstruction.scene import TrainingView
+from endo_sim_ros.reconstruction.stage_configs import PhotometryConfig
+from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
+
+
+def lit_views(light: Light, gains, poses) -> list[TrainingView]:
+    """Pictures of the wall by cameras of fixed exposures."""
+    frames = []
+    for stamp, (gain, pose) in enumerate(zip(gains, poses), 1):
+        model = dataclasses.replace(wall(), light=dataclasses.replace(light, level_r=gain, level_g=gain, level_b=gain, response=0.0))
+        image, depth = DeformableRenderer(model, None, RenderingConfig(device="cpu")).render(CAMERA.at(pose))
+        frames.append(TrainingView(stamp, image, CAMERA.at(pose), depth_prior=depth))
+    return frames
+
+
+def test_light_and_exposures_are_found_from_views_at_several_distances():
+    places = ((-0.02, 0.03), (0.02, 0.0), (0.0, -0.03), (0.015, -0.05))
+    poses = [look_at(np.array([x, 0.5 * x, z]), np.array([x, -x, 0.1])) for x, z in places]
+    gains = [-0.5, 0.0, 0.2, 0.4]
+    frames = lit_views(LAMP, gains, poses)
+    points = wall().means.numpy().astype(np.float64)
+    theta, exposures = fit_light(frames, points, 0.1, 0.1)
+    assert (np.abs(theta - [1.2, 8.0, 0.4, -0.3]) < [0.2, 0.5, 0.1, 0.1]).all(), theta
+    np.testing.assert_allclose(exposures.mean(1) - exposures.mean(), np.array(gains) - np.mean(gains), atol=0.1)
+    # Glints do not matter.
+    spoilt = frames[1].image.copy()
+    for center in ((40, 40), (100, 80), (90, 20)):
+        cv2.circle(spoilt, center, 9, (255, 255, 255), -1)
+    again, _ = fit_light([frames[0], dataclasses.replace(frames[1], image=spoilt), *frames[2:]], points, 0.1, 0.1)
+    assert (np.abs(again - theta) < [0.1, 0.5, 0.1, 0.1]).all(), again
+    # The colours without light are the wall's, up to one factor.
+    colors = remove_light(wall(), frames, theta, exposures, 0.1, 0.1).base_colors
+    ratio = (colors / wall().base_colors).median()
+    assert (colors.mean(0) / wall().base_colors.mean(0) / ratio - 1).abs().max() < 0.1
+
+
+def test_what_is_switched_off_stays_off():
+    frames = lit_views(LAMP, [0.0, 0.3], [np.eye(4), look_at(np.array([0.02, 0, 0]), np.array([0, 0, 0.1]))])
+    points = wall().means.numpy().astype(np.float64)
+    theta, exposures = fit_light(frames, points, 0.1, 0.1, light=False)
+    np.testing.assert_allclose(theta, 0, atol=1e-6)
+    assert np.ptp(exposures) > 0.1
+    theta, exposures = fit_light(frames, points, 0.1, 0.1, exposure=False)
+    np.testing.assert_allclose(exposures, 0, atol=1e-6)
+    assert theta[1] > 4
+
+
+def test_without_two_views_of_a_point_the_prior_counts():
+    theta, exposures = fit_light(lit_views(LAMP, [0.3], [np.eye(4)]), wall().means.numpy().astype(np.float64), 0.1, 0.1)
+    np.testing.assert_array_equal(theta, [0.9, 3.0, 0.0, 0.0])
+    assert not exposures.any()
+
+
+@pytest.mark.parametrize("response", [0.0, 0.9])
+def test_the_response_of_the_exposure_is_found_where_brightness_varies(response):
+    brightness = np.linspace(-1, 1, 6)
+    exposures = np.stack([0.2 * c - response * brightness for c in range(3)], 1)
+    found, levels, residuals = fit_exposure(exposures, brightness)
+    assert found == pytest.approx(response, abs=0.01)
+    np.testing.assert_allclose(levels, [0, 0.2, 0.4], atol=1e-9)
+    np.testing.assert_allclose(residuals, 0, atol=0.01)
+    assert fit_exposure(exposures[:1], brightness[:1])[0] == 0.9  # one view tells nothing
+
+
+def test_what_brightness_does_not_explain_of_the_exposures_is_taken_as_time_has_it():
+    brightness, darker = np.array([-0.5, 0.5, 0.0]), np.array([0.3, 0.0, -0.3])  # in the order of time: third, second, first
+    exposures = (darker - 0.9 * brightness)[:, None] + np.zeros(3)
+    response, levels, residuals = fit_exposure(exposures, brightness)
+    light = dataclasses.replace(LAMP, response=response, **dict(zip(("level_r", "level_g", "level_b"), levels)))
+    drift = Drift([30, 20, 10], residuals)
+    for stamp, own, seen in zip(drift.stamps_ns, exposures, brightness):
+        then = drift.at(light, stamp)
+        np.testing.assert_allclose(np.array([then.level_r, then.level_g, then.level_b]) - response * seen, own, atol=1e-9)
+    between = (drift.at(light, 10).level_g + drift.at(light, 20).level_g) / 2
+    assert drift.at(light, 15).level_g == pytest.approx(between)
+    assert drift.at(light, 5) == drift.at(light, 10) and drift.at(light, 99) == drift.at(light, 30)
+    assert drift.at(None, 15) is None
+    at_once = Drift([10, 10, 20], residuals)
+    assert at_once.at(light, 10).level_r == pytest.approx(light.level_r + residuals[:2, 0].mean())
+
+
+def test_what_the_views_leave_open_is_taken_from_the_options():
+    (view,) = lit_views(LAMP, [0.3], [np.eye(4)])
+    points = wall().means.numpy().astype(np.float64)
+    theta, _ = fit_light([view], points, 0.1, 0.1, PhotometryConfig(distance=2.0, angle=1.0))
+    np.testing.assert_array_equal(theta, [2, 1, 0, 0])
+    one = np.zeros((1, 3)), np.zeros(1)
+    assert fit_exposure(*one, PhotometryConfig(response=0.3))[0] == pytest.approx(0.3)
+
+
+def test_hidden_and_masked_points_keep_their_colour():
+    (view,) = lit_views(LAMP, [0.0], [np.eye(4)])
+    mask = np.full(view.image.shape[:2], 255, np.uint8)
+    mask[:, :80] = 0
+    model = dataclasses.replace(wall(), sh=torch.full_like(wall().sh, 7.0))
+    behind = dataclasses.replace(model, means=model.means + torch.tensor([0.0, 0.0, 0.03]))
+    unlit = lambda model, view: remove_light(model, [view], np.zeros(4), np.zeros((1, 3)), 0.1, 0.05)
+    assert torch.equal(unlit(behind, view).sh, behind.sh)
+    uv = view.camera.project(model.means.numpy().astype(np.float64))[0]
+    changed = (unlit(model, dataclasses.replace(view, mask=mask)).sh != model.sh).flatten(1).any(1).numpy()
+    inside = view.camera.sees(model.means.numpy().astype(np.float64))
+    assert not changed[uv[:, 0] < 80].any() and changed[inside & (uv[:, 0] >= 80)].mean() > 0.95

@@ -16,6 +16,7 @@ from endo_sim_ros.core.gaussians import GaussianModel, save_ply
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.evaluation.lpips import Lpips
 from endo_sim_ros.reconstruction import Progress, ReconstructionConfig, Trainer, prepare, scene_points, select_keyframes, shrink
+from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.triangulation import points_in_view
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.bag import read_bag
@@ -153,13 +154,15 @@ def reconstruct_and_measure(bag: Path, out: Path, config: ReconstructionConfig, 
     out.mkdir(parents=True, exist_ok=True)  # before the long work
     chosen = select_keyframes(frames, config.keyframes)
     log.info("%d views, training on %d", len(frames), len(chosen))
-    points = scene_points(frames) if len(chosen) < len(frames) else None
     with ProgressBar() as bar:
         task = bar.add_task("preparing", total=None)
 
         def on_stage(stage: str, done: int, total: int) -> None:
             bar.update(task, description=stage, completed=done, total=total or None)
 
+        points = None
+        if len(chosen) < len(frames):
+            points = scene_points(frames, options=config.matching, progress=StageProgress("scene points", on_stage))
         trainer = Trainer(prepare([frames[index] for index in chosen], config, points, on_stage), config)
     if resume:
         trainer.load_checkpoint(out / "checkpoint.pt")

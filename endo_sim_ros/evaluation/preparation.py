@@ -14,7 +14,8 @@ from endo_sim_ros.evaluation.cells import Cell
 from endo_sim_ros.evaluation.sources import open_named, split_source
 from endo_sim_ros.evaluation.splits import STEREO, right_views, split_views
 from endo_sim_ros.reconstruction import ReconstructionConfig, ScenePoints, scene_points, shrink
-from endo_sim_ros.reconstruction.priors.sources import with_depth_prior
+from endo_sim_ros.reconstruction.priors.sources import estimate_depth
+from endo_sim_ros.reconstruction.scene import TrainingView
 from endo_sim_ros.sequences.folder import read_points
 
 _POINT_VIEWS = 48  # views that structure from motion is done with
@@ -58,7 +59,8 @@ def prepare_sequence(cells: Sequence[Cell], bar: Progress) -> Prepared:
         points, judging = divide_points(points)
     if any(frame.right is not None for frame in frames) and (STEREO in splits or not recorded):
         task = bar.add_task(f"stereo matching of {cells[0].sequence}", total=None)
-        matched = with_depth_prior(frames, points, ReconstructionConfig(depth="stereo"))
+        views = estimate_depth([TrainingView.of(frame) for frame in frames], points, ReconstructionConfig(depth="stereo"))
+        matched = [dataclasses.replace(view, depth=view.depth_prior) for view in views]
         bar.remove_task(task)
     if recorded:
         depth_source = "recorded"

@@ -4,7 +4,7 @@ import re
 from typing import NamedTuple
 
 from endo_sim_ros.core.frames import Frame, SequenceError
-from endo_sim_ros.reconstruction.priors.sources import right_camera
+from endo_sim_ros.reconstruction.priors.stereo import right_camera
 from endo_sim_ros.sequences.masks import lit_area, lit_now
 from endo_sim_ros.sequences.recording import spread
 

@@ -30,6 +30,7 @@ from endo_sim_ros.reconstruction import (
     scene_points,
     select_keyframes,
 )
+from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.sequences.bag import feed
 from endo_sim_ros.sequences.synchronizer import Synchronizer
 
@@ -181,8 +182,9 @@ class ReconstructionNode(EndoNode):
 
     def _train(self, views: list[Frame], frames: list[Frame], config: ReconstructionConfig) -> None:
         try:
-            self._on_stage("scene points", 0, 0)
-            points = scene_points(frames) if len(views) < len(frames) else None
+            points = None
+            if len(views) < len(frames):
+                points = scene_points(frames, options=config.matching, progress=StageProgress("scene points", self._on_stage))
             trainer, lockstep = Trainer(prepare(views, config, points, self._on_stage), config), self._options.mode == "lockstep"
             if not lockstep:
                 self._offer(trainer)

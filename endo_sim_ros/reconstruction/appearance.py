@@ -88,5 +88,5 @@ class Appearance:
             where = alpha > SURFACE if view.mask is None else (alpha > SURFACE) & (view.mask > 0)
             brightness.append(float(log_brightness(image, where)))
         exposures = exposures.cpu().numpy().astype(np.float64)
-        response, levels, residuals = photometry.fit_exposure(exposures, np.array(brightness))
+        response, levels, residuals = photometry.fit_exposure(exposures, np.array(brightness), self._config.photometry)
         return Light(*light.tolist(), self._reference, *map(float, levels), response), residuals

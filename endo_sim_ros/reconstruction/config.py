@@ -5,14 +5,16 @@ from typing import Annotated, ClassVar, Literal
 
 from endo_sim_ros.core.config import Range, StageConfig
 from endo_sim_ros.reconstruction.stage_configs import (
-    DepthPriorConfig,
     DynamicMaskConfig,
     ExtrapolationConfig,
     InitialModelConfig,
+    InterpolationConfig,
     MatchingConfig,
     MultiViewConfig,
+    NetworkDepthConfig,
     PhotometryConfig,
     PosesConfig,
+    StereoConfig,
     UsableViewsConfig,
 )
 
@@ -164,7 +166,9 @@ class ReconstructionConfig(StageConfig):
     views: UsableViewsConfig = UsableViewsConfig()
     matching: MatchingConfig = MatchingConfig()
     poses: PosesConfig = PosesConfig()
-    depth_prior: DepthPriorConfig = DepthPriorConfig()
+    stereo: StereoConfig = StereoConfig()
+    network: NetworkDepthConfig = NetworkDepthConfig()
+    interpolation: InterpolationConfig = InterpolationConfig()
     multi_view: MultiViewConfig = MultiViewConfig()
     motion: DynamicMaskConfig = DynamicMaskConfig()
     initial: InitialModelConfig = InitialModelConfig()

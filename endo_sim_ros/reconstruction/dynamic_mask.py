@@ -1,102 +1,110 @@
-"""What moved between the views, such as an instrument that is in one of them: it is left out where it stands alone."""
+"""The dynamic mask: what moved between the views, such as an instrument in one of them, is left out of the view."""
 
 import dataclasses
 import logging
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from endo_sim_ros.core.device import map_in_threads
-from endo_sim_ros.core.frames import Frame
-from endo_sim_ros.reconstruction.triangulation import neighbours
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.reconstruction.progress import StageProgress
+from endo_sim_ros.reconstruction.scene import TrainingView
+from endo_sim_ros.reconstruction.stage_configs import DynamicMaskConfig
+from endo_sim_ros.reconstruction.triangulation import nearest_views
 
 log = logging.getLogger(__name__)
 
-_WIDTH = 320  # pixels of the images that are compared
-_BLUR = 1.5  # pixels
-_CHROMA = 0.5  # difference of log colour ratios, which light and exposure hardly change, between tissue and a tool
-_LEAST = 0.004  # of the image: smaller pieces are glints and edges of the depth
-_OPENING = 1 / 50  # of the width: narrower ones are such edges
-_MOST = 0.4  # of the image: when more contradicts, it is depth or pose that is wrong
+
+class _Small(NamedTuple):
+    """A view at the size at which views are compared."""
+
+    camera: Camera
+    image: np.ndarray  # [H, W, 3] RGB, uint8
+    depth: np.ndarray  # [H, W] m, 0 = none
+    tissue: np.ndarray  # [H, W] float32, 1 or 0
 
 
-def without_motion(frames: list[Frame], tolerance: float) -> list[Frame]:
-    """The views with what contradicts two or more others, and most of those that see it, masked.
+def mask_motion(
+    views: Sequence[TrainingView],
+    tolerance: float,
+    options: DynamicMaskConfig = DynamicMaskConfig(),
+    progress: StageProgress = StageProgress(),
+) -> list[TrainingView]:
+    """The views with what contradicts two or more others, and most of those that see it, masked and without depth prior.
 
     Args:
-        frames: Training views with their depth prior.
+        views: Training views with their depth prior.
         tolerance: Relative difference of depth within which two views see the same surface.
+        options: What contradicts, and how large a piece must be.
+        progress: Reported to by views.
     """
-    near = neighbours(frames)
-    small = [frame if frame.depth is None else _small(frame) for frame in frames]
+    near = nearest_views(views, 3)  # two of which must contradict
+    small = [None if view.depth_prior is None else _small(view, options) for view in views]
 
-    def what_moved(i: int) -> np.ndarray | None:
-        others = [small[j] for j in near[i] if j != i and frames[j].depth is not None]
-        if frames[i].depth is None or not (small[i].depth > 0).any() or len(others) < 2:
+    def moved(i: int) -> np.ndarray | None:
+        others = [small[j] for j in near[i] if j != i and small[j] is not None]
+        if small[i] is None or not (small[i].depth > 0).any() or len(others) < 2:
             return None
-        verdicts = np.array([_contradiction(small[i], other, tolerance) for other in others])
+        verdicts = np.array([_verdict(small[i], other, tolerance, options) for other in others])
         against, agreeing = (verdicts > 0).sum(0), (verdicts < 0).sum(0)
-        return _large_pieces((against >= 2) & (against > agreeing))
+        return _wide_pieces((against >= 2) & (against > agreeing), options)
 
-    result = []
-    for frame, moved in zip(frames, map_in_threads(what_moved, range(len(frames)))):
-        if moved is None or not moved.any():
-            result.append(frame)
-            continue
-        at = frame.stamp_ns * 1e-9
-        if moved.mean() > _MOST:
-            log.warning("view at %.3f s: most of it contradicts the other views; check its depth and pose", at)
-            result.append(frame)
-            continue
-        moved = cv2.resize(moved.astype(np.uint8), (frame.camera.width, frame.camera.height), interpolation=cv2.INTER_NEAREST) > 0
-        mask = np.where(moved, 0, 255 if frame.mask is None else frame.mask).astype(np.uint8)
-        result.append(dataclasses.replace(frame, mask=mask, depth=np.where(moved, np.float32(0), frame.depth)))
-        text = "view at %.3f s: %.0f %% of it contradicts the other views and is left out; something moved"
-        log.warning(text, at, 100 * moved.mean())
-    return result
+    return [_masked(view, pixels, options) for view, pixels in zip(views, progress.map(moved, range(len(views))))]
 
 
-def _small(frame: Frame) -> Frame:
-    camera = frame.camera.resized(_WIDTH, max(round(_WIDTH * frame.camera.height / frame.camera.width), 1))
+def _masked(view: TrainingView, moved: np.ndarray | None, options: DynamicMaskConfig) -> TrainingView:
+    """The view without the pixels [H', W'] of its small version that moved."""
+    at = view.stamp_ns * 1e-9
+    if moved is None or not moved.any():
+        return view
+    if moved.mean() > options.max_area:
+        log.warning("view at %.3f s: most of it contradicts the other views; check its depth and pose", at)
+        return view
+    moved = cv2.resize(moved.astype(np.uint8), (view.camera.width, view.camera.height), interpolation=cv2.INTER_NEAREST) > 0
+    mask = np.where(moved, 0, 255 if view.mask is None else view.mask).astype(np.uint8)
+    text = "view at %.3f s: %.0f %% of it contradicts the other views and is left out; something moved"
+    log.warning(text, at, 100 * moved.mean())
+    return dataclasses.replace(view, mask=mask, depth_prior=np.where(moved, np.float32(0), view.depth_prior))
+
+
+def _small(view: TrainingView, options: DynamicMaskConfig) -> _Small:
+    width = options.width
+    camera = view.camera.resized(width, max(round(width * view.camera.height / view.camera.width), 1))
     size = (camera.width, camera.height)
-    nearest = lambda array: None if array is None else cv2.resize(array, size, interpolation=cv2.INTER_NEAREST_EXACT)
-    image = cv2.GaussianBlur(cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA), (0, 0), _BLUR)
-    return Frame(frame.stamp_ns, image, camera, depth=nearest(frame.depth), mask=nearest(frame.mask))
+    nearest = lambda array: cv2.resize(array, size, interpolation=cv2.INTER_NEAREST_EXACT)
+    # Smoothed over a pixel and a half, what poses and depth leave off.
+    image = cv2.GaussianBlur(cv2.resize(view.image, size, interpolation=cv2.INTER_AREA), (0, 0), 1.5)
+    return _Small(camera, image, nearest(view.depth_prior), nearest(view.tissue))
 
 
-def _contradiction(frame: Frame, other: Frame, tolerance: float) -> np.ndarray:
+def _verdict(view: _Small, other: _Small, tolerance: float, options: DynamicMaskConfig) -> np.ndarray:
     """1 where another view contradicts a view [H, W], -1 where it agrees, 0 where it sees nothing of it."""
-    known = frame.depth > 0
+    known = view.depth > 0
     # In a hole something may hide that has no depth: let it be as deep as what is beside it.
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
-    depth = frame.depth[tuple(nearest)]
-    uv, z = other.camera.project(frame.camera.backproject(depth).reshape(-1, 3))
+    depth = view.depth[tuple(nearest)]
+    uv, z = other.camera.project(view.camera.backproject(depth).reshape(-1, 3))
     u, v = ((uv - 0.5).T.reshape(2, *depth.shape)).astype(np.float32)  # OpenCV counts from the centre of the first pixel
     z = z.reshape(depth.shape)
     look = lambda array, how: cv2.remap(array, u, v, how, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
     surface = look(other.depth, cv2.INTER_NEAREST)
-    seen = (z > 0) & (surface > 0) & (True if frame.mask is None else frame.mask > 0)
-    if other.mask is not None:
-        seen &= look(other.mask, cv2.INTER_NEAREST) > 0
+    seen = (z > 0) & (surface > 0) & (view.tissue > 0) & (look(other.tissue, cv2.INTER_NEAREST) > 0)
     floats = seen & known & (z < surface * (1 - tolerance))
     same = seen & (np.abs(z - surface) < tolerance * surface)
-    image = look(other.image, cv2.INTER_LINEAR)
-    chroma = np.abs(_chroma(frame.image) - _chroma(image)).max(-1) > _CHROMA
-    return np.where(floats | same & chroma, 1, np.where(same, -1, 0))
+    differs = np.abs(_chroma(view.image) - _chroma(look(other.image, cv2.INTER_LINEAR))).max(-1) > options.chroma
+    return np.where(floats | same & differs, 1, np.where(same, -1, 0))
 
 
 def _chroma(image: np.ndarray) -> np.ndarray:
-    """Logarithms of red and blue over green [H, W, 2]."""
+    """Logarithms of red and blue over green [H, W, 2], those of dark pixels, which are noise, next to 0."""
     colors = np.log(image.astype(np.float32) + 8)
     return colors[..., ::2] - colors[..., 1:2]
 
 
-def _large_pieces(where: np.ndarray) -> np.ndarray:
-    """The pixels [H, W] in large, compact pieces, with a margin."""
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (max(round(_OPENING * _WIDTH), 1),) * 2)
-    opened = cv2.morphologyEx(where.astype(np.uint8), cv2.MORPH_OPEN, kernel)
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(opened)
-    large = stats[:, cv2.CC_STAT_AREA] >= _LEAST * where.size
-    large[0] = False
-    return cv2.dilate(large[labels].astype(np.uint8), kernel) > 0
+def _wide_pieces(pixels: np.ndarray, options: DynamicMaskConfig) -> np.ndarray:
+    """The pixels [H, W] in wide pieces, with a margin."""
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (max(round(options.min_width * options.width), 1),) * 2)
+    return cv2.dilate(cv2.morphologyEx(pixels.astype(np.uint8), cv2.MORPH_OPEN, kernel), kernel) > 0

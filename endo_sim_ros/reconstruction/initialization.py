@@ -1,6 +1,6 @@
 """The Gaussians that training starts from: depth back-projected from every view, checked between views."""
 
-import dataclasses
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -8,14 +8,13 @@ import torch
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
+from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import map_in_threads
-from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
-from endo_sim_ros.reconstruction.config import ReconstructionConfig
-
-_OPACITY = 0.5
-_STEEPEST = 2.0  # slope of a surface across the line of sight, beyond which a point near it floats in front of it
-_MIN_POINTS = 10
+from endo_sim_ros.reconstruction.progress import StageProgress
+from endo_sim_ros.reconstruction.scene import TrainingView
+from endo_sim_ros.reconstruction.stage_configs import InitialModelConfig
 
 
 class _Points(NamedTuple):
@@ -26,68 +25,85 @@ class _Points(NamedTuple):
     spacing: np.ndarray  # [N] m, distance to the neighbours
 
 
-def initial_model(frames: list[Frame], points: np.ndarray, colors: np.ndarray, config: ReconstructionConfig) -> GaussianModel:
+def initial_model(
+    views: Sequence[TrainingView],
+    points: np.ndarray,
+    colors: np.ndarray,
+    tolerance: float,
+    max_gaussians: int,
+    sh_degree: int = 0,
+    options: InitialModelConfig = InitialModelConfig(),
+    progress: StageProgress = StageProgress(),
+) -> GaussianModel:
     """Isotropic Gaussians at the back-projected depth of the views, and at triangulated points where no depth reaches.
 
     Args:
-        frames: Training views, with their depth prior.
+        views: Training views; those without a depth prior have no part in the surface.
         points, colors: Triangulated points [N, 3] (m, world) and their RGB in [0, 1].
+        tolerance: Relative difference of depth at which two views contradict each other.
+        max_gaussians: Largest number of Gaussians.
+        sh_degree: Degree of the spherical harmonics.
+        options: Opacity, and which points float before the surface.
+        progress: Reported to by views.
 
     Raises:
         SequenceError: If neither depth nor points give the scene a shape.
     """
-    if config.initialization == "points":
-        frames = [dataclasses.replace(frame, depth=None) for frame in frames]
-    chosen = _surface_pixels(frames, config.depth_tolerance)
-    stride = _stride(chosen, config.max_gaussians)
+    surfaces = [view for view in views if view.depth_prior is not None and (view.depth_prior > 0).any()]
+    chosen = _surface_pixels(surfaces, tolerance, progress)
+    stride = _stride(chosen, max_gaussians)
     taken = [pixels & _lattice(pixels.shape, stride) for pixels in chosen]
-    parts = [_back_project(frames, i, pixels, stride, config.depth_tolerance) for i, pixels in enumerate(taken)]
-    useful = ~_afloat(frames, points, config.depth_tolerance)
-    if any(pixels.any() for pixels in chosen):  # lone points beyond the views would reach into them; see `with_surroundings`
-        useful &= np.any([frame.camera.sees(points) for frame in frames], 0)
+    parts = [_Points(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))]
+    for done, pixels in enumerate(taken):
+        progress(len(surfaces) + done, 2 * len(surfaces))
+        parts.append(_back_project(surfaces, done, pixels, stride, tolerance))
+    useful = ~_afloat(surfaces, points, tolerance, options)
+    if any(pixels.any() for pixels in chosen):  # lone points beyond the views would reach into them; see `extrapolate`
+        useful &= np.any([view.camera.sees(points) for view in views], 0)
     parts.append(_in_holes(parts, points[useful], colors[useful]))
-    positions, colors, spacing = (np.concatenate(arrays) for arrays in zip(*parts))
-    if len(positions) < _MIN_POINTS:
+    positions, *others = (np.concatenate(arrays) for arrays in zip(*parts))
+    if len(positions) < 10:  # stray matches
         raise SequenceError(
-            f"only {len(positions)} scene points could be found in {len(frames)} views; give depth or a right image, "
+            f"only {len(positions)} scene points could be found in {len(views)} views; give depth or a right image, "
             "views that overlap from different positions, or check the poses"
         )
-    arrays = (array[: config.max_gaussians] for array in (positions, colors, spacing))
-    tensors = [torch.from_numpy(array.astype(np.float32)) for array in arrays]
-    return GaussianModel.from_points(*tensors, _OPACITY, config.sh_degree)
+    tensors = [torch.from_numpy(array[:max_gaussians].astype(np.float32)) for array in (positions, *others)]
+    return GaussianModel.from_points(*tensors, options.opacity, sh_degree)
 
 
-def _surface_pixels(frames: list[Frame], tolerance: float) -> list[np.ndarray]:
+def _surface_pixels(views: list[TrainingView], tolerance: float, progress: StageProgress) -> list[np.ndarray]:
     """Which pixels [H, W] of each view to back-project, so that every piece of surface is there once.
 
     The view that sees a piece from nearest provides it. A pixel whose point floats in front of the surface that another
     view sees, by more than the relative tolerance, is contradicted and left out.
     """
-    chosen = [np.zeros((frame.camera.height, frame.camera.width), bool) for frame in frames]
-    with_depth = [i for i, frame in enumerate(frames) if frame.depth is not None and (frame.depth > 0).any()]
-    fineness = {i: np.median(frames[i].depth[frames[i].depth > 0]) / frames[i].camera.K[0, 0] for i in with_depth}
-    done = []
-    for i in sorted(with_depth, key=fineness.get):
-        frame = frames[i]
-        pixels = (frame.depth > 0) & (True if frame.mask is None else frame.mask > 0)
-        points = frame.camera.backproject(frame.depth)[pixels]
+    chosen = [np.zeros(view.depth_prior.shape, bool) for view in views]
+    fineness = [np.median(view.depth_prior[view.depth_prior > 0]) / view.camera.K[0, 0] for view in views]
+    done: list[int] = []
+    for i in np.argsort(fineness, kind="stable"):
+        progress(len(done), 2 * len(views))
+        view = views[i]
+        pixels = (view.depth_prior > 0) & (view.tissue > 0)
+        points = view.camera.backproject(view.depth_prior)[pixels]
 
         def keeps(j: int) -> np.ndarray:
-            z, surface, _ = _seen(frames[j], points)  # noqa: B023
+            progress.check()
+            z, surface, _ = _look_up(views[j].camera, views[j].depth_prior, points)  # noqa: B023
             return (surface <= 0) | (z >= surface * (1 + tolerance if j in done else 1 - tolerance))
 
-        chosen[i][pixels] = np.all([np.ones(len(points), bool), *map_in_threads(keeps, [j for j in with_depth if j != i])], 0)
+        chosen[i][pixels] = np.all([np.ones(len(points), bool), *map_in_threads(keeps, [j for j in range(len(views)) if j != i])], 0)
         done.append(i)
     return chosen
 
 
-def _seen(frame: Frame, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Depth [N] (m) of points [N, 3] in a view; depth (0 = none) of the surface that it sees there, and which of its pixels that is [N]."""
-    uv, z = frame.camera.project(points)
+def _look_up(camera: Camera, depth: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Depth [N] (m) of points [N, 3] in a view, depth [N] (m, 0 = none) of the surface that it sees there by its depth image
+    [H, W], and which of its pixels that is [N]."""
+    uv, z = camera.project(points)
     u, v = uv.T
-    inside = (z > 0) & (u >= 0) & (v >= 0) & (u < frame.camera.width) & (v < frame.camera.height)
-    pixels = np.where(inside, v, 0).astype(int) * frame.camera.width + np.where(inside, u, 0).astype(int)
-    return z, np.where(inside, frame.depth.reshape(-1)[pixels], 0.0), pixels
+    inside = (z > 0) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+    pixels = np.where(inside, v, 0).astype(int) * camera.width + np.where(inside, u, 0).astype(int)
+    return z, np.where(inside, depth.reshape(-1)[pixels], 0.0), pixels
 
 
 def _stride(chosen: list[np.ndarray], limit: int) -> float:
@@ -105,37 +121,33 @@ def _lattice(shape: tuple[int, int], stride: float) -> np.ndarray:
     return rows[:, None] & columns
 
 
-def _back_project(frames: list[Frame], index: int, pixels: np.ndarray, stride: float, tolerance: float) -> _Points:
+def _back_project(views: list[TrainingView], index: int, pixels: np.ndarray, stride: float, tolerance: float) -> _Points:
     """Points of the given pixels [H, W] of one view, with the mean colour of the views that see them.
 
     The light moves with the endoscope: colours of one view alone would show where the next view's piece begins.
     """
-    if not pixels.any():
-        return _Points(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
-    frame = frames[index]
-    points, colors = frame.camera.backproject(frame.depth)[pixels], frame.image[pixels] / 255.0
+    view = views[index]
+    points, colors = view.camera.backproject(view.depth_prior)[pixels], view.image[pixels] / 255.0
     count = np.ones((len(points), 1))
-    for j, other in enumerate(frames):
-        if j == index or other.depth is None:
-            continue
-        z, surface, seen = _seen(other, points)
-        agrees = ((surface > 0) & (np.abs(z - surface) < tolerance * surface))[:, None]
-        colors, count = colors + agrees * (other.image.reshape(-1, 3)[seen] / 255.0), count + agrees
-    return _Points(points, colors / count, stride * frame.depth[pixels].astype(np.float64) / frame.camera.K[0, 0])
+    for j, other in enumerate(views):
+        if j != index:
+            z, surface, seen = _look_up(other.camera, other.depth_prior, points)
+            agrees = ((surface > 0) & (np.abs(z - surface) < tolerance * surface))[:, None]
+            colors, count = colors + agrees * (other.image.reshape(-1, 3)[seen] / 255.0), count + agrees
+    return _Points(points, colors / count, stride * view.depth_prior[pixels].astype(np.float64) / view.camera.K[0, 0])
 
 
-def _afloat(frames: list[Frame], points: np.ndarray, tolerance: float) -> np.ndarray:
+def _afloat(views: list[TrainingView], points: np.ndarray, tolerance: float, options: InitialModelConfig) -> np.ndarray:
     """Which triangulated points [N] float in front of the surface that some view sees there or, in a hole of it, beside it.
 
     Highlights are where depth has holes, and where points are matched that are no tissue: they move with the light.
     """
     floats = np.zeros(len(points), bool)
-    for frame in frames:
-        if frame.depth is None or not (frame.depth > 0).any():
-            continue
-        distance, nearest = distance_transform_edt(frame.depth <= 0, return_indices=True)
-        beside = (frame.depth[tuple(nearest)] * (1 - tolerance - _STEEPEST * distance / frame.camera.K[0, 0])).astype(np.float32)
-        z, surface, _ = _seen(dataclasses.replace(frame, depth=np.maximum(beside, 0)), points)
+    for view in views:
+        distance, nearest = distance_transform_edt(view.depth_prior <= 0, return_indices=True)
+        depth = view.depth_prior[tuple(nearest)]
+        beside = (depth * (1 - tolerance - options.max_slope * distance / view.camera.K[0, 0])).astype(np.float32)
+        z, surface, _ = _look_up(view.camera, np.maximum(beside, 0), points)
         floats |= (surface > 0) & (z < surface)
     return floats
 

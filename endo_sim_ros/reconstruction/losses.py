@@ -96,7 +96,7 @@ def depth_l1(depth: Tensor, prior: Tensor, mask: Tensor | None, alpha: Tensor, o
 
 
 def total_variation(depth: Tensor, mask: Tensor | None) -> Tensor:
-    """Mean absolute difference of neighbour depths, metres (the third regulariser of paper eq. 6); pairs across a mask's edge do not count."""
+    """Mean absolute difference of neighbour depths, metres (in paper eq. 6); pairs across a mask's edge do not count."""
     dx, dy = (depth[:, 1:] - depth[:, :-1]).abs(), (depth[1:] - depth[:-1]).abs()
     if mask is None:
         return dx.mean() + dy.mean()

@@ -14,15 +14,16 @@ from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.reconstruction import photometry
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
-from endo_sim_ros.reconstruction.dynamic_mask import without_motion
+from endo_sim_ros.reconstruction.dynamic_mask import mask_motion
 from endo_sim_ros.reconstruction.initialization import initial_model
-from endo_sim_ros.reconstruction.priors.extrapolation import with_surroundings
-from endo_sim_ros.reconstruction.priors.multi_view import agreed
-from endo_sim_ros.reconstruction.priors.sources import depth_source, with_depth_prior
+from endo_sim_ros.reconstruction.pose_check import misposed
+from endo_sim_ros.reconstruction.priors.extrapolation import extrapolate
+from endo_sim_ros.reconstruction.priors.multi_view import refine_depth
+from endo_sim_ros.reconstruction.priors.sources import depth_source, estimate_depth
 from endo_sim_ros.reconstruction.progress import OnProgress, StageProgress
 from endo_sim_ros.reconstruction.scene import PreparedScene, ScenePoints, TrainingView, shrink
 from endo_sim_ros.reconstruction.trainer import Trainer
-from endo_sim_ros.reconstruction.triangulation import match_features, misposed, triangulate
+from endo_sim_ros.reconstruction.triangulation import match_features, triangulate
 
 _UNUSABLE = {
     "masked": "every pixel of every view is masked; a mask has 255 where there is tissue",
@@ -111,12 +112,16 @@ def select_usable(scene: PreparedScene, config: ReconstructionConfig, progress: 
 
 def match_views(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Match features between near views."""
-    return scene.replaced(matches=tuple(match_features(list(scene.frames))))
+    return scene.replaced(matches=tuple(match_features(scene.frames, config.matching, progress)))
 
 
 def check_poses(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Leave out views whose poses contradict the others, with measured depth if there is any."""
-    while not _judged_by_stereo(scene, config) and (wrong := misposed(list(scene.frames), list(scene.matches))):
+    while not _judged_by_stereo(scene, config):
+        depths = [frame.depth for frame in scene.frames]
+        wrong = misposed(scene.frames, scene.matches, depths, config.poses, config.matching, progress)
+        if not wrong:
+            break
         scene = match_views(_without(scene, wrong), config, progress)
     return scene
 
@@ -125,20 +130,25 @@ def find_points(scene: PreparedScene, config: ReconstructionConfig, progress: St
     """Triangulate scene points, unless they are given."""
     if scene.given_points:
         return scene
-    return scene.replaced(points=triangulate(list(scene.frames), list(scene.matches)))
+    return scene.replaced(points=triangulate(scene.frames, scene.matches, config.matching, progress))
 
 
-def estimate_depth(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
+def find_depth(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Give each view its depth prior, and a right image that is rectified well."""
-    found = with_depth_prior(list(scene.frames), scene.points, config)
-    return scene.replaced(views=_restored(scene.frames, found), depth_source=depth_source(list(scene.frames), config))
+    views = [TrainingView.of(frame) for frame in scene.frames]
+    found = tuple(estimate_depth(views, scene.points, config, progress))
+    return scene.replaced(views=found, depth_source=depth_source(scene.frames, config))
 
 
 def check_poses_by_stereo(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """As `check_poses`, with the depth that each view's own pair of images tells, which does not depend on the poses."""
-    while _judged_by_stereo(scene, config) and (wrong := misposed(_disguised(scene.views), list(scene.matches))):
+    while _judged_by_stereo(scene, config):
+        depths = [view.depth_prior for view in scene.views]
+        wrong = misposed(scene.views, scene.matches, depths, config.poses, config.matching, progress)
+        if not wrong:
+            break
         scene = _without(scene, wrong)
-        for stage in (match_views, check_poses, find_points, estimate_depth):
+        for stage in (match_views, check_poses, find_points, find_depth):
             scene = stage(scene, config, progress)
     return scene
 
@@ -149,8 +159,9 @@ def refine_across_views(scene: PreparedScene, config: ReconstructionConfig, prog
         return scene
     # Flow is the more precise the finer the pixels are, as matching is.
     fine = [shrink(view, _FINER * config.image_width) for view in scene.views]
-    refined, _ = agreed(_disguised(fine), scene.points, scene.depth_source)
-    return scene.replaced(views=_restored(fine, refined))
+    options = config.multi_view, config.stereo, config.interpolation
+    refined = refine_depth(fine, scene.points, scene.depth_source, *options, progress)
+    return scene.replaced(views=tuple(refined))
 
 
 def shrink_views(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
@@ -158,18 +169,21 @@ def shrink_views(scene: PreparedScene, config: ReconstructionConfig, progress: S
     return scene.replaced(views=tuple(shrink(view, config.image_width) for view in scene.views))
 
 
-def mask_motion(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
+def mask_dynamic(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Mask what moved between the views."""
     if not config.dynamic_mask:
         return scene
-    return scene.replaced(views=_restored(scene.views, without_motion(_disguised(scene.views), config.depth_tolerance)))
+    return scene.replaced(views=tuple(mask_motion(scene.views, config.depth_tolerance, config.motion, progress)))
 
 
 def place_gaussians(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Place the Gaussians that training starts from, and measure the depth of the scene."""
     most = max(int(_SEEN * config.max_gaussians) if config.extrapolation else config.max_gaussians, 1)
-    views = _disguised(scene.views)
-    model = initial_model(views, scene.points.positions, scene.points.colors, replace(config, max_gaussians=most))
+    views, points = scene.views, scene.points
+    if config.initialization == "points":
+        views = [replace(view, depth_prior=None) for view in views]
+    about = config.depth_tolerance, most, config.sh_degree, config.initial, progress
+    model = initial_model(views, points.positions, points.colors, *about)
     positions = model.means.numpy().astype(np.float64)
     depths = np.concatenate([view.camera.project(positions)[1] for view in views])
     return scene.replaced(model=model, depth=float(np.median(depths[depths > 0])), exposures=np.zeros((len(views), 3)))
@@ -179,19 +193,21 @@ def fit_light(scene: PreparedScene, config: ReconstructionConfig, progress: Stag
     """Fit the light and each view's exposure, and take both out of the Gaussians' colours."""
     if not (config.light or config.exposure):
         return scene
-    views, about = _disguised(scene.views), (scene.depth, config.depth_tolerance)
+    about = scene.depth, config.depth_tolerance, config.photometry
     means = scene.model.means.numpy().astype(np.float64)
-    light, exposures = photometry.fit_light(views, means, *about, light=config.light, exposure=config.exposure)
-    return scene.replaced(model=photometry.unlit(scene.model, views, light, exposures, *about), light=light, exposures=exposures)
+    light, exposures = photometry.fit_light(scene.views, means, *about, light=config.light, exposure=config.exposure, progress=progress)
+    model = photometry.remove_light(scene.model, scene.views, light, exposures, scene.depth, config.depth_tolerance)
+    return scene.replaced(model=model, light=light, exposures=exposures)
 
 
 def extrapolate_tissue(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Add Gaussians in the holes of the depth prior and beyond the pictures."""
     if not config.extrapolation:
         return scene
-    about = scene.light, scene.exposures, scene.depth, scene.points.positions
-    views = _disguised(scene.views)
-    return scene.replaced(model=with_surroundings(scene.model, views, *about, config.extrapolation, config.max_gaussians))
+    lit = scene.light, scene.exposures, scene.depth
+    options = config.extrapolated, config.interpolation, progress
+    model = extrapolate(scene.model, scene.views, scene.points.positions, *lit, config.extrapolation, config.max_gaussians, *options)
+    return scene.replaced(model=model)
 
 
 STAGES = (
@@ -199,11 +215,11 @@ STAGES = (
     Stage("matching features", match_views),
     Stage("checking poses", check_poses),
     Stage("scene points", find_points),
-    Stage("depth prior", estimate_depth),
+    Stage("depth prior", find_depth),
     Stage("checking poses by stereo", check_poses_by_stereo),
     Stage("multi-view refinement", refine_across_views),
     Stage("shrinking views", shrink_views),
-    Stage("dynamic mask", mask_motion),
+    Stage("dynamic mask", mask_dynamic),
     Stage("initial model", place_gaussians),
     Stage("light and exposure", fit_light),
     Stage("extrapolation", extrapolate_tissue),
@@ -248,14 +264,3 @@ def _stamps(frames: Sequence[Frame]) -> str:
 def _judged_by_stereo(scene: PreparedScene, config: ReconstructionConfig) -> bool:
     """Whether poses are judged with the depth of stereo matching."""
     return config.depth in ("auto", "stereo") and any(frame.right is not None for frame in scene.frames)
-
-
-# Until every stage takes views, their prior is shown to it as the depth of frames.
-
-
-def _disguised(views: Sequence[TrainingView]) -> list[Frame]:
-    return [replace(view, depth=view.depth_prior) for view in views]
-
-
-def _restored(views: Sequence[Frame], found: Sequence[Frame]) -> tuple[TrainingView, ...]:
-    return tuple(replace(TrainingView.of(new), depth=old.depth, depth_prior=new.depth) for old, new in zip(views, found))

@@ -50,21 +50,25 @@ class StageProgress:
     def map(self, function: Callable, items: Iterable) -> list:
         """Results of a function, which mostly waits for OpenCV or numpy, for each item, several at a time; reports the share done.
 
-        After an error, a cancellation or Ctrl-C no further item begins, and `check` raises in those that run.
+        After an error, a cancellation or Ctrl-C no further item begins, and `check` raises in those that run. One that does not check,
+        as a single call of OpenCV can take seconds, is left to end by itself.
         """
         items = list(items)
-        self(0, len(items))
-        with ThreadPoolExecutor(cpu_threads(), "endo_sim") as pool:
+        self._stopped = stopped = threading.Event()
+        pool, futures = ThreadPoolExecutor(cpu_threads(), "endo_sim"), []
+        try:
+            self(0, len(items))
             futures = [pool.submit(function, item) for item in items]
-            try:
-                left = set(futures)
-                while left:
-                    done, left = wait(left, timeout=0.2, return_when=FIRST_COMPLETED)
-                    for future in done:
-                        future.result()
-                    self(len(items) - len(left), len(items))
-            except BaseException:
-                self._stopped.set()
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise
+            left = set(futures)
+            while left:
+                done, left = wait(left, timeout=0.2, return_when=FIRST_COMPLETED)
+                for future in done:
+                    future.result()
+                self(len(items) - len(left), len(items))
+        except BaseException:
+            stopped.set()
+            pool.shutdown(wait=False, cancel_futures=True)
+            wait([future for future in futures if not future.cancelled()], timeout=0.5)
+            raise
+        pool.shutdown()
         return [future.result() for future in futures]

@@ -24,37 +24,189 @@ class UsableViewsConfig(StageConfig):
 class MatchingConfig(StageConfig):
     """Features that views share, and scene points triangulated from them."""
 
+    max_features: Annotated[int, Range(50, 100_000)] = 4000
+    """SIFT features of an image, the strongest first; the time to match two images grows with the square."""
+    ratio: Annotated[float, Range(0.3, 1)] = 0.8
+    """Largest ratio of the distances of a feature's best and second-best match. Lowe 2004: 0.8 drops nine of ten wrong matches and one
+    of twenty right ones."""
+    neighbours: Annotated[int, Range(1, 100)] = 3
+    """Views that each view is matched with: the nearest in space."""
+    reprojection_error: Annotated[float, Range(0.1, 100, "pixels")] = 2.0
+    """Farthest that a scene point may lie from its features: poses and calibration are a pixel or two off."""
+    min_parallax: Annotated[float, Range(0.01, 45, "degrees")] = 1.0
+    """Smallest angle between the rays to a scene point; below it a pixel is several per cent of its depth."""
+    outlier_depth: Annotated[float, Range(0.001, 10)] = 0.1
+    """Relative difference from the depth of the eight points around, in an image, from which on a scene point is a wrong match or
+    hidden."""
+    min_points: Annotated[int, Range(8, 10_000)] = 30
+    """Matches or scene points from which on they tell anything: whether poses are right, where the right image is off, depth between
+    them. Fewer may agree by accident."""
+
 
 @dataclass(frozen=True)
 class PosesConfig(StageConfig):
     """Which poses contradict what the views share."""
 
+    min_error: Annotated[float, Range(0, 1, "widths of the image")] = 0.007
+    """Median distance of matches from where the poses expect them, up to which poses are right: calibration and structure from motion
+    leave as much."""
+    max_error: Annotated[float, Range(0, 1, "widths of the image")] = 0.02
+    """Median distance from which on they are wrong whatever the others are; tissue that breathes moves by less."""
+    outlier_factor: Annotated[float, Range(1, 1000)] = 5.0
+    """In between, how many times as far off as the best fifth of the groups of views a wrong one is."""
+
 
 @dataclass(frozen=True)
-class DepthPriorConfig(StageConfig):
-    """Depth by stereo matching, a network or interpolation between scene points."""
+class StereoConfig(StageConfig):
+    """Depth by matching the right image of a stereo pair."""
+
+    nearest: Annotated[float, Range(0.001, 1, "m")] = 0.02
+    """Distance of the nearest tissue that is searched for; closer no laparoscope works. The search takes time in proportion to its
+    inverse."""
+    min_disparity: Annotated[float, Range(0.1, 100, "pixels")] = 2.0
+    """Smallest disparity that gives depth: half a pixel is a quarter of the depth there."""
+    max_disparity: Annotated[float, Range(0.01, 1, "widths of the image")] = 0.1
+    """Largest disparity of what a tool in the left image hides in the right one; masks are widened by it."""
+    disparity_error: Annotated[float, Range(0.01, 10, "pixels")] = 0.5
+    """Standard deviation of a disparity: semi-global matching prefers whole pixels."""
+    min_area: Annotated[float, Range(0, 1)] = 0.003
+    """Share of the image below which a patch of disparity that is like none around it is a wrong match."""
+    max_row_offset: Annotated[float, Range(0, 0.5, "heights of the image")] = 0.01
+    """Farthest that rectification may have left the rows of the two images apart; of matches farther apart none is right."""
+    own_offset_points: Annotated[int, Range(1, 100_000)] = 100
+    """Scene points from which on a view has an offset of its own: poses and baselines of views err differently, but their points err
+    alike."""
+    max_offset: Annotated[float, Range(0, 10)] = 0.3
+    """Largest offset, in median disparities: a larger one is no principal point, but poses of another scale."""
+
+
+@dataclass(frozen=True)
+class NetworkDepthConfig(StageConfig):
+    """Depth by a network, which knows it up to a scale and a shift of its inverse."""
+
+    max_error: Annotated[float, Range(0.001, 1)] = 0.1
+    """Median relative error of inverse depth above which the fit has failed."""
+    max_unexplained: Annotated[float, Range(0.01, 1)] = 0.7
+    """Share of the spread of the known inverse depths that the fit may leave; a network that leaves more tells no more than one depth
+    for all."""
+
+
+@dataclass(frozen=True)
+class InterpolationConfig(StageConfig):
+    """How depth and colour are continued from pixels and scene points to where there are none."""
+
+    cell: Annotated[float, Range(0.001, 0.2, "widths of the image")] = 1 / 80
+    """Side of the cells that values are told for, and the spacing of extrapolated Gaussians."""
+    pixel_error: Annotated[float, Range(0, 10, "widths of the image")] = 1 / 128
+    """How far apart tissue differs in inverse depth as much as a known pixel errs."""
+    point_error: Annotated[float, Range(0, 10, "widths of the image")] = 1 / 8
+    """The same for a scene point: the larger, the smoother is what lies between them."""
+    neighbours: Annotated[int, Range(1, 1000)] = 40
+    """Pixels and points, the nearest, that tell a value; time grows with the third power."""
+    margin: Annotated[float, Range(0, 10)] = 0.2
+    """By how much of it inverse depth may leave the range of what is known; kriging overshoots where slopes meet a gap."""
 
 
 @dataclass(frozen=True)
 class MultiViewConfig(StageConfig):
     """Refinement of the depth prior by other images of the same tissue."""
 
+    neighbours: Annotated[int, Range(1, 100)] = 4
+    """Views that each view is compared with: the nearest in space."""
+    prior_error: Annotated[float, Range(0.001, 1)] = 0.05
+    """Relative error of the depth of a network, and of any other of which none is known."""
+    points_error: Annotated[float, Range(0.001, 1)] = 0.015
+    """Relative error of depth interpolated between scene points."""
+    refined_disparity_error: Annotated[float, Range(0.01, 10, "pixels")] = 0.15
+    """Error of a disparity that flow between the eyes has corrected; before, it is ``stereo.disparity_error``."""
+    flow_error: Annotated[float, Range(0.01, 10, "pixels")] = 0.35
+    """Error of a displacement by optical flow, that of the poses included."""
+    max_round_trip: Annotated[float, Range(0.01, 100, "pixels")] = 0.4
+    """By how much flow there and flow back may miss each other. They do where one image shows what the other hides."""
+    max_flow: Annotated[float, Range(1, 640, "pixels at width 640")] = 40.0
+    """Longest displacement between prediction and image that is believed."""
+    max_beside: Annotated[float, Range(0.01, 640, "pixels at width 640")] = 2.0
+    """Farthest beside the line along which depth moves a pixel; what is farther is no error of depth."""
+    max_step: Annotated[float, Range(0.01, 640, "pixels at width 640")] = 1.0
+    """Largest correction of a disparity by flow between the eyes: matching is off by less, or wholly wrong."""
+    reflection: Annotated[int, Range(1, 255, "grey levels")] = 60
+    """By how much all channels of a reflection of the light are above what is around it. Between views, reflections tell nothing."""
+    point_window: Annotated[float, Range(1, 640, "pixels at width 640")] = 11.0
+    """Side of the square that a scene point speaks for."""
+    doubt: Annotated[float, Range(0.1, 1000)] = 3.0
+    """How many errors of the prior a scene point may be off before it counts half: some are wrong matches."""
+    max_correction: Annotated[float, Range(0.001, 1)] = 0.25
+    """Largest relative correction of inverse depth; what is farther off is another surface."""
+    window: Annotated[float, Range(1, 640, "pixels at width 640")] = 10.0
+    """Standard deviation of the window over which contrast is made alike in all images, corrections are continued to pixels without,
+    and ripples of the corrected depth are smoothed."""
+    edge: Annotated[float, Range(0.001, 1)] = 0.02
+    """Relative step of the depth that is an edge, and stays, in the end."""
+    eyes_edge: Annotated[float, Range(0.001, 1)] = 0.03
+    """The same after the flow between the eyes; of what is known better, smaller steps are edges."""
+    matched_window: Annotated[float, Range(1, 640, "pixels at width 640")] = 24.0
+    """Standard deviation of the window over which the steps of semi-global matching are smoothed: they are wider than ripples."""
+    matched_edge: Annotated[float, Range(0.001, 1)] = 0.1
+    """Relative step of the depth that is an edge as matched."""
+
 
 @dataclass(frozen=True)
 class DynamicMaskConfig(StageConfig):
     """What moved between the views."""
+
+    width: Annotated[int, Range(32, 4096, "pixels")] = 320
+    """Views are compared at this width: finer, edges of the depth and poses a pixel off would look as if something moved."""
+    chroma: Annotated[float, Range(0.01, 10)] = 0.5
+    """Difference of log ratios of colours at which two views show something else on the same surface: tissue and a tool. Light and
+    exposure hardly change these ratios."""
+    min_width: Annotated[float, Range(0, 1, "widths of the image")] = 0.02
+    """Narrower pieces are glints and edges of the depth; wider ones are masked with as much of a margin."""
+    max_area: Annotated[float, Range(0, 1)] = 0.4
+    """Share of the image above which the depth or pose of the view is wrong, and nothing is masked."""
 
 
 @dataclass(frozen=True)
 class InitialModelConfig(StageConfig):
     """The Gaussians that training starts from."""
 
+    opacity: Annotated[float, Range(0.005, 0.995)] = 0.5
+    """Opacity of the Gaussians; 3DGS starts with 0.1, but of these most lie on the surface."""
+    max_slope: Annotated[float, Range(0, 100)] = 2.0
+    """Slope of a surface across the line of sight in holes of the depth prior; a point that it would have to rise more for floats before
+    the surface."""
+
 
 @dataclass(frozen=True)
 class PhotometryConfig(StageConfig):
     """The light at the camera and each view's exposure, before training."""
 
+    distance: Annotated[float, Range(0, 4)] = 0.9
+    """Likely exponent of the fall of brightness with distance: the inverse-square law at a gamma of 2.2."""
+    angle: Annotated[float, Range(0, 20)] = 3.0
+    """Likely exponent of the fall with the cosine of the angle from the axis: that of a usual lamp."""
+    response: Annotated[float, Range(0, 1)] = 0.9
+    """Likely share of a change of brightness that the camera's automatic exposure evens out."""
+    noise: Annotated[float, Range(0.001, 1)] = 0.05
+    """Standard deviation of the logarithm of a brightness: noise, and what the shape of the tissue does."""
+    max_points: Annotated[int, Range(100, 1_000_000)] = 4000
+    """Points whose brightness is compared between views; more cost time and tell little."""
+    darkest: Annotated[int, Range(0, 254, "grey levels")] = 12
+    """Brightness of the brightest channel above which a camera keeps to its curve."""
+    brightest: Annotated[int, Range(1, 255, "grey levels")] = 235
+    """Brightness of the brightest channel below which a camera keeps to its curve."""
+
 
 @dataclass(frozen=True)
 class ExtrapolationConfig(StageConfig):
     """Gaussians where no view has seen the tissue."""
+
+    opacity: Annotated[float, Range(0.005, 0.995)] = 0.8
+    """Opacity of the Gaussians: no other view may see through them, and no training makes them denser."""
+    size: Annotated[float, Range(0.1, 10)] = 0.6
+    """Standard deviation of a Gaussian in spacings: with smaller ones there are gaps; the nearer of larger ones hide the others where
+    tissue is steep."""
+    fine_reach: Annotated[float, Range(0, 1, "widths of the image")] = 0.15
+    """Up to where around the picture Gaussians are spaced by ``interpolation.cell``, beyond it half as much farther apart. Large
+    Gaussians close to it would reach in and cover what was seen."""
+    min_coverage: Annotated[float, Range(0, 1)] = 0.02
+    """Share of the pixels with depth from which on the surroundings of a view can be told."""

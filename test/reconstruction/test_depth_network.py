@@ -4,11 +4,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from training_views import unknown
 
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.reconstruction import ReconstructionConfig
 from endo_sim_ros.reconstruction.priors.network import align, load_network, network_depth
-from endo_sim_ros.reconstruction.priors.sources import with_depth_prior
+from endo_sim_ros.reconstruction.priors.sources import estimate_depth
+from endo_sim_ros.reconstruction.stage_configs import NetworkDepthConfig
 from endo_sim_ros.reconstruction.triangulation import triangulate
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
@@ -64,6 +66,10 @@ def test_alignment_survives_outliers_and_refuses_what_does_not_fit():
     assert align(-relative, inverse) is None  # depth instead of inverse depth
     assert align(relative[:5], inverse[:5]) is None
     assert align(np.ones(200), inverse) is None
+    noisy = inverse * rng.normal(1, 0.02, 200)
+    assert align(relative, noisy) is not None and align(relative, noisy, NetworkDepthConfig(max_error=0.005)) is None
+    flat = rng.uniform(9.8, 10.2, 200)  # one depth for all is hardly off: a network that tells no more is none
+    assert align(rng.random(200), flat) is None
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +92,7 @@ def test_a_networks_depth_becomes_metric(views):
 def test_views_that_do_not_fit_are_dropped_and_none_at_all_is_an_error(views, tiny):
     points = triangulate(views)
     with pytest.raises(SequenceError, match="no view's depth fits"):
-        with_depth_prior(views, points, ReconstructionConfig(depth="network", depth_model=str(tiny), device="cpu"))
+        estimate_depth(unknown(views), points, ReconstructionConfig(depth="network", depth_model=str(tiny), device="cpu"))
 
 
 @pytest.mark.skipif(not ONNX.is_file(), reason="no ONNX depth network at ../shared/data/weights")
@@ -95,3 +101,18 @@ def test_a_real_network_gives_depth_that_correlates(views):
     relative = load_network(str(ONNX), "cpu")(views[0].image)
     assert relative.shape == (256, 320) and np.isfinite(relative).all()
     assert abs(np.corrcoef(relative.ravel(), 1 / views[0].depth.ravel())[0, 1]) > 0.3
+
+
+def test_views_that_fit_get_the_depth_of_the_network(views, monkeypatch, tmp_path):
+    """The network is loaded once, whatever the views."""
+    loaded, depths = [], {view.image.tobytes(): view.depth for view in views}
+
+    def load(path, device):
+        loaded.append(path)
+        return lambda image: (1 / depths[image.tobytes()] - 3) / 11
+
+    monkeypatch.setattr("endo_sim_ros.reconstruction.priors.sources.load_network", load)
+    config = ReconstructionConfig(depth="network", depth_model=str(tmp_path), device="cpu")
+    found = estimate_depth(unknown(views), triangulate(views), config)
+    assert len(loaded) == 1
+    assert all(np.median(np.abs(view.depth_prior / frame.depth - 1)[view.depth_prior > 0]) < 0.01 for view, frame in zip(found, views))

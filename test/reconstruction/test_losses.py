@@ -2,10 +2,12 @@
 
 import pytest
 import torch
+from short_training import SHORT
 from torchmetrics.functional.image import structural_similarity_index_measure
+from trained import trainer_of
 
 from endo_sim_ros.core.kernels import plain_kernels
-from endo_sim_ros.reconstruction import losses
+from endo_sim_ros.reconstruction import losses, preset
 
 
 def reference_ssim(x, y):
@@ -111,3 +113,11 @@ def test_pearson_does_not_see_scale_and_shift():
     prior = depth.clone()
     prior[:10] = 0  # no measurement
     assert float(losses.pearson(spoilt, prior, None)) == pytest.approx(0, abs=1e-5)
+
+
+@pytest.mark.parametrize(("name", "opaque"), [("default", 0.01), ("paper", 0.0)])
+def test_transparency_is_weighed_apart_by_default_and_not_as_printed(views, monkeypatch, name, opaque):
+    weights = []
+    monkeypatch.setattr(losses, "depth_l1", lambda *arguments: weights.append(arguments[-1]) or torch.zeros(()))
+    trainer_of(views[:3], preset(name, **SHORT)).step()
+    assert weights == [opaque]

@@ -5,22 +5,24 @@ import dataclasses
 import cv2
 import numpy as np
 import pytest
+import torch
 from lit_wall import CAMERA, LAMP, wall
 
 from endo_sim_ros.core.cameras import look_at
-from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.light import Light
-from endo_sim_ros.reconstruction.photometry import PRIOR, Drift, fit_exposure, fit_light, unlit
+from endo_sim_ros.reconstruction.photometry import Drift, fit_exposure, fit_light, remove_light
+from endo_sim_ros.reconstruction.scene import TrainingView
+from endo_sim_ros.reconstruction.stage_configs import PhotometryConfig
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 
 
-def lit_views(light: Light, gains, poses) -> list[Frame]:
+def lit_views(light: Light, gains, poses) -> list[TrainingView]:
     """Pictures of the wall by cameras of fixed exposures."""
     frames = []
     for stamp, (gain, pose) in enumerate(zip(gains, poses), 1):
         model = dataclasses.replace(wall(), light=dataclasses.replace(light, level_r=gain, level_g=gain, level_b=gain, response=0.0))
         image, depth = DeformableRenderer(model, None, RenderingConfig(device="cpu")).render(CAMERA.at(pose))
-        frames.append(Frame(stamp, image, CAMERA.at(pose), depth=depth))
+        frames.append(TrainingView(stamp, image, CAMERA.at(pose), depth_prior=depth))
     return frames
 
 
@@ -40,7 +42,7 @@ def test_light_and_exposures_are_found_from_views_at_several_distances():
     again, _ = fit_light([frames[0], dataclasses.replace(frames[1], image=spoilt), *frames[2:]], points, 0.1, 0.1)
     assert (np.abs(again - theta) < [0.1, 0.5, 0.1, 0.1]).all(), again
     # The colours without light are the wall's, up to one factor.
-    colors = unlit(wall(), frames, theta, exposures, 0.1, 0.1).base_colors
+    colors = remove_light(wall(), frames, theta, exposures, 0.1, 0.1).base_colors
     ratio = (colors / wall().base_colors).median()
     assert (colors.mean(0) / wall().base_colors.mean(0) / ratio - 1).abs().max() < 0.1
 
@@ -58,7 +60,7 @@ def test_what_is_switched_off_stays_off():
 
 def test_without_two_views_of_a_point_the_prior_counts():
     theta, exposures = fit_light(lit_views(LAMP, [0.3], [np.eye(4)]), wall().means.numpy().astype(np.float64), 0.1, 0.1)
-    np.testing.assert_array_equal(theta, PRIOR)
+    np.testing.assert_array_equal(theta, [0.9, 3.0, 0.0, 0.0])
     assert not exposures.any()
 
 
@@ -88,3 +90,26 @@ def test_what_brightness_does_not_explain_of_the_exposures_is_taken_as_time_has_
     assert drift.at(None, 15) is None
     at_once = Drift([10, 10, 20], residuals)
     assert at_once.at(light, 10).level_r == pytest.approx(light.level_r + residuals[:2, 0].mean())
+
+
+def test_what_the_views_leave_open_is_taken_from_the_options():
+    (view,) = lit_views(LAMP, [0.3], [np.eye(4)])
+    points = wall().means.numpy().astype(np.float64)
+    theta, _ = fit_light([view], points, 0.1, 0.1, PhotometryConfig(distance=2.0, angle=1.0))
+    np.testing.assert_array_equal(theta, [2, 1, 0, 0])
+    one = np.zeros((1, 3)), np.zeros(1)
+    assert fit_exposure(*one, PhotometryConfig(response=0.3))[0] == pytest.approx(0.3)
+
+
+def test_hidden_and_masked_points_keep_their_colour():
+    (view,) = lit_views(LAMP, [0.0], [np.eye(4)])
+    mask = np.full(view.image.shape[:2], 255, np.uint8)
+    mask[:, :80] = 0
+    model = dataclasses.replace(wall(), sh=torch.full_like(wall().sh, 7.0))
+    behind = dataclasses.replace(model, means=model.means + torch.tensor([0.0, 0.0, 0.03]))
+    unlit = lambda model, view: remove_light(model, [view], np.zeros(4), np.zeros((1, 3)), 0.1, 0.05)
+    assert torch.equal(unlit(behind, view).sh, behind.sh)
+    uv = view.camera.project(model.means.numpy().astype(np.float64))[0]
+    changed = (unlit(model, dataclasses.replace(view, mask=mask)).sh != model.sh).flatten(1).any(1).numpy()
+    inside = view.camera.sees(model.means.numpy().astype(np.float64))
+    assert not changed[uv[:, 0] < 80].any() and changed[inside & (uv[:, 0] >= 80)].mean() > 0.95

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
 from short_training import bare, film, finite, options
@@ -62,3 +63,55 @@ def test_odd_sizes_train():
     frames = film(161, 97, 3)
     model = trainer_of(list(frames[::2]), options(image_width=75)).run()
     assert finite(model)
+
+
+@pytest.mark.parametrize("known", [np.s_[20:21], np.s_[:, 20:21]])
+def test_depth_in_one_line_is_continued_level_to_its_sides(known):
+    """Of how depth changes across the line nothing is known."""
+    (frame,) = film(40, 40, 1)
+    line = np.zeros_like(frame.depth)
+    line[known] = frame.depth[known]
+    model = trainer_of([dataclasses.replace(bare(frame), depth=line)], options(depth="topic")).run()
+    _, depth = frame.camera.project(model.means.numpy())
+    assert len(model) > 100 and 0.7 * line[known].min() < depth.min() and depth.max() < 1.4 * line.max()
+
+
+@pytest.mark.parametrize(
+    "positions, error, said",
+    [
+        (np.full((9, 3), np.nan), 0.01, "not finite"),
+        (np.ones((9, 3)), np.zeros(9), "above zero"),
+        (np.ones((9, 3)), np.full(9, np.nan), "above zero"),
+        (np.ones((9, 2)), 0.01, r"arrays \[N, 3\]"),
+    ],
+)
+def test_scene_points_that_are_none_are_refused(large, positions, error, said):
+    with pytest.raises(SequenceError, match=said):
+        trainer_of(list(large[:1]), options(iterations=1), (positions, np.ones((len(positions), positions.shape[1])), error))
+
+
+def test_pure_rotation_trains_with_depth_and_is_an_error_without(views):
+    turned = []
+    for frame, angle in ((views[0], 0.0), (views[0], 0.04)):
+        pose = frame.camera.pose.copy()
+        pose[:3, :3] = pose[:3, :3] @ cv2.Rodrigues(np.array([0.0, angle, 0.0]))[0]
+        H = frame.camera.K @ pose[:3, :3].T @ frame.camera.pose[:3, :3] @ np.linalg.inv(frame.camera.K)
+        warp = lambda image, H=H: cv2.warpPerspective(image, H, (160, 128))
+        images = {name: warp(getattr(frame, name)) for name in ("image", "mask", "depth")}
+        turned.append(dataclasses.replace(frame, right=None, camera=frame.camera.at(pose), **images))
+    assert finite(trainer_of(turned, options()).run())
+    with pytest.raises(SequenceError, match="scene points could be found in 2 views"):
+        trainer_of([bare(frame) for frame in turned], options())
+
+
+@pytest.mark.parametrize("reason, change", {
+    "overexposed": lambda frame: {"image": np.full_like(frame.image, 255)},
+    "black": lambda frame: {"image": np.zeros_like(frame.image)},
+    "masked": lambda frame: {"mask": np.zeros_like(frame.mask)},
+}.items())  # fmt: skip
+def test_a_view_that_shows_nothing_is_left_out(views, caplog, reason, change):
+    blind = dataclasses.replace(views[4], **change(views[4]))
+    trainer = trainer_of([views[0], blind, views[8]], options())
+    assert len(trainer.cameras) == 2 and f"left out: {reason}" in caplog.text
+    with pytest.raises(SequenceError, match=f"every (view|pixel of every view) is {reason}"):
+        trainer_of([blind], options())

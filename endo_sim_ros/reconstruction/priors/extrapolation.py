@@ -1,9 +1,10 @@
-"""Tissue goes on where no training view has seen it: large Gaussians in the holes of the depth prior and beyond the pictures.
+"""Tissue continued where no training view has seen it: large Gaussians in the holes of the depth prior and beyond the pictures.
 
 They keep other views from looking into the void. Physics, which knows the training cameras, takes no control nodes from them.
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
@@ -12,21 +13,22 @@ import torch
 from scipy.spatial import cKDTree
 
 from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.core.device import map_in_threads
-from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import features_at
-from endo_sim_ros.reconstruction.priors.interpolation import inverse_distance_weighted, kept_in_range, kriged, plane_through
+from endo_sim_ros.reconstruction.priors.interpolation import clip_to_range, fit_plane, inverse_distance_weighted, krige
+from endo_sim_ros.reconstruction.progress import StageProgress
+from endo_sim_ros.reconstruction.scene import TrainingView
+from endo_sim_ros.reconstruction.stage_configs import ExtrapolationConfig, InterpolationConfig
 from endo_sim_ros.reconstruction.triangulation import points_in_view
 
-# In widths of the image:
-_FINE, _COARSE = 1 / 80, 1 / 54  # spacing in holes and close around the picture, and farther out
-_RING, _CLOSE = 0.05, 3  # how much farther out at a time, and how often finely: large Gaussians would reach in and cover what was seen
-_SIZE = 0.6  # standard deviation in spacings: the nearer ones of larger Gaussians hide the others where tissue is steep
-_OPACITY = 0.8
-_POINTS = 9  # neighbours among which a scene point's depth has to be the usual one
-_LEAST_SEEN = 0.02  # share of the pixels with depth, from which on its surroundings can be told
-_BRIGHTEST = 2.0
+
+class ContinuedView(NamedTuple):
+    """A view with a margin around its picture."""
+
+    camera: Camera  # of the picture and its margin
+    depth: np.ndarray  # [H, W] m, everywhere
+    colors: np.ndarray  # [H, W, 3] without light
+    away: np.ndarray  # [H, W] pixels from the tissue in the picture, 0 in it
 
 
 class _Guess(NamedTuple):
@@ -38,120 +40,144 @@ class _Guess(NamedTuple):
     away: np.ndarray  # [N] from the tissue in the picture, 0 in it; widths of the picture
 
 
-def with_surroundings(
+def extrapolate(
     model: GaussianModel,
-    frames: list[Frame],
+    views: Sequence[TrainingView],
+    points: np.ndarray,
     light: np.ndarray,
     exposures: np.ndarray,
     reference: float,
-    points: np.ndarray,
     reach: float,
-    limit: int,
+    max_gaussians: int,
+    options: ExtrapolationConfig = ExtrapolationConfig(),
+    interpolation: InterpolationConfig = InterpolationConfig(),
+    progress: StageProgress = StageProgress(),
 ) -> GaussianModel:
     """The model and what may be around it: inverse depth is the likeliest one, colour the mean of what is seen, by its distance.
 
     Args:
         model: What was seen.
-        frames: Training views with their depth prior; views without one add nothing.
-        light, exposures, reference: The light [4], the logarithm of each view's exposure [V, 3] and the distance (m) at which
-            colours are the tissue's own.
+        views: Training views with their depth prior; views without one add nothing.
         points: Scene points [N, 3] (m, world) that other views may have given; they tell how the surface goes on.
+        light, exposures: The light [4] and the logarithm of each view's exposure [V, 3].
+        reference: Distance (m) at which colours are the tissue's own.
         reach: How far to go beyond the pictures, in their widths.
-        limit: Largest number of Gaussians in all.
+        max_gaussians: Largest number of Gaussians in all.
+        options: Size and opacity of the Gaussians.
+        interpolation: How depth and colour are continued, and on how fine a lattice.
+        progress: Reported to by views.
     """
     parts = [model.means.numpy().astype(np.float64)]
     points = np.concatenate([parts[0], points])
     colors, spacings = [], []
-    told = [(f, e) for f, e in zip(frames, exposures) if f.depth is not None and (f.depth > 0).mean() >= _LEAST_SEEN and f.tissue.any()]
-    around = map_in_threads(lambda view: _around(view[0], points, light, view[1], reference, reach), told)
-    rings = range(math.ceil(reach / _RING))
+    known = [view.depth_prior is not None and (view.depth_prior > 0).mean() >= options.min_coverage for view in views]
+    usable = [index for index, view in enumerate(views) if known[index] and view.tissue.any()]
+
+    def around(index: int) -> tuple[_Guess, _Guess]:
+        view = views[index]
+        pad = int(reach * view.camera.width)
+        continued = continue_view(view, points, light, exposures[index], reference, pad, interpolation)
+        positions = continued.camera.backproject(continued.depth)
+        return tuple(_on_lattice(view, continued, positions, times * interpolation.cell) for times in (1.0, 1.5))
+
+    guesses = progress.map(around, usable)
+    width = 4 * interpolation.cell
+    rings = range(math.ceil(reach / width))
     # Holes, then outwards around all views at a time, since what is close to one picture and far from another is told by the former.
     for ring in (-1, *rings):
-        least, most = ring * _RING, np.inf if ring == rings[-1] else (ring + 1) * _RING
-        for view in around:
-            guess = view[_FINE if ring < _CLOSE else _COARSE]
+        least, most = ring * width, np.inf if ring == rings[-1] else (ring + 1) * width
+        for fine, coarse in guesses:
+            progress.check()
+            guess = fine if least < options.fine_reach else coarse
             chosen = (guess.away > least) & (guess.away <= most)
             positions, spacing = guess.positions[chosen], guess.spacing[chosen]
-            new = _unknown(positions, frames, ring in rings)
+            new = _unknown(positions, views, ring in rings)
             if new.any():
                 new[new] = cKDTree(np.concatenate(parts)).query(positions[new])[0] > 0.7 * spacing[new]
             parts.append(positions[new])
             colors.append(guess.colors[chosen][new])
             spacings.append(spacing[new])
-    count, room = sum(map(len, spacings)), limit - len(model)
+    count, room = sum(map(len, spacings)), max_gaussians - len(model)
     if not count or room <= 0:
         return model
-    arrays = np.concatenate(parts[1:]), np.concatenate(colors), _SIZE * np.concatenate(spacings)
+    arrays = np.concatenate(parts[1:]), np.concatenate(colors), options.size * np.concatenate(spacings)
     if count > room:  # fewer and larger ones
         kept = np.linspace(0, count - 1, room).astype(int)
         arrays = arrays[0][kept], arrays[1][kept], arrays[2][kept] * (count / room) ** 0.5
-    added = GaussianModel.from_points(*(torch.from_numpy(a.astype(np.float32)) for a in arrays), _OPACITY, model.sh_degree)
+    added = GaussianModel.from_points(*(torch.from_numpy(a.astype(np.float32)) for a in arrays), options.opacity, model.sh_degree)
     return GaussianModel(**{name: torch.cat([value, added.tensors()[name]]) for name, value in model.tensors().items()})
 
 
-def _around(
-    frame: Frame, points: np.ndarray, light: np.ndarray, exposure: np.ndarray, reference: float, reach: float
-) -> dict[float, _Guess]:
-    """Where the view knows no depth, what may be there; by how fine the lattice is."""
-    width = frame.camera.width
-    pad = int(reach * width)
-    camera, depth, colors, away = _continued(frame, points, light, exposure, reference, pad)
-    positions, unknown, found = camera.backproject(depth), np.pad(frame.depth, pad) <= 0, {}
-    for share in (_FINE, _COARSE):
-        stride = max(round(share * width), 1)
-        lattice = np.zeros(away.shape, bool)
-        lattice[stride // 2 :: stride, stride // 2 :: stride] = True
-        lattice &= unknown
-        found[share] = _Guess(positions[lattice], colors[lattice], stride * depth[lattice] / camera.K[0, 0], away[lattice] / width)
-    return found
+def continue_view(
+    view: TrainingView,
+    points: np.ndarray,
+    light: np.ndarray,
+    exposure: np.ndarray,
+    reference: float,
+    pad: int,
+    interpolation: InterpolationConfig = InterpolationConfig(),
+) -> ContinuedView:
+    """The view with a margin of so many pixels, and depth and colour wherever it has none.
 
-
-def _continued(
-    frame: Frame, points: np.ndarray, light: np.ndarray, exposure: np.ndarray, reference: float, pad: int
-) -> tuple[Camera, np.ndarray, np.ndarray, np.ndarray]:
-    """The view with a margin: its camera, depth [H', W'] (m) everywhere, colours without light [H', W', 3], and how far away the
-    tissue in the picture is [H', W'] (pixels, 0 in it)."""
-    K = frame.camera.K.copy()
+    Args:
+        view: A training view with a depth prior.
+        points: Scene points [N, 3] (m, world).
+        light, exposure: The light [4] and the logarithm of the view's exposure [3].
+        reference: Distance (m) at which colours are the tissue's own.
+        pad: Width of the margin, pixels.
+        interpolation: How depth and colour are continued.
+    """
+    K = view.camera.K.copy()
     K[:2, 2] += pad
-    camera = Camera(K, frame.camera.width + 2 * pad, frame.camera.height + 2 * pad, frame.camera.pose)
-    depth, image = np.pad(frame.depth, pad), np.pad(frame.image, ((pad, pad), (pad, pad), (0, 0))) / np.float32(255)
+    camera = Camera(K, view.camera.width + 2 * pad, view.camera.height + 2 * pad, view.camera.pose)
+    depth, image = np.pad(view.depth_prior, pad), np.pad(view.image, ((pad, pad), (pad, pad), (0, 0))) / np.float32(255)
     known = depth > 0
     v, u = np.nonzero(known)
     inverse = 1 / depth[known].astype(np.float64)
-    a, b, c = plane_through(u, v, inverse)
-    flat = a * np.arange(camera.width) + b * np.arange(camera.height)[:, None] + c  # what departs from it fades
-    rest = np.zeros(depth.shape, np.float32)
-    rest[known] = inverse - flat[known]
+    a, b, c = fit_plane(u, v, inverse)
+    plane = a * np.arange(camera.width) + b * np.arange(camera.height)[:, None] + c  # what departs from it fades
+    residual = np.zeros(depth.shape, np.float32)
+    residual[known] = inverse - plane[known]
     uv, z = points_in_view(camera, points)
     columns, rows = np.floor(uv).astype(int).T
     beyond = ~known[rows, columns]
-    columns, rows, there = columns[beyond], rows[beyond], 1 / z[beyond]
-    over = there - flat[rows, columns]
-    if len(over) >= _POINTS:  # one wrong point would stand like a pillar before the tissue
-        over = np.median(over[cKDTree(uv[beyond]).query(uv[beyond], k=_POINTS)[1]], 1)
-    rest = kriged(rest, known, uv[beyond], over, frame.camera.width)
-    depth = 1 / kept_in_range(flat + rest, np.concatenate([inverse, there]))
+    uv, columns, rows, point_inverse = uv[beyond], columns[beyond], rows[beyond], 1 / z[beyond]
+    point_residual = point_inverse - plane[rows, columns]
+    if len(point_residual) > 8:  # the median of a point and those around: one wrong point would stand like a pillar before the tissue
+        point_residual = np.median(point_residual[cKDTree(uv).query(uv, k=9)[1]], 1)
+    residual = krige(residual, known, uv, point_residual, view.camera.width, interpolation)
+    depth = 1 / clip_to_range(plane + residual, np.concatenate([inverse, point_inverse]), interpolation)
     shading = features_at(camera.backproject(depth).reshape(-1, 3), camera, reference) * light
     near, lit = np.exp(shading[:, 0]).reshape(depth.shape), np.exp(shading[:, 1:].sum(1)[:, None] + exposure).reshape(image.shape)
-    clipped = lambda colors: np.clip(colors, 0, _BRIGHTEST).astype(np.float32)
-    tissue = np.pad(frame.tissue > 0, pad)
+    clipped = lambda colors: np.clip(colors, 0, 2).astype(np.float32)  # in full light; a guess must not glare
+    tissue = np.pad(view.tissue > 0, pad)
     away = cv2.distanceTransform(np.uint8(~tissue), cv2.DIST_C, cv2.DIST_MASK_3)
     # The picture goes on as bright as it is at its edges, however near or far the guess is: wrong, it would glare in other views.
-    colors = clipped(inverse_distance_weighted(clipped(image / lit), tissue, frame.camera.width) / near[..., None])
-    return camera, depth, colors, away
+    continued = inverse_distance_weighted(clipped(image / lit), tissue, view.camera.width, interpolation)
+    return ContinuedView(camera, depth, clipped(continued / near[..., None]), away)
 
 
-def _unknown(points: np.ndarray, frames: list[Frame], beyond: bool) -> np.ndarray:
+def _on_lattice(view: TrainingView, continued: ContinuedView, positions: np.ndarray, spacing: float) -> _Guess:
+    """Where the view knows no depth, what may be there, every so many widths of the picture; positions [H, W, 3] are those of pixels."""
+    camera, depth, colors, away = continued
+    width = view.camera.width
+    stride = max(round(spacing * width), 1)
+    lattice = np.zeros(away.shape, bool)
+    lattice[stride // 2 :: stride, stride // 2 :: stride] = True
+    lattice &= np.pad(view.depth_prior, (camera.width - width) // 2) <= 0
+    return _Guess(positions[lattice], colors[lattice], stride * depth[lattice] / camera.K[0, 0], away[lattice] / width)
+
+
+def _unknown(points: np.ndarray, views: Sequence[TrainingView], beyond: bool) -> np.ndarray:
     """Which points [N] lie where no view knows the depth, or beyond what any view sees."""
     unknown = np.ones(len(points), bool)
-    for frame in frames:
-        if frame.depth is None:
+    for view in views:
+        if view.depth_prior is None:
             continue
-        uv, z = frame.camera.project(points)
-        inside = np.nonzero((z > 0) & (uv >= 0).all(1) & (uv < [frame.camera.width, frame.camera.height]).all(1))[0]
-        u, v = np.floor(uv[inside]).astype(int).T
-        known = frame.depth[v, u] > 0
+        inside = np.nonzero(view.camera.sees(points))[0]
+        u, v = np.floor(view.camera.project(points[inside])[0]).astype(int).T
+        known = view.depth_prior[v, u] > 0
         if beyond:
-            known |= True if frame.mask is None else frame.mask[v, u] > 0
+            known |= view.tissue[v, u] > 0
         unknown[inside[known]] = False
     return unknown

@@ -13,16 +13,12 @@ import numpy as np
 import torch
 
 from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.reconstruction.stage_configs import NetworkDepthConfig
 
 log = logging.getLogger(__name__)
 
-_SIDE = 518  # pixels of the shorter side that Depth-Anything-V2 was trained at
-_PATCH = 14  # its sizes are multiples of this
-_MEAN, _STD = np.float32([0.485, 0.456, 0.406]), np.float32([0.229, 0.224, 0.225])  # of ImageNet
-_LEAST_POINTS = 12  # to fit a scale and a shift to
-_FARTHEST_OFF = 0.1  # median relative error of inverse depth from which on a fit has failed
-_LEAST_GAIN = 0.7  # of the error that one depth for all would leave, the most that may be left
-_SIZES = ("Large", "Base", "Small")  # in the order of preference
+# Of Depth-Anything-V2: the shorter side that it was trained at, pixels, and what sides are multiples of.
+_SIDE, _PATCH = 518, 14
 
 Network = Callable[[np.ndarray], np.ndarray]
 
@@ -55,7 +51,7 @@ def load_network(path: str, device: str) -> Network:
 
 def cached_checkpoint() -> Path | None:
     """The largest Depth-Anything-V2 checkpoint in Hugging Face's cache, if there is any."""
-    for size in _SIZES:
+    for size in ("Large", "Base", "Small"):
         for found in sorted(_cache().glob(f"models--depth-anything--Depth-Anything-V2-{size}-hf/snapshots/*/config.json")):
             return found.parent
     return None
@@ -96,23 +92,30 @@ def _onnx(file: Path) -> Network:
 
 
 def _normalised(image: np.ndarray, width: int, height: int) -> np.ndarray:
+    """The image [1, 3, height, width] as networks take it whose backbone was trained on ImageNet: by its mean and deviation."""
+    mean, deviation = np.float32([0.485, 0.456, 0.406]), np.float32([0.229, 0.224, 0.225])
     small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
-    return np.ascontiguousarray(((small - _MEAN) / _STD).transpose(2, 0, 1)[None])
+    return np.ascontiguousarray(((small - mean) / deviation).transpose(2, 0, 1)[None])
 
 
 def _enlarged(values: np.ndarray, image: np.ndarray) -> np.ndarray:
     return cv2.resize(values.astype(np.float32), image.shape[1::-1], interpolation=cv2.INTER_LINEAR)
 
 
-def network_depth(frame: Frame, network: Network, known: np.ndarray) -> np.ndarray | None:
+def network_depth(
+    frame: Frame, network: Network, known: np.ndarray, options: NetworkDepthConfig = NetworkDepthConfig()
+) -> np.ndarray | None:
     """Metric depth [H, W] (m) of a view from the network, or None where it does not fit what is known.
 
     Args:
+        frame: The view.
+        network: What tells relative inverse depth.
         known: Pixels u, v and depths z (m) of points seen in this view [N, 3], some of them wrong.
+        options: When a fit has failed.
     """
     relative = network(frame.image)
     u, v = np.floor(known[:, :2]).astype(int).T
-    fit = align(relative[v, u], 1 / known[:, 2])
+    fit = align(relative[v, u], 1 / known[:, 2], options)
     if fit is None:
         log.warning("view %d: the depth network does not fit the %d known depths; left out", frame.stamp_ns, len(known))
         return None
@@ -123,13 +126,15 @@ def network_depth(frame: Frame, network: Network, known: np.ndarray) -> np.ndarr
     return (1 / np.clip(inverse, 0.5 * farthest, 2 * nearest)).astype(np.float32)
 
 
-def align(relative: np.ndarray, inverse: np.ndarray) -> tuple[float, float, float] | None:
+def align(
+    relative: np.ndarray, inverse: np.ndarray, options: NetworkDepthConfig = NetworkDepthConfig()
+) -> tuple[float, float, float] | None:
     """Scale and shift that take relative [N] to metric inverse depths [N] (1/m), and the median relative error left.
 
     A consensus of random pairs, then reweighted least squares (Cauchy). None if too few points, no positive scale or too large an error
     is left.
     """
-    if len(relative) < _LEAST_POINTS or np.ptp(relative) < 1e-9:
+    if len(relative) < 12 or np.ptp(relative) < 1e-9:  # two for the numbers, and enough to outvote wrong ones
         return None
     rng = np.random.default_rng(0)
     first, second = rng.integers(0, len(relative), (2, 500))
@@ -137,7 +142,7 @@ def align(relative: np.ndarray, inverse: np.ndarray) -> tuple[float, float, floa
     usable = np.abs(rise) > 1e-3 * np.ptp(relative)
     scales = (inverse[first] - inverse[second])[usable] / rise[usable]
     shifts = inverse[first][usable] - scales * relative[first][usable]
-    errors = np.median(np.abs(scales[:, None] * relative + shifts[:, None] - inverse), axis=1) if len(scales) else np.empty(0)
+    errors = np.median(np.abs(scales[:, None] * relative + shifts[:, None] - inverse), axis=1)
     if not len(errors):
         return None
     scale, shift = scales[errors.argmin()], shifts[errors.argmin()]
@@ -151,5 +156,5 @@ def align(relative: np.ndarray, inverse: np.ndarray) -> tuple[float, float, floa
         shift = mean_y - scale * mean_x
     left = np.abs(scale * relative + shift - inverse)
     error = float(np.median(left / inverse))
-    explains = np.median(left) < _LEAST_GAIN * np.median(np.abs(inverse - np.median(inverse)))
-    return (float(scale), float(shift), error) if scale > 0 and explains and error < _FARTHEST_OFF else None
+    explains = np.median(left) < options.max_unexplained * np.median(np.abs(inverse - np.median(inverse)))
+    return (float(scale), float(shift), error) if scale > 0 and explains and error < options.max_error else None

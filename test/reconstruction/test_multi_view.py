@@ -1,19 +1,25 @@
-"""Depth on which views agree."""
+"""Depth refined by the right image, other views and scene points."""
 
 import dataclasses
 
 import cv2
 import numpy as np
 import pytest
-from short_training import NO_POINTS, bare, film, options
-from trained import trainer_of
+from short_training import NO_POINTS, bare, options
+from training_views import unknown, with_prior
 
 from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.core.frames import Frame, SequenceError
-from endo_sim_ros.reconstruction import shrink
-from endo_sim_ros.reconstruction.priors.multi_view import _BY_EYES, _IN_THE_END, _MATCHED, _corrected, _smooth, agreed
-from endo_sim_ros.reconstruction.priors.sources import with_depth_prior
-from endo_sim_ros.reconstruction.triangulation import ScenePoints
+from endo_sim_ros.core.frames import Frame
+from endo_sim_ros.reconstruction import prepare
+from endo_sim_ros.reconstruction.priors.inverse_depth import correct, smooth
+from endo_sim_ros.reconstruction.priors.multi_view import refine_depth
+from endo_sim_ros.reconstruction.priors.sources import estimate_depth
+from endo_sim_ros.reconstruction.scene import ScenePoints, shrink
+
+
+def matched(frames):
+    """Views whose prior is from stereo matching."""
+    return estimate_depth(unknown(frames), NO_POINTS, options(depth="stereo"))
 
 
 def plain_pair(frame):
@@ -37,32 +43,28 @@ def with_eyes_that_converge(frame):
     return dataclasses.replace(frame, right=moved, right_K=K)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("pair", [plain_pair, dark_right, behind_a_tool, with_eyes_that_converge])
 def test_flow_between_the_eyes_corrects_what_matching_left(large, pair):
-    (matched,) = with_depth_prior([pair(large[0])], NO_POINTS, options(depth="stereo"))
-    (corrected,), contradiction = agreed([matched], NO_POINTS, "stereo")
-    error = lambda view: np.abs(view.depth - large[0].depth)[(matched.depth > 0) & (view.depth > 0)]
-    assert np.median(error(corrected)) < 0.6 * np.median(error(matched))
-    assert np.sqrt((error(corrected) ** 2).mean()) < 0.8 * np.sqrt((error(matched) ** 2).mean())
-    assert np.isnan(contradiction)  # one view contradicts none
+    (prior,) = matched([pair(large[0])])
+    (corrected,) = refine_depth([prior], NO_POINTS, "stereo")
+    error = lambda view: np.abs(view.depth_prior - large[0].depth)[(prior.depth_prior > 0) & (view.depth_prior > 0)]
+    assert np.median(error(corrected)) < 0.6 * np.median(error(prior))
+    assert np.sqrt((error(corrected) ** 2).mean()) < 0.8 * np.sqrt((error(prior) ** 2).mean())
 
 
 def test_flow_is_found_in_finer_pixels_than_are_trained_on(large):
-    wide = trainer_of([dataclasses.replace(large[0], depth=None)], options(image_width=320))._frames[0]
-    (matched,) = with_depth_prior([dataclasses.replace(large[0], depth=None)], NO_POINTS, options())
-    (narrow,), _ = agreed([shrink(matched, 320)], NO_POINTS, "stereo")
+    (wide,) = prepare([dataclasses.replace(large[0], depth=None)], options(image_width=320)).views
+    (narrow,) = refine_depth([shrink(view, 320) for view in matched(large[:1])], NO_POINTS, "stereo")
     exact = shrink(large[0], 320).depth
-    error = lambda depth: np.sqrt((((depth - exact)[(wide.depth_prior > 0) & (narrow.depth > 0)]) ** 2).mean())
-    assert error(wide.depth_prior) < 0.95 * error(narrow.depth)
+    error = lambda view: np.sqrt((((view.depth_prior - exact)[(wide.depth_prior > 0) & (narrow.depth_prior > 0)]) ** 2).mean())
+    assert error(wide) < 0.95 * error(narrow)
 
 
-@pytest.mark.slow
 def test_reflections_of_the_light_do_not_spoil_the_depth_that_views_agree_on(large):
     """A reflection is seen where the tissue is not: through another view's depth it lies beside where that view has it."""
-    frames = with_depth_prior(list(large[:2]), NO_POINTS, options(depth="stereo"))
+    frames = matched(large[:2])
     centres = np.array([(x, y) for x in range(160, 500, 80) for y in range(120, 420, 80)])
-    lit, around = list(frames), np.zeros(frames[0].depth.shape, np.uint8)
+    lit, around = list(frames), np.zeros((512, 640), np.uint8)
     for i, (frame, aside) in enumerate(zip(frames, ((0, 0), (10, 6)))):
         image = frame.image.copy()
         uv, _ = frame.camera.project(frames[0].camera.backproject(large[0].depth)[centres[:, 1], centres[:, 0]])
@@ -71,26 +73,30 @@ def test_reflections_of_the_light_do_not_spoil_the_depth_that_views_agree_on(lar
         lit[i] = dataclasses.replace(frame, image=image)
     for x, y in centres:
         cv2.circle(around, (int(x), int(y)), 25, 1, -1)
-    where = (around > 0) & (frames[0].depth > 0)
-    error = lambda views: np.sqrt(((agreed(views, NO_POINTS, "network")[0][0].depth - large[0].depth)[where] ** 2).mean())
+    where = (around > 0) & (frames[0].depth_prior > 0)
+    error = lambda views: np.sqrt(((refine_depth(views, NO_POINTS, "network")[0].depth_prior - large[0].depth)[where] ** 2).mean())
     assert error(lit) < 1.6 * error(frames)
 
 
 def test_pale_tissue_is_no_reflection(large):
     pale = [dataclasses.replace(frame, image=(180 + frame.image // 4).astype(np.uint8)) for frame in large[:2]]
     off = [dataclasses.replace(frame, depth=frame.depth * np.float32(1.03), right=None, baseline=None) for frame in pale]
-    corrected, _ = agreed(off, NO_POINTS, "network")
-    assert all(np.median(np.abs(a.depth / b.depth - 1)) < 0.012 for a, b in zip(corrected, large))
+    corrected = refine_depth(with_prior(off), NO_POINTS, "network")
+    assert all(np.median(np.abs(a.depth_prior / b.depth - 1)) < 0.012 for a, b in zip(corrected, large))
 
 
-@pytest.mark.slow
 def test_views_correct_each_others_depth(large):
-    frames = with_depth_prior(list(large), NO_POINTS, options(depth="stereo"))
-    corrected, contradiction = agreed(frames, NO_POINTS, "stereo")
-    error = lambda views: np.median(np.concatenate([np.abs(v.depth - e.depth)[v.depth > 0] for v, e in zip(views, large)]))
-    assert error(corrected) < 0.5 * error(frames)
-    assert contradiction < 0.2
-    assert all(((a.depth > 0) == (b.depth > 0)).mean() > 0.999 for a, b in zip(corrected, frames))
+    views = matched(large)
+    corrected = refine_depth(views, NO_POINTS, "stereo")
+    errors = lambda views: [np.abs(view.depth_prior - exact.depth)[view.depth_prior > 0] for view, exact in zip(views, large)]
+    assert np.median(np.concatenate(errors(corrected))) < 0.5 * np.median(np.concatenate(errors(views)))
+    assert all(((a.depth_prior > 0) == (b.depth_prior > 0)).mean() > 0.999 for a, b in zip(corrected, views))
+
+
+def test_depth_between_points_is_believed_more_than_a_guess(large):
+    off = with_prior(dataclasses.replace(frame, depth=frame.depth * np.float32(1.03)) for frame in large)
+    moved = lambda source: np.abs(refine_depth(off, NO_POINTS, source)[0].depth_prior - off[0].depth_prior).mean()
+    assert moved("points") < moved("network")
 
 
 def test_what_the_other_view_hides_stays_where_it_was():
@@ -104,8 +110,8 @@ def test_what_the_other_view_hides_stays_where_it_was():
         pose = np.eye(4)
         pose[0, 3] = 0.005 * i
         views.append(Frame(image=image, camera=Camera(K, 640, 512, pose), stamp_ns=i, depth=depth))
-    corrected = agreed(views, NO_POINTS, "network")[0][0]
-    hidden = (corrected.depth - views[0].depth)[150:350, 225:240]
+    corrected, _ = refine_depth(with_prior(views), NO_POINTS, "network")
+    hidden = (corrected.depth_prior - views[0].depth)[150:350, 225:240]
     assert np.sqrt((hidden**2).mean()) < 0.0025  # twice as much where flow is believed that does not lead back
 
 
@@ -117,77 +123,49 @@ def test_images_too_small_for_optical_flow_keep_their_depth(small, kept):
         image, depth = cut(frame.image), cut(frame.depth)
         camera = dataclasses.replace(frame.camera, height=image.shape[0], width=image.shape[1])
         views.append(dataclasses.replace(bare(frame), image=image, depth=depth, mask=None, camera=camera))
-    corrected, contradiction = agreed(views, NO_POINTS, "network")
-    assert np.isnan(contradiction)
-    assert all(np.abs(a.depth / b.depth - 1).max() < 0.02 for a, b in zip(corrected, views))
-
-
-@pytest.mark.parametrize("known", [np.s_[20:21], np.s_[:, 20:21]])
-def test_depth_in_one_line_is_continued_level_to_its_sides(known):
-    """Of how depth changes across the line nothing is known."""
-    (frame,) = film(40, 40, 1)
-    line = np.zeros_like(frame.depth)
-    line[known] = frame.depth[known]
-    model = trainer_of([dataclasses.replace(bare(frame), depth=line)], options(depth="topic")).run()
-    _, depth = frame.camera.project(model.means.numpy())
-    assert len(model) > 100 and 0.7 * line[known].min() < depth.min() and depth.max() < 1.4 * line.max()
+    corrected = refine_depth(with_prior(views), NO_POINTS, "network")
+    assert all(np.abs(a.depth_prior / b.depth - 1).max() < 0.02 for a, b in zip(corrected, views))
 
 
 def test_no_pixel_is_corrected_to_another_surface():
     inverse, weight = np.full((64, 80), 10, np.float32), np.zeros((64, 80), np.float32)
     weight[20:40, 20:40] = 1e6
-    corrected = _corrected(inverse, 9 * weight, weight, 0.1, 80, (10.0, 0.05))
+    corrected = correct(inverse, 9 * weight, weight, np.full_like(inverse, 0.1), reach=12, limit=0.25)
     assert 12 < corrected.max() < 12.6 and corrected.min() > 9.9
 
 
 def test_ripples_of_wide_images_are_smoothed_and_edges_are_not():
     width, noise = 1920, np.random.default_rng(0).normal(0, 0.1, (160, 1920))
     step = np.where(np.arange(width) < 960, 8.0, 12.0) + np.zeros_like(noise)
-    error = _smooth((step + noise).astype(np.float32), width, (10.0, 0.05)) - step
+    error = smooth((step + noise).astype(np.float32), 10, 0.05) - step
     assert error.std() < 0.1 * noise.std()
     assert np.abs(error[:, 950:970]).max() < 0.5 * noise.std()
 
 
-def test_of_depth_that_is_known_better_smaller_steps_are_kept():
+def test_larger_relative_steps_than_an_edge_are_kept():
     step = np.where(np.arange(640) < 320, 10.0, 10.4) + np.zeros((64, 640))
-    off = [np.abs(_smooth(step.astype(np.float32), 640, ripples) - step)[:, 310:330].max() for ripples in (_MATCHED, _BY_EYES, _IN_THE_END)]
+    off = [np.abs(smooth(step.astype(np.float32), 10, edge) - step)[:, 310:330].max() for edge in (0.1, 0.03, 0.02)]
     assert off[0] > 0.15 and off[0] > off[1] > off[2] and off[2] < 0.07
 
 
 def test_scene_points_correct_the_depth_around_them(large):
     frame = large[0]
-    off = dataclasses.replace(frame, depth=frame.depth * np.float32(1.04), right=None, baseline=None)
+    off = with_prior([dataclasses.replace(frame, depth=frame.depth * np.float32(1.04), right=None, baseline=None)])
     v, u = np.mgrid[8:512:16, 8:640:16].reshape(2, -1)
     positions = frame.camera.backproject(frame.depth)[v, u]
-    (corrected,), contradiction = agreed([off], ScenePoints(positions, np.zeros_like(positions), 0.002), "network")
-    assert np.median(np.abs(corrected.depth / frame.depth - 1)) < 0.01
-    assert np.isnan(contradiction)  # one view contradicts none
+    (corrected,) = refine_depth(off, ScenePoints(positions, np.zeros_like(positions), 0.002), "network")
+    assert np.median(np.abs(corrected.depth_prior / frame.depth - 1)) < 0.01
 
 
-@pytest.mark.slow
 def test_wrong_scene_points_among_good_ones_hardly_move_what_matching_knows(large):
-    (matched,) = with_depth_prior([dataclasses.replace(large[0], depth=None)], NO_POINTS, options(depth="stereo"))
+    (prior,) = matched(large[:1])
     v, u = np.mgrid[8:512:16, 8:640:16].reshape(2, -1)
     wrong = np.arange(len(u)) % 10 == 0  # 15 % too far, and as sure of themselves as all
     positions = large[0].camera.backproject(large[0].depth * np.float32(1.15))[v, u]
     good = large[0].camera.backproject(large[0].depth)[v, u]
 
     def error(positions):
-        (corrected,), _ = agreed([matched], ScenePoints(positions, np.zeros_like(positions), 0.003), "stereo")
-        return np.sqrt(((corrected.depth - large[0].depth)[matched.depth > 0] ** 2).mean())
+        (corrected,) = refine_depth([prior], ScenePoints(positions, np.zeros_like(positions), 0.003), "stereo")
+        return np.sqrt(((corrected.depth_prior - large[0].depth)[prior.depth_prior > 0] ** 2).mean())
 
     assert error(good[~wrong]) < error(np.where(wrong[:, None], positions, good)) < 2.5 * error(good[~wrong])
-
-
-@pytest.mark.parametrize(
-    "positions, error, said",
-    [
-        (np.full((9, 3), np.nan), 0.01, "not finite"),
-        (np.ones((9, 3)), np.zeros(9), "above zero"),
-        (np.ones((9, 3)), np.full(9, np.nan), "above zero"),
-        (np.ones((9, 2)), 0.01, r"arrays \[N, 3\]"),
-    ],
-)
-def test_scene_points_that_are_none_are_refused(large, positions, error, said):
-    with pytest.raises(SequenceError, match=said):
-        trainer_of(list(large[:1]), options(iterations=1), (positions, np.ones((len(positions), positions.shape[1])), error))

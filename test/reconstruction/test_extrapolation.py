@@ -3,17 +3,21 @@
 import dataclasses
 
 import numpy as np
-import pytest
 import torch
-from short_training import SHORT, bare, options
-from trained import trainer_of
+from short_training import bare, options
+from training_views import with_prior
 
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import features_at
-from endo_sim_ros.reconstruction import losses, preset
-from endo_sim_ros.reconstruction.priors.extrapolation import _continued, with_surroundings
-from endo_sim_ros.reconstruction.priors.interpolation import inverse_distance_weighted, kriged
+from endo_sim_ros.reconstruction import prepare
+from endo_sim_ros.reconstruction.priors.extrapolation import continue_view, extrapolate
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
+
+
+def initial(frame, points=None, **changes):
+    """What a training of one view starts from, without light, and with grey scene points [N, 3]."""
+    points = None if points is None else (points, np.full((len(points), 3), 0.5))
+    return prepare([frame], options(max_gaussians=8000, light=False, exposure=False, **changes), points).model
 
 
 def test_what_goes_on_beyond_a_picture_does_not_reach_into_it(views):
@@ -26,10 +30,8 @@ def test_what_goes_on_beyond_a_picture_does_not_reach_into_it(views):
     depth[20] *= 0.6
     local = np.column_stack([(pixels - K[:2, 2]) / K[[0, 1], [0, 1]] * depth[:, None], depth])
     points = frame.camera.position + local @ frame.camera.pose[:3, :3].T
-    trainer = trainer_of([known], options(max_gaussians=8000, light=False, exposure=False), (points, np.full((40, 3), 0.5)))
-    rendered = DeformableRenderer(trainer.model, None, RenderingConfig(device="cpu")).render(frame.camera)[1]
-    plain = trainer_of([known], options(max_gaussians=8000, light=False, exposure=False, extrapolation=0.0)).model
-    alone = DeformableRenderer(plain, None, RenderingConfig(device="cpu")).render(frame.camera)[1]
+    depth_of = lambda model: DeformableRenderer(model, None, RenderingConfig(device="cpu")).render(frame.camera)[1]
+    rendered, alone = depth_of(initial(known, points)), depth_of(initial(known, extrapolation=0.0))
     border = np.ones(exact.shape, bool)
     border[8:-8, 8:-8] = False
     border &= (exact > 0) & (rendered > 0) & (alone > 0) & (True if frame.mask is None else frame.mask > 0)
@@ -41,7 +43,8 @@ def test_gaussians_around_a_picture_are_small_close_to_it_and_none_is_a_lone_sce
     K, aside = frame.camera.K, np.array([[230.0, 20.0], [250.0, 60.0], [270.0, 100.0]])  # far beyond the right edge
     local = np.column_stack([(aside - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones(3)]) * np.median(frame.depth)
     points = frame.camera.position + local @ frame.camera.pose[:3, :3].T
-    model = trainer_of([frame], options(max_gaussians=20_000, light=False, exposure=False), (points, np.full((3, 3), 0.5))).model
+    config = options(max_gaussians=20_000, light=False, exposure=False)
+    model = prepare([frame], config, (points, np.full((3, 3), 0.5))).model
     uv, _ = frame.camera.project(model.means.numpy().astype(np.float64))
     out = np.maximum(-uv, uv - [frame.camera.width, frame.camera.height]).max(1)
     sizes = model.scales.numpy().max(1)
@@ -50,15 +53,15 @@ def test_gaussians_around_a_picture_are_small_close_to_it_and_none_is_a_lone_sce
 
 
 def test_noise_of_scene_points_does_not_make_the_tissue_beyond_rough(views):
-    frame = dataclasses.replace(bare(views[4]), depth=views[4].depth)
+    (frame,) = with_prior(views[4:5])
     random, K = np.random.default_rng(0), frame.camera.K
     pixels = random.uniform([170, 0], [200, 128], (400, 2))
-    flat = float(np.median(frame.depth[:, -20:]))
+    flat = float(np.median(frame.depth_prior[:, -20:]))
     depth = flat * random.normal(1, 0.03, 400)
     local = np.column_stack([(pixels - K[:2, 2]) / K[[0, 1], [0, 1]] * depth[:, None], depth])
     points = frame.camera.position + local @ frame.camera.pose[:3, :3].T
-    _, continued, *_ = _continued(frame, points, np.zeros(4), np.zeros(3), flat, 48)
-    around = continued[48 + 10 : 48 + 118, 48 + 175 : 48 + 195]
+    continued = continue_view(frame, points, np.zeros(4), np.zeros(3), flat, 48)
+    around = continued.depth[48 + 10 : 48 + 118, 48 + 175 : 48 + 195]
     assert np.std(around / flat) < 0.012  # points alone: 0.017
 
 
@@ -69,54 +72,13 @@ def test_a_picture_goes_on_as_bright_as_it_is_however_far_the_tissue_beyond_is_g
     shading = lambda camera, depth: (features_at(camera.backproject(depth).reshape(-1, 3), camera, 0.1) * light).reshape(*depth.shape, 4)
     picture = lambda shaded: 100 * np.exp(shaded.sum(-1) - 0.9 * np.log(1.3))  # of tissue that is of one colour
     image = np.repeat(picture(shading(camera, depth))[..., None], 3, 2).round().astype(np.uint8)
-    frame = dataclasses.replace(bare(views[4]), mask=None, image=image, depth=depth)
-    wide, continued, colors, _ = _continued(frame, np.empty((0, 3)), light, exposure, 0.1, 48)
+    (view,) = with_prior([dataclasses.replace(bare(views[4]), mask=None, image=image, depth=depth)])
+    wide, continued, colors, _ = continue_view(view, np.empty((0, 3)), light, exposure, 0.1, 48)
     assert continued[48:-48, -10:].max() < 0.95 * depth.min()
     shaded = shading(wide, continued)
     np.testing.assert_allclose(colors[48:-48, 48:-48, 0], colors[64, 64, 0], rtol=0.03)  # in the picture that of the tissue
     without_distance = colors[..., 0] * np.exp(shaded[..., 0])
     np.testing.assert_allclose(without_distance[48:-48, -10:], without_distance[48:-48, -60:-50], rtol=0.05)
-
-
-@pytest.mark.parametrize(("name", "opaque"), [("default", 0.01), ("paper", 0.0)])
-def test_transparency_is_weighed_apart_by_default_and_not_as_printed(views, monkeypatch, name, opaque):
-    weights = []
-    monkeypatch.setattr(losses, "depth_l1", lambda *arguments: weights.append(arguments[-1]) or torch.zeros(()))
-    trainer_of(views[:3], preset(name, **SHORT)).step()
-    assert weights == [opaque]
-
-
-def test_depth_beyond_is_that_of_kriging():
-    random, width = np.random.default_rng(0), 80  # one pixel a cell
-    known = np.zeros((12, width), bool)
-    known[2:6, 3:8] = True
-    values, uv, there = random.normal(0, 1, known.shape), random.uniform(0, [width, 12], (15, 2)), random.normal(0, 1, 15)
-    told = kriged(values, known, uv, there, width)
-    assert (told[known] == values[known]).all()
-    rows, columns = np.nonzero(known)
-    sources = np.concatenate([np.column_stack([columns, rows]) + 0.5, uv])
-    rows, columns = np.nonzero(~known)
-    targets = np.column_stack([columns, rows]) + 0.5
-    # Half the squared difference of what lies a distance apart is that distance, to which the variances of the sources come.
-    between = lambda a, b: -np.linalg.norm(a[:, None] - b, axis=2)
-    system = np.zeros((36, 36))
-    system[:35, :35] = between(sources, sources) + np.diag(np.repeat([width / 128, width / 8], [20, 15]))
-    system[35, :35] = system[:35, 35] = 1
-    weights = np.linalg.solve(system, np.column_stack([between(targets, sources), np.ones(len(targets))]).T)[:35]
-    expected = weights.T @ np.concatenate([values[known], there])
-    np.testing.assert_allclose(told[~known], expected, atol=1e-4)
-
-
-def test_colour_beyond_is_the_mean_of_what_is_seen_by_distance():
-    random, width = np.random.default_rng(0), 80  # one pixel a cell
-    known = random.random((12, width)) < 0.2
-    values = random.random((*known.shape, 3))
-    carried = inverse_distance_weighted(values, known, width)
-    assert (carried[known] == values[known]).all()
-    distance = np.linalg.norm(np.argwhere(~known)[:, None] - np.argwhere(known), axis=2)
-    weights = 1 / (distance**2 + 0.25) ** 2
-    expected = weights @ values[known] / weights.sum(1, keepdims=True)
-    np.testing.assert_allclose(carried[~known], expected, atol=1e-5)
 
 
 def test_what_lies_beyond_two_views_looks_as_in_the_nearer_one(views):
@@ -130,7 +92,7 @@ def test_what_lies_beyond_two_views_looks_as_in_the_nearer_one(views):
     right = dataclasses.replace(frame, image=green, camera=frame.camera.at(pose))
     nothing = GaussianModel.from_points(torch.zeros(1, 3), torch.zeros(1, 3), torch.full((1,), 1e-6), 0.5)
     for pair in ([left, right], [right, left]):
-        around = with_surroundings(nothing, pair, np.zeros(4), np.zeros((2, 3)), 0.1, np.empty((0, 3)), 0.9, 60_000)
+        around = extrapolate(nothing, with_prior(pair), np.empty((0, 3)), np.zeros(4), np.zeros((2, 3)), 0.1, 0.9, 60_000)
         (u, v), colors = left.camera.project(around.means.numpy().astype(np.float64))[0].T, around.sh[:, 0].numpy()
         beside = (v > 0) & (v < 128)
         for where, nearer, farther in (((u > 250) & beside, 1, 0), ((u < -10) & beside, 0, 1)):
@@ -140,12 +102,29 @@ def test_what_lies_beyond_two_views_looks_as_in_the_nearer_one(views):
 def test_tissue_goes_on_beyond_the_pictures_and_in_holes(views):
     frame = dataclasses.replace(bare(views[4]), depth=views[4].depth.copy())
     frame.depth[50:80, 60:100] = 0  # as at a glint
-    known = trainer_of([frame], options(max_gaussians=4000, extrapolation=0.0)).model
-    wider = trainer_of([frame], options(max_gaussians=4000, extrapolation=0.3))
+    known, wider = (prepare([frame], options(max_gaussians=4000, extrapolation=reach)).model for reach in (0.0, 0.3))
     camera = dataclasses.replace(frame.camera, K=frame.camera.K + np.array([[0, 0, 40], [0, 0, 30], [0, 0, 0]]), width=240, height=188)
     renderer = lambda model: DeformableRenderer(model, None, RenderingConfig(device="cpu")).render(camera)[1]
-    before, after = renderer(known), renderer(wider.model)
+    before, after = renderer(known), renderer(wider)
     assert (before > 0).mean() < 0.6 and (after > 0).mean() > 0.95
     hole = after[30 + 55 : 30 + 75, 40 + 65 : 40 + 95]
     exact = views[4].depth[55:75, 65:95]
     assert np.median(np.abs(hole / exact - 1)) < 0.03
+
+
+def test_no_more_gaussians_than_asked_for_and_larger_ones_instead(views):
+    (view,) = with_prior(views[4:5])
+    nothing = GaussianModel.from_points(torch.zeros(1, 3), torch.zeros(1, 3), torch.full((1,), 1e-6), 0.5)
+    around = lambda most: extrapolate(nothing, [view], np.empty((0, 3)), np.zeros(4), np.zeros((1, 3)), 0.1, 0.3, most)
+    many, few = around(60_000), around(201)
+    assert len(few) == 201 < len(many)
+    assert few.scales[1:].median() > 1.5 * many.scales[1:].median()
+    assert len(around(1)) == 1
+
+
+def test_a_view_that_knows_next_to_no_depth_tells_nothing_of_its_surroundings(views):
+    depth = np.zeros_like(views[4].depth)
+    depth[60:62, 80:90] = views[4].depth[60:62, 80:90]
+    seen = with_prior([dataclasses.replace(views[4], depth=depth), bare(views[0])])
+    nothing = GaussianModel.from_points(torch.zeros(1, 3), torch.zeros(1, 3), torch.full((1,), 1e-6), 0.5)
+    assert extrapolate(nothing, seen, np.empty((0, 3)), np.zeros(4), np.zeros((2, 3)), 0.1, 0.3, 60_000) is nothing

@@ -1,0 +1,171 @@
+"""Views whose pose contradicts what they share with the others."""
+
+import logging
+from collections.abc import Sequence
+from itertools import combinations
+
+import cv2
+import numpy as np
+
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.frames import Frame
+from endo_sim_ros.reconstruction.progress import StageProgress
+from endo_sim_ros.reconstruction.scene import Matches
+from endo_sim_ros.reconstruction.stage_configs import MatchingConfig, PosesConfig
+
+log = logging.getLogger(__name__)
+
+_Views = tuple[int, ...]
+
+
+def misposed(
+    frames: Sequence[Frame],
+    matches: Sequence[Matches],
+    depths: Sequence[np.ndarray | None] | None = None,
+    options: PosesConfig = PosesConfig(),
+    matching: MatchingConfig = MatchingConfig(),
+    progress: StageProgress = StageProgress(),
+) -> list[int]:
+    """Indices of the views whose poses contradict most of the views that they share features with.
+
+    Matches of two views that fit one motion of the camera, whichever, must fit the given one; and what three views share must be one
+    point each, which a pose wrong along the line of sight fails. Where views contradict each other and nobody can tell which is
+    wrong, that is logged, and none is named.
+
+    Args:
+        frames: Posed views.
+        matches: Features that they share.
+        depths: Depth [H, W] (m, 0 = none) of each view that does not depend on its pose, such as a sensor's; None for none.
+        options: When a pose is wrong.
+        matching: How far a match may lie beside where a motion of the camera has it, and how many matches tell anything.
+        progress: Reported to by pairs of views.
+    """
+    check, moving = _PoseCheck([frame.camera for frame in frames], depths or [None] * len(frames), options, matching), []
+    for done, match in enumerate(matches):
+        progress(done, len(matches))
+        fits = check.fits_one_motion(match)
+        if fits.any():
+            moving.append(match._replace(first=match.first[fits], second=match.second[fits]))
+    wrong = check.outvoted([(match.views, check.error_in_two(match)) for match in moving])
+    moving = [match for match in moving if not set(match.views) & set(wrong)]
+    errors = []
+    for views, pixels in _tracks(moving, matching.min_points):
+        progress.check()
+        errors.append((views, check.error_in_three(views, pixels)))
+    return sorted(wrong + check.outvoted(errors))
+
+
+class _PoseCheck:
+    """How far off features of several views are, and which views are to blame; errors are in widths of the image."""
+
+    def __init__(self, cameras: Sequence[Camera], depths: Sequence[np.ndarray | None], options: PosesConfig, matching: MatchingConfig):
+        self._cameras, self._depths, self._options, self._matching = cameras, depths, options, matching
+
+    def fits_one_motion(self, matches: Matches) -> np.ndarray:
+        """Which matches [M] fit the motion of the camera that most fit; none where it may be an accident."""
+        first, second = (self._cameras[view] for view in matches.views)
+        none = np.zeros(len(matches.first), bool)
+        if len(none) < self._matching.min_points:
+            return none
+        sight = [_slopes(camera, uv) for camera, uv in ((first, matches.first), (second, matches.second))]
+        _, inliers = cv2.findEssentialMat(*sight, np.eye(3), cv2.RANSAC, 0.999, self._matching.reprojection_error / second.K[0, 0])
+        count = 0 if inliers is None else int((inliers > 0).sum())
+        # Fewer than half of the matches fit many a motion.
+        return inliers[:, 0] > 0 if count >= max(self._matching.min_points, 0.5 * len(none)) else none
+
+    def error_in_two(self, matches: Matches) -> float:
+        """How far matches are from where the poses, and depth if there is any, expect them: the median."""
+        (i, j), here, there = matches
+        errors = [np.median(_epipolar_distance(self._cameras[i], self._cameras[j], here, there))]
+        for one, other, here, there in ((i, j, here, there), (j, i, there, here)):
+            if self._depths[one] is None:
+                continue
+            u, v = np.floor(here).astype(int).T
+            known = self._depths[one][v, u] > 0
+            if known.sum() >= self._matching.min_points:
+                points = self._cameras[one].backproject(self._depths[one])[v, u][known]
+                errors.append(np.median(np.linalg.norm(self._cameras[other].project(points)[0] - there[known], axis=1)))
+        return float(max(errors)) / self._cameras[j].width
+
+    def error_in_three(self, views: _Views, pixels: Sequence[np.ndarray]) -> float:
+        """How far features [M, 2] of several views are from one point each: the median, of the worst view each."""
+        cameras = [self._cameras[view] for view in views]
+        if np.ptp([camera.position for camera in cameras], 0).max() < 1e-6:
+            return 0.0  # from one place any point on a ray would do
+        rows = []
+        for camera, uv in zip(cameras, pixels):
+            x, y = _slopes(camera, uv).T[..., None]
+            rows += [x * camera.viewmat[2] - camera.viewmat[0], y * camera.viewmat[2] - camera.viewmat[1]]
+        homogeneous = np.linalg.svd(np.stack(rows, 1))[2][:, -1]
+        points = homogeneous[:, :3] / np.where(np.abs(homogeneous[:, 3:]) < 1e-9, 1e-9, homogeneous[:, 3:])
+        errors = np.zeros(len(points))
+        for camera, uv in zip(cameras, pixels):
+            expected, z = camera.project(points)
+            errors = np.maximum(errors, np.where(z > 0, np.linalg.norm(expected - uv, axis=1) / camera.width, np.inf))
+        return float(np.median(errors))
+
+    def outvoted(self, errors: Sequence[tuple[_Views, float]]) -> list[int]:
+        """The views that most of their groups contradict, of groups of views and the error of each.
+
+        None if no more than as many others agree with each other.
+        """
+        if not errors:
+            return []
+        options = self._options
+        # A fifth of the groups is right, even where most views are wrong.
+        usual = np.quantile([error for _, error in errors], 0.2, method="lower")
+        limit = min(max(options.min_error, options.outlier_factor * usual), options.max_error)
+        wrong: list[int] = []
+        while True:  # the worst first: what contradicts it may be right without it
+            left = [(views, error) for views, error in errors if not set(views) & set(wrong)]
+            bad, all_of, total = np.zeros((3, len(self._cameras)))
+            for views, error in left:
+                bad[list(views)] += error > limit
+                all_of[list(views)] += 1
+                total[list(views)] += min(error, 1.0)
+            share = bad / np.maximum(all_of, 1)
+            worst = max(range(len(share)), key=lambda view: (share[view], bad[view], total[view]))
+            if not bad[worst] or all_of[worst] < 2 or share[worst] <= 0.5:
+                break
+            wrong.append(worst)
+        agreeing = {view for views, error in left if error <= limit for view in views}
+        wrong = wrong if len(agreeing) > len(wrong) else []
+        unsettled = {tuple(sorted(views)) for views, error in errors if error > limit and not set(views) & set(wrong)}
+        if unsettled:
+            groups = ", ".join(" and ".join(map(str, views)) for views in sorted(unsettled)[:5])
+            log.warning("the poses of views %s contradict what they see; check them", groups)
+        return wrong
+
+
+def _slopes(camera: Camera, uv: np.ndarray) -> np.ndarray:
+    """x/z and y/z [M, 2] of pixels [M, 2]."""
+    return (uv - camera.K[:2, 2]) / camera.K.diagonal()[:2]
+
+
+def _tracks(matches: Sequence[Matches], least: int) -> list[tuple[_Views, list[np.ndarray]]]:
+    """Three views each, with their pixels [M, 2] of the features that the first shares with both others, if they are enough."""
+    ends: dict[int, list[tuple[int, np.ndarray, np.ndarray]]] = {}
+    for (i, j), first, second in matches:
+        ends.setdefault(i, []).append((j, first, second))
+        ends.setdefault(j, []).append((i, second, first))
+    found = []
+    for view, others in ends.items():
+        for (j, here_j, there_j), (k, here_k, there_k) in combinations(others, 2):
+            _, of_j, of_k = np.intersect1d(here_j @ [1, 1j], here_k @ [1, 1j], return_indices=True)
+            if len(of_j) >= least:
+                found.append(((view, j, k), [here_j[of_j], there_j[of_j], there_k[of_k]]))
+    return found
+
+
+def _epipolar_distance(first: Camera, second: Camera, uv_1: np.ndarray, uv_2: np.ndarray) -> np.ndarray:
+    """Pixels [M] from a feature in the second view to where the first view's feature may appear there: a piece of a line."""
+    near, far = 1e-3, 1e3  # metres, between which lies whatever an endoscope sees
+    rays = np.column_stack([_slopes(first, uv_1), np.ones(len(uv_1))]) @ first.pose[:3, :3].T
+    start, rise = (first.position - second.position) @ second.pose[:3, 2], rays @ second.pose[:3, 2]
+    nearest = np.maximum(near, (near / 2 - start) / np.maximum(rise, 1e-6))  # where both cameras have it in front of them
+    ends = [second.project(first.position + depth * rays) for depth in (nearest[:, None], far)]
+    (near_end, z_near), (far_end, z_far) = ends
+    along = far_end - near_end
+    t = ((uv_2 - near_end) * along).sum(1) / np.maximum((along * along).sum(1), 1e-12)
+    distance = np.linalg.norm(uv_2 - near_end - t.clip(0, 1)[:, None] * along, axis=1)
+    return np.where((z_near > 0) & (z_far > 0), distance, np.inf)

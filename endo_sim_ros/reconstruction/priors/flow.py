@@ -1,0 +1,116 @@
+"""What the optical flow between an image and its prediction from another one tells of depth."""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.frames import Frame
+from endo_sim_ros.reconstruction.priors.inverse_depth import blur, scaled
+from endo_sim_ros.reconstruction.stage_configs import MultiViewConfig
+
+
+class EyeImage(NamedTuple):
+    """What one eye of a view sees, freed of what differs between images of the same tissue."""
+
+    camera: Camera
+    grey: np.ndarray  # [H, W] uint8, freed of light and contrast
+    tissue: np.ndarray  # [H, W] float32, 1 = there
+    matte: np.ndarray  # the same without reflections of the light
+
+
+class FlowCorrection(NamedTuple):
+    """What another image tells of a view's depth."""
+
+    correction: np.ndarray  # [H, W] 1/m, of inverse depth
+    precision: np.ndarray  # [H, W] m², 0 where it tells nothing
+
+
+def eye_image(frame: Frame, options: MultiViewConfig) -> EyeImage:
+    """The image of a frame, for `flow_correction`."""
+    tissue, width = frame.tissue, frame.camera.width
+    grey = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    around = lambda values: blur(values, options.window, width)
+    share = np.maximum(around(tissue), 1e-3)
+    mean = around(grey * tissue) / share
+    variance = np.maximum(around(grey * grey * tissue) / share - mean * mean, 0)
+    grey = np.uint8(np.clip(128 + 40 * (grey - mean) / np.sqrt(variance + 4), 0, 255))  # 2 grey levels are noise
+    return EyeImage(frame.camera, grey, tissue, tissue * ~reflections(frame.image, tissue, options))
+
+
+def reflections(image: np.ndarray, tissue: np.ndarray, options: MultiViewConfig = MultiViewConfig()) -> np.ndarray:
+    """Where an image [H, W, 3] shows reflections of the light [H, W], which lie deeper than the tissue [H, W] and move with the camera."""
+    width = image.shape[1]
+    least = image.min(2).astype(np.float32)
+    around = blur(least * tissue, 15, width) / np.maximum(blur(tissue, 15, width), 1e-3)
+    bright = np.uint8(((least > 250) | (least > around + options.reflection)) & (tissue > 0))  # white is a few levels short of 255
+    return cv2.dilate(bright, np.ones((2 * round(scaled(3, width)) + 1,) * 2, np.uint8)) > 0  # with the glow around
+
+
+def flow_correction(inverse: np.ndarray, own: EyeImage, other: EyeImage, options: MultiViewConfig) -> FlowCorrection | None:
+    """What another image tells of a view's inverse depth [H, W] (1/m); None where nothing can tell.
+
+    The view's image is predicted from the other with its depth. Flow between prediction and image, along the direction in which depth
+    moves a pixel, is a correction of inverse depth; across it, it is from poses, calibration or motion.
+    """
+    camera = own.camera
+    unit = camera.width / 640
+    u, v, z = _project(camera, inverse, other.camera)
+    inside = (z > 0) & (_sample(other.matte, u, v, cv2.INTER_NEAREST) > 0)
+    if not inside.any() or min(inside.shape) < 16:  # pixels, which optical flow needs
+        return None
+    predicted = np.where(inside, _sample(other.grey, u, v), own.grey)
+    flow, back = _flow(own.grey, predicted), _flow(predicted, own.grey)
+    # A pixel is seen where the prediction took the pixel from that flow leads to.
+    rows, columns = np.mgrid[: inverse.shape[0], : inverse.shape[1]].astype(np.float32) + np.float32(0.5)
+    columns, rows = columns + flow[..., 0], rows + flow[..., 1]
+    seen_u, seen_v = _sample(u, columns, rows), _sample(v, columns, rows)
+    step = 0.01 * inverse
+    ahead_u, ahead_v, _ = _project(camera, inverse + step, other.camera)
+    along_u, along_v = (ahead_u - u) / step, (ahead_v - v) / step
+    speed = np.maximum(along_u**2 + along_v**2, 1e-9)  # squared pixels per 1/m
+    off_u, off_v = seen_u - u, seen_v - v
+    beside = np.abs(along_u * off_v - along_v * off_u) / np.sqrt(speed)
+    alike = _correlation(own.grey, _sample(other.grey, seen_u, seen_v))
+    good = inside & (_sample(np.float32(inside), columns, rows, cv2.INTER_NEAREST) > 0)
+    good &= (own.matte > 0) & (beside < options.max_beside * unit) & (np.abs(flow).max(2) < options.max_flow * unit)
+    good &= np.hypot(off_u, off_v) < options.max_flow * unit
+    good &= np.hypot(*cv2.split(flow + _sample(back, columns, rows))) < options.max_round_trip
+    precision = np.where(good, speed * (alike / options.flow_error) ** 2, 0)
+    return FlowCorrection((along_u * off_u + along_v * off_v) / speed, precision)
+
+
+def _flow(image: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """By how many pixels [H, W, 2] what an image shows lies elsewhere in another."""
+    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    flow.setFinestScale(0)
+    return flow.calc(image, other, None)
+
+
+def _project(camera: Camera, inverse: np.ndarray, other: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where another camera sees a view's pixels of the given inverse depth: u, v and z [H, W] float32."""
+    motion = (other.viewmat @ camera.pose)[:3]
+    # Scaled by inverse depth, which leaves u and v alone, z keeps its sign.
+    rays = camera.rays().astype(np.float32)
+    x, y, z = cv2.split(cv2.transform(rays, motion[:, :3]) + (inverse[..., None] * motion[:, 3]).astype(np.float32))
+    ahead = np.where(z > 1e-3, z, np.inf)
+    K = other.K
+    far = np.float32(-1e4)  # out of any picture
+    u, v = (np.where(z > 1e-3, a / ahead * f + c, far) for a, f, c in ((x, K[0, 0], K[0, 2]), (y, K[1, 1], K[1, 2])))
+    return u.astype(np.float32), v.astype(np.float32), z
+
+
+def _sample(image: np.ndarray, u: np.ndarray, v: np.ndarray, how: int = cv2.INTER_LINEAR) -> np.ndarray:
+    """Values of an image at pixels u, v [H, W]; 0 beyond it."""
+    half = np.float32(0.5)  # OpenCV counts from the centre of the first pixel
+    return cv2.remap(image, u - half, v - half, how, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+
+
+def _correlation(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Correlation [H, W] of two images over windows of 11 × 11 pixels, none below 0."""
+    a, b = a.astype(np.float32), b.astype(np.float32)
+    mean = lambda values: cv2.blur(values, (11, 11))
+    ma, mb = mean(a), mean(b)
+    spread = np.maximum((mean(a * a) - ma * ma) * (mean(b * b) - mb * mb), 1e-3)
+    return np.clip((mean(a * b) - ma * mb) / np.sqrt(spread), 0, 1)

@@ -1,0 +1,49 @@
+"""Images of inverse depth, corrected and smoothed within edges.
+
+Windows are in pixels of an image 640 wide; images of other widths have them in proportion.
+"""
+
+import cv2
+import numpy as np
+
+
+def scaled(size: float, width: int) -> float:
+    """Pixels of an image of this width that so many of one 640 wide come to."""
+    return size * width / 640
+
+
+def blur(values: np.ndarray, size: float, width: int) -> np.ndarray:
+    """The values [H, W] blurred by a Gaussian of this standard deviation, pixels of an image 640 wide."""
+    return cv2.GaussianBlur(values.astype(np.float32), (0, 0), scaled(size, width))
+
+
+def correct(inverse: np.ndarray, total: np.ndarray, weight: np.ndarray, error: np.ndarray, reach: float, limit: float) -> np.ndarray:
+    """Inverse depth [H, W] (1/m) averaged with corrections by precision; where there are none, those of the surroundings count.
+
+    Args:
+        inverse, error: Inverse depth [H, W] and its standard deviation [H, W], 1/m.
+        total, weight: Σ precision × correction and Σ precision [H, W] of the corrections.
+        reach: Standard deviation of the surroundings, pixels of an image 640 wide.
+        limit: Largest relative correction: nothing moves to another surface.
+    """
+    correction, trust = total / np.maximum(weight, 1e-12), weight / (weight + 1 / error**2)
+    width = inverse.shape[1]
+    around = blur(trust, reach, width)
+    continued = blur(trust * correction, reach, width) / np.maximum(around, 1e-6) * np.minimum(4 * around, 1)
+    return inverse + np.clip(trust * correction + (1 - trust) * continued, -limit * inverse, limit * inverse)
+
+
+def smooth(inverse: np.ndarray, size: float, edge: float) -> np.ndarray:
+    """Inverse depth [H, W] without ripples up to a size (standard deviation, pixels of an image 640 wide), edges kept.
+
+    A relative step of more than ``edge`` is an edge.
+    """
+    median = np.float32(np.median(inverse))
+    relative = (inverse / median).astype(np.float32)
+    spread = scaled(size, inverse.shape[1])
+    # The filter takes as long as its window is large: beyond 8 pixels every n-th pixel is filtered with others of its kind.
+    smoothed, stride = np.empty_like(relative), max(round(spread / 8), 1)
+    for row, column in np.ndindex(min(stride, len(relative)), stride):
+        part = np.ascontiguousarray(relative[row::stride, column::stride])
+        smoothed[row::stride, column::stride] = cv2.bilateralFilter(part, 0, edge, spread / stride)
+    return median * smoothed

@@ -1,0 +1,185 @@
+"""Depth by matching the right image of a stereo pair, with what its calibration leaves wrong corrected."""
+
+import dataclasses
+import logging
+from collections.abc import Sequence
+from typing import TypeVar
+
+import cv2
+import numpy as np
+
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.frames import Frame
+from endo_sim_ros.reconstruction.progress import StageProgress
+from endo_sim_ros.reconstruction.scene import ScenePoints
+from endo_sim_ros.reconstruction.stage_configs import MatchingConfig, StereoConfig
+from endo_sim_ros.reconstruction.triangulation import detect, match_pair
+from endo_sim_ros.sequences.recordings import lit_area
+
+log = logging.getLogger(__name__)
+
+AnyFrame = TypeVar("AnyFrame", bound=Frame)
+
+
+def stereo_depth(
+    views: Sequence[AnyFrame],
+    points: ScenePoints,
+    options: StereoConfig = StereoConfig(),
+    matching: MatchingConfig = MatchingConfig(),
+    progress: StageProgress = StageProgress(),
+) -> list[tuple[AnyFrame, np.ndarray | None]]:
+    """Each view with its right image on the rows of the left one and that eye's principal point corrected, and its depth [H, W].
+
+    Depth is in metres, 0 = none; None without a right image.
+
+    Args:
+        views: Best at full size: disparities are as precise as the pixels are fine.
+        points: Scene points, to find a constant offset of the disparity.
+        options: How to match and what to believe.
+        matching: Features by which rows are aligned, and how many points tell an offset.
+        progress: Reported to by views.
+    """
+    aligned = progress.map(lambda view: view if view.right is None else align_rows(view, options, matching), views)
+    disparities = progress.map(lambda view: None if view.right is None else stereo_disparity(view, options), aligned)
+    offsets = disparity_offsets(aligned, disparities, points, options, matching)
+    found = []
+    for view, disparity, offset in zip(aligned, disparities, offsets):
+        if disparity is None:
+            found.append((view, None))
+        else:
+            found.append((_with_right_K(view, column=offset), disparity_to_depth(view, disparity, offset, options)))
+    return found
+
+
+def right_camera(frame: Frame) -> Camera:
+    """The camera of a stereo frame's right eye."""
+    pose = frame.camera.pose.copy()
+    pose[:3, 3] += frame.baseline * pose[:3, 0]
+    return dataclasses.replace(frame.camera, K=_right_K(frame), pose=pose)
+
+
+def right_view(frame: Frame, options: StereoConfig = StereoConfig()) -> Frame:
+    """The right image of a stereo frame as a view of its own, without depth."""
+    mask = lit_area([frame.right])
+    if frame.mask is not None:
+        # Tools of the left image lie farther to the left, by any of the disparities that there are.
+        tools = (frame.mask == 0) & (lit_area([frame.image]) > 0)
+        farthest = int(options.max_disparity * frame.camera.width)
+        mask[cv2.dilate(np.uint8(tools), np.ones((1, farthest + 1), np.uint8), anchor=(0, 0)) > 0] = 0
+    return Frame(frame.stamp_ns, frame.right, right_camera(frame), mask=mask)
+
+
+def align_rows(view: AnyFrame, options: StereoConfig = StereoConfig(), matching: MatchingConfig = MatchingConfig()) -> AnyFrame:
+    """The view with matched features of its right image on the rows where the left image has them.
+
+    The image moves by whole pixels, the right eye's principal point by the rest: rectification is seldom that good.
+    """
+    left, right = match_pair(detect(view.image, view.mask, matching), detect(view.right, None, matching), matching)
+    shifts = right[:, 1] - left[:, 1]
+    shifts = shifts[np.abs(shifts) < options.max_row_offset * view.camera.height]
+    if len(shifts) < matching.min_points:
+        return view
+    shift = float(np.median(shifts))
+    rows = round(shift)
+    moved = view.right[np.clip(np.arange(len(view.right)) + rows, 0, len(view.right) - 1)]
+    return _with_right_K(dataclasses.replace(view, right=moved), row=shift - rows)
+
+
+def stereo_disparity(frame: Frame, options: StereoConfig = StereoConfig()) -> np.ndarray:
+    """Disparity [H, W] float32 in pixels (0 = none) of a rectified pair by semi-global matching, checked both ways.
+
+    A difference of the principal points of the two eyes is removed, so that disparity = fx·B/z.
+    """
+    fx, width = frame.camera.K[0, 0], frame.camera.width
+    shift = frame.camera.K[0, 2] - _right_K(frame)[0, 2]
+    levels = int(np.ceil((fx * frame.baseline / options.nearest + abs(shift)) / 16)) * 16  # the matcher takes multiples of 16
+    levels = min(levels, max(width // 2 // 16, 1) * 16)
+    # Penalties as OpenCV recommends for blocks of 5 × 5 pixels.
+    matcher = cv2.StereoSGBM_create(
+        minDisparity=0, numDisparities=levels, blockSize=5, P1=8 * 25, P2=32 * 25, uniquenessRatio=5,
+        speckleWindowSize=100, speckleRange=2, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+    )  # fmt: skip
+    # The matcher skips as many columns on the left as it has levels: let those be padding.
+    pad = lambda image: cv2.copyMakeBorder(image, 0, 0, levels, 0, cv2.BORDER_REPLICATE)
+    match = lambda a, b: matcher.compute(pad(a), pad(b))[:, levels:].astype(np.float32) / 16
+    left, right = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (frame.image, frame.right))
+    disparity = match(left, right)
+    # The right image's own disparity, by matching the mirrored pair, must lead back to the same pixel.
+    back = match(np.ascontiguousarray(right[:, ::-1]), np.ascontiguousarray(left[:, ::-1]))[:, ::-1]
+    columns = np.arange(width) - disparity.round().astype(int)
+    back = np.take_along_axis(back, columns.clip(0, width - 1), 1)
+    valid = (disparity > 0) & (columns >= 0) & (np.abs(back - disparity) <= 1)
+    # What is left of wrong matches are islands.
+    sixteenths = np.where(valid, 16 * disparity, 0).astype(np.int16)
+    cv2.filterSpeckles(sixteenths, 0, int(options.min_area * disparity.size), 16)
+    return np.where(sixteenths > 0, np.maximum(disparity - np.float32(shift), 0), np.float32(0))
+
+
+def disparity_offsets(
+    frames: Sequence[Frame],
+    disparities: Sequence[np.ndarray | None],
+    points: ScenePoints,
+    options: StereoConfig = StereoConfig(),
+    matching: MatchingConfig = MatchingConfig(),
+) -> np.ndarray:
+    """Constants [V] to add to the stereo disparities (pixels) of views so that they agree with scene points.
+
+    A wrong principal point of one eye shifts every disparity by the same amount, an error of the poses or the baseline
+    those of one view. A view has an offset of its own where it sees points enough; all are zero when too few points are
+    seen, when their common offset is within the scatter that explains it by chance, or so large that the poses must be
+    wrong. A point counts the less the farther a pixel's error moves it.
+    """
+    none, noise = np.zeros(len(frames)), options.disparity_error
+    residuals, weights = [np.empty(0)] * len(frames), [np.empty(0)] * len(frames)
+    for i, (frame, disparity) in enumerate(zip(frames, disparities)):
+        if disparity is None or not len(points.positions):
+            continue
+        inside = frame.camera.sees(points.positions)
+        uv, z = frame.camera.project(points.positions[inside])
+        u, v = np.floor(uv).astype(int).T
+        measured, expected = disparity[v, u], frame.camera.K[0, 0] * frame.baseline / z
+        error = np.broadcast_to(points.error, inside.shape)[inside]
+        residuals[i] = (expected - measured)[measured > 0]
+        weights[i] = (1 / (noise**2 + (error * expected) ** 2))[measured > 0]
+    residual, weight = np.concatenate(residuals), np.concatenate(weights)
+    if len(residual) < matching.min_points:
+        return none
+    offset = _weighted_median(residual, weight)
+    spread = 1.4826 * _weighted_median(np.abs(residual - offset), weight)
+    # A quarter of a pixel is as good as none.
+    if abs(offset) < max(0.25, 3 * spread * np.sqrt((weight**2).sum()) / weight.sum()):
+        return none
+    typical = float(np.median(np.concatenate([d[d > 0] for d in disparities if d is not None])))
+    if abs(offset) > options.max_offset * typical:
+        text = "stereo disparity, %.1f pixels, and the poses are %.1f pixels apart: left so; check poses, their scale and the baseline"
+        log.warning(text, typical, abs(offset))
+        return none
+    worth = [w.sum() * noise**2 for w in weights]  # in points of no error
+    offsets = [_weighted_median(r, w) if n > options.own_offset_points else offset for r, w, n in zip(residuals, weights, worth)]
+    text = "stereo disparity shifted by %.2f pixels to agree with the poses (%d points, scatter %.2f; views %.2f to %.2f)"
+    log.info(text, offset, len(residual), spread, min(offsets), max(offsets))
+    return np.array(offsets)
+
+
+def disparity_to_depth(frame: Frame, disparity: np.ndarray, offset: float = 0.0, options: StereoConfig = StereoConfig()) -> np.ndarray:
+    """Depth [H, W] (m, 0 = none) of a disparity [H, W] (pixels, 0 = none) to which an offset is added."""
+    corrected = np.where(disparity > 0, disparity + offset, 0)
+    depth = frame.camera.K[0, 0] * frame.baseline / np.maximum(corrected, options.min_disparity)
+    return np.where(corrected > options.min_disparity, depth, 0)
+
+
+def _right_K(frame: Frame) -> np.ndarray:
+    """Intrinsics [3, 3] of the right eye."""
+    return frame.camera.K if frame.right_K is None else frame.right_K
+
+
+def _with_right_K(view: AnyFrame, column: float = 0.0, row: float = 0.0) -> AnyFrame:
+    """The view with the right eye's principal point moved by so many pixels."""
+    K = _right_K(view).copy()
+    K[:2, 2] += column, row
+    return dataclasses.replace(view, right_K=K)
+
+
+def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
+    order = np.argsort(values)
+    return float(values[order][np.searchsorted(np.cumsum(weights[order]), weights.sum() / 2)])

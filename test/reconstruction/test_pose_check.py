@@ -1,0 +1,80 @@
+"""Views whose poses contradict the others."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+from short_training import bare, options
+
+from endo_sim_ros.reconstruction import prepare
+from endo_sim_ros.reconstruction.pose_check import misposed
+from endo_sim_ros.reconstruction.stage_configs import MatchingConfig, PosesConfig
+from endo_sim_ros.reconstruction.triangulation import match_features
+from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
+
+
+@pytest.fixture(scope="module")
+def large():
+    """Five frames 480×384."""
+    return list(phantom_sequence(PhantomConfig(width=480, height=384, frames=5, travel=0.02, stereo=False)))
+
+
+FAULTS = {  # of view 2 of five: a rotation vector of its camera, and a movement along its axes in metres
+    "turned": ([0.1, -0.08, 0.0], [0.0, 0.0, 0.0]),
+    "rolled": ([0.0, 0.0, 0.1], [0.0, 0.0, 0.0]),
+    "moved": ([0.0, 0.0, 0.0], [0.03, 0.02, 0.0]),
+    "nearer": ([0.0, 0.0, 0.0], [0.0, 0.0, 0.01]),  # as a zoom would
+    "farther": ([0.0, 0.0, 0.0], [0.0, 0.0, -0.01]),
+}
+
+
+def misplaced(frame, fault):
+    pose, (rotation, movement) = frame.camera.pose.copy(), FAULTS[fault]
+    pose[:3, 3] += pose[:3, :3] @ np.array(movement)
+    pose[:3, :3] = pose[:3, :3] @ cv2.Rodrigues(np.array(rotation))[0]
+    return dataclasses.replace(frame, camera=frame.camera.at(pose))
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_wrong_pose_among_good_ones_is_found(large, fault, caplog):
+    frames = [bare(frame) for frame in large]
+    assert misposed(frames, match_features(frames)) == [] and not caplog.text
+    frames[2] = misplaced(frames[2], fault)
+    assert misposed(frames, match_features(frames)) == [2]
+    if fault == "moved":
+        scene = prepare(frames, options(image_width=160, depth="points"))
+        assert len(scene.views) == 4 and "left out" in caplog.text
+
+
+def test_with_stereo_a_wrong_pose_among_three_is_left_out(caplog):
+    views = list(phantom_sequence(PhantomConfig(width=320, height=256, frames=3, travel=0.02)))
+    views = [dataclasses.replace(view, depth=None) for view in views]
+    short = options(image_width=80, iterations=1)
+    assert len(prepare(views, short).views) == 3 and "left out" not in caplog.text
+    scene = prepare([views[0], misplaced(views[1], "farther"), views[2]], short)
+    assert len(scene.views) == 2 and f"{views[1].stamp_ns * 1e-9:.3f} s left out" in caplog.text
+    prepare([views[0], misplaced(views[1], "farther")], short)
+    assert "the poses of views 0 and 1 contradict" in caplog.text
+
+
+def test_swapped_poses_of_two_views_are_found(large):
+    frames = [bare(frame) for frame in large]
+    frames[1], frames[3] = (dataclasses.replace(frames[i], camera=frames[j].camera) for i, j in ((1, 3), (3, 1)))
+    assert misposed(frames, match_features(frames)) == [1, 3]
+
+
+def test_of_two_views_neither_is_left_out(large, caplog):
+    for first, second, fault in ((bare(large[0]), bare(large[1]), "turned"), (large[0], large[1], "nearer")):  # the latter takes depth
+        frames = [first, misplaced(second, fault)]
+        caplog.clear()
+        assert misposed(frames, match_features(frames), [frame.depth for frame in frames]) == []
+        assert "the poses of views 0 and 1 contradict" in caplog.text
+
+
+def test_what_is_near_enough_is_an_option(large):
+    frames = [bare(frame) for frame in large]
+    frames[2] = misplaced(frames[2], "turned")
+    matches = match_features(frames)
+    assert misposed(frames, matches, options=PosesConfig(min_error=1.0, max_error=1.0)) == []
+    assert misposed(frames, matches, matching=MatchingConfig(min_points=10_000)) == []

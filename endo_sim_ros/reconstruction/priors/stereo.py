@@ -14,7 +14,7 @@ from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import ScenePoints
 from endo_sim_ros.reconstruction.stage_configs import MatchingConfig, StereoConfig
 from endo_sim_ros.reconstruction.triangulation import detect, match_pair
-from endo_sim_ros.sequences.recordings import lit_area
+from endo_sim_ros.sequences.masks import lit_area
 
 log = logging.getLogger(__name__)
 

@@ -198,9 +198,7 @@ def build_control_nodes(
     """
     carves = config.carve and config.layers > 0 and len(cameras) > 0 and not config.dense
     if carves and render_depth is None:
-        raise ValueError(
-            "carving needs the model's depth: pass render_depth, e.g. that of endo_sim_ros.rendering, or set carve=False"
-        )
+        raise ValueError("carving needs the model's depth: pass render_depth, e.g. that of endo_sim_ros.rendering, or set carve=False")
     eye = np.asarray(viewpoint, np.float64).reshape(-1, 3)
     means = model.means.detach().cpu().double().numpy()
     opacities = model.opacities.detach().cpu().double().numpy()

@@ -1,4 +1,4 @@
-"""Where to compute: one name for torch and Warp."""
+"""Devices and threads: one name of a device for torch and Warp, Warp on torch's streams, and shares of work."""
 
 import contextlib
 import functools
@@ -11,7 +11,10 @@ import torch
 
 
 def pick_device(name: str = "auto") -> str:
-    """Resolve a device name to one that both torch and Warp understand, e.g. ``cpu`` or ``cuda:0``.
+    """Return the name of a device that both torch and Warp understand, e.g. ``cpu`` or ``cuda:0``.
+
+    Args:
+        name: ``auto`` (the GPU when there is one), ``cpu``, ``cuda`` or ``cuda:N``.
 
     Raises:
         ValueError: If the name is unknown or names a GPU that is not there.
@@ -53,7 +56,7 @@ def _silent_stderr():
 
 
 def on_torch_stream(device: torch.device | str) -> contextlib.AbstractContextManager:
-    """Make Warp work on torch's current stream of a CUDA device, in order with torch's own work."""
+    """Return a context within which Warp works on torch's current stream of a CUDA device, in order with torch's own work."""
     if torch.device(device).type == "cpu":
         return contextlib.nullcontext()
     import warp as wp
@@ -62,7 +65,7 @@ def on_torch_stream(device: torch.device | str) -> contextlib.AbstractContextMan
 
 
 def warp_stream(stream: torch.cuda.Stream):
-    """Warp's name for a stream of torch; the same object each time, as Warp forgets what it knows of a stream with it."""
+    """Return Warp's object for a stream of torch, the same each time: with it Warp would forget what it knows of the stream."""
     return _warp_stream(stream.device, stream.cuda_stream)
 
 
@@ -74,7 +77,7 @@ def _warp_stream(device: torch.device, handle: int):
 
 
 def cpu_threads() -> int:
-    """Number of worker threads for CPU kernels: the cores this process may use, or ENDO_SIM_THREADS.
+    """Return the number of threads for CPU kernels: the cores that this process may use, or ENDO_SIM_THREADS.
 
     Raises:
         ValueError: If ENDO_SIM_THREADS is no whole number.
@@ -87,7 +90,7 @@ def cpu_threads() -> int:
 
 
 def shares(count: int, least: int) -> list[tuple[int, int]]:
-    """First and number of the items, of count, that each CPU thread takes; fewer than ``least`` are left to one."""
+    """Return the first item and the number of items, of count, that each CPU thread takes; fewer than ``least`` are left to one."""
     threads = cpu_threads() if count >= least else 1
     bounds = [count * i // threads for i in range(threads + 1)]
     return [(first, end - first) for first, end in zip(bounds, bounds[1:])]
@@ -102,7 +105,7 @@ os.register_at_fork(after_in_child=_pool.cache_clear)  # a forked process has no
 
 
 def run_in_threads(jobs: Sequence[Callable[[], object]]) -> None:
-    """Run callables at the same time; the last one in this thread. A kernel launch releases the interpreter lock."""
+    """Run callables at the same time, the last one in this thread; a kernel launch releases the interpreter lock."""
     futures = [_pool(len(jobs) - 1).submit(job) for job in jobs[:-1]]
     jobs[-1]()
     for future in futures:
@@ -110,6 +113,6 @@ def run_in_threads(jobs: Sequence[Callable[[], object]]) -> None:
 
 
 def map_in_threads(function: Callable, items: Iterable) -> list:
-    """Results of a function, which mostly waits for OpenCV or numpy, for each of the items, several at a time."""
+    """Return the results of a function, which mostly waits for OpenCV or numpy, for each of the items, several at a time."""
     with ThreadPoolExecutor(cpu_threads(), "endo_sim") as pool:
         return list(pool.map(function, items))

@@ -103,10 +103,14 @@ template <class F> struct Pixel {
 };
 
 // Whether the transmittance reaches a half here. One splat does not finish a pixel above that, as ALPHA_MAX is below 1.
-template <class F> ENDO_SIM_INLINE auto crosses_median(const Layer<F>& layer) { return (layer.before > MEDIAN) & (layer.after <= MEDIAN); }
+template <class F> ENDO_SIM_INLINE auto crosses_median(const Layer<F>& layer)
+{
+    return (layer.before > MEDIAN) & (layer.after <= MEDIAN);
+}
 
 // Write one pixel's images.
-ENDO_SIM_INLINE void finish(const Pixel<float>& pixel, size_t index, const float* background, float reference, const Images& images)
+ENDO_SIM_INLINE void finish(
+    const Pixel<float>& pixel, size_t index, const float* background, float reference, const Images& images)
 {
     ENDO_SIM_FUSE(on)
     const float seen_through = fabsf(pixel.transmittance);
@@ -148,8 +152,8 @@ template <class F> struct PixelGradient {
 };
 
 // A pixel before its first splat, on the way back.
-ENDO_SIM_INLINE PixelGradient<float>
-begin(size_t index, const float* background, float reference, const ConstImages& images, const ConstImages& v_images)
+ENDO_SIM_INLINE PixelGradient<float> begin(
+    size_t index, const float* background, float reference, const ConstImages& images, const ConstImages& v_images)
 {
     ENDO_SIM_FUSE(on)
     const float *v_color = v_images.colors + 3 * index, *color = images.colors + 3 * index;

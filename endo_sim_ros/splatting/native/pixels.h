@@ -97,8 +97,12 @@ ENDO_SIM_INLINE StagedSplat staged_splat(const SplatLists&, int batch, int, int 
     const int place = batch + (int)sizeof(StagedSplat) * i;
     asm volatile("ld.shared.v4.f32 {%0, %1, %2, %3}, [%4];" : "=f"(s.x), "=f"(s.y), "=f"(s.a), "=f"(s.shear) : "r"(place));
     float index;
-    asm volatile("ld.shared.v4.f32 {%0, %1, %2, %3}, [%4];" : "=f"(s.aspect), "=f"(s.opacity), "=f"(s.z), "=f"(index) : "r"(place + 16));
-    asm volatile("ld.shared.v4.f32 {%0, %1, %2, %3}, [%4];" : "=f"(s.red), "=f"(s.green), "=f"(s.blue), "=f"(s.unused) : "r"(place + 32));
+    asm volatile("ld.shared.v4.f32 {%0, %1, %2, %3}, [%4];"
+        : "=f"(s.aspect), "=f"(s.opacity), "=f"(s.z), "=f"(index)
+        : "r"(place + 16));
+    asm volatile("ld.shared.v4.f32 {%0, %1, %2, %3}, [%4];"
+        : "=f"(s.red), "=f"(s.green), "=f"(s.blue), "=f"(s.unused)
+        : "r"(place + 32));
     s.index = __float_as_int(index);
     return s;
 }
@@ -221,9 +225,10 @@ ENDO_SIM_INLINE void composite_pixel(int thread, const SplatLists& lists, const 
     const float px = own.column + 0.5f, py = own.row + 0.5f, reference = reference_depth(lists, own);
     Pixel<float> pixel{own.inside ? 1.0f : -1.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
     int owner = -1;
-    visit_splats(lists, own, [&] { return pixel.transmittance > 0.0f; }, [&](const StagedSplat& s) {
+    const auto live = [&] { return pixel.transmittance > 0.0f; };
+    visit_splats(lists, own, live, [&](const StagedSplat& s) {
         const float alpha = limited(s.opacity * falloff(s.x - px, s.y - py, s.a, s.shear, s.aspect));
-        if (pixel.transmittance > 0.0f && alpha >= ALPHA_MIN) {
+        if (live() && alpha >= ALPHA_MIN) {
             const Layer<float> layer = pixel.add(alpha, s.z - reference, s.red, s.green, s.blue);
             if (crosses_median(layer))
                 owner = s.index;
@@ -247,11 +252,12 @@ ENDO_SIM_INLINE void composite_pixel_backward(int thread, const SplatLists& list
     pixel.transmittance = -1.0f;
     if (own.inside)
         pixel = begin(own.index, background, reference, images, v_images);
-    visit_splats(lists, own, [&] { return pixel.transmittance > 0.0f; }, [&](const StagedSplat& s) {
+    const auto live = [&] { return pixel.transmittance > 0.0f; };
+    visit_splats(lists, own, live, [&](const StagedSplat& s) {
         ENDO_SIM_FUSE(on)
         const float dx = s.x - px, dy = s.y - py, fall = falloff(dx, dy, s.a, s.shear, s.aspect);
         const float alpha = limited(s.opacity * fall);
-        const bool draws = pixel.transmittance > 0.0f && alpha >= ALPHA_MIN;
+        const bool draws = live() && alpha >= ALPHA_MIN;
         if (warp_any(draws)) {
             Record v{};
             if (draws) {

@@ -42,8 +42,8 @@ ENDO_SIM_INLINE Rows rows_met(const Splat& splat, float x0, float y0)
 
 // Call visit(slot, splat, rows) for the splats of a tile until all pixels are finished; returns the first slot that is not
 // visited. What a splat needs of memory, and its rows, are asked for before its turn.
-template <class P, class Visit>
-ENDO_SIM_INLINE int visit_splats(const TileLists& lists, int tile, const Place& place, const P* pixels, const float* records, Visit visit)
+template <class P, class Visit> ENDO_SIM_INLINE int visit_splats(
+    const TileLists& lists, int tile, const Place& place, const P* pixels, const float* records, Visit visit)
 {
     const int start = lists.starts[tile], end = lists.starts[tile + 1];
     Rows next{};
@@ -108,8 +108,8 @@ ENDO_SIM_INLINE void composite_tile(
         for (int column = 0; column < columns; ++column) {
             const Pixel<vfloat>& p = pixels[row];
             const size_t index = place.pixel0 + (size_t)row * width + column;
-            const Pixel<float> pixel{p.transmittance[column], p.depth[column], p.distortion[column], p.red[column], p.green[column],
-                p.blue[column]};
+            const Pixel<float> pixel{
+                p.transmittance[column], p.depth[column], p.distortion[column], p.red[column], p.green[column], p.blue[column]};
             finish(pixel, index, background, reference, images);
             if (owners_of_median)
                 owners_of_median[index] = owner[row][column];
@@ -134,8 +134,8 @@ ENDO_SIM_INLINE void composite_tile_backward(int tile, const TileLists& lists, c
         p = PixelGradient<vfloat>{};
         p.transmittance = broadcast(-1.0f);
         for (int column = 0; row < rows && column < columns; ++column) {
-            const PixelGradient<float> pixel
-                = begin(place.pixel0 + (size_t)row * width + column, background, reference, images, v_images);
+            const PixelGradient<float> pixel =
+                begin(place.pixel0 + (size_t)row * width + column, background, reference, images, v_images);
             p.v_red[column] = pixel.v_red;
             p.v_green[column] = pixel.v_green;
             p.v_blue[column] = pixel.v_blue;

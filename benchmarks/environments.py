@@ -7,7 +7,7 @@ import numpy as np
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.evaluation.measurement import Row, machine, median_seconds, report
 from endo_sim_ros.learning.scenes import Scene, load_scene
-from endo_sim_ros.learning.task_batch import TaskBatch
+from endo_sim_ros.learning.task_batch import Observations, TaskBatch
 from endo_sim_ros.learning.train import single_threaded_torch
 
 _STEPS = 25  # of random actions in one measurement
@@ -32,7 +32,8 @@ def bench_environments(
         raise ValueError(f"give numbers of environments of at least 1, got {' '.join(map(str, environments)) or 'none'}")
     device, scene, rows = pick_device(device), load_scene(), []
     with single_threaded_torch():
-        for observations in ("state", "image"):
+        kinds: tuple[Observations, ...] = ("state", "image")
+        for observations in kinds:
             rates = [_rate(task, scene, count, observations, device, repeats) for count in environments]
             peer = f"{environments[0]} environment{'s' * (environments[0] > 1)}"
             for count, rate in zip(environments, rates):
@@ -42,7 +43,7 @@ def bench_environments(
     report(f"Environments: {task} on {machine(device)}", rows, json_file)
 
 
-def _rate(task: str, scene: Scene, count: int, observations: str, device: str, repeats: int) -> float:
+def _rate(task: str, scene: Scene, count: int, observations: Observations, device: str, repeats: int) -> float:
     """Steps per second of all environments together, the tools at work in the tissue."""
     batch, rng = TaskBatch(task, scene, count, observations, device=device), np.random.default_rng(0)
     everyone = range(count)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from rich.progress import Progress
@@ -81,7 +81,8 @@ def bench_raster(device: str, json_file: Path | None = None, plan: Plan = Plan()
     for size in plan.sizes:
         for count in plan.counts:
             stages.append((named(count, size), partial(_speed, named(count, size), count, size, device, plan.seconds)))
-    count, *size = plan.reference
+    count, width, height = plan.reference
+    size = width, height
     stages.append(("torch reference", partial(_against_reference, named(count, size), count, size, device, plan.seconds)))
     stages.append(("precision", partial(_precision, count, size, device)))
     size, count = plan.sizes[0], plan.counts[0]
@@ -113,8 +114,13 @@ def bench_raster(device: str, json_file: Path | None = None, plan: Plan = Plan()
 Draw = Callable[[list[Tensor]], Sequence[Tensor]]
 
 
+def _arguments(gaussians: Sequence[Tensor], scene: Scene) -> list[Any]:
+    """Positional arguments of a rasteriser: Gaussians, then the cameras of a scene and the size of their images."""
+    return [*gaussians, *scene[1:]]
+
+
 def _ours(scene: Scene) -> Draw:
-    return lambda gaussians: rasterize(*gaussians, *scene[1:])[:4]
+    return lambda gaussians: rasterize(*_arguments(gaussians, scene))[:4]
 
 
 def _speed(name: str, count: int, size: tuple[int, int], device: str, seconds: float) -> list[Row]:
@@ -161,7 +167,7 @@ def _forward_and_backward(draw: Draw, scene: Scene) -> Callable[[], object]:
 def _against_reference(name: str, count: int, size: tuple[int, int], device: str, seconds: float) -> list[Row]:
     """The same small scene by the kernels and by plain torch, both float32."""
     scene = tissue(count, *size, device)
-    return _compare(name, scene, {"torch reference": lambda gaussians: _rasterize(*gaussians, *scene[1:])[:4]}, device, seconds)
+    return _compare(name, scene, {"torch reference": lambda gaussians: _rasterize(*_arguments(gaussians, scene))[:4]}, device, seconds)
 
 
 def _precision(count: int, size: tuple[int, int], device: str) -> list[Row]:
@@ -171,7 +177,8 @@ def _precision(count: int, size: tuple[int, int], device: str) -> list[Row]:
     for function, where, dtype in ((rasterize, device, torch.float32), (_rasterize, "cpu", torch.float64)):
         leaves = [x.detach().to(where, dtype).requires_grad_() for x in (*scene.gaussians, scene.viewmats)]
         absgrad = torch.zeros(1, count, 2, dtype=dtype, device=where, requires_grad=True)
-        images = function(*leaves, scene.Ks.to(where, dtype), *size, absgrad=absgrad)[:4]
+        arguments: list[Any] = [*leaves, scene.Ks.to(where, dtype), *size]
+        images = function(*arguments, absgrad=absgrad)[:4]
         generator = torch.Generator().manual_seed(1)
         cotangents = [torch.randn(image.shape, generator=generator).to(image) for image in images]
         gradients = torch.autograd.grad(images, [*leaves, absgrad], cotangents)
@@ -189,7 +196,7 @@ def _curve(name: str, count: int, size: tuple[int, int], overlap: float, device:
     """One point of a curve: forward and backward."""
     scene = tissue(count, *size, device, overlap)
     point = f"{short(count)} {size[0]}x{size[1]}" + (f" overlap x{overlap:g}" if "overlap" in name else "")
-    return [Row(f"{name}: {point}", *milliseconds([_forward_and_backward(_ours(scene), scene)], device, seconds), "ms")]
+    return [Row(f"{name}: {point}", milliseconds([_forward_and_backward(_ours(scene), scene)], device, seconds)[0], "ms")]
 
 
 def _training(count: int, width: int, height: int, device: str, seconds: float) -> list[Row]:
@@ -229,7 +236,7 @@ def _plain(scene: Scene) -> Draw:
 
 
 def _gsplat(scene: Scene) -> Draw:
-    from gsplat import rasterization
+    from gsplat import rasterization  # pyright: ignore[reportMissingImports]  (optional)
 
     def draw(gaussians: list[Tensor]) -> Sequence[Tensor]:
         options = {"sh_degree": 0, "packed": False, "render_mode": "RGB+ED"}
@@ -241,7 +248,10 @@ def _gsplat(scene: Scene) -> Draw:
 
 def _gswarp(scene: Scene) -> Draw:
     """Has the interface of the rasteriser of 3DGS: OpenGL's projection, matrices transposed."""
-    from gswarp import GaussianRasterizationSettings, GaussianRasterizer
+    from gswarp import (  # pyright: ignore[reportMissingImports]  (optional)
+        GaussianRasterizationSettings,
+        GaussianRasterizer,
+    )
 
     width, height, viewmat = scene.width, scene.height, scene.viewmats[0]
     fx, fy, near, far = float(scene.Ks[0, 0, 0]), float(scene.Ks[0, 1, 1]), 0.01, 100.0

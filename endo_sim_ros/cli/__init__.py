@@ -10,6 +10,7 @@ import sys
 import textwrap
 import time
 from pathlib import Path
+from typing import Protocol
 
 from endo_sim_ros import hear_interrupts
 
@@ -21,7 +22,14 @@ COMMANDS = (
 DESCRIPTION = "Endoscope recordings become tissue that a robot can touch."
 
 
-def load_command(name: str) -> type:
+class Runnable(Protocol):
+    """A command with its options."""
+
+    def run(self) -> None:
+        """Do what the command is for; what is wrong with its options raises."""
+
+
+def load_command(name: str) -> type[Runnable]:
     """The dataclass whose fields are a command's options, and whose `run` is what it does."""
     return importlib.import_module(f"endo_sim_ros.cli.{name}").Command
 
@@ -41,7 +49,7 @@ def overview() -> str:
     return "\n".join([*lines, "", "`endo-sim COMMAND --help` tells the options of a command."])
 
 
-def parse(name: str, words: list[str]) -> object:
+def parse(name: str, words: list[str]) -> Runnable:
     """The command with its options as the words give them; what is wrong with them ends the program with a sentence."""
     import tyro
 

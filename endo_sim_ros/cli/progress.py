@@ -1,6 +1,6 @@
 """Progress bars of commands that read or write recordings."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sized
 from typing import Generic, TypeVar
 
 from rich.progress import track
@@ -28,4 +28,4 @@ class SizedIterator(Generic[Item]):
 
 def tracked(items: Iterable[Item], text: str) -> Iterable[Item]:
     """The same items, with a progress bar under a text; it shows how many are left where that is known."""
-    return track(items, description=text, total=len(items) if hasattr(items, "__len__") else None)
+    return track(items, description=text, total=len(items) if isinstance(items, Sized) else None)

@@ -1,6 +1,7 @@
 """`endo-sim train`."""
 
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -35,15 +36,15 @@ class Command:
         from endo_sim_ros.learning.scenes import load_scene
         from endo_sim_ros.learning.train import save_training, train
 
-        config, unused = self.config, self.ppo
+        config, unused, learn = self.config, self.ppo, partial(train, config=self.config)
         if self.algorithm == "ppo":
-            from endo_sim_ros.learning.ppo import train_ppo as train
+            from endo_sim_ros.learning.ppo import train_ppo
 
-            config, unused = unused, config
+            config, unused, learn = self.ppo, self.config, partial(train_ppo, config=self.ppo)
         if unused != type(unused)():
             raise ConfigError(f"options that begin with --ppo. are for ppo, the others for cem; --algorithm is {self.algorithm}")
         self.out.mkdir(parents=True, exist_ok=True)  # before the long work
-        policy, curve = train(self.task, load_scene(self.model), config, self.vary, self.device)
+        policy, curve = learn(self.task, load_scene(self.model), randomisation=self.vary, device=self.device)
         save_training(self.out, policy, curve, config)
         last = curve[-1]
         print(f"{self.out}: {last['test_success']:.0%} of test episodes solved after {last['episodes']} episodes")

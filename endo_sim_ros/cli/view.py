@@ -1,6 +1,6 @@
 """`endo-sim view`."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -27,5 +27,7 @@ class Command:
         """Serve the page until interrupted."""
         from endo_sim_ros.viewer.standalone import view
 
-        count = {} if self.node_count is None else {"node_count": self.node_count}
-        view(self.model, PhysicsConfig(device=self.device, **count), self.config)
+        physics = PhysicsConfig(device=self.device)
+        if self.node_count is not None:
+            physics = replace(physics, node_count=self.node_count)
+        view(self.model, physics, self.config)

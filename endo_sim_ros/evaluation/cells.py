@@ -11,7 +11,7 @@ from endo_sim_ros.core import drawing
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.evaluation.config import EvaluationConfig
-from endo_sim_ros.evaluation.lpips import Lpips, WeightsError
+from endo_sim_ros.evaluation.lpips import Backbone, Lpips, WeightsError
 from endo_sim_ros.evaluation.sources import PHANTOM, parse_values, split_source
 from endo_sim_ros.evaluation.splits import check_split
 from endo_sim_ros.evaluation.workers import Finished
@@ -32,7 +32,7 @@ class Cell(NamedTuple):
     source: str
     train_depth: bool
     mono: bool
-    lpips: tuple[str, ...]  # networks whose weights are there
+    lpips: tuple[Backbone, ...]  # networks whose weights are there
     curve: int
 
     @property
@@ -124,9 +124,10 @@ def _methods(config: EvaluationConfig) -> dict[str, dict[str, Any]]:
     return unlike
 
 
-def _networks(config: EvaluationConfig) -> tuple[tuple[str, ...], dict[str, str]]:
+def _networks(config: EvaluationConfig) -> tuple[tuple[Backbone, ...], dict[str, str]]:
     """The networks of LPIPS that can be used, and why the others cannot."""
-    usable, missing = [], {}
+    usable: list[Backbone] = []
+    missing: dict[str, str] = {}
     for name in config.lpips:
         try:
             Lpips(name, config.weights)

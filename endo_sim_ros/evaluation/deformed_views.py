@@ -69,7 +69,7 @@ def _deformed_view_psnr(model: GaussianModel, cameras: Sequence[Camera], device:
             continue
         state = simulation.state()
         picture, expected = (each.render(camera, state.positions, state.F, depth=False)[0] for each in (ours, reference))
-        changed = np.uint8(np.abs(expected - at_rest).max(-1) > _MOVED)
+        changed = (np.abs(expected - at_rest).max(-1) > _MOVED).astype(np.uint8)
         if changed.any():
             found.append(metrics.psnr(picture, expected, cv2.dilate(changed, np.ones((2 * _ROUND + 1,) * 2))))
     return float(np.mean(found)) if found else float("nan")

@@ -89,9 +89,10 @@ def _run(cells: list[Cell], config: EvaluationConfig) -> Iterator[tuple[Cell, Fi
                     yield cell, Finished(index, error=str(error))
                 continue
             if with_ray:
-                import ray
+                import ray  # pyright: ignore[reportMissingImports]  (optional)
 
-                ray.is_initialized() or ray.init(log_to_driver=False, logging_level="ERROR")
+                if not ray.is_initialized():
+                    ray.init(log_to_driver=False, logging_level="ERROR")
                 shared = ray.put(prepared)
                 arguments = [(cell, config.weights, shared) for cell in ours]
                 events = run_in_ray(train_and_measure, arguments, devices[0] != "cpu", config.workers)

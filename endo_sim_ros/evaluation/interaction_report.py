@@ -50,10 +50,11 @@ class TouchReport:
         names = [topic.name for topic in messages.RENDERED_TOPICS]
         self._times = [time for time in sorted(self._rendered) if all(name in self._rendered[time] for name in names)]
         began = forces[0][0] if forces else np.inf
-        self._rest = max((time for time in self._times if time < began), default=None)
+        before = [time for time in self._times if time < began]
         self._times = [time for time in self._times if time >= began]
-        if not self._times or self._rest is None or not tips:
+        if not self._times or not before or not tips:
             raise SequenceError(f"{recording}: no images were rendered before and while the tool {arm} acted")
+        self._rest = before[-1]
         self._tips, self._forces = _Track(tips), _Track(forces)
         camera = self._camera(self._times[0])
         distance = float(camera.project(self._tips.at(self._times[0])[None])[1][0])

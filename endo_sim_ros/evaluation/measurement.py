@@ -64,8 +64,8 @@ def report(title: str, rows: Iterable[Row], json_file: Path | None = None) -> No
     """Print rows as a table and, if asked for, write them as a JSON list of name, value, unit, ratio and peer."""
     rows = list(rows)
     table = Table(title=title, title_justify="left")
-    for heading, justify in (("", "left"), ("value", "right"), ("unit", "left"), ("ratio", "right"), ("to", "left")):
-        table.add_column(heading, justify=justify)
+    for heading in ("", "value", "unit", "ratio", "to"):
+        table.add_column(heading, justify="right" if heading in ("value", "ratio") else "left")
     for row in rows:
         ratio = "" if row.ratio is None else f"{row.ratio:.3g}"
         table.add_row(row.name, f"{row.value:.4g}", row.unit, ratio, row.peer or "")

@@ -2,12 +2,12 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Sequence, Sized
 from typing import NamedTuple
 
 import numpy as np
 from rich.progress import Progress
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.evaluation.cells import Cell
@@ -38,7 +38,7 @@ def prepare_sequence(cells: Sequence[Cell], bar: Progress) -> Prepared:
     """Read the sequence of these cells; what is the same for all of them is done here, once."""
     source = cells[0].source
     frames, opened = [], open_named(source)
-    task = bar.add_task(f"reading {cells[0].sequence}", total=len(opened) if hasattr(opened, "__len__") else None)
+    task = bar.add_task(f"reading {cells[0].sequence}", total=len(opened) if isinstance(opened, Sized) else None)
     for frame in opened:
         frames.append(frame)
         bar.advance(task)
@@ -83,7 +83,7 @@ def divide_points(points: ScenePoints) -> tuple[ScenePoints, np.ndarray | None]:
     judging = np.unique(points.positions, axis=0)[::_JUDGING]
     if len(judging) < _FEWEST_JUDGES:
         return points, None
-    tree = cKDTree(judging)
+    tree = KDTree(judging)
     apart = np.median(tree.query(judging, k=2)[0][:, 1])
     kept = tree.query(points.positions)[0] > _SAME_POINT * apart
     error = np.asarray(points.error)

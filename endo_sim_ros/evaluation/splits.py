@@ -50,7 +50,7 @@ def split_views(name: str, count: int) -> Split:
         share, group = int(ratio[1]), int(ratio[1]) + int(ratio[2])
         trains = lambda i: i % group < share
     else:
-        kind, step = re.fullmatch(_STEPPED, name).groups()
+        kind, step = _stepped(name)
         trains = lambda i: (i % int(step) == 0) == (kind == "every")
     train = [i for i in everything if trains(i)]
     held_out = sorted(set(everything) - set(train))
@@ -69,10 +69,17 @@ def explain_split(name: str) -> str:
         share, rest = int(ratio[1]), int(ratio[2])
         first = f"first {share} train" if share > 1 else "first one trains"
         return f"Of each {share + rest} views in order the {first}, the others are held out."
-    kind, step = re.fullmatch(_STEPPED, name).groups()
+    kind, step = _stepped(name)
     if kind == "every":
         return f"One view in {step} trains, beginning with the first; the others are held out."
     return f"One view in {step} is held out, beginning with the first; the others train."
+
+
+def _stepped(name: str) -> tuple[str, str]:
+    """Kind (`every` or `all-but`) and step of a split that goes by every n-th view."""
+    match = re.fullmatch(_STEPPED, name)
+    assert match is not None  # the only other kind that check_split lets pass
+    return match[1], match[2]
 
 
 def right_views(frames: list[Frame]) -> list[Frame]:
@@ -81,8 +88,8 @@ def right_views(frames: list[Frame]) -> list[Frame]:
     Raises:
         SequenceError: If there are none.
     """
-    pairs = [frame for frame in frames if frame.right is not None]
+    pairs = [(frame, frame.right) for frame in frames if frame.right is not None]
     if not pairs:
         raise SequenceError("split stereo: the sequence has no right images")
-    lit = lit_area(frame.right for frame in spread(pairs, 10))
-    return [Frame(frame.stamp_ns, frame.right, right_camera(frame), mask=lit_now(lit, frame.right)) for frame in pairs]
+    lit = lit_area(right for _, right in spread(pairs, 10))
+    return [Frame(frame.stamp_ns, right, right_camera(frame), mask=lit_now(lit, right)) for frame, right in pairs]

@@ -62,7 +62,7 @@ class Summary(NamedTuple):
 
 def summarise(results: dict[str, Any]) -> list[Summary]:
     """Means and spreads over the seeds, in the order of the cells."""
-    groups: dict[tuple, list[dict]] = {}
+    groups: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
     for record in results["cells"]:
         cell = record["cell"]
         groups.setdefault((cell["sequence"], cell["split"], cell["method"]), []).append(record)
@@ -263,6 +263,9 @@ def _write_strips(summaries: list[Summary], out: Path) -> None:
 
 
 def _small(path: Path) -> np.ndarray:
-    image = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
+    image = cv2.imread(str(path))
+    if image is None:
+        raise OSError(f"{path}: the picture cannot be read; remove its record from cells/ and evaluate again")
+    image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
     scale = min(_STRIP_WIDTH / image.shape[1], 1.0)
     return cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)

@@ -23,7 +23,7 @@ from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.evaluation.cells import Cell
 from endo_sim_ros.evaluation.deformed_views import deformed_view_psnr
 from endo_sim_ros.evaluation.held_out import difference, mean_figures, measure, model_renderer, seen_pixels
-from endo_sim_ros.evaluation.lpips import Lpips
+from endo_sim_ros.evaluation.lpips import Backbone, Lpips
 from endo_sim_ros.evaluation.measurement import machine, peak_megabytes
 from endo_sim_ros.evaluation.preparation import Prepared
 from endo_sim_ros.evaluation.splits import Split, split_views
@@ -41,7 +41,7 @@ def _load(file: Path) -> Prepared:
 
 
 @functools.lru_cache(maxsize=2)
-def _network(name: str, weights: Path | None, device: str) -> Lpips:
+def _network(name: Backbone, weights: Path | None, device: str) -> Lpips:
     return Lpips(name, weights, device)
 
 
@@ -94,11 +94,12 @@ def train_and_measure(argument: tuple[Cell, Path | None, Prepared | Path], devic
     shown = set(spread(range(len(held_out)), _SHOWN))
     # Without reference depth that of the model tells what was seen.
     known = all(frame.depth is not None for frame in [*held_out, *seen_by])
-    surfaces = [(view.camera, view.depth if known else renderer.render(view.camera)[1], view.mask) for view in seen_by]
+    depth_of = lambda view: view.depth if known else renderer.render(view.camera)[1]
+    surfaces = [(view.camera, depth_of(view), view.mask) for view in seen_by]
 
     def of_view(index: int, image: np.ndarray, depth: np.ndarray) -> tuple[dict[str, float], dict[str, bytes]]:
         frame, number = held_out[index], split.held_out[index]
-        seen = seen_pixels(frame.camera, frame.depth if known else depth, surfaces)
+        seen = seen_pixels(frame.camera, depth if frame.depth is None or not known else frame.depth, surfaces)
         found = measure(image, depth, frame, seen, networks, prepared.judging)
         row = {"view": number} | {name: value for name, value in found.items() if np.isfinite(value)}
         return row, _pictures(number, image, depth, frame) if index in shown else {}
@@ -147,8 +148,11 @@ def _reference_at_points(held_out: list[Frame], judging: np.ndarray | None) -> f
     """How far the reference depth is off at the scene points that judge, metres; None if there are not both."""
     if judging is None:
         return None
-    judged = [frame for frame in held_out if frame.depth is not None]
-    off = [metrics.depth_at_points(frame.depth, *points_in_view(frame.camera, judging), frame.mask) for frame in judged]
+    off = [
+        metrics.depth_at_points(frame.depth, *points_in_view(frame.camera, judging), frame.mask)
+        for frame in held_out
+        if frame.depth is not None
+    ]
     off = [value for value in off if np.isfinite(value)]
     return float(np.mean(off)) if off else None
 

@@ -7,6 +7,7 @@ import signal
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
 from typing import Any, NamedTuple
 
 import torch
@@ -52,8 +53,10 @@ def run_in_processes(job: Job, arguments: Sequence[Any], devices: Sequence[str])
                 if worker.index is None and waiting:
                     worker.start(*waiting.pop(0))
             busy = {worker.connection: worker for worker in workers if worker.index is not None}
-            for connection in wait(list(busy)):
-                yield busy[connection].receive()
+            ready = wait(list(busy))
+            for connection, worker in busy.items():
+                if connection in ready:
+                    yield worker.receive()
     finally:
         for worker in workers:
             worker.stop()
@@ -65,7 +68,7 @@ class _Worker:
     def __init__(self, job: Job, device: str, threads: int):
         self._arguments = job, device, threads
         self.index: int | None = None  # of the job at hand
-        self._process: multiprocessing.Process | None = None
+        self._process: BaseProcess | None = None
 
     def start(self, index: int, argument: Any) -> None:
         if self._process is None or not self._process.is_alive():
@@ -78,12 +81,13 @@ class _Worker:
         self.connection.send(argument)
 
     def receive(self) -> News | Finished:
-        index = self.index
+        index, process = self.index, self._process
+        assert index is not None and process is not None  # only a worker that was started is heard
         try:
             kind, payload = self.connection.recv()
         except (EOFError, ConnectionResetError):
-            self._process.join()
-            reason, self._process, self.index = _reason(self._process.exitcode), None, None
+            process.join()
+            reason, self._process, self.index = _reason(process.exitcode or 0), None, None
             return Finished(index, error=reason)
         if kind == "news":
             return News(index, payload)
@@ -140,7 +144,7 @@ def run_in_ray(job: Job, arguments: Sequence[Any], on_gpu: bool, at_once: int) -
         on_gpu: Whether a job needs a GPU.
         at_once: Jobs that share one GPU, or without GPUs one host.
     """
-    import ray
+    import ray  # pyright: ignore[reportMissingImports]  (optional)
 
     if not ray.is_initialized():
         ray.init(log_to_driver=False, logging_level="ERROR")

@@ -5,6 +5,7 @@ one batched simulation. Environment i of those, with seed s + i, is the single o
 :class:`TaskEnvironment`.
 """
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -154,11 +155,14 @@ class VectorTaskEnvironment(gymnasium.vector.VectorEnv):
         Raises:
             ValueError: If there are more or fewer seeds or places in the mask than environments.
         """
-        seeds = [None if seed is None else seed + i for i in range(self.num_envs)] if seed is None or np.isscalar(seed) else list(seed)
+        if seed is None:
+            seeds = [None] * self.num_envs
+        else:
+            seeds = [int(seed) + i for i in range(self.num_envs)] if isinstance(seed, (int, np.integer)) else list(seed)
         chosen = np.array((options or {}).get("reset_mask", np.ones(self.num_envs)), bool)
-        for what, given in (("seeds", seeds), ("places in reset_mask", chosen)):
-            if np.shape(given) != (self.num_envs,):
-                raise ValueError(f"{self.num_envs} environments need as many {what}, got {np.size(given)}")
+        for what, shape in (("seeds", (len(seeds),)), ("places in reset_mask", chosen.shape)):
+            if shape != (self.num_envs,):
+                raise ValueError(f"{self.num_envs} environments need as many {what}, got {math.prod(shape)}")
         for i, each in enumerate(seeds):
             if each is not None and chosen[i]:
                 self._generators[i] = np.random.default_rng(each)

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import matrix_to_quat, parse_frames
@@ -169,7 +169,7 @@ def read_episode(
 def summarize_tissue(nodes: ControlNodeCloud, tips: np.ndarray) -> np.ndarray:
     """The row of `Episode.environment_state`, [4 + 6·A], of control nodes and the tips [A, 3] (m, world)."""
     displacement = nodes.positions - nodes.rest
-    near = cKDTree(nodes.positions).query(tips, min(NEAREST, len(displacement)))[1].reshape(len(tips), -1)
+    near = KDTree(nodes.positions).query(tips, min(NEAREST, len(displacement)))[1].reshape(len(tips), -1)
     parts = [displacement.mean(0), [np.linalg.norm(displacement, axis=1).max()]]
     for tip, indices in zip(tips, near):
         parts += [(nodes.positions[indices] - tip).mean(0), displacement[indices].mean(0)]

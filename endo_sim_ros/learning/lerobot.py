@@ -112,7 +112,8 @@ class _Dataset:
     """Writes the files of a dataset."""
 
     def __init__(self, root: Path, pyarrow: Any, task: str, images: ImageFormat):
-        self._root, self._pa, self._task, self._images = root, pyarrow, task, images
+        self._root, self._pa, self._task = root, pyarrow, task
+        self._images: ImageFormat = images
 
     def write(self, episodes: list[Episode]) -> None:
         features = _features(episodes[0], self._images)
@@ -125,7 +126,7 @@ class _Dataset:
             histograms.append(histogram)
             begin += len(episode)
         merged = {key: np.concatenate([columns[key] for columns in all_columns]) for key in all_columns[0]}
-        statistics = _statistics(merged, sum(histograms), begin)
+        statistics = _statistics(merged, np.sum(histograms, axis=0), begin)
         self._write_json("meta/stats.json", statistics)
         self._write_json("meta/info.json", _info(episodes[0].fps, len(episodes), begin, features, self._images))
         self._write_table(_EPISODES, {key: self._pa.array([row[key] for row in rows]) for key in rows[0]})

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -22,6 +22,7 @@ class Policy(Protocol):
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Actions [B, 4] for state observations [B, n]."""
+        ...
 
 
 class RetractionScript:
@@ -53,7 +54,7 @@ class PalpationScript:
     deep, further = 0.003, 0.002  # m: of the tip over the skin at last; by how much that is deeper than before
 
     def __init__(self, count: int = 1):
-        self._runs: list[Moves] = [iter(()) for _ in range(count)]
+        self._runs = [self._search() for _ in range(count)]
         self.reset(range(count))
 
     def reset(self, episodes: Sequence[int]) -> None:
@@ -162,7 +163,8 @@ class NetworkPolicy:
     def save(self, path: str | Path) -> None:
         """Write a .npz file of plain arrays."""
         with Path(path).open("wb") as file:
-            np.savez(file, task=np.array(self.task), **{f"layer{i}": layer for i, layer in enumerate(self.layers)})
+            layers: dict[str, Any] = {f"layer{i}": layer for i, layer in enumerate(self.layers)}
+            np.savez(file, task=np.array(self.task), **layers)
 
     @classmethod
     def load(cls, path: str | Path) -> "NetworkPolicy":

@@ -17,10 +17,14 @@ from endo_sim_ros.learning.task_batch import TaskBatch
 from endo_sim_ros.learning.train import measure_policy, single_threaded_torch
 
 try:
-    from stable_baselines3 import PPO
-    from stable_baselines3.common.callbacks import BaseCallback
-    from stable_baselines3.common.vec_env import VecEnv
-    from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
+    from stable_baselines3 import PPO  # pyright: ignore[reportMissingImports]  (optional)
+    from stable_baselines3.common.callbacks import BaseCallback  # pyright: ignore[reportMissingImports]  (optional)
+    from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore[reportMissingImports]  (optional)
+    from stable_baselines3.common.vec_env.base_vec_env import (  # pyright: ignore[reportMissingImports]  (optional)
+        VecEnvIndices,
+        VecEnvObs,
+        VecEnvStepReturn,
+    )
 except ImportError as error:
     raise ImportError("PPO needs stable-baselines3, which is not installed; pip install 'endo_sim_ros[rl]'") from error
 
@@ -51,7 +55,7 @@ class StableEnvironments(VecEnv):
         observations, rewards, terminated, truncated, info = self.environment.step(self._actions)
         ended = np.flatnonzero(terminated | truncated)
         infos = [{name: values[i] for name, values in info.items()} for i in range(self.num_envs)]
-        for i in ended:
+        for i in ended.tolist():
             infos[i]["terminal_observation"] = _of(observations, i)
             infos[i]["TimeLimit.truncated"] = bool(truncated[i])
         if len(ended):
@@ -64,7 +68,7 @@ class StableEnvironments(VecEnv):
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         """Images [H, W, 3], uint8, of all environments."""
-        return self.environment.render()
+        return self.environment.render() or ()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """An attribute of the environments, once for each index."""

@@ -272,8 +272,15 @@ class Palpation(Task):
     @staticmethod
     def physics(device: str = "auto") -> PhysicsConfig:
         """Soft tissue, and a ball that pushes."""
-        tool = {"contact_radius": 0.008, "friction": 0.1}
-        return PhysicsConfig(node_count=1000, layers=3, thickness=0.02, young_modulus=4e3, **tool, device=device)
+        return PhysicsConfig(
+            node_count=1000,
+            layers=3,
+            thickness=0.02,
+            young_modulus=4e3,
+            contact_radius=0.008,
+            friction=0.1,
+            device=device,
+        )
 
     def __init__(self, nodes: ControlNodes, viewpoint: np.ndarray, count: int):
         super().__init__(nodes, viewpoint, count)

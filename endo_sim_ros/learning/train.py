@@ -31,6 +31,7 @@ def run_episodes(batch: TaskBatch, policy: Policy, seeds: np.ndarray) -> tuple[n
     running = np.ones(batch.count, bool)
     observations = batch.observe()
     while running.any():
+        assert isinstance(observations, np.ndarray)  # policies act on states
         observations, outcome = batch.step(policy.act(observations))
         returns += outcome.reward * running
         lengths += running

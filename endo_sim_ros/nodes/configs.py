@@ -193,8 +193,8 @@ class PolicyConfig(StageConfig):
     """Options of the policy. physics_node must have mode lockstep, arm_source commanded, lockstep_inputs [pose, jaw] and the
     tissue of the task: `endo-sim scene` writes these parameters to a file."""
 
-    task: Literal["retraction", "palpation"] = "retraction"
-    """Task to solve."""
+    task: str = "retraction"
+    """Name of the task; an unknown one is answered with the list."""
     policy: str = "scripted"
     """scripted, or the .npz file of a trained policy."""
     scene: str = ""

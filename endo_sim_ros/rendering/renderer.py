@@ -1,5 +1,7 @@
 """Images and depth of a Gaussian model, at rest or as it follows its control nodes, in a camera."""
 
+from typing import Literal, overload
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -60,6 +62,39 @@ class DeformableRenderer:
             raise ValueError("this renderer has no control nodes and shows the model at rest only; give it node_rest")
         return self._skinning.deform(positions, F)
 
+    @overload
+    def render(
+        self,
+        camera: Camera,
+        positions: np.ndarray | None = None,
+        F: np.ndarray | None = None,
+        *,
+        depth: Literal[True] = True,
+        light: Light | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]: ...
+
+    @overload
+    def render(
+        self,
+        camera: Camera,
+        positions: np.ndarray | None = None,
+        F: np.ndarray | None = None,
+        *,
+        depth: Literal[False],
+        light: Light | None = None,
+    ) -> tuple[np.ndarray, None]: ...
+
+    @overload
+    def render(
+        self,
+        camera: Camera,
+        positions: np.ndarray | None = None,
+        F: np.ndarray | None = None,
+        *,
+        depth: bool,
+        light: Light | None = None,
+    ) -> tuple[np.ndarray, np.ndarray | None]: ...
+
     @torch.no_grad()
     def render(
         self,
@@ -87,6 +122,7 @@ class DeformableRenderer:
             if F is None:
                 raise ValueError("render: positions of control nodes go with their deformation gradients F; F is None")
             means, covars = self.deform(positions, F)
+            assert self._skinning is not None  # else deform has refused
             sh = turned_colors(model.sh, self._skinning, means, F, camera) if model.sh_degree else model.sh
             model = GaussianModel(means, model.quats, model.log_scales, model.logit_opacities, sh)
         output = render(model, camera, background=self._background, covars=covars)
@@ -104,6 +140,7 @@ class DeformableRenderer:
 def render_depth(model: GaussianModel, camera: Camera) -> np.ndarray:
     """Return the median depth [H, W] of a model at rest in a camera, float32, metres, 0 = no surface."""
     output = render(model, camera, median=True)
+    assert output.medians is not None  # asked for
     return torch.where(output.alphas[0] > SURFACE, output.medians[0], 0.0).cpu().numpy()
 
 

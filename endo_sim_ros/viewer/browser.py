@@ -98,7 +98,7 @@ class Browser:
         self._camera_shown, self._endoscope_shown = None, (None, 0.0)
         if self._room is not None:
             self._room.remove_drag_callback()
-            self._listen()
+            self._listen(self._room)
         self._changed()
 
     # ----------------------------------------------------------------- mouse
@@ -120,19 +120,19 @@ class Browser:
         self._room = self.client.scene.add_box(
             "/room", dimensions=(size, size, size), position=(low + high) / 2, opacity=0.0, side="back", cast_shadow=False
         )  # seen from inside only, so that it hides nothing
-        self._listen()
+        self._listen(self._room)
         self.look_from(camera)
         self._camera_shown, self._endoscope_shown = None, (None, 0.0)
 
-    def _listen(self) -> None:
-        """Hear drags: Shift pulls, Ctrl lifts, and plain ones pull where they are not for turning."""
+    def _listen(self, room: Any) -> None:
+        """Hear drags in the box: Shift pulls, Ctrl lifts, and plain ones pull where they are not for turning."""
 
         def listen(modifier: str | None, lifts: bool) -> None:
             async def on_drag(event: Any) -> None:  # a coroutine, as only those are called in order
                 pointer = Pointer(event.client_id, event.phase, event.start_screen_pos, event.end_screen_pos, lifts)
                 self._post(lambda: self._point(pointer))
 
-            self._room.on_drag("left", modifier=modifier)(on_drag)
+            room.on_drag("left", modifier=modifier)(on_drag)
 
         listen("shift", False)
         listen("cmd/ctrl", True)
@@ -178,7 +178,7 @@ class Browser:
     def show_nodes(self, positions: np.ndarray, colors: np.ndarray | None, size: float) -> None:
         """Nodes at positions [M, 3], m, in colours [M, 3] uint8, as points of a size in cm."""
         points = (CENTIMETRES * positions).astype(np.float32)
-        colors = np.tile(np.uint8(_PLAIN), (len(points), 1)) if colors is None or not self.wants_stress else colors
+        colors = np.tile(np.array(_PLAIN, np.uint8), (len(points), 1)) if colors is None or not self.wants_stress else colors
         if self._points is not None and len(self._points.points) != len(points):
             self._points.remove()
             self._points = None
@@ -326,6 +326,6 @@ def _around_axis(camera: Camera, aspect: float) -> tuple[float, float, float]:
 def _padded(image: np.ndarray, camera: Camera, aspect: float) -> np.ndarray:
     """The picture in a black frame, such that it fills a canvas of an aspect and its optical axis is in the middle."""
     square, width, height = _around_axis(camera, aspect)
-    M = np.float64([[square, 0, width / 2 - camera.K[0, 2] * square], [0, 1, height / 2 - camera.K[1, 2]]])
+    M = np.array([[square, 0, width / 2 - camera.K[0, 2] * square], [0, 1, height / 2 - camera.K[1, 2]]], np.float64)
     M[:, 2] += M[:, :2] @ [0.5, 0.5] - 0.5  # pixel centres are at half numbers
     return cv2.warpAffine(image, M, (round(width), round(height)), flags=cv2.INTER_LINEAR)

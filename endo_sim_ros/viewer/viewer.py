@@ -307,6 +307,7 @@ class Viewer:
 
     def splats(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Centres, covariances, colours and opacities of the Gaussians now, centimetres."""
+        assert self.renderer is not None  # nothing is drawn before there is a model
         model = self.renderer.model
         if self.state is None:
             means, covars = model.means, model.covariances

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import try_shutdown
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
@@ -247,7 +248,7 @@ def _watch(supervisor: _Supervisor, console: Console, asked: threading.Event) ->
             live.stop()
         executor.shutdown()
         watcher.destroy_node()
-        rclpy.try_shutdown()
+        try_shutdown()
 
 
 def _table(rows: list[_Row]) -> Table:

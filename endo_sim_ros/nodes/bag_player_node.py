@@ -5,8 +5,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-import rclpy
 from rclpy.duration import Duration
+from rclpy.utilities import try_shutdown
 
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.messages import DIAGNOSTICS, STATE, BagPlayerState, MessageError, Topic
@@ -68,7 +68,7 @@ class BagPlayerNode(EndoNode):
         self._state = BagPlayerState.DONE
         self.publish_diagnostics()
         self.get_logger().info(f"finished: {self._sent} messages")
-        rclpy.try_shutdown(context=self.context)
+        try_shutdown(context=self.context)
 
     @property
     def _stopped(self) -> bool:

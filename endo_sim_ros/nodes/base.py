@@ -12,11 +12,13 @@ from typing import Any
 
 import rclpy
 import torch
-from rclpy.clock import Clock, ClockType
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.context import Context
 from rclpy.exceptions import NameValidationException
 from rclpy.executors import ExternalShutdownException
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.utilities import ok, try_shutdown
 
 from endo_sim_ros import hear_interrupts, messages
 from endo_sim_ros.core.config import ConfigError
@@ -186,12 +188,12 @@ def run(node_class: Callable[[], EndoNode]) -> int:
         print(f"{node_class.__name__}: {_one_line(error)}", file=sys.stderr)
         status = 2
     except Exception:
-        if rclpy.ok():  # otherwise an interrupt came while the node was starting, and made that fail
+        if ok():  # otherwise an interrupt came while the node was starting, and made that fail
             raise
     finally:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # an impatient second one must not cut short what follows
         with contextlib.suppress(RuntimeError):  # ROS may be shutting itself down at the same moment
-            rclpy.try_shutdown()
+            try_shutdown()
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # ROS has put Python's handler back
         if node is not None:
             node.destroy_node()

@@ -140,8 +140,9 @@ class PolicyNode(EndoNode):
         if self._config.record:
             names, path = ("observations", "actions", "rewards", "success", "episode"), Path(self._config.record)
             partial = path.with_name(path.name + ".part")
+            columns: dict[str, Any] = {name: np.array(column) for name, column in zip(names, zip(*self._rows))}
             with partial.open("wb") as file:
-                np.savez(file, **{name: np.array(column) for name, column in zip(names, zip(*self._rows))})
+                np.savez(file, **columns)
             partial.replace(path)  # there whole or not at all
         self.publish_diagnostics()
 

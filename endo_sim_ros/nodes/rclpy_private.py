@@ -1,6 +1,6 @@
 """What we need of rclpy beyond its stable interface, seen with rclpy 7.1.5 (Jazzy)."""
 
-from rclpy.experimental import EventsExecutor
+from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 
 _WAKE_EVERY = 1.0  # seconds; see spin

@@ -300,7 +300,7 @@ class ReconstructionNode(EndoNode):
         if state is ReconstructionState.PREPARING:
             stage, done, total = self._stage
             return OK, f"preparing views: {stage}", values | {"stage": stage, "progress": f"{done / max(total, 1):.2f}"}
-        if state is ReconstructionState.TRAINING:
+        if state is ReconstructionState.TRAINING and progress is not None:
             values |= {"iteration": progress.iteration, "iterations": progress.iterations}
             values |= {"loss": f"{progress.loss:.4f}", "gaussians": progress.gaussians}
             return OK, f"training, iteration {progress.iteration} of {progress.iterations}", values
@@ -308,7 +308,7 @@ class ReconstructionNode(EndoNode):
             return ERROR, self._failure, values
         if state is ReconstructionState.DONE:
             return OK, f"finished, model saved in {self._saved}", values
-        if self._file is not None and not self._frames and not any(dropped.values()):
+        if self._file is not None and self._published is not None and not self._frames and not any(dropped.values()):
             values["gaussians"] = len(self._published)
             return OK, f"published the model of {self._file}; a recording that comes is reconstructed", values
         silent = time.monotonic() - self._last_view

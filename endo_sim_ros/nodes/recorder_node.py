@@ -10,6 +10,7 @@ from typing import Any
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.utilities import try_shutdown
 from rich.live import Live
 from rich.text import Text
 
@@ -154,7 +155,7 @@ def record(bag: Path, arms: tuple[str, ...], topics: tuple[str, ...], namespace:
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
-        rclpy.try_shutdown()
+        try_shutdown()
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # an impatient second one must not cut short what follows
         if node is not None:
             node.destroy_node()

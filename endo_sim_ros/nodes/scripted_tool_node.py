@@ -62,40 +62,42 @@ class ScriptedToolNode(EndoNode):
                 if not self._take_hold():
                     return
                 self._began = now
-            self._publish(now - self._began)
+            if self._nodes is not None:
+                self._publish(self._nodes, now - self._began)
 
     def _take_hold(self) -> bool:
         """Choose the tissue point under the configured pixel."""
-        if any(part is None for part in (self._camera_pose, self._info, self._depth, self._nodes)):
+        info, depth, nodes, pose = self._info, self._depth, self._nodes, self._camera_pose
+        if info is None or depth is None or nodes is None or pose is None:
             return False
         if self._wrench_pub.get_subscription_count() < self._config.listeners:
             self._missing = "waiting for somebody to feel the tool"
             return False
-        height, width = self._depth.shape
-        camera = Camera(self._info.P[:, :3], width, height, self._camera_pose)
+        height, width = depth.shape
+        camera = Camera(info.P[:, :3], width, height, pose)
         row, column = min(int(self._config.v * height), height - 1), min(int(self._config.u * width), width - 1)
-        seen = np.argwhere(self._depth > 0)
+        seen = np.argwhere(depth > 0)
         if not len(seen):
             self._missing = "no tissue in the picture"
             return False
         row, column = seen[((seen - [row, column]) ** 2).sum(1).argmin()]  # the nearest pixel with tissue
-        self._tip = camera.backproject(self._depth)[row, column]
-        self._follow(self._nodes.positions)
+        self._tip = camera.backproject(depth)[row, column]
+        self._follow(nodes, nodes.positions)
         self._towards_camera = camera.position - self._tip
         self._towards_camera /= np.linalg.norm(self._towards_camera)
         self._across = invert_pose(camera.pose)[0, :3]  # the image's x axis in the world
         return True
 
-    def _follow(self, positions: np.ndarray) -> None:
-        """Choose the nodes at the grasped point."""
+    def _follow(self, nodes: ControlNodeCloud, positions: np.ndarray) -> None:
+        """Choose the control nodes at the grasped point, by their positions [M, 3], m, world."""
         self._near = np.argsort(np.linalg.norm(positions - self._tip, axis=1))[:_FOLLOWED]
-        self._near_stamp = self._nodes.model_stamp_ns
+        self._near_stamp = nodes.model_stamp_ns
 
-    def _publish(self, elapsed: float) -> None:
+    def _publish(self, nodes: ControlNodeCloud, elapsed: float) -> None:
         config, stamp = self._config, self.now_ns()
-        if self._nodes.model_stamp_ns != self._near_stamp:  # a new model has nodes of its own
-            self._follow(self._nodes.rest)
-        moved = (self._nodes.positions - self._nodes.rest)[self._near].mean(0)
+        if nodes.model_stamp_ns != self._near_stamp:  # a new model has control nodes of its own
+            self._follow(nodes, nodes.rest)
+        moved = (nodes.positions - nodes.rest)[self._near].mean(0)
         pose = np.eye(4)
         pose[:3, 3] = self._tip + moved
         force = self._force(elapsed)

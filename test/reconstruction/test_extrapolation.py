@@ -3,8 +3,9 @@
 import dataclasses
 
 import numpy as np
+import pytest
 import torch
-from short_training import bare, options
+from short_training import bare, film, options
 from training_views import with_prior
 
 from endo_sim_ros.core.gaussians import GaussianModel
@@ -128,3 +129,14 @@ def test_a_view_that_knows_next_to_no_depth_tells_nothing_of_its_surroundings(vi
     seen = with_prior([dataclasses.replace(views[4], depth=depth), bare(views[0])])
     nothing = GaussianModel.from_points(torch.zeros(1, 3), torch.zeros(1, 3), torch.full((1,), 1e-6), 0.5)
     assert extrapolate(nothing, seen, np.empty((0, 3)), np.zeros(4), np.zeros((2, 3)), 0.1, 0.3, 60_000) is nothing
+
+
+@pytest.mark.parametrize("known", [np.s_[20:21], np.s_[:, 20:21]])
+def test_depth_in_one_line_is_continued_level_to_its_sides(known):
+    """Of how depth changes across the line nothing is known."""
+    (frame,) = film(40, 40, 1)
+    line = np.zeros_like(frame.depth)
+    line[known] = frame.depth[known]
+    model = prepare([dataclasses.replace(bare(frame), depth=line)], options(depth="topic")).model
+    _, depth = frame.camera.project(model.means.numpy())
+    assert len(model) > 100 and 0.7 * line[known].min() < depth.min() and depth.max() < 1.4 * line.max()

@@ -1,13 +1,13 @@
 """Losses against references and by hand."""
 
+import numpy as np
 import pytest
 import torch
-from short_training import SHORT
 from torchmetrics.functional.image import structural_similarity_index_measure
-from trained import trainer_of
 
+from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.kernels import plain_kernels
-from endo_sim_ros.reconstruction import losses, preset
+from endo_sim_ros.reconstruction import losses
 
 
 def reference_ssim(x, y):
@@ -115,9 +115,17 @@ def test_pearson_does_not_see_scale_and_shift():
     assert float(losses.pearson(spoilt, prior, None)) == pytest.approx(0, abs=1e-5)
 
 
-@pytest.mark.parametrize(("name", "opaque"), [("default", 0.01), ("paper", 0.0)])
-def test_transparency_is_weighed_apart_by_default_and_not_as_printed(views, monkeypatch, name, opaque):
-    weights = []
-    monkeypatch.setattr(losses, "depth_l1", lambda *arguments: weights.append(arguments[-1]) or torch.zeros(()))
-    trainer_of(views[:3], preset(name, **SHORT)).step()
-    assert weights == [opaque]
+def test_depth_extent_sees_needles_along_the_line_of_sight_only():
+    eye, angle = torch.tensor([0.0, 0.0, -0.1]), np.pi / 4
+    turned = [np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0]  # the z axis turns towards x
+    quats = torch.tensor([[1.0, 0, 0, 0], [1, 0, 0, 0], [2, 0, 0, 0], turned], dtype=torch.float32)
+    scales = torch.tensor([[1.0, 1, 1], [4, 4, 1], [1, 1, 6], [1, 1, 6]]) * 1e-3
+    model = GaussianModel(torch.zeros(4, 3), quats, scales.log(), torch.zeros(4), torch.zeros(4, 1, 3))
+    model.log_scales.requires_grad_()
+    extent = losses.depth_extent(model, eye, 1.5)
+    # A sphere and a disc across the view are fine; a needle along it is 6 times as deep as wide, a turned one less.
+    deep, wide = (1 + 36) / 2, (1 + (1 + 36) / 2) / 2
+    expected = [0, 0, np.log(6 / 1.5), 0.5 * np.log(deep / wide) - np.log(1.5)]
+    np.testing.assert_allclose(extent.detach(), np.maximum(expected, 0), atol=1e-5)
+    extent[2].backward()
+    assert model.log_scales.grad[2, 2] > 0 > model.log_scales.grad[2, 0] and not model.log_scales.grad[:2].any()

@@ -43,6 +43,7 @@ def with_eyes_that_converge(frame):
     return dataclasses.replace(frame, right=moved, right_K=K)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pair", [plain_pair, dark_right, behind_a_tool, with_eyes_that_converge])
 def test_flow_between_the_eyes_corrects_what_matching_left(large, pair):
     (prior,) = matched([pair(large[0])])
@@ -60,6 +61,7 @@ def test_flow_is_found_in_finer_pixels_than_are_trained_on(large):
     assert error(wide) < 0.95 * error(narrow)
 
 
+@pytest.mark.slow
 def test_reflections_of_the_light_do_not_spoil_the_depth_that_views_agree_on(large):
     """A reflection is seen where the tissue is not: through another view's depth it lies beside where that view has it."""
     frames = matched(large[:2])
@@ -85,6 +87,7 @@ def test_pale_tissue_is_no_reflection(large):
     assert all(np.median(np.abs(a.depth_prior / b.depth - 1)) < 0.012 for a, b in zip(corrected, large))
 
 
+@pytest.mark.slow
 def test_views_correct_each_others_depth(large):
     views = matched(large)
     corrected = refine_depth(views, NO_POINTS, "stereo")
@@ -157,6 +160,7 @@ def test_scene_points_correct_the_depth_around_them(large):
     assert np.median(np.abs(corrected.depth_prior / frame.depth - 1)) < 0.01
 
 
+@pytest.mark.slow
 def test_wrong_scene_points_among_good_ones_hardly_move_what_matching_knows(large):
     (prior,) = matched(large[:1])
     v, u = np.mgrid[8:512:16, 8:640:16].reshape(2, -1)

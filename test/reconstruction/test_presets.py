@@ -12,7 +12,7 @@ from trained import trainer_of
 from endo_sim_ros.core.config import ConfigError, option_values
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.evaluation import metrics
-from endo_sim_ros.reconstruction import ABLATIONS, PRESETS, ReconstructionConfig, preset
+from endo_sim_ros.reconstruction import ABLATIONS, PRESETS, ReconstructionConfig, losses, preset
 from endo_sim_ros.reconstruction.scene import shrink
 from endo_sim_ros.reconstruction.triangulation import triangulate
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
@@ -115,3 +115,11 @@ def test_a_checkpoint_knows_the_options_and_not_the_preset_that_they_came_from(v
     assert spelled_out.iteration == 1
     with pytest.raises(SequenceError, match=r"other options \(lambda_dist\)"):
         trainer_of(views[::4], preset("paper", **SHORT), points).load_checkpoint(tmp_path / "checkpoint.pt")
+
+
+@pytest.mark.parametrize(("name", "opaque"), [("default", 0.01), ("paper", 0.0)])
+def test_transparency_is_weighed_apart_by_default_and_not_as_printed(views, monkeypatch, name, opaque):
+    weights = []
+    monkeypatch.setattr(losses, "depth_l1", lambda *arguments: weights.append(arguments[-1]) or torch.zeros(()))
+    trainer_of(views[:3], preset(name, **SHORT)).step()
+    assert weights == [opaque]

@@ -11,9 +11,11 @@ from trained import trainer_of
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.evaluation.held_out import reconstruct_and_measure
+from endo_sim_ros.reconstruction import ReconstructionConfig
 from endo_sim_ros.reconstruction.optimizer import Adam
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.bag import write_bag
+from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
 
 def held_out(model, frames):
@@ -148,3 +150,10 @@ def test_reconstruction_of_a_bag_is_measured(tmp_path, small):
     assert found["depth_rmse"] < 0.010
     for name in ("model.ply", "checkpoint.pt", "held_out.png"):
         assert (tmp_path / "out" / name).stat().st_size > 0
+
+
+def test_no_gaussian_outgrows_the_scene():
+    frames = list(phantom_sequence(PhantomConfig(frames=4, width=96, height=80, border=0.1)))
+    trainer = trainer_of(frames, ReconstructionConfig(iterations=60, max_gaussians=1000, device="cpu", learning_rate=5.0))
+    trainer.run()
+    assert trainer.model.scales.max() <= 0.06 * trainer.scene_depth * 1.001

@@ -9,6 +9,9 @@ from short_training import bare, film, finite, options
 from trained import trainer_of
 
 from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.evaluation import metrics
+from endo_sim_ros.reconstruction.priors.stereo import right_view
+from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 
 
 def test_no_views_is_one_clear_error():
@@ -65,29 +68,13 @@ def test_odd_sizes_train():
     assert finite(model)
 
 
-@pytest.mark.parametrize("known", [np.s_[20:21], np.s_[:, 20:21]])
-def test_depth_in_one_line_is_continued_level_to_its_sides(known):
-    """Of how depth changes across the line nothing is known."""
-    (frame,) = film(40, 40, 1)
-    line = np.zeros_like(frame.depth)
-    line[known] = frame.depth[known]
-    model = trainer_of([dataclasses.replace(bare(frame), depth=line)], options(depth="topic")).run()
-    _, depth = frame.camera.project(model.means.numpy())
-    assert len(model) > 100 and 0.7 * line[known].min() < depth.min() and depth.max() < 1.4 * line.max()
-
-
-@pytest.mark.parametrize(
-    "positions, error, said",
-    [
-        (np.full((9, 3), np.nan), 0.01, "not finite"),
-        (np.ones((9, 3)), np.zeros(9), "above zero"),
-        (np.ones((9, 3)), np.full(9, np.nan), "above zero"),
-        (np.ones((9, 2)), 0.01, r"arrays \[N, 3\]"),
-    ],
-)
-def test_scene_points_that_are_none_are_refused(large, positions, error, said):
-    with pytest.raises(SequenceError, match=said):
-        trainer_of(list(large[:1]), options(iterations=1), (positions, np.ones((len(positions), positions.shape[1])), error))
+def test_the_right_image_is_a_view_of_the_same_scene(views):
+    frame = views[4]
+    right = right_view(frame)
+    model = trainer_of(views, options(iterations=40, max_gaussians=8000, extrapolation=0.0, learning_rate=1.0)).run()
+    image, _ = DeformableRenderer(model, None, RenderingConfig(device="cpu")).render(right.camera)
+    wrong, _ = DeformableRenderer(model, None, RenderingConfig(device="cpu")).render(frame.camera)
+    assert metrics.psnr(image, right.image, right.mask) > metrics.psnr(wrong, right.image, right.mask) + 3
 
 
 def test_pure_rotation_trains_with_depth_and_is_an_error_without(views):
@@ -115,3 +102,17 @@ def test_a_view_that_shows_nothing_is_left_out(views, caplog, reason, change):
     assert len(trainer.cameras) == 2 and f"left out: {reason}" in caplog.text
     with pytest.raises(SequenceError, match=f"every (view|pixel of every view) is {reason}"):
         trainer_of([blind], options())
+
+
+@pytest.mark.parametrize(
+    "positions, error, said",
+    [
+        (np.full((9, 3), np.nan), 0.01, "not finite"),
+        (np.ones((9, 3)), np.zeros(9), "above zero"),
+        (np.ones((9, 3)), np.full(9, np.nan), "above zero"),
+        (np.ones((9, 2)), 0.01, r"arrays \[N, 3\]"),
+    ],
+)
+def test_scene_points_that_are_none_are_refused(large, positions, error, said):
+    with pytest.raises(SequenceError, match=said):
+        trainer_of(list(large[:1]), options(iterations=1), (positions, np.ones((len(positions), positions.shape[1])), error))

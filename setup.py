@@ -32,13 +32,13 @@ setup(
         "pycolmap>=3.10",
         "pyyaml>=6",
         "rich>=13.4",
-        "rosbags>=0.11,<0.12",
+        "rosbags>=0.11,<0.12",  # private parts: endo_sim_ros/sequences/bag_private.py
         "scipy>=1.11",
         "tifffile>=2023.7.10",
         "torch>=2.4",
         "typing_extensions>=4.12",
         "tyro>=0.9.2",
-        "warp-lang>=1.19,<1.20",  # private parts: endo_sim_ros/core/warp_private.py
+        "warp-lang>=1.19,<1.20",  # private parts: endo_sim_ros/core/native.py and kernels.py
     ],
     extras_require={
         "depth": ["onnxruntime", "transformers"],  # reconstruction with depth:=network

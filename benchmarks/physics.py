@@ -20,6 +20,7 @@ from rich.progress import Progress
 from endo_sim_ros.core.cameras import Camera, load_cameras, look_at
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.gaussians import GaussianModel, load_ply
+from endo_sim_ros.core.kernels import plain_kernels
 from endo_sim_ros.evaluation.measurement import Row, machine, median_seconds, milliseconds, peak_megabytes, report, short
 from endo_sim_ros.physics import ControlNodes, MpmSolver, PhysicsConfig, Skinning, TissueBatch, TissueSimulation, build_control_nodes
 from endo_sim_ros.physics.tools import Tools
@@ -238,10 +239,10 @@ def _psnr(image: np.ndarray, other: np.ndarray) -> float:
 # ---------------------------------------------------------------- what a step costs
 
 
-def _pulled(scene: Scene, config: PhysicsConfig, vectorised: bool = True, pressed: bool = False) -> MpmSolver:
+def _pulled(scene: Scene, config: PhysicsConfig, pressed: bool = False) -> MpmSolver:
     """A solver whose tissue a tool pulls by 5 mm, or presses with its capsule: nothing is at rest."""
     nodes = build_control_nodes(scene.model, scene.camera.position, config)
-    solver = MpmSolver(nodes, config, vectorised=vectorised)
+    solver = MpmSolver(nodes, config)
     _pull(Tools(solver, nodes, config), scene, pressed)
     return solver
 
@@ -257,15 +258,18 @@ def _pull(tools: Tools, scene: Scene, pressed: bool = False) -> None:
     tools.tips += torch.from_numpy(0.005 * into * (1 if pressed else -1)).to(tools.tips)
 
 
-def _against_plain(name: str, make: Callable[[bool], Callable[[], object]], device: str, seconds: float) -> list[Row]:
-    """Time of an action, on a CPU beside the same without vectors; `make` is told whether to use these."""
-    actions = [make(vectorised) for vectorised in ((True, False) if device == "cpu" else (True,))]
+def _against_plain(name: str, make: Callable[[], Callable[[], object]], device: str, seconds: float) -> list[Row]:
+    """Time of the action that `make` returns, on a CPU beside the same by plain kernels."""
+    actions = [make()]
+    if device == "cpu":
+        with plain_kernels():
+            actions.append(make())
     ours, *plain = milliseconds(actions, device, seconds)
     return [Row(name, ours, "ms", ours / plain[0], PLAIN) if plain else Row(name, ours, "ms")]
 
 
 def _step_rows(name: str, scene: Scene, config: PhysicsConfig, device: str, seconds: float, pressed: bool = False) -> list[Row]:
-    return _against_plain(name, lambda vectorised: _pulled(scene, config, vectorised=vectorised, pressed=pressed).step, device, seconds)
+    return _against_plain(name, lambda: _pulled(scene, config, pressed).step, device, seconds)
 
 
 def _over_nodes(scene: Scene, count: int, device: str, seconds: float) -> list[Row]:
@@ -312,12 +316,12 @@ def _over_gaussians(count: int, plan: Plan, device: str) -> list[Row]:
     batch = moving()
     positions, F = batch.positions()[0], batch.F[0].clone()
 
-    def skinning(vectorised: bool = True) -> Skinning:
-        return Skinning(scene.model, nodes.rest, device=device, vectorised=vectorised)
+    def skinning() -> Skinning:
+        return Skinning(scene.model, nodes.rest, device=device)
 
     name, seconds = short(count), plan.seconds
-    rows = _against_plain(f"skin {name}", lambda vectorised: partial(skinning(vectorised).deform, positions, F), device, seconds)
-    rows += _against_plain(f"step and skin {name}", lambda vectorised: _pulled_with_skin(scene, config, vectorised).step, device, seconds)
+    rows = _against_plain(f"skin {name}", lambda: partial(skinning().deform, positions, F), device, seconds)
+    rows += _against_plain(f"step and skin {name}", lambda: _pulled_with_skin(scene, config).step, device, seconds)
     one, apart, skin = moving(), moving(), skinning()
     one.carry(skin)
     together, separate = milliseconds([one.step, lambda: (apart.step(), skin.deform(apart.positions()[0], apart.F[0]))], device, seconds)
@@ -430,12 +434,12 @@ def _beside_peer(scene: Scene, device: str, plan: Plan, notes: list[str]) -> lis
     return rows
 
 
-def _pulled_with_skin(scene: Scene, config: PhysicsConfig, vectorised: bool = True) -> MpmSolver:
+def _pulled_with_skin(scene: Scene, config: PhysicsConfig) -> MpmSolver:
     """A solver whose tissue a tool pulls and whose step ends with the Gaussians where it took them."""
-    solver = _pulled(scene, config, vectorised)
+    solver = _pulled(scene, config)
     nodes = build_control_nodes(scene.model, scene.camera.position, config)
-    skinning = Skinning(scene.model, nodes.rest, device=config.device, vectorised=vectorised)
-    solver.end_with(skinning.launches(solver.state.u, solver.state.F, nodes.pinned, 1)[0])
+    skinning = Skinning(scene.model, nodes.rest, device=config.device)
+    solver.append_launches(skinning.work(solver.state.u, solver.state.F, nodes.pinned, 1)[0])
     return solver
 
 

@@ -61,6 +61,19 @@ class PhysicsConfig(StageConfig):
     grid_ratio: Annotated[float, Range(1.0, 4.0)] = 1.5
     """Grid cell size over node spacing. Near 1 a cell holds one node and has motions that no node resists (with current
     kinematics it fractures); above 2 dents are blurred."""
+    courant_number: Annotated[float, Range(0.05, 0.7)] = 0.5
+    """Largest c Δt/h (sound speed, substep, grid cell) that ``substeps: 0`` chooses. Above 0.7 no substep is stable; the rest is
+    room for tissue that stiffens where it is compressed."""
+    pin_stiffness: Annotated[float, Range(1.0, 1e5)] = 100.0
+    """Stiffness of the springs that pin control nodes, over the stiffness (λ + 2μ) V/h² of their tissue in a grid cell: all springs
+    of a cell together are then as stiff however many nodes share it. Stiffer ones lock tissue that is few cells thick."""
+    grasp_stiffness: Annotated[float, Range(1.0, 1e5)] = 400.0
+    """The same of the springs by which jaws hold and capsules push; softer ones let tissue lag behind its jaw."""
+    push_out_speed: Annotated[float, Range(1e-3, 10.0, "m/s")] = 0.5
+    """A capsule that suddenly is deep within tissue pushes it out no faster than this."""
+    rollback_damping: Annotated[float, Range(0.0, 1.0)] = 0.9
+    """Share of its deformation that is left to tissue when a step is undone right after another that was: from some states every
+    step ends badly, and tissue has to give way towards rest."""
     travel: Annotated[float, Range(1e-3, 10.0, "m")] = 0.05
     """Farthest a node may move from rest; a step that takes one farther is undone and counted as a fault."""
     force_radius: Annotated[float, Range(1e-4, 1.0, "m")] = 0.01

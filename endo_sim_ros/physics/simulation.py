@@ -10,12 +10,13 @@ from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.physics.backends.base import capturing
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes, RenderDepth, build_control_nodes
 from endo_sim_ros.physics.cutting import Blade, CutStencils
 from endo_sim_ros.physics.regions import TissueProperties, paint_regions
 from endo_sim_ros.physics.skinning import Skinning
-from endo_sim_ros.physics.solver import MpmSolver, capturing
+from endo_sim_ros.physics.solver import MpmSolver
 from endo_sim_ros.physics.tools import Tools
 
 MAX_TOOLS = 8  # of a TissueSimulation
@@ -90,8 +91,8 @@ class TissueBatch:
             ValueError: If the skinning is another's.
         """
         state = self.solver.state
-        launches, means, covars = skinning.launches(state.u, state.F, self.nodes.pinned, self.solver.environments)
-        self.solver.end_with(launches)
+        work, means, covars = skinning.work(state.u, state.F, self.nodes.pinned, self.solver.environments)
+        self.solver.append_launches(work)
         return means, covars
 
     def reset(self, environments: Tensor | slice = slice(None)) -> None:
@@ -292,7 +293,7 @@ class TissueSimulation:
         if self._stencils is None:
             self._stencils = CutStencils(self.nodes.rest, self.solver.rest_cells, self.solver.grid_shape)
             with capturing:
-                self.solver.load_kernels()
+                self.solver.load_for_cuts()
 
     @property
     def cuts(self) -> np.ndarray:

@@ -1,6 +1,5 @@
-"""Skinning: Gaussians follow their nearest control nodes."""
+"""Skinning: Gaussians follow their nearest control nodes (paper eq. 9, 10)."""
 
-import functools
 from typing import Literal
 
 import numpy as np
@@ -9,21 +8,18 @@ import warp as wp
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from endo_sim_ros.core.device import init_warp, on_torch_stream, pick_device, run_in_threads, shares
+from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.gaussians import GaussianModel
-from endo_sim_ros.physics import skinning_cpu_kernels as simd_kernels
+from endo_sim_ros.core.kernels import load_kernels
 from endo_sim_ros.physics import skinning_kernels as kernels
+from endo_sim_ros.physics.backends.base import Launch, SkinData, Work, array, backend_for
 from endo_sim_ros.physics.cutting import CutNeighbours, clip_to_sides
-from endo_sim_ros.physics.solver import Launch
-
-STRETCH_RANGE = (0.2, 4.0)  # of a Gaussian; beyond it the picture shows needles or holes, not tissue
-SHARED_FROM = 4096  # Gaussians; fewer are done before a second thread has begun
 
 
 def bind_weights(means: np.ndarray, node_rest: np.ndarray, neighbours: int, weighting: str) -> tuple[np.ndarray, np.ndarray]:
-    """Nearest nodes [N, K] int32 and their weights [N, K] float32, which add up to one, of means [N, 3].
+    """Return the nearest control nodes [N, K] int32 of means [N, 3], and their weights [N, K] float32, which add up to one.
 
-    ``compact``: (1 − (d/d_{K+1})²)², normalised; a node's weight falls smoothly to zero where it is no longer among the
+    ``compact``: (1 − (d/d_{K+1})²)², normalised; the weight of a control node falls smoothly to zero where it is no longer among the
     nearest. ``softmax``: exp(d)/Σ exp(d) with d in metres, as the paper prints it.
     """
     count = min(neighbours, max(len(node_rest) - 1, 1))
@@ -38,18 +34,19 @@ def bind_weights(means: np.ndarray, node_rest: np.ndarray, neighbours: int, weig
 
 
 class Skinning:
-    """Carries a model's Gaussians along with control nodes.
+    """Moves a model's Gaussians with control nodes.
 
     Args:
         model: Gaussians at rest, world.
-        node_rest: Nodes at rest [M, 3], metres, world.
-        neighbours: Number of nearest nodes K that move one Gaussian.
+        node_rest: Control nodes at rest [M, 3], metres, world.
+        neighbours: Number of nearest control nodes K that move one Gaussian.
         weighting: ``compact`` (with F_k) or the paper's ``softmax`` (with R_k), see :func:`bind_weights`.
+        stretch: Bounds that the singular values of every Gaussian's F are clamped to; beyond them a picture shows needles
+            or holes, not tissue.
         device: Where to compute: auto, cpu, cuda or cuda:N.
-        vectorised: Use the CPU's own kernel; False runs that of the GPU on it, to compare.
 
     Raises:
-        ValueError: If there are no nodes, or positions are not finite.
+        ValueError: If there are no control nodes, or positions are not finite.
     """
 
     def __init__(
@@ -59,20 +56,19 @@ class Skinning:
         *,
         neighbours: int = 4,
         weighting: Literal["compact", "softmax"] = "compact",
+        stretch: tuple[float, float] = (0.2, 4.0),
         device: str = "auto",
-        vectorised: bool = True,
     ):
-        init_warp()
         self.device = pick_device(device)
-        self.weighting = weighting
-        self._vectorised = vectorised and self.device == "cpu"
+        self.backend = backend_for(self.device)
+        load_kernels((kernels, *self.backend.skin_modules), self.device)
+        self.weighting, self.stretch = weighting, stretch
         rest = torch.as_tensor(node_rest).detach().cpu().double().numpy()
         means = model.means.detach().cpu().double().numpy()
         if rest.ndim != 2 or rest.shape[1] != 3 or not len(rest):
             raise ValueError(f"skinning: node_rest has shape {rest.shape}, expected [M, 3] with M > 0")
         if not np.isfinite(rest).all() or not np.isfinite(means).all():
             raise ValueError("skinning: node positions and Gaussian means must be finite")
-        _load_kernels(self.device)
         model = model.detach().to(self.device)
         self.means = model.means.float().contiguous()  # [N, 3] m, at rest
         self.covars = model.covariances.float().contiguous()  # [N, 3, 3] m², at rest
@@ -83,7 +79,7 @@ class Skinning:
         self._cuts = CutNeighbours(means, rest, index, weights)
         self._covars = self.covars.cpu().double().numpy()
         self._clipped = self._covars.copy()  # where the cuts left them
-        self._reach = 2 * np.sqrt(np.trace(self._covars, axis1=1, axis2=2))
+        self._extents = 2 * np.sqrt(np.trace(self._covars, axis1=1, axis2=2))
 
     def cut(self, triangles: np.ndarray) -> None:
         """Let no Gaussian follow nodes, or reach, across a cut: all of it [T, 3, 3], m, world, in the tissue at rest."""
@@ -94,7 +90,7 @@ class Skinning:
             self.rebind(cuts.index, cuts.weights)
             self.covars.copy_(torch.from_numpy(self._clipped))
         rebound = cuts.cut(triangles)
-        clipped = clip_to_sides(cuts.means, self._clipped, self._reach, cuts.triangles[known:])
+        clipped = clip_to_sides(cuts.means, self._clipped, self._extents, cuts.triangles[known:])
         for tensor, values, some in (
             (self.neighbours, cuts.index, rebound),
             (self.weights, cuts.weights, rebound),
@@ -109,10 +105,10 @@ class Skinning:
         return self._cuts.triangles
 
     def rebind(self, index: np.ndarray, weights: np.ndarray) -> None:
-        """Let Gaussians follow other nodes from now on, e.g. those on their side of a cut.
+        """Let Gaussians follow other control nodes from now on, e.g. those on their side of a cut.
 
         Args:
-            index: Nodes that move each Gaussian [N, K], 0 to M − 1; K may differ from before.
+            index: Control nodes that move each Gaussian [N, K], 0 to M − 1; K may differ from before.
             weights: Their weights [N, K], which add up to one; a node with weight zero moves nothing.
 
         Raises:
@@ -130,27 +126,27 @@ class Skinning:
         self.weights = torch.tensor(weights, dtype=torch.float32, device=self.device)  # [N, K]
 
     def deform(self, positions: Tensor | np.ndarray, F: Tensor | np.ndarray) -> tuple[Tensor, Tensor]:
-        """Means [N, 3] (m) and covariances [N, 3, 3] (m²) of the Gaussians.
+        """Return means [N, 3] (m) and covariances [N, 3, 3] (m²) of the Gaussians.
 
-        The nodes are at positions [M, 3] (m, world) with deformation gradients F [M, 3, 3]. The singular values of
-        every Gaussian's F are clamped to ``STRETCH_RANGE``.
+        Args:
+            positions: Of the control nodes [M, 3], m, world.
+            F: Their deformation gradients [M, 3, 3].
         """
         positions = self._nodes("positions", positions, (3,))
         F = self._nodes("F", F, (3, 3))
         means, covars = self._skin(positions, F)
         if self.weighting == "softmax":
             R = torch.empty_like(F)
-            self._launch(kernels.node_rotations, len(F), [_array(F, wp.mat33), _array(R, wp.mat33)])
+            self.backend.over_items(kernels.node_rotations, len(F), [F, R])
             means, _ = self._skin(positions, R)
         return means, covars
 
     def rotations(self, F: Tensor | np.ndarray) -> Tensor:
-        """Rotation of every Gaussian [N, 3, 3] for node F [M, 3, 3]; its transpose turns view directions where the
-        SH degree is above 0."""
+        """Return the rotation of every Gaussian [N, 3, 3] for F of the control nodes [M, 3, 3]; its transpose turns view
+        directions where the SH degree is above 0."""
         F = self._nodes("F", F, (3, 3))
         out = torch.empty_like(self.covars)
-        inputs = [_array(self.neighbours), _array(self.weights), _array(F, wp.mat33), _array(out, wp.mat33)]
-        self._launch_shares(kernels.blend_rotations, len(out), inputs)
+        self.backend.over_items(kernels.blend_rotations, len(out), [self.neighbours, self.weights, F, out])
         return out
 
     def _nodes(self, name: str, values: Tensor | np.ndarray, shape: tuple[int, ...]) -> Tensor:
@@ -160,33 +156,29 @@ class Skinning:
             raise ValueError(f"skinning: {name} has shape {tuple(values.shape)}, expected {expected}")
         return values
 
+    def _at_rest(self) -> SkinData:
+        return SkinData(self.means, self.covars, self.neighbours, self.weights, self._origin, *self.stretch)
+
     def _skin(self, positions: Tensor, A: Tensor) -> tuple[Tensor, Tensor]:
-        """Means [N, 3] and covariances [N, 3, 3] for node transforms A [M, 3, 3]."""
+        """Means [N, 3] and covariances [N, 3, 3] for transforms A of the control nodes [M, 3, 3]."""
         maps = torch.empty((len(A), 4, 4), device=self.device)
-        inputs = [_array(self.node_rest, wp.vec3), _array(positions, wp.vec3), _array(A, wp.mat33), self._origin, _array(maps, wp.mat44)]
-        self._launch(kernels.node_maps, len(A), inputs)
-        if self.device == "cpu" and not maps.any():  # nothing has moved yet
-            return self.means.clone(), self.covars.clone()
+        self.backend.over_items(kernels.node_maps, len(A), [self.node_rest, positions, A, self._origin, maps])
         means, covars = torch.empty_like(self.means), torch.empty_like(self.covars)
-        inputs = [_array(self.means, wp.vec3), _array(self.covars, wp.mat33), _array(self.neighbours), _array(self.weights)]
-        inputs += [_array(maps, wp.mat44), self._origin, *STRETCH_RANGE, _array(means, wp.vec3), _array(covars, wp.mat33)]
-        self._launch_shares(self._kernel(), len(means), inputs)
+        self.backend.skin(self._at_rest(), maps, means, covars)
         return means, covars
 
-    def launches(
-        self, u: wp.array, F: wp.array, pinned: np.ndarray, environments: int
-    ) -> tuple[list[Launch | list[Launch]], Tensor, Tensor]:
-        """What computes `deform` from the state of a solver, as launches (those in a list may run at the same time), and the
-        means [B, N, 3] and covariances [B, N, 3, 3] that they overwrite.
+    def work(self, u: wp.array, F: wp.array, pinned: np.ndarray, environments: int) -> tuple[list[Work], Tensor, Tensor]:
+        """Return the work that computes `deform` from the state of a solver, and the means [B, N, 3] and covariances
+        [B, N, 3, 3] that it overwrites.
 
         Args:
-            u: Displacements of the nodes in all environments [B · M].
+            u: Displacements of the control nodes in all environments [B · M].
             F: Their deformation gradients [B · M].
-            pinned: Nodes that never move [M].
+            pinned: Control nodes that never move [M].
             environments: B.
 
         Raises:
-            ValueError: If the weights are not compact, or the nodes or the device are others than the solver's.
+            ValueError: If the weights are not compact, or the control nodes or the device are others than the solver's.
         """
         count, device = len(self.node_rest), self.device
         if self.weighting != "compact":
@@ -195,48 +187,7 @@ class Skinning:
             raise ValueError(f"skinning: {count} nodes on {device} cannot follow {environments} × {len(pinned)} nodes on {u.device}")
         means, covars = (rest.repeat(environments, *[1] * rest.ndim) for rest in (self.means, self.covars))
         maps = torch.zeros((environments, count, 4, 4), device=device)
-        array = functools.partial(wp.from_torch, requires_grad=False)  # which keeps the tensor
         held = array(torch.from_numpy(pinned).to(device, torch.int32))
         inputs = [array(self.node_rest, wp.vec3), held, u, F, self._origin, array(maps.view(-1, 4, 4), wp.mat44)]
-        done: list[Launch | list[Launch]] = [Launch(kernels.moved_node_maps, (environments, count), inputs)]
-        at_rest = [array(self.means, wp.vec3), array(self.covars, wp.mat33), array(self.neighbours), array(self.weights)]
-        limits = [self._origin, *STRETCH_RANGE]
-        if not self._vectorised:
-            outputs = [array(means.view(-1, 3), wp.vec3), array(covars.view(-1, 3, 3), wp.mat33)]
-            inputs = [count, *at_rest, array(maps.view(-1, 4, 4), wp.mat44), *limits, *outputs]
-            done.append(Launch(kernels.skin_environments, (environments, len(self.means)), inputs))
-        else:
-            for b in range(environments):
-                outputs = [array(means[b], wp.vec3), array(covars[b], wp.mat33)]
-                inputs = [*at_rest, array(maps[b], wp.mat44), *limits, *outputs]
-                own = self._shares(len(self.means))
-                done.append([Launch(simd_kernels.skin_gaussians, size, [first, *inputs]) for first, size in own])
-        return done, means, covars
-
-    def _kernel(self) -> wp.Kernel:
-        return simd_kernels.skin_gaussians if self._vectorised else kernels.skin_gaussians
-
-    def _launch(self, kernel, count: int, inputs: list) -> None:
-        with on_torch_stream(self.device):
-            wp.launch(kernel, count, inputs, device=self.device)
-
-    def _launch_shares(self, kernel, count: int, inputs: list) -> None:
-        """Launch a kernel whose first argument is an offset: at once on CUDA, in shares on the CPU."""
-        jobs = [functools.partial(self._launch, kernel, size, [first, *inputs]) for first, size in self._shares(count)]
-        run_in_threads(jobs)
-
-    def _shares(self, count: int) -> list[tuple[int, int]]:
-        """First and number of the Gaussians of each thread."""
-        return shares(count, SHARED_FROM) if self.device == "cpu" else [(0, count)]
-
-
-@functools.cache
-def _load_kernels(device: str) -> None:
-    """Compile the kernels before several threads ask for them."""
-    for module in (kernels, simd_kernels) if device == "cpu" else (kernels,):
-        wp.load_module(module, device)
-
-
-def _array(tensor: Tensor, dtype=None):
-    """A tensor as a kernel argument, without copying."""
-    return wp.from_torch(tensor, dtype, requires_grad=False, return_ctype=True)
+        mapping = Launch(kernels.moved_node_maps, (environments, count), inputs)
+        return [mapping, *self.backend.skin_work(self._at_rest(), maps, means, covars)], means, covars

@@ -10,7 +10,6 @@ from endo_sim_ros.physics.materials import sound_speed
 from endo_sim_ros.physics.regions import TissueProperties
 
 CFL_LIMIT = 0.7  # c Δt / h; measured: 0.7 runs, 0.9 blows up
-CFL_CHOSEN = 0.5  # leaves room for tissue that stiffens where it is compressed
 MAX_SUBSTEPS = 100_000  # beyond it a step of the default tissue takes a minute
 
 
@@ -46,14 +45,14 @@ def plan_substeps(config: PhysicsConfig, cell_size: float, properties: TissuePro
     limits = np.array([sound_speed(*each) for each in zip(young, properties.poisson_ratio, properties.density)])
     worst = int(limits.argmax())
     limit = float(limits[worst])
-    count = config.substeps or max(math.ceil(config.step_duration * limit / (CFL_CHOSEN * cell_size)), 1)
+    count = config.substeps or max(math.ceil(config.step_duration * limit / (config.courant_number * cell_size)), 1)
     dt = config.step_duration / count
     cfl = limit * dt / cell_size
     if cfl > CFL_LIMIT or count > MAX_SUBSTEPS:
         fitting = math.ceil(count * cfl / CFL_LIMIT)
         fit = f"set substeps to {fitting}{' or to 0, as few as are safe' * bool(config.substeps)}, or use a softer material"
         if fitting > MAX_SUBSTEPS:
-            largest = young[worst] / (1 + config.relaxation) * (MAX_SUBSTEPS * CFL_CHOSEN / (count * cfl)) ** 2
+            largest = young[worst] / (1 + config.relaxation) * (MAX_SUBSTEPS * config.courant_number / (count * cfl)) ** 2
             fit = f"use young_modulus {0.99 * largest:.3g} Pa or less with substeps 0, or a shorter step_duration"
         raise StabilityError(
             f"young_modulus {young[worst] / (1 + config.relaxation):g} Pa, poisson_ratio {properties.poisson_ratio[worst]:g}"

@@ -5,9 +5,10 @@ import torch
 import warp as wp
 from scipy.spatial import cKDTree
 
+from endo_sim_ros.physics.backends.base import Launch
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes
-from endo_sim_ros.physics.solver import Launch, MpmSolver
+from endo_sim_ros.physics.solver import MpmSolver
 from endo_sim_ros.physics.tools_kernels import Commands, Holds, Reach, load_nodes, measure_reactions, take_hold
 
 # A capsule acts as at least this thick: of the distance between skin nodes, as a thinner one would part them and pass, and of
@@ -77,17 +78,17 @@ class Tools:
         self._faults = wp.zeros(solver.environments, int, device=solver.device)
         self.faults = wp.to_torch(self._faults)  # steps undone [B], int32
 
-        threads = solver.reducing
+        threads = solver.backend.threads
         dim = (solver.environments, threads)
         common = [solver.tool_count, threads, commands, holds, reach, solver.nodes, solver.state]
         self._take_hold = Launch(take_hold, dim, common, threads)
         load = Launch(load_nodes, dim, [*common, solver.loads, solver.rigid, solver.bad_nodes], threads)
         measure = Launch(measure_reactions, dim, [*common, solver.rigid, solver.bad_nodes, self._faults], threads)
-        solver.surround([self._take_hold, load], [measure])
+        solver.wrap_step([self._take_hold, load], [measure])
 
     def take_hold(self) -> None:
         """Take hold of, or let go, now what commands say; otherwise the next step begins with it."""
-        self._solver.launch(self._take_hold)
+        self._solver.backend.launch(self._take_hold)
 
     def copy(self, other: "Tools") -> None:
         """Take over commands, holds and counts of the tools of other tissue with the same nodes and environments."""

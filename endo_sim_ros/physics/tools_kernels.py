@@ -7,9 +7,10 @@ matters and a scene metres from the world's origin as accurate as one at it.
 
 import warp as wp
 
-from endo_sim_ros.physics.backends.warp_kernels import REDUCING, Loads, Nodes, RigidTools, State, block_sum
+from endo_sim_ros.physics.backends.end_kernels import OPTIONS, block_sum
+from endo_sim_ros.physics.backends.structs import Loads, Nodes, RigidTools, State
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, **OPTIONS})
 
 SLIP = 0.9  # of the travel; tissue pulled farther slips out of the jaw
 
@@ -149,7 +150,7 @@ def take_hold(
                 holds.gripping[c] = 0
 
 
-@wp.kernel(launch_bounds=REDUCING)
+@wp.kernel(launch_bounds=512)
 def load_nodes(
     tools: int,
     threads: int,

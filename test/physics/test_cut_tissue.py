@@ -1,11 +1,14 @@
 """Cutting in the simulation: what is separated, what still holds, and the skin beside it."""
 
+import contextlib
+
 import numpy as np
 import pytest
 import torch
 from tissue_scene import TIP, curved_sheet, free_block, pose_at, simulate, steps
 
-from endo_sim_ros.physics import Skinning, TissueSimulation, solver
+from endo_sim_ros.core.kernels import plain_kernels
+from endo_sim_ros.physics import Skinning, TissueSimulation
 
 
 def cut_along(simulation: TissueSimulation, ys: np.ndarray, tool: str = "knife") -> None:
@@ -27,12 +30,11 @@ def pull_apart(simulation: TissueSimulation, force: float = 0.4) -> tuple[np.nda
     return (state.positions - state.rest)[skin, 0], state.rest[skin]
 
 
-@pytest.mark.parametrize("vectorised", [True, False])
-def test_a_cut_separates_what_is_pulled_apart_and_heals_on_reset(vectorised, monkeypatch):
-    if not vectorised:
-        monkeypatch.setattr(solver, "STRESSES", {})
+@pytest.mark.parametrize("backend", [contextlib.nullcontext, plain_kernels], ids=["vectorised", "plain"])
+def test_a_cut_separates_what_is_pulled_apart_and_heals_on_reset(backend):
     gaps = []
-    simulation = simulate(node_count=2400, layers=3, blade_length=0.03)
+    with backend():
+        simulation = simulate(node_count=2400, layers=3, blade_length=0.03)
     for cut in (False, True, False):
         simulation.reset()
         assert len(simulation.cuts) == 0

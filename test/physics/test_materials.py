@@ -7,8 +7,11 @@ import warp as wp
 from tissue_scene import random_rotations
 
 from endo_sim_ros.core.config import ConfigError, options
-from endo_sim_ros.physics import PhysicsConfig, lame_parameters, sound_speed
-from endo_sim_ros.physics.materials import MATERIALS, energy_density, kirchhoff_stress, rotation_of
+from endo_sim_ros.core.device import init_warp
+from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.core.native import native
+from endo_sim_ros.physics import PhysicsConfig, Skinning, lame_parameters, sound_speed
+from endo_sim_ros.physics.materials import MATERIALS, energy_density
 
 
 def test_every_option_has_a_description_and_every_material_is_a_choice():
@@ -20,56 +23,71 @@ def test_every_option_has_a_description_and_every_material_is_a_choice():
         PhysicsConfig(poisson_ratio=0.5)
 
 
-@wp.kernel(enable_backward=False)
-def _rotations(F: wp.array[wp.mat33], R: wp.array[wp.mat33]):
-    i = wp.tid()
-    R[i] = rotation_of(F[i])
+LANES = {"float": 1, "endo_sim::vfloat": 16}  # control nodes at a time: on a GPU and in the plain kernels; in a CPU's vectors
 
 
-def _stress_kernel(material):
-    stress = MATERIALS[material][0]
+def stresses(material: str, number: str, F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """P and τ [N, 3, 3] of F [N, 3, 3] for μ = 2 and λ = 3, as a kernel computes them for so many control nodes at a time."""
 
-    @wp.kernel(enable_backward=False, module="unique")
-    def evaluate(F: wp.array[wp.mat33], mu: float, lam: float, P: wp.array[wp.mat33], tau: wp.array[wp.mat33]):
-        i = wp.tid()
-        P[i] = stress(F[i], mu, lam)
-        tau[i] = kirchhoff_stress(P[i], F[i])
+    @wp.func_native(f"""
+        typedef {number} T;
+        constexpr int lanes = endo_sim::Lanes<T>::count;
+        T f[9] = {{}}, p[9], t[9];
+        for (int lane = 0; lane < lanes; ++lane)
+            for (int i = 0; i < 9; ++i)
+                endo_sim::set_lane(f[i], lane, F.data[lanes * n + lane].data[i / 3][i % 3]);
+        endo_sim::{material}::stress(f, endo_sim::everywhere<T>(2.0f), endo_sim::everywhere<T>(3.0f), p);
+        for (int i = 0; i < 9; ++i)
+            t[i] = p[i];
+        endo_sim::kirchhoff(f, t);
+        for (int lane = 0; lane < lanes; ++lane)
+            for (int i = 0; i < 9; ++i) {{
+                P.data[lanes * n + lane].data[i / 3][i % 3] = endo_sim::lane_of(p[i], lane);
+                tau.data[lanes * n + lane].data[i / 3][i % 3] = endo_sim::lane_of(t[i], lane);
+            }}
+    """)
+    def stress(n: int, F: wp.array[wp.mat33], P: wp.array[wp.mat33], tau: wp.array[wp.mat33]): ...
 
-    return evaluate
+    @wp.kernel(enable_backward=False, module="unique", module_options={"extra_build_options": native("physics/native/node.h")})
+    def evaluate(F: wp.array[wp.mat33], P: wp.array[wp.mat33], tau: wp.array[wp.mat33]):
+        stress(wp.tid(), F, P, tau)
+
+    init_warp()
+    padded = np.tile(np.eye(3, dtype=np.float32), (-(-len(F) // 16) * 16, 1, 1))
+    padded[: len(F)] = F
+    gradients = wp.array(padded, dtype=wp.mat33, device="cpu")
+    P, tau = wp.empty_like(gradients), wp.empty_like(gradients)
+    wp.launch(evaluate, len(padded) // LANES[number], [gradients, P, tau], device="cpu")
+    return P.numpy()[: len(F)], tau.numpy()[: len(F)]
 
 
-def stresses(material: str, F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """P and τ [N, 3, 3] of F [N, 3, 3] for μ = 2 and λ = 3."""
-    F = wp.array(F.astype(np.float32), dtype=wp.mat33, device="cpu")
-    P, tau = wp.empty_like(F), wp.empty_like(F)
-    wp.launch(_stress_kernel(material), len(F), [F, 2.0, 3.0, P, tau], device="cpu")
-    return P.numpy(), tau.numpy()
-
-
+@pytest.mark.parametrize("number", LANES)
 @pytest.mark.parametrize("material", MATERIALS)
-def test_stress_is_the_gradient_of_the_energy(material):
+def test_stress_is_the_gradient_of_the_energy(material, number):
     rng = np.random.default_rng(2)
     F = random_rotations(64) @ (np.eye(3) + 0.25 * rng.uniform(-1, 1, (64, 3, 3)))
     F = F[np.linalg.det(F) > 0.2]
     leaf = torch.from_numpy(F).requires_grad_()
     energy_density(material, leaf, 2.0, 3.0).sum().backward()
-    P, tau = stresses(material, F)
+    P, tau = stresses(material, number, F)
     np.testing.assert_allclose(P, leaf.grad.numpy(), atol=3e-5)
     np.testing.assert_allclose(tau, leaf.grad.numpy() @ F.transpose(0, 2, 1), atol=3e-5)
     assert np.abs(P).max() > 0.5
 
 
+@pytest.mark.parametrize("number", LANES)
 @pytest.mark.parametrize("material", MATERIALS)
-def test_rigid_rotation_gives_no_stress_and_rest_gives_exactly_none(material):
-    P, _ = stresses(material, random_rotations(64))
+def test_rigid_rotation_gives_no_stress_and_rest_gives_exactly_none(material, number):
+    P, _ = stresses(material, number, random_rotations(64))
     np.testing.assert_allclose(P, 0, atol=5e-6)
-    assert not np.any(stresses(material, np.eye(3)[None])[0])
+    assert not np.any(stresses(material, number, np.eye(3)[None])[0])
 
 
+@pytest.mark.parametrize("number", LANES)
 @pytest.mark.parametrize("material", MATERIALS)
-def test_inverted_and_collapsed_matter_has_finite_stress(material):
+def test_inverted_and_collapsed_matter_has_finite_stress(material, number):
     F = np.stack([np.diag([1.0, 1.0, -0.5]), np.zeros((3, 3)), np.diag([1.0, 1.0, 0.0]), -np.eye(3)])
-    assert np.isfinite(stresses(material, F)[0]).all()
+    assert np.isfinite(stresses(material, number, F)[0]).all()
 
 
 def test_polar_rotation_is_proper_and_nearest():
@@ -77,18 +95,20 @@ def test_polar_rotation_is_proper_and_nearest():
     F = rng.normal(size=(200, 3, 3))
     U, _, Vt = np.linalg.svd(F)
     U[np.linalg.det(U @ Vt) < 0, :, 2] *= -1
-    R = wp.empty(200, dtype=wp.mat33, device="cpu")
-    wp.launch(_rotations, 200, [wp.array(F.astype(np.float32), dtype=wp.mat33, device="cpu"), R], device="cpu")
+    points = torch.from_numpy(rng.normal(size=(200, 3))).float()
+    model = GaussianModel.from_points(points, torch.zeros(200, 3), torch.ones(200))  # each Gaussian is a control node
+    R = Skinning(model, points, neighbours=1, device="cpu").rotations(F).numpy()
     near_tie = np.abs(np.linalg.svd(F)[1][:, 2]) < 0.05  # the rotation is ill-conditioned there
-    np.testing.assert_allclose(R.numpy()[~near_tie], (U @ Vt)[~near_tie], atol=2e-3)
-    np.testing.assert_allclose(np.linalg.det(R.numpy()), 1, atol=1e-4)
+    np.testing.assert_allclose(R[~near_tie], (U @ Vt)[~near_tie], atol=2e-3)
+    np.testing.assert_allclose(np.linalg.det(R), 1, atol=1e-4)
 
 
-def test_small_strains_obey_hooke():
+@pytest.mark.parametrize("number", LANES)
+@pytest.mark.parametrize("material", MATERIALS)
+def test_small_strains_obey_hooke(material, number):
     strain = np.diag([1e-3, -2e-4, -2e-4])
-    for material in MATERIALS:
-        P, _ = stresses(material, (np.eye(3) + strain)[None])
-        np.testing.assert_allclose(P[0], 4.0 * strain + 3.0 * np.trace(strain) * np.eye(3), atol=2e-5)
+    P, _ = stresses(material, number, (np.eye(3) + strain)[None])
+    np.testing.assert_allclose(P[0], 4.0 * strain + 3.0 * np.trace(strain) * np.eye(3), atol=2e-5)
 
 
 def test_sound_speed_of_the_default_tissue():

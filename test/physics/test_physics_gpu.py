@@ -5,7 +5,8 @@ import pytest
 import torch
 from dense_sheet import sheet
 
-from endo_sim_ros.physics import PhysicsConfig, Skinning, TissueBatch, TissueSimulation, build_control_nodes, solver
+from endo_sim_ros.physics import PhysicsConfig, Skinning, TissueBatch, TissueSimulation, build_control_nodes
+from endo_sim_ros.physics.backends import cuda
 
 pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")]
 TIP = np.array([0.0, 0.0, 0.12])
@@ -14,8 +15,8 @@ TIP = np.array([0.0, 0.0, 0.12])
 def test_prepared_tissue_has_nothing_left_to_make_ready_when_it_is_first_touched(monkeypatch):
     simulation = TissueSimulation(sheet(), np.zeros(3), PhysicsConfig(device="cuda", node_count=500))
     simulation.prepare()
-    monkeypatch.setattr(solver.wp, "load_module", lambda *_, **__: pytest.fail("kernels are loaded only now"))
-    monkeypatch.setattr(solver.wp, "ScopedCapture", lambda *_, **__: pytest.fail("the step is recorded only now"))
+    monkeypatch.setattr(cuda.wp, "load_module", lambda *_, **__: pytest.fail("kernels are loaded only now"))
+    monkeypatch.setattr(cuda.wp, "ScopedCapture", lambda *_, **__: pytest.fail("the step is captured only now"))
     assert simulation.set_wrench("pull", TIP, [0.0, 0.0, -0.3])
     simulation.step()
     assert np.abs(simulation.state().positions - simulation.nodes.rest).max() > 1e-6
@@ -57,7 +58,7 @@ def test_physics_agrees_step_for_step(kinematics, material):
 @pytest.mark.parametrize("count", [700, 2000, 4000])
 def test_blocks_that_share_the_tissue_agree_with_launches_for_each_substep(count, monkeypatch):
     one, few = touch("cuda", node_count=count, relaxation=0.5)
-    monkeypatch.setattr(solver.cluster, "divide", lambda *arguments: None)
+    monkeypatch.setattr(cuda.cluster, "divide", lambda *arguments: None)
     many = touch("cuda", node_count=count, relaxation=0.5)[1]
     np.testing.assert_allclose(few["positions"], many["positions"], atol=2e-3 * np.abs(many["positions"] - one.nodes.rest).max())
     np.testing.assert_allclose(few["felt"], many["felt"], atol=2e-2 * np.abs(many["felt"]).max())

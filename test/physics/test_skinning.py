@@ -1,12 +1,15 @@
 """Skinning: exact on affine fields, fast with any number of threads, other nodes after a cut."""
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 import torch
 from tissue_scene import EYE, TIP, curved_sheet, random_rotations, simulate, steps
 
 from endo_sim_ros.core.gaussians import GaussianModel
-from endo_sim_ros.physics import PhysicsConfig, Skinning, TissueBatch, build_control_nodes, sample_farthest, skinning
+from endo_sim_ros.core.kernels import plain_kernels
+from endo_sim_ros.physics import PhysicsConfig, Skinning, TissueBatch, build_control_nodes, sample_farthest
 
 
 def affine_field(rest: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -132,13 +135,13 @@ def wild_state(rest: np.ndarray, where=slice(None)) -> tuple[np.ndarray, np.ndar
 
 
 def _deform(s: Skinning, positions: np.ndarray, F: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
-    """Equations 10 and 11 with A = F in float64; Gaussians stretched beyond the range have covariance NaN."""
+    """Equations 9 and 10 of the paper with A = F in float64; Gaussians stretched beyond the range have covariance NaN."""
     index, w, F = s.neighbours.numpy(), s.weights.double().numpy(), F.astype(np.float64)
     p, rest, means = positions.astype(np.float64), s.node_rest.double().numpy(), s.means.double().numpy()
     moved = np.einsum("nkij,nkj->nki", F[index], means[:, None] - rest[index]) + p[index]
     blend = np.einsum("nk,nkij->nij", w, F[index])
     sigma = np.linalg.svd(blend, compute_uv=False)
-    low, high = skinning.STRETCH_RANGE
+    low, high = s.stretch
     blend[(np.linalg.det(blend) <= 0) | (sigma[:, -1] < low) | (sigma[:, 0] > high)] = np.nan
     covars = blend @ s.covars.double().numpy() @ blend.transpose(0, 2, 1)
     return torch.from_numpy((w[..., None] * moved).sum(1)), torch.from_numpy(covars)
@@ -158,7 +161,7 @@ def test_number_of_threads_changes_no_bit(monkeypatch, weighting):
 
 
 @pytest.mark.parametrize("neighbours", [1, 4, 7])
-def test_vectors_agree_with_the_equations_and_with_the_kernel_of_cuda(monkeypatch, neighbours):
+def test_vectors_agree_with_the_equations_and_with_the_kernel_of_cuda(neighbours):
     model, rest = model_and_rest(5000)
     positions, F = wild_state(rest)
     s = Skinning(model, rest, neighbours=neighbours, device="cpu")
@@ -171,8 +174,9 @@ def test_vectors_agree_with_the_equations_and_with_the_kernel_of_cuda(monkeypatc
     torch.testing.assert_close(covars.double()[healthy], expected_covars[healthy], atol=2e-11, rtol=1e-4)
     assert covars.isfinite().all()
 
-    monkeypatch.setattr(skinning.simd_kernels, "skin_gaussians", skinning.kernels.skin_gaussians)
-    scalar_means, scalar_covars = s.deform(positions, F)
+    with plain_kernels():
+        scalar = Skinning(model, rest, neighbours=neighbours, device="cpu")
+    scalar_means, scalar_covars = scalar.deform(positions, F)
     torch.testing.assert_close(means, scalar_means, atol=1e-7, rtol=0)
     torch.testing.assert_close(covars, scalar_covars, atol=2e-11, rtol=1e-4)
 
@@ -257,13 +261,14 @@ def test_bindings_that_make_no_sense_are_refused_and_change_nothing():
     assert torch.equal(s.neighbours, before[0]) and torch.equal(s.weights, before[1])
 
 
-@pytest.mark.parametrize("environments, vectorised", [(1, True), (3, True), (3, False)])
-def test_skinning_within_the_step_gives_the_same_bits_as_after_it(environments, vectorised):
+@pytest.mark.parametrize("environments, backend", [(1, nullcontext), (3, nullcontext), (3, plain_kernels)])
+def test_skinning_within_the_step_gives_the_same_bits_as_after_it(environments, backend):
     model, _ = model_and_rest(5000)
     config = PhysicsConfig(node_count=400, device="cpu")
     nodes = build_control_nodes(model, np.zeros(3), config)
     batch = TissueBatch(nodes, config, environments)
-    s = Skinning(model, nodes.rest, device="cpu", vectorised=vectorised)
+    with backend():
+        s = Skinning(model, nodes.rest, device="cpu")
     means, covars = batch.carry(s)
     assert torch.equal(means[0], s.means) and torch.equal(covars[-1], s.covars)
     force = torch.tensor([0.2, 0.0, -0.4], dtype=torch.float64)

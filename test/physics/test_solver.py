@@ -1,14 +1,19 @@
 """The solver: the same bits again, both implementations alike, recovery, rest."""
 
+import contextlib
 import threading
 
 import numpy as np
 import pytest
 from tissue_scene import EYE, TIP, curved_sheet, depth_of_dent, pose_at, simulate, steps
 
-from endo_sim_ros.physics import PhysicsConfig, TissueSimulation, sample_farthest, solver
-from endo_sim_ros.physics.backends import cluster_kernels as cluster
+from endo_sim_ros.core.kernels import plain_kernels
+from endo_sim_ros.physics import PhysicsConfig, TissueSimulation, sample_farthest
+from endo_sim_ros.physics.backends import cluster_division as cluster
 from endo_sim_ros.physics.materials import MATERIALS
+from endo_sim_ros.physics.stencils import Stencils
+
+BACKENDS = {"vectorised": contextlib.nullcontext, "plain": plain_kernels}
 
 
 @pytest.mark.parametrize("kinematics", ["rest", "current"])
@@ -25,7 +30,7 @@ def test_rest_state_stays_bit_identical_without_force(kinematics, material):
 @pytest.mark.parametrize("count", [20, 700, 2000, 4000])
 def test_blocks_of_a_cluster_add_up_what_all_nodes_give_to_a_grid_node(count):
     solver = simulate(node_count=count).solver
-    corners = solver._corners()
+    corners = Stencils(solver.rest_cells, solver.grid_shape).corners()
     division = cluster.divide(solver.rest_cells, corners)
     given = np.random.default_rng(0).normal(size=corners.shape)
     expected = np.zeros(corners.max() + 1)
@@ -54,7 +59,7 @@ def test_blocks_of_a_cluster_add_up_what_all_nodes_give_to_a_grid_node(count):
 
 def test_more_nodes_than_a_cluster_holds_are_not_divided():
     solver = simulate(curved_sheet(20_000), node_count=8000).solver
-    assert cluster.divide(solver.rest_cells, solver._corners()) is None
+    assert cluster.divide(solver.rest_cells, Stencils(solver.rest_cells, solver.grid_shape).corners()) is None
 
 
 @pytest.mark.parametrize("kinematics", ["rest", "current"])
@@ -76,17 +81,16 @@ def test_same_inputs_give_the_same_bits_twice(kinematics):
 
 @pytest.mark.parametrize("kinematics", ["rest", "current"])
 @pytest.mark.parametrize("material", MATERIALS)
-def test_the_vectorised_step_agrees_with_the_kernels_of_the_gpu(kinematics, material, monkeypatch):
-    """The same kernels that a GPU runs, here on the CPU: a second implementation of everything that acts at once."""
-    states = []
-    for vectorised in (True, False):
-        if not vectorised:
-            monkeypatch.setattr(solver, "STRESSES", {})
-        simulation = simulate(
-            kinematics=kinematics, material=material, contact_radius=0.006, relaxation=0.5, gravity_z=0.5,
-            regions=("sphere 0 0 0.12 0.02 young_modulus=20000",),
-        )  # fmt: skip
-        assert simulation.solver._vectorised == vectorised
+def test_backends_agree_on_everything_that_acts_at_once(kinematics, material):
+    """The kernels that a GPU runs, here on the CPU, and those for a CPU: what is in both is the update of control nodes."""
+    states, kinds = [], set()
+    for backend in BACKENDS.values():
+        with backend():
+            simulation = simulate(
+                kinematics=kinematics, material=material, contact_radius=0.006, relaxation=0.5, gravity_z=0.5,
+                regions=("sphere 0 0 0.12 0.02 young_modulus=20000",),
+            )  # fmt: skip
+        kinds.add(type(simulation.solver.backend))
         assert simulation.set_wrench("pull", TIP - [0.03, 0, 0], [0.1, 0.0, -0.3])
         assert simulation.set_grasp("grip", pose_at(TIP + [0.03, 0, 0]), True)
         for step in range(6):
@@ -96,19 +100,19 @@ def test_the_vectorised_step_agrees_with_the_kernels_of_the_gpu(kinematics, mate
         state = simulation.state()
         reactions = [np.concatenate(simulation.reaction(tool)) for tool in ("pull", "grip", "probe")]
         states.append((state.positions - state.rest, state.F, np.array(reactions)))
+    assert len(kinds) == len(BACKENDS)
     assert np.abs(states[0][0]).max() > 3e-3 and states[0][2][2, 2] < -0.01
     np.testing.assert_allclose(states[1][0], states[0][0], atol=1e-6)
     np.testing.assert_allclose(states[1][1], states[0][1], atol=2e-4)
     np.testing.assert_allclose(states[1][2], states[0][2], atol=1e-3)
 
 
-def test_inverted_tissue_recovers_in_both_implementations(monkeypatch):
+def test_inverted_tissue_recovers_with_every_backend():
     """Near-singular and inverted F take the decomposition instead of the iteration."""
     ends, chosen = [], np.random.default_rng(6).permutation(300)[:20]
-    for vectorised in (True, False):
-        if not vectorised:
-            monkeypatch.setattr(solver, "STRESSES", {})
-        simulation = simulate(node_count=300, damping=200.0)
+    for backend in BACKENDS.values():
+        with backend():
+            simulation = simulate(node_count=300, damping=200.0)
         F = simulation.solver.deformation_gradients()
         F[chosen] = np.float32(np.diag([1.0, 1.0, -0.3]))
         F[chosen[:4]] = 0.0

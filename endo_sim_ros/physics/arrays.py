@@ -1,0 +1,99 @@
+"""Builds what kernels take, in the memory of a device."""
+
+import numpy as np
+import torch
+import warp as wp
+
+from endo_sim_ros.physics.backends.structs import Grid, Loads, Nodes, RigidTools, State
+from endo_sim_ros.physics.control_nodes import ControlNodes
+from endo_sim_ros.physics.grid import GridPlan
+from endo_sim_ros.physics.regions import TissueProperties
+from endo_sim_ros.physics.stencils import Stencils
+
+
+def array(values: np.ndarray, dtype: type, device: str) -> wp.array:
+    """Return values as an array of a Warp type on a device."""
+    return wp.array(np.ascontiguousarray(values, np.int32 if dtype in (int, wp.vec3i) else np.float32), dtype=dtype, device=device)
+
+
+def adjoining(count: int, device: str, *dtypes: type) -> tuple[wp.array, list[wp.array]]:
+    """Return arrays of count zeros that lie one after the other, and all of them as one array of float, to copy or clear at once."""
+    sizes = [count * wp.types.type_size(dtype) for dtype in dtypes]
+    everything = torch.zeros(sum(sizes), device=device)
+    parts = [part.view(count, *dtype._shape_) for part, dtype in zip(everything.split(sizes), dtypes)]
+    arrays = [wp.from_torch(part, dtype, requires_grad=False) for part, dtype in zip(parts, dtypes)]
+    return wp.from_torch(everything, requires_grad=False), arrays
+
+
+def new_grid(plan: GridPlan) -> Grid:
+    """Return the grid of a plan, without copies of grid nodes."""
+    grid = Grid()
+    grid.h, grid.inverse_h = plan.cell_size, 1 / plan.cell_size
+    grid.nx, grid.ny, grid.nz = plan.shape
+    grid.count = plan.count
+    return grid
+
+
+def new_nodes(
+    nodes: ControlNodes, plan: GridPlan, properties: TissueProperties, mu: np.ndarray, lam: np.ndarray, environments: int, device: str
+) -> Nodes:
+    """Return control nodes at rest, without stencils.
+
+    Args:
+        nodes: Where they are.
+        plan: The grid that they are in.
+        properties: What each is made of.
+        mu, lam: Lamé's parameters of each [M], Pa.
+        environments: B.
+        device: Where to.
+    """
+    made = Nodes()
+    made.X = array(plan.local, wp.vec3, device)
+    made.mass = array(nodes.volumes * properties.density, float, device)
+    made.volume = array(nodes.volumes, float, device)
+    made.mu, made.lam = array(mu, float, device), array(lam, float, device)
+    made.stiffness = wp.zeros(environments * len(nodes), float, device=device)
+    return made
+
+
+def set_stencils(nodes: Nodes, grid: Grid, stencils: Stencils, device: str) -> None:
+    """Let control nodes transfer to the grid nodes of these stencils."""
+    nodes.first, nodes.row = array(stencils.first, wp.vec3i, device), array(stencils.row, int, device)
+    nodes.table = array(stencils.table.ravel() if len(stencils.table) else np.zeros(1), int, device)
+    grid.count = stencils.grid_count
+
+
+def new_state(count: int, device: str) -> tuple[wp.array, State]:
+    """Return what a bad step brings back, as one array, and the state of count control nodes that it is part of."""
+    state = State()
+    saved, (state.u, state.F, state.Q) = adjoining(count, device, wp.vec3, wp.mat33, wp.mat33)
+    state.v, state.C = wp.zeros(count, wp.vec3, device=device), wp.zeros(count, wp.mat33, device=device)
+    return saved, state
+
+
+def new_loads(count: int, device: str) -> Loads:
+    """Return loads on count control nodes: none."""
+    loads = Loads()
+    loads.force, loads.target, loads.target_v = (wp.zeros(count, wp.vec3, device=device) for _ in range(3))
+    loads.spring = wp.zeros(count, float, device=device)
+    loads.holder = wp.full(count, -1, dtype=int, device=device)
+    return loads
+
+
+def new_tools(count: int, environments: int, nodes: int, friction: float, push_out: float, device: str) -> tuple[wp.array, RigidTools]:
+    """Return what rigid tools gave to control nodes, as one array to clear, and the tools, which touch nothing.
+
+    Args:
+        count: Number of tools T in each environment.
+        environments: B.
+        nodes: Number of control nodes M in each.
+        friction: Coulomb's coefficient.
+        push_out: Speed at which tools push out tissue that they are suddenly deep in, m/s.
+        device: Where to.
+    """
+    tools = RigidTools()
+    tools.count, tools.friction, tools.push_out = count, friction, push_out
+    tools.tip, tools.tip_v, tools.end, tools.end_v = (wp.zeros(environments * count, wp.vec3, device=device) for _ in range(4))
+    tools.radius = wp.zeros(environments * count, float, device=device)
+    given, (tools.impulse, tools.moment) = adjoining(environments * count * nodes, device, wp.vec3, wp.vec3)
+    return given, tools

@@ -1,0 +1,144 @@
+"""What a backend does, and which one a device has: where the solver's step, skinning and the sampling of control nodes run."""
+
+import functools
+import threading
+import types
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import warp as wp
+from torch import Tensor
+
+from endo_sim_ros.core.device import init_warp
+from endo_sim_ros.core.kernels import vectorised
+from endo_sim_ros.physics.backends.structs import Grid, Loads, Nodes, RigidTools, State, Substep
+from endo_sim_ros.physics.stencils import Stencils
+from endo_sim_ros.physics.substeps import Substepping
+
+BLOCK = 64  # threads of a GPU's block: a few thousand control nodes then reach many multiprocessors
+
+Action = Callable[[], object]
+
+array = functools.partial(wp.from_torch, requires_grad=False)
+"""A tensor as an array of Warp, which keeps the tensor."""
+
+capturing = threading.Lock()
+"""Held while a graph is captured on a GPU: what another thread launches there meanwhile would become part of it."""
+
+
+@dataclass(frozen=True)
+class Launch:
+    """A kernel with what it is launched with."""
+
+    kernel: Any  # a kernel of Warp
+    dim: int | tuple[int, ...]
+    inputs: list
+    block: int = BLOCK  # threads of a GPU's block
+
+
+Work = Launch | list[Launch]
+"""A launch, or several that may run at the same time."""
+
+
+@dataclass(frozen=True)
+class StepData:
+    """What the substeps of a step work on, all on the backend's device."""
+
+    environments: int  # B
+    node_count: int  # control nodes M
+    material: str
+    kinematics: str
+    substepping: Substepping
+    nodes: Nodes
+    state: State
+    loads: Loads
+    tools: RigidTools
+    grid: Grid
+    substep: Substep
+    scale: wp.array  # of the moduli of each control node [B · M]
+    stencils: Stencils
+
+
+class SkinData(NamedTuple):
+    """N Gaussians at rest and the K control nodes that move each: float32 and int32 tensors on the backend's device."""
+
+    means: Tensor  # [N, 3] m, world
+    covars: Tensor  # [N, 3, 3] m²
+    neighbours: Tensor  # [N, K]
+    weights: Tensor  # [N, K]
+    origin: wp.vec3  # of the maps
+    low: float  # bounds of the singular values of each Gaussian's F
+    high: float
+
+
+class Backend(Protocol):
+    """How physics runs on a kind of device."""
+
+    device: str
+    threads: int
+    """Threads that add up for one environment; they are one block of a GPU."""
+    prepares_early: bool
+    """Whether a step is made ready when the solver is, rather than when it is first taken."""
+
+    skin_modules: tuple[types.ModuleType, ...]
+    """Modules of the kernels of `skin`, to be loaded before."""
+
+    def substeps(self, step: StepData) -> list[Action]:
+        """Return what does all substeps, in order; memory and kernels are ready when it returns."""
+        ...
+
+    def action(self, work: Work) -> Action:
+        """Return work as a call, its kernels loaded."""
+        ...
+
+    def record(self, actions: Sequence[Action]) -> Action:
+        """Return one call that does all of these in order: on a GPU a captured graph. Arrays are read anew every time."""
+        ...
+
+    def launch(self, launch: Launch) -> None:
+        """Launch now, in order with torch's own work."""
+        ...
+
+    def load_for_cuts(self, material: str, kinematics: str) -> None:
+        """Load what a step needs once cuts have made more grid nodes than it was made ready for."""
+        ...
+
+    def over_items(self, kernel: Any, count: int, arguments: Sequence) -> None:
+        """Launch a kernel now over count items, whose first argument, not among these, is the number of the first one.
+
+        Args:
+            kernel: The kernel; a thread adds `wp.tid()` to its first argument.
+            count: Number of items.
+            arguments: The others, tensors among them.
+        """
+        ...
+
+    def skin(self, skin: SkinData, maps: Tensor, means: Tensor, covars: Tensor) -> None:
+        """Move Gaussians now by the maps of their control nodes, see `skinning_kernels`.
+
+        Args:
+            skin: Gaussians at rest.
+            maps: [M, 4, 4].
+            means: Out [N, 3], m, world.
+            covars: Out [N, 3, 3], m².
+        """
+        ...
+
+    def skin_work(self, skin: SkinData, maps: Tensor, means: Tensor, covars: Tensor) -> list[Work]:
+        """Return the work that moves Gaussians in B environments by maps [B, M, 4, 4]; means and covars are [B, N, …]."""
+        ...
+
+    def sample_farthest(self, points: np.ndarray, count: int, start: int) -> np.ndarray:
+        """Return numbers [count] of points [N, 3] float32, each the farthest from all before it, the first being `start`."""
+        ...
+
+
+def backend_for(device: str) -> Backend:
+    """Return the backend of a device, as `pick_device` names it."""
+    from endo_sim_ros.physics.backends.cpu import CpuBackend
+    from endo_sim_ros.physics.backends.cuda import CudaBackend
+
+    init_warp()
+    return CpuBackend() if vectorised(device) else CudaBackend(device)

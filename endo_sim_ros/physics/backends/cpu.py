@@ -1,0 +1,102 @@
+"""Physics on a CPU: vectorised kernels, shared out among threads."""
+
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+from torch import Tensor
+
+from endo_sim_ros.core.device import cpu_threads, run_in_threads, shares
+from endo_sim_ros.core.kernels import launch_in_shares
+from endo_sim_ros.physics.backends import cpu_kernels
+from endo_sim_ros.physics.backends.base import Action, Launch, SkinData, StepData, Work, array
+from endo_sim_ros.physics.backends.cpu_kernels import LANES, SCRATCH, make_step_kernel, skin_gaussians
+from endo_sim_ros.physics.backends.sampling_kernels import sample_farthest_points
+
+SHARED_FROM = 4096  # Gaussians; fewer are done before a second thread has begun
+
+
+class CpuBackend:
+    """The vectorised kernels; see `Backend`."""
+
+    device = "cpu"
+    threads = 1
+    prepares_early = True
+    skin_modules = (cpu_kernels,)
+
+    def substeps(self, step: StepData) -> list[Action]:
+        """One launch for all substeps; environments are shared out among threads, each with its scratch memory."""
+        kernel = make_step_kernel(step.material, step.kinematics)
+        slots = min(cpu_threads(), step.environments)
+        padded = -(-step.node_count // LANES) * LANES
+        order = np.full(padded, -1, np.int32)
+        order[: step.node_count] = step.stencils.sorted_nodes()
+        floats = functools.partial(wp.zeros, dtype=float, device="cpu")
+        scratch = [wp.array(order, dtype=int, device="cpu")]
+        scratch += [floats(slots * 4 * (step.grid.count + 4)) for _ in range(2)]
+        scratch += [floats(slots * SCRATCH * padded), wp.zeros(slots * padded, int, device="cpu")]
+        scratch += [floats(slots * 4 * padded), wp.full(slots * padded, -1, dtype=int, device="cpu")]
+        inputs = [step.nodes, step.state, step.loads, step.tools, step.grid, step.substep, step.substepping.count, step.scale]
+        ends = [step.environments * slot // slots for slot in range(slots + 1)]
+        launches = [
+            self.action(Launch(kernel, end - begin, [begin, slot, *inputs, *scratch]))
+            for slot, (begin, end) in enumerate(zip(ends, ends[1:]))
+        ]
+        return [lambda: run_in_threads(launches)]
+
+    def action(self, work: Work) -> Action:
+        """A recorded launch, or several that are shared out among threads."""
+        return cpu_action(work)
+
+    def record(self, actions: Sequence[Action]) -> Action:
+        """The actions one after the other. No graph: its capture on a CPU takes in, and does not run, what other threads
+        of the process launch meanwhile."""
+        return lambda: [action() for action in actions]
+
+    def launch(self, launch: Launch) -> None:
+        wp.launch(launch.kernel, launch.dim, launch.inputs, device="cpu")
+
+    def load_for_cuts(self, material: str, kinematics: str) -> None:
+        pass
+
+    def over_items(self, kernel: Any, count: int, arguments: Sequence) -> None:
+        launch_in_shares(kernel, count, arguments, SHARED_FROM)
+
+    def skin(self, skin: SkinData, maps: Tensor, means: Tensor, covars: Tensor) -> None:
+        if maps.any():
+            self.over_items(skin_gaussians, len(skin.means), [*skin[:4], maps, *skin[4:], means, covars])
+        else:  # nothing has moved yet
+            means.copy_(skin.means)
+            covars.copy_(skin.covars)
+
+    def skin_work(self, skin: SkinData, maps: Tensor, means: Tensor, covars: Tensor) -> list[Work]:
+        at_rest = [array(skin.means, wp.vec3), array(skin.covars, wp.mat33), array(skin.neighbours), array(skin.weights)]
+        done: list[Work] = []
+        for b in range(len(means)):
+            inputs = [*at_rest, array(maps[b], wp.mat44), *skin[4:], array(means[b], wp.vec3), array(covars[b], wp.mat33)]
+            done.append([Launch(skin_gaussians, size, [first, *inputs]) for first, size in shares(len(skin.means), SHARED_FROM)])
+        return done
+
+    def sample_farthest(self, points: np.ndarray, count: int, start: int) -> np.ndarray:
+        return sample_farthest_on_cpu(points, count, start)
+
+
+def cpu_action(work: Work) -> Action:
+    """Return work on the CPU as a call."""
+    if isinstance(work, list):
+        actions = [cpu_action(each) for each in work]
+        return functools.partial(run_in_threads, actions)
+    wp.load_module(work.kernel.module, device="cpu")
+    command: Any = wp.launch(work.kernel, work.dim, work.inputs, device="cpu", record_cmd=True)
+    return command.launch
+
+
+def sample_farthest_on_cpu(points: np.ndarray, count: int, start: int) -> np.ndarray:
+    """`Backend.sample_farthest` by one core: every sample has to wait for the one before."""
+    axes = [wp.array(np.ascontiguousarray(points[:, axis]), dtype=float, device="cpu") for axis in range(3)]
+    distances = wp.full(len(points), float("inf"), dtype=float, device="cpu")
+    samples = wp.zeros(count, dtype=int, device="cpu")
+    wp.launch(sample_farthest_points, 1, [*axes, len(points), count, start, distances, samples], device="cpu")
+    return samples.numpy().copy()

@@ -1,0 +1,152 @@
+"""Physics on a GPU: a step is one captured graph, on a GPU with thread block clusters of one launch.
+
+Within `plain_kernels` the same kernels run on a CPU, to compare with the vectorised ones.
+"""
+
+import functools
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+from torch import Tensor
+
+from endo_sim_ros.core.device import on_torch_stream
+from endo_sim_ros.core.kernels import launch
+from endo_sim_ros.physics.backends import cluster_division as cluster
+from endo_sim_ros.physics.backends import skin_kernels
+from endo_sim_ros.physics.backends.base import Action, Launch, SkinData, StepData, Work, array, capturing
+from endo_sim_ros.physics.backends.cluster_kernels import make_step_kernel
+from endo_sim_ros.physics.backends.cpu import cpu_action, sample_farthest_on_cpu
+from endo_sim_ros.physics.backends.plain_kernels import collect, make_advance_kernel, scatter, update_grid
+from endo_sim_ros.physics.backends.skin_kernels import skin_environments, skin_gaussians
+from endo_sim_ros.physics.backends.structs import Transfer
+
+
+class CudaBackend:
+    """Plain Warp kernels, and those of a thread block cluster; see `Backend`."""
+
+    skin_modules = (skin_kernels,)
+
+    def __init__(self, device: str):
+        self.device = device
+        self._on_cpu = device == "cpu"
+        self.threads = 1 if self._on_cpu else 512
+        self.prepares_early = self._on_cpu
+
+    def substeps(self, step: StepData) -> list[Action]:
+        """One launch where the control nodes fit into a cluster, otherwise two or three for each substep."""
+        return self._clustered(step) or self._launched(step)
+
+    def action(self, work: Work) -> Action:
+        """A launch; several run in order."""
+        if self._on_cpu:
+            return cpu_action(work)
+        if isinstance(work, list):
+            actions = [self.action(each) for each in work]
+            return lambda: [action() for action in actions]
+        wp.load_module(work.kernel.module, device=self.device, block_dim=work.block)
+        return functools.partial(wp.launch, work.kernel, work.dim, work.inputs, device=self.device, block_dim=work.block)
+
+    def record(self, actions: Sequence[Action]) -> Action:
+        """The actions as one captured graph."""
+        if self._on_cpu:
+            return lambda: [action() for action in actions]
+        with capturing, wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
+            for action in actions:
+                action()
+        wp.synchronize_device(self.device)  # its arrays were filled on another stream than torch's, on which it runs
+        return _Replay(capture.graph, actions)
+
+    def launch(self, launch: Launch) -> None:
+        with on_torch_stream(self.device):
+            wp.launch(launch.kernel, launch.dim, launch.inputs, device=self.device, block_dim=launch.block)
+
+    def load_for_cuts(self, material: str, kinematics: str) -> None:
+        """Load the kernels of single substeps: the grid nodes of tissue that is much cut no longer fit into a cluster."""
+        if not self._on_cpu:
+            for kernel in (make_advance_kernel(material, kinematics), collect):
+                wp.load_module(kernel.module, self.device, block_dim=Launch.block)
+
+    def over_items(self, kernel: Any, count: int, arguments: Sequence) -> None:
+        if count:
+            launch(kernel, count, [0, *arguments], self.device)
+
+    def skin(self, skin: SkinData, maps: Tensor, means: Tensor, covars: Tensor) -> None:
+        self.over_items(skin_gaussians, len(skin.means), [*skin[:4], maps, *skin[4:], means, covars])
+
+    def skin_work(self, skin: SkinData, maps: Tensor, means: Tensor, covars: Tensor) -> list[Work]:
+        at_rest = [array(skin.means, wp.vec3), array(skin.covars, wp.mat33), array(skin.neighbours), array(skin.weights)]
+        outputs = [array(means.view(-1, 3), wp.vec3), array(covars.view(-1, 3, 3), wp.mat33)]
+        inputs = [maps.shape[1], *at_rest, array(maps.view(-1, 4, 4), wp.mat44), *skin[4:], *outputs]
+        return [Launch(skin_environments, (len(means), len(skin.means)), inputs)]
+
+    def sample_farthest(self, points: np.ndarray, count: int, start: int) -> np.ndarray:
+        return sample_farthest_on_cpu(points, count, start)
+
+    def _clustered(self, step: StepData) -> list[Action]:
+        """One launch for all substeps, on a GPU with clusters of multiprocessors; none for more control nodes than they hold."""
+        # What it compiles for, which is less than the GPU where another one in the machine is older.
+        arch = wp.get_device(self.device).get_cuda_compile_arch()
+        if arch is None or arch < 90 or step.kinematics == "current":
+            return []
+        division = cluster.divide(step.stencils.rest_cells, step.stencils.corners())
+        if division is None:
+            return []
+        device, memory = wp.get_device(self.device), 16 * cluster.SHARED
+        if device.max_shared_memory_per_block < memory + cluster.OTHERS:
+            return []
+        kernel = make_step_kernel(step.material, division.lanes)
+        if wp.get_cuda_max_cluster_dim(kernel, device, block_dim=cluster.BLOCK, dynamic_smem_bytes=memory) < cluster.CLUSTER:
+            return []
+        tables = [wp.array(values, dtype=int, device=device) for values in division[3:]]
+        inputs = [step.nodes, step.state, step.loads, step.tools, step.grid, step.substep, step.substepping.count, step.scale]
+        inputs += [division.slots, division.inbox, *tables]
+        return [self.action(Launch(kernel, step.environments * cluster.THREADS, inputs, cluster.BLOCK))]
+
+    def _launched(self, step: StepData) -> list[Action]:
+        """Two launches for each substep with rest kinematics, three with current kinematics."""
+        current, device = step.kinematics == "current", self.device
+        advance = make_advance_kernel(step.material, step.kinematics)
+        every, grid_count = (step.environments, step.node_count), step.environments * step.grid.count
+        transfer = Transfer()
+        transfer.given, transfer.pull = (wp.zeros(n * math.prod(every), wp.vec4, device=device) for n in (4, 1))
+        transfer.source_tool = wp.full(math.prod(every), -1, dtype=int, device=device)
+        grid_v, decay = wp.zeros(grid_count, wp.vec4, device=device), step.substep.decay
+        if current:
+            grid_mv = wp.zeros(grid_count, wp.vec4, device=device)
+            collecting = [
+                self.action(Launch(scatter, every, [step.nodes, step.state, transfer, step.grid, grid_mv])),
+                self.action(Launch(update_grid, grid_count, [decay, grid_mv, grid_v])),
+            ]
+            actions: list[Action] = [grid_mv.zero_]
+        else:
+            lanes, entries = 1 if self._on_cpu else 32, self._entries(step)
+            inputs = [*entries, lanes, step.node_count, step.grid, decay, transfer, grid_v]
+            collecting = [self.action(Launch(collect, (step.environments, len(entries[-1]), lanes), inputs))]
+            actions = []
+        constants = [step.nodes, step.state, step.loads, step.tools, transfer, step.grid, step.substep, step.scale]
+        count = step.substepping.count
+        for substep in range(count + 1):
+            halves = [int(substep > 0), int(substep < count)]
+            time = (substep + 1) * step.substepping.dt
+            actions.append(self.action(Launch(advance, every, [*constants, time, *halves, grid_v])))
+            if substep < count:
+                actions += collecting
+        return actions
+
+    def _entries(self, step: StepData) -> list[wp.array]:
+        """For each grid node the control nodes that give to it, as `collect` reads them."""
+        values = step.stencils.by_grid_node()
+        return [wp.array(each, dtype=dtype, device=self.device) for each, dtype in zip(values, (int, int, wp.vec4, int))]
+
+
+class _Replay:
+    """Replays a graph, and keeps what it works on: a graph does not keep the memory."""
+
+    def __init__(self, graph: Any, actions: Sequence[Action]):
+        self._graph, self._actions = graph, actions
+
+    def __call__(self) -> None:
+        wp.capture_launch(self._graph)

@@ -1,0 +1,101 @@
+// What code that is written once needs for one number (float: CUDA, and Warp's kernels on a CPU) and for the 16 of a CPU's
+// vectors (vfloat): one item in each lane.
+#pragma once
+#include "core/native/vector.h"
+
+namespace endo_sim {
+
+// ---------------------------------------------------------------- one lane
+
+template <class T> struct Lanes {
+    static constexpr int count = 1;
+    typedef int integers;
+};
+
+ENDO_SIM_INLINE bool any(bool condition) { return condition; }
+ENDO_SIM_INLINE bool negated(bool condition) { return !condition; }
+ENDO_SIM_INLINE float root(float x) { return sqrtf(x); }
+ENDO_SIM_INLINE float float_of(int x) { return (float)x; }
+ENDO_SIM_INLINE float lane_of(float x, int) { return x; }
+ENDO_SIM_INLINE bool lane_of(bool condition, int) { return condition; }
+ENDO_SIM_INLINE void set_lane(float& x, int, float value) { x = value; }
+
+#if defined(__CUDA_ARCH__)  // on a CPU vector.h has these for one number as well
+ENDO_SIM_INLINE int bits_of(float x) { return __float_as_int(x); }
+ENDO_SIM_INLINE float of_bits(int bits) { return __int_as_float(bits); }
+#endif
+
+// ---------------------------------------------------------------- sixteen lanes
+
+#if !defined(__CUDA_ARCH__)
+
+template <> struct Lanes<vfloat> {
+    static constexpr int count = 16;
+    typedef vint integers;
+};
+
+ENDO_SIM_INLINE vint negated(vint condition) { return ~condition; }
+ENDO_SIM_INLINE vfloat float_of(vint x) { return __builtin_convertvector(x, vfloat); }
+ENDO_SIM_INLINE float lane_of(vfloat x, int lane) { return x[lane]; }
+ENDO_SIM_INLINE bool lane_of(vint condition, int lane) { return condition[lane] != 0; }
+ENDO_SIM_INLINE void set_lane(vfloat& x, int lane, float value) { x[lane] = value; }
+
+#if defined(__clang__)
+ENDO_SIM_INLINE vfloat root(vfloat x) { return __builtin_elementwise_sqrt(x); }
+ENDO_SIM_INLINE vfloat floor_of(vfloat x) { return __builtin_elementwise_floor(x); }
+ENDO_SIM_INLINE float smallest(vfloat x) { return __builtin_reduce_min(x); }
+ENDO_SIM_INLINE float largest(vfloat x) { return __builtin_reduce_max(x); }
+#else  // for a compiler that only checks
+vfloat root(vfloat x);
+vfloat floor_of(vfloat x);
+float smallest(vfloat x);
+float largest(vfloat x);
+#endif
+
+#endif
+
+// ---------------------------------------------------------------- any number of lanes
+
+template <class T> using integers_of = typename Lanes<T>::integers;
+
+template <class T> ENDO_SIM_INLINE T everywhere(float x) { return T{} + x; }
+template <class T> ENDO_SIM_INLINE T larger(T a, T b) { return a > b ? a : b; }
+template <class T> ENDO_SIM_INLINE T smaller(T a, T b) { return a < b ? a : b; }
+
+template <class T> ENDO_SIM_INLINE T clamp(T x, float low, float high)
+{
+    return smaller(larger(x, everywhere<T>(low)), everywhere<T>(high));
+}
+
+// a · b of vectors of three. `unrounded` tells which of the first two products is fused, and so is not rounded: sums in
+// either order are as good, but a result must not depend on who computes it.
+template <int unrounded = 0, class T> ENDO_SIM_INLINE T dot(const T* a, const T* b)
+{
+    ENDO_SIM_FUSE(on)
+    constexpr int other = 1 - unrounded;
+    return a[unrounded] * b[unrounded] + a[other] * b[other] + a[2] * b[2];
+}
+
+// ln x of x >= 0.05, to 1e-7: 2^n (1 + f) with a polynomial in f (that of Cephes' logf).
+template <class T> ENDO_SIM_INLINE T logarithm(T x)
+{
+    ENDO_SIM_FUSE(on)
+    const T m = of_bits((bits_of(x) & 0x007fffff) | 0x3f000000);  // in [1/2, 1)
+    const auto low = m < 0.70710678f;
+    const integers_of<T> exponent = (bits_of(x) >> 23) - 126, n = low ? exponent - 1 : exponent;
+    const T f = (low ? m + m : m) - 1.0f;
+    const T e = float_of(n), z = f * f;
+    T p = everywhere<T>(7.0376836292e-2f);
+    p = p * f - 1.1514610310e-1f;
+    p = p * f + 1.1676998740e-1f;
+    p = p * f - 1.2420140846e-1f;
+    p = p * f + 1.4249322787e-1f;
+    p = p * f - 1.6668057665e-1f;
+    p = p * f + 2.0000714765e-1f;
+    p = p * f - 2.4999993993e-1f;
+    p = p * f + 3.3333331174e-1f;
+    return f * z * p - 2.12194440e-4f * e - 0.5f * z + f + 0.693359375f * e;
+
+}
+
+}  // namespace endo_sim

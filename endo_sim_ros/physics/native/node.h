@@ -1,0 +1,233 @@
+// The update of a control node in one substep: from its motion to what it gives to the grid. One definition for every kernel.
+//
+// The maths is in backends/plain_kernels.py. One node a lane; vectors are three and matrices nine numbers, row by row.
+#pragma once
+#include "physics/native/materials.h"
+
+namespace endo_sim {
+
+// A node, with pointers to what is only read if need be.
+template <class T> struct Node {
+    const T* X;  // where it is at rest
+    const T* u;  // displacement
+    const T* v;
+    const T* C;
+    const T* F;
+    T* Q;  // in and out: stress that the Maxwell branch has forgotten
+    const T* force;
+    const T* target;  // of the spring
+    const T* target_v;
+    T mass, volume, mu, lam;
+    T stiffness;  // of what pushes the node
+    T spring;  // zero where free
+    integers_of<T> holder;  // tool that the spring belongs to
+};
+
+// What it gives: momentum at the node and its growth along x, y and z (for each of its components r the three 3 r + c).
+template <class T> struct Given {
+    T momentum[3], growth[9];
+    T pull[3], added;  // the part of momentum and mass that springs and contact gave
+    integers_of<T> source_tool;  // that gave it, -1 = none
+};
+
+// Quadratic B-spline weights of the three grid nodes around a point x cells (0.5 to 1.5) past the first.
+template <class T> ENDO_SIM_INLINE void spline(T x, T* weights)
+{
+    ENDO_SIM_FUSE(on)
+    const T a = 1.5f - x, b = x - 1.0f, c = x - 0.5f;
+    weights[0] = 0.5f * a * a;
+    weights[1] = 0.75f - b * b;
+    weights[2] = 0.5f * c * c;
+}
+
+// Move a node on: u += Δt v, and F += Δt C or, with current kinematics, Δt C F.
+template <bool CURRENT, class T> ENDO_SIM_INLINE void move(const T* v, const T* C, float dt, T* u, T* F)
+{
+    ENDO_SIM_FUSE(on)
+    T rate[9];
+    for (int i = 0; i < 3; ++i)
+        u[i] += dt * v[i];
+    for (int r = 0; r < 3; ++r)
+        for (int c = 0; c < 3; ++c)
+            rate[3 * r + c]
+
+                = CURRENT ? C[3 * r] * F[c] + C[3 * r + 1] * F[3 + c] + C[3 * r + 2] * F[6 + c] : C[3 * r + c];
+    for (int i = 0; i < 9; ++i)
+        F[i] += dt * rate[i];
+}
+
+// P of an elastic law with a Maxwell branch beside it (standard linear solid; Simo 1987): P + g (P − F Q).
+//
+// The branch has g times the stiffness of the law, of which it has forgotten Q. That follows S = F⁻¹ P, the stress that a
+// rotation of the tissue does not change: dQ/dt = (S − Q)/τ. Fast tissue is 1 + g times as stiff as tissue at rest, and held
+// tissue relaxes with the time τ. S is finite for collapsed F as well.
+template <class T> ENDO_SIM_INLINE void relax(const T* F, T J, float ratio, float forget, T* Q, T* P)
+{
+    ENDO_SIM_FUSE(on)
+    T cofactor[9], given[9];
+    cofactor_of(F, cofactor);
+    J = larger(J, everywhere<T>(0.05f));
+    for (int r = 0; r < 3; ++r)
+        for (int c = 0; c < 3; ++c) {
+            const T S = (cofactor[r] * P[c] + cofactor[3 + r] * P[3 + c] + cofactor[6 + r] * P[6 + c]) / J;
+            Q[3 * r + c] += forget * (S - Q[3 * r + c]);
+        }
+    for (int r = 0; r < 3; ++r)
+        for (int c = 0; c < 3; ++c) {
+            given[3 * r + c] = P[3 * r + c];
+            for (int k = 0; k < 3; ++k)
+                given[3 * r + c] -= F[3 * r + k] * Q[3 * k + c];
+        }
+    for (int i = 0; i < 9; ++i)
+        P[i] += ratio * given[i];
+}
+
+// τ = P Fᵀ.
+template <class T> ENDO_SIM_INLINE void kirchhoff(const T* F, T* P)
+{
+    ENDO_SIM_FUSE(on)
+    T tau[9];
+    for (int r = 0; r < 3; ++r)
+        for (int c = 0; c < 3; ++c)
+            tau[3 * r + c] = P[3 * r + 1] * F[3 * c + 1] + P[3 * r] * F[3 * c] + P[3 * r + 2] * F[3 * c + 2];
+    for (int i = 0; i < 9; ++i)
+        P[i] = tau[i];
+}
+
+// The spring that pins or grasps a node, until `time` of the step: mass Δt² k and momentum −Δt k (u − u*).
+template <class T> ENDO_SIM_INLINE void pull_by_spring(const Node<T>& node, float dt, float time, Given<T>& given)
+{
+    ENDO_SIM_FUSE(on)
+    const auto held = node.spring > 0.0f;
+    if (!any(held))
+        return;
+    given.added = dt * dt * node.spring;
+    for (int i = 0; i < 3; ++i)
+        given.pull[i] = -dt * node.spring * (node.u[i] - node.target[i] - time * node.target_v[i]);
+    given.source_tool = held ? node.holder : given.source_tool;
+}
+
+// Momentum and mass by which the tool that a free node is about to enter deepest pushes it out.
+//
+// The tool is where it will be at the end of the substep, `time`. The node is drawn to the tool's surface along the normal n
+// by an implicit spring k, mass Δt² k, with normal velocity −φ/Δt; along the surface that mass moves with the node, less
+// what Coulomb's friction takes from the velocity relative to the tool.
+template <class T, class Tools>
+ENDO_SIM_INLINE void push_by_tools(
+    const Node<T>& node, const Tools& tools, int first, int count, float dt, float time, Given<T>& given)
+{
+    ENDO_SIM_FUSE(on)
+    const T zero = {};
+    const auto held = node.spring > 0.0f;
+    if (!any(negated(held)))
+        return;
+    T deepest = zero, outward = zero, normal[3] = {}, along[3] = {};
+    integers_of<T> pushing = integers_of<T>{} - 1;
+    for (int t = 0; t < count; ++t) {
+        const int tool = first + t;
+        const float radius = tools.radius.data[tool];
+        if (!(radius > 0.0f))
+            continue;
+        float tip[3], axis[3], square = 0.0f;
+        const float *tip_v = tools.tip_v.data[tool].c, *end_v = tools.end_v.data[tool].c;
+        for (int i = 0; i < 3; ++i) {
+            tip[i] = tools.tip.data[tool].c[i] + time * tip_v[i];
+            axis[i] = tools.end.data[tool].c[i] + time * end_v[i] - tip[i];
+            square += axis[i] * axis[i];
+        }
+        T arm[3], share = zero;
+        for (int i = 0; i < 3; ++i) {
+            arm[i] = node.X[i] + node.u[i] - tip[i];
+            share += arm[i] * axis[i];
+        }
+        share = clamp(share / (square > 1e-12f ? square : 1e-12f), 0.0f, 1.0f);
+        for (int i = 0; i < 3; ++i)
+            arm[i] -= share * axis[i];
+        const T distance = root(dot(arm, arm));
+        if (!any(distance < radius + dt * 10.0f))  // nothing comes nearer at 10 m/s
+            continue;
+        const T gap = distance - radius;
+        for (int i = 0; i < 3; ++i)
+            arm[i] /= larger(distance, everywhere<T>(1e-9f));
+        const T predicted = gap + dt * dot(node.v, arm);
+        const auto deeper = (distance > 1e-9f) & (predicted < deepest) & negated(held) & (node.mass > 0.0f);
+        T moving[3];
+        for (int i = 0; i < 3; ++i)
+            moving[i] = tip_v[i] + share * (end_v[i] - tip_v[i]);
+        const T out = smaller(-gap / dt, larger(dot(moving, arm), zero) + tools.push_out);
+        deepest = deeper ? predicted : deepest;
+        pushing = deeper ? integers_of<T>{} + t : pushing;
+        outward = deeper ? out : outward;
+        for (int i = 0; i < 3; ++i) {
+            normal[i] = deeper ? arm[i] : normal[i];
+            along[i] = deeper ? moving[i] : along[i];
+        }
+    }
+    const auto pushed = pushing >= 0;
+    if (!any(pushed))
+        return;
+    const T weight = dt * dt * node.stiffness, towards = dot(along, normal);
+    T slip[3];
+    for (int i = 0; i < 3; ++i)
+        slip[i] = node.v[i] - along[i];
+    const T parting = dot<1>(slip, normal);
+    for (int i = 0; i < 3; ++i)
+        slip[i] -= parting * normal[i];
+    const T lost = tools.friction * weight * larger(outward - dot<1>(node.v, normal), zero) / (node.mass + weight);
+    const T speed = larger(root(dot(slip, slip)), everywhere<T>(1e-12f));
+    const T kept = larger(1.0f - lost / speed, zero);
+    for (int i = 0; i < 3; ++i)
+        given.pull[i] = pushed ? weight * (outward * normal[i] + along[i] - towards * normal[i] + kept * slip[i])
+                               : given.pull[i];
+    given.added = pushed ? weight : given.added;
+    given.source_tool = pushed ? pushing : given.source_tool;
+}
+
+// What a node gives to the grid in a substep that ends at `time` of the step, while so many tools push, from the first on.
+template <class Law, bool CURRENT, class T, class Tools, class Grid, class Substep>
+ENDO_SIM_INLINE Given<T> update(
+    const Node<T>& node, const Tools& tools, int first_tool, int tool_count, const Grid& grid, const Substep& substep, float time)
+{
+    ENDO_SIM_FUSE(on)
+    const float dt = substep.dt;
+    T P[9];
+    const T J = Law::stress(node.F, node.mu, node.lam, P);
+    if (substep.ratio > 0.0f)
+        relax(node.F, J, substep.ratio, substep.forget, node.Q, P);
+    if (CURRENT)
+        kirchhoff(node.F, P);
+    Given<T> given = {};
+    given.source_tool = integers_of<T>{} - 1;
+    pull_by_spring(node, dt, time, given);
+    push_by_tools(node, tools, first_tool, tool_count, dt, time, given);
+    const T share = dt * 4.0f * grid.inverse_h * node.volume;
+    for (int r = 0; r < 3; ++r) {
+        given.momentum[r] = node.mass * (node.v[r] + dt * substep.gravity[r]) + dt * node.force[r] + given.pull[r];
+        // What springs and contact add turns with the node: adding mass alone would resist turning.
+        for (int c = 0; c < 3; ++c)
+            given.growth[3 * r + c] = ((node.mass + given.added) * grid.h) * node.C[3 * r + c] - share * P[3 * r + c];
+    }
+    return given;
+}
+
+// `update` of one control node in the vectors and matrices of Warp; returns the tool that gave the pull (x, y, z, mass).
+template <class Law, bool CURRENT, class Tools, class Grid, class Substep, class Three, class Nine, class Four>
+ENDO_SIM_INLINE int update_one(const Tools& tools, int first_tool, int tool_count, const Grid& grid, const Substep& substep,
+    float time, const Three& X, const Three& u, const Three& v, const Nine& C, const Nine& F, Nine& Q, const Three& force,
+    const Three& target, const Three& target_v, float mass, float volume, float mu, float lam, float stiffness, float spring,
+    int holder, Three& momentum, Nine& growth, Four& pull)
+{
+    const Node<float> node = {X.c, u.c, v.c, &C.data[0][0], &F.data[0][0], &Q.data[0][0], force.c, target.c, target_v.c,
+        mass, volume, mu, lam, stiffness, spring, holder};
+    const auto given = update<Law, CURRENT>(node, tools, first_tool, tool_count, grid, substep, time);
+    for (int r = 0; r < 3; ++r) {
+        momentum.c[r] = given.momentum[r];
+        for (int c = 0; c < 3; ++c)
+            growth.data[r][c] = given.growth[3 * r + c];
+        pull.c[r] = given.pull[r];
+    }
+    pull.c[3] = given.added;
+    return given.source_tool;
+}
+
+}  // namespace endo_sim

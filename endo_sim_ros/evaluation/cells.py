@@ -113,9 +113,9 @@ def _names(sequences: Sequence[str]) -> dict[str, str]:
 
 def _methods(config: EvaluationConfig) -> dict[str, dict[str, Any]]:
     """All options of each method, by its name."""
-    common = {"device": "auto"} | parse_values(config.set, "--set", ReconstructionConfig)
-    if "preset" in common:
+    if any(item.partition("=")[0] == "preset" for item in config.set):
         raise ConfigError("--set preset: methods are named with --presets")
+    common = {"device": "auto"} | parse_values(config.set, "--set", ReconstructionConfig)
     unlike = {name: dataclasses.asdict(preset(name, **common)) for name in config.presets}
     if config.ablation:
         for name in config.presets:

@@ -9,7 +9,7 @@ from scipy.spatial import Delaunay, QhullError, cKDTree
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.gaussians import GaussianModel
-from endo_sim_ros.physics.backends.base import backend_for
+from endo_sim_ros.physics.backends import backend_for
 from endo_sim_ros.physics.config import PhysicsConfig
 
 OUTLIER_FACTOR = 5.0  # a Gaussian this many times farther from its neighbours than the median one floats

@@ -12,7 +12,8 @@ from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.kernels import load_kernels
 from endo_sim_ros.physics import skinning_kernels as kernels
-from endo_sim_ros.physics.backends.base import Launch, SkinData, Work, array, backend_for
+from endo_sim_ros.physics.backends import backend_for
+from endo_sim_ros.physics.backends.base import Launch, SkinData, Work, array
 from endo_sim_ros.physics.cutting import CutNeighbours, clip_to_sides
 
 

@@ -9,7 +9,8 @@ import warp as wp
 
 from endo_sim_ros.core.device import on_torch_stream, pick_device
 from endo_sim_ros.physics.arrays import new_grid, new_loads, new_nodes, new_state, new_tools, set_stencils
-from endo_sim_ros.physics.backends.base import Launch, StepData, Work, backend_for
+from endo_sim_ros.physics.backends import backend_for
+from endo_sim_ros.physics.backends.base import Launch, StepData, Work
 from endo_sim_ros.physics.backends.end_kernels import end_step
 from endo_sim_ros.physics.backends.structs import Substep
 from endo_sim_ros.physics.config import PhysicsConfig

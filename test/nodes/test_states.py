@@ -164,11 +164,13 @@ def test_a_reconstruction_goes_through_its_states_in_order(start, small_frames, 
     graph.until("reconstruction_node", ReconstructionState.WAITING)
     send_recording(graph.client, small_frames[:5], S)
     graph.until("reconstruction_node", ReconstructionState.DONE)
-    assert graph.heard["reconstruction_node"] == ["waiting", "collecting", "preparing", "training", "done"]
+    order, heard = ["waiting", "collecting", "preparing", "training", "done"], list(graph.heard["reconstruction_node"])
+    assert heard == [state for state in order if state in heard]  # a short one may pass between two messages
+    assert heard[0] == "waiting" and heard[-1] == "done"
     assert graph.newest["reconstruction_node"].values["saved"].startswith(str(tmp_path))
     send_recording(graph.client, small_frames[:5], 100 * S, masked=True)  # nothing to learn from
     graph.until("reconstruction_node", ReconstructionState.FAILED)
-    assert [state for state in graph.heard["reconstruction_node"][5:] if state != "preparing"] == ["failed"]  # at once
+    assert [state for state in graph.heard["reconstruction_node"][len(heard) :] if state != "preparing"] == ["failed"]  # at once
     assert graph.newest["reconstruction_node"].level == ERROR
 
 

@@ -11,8 +11,6 @@ import numpy as np
 import warp as wp
 from torch import Tensor
 
-from endo_sim_ros.core.device import init_warp
-from endo_sim_ros.core.kernels import vectorised
 from endo_sim_ros.physics.backends.structs import Grid, Loads, Nodes, RigidTools, State, Substep
 from endo_sim_ros.physics.stencils import Stencils
 from endo_sim_ros.physics.substeps import Substepping
@@ -133,12 +131,3 @@ class Backend(Protocol):
     def sample_farthest(self, points: np.ndarray, count: int, start: int) -> np.ndarray:
         """Return numbers [count] of points [N, 3] float32, each the farthest from all before it, the first being `start`."""
         ...
-
-
-def backend_for(device: str) -> Backend:
-    """Return the backend of a device, as `pick_device` names it."""
-    from endo_sim_ros.physics.backends.cpu import CpuBackend
-    from endo_sim_ros.physics.backends.cuda import CudaBackend
-
-    init_warp()
-    return CpuBackend() if vectorised(device) else CudaBackend(device)

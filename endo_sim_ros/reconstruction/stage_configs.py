@@ -137,9 +137,12 @@ class MultiViewConfig(StageConfig):
     """How many errors of the prior a scene point may be off before it counts half: some are wrong matches."""
     max_correction: Annotated[float, Range(0.001, 1)] = 0.25
     """Largest relative correction of inverse depth; what is farther off is another surface."""
-    window: Annotated[float, Range(1, 640, "pixels at width 640")] = 10.0
-    """Standard deviation of the window over which contrast is made alike in all images, corrections are continued to pixels without,
-    and ripples of the corrected depth are smoothed."""
+    contrast_window: Annotated[float, Range(1, 640, "pixels at width 640")] = 8.0
+    """Standard deviation of the window over which brightness and contrast are made alike: light and exposure differ between views."""
+    continuation: Annotated[float, Range(1, 640, "pixels at width 640")] = 12.0
+    """Standard deviation of the surroundings over which corrections are continued to pixels without."""
+    smoothing: Annotated[float, Range(1, 640, "pixels at width 640")] = 10.0
+    """Standard deviation of the window over which ripples of the corrected depth are smoothed."""
     edge: Annotated[float, Range(0.001, 1)] = 0.02
     """Relative step of the depth that is an edge, and stays, in the end."""
     eyes_edge: Annotated[float, Range(0.001, 1)] = 0.03

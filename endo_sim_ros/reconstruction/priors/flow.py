@@ -31,7 +31,7 @@ def eye_image(frame: Frame, options: MultiViewConfig) -> EyeImage:
     """The image of a frame, for `flow_correction`."""
     tissue, width = frame.tissue, frame.camera.width
     grey = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    around = lambda values: blur(values, options.window, width)
+    around = lambda values: blur(values, options.contrast_window, width)
     share = np.maximum(around(tissue), 1e-3)
     mean = around(grey * tissue) / share
     variance = np.maximum(around(grey * grey * tissue) / share - mean * mean, 0)

@@ -66,8 +66,8 @@ def refine_depth(
             progress.check()
             if j != i and (found := flow_correction(inverse, images[i], images[j], options)) is not None:
                 total, weight = total + found.precision * found.correction, weight + found.precision
-        inverse = correct(inverse, total, weight, error, options.window, options.max_correction)
-        inverse = smooth(inverse, options.window, options.edge)
+        inverse = correct(inverse, total, weight, error, options.continuation, options.max_correction)
+        inverse = smooth(inverse, options.smoothing, options.edge)
         good = known & np.isfinite(inverse) & (inverse > 0)
         return np.where(good, 1 / np.where(good, inverse, 1), 0).astype(np.float32)
 
@@ -92,11 +92,11 @@ def _refine_by_eyes(
     believed = np.abs(found.correction) * pixel < scaled(options.max_step, width)
     precision = np.where(believed, found.precision, 0)
     correction = np.where(precision > 0, found.correction, 0)
-    corrected = correct(inverse, precision * correction, precision, matched, options.window, options.max_correction)
+    corrected = correct(inverse, precision * correction, precision, matched, options.continuation, options.max_correction)
     # Where flow tells nothing, far and wide, the error stays that of matching.
-    share = np.minimum(2 * blur(precision > 0, options.window, width), 1)
+    share = np.minimum(2 * blur(precision > 0, options.continuation, width), 1)
     error = (stereo.disparity_error + (options.refined_disparity_error - stereo.disparity_error) * share) / pixel
-    return smooth(corrected, options.window, options.eyes_edge), error
+    return smooth(corrected, options.smoothing, options.eyes_edge), error
 
 
 def _point_corrections(

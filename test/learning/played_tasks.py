@@ -3,6 +3,7 @@
 import gymnasium
 import numpy as np
 
+import endo_sim_ros.learning.environments  # noqa: F401  (registers them)
 from endo_sim_ros.learning.policies import NetworkPolicy
 from endo_sim_ros.learning.tasks import TASKS
 

@@ -49,7 +49,7 @@ setup(
         "report": ["matplotlib"],  # `endo-sim report`, `endo-sim plot`, plots of `endo-sim evaluate`
         "test": [
             *("gaussforge", "gymnasium", "hypothesis", "matplotlib", "mcap-ros2-support", "plyfile", "pyarrow", "pytest"),
-            *("pytest-xdist", "ruff", "torchmetrics", "viser>=1.1"),
+            *("pdoc", "pyright", "pytest-xdist", "ruff", "torchmetrics", "viser>=1.1"),
         ],
     },
     entry_points={"console_scripts": ["endo-sim = endo_sim_ros.cli:main"]},

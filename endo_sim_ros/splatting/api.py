@@ -14,7 +14,7 @@ from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.splatting.backend import backend_for
 from endo_sim_ros.splatting.constants import ALPHA_MIN, TILE
-from endo_sim_ros.splatting.scene import Scene, Settings
+from endo_sim_ros.splatting.scene import Gradients, Scene, Settings
 
 
 class RenderOutput(NamedTuple):
@@ -86,22 +86,20 @@ def rasterize(
             gradients, or a mean is not finite. The last is tested on the CPU only: on CUDA the test would stall the device.
             Any other Gaussian whose projection is not finite is not drawn and gets zero gradients.
     """
-    options = {"covars": covars, "background": background, "masks": masks, "absgrad": absgrad}
-    check_inputs("rasterize", means, quats, scales, opacities, sh, viewmats, Ks, width, height, near, eps2d, **options)
+    background = _black(means.device) if background is None else background
+    scene = Scene(means, quats, scales, covars, opacities, sh, viewmats, Ks, background)
+    settings = Settings(int(width), int(height), float(near), float(eps2d), bool(median))
+    check_inputs("rasterize", scene, settings, masks, absgrad)
     if means.device.type == "cpu" and not means.isfinite().all():
         index = tuple((~means.detach().isfinite()).any(-1).nonzero()[0].tolist())
         raise ValueError(f"rasterize: means[{', '.join(map(str, index))}] is not finite: {means[index].tolist()}")
     differentiable = (means, covars, opacities, sh, viewmats, background, absgrad)
     if means.ndim == 3 and torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in differentiable):
         raise ValueError("rasterize: means of each camera have no gradients; call it under torch.no_grad()")
-    settings = Settings(int(width), int(height), float(near), float(eps2d), bool(median))
-    if background is None:
-        background = _black(means.device)
-    arguments = [means, quats, scales, covars, opacities, sh, viewmats, background, absgrad]
-    arguments = [None if x is None else x.to(means.device, torch.float32).contiguous() for x in arguments]
-    Ks = Ks.to(means.device, torch.float32).contiguous()
-    *images, owners = _Rasterize.apply(settings, masks, Ks, *arguments)
-    return RenderOutput(*images, median_depths(owners, arguments[0], arguments[6]) if median else None)
+    *tensors, absgrad = (None if x is None else x.to(means.device, torch.float32).contiguous() for x in (*scene, absgrad))
+    scene = Scene._make(tensors)
+    *images, owners = _Rasterize.apply(settings, masks, absgrad, *scene)
+    return RenderOutput(*images, median_depths(owners, scene.means, scene.viewmats) if median else None)
 
 
 def render(
@@ -110,10 +108,7 @@ def render(
     *,
     covars: Tensor | None = None,
     background: Tensor | None = None,
-    mask: Tensor | None = None,
     median: bool = False,
-    near: float = 1e-3,
-    eps2d: float = 0.3,
 ) -> RenderOutput:
     """Return images of a Gaussian model in one camera: `rasterize` with C = 1.
 
@@ -122,60 +117,26 @@ def render(
         camera: Intrinsics, pose and image size.
         covars: World covariances [N, 3, 3], m², instead of the model's own.
         background: Colour behind everything [3]; black by default.
-        mask: True where the image matters [H, W]; whole tiles without any True are skipped.
         median: Whether to compute median depths.
-        near: Gaussians nearer than this are not drawn, metres.
-        eps2d: Added to the variances in the image, pixel².
 
     Raises:
         ValueError: As `rasterize` does.
     """
-    viewmat = torch.tensor(camera.viewmat, dtype=torch.float32, device=model.means.device)
-    K = torch.tensor(camera.K, dtype=torch.float32, device=model.means.device)
-    return rasterize(
-        model.means,
-        None if covars is not None else model.quats,
-        None if covars is not None else model.scales,
-        model.opacities,
-        model.sh,
-        viewmat[None],
-        K[None],
-        camera.width,
-        camera.height,
-        covars=covars,
-        background=background,
-        masks=None if mask is None else mask[None],
-        median=median,
-        near=near,
-        eps2d=eps2d,
-    )
+    viewmat, K = (torch.tensor(matrix, dtype=torch.float32, device=model.means.device) for matrix in (camera.viewmat, camera.K))
+    shapes = (None, None) if covars is not None else (model.quats, model.scales)
+    cameras = viewmat[None], K[None], camera.width, camera.height
+    return rasterize(model.means, *shapes, model.opacities, model.sh, *cameras, covars=covars, background=background, median=median)
 
 
-def check_inputs(
-    name: str,
-    means: Tensor,
-    quats: Tensor | None,
-    scales: Tensor | None,
-    opacities: Tensor,
-    sh: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    near: float,
-    eps2d: float,
-    *,
-    covars: Tensor | None,
-    background: Tensor | None,
-    masks: Tensor | None,
-    absgrad: Tensor | None,
-) -> None:
-    """Check the arguments of `rasterize`.
+def check_inputs(name: str, scene: Scene, settings: Settings, masks: Tensor | None, absgrad: Tensor | None) -> None:
+    """Check the arguments of `rasterize`, or of the reference.
 
     Raises:
         ValueError: If shapes disagree or a number makes no sense; the message begins with ``name`` and names the argument
             and both shapes.
     """
+    means, quats, scales, covars, opacities, sh, viewmats, Ks, background = scene
+    width, height, near, eps2d, _ = settings
     if means.ndim not in (2, 3) or means.shape[-1] != 3:
         raise ValueError(f"{name}: means shape {tuple(means.shape)} != expected shape (N, 3)")
     if viewmats.ndim != 3 or viewmats.shape[1:] != (4, 4):
@@ -255,14 +216,13 @@ def _tile_mask(masks: Tensor | None, settings: Settings, camera_count: int, devi
 
 
 class _Rasterize(torch.autograd.Function):
-    """Draws a scene; takes settings, masks and Ks, then the differentiable tensors: float32, contiguous, on one device."""
+    """Draws a scene, whose tensors are float32, contiguous, and on one device; absgrad is there for its gradient alone."""
 
     @staticmethod
-    def forward(ctx, settings, masks, Ks, means, quats, scales, covars, opacities, sh, viewmats, background, absgrad):
-        device = means.device
-        scene = Scene(means, quats, scales, covars, opacities, sh, viewmats, Ks, background)
-        ctx.backend, ctx.settings = backend_for(device), settings
-        tile_mask = _tile_mask(masks, settings, len(viewmats), device)
+    def forward(ctx, settings, masks, absgrad, *tensors):
+        scene = Scene(*tensors)
+        ctx.backend, ctx.settings = backend_for(scene.means.device), settings
+        tile_mask = _tile_mask(masks, settings, len(scene.viewmats), scene.means.device)
         images, radii, owners, ctx.state = ctx.backend.forward(scene, tile_mask, settings)
         ctx.save_for_backward(*scene, *images)
         ctx.mark_non_differentiable(radii, owners)
@@ -273,14 +233,15 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx, *v_outputs):
         scene, images = Scene(*ctx.saved_tensors[:-4]), ctx.saved_tensors[-4:]
         v_images = [v.float().contiguous() for v in v_outputs[:4]]
-        wants_pose, wants_background, wants_absolute = ctx.needs_input_grad[9:12]
-        v = ctx.backend.backward(scene, ctx.state, ctx.settings, images, v_images, wants_pose, wants_absolute)
+        wants_absolute, wants_pose, wants_background = (ctx.needs_input_grad[i] for i in (2, 9, 11))
+        v = Gradients.empty(scene, wants_pose, wants_absolute)
+        ctx.backend.backward(scene, ctx.state, ctx.settings, images, v_images, v)
         v_viewmats = v_background = None
         if wants_pose:
             v_viewmats = _repeatable_sum(v.camera_shares, 1)
         if wants_background:
             v_background = _repeatable_sum((v_images[0] * (1 - images[2])[..., None]).view(-1, 3), 0)
-        return None, None, None, *v[:6], v_viewmats, v_background, v.absolutes
+        return None, None, v.absolutes, *v[:6], v_viewmats, None, v_background
 
 
 def _repeatable_sum(x: Tensor, dim: int) -> Tensor:

@@ -34,24 +34,16 @@ class RasterBackend(Protocol):
         ...
 
     def backward(
-        self,
-        scene: Scene,
-        state: Any,
-        settings: Settings,
-        images: Sequence[Tensor],
-        v_images: Sequence[Tensor],
-        wants_pose: bool,
-        wants_absolute: bool,
-    ) -> Gradients:
-        """Return the gradients of a scene.
+        self, scene: Scene, state: Any, settings: Settings, images: Sequence[Tensor], v_images: Sequence[Tensor], gradients: Gradients
+    ) -> None:
+        """Fill the gradients of a scene.
 
         Args:
             scene, settings: Those of the forward pass.
             state: What the forward pass returned for it.
             images: The images of the forward pass.
             v_images: Their gradients, float32, contiguous.
-            wants_pose: Whether to compute `Gradients.camera_shares`.
-            wants_absolute: Whether to compute `Gradients.absolutes`.
+            gradients: Memory that is written; what is None is not computed.
         """
         ...
 

@@ -45,23 +45,15 @@ def forward(scene: Scene, tile_mask: Tensor, settings: Settings) -> tuple[list[T
 
 
 def backward(
-    scene: Scene,
-    state: State,
-    settings: Settings,
-    images: Sequence[Tensor],
-    v_images: Sequence[Tensor],
-    wants_pose: bool,
-    wants_absolute: bool,
-) -> Gradients:
-    """Return gradients of a scene, as `RasterBackend` says."""
-    gradients = Gradients.empty(scene, wants_pose, wants_absolute)
+    scene: Scene, state: State, settings: Settings, images: Sequence[Tensor], v_images: Sequence[Tensor], gradients: Gradients
+) -> None:
+    """Fill the gradients of a scene, as `RasterBackend` says."""
     records = scene.means.new_empty(len(state.owners), RECORD_SIZE)
-    arguments = [*_image_arguments(state, scene, settings, images), *v_images, int(wants_absolute), records]
+    arguments = [*_image_arguments(state, scene, settings, images), *v_images, int(gradients.absolutes is not None), records]
     _launch_tiles(cpu_kernels.render_tiles_backward, len(state.starts) - 1, arguments)
     arguments = [*scene.gaussian_arguments(), scene.sh, scene.viewmats, scene.Ks, settings.width, settings.height, settings.eps2d]
-    arguments += [state.counts, 0, state.firsts, records, int(wants_pose), int(wants_absolute), *gradients]
+    arguments += [state.counts, 0, state.firsts, records, *gradients.arguments()]
     launch_in_shares(kernels.project_backward, len(scene.means), arguments)
-    return gradients
 
 
 def _intersect(

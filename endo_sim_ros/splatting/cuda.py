@@ -75,23 +75,15 @@ def forward(scene: Scene, tile_mask: Tensor, settings: Settings) -> tuple[list[T
 
 
 def backward(
-    scene: Scene,
-    state: State,
-    settings: Settings,
-    images: Sequence[Tensor],
-    v_images: Sequence[Tensor],
-    wants_pose: bool,
-    wants_absolute: bool,
-) -> Gradients:
-    """Return gradients of a scene, as `RasterBackend` says."""
-    gradients = Gradients.empty(scene, wants_pose, wants_absolute)
+    scene: Scene, state: State, settings: Settings, images: Sequence[Tensor], v_images: Sequence[Tensor], gradients: Gradients
+) -> None:
+    """Fill the gradients of a scene, as `RasterBackend` says."""
     records = scene.means.new_zeros(scene.splat_count, RECORD_SIZE)
     with _lock, on_torch_stream(scene.means.device):
-        arguments = [*_image_arguments(state, scene, settings, images), *v_images, int(wants_absolute), records]
+        arguments = [*_image_arguments(state, scene, settings, images), *v_images, int(gradients.absolutes is not None), records]
         _launch(cuda_kernels.render_pixels_backward, len(state.ranges) * cuda_kernels.BLOCK, arguments)
         arguments = [0, *scene.gaussian_arguments(), *_cameras(scene, settings)[1:], settings.eps2d, state.counts, 1, None, records]
-        _launch(kernels.project_backward, len(scene.means), [*arguments, int(wants_pose), int(wants_absolute), *gradients])
-    return gradients
+        _launch(kernels.project_backward, len(scene.means), [*arguments, *gradients.arguments()])
 
 
 def _cameras(scene: Scene, settings: Settings) -> list:

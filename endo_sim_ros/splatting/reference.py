@@ -5,6 +5,7 @@ from torch import Tensor
 
 from endo_sim_ros.splatting.api import RenderOutput, check_inputs, median_depths
 from endo_sim_ros.splatting.constants import ALPHA_MAX, ALPHA_MIN, LOG_ALPHA_SLACK, MEDIAN, TRANSMITTANCE_MIN
+from endo_sim_ros.splatting.scene import Scene, Settings
 
 
 def _rasterize(
@@ -30,14 +31,13 @@ def _rasterize(
 
     Arguments and errors are those of `rasterize`; masks are checked, but nothing is skipped.
     """
-    options = {"covars": covars, "background": background, "masks": masks, "absgrad": absgrad}
-    check_inputs("_rasterize", means, quats, scales, opacities, sh, viewmats, Ks, width, height, near, eps2d, **options)
+    background = means.new_zeros(3) if background is None else background
+    scene = Scene(means, quats, scales, covars, opacities, sh, viewmats, Ks, background)
+    check_inputs("_rasterize", scene, Settings(width, height, near, eps2d, median), masks, absgrad)
     if covars is None:
         rotations = _quat_to_matrix(quats)
         covars = rotations @ torch.diag_embed(scales**2) @ rotations.mT
     covars = (covars + covars.mT) / 2
-    if background is None:
-        background = means.new_zeros(3)
     count = means.shape[-2]
     if absgrad is None:
         absgrad = means.new_zeros(len(viewmats), count, 2)

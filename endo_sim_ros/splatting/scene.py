@@ -81,6 +81,10 @@ class Gradients(NamedTuple):
         shares = scene.means.new_empty(*size, 4, 4) if wants_pose else None
         return cls(*gradients, shares, scene.means.new_empty(*size, 2) if wants_absolute else None)
 
+    def arguments(self) -> list:
+        """Return the last arguments of the kernel `project_backward`."""
+        return [int(self.camera_shares is not None), int(self.absolutes is not None), *self]
+
 
 def empty_images(scene: Scene, settings: Settings) -> tuple[list[Tensor], Tensor]:
     """Return memory for images, not initialised.

@@ -80,17 +80,6 @@ class DeformableRenderer:
         positions: np.ndarray | None = None,
         F: np.ndarray | None = None,
         *,
-        depth: Literal[False],
-        light: Light | None = None,
-    ) -> tuple[np.ndarray, None]: ...
-
-    @overload
-    def render(
-        self,
-        camera: Camera,
-        positions: np.ndarray | None = None,
-        F: np.ndarray | None = None,
-        *,
         depth: bool,
         light: Light | None = None,
     ) -> tuple[np.ndarray, np.ndarray | None]: ...

@@ -6,7 +6,6 @@ recording do not ask for it. Inside, a stage gives the algorithm views, its own 
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -24,21 +23,6 @@ from endo_sim_ros.reconstruction.progress import OnProgress, StageProgress
 from endo_sim_ros.reconstruction.scene import PreparedScene, ScenePoints, TrainingView, shrink
 from endo_sim_ros.reconstruction.trainer import Trainer
 from endo_sim_ros.reconstruction.triangulation import match_features, triangulate
-
-_UNUSABLE = {
-    "masked": "every pixel of every view is masked; a mask has 255 where there is tissue",
-    "overexposed": "every view is overexposed; lower the light or the camera's exposure",
-    "black": "every view is black; switch on the light, or check the camera",
-}
-_FINER = 2  # times the width trained on, at which depth is corrected where images are so fine
-_SEEN = 0.8  # share of the Gaussians that stand for what the training views see, at first
-
-
-class Stage(NamedTuple):
-    """A step of the preparation."""
-
-    name: str
-    run: Callable[[PreparedScene, ReconstructionConfig, StageProgress], PreparedScene]
 
 
 def prepare(
@@ -67,10 +51,10 @@ def prepare(
 
     given = None if points is None else _checked(ScenePoints(*points))
     scene = PreparedScene(tuple(frames), points=given, given_points=given is not None)
-    for stage in STAGES:
-        progress = StageProgress(stage.name, on_progress)
+    for name, stage in STAGES.items():
+        progress = StageProgress(name, on_progress)
         progress.check()
-        scene = stage.run(scene, config, progress)
+        scene = stage(scene, config, progress)
     return scene
 
 
@@ -104,7 +88,12 @@ def select_usable(scene: PreparedScene, config: ReconstructionConfig, progress: 
             kept.append(frame)
         progress.check()
     if not kept:
-        raise SequenceError(_UNUSABLE[max(out, key=lambda reason: len(out[reason]))])
+        advice = {
+            "masked": "every pixel of every view is masked; a mask has 255 where there is tissue",
+            "overexposed": "every view is overexposed; lower the light or the camera's exposure",
+            "black": "every view is black; switch on the light, or check the camera",
+        }
+        raise SequenceError(advice[max(out, key=lambda reason: len(out[reason]))])
     for reason, frames in out.items():
         scene = scene.decided(f"views at {_stamps(frames)} left out: {reason}")
     return _of_frames(scene, kept)
@@ -112,7 +101,7 @@ def select_usable(scene: PreparedScene, config: ReconstructionConfig, progress: 
 
 def match_views(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Match features between near views."""
-    return scene.replaced(matches=tuple(match_features(scene.frames, config.matching, progress)))
+    return replace(scene, matches=tuple(match_features(scene.frames, config.matching, progress)))
 
 
 def check_poses(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
@@ -130,14 +119,13 @@ def find_points(scene: PreparedScene, config: ReconstructionConfig, progress: St
     """Triangulate scene points, unless they are given."""
     if scene.given_points:
         return scene
-    return scene.replaced(points=triangulate(scene.frames, scene.matches, config.matching, progress))
+    return replace(scene, points=triangulate(scene.frames, scene.matches, config.matching, progress))
 
 
 def find_depth(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Give each view its depth prior, and a right image that is rectified well."""
-    views = [TrainingView.of(frame) for frame in scene.frames]
-    found = tuple(estimate_depth(views, scene.points, config, progress))
-    return scene.replaced(views=found, depth_source=depth_source(scene.frames, config))
+    found = tuple(estimate_depth(scene.views, scene.points, config, progress))
+    return replace(scene, views=found, depth_source=depth_source(scene.frames, config))
 
 
 def check_poses_by_stereo(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
@@ -157,28 +145,27 @@ def refine_across_views(scene: PreparedScene, config: ReconstructionConfig, prog
     """Correct the depth prior by scene points and the other images of the same tissue."""
     if not config.multi_view_refinement or scene.depth_source in ("topic", "none"):
         return scene
-    # Flow is the more precise the finer the pixels are, as matching is.
-    fine = [shrink(view, _FINER * config.image_width) for view in scene.views]
+    fine = [shrink(view, config.multi_view.width_factor * config.image_width) for view in scene.views]
     options = config.multi_view, config.stereo, config.interpolation
     refined = refine_depth(fine, scene.points, scene.depth_source, *options, progress)
-    return scene.replaced(views=tuple(refined))
+    return replace(scene, views=tuple(refined))
 
 
 def shrink_views(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Bring the views to the width that is trained on."""
-    return scene.replaced(views=tuple(shrink(view, config.image_width) for view in scene.views))
+    return replace(scene, views=tuple(shrink(view, config.image_width) for view in scene.views))
 
 
 def mask_dynamic(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Mask what moved between the views."""
     if not config.dynamic_mask:
         return scene
-    return scene.replaced(views=tuple(mask_motion(scene.views, config.depth_tolerance, config.motion, progress)))
+    return replace(scene, views=tuple(mask_motion(scene.views, config.depth_tolerance, config.motion, progress)))
 
 
 def place_gaussians(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Place the Gaussians that training starts from, and measure the depth of the scene."""
-    most = max(int(_SEEN * config.max_gaussians) if config.extrapolation else config.max_gaussians, 1)
+    most = max(int(config.initial.seen_share * config.max_gaussians) if config.extrapolation else config.max_gaussians, 1)
     views, points = scene.views, scene.points
     if config.initialization == "points":
         views = [replace(view, depth_prior=None) for view in views]
@@ -186,7 +173,7 @@ def place_gaussians(scene: PreparedScene, config: ReconstructionConfig, progress
     model = initial_model(views, points.positions, points.colors, *about)
     positions = model.means.numpy().astype(np.float64)
     depths = np.concatenate([view.camera.project(positions)[1] for view in views])
-    return scene.replaced(model=model, depth=float(np.median(depths[depths > 0])), exposures=np.zeros((len(views), 3)))
+    return replace(scene, model=model, depth=float(np.median(depths[depths > 0])), exposures=np.zeros((len(views), 3)))
 
 
 def fit_light(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
@@ -197,7 +184,7 @@ def fit_light(scene: PreparedScene, config: ReconstructionConfig, progress: Stag
     means = scene.model.means.numpy().astype(np.float64)
     light, exposures = photometry.fit_light(scene.views, means, *about, light=config.light, exposure=config.exposure, progress=progress)
     model = photometry.remove_light(scene.model, scene.views, light, exposures, scene.depth, config.depth_tolerance)
-    return scene.replaced(model=model, light=light, exposures=exposures)
+    return replace(scene, model=model, light=light, exposures=exposures)
 
 
 def extrapolate_tissue(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
@@ -207,24 +194,24 @@ def extrapolate_tissue(scene: PreparedScene, config: ReconstructionConfig, progr
     lit = scene.light, scene.exposures, scene.depth
     options = config.extrapolated, config.interpolation, progress
     model = extrapolate(scene.model, scene.views, scene.points.positions, *lit, config.extrapolation, config.max_gaussians, *options)
-    return scene.replaced(model=model)
+    return replace(scene, model=model)
 
 
-STAGES = (
-    Stage("usable views", select_usable),
-    Stage("matching features", match_views),
-    Stage("checking poses", check_poses),
-    Stage("scene points", find_points),
-    Stage("depth prior", find_depth),
-    Stage("checking poses by stereo", check_poses_by_stereo),
-    Stage("multi-view refinement", refine_across_views),
-    Stage("shrinking views", shrink_views),
-    Stage("dynamic mask", mask_dynamic),
-    Stage("initial model", place_gaussians),
-    Stage("light and exposure", fit_light),
-    Stage("extrapolation", extrapolate_tissue),
-)
-"""What `prepare` does, in this order."""
+STAGES: dict[str, Callable[[PreparedScene, ReconstructionConfig, StageProgress], PreparedScene]] = {
+    "usable views": select_usable,
+    "matching features": match_views,
+    "checking poses": check_poses,
+    "scene points": find_points,
+    "depth prior": find_depth,
+    "checking poses by stereo": check_poses_by_stereo,
+    "multi-view refinement": refine_across_views,
+    "shrinking views": shrink_views,
+    "dynamic mask": mask_dynamic,
+    "initial model": place_gaussians,
+    "light and exposure": fit_light,
+    "extrapolation": extrapolate_tissue,
+}
+"""What `prepare` does, in this order, by the names that progress reports."""
 
 
 # ------------------------------------------------------------------------------------------------------------ helpers
@@ -246,7 +233,7 @@ def _of_frames(scene: PreparedScene, frames: Sequence[Frame]) -> PreparedScene:
     """The scene with other frames, and nothing found in them yet."""
     views = tuple(TrainingView.of(frame) for frame in frames)
     points = scene.points if scene.given_points else None
-    return scene.replaced(frames=tuple(frames), views=views, matches=(), points=points)
+    return replace(scene, frames=tuple(frames), views=views, matches=(), points=points)
 
 
 def _without(scene: PreparedScene, wrong: Sequence[int]) -> PreparedScene:

@@ -3,12 +3,13 @@
 import dataclasses
 import logging
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
 from typing_extensions import Self
 
+from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.gaussians import GaussianModel
 
@@ -33,6 +34,23 @@ class Matches(NamedTuple):
     views: tuple[int, int]
     first: np.ndarray  # [M, 2] pixels
     second: np.ndarray  # [M, 2] pixels
+
+
+class PointPixels(NamedTuple):
+    """The pixels of those points that lie in a picture, hidden or not."""
+
+    index: np.ndarray  # [M] of the points
+    rows: np.ndarray  # [M]
+    columns: np.ndarray  # [M]
+    depth: np.ndarray  # [M] m
+
+
+def pixels_of(camera: Camera, points: np.ndarray) -> PointPixels:
+    """The pixels of points [N, 3] (m, world)."""
+    index = np.nonzero(camera.sees(points))[0]
+    uv, z = camera.project(points[index])
+    columns, rows = np.floor(uv).astype(int).T
+    return PointPixels(index, rows, columns, z)
 
 
 @dataclass(frozen=True)
@@ -80,10 +98,6 @@ class PreparedScene:
     light: np.ndarray = field(default_factory=lambda: np.zeros(4))
     exposures: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     decisions: tuple[str, ...] = ()
-
-    def replaced(self, **changes: Any) -> Self:
-        """A copy with other values."""
-        return dataclasses.replace(self, **changes)
 
     def decided(self, sentence: str) -> Self:
         """A copy that knows of a decision, which is logged."""

@@ -113,6 +113,8 @@ class MultiViewConfig(StageConfig):
 
     neighbours: Annotated[int, Range(1, 100)] = 4
     """Views that each view is compared with: the nearest in space."""
+    width_factor: Annotated[int, Range(1, 16)] = 2
+    """Width at which depth is corrected, in widths trained on, if images are as wide. The finer the pixels, the more precise is flow."""
     prior_error: Annotated[float, Range(0.001, 1)] = 0.05
     """Relative error of the depth of a network, and of any other of which none is known."""
     points_error: Annotated[float, Range(0.001, 1)] = 0.015
@@ -174,6 +176,8 @@ class InitialModelConfig(StageConfig):
 
     opacity: Annotated[float, Range(0.005, 0.995)] = 0.5
     """Opacity of the Gaussians; 3DGS starts with 0.1, but of these most lie on the surface."""
+    seen_share: Annotated[float, Range(0.01, 1)] = 0.8
+    """Share of ``max_gaussians`` that stand for what the training views see; the others are left to extrapolation."""
     max_slope: Annotated[float, Range(0, 100)] = 2.0
     """Slope of a surface across the line of sight in holes of the depth prior; a point that it would have to rise more for floats before
     the surface."""

@@ -60,11 +60,3 @@ def reprojected_prior(view: DeviceView, viewmat: Tensor) -> Tensor:
     pixels = (v * width + u).long()[inside]
     nearest = torch.full((height * width,), math.inf, device=z.device).scatter_reduce(0, pixels, z[inside], "amin")
     return torch.where(nearest.isfinite(), nearest, 0).view(height, width)
-
-
-def nearest_views(cameras: Sequence[Camera]) -> list[int]:
-    """Index of each camera's nearest other one (by optical centre); its own for a single one."""
-    centres = np.array([camera.position for camera in cameras])
-    distance = np.linalg.norm(centres[:, None] - centres, axis=2)
-    np.fill_diagonal(distance, math.inf)
-    return distance.argmin(1).tolist()

@@ -45,7 +45,7 @@ def mask_motion(
     small = [None if view.depth_prior is None else _small(view, options) for view in views]
 
     def moved(i: int) -> np.ndarray | None:
-        others = [small[j] for j in near[i] if j != i and small[j] is not None]
+        others = [small[j] for j in near[i] if small[j] is not None]
         if small[i] is None or not (small[i].depth > 0).any() or len(others) < 2:
             return None
         verdicts = np.array([_verdict(small[i], other, tolerance, options) for other in others])

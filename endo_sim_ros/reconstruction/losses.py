@@ -44,17 +44,15 @@ def active_terms(config: ReconstructionConfig, iteration: int) -> tuple[Term, ..
     return tuple(term for term in TERMS if getattr(config, term.weight) > 0 and due(term))
 
 
-def regularized(
-    loss: Tensor | None, terms: Sequence[Term], rendering: Rendering, config: ReconstructionConfig, virtual: bool = False
-) -> Tensor | None:
-    """The loss so far, None for none, plus the terms of an image of a training or a virtual camera."""
+def regularized(loss: Tensor, terms: Sequence[Term], rendering: Rendering, config: ReconstructionConfig, virtual: bool = False) -> Tensor:
+    """The loss so far, plus the terms of an image of a training or a virtual camera."""
     for term in terms:
         if (virtual and not term.of_virtual) or (term.needs_prior and rendering.prior is None):
             continue
         value = term.weighted(rendering, config)
         if term.every is not None:
             value = getattr(config, term.every) * value
-        loss = value if loss is None else loss + value
+        loss = loss + value
     return loss
 
 

@@ -3,7 +3,6 @@
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -12,7 +11,7 @@ import torch
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
 from endo_sim_ros.core.light import Light, features_at
 from endo_sim_ros.reconstruction.progress import StageProgress
-from endo_sim_ros.reconstruction.scene import TrainingView
+from endo_sim_ros.reconstruction.scene import PointPixels, TrainingView, pixels_of
 from endo_sim_ros.reconstruction.stage_configs import PhotometryConfig
 
 
@@ -139,31 +138,21 @@ def fit_exposure(
     return response, exposures.mean(0) + response * brightness.mean(), residuals
 
 
-class _Seen(NamedTuple):
-    """Points that a view sees."""
-
-    index: np.ndarray  # [M] of the points
-    rows: np.ndarray  # [M] and so on: of the pixels that show them
-    columns: np.ndarray
-
-
-def _visible(view: TrainingView, points: np.ndarray, tolerance: float) -> _Seen:
+def _visible(view: TrainingView, points: np.ndarray, tolerance: float) -> PointPixels:
     """Which of the points [N, 3] a view sees: those on its tissue that its depth prior does not hide."""
-    index = np.nonzero(view.camera.sees(points))[0]
-    uv, z = view.camera.project(points[index])
-    u, v = np.floor(uv).astype(int).T
-    seen = view.tissue[v, u] > 0
+    found = pixels_of(view.camera, points)
+    seen = view.tissue[found.rows, found.columns] > 0
     if view.depth_prior is not None:
-        surface = view.depth_prior[v, u]
-        seen &= (surface <= 0) | (np.abs(z - surface) < tolerance * surface)
-    return _Seen(index[seen], v[seen], u[seen])
+        surface = view.depth_prior[found.rows, found.columns]
+        seen &= (surface <= 0) | (np.abs(found.depth - surface) < tolerance * surface)
+    return PointPixels(*(values[seen] for values in found))
 
 
 def _well_seen(
     view: TrainingView, points: np.ndarray, reference: float, tolerance: float, options: PhotometryConfig
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of the points that a view sees well: their indices [M], colours [M, 3] in [0, 1] and light's quantities [M, 4]."""
-    index, rows, columns = _visible(view, points, tolerance)
+    index, rows, columns, _ = _visible(view, points, tolerance)
     colors = cv2.GaussianBlur(view.image, (0, 0), 1.5)[rows, columns].astype(np.float64)  # over a pixel and a half, what depth is off
     good = (colors.max(1) < options.brightest) & (colors.max(1) > options.darkest)
     return index[good], colors[good].clip(1) / 255, features_at(points[index[good]], view.camera, reference)

@@ -22,10 +22,11 @@ from endo_sim_ros.reconstruction import losses, photometry
 from endo_sim_ros.reconstruction.appearance import Appearance
 from endo_sim_ros.reconstruction.checkpoint import read_checkpoint, write_checkpoint
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
-from endo_sim_ros.reconstruction.device_views import DeviceView, matrices, nearest_views, reprojected_prior
+from endo_sim_ros.reconstruction.device_views import DeviceView, matrices, reprojected_prior
 from endo_sim_ros.reconstruction.optimizer import PARAMETERS, Adam, model_of, parameters_of
 from endo_sim_ros.reconstruction.scene import PreparedScene, TrainingView, shrink
 from endo_sim_ros.reconstruction.strategies import STRATEGIES
+from endo_sim_ros.reconstruction.triangulation import nearest_views
 from endo_sim_ros.splatting import RenderOutput, rasterize
 from endo_sim_ros.splatting.graph_capture import GraphCapture
 
@@ -69,7 +70,7 @@ class Trainer:
         self.stamps = [view.stamp_ns for view in scene.views]
         """When the views were taken that are trained on, nanoseconds; views that were left out are not among them."""
         self.iteration = 0
-        self._nearest = nearest_views([view.camera for view in scene.views])
+        self._nearest = nearest_views(scene.views, 1)
         self._load(scene.views)
         eye = np.mean([view.camera.position for view in self._views], 0)
         self._eye = torch.as_tensor(eye, dtype=torch.float32, device=self.device)
@@ -233,7 +234,7 @@ class Trainer:
 
     def _virtual_camera(self, index: int) -> Camera:
         """Paper eq. 7: a random camera between a view and its nearest view."""
-        first, second = (self._views[i].camera for i in (index, self._nearest[index]))
+        first, second = (self._views[i].camera for i in (index, self._nearest[index][0]))
         alpha = torch.rand((), generator=self._generator).item()
         return first.at(interpolate_pose(first.pose, second.pose, alpha))
 

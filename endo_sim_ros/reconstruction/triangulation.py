@@ -1,5 +1,7 @@
 """Features that near views share, and scene points where their rays meet."""
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from scipy.spatial import cKDTree
@@ -21,8 +23,7 @@ def match_features(
     def match(pair: tuple[int, int]) -> Matches:
         return Matches(pair, *match_pair(features[pair[0]], features[pair[1]], options))
 
-    near = nearest_views(frames, options.neighbours)
-    pairs = sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(near) for j in row if j != i})
+    pairs = sorted({(min(i, j), max(i, j)) for i, near in enumerate(nearest_views(frames, options.neighbours)) for j in near})
     return [found for found in progress.map(match, pairs) if len(found.first)]
 
 
@@ -46,11 +47,12 @@ def match_pair(
     return uv_1[[match.queryIdx for match in good]], uv_2[[match.trainIdx for match in good]]
 
 
-def nearest_views(frames: list[Frame], count: int) -> np.ndarray:
-    """Indices [V, up to count + 1] of the views nearest to each in space, mostly itself among them."""
+def nearest_views(frames: Sequence[Frame], count: int) -> list[list[int]]:
+    """For each view, the indices of so many others nearest in space, the nearest first; one more where many are in one place."""
     centres = np.array([frame.camera.position for frame in frames])
     distance = np.linalg.norm(centres[:, None] - centres, axis=2)
-    return np.argsort(distance, axis=1, kind="stable")[:, : count + 1]
+    order = np.argsort(distance, axis=1, kind="stable")[:, : count + 1].tolist()
+    return [[other for other in row if other != view] for view, row in enumerate(order)]
 
 
 def triangulate(

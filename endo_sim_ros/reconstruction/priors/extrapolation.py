@@ -17,7 +17,7 @@ from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import features_at
 from endo_sim_ros.reconstruction.priors.interpolation import clip_to_range, fit_plane, inverse_distance_weighted, krige
 from endo_sim_ros.reconstruction.progress import StageProgress
-from endo_sim_ros.reconstruction.scene import TrainingView
+from endo_sim_ros.reconstruction.scene import TrainingView, pixels_of
 from endo_sim_ros.reconstruction.stage_configs import ExtrapolationConfig, InterpolationConfig
 from endo_sim_ros.reconstruction.triangulation import points_in_view
 
@@ -174,10 +174,9 @@ def _unknown(points: np.ndarray, views: Sequence[TrainingView], beyond: bool) ->
     for view in views:
         if view.depth_prior is None:
             continue
-        inside = np.nonzero(view.camera.sees(points))[0]
-        u, v = np.floor(view.camera.project(points[inside])[0]).astype(int).T
+        index, v, u, _ = pixels_of(view.camera, points)
         known = view.depth_prior[v, u] > 0
         if beyond:
             known |= view.tissue[v, u] > 0
-        unknown[inside[known]] = False
+        unknown[index[known]] = False
     return unknown

@@ -16,7 +16,7 @@ from endo_sim_ros.reconstruction.priors.interpolation import inverse_distance_we
 from endo_sim_ros.reconstruction.priors.inverse_depth import blur, correct, scaled, smooth
 from endo_sim_ros.reconstruction.priors.stereo import right_view
 from endo_sim_ros.reconstruction.progress import StageProgress
-from endo_sim_ros.reconstruction.scene import ScenePoints, TrainingView
+from endo_sim_ros.reconstruction.scene import ScenePoints, TrainingView, pixels_of
 from endo_sim_ros.reconstruction.stage_configs import InterpolationConfig, MultiViewConfig, StereoConfig
 from endo_sim_ros.reconstruction.triangulation import nearest_views
 
@@ -64,7 +64,7 @@ def refine_depth(
         total, weight = _point_corrections(camera, inverse, error, points, options)
         for j in near[i]:
             progress.check()
-            if j != i and (found := flow_correction(inverse, images[i], images[j], options)) is not None:
+            if (found := flow_correction(inverse, images[i], images[j], options)) is not None:
                 total, weight = total + found.precision * found.correction, weight + found.precision
         inverse = correct(inverse, total, weight, error, options.continuation, options.max_correction)
         inverse = smooth(inverse, options.smoothing, options.edge)
@@ -108,14 +108,12 @@ def _point_corrections(
     """
     total, weight = np.zeros(inverse.shape, np.float32), np.zeros(inverse.shape, np.float32)
     if len(points.positions):
-        inside = camera.sees(points.positions)
-        uv, z = camera.project(points.positions[inside])
-        u, v = np.floor(uv).astype(int).T
+        index, v, u, z = pixels_of(camera, points.positions)
         there = inverse[v, u]
         correction = 1 / z - there
         near = np.abs(correction) < options.max_correction * there
         u, v, there, correction = u[near], v[near], there[near], correction[near]
-        precision = 1 / (np.broadcast_to(points.error, inside.shape)[inside][near] * there) ** 2
+        precision = 1 / (np.broadcast_to(points.error, len(points.positions))[index][near] * there) ** 2
         precision /= 1 + (correction / (options.doubt * error[v, u])) ** 2
         np.add.at(total, (v, u), precision * correction)
         np.add.at(weight, (v, u), precision)

@@ -3,7 +3,6 @@
 import dataclasses
 import logging
 from collections.abc import Sequence
-from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -11,14 +10,12 @@ import numpy as np
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.reconstruction.progress import StageProgress
-from endo_sim_ros.reconstruction.scene import ScenePoints
+from endo_sim_ros.reconstruction.scene import AnyFrame, ScenePoints, pixels_of
 from endo_sim_ros.reconstruction.stage_configs import MatchingConfig, StereoConfig
 from endo_sim_ros.reconstruction.triangulation import detect, match_pair
 from endo_sim_ros.sequences.masks import lit_area
 
 log = logging.getLogger(__name__)
-
-AnyFrame = TypeVar("AnyFrame", bound=Frame)
 
 
 def stereo_depth(
@@ -42,13 +39,10 @@ def stereo_depth(
     aligned = progress.map(lambda view: view if view.right is None else align_rows(view, options, matching), views)
     disparities = progress.map(lambda view: None if view.right is None else stereo_disparity(view, options), aligned)
     offsets = disparity_offsets(aligned, disparities, points, options, matching)
-    found = []
-    for view, disparity, offset in zip(aligned, disparities, offsets):
-        if disparity is None:
-            found.append((view, None))
-        else:
-            found.append((_with_right_K(view, column=offset), disparity_to_depth(view, disparity, offset, options)))
-    return found
+    return [
+        (view, None) if found is None else (_with_right_K(view, column=offset), disparity_to_depth(view, found, offset, options))
+        for view, found, offset in zip(aligned, disparities, offsets)
+    ]
 
 
 def right_camera(frame: Frame) -> Camera:
@@ -134,11 +128,9 @@ def disparity_offsets(
     for i, (frame, disparity) in enumerate(zip(frames, disparities)):
         if disparity is None or not len(points.positions):
             continue
-        inside = frame.camera.sees(points.positions)
-        uv, z = frame.camera.project(points.positions[inside])
-        u, v = np.floor(uv).astype(int).T
+        index, v, u, z = pixels_of(frame.camera, points.positions)
         measured, expected = disparity[v, u], frame.camera.K[0, 0] * frame.baseline / z
-        error = np.broadcast_to(points.error, inside.shape)[inside]
+        error = np.broadcast_to(points.error, len(points.positions))[index]
         residuals[i] = (expected - measured)[measured > 0]
         weights[i] = (1 / (noise**2 + (error * expected) ** 2))[measured > 0]
     residual, weight = np.concatenate(residuals), np.concatenate(weights)

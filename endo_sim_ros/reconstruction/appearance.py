@@ -28,9 +28,9 @@ class Appearance:
     def __init__(self, light: np.ndarray, exposures: np.ndarray, reference: float, config: ReconstructionConfig, device: str):
         self._config, self._reference, self._device = config, reference, device
         self._prior = torch.tensor(light, dtype=torch.float32, device=device)
-        exposures = torch.tensor(exposures, dtype=torch.float32, device=device)
-        self._level = exposures.mean(0)
-        self.set(self._prior, exposures)
+        first = torch.tensor(exposures, dtype=torch.float32, device=device)
+        self._level = first.mean(0)
+        self.set(self._prior, first)
 
     def set(self, light: Tensor, exposures: Tensor) -> None:
         """Start optimising these, as far as there is such a thing."""
@@ -47,11 +47,11 @@ class Appearance:
 
         Args:
             depth, alpha: Rendered Σ w z (m) and Σ w [H, W].
-            rays: `directions` of the camera [3, H, W].
+            rays: `directions` of the camera [3, H, W]; None without light.
             view: Index of the exposure [1].
         """
         gain = None
-        if self._config.light:
+        if rays is not None:
             gain = falloff(features(depth, alpha, rays, self._reference), self.tensors["light"])[..., None]
         if self._config.exposure:
             exposure = self.tensors["exposures"].index_select(0, view).exp()[None]
@@ -77,7 +77,7 @@ class Appearance:
         if not (self._config.light or self._config.exposure):
             return None, unexplained
         if not self._config.exposure:
-            return Light(*light.tolist(), self._reference), unexplained
+            return Light(*light.tolist(), reference=self._reference), unexplained
         brightness = []
         for view in views:
             output = render(view)
@@ -89,4 +89,5 @@ class Appearance:
             brightness.append(float(log_brightness(image, where)))
         exposures = exposures.cpu().numpy().astype(np.float64)
         response, levels, residuals = photometry.fit_exposure(exposures, np.array(brightness), self._config.photometry)
-        return Light(*light.tolist(), self._reference, *map(float, levels), response), residuals
+        levels = {f"level_{channel}": float(level) for channel, level in zip("rgb", levels)}
+        return Light(*light.tolist(), reference=self._reference, response=response, **levels), residuals

@@ -45,12 +45,12 @@ def matrices(cameras: Sequence[Camera], device: str) -> tuple[Tensor, Tensor]:
     return tensor([camera.viewmat for camera in cameras]), tensor([camera.K for camera in cameras])
 
 
-def reprojected_prior(view: DeviceView, viewmat: Tensor) -> Tensor:
-    """The prior of a view as another camera [4, 4] of its kind sees it [H, W], metres; 0 where nothing falls."""
-    height, width = view.prior.shape
-    v, u = (view.prior > 0).nonzero(as_tuple=True)
-    K, pose = (torch.tensor(matrix).to(viewmat) for matrix in (view.camera.K, view.camera.pose))
-    z = view.prior[v, u]
+def reprojected_prior(prior: Tensor, camera: Camera, viewmat: Tensor) -> Tensor:
+    """The depth prior [H, W] of a camera as another one [4, 4] of its kind sees it [H, W], metres; 0 where nothing falls."""
+    height, width = prior.shape
+    v, u = (prior > 0).nonzero(as_tuple=True)
+    K, pose = (torch.tensor(matrix).to(viewmat) for matrix in (camera.K, camera.pose))
+    z = prior[v, u]
     points = torch.stack([(u + 0.5 - K[0, 2]) / K[0, 0] * z, (v + 0.5 - K[1, 2]) / K[1, 1] * z, z], 1)
     # Without a matrix product: libraries give other last bits with other numbers of threads.
     x, y, z = (sum(row[i] * points[:, i] for i in range(3)) + row[3] for row in (viewmat @ pose)[:3])

@@ -7,11 +7,10 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from scipy.ndimage import distance_transform_edt
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.reconstruction.progress import StageProgress
-from endo_sim_ros.reconstruction.scene import TrainingView
+from endo_sim_ros.reconstruction.scene import TrainingView, fill_holes
 from endo_sim_ros.reconstruction.stage_configs import DynamicMaskConfig
 from endo_sim_ros.reconstruction.triangulation import nearest_views
 
@@ -45,10 +44,10 @@ def mask_motion(
     small = [None if view.depth_prior is None else _small(view, options) for view in views]
 
     def moved(i: int) -> np.ndarray | None:
-        others = [small[j] for j in near[i] if small[j] is not None]
-        if small[i] is None or not (small[i].depth > 0).any() or len(others) < 2:
+        own, others = small[i], [other for j in near[i] if (other := small[j]) is not None]
+        if own is None or not (own.depth > 0).any() or len(others) < 2:
             return None
-        verdicts = np.array([_verdict(small[i], other, tolerance, options) for other in others])
+        verdicts = np.array([_verdict(own, other, tolerance, options) for other in others])
         against, agreeing = (verdicts > 0).sum(0), (verdicts < 0).sum(0)
         return _wide_pieces((against >= 2) & (against > agreeing), options)
 
@@ -67,7 +66,7 @@ def _masked(view: TrainingView, moved: np.ndarray | None, options: DynamicMaskCo
     mask = np.where(moved, 0, 255 if view.mask is None else view.mask).astype(np.uint8)
     text = "view at %.3f s: %.0f %% of it contradicts the other views and is left out; something moved"
     log.warning(text, at, 100 * moved.mean())
-    return dataclasses.replace(view, mask=mask, depth_prior=np.where(moved, np.float32(0), view.depth_prior))
+    return dataclasses.replace(view, mask=mask, depth_prior=np.where(moved, np.float32(0), view.surface))
 
 
 def _small(view: TrainingView, options: DynamicMaskConfig) -> _Small:
@@ -77,15 +76,14 @@ def _small(view: TrainingView, options: DynamicMaskConfig) -> _Small:
     nearest = lambda array: cv2.resize(array, size, interpolation=cv2.INTER_NEAREST_EXACT)
     # Smoothed over a pixel and a half, what poses and depth leave off.
     image = cv2.GaussianBlur(cv2.resize(view.image, size, interpolation=cv2.INTER_AREA), (0, 0), 1.5)
-    return _Small(camera, image, nearest(view.depth_prior), nearest(view.tissue))
+    return _Small(camera, image, nearest(view.surface), nearest(view.tissue))
 
 
 def _verdict(view: _Small, other: _Small, tolerance: float, options: DynamicMaskConfig) -> np.ndarray:
     """1 where another view contradicts a view [H, W], -1 where it agrees, 0 where it sees nothing of it."""
     known = view.depth > 0
     # In a hole something may hide that has no depth: let it be as deep as what is beside it.
-    nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
-    depth = view.depth[tuple(nearest)]
+    depth, _ = fill_holes(view.depth)
     uv, z = other.camera.project(view.camera.backproject(depth).reshape(-1, 3))
     u, v = ((uv - 0.5).T.reshape(2, *depth.shape)).astype(np.float32)  # OpenCV counts from the centre of the first pixel
     z = z.reshape(depth.shape)

@@ -5,15 +5,14 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.ndimage import distance_transform_edt
-from scipy.spatial import cKDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (it is public)
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import map_in_threads
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.reconstruction.progress import StageProgress
-from endo_sim_ros.reconstruction.scene import TrainingView
+from endo_sim_ros.reconstruction.scene import TrainingView, fill_holes
 from endo_sim_ros.reconstruction.stage_configs import InitialModelConfig
 
 
@@ -49,7 +48,7 @@ def initial_model(
     Raises:
         SequenceError: If neither depth nor points give the scene a shape.
     """
-    surfaces = [view for view in views if view.depth_prior is not None and (view.depth_prior > 0).any()]
+    surfaces = [view for view in views if (view.surface > 0).any()]
     chosen = _surface_pixels(surfaces, tolerance, progress)
     stride = _stride(chosen, max_gaussians)
     taken = [pixels & _lattice(pixels.shape, stride) for pixels in chosen]
@@ -68,7 +67,7 @@ def initial_model(
             "views that overlap from different positions, or check the poses"
         )
     tensors = [torch.from_numpy(array[:max_gaussians].astype(np.float32)) for array in (positions, *others)]
-    return GaussianModel.from_points(*tensors, options.opacity, sh_degree)
+    return GaussianModel.from_points(*tensors, opacity=options.opacity, sh_degree=sh_degree)
 
 
 def _surface_pixels(views: list[TrainingView], tolerance: float, progress: StageProgress) -> list[np.ndarray]:
@@ -77,18 +76,18 @@ def _surface_pixels(views: list[TrainingView], tolerance: float, progress: Stage
     The view that sees a piece from nearest provides it. A pixel whose point floats in front of the surface that another
     view sees, by more than the relative tolerance, is contradicted and left out.
     """
-    chosen = [np.zeros(view.depth_prior.shape, bool) for view in views]
-    fineness = [np.median(view.depth_prior[view.depth_prior > 0]) / view.camera.K[0, 0] for view in views]
+    chosen = [np.zeros(view.surface.shape, bool) for view in views]
+    fineness = [np.median(view.surface[view.surface > 0]) / view.camera.K[0, 0] for view in views]
     done: list[int] = []
     for i in np.argsort(fineness, kind="stable"):
         progress(len(done), 2 * len(views))
         view = views[i]
-        pixels = (view.depth_prior > 0) & (view.tissue > 0)
-        points = view.camera.backproject(view.depth_prior)[pixels]
+        pixels = (view.surface > 0) & (view.tissue > 0)
+        points = view.camera.backproject(view.surface)[pixels]
 
         def keeps(j: int) -> np.ndarray:
             progress.check()
-            z, surface, _ = _look_up(views[j].camera, views[j].depth_prior, points)  # noqa: B023
+            z, surface, _ = _look_up(views[j].camera, views[j].surface, points)  # noqa: B023
             return (surface <= 0) | (z >= surface * (1 + tolerance if j in done else 1 - tolerance))
 
         chosen[i][pixels] = np.all([np.ones(len(points), bool), *map_in_threads(keeps, [j for j in range(len(views)) if j != i])], 0)
@@ -127,14 +126,14 @@ def _back_project(views: list[TrainingView], index: int, pixels: np.ndarray, str
     The light moves with the endoscope: colours of one view alone would show where the next view's piece begins.
     """
     view = views[index]
-    points, colors = view.camera.backproject(view.depth_prior)[pixels], view.image[pixels] / 255.0
+    points, colors = view.camera.backproject(view.surface)[pixels], view.image[pixels] / 255.0
     count = np.ones((len(points), 1))
     for j, other in enumerate(views):
         if j != index:
-            z, surface, seen = _look_up(other.camera, other.depth_prior, points)
+            z, surface, seen = _look_up(other.camera, other.surface, points)
             agrees = ((surface > 0) & (np.abs(z - surface) < tolerance * surface))[:, None]
             colors, count = colors + agrees * (other.image.reshape(-1, 3)[seen] / 255.0), count + agrees
-    return _Points(points, colors / count, stride * view.depth_prior[pixels].astype(np.float64) / view.camera.K[0, 0])
+    return _Points(points, colors / count, stride * view.surface[pixels].astype(np.float64) / view.camera.K[0, 0])
 
 
 def _afloat(views: list[TrainingView], points: np.ndarray, tolerance: float, options: InitialModelConfig) -> np.ndarray:
@@ -144,8 +143,7 @@ def _afloat(views: list[TrainingView], points: np.ndarray, tolerance: float, opt
     """
     floats = np.zeros(len(points), bool)
     for view in views:
-        distance, nearest = distance_transform_edt(view.depth_prior <= 0, return_indices=True)
-        depth = view.depth_prior[tuple(nearest)]
+        depth, distance = fill_holes(view.surface)
         beside = (depth * (1 - tolerance - options.max_slope * distance / view.camera.K[0, 0])).astype(np.float32)
         z, surface, _ = _look_up(view.camera, np.maximum(beside, 0), points)
         floats |= (surface > 0) & (z < surface)

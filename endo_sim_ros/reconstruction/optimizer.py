@@ -43,8 +43,9 @@ class Adam:
 
     def set_rate(self, name: str, rate: float) -> None:
         """Change the rate of a tensor."""
-        if isinstance(self.rates[name], Tensor):
-            self.rates[name].fill_(rate)
+        held = self.rates[name]
+        if isinstance(held, Tensor):
+            held.fill_(rate)
         else:
             self.rates[name] = rate
 

@@ -142,9 +142,8 @@ def _visible(view: TrainingView, points: np.ndarray, tolerance: float) -> PointP
     """Which of the points [N, 3] a view sees: those on its tissue that its depth prior does not hide."""
     found = pixels_of(view.camera, points)
     seen = view.tissue[found.rows, found.columns] > 0
-    if view.depth_prior is not None:
-        surface = view.depth_prior[found.rows, found.columns]
-        seen &= (surface <= 0) | (np.abs(found.depth - surface) < tolerance * surface)
+    surface = view.surface[found.rows, found.columns]
+    seen &= (surface <= 0) | (np.abs(found.depth - surface) < tolerance * surface)
     return PointPixels(*(values[seen] for values in found))
 
 

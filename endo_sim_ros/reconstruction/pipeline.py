@@ -6,6 +6,7 @@ recording do not ask for it. Inside, a stage gives the algorithm views, its own 
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -49,8 +50,9 @@ def prepare(
     if not frames:
         raise SequenceError("there are no views to reconstruct from; check the image, camera_info and pose topics")
 
-    given = None if points is None else _checked(ScenePoints(*points))
-    scene = PreparedScene(tuple(frames), points=given, given_points=given is not None)
+    scene = PreparedScene(tuple(frames))
+    if points is not None:
+        scene = replace(scene, points=_checked(points), given_points=True)
     for name, stage in STAGES.items():
         progress = StageProgress(name, on_progress)
         progress.check()
@@ -217,8 +219,9 @@ STAGES: dict[str, Callable[[PreparedScene, ReconstructionConfig, StageProgress],
 # ------------------------------------------------------------------------------------------------------------ helpers
 
 
-def _checked(points: ScenePoints) -> ScenePoints:
+def _checked(given: tuple[Any, ...]) -> ScenePoints:
     """Scene points that somebody gave."""
+    points = ScenePoints(*given)
     shape, error = np.shape(points.positions), np.asarray(points.error)
     if len(shape) != 2 or shape[1] != 3 or np.shape(points.colors) != shape or error.shape not in ((), shape[:1]):
         raise SequenceError("scene points: give positions and colours as arrays [N, 3], and errors [N] or one for all")
@@ -232,7 +235,7 @@ def _checked(points: ScenePoints) -> ScenePoints:
 def _of_frames(scene: PreparedScene, frames: Sequence[Frame]) -> PreparedScene:
     """The scene with other frames, and nothing found in them yet."""
     views = tuple(TrainingView.of(frame) for frame in frames)
-    points = scene.points if scene.given_points else None
+    points = scene.points if scene.given_points else ScenePoints.none()
     return replace(scene, frames=tuple(frames), views=views, matches=(), points=points)
 
 

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Sequence
 from itertools import combinations
+from typing import Any
 
 import cv2
 import numpy as np
@@ -67,23 +68,26 @@ class _PoseCheck:
         none = np.zeros(len(matches.first), bool)
         if len(none) < self._matching.min_points:
             return none
-        sight = [_slopes(camera, uv) for camera, uv in ((first, matches.first), (second, matches.second))]
-        _, inliers = cv2.findEssentialMat(*sight, np.eye(3), cv2.RANSAC, 0.999, self._matching.reprojection_error / second.K[0, 0])
-        count = 0 if inliers is None else int((inliers > 0).sum())
+        here, there = _slopes(first, matches.first), _slopes(second, matches.second)
+        found: Any = cv2.findEssentialMat(here, there, np.eye(3), cv2.RANSAC, 0.999, self._matching.reprojection_error / second.K[0, 0])
+        if found[1] is None:
+            return none
+        inliers = found[1][:, 0] > 0
         # Fewer than half of the matches fit many a motion.
-        return inliers[:, 0] > 0 if count >= max(self._matching.min_points, 0.5 * len(none)) else none
+        return inliers if inliers.sum() >= max(self._matching.min_points, 0.5 * len(none)) else none
 
     def error_in_two(self, matches: Matches) -> float:
         """How far matches are from where the poses, and depth if there is any, expect them: the median."""
         (i, j), here, there = matches
         errors = [np.median(_epipolar_distance(self._cameras[i], self._cameras[j], here, there))]
         for one, other, here, there in ((i, j, here, there), (j, i, there, here)):
-            if self._depths[one] is None:
+            depth = self._depths[one]
+            if depth is None:
                 continue
             u, v = np.floor(here).astype(int).T
-            known = self._depths[one][v, u] > 0
+            known = depth[v, u] > 0
             if known.sum() >= self._matching.min_points:
-                points = self._cameras[one].backproject(self._depths[one])[v, u][known]
+                points = self._cameras[one].backproject(depth)[v, u][known]
                 errors.append(np.median(np.linalg.norm(self._cameras[other].project(points)[0] - there[known], axis=1)))
         return float(max(errors)) / self._cameras[j].width
 

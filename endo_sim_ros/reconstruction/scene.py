@@ -3,10 +3,12 @@
 import dataclasses
 import logging
 from dataclasses import dataclass, field
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
+import torch
+from scipy.ndimage import distance_transform_edt
 from typing_extensions import Self
 
 from endo_sim_ros.core.cameras import Camera
@@ -25,6 +27,7 @@ class ScenePoints(NamedTuple):
 
     @classmethod
     def none(cls) -> "ScenePoints":
+        """No points at all."""
         return cls(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
 
 
@@ -53,6 +56,13 @@ def pixels_of(camera: Camera, points: np.ndarray) -> PointPixels:
     return PointPixels(index, rows, columns, z)
 
 
+def fill_holes(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Depth [H, W] (0 = none) with that of the nearest pixel that has any in its holes, and the distance from it [H, W], pixels."""
+    found: Any = distance_transform_edt(depth <= 0, return_indices=True)
+    distance, nearest = found
+    return depth[tuple(nearest)], distance
+
+
 @dataclass(frozen=True)
 class TrainingView(Frame):
     """A view to train on: a frame, whose `depth` is what was measured, and the depth that training starts from and is held to.
@@ -62,6 +72,11 @@ class TrainingView(Frame):
     """
 
     depth_prior: np.ndarray | None = None
+
+    @property
+    def surface(self) -> np.ndarray:
+        """The depth prior [H, W], m; zeros if there is none anywhere."""
+        return np.zeros(self.image.shape[:2], np.float32) if self.depth_prior is None else self.depth_prior
 
     @classmethod
     def of(cls, frame: Frame) -> Self:
@@ -76,11 +91,11 @@ class PreparedScene:
     Args:
         frames: Usable frames, as they were recorded.
         views: The same as they are trained on: shrunk, with depth prior, rectified right image and mask of what is still.
-        points: Scene points; None before they are found.
+        points: Scene points; none before they are found.
         given_points: Whether the caller gave them.
         matches: Features that the frames share.
         depth_source: Where the depth prior is from: topic, stereo, network, points or none.
-        model: Gaussians to start from.
+        model: Gaussians to start from; none before they are placed.
         depth: Median depth of the scene, metres.
         light: Of the light at the camera (distance, angle, tilt_x, tilt_y) [4].
         exposures: Logarithm of each view's exposure [V, 3].
@@ -89,11 +104,11 @@ class PreparedScene:
 
     frames: tuple[Frame, ...]
     views: tuple[TrainingView, ...] = ()
-    points: ScenePoints | None = None
+    points: ScenePoints = ScenePoints.none()
     given_points: bool = False
     matches: tuple[Matches, ...] = ()
     depth_source: str = "none"
-    model: GaussianModel | None = None
+    model: GaussianModel = field(default_factory=lambda: GaussianModel.from_points(torch.empty(0, 3), torch.empty(0, 3), torch.empty(0)))
     depth: float = 0.0
     light: np.ndarray = field(default_factory=lambda: np.zeros(4))
     exposures: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
@@ -117,16 +132,17 @@ def shrink(frame: AnyFrame, width: int) -> AnyFrame:
     if camera.width <= width:
         return frame
     size = (width, max(round(camera.height * width / camera.width), 1))
-    average = lambda image: None if image is None else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    average = lambda image: cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     # Plain INTER_NEAREST takes the corner instead of the centre.
-    nearest = lambda depth: None if depth is None else cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT)
+    nearest = lambda depth: cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT)
+    depths = {name: getattr(frame, name, None) for name in ("depth", "depth_prior")}
     scale = np.diag([size[0] / camera.width, size[1] / camera.height, 1])
     return dataclasses.replace(
         frame,
         image=average(frame.image),
         camera=camera.resized(*size),
-        right=average(frame.right),
+        right=None if frame.right is None else average(frame.right),
         right_K=None if frame.right_K is None else scale @ frame.right_K,
         mask=None if frame.mask is None else np.uint8(255) * (average(np.float32(frame.mask > 0)) > 0.999),
-        **{name: nearest(getattr(frame, name)) for name in ("depth", "depth_prior") if hasattr(frame, name)},
+        **{name: nearest(depth) for name, depth in depths.items() if depth is not None},
     )

@@ -171,7 +171,7 @@ class Trainer:
         return {name: value for name, value in option_values(self.config).items() if name != "device"}
 
     def _detached(self) -> GaussianModel:
-        return GaussianModel(**{name: tensor.detach().clone() for name, tensor in model_of(self._parameters).tensors().items()})
+        return model_of({name: tensor.detach().clone() for name, tensor in self._parameters.items()})
 
     def _fitted_light(self) -> tuple[Light | None, np.ndarray]:
         """The light and what it leaves of the views' exposures [V, 3]."""
@@ -242,7 +242,7 @@ class Trainer:
         viewmats, Ks = matrices([view.camera] if virtual is None else [view.camera, virtual], self.device)
         virtual_prior = None
         if virtual is not None and view.prior is not None and any(term.of_virtual and term.needs_prior for term in terms):
-            virtual_prior = reprojected_prior(view, viewmats[1])
+            virtual_prior = reprojected_prior(view.prior, view.camera, viewmats[1])
         rays = directions(view.camera, self.device) if self.config.light else None
         return _Inputs(viewmats, Ks, view.image, view.index_tensor, view.mask, view.prior, rays, virtual_prior)
 
@@ -258,7 +258,7 @@ class Trainer:
             return self._captures[key](*inputs)
 
     def _descend_once(self, terms: tuple[losses.Term, ...], *inputs: Tensor | None) -> Tensor:
-        config, view, appearance = self.config, _Inputs(*inputs), self._appearance
+        config, view, appearance = self.config, _Inputs._make(inputs), self._appearance
         cameras, (height, width) = len(view.viewmats), view.image.shape[:2]
         wanted = {name: value for name, value in (self._parameters | appearance.tensors).items() if value.requires_grad}
         absgrad = None
@@ -292,13 +292,14 @@ class Trainer:
         """Paper eq. 6 of a training view, the first camera, and eq. 8 of a virtual camera, the second one."""
         config = self.config
         images = lambda camera: (model, *(images[camera] for images in (output.depths, output.alphas, output.distortions)))
-        seen = losses.Rendering(*images(0), view.mask, view.prior, self._eye, self.scene_depth)
+        of_scene = {"eye": self._eye, "scene_depth": self.scene_depth}
+        seen = losses.Rendering(*images(0), mask=view.mask, prior=view.prior, **of_scene)
         gain = self._appearance.gain(seen.depth, seen.alpha, view.rays, view.exposure)
         color = output.colors[0] if gain is None else output.colors[0] * gain
         loss = losses.photometric(color, view.image, view.mask, config.lambda_ssim)
         loss = losses.regularized(loss, terms, seen, config)
         if len(view.viewmats) > 1:
-            seen = losses.Rendering(*images(1), None, view.virtual_prior, self._eye, self.scene_depth)
+            seen = losses.Rendering(*images(1), mask=None, prior=view.virtual_prior, **of_scene)
             loss = losses.regularized(loss, terms, seen, config, virtual=True)
         return loss + config.light_anchor * self._appearance.changes() if config.light else loss
 

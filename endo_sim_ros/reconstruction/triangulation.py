@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (it is public)
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame
@@ -15,7 +15,7 @@ from endo_sim_ros.sequences.recording import spread
 
 
 def match_features(
-    frames: list[Frame], options: MatchingConfig = MatchingConfig(), progress: StageProgress = StageProgress()
+    frames: Sequence[Frame], options: MatchingConfig = MatchingConfig(), progress: StageProgress = StageProgress()
 ) -> list[Matches]:
     """SIFT features matched between each view and the nearest others; pairs of views that share none are left out."""
     features = progress.map(lambda frame: detect(frame.image, frame.mask, options), frames)
@@ -30,7 +30,7 @@ def match_features(
 def detect(image: np.ndarray, mask: np.ndarray | None, options: MatchingConfig) -> tuple[np.ndarray, np.ndarray | None]:
     """Pixels [N, 2] and descriptors [N, 128] of the SIFT features of an RGB image [H, W, 3] where a mask [H, W] is not 0."""
     # A quarter of OpenCV's threshold: tissue has little contrast.
-    sift = cv2.SIFT_create(nfeatures=options.max_features, contrastThreshold=0.01)
+    sift = cv2.SIFT.create(nfeatures=options.max_features, contrastThreshold=0.01)
     keys, descriptors = sift.detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), mask)
     return np.array([key.pt for key in keys]).reshape(-1, 2) + 0.5, descriptors  # OpenCV counts from the centre of the first pixel
 
@@ -56,8 +56,8 @@ def nearest_views(frames: Sequence[Frame], count: int) -> list[list[int]]:
 
 
 def triangulate(
-    frames: list[Frame],
-    matches: list[Matches] | None = None,
+    frames: Sequence[Frame],
+    matches: Sequence[Matches] | None = None,
     options: MatchingConfig = MatchingConfig(),
     progress: StageProgress = StageProgress(),
 ) -> ScenePoints:
@@ -81,7 +81,7 @@ def triangulate(
 
 
 def scene_points(
-    frames: list[Frame], views: int = 24, options: MatchingConfig = MatchingConfig(), progress: StageProgress = StageProgress()
+    frames: Sequence[Frame], views: int = 24, options: MatchingConfig = MatchingConfig(), progress: StageProgress = StageProgress()
 ) -> ScenePoints:
     """Points of a whole recording, triangulated from so many of its views: more of the scene than those one trains on show."""
     shown = spread([frame for frame in frames if frame.mask is None or frame.mask.any()], views)
@@ -110,7 +110,7 @@ def _intersect(
     first: Camera, second: Camera, uv_1: np.ndarray, uv_2: np.ndarray, options: MatchingConfig
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points [M, 3] where the rays of two views meet, the indices [M] of the matches that gave one, and the angles [M] between the rays."""
-    homogeneous = cv2.triangulatePoints(*(camera.K @ camera.viewmat[:3] for camera in (first, second)), uv_1.T, uv_2.T)
+    homogeneous = cv2.triangulatePoints(first.K @ first.viewmat[:3], second.K @ second.viewmat[:3], uv_1.T, uv_2.T)
     with np.errstate(divide="ignore", invalid="ignore"):
         points = (homogeneous[:3] / homogeneous[3]).T
     good = np.isfinite(points).all(1)

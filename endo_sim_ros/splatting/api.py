@@ -99,7 +99,7 @@ def rasterize(
     *tensors, absgrad = (None if x is None else x.to(means.device, torch.float32).contiguous() for x in (*scene, absgrad))
     scene = Scene._make(tensors)
     *images, owners = _Rasterize.apply(settings, masks, absgrad, *scene)
-    return RenderOutput(*images, median_depths(owners, scene.means, scene.viewmats) if median else None)
+    return RenderOutput(*images, medians=median_depths(owners, scene.means, scene.viewmats) if median else None)
 
 
 def render(
@@ -237,7 +237,7 @@ class _Rasterize(torch.autograd.Function):
         v = Gradients.empty(scene, wants_pose, wants_absolute)
         ctx.backend.backward(scene, ctx.state, ctx.settings, images, v_images, v)
         v_viewmats = v_background = None
-        if wants_pose:
+        if v.camera_shares is not None:
             v_viewmats = _repeatable_sum(v.camera_shares, 1)
         if wants_background:
             v_background = _repeatable_sum((v_images[0] * (1 - images[2])[..., None]).view(-1, 3), 0)

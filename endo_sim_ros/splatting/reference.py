@@ -35,6 +35,7 @@ def _rasterize(
     scene = Scene(means, quats, scales, covars, opacities, sh, viewmats, Ks, background)
     check_inputs("_rasterize", scene, Settings(width, height, near, eps2d, median), masks, absgrad)
     if covars is None:
+        assert quats is not None and scales is not None  # else the check has refused
         rotations = _quat_to_matrix(quats)
         covars = rotations @ torch.diag_embed(scales**2) @ rotations.mT
     covars = (covars + covars.mT) / 2
@@ -52,7 +53,7 @@ def _rasterize(
     *images, owners = (torch.stack(images) for images in zip(*cameras))
     first = count * torch.arange(len(viewmats), device=means.device)[:, None, None]
     owners = torch.where(owners >= 0, owners + first, -1)
-    return RenderOutput(*images, median_depths(owners, means, viewmats) if median else None)
+    return RenderOutput(*images, medians=median_depths(owners, means, viewmats) if median else None)
 
 
 def _quat_to_matrix(quats: Tensor) -> Tensor:

@@ -79,7 +79,8 @@ class Gradients(NamedTuple):
         gradients = [None if x is None else torch.empty_like(x) for x in scene[:6]]
         size = (len(scene.viewmats), scene.gaussian_count)
         shares = scene.means.new_empty(*size, 4, 4) if wants_pose else None
-        return cls(*gradients, shares, scene.means.new_empty(*size, 2) if wants_absolute else None)
+        absolutes = scene.means.new_empty(*size, 2) if wants_absolute else None
+        return cls._make([*gradients, shares, absolutes])
 
     def arguments(self) -> list:
         """Return the last arguments of the kernel `project_backward`."""

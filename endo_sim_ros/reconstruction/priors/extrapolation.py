@@ -3,6 +3,7 @@
 They keep other views from looking into the void. Physics, which knows the training cameras, takes no control nodes from them.
 """
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -10,7 +11,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (it is public)
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.gaussians import GaussianModel
@@ -78,7 +79,8 @@ def extrapolate(
         pad = int(reach * view.camera.width)
         continued = continue_view(view, points, light, exposures[index], reference, pad, interpolation)
         positions = continued.camera.backproject(continued.depth)
-        return tuple(_on_lattice(view, continued, positions, times * interpolation.cell) for times in (1.0, 1.5))
+        on_lattice = lambda times: _on_lattice(view, continued, positions, times * interpolation.cell)
+        return on_lattice(1.0), on_lattice(1.5)
 
     guesses = progress.map(around, usable)
     width = 4 * interpolation.cell
@@ -104,8 +106,9 @@ def extrapolate(
     if count > room:  # fewer and larger ones
         kept = np.linspace(0, count - 1, room).astype(int)
         arrays = arrays[0][kept], arrays[1][kept], arrays[2][kept] * (count / room) ** 0.5
-    added = GaussianModel.from_points(*(torch.from_numpy(a.astype(np.float32)) for a in arrays), options.opacity, model.sh_degree)
-    return GaussianModel(**{name: torch.cat([value, added.tensors()[name]]) for name, value in model.tensors().items()})
+    tensors = (torch.from_numpy(array.astype(np.float32)) for array in arrays)
+    added = GaussianModel.from_points(*tensors, opacity=options.opacity, sh_degree=model.sh_degree).tensors()
+    return dataclasses.replace(model, **{name: torch.cat([value, added[name]]) for name, value in model.tensors().items()})
 
 
 def continue_view(
@@ -130,7 +133,7 @@ def continue_view(
     K = view.camera.K.copy()
     K[:2, 2] += pad
     camera = Camera(K, view.camera.width + 2 * pad, view.camera.height + 2 * pad, view.camera.pose)
-    depth, image = np.pad(view.depth_prior, pad), np.pad(view.image, ((pad, pad), (pad, pad), (0, 0))) / np.float32(255)
+    depth, image = np.pad(view.surface, pad), np.pad(view.image, ((pad, pad), (pad, pad), (0, 0))) / np.float32(255)
     known = depth > 0
     v, u = np.nonzero(known)
     inverse = 1 / depth[known].astype(np.float64)
@@ -151,7 +154,7 @@ def continue_view(
     near, lit = np.exp(shading[:, 0]).reshape(depth.shape), np.exp(shading[:, 1:].sum(1)[:, None] + exposure).reshape(image.shape)
     clipped = lambda colors: np.clip(colors, 0, 2).astype(np.float32)  # in full light; a guess must not glare
     tissue = np.pad(view.tissue > 0, pad)
-    away = cv2.distanceTransform(np.uint8(~tissue), cv2.DIST_C, cv2.DIST_MASK_3)
+    away = cv2.distanceTransform((~tissue).astype(np.uint8), cv2.DIST_C, cv2.DIST_MASK_3)
     # The picture goes on as bright as it is at its edges, however near or far the guess is: wrong, it would glare in other views.
     continued = inverse_distance_weighted(clipped(image / lit), tissue, view.camera.width, interpolation)
     return ContinuedView(camera, depth, clipped(continued / near[..., None]), away)
@@ -164,7 +167,7 @@ def _on_lattice(view: TrainingView, continued: ContinuedView, positions: np.ndar
     stride = max(round(spacing * width), 1)
     lattice = np.zeros(away.shape, bool)
     lattice[stride // 2 :: stride, stride // 2 :: stride] = True
-    lattice &= np.pad(view.depth_prior, (camera.width - width) // 2) <= 0
+    lattice &= np.pad(view.surface, (camera.width - width) // 2) <= 0
     return _Guess(positions[lattice], colors[lattice], stride * depth[lattice] / camera.K[0, 0], away[lattice] / width)
 
 

@@ -1,6 +1,6 @@
 """What the optical flow between an image and its prediction from another one tells of depth."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -35,7 +35,7 @@ def eye_image(frame: Frame, options: MultiViewConfig) -> EyeImage:
     share = np.maximum(around(tissue), 1e-3)
     mean = around(grey * tissue) / share
     variance = np.maximum(around(grey * grey * tissue) / share - mean * mean, 0)
-    grey = np.uint8(np.clip(128 + 40 * (grey - mean) / np.sqrt(variance + 4), 0, 255))  # 2 grey levels are noise
+    grey = np.clip(128 + 40 * (grey - mean) / np.sqrt(variance + 4), 0, 255).astype(np.uint8)  # 2 grey levels are noise
     return EyeImage(frame.camera, grey, tissue, tissue * ~reflections(frame.image, tissue, options))
 
 
@@ -44,8 +44,8 @@ def reflections(image: np.ndarray, tissue: np.ndarray, options: MultiViewConfig 
     width = image.shape[1]
     least = image.min(2).astype(np.float32)
     around = blur(least * tissue, 15, width) / np.maximum(blur(tissue, 15, width), 1e-3)
-    bright = np.uint8(((least > 250) | (least > around + options.reflection)) & (tissue > 0))  # white is a few levels short of 255
-    return cv2.dilate(bright, np.ones((2 * round(scaled(3, width)) + 1,) * 2, np.uint8)) > 0  # with the glow around
+    bright = ((least > 250) | (least > around + options.reflection)) & (tissue > 0)  # white is a few levels short of 255
+    return cv2.dilate(bright.astype(np.uint8), np.ones((2 * round(scaled(3, width)) + 1,) * 2, np.uint8)) > 0  # with the glow around
 
 
 def flow_correction(inverse: np.ndarray, own: EyeImage, other: EyeImage, options: MultiViewConfig) -> FlowCorrection | None:
@@ -73,7 +73,7 @@ def flow_correction(inverse: np.ndarray, own: EyeImage, other: EyeImage, options
     off_u, off_v = seen_u - u, seen_v - v
     beside = np.abs(along_u * off_v - along_v * off_u) / np.sqrt(speed)
     alike = _correlation(own.grey, _sample(other.grey, seen_u, seen_v))
-    good = inside & (_sample(np.float32(inside), columns, rows, cv2.INTER_NEAREST) > 0)
+    good = inside & (_sample(inside.astype(np.float32), columns, rows, cv2.INTER_NEAREST) > 0)
     good &= (own.matte > 0) & (beside < options.max_beside * unit) & (np.abs(flow).max(2) < options.max_flow * unit)
     good &= np.hypot(off_u, off_v) < options.max_flow * unit
     good &= np.hypot(*cv2.split(flow + _sample(back, columns, rows))) < options.max_round_trip
@@ -83,7 +83,7 @@ def flow_correction(inverse: np.ndarray, own: EyeImage, other: EyeImage, options
 
 def _flow(image: np.ndarray, other: np.ndarray) -> np.ndarray:
     """By how many pixels [H, W, 2] what an image shows lies elsewhere in another."""
-    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    flow: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     flow.setFinestScale(0)
     return flow.calc(image, other, None)
 

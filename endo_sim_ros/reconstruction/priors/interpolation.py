@@ -1,5 +1,7 @@
 """Values of some pixels and points of a picture continued to all its pixels."""
 
+from typing import Any
+
 import cv2
 import numpy as np
 from scipy.interpolate import RBFInterpolator
@@ -31,7 +33,7 @@ def krige(
     rows, columns = count.shape
     centres = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1) + 0.5
     sources = np.concatenate([centres[occupied], uv / side])
-    errors = np.repeat([options.pixel_error, options.point_error], [occupied.sum(), len(uv)]) * width / side
+    errors: Any = np.repeat([options.pixel_error, options.point_error], [occupied.sum(), len(uv)]) * width / side
     source_values = np.concatenate([means[occupied], point_values])
     kriging = RBFInterpolator(sources, source_values, neighbors=options.neighbours, smoothing=errors, kernel="linear", degree=0)
     means[~occupied] = kriging(centres[~occupied])

@@ -63,7 +63,7 @@ def _cache() -> Path:
 
 
 def _transformers(folder: Path, device: str) -> Network:
-    from transformers import AutoModelForDepthEstimation
+    from transformers import AutoModelForDepthEstimation  # pyright: ignore[reportMissingImports]  (optional)
 
     model = AutoModelForDepthEstimation.from_pretrained(folder, local_files_only=True).eval().to(device)
 
@@ -78,7 +78,7 @@ def _transformers(folder: Path, device: str) -> Network:
 
 
 def _onnx(file: Path) -> Network:
-    import onnxruntime
+    import onnxruntime  # pyright: ignore[reportMissingImports]  (optional)
 
     session = onnxruntime.InferenceSession(str(file), providers=onnxruntime.get_available_providers())
     entry = session.get_inputs()[0]
@@ -93,7 +93,7 @@ def _onnx(file: Path) -> Network:
 
 def _normalised(image: np.ndarray, width: int, height: int) -> np.ndarray:
     """The image [1, 3, height, width] as networks take it whose backbone was trained on ImageNet: by its mean and deviation."""
-    mean, deviation = np.float32([0.485, 0.456, 0.406]), np.float32([0.229, 0.224, 0.225])
+    mean, deviation = np.array([[0.485, 0.456, 0.406], [0.229, 0.224, 0.225]], np.float32)
     small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
     return np.ascontiguousarray(((small - mean) / deviation).transpose(2, 0, 1)[None])
 

@@ -100,7 +100,7 @@ def interpolate_points(
     if len(uv) < matching.min_points or np.linalg.matrix_rank(uv - uv.mean(0), tol=1.0) < 2:
         return None
     height, width = shape = frame.camera.height, frame.camera.width
-    a, b, c = fit_plane(*uv.T, 1 / z)
+    a, b, c = fit_plane(uv[:, 0], uv[:, 1], 1 / z)
     residual = krige(np.zeros(shape), np.zeros(shape, bool), uv, 1 / z - (a * uv[:, 0] + b * uv[:, 1] + c), width, options)
     plane = a * (np.arange(width) + 0.5) + b * (np.arange(height)[:, None] + 0.5) + c
     inverse = clip_to_range(plane + residual, 1 / z, options)

@@ -54,12 +54,13 @@ def right_camera(frame: Frame) -> Camera:
 
 def right_view(frame: Frame, options: StereoConfig = StereoConfig()) -> Frame:
     """The right image of a stereo frame as a view of its own, without depth."""
+    assert frame.right is not None
     mask = lit_area([frame.right])
     if frame.mask is not None:
         # Tools of the left image lie farther to the left, by any of the disparities that there are.
         tools = (frame.mask == 0) & (lit_area([frame.image]) > 0)
         farthest = int(options.max_disparity * frame.camera.width)
-        mask[cv2.dilate(np.uint8(tools), np.ones((1, farthest + 1), np.uint8), anchor=(0, 0)) > 0] = 0
+        mask[cv2.dilate(tools.astype(np.uint8), np.ones((1, farthest + 1), np.uint8), anchor=(0, 0)) > 0] = 0
     return Frame(frame.stamp_ns, frame.right, right_camera(frame), mask=mask)
 
 
@@ -68,6 +69,7 @@ def align_rows(view: AnyFrame, options: StereoConfig = StereoConfig(), matching:
 
     The image moves by whole pixels, the right eye's principal point by the rest: rectification is seldom that good.
     """
+    assert view.right is not None
     left, right = match_pair(detect(view.image, view.mask, matching), detect(view.right, None, matching), matching)
     shifts = right[:, 1] - left[:, 1]
     shifts = shifts[np.abs(shifts) < options.max_row_offset * view.camera.height]
@@ -84,12 +86,13 @@ def stereo_disparity(frame: Frame, options: StereoConfig = StereoConfig()) -> np
 
     A difference of the principal points of the two eyes is removed, so that disparity = fx·B/z.
     """
+    assert frame.right is not None
     fx, width = frame.camera.K[0, 0], frame.camera.width
     shift = frame.camera.K[0, 2] - _right_K(frame)[0, 2]
     levels = int(np.ceil((fx * frame.baseline / options.nearest + abs(shift)) / 16)) * 16  # the matcher takes multiples of 16
     levels = min(levels, max(width // 2 // 16, 1) * 16)
     # Penalties as OpenCV recommends for blocks of 5 × 5 pixels.
-    matcher = cv2.StereoSGBM_create(
+    matcher = cv2.StereoSGBM.create(
         minDisparity=0, numDisparities=levels, blockSize=5, P1=8 * 25, P2=32 * 25, uniquenessRatio=5,
         speckleWindowSize=100, speckleRange=2, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )  # fmt: skip

@@ -42,7 +42,7 @@ class Default(Strategy):
         source = torch.cat(indices)
         new = model.select(source)
         halves = len(source) - 2 * len(indices[2])
-        moved = new.select(slice(halves, None))
+        moved = model.select(source[halves:])
         noise = torch.randn(len(moved), 3, generator=generator).to(device)
         steps = (moved.rotations @ (moved.scales * noise)[..., None])[..., 0]
         means, log_scales = new.means.clone(), new.log_scales.clone()

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (it is public)
 from torch import Tensor
 
 from endo_sim_ros.core.gaussians import GaussianModel

@@ -25,7 +25,7 @@ class Appearance:
         device: Where to compute.
     """
 
-    def __init__(self, light: np.ndarray, exposures: np.ndarray, reference: float, config: ReconstructionConfig, device: str):
+    def __init__(self, light: np.ndarray, exposures: np.ndarray, reference: float, config: ReconstructionConfig, device: str) -> None:
         self._config, self._reference, self._device = config, reference, device
         self._prior = torch.tensor(light, dtype=torch.float32, device=device)
         first = torch.tensor(exposures, dtype=torch.float32, device=device)

@@ -32,7 +32,7 @@ class Adam:
         rates: Of each of them, the learning rate.
     """
 
-    def __init__(self, parameters: dict[str, Tensor], rates: dict[str, float]):
+    def __init__(self, parameters: dict[str, Tensor], rates: dict[str, float]) -> None:
         self.parameters = parameters
         # Where a GPU finds them, a captured step reads what they are by then.
         self.rates = {name: x.new_tensor(rates[name]) if x.is_cuda else rates[name] for name, x in parameters.items()}

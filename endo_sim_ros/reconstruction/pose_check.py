@@ -59,7 +59,9 @@ def misposed(
 class _PoseCheck:
     """How far off features of several views are, and which views are to blame; errors are in widths of the image."""
 
-    def __init__(self, cameras: Sequence[Camera], depths: Sequence[np.ndarray | None], options: PosesConfig, matching: MatchingConfig):
+    def __init__(
+        self, cameras: Sequence[Camera], depths: Sequence[np.ndarray | None], options: PosesConfig, matching: MatchingConfig
+    ) -> None:
         self._cameras, self._depths, self._options, self._matching = cameras, depths, options, matching
 
     def fits_one_motion(self, matches: Matches) -> np.ndarray:

@@ -23,7 +23,7 @@ class StageProgress:
         on_progress: Called with the stage, how much of it is done, and how much there is; None calls nothing.
     """
 
-    def __init__(self, stage: str = "", on_progress: OnProgress | None = None):
+    def __init__(self, stage: str = "", on_progress: OnProgress | None = None) -> None:
         self._stage, self._on_progress = stage, on_progress
         self._done, self._total, self._stopped = 0, 0, threading.Event()
 

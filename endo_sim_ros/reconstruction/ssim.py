@@ -6,7 +6,7 @@ pixels, σ 1.5, with zeros around the image.
 
 import types
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 import torch
@@ -45,7 +45,7 @@ def backend_for(device: torch.device) -> SsimBackend:
 
 class _Ssim(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, x: Tensor, y: Tensor) -> Tensor:
+    def forward(ctx: Any, x: Tensor, y: Tensor) -> Tensor:
         ctx.backend = backend_for(x.device)
         values, saved = ctx.backend.forward(x.detach().contiguous(), y.detach().contiguous())
         ctx.save_for_backward(*saved)
@@ -53,7 +53,7 @@ class _Ssim(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, v: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx: Any, v: Tensor) -> tuple[Tensor, None]:
         return ctx.backend.backward(v, *ctx.saved_tensors), None
 
 
@@ -104,7 +104,7 @@ def _blur(image: Tensor) -> Tensor:
     return torch.from_numpy(blurred.reshape(image.shape))
 
 
-def _launch(kernel, arguments: list, image: Tensor) -> None:
+def _launch(kernel: Any, arguments: list, image: Tensor) -> None:
     """Launch a kernel for each value of an image."""
     arguments = [x.view(-1) if isinstance(x, Tensor) and x.ndim == 3 else x for x in arguments]
     launch(kernel, image.numel(), arguments, image.device)

@@ -63,7 +63,7 @@ class Trainer:
         config: The options that it was prepared with.
     """
 
-    def __init__(self, scene: PreparedScene, config: ReconstructionConfig):
+    def __init__(self, scene: PreparedScene, config: ReconstructionConfig) -> None:
         self.config = config = config
         self.scene_depth = scene.depth
         self.device = pick_device(config.device)
@@ -109,6 +109,7 @@ class Trainer:
 
     @property
     def progress(self) -> Progress:
+        """How far the training is; on a GPU this waits for it."""
         return Progress(self.iteration, self.config.iterations, float(self._last_loss), len(self._parameters["means"]))
 
     def save_checkpoint(self, path: str | Path) -> None:

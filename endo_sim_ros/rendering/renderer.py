@@ -28,7 +28,7 @@ class DeformableRenderer:
         ValueError: If the device is not there, there are no nodes, or positions are not finite.
     """
 
-    def __init__(self, model: GaussianModel, node_rest: np.ndarray | None, config: RenderingConfig):
+    def __init__(self, model: GaussianModel, node_rest: np.ndarray | None, config: RenderingConfig) -> None:
         self.device = pick_device(config.device)
         self.model = model.detach().to(self.device)
         self.config = config

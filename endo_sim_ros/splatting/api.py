@@ -4,7 +4,7 @@
 """
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -219,8 +219,8 @@ class _Rasterize(torch.autograd.Function):
     """Draws a scene, whose tensors are float32, contiguous, and on one device; absgrad is there for its gradient alone."""
 
     @staticmethod
-    def forward(ctx, settings, masks, absgrad, *tensors):
-        scene = Scene(*tensors)
+    def forward(ctx: Any, settings: Settings, masks: Tensor | None, absgrad: Tensor | None, *tensors: Tensor | None):
+        scene = Scene._make(tensors)
         ctx.backend, ctx.settings = backend_for(scene.means.device), settings
         tile_mask = _tile_mask(masks, settings, len(scene.viewmats), scene.means.device)
         images, radii, owners, ctx.state = ctx.backend.forward(scene, tile_mask, settings)
@@ -230,7 +230,7 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, *v_outputs):
+    def backward(ctx: Any, *v_outputs: Tensor):
         scene, images = Scene(*ctx.saved_tensors[:-4]), ctx.saved_tensors[-4:]
         v_images = [v.float().contiguous() for v in v_outputs[:4]]
         wants_absolute, wants_pose, wants_background = (ctx.needs_input_grad[i] for i in (2, 9, 11))

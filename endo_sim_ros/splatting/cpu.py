@@ -86,7 +86,7 @@ def _image_arguments(state: State, scene: Scene, settings: Settings, images: Seq
     return [*lists, scene.background, settings.width, settings.height, *images]
 
 
-def _launch_tiles(kernel, tile_count: int, arguments: list) -> None:
+def _launch_tiles(kernel: Any, tile_count: int, arguments: list) -> None:
     """Launch a kernel that draws tiles from a counter, its first argument, in all threads."""
     inputs = kernel_arguments(kernel, [torch.zeros(1, dtype=torch.int32, device="cpu"), *arguments])
     command: Any = wp.launch(kernel, dim=tile_count, inputs=inputs, device="cpu", record_cmd=True)

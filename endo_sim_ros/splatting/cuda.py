@@ -107,7 +107,7 @@ class _Expectation:
     CPU there is nothing to wait for, and the number is known at once.
     """
 
-    def __init__(self, device: torch.device):
+    def __init__(self, device: torch.device) -> None:
         self.seen = torch.zeros(2, dtype=torch.int64, pin_memory=device.type == "cuda")  # intersections and splats
         self.numbers = self.seen.numpy()
         self._mean = _FIRST_GUESS
@@ -157,7 +157,7 @@ def noted_capacities() -> Iterator[list[Capacity]]:
 class _Scratch:
     """Memory that is written and read within one picture, in one stream of a device."""
 
-    def __init__(self, device: torch.device, expectations: dict[int, _Expectation] | None = None):
+    def __init__(self, device: torch.device, expectations: dict[int, _Expectation] | None = None) -> None:
         self._device = device
         self._splat_count, self._reserved, self.capacity = 0, 0, 0
         self._expectations = collections.defaultdict(functools.partial(_Expectation, device)) if expectations is None else expectations
@@ -220,7 +220,7 @@ def _stream(device: torch.device) -> int:
 _lock = threading.Lock()
 
 
-def _launch(kernel, count: int, arguments: list) -> None:
+def _launch(kernel: Any, count: int, arguments: list) -> None:
     """Launch a kernel over count items.
 
     Packing the arguments takes longer than many kernels run. So launches are recorded, and a launch of the same kind as an
@@ -240,7 +240,7 @@ def _launch(kernel, count: int, arguments: list) -> None:
     command.launch()
 
 
-def _record(kernel, count: int, arguments: list, device: str) -> tuple[Any, list]:
+def _record(kernel: Any, count: int, arguments: list, device: str) -> tuple[Any, list]:
     """Return a launch, not made yet, and its array arguments, whose addresses are to be filled in."""
     command: Any = wp.launch(kernel, dim=count, inputs=kernel_arguments(kernel, arguments), device=device, record_cmd=True)
     places = [command.params[1 + i] for i, x in enumerate(arguments) if isinstance(x, Tensor)]

@@ -23,7 +23,7 @@ class GraphCapture:
             that it reads or writes must stay where they are: call `invalidate` when they have moved.
     """
 
-    def __init__(self, function: Callable[..., Tensor]):
+    def __init__(self, function: Callable[..., Tensor]) -> None:
         self._function, self._pool = function, torch.cuda.graph_pool_handle()
         self._inputs: list[Tensor | None] | None = None
         # Kept until there is another graph: its memory serves that, too.

@@ -1,5 +1,7 @@
 """What `rasterize` computes, in plain torch, as its formulas are written: every Gaussian at every pixel."""
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -33,7 +35,8 @@ def _rasterize(
     """
     background = means.new_zeros(3) if background is None else background
     scene = Scene(means, quats, scales, covars, opacities, sh, viewmats, Ks, background)
-    check_inputs("_rasterize", scene, Settings(width, height, near, eps2d, median), masks, absgrad)
+    settings = Settings(width, height, near, eps2d, median)
+    check_inputs("_rasterize", scene, settings, masks, absgrad)
     if covars is None:
         assert quats is not None and scales is not None  # else the check has refused
         rotations = _quat_to_matrix(quats)
@@ -42,14 +45,7 @@ def _rasterize(
     count = means.shape[-2]
     if absgrad is None:
         absgrad = means.new_zeros(len(viewmats), count, 2)
-    shared = means.ndim == 2
-    cameras = [
-        _render_reference(
-            *((means, covars) if shared else (means[c], covars[c])), opacities, sh if sh.ndim == 3 else sh[c],
-            viewmat, K, width, height, background, absgrad[c], near, eps2d,
-        )
-        for c, (viewmat, K) in enumerate(zip(viewmats, Ks))
-    ]  # fmt: skip
+    cameras = [_render_camera(scene, settings, index, covars, absgrad[index]) for index in range(len(viewmats))]
     *images, owners = (torch.stack(images) for images in zip(*cameras))
     first = count * torch.arange(len(viewmats), device=means.device)[:, None, None]
     owners = torch.where(owners >= 0, owners + first, -1)
@@ -99,16 +95,22 @@ class _SumOfAbsolutes(torch.autograd.Function):
     """Returns the first argument [N, H, W]; the gradient of the second [N] is the sum of its gradient's absolute values."""
 
     @staticmethod
-    def forward(ctx, x, probe):
+    def forward(ctx: Any, x: Tensor, probe: Tensor) -> Tensor:
         return x.clone()
 
     @staticmethod
-    def backward(ctx, v):
+    def backward(ctx: Any, v: Tensor) -> tuple[Tensor, Tensor]:
         return v, v.abs().sum((1, 2))
 
 
-def _render_reference(means, covars, opacities, sh, viewmat, K, width, height, background, absgrad, near, eps2d):
+def _render_camera(scene: Scene, settings: Settings, camera: int, covars: Tensor, absgrad: Tensor) -> tuple[Tensor, ...]:
     """Return images of one camera, radii [N] and, per pixel, the Gaussian at the median depth or −1 [H, W]."""
+    means, opacities, sh, viewmat, K = scene.means, scene.opacities, scene.sh, scene.viewmats[camera], scene.Ks[camera]
+    if means.ndim == 3:
+        means, covars = means[camera], covars[camera]
+    if sh.ndim == 4:
+        sh = sh[camera]
+    width, height, near, eps2d, _ = settings
     rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     points = means @ rotation.T + translation
@@ -159,7 +161,7 @@ def _render_reference(means, covars, opacities, sh, viewmat, K, width, height, b
     before_weight = weights.cumsum(0) - weights
     alphas = weights.sum(0)
     images = (
-        torch.einsum("nhw,nc->hwc", weights, colors) + (1 - alphas)[..., None] * background,
+        torch.einsum("nhw,nc->hwc", weights, colors) + (1 - alphas)[..., None] * scene.background,
         (weights * z).sum(0),
         alphas,
         (2 * weights * (z * before_weight - before_depth)).sum(0),

@@ -1,6 +1,6 @@
 """What the trainer asks of a densification strategy."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -28,7 +28,7 @@ class Strategy:
     wants_absgrad = False
     """Whether `step_post_backward` is to get the gradients of image positions, which costs time."""
 
-    def __init__(self, options, limit: int, scene_depth: float):
+    def __init__(self, options: Any, limit: int, scene_depth: float) -> None:
         self.options, self.limit, self.scene_depth = options, limit, scene_depth
 
     def initialize_state(self, count: int, device: torch.device | str) -> dict[str, Tensor]:

@@ -16,10 +16,11 @@ class Default(Strategy):
     wants_absgrad = True
 
     def initialize_state(self, count: int, device: torch.device | str) -> dict[str, Tensor]:
-        # Σ of image gradients and number of views that had any.
+        """Of each Gaussian, Σ of its image gradients, and the number of iterations in which it had any."""
         return {"gradients": torch.zeros(2, count, device=device)}
 
     def step_post_backward(self, state: dict[str, Tensor], steepness: Tensor) -> None:
+        """Add up the image gradients."""
         state["gradients"] += torch.stack([steepness, (steepness > 0).to(steepness.dtype)])
 
     def refine(self, model: GaussianModel, state: dict[str, Tensor], generator: torch.Generator) -> Refined:

@@ -16,6 +16,7 @@ class Proximity(Default):
     """New Gaussians also fill the gaps around those that lie alone; options: `ProximityConfig`."""
 
     def refine(self, model: GaussianModel, state: dict[str, Tensor], generator: torch.Generator) -> Refined:
+        """Refine as `Default` does, then `unpool`."""
         model, source, fresh = super().refine(model, state, generator)
         model, others, added = self.unpool(model)
         return Refined(model, source[others], fresh[others] | added)

@@ -10,9 +10,6 @@ import torch
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.reconstruction.optimizer import parameters_of
 
-_KEYS = {"config", "stamps", "iteration", "order", "generator", "noise"}
-_KEYS |= {"model", "optimizer", "strategy", "light", "light_optimizer"}
-
 
 def write_checkpoint(state: dict[str, Any], path: str | Path) -> None:
     """Write the state of a training; what was there before stays until it is complete."""
@@ -40,7 +37,8 @@ def read_checkpoint(path: str | Path, device: str) -> dict[str, Any]:
         state = torch.load(path, map_location=device, weights_only=True)
     except pickle.UnpicklingError:  # whose text advises to load it all the same
         raise ValueError("it holds other objects than tensors and numbers") from None
-    if set(state) != _KEYS:
+    written = {"config", "stamps", "iteration", "order", "generator", "noise", "model", "optimizer", "strategy", "light", "light_optimizer"}
+    if set(state) != written:
         raise ValueError("another version made it; start anew")
     moments, lights = state["optimizer"], state["light_optimizer"]  # of each parameter, by its name
     tensors = [*state["model"].values(), *state["light"].values(), *state["strategy"].values()]

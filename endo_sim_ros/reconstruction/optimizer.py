@@ -7,6 +7,7 @@ from torch.optim.adam import adam
 from endo_sim_ros.core.gaussians import GaussianModel
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh_base", "sh_rest")
+"""Names of the tensors that are optimised, as `LearningRatesConfig` has them."""
 
 
 def parameters_of(model: GaussianModel) -> dict[str, Tensor]:

@@ -86,15 +86,15 @@ class _Kernels:
 
     def forward(self, x: Tensor, y: Tensor) -> tuple[Tensor, Sequence[Tensor]]:
         moments, slopes, values = x.new_empty(5, x.numel()), x.new_empty(3, x.numel()), torch.empty_like(x)
-        _launch(kernels.moments_across, [x, y, *x.shape[1:], moments], x)
-        _launch(kernels.similarity_down, [moments, x[0].numel(), values, slopes], x)
+        launch(kernels.moments_across, x.numel(), [x, y, *x.shape[1:], moments], x.device)
+        launch(kernels.similarity_down, x.numel(), [moments, x[0].numel(), values, slopes], x.device)
         return values, (x, y, slopes)
 
     def backward(self, v: Tensor, *saved: Tensor) -> Tensor:
         x, y, slopes = saved
         sums, v_x = torch.empty_like(slopes), torch.empty_like(x)
-        _launch(kernels.gradient_across, [v.contiguous(), slopes, *x.shape[1:], sums], x)
-        _launch(kernels.gradient_down, [sums, x, y, x[0].numel(), v_x], x)
+        launch(kernels.gradient_across, x.numel(), [v.contiguous(), slopes, *x.shape[1:], sums], x.device)
+        launch(kernels.gradient_down, x.numel(), [sums, x, y, x[0].numel(), v_x], x.device)
         return v_x
 
 
@@ -102,9 +102,3 @@ def _blur(image: Tensor) -> Tensor:
     """Return the Gaussian window's sums over [H, W, C], with zeros around; symmetric, hence its own adjoint."""
     blurred = cv2.sepFilter2D(image.numpy(), -1, kernels.gaussian, kernels.gaussian, borderType=cv2.BORDER_CONSTANT)
     return torch.from_numpy(blurred.reshape(image.shape))
-
-
-def _launch(kernel: Any, arguments: list, image: Tensor) -> None:
-    """Launch a kernel for each value of an image."""
-    arguments = [x.view(-1) if isinstance(x, Tensor) and x.ndim == 3 else x for x in arguments]
-    launch(kernel, image.numel(), arguments, image.device)

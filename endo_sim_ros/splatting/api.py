@@ -13,7 +13,7 @@ from torch import Tensor
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.splatting.backend import backend_for
-from endo_sim_ros.splatting.constants import ALPHA_MIN, TILE
+from endo_sim_ros.splatting.constants import TILE
 from endo_sim_ros.splatting.scene import Gradients, Scene, Settings
 
 
@@ -26,11 +26,6 @@ class RenderOutput(NamedTuple):
     distortions: Tensor  # [C, H, W] Σ_ij w_i w_j |z_i − z_j|, metres
     radii: Tensor  # [C, N] int32, half size of the footprint's bounding box, pixels; 0 = not in the image; no gradient
     medians: Tensor | None = None  # [C, H, W] z where half of the light is blocked, metres; 0 = never; None = not asked for
-
-    @property
-    def expected_depths(self) -> Tensor:
-        """Mean depths Σ w_i z_i / Σ w_i [C, H, W], metres; 0 where nothing is drawn."""
-        return self.depths / self.alphas.clamp_min(ALPHA_MIN / 2)  # alpha is 0 or at least ALPHA_MIN
 
 
 def rasterize(

@@ -54,15 +54,15 @@ def forward(scene: Scene, tile_mask: Tensor, settings: Settings) -> tuple[list[T
             arguments = [*scene.gaussian_arguments(), *_cameras(scene, settings), settings.near, settings.eps2d, scene.per_camera]
             outputs = [splats, radii, scratch.depth_keys, scratch.order, counts]
             _launch(kernels.project, splat_count, [0, *arguments, tile_mask, *outputs])
-            scratch.sort_by_depth()
+            wp.utils.radix_sort_pairs(*scratch.by_depth, splat_count, 0, 31)
             _launch(cuda_kernels.gather_counts, splat_count, [scratch.order, counts, scratch.sorted_counts])
-            scratch.sum_counts()
+            wp.utils.array_scan(*scratch.sums)
             capacity = scratch.reserve_lists(tile_count)
             splat_list = integers(capacity)
             _launch(cuda_kernels.clear_lists, capacity, [tile_count, ranges, scratch.tiles])
             arguments = [scratch.order, scratch.ends, counts, scene.gaussian_count, splats, tile_mask, settings.tiles_x, settings.tiles_y]
             _launch(kernels.emit_intersections, splat_count, [0, *arguments, capacity, 1, scratch.tiles, scratch.values, None, None])
-            scratch.sort_by_tile(tile_count)
+            wp.utils.radix_sort_pairs(*scratch.by_tile, capacity, 0, tile_count.bit_length())
             arguments = [scratch.tiles, scratch.values, scratch.order, scratch.ends, tile_mask]
             _launch(cuda_kernels.find_ranges, capacity, [*arguments, splat_list, ranges, scratch.seen])
         else:
@@ -172,8 +172,8 @@ class _Scratch:
             self._splat_count = 0  # if there is no memory, the next picture must not find it either
             self.depth_keys, self.order = self._integers(2 * splat_count), self._integers(2 * splat_count)
             self.sorted_counts, self.ends = (self._integers(splat_count, torch.int64) for _ in range(2))
-            self._by_depth = wp.from_torch(self.depth_keys), wp.from_torch(self.order)
-            self._sums = wp.from_torch(self.sorted_counts), wp.from_torch(self.ends)
+            self.by_depth = wp.from_torch(self.depth_keys), wp.from_torch(self.order)
+            self.sums = wp.from_torch(self.sorted_counts), wp.from_torch(self.ends)
             self._splat_count = splat_count
 
     def reserve_lists(self, tile_count: int) -> int:
@@ -189,18 +189,9 @@ class _Scratch:
         if self.capacity > self._reserved:
             self._reserved = 0
             self.tiles, self.values = self._integers(2 * self.capacity), self._integers(2 * self.capacity)
-            self._by_tile = wp.from_torch(self.tiles), wp.from_torch(self.values)
+            self.by_tile = wp.from_torch(self.tiles), wp.from_torch(self.values)
             self._reserved = self.capacity
         return self.capacity
-
-    def sort_by_depth(self) -> None:
-        wp.utils.radix_sort_pairs(*self._by_depth, self._splat_count, 0, 31)
-
-    def sum_counts(self) -> None:
-        wp.utils.array_scan(*self._sums)
-
-    def sort_by_tile(self, tile_count: int) -> None:
-        wp.utils.radix_sort_pairs(*self._by_tile, self.capacity, 0, tile_count.bit_length())
 
     def _integers(self, count: int, dtype: torch.dtype = torch.int32) -> Tensor:
         return torch.empty(count, dtype=dtype, device=self._device)

@@ -184,14 +184,14 @@ def test_median_depth_is_where_half_of_the_light_is_blocked(compositor):
     assert not faint.medians.any() and rasterize(*arguments).medians is None
 
 
-def test_expected_depth_lies_on_the_surface_also_where_it_is_thin():
+def test_mean_depth_lies_on_the_surface_also_where_it_is_thin():
     gaussians = [x.float() for x in make_gaussians(seed=19)]
     gaussians[0][:, 2] = 0.12
     viewmats, Ks = (x.float() for x in make_cameras(1))
     output = rasterize(*gaussians, torch.eye(4)[None], Ks, WIDTH, HEIGHT)
     drawn = output.alphas > 0
     assert drawn.any() and not drawn.all()
-    assert torch.allclose(output.expected_depths, torch.where(drawn, 0.12, 0.0), atol=1e-6)
+    assert torch.allclose(output.depths, 0.12 * output.alphas, rtol=1e-5, atol=0)
 
 
 def test_float64_inputs_get_float64_gradients():

@@ -36,10 +36,10 @@ def eye_image(frame: Frame, options: MultiViewConfig) -> EyeImage:
     mean = around(grey * tissue) / share
     variance = np.maximum(around(grey * grey * tissue) / share - mean * mean, 0)
     grey = np.clip(128 + 40 * (grey - mean) / np.sqrt(variance + 4), 0, 255).astype(np.uint8)  # 2 grey levels are noise
-    return EyeImage(frame.camera, grey, tissue, tissue * ~reflections(frame.image, tissue, options))
+    return EyeImage(frame.camera, grey, tissue, tissue * ~_reflections(frame.image, tissue, options))
 
 
-def reflections(image: np.ndarray, tissue: np.ndarray, options: MultiViewConfig = MultiViewConfig()) -> np.ndarray:
+def _reflections(image: np.ndarray, tissue: np.ndarray, options: MultiViewConfig) -> np.ndarray:
     """Where an image [H, W, 3] shows reflections of the light [H, W], which lie deeper than the tissue [H, W] and move with the camera."""
     width = image.shape[1]
     least = image.min(2).astype(np.float32)

@@ -52,10 +52,10 @@ def refine_depth(
 
     def refine(i: int) -> np.ndarray | None:
         view, camera = views[i], views[i].camera
-        if view.depth_prior is None or not (view.depth_prior > 0).any():
+        known = view.surface > 0
+        if not known.any():
             return view.depth_prior
-        known = view.depth_prior > 0
-        inverse = (known / np.where(known, view.depth_prior, 1)).astype(np.float32)[..., None]
+        inverse = (known / np.where(known, view.surface, 1)).astype(np.float32)[..., None]
         inverse = inverse_distance_weighted(inverse, known, camera.width, interpolation)[..., 0]
         error = (options.points_error if source == "points" else options.prior_error) * inverse
         if source == "stereo" and view.right is not None:

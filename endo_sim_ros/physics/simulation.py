@@ -13,7 +13,8 @@ from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.physics.backends.base import capturing
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes, RenderDepth, build_control_nodes
-from endo_sim_ros.physics.cutting import Blade, CutStencils
+from endo_sim_ros.physics.cutting.blade import Blade
+from endo_sim_ros.physics.cutting.stencils import CutStencils
 from endo_sim_ros.physics.regions import TissueProperties, paint_regions
 from endo_sim_ros.physics.skinning import Skinning
 from endo_sim_ros.physics.solver import MpmSolver
@@ -77,7 +78,7 @@ class TissueBatch:
         """Positions of the nodes [B, M, 3], m, world; pinned ones where they rest."""
         return self._rest + self.displacements * self._free[:, None]
 
-    def carry(self, skinning: Skinning) -> tuple[Tensor, Tensor]:
+    def append_skinning(self, skinning: Skinning) -> tuple[Tensor, Tensor]:
         """Make skinning part of every step from now on, in place of another that was; on a GPU of the one graph that a step is.
 
         Args:
@@ -209,7 +210,7 @@ class TissueSimulation:
         if not wanted and tool not in self._slots:
             return True
         slot, tools = self._slot(tool), self._tools
-        for tensor, value in ((tools.reaches, tip), (tools.forces, force), (tools.torques, torque)):
+        for tensor, value in ((tools.grasp_points, tip), (tools.forces, force), (tools.torques, torque)):
             tensor[0, slot] = torch.from_numpy(value)
         was = bool(tools.attached[0, slot])
         if wanted != was:

@@ -15,11 +15,10 @@ from endo_sim_ros.physics.backends.end_kernels import end_step
 from endo_sim_ros.physics.backends.structs import Substep
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes
-from endo_sim_ros.physics.cutting import CutTable
 from endo_sim_ros.physics.grid import plan_grid
 from endo_sim_ros.physics.materials import energy_density, lame_parameters
 from endo_sim_ros.physics.regions import TissueProperties
-from endo_sim_ros.physics.stencils import Stencils
+from endo_sim_ros.physics.stencils import CutTable, Stencils
 from endo_sim_ros.physics.substeps import plan_substeps
 
 

@@ -6,7 +6,9 @@ from cut_block import MIDDLE, SPACING, block, wall
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from endo_sim_ros.physics.cutting import CutStencils, CutTable, separated, sweep
+from endo_sim_ros.physics.cutting.geometry import separated, sweep
+from endo_sim_ros.physics.cutting.stencils import CutStencils
+from endo_sim_ros.physics.stencils import CutTable
 
 
 def cut_stencils(rest_cells: np.ndarray, shape: tuple[int, int, int], triangles: np.ndarray, rest: np.ndarray) -> CutTable | None:

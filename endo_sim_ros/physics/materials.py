@@ -12,16 +12,13 @@ Tests take it from ``MATERIALS``: they compare the stress with the gradient of t
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
-Number = TypeVar("Number", float, np.ndarray)
 
-
-def lame_parameters(young_modulus: Number, poisson_ratio: Number) -> tuple[Number, Number]:
+def lame_parameters(young_modulus: Any, poisson_ratio: Any) -> tuple[Any, Any]:
     """Lamé's parameters (mu, lambda) in Pa of Young's modulus in Pa and Poisson's ratio; of numbers or arrays of them."""
     mu = young_modulus / (2 * (1 + poisson_ratio))
     lam = young_modulus * poisson_ratio / ((1 + poisson_ratio) * (1 - 2 * poisson_ratio))

@@ -6,6 +6,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 import warp as wp
+from numpy.typing import ArrayLike
 
 from endo_sim_ros.core.device import on_torch_stream, pick_device
 from endo_sim_ros.physics.arrays import new_grid, new_loads, new_nodes, new_state, new_tools, set_stencils
@@ -52,7 +53,7 @@ class MpmSolver:
         *,
         environments: int = 1,
         tools: int = 1,
-        stiffness: np.ndarray | None = None,
+        stiffness: ArrayLike | None = None,
     ):
         if environments < 1 or tools < 0:
             raise ValueError(f"there must be at least one environment and no fewer than zero tools, not {environments} and {tools}")

@@ -32,9 +32,8 @@ class Stencils:
 
     def __init__(self, rest_cells: np.ndarray, shape: tuple[int, int, int], cut: CutTable | None = None):
         self.rest_cells, self.shape = rest_cells, shape
-        self.first = (
-            np.floor(rest_cells - 0.5).astype(np.int64).clip(0, np.array(shape) - 3)
-        )  # first grid node (i, j, k) of each stencil [M, 3]
+        # First grid node (i, j, k) of each stencil [M, 3].
+        self.first = np.floor(rest_cells - 0.5).astype(np.int64).clip(0, np.array(shape) - 3)
         self.row = np.full(len(rest_cells), -1)  # in the table, of control nodes beside a cut; -1 for all others [M]
         self.table = np.zeros((0, 27), int)  # numbers of their grid nodes [A, 27]
         self.grid_count = int(np.prod(shape))  # of grid nodes with their copies

@@ -1,9 +1,11 @@
 """Tools: wrenches, jaws and rigid capsules that act on the nodes, in device memory."""
 
+from typing import Any
+
 import numpy as np
 import torch
 import warp as wp
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from endo_sim_ros.physics.backends.base import Launch
 from endo_sim_ros.physics.config import PhysicsConfig
@@ -35,7 +37,7 @@ class Tools:
 
         self._everything: list[torch.Tensor] = []
 
-        def tensors(struct, names: str, dtype, count: int = tools) -> list[torch.Tensor]:
+        def tensors(struct: Any, names: str, dtype: type, count: int = tools) -> list[torch.Tensor]:
             made = []
             for name in names.split():
                 array = wp.zeros(count, dtype, device=solver.device)
@@ -70,7 +72,7 @@ class Tools:
         constants.origin = wp.vec3d(*solver.origin)
         constants.radius, constants.travel, constants.duration = config.force_radius, config.travel, config.step_duration
         skin = nodes.rest[nodes.is_skin].astype(np.float64)
-        apart = float(np.median(cKDTree(skin).query(skin, k=2)[0][:, 1])) if len(skin) > 1 else 0.0
+        apart = float(np.median(KDTree(skin).query(skin, k=2)[0][:, 1])) if len(skin) > 1 else 0.0
         thinnest = max(_THINNEST * apart, _THINNEST_CELL * solver.cell_size)
         radius = max(config.contact_radius, thinnest) if config.contact_radius else 0.0
         constants.contact_radius, constants.contact_length = radius, config.contact_length

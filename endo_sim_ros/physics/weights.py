@@ -1,6 +1,19 @@
 """Weights by which what lies in the tissue follows the nearest control nodes (paper eq. 9)."""
 
+from typing import Any
+
 import numpy as np
+from scipy.spatial import KDTree
+
+
+def nearest_nodes(rest: np.ndarray, points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return distances [N, count] of points [N, 3] to their nearest control nodes [M, 3], m, nearest first, and the numbers of these.
+
+    Where there are fewer, distances are infinite and numbers are M.
+    """
+    ranks: Any = list(range(1, count + 1))  # a list gives a column for a count of one, too
+    distances, index = KDTree(rest).query(points, k=ranks, workers=-1)
+    return np.asarray(distances), np.asarray(index)
 
 
 def compact_weights(d: np.ndarray, beyond: np.ndarray, kept: np.ndarray | bool = True) -> np.ndarray:

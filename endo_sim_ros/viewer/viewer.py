@@ -301,7 +301,7 @@ class Viewer:
                 browser.show_splats(*splats)
             if dirty and browser.wants_nodes and self.state is not None:
                 if browser.wants_stress and colors is None:
-                    colors = self.stress_colors()
+                    colors = self.stress_colors(self.state[1])
                 browser.show_nodes(self.state[0], colors, self._node_size)
             browser.show_picture(self._render, self.endoscope, self._tools_on, dirty)
         self._pictures += dirty
@@ -321,20 +321,23 @@ class Viewer:
         rgb, opacity = ((values * 255).byte().cpu().numpy() for values in (model.base_colors, model.opacities[:, None]))
         return (CENTIMETRES * means).cpu().numpy(), (CENTIMETRES**2 * covars).cpu().numpy(), rgb, opacity
 
-    def stress_colors(self) -> np.ndarray:
-        """Colours [M, 3] uint8 of the nodes: blue without stress, red at almost the largest von Mises stress of late."""
+    def stress_colors(self, F: np.ndarray) -> np.ndarray:
+        """Colours [M, 3] uint8 of nodes with these deformation gradients [M, 3, 3].
+
+        Blue is no stress; red is almost the largest von Mises stress of late.
+        """
         if self._tissue is None:
-            self._tissue = self._properties()
-        stress = von_mises(self.state[1], self._tissue.young_modulus, self._tissue.poisson_ratio, self._parameters["material"])
+            self._tissue = self._properties(len(F))
+        stress = von_mises(F, self._tissue.young_modulus, self._tissue.poisson_ratio, self._parameters["material"])
         largest = max(float(np.percentile(stress, _RED)), _LEAST_SCALE * self._parameters["young_modulus"])
         self._stress_scale = max(largest, 0.98 * self._stress_scale)
         levels = (255 * np.minimum(stress / self._stress_scale, 1)).astype(np.uint8)
         return cv2.applyColorMap(levels[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1]
 
-    def _properties(self) -> TissueProperties:
+    def _properties(self, count: int) -> TissueProperties:
         """What each node is made of, as the physics' parameters tell."""
         known = self._parameters  # stress does not depend on density
-        uniform = TissueProperties.uniform(len(self.state[1]), known["young_modulus"], known["poisson_ratio"], density=1.0)
+        uniform = TissueProperties.uniform(count, known["young_modulus"], known["poisson_ratio"], density=1.0)
         if self._rest is None:
             return uniform
         try:

@@ -1,10 +1,9 @@
 """Gaussians beside a cut: which control nodes they follow, and how far they reach."""
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from endo_sim_ros.physics.cutting.geometry import OVERLAP, separated
-from endo_sim_ros.physics.weights import compact_weights
+from endo_sim_ros.physics.weights import compact_weights, nearest_nodes
 
 FLATTEST = 0.05  # of its extent; a Gaussian in the cut itself keeps that much across it
 
@@ -54,8 +53,7 @@ class CutNeighbours:
             return np.zeros(0, int)
         count = self.index.shape[1]
         if self._candidates is None:
-            ranks = list(range(1, min(4 * count + 1, len(self._rest)) + 1))
-            d, node = cKDTree(self._rest).query(self.means, k=ranks, workers=-1)
+            d, node = nearest_nodes(self._rest, self.means, min(4 * count + 1, len(self._rest)))
             self._candidates = d, node, np.zeros(d.shape, bool)
         d, node, parted = self._candidates
         reach = d[:, -1].max()

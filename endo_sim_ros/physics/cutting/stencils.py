@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import Delaunay, QhullError, cKDTree
+from scipy.spatial import Delaunay, KDTree, QhullError
 
 from endo_sim_ros.physics.cutting.geometry import separated
 from endo_sim_ros.physics.stencils import CutTable, Stencils
@@ -50,9 +50,9 @@ class CutStencils:
         if min(shape) < 3:
             raise ValueError(f"CutStencils: a grid of {shape} nodes is too small, expected at least 3 along each axis")
         self.core = core
-        self.shape = tuple(int(n) for n in shape)
+        self.shape = int(shape[0]), int(shape[1]), int(shape[2])
         self._rest, self._cells = rest, cells
-        self._tree = cKDTree(cells)
+        self._tree = KDTree(cells)
         whole = Stencils(cells, self.shape)
         self._base, self._stencils = whole.first, whole.corners()  # [M, 3], [M, 27]
         # Centres of the cores: the grid nodes in use, moved into the box of the points that use them.

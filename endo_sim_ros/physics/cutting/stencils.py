@@ -229,7 +229,8 @@ def _link(cells: np.ndarray) -> np.ndarray:
 
 def _components(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Label [count] of the component of every vertex, for links between vertices a [L] and b [L]."""
-    graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(count, count))
+    ends = a.astype(np.int32), b.astype(np.int32)  # SciPy below 1.12 has no components of other integers
+    graph = coo_array((np.ones(len(a), np.int8), ends), shape=(count, count))
     return connected_components(graph, directed=False)[1].astype(np.int64)
 
 

@@ -26,24 +26,24 @@ setup(
     install_requires=[
         *ROS,
         "av>=12",
-        "mcap>=1.2",
+        "mcap>=1.2.2",
         "numpy>=1.26",
         "opencv-python-headless>=4.9",
-        "pycolmap>=3.10",
+        "pycolmap>=4",
         "pyyaml>=6",
         "rich>=13.4",
-        "rosbags>=0.11,<0.12",  # private parts: endo_sim_ros/sequences/bag_private.py
+        "rosbags>=0.11.6,<0.12",  # private parts: endo_sim_ros/sequences/bag_private.py
         "scipy>=1.11",
         "tifffile>=2023.7.10",
         "torch>=2.4",
         "typing_extensions>=4.12",
-        "tyro>=0.9.2",
+        "tyro>=0.9.20",
         "warp-lang>=1.19,<1.20",  # private parts: endo_sim_ros/core/native.py and kernels.py
     ],
     extras_require={
         "depth": ["onnxruntime", "transformers"],  # reconstruction with depth:=network
         "learning": ["gymnasium>=1.1"],  # endo_sim_ros.learning.environments
-        "lerobot": ["pyarrow"],  # `endo-sim export`
+        "lerobot": ["pyarrow>=15"],  # `endo-sim export`
         "rl": ["gymnasium>=1.1", "stable-baselines3>=2.4"],  # `endo-sim train --algorithm ppo`
         "viewer": ["viser>=1.1"],  # `endo-sim view`, viewer_node
         "report": ["matplotlib"],  # `endo-sim report`, `endo-sim plot`, plots of `endo-sim evaluate`

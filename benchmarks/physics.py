@@ -323,7 +323,7 @@ def _over_gaussians(count: int, plan: Plan, device: str) -> list[Row]:
     rows = _against_plain(f"skin {name}", lambda: partial(skinning().deform, positions, F), device, seconds)
     rows += _against_plain(f"step and skin {name}", lambda: _pulled_with_skin(scene, config).step, device, seconds)
     one, apart, skin = moving(), moving(), skinning()
-    one.carry(skin)
+    one.append_skinning(skin)
     together, separate = milliseconds([one.step, lambda: (apart.step(), skin.deform(apart.positions()[0], apart.F[0]))], device, seconds)
     return [*rows, Row(f"step and skin {name}", together, "ms", together / separate, "step, then skin")]
 

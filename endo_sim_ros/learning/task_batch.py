@@ -80,7 +80,7 @@ class TaskBatch:
             device = self.tissue.solver.device
             model = scene.model.detach().to(device)
             self._skinning = Skinning(model, nodes.rest, device=device)
-            self._means, self._covars = self.tissue.carry(self._skinning)
+            self._means, self._covars = self.tissue.append_skinning(self._skinning)
             self._model = model
             self._pinned = torch.from_numpy(nodes.pinned).to(device)[:, None, None]
             self.views = [_View(self.camera) for _ in range(count)]

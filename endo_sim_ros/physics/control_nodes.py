@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import Delaunay, QhullError, cKDTree
+from scipy.spatial import Delaunay, KDTree, QhullError
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import pick_device
@@ -70,7 +70,7 @@ def select_solid(points: np.ndarray, opacities: np.ndarray, min_opacity: float) 
     solid = np.flatnonzero(opacities >= min_opacity)
     if len(solid) <= OUTLIER_NEIGHBOURS:
         return solid
-    distances = cKDTree(points[solid]).query(points[solid], k=OUTLIER_NEIGHBOURS + 1, workers=-1)[0][:, 1:].mean(1)
+    distances = KDTree(points[solid]).query(points[solid], k=OUTLIER_NEIGHBOURS + 1, workers=-1)[0][:, 1:].mean(1)
     return solid[distances <= OUTLIER_FACTOR * np.median(distances)]
 
 
@@ -107,9 +107,9 @@ def measure_skin(points: np.ndarray, viewpoint: np.ndarray) -> Skin:
             " Gaussians, or the viewpoint is wrong"
         ) from error
 
-    def edge_lengths(coordinates):
+    def edge_lengths(coordinates: np.ndarray) -> np.ndarray:  # [T, 3]
         corners = coordinates[triangles]
-        return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)  # [T, 3]
+        return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
 
     in_image, in_space = edge_lengths(image), edge_lengths(points)
     near = in_space.max(1) <= GAP_FACTOR * np.median(in_space)
@@ -127,7 +127,7 @@ def measure_skin(points: np.ndarray, viewpoint: np.ndarray) -> Skin:
     along = np.linspace(0, 1, 9)[:, None, None]
     border = (ends[:, 0] * (1 - along) + ends[:, 1] * along).reshape(-1, 3)
     spacing = float(np.sqrt(surface[near].sum() / len(points)))
-    rim = cKDTree(border).query(points)[0] <= RIM_WIDTH * spacing
+    rim = KDTree(border).query(points)[0] <= RIM_WIDTH * spacing
     return Skin(areas, rim, spacing)
 
 
@@ -255,7 +255,7 @@ def _dense_nodes(points: np.ndarray, eye: np.ndarray, skin: np.ndarray, sheet: S
     _, cell_of, occupancy = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     pinned = np.zeros(len(points), bool)
     if config.pin_rim:
-        pinned = cKDTree(skin[sheet.rim]).query(points)[0] <= max(sheet.spacing, spacing)
+        pinned = KDTree(skin[sheet.rim]).query(points)[0] <= max(sheet.spacing, spacing)
     volumes = spacing**3 / occupancy[cell_of.ravel()]
     rest = (points + eye).astype(np.float32)
     return ControlNodes(rest, pinned, volumes.astype(np.float32), np.ones(len(points), bool), spacing)

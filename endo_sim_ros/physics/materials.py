@@ -12,13 +12,13 @@ Tests take it from ``MATERIALS``: they compare the stress with the gradient of t
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 
-def lame_parameters(young_modulus: float, poisson_ratio: float) -> tuple[float, float]:
+def lame_parameters(young_modulus: Any, poisson_ratio: Any) -> tuple[Any, Any]:
     """Lamé's parameters (mu, lambda) in Pa of Young's modulus in Pa and Poisson's ratio; of numbers or arrays of them."""
     mu = young_modulus / (2 * (1 + poisson_ratio))
     lam = young_modulus * poisson_ratio / ((1 + poisson_ratio) * (1 - 2 * poisson_ratio))

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 
 from endo_sim_ros.core.cameras import Camera, load_cameras
 from endo_sim_ros.core.config import ConfigError
@@ -107,12 +108,12 @@ def _in_range(name: str, values: np.ndarray) -> np.ndarray:
 def inside_box(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """Which points [M, 3] lie between two corners [3], faces included: bool [M]. Metres, one frame."""
     points = np.asarray(points, np.float64)
-    return ((points >= low) & (points <= high)).all(1)
+    return np.asarray(((points >= low) & (points <= high)).all(1))
 
 
-def inside_sphere(points: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
+def inside_sphere(points: np.ndarray, centre: ArrayLike, radius: float) -> np.ndarray:
     """Which points [M, 3] lie within a distance of a centre [3], surface included: bool [M]. Metres, one frame."""
-    return ((np.asarray(points, np.float64) - centre) ** 2).sum(1) <= radius**2
+    return np.asarray(((np.asarray(points, np.float64) - np.asarray(centre)) ** 2).sum(1) <= radius**2)
 
 
 def seen_in_mask(points: np.ndarray, camera: Camera, mask: np.ndarray) -> np.ndarray:

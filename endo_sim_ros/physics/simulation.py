@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import warp as wp
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
@@ -13,7 +14,8 @@ from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.physics.backends.base import capturing
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes, RenderDepth, build_control_nodes
-from endo_sim_ros.physics.cutting import Blade, CutStencils
+from endo_sim_ros.physics.cutting.blade import Blade
+from endo_sim_ros.physics.cutting.stencils import CutStencils
 from endo_sim_ros.physics.regions import TissueProperties, paint_regions
 from endo_sim_ros.physics.skinning import Skinning
 from endo_sim_ros.physics.solver import MpmSolver
@@ -56,7 +58,7 @@ class TissueBatch:
         environments: int,
         tools: int = 1,
         properties: TissueProperties | None = None,
-        stiffness: Sequence[float] | np.ndarray | None = None,
+        stiffness: ArrayLike | None = None,
     ):
         self.nodes, self.config = nodes, config
         properties = tissue_properties(nodes, config) if properties is None else properties
@@ -77,7 +79,7 @@ class TissueBatch:
         """Positions of the nodes [B, M, 3], m, world; pinned ones where they rest."""
         return self._rest + self.displacements * self._free[:, None]
 
-    def carry(self, skinning: Skinning) -> tuple[Tensor, Tensor]:
+    def append_skinning(self, skinning: Skinning) -> tuple[Tensor, Tensor]:
         """Make skinning part of every step from now on, in place of another that was; on a GPU of the one graph that a step is.
 
         Args:
@@ -189,7 +191,7 @@ class TissueSimulation:
             self._slots[tool] = len(self._slots)
         return self._slots[tool]
 
-    def set_wrench(self, tool: str, tip: np.ndarray, force: np.ndarray, torque: np.ndarray | tuple[float, ...] = (0.0, 0.0, 0.0)) -> bool:
+    def set_wrench(self, tool: str, tip: np.ndarray, force: np.ndarray, torque: ArrayLike = (0.0, 0.0, 0.0)) -> bool:
         """The wrench that a tool exerts on the tissue at its tip, until changed; zero lets go.
 
         Args:
@@ -209,7 +211,7 @@ class TissueSimulation:
         if not wanted and tool not in self._slots:
             return True
         slot, tools = self._slot(tool), self._tools
-        for tensor, value in ((tools.reaches, tip), (tools.forces, force), (tools.torques, torque)):
+        for tensor, value in ((tools.grasp_points, tip), (tools.forces, force), (tools.torques, torque)):
             tensor[0, slot] = torch.from_numpy(value)
         was = bool(tools.attached[0, slot])
         if wanted != was:
@@ -268,13 +270,13 @@ class TissueSimulation:
         if not cutting:
             self._blades.pop(tool, None)
             return
-        self.prepare_cutting()
+        stencils = self._prepared_stencils()
         self._blades.setdefault(tool, Blade(self.config.blade_length, self.nodes.spacing))
         state = self.state()
         triangles = self._blades[tool].move(pose, state.rest, state.positions, state.F, self.cuts)
-        if self._stencils.cut(triangles):
+        if stencils.cut(triangles):
             with capturing:
-                self.solver.set_cut(self._stencils.table())
+                self.solver.set_cut(stencils.table())
             self._disturbed = True
 
     def prepare(self) -> None:
@@ -288,12 +290,16 @@ class TissueSimulation:
         Raises:
             ValueError: If kinematics is not rest.
         """
+        self._prepared_stencils()
+
+    def _prepared_stencils(self) -> CutStencils:
         if self.config.kinematics != "rest":
             raise ValueError(f"tissue with kinematics {self.config.kinematics} cannot be cut; set kinematics to rest")
         if self._stencils is None:
             self._stencils = CutStencils(self.nodes.rest, self.solver.rest_cells, self.solver.grid_shape)
             with capturing:
                 self.solver.load_for_cuts()
+        return self._stencils
 
     @property
     def cuts(self) -> np.ndarray:
@@ -382,11 +388,11 @@ class TissueSimulation:
         if len(other.cuts):
             if self.solver.grid_shape == other.solver.grid_shape and self.solver.cell_size == other.solver.cell_size:
                 self._stencils = other._stencils
-            else:
-                self.prepare_cutting()
-                self._stencils.cut(other.cuts)
+            stencils = self._prepared_stencils()
+            if stencils is not other._stencils:
+                stencils.cut(other.cuts)
             with capturing:
-                self.solver.set_cut(self._stencils.table())
+                self.solver.set_cut(stencils.table())
         self._disturbed = True
         return True
 
@@ -420,7 +426,7 @@ def _pose(tool: str, value: np.ndarray) -> np.ndarray:
     return pose
 
 
-def _vector(name: str, value: np.ndarray, tool: str) -> np.ndarray:
+def _vector(name: str, value: ArrayLike, tool: str) -> np.ndarray:
     vector = np.array(value, np.float64)
     if vector.shape != (3,) or not np.isfinite(vector).all():
         raise ValueError(f"{name} of tool {tool!r} must be three finite numbers, got {vector.tolist()}")

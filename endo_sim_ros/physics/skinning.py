@@ -5,7 +5,6 @@ from typing import Literal
 import numpy as np
 import torch
 import warp as wp
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from endo_sim_ros.core.device import pick_device
@@ -14,23 +13,23 @@ from endo_sim_ros.core.kernels import load_kernels
 from endo_sim_ros.physics import skinning_kernels as kernels
 from endo_sim_ros.physics.backends import backend_for
 from endo_sim_ros.physics.backends.base import Launch, SkinData, Work, array
-from endo_sim_ros.physics.cutting import CutNeighbours, clip_to_sides
+from endo_sim_ros.physics.cutting.gaussians import CutNeighbours, clip_to_sides
+from endo_sim_ros.physics.weights import compact_weights, nearest_nodes
 
 
 def bind_weights(means: np.ndarray, node_rest: np.ndarray, neighbours: int, weighting: str) -> tuple[np.ndarray, np.ndarray]:
     """Return the nearest control nodes [N, K] int32 of means [N, 3], and their weights [N, K] float32, which add up to one.
 
-    ``compact``: (1 − (d/d_{K+1})²)², normalised; the weight of a control node falls smoothly to zero where it is no longer among the
-    nearest. ``softmax``: exp(d)/Σ exp(d) with d in metres, as the paper prints it.
+    ``compact``: see `compact_weights`. ``softmax``: exp(d)/Σ exp(d) with d in metres, as the paper prints it.
     """
     count = min(neighbours, max(len(node_rest) - 1, 1))
-    distances, index = cKDTree(node_rest).query(means, k=list(range(1, count + 2)), workers=-1)
+    distances, index = nearest_nodes(node_rest, means, count + 1)
     d, beyond = distances[:, :count], distances[:, count:]
     if weighting == "softmax":
         weights = np.exp(d - d.max(1, keepdims=True)) if len(d) else d
-    else:  # beyond is infinite when there is a single node; equidistant nodes share evenly
-        weights = np.maximum(1 - (d / np.maximum(beyond, 1e-30)) ** 2, 1e-6) ** 2
-    weights = weights / weights.sum(1, keepdims=True)
+        weights = weights / weights.sum(1, keepdims=True)
+    else:
+        weights = compact_weights(d, beyond)
     return index[:, :count].astype(np.int32), weights.astype(np.float32)
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 import warp as wp
+from numpy.typing import ArrayLike
 
 from endo_sim_ros.core.device import on_torch_stream, pick_device
 from endo_sim_ros.physics.arrays import new_grid, new_loads, new_nodes, new_state, new_tools, set_stencils
@@ -15,11 +16,10 @@ from endo_sim_ros.physics.backends.end_kernels import end_step
 from endo_sim_ros.physics.backends.structs import Substep
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes
-from endo_sim_ros.physics.cutting import CutTable
 from endo_sim_ros.physics.grid import plan_grid
 from endo_sim_ros.physics.materials import energy_density, lame_parameters
 from endo_sim_ros.physics.regions import TissueProperties
-from endo_sim_ros.physics.stencils import Stencils
+from endo_sim_ros.physics.stencils import CutTable, Stencils
 from endo_sim_ros.physics.substeps import plan_substeps
 
 
@@ -53,7 +53,7 @@ class MpmSolver:
         *,
         environments: int = 1,
         tools: int = 1,
-        stiffness: np.ndarray | None = None,
+        stiffness: ArrayLike | None = None,
     ):
         if environments < 1 or tools < 0:
             raise ValueError(f"there must be at least one environment and no fewer than zero tools, not {environments} and {tools}")

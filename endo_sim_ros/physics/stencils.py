@@ -1,11 +1,24 @@
 """Stencils: which grid nodes the control nodes transfer to, for rest kinematics."""
 
-import numpy as np
+from dataclasses import dataclass
 
-from endo_sim_ros.physics.cutting import CutTable, first_nodes
+import numpy as np
 
 STENCIL = np.stack(np.meshgrid(*[np.arange(3)] * 3, indexing="ij"), -1).reshape(27, 3)
 """Steps from the first grid node of a stencil to all of them, k fastest."""
+
+
+@dataclass(frozen=True)
+class CutTable:
+    """Stencils of the nodes that use a copy of a grid node; all other nodes keep the regular ones.
+
+    The grid then has G + extra nodes: G = nx·ny·nz regular ones, then the copies.
+    """
+
+    affected: np.ndarray  # nodes, ascending [A], int32
+    base: np.ndarray  # first grid node (i, j, k) of their stencils [A, 3], int32; the weights go by it
+    table: np.ndarray  # grid nodes of their stencils [A, 27], int32, those of (i, j, k) at 9 i + 3 j + k
+    extra: int
 
 
 class Stencils:
@@ -19,7 +32,8 @@ class Stencils:
 
     def __init__(self, rest_cells: np.ndarray, shape: tuple[int, int, int], cut: CutTable | None = None):
         self.rest_cells, self.shape = rest_cells, shape
-        self.first = first_nodes(rest_cells, shape)  # first grid node (i, j, k) of each stencil [M, 3]
+        # First grid node (i, j, k) of each stencil [M, 3].
+        self.first = np.floor(rest_cells - 0.5).astype(np.int64).clip(0, np.array(shape) - 3)
         self.row = np.full(len(rest_cells), -1)  # in the table, of control nodes beside a cut; -1 for all others [M]
         self.table = np.zeros((0, 27), int)  # numbers of their grid nodes [A, 27]
         self.grid_count = int(np.prod(shape))  # of grid nodes with their copies

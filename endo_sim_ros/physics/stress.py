@@ -8,19 +8,21 @@ from endo_sim_ros.physics.materials import energy_density, lame_parameters
 _LEAST_VOLUME = 0.05  # of that at rest; below it the laws have no value
 
 
-def von_mises(F: np.ndarray, young_modulus: float, poisson_ratio: float, material: str = "fixed_corotated") -> np.ndarray:
+def von_mises(
+    F: np.ndarray, young_modulus: float | np.ndarray, poisson_ratio: float | np.ndarray, material: str = "fixed_corotated"
+) -> np.ndarray:
     """Von Mises stress √(3/2 s:s), s the deviator of the Cauchy stress σ = P Fᵀ / J with P = ∂ψ/∂F.
 
     Args:
         F: Deformation gradients [M, 3, 3].
-        young_modulus: Pa.
-        poisson_ratio: Poisson's ratio.
+        young_modulus: Pa, one for all or one for each node [M].
+        poisson_ratio: Poisson's ratio, likewise.
         material: Name of the law in `MATERIALS`.
 
     Returns:
         Stress [M], Pa, float32; zero where F is collapsed or inverted, as the laws have no value there.
     """
-    mu, lam = lame_parameters(young_modulus, poisson_ratio)
+    mu, lam = (torch.as_tensor(each, dtype=torch.float32) for each in lame_parameters(young_modulus, poisson_ratio))
     gradients = torch.tensor(F, dtype=torch.float32)
     J = torch.linalg.det(gradients)
     sound = J > _LEAST_VOLUME

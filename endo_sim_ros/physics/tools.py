@@ -1,15 +1,17 @@
 """Tools: wrenches, jaws and rigid capsules that act on the nodes, in device memory."""
 
+from typing import Any
+
 import numpy as np
 import torch
 import warp as wp
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from endo_sim_ros.physics.backends.base import Launch
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes
 from endo_sim_ros.physics.solver import MpmSolver
-from endo_sim_ros.physics.tools_kernels import Commands, Holds, Reach, load_nodes, measure_reactions, take_hold
+from endo_sim_ros.physics.tools_kernels import Commands, Holds, ToolConstants, load_nodes, measure_reactions, take_hold
 
 # A capsule acts as at least this thick: of the distance between skin nodes, as a thinner one would part them and pass, and of
 # a cell of the grid, as it would touch too few of its nodes to push the cell away.
@@ -35,7 +37,7 @@ class Tools:
 
         self._everything: list[torch.Tensor] = []
 
-        def tensors(struct, names: str, dtype, count: int = tools) -> list[torch.Tensor]:
+        def tensors(struct: Any, names: str, dtype: type, count: int = tools) -> list[torch.Tensor]:
             made = []
             for name in names.split():
                 array = wp.zeros(count, dtype, device=solver.device)
@@ -44,10 +46,10 @@ class Tools:
             self._everything += made
             return made
 
-        commands, holds, reach = Commands(), Holds(), Reach()
+        commands, holds, constants = Commands(), Holds(), ToolConstants()
         # Wrench [B, T, 3], N and N·m about the point held; where it takes hold, m; the tip at the end of the step, m.
-        self.forces, self.torques, self.reaches, self.tips = (
-            each.view(*shape, 3) for each in tensors(commands, "force torque reach tip", wp.vec3d)
+        self.forces, self.torques, self.grasp_points, self.tips = (
+            each.view(*shape, 3) for each in tensors(commands, "force torque grasp_point tip", wp.vec3d)
         )
         (R,) = tensors(commands, "R", wp.mat33d)
         self.rotations = R.view(*shape, 3, 3)  # axes of the tip [B, T, 3, 3]
@@ -66,21 +68,21 @@ class Tools:
         (weight,), (held,) = tensors(holds, "weight", float, entries), tensors(holds, "held", int, entries)
         self.weights, self.held = (each.view(*shape, len(self.touchable)) for each in (weight, held))
         tensors(holds, "local pulled", wp.vec3d, entries)
-        reach.touchable = wp.array(self.touchable.astype(np.int32), dtype=int, device=solver.device)
-        reach.origin = wp.vec3d(*solver.origin)
-        reach.radius, reach.travel, reach.duration = config.force_radius, config.travel, config.step_duration
+        constants.touchable = wp.array(self.touchable.astype(np.int32), dtype=int, device=solver.device)
+        constants.origin = wp.vec3d(*solver.origin)
+        constants.radius, constants.travel, constants.duration = config.force_radius, config.travel, config.step_duration
         skin = nodes.rest[nodes.is_skin].astype(np.float64)
-        apart = float(np.median(cKDTree(skin).query(skin, k=2)[0][:, 1])) if len(skin) > 1 else 0.0
+        apart = float(np.median(KDTree(skin).query(skin, k=2)[0][:, 1])) if len(skin) > 1 else 0.0
         thinnest = max(_THINNEST * apart, _THINNEST_CELL * solver.cell_size)
         radius = max(config.contact_radius, thinnest) if config.contact_radius else 0.0
-        reach.contact_radius, reach.contact_length = radius, config.contact_length
+        constants.contact_radius, constants.contact_length = radius, config.contact_length
         self.contact_radius = radius  # of the capsule that acts, m; 0 = none
         self._faults = wp.zeros(solver.environments, int, device=solver.device)
         self.faults = wp.to_torch(self._faults)  # steps undone [B], int32
 
         threads = solver.backend.threads
         dim = (solver.environments, threads)
-        common = [solver.tool_count, threads, commands, holds, reach, solver.nodes, solver.state]
+        common = [solver.tool_count, threads, commands, holds, constants, solver.nodes, solver.state]
         self._take_hold = Launch(take_hold, dim, common, threads)
         load = Launch(load_nodes, dim, [*common, solver.loads, solver.rigid, solver.bad_nodes], threads)
         measure = Launch(measure_reactions, dim, [*common, solver.rigid, solver.bad_nodes, self._faults], threads)

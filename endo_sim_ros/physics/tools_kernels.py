@@ -21,7 +21,7 @@ class Commands:
 
     force: wp.array[wp.vec3d]  # N
     torque: wp.array[wp.vec3d]  # about the point held, N·m
-    reach: wp.array[wp.vec3d]  # where the wrench takes hold, m
+    grasp_point: wp.array[wp.vec3d]  # where the wrench takes hold, m
     tip: wp.array[wp.vec3d]  # of the tool at the end of the step, m
     R: wp.array[wp.mat33d]  # its axes
     present: wp.array[int]  # whether tip and R mean anything
@@ -50,7 +50,9 @@ class Holds:
 
 
 @wp.struct
-class Reach:
+class ToolConstants:
+    """What all tools share."""
+
     touchable: wp.array[int]  # [S] nodes that tools may take hold of
     origin: wp.vec3d  # of the local frame, world, m
     radius: wp.float64  # of the wrench and the jaw, m
@@ -94,14 +96,14 @@ def take_hold(
     threads: int,
     commands: Commands,
     holds: Holds,
-    reach: Reach,
+    constants: ToolConstants,
     nodes: Nodes,
     state: State,
 ):
     """Wrenches and jaws that begin to act take hold of the nodes in reach, in their current positions; others let go."""
     b, thread = wp.tid()
     count = nodes.X.shape[0]
-    touchable = reach.touchable.shape[0]
+    touchable = constants.touchable.shape[0]
     zero, one = wp.float64(0.0), wp.float64(1.0)
     for t in range(tools):
         c = b * tools + t
@@ -114,11 +116,11 @@ def take_hold(
             centre = wp.vec3d()
             total, gripped = wp.float64(0.0), wp.float64(0.0)
             for s in range(thread, touchable, threads):
-                p = reach.touchable[s]
+                p = constants.touchable[s]
                 u = double(state.u[b * count + p])
-                x = reach.origin + double(nodes.X[p]) + u
+                x = constants.origin + double(nodes.X[p]) + u
                 if attach:
-                    distance = wp.length(x - commands.reach[c]) / reach.radius
+                    distance = wp.length(x - commands.grasp_point[c]) / constants.radius
                     weight = wp.float64(0.0)
                     if distance <= one:  # smooth, and never quite zero, so that a node at the rim still counts
                         near = wp.max(one - distance * distance, wp.float64(1.0e-3))
@@ -130,7 +132,7 @@ def take_hold(
                 if grip:
                     arm = x - commands.tip[c]
                     inside = int(0)
-                    if wp.length(arm) <= reach.radius:
+                    if wp.length(arm) <= constants.radius:
                         inside = 1
                         gripped += one
                         holds.local[c * touchable + s] = wp.transpose(commands.R[c]) * arm
@@ -140,7 +142,7 @@ def take_hold(
             if thread == 0:
                 if attach and total > zero:
                     holds.attached[c] = 1
-                    holds.contact[c] = commands.reach[c] - centre / total
+                    holds.contact[c] = commands.grasp_point[c] - centre / total
                 if grip and gripped > zero:
                     holds.gripping[c] = 1
         if thread == 0:
@@ -156,7 +158,7 @@ def load_nodes(
     threads: int,
     commands: Commands,
     holds: Holds,
-    reach: Reach,
+    constants: ToolConstants,
     nodes: Nodes,
     state: State,
     loads: Loads,
@@ -173,10 +175,10 @@ def load_nodes(
     """
     b, thread = wp.tid()
     count = nodes.X.shape[0]
-    touchable = reach.touchable.shape[0]
+    touchable = constants.touchable.shape[0]
     zero, one = wp.float64(0.0), wp.float64(1.0)
     for s in range(thread, touchable, threads):
-        e = b * count + reach.touchable[s]
+        e = b * count + constants.touchable[s]
         loads.force[e] = wp.vec3()
         loads.spring[e] = 0.0  # its last holder stays known
     for t in range(tools):
@@ -187,7 +189,7 @@ def load_nodes(
             for s in range(thread, touchable, threads):
                 w = wp.float64(holds.weight[c * touchable + s])
                 if w > zero:
-                    p = reach.touchable[s]
+                    p = constants.touchable[s]
                     total += w
                     centre += w * (double(nodes.X[p]) + double(state.u[b * count + p]))
             total, centre = block_sum(total), block_sum3(centre)
@@ -197,7 +199,7 @@ def load_nodes(
             for s in range(thread, touchable, threads):
                 w = wp.float64(holds.weight[c * touchable + s]) / total
                 if w > zero:
-                    p = reach.touchable[s]
+                    p = constants.touchable[s]
                     arm = double(nodes.X[p]) + double(state.u[b * count + p]) - centre
                     xx += w * arm[0] * arm[0]
                     yy += w * arm[1] * arm[1]
@@ -216,30 +218,30 @@ def load_nodes(
             for s in range(thread, touchable, threads):
                 w = wp.float64(holds.weight[c * touchable + s]) / total
                 if w > zero:
-                    p = reach.touchable[s]
+                    p = constants.touchable[s]
                     arm = double(nodes.X[p]) + double(state.u[b * count + p]) - centre
                     loads.force[b * count + p] += single(w * (F + wp.cross(beta, arm)))
         if holds.gripping[c] != 0:
             beyond = wp.float64(0.0)
             for s in range(thread, touchable, threads):
                 if holds.held[c * touchable + s] != 0:
-                    p = reach.touchable[s]
+                    p = constants.touchable[s]
                     goal = commands.tip[c] + commands.R[c] * holds.local[c * touchable + s]
-                    if wp.length(goal - reach.origin - double(nodes.X[p])) > wp.float64(SLIP) * reach.travel:
+                    if wp.length(goal - constants.origin - double(nodes.X[p])) > wp.float64(SLIP) * constants.travel:
                         beyond += one
             beyond = block_sum(beyond)
             for s in range(thread, touchable, threads):
                 if beyond == zero and holds.held[c * touchable + s] != 0:
-                    p = reach.touchable[s]
+                    p = constants.touchable[s]
                     e = b * count + p
                     start = holds.pulled[c * touchable + s]
                     # Where the last step was undone, or another jaw had the node: pull on from where the tissue is.
                     if bad_nodes[b] > 0 or loads.holder[e] != t:
                         start = double(state.u[e])
-                    goal = commands.tip[c] + commands.R[c] * holds.local[c * touchable + s] - reach.origin - double(nodes.X[p])
+                    goal = commands.tip[c] + commands.R[c] * holds.local[c * touchable + s] - constants.origin - double(nodes.X[p])
                     loads.spring[e] = nodes.stiffness[e]
                     loads.target[e] = single(start)
-                    loads.target_v[e] = single((goal - start) / reach.duration)
+                    loads.target_v[e] = single((goal - start) / constants.duration)
                     loads.holder[e] = t
                     holds.pulled[c * touchable + s] = goal
             if thread == 0 and beyond > zero:
@@ -250,7 +252,7 @@ def load_nodes(
         if commands.present[c] != 0:
             unusable = unusable or not wp.isfinite(wp.length_sq(commands.tip[c]) + wp.ddot(commands.R[c], commands.R[c]))
         if unusable and thread == 0 and touchable > 0:
-            loads.force[b * count + reach.touchable[0]] = wp.vec3(wp.nan, wp.nan, wp.nan)
+            loads.force[b * count + constants.touchable[0]] = wp.vec3(wp.nan, wp.nan, wp.nan)
         if thread == 0:
             holds.applied_force[c] = F
             holds.applied_torque[c] = torque
@@ -260,13 +262,13 @@ def load_nodes(
                     holds.last_tip[c] = commands.tip[c]
                     holds.last_R[c] = commands.R[c]
                 tip, R, before, R_before = commands.tip[c], commands.R[c], holds.last_tip[c], holds.last_R[c]
-                end = tip - reach.contact_length * wp.vec3d(R[0, 2], R[1, 2], R[2, 2])
-                end_before = before - reach.contact_length * wp.vec3d(R_before[0, 2], R_before[1, 2], R_before[2, 2])
-                rigid.radius[c] = reach.contact_radius
-                rigid.tip[c] = single(before - reach.origin)
-                rigid.tip_v[c] = single((tip - before) / reach.duration)
-                rigid.end[c] = single(end_before - reach.origin)
-                rigid.end_v[c] = single((end - end_before) / reach.duration)
+                end = tip - constants.contact_length * wp.vec3d(R[0, 2], R[1, 2], R[2, 2])
+                end_before = before - constants.contact_length * wp.vec3d(R_before[0, 2], R_before[1, 2], R_before[2, 2])
+                rigid.radius[c] = constants.contact_radius
+                rigid.tip[c] = single(before - constants.origin)
+                rigid.tip_v[c] = single((tip - before) / constants.duration)
+                rigid.end[c] = single(end_before - constants.origin)
+                rigid.end_v[c] = single((end - end_before) / constants.duration)
                 holds.last_tip[c] = tip
                 holds.last_R[c] = R
             holds.placed[c] = commands.present[c]
@@ -278,7 +280,7 @@ def measure_reactions(
     threads: int,
     commands: Commands,
     holds: Holds,
-    reach: Reach,
+    constants: ToolConstants,
     nodes: Nodes,
     state: State,
     rigid: RigidTools,
@@ -295,11 +297,11 @@ def measure_reactions(
             for p in range(thread, count, threads):
                 given = rigid.impulse[c * count + p]
                 if wp.length_sq(given) > 0.0:
-                    force += double(given) / reach.duration
-                    moment += double(rigid.moment[c * count + p]) / reach.duration
+                    force += double(given) / constants.duration
+                    moment += double(rigid.moment[c * count + p]) / constants.duration
             force, moment = block_sum3(force), block_sum3(moment)
         if thread == 0:
-            torque = moment - wp.cross(commands.tip[c] - reach.origin, force)
+            torque = moment - wp.cross(commands.tip[c] - constants.origin, force)
             force += holds.applied_force[c]
             torque += holds.applied_torque[c]
             if bad_nodes[b] > 0:  # the step was undone, and all that tools did in it

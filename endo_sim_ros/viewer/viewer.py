@@ -17,6 +17,7 @@ from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.drawing import draw_force
 from endo_sim_ros.physics import PhysicsConfig
+from endo_sim_ros.physics.regions import TissueProperties, paint_regions
 from endo_sim_ros.physics.stress import von_mises
 from endo_sim_ros.rendering import DeformableRenderer
 from endo_sim_ros.viewer.browser import CENTIMETRES, ENDOSCOPE, Browser, Pointer
@@ -52,7 +53,7 @@ SLIDERS = (
     Slider("thickness", "thickness, mm", 1e-3, 2, 80, 1),
     Slider("force_radius", "hold radius, mm", 1e-3, 2, 40, 1),
 )
-PARAMETERS = (*(slider.parameter for slider in SLIDERS), "poisson_ratio", "material", "travel")  # that the page needs to know
+PARAMETERS = (*(slider.parameter for slider in SLIDERS), "poisson_ratio", "material", "regions", "travel")  # that the page needs to know
 
 
 class Actions(Protocol):
@@ -120,6 +121,8 @@ class Viewer:
         self.latency, self.pictures_per_second = 0.0, 0.0  # s; Hz
         self._pictures, self._texted, self._updated = 0, 0.0, time.monotonic()
         self._parameters: dict[str, Any] = {name: getattr(PhysicsConfig(), name) for name in PARAMETERS}
+        self._rest: np.ndarray | None = None  # nodes [M, 3], m, world
+        self._tissue: TissueProperties | None = None  # what each node is made of; None = not known yet
         self._wanted: dict[str, float] = {}
         self._wanted_at = 0.0
         self.paused = False
@@ -146,6 +149,7 @@ class Viewer:
         old = self.renderer
         same = old is not None and torch.equal(old.model.means, renderer.model.means)
         self.renderer, self.state, self.camera = renderer, None, camera
+        self._rest, self._tissue = node_rest, None
         self.release()
         means = renderer.model.means.cpu().numpy()
         if node_rest is not None and len(node_rest) > 1:
@@ -185,7 +189,8 @@ class Viewer:
 
     def show_parameters(self, values: dict[str, Any]) -> None:
         """The physics' parameters as they are."""
-        self._parameters |= values
+        if (known := self._parameters | values) != self._parameters:
+            self._parameters, self._tissue = known, None
         for slider in SLIDERS:
             if slider.parameter in values and slider.parameter not in self._wanted:
                 self._sliders[slider.parameter].value = _on_slider(slider, values[slider.parameter])
@@ -296,7 +301,7 @@ class Viewer:
                 browser.show_splats(*splats)
             if dirty and browser.wants_nodes and self.state is not None:
                 if browser.wants_stress and colors is None:
-                    colors = self.stress_colors()
+                    colors = self.stress_colors(self.state[1])
                 browser.show_nodes(self.state[0], colors, self._node_size)
             browser.show_picture(self._render, self.endoscope, self._tools_on, dirty)
         self._pictures += dirty
@@ -316,14 +321,30 @@ class Viewer:
         rgb, opacity = ((values * 255).byte().cpu().numpy() for values in (model.base_colors, model.opacities[:, None]))
         return (CENTIMETRES * means).cpu().numpy(), (CENTIMETRES**2 * covars).cpu().numpy(), rgb, opacity
 
-    def stress_colors(self) -> np.ndarray:
-        """Colours [M, 3] uint8 of the nodes: blue without stress, red at almost the largest von Mises stress of late."""
-        known = self._parameters
-        stress = von_mises(self.state[1], known["young_modulus"], known["poisson_ratio"], known["material"])
-        largest = max(float(np.percentile(stress, _RED)), _LEAST_SCALE * known["young_modulus"])
+    def stress_colors(self, F: np.ndarray) -> np.ndarray:
+        """Colours [M, 3] uint8 of nodes with these deformation gradients [M, 3, 3].
+
+        Blue is no stress; red is almost the largest von Mises stress of late.
+        """
+        if self._tissue is None:
+            self._tissue = self._properties(len(F))
+        stress = von_mises(F, self._tissue.young_modulus, self._tissue.poisson_ratio, self._parameters["material"])
+        largest = max(float(np.percentile(stress, _RED)), _LEAST_SCALE * self._parameters["young_modulus"])
         self._stress_scale = max(largest, 0.98 * self._stress_scale)
         levels = (255 * np.minimum(stress / self._stress_scale, 1)).astype(np.uint8)
         return cv2.applyColorMap(levels[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1]
+
+    def _properties(self, count: int) -> TissueProperties:
+        """What each node is made of, as the physics' parameters tell."""
+        known = self._parameters  # stress does not depend on density
+        uniform = TissueProperties.uniform(count, known["young_modulus"], known["poisson_ratio"], density=1.0)
+        if self._rest is None:
+            return uniform
+        try:
+            return paint_regions(uniform, self._rest, self._parameters["regions"])
+        except ConfigError as error:  # a mask may lie on the physics' machine only
+            self.notify(f"stress is coloured without regions: {error}")
+            return uniform
 
     def _tools_on(self, image: np.ndarray, camera: Camera) -> np.ndarray:
         """A picture with the tools' forces."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from endo_sim_ros.physics.cutting import sweep
+from endo_sim_ros.physics.cutting.geometry import sweep
 
 SPACING = 0.005
 MIDDLE = 0.0311  # m along x; no node lies there

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from cut_block import MIDDLE, block, wall
 
-from endo_sim_ros.physics.cutting import Blade, separated, sweep, to_rest
+from endo_sim_ros.physics.cutting.blade import Blade, to_rest
+from endo_sim_ros.physics.cutting.geometry import separated, sweep
 
 
 def test_a_sweep_is_the_quad_between_two_blades():

@@ -3,7 +3,7 @@
 import numpy as np
 from cut_block import MIDDLE, block, wall
 
-from endo_sim_ros.physics.cutting import CutNeighbours, clip_to_sides
+from endo_sim_ros.physics.cutting.gaussians import CutNeighbours, clip_to_sides
 from endo_sim_ros.physics.skinning import bind_weights
 
 

@@ -6,7 +6,9 @@ from cut_block import MIDDLE, SPACING, block, wall
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from endo_sim_ros.physics.cutting import CutStencils, CutTable, separated, sweep
+from endo_sim_ros.physics.cutting.geometry import separated, sweep
+from endo_sim_ros.physics.cutting.stencils import CutStencils
+from endo_sim_ros.physics.stencils import CutTable
 
 
 def cut_stencils(rest_cells: np.ndarray, shape: tuple[int, int, int], triangles: np.ndarray, rest: np.ndarray) -> CutTable | None:
@@ -43,7 +45,8 @@ def tables(stencils: CutStencils) -> tuple[np.ndarray, np.ndarray, int]:
 def momentum_pieces(table: np.ndarray) -> np.ndarray:
     """Piece [M] that each node belongs to, when nodes that share a grid node exchange momentum."""
     count, grid = len(table), table.max() + 1
-    graph = coo_array((np.ones(table.size), (np.repeat(np.arange(count), 27), count + table.ravel())), shape=(count + grid,) * 2)
+    ends = np.repeat(np.arange(count, dtype=np.int32), 27), (count + table.ravel()).astype(np.int32)
+    graph = coo_array((np.ones(table.size), ends), shape=(count + grid,) * 2)
     return np.unique(connected_components(graph, directed=False)[1][:count], return_inverse=True)[1]
 
 

@@ -75,8 +75,8 @@ def test_many_environments_agree_with_one_and_faults_stay_in_theirs():
     nodes = build_control_nodes(sheet(), np.zeros(3), config)
     batch = TissueBatch(nodes, config, environments=count, tools=2)
     skinning = Skinning(sheet(), nodes.rest, device="cuda")
-    means, covars = batch.carry(skinning)
-    batch.tools.reaches[:, 0] = torch.from_numpy(TIP)
+    means, covars = batch.append_skinning(skinning)
+    batch.tools.grasp_points[:, 0] = torch.from_numpy(TIP)
     batch.tools.forces[:, 0, 2] = torch.linspace(0.0, 0.3, count, dtype=torch.float64)
     batch.tools.forces[7, 0, 2] = 1e7
     for _ in range(5):
@@ -86,7 +86,7 @@ def test_many_environments_agree_with_one_and_faults_stay_in_theirs():
     depths = batch.displacements.norm(dim=2).amax(1)
     assert bool((depths[8:] > depths[7:-1]).all())
     single = TissueBatch(nodes, config, environments=1, tools=2)
-    single.tools.reaches[:, 0] = torch.from_numpy(TIP)
+    single.tools.grasp_points[:, 0] = torch.from_numpy(TIP)
     single.tools.forces[:, 0, 2] = 0.3
     for _ in range(5):
         single.step()
@@ -104,7 +104,7 @@ def test_commands_written_on_a_side_stream_reach_the_next_step():
     batch = TissueBatch(build_control_nodes(sheet(), np.zeros(3), config), config, environments=4)
     with torch.cuda.stream(torch.cuda.Stream()):
         for step in range(20):
-            batch.tools.reaches[:, 0] = torch.from_numpy(TIP)
+            batch.tools.grasp_points[:, 0] = torch.from_numpy(TIP)
             batch.tools.forces[:, 0, 2] = 0.01 * (step + 1)
             batch.step()
             reactions = batch.tools.reaction_forces[:, 0, 2].clone()

@@ -269,10 +269,10 @@ def test_skinning_within_the_step_gives_the_same_bits_as_after_it(environments, 
     batch = TissueBatch(nodes, config, environments)
     with backend():
         s = Skinning(model, nodes.rest, device="cpu")
-    means, covars = batch.carry(s)
+    means, covars = batch.append_skinning(s)
     assert torch.equal(means[0], s.means) and torch.equal(covars[-1], s.covars)
     force = torch.tensor([0.2, 0.0, -0.4], dtype=torch.float64)
-    batch.tools.reaches[:] = torch.tensor([0.0, 0.0, 0.12])
+    batch.tools.grasp_points[:] = torch.tensor([0.0, 0.0, 0.12])
     batch.tools.forces[:, 0] = force * torch.arange(1, environments + 1)[:, None]
     for _ in range(3):
         batch.step()
@@ -290,6 +290,6 @@ def test_skinning_of_other_nodes_or_with_the_printed_weights_cannot_be_part_of_t
     nodes = build_control_nodes(model, np.zeros(3), config)
     batch = TissueBatch(nodes, config, 2)
     with pytest.raises(ValueError, match="125 nodes on cpu cannot follow 2 × 400 nodes on cpu"):
-        batch.carry(Skinning(model, rest, device="cpu"))
+        batch.append_skinning(Skinning(model, rest, device="cpu"))
     with pytest.raises(ValueError, match="softmax cannot be part of the step"):
-        batch.carry(Skinning(model, nodes.rest, weighting="softmax", device="cpu"))
+        batch.append_skinning(Skinning(model, nodes.rest, weighting="softmax", device="cpu"))

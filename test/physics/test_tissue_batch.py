@@ -21,7 +21,7 @@ def test_environments_are_independent_copies_on_any_number_of_threads(monkeypatc
     def run(threads: int):
         monkeypatch.setenv("ENDO_SIM_THREADS", str(threads))
         batch = TissueBatch(nodes, config, environments=5, tools=2, stiffness=[1.0, 1.0, 2.0, 1.0, 1.0])
-        batch.tools.reaches[:, 0] = torch.from_numpy(TIP)
+        batch.tools.grasp_points[:, 0] = torch.from_numpy(TIP)
         batch.tools.forces[:, 0, 2] = torch.tensor([0.1, 0.2, 0.2, 0.0, 1e7])
         for _ in range(5):
             batch.step()
@@ -64,7 +64,7 @@ def test_copies_feel_their_own_stiffness_whatever_that_of_the_others():
 def test_commands_that_are_not_finite_are_faults_of_their_copy(name, value):
     nodes = build_control_nodes(curved_sheet(), EYE, PhysicsConfig(node_count=300))
     batch = TissueBatch(nodes, PhysicsConfig(device="cpu", node_count=300, contact_radius=0.005), environments=2)
-    batch.tools.reaches[:, 0] = torch.from_numpy(TIP)
+    batch.tools.grasp_points[:, 0] = torch.from_numpy(TIP)
     batch.tools.forces[:, 0, 2] = 0.1
     batch.tools.present[:] = 1
     batch.tools.rotations[:] = torch.eye(3)

@@ -38,7 +38,7 @@ def see_plane(K_cv, distortion, pose) -> tuple[np.ndarray, np.ndarray]:
     """What a raw camera (OpenCV pixel convention) sees: RGB [H, W, 3] and points [H, W, 3] in its own frame."""
     u, v = np.meshgrid(np.arange(WIDTH, dtype=np.float64), np.arange(HEIGHT, dtype=np.float64))
     pixels = np.stack([u, v], -1).reshape(-1, 1, 2)
-    rays = cv2.undistortPoints(pixels, K_cv, distortion, criteria=(3, 100, 1e-12)).reshape(HEIGHT, WIDTH, 2)
+    rays = cv2.undistortPointsIter(pixels, K_cv, distortion, np.eye(3), np.eye(3), (3, 100, 1e-12)).reshape(HEIGHT, WIDTH, 2)
     rays = np.dstack([rays, np.ones_like(u)])
     turned = rays @ pose[:3, :3].T
     depth = (PLANE_Z - pose[2, 3]) / turned[..., 2]

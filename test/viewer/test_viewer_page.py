@@ -55,6 +55,20 @@ def test_mouse_pulls_tissue_and_lets_go(page):
     turn_until(page, lambda: moved(page) < 0.5 * far, "tissue to come back")
 
 
+def test_stress_is_coloured_by_the_stiffness_of_each_node(page):
+    viewer, rest = page.viewer, page.simulation.nodes.rest
+    strained = np.tile(np.diag([1.05, 1, 1]).astype(np.float32), (len(rest), 1, 1))
+    assert len(np.unique(viewer.stress_colors(strained), axis=0)) == 1, "the same strain in the same tissue"
+    viewer.show_parameters({"regions": ["box 0 -1 -1 1 1 1 young_modulus=80000"]})
+    colors, stiff = viewer.stress_colors(strained), rest[:, 0] >= 0
+    assert 0 < stiff.sum() < len(rest)
+    assert (colors[stiff] == colors[stiff][0]).all() and (colors[~stiff] == colors[~stiff][0]).all()
+    assert colors[stiff][0, 0] > 100 > colors[~stiff][0, 0], "red where it is stiff, blue elsewhere"
+    viewer.show_parameters({"regions": ["mask /missing.png /missing.json 0 young_modulus=80000"]})
+    assert len(np.unique(viewer.stress_colors(strained), axis=0)) == 1
+    assert "without regions" in viewer._notice and "/missing" in viewer._notice
+
+
 def test_lifting_pulls_towards_the_user_with_no_more_than_the_largest_force(page):
     point(page.viewer, "start", (0.5, 0.5), lifts=True)
     point(page.viewer, "update", (0.5, 0.0), lifts=True)

@@ -166,7 +166,7 @@ ENDO_SIM_INLINE void push_by_tools(
     const auto pushed = pushing >= 0;
     if (!any(pushed))
         return;
-    const T weight = dt * dt * node.stiffness, towards = dot(along, normal);
+    const T weight = dt * dt * node.stiffness, towards = dot<1>(along, normal);
     T slip[3];
     for (int i = 0; i < 3; ++i)
         slip[i] = node.v[i] - along[i];

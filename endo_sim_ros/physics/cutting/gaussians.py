@@ -1,0 +1,129 @@
+"""Gaussians beside a cut: which control nodes they follow, and how far they reach."""
+
+import numpy as np
+
+from endo_sim_ros.physics.cutting.geometry import OVERLAP, separated
+from endo_sim_ros.physics.weights import compact_weights, nearest_nodes
+
+FLATTEST = 0.05  # of its extent; a Gaussian in the cut itself keeps that much across it
+
+
+class CutNeighbours:
+    """Nodes and weights by which Gaussians follow the tissue on their own side of a cut, as cuts accumulate.
+
+    A Gaussian that a triangle parts from one of its nodes takes the nearest K of its 4 K nearest nodes that are on its
+    side, with compact weights; where fewer remain, entries repeat with weight zero, and where none does, it keeps its
+    own. All others are as they were, bit for bit. The result does not depend on how cuts are divided into calls.
+
+    Args:
+        means: Gaussians at rest [N, 3], m, world.
+        node_rest: Nodes at rest [M, 3], m, world.
+        index: Nodes that move each Gaussian [N, K].
+        weights: Their weights [N, K], which add up to one.
+    """
+
+    def __init__(self, means: np.ndarray, node_rest: np.ndarray, index: np.ndarray, weights: np.ndarray):
+        self.means, self._rest = np.asarray(means, np.float64), np.asarray(node_rest, np.float64)
+        self._uncut = index, weights
+        self.triangles = np.zeros((0, 3, 3))  # of all cuts [T, 3, 3], m, world, at rest
+        self.index, self.weights = index.copy(), weights.copy()  # now
+        # Distances, nodes and whether a cut parts them [N, 4 K + 1], nearest first, from the first cut on.
+        self._candidates: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+
+    def extends(self, triangles: np.ndarray) -> bool:
+        """Whether cuts [T, 3, 3] begin with those that are heeded."""
+        known = len(self.triangles)
+        return known <= len(triangles) and np.array_equal(triangles[:known], self.triangles)
+
+    def heal(self) -> None:
+        """Forget all cuts."""
+        self.index, self.weights = self._uncut[0].copy(), self._uncut[1].copy()
+        self.triangles = np.zeros((0, 3, 3))
+        if self._candidates is not None:
+            self._candidates[2][:] = False
+
+    def cut(self, triangles: np.ndarray) -> np.ndarray:
+        """Heed all cuts [T, 3, 3], m, world, at rest, and return the numbers of the Gaussians that follow other nodes now.
+
+        They begin with those of the last call: only what is new is looked at.
+        """
+        triangles = np.asarray(triangles, np.float64).reshape(-1, 3, 3)
+        new, self.triangles = triangles[len(self.triangles) :], triangles.copy()
+        if not len(new) or not len(self.means):
+            return np.zeros(0, int)
+        count = self.index.shape[1]
+        if self._candidates is None:
+            d, node = nearest_nodes(self._rest, self.means, min(4 * count + 1, len(self._rest)))
+            self._candidates = d, node, np.zeros(d.shape, bool)
+        d, node, parted = self._candidates
+        reach = d[:, -1].max()
+        near = (self.means >= new.min((0, 1)) - reach) & (self.means <= new.max((0, 1)) + reach)
+        near = np.flatnonzero(near.all(1))
+        ends = node[near]
+        crossed = separated(np.repeat(self.means[near], ends.shape[1], 0), self._rest[ends.ravel()], new)
+        crossed = crossed.reshape(ends.shape)
+        parted[near] |= crossed
+        near = near[crossed.any(1)]
+        # The nodes that it follows while whole are the first of the candidates.
+        near = near[(parted[near, :count] & (self._uncut[1][near] > 0)).any(1)]
+        if not len(near):
+            return near
+
+        d, node, parted = d[near], node[near], parted[near]
+        order = np.argsort(parted, axis=1, kind="stable")  # those on this side first
+        node, kept = np.take_along_axis(node, order, 1), ~np.take_along_axis(parted, order, 1)
+        distances = np.where(kept, np.take_along_axis(d, order, 1), d[:, -1:])  # all others are at least this far
+        missing = count + 1 - d.shape[1]
+        if missing > 0:  # so few nodes
+            pad = ((0, 0), (0, missing))
+            node, kept = np.pad(node, pad, "edge"), np.pad(kept, pad)
+            distances = np.pad(distances, pad, constant_values=np.inf)
+        compact = compact_weights(distances[:, :count], distances[:, count : count + 1], kept[:, :count])
+        able = kept[:, 0]
+        self.index[near[able]] = np.where(kept[:, :count], node[:, :count], node[:, :1])[able]
+        self.weights[near[able]] = compact[able]
+        return near
+
+
+def clip_to_sides(means: np.ndarray, covars: np.ndarray, reach: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Make covariances [N, 3, 3] no longer reach across a cut, so that its edges are sharp when it opens; returns the
+    numbers of those that changed.
+
+    A Gaussian less than two standard deviations from a triangle below it is flattened along the triangle's normal until
+    it is two away, or to a twentieth. Triangles act one after the other, so it does not matter how cuts are divided into calls.
+
+    Args:
+        means: Gaussians at rest [N, 3], m, world.
+        covars: Their covariances [N, 3, 3], m²; changed in place.
+        reach: Bounds on two standard deviations [N], m.
+        triangles: Of the cut [T, 3, 3], m, world, at rest.
+    """
+    triangles, changed = np.asarray(triangles, np.float64), np.zeros(len(means), bool)
+    if not len(triangles):
+        return np.flatnonzero(changed)
+    low, high = triangles.min((0, 1)), triangles.max((0, 1))
+    some = np.ones(len(means), bool)
+    for axis in range(3):
+        some &= (means[:, axis] >= low[axis] - reach) & (means[:, axis] <= high[axis] + reach)
+    some = np.flatnonzero(some)
+    x, reach = means[some], reach[some, None]
+    for a, b, c in triangles:
+        e1, e2 = b - a, c - a
+        cross = np.cross(e1, e2)
+        square = cross @ cross
+        normal = cross / np.sqrt(square)
+        corners = np.stack([a, b, c])
+        near = np.flatnonzero(((x >= corners.min(0) - reach) & (x <= corners.max(0) + reach)).all(1))
+        arm = x[near] - a
+        u, v, height = arm @ np.cross(e2, cross) / square, arm @ np.cross(cross, e1) / square, np.abs(arm @ normal)
+        near = some[near]
+        along = covars[near] @ normal  # [n, 3]
+        spread = 2 * np.sqrt(np.maximum(along @ normal, 0))
+        over = (u >= -OVERLAP) & (v >= -OVERLAP) & (u + v <= 1 + OVERLAP) & (height < spread)
+        near, along = near[over], along[over]
+        lost = 1 - np.maximum(height[over] / spread[over], FLATTEST)
+        outer = lost[:, None, None] * along[:, :, None] * normal
+        kept = lost**2 * (along @ normal)
+        covars[near] += kept[:, None, None] * np.outer(normal, normal) - outer - outer.transpose(0, 2, 1)
+        changed[near] = True
+    return np.flatnonzero(changed)

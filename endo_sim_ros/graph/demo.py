@@ -17,9 +17,9 @@ from std_srvs.srv import Trigger
 from endo_sim_ros.core import drawing
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.evaluation.interaction_report import TouchReport
-from endo_sim_ros.graph.client import Watcher
 from endo_sim_ros.graph.processes import NodeGroup
 from endo_sim_ros.messages import ERROR, ReconstructionState, ScriptedToolState
+from endo_sim_ros.nodes.watcher import Watcher
 from endo_sim_ros.sequences.bag import BagReader, write_bag
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 

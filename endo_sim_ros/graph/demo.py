@@ -4,7 +4,7 @@ import itertools
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import rclpy
@@ -90,12 +90,7 @@ def _phantom_bag(path: Path, seed: int, frames: int, width: int, progress: Progr
     shutil.rmtree(path, ignore_errors=True)
     config = PhantomConfig(seed=seed, frames=frames, width=width, height=width * 4 // 5)
 
-    def counted() -> Iterator:
-        for frame in phantom_sequence(config):
-            yield frame
-            progress.advance(task)
-
-    write_bag(path, counted())
+    write_bag(path, progress.track(phantom_sequence(config), total=frames, task_id=task))
     progress.update(task, note=f"{path}")
     return path
 

@@ -129,7 +129,7 @@ class NodeStatus(NamedTuple):
 
 
 def encode_diagnostics(
-    name: str, level: int, message: str, values: Mapping[str, Any], stamp_ns: int, types: MessageTypes | None = None
+    name: str, level: int, message: str, values: Mapping[str, Any], stamp_ns: int, types: MessageTypes = ros_types()
 ) -> Message:
     """DiagnosticArray with one status.
 
@@ -141,7 +141,6 @@ def encode_diagnostics(
         stamp_ns: Time, nanoseconds.
         types: Message classes to build; those of ROS by default.
     """
-    types = types or ros_types()
     status = types.DiagnosticStatus(
         level=_LEVELS[level] if isinstance(types, RosTypes) else level,
         name=name,

@@ -46,7 +46,6 @@ def check_frame(message: Message, allowed: Iterable[str], topic: str) -> str:
     return frame
 
 
-def encode_clock(stamp_ns: int, types: MessageTypes | None = None) -> Message:
+def encode_clock(stamp_ns: int, types: MessageTypes = ros_types()) -> Message:
     """Clock of a simulated time in nanoseconds."""
-    types = types or ros_types()
     return types.Clock(clock=make_time(types, stamp_ns))

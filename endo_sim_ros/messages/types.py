@@ -16,16 +16,14 @@ from endo_sim_ros.messages.errors import MessageError
 Message = Any  # an instance of a message class, of ROS or of rosbags: both have the same fields
 
 MESSAGE_PACKAGES = {
-    "builtin_interfaces": ("Time", "Duration"),
+    "builtin_interfaces": ("Time",),
     "rosgraph_msgs": ("Clock",),
     "std_msgs": ("Header", "ColorRGBA"),
-    "geometry_msgs": (
-        "Point", "Quaternion", "Pose", "PoseStamped", "PoseArray", "Vector3", "Wrench", "WrenchStamped",
-    ),
+    "geometry_msgs": ("Point", "Quaternion", "Pose", "PoseStamped", "PoseArray", "Vector3", "Wrench", "WrenchStamped"),
     "sensor_msgs": ("Image", "CompressedImage", "CameraInfo", "RegionOfInterest", "PointCloud2", "PointField", "JointState", "Joy"),
-    "visualization_msgs": ("Marker", "MarkerArray", "UVCoordinate", "MeshFile"),
+    "visualization_msgs": ("Marker", "MarkerArray"),
     "diagnostic_msgs": ("DiagnosticArray", "DiagnosticStatus", "KeyValue"),
-}  # fmt: skip
+}
 _FULL_NAMES = {name: f"{package}/msg/{name}" for package, names in MESSAGE_PACKAGES.items() for name in names}
 _TYPECODES = {"uint8": "B", "int32": "i", "float32": "f", "float64": "d"}  # of array.array
 

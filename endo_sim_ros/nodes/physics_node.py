@@ -8,7 +8,7 @@ import numpy as np
 from std_srvs.srv import SetBool, Trigger
 
 from endo_sim_ros import messages
-from endo_sim_ros.messages import STATE, ControlNodeCloud, MessageError, PhysicsState
+from endo_sim_ros.messages import STATE, ControlNodeCloud, PhysicsState
 from endo_sim_ros.nodes.arm import Arm
 from endo_sim_ros.nodes.arm_topics import ArmTopics
 from endo_sim_ros.nodes.base import ERROR, OK, STREAM_DEPTH, WARN, EndoNode, run, sentence
@@ -102,11 +102,8 @@ class PhysicsNode(EndoNode):
         if self._lockstep and kind in self._options.lockstep_inputs:
             stamp = messages.stamp_to_ns(message.header.stamp)
             if stamp <= 0:
-                raise MessageError(f"{topic}: a stamp of zero; in lockstep all parts of a command bear its stamp")
-            try:
-                self._commands.put(stamp, (name, kind), act)
-            except ValueError as error:
-                raise MessageError(f"{topic}: {error}") from error
+                raise ValueError("a stamp of zero; in lockstep all parts of a command bear its stamp")
+            self._commands.put(stamp, (name, kind), (topic, act))
             self._run_commands()
             return
         act()
@@ -124,8 +121,9 @@ class PhysicsNode(EndoNode):
         while self._simulation is not None and (command := self._commands.take(give_up)):
             stamp, parts = command
             for part in sorted(parts, key=lambda part: (COMMAND_PARTS.index(part[1]), part[0])):  # poses before what needs them
-                with self.guard("command"):
-                    parts[part]()
+                topic, act = parts[part]
+                with self.guard(topic):
+                    act()
             self._step(self._simulation)
             self._publish(self._simulation, stamp)
 

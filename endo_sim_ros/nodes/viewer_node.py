@@ -139,9 +139,7 @@ class ViewerNode(Watcher):
             self.viewer.show_endoscope(image, Camera(info.P[:, :3], info.width, info.height, pose))
 
     def _on_tool_pose(self, name: str, message: Any) -> None:
-        frames = self._options.frame_poses
-        unnamed = frames.get(f"{name}_base", np.eye(4))
-        self._arms[name].pose = messages.decode_pose(message, frames | {"": unnamed}, messages.tool_pose(name).name)
+        self._arms[name].pose = messages.decode_tip(message, self._options.frame_poses, name, messages.tool_pose(name).name)
 
     def _on_reaction(self, name: str, message: Any) -> None:
         self._arms[name].reaction, _ = messages.decode_wrench(message, messages.tool_reaction(name).name)

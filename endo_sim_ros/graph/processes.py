@@ -17,51 +17,28 @@ _STOP_AFTER = 15.0  # seconds that a node has to end after an interrupt
 class NodeProcess:
     """One node in its own process, with its output in a log file."""
 
-    def __init__(
-        self,
-        name: str,
-        parameters: dict[str, Any],
-        environment: dict[str, str],
-        log: Path,
-        ros_arguments: tuple[str, ...] = (),
-    ):
+    def __init__(self, name: str, parameters: dict[str, Any], environment: dict[str, str], log: Path, ros_arguments: tuple[str, ...]):
         self.name, self.log = name, log
-        arguments = [sys.executable, "-m", f"endo_sim_ros.nodes.{name}"]
-        if parameters or ros_arguments:
-            arguments += ["--ros-args", *ros_arguments]
+        arguments = [sys.executable, "-m", f"endo_sim_ros.nodes.{name}", "--ros-args", *ros_arguments]
         for key, value in parameters.items():
             arguments += ["-p", f"{key}:={_yaml(value)}"]
         log.parent.mkdir(parents=True, exist_ok=True)
         with log.open("wb") as output:
             mine = environment | {PARENT: str(os.getpid())}
-            self._process = subprocess.Popen(arguments, env=mine, stdout=output, stderr=subprocess.STDOUT, start_new_session=True)
+            self.process = subprocess.Popen(arguments, env=mine, stdout=output, stderr=subprocess.STDOUT, start_new_session=True)
 
     @property
     def exit_status(self) -> int | None:
         """None while the node runs."""
-        return self._process.poll()
-
-    @property
-    def pid(self) -> int:
-        """Number of the process."""
-        return self._process.pid
-
-    def send_signal(self, number: int) -> None:
-        """Send a signal to the process, if it runs."""
-        if self.exit_status is None:
-            self._process.send_signal(number)
-
-    def interrupt(self) -> None:
-        """Ask the ROS node to end, as Ctrl-C does."""
-        self.send_signal(signal.SIGINT)
+        return self.process.poll()
 
     def wait(self, seconds: float = _STOP_AFTER) -> int:
         """Exit status; a node that does not end in time is killed."""
         try:
-            return self._process.wait(seconds)
+            return self.process.wait(seconds)
         except subprocess.TimeoutExpired:
-            self._process.kill()
-            return self._process.wait()
+            self.process.kill()
+            return self.process.wait()
 
 
 def _yaml(value: Any) -> str:
@@ -87,9 +64,8 @@ class NodeGroup:
     def start(self, name: str, *ros_arguments: str, **parameters: Any) -> NodeProcess:
         """Start a node, or another one in its place, with parameters and arguments such as ``-r __ns:=/left``."""
         log = self._log_folder / f"{name}.log"
-        node = NodeProcess(name, parameters, self.environment, log, ros_arguments)
-        self.nodes[name] = node
-        return node
+        self.nodes[name] = NodeProcess(name, parameters, self.environment, log, ros_arguments)
+        return self.nodes[name]
 
     def dead(self) -> list[NodeProcess]:
         """Nodes that ended with an error."""
@@ -99,7 +75,7 @@ class NodeGroup:
         """Interrupt all nodes, the youngest first, and wait for them."""
         nodes = list(self.nodes.values())[::-1]
         for node in nodes:
-            node.interrupt()
+            node.process.send_signal(signal.SIGINT)
             time.sleep(0.05)
         for node in nodes:
             node.wait()

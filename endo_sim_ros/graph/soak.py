@@ -193,7 +193,7 @@ def _send(client: Client, group: NodeGroup, traffic: _Traffic, rng: random.Rando
                 for name in _NODES:
                     if group.nodes[name].exit_status is not None:
                         raise RuntimeError(f"{name} ended after {now:.0f} s:\n{group.nodes[name].log.read_text()[-3000:]}")
-                    used[name].append(_memory(group.nodes[name].pid))
+                    used[name].append(_memory(group.nodes[name].process.pid))
     rows = [Row("messages sent", sent, ""), Row("of them spoilt", spoilt, ""), Row("messages per second", sent / seconds, "1/s")]
     for name in _NODES:
         settled, last = max(used[name][: int(_SETTLED * len(used[name])) + 1]), np.median(used[name][-3:])

@@ -133,10 +133,5 @@ class BagPlayerNode(EndoNode):
             self._sent += 1
 
 
-def main() -> int:
-    """Run the node until it is told to stop, and return the exit status of the process."""
-    return run(BagPlayerNode)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run(BagPlayerNode))

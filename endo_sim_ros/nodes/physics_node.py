@@ -329,10 +329,5 @@ def _poll(config: PhysicsConfig) -> float:
     return min(config.step_duration / _POLLS, _LONGEST_POLL)
 
 
-def main() -> int:
-    """Run the node until it is told to stop, and return the exit status of the process."""
-    return run(PhysicsNode)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run(PhysicsNode))

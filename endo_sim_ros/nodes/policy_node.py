@@ -158,10 +158,5 @@ class PolicyNode(EndoNode):
         return (WARN if self._state is PolicyState.WAITING else OK), text + solved, values
 
 
-def main() -> int:
-    """Run the node until it is told to stop, and return the exit status of the process."""
-    return run(PolicyNode)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run(PolicyNode))

@@ -328,10 +328,5 @@ class ReconstructionNode(EndoNode):
         super().destroy_node()
 
 
-def main() -> int:
-    """Run the node until it is told to stop, and return the exit status of the process."""
-    return run(ReconstructionNode)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run(ReconstructionNode))

@@ -165,10 +165,5 @@ def record(bag: Path, arms: tuple[str, ...], topics: tuple[str, ...], namespace:
         print(node.summary)
 
 
-def main() -> int:
-    """Run the node until it is told to stop, and return the exit status of the process."""
-    return run(RecorderNode)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run(RecorderNode))

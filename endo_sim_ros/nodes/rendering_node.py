@@ -307,10 +307,5 @@ def _decode_info(message: Any, topic: str) -> CameraInfo:
     return info
 
 
-def main() -> int:
-    """Run the node until it is told to stop, and return the exit status of the process."""
-    return run(RenderingNode)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run(RenderingNode))

@@ -132,10 +132,5 @@ class ScriptedToolNode(EndoNode):
         return OK, "finished" if self._state is ScriptedToolState.DONE else str(self._state), values
 
 
-def main() -> int:
-    """Run the node until it is told to stop, and return the exit status of the process."""
-    return run(ScriptedToolNode)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run(ScriptedToolNode))

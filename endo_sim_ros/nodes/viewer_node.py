@@ -291,10 +291,5 @@ class ViewerNode(Watcher):
         super().destroy_node()
 
 
-def main() -> int:
-    """Run the node until it is told to stop, and return the exit status of the process."""
-    return run(ViewerNode)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run(ViewerNode))

@@ -15,7 +15,6 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from std_srvs.srv import Trigger
 
 from endo_sim_ros.core import drawing
-from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.evaluation.interaction_report import TouchReport
 from endo_sim_ros.graph.processes import NodeGroup
 from endo_sim_ros.messages import ERROR, ReconstructionState, ScriptedToolState
@@ -166,6 +165,3 @@ def _touch_over_dds(
         executor.shutdown()
         watcher.destroy_node()
         try_shutdown()
-
-
-__all__ = ["DemoError", "SequenceError", "run_demo"]

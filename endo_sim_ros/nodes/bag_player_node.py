@@ -9,8 +9,8 @@ from rclpy.duration import Duration
 from rclpy.utilities import try_shutdown
 
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.messages import DIAGNOSTICS, STATE, BagPlayerState, MessageError, Topic
-from endo_sim_ros.nodes.base import ERROR, OK, EndoNode, run, sentence
+from endo_sim_ros.messages import DIAGNOSTICS, ERROR, OK, STATE, BagPlayerState, MessageError, Topic
+from endo_sim_ros.nodes.base import EndoNode, run, sentence
 from endo_sim_ros.nodes.configs import BagPlayerConfig
 from endo_sim_ros.sequences.bag import BagReader
 

@@ -206,6 +206,3 @@ def run(node_class: Callable[[], EndoNode]) -> int:
 
 def _one_line(error: Exception) -> str:
     return " ".join(str(error).split())
-
-
-__all__ = ["ERROR", "OK", "WARN", "EndoNode", "run", "sentence"]

@@ -12,8 +12,8 @@ from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.learning.policies import make_policy
 from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.learning.tasks import find_task, make_task
-from endo_sim_ros.messages import STATE, PolicyState
-from endo_sim_ros.nodes.base import OK, WARN, EndoNode, run
+from endo_sim_ros.messages import OK, STATE, WARN, PolicyState
+from endo_sim_ros.nodes.base import EndoNode, run
 from endo_sim_ros.nodes.configs import PolicyConfig, arm_names
 
 _OPEN, _CLOSED = 1.0, 0.0  # rad

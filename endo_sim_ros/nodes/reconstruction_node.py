@@ -16,8 +16,8 @@ from endo_sim_ros.core.cameras import Camera, load_cameras, save_cameras
 from endo_sim_ros.core.config import option_values
 from endo_sim_ros.core.frames import LEFT_FRAME, Frame, SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel, load_ply, save_ply
-from endo_sim_ros.messages import STATE, ReconstructionState, Topic
-from endo_sim_ros.nodes.base import ERROR, OK, WARN, EndoNode, run, sentence
+from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ReconstructionState, Topic
+from endo_sim_ros.nodes.base import EndoNode, run, sentence
 from endo_sim_ros.nodes.configs import ReconstructionNodeConfig
 from endo_sim_ros.reconstruction import (
     PRESETS,

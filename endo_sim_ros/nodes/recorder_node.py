@@ -17,8 +17,8 @@ from rich.text import Text
 from endo_sim_ros import messages
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.messages import STATE, RecorderState, Topic
-from endo_sim_ros.nodes.base import ERROR, OK, EndoNode, quality, run, sentence
+from endo_sim_ros.messages import ERROR, OK, STATE, RecorderState, Topic
+from endo_sim_ros.nodes.base import EndoNode, quality, run, sentence
 from endo_sim_ros.nodes.configs import ALL_TOPICS, RecorderConfig, arm_names
 from endo_sim_ros.nodes.transport import prepare_transport
 from endo_sim_ros.sequences.bag import BagWriter, canonical_cdr

@@ -6,8 +6,8 @@ import numpy as np
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera, invert_pose
-from endo_sim_ros.messages import STATE, ControlNodeCloud, ScriptedToolState
-from endo_sim_ros.nodes.base import OK, WARN, EndoNode, run
+from endo_sim_ros.messages import OK, STATE, WARN, ControlNodeCloud, ScriptedToolState
+from endo_sim_ros.nodes.base import EndoNode, run
 from endo_sim_ros.nodes.configs import ScriptedToolConfig, arm_names
 
 _FOLLOWED = 8  # nodes around the grasped point whose movement carries the tip

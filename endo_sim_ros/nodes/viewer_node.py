@@ -12,8 +12,8 @@ from std_srvs.srv import SetBool, Trigger
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.messages import STATE, ControlNodeCloud, PhysicsState, ViewerState
-from endo_sim_ros.nodes.base import OK, WARN, run
+from endo_sim_ros.messages import OK, STATE, WARN, ControlNodeCloud, PhysicsState, ViewerState
+from endo_sim_ros.nodes.base import run
 from endo_sim_ros.nodes.configs import ViewerNodeConfig, arm_names
 from endo_sim_ros.nodes.model_tracker import ModelTracker
 from endo_sim_ros.nodes.watcher import Watcher

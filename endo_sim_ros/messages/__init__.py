@@ -18,7 +18,6 @@ from endo_sim_ros.messages.clouds import (
 )
 from endo_sim_ros.messages.diagnostics import (
     ERROR,
-    NODE_STATES,
     OK,
     STATE,
     WARN,
@@ -94,7 +93,6 @@ from endo_sim_ros.messages.topics import (
     tool_wrench,
 )
 from endo_sim_ros.messages.types import (
-    MESSAGE_PACKAGES,
     Message,
     MessageTypes,
     bag_types,
@@ -106,7 +104,7 @@ from endo_sim_ros.messages.types import (
 __all__ = [
     "BagPlayerState", "CAMERA_POSE", "CLOCK", "CONTROL_NODES", "CUT_SURFACE", "CameraInfo", "ClientState",
     "ControlNodeCloud", "DEPTH", "DIAGNOSTICS", "ERROR", "GAUSSIANS", "LEFT_COMPRESSED", "LEFT_IMAGE", "LEFT_INFO", "MASK",
-    "MESSAGE_PACKAGES", "MODEL_TOPICS", "Message", "MessageError", "MessageTypes", "NODE_STATES",
+    "MODEL_TOPICS", "Message", "MessageError", "MessageTypes",
     "NodeState", "NodeStatus", "OK", "PhysicsState", "PolicyState", "RECORDING_TOPICS", "RENDERED_DEPTH", "RENDERED_IMAGE",
     "RENDERED_INFO", "RENDERED_POSE", "RENDERED_TOPICS", "RIGHT_COMPRESSED", "RIGHT_IMAGE", "RIGHT_INFO", "ReconstructionState",
     "RecorderState", "RenderingState", "STATE", "ScriptedToolState", "TOOL_MARKERS",

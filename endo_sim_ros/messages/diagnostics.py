@@ -100,17 +100,6 @@ class ClientState(NodeState):
     RUNNING = "running"
 
 
-NODE_STATES: dict[str, type[NodeState]] = {  # by the default name of the node
-    "reconstruction_node": ReconstructionState,
-    "physics_node": PhysicsState,
-    "rendering_node": RenderingState,
-    "viewer_node": ViewerState,
-    "bag_player": BagPlayerState,
-    "recorder": RecorderState,
-    "policy": PolicyState,
-    "scripted_tool": ScriptedToolState,
-}
-
 _State = TypeVar("_State", bound=NodeState)
 
 

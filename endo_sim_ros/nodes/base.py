@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import rclpy
@@ -66,7 +66,7 @@ class EndoNode(ConfiguredNode):
         return self.create_publisher(messages.ros_class(topic.type), topic.name, quality(topic, depth))
 
     def subscribe(self, topic: Topic, callback: Callable[[Any], None], depth: int = STREAM_DEPTH, reliable: bool = True) -> None:
-        """Subscribe with a callback whose errors are reported instead of raised.
+        """Subscribe with a callback whose errors are reported, with the name of the topic, instead of raised.
 
         Args:
             topic: The topic.
@@ -100,9 +100,16 @@ class EndoNode(ConfiguredNode):
 
     # ------------------------------------------------------------ diagnostics
 
-    def guard(self, where: str) -> "_Guard":
-        """Context that reports what its block raises; the node lives on."""
-        return _Guard(self, where)
+    @contextlib.contextmanager
+    def guard(self, where: str) -> Iterator[None]:
+        """Context that reports what its block raises, and where if the error does not say so; the node lives on."""
+        try:
+            yield
+        except ExternalShutdownException:
+            raise
+        except Exception as error:
+            if self.context.ok():  # what fails because the node is being shut down is no error
+                self.report_error(sentence(where, error))
 
     def report_error(self, text: str) -> None:
         """Show an error on /diagnostics for a while, beginning now; repetitions are only counted."""
@@ -140,21 +147,6 @@ class EndoNode(ConfiguredNode):
         except Exception:
             if self.context.ok():  # otherwise a worker came to its end after the node
                 raise
-
-
-class _Guard:
-    def __init__(self, node: EndoNode, where: str):
-        self._node, self._where = node, where
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: type | None, error: BaseException | None, _: Any) -> bool:
-        if error is None or not isinstance(error, Exception) or isinstance(error, ExternalShutdownException):
-            return False
-        if self._node.context.ok():  # what fails because the node is being shut down is no error
-            self._node.report_error(sentence(self._where, error))
-        return True
 
 
 def quality(topic: Topic, depth: int = STREAM_DEPTH, reliable: bool = True) -> QoSProfile:

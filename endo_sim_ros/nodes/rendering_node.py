@@ -131,9 +131,8 @@ class RenderingNode(EndoNode):
 
     def _on_info(self, message: Any) -> None:
         info, old = _decode_info(message, messages.LEFT_INFO.name), self._info
-        same = old is not None and np.array_equal(info.P, old.P) and (info.width, info.height) == (old.width, old.height)
         self._info = info
-        if not same:
+        if old is None or not info.same_as(old):
             self._change()
 
     def _camera(self) -> Camera | None:

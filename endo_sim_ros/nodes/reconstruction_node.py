@@ -34,11 +34,9 @@ from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.sequences.bag import feed
 from endo_sim_ros.sequences.synchronizer import Synchronizer
 
-_LEFT_IMAGES = (messages.LEFT_IMAGE, messages.LEFT_COMPRESSED)
 # Seconds by which stamps must jump to mean that another recording began; after a pause any step back means it.
 _JUMP_BACK, _JUMP_AHEAD, _PAUSE = 1.0, 60.0, 1.0
-
-_LATEST, _CAMERAS = "latest", "cameras.json"
+_CAMERAS = "cameras.json"
 
 
 class ReconstructionNode(EndoNode):
@@ -96,7 +94,7 @@ class ReconstructionNode(EndoNode):
     # ------------------------------------------------------------------ views
 
     def _on_recording(self, topic: Topic, message: Any) -> None:
-        if topic in _LEFT_IMAGES:
+        if topic in (messages.LEFT_IMAGE, messages.LEFT_COMPRESSED):
             self._note_image(messages.stamp_to_ns(message.header.stamp))
         self._add_views(feed(self._synchronizer, topic, message, self._options.frame_poses))
 
@@ -239,7 +237,7 @@ class ReconstructionNode(EndoNode):
         if not name:
             return
         path = Path(name).expanduser()
-        if name == _LATEST:
+        if name == "latest":
             folder = Path(self._options.output_dir).expanduser()
             path = max(folder.glob("*/model.ply"), default=None)
             if path is None:

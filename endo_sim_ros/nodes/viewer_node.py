@@ -66,8 +66,8 @@ class ViewerNode(Watcher):
         self._physics = self._full_name(name)
         self._set = self.create_client(SetParameters, f"{name}/set_parameters")
         self._get = self.create_client(GetParameters, f"{name}/get_parameters")
-        self._calls = {"reset": Trigger, "step": Trigger, "pause": SetBool}
-        self._calls = {what: self.create_client(kind, f"{name}/{what}") for what, kind in self._calls.items()}
+        kinds = {"reset": Trigger, "step": Trigger, "pause": SetBool}
+        self._calls = {what: self.create_client(kind, f"{name}/{what}") for what, kind in kinds.items()}
         self.subscribe(messages.GAUSSIANS, self._on_model)
         self.subscribe(messages.TRAINING_CAMERAS, self._on_training_cameras)
         self.subscribe(messages.CUT_SURFACE, self._on_cut_surface, depth=1)

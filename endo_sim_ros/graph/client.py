@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.publisher import Publisher
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
@@ -25,12 +26,12 @@ CHANGED = 60  # grey levels by which an image must differ to show that the tissu
 class Client(Watcher):
     """A teleoperation stack: sends poses and wrenches of a tool, receives images and states."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__("bench")
         self.images: list[tuple[float, int, np.ndarray]] = []  # time of arrival s, stamp ns, pixels [H, W, 3]
         self.states: list[tuple[float, int]] = []  # time of arrival s and stamp ns of control_nodes
         self._newest: Any = None  # control_nodes
-        self._senders: dict[Topic, Any] = {}
+        self._senders: dict[Topic, Publisher] = {}
         self.subscribe(messages.RENDERED_IMAGE, self._on_image)
         self.subscribe(messages.CONTROL_NODES, self._on_control_nodes)
         self._spinner = SingleThreadedExecutor()

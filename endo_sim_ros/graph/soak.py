@@ -73,7 +73,7 @@ def spoil(message: Any, rng: random.Random) -> None:
 class _Traffic:
     """What anybody might publish on the graph's topics, well made."""
 
-    def __init__(self, rng: random.Random):
+    def __init__(self, rng: random.Random) -> None:
         self._rng = rng
         self.recording = list(phantom_sequence(PhantomConfig(frames=8, width=_WIDTH, height=_HEIGHT)))
         self._frame = self.recording[0]

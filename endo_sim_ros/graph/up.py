@@ -65,7 +65,7 @@ class _Row(NamedTuple):
 class _Supervisor:
     """Starts the nodes, notices when one ends, and knows what to show of each."""
 
-    def __init__(self, graph: NodeGroup, namespace: str, console: Console, respawn: bool):
+    def __init__(self, graph: NodeGroup, namespace: str, console: Console, respawn: bool) -> None:
         self._graph, self._namespace, self._console, self._respawn = graph, namespace.strip("/"), console, respawn
         self._arguments: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {}
         self._began: dict[str, float] = {}

@@ -46,7 +46,7 @@ class RosTypes:
 class BagTypes:
     """Message classes of the rosbags library, by short name; ``typestore`` serialises them."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         from rosbags.typesys import Stores, get_typestore
 
         self.typestore = get_typestore(Stores.ROS2_JAZZY)

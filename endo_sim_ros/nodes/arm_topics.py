@@ -27,7 +27,7 @@ class ArmTopics:
             topic, and a function that lets the part act on the arm; decides when that is called.
     """
 
-    def __init__(self, node: EndoNode, arms: dict[str, Arm], options: PhysicsNodeConfig, depth: int, deliver: Deliver):
+    def __init__(self, node: EndoNode, arms: dict[str, Arm], options: PhysicsNodeConfig, depth: int, deliver: Deliver) -> None:
         self.options = options
         self._node, self._arms, self._deliver = node, arms, deliver
         commanded = options.arm_source == "commanded"

@@ -29,7 +29,7 @@ class BagPlayerNode(EndoNode):
 
     read_at_start = frozenset({"bag", "wait_for_subscribers"})
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__("bag_player")
         self._config = self.declare(BagPlayerConfig)
         self._sent, self._total = 0, 0

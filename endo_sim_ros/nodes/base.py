@@ -17,7 +17,9 @@ from rclpy.clock_type import ClockType
 from rclpy.context import Context
 from rclpy.exceptions import NameValidationException
 from rclpy.executors import ExternalShutdownException
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.timer import Timer
 from rclpy.utilities import ok, try_shutdown
 
 from endo_sim_ros import hear_interrupts, messages
@@ -39,7 +41,7 @@ STREAM_DEPTH = 20
 class EndoNode(ConfiguredNode):
     """A ROS node that survives errors in its callbacks: each becomes one sentence on /diagnostics."""
 
-    def __init__(self, name: str, context: Context | None = None):
+    def __init__(self, name: str, context: Context | None = None) -> None:
         super().__init__(name, context)
         torch.set_num_threads(1)  # the kernels bring their own threads
         self._diagnostics = self.publisher(messages.DIAGNOSTICS)
@@ -47,13 +49,13 @@ class EndoNode(ConfiguredNode):
         self._logged: dict[str, float] = {}
         self.every(1.0, self.publish_diagnostics)
 
-    def every(self, seconds: float, callback: Callable[[], None]) -> Any:
+    def every(self, seconds: float, callback: Callable[[], None]) -> Timer:
         """A timer of wall time, which also runs while a simulated clock stands still."""
         return self.create_timer(seconds, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     # ----------------------------------------------------------------- topics
 
-    def publisher(self, topic: Topic, depth: int = STREAM_DEPTH) -> Any:
+    def publisher(self, topic: Topic, depth: int = STREAM_DEPTH) -> Publisher:
         """A publisher of a topic.
 
         Args:

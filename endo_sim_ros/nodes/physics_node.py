@@ -29,7 +29,7 @@ class PhysicsNode(EndoNode):
 
     read_at_start = frozenset({"arms", "arm_source", "mode", "lockstep_inputs"})
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__("physics_node")
         self._options = self.declare(PhysicsNodeConfig)
         self._config = self.declare(PhysicsConfig)

@@ -25,7 +25,7 @@ class PolicyNode(EndoNode):
 
     read_at_start = frozenset(PolicyConfig.__dataclass_fields__)
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__("policy")
         self._config = config = self.declare(PolicyConfig)
         (arm,) = arm_names([config.arm])

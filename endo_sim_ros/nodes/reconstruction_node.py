@@ -44,7 +44,7 @@ class ReconstructionNode(EndoNode):
 
     read_at_start = frozenset({"reliable"})
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__("reconstruction_node")
         self._options = self.declare(ReconstructionNodeConfig)
         self._config = self.declare(ReconstructionConfig, option_values(preset(self._options.preset)))

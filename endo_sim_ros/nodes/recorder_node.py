@@ -5,6 +5,7 @@ import queue
 import signal
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ class RecorderNode(EndoNode):
 
     read_at_start = frozenset({"bag", "arms", "topics", "canonical"})
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__("recorder")
         self._config = self.declare(RecorderConfig)
         topics = _chosen(self._config.topics, arm_names(self._config.arms))
@@ -47,7 +48,7 @@ class RecorderNode(EndoNode):
             kind = messages.ros_class(topic.type)
             self.create_subscription(kind, topic.name, self._recorder(topic), quality(topic, 100), raw=True)
 
-    def _recorder(self, topic: Topic):
+    def _recorder(self, topic: Topic) -> Callable[[bytes], None]:
         # By the name in the contract, whatever the namespace: so it is replayed into any, and exported.
         absolute = topic._replace(name="/" + topic.name.lstrip("/"))
 

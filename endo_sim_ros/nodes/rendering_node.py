@@ -25,7 +25,7 @@ class RenderingNode(EndoNode):
 
     read_at_start = frozenset({"mode", "lockstep_camera"})
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__("rendering_node")
         self._options = self.declare(RenderingNodeConfig)
         self._config = self.declare(RenderingConfig)

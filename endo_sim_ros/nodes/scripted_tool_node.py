@@ -18,7 +18,7 @@ class ScriptedToolNode(EndoNode):
 
     read_at_start = frozenset({"arm", "rate"})
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__("scripted_tool")
         self._config = config = self.declare(ScriptedToolConfig)
         (arm,) = arm_names([config.arm])

@@ -23,7 +23,7 @@ class TissueBuilder:
         model: The newest model, or None.
     """
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.model: GaussianModel | None = None
         self._model_stamp, self._model_number, self._model_came = 0, 0, 0.0  # ns; in order of arrival; when it arrived, seconds
         self._views: tuple[int | None, np.ndarray] = None, np.zeros((0, 4, 4))  # stamp and poses of the newest training_cameras

@@ -44,7 +44,7 @@ class ViewerNode(Watcher):
 
     read_at_start = frozenset({"arm", "arm_source", "arms", "physics_node", "host", "port"})
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__("viewer_node")
         self._options = self.declare(ViewerNodeConfig)
         config, self._rendering = self.declare(ViewerConfig), self.declare(RenderingConfig)

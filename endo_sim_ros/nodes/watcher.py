@@ -15,7 +15,7 @@ class Watcher(EndoNode):
         heard: When that came, seconds of ``time.monotonic``.
     """
 
-    def __init__(self, name: str):
+    def __init__(self, name: str) -> None:
         super().__init__(name)
         self.statuses: dict[str, NodeStatus] = {}
         self.heard: dict[str, float] = {}

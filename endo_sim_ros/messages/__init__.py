@@ -35,7 +35,6 @@ from endo_sim_ros.messages.diagnostics import (
     decode_diagnostics,
     encode_diagnostics,
 )
-from endo_sim_ros.messages.errors import MessageError
 from endo_sim_ros.messages.headers import check_frame, encode_clock, stamp_to_ns
 from endo_sim_ros.messages.images import decode_depth, decode_image, decode_mask, encode_image
 from endo_sim_ros.messages.poses import decode_pose, decode_poses, decode_tip, encode_pose, encode_poses
@@ -94,6 +93,7 @@ from endo_sim_ros.messages.topics import (
 )
 from endo_sim_ros.messages.types import (
     Message,
+    MessageError,
     MessageTypes,
     bag_types,
     crtk_type,

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from endo_sim_ros.messages.errors import MessageError
 from endo_sim_ros.messages.headers import make_header
 from endo_sim_ros.messages.topics import LEFT_INFO
-from endo_sim_ros.messages.types import Message, MessageTypes, ros_types
+from endo_sim_ros.messages.types import Message, MessageError, MessageTypes, ros_types
 
 _DISTORTION_MODELS = ("", "plumb_bob", "rational_polynomial")
 

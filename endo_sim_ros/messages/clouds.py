@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from endo_sim_ros.messages.errors import MessageError
 from endo_sim_ros.messages.headers import NANOSECONDS, make_header
 from endo_sim_ros.messages.topics import CONTROL_NODES, CUT_SURFACE, GAUSSIANS
-from endo_sim_ros.messages.types import Message, MessageTypes, ros_types
+from endo_sim_ros.messages.types import Message, MessageError, MessageTypes, ros_types
 
 if TYPE_CHECKING:  # it takes torch, which most users of this package do not need
     from endo_sim_ros.core.gaussians import GaussianModel

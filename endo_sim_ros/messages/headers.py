@@ -2,8 +2,7 @@
 
 from collections.abc import Iterable
 
-from endo_sim_ros.messages.errors import MessageError
-from endo_sim_ros.messages.types import Message, MessageTypes, ros_types
+from endo_sim_ros.messages.types import Message, MessageError, MessageTypes, ros_types
 
 NANOSECONDS = 1_000_000_000  # in a second
 

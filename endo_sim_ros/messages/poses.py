@@ -5,10 +5,9 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from endo_sim_ros.core.cameras import make_pose, matrix_to_quat
-from endo_sim_ros.messages.errors import MessageError
 from endo_sim_ros.messages.headers import check_frame, make_header
 from endo_sim_ros.messages.topics import TRAINING_CAMERAS
-from endo_sim_ros.messages.types import Message, MessageTypes, ros_types
+from endo_sim_ros.messages.types import Message, MessageError, MessageTypes, ros_types
 
 
 def _decode_pose(pose: Message, topic: str) -> np.ndarray:

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from endo_sim_ros.messages.errors import MessageError
 from endo_sim_ros.messages.headers import make_header
-from endo_sim_ros.messages.types import Message, MessageTypes, crtk_type, ros_class, ros_types
+from endo_sim_ros.messages.types import Message, MessageError, MessageTypes, crtk_type, ros_class, ros_types
 
 
 def decode_wrench(message: Message, topic: str) -> tuple[np.ndarray, np.ndarray]:

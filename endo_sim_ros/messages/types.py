@@ -1,6 +1,6 @@
-"""Message classes to build: those of a ROS installation, or those of the rosbags library for bag files.
+"""What encoders and decoders share: the classes of messages, of a ROS installation or of the rosbags library, and their error.
 
-Encoders take them as ``types``. Byte fields are filled through ``sequence``, so that images and clouds cross at memcpy speed.
+Encoders take the classes as ``types``. Byte fields are filled through ``sequence``, so that images and clouds cross at memcpy speed.
 """
 
 import array
@@ -11,7 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from endo_sim_ros.messages.errors import MessageError
+
+class MessageError(ValueError):
+    """A message that cannot be used. The sentence names the topic, the field and what to do."""
+
 
 Message = Any  # an instance of a message class, of ROS or of rosbags: both have the same fields
 

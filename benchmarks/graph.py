@@ -133,7 +133,7 @@ def _recovery(client: Client, group: NodeGroup, scene: Scene, rate: float, devic
             seconds = []
             for _ in track(range(kills), description=f"{node} killed"):
                 model = client.model_stamp
-                group.nodes[node].send_signal(signal.SIGKILL)
+                group.nodes[node].process.send_signal(signal.SIGKILL)
                 group.nodes[node].wait()
                 began = time.perf_counter()
                 group.start(node, **parameters)

@@ -19,7 +19,6 @@ COMMANDS = (
     *("demo", "view", "up", "convert", "phantom", "reconstruct", "compress", "touch", "record", "export", "scene", "train"),
     *("config", "evaluate", "report", "bench", "plot"),
 )
-DESCRIPTION = "Endoscope recordings become tissue that a robot can touch."
 
 
 class Runnable(Protocol):
@@ -27,11 +26,6 @@ class Runnable(Protocol):
 
     def run(self) -> None:
         """Do what the command is for; what is wrong with its options raises."""
-
-
-def load_command(name: str) -> type[Runnable]:
-    """The dataclass whose fields are a command's options, and whose `run` is what it does."""
-    return importlib.import_module(f"endo_sim_ros.cli.{name}").Command
 
 
 def summary(name: str) -> str:
@@ -43,9 +37,9 @@ def summary(name: str) -> str:
 
 def overview() -> str:
     """What `endo-sim --help` prints."""
-    lines = ["usage: endo-sim COMMAND [OPTIONS]", "", DESCRIPTION, "", "commands:"]
+    lines = ["usage: endo-sim COMMAND [OPTIONS]", "", "Endoscope recordings become tissue that a robot can touch.", "", "commands:"]
     for name in COMMANDS:
-        lines += textwrap.wrap(f"{summary(name)}", 100, initial_indent=f"  {name:13}", subsequent_indent=" " * 15)
+        lines += textwrap.wrap(summary(name), 100, initial_indent=f"  {name:13}", subsequent_indent=" " * 15)
     return "\n".join([*lines, "", "`endo-sim COMMAND --help` tells the options of a command."])
 
 
@@ -55,7 +49,7 @@ def parse(name: str, words: list[str]) -> Runnable:
 
     from endo_sim_ros.core.config import refuse_renamed_flags
 
-    command = load_command(name)
+    command: type[Runnable] = importlib.import_module(f"endo_sim_ros.cli.{name}").Command
     refuse_renamed_flags(words, command)
     return tyro.cli(command, prog=f"endo-sim {name}", description=summary(name), args=words)
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from rich.progress import track
 from tyro.conf import Positional
 
-from endo_sim_ros.cli.progress import tracked
 from endo_sim_ros.core.frames import SequenceError
 
 
@@ -72,7 +72,7 @@ class Command:
         options = {name: value for name, value in vars(self).items() if name not in fixed and value is not None}
         frames = open_sequence(self.source, self.kind, **options)
         try:
-            count = write_bag(self.bag, tracked(frames, f"converting {self.source.name}"))
+            count = write_bag(self.bag, track(frames, f"converting {self.source.name}"))
         except BaseException:  # half a conversion would only be in the way of the next try
             shutil.rmtree(self.bag, ignore_errors=True)
             raise

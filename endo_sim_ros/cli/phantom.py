@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+from rich.progress import track
 from tyro.conf import Positional
 
-from endo_sim_ros.cli.progress import SizedIterator, tracked
 from endo_sim_ros.sequences.phantom import PhantomConfig
 
 
@@ -24,5 +24,5 @@ class Command:
         from endo_sim_ros.sequences.bag import write_bag
         from endo_sim_ros.sequences.phantom import phantom_sequence
 
-        frames = SizedIterator(phantom_sequence(self.config), self.config.frames)
-        print(f"{self.bag}: {write_bag(self.bag, tracked(frames, 'rendering the patient'))} frames")
+        frames = track(phantom_sequence(self.config), "rendering the patient", total=self.config.frames)
+        print(f"{self.bag}: {write_bag(self.bag, frames)} frames")

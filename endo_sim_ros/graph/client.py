@@ -1,4 +1,4 @@
-"""Clients of a running graph: one that hears what the nodes report, one that is a teleoperation stack, and tissue to touch."""
+"""A client of a running graph, as a teleoperation stack is, and tissue to touch."""
 
 import time
 from collections.abc import Callable
@@ -7,13 +7,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.publisher import Publisher
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.gaussians import GaussianModel
-from endo_sim_ros.messages import NodeState, NodeStatus, Topic
-from endo_sim_ros.nodes.base import EndoNode
+from endo_sim_ros.messages import Topic
+from endo_sim_ros.nodes.watcher import Watcher
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
 ARM = "PSM1"
@@ -22,39 +23,15 @@ PATIENCE = 60.0  # s that anything may take
 CHANGED = 60  # grey levels by which an image must differ to show that the tissue moved; creeping tissue differs by 1-5
 
 
-class Watcher(EndoNode):
-    """Hears what the nodes report on /diagnostics. ``statuses`` has the newest of each node, by full name."""
-
-    def __init__(self, name: str):
-        super().__init__(name)
-        self.statuses: dict[str, NodeStatus] = {}
-        self.subscribe(messages.DIAGNOSTICS, self._on_diagnostics)
-
-    def _on_diagnostics(self, message: messages.Message) -> None:
-        self.statuses.update((status.name, status) for status in messages.decode_diagnostics(message))
-
-    def in_state(self, node: str, state: NodeState) -> bool:
-        """Whether a node reports this state. A state that is missing or unknown is none."""
-        return node in self.statuses and self.statuses[node].state(type(state)) is state
-
-    def value(self, node: str, key: str, default: str = "") -> str:
-        """A value that a node reports, or a default."""
-        return self.statuses[node].values.get(key, default) if node in self.statuses else default
-
-    def renders_control_nodes(self) -> bool:
-        """Whether the renderer shows the tissue as the control nodes deform it."""
-        return self.value("rendering_node", "following control nodes") == "True"
-
-
 class Client(Watcher):
     """A teleoperation stack: sends poses and wrenches of a tool, receives images and states."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__("bench")
         self.images: list[tuple[float, int, np.ndarray]] = []  # time of arrival s, stamp ns, pixels [H, W, 3]
         self.states: list[tuple[float, int]] = []  # time of arrival s and stamp ns of control_nodes
         self._newest: Any = None  # control_nodes
-        self._senders: dict[Topic, Any] = {}
+        self._senders: dict[Topic, Publisher] = {}
         self.subscribe(messages.RENDERED_IMAGE, self._on_image)
         self.subscribe(messages.CONTROL_NODES, self._on_control_nodes)
         self._spinner = SingleThreadedExecutor()

@@ -4,7 +4,7 @@ import itertools
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import rclpy
@@ -15,11 +15,10 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from std_srvs.srv import Trigger
 
 from endo_sim_ros.core import drawing
-from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.evaluation.interaction_report import TouchReport
-from endo_sim_ros.graph.client import Watcher
 from endo_sim_ros.graph.processes import NodeGroup
-from endo_sim_ros.messages import ERROR, ReconstructionState, ScriptedToolState
+from endo_sim_ros.messages import ERROR, OK, NodeStatus, ReconstructionState, ScriptedToolState
+from endo_sim_ros.nodes.watcher import Watcher
 from endo_sim_ros.sequences.bag import BagReader, write_bag
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
@@ -66,7 +65,7 @@ def run_demo(bag: Path | None, out: Path, seed: int, frames: int, width: int, it
         else:
             with BagReader(bag) as reader:  # a bag that cannot do is reported before anything starts
                 reader.require_recording()
-        _touch_over_dds(graph, progress, bag, recording, out, width, iterations, force, timeout)
+        _touch_over_dds(graph, progress, bag, out, width, iterations, force, timeout)
     with console.status("writing the video and the contact sheet"):
         report = TouchReport(recording, _ARM)
         count = drawing.write_video(out / "touch.mp4", report.video(_FPS), _FPS)
@@ -89,27 +88,13 @@ def _phantom_bag(path: Path, seed: int, frames: int, width: int, progress: Progr
     task = progress.add_task("phantom", total=frames, note="rendering the synthetic patient")
     shutil.rmtree(path, ignore_errors=True)
     config = PhantomConfig(seed=seed, frames=frames, width=width, height=width * 4 // 5)
-
-    def counted() -> Iterator:
-        for frame in phantom_sequence(config):
-            yield frame
-            progress.advance(task)
-
-    write_bag(path, counted())
+    write_bag(path, progress.track(phantom_sequence(config), total=frames, task_id=task))
     progress.update(task, note=f"{path}")
     return path
 
 
 def _touch_over_dds(
-    graph: NodeGroup,
-    progress: Progress,
-    bag: Path,
-    recording: Path,
-    out: Path,
-    width: int,
-    iterations: int,
-    force: float,
-    timeout: float,
+    graph: NodeGroup, progress: Progress, bag: Path, out: Path, width: int, iterations: int, force: float, timeout: float
 ) -> None:
     """Run the nodes until the tool has let go."""
     os.environ.update(graph.environment)  # this process joins the same graph
@@ -123,7 +108,11 @@ def _touch_over_dds(
         task = progress.add_task(stage, total=None, note="")
         while not done():
             executor.spin_once(timeout_sec=0.1)
-            text, completed, total = progress_of(shown)
+            _, level, text, values = watcher.statuses.get(shown, NodeStatus(shown, OK, "starting", {}))
+            if level == ERROR:
+                raise DemoError(f"{shown}: {text}")
+            completed = float(values.get("iteration", values.get("messages", 0)))
+            total = float(values.get("iterations", values.get("of", 0)))
             progress.update(task, note=text, completed=completed, total=total or None)
             for node in graph.dead():
                 raise DemoError(f"{node.name} ended with status {node.exit_status}; its log is {node.log}")
@@ -132,18 +121,8 @@ def _touch_over_dds(
                 raise DemoError(f"{late}; logs are in {out / 'logs'}")
         progress.update(task, completed=1, total=1)
 
-    def progress_of(name: str) -> tuple[str, float, float]:
-        """What a node says, and how much it has done of how much."""
-        if name not in watcher.statuses:
-            return "starting", 0.0, 0.0
-        _, level, text, values = watcher.statuses[name]
-        if level == ERROR:
-            raise DemoError(f"{name}: {text}")
-        completed = values.get("iteration", values.get("messages", 0))
-        return text, float(completed), float(values.get("iterations", values.get("of", 0)))
-
     try:
-        graph.start("recorder_node", bag=recording, arms=[_ARM])
+        graph.start("recorder_node", bag=out / "recording", arms=[_ARM])
         graph.start(
             "reconstruction_node",
             start_after=0.0,  # asked to, below
@@ -171,6 +150,3 @@ def _touch_over_dds(
         executor.shutdown()
         watcher.destroy_node()
         try_shutdown()
-
-
-__all__ = ["DemoError", "SequenceError", "run_demo"]

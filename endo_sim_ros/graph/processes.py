@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,54 +15,26 @@ from endo_sim_ros.nodes.transport import graph_environment
 _STOP_AFTER = 15.0  # seconds that a node has to end after an interrupt
 
 
+@dataclass(frozen=True)
 class NodeProcess:
-    """One node in its own process, with its output in a log file."""
+    """One node in its own process."""
 
-    def __init__(
-        self,
-        name: str,
-        parameters: dict[str, Any],
-        environment: dict[str, str],
-        log: Path,
-        ros_arguments: tuple[str, ...] = (),
-    ):
-        self.name, self.log = name, log
-        arguments = [sys.executable, "-m", f"endo_sim_ros.nodes.{name}"]
-        if parameters or ros_arguments:
-            arguments += ["--ros-args", *ros_arguments]
-        for key, value in parameters.items():
-            arguments += ["-p", f"{key}:={_yaml(value)}"]
-        log.parent.mkdir(parents=True, exist_ok=True)
-        with log.open("wb") as output:
-            mine = environment | {PARENT: str(os.getpid())}
-            self._process = subprocess.Popen(arguments, env=mine, stdout=output, stderr=subprocess.STDOUT, start_new_session=True)
+    name: str
+    log: Path  # what it prints
+    process: subprocess.Popen
 
     @property
     def exit_status(self) -> int | None:
-        """None while the node runs."""
-        return self._process.poll()
-
-    @property
-    def pid(self) -> int:
-        """Number of the process."""
-        return self._process.pid
-
-    def send_signal(self, number: int) -> None:
-        """Send a signal to the process, if it runs."""
-        if self.exit_status is None:
-            self._process.send_signal(number)
-
-    def interrupt(self) -> None:
-        """Ask the ROS node to end, as Ctrl-C does."""
-        self.send_signal(signal.SIGINT)
+        """Exit status of the process, None while it runs."""
+        return self.process.poll()
 
     def wait(self, seconds: float = _STOP_AFTER) -> int:
         """Exit status; a node that does not end in time is killed."""
         try:
-            return self._process.wait(seconds)
+            return self.process.wait(seconds)
         except subprocess.TimeoutExpired:
-            self._process.kill()
-            return self._process.wait()
+            self.process.kill()
+            return self.process.wait()
 
 
 def _yaml(value: Any) -> str:
@@ -73,7 +46,7 @@ def _yaml(value: Any) -> str:
 class NodeGroup:
     """Nodes that live and end together. Use as a context manager."""
 
-    def __init__(self, log_folder: Path):
+    def __init__(self, log_folder: Path) -> None:
         self.environment = graph_environment()
         self._log_folder = log_folder
         self.nodes: dict[str, NodeProcess] = {}
@@ -86,10 +59,15 @@ class NodeGroup:
 
     def start(self, name: str, *ros_arguments: str, **parameters: Any) -> NodeProcess:
         """Start a node, or another one in its place, with parameters and arguments such as ``-r __ns:=/left``."""
-        log = self._log_folder / f"{name}.log"
-        node = NodeProcess(name, parameters, self.environment, log, ros_arguments)
-        self.nodes[name] = node
-        return node
+        arguments = [sys.executable, "-m", f"endo_sim_ros.nodes.{name}", "--ros-args", *ros_arguments]
+        for key, value in parameters.items():
+            arguments += ["-p", f"{key}:={_yaml(value)}"]
+        environment, log = self.environment | {PARENT: str(os.getpid())}, self._log_folder / f"{name}.log"
+        log.parent.mkdir(parents=True, exist_ok=True)
+        with log.open("wb") as output:
+            process = subprocess.Popen(arguments, env=environment, stdout=output, stderr=subprocess.STDOUT, start_new_session=True)
+        self.nodes[name] = NodeProcess(name, log, process)
+        return self.nodes[name]
 
     def dead(self) -> list[NodeProcess]:
         """Nodes that ended with an error."""
@@ -99,7 +77,7 @@ class NodeGroup:
         """Interrupt all nodes, the youngest first, and wait for them."""
         nodes = list(self.nodes.values())[::-1]
         for node in nodes:
-            node.interrupt()
+            node.process.send_signal(signal.SIGINT)
             time.sleep(0.05)
         for node in nodes:
             node.wait()

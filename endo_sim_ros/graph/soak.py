@@ -23,6 +23,7 @@ from endo_sim_ros.messages import OK, ReconstructionState, Topic
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
 _NODES = ("reconstruction_node", "physics_node", "rendering_node")
+_WIDTH, _HEIGHT = 96, 80  # pixels of the images; small, for many messages
 _SETTLED = 0.25  # part of the time after which memory is compared: caches and pools are full by then
 _VALID = 0.5  # part of the messages that are left as they are
 _FLOATS = (0.0, -0.0, 1.0, -1.0, float("nan"), float("inf"), float("-inf"), 1e-320, 1e30, -1e300)
@@ -72,11 +73,11 @@ def spoil(message: Any, rng: random.Random) -> None:
 class _Traffic:
     """What anybody might publish on the graph's topics, well made."""
 
-    def __init__(self, rng: random.Random, width: int, height: int, gaussians: int):
+    def __init__(self, rng: random.Random) -> None:
         self._rng = rng
-        self.recording = list(phantom_sequence(PhantomConfig(frames=8, width=width, height=height)))
+        self.recording = list(phantom_sequence(PhantomConfig(frames=8, width=_WIDTH, height=_HEIGHT)))
         self._frame = self.recording[0]
-        self.scene = tissue(gaussians, width, height)
+        self.scene = tissue(2000, _WIDTH, _HEIGHT)
         self._rest = self.scene.model.means.numpy()[:300]
 
     def message(self, topic: Topic, stamp: int) -> Any:
@@ -85,8 +86,8 @@ class _Traffic:
         if topic in (messages.LEFT_IMAGE, messages.RIGHT_IMAGE):
             return messages.encode_image(frame.image, stamp, LEFT_FRAME)
         if topic in (messages.LEFT_COMPRESSED, messages.RIGHT_COMPRESSED):
-            jpeg = cv2.imencode(".jpg", frame.image)[1].tobytes()
-            return messages.ros_class(topic.type)(format="jpeg", data=array.array("B", jpeg), header=self._header(stamp))
+            jpeg, header = cv2.imencode(".jpg", frame.image)[1].tobytes(), messages.encode_pose(camera.pose, stamp, LEFT_FRAME).header
+            return messages.ros_class(topic.type)(format="jpeg", data=array.array("B", jpeg), header=header)
         if topic in (messages.LEFT_INFO, messages.RIGHT_INFO, messages.TRAINING_CAMERA_INFO):
             return messages.encode_camera_info(camera.K, camera.width, camera.height, stamp, LEFT_FRAME, frame.baseline or 0.0)
         if topic == messages.DEPTH:
@@ -116,10 +117,6 @@ class _Traffic:
             return messages.encode_cut_surface(triangles, stamp, "world")
         return messages.encode_jaw(rng.uniform(-0.2, 1.0), stamp)
 
-    @staticmethod
-    def _header(stamp: int) -> Any:
-        return messages.encode_pose(np.eye(4), stamp, LEFT_FRAME).header
-
 
 _TOPICS = (
     *messages.RECORDING_TOPICS, *messages.MODEL_TOPICS, messages.CONTROL_NODES,
@@ -135,7 +132,7 @@ def _memory(pid: int) -> float:
     return next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmRSS")) / 1024
 
 
-def soak(json_file: Path | None, minutes: float = 10.0, rate: float = 500.0, seed: int = 0, width: int = 96, height: int = 80) -> list[Row]:
+def soak(json_file: Path | None, minutes: float, rate: float = 500.0, seed: int = 0) -> list[Row]:
     """Send random traffic to a graph, then let it do its work; print and return what was measured.
 
     Args:
@@ -143,13 +140,12 @@ def soak(json_file: Path | None, minutes: float = 10.0, rate: float = 500.0, see
         minutes: Duration of the traffic.
         rate: Messages a second, on all topics together; half of them spoilt.
         seed: Of the traffic.
-        width, height: Size of the images, pixels.
 
     Raises:
         RuntimeError: If a node died, or the graph does not work any more.
     """
     rng, rows = random.Random(seed), []
-    traffic = _Traffic(rng, width, height, 2000)
+    traffic = _Traffic(rng)
     parameters = {
         "reconstruction_node": {"iterations": 20, "max_gaussians": 1500, "start_after": 0.5},
         "physics_node": {"node_count": 400, "arms": [ARM], "contact_radius": 0.005},
@@ -193,7 +189,7 @@ def _send(client: Client, group: NodeGroup, traffic: _Traffic, rng: random.Rando
                 for name in _NODES:
                     if group.nodes[name].exit_status is not None:
                         raise RuntimeError(f"{name} ended after {now:.0f} s:\n{group.nodes[name].log.read_text()[-3000:]}")
-                    used[name].append(_memory(group.nodes[name].pid))
+                    used[name].append(_memory(group.nodes[name].process.pid))
     rows = [Row("messages sent", sent, ""), Row("of them spoilt", spoilt, ""), Row("messages per second", sent / seconds, "1/s")]
     for name in _NODES:
         settled, last = max(used[name][: int(_SETTLED * len(used[name])) + 1]), np.median(used[name][-3:])

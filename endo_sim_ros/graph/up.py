@@ -6,7 +6,7 @@ import shlex
 import signal
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,11 +20,10 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from endo_sim_ros import messages
 from endo_sim_ros.graph.processes import NodeGroup
-from endo_sim_ros.messages import ERROR, OK, WARN
-from endo_sim_ros.nodes.base import EndoNode
+from endo_sim_ros.messages import ERROR, OK, WARN, NodeStatus
 from endo_sim_ros.nodes.transport import prepare_transport
+from endo_sim_ros.nodes.watcher import Watcher
 from endo_sim_ros.sequences.bag import BagReader
 
 _CANNOT_START = 2  # exit status of a node that was given something it cannot use; see base.run
@@ -63,28 +62,10 @@ class _Row(NamedTuple):
     values: str
 
 
-class _Watcher(EndoNode):
-    """Listens to what the nodes say about themselves."""
-
-    def __init__(self):
-        super().__init__("up")
-        self.statuses: dict[str, tuple[float, int, str, dict[str, str]]] = {}  # by full name; the first is when
-        self.subscribe(messages.DIAGNOSTICS, self._on_diagnostics)
-
-    def _on_diagnostics(self, message: Any) -> None:
-        for name, level, text, values in messages.decode_diagnostics(message):
-            self.statuses[name] = (time.monotonic(), level, text, values)
-
-    def twins(self, names: Iterable[str]) -> list[str]:
-        """Those of these nodes that exist more than once, because another graph runs in the same domain."""
-        there = ["/".join((space.strip("/"), name)).lstrip("/") for name, space in self.get_node_names_and_namespaces()]
-        return [name for name in names if there.count(name) > 1]
-
-
 class _Supervisor:
     """Starts the nodes, notices when one ends, and knows what to show of each."""
 
-    def __init__(self, graph: NodeGroup, namespace: str, console: Console, respawn: bool):
+    def __init__(self, graph: NodeGroup, namespace: str, console: Console, respawn: bool) -> None:
         self._graph, self._namespace, self._console, self._respawn = graph, namespace.strip("/"), console, respawn
         self._arguments: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {}
         self._began: dict[str, float] = {}
@@ -103,10 +84,10 @@ class _Supervisor:
         """Name of a node on /diagnostics."""
         return f"{self._namespace}/{_NODE_NAMES.get(name, name)}".lstrip("/")
 
-    @property
-    def full_names(self) -> list[str]:
-        """Names of all nodes on /diagnostics."""
-        return [self.full_name(name) for name in self._graph.nodes]
+    def twins(self, watcher: Watcher) -> list[str]:
+        """Names of the nodes that exist more than once, because another graph runs in the same domain."""
+        there = ["/".join((space.strip("/"), name)).lstrip("/") for name, space in watcher.get_node_names_and_namespaces()]
+        return [name for name in map(self.full_name, self._graph.nodes) if there.count(name) > 1]
 
     def check(self) -> None:
         """Report nodes that ended; start those that crashed again after a pause, unless they crash again and again.
@@ -148,11 +129,13 @@ class _Supervisor:
         if self._ended >= self._graph.nodes.keys() - {"bag_player_node"}:
             raise UpError("no node is left")
 
-    def rows(self, statuses: dict[str, tuple[float, int, str, dict[str, str]]]) -> list[_Row]:
+    def rows(self, watcher: Watcher) -> list[_Row]:
         """The state of each node."""
         rows = []
         for name, node in self._graph.nodes.items():
-            heard, level, text, values = statuses.get(self.full_name(name), (0.0, OK, "", {}))
+            full_name = self.full_name(name)
+            heard = watcher.heard.get(full_name, 0.0)
+            _, level, text, values = watcher.statuses.get(full_name, NodeStatus(full_name, OK, "", {}))
             shown = ", ".join(f"{key} {values[key]}" for key in _VALUES.get(name, ()) if values.get(key, "0") != "0")
             if node.exit_status is not None:  # what it said last is history unless it finished
                 done = node.exit_status == 0
@@ -221,7 +204,7 @@ def run_up(
 def _watch(supervisor: _Supervisor, console: Console, asked: threading.Event) -> None:
     """Show the nodes until asked to end."""
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)  # the signals are heard by the caller
-    watcher, executor = _Watcher(), SingleThreadedExecutor()
+    watcher, executor = Watcher("up"), SingleThreadedExecutor()
     executor.add_node(watcher)
     warned = False
     live = Live(console=console, auto_refresh=False) if console.is_terminal else None
@@ -233,11 +216,11 @@ def _watch(supervisor: _Supervisor, console: Console, asked: threading.Event) ->
             while (left := deadline - time.monotonic()) > 0 and not asked.is_set():
                 executor.spin_once(timeout_sec=left)
             supervisor.check()
-            if not warned and not supervisor.restarted and (twins := watcher.twins(supervisor.full_names)):
+            if not warned and not supervisor.restarted and (twins := supervisor.twins(watcher)):
                 warned = True  # after a restart the one that crashed is still known to others for a while
                 text = f"{', '.join(twins)}: there more than once; does another graph run in this ROS domain?"
                 console.print(text, style="yellow", highlight=False, soft_wrap=True)
-            rows = supervisor.rows(watcher.statuses)
+            rows = supervisor.rows(watcher)
             if live is None:
                 for line in supervisor.news(rows):
                     console.print(line, highlight=False, markup=False, soft_wrap=True)

@@ -233,9 +233,8 @@ def _streams(reader: BagReader, arms: tuple[str, ...], frames: Mapping[str, np.n
     """
     decoders = {}
     for arm in arms:
-        bases = {**frames, "": frames.get(f"{arm}_base", np.eye(4))}  # clients of CRTK leave the frame empty
         for make in (messages.tool_pose, messages.tool_pose_command):
-            decoders[make(arm)] = lambda m, topic, bases=bases: _pose_row(messages.decode_pose(m, bases, topic))
+            decoders[make(arm)] = lambda m, topic, arm=arm: _pose_row(messages.decode_tip(m, frames, arm, topic))
         for make in (messages.tool_jaw, messages.tool_jaw_state):
             decoders[make(arm)] = lambda m, topic: [messages.decode_jaw(m, topic)]
         for make in (messages.tool_wrench, messages.tool_reaction):

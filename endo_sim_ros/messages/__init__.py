@@ -1,7 +1,7 @@
 """numpy ⇄ ROS messages: the code twin of msg_conventions.md. Only this package encodes or decodes bytes.
 
-Every encoder takes ``types``, the message classes to build: `ros_types()` for a running graph (the default), `bag_types()` for
-bag files, which needs no ROS installation. Decoders accept messages of either. Images and clouds cross at memcpy speed.
+Encoders take ``types``, the message classes to build: `ros_types()` for a running graph (the default), `bag_types()` for bag
+files, which needs no ROS installation. Decoders accept messages of either. Images and clouds cross at memcpy speed.
 """
 
 from endo_sim_ros.messages.cameras import CameraInfo, decode_camera_info, encode_camera_info
@@ -18,7 +18,6 @@ from endo_sim_ros.messages.clouds import (
 )
 from endo_sim_ros.messages.diagnostics import (
     ERROR,
-    NODE_STATES,
     OK,
     STATE,
     WARN,
@@ -36,12 +35,10 @@ from endo_sim_ros.messages.diagnostics import (
     decode_diagnostics,
     encode_diagnostics,
 )
-from endo_sim_ros.messages.errors import MessageError
 from endo_sim_ros.messages.headers import check_frame, encode_clock, stamp_to_ns
 from endo_sim_ros.messages.images import decode_depth, decode_image, decode_mask, encode_image
-from endo_sim_ros.messages.poses import decode_pose, decode_poses, encode_pose, encode_poses
+from endo_sim_ros.messages.poses import decode_pose, decode_poses, decode_tip, encode_pose, encode_poses
 from endo_sim_ros.messages.tools import (
-    METRES_PER_NEWTON,
     ToolDisplay,
     decode_cut,
     decode_jaw,
@@ -76,7 +73,6 @@ from endo_sim_ros.messages.topics import (
     RIGHT_IMAGE,
     RIGHT_INFO,
     TOOL_MARKERS,
-    TOOL_TOPICS,
     TRAINING_CAMERA_INFO,
     TRAINING_CAMERAS,
     Topic,
@@ -96,11 +92,9 @@ from endo_sim_ros.messages.topics import (
     tool_wrench,
 )
 from endo_sim_ros.messages.types import (
-    MESSAGE_PACKAGES,
-    BagTypes,
     Message,
+    MessageError,
     MessageTypes,
-    RosTypes,
     bag_types,
     crtk_type,
     ros_class,
@@ -108,16 +102,16 @@ from endo_sim_ros.messages.types import (
 )
 
 __all__ = [
-    "BagPlayerState", "BagTypes", "CAMERA_POSE", "CLOCK", "CONTROL_NODES", "CUT_SURFACE", "CameraInfo", "ClientState",
+    "BagPlayerState", "CAMERA_POSE", "CLOCK", "CONTROL_NODES", "CUT_SURFACE", "CameraInfo", "ClientState",
     "ControlNodeCloud", "DEPTH", "DIAGNOSTICS", "ERROR", "GAUSSIANS", "LEFT_COMPRESSED", "LEFT_IMAGE", "LEFT_INFO", "MASK",
-    "MESSAGE_PACKAGES", "METRES_PER_NEWTON", "MODEL_TOPICS", "Message", "MessageError", "MessageTypes", "NODE_STATES",
+    "MODEL_TOPICS", "Message", "MessageError", "MessageTypes",
     "NodeState", "NodeStatus", "OK", "PhysicsState", "PolicyState", "RECORDING_TOPICS", "RENDERED_DEPTH", "RENDERED_IMAGE",
     "RENDERED_INFO", "RENDERED_POSE", "RENDERED_TOPICS", "RIGHT_COMPRESSED", "RIGHT_IMAGE", "RIGHT_INFO", "ReconstructionState",
-    "RecorderState", "RenderingState", "RosTypes", "STATE", "ScriptedToolState", "TOOL_MARKERS", "TOOL_TOPICS",
+    "RecorderState", "RenderingState", "STATE", "ScriptedToolState", "TOOL_MARKERS",
     "TRAINING_CAMERAS", "TRAINING_CAMERA_INFO", "ToolDisplay", "Topic", "ViewerState", "WARN", "all_topics", "bag_types",
     "check_frame", "crtk_type", "cut_number", "decode_camera_info", "decode_cloud", "decode_control_nodes", "decode_cut",
     "decode_cut_surface", "decode_depth", "decode_diagnostics", "decode_gaussians", "decode_image", "decode_jaw", "decode_mask",
-    "decode_pose", "decode_poses", "decode_state_command", "decode_wrench", "encode_camera_info", "encode_clock",
+    "decode_pose", "decode_poses", "decode_state_command", "decode_tip", "decode_wrench", "encode_camera_info", "encode_clock",
     "encode_control_nodes", "encode_cut", "encode_cut_surface", "encode_diagnostics", "encode_gaussians", "encode_image",
     "encode_jaw", "encode_operating_state", "encode_pose", "encode_poses", "encode_tool_markers", "encode_wrench",
     "ros_class", "ros_types", "stamp_to_ns", "tool_cut", "tool_jaw", "tool_jaw_move", "tool_jaw_setpoint", "tool_jaw_state",

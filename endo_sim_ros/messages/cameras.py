@@ -6,10 +6,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from endo_sim_ros.messages.errors import MessageError
 from endo_sim_ros.messages.headers import make_header
 from endo_sim_ros.messages.topics import LEFT_INFO
-from endo_sim_ros.messages.types import Message, MessageTypes, ros_types
+from endo_sim_ros.messages.types import Message, MessageError, MessageTypes, ros_types
 
 _DISTORTION_MODELS = ("", "plumb_bob", "rational_polynomial")
 
@@ -90,7 +89,7 @@ def decode_camera_info(message: Message, topic: str = LEFT_INFO.name) -> CameraI
 
 
 def encode_camera_info(
-    K: np.ndarray, width: int, height: int, stamp_ns: int, frame_id: str, baseline: float = 0.0, types: MessageTypes | None = None
+    K: np.ndarray, width: int, height: int, stamp_ns: int, frame_id: str, baseline: float = 0.0, types: MessageTypes = ros_types()
 ) -> Message:
     """CameraInfo of a rectified eye.
 
@@ -102,7 +101,6 @@ def encode_camera_info(
         baseline: Distance of a right eye to the left one, metres: P[0, 3] = −fx·baseline.
         types: Message classes to build; those of ROS by default.
     """
-    types = types or ros_types()
     P = np.hstack([K, np.zeros((3, 1))])
     P[0, 3] = -K[0, 0] * baseline
     flat = lambda matrix: np.asarray(matrix, np.float64).reshape(-1)  # noqa: E731

@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from endo_sim_ros.messages.errors import MessageError
 from endo_sim_ros.messages.headers import NANOSECONDS, make_header
 from endo_sim_ros.messages.topics import CONTROL_NODES, CUT_SURFACE, GAUSSIANS
-from endo_sim_ros.messages.types import Message, MessageTypes, ros_types
+from endo_sim_ros.messages.types import Message, MessageError, MessageTypes, ros_types
 
 if TYPE_CHECKING:  # it takes torch, which most users of this package do not need
     from endo_sim_ros.core.gaussians import GaussianModel
@@ -55,9 +54,8 @@ def _columns(points: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
     return np.stack([points[name].astype(np.float32) for name in names], 1)
 
 
-def _encode_cloud(points: np.ndarray, stamp_ns: int, frame_id: str, types: MessageTypes | None) -> Message:
+def _encode_cloud(points: np.ndarray, stamp_ns: int, frame_id: str, types: MessageTypes) -> Message:
     """PointCloud2 of a structured array [N]."""
-    types = types or ros_types()
     layout = points.dtype.fields or {}
     fields = [
         types.PointField(name=name, offset=offset, datatype=_POINT_DATATYPES[dtype.str[1:]], count=1)
@@ -76,7 +74,7 @@ def _encode_cloud(points: np.ndarray, stamp_ns: int, frame_id: str, types: Messa
     )
 
 
-def encode_gaussians(model: "GaussianModel", stamp_ns: int, frame_id: str, types: MessageTypes | None = None) -> Message:
+def encode_gaussians(model: "GaussianModel", stamp_ns: int, frame_id: str, types: MessageTypes = ros_types()) -> Message:
     """PointCloud2 of a model: INRIA's field names (float32), packed `rgb`, and `light` where the model has one.
 
     Args:
@@ -141,7 +139,7 @@ _NUMBERS = ("model_sec", "model_nanosec", "cut")
 _NODE_DTYPE = np.dtype([(name, "<f4") for name in (*_POSITION, *_REST, *_F)] + [(name, "<u4") for name in _NUMBERS])
 
 
-def encode_control_nodes(state: ControlNodeCloud, stamp_ns: int, frame_id: str, types: MessageTypes | None = None) -> Message:
+def encode_control_nodes(state: ControlNodeCloud, stamp_ns: int, frame_id: str, types: MessageTypes = ros_types()) -> Message:
     """PointCloud2 of a state: position, rest position, F row by row, stamp of the model, number of the cut surface.
 
     Args:
@@ -190,7 +188,7 @@ def cut_number(triangles: np.ndarray) -> int:
     return zlib.crc32(np.ascontiguousarray(triangles, "<f4").tobytes()) if len(triangles) else 0
 
 
-def encode_cut_surface(triangles: np.ndarray, model_stamp_ns: int, frame_id: str, types: MessageTypes | None = None) -> Message:
+def encode_cut_surface(triangles: np.ndarray, model_stamp_ns: int, frame_id: str, types: MessageTypes = ros_types()) -> Message:
     """PointCloud2 of the triangles of all cuts, three points each.
 
     Args:

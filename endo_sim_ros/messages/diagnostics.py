@@ -100,17 +100,6 @@ class ClientState(NodeState):
     RUNNING = "running"
 
 
-NODE_STATES: dict[str, type[NodeState]] = {  # by the default name of the node
-    "reconstruction_node": ReconstructionState,
-    "physics_node": PhysicsState,
-    "rendering_node": RenderingState,
-    "viewer_node": ViewerState,
-    "bag_player": BagPlayerState,
-    "recorder": RecorderState,
-    "policy": PolicyState,
-    "scripted_tool": ScriptedToolState,
-}
-
 _State = TypeVar("_State", bound=NodeState)
 
 
@@ -129,7 +118,7 @@ class NodeStatus(NamedTuple):
 
 
 def encode_diagnostics(
-    name: str, level: int, message: str, values: Mapping[str, Any], stamp_ns: int, types: MessageTypes | None = None
+    name: str, level: int, message: str, values: Mapping[str, Any], stamp_ns: int, types: MessageTypes = ros_types()
 ) -> Message:
     """DiagnosticArray with one status.
 
@@ -141,7 +130,6 @@ def encode_diagnostics(
         stamp_ns: Time, nanoseconds.
         types: Message classes to build; those of ROS by default.
     """
-    types = types or ros_types()
     status = types.DiagnosticStatus(
         level=_LEVELS[level] if isinstance(types, RosTypes) else level,
         name=name,

@@ -2,8 +2,7 @@
 
 from collections.abc import Iterable
 
-from endo_sim_ros.messages.errors import MessageError
-from endo_sim_ros.messages.types import Message, MessageTypes, ros_types
+from endo_sim_ros.messages.types import Message, MessageError, MessageTypes, ros_types
 
 NANOSECONDS = 1_000_000_000  # in a second
 
@@ -46,7 +45,6 @@ def check_frame(message: Message, allowed: Iterable[str], topic: str) -> str:
     return frame
 
 
-def encode_clock(stamp_ns: int, types: MessageTypes | None = None) -> Message:
+def encode_clock(stamp_ns: int, types: MessageTypes = ros_types()) -> Message:
     """Clock of a simulated time in nanoseconds."""
-    types = types or ros_types()
     return types.Clock(clock=make_time(types, stamp_ns))

@@ -4,10 +4,9 @@ import cv2
 import numpy as np
 from numpy.typing import DTypeLike
 
-from endo_sim_ros.messages.errors import MessageError
 from endo_sim_ros.messages.headers import make_header
 from endo_sim_ros.messages.topics import DEPTH, LEFT_IMAGE, MASK
-from endo_sim_ros.messages.types import Message, MessageTypes, ros_types
+from endo_sim_ros.messages.types import Message, MessageError, MessageTypes, ros_types
 
 _COLOR_CHANNELS = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "8UC1": 1, "8UC3": 3}
 _ENCODINGS = {("uint8", 3): "rgb8", ("uint8", 1): "mono8", ("float32", 1): "32FC1"}  # by dtype and channels
@@ -84,13 +83,12 @@ def decode_mask(message: Message, topic: str = MASK.name) -> np.ndarray:
     return np.where(_pixels(message, np.uint8, 1, topic)[..., 0] >= 128, np.uint8(255), np.uint8(0))
 
 
-def encode_image(pixels: np.ndarray, stamp_ns: int, frame_id: str, types: MessageTypes | None = None) -> Message:
+def encode_image(pixels: np.ndarray, stamp_ns: int, frame_id: str, types: MessageTypes = ros_types()) -> Message:
     """Image of uint8 [H, W, 3] (rgb8), uint8 [H, W] (mono8) or float32 [H, W] (32FC1, metres).
 
     Raises:
         MessageError: If there is no encoding for the dtype and the number of channels.
     """
-    types = types or ros_types()
     channels = 1 if pixels.ndim == 2 else pixels.shape[2]
     encoding = _ENCODINGS.get((pixels.dtype.name, channels))
     if encoding is None:

@@ -5,10 +5,9 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from endo_sim_ros.core.cameras import make_pose, matrix_to_quat
-from endo_sim_ros.messages.errors import MessageError
 from endo_sim_ros.messages.headers import check_frame, make_header
 from endo_sim_ros.messages.topics import TRAINING_CAMERAS
-from endo_sim_ros.messages.types import Message, MessageTypes, ros_types
+from endo_sim_ros.messages.types import Message, MessageError, MessageTypes, ros_types
 
 
 def _decode_pose(pose: Message, topic: str) -> np.ndarray:
@@ -39,6 +38,23 @@ def decode_pose(message: Message, frames: str | Mapping[str, np.ndarray], topic:
     return pose if isinstance(frames, str) else frames[frame] @ pose
 
 
+def decode_tip(message: Message, frames: Mapping[str, np.ndarray], arm: str, topic: str) -> np.ndarray:
+    """Pose [4, 4] of an arm's tip from a PoseStamped, metres, in the world.
+
+    Clients of CRTK leave the frame empty. It is the arm's base then, ``PSM1_base`` for PSM1, or the world if that is unknown.
+
+    Args:
+        message: The message.
+        frames: Poses [4, 4] of known frames in the world, by name.
+        arm: Name of the arm.
+        topic: For errors.
+
+    Raises:
+        MessageError: As from `decode_pose`.
+    """
+    return decode_pose(message, {**frames, "": frames.get(f"{arm}_base", np.eye(4))}, topic)
+
+
 def decode_poses(message: Message, topic: str = TRAINING_CAMERAS.name) -> np.ndarray:
     """Poses [V, 4, 4] of a PoseArray, metres, in the frame of its header.
 
@@ -54,13 +70,11 @@ def _encode_pose(types: MessageTypes, pose: np.ndarray) -> Message:
     return types.Pose(position=types.Point(x=px, y=py, z=pz), orientation=types.Quaternion(x=x, y=y, z=z, w=w))
 
 
-def encode_pose(pose: np.ndarray, stamp_ns: int, frame_id: str, types: MessageTypes | None = None) -> Message:
+def encode_pose(pose: np.ndarray, stamp_ns: int, frame_id: str, types: MessageTypes = ros_types()) -> Message:
     """PoseStamped of a rigid transform [4, 4], metres."""
-    types = types or ros_types()
     return types.PoseStamped(header=make_header(types, stamp_ns, frame_id), pose=_encode_pose(types, pose))
 
 
-def encode_poses(poses: Iterable[np.ndarray], stamp_ns: int, frame_id: str, types: MessageTypes | None = None) -> Message:
+def encode_poses(poses: Iterable[np.ndarray], stamp_ns: int, frame_id: str, types: MessageTypes = ros_types()) -> Message:
     """PoseArray of rigid transforms [4, 4], metres."""
-    types = types or ros_types()
     return types.PoseArray(header=make_header(types, stamp_ns, frame_id), poses=[_encode_pose(types, pose) for pose in poses])

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from endo_sim_ros.messages.errors import MessageError
 from endo_sim_ros.messages.headers import make_header
-from endo_sim_ros.messages.types import Message, MessageTypes, crtk_type, ros_class, ros_types
+from endo_sim_ros.messages.types import Message, MessageError, MessageTypes, crtk_type, ros_class, ros_types
 
 
 def decode_wrench(message: Message, topic: str) -> tuple[np.ndarray, np.ndarray]:
@@ -23,9 +22,8 @@ def decode_wrench(message: Message, topic: str) -> tuple[np.ndarray, np.ndarray]
     return force, torque
 
 
-def encode_wrench(force: np.ndarray, torque: np.ndarray, stamp_ns: int, frame_id: str, types: MessageTypes | None = None) -> Message:
+def encode_wrench(force: np.ndarray, torque: np.ndarray, stamp_ns: int, frame_id: str, types: MessageTypes = ros_types()) -> Message:
     """WrenchStamped of a force [3] (N) and a torque [3] (N·m), in the axes of the frame."""
-    types = types or ros_types()
     vector = lambda v: types.Vector3(x=float(v[0]), y=float(v[1]), z=float(v[2]))  # noqa: E731
     wrench = types.Wrench(force=vector(force), torque=vector(torque))
     return types.WrenchStamped(header=make_header(types, stamp_ns, frame_id), wrench=wrench)
@@ -43,9 +41,8 @@ def decode_jaw(message: Message, topic: str) -> float:
     return float(positions[0])
 
 
-def encode_jaw(angle: float, stamp_ns: int, types: MessageTypes | None = None) -> Message:
+def encode_jaw(angle: float, stamp_ns: int, types: MessageTypes = ros_types()) -> Message:
     """JointState of a jaw's opening angle, radians."""
-    types = types or ros_types()
     empty = types.sequence(np.zeros(0))
     return types.JointState(
         header=make_header(types, stamp_ns, ""),
@@ -67,9 +64,8 @@ def decode_cut(message: Message, topic: str) -> bool:
     return bool(message.buttons[0])
 
 
-def encode_cut(cutting: bool, stamp_ns: int, types: MessageTypes | None = None) -> Message:
+def encode_cut(cutting: bool, stamp_ns: int, types: MessageTypes = ros_types()) -> Message:
     """Joy with one button, pressed while the edge of a tool cuts."""
-    types = types or ros_types()
     return types.Joy(
         header=make_header(types, stamp_ns, ""),
         axes=types.sequence(np.zeros(0, np.float32)),
@@ -107,43 +103,30 @@ _SPHERE, _ARROW, _POINTS = 2, 0, 8  # Marker.type
 _ADD, _DELETE = 0, 2  # Marker.action
 
 
-def encode_tool_markers(tools: Iterable[ToolDisplay], stamp_ns: int, frame_id: str, types: MessageTypes | None = None) -> Message:
+def encode_tool_markers(tools: Iterable[ToolDisplay], stamp_ns: int, frame_id: str) -> Message:
     """MarkerArray for RViz and Foxglove. The namespace of a marker is its arm.
 
     Ids of each arm: 0 the tip, 1 the force on the tissue, 2 the reaction, 3 the held control nodes. Arrows are 1 cm per newton.
     A marker with nothing to show is deleted.
     """
-    types = types or ros_types()
+    types, r = ros_types(), _MARKER_RADIUS
     point = lambda p: types.Point(x=float(p[0]), y=float(p[1]), z=float(p[2]))  # noqa: E731
     markers = []
 
     def add(tool: ToolDisplay, kind: int, points: list, size: tuple, color: tuple, visible: bool) -> None:
-        position = tool.tip if kind == _SPHERE else np.zeros(3)
-        orientation = types.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
         marker = types.Marker(
             header=make_header(types, stamp_ns, frame_id),
             ns=tool.arm,
             id=len(markers) % 4,
             type=kind,
             action=_ADD if visible else _DELETE,
-            pose=types.Pose(position=point(position), orientation=orientation),
+            pose=types.Pose(position=point(tool.tip if kind == _SPHERE else np.zeros(3))),
             scale=types.Vector3(**dict(zip("xyz", size))),
             color=types.ColorRGBA(**dict(zip("rgba", color))),
-            lifetime=types.Duration(sec=0, nanosec=0),
-            frame_locked=False,
             points=[point(p) for p in points],
-            colors=[],
-            texture_resource="",
-            texture=types.CompressedImage(header=make_header(types, 0, ""), format="", data=types.sequence(np.zeros(0, np.uint8))),
-            uv_coordinates=[],
-            text="",
-            mesh_resource="",
-            mesh_file=types.MeshFile(filename="", data=types.sequence(np.zeros(0, np.uint8))),
-            mesh_use_embedded_materials=False,
         )
         markers.append(marker)
 
-    r = _MARKER_RADIUS
     for tool in tools:
         add(tool, _SPHERE, [], (2 * r, 2 * r, 2 * r), (0.9, 0.9, 0.9, 1.0), True)
         for vector, color in ((tool.force, (1.0, 0.55, 0.1, 1.0)), (tool.reaction, (0.2, 0.6, 1.0, 1.0))):

@@ -1,5 +1,6 @@
 """Topics of the contract: name, type and quality of service of each, as in msg_conventions.md."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 from endo_sim_ros.messages.types import crtk_type
@@ -37,59 +38,33 @@ DIAGNOSTICS = Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
 CLOCK = Topic("/clock", "rosgraph_msgs/msg/Clock")
 
 
-def tool_pose(arm: str) -> Topic:
-    """Measured pose of an arm's tip."""
-    return Topic(f"{arm}/measured_cp", "geometry_msgs/msg/PoseStamped")
+def _of_arm(name: str, kind: str) -> Callable[[str], Topic]:
+    """Function from the name of an arm to its topic."""
+    return lambda arm: Topic(f"{arm}/{name}", kind)
 
 
-def tool_pose_command(arm: str) -> Topic:
-    """Commanded pose of an arm's tip, reached at once."""
-    return Topic(f"{arm}/servo_cp", "geometry_msgs/msg/PoseStamped")
-
-
-def tool_move(arm: str) -> Topic:
-    """Goal to which an arm's tip moves."""
-    return Topic(f"{arm}/move_cp", "geometry_msgs/msg/PoseStamped")
-
-
-def tool_setpoint(arm: str) -> Topic:
-    """Current setpoint of an arm's tip."""
-    return Topic(f"{arm}/setpoint_cp", "geometry_msgs/msg/PoseStamped")
-
-
-def tool_wrench(arm: str) -> Topic:
-    """Commanded wrench, tool on tissue."""
-    return Topic(f"{arm}/body/servo_cf", "geometry_msgs/msg/WrenchStamped")
-
-
-def tool_reaction(arm: str) -> Topic:
-    """Measured wrench, tissue on tool."""
-    return Topic(f"{arm}/body/measured_cf", "geometry_msgs/msg/WrenchStamped")
-
-
-def tool_jaw(arm: str) -> Topic:
-    """Commanded angle of an arm's jaw, reached at once."""
-    return Topic(f"{arm}/jaw/servo_jp", "sensor_msgs/msg/JointState")
-
-
-def tool_jaw_move(arm: str) -> Topic:
-    """Goal to which an arm's jaw moves."""
-    return Topic(f"{arm}/jaw/move_jp", "sensor_msgs/msg/JointState")
-
-
-def tool_jaw_state(arm: str) -> Topic:
-    """Measured angle of an arm's jaw."""
-    return Topic(f"{arm}/jaw/measured_js", "sensor_msgs/msg/JointState")
-
-
-def tool_jaw_setpoint(arm: str) -> Topic:
-    """Current setpoint of an arm's jaw."""
-    return Topic(f"{arm}/jaw/setpoint_js", "sensor_msgs/msg/JointState")
-
-
-def tool_cut(arm: str) -> Topic:
-    """Whether an arm's edge cuts."""
-    return Topic(f"{arm}/cut", "sensor_msgs/msg/Joy")
+tool_pose = _of_arm("measured_cp", "geometry_msgs/msg/PoseStamped")
+"""Measured pose of an arm's tip."""
+tool_pose_command = _of_arm("servo_cp", "geometry_msgs/msg/PoseStamped")
+"""Commanded pose of an arm's tip, reached at once."""
+tool_move = _of_arm("move_cp", "geometry_msgs/msg/PoseStamped")
+"""Goal to which an arm's tip moves."""
+tool_setpoint = _of_arm("setpoint_cp", "geometry_msgs/msg/PoseStamped")
+"""Current setpoint of an arm's tip."""
+tool_wrench = _of_arm("body/servo_cf", "geometry_msgs/msg/WrenchStamped")
+"""Commanded wrench, tool on tissue."""
+tool_reaction = _of_arm("body/measured_cf", "geometry_msgs/msg/WrenchStamped")
+"""Measured wrench, tissue on tool."""
+tool_jaw = _of_arm("jaw/servo_jp", "sensor_msgs/msg/JointState")
+"""Commanded angle of an arm's jaw, reached at once."""
+tool_jaw_move = _of_arm("jaw/move_jp", "sensor_msgs/msg/JointState")
+"""Goal to which an arm's jaw moves."""
+tool_jaw_state = _of_arm("jaw/measured_js", "sensor_msgs/msg/JointState")
+"""Measured angle of an arm's jaw."""
+tool_jaw_setpoint = _of_arm("jaw/setpoint_js", "sensor_msgs/msg/JointState")
+"""Current setpoint of an arm's jaw."""
+tool_cut = _of_arm("cut", "sensor_msgs/msg/Joy")
+"""Whether an arm's edge cuts."""
 
 
 def tool_state(arm: str) -> Topic:

@@ -1,6 +1,6 @@
-"""Message classes to build: those of a ROS installation, or those of the rosbags library for bag files.
+"""What encoders and decoders share: the classes of messages, of a ROS installation or of the rosbags library, and their error.
 
-Encoders take them as ``types``. Byte fields are filled through ``sequence``, so that images and clouds cross at memcpy speed.
+Encoders take the classes as ``types``. Byte fields are filled through ``sequence``, so that images and clouds cross at memcpy speed.
 """
 
 import array
@@ -11,21 +11,22 @@ from typing import Any
 
 import numpy as np
 
-from endo_sim_ros.messages.errors import MessageError
+
+class MessageError(ValueError):
+    """A message that cannot be used. The sentence names the topic, the field and what to do."""
+
 
 Message = Any  # an instance of a message class, of ROS or of rosbags: both have the same fields
 
 MESSAGE_PACKAGES = {
-    "builtin_interfaces": ("Time", "Duration"),
+    "builtin_interfaces": ("Time",),
     "rosgraph_msgs": ("Clock",),
     "std_msgs": ("Header", "ColorRGBA"),
-    "geometry_msgs": (
-        "Point", "Quaternion", "Pose", "PoseStamped", "PoseArray", "Vector3", "Wrench", "WrenchStamped",
-    ),
+    "geometry_msgs": ("Point", "Quaternion", "Pose", "PoseStamped", "PoseArray", "Vector3", "Wrench", "WrenchStamped"),
     "sensor_msgs": ("Image", "CompressedImage", "CameraInfo", "RegionOfInterest", "PointCloud2", "PointField", "JointState", "Joy"),
-    "visualization_msgs": ("Marker", "MarkerArray", "UVCoordinate", "MeshFile"),
+    "visualization_msgs": ("Marker", "MarkerArray"),
     "diagnostic_msgs": ("DiagnosticArray", "DiagnosticStatus", "KeyValue"),
-}  # fmt: skip
+}
 _FULL_NAMES = {name: f"{package}/msg/{name}" for package, names in MESSAGE_PACKAGES.items() for name in names}
 _TYPECODES = {"uint8": "B", "int32": "i", "float32": "f", "float64": "d"}  # of array.array
 
@@ -48,7 +49,7 @@ class RosTypes:
 class BagTypes:
     """Message classes of the rosbags library, by short name; ``typestore`` serialises them."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         from rosbags.typesys import Stores, get_typestore
 
         self.typestore = get_typestore(Stores.ROS2_JAZZY)

@@ -1,0 +1,1 @@
+"""The ROS nodes, a file each: topics and parameters in, library calls, topics and /diagnostics out."""

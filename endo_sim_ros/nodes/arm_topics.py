@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from endo_sim_ros import messages
-from endo_sim_ros.messages import MessageError, Topic
+from endo_sim_ros.messages import Topic
 from endo_sim_ros.nodes.arm import Arm
 from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode
 from endo_sim_ros.nodes.configs import PhysicsNodeConfig
@@ -27,110 +27,99 @@ class ArmTopics:
             topic, and a function that lets the part act on the arm; decides when that is called.
     """
 
-    def __init__(self, node: EndoNode, arms: dict[str, Arm], options: PhysicsNodeConfig, depth: int, deliver: Deliver):
+    def __init__(self, node: EndoNode, arms: dict[str, Arm], options: PhysicsNodeConfig, depth: int, deliver: Deliver) -> None:
         self.options = options
         self._node, self._arms, self._deliver = node, arms, deliver
         commanded = options.arm_source == "commanded"
-        self._pose_topic: Callable[[str], Topic] = messages.tool_pose_command if commanded else messages.tool_pose
+        self._pose_topic = messages.tool_pose_command if commanded else messages.tool_pose
         self._reactions = {name: node.publisher(messages.tool_reaction(name)) for name in arms}
         shown = messages.tool_pose, messages.tool_setpoint, messages.tool_jaw_state, messages.tool_jaw_setpoint, messages.tool_state
         self._publishers = {name: [node.publisher(topic(name)) for topic in shown] for name in arms if commanded}
         self._told: dict[str, tuple[str, bool, bool]] = {}  # what was last said on operating_state
-        for name in arms:
-            node.subscribe(self._pose_topic(name), partial(self._on_pose, name), depth)
-            node.subscribe(messages.tool_wrench(name), partial(self._on_wrench, name), depth)
-            several = max(depth, STREAM_DEPTH)  # some come once
-            node.subscribe(messages.tool_jaw(name), partial(self._on_jaw, name), several)
-            node.subscribe(messages.tool_jaw_move(name), partial(self._on_jaw_move, name), several)
-            node.subscribe(messages.tool_cut(name), partial(self._on_cut, name), several)
+        several = max(depth, STREAM_DEPTH)  # for what comes once
+        for arm in arms.values():
+            self._hear(arm, self._pose_topic, self._on_pose, depth)
+            self._hear(arm, messages.tool_wrench, self._on_wrench, depth)
+            self._hear(arm, messages.tool_jaw, self._on_jaw, several)
+            self._hear(arm, messages.tool_jaw_move, self._on_jaw_move, several)
+            self._hear(arm, messages.tool_cut, self._on_cut, several)
             if commanded:
-                node.subscribe(messages.tool_move(name), partial(self._on_move, name), several)
-                node.subscribe(messages.tool_state_command(name), partial(self._on_state_command, name))
+                self._hear(arm, messages.tool_move, self._on_move, several)
+                self._hear(arm, messages.tool_state_command, self._on_state_command, STREAM_DEPTH)
         self.publish_operating_states()
 
     # ---------------------------------------------------------------- commands
 
-    def _decode_tip(self, name: str, message: Any, topic: str) -> np.ndarray:
-        """Pose [4, 4] of a tool tip in the world."""
-        frames = self.options.frame_poses
-        unnamed = frames.get(f"{name}_base", np.eye(4))  # clients of CRTK leave the frame empty
-        return messages.decode_pose(message, frames | {"": unnamed}, topic)
+    def _hear(self, arm: Arm, topic_of: Callable[[str], Topic], callback: Callable[[Arm, str, Any], None], depth: int) -> None:
+        """Call back with the arm, the topic's name and each message; a ValueError is reported under that name."""
+        topic = topic_of(arm.name)
+        self._node.subscribe(topic, partial(callback, arm, topic.name), depth)
 
-    def _on_pose(self, name: str, message: Any) -> None:
-        arm, topic = self._arms[name], self._pose_topic(name).name
-        pose = self._decode_tip(name, message, topic)
+    def _on_pose(self, arm: Arm, topic: str, message: Any) -> None:
+        pose = messages.decode_tip(message, self.options.frame_poses, arm.name, topic)
 
         def act() -> None:
-            _require_enabled(arm, topic)
+            arm.require_enabled()
             arm.pose, arm.pose_goal = pose, None
             self.publish_operating_states()
 
-        self._deliver(name, "pose", message, topic, act)
+        self._deliver(arm.name, "pose", message, topic, act)
 
-    def _on_move(self, name: str, message: Any) -> None:
-        arm, topic = self._arms[name], messages.tool_move(name).name
-        goal = self._decode_tip(name, message, topic)
-        _require_enabled(arm, topic)
+    def _on_move(self, arm: Arm, topic: str, message: Any) -> None:
+        goal = messages.decode_tip(message, self.options.frame_poses, arm.name, topic)
+        arm.require_enabled()
         arm.pose_goal = goal
-        self.publish_operating_states(name)
+        self.publish_operating_states(arm.name)
 
-    def _on_wrench(self, name: str, message: Any) -> None:
-        topic, arm = messages.tool_wrench(name).name, self._arms[name]
+    def _on_wrench(self, arm: Arm, topic: str, message: Any) -> None:
         force, torque = messages.decode_wrench(message, topic)
         frames = self.options.frame_poses
-        frame = messages.check_frame(message, ("", name, *frames), topic)
+        frame = messages.check_frame(message, ("", arm.name, *frames), topic)
 
         def act() -> None:
-            pose = self._require_pose(name, topic, "wrench")
+            pose = self._require_pose(arm, "wrench")
             R = frames.get(frame, pose)[:3, :3]  # any other is the tool's own
             arm.force, arm.torque, arm.heard = R @ force, R @ torque, self._node.now_ns() * 1e-9
 
-        self._deliver(name, "wrench", message, topic, act)
+        self._deliver(arm.name, "wrench", message, topic, act)
 
-    def _on_jaw(self, name: str, message: Any) -> None:
-        topic, arm = messages.tool_jaw(name).name, self._arms[name]
+    def _on_jaw(self, arm: Arm, topic: str, message: Any) -> None:
         angle = messages.decode_jaw(message, topic)
 
         def act() -> None:
-            self._require_pose(name, topic, "jaw command")
+            self._require_pose(arm, "jaw command")
             arm.angle, arm.angle_goal = angle, None
             arm.hold(self.options.jaw_closed, self.options.jaw_open)
             self.publish_operating_states()
 
-        self._deliver(name, "jaw", message, topic, act)
+        self._deliver(arm.name, "jaw", message, topic, act)
 
-    def _on_jaw_move(self, name: str, message: Any) -> None:
-        arm, topic = self._arms[name], messages.tool_jaw_move(name).name
+    def _on_jaw_move(self, arm: Arm, topic: str, message: Any) -> None:
         goal = messages.decode_jaw(message, topic)
-        self._require_pose(name, topic, "jaw command")
+        self._require_pose(arm, "jaw command")
         arm.angle_goal = goal
-        self.publish_operating_states(name)
+        self.publish_operating_states(arm.name)
 
-    def _on_cut(self, name: str, message: Any) -> None:
-        topic, arm = messages.tool_cut(name).name, self._arms[name]
+    def _on_cut(self, arm: Arm, topic: str, message: Any) -> None:
         cutting = messages.decode_cut(message, topic)
 
         def act() -> None:
-            self._require_pose(name, topic, "cut")
+            self._require_pose(arm, "cut")
             arm.cutting = cutting
 
-        self._deliver(name, "cut", message, topic, act)
+        self._deliver(arm.name, "cut", message, topic, act)
 
-    def _on_state_command(self, name: str, message: Any) -> None:
+    def _on_state_command(self, arm: Arm, topic: str, message: Any) -> None:
         try:
-            self._arms[name].command_state(messages.decode_state_command(message))
-        except ValueError as error:
-            raise MessageError(f"{messages.tool_state_command(name).name}: {error}") from error
+            arm.command_state(messages.decode_state_command(message))
         finally:
-            self.publish_operating_states(name)
+            self.publish_operating_states(arm.name)
 
-    def _require_pose(self, name: str, topic: str, what: str) -> np.ndarray:
-        """The pose of an arm that may move; MessageError if it has none or may not."""
-        arm = self._arms[name]
-        _require_enabled(arm, topic)
+    def _require_pose(self, arm: Arm, what: str) -> np.ndarray:
+        """The pose of an arm that may move; ValueError if it has none or may not."""
+        arm.require_enabled()
         if arm.pose is None:
-            pose_topic = self._pose_topic(name).name
-            raise MessageError(f"{topic}: a {what} came before any pose on {pose_topic}; publish the tip's pose")
+            raise ValueError(f"a {what} came before any pose on {self._pose_topic(arm.name).name}; publish the tip's pose")
         return arm.pose
 
     # ------------------------------------------------------------------ states
@@ -167,10 +156,3 @@ class ArmTopics:
                 publisher.publish(messages.encode_pose(pose, stamp, self.options.world_frame))
             for publisher in (jaw_state, jaw_setpoint):
                 publisher.publish(messages.encode_jaw(arm.angle, stamp))
-
-
-def _require_enabled(arm: Arm, topic: str) -> None:
-    try:
-        arm.require_enabled()
-    except ValueError as error:
-        raise MessageError(f"{topic}: {error}") from error

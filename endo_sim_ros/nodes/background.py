@@ -11,7 +11,7 @@ class Background:
     A wish is known by its key: anything that compares equal only for equal wishes.
     """
 
-    def __init__(self):
+    def __init__(self) -> None:
         self._executor = ThreadPoolExecutor(1)
         self._key: Any = None
         self._future: Future | None = None

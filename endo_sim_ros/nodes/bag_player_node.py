@@ -9,8 +9,8 @@ from rclpy.duration import Duration
 from rclpy.utilities import try_shutdown
 
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.messages import DIAGNOSTICS, STATE, BagPlayerState, MessageError, Topic
-from endo_sim_ros.nodes.base import ERROR, OK, EndoNode, run, sentence
+from endo_sim_ros.messages import DIAGNOSTICS, ERROR, OK, STATE, BagPlayerState, MessageError, Topic
+from endo_sim_ros.nodes.base import EndoNode, run, sentence
 from endo_sim_ros.nodes.configs import BagPlayerConfig
 from endo_sim_ros.sequences.bag import BagReader
 
@@ -29,7 +29,7 @@ class BagPlayerNode(EndoNode):
 
     read_at_start = frozenset({"bag", "wait_for_subscribers"})
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__("bag_player")
         self._config = self.declare(BagPlayerConfig)
         self._sent, self._total = 0, 0
@@ -133,10 +133,5 @@ class BagPlayerNode(EndoNode):
             self._sent += 1
 
 
-def main() -> int:
-    """Run the node until it is told to stop, and return the exit status of the process."""
-    return run(BagPlayerNode)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run(BagPlayerNode))

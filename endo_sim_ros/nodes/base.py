@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import rclpy
@@ -17,7 +17,9 @@ from rclpy.clock_type import ClockType
 from rclpy.context import Context
 from rclpy.exceptions import NameValidationException
 from rclpy.executors import ExternalShutdownException
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.timer import Timer
 from rclpy.utilities import ok, try_shutdown
 
 from endo_sim_ros import hear_interrupts, messages
@@ -39,7 +41,7 @@ STREAM_DEPTH = 20
 class EndoNode(ConfiguredNode):
     """A ROS node that survives errors in its callbacks: each becomes one sentence on /diagnostics."""
 
-    def __init__(self, name: str, context: Context | None = None):
+    def __init__(self, name: str, context: Context | None = None) -> None:
         super().__init__(name, context)
         torch.set_num_threads(1)  # the kernels bring their own threads
         self._diagnostics = self.publisher(messages.DIAGNOSTICS)
@@ -47,13 +49,13 @@ class EndoNode(ConfiguredNode):
         self._logged: dict[str, float] = {}
         self.every(1.0, self.publish_diagnostics)
 
-    def every(self, seconds: float, callback: Callable[[], None]) -> Any:
+    def every(self, seconds: float, callback: Callable[[], None]) -> Timer:
         """A timer of wall time, which also runs while a simulated clock stands still."""
         return self.create_timer(seconds, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     # ----------------------------------------------------------------- topics
 
-    def publisher(self, topic: Topic, depth: int = STREAM_DEPTH) -> Any:
+    def publisher(self, topic: Topic, depth: int = STREAM_DEPTH) -> Publisher:
         """A publisher of a topic.
 
         Args:
@@ -66,7 +68,7 @@ class EndoNode(ConfiguredNode):
         return self.create_publisher(messages.ros_class(topic.type), topic.name, quality(topic, depth))
 
     def subscribe(self, topic: Topic, callback: Callable[[Any], None], depth: int = STREAM_DEPTH, reliable: bool = True) -> None:
-        """Subscribe with a callback whose errors are reported instead of raised.
+        """Subscribe with a callback whose errors are reported, with the name of the topic, instead of raised.
 
         Args:
             topic: The topic.
@@ -100,9 +102,16 @@ class EndoNode(ConfiguredNode):
 
     # ------------------------------------------------------------ diagnostics
 
-    def guard(self, where: str) -> "_Guard":
-        """Context that reports what its block raises; the node lives on."""
-        return _Guard(self, where)
+    @contextlib.contextmanager
+    def guard(self, where: str) -> Iterator[None]:
+        """Context that reports what its block raises, and where if the error does not say so; the node lives on."""
+        try:
+            yield
+        except ExternalShutdownException:
+            raise
+        except Exception as error:
+            if self.context.ok():  # what fails because the node is being shut down is no error
+                self.report_error(sentence(where, error))
 
     def report_error(self, text: str) -> None:
         """Show an error on /diagnostics for a while, beginning now; repetitions are only counted."""
@@ -140,21 +149,6 @@ class EndoNode(ConfiguredNode):
         except Exception:
             if self.context.ok():  # otherwise a worker came to its end after the node
                 raise
-
-
-class _Guard:
-    def __init__(self, node: EndoNode, where: str):
-        self._node, self._where = node, where
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: type | None, error: BaseException | None, _: Any) -> bool:
-        if error is None or not isinstance(error, Exception) or isinstance(error, ExternalShutdownException):
-            return False
-        if self._node.context.ok():  # what fails because the node is being shut down is no error
-            self._node.report_error(sentence(self._where, error))
-        return True
 
 
 def quality(topic: Topic, depth: int = STREAM_DEPTH, reliable: bool = True) -> QoSProfile:
@@ -206,6 +200,3 @@ def run(node_class: Callable[[], EndoNode]) -> int:
 
 def _one_line(error: Exception) -> str:
     return " ".join(str(error).split())
-
-
-__all__ = ["ERROR", "OK", "WARN", "EndoNode", "run", "sentence"]

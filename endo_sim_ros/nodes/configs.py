@@ -32,7 +32,7 @@ class WorldConfig(StageConfig):
     """Other frames of camera and tool poses, such as the bases of robot arms: the name and the pose in the world of each,
     'PSM1_base x y z qx qy qz qw', metres."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         super().__post_init__()
         try:
             parse_frames(self.world_frame, self.frames)
@@ -108,7 +108,7 @@ class PhysicsNodeConfig(WorldConfig):
     jaw_open: Annotated[float, Range(-3.2, 3.2, "rad")] = 0.2
     """A jaw at or above this angle releases; between the two angles nothing changes."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         super().__post_init__()
         if self.jaw_closed >= self.jaw_open:
             raise ConfigError(f"jaw_closed, {self.jaw_closed:g} rad, must be less than jaw_open, {self.jaw_open:g} rad")

@@ -45,7 +45,7 @@ class ModelTracker:
         bound: The newest bound model, or None.
     """
 
-    def __init__(self, kept_cuts: int = STREAM_DEPTH):
+    def __init__(self, kept_cuts: int = STREAM_DEPTH) -> None:
         self.model: GaussianModel | None = None
         self.model_stamp = 0
         self.bound: BoundModel | None = None

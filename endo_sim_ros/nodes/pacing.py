@@ -14,7 +14,7 @@ class Pacer:
     period was over, all those after it would have had to wait as well.
     """
 
-    def __init__(self):
+    def __init__(self) -> None:
         self._due: float | None = None
         self._inputs: dict[Hashable, tuple[float, float]] = {}  # times of the last two of each source
         self._fresh: set[Hashable] = set()  # sources whose last input was not used yet
@@ -72,7 +72,7 @@ class CommandQueue(Generic[Part]):
         needed: The parts of a command.
     """
 
-    def __init__(self, needed: frozenset[Part]):
+    def __init__(self, needed: frozenset[Part]) -> None:
         self.needed = needed
         self.last_stamp = 0  # ns, of the last command taken
         self._waiting: dict[int, dict[Part, Any]] = {}

@@ -32,7 +32,7 @@ class ConfiguredNode(Node):
     read_at_start: frozenset[str] = frozenset()
     """Parameters that act at start only; all others act when they are set."""
 
-    def __init__(self, name: str, context: Context | None = None):
+    def __init__(self, name: str, context: Context | None = None) -> None:
         super().__init__(name, context=context)
         self._configs: dict[type[StageConfig], StageConfig] = {}
         self._given = set(given_parameters(self))  # parameters that somebody gave a value
@@ -143,7 +143,7 @@ class ConfiguredNode(Node):
 class _NotDeclared(ParameterNotDeclaredException):
     """A parameter that does not exist; rclpy tells the text to whoever wanted to set it."""
 
-    def __init__(self, text: str):
+    def __init__(self, text: str) -> None:
         Exception.__init__(self, text)
 
 

@@ -8,10 +8,10 @@ import numpy as np
 from std_srvs.srv import SetBool, Trigger
 
 from endo_sim_ros import messages
-from endo_sim_ros.messages import STATE, ControlNodeCloud, MessageError, PhysicsState
+from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ControlNodeCloud, PhysicsState
 from endo_sim_ros.nodes.arm import Arm
 from endo_sim_ros.nodes.arm_topics import ArmTopics
-from endo_sim_ros.nodes.base import ERROR, OK, STREAM_DEPTH, WARN, EndoNode, run, sentence
+from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode, run, sentence
 from endo_sim_ros.nodes.configs import COMMAND_PARTS, PhysicsNodeConfig, arm_names
 from endo_sim_ros.nodes.pacing import MOST_WAITING, CommandQueue, Pacer
 from endo_sim_ros.nodes.tissue_builder import TissueBuilder
@@ -29,7 +29,7 @@ class PhysicsNode(EndoNode):
 
     read_at_start = frozenset({"arms", "arm_source", "mode", "lockstep_inputs"})
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__("physics_node")
         self._options = self.declare(PhysicsNodeConfig)
         self._config = self.declare(PhysicsConfig)
@@ -102,11 +102,8 @@ class PhysicsNode(EndoNode):
         if self._lockstep and kind in self._options.lockstep_inputs:
             stamp = messages.stamp_to_ns(message.header.stamp)
             if stamp <= 0:
-                raise MessageError(f"{topic}: a stamp of zero; in lockstep all parts of a command bear its stamp")
-            try:
-                self._commands.put(stamp, (name, kind), act)
-            except ValueError as error:
-                raise MessageError(f"{topic}: {error}") from error
+                raise ValueError("a stamp of zero; in lockstep all parts of a command bear its stamp")
+            self._commands.put(stamp, (name, kind), (topic, act))
             self._run_commands()
             return
         act()
@@ -124,8 +121,9 @@ class PhysicsNode(EndoNode):
         while self._simulation is not None and (command := self._commands.take(give_up)):
             stamp, parts = command
             for part in sorted(parts, key=lambda part: (COMMAND_PARTS.index(part[1]), part[0])):  # poses before what needs them
-                with self.guard("command"):
-                    parts[part]()
+                topic, act = parts[part]
+                with self.guard(topic):
+                    act()
             self._step(self._simulation)
             self._publish(self._simulation, stamp)
 
@@ -331,10 +329,5 @@ def _poll(config: PhysicsConfig) -> float:
     return min(config.step_duration / _POLLS, _LONGEST_POLL)
 
 
-def main() -> int:
-    """Run the node until it is told to stop, and return the exit status of the process."""
-    return run(PhysicsNode)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run(PhysicsNode))

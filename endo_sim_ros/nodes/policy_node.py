@@ -12,8 +12,8 @@ from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.learning.policies import make_policy
 from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.learning.tasks import find_task, make_task
-from endo_sim_ros.messages import STATE, PolicyState
-from endo_sim_ros.nodes.base import OK, WARN, EndoNode, run
+from endo_sim_ros.messages import OK, STATE, WARN, PolicyState
+from endo_sim_ros.nodes.base import EndoNode, run
 from endo_sim_ros.nodes.configs import PolicyConfig, arm_names
 
 _OPEN, _CLOSED = 1.0, 0.0  # rad
@@ -25,7 +25,7 @@ class PolicyNode(EndoNode):
 
     read_at_start = frozenset(PolicyConfig.__dataclass_fields__)
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__("policy")
         self._config = config = self.declare(PolicyConfig)
         (arm,) = arm_names([config.arm])
@@ -158,10 +158,5 @@ class PolicyNode(EndoNode):
         return (WARN if self._state is PolicyState.WAITING else OK), text + solved, values
 
 
-def main() -> int:
-    """Run the node until it is told to stop, and return the exit status of the process."""
-    return run(PolicyNode)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run(PolicyNode))

@@ -16,8 +16,8 @@ from endo_sim_ros.core.cameras import Camera, load_cameras, save_cameras
 from endo_sim_ros.core.config import option_values
 from endo_sim_ros.core.frames import LEFT_FRAME, Frame, SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel, load_ply, save_ply
-from endo_sim_ros.messages import STATE, ReconstructionState, Topic
-from endo_sim_ros.nodes.base import ERROR, OK, WARN, EndoNode, run, sentence
+from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ReconstructionState, Topic
+from endo_sim_ros.nodes.base import EndoNode, run, sentence
 from endo_sim_ros.nodes.configs import ReconstructionNodeConfig
 from endo_sim_ros.reconstruction import (
     PRESETS,
@@ -34,11 +34,9 @@ from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.sequences.bag import feed
 from endo_sim_ros.sequences.synchronizer import Synchronizer
 
-_LEFT_IMAGES = (messages.LEFT_IMAGE, messages.LEFT_COMPRESSED)
 # Seconds by which stamps must jump to mean that another recording began; after a pause any step back means it.
 _JUMP_BACK, _JUMP_AHEAD, _PAUSE = 1.0, 60.0, 1.0
-
-_LATEST, _CAMERAS = "latest", "cameras.json"
+_CAMERAS = "cameras.json"
 
 
 class ReconstructionNode(EndoNode):
@@ -46,7 +44,7 @@ class ReconstructionNode(EndoNode):
 
     read_at_start = frozenset({"reliable"})
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__("reconstruction_node")
         self._options = self.declare(ReconstructionNodeConfig)
         self._config = self.declare(ReconstructionConfig, option_values(preset(self._options.preset)))
@@ -96,7 +94,7 @@ class ReconstructionNode(EndoNode):
     # ------------------------------------------------------------------ views
 
     def _on_recording(self, topic: Topic, message: Any) -> None:
-        if topic in _LEFT_IMAGES:
+        if topic in (messages.LEFT_IMAGE, messages.LEFT_COMPRESSED):
             self._note_image(messages.stamp_to_ns(message.header.stamp))
         self._add_views(feed(self._synchronizer, topic, message, self._options.frame_poses))
 
@@ -239,7 +237,7 @@ class ReconstructionNode(EndoNode):
         if not name:
             return
         path = Path(name).expanduser()
-        if name == _LATEST:
+        if name == "latest":
             folder = Path(self._options.output_dir).expanduser()
             path = max(folder.glob("*/model.ply"), default=None)
             if path is None:
@@ -328,10 +326,5 @@ class ReconstructionNode(EndoNode):
         super().destroy_node()
 
 
-def main() -> int:
-    """Run the node until it is told to stop, and return the exit status of the process."""
-    return run(ReconstructionNode)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run(ReconstructionNode))

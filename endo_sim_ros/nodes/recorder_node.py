@@ -5,6 +5,7 @@ import queue
 import signal
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,8 @@ from rich.text import Text
 from endo_sim_ros import messages
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.messages import STATE, RecorderState, Topic
-from endo_sim_ros.nodes.base import ERROR, OK, EndoNode, quality, run, sentence
+from endo_sim_ros.messages import ERROR, OK, STATE, RecorderState, Topic
+from endo_sim_ros.nodes.base import EndoNode, quality, run, sentence
 from endo_sim_ros.nodes.configs import ALL_TOPICS, RecorderConfig, arm_names
 from endo_sim_ros.nodes.transport import prepare_transport
 from endo_sim_ros.sequences.bag import BagWriter, canonical_cdr
@@ -32,7 +33,7 @@ class RecorderNode(EndoNode):
 
     read_at_start = frozenset({"bag", "arms", "topics", "canonical"})
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__("recorder")
         self._config = self.declare(RecorderConfig)
         topics = _chosen(self._config.topics, arm_names(self._config.arms))
@@ -47,7 +48,7 @@ class RecorderNode(EndoNode):
             kind = messages.ros_class(topic.type)
             self.create_subscription(kind, topic.name, self._recorder(topic), quality(topic, 100), raw=True)
 
-    def _recorder(self, topic: Topic):
+    def _recorder(self, topic: Topic) -> Callable[[bytes], None]:
         # By the name in the contract, whatever the namespace: so it is replayed into any, and exported.
         absolute = topic._replace(name="/" + topic.name.lstrip("/"))
 
@@ -165,10 +166,5 @@ def record(bag: Path, arms: tuple[str, ...], topics: tuple[str, ...], namespace:
         print(node.summary)
 
 
-def main() -> int:
-    """Run the node until it is told to stop, and return the exit status of the process."""
-    return run(RecorderNode)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run(RecorderNode))

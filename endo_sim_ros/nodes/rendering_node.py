@@ -9,8 +9,8 @@ import numpy as np
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.messages import STATE, CameraInfo, ControlNodeCloud, MessageError, RenderingState
-from endo_sim_ros.nodes.base import ERROR, OK, STREAM_DEPTH, WARN, EndoNode, run, sentence
+from endo_sim_ros.messages import ERROR, OK, STATE, WARN, CameraInfo, ControlNodeCloud, MessageError, RenderingState
+from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode, run, sentence
 from endo_sim_ros.nodes.configs import RenderingNodeConfig
 from endo_sim_ros.nodes.model_tracker import BoundModel, ModelTracker
 from endo_sim_ros.nodes.pacing import MOST_WAITING, Pacer
@@ -25,7 +25,7 @@ class RenderingNode(EndoNode):
 
     read_at_start = frozenset({"mode", "lockstep_camera"})
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__("rendering_node")
         self._options = self.declare(RenderingNodeConfig)
         self._config = self.declare(RenderingConfig)
@@ -131,9 +131,8 @@ class RenderingNode(EndoNode):
 
     def _on_info(self, message: Any) -> None:
         info, old = _decode_info(message, messages.LEFT_INFO.name), self._info
-        same = old is not None and np.array_equal(info.P, old.P) and (info.width, info.height) == (old.width, old.height)
         self._info = info
-        if not same:
+        if old is None or not info.same_as(old):
             self._change()
 
     def _camera(self) -> Camera | None:
@@ -307,10 +306,5 @@ def _decode_info(message: Any, topic: str) -> CameraInfo:
     return info
 
 
-def main() -> int:
-    """Run the node until it is told to stop, and return the exit status of the process."""
-    return run(RenderingNode)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run(RenderingNode))

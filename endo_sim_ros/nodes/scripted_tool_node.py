@@ -6,8 +6,8 @@ import numpy as np
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera, invert_pose
-from endo_sim_ros.messages import STATE, ControlNodeCloud, ScriptedToolState
-from endo_sim_ros.nodes.base import OK, WARN, EndoNode, run
+from endo_sim_ros.messages import OK, STATE, WARN, ControlNodeCloud, ScriptedToolState
+from endo_sim_ros.nodes.base import EndoNode, run
 from endo_sim_ros.nodes.configs import ScriptedToolConfig, arm_names
 
 _FOLLOWED = 8  # nodes around the grasped point whose movement carries the tip
@@ -18,7 +18,7 @@ class ScriptedToolNode(EndoNode):
 
     read_at_start = frozenset({"arm", "rate"})
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__("scripted_tool")
         self._config = config = self.declare(ScriptedToolConfig)
         (arm,) = arm_names([config.arm])
@@ -132,10 +132,5 @@ class ScriptedToolNode(EndoNode):
         return OK, "finished" if self._state is ScriptedToolState.DONE else str(self._state), values
 
 
-def main() -> int:
-    """Run the node until it is told to stop, and return the exit status of the process."""
-    return run(ScriptedToolNode)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run(ScriptedToolNode))

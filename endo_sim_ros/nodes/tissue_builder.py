@@ -23,12 +23,11 @@ class TissueBuilder:
         model: The newest model, or None.
     """
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.model: GaussianModel | None = None
         self._model_stamp, self._model_number, self._model_came = 0, 0, 0.0  # ns; in order of arrival; when it arrived, seconds
-        self._views: np.ndarray | None = None  # poses [V, 4, 4] of the newest training cameras that were any
-        self._views_stamp: int | None = None  # stamp of the newest training_cameras, and whether there were any:
-        self._views_given = False
+        self._views: tuple[int | None, np.ndarray] = None, np.zeros((0, 4, 4))  # stamp and poses of the newest training_cameras
+        self._earlier_views: np.ndarray | None = None  # the newest poses [V, 4, 4] that were any
         self._view_info: tuple[int, messages.CameraInfo] | None = None  # stamp and intrinsics of the newest training cameras
         self._camera_position: np.ndarray | None = None  # [3] m, world
         self._background = Background()
@@ -57,9 +56,9 @@ class TissueBuilder:
         """
         messages.check_frame(message, (world_frame,), messages.TRAINING_CAMERAS.name)
         poses = messages.decode_poses(message)
-        self._views_stamp, self._views_given = messages.stamp_to_ns(message.header.stamp), len(poses) > 0
-        if self._views_given:
-            self._views = poses
+        self._views = messages.stamp_to_ns(message.header.stamp), poses
+        if len(poses):
+            self._earlier_views = poses
 
     def receive_training_info(self, message: Any) -> None:
         """Decode and keep a message of the topic training_camera_info.
@@ -103,24 +102,23 @@ class TissueBuilder:
     def _viewpoint(self) -> tuple[str, np.ndarray | None]:
         """Whose position the tissue was seen from, and that position or positions [V, 3], m, world, or None as long as it
         may still arrive: the model's own cameras, else the camera now, else the cameras of an earlier model."""
-        own = self._views_stamp == self._model_stamp
-        whole = own and (not self._views_given or self._own_cameras())
+        stamp, poses = self._views
+        own = stamp == self._model_stamp
+        whole = own and (not len(poses) or self._own_cameras())
         if not whole and time.monotonic() - self._model_came < _CAMERAS_LATE:
             return "", None
-        if own and self._views_given and self._views is not None:
-            return "own cameras", self._views[:, :3, 3]
+        if own and len(poses):
+            return "own cameras", poses[:, :3, 3]
         if self._camera_position is not None:
             return "camera", self._camera_position
-        return "earlier cameras", None if self._views is None else self._views[:, :3, 3]
+        return "earlier cameras", None if self._earlier_views is None else self._earlier_views[:, :3, 3]
 
     def _own_cameras(self) -> list[Camera]:
         """The cameras of the newest model, if all about them has arrived."""
-        if self._views_stamp != self._model_stamp or not self._views_given or self._views is None or self._view_info is None:
+        (stamp, poses), info = self._views, self._view_info
+        if info is None or not stamp == info[0] == self._model_stamp:
             return []
-        stamp, info = self._view_info
-        if stamp != self._model_stamp:
-            return []
-        return [Camera(info.P[:, :3], info.width, info.height, pose) for pose in self._views]
+        return [Camera(info[1].P[:, :3], info[1].width, info[1].height, pose) for pose in poses]
 
 
 def _tissue(model: GaussianModel, viewpoint: np.ndarray, config: PhysicsConfig, cameras: list[Camera]) -> TissueSimulation:

@@ -12,10 +12,11 @@ from std_srvs.srv import SetBool, Trigger
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.messages import STATE, ControlNodeCloud, NodeStatus, PhysicsState, ViewerState
-from endo_sim_ros.nodes.base import OK, WARN, EndoNode, run
+from endo_sim_ros.messages import OK, STATE, WARN, ControlNodeCloud, PhysicsState, ViewerState
+from endo_sim_ros.nodes.base import run
 from endo_sim_ros.nodes.configs import ViewerNodeConfig, arm_names
 from endo_sim_ros.nodes.model_tracker import ModelTracker
+from endo_sim_ros.nodes.watcher import Watcher
 from endo_sim_ros.rendering import RenderingConfig
 from endo_sim_ros.viewer.config import ViewerConfig
 from endo_sim_ros.viewer.viewer import PARAMETERS, Tool, Viewer, plain_camera
@@ -38,12 +39,12 @@ class _Arm:
     heard: float = 0.0  # when the reaction came
 
 
-class ViewerNode(EndoNode):
+class ViewerNode(Watcher):
     """Hands what it hears to a `Viewer`, and what users do there to the graph."""
 
     read_at_start = frozenset({"arm", "arm_source", "arms", "physics_node", "host", "port"})
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__("viewer_node")
         self._options = self.declare(ViewerNodeConfig)
         config, self._rendering = self.declare(ViewerConfig), self.declare(RenderingConfig)
@@ -55,7 +56,6 @@ class ViewerNode(EndoNode):
         self._infos: dict[str, messages.CameraInfo] = {}  # by topic
         self._rendered: dict[str, tuple[int, Any]] = {}  # stamp and content of the newest rendered messages
         self._nodes: ControlNodeCloud | None = None
-        self._statuses: dict[str, tuple[float, NodeStatus]] = {}  # the newest of each node, and when it came
         self._asked, self._closed, self._lockstep = 0.0, False, False
         self._paused, self._paused_until = False, 0.0  # as a service said, which counts more than diagnostics before it
         self.viewer = Viewer(config, self)
@@ -66,8 +66,8 @@ class ViewerNode(EndoNode):
         self._physics = self._full_name(name)
         self._set = self.create_client(SetParameters, f"{name}/set_parameters")
         self._get = self.create_client(GetParameters, f"{name}/get_parameters")
-        self._calls = {"reset": Trigger, "step": Trigger, "pause": SetBool}
-        self._calls = {what: self.create_client(kind, f"{name}/{what}") for what, kind in self._calls.items()}
+        kinds = {"reset": Trigger, "step": Trigger, "pause": SetBool}
+        self._calls = {what: self.create_client(kind, f"{name}/{what}") for what, kind in kinds.items()}
         self.subscribe(messages.GAUSSIANS, self._on_model)
         self.subscribe(messages.TRAINING_CAMERAS, self._on_training_cameras)
         self.subscribe(messages.CUT_SURFACE, self._on_cut_surface, depth=1)
@@ -79,7 +79,6 @@ class ViewerNode(EndoNode):
         for name in self._arms:
             self.subscribe(messages.tool_pose(name), partial(self._on_tool_pose, name), depth=1)
             self.subscribe(messages.tool_reaction(name), partial(self._on_reaction, name), depth=1)
-        self.subscribe(messages.DIAGNOSTICS, self._on_diagnostics)
         self.every(_PERIOD, self._on_timer)
         self.get_logger().info(f"open {self.viewer.url} in a browser")
 
@@ -113,7 +112,7 @@ class ViewerNode(EndoNode):
         if bound is None or not bound.follows(self._nodes):
             return
         self._tissue.cut(bound, self._nodes)
-        milliseconds = float(self._value("milliseconds per step", "0"))
+        milliseconds = float(self.value(self._physics, "milliseconds per step", "0"))
         age = 1e-9 * (self.now_ns() - messages.stamp_to_ns(message.header.stamp)) + 1e-3 * milliseconds
         self.viewer.show_state(self._nodes.positions, self._nodes.F, age)
 
@@ -140,24 +139,17 @@ class ViewerNode(EndoNode):
             self.viewer.show_endoscope(image, Camera(info.P[:, :3], info.width, info.height, pose))
 
     def _on_tool_pose(self, name: str, message: Any) -> None:
-        frames = self._options.frame_poses
-        unnamed = frames.get(f"{name}_base", np.eye(4))
-        self._arms[name].pose = messages.decode_pose(message, frames | {"": unnamed}, messages.tool_pose(name).name)
+        self._arms[name].pose = messages.decode_tip(message, self._options.frame_poses, name, messages.tool_pose(name).name)
 
     def _on_reaction(self, name: str, message: Any) -> None:
         self._arms[name].reaction, _ = messages.decode_wrench(message, messages.tool_reaction(name).name)
         self._arms[name].heard = time.monotonic()
 
     def _on_diagnostics(self, message: Any) -> None:
-        for status in messages.decode_diagnostics(message):
-            self._statuses[status.name] = time.monotonic(), status
-            if status.name == self._physics and time.monotonic() > self._paused_until:
-                self._paused = status.state(PhysicsState) is PhysicsState.PAUSED
-                self._lockstep = status.values.get("mode") == "lockstep"
-
-    def _value(self, key: str, default: str) -> str:
-        """A value that physics last reported."""
-        return self._statuses[self._physics][1].values.get(key, default) if self._physics in self._statuses else default
+        super()._on_diagnostics(message)
+        if self.heard.get(self._physics, 0.0) > self._paused_until:
+            self._paused = self.in_state(self._physics, PhysicsState.PAUSED)
+            self._lockstep = self.value(self._physics, "mode") == "lockstep"
 
     def _full_name(self, name: str) -> str:
         """The name of a node on /diagnostics."""
@@ -199,10 +191,12 @@ class ViewerNode(EndoNode):
         if (bound := self._tissue.bound) is not None:
             count = 0 if bound.node_rest is None else len(bound.node_rest)
             lines.append(f"{len(bound.renderer.model)} Gaussians, {count} nodes")
-        lines.append(f"{self._value('simulated time', '0')} s, real time × {self._value('real-time factor', '0')}")
+        simulated, factor = (self.value(self._physics, key, "0") for key in ("simulated time", "real-time factor"))
+        lines.append(f"{simulated} s, real time × {factor}")
         for name in dict.fromkeys((self._options.physics_node, *_SHOWN)):
-            heard, status = self._statuses.get(self._full_name(name), (now, None))
-            silent = " (silent)" if now - heard > _SILENT else ""
+            full_name = self._full_name(name)
+            status = self.statuses.get(full_name)
+            silent = " (silent)" if status and now - self.heard[full_name] > _SILENT else ""
             lines.append(f"{name.lstrip('/')}: {status.message if status else 'not heard yet'}{silent}")
         return lines
 
@@ -297,10 +291,5 @@ class ViewerNode(EndoNode):
         super().destroy_node()
 
 
-def main() -> int:
-    """Run the node until it is told to stop, and return the exit status of the process."""
-    return run(ViewerNode)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run(ViewerNode))

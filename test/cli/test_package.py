@@ -103,7 +103,7 @@ def test_package_xml_names_what_the_code_imports():
             words = line.split()
             if len(words) > 1 and words[0] in ("import", "from"):
                 imported.add(words[1].split(".")[0])
-    from endo_sim_ros.messages import MESSAGE_PACKAGES
+    from endo_sim_ros.messages.types import MESSAGE_PACKAGES
 
     ros = {name for name in imported if name == "rclpy" or name.endswith(("_msgs", "_srvs", "_interfaces"))} | set(MESSAGE_PACKAGES)
     assert ros <= declared, ros - declared

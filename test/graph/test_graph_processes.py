@@ -62,7 +62,7 @@ def test_every_node_ends_by_sigterm_within_seconds_and_without_a_traceback(bench
         bench.until(lambda: bench.statuses[name], f"a word of {name}", 40)
     start = time.monotonic()
     for node in graph.nodes.values():
-        node.send_signal(signal.SIGTERM)
+        node.process.send_signal(signal.SIGTERM)
     assert [node.wait(10) for node in graph.nodes.values()] == [0] * 6
     assert time.monotonic() - start < 6
     for node in graph.nodes.values():
@@ -106,7 +106,7 @@ def test_whole_graph_starts_in_the_wrong_order_and_survives_the_loss_of_each_nod
     start = lambda name, **more: graph.start(name, **options[name], **more)  # noqa: E731
 
     def kill(name):
-        graph.nodes[name].send_signal(signal.SIGKILL)
+        graph.nodes[name].process.send_signal(signal.SIGKILL)
         assert graph.nodes[name].wait(5) == -signal.SIGKILL
         bench.statuses[name].clear()
 

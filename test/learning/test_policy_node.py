@@ -1,5 +1,6 @@
 """Tasks over topics are, bit for bit, those of the environment."""
 
+import signal
 import time
 from itertools import pairwise
 
@@ -64,7 +65,7 @@ def test_over_topics_observations_images_and_actions_are_bit_for_bit_those_of_th
                 group.start("reconstruction_node", *parameters, output_dir=tmp_path)
             user.until(lambda: record.exists() or group.dead(), logs, 90)
             assert not group.dead(), logs()
-            node.interrupt()
+            node.process.send_signal(signal.SIGINT)
             user.until(lambda: node.exit_status is not None, logs)  # images come meanwhile
             assert node.exit_status == 0
 

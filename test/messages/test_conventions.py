@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 import rclpy
+from node_states import NODE_STATES
 
 from endo_sim_ros import messages
-from endo_sim_ros.messages import NODE_STATES, STATE
+from endo_sim_ros.messages import STATE
 from endo_sim_ros.nodes.bag_player_node import BagPlayerNode
 from endo_sim_ros.nodes.physics_node import PhysicsNode
 from endo_sim_ros.nodes.policy_node import PolicyNode

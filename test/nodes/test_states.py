@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import rclpy
 import torch
+from node_states import NODE_STATES
 from rclpy.executors import SingleThreadedExecutor
 from std_srvs.srv import SetBool
 
@@ -17,7 +18,6 @@ from endo_sim_ros.graph.client import Client
 from endo_sim_ros.graph.processes import NodeGroup
 from endo_sim_ros.messages import (
     ERROR,
-    NODE_STATES,
     OK,
     STATE,
     BagPlayerState,

@@ -38,7 +38,11 @@ def see_plane(K_cv, distortion, pose) -> tuple[np.ndarray, np.ndarray]:
     """What a raw camera (OpenCV pixel convention) sees: RGB [H, W, 3] and points [H, W, 3] in its own frame."""
     u, v = np.meshgrid(np.arange(WIDTH, dtype=np.float64), np.arange(HEIGHT, dtype=np.float64))
     pixels = np.stack([u, v], -1).reshape(-1, 1, 2)
-    rays = cv2.undistortPointsIter(pixels, K_cv, distortion, np.eye(3), np.eye(3), (3, 100, 1e-12)).reshape(HEIGHT, WIDTH, 2)
+    rays = cv2.undistortPoints(pixels, K_cv, distortion).reshape(-1, 2)
+    for _ in range(20):  # OpenCV stops early
+        seen = cv2.projectPoints(np.c_[rays, np.ones(len(rays))], np.zeros(3), np.zeros(3), K_cv, distortion)[0].reshape(-1, 2)
+        rays += (pixels.reshape(-1, 2) - seen) / [K_cv[0, 0], K_cv[1, 1]]
+    rays = rays.reshape(HEIGHT, WIDTH, 2)
     rays = np.dstack([rays, np.ones_like(u)])
     turned = rays @ pose[:3, :3].T
     depth = (PLANE_Z - pose[2, 3]) / turned[..., 2]

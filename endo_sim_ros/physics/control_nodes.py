@@ -4,13 +4,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import warp as wp
 from scipy.spatial import Delaunay, KDTree, QhullError
 
 from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.core.device import pick_device
+from endo_sim_ros.core.device import init_warp
 from endo_sim_ros.core.gaussians import GaussianModel
-from endo_sim_ros.physics.backends import backend_for
 from endo_sim_ros.physics.config import PhysicsConfig
+from endo_sim_ros.physics.sampling_kernels import sample_farthest_points
 
 OUTLIER_FACTOR = 5.0  # a Gaussian this many times farther from its neighbours than the median one floats
 OUTLIER_NEIGHBOURS = 8
@@ -45,10 +46,11 @@ class ControlNodes:
         return len(self.rest)
 
 
-def sample_farthest(points: np.ndarray, count: int, start: int = 0, device: str = "cpu") -> np.ndarray:
+def sample_farthest(points: np.ndarray, count: int, start: int = 0) -> np.ndarray:
     """Return the numbers [count] of samples of points [N, 3], the first being `start` (Qi et al. 2017); exact and deterministic.
 
-    Each next sample is the point farthest from all samples so far; among equals the lowest number.
+    Each next sample is the point farthest from all samples so far; among equals the lowest number. One core of a CPU does it, as
+    every sample has to wait for the one before.
 
     Raises:
         ValueError: If there are fewer points than samples.
@@ -56,7 +58,13 @@ def sample_farthest(points: np.ndarray, count: int, start: int = 0, device: str 
     points = np.asarray(points, np.float64)
     if not 1 <= count <= len(points):
         raise ValueError(f"sample_farthest: cannot pick {count} of {len(points)} points")
-    return backend_for(device).sample_farthest((points - points.mean(0)).astype(np.float32), count, start)
+    init_warp()
+    centred = (points - points.mean(0)).astype(np.float32)
+    axes = [wp.array(np.ascontiguousarray(centred[:, axis]), dtype=float, device="cpu") for axis in range(3)]
+    distances = wp.full(len(points), float("inf"), dtype=float, device="cpu")
+    samples = wp.zeros(count, dtype=int, device="cpu")
+    wp.launch(sample_farthest_points, 1, [*axes, len(points), count, start, distances, samples], device="cpu")
+    return samples.numpy().copy()
 
 
 def select_solid(points: np.ndarray, opacities: np.ndarray, min_opacity: float) -> np.ndarray:
@@ -214,7 +222,7 @@ def build_control_nodes(
             " others; tissue needs at least 4"
         )
     count = min(config.node_count // (config.layers + 1), len(solid))
-    skin = points[solid[sample_farthest(points[solid], max(count, 4), device=pick_device(config.device))]]
+    skin = points[solid[sample_farthest(points[solid], max(count, 4))]]
     skin = skin[np.sort(np.unique(skin, axis=0, return_index=True)[1])]  # Gaussians may coincide, nodes must not
     sheet = measure_skin(skin, np.zeros(3))
     if config.dense:

@@ -1,4 +1,4 @@
-"""What a backend does, and which one a device has: where the solver's step, skinning and the sampling of control nodes run."""
+"""What a backend does, and which one a device has: where the solver's step and skinning run."""
 
 import functools
 import threading
@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
-import numpy as np
 import warp as wp
 from torch import Tensor
 
@@ -126,8 +125,4 @@ class Backend(Protocol):
 
     def skin_work(self, skin: SkinData, maps: Tensor, means: Tensor, covars: Tensor) -> list[Work]:
         """Return the work that moves Gaussians in B environments by maps [B, M, 4, 4]; means and covars are [B, N, …]."""
-        ...
-
-    def sample_farthest(self, points: np.ndarray, count: int, start: int) -> np.ndarray:
-        """Return numbers [count] of points [N, 3] float32, each the farthest from all before it, the first being `start`."""
         ...

@@ -13,7 +13,6 @@ from endo_sim_ros.core.kernels import launch_in_shares
 from endo_sim_ros.physics.backends import cpu_kernels
 from endo_sim_ros.physics.backends.base import Action, Launch, SkinData, StepData, Work, array
 from endo_sim_ros.physics.backends.cpu_kernels import LANES, SCRATCH, make_step_kernel, skin_gaussians
-from endo_sim_ros.physics.backends.sampling_kernels import sample_farthest_points
 
 SHARED_FROM = 4096  # Gaussians; fewer are done before a second thread has begun
 
@@ -79,9 +78,6 @@ class CpuBackend:
             done.append([Launch(skin_gaussians, size, [first, *inputs]) for first, size in shares(len(skin.means), SHARED_FROM)])
         return done
 
-    def sample_farthest(self, points: np.ndarray, count: int, start: int) -> np.ndarray:
-        return sample_farthest_on_cpu(points, count, start)
-
 
 def cpu_action(work: Work) -> Action:
     """Return work on the CPU as a call."""
@@ -91,12 +87,3 @@ def cpu_action(work: Work) -> Action:
     wp.load_module(work.kernel.module, device="cpu")
     command: Any = wp.launch(work.kernel, work.dim, work.inputs, device="cpu", record_cmd=True)
     return command.launch
-
-
-def sample_farthest_on_cpu(points: np.ndarray, count: int, start: int) -> np.ndarray:
-    """`Backend.sample_farthest` by one core: every sample has to wait for the one before."""
-    axes = [wp.array(np.ascontiguousarray(points[:, axis]), dtype=float, device="cpu") for axis in range(3)]
-    distances = wp.full(len(points), float("inf"), dtype=float, device="cpu")
-    samples = wp.zeros(count, dtype=int, device="cpu")
-    wp.launch(sample_farthest_points, 1, [*axes, len(points), count, start, distances, samples], device="cpu")
-    return samples.numpy().copy()

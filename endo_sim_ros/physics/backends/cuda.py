@@ -8,7 +8,6 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import warp as wp
 from torch import Tensor
 
@@ -18,7 +17,7 @@ from endo_sim_ros.physics.backends import cluster_division as cluster
 from endo_sim_ros.physics.backends import skin_kernels
 from endo_sim_ros.physics.backends.base import Action, Launch, SkinData, StepData, Work, array, capturing
 from endo_sim_ros.physics.backends.cluster_kernels import make_step_kernel
-from endo_sim_ros.physics.backends.cpu import cpu_action, sample_farthest_on_cpu
+from endo_sim_ros.physics.backends.cpu import cpu_action
 from endo_sim_ros.physics.backends.plain_kernels import collect, make_advance_kernel, scatter, update_grid
 from endo_sim_ros.physics.backends.skin_kernels import skin_environments, skin_gaussians
 from endo_sim_ros.physics.backends.structs import Transfer
@@ -81,9 +80,6 @@ class CudaBackend:
         outputs = [array(means.view(-1, 3), wp.vec3), array(covars.view(-1, 3, 3), wp.mat33)]
         inputs = [maps.shape[1], *at_rest, array(maps.view(-1, 4, 4), wp.mat44), *skin[4:], *outputs]
         return [Launch(skin_environments, (len(means), len(skin.means)), inputs)]
-
-    def sample_farthest(self, points: np.ndarray, count: int, start: int) -> np.ndarray:
-        return sample_farthest_on_cpu(points, count, start)
 
     def _clustered(self, step: StepData) -> list[Action]:
         """One launch for all substeps, on a GPU with clusters of multiprocessors; none for more control nodes than they hold."""

@@ -106,21 +106,3 @@ from endo_sim_ros.messages.types import (
     ros_class,
     ros_types,
 )
-
-__all__ = [
-    "BagPlayerState", "BagTypes", "CAMERA_POSE", "CLOCK", "CONTROL_NODES", "CUT_SURFACE", "CameraInfo", "ClientState",
-    "ControlNodeCloud", "DEPTH", "DIAGNOSTICS", "ERROR", "GAUSSIANS", "LEFT_COMPRESSED", "LEFT_IMAGE", "LEFT_INFO", "MASK",
-    "MESSAGE_PACKAGES", "METRES_PER_NEWTON", "MODEL_TOPICS", "Message", "MessageError", "MessageTypes", "NODE_STATES",
-    "NodeState", "NodeStatus", "OK", "PhysicsState", "PolicyState", "RECORDING_TOPICS", "RENDERED_DEPTH", "RENDERED_IMAGE",
-    "RENDERED_INFO", "RENDERED_POSE", "RENDERED_TOPICS", "RIGHT_COMPRESSED", "RIGHT_IMAGE", "RIGHT_INFO", "ReconstructionState",
-    "RecorderState", "RenderingState", "RosTypes", "STATE", "ScriptedToolState", "TOOL_MARKERS", "TOOL_TOPICS",
-    "TRAINING_CAMERAS", "TRAINING_CAMERA_INFO", "ToolDisplay", "Topic", "ViewerState", "WARN", "all_topics", "bag_types",
-    "check_frame", "crtk_type", "cut_number", "decode_camera_info", "decode_cloud", "decode_control_nodes", "decode_cut",
-    "decode_cut_surface", "decode_depth", "decode_diagnostics", "decode_gaussians", "decode_image", "decode_jaw", "decode_mask",
-    "decode_pose", "decode_poses", "decode_state_command", "decode_wrench", "encode_camera_info", "encode_clock",
-    "encode_control_nodes", "encode_cut", "encode_cut_surface", "encode_diagnostics", "encode_gaussians", "encode_image",
-    "encode_jaw", "encode_operating_state", "encode_pose", "encode_poses", "encode_tool_markers", "encode_wrench",
-    "ros_class", "ros_types", "stamp_to_ns", "tool_cut", "tool_jaw", "tool_jaw_move", "tool_jaw_setpoint", "tool_jaw_state",
-    "tool_move", "tool_pose", "tool_pose_command", "tool_reaction", "tool_setpoint", "tool_state", "tool_state_command",
-    "tool_wrench",
-]  # fmt: skip

@@ -2,5 +2,3 @@
 
 from endo_sim_ros.splatting.api import RenderOutput, rasterize, render
 from endo_sim_ros.splatting.reference import _rasterize, sh_basis
-
-__all__ = ["RenderOutput", "_rasterize", "rasterize", "render", "sh_basis"]

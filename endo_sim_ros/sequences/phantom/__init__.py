@@ -10,5 +10,3 @@ from endo_sim_ros.sequences.phantom.config import PhantomConfig
 from endo_sim_ros.sequences.phantom.path import phantom_camera, phantom_poses
 from endo_sim_ros.sequences.phantom.rendering import Phantom, build_phantom, render_phantom
 from endo_sim_ros.sequences.phantom.sequence import phantom_sequence
-
-__all__ = ["Phantom", "PhantomConfig", "build_phantom", "phantom_camera", "phantom_poses", "phantom_sequence", "render_phantom"]

@@ -4,7 +4,7 @@ import contextlib
 import functools
 import os
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import torch
@@ -87,6 +87,17 @@ def cpu_threads() -> int:
     if not wanted.isdecimal():
         raise ValueError(f"ENDO_SIM_THREADS is {wanted!r}; it must be a number of threads, or 0 for as many as there are cores")
     return int(wanted) or available
+
+
+@contextlib.contextmanager
+def single_threaded_torch() -> Iterator[None]:
+    """As in the nodes: on a CPU the kernels bring their own threads. Also a decorator."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def shares(count: int, least: int) -> list[tuple[int, int]]:

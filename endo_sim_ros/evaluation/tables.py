@@ -1,11 +1,9 @@
 """The results of an evaluation as tables for people and files for machines."""
 
 import csv
-import json
 import statistics
 import sys
 from collections.abc import Iterable
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +15,7 @@ from rich.table import Table
 from endo_sim_ros.core import drawing
 from endo_sim_ros.evaluation import plots
 from endo_sim_ros.evaluation.held_out import FIGURES, Figure
-from endo_sim_ros.evaluation.measurement import Row
+from endo_sim_ros.evaluation.measurement import Row, write_rows
 from endo_sim_ros.evaluation.paper import PRINTED, Printed
 from endo_sim_ros.evaluation.splits import explain_split
 
@@ -148,8 +146,7 @@ def write(results: dict[str, Any], out: Path, json_file: Path | None) -> None:
     _write_strips(summaries, out)
     plots.write(summaries, out)
     if json_file is not None:
-        json_file.parent.mkdir(parents=True, exist_ok=True)
-        json_file.write_text(json.dumps([asdict(row) for row in machine_rows(summaries)], indent=1) + "\n")
+        write_rows(machine_rows(summaries), json_file)
     Console(width=None if sys.stdout.isatty() else 150).print(_terminal_table(summaries, results["missing"]))
 
 

@@ -123,7 +123,7 @@ def read_folder(
     if poses is not None:
         return recording
     logger.warning("%s: no %s, so poses come from structure from motion", root, " or ".join(POSE_FILES))
-    return with_estimated_poses(recording, len(numbers), root)
+    return with_estimated_poses(recording, root)
 
 
 def read_points(path: Path | str) -> tuple[np.ndarray, np.ndarray] | None:

@@ -115,7 +115,7 @@ def read_scared(
     if published:
         return recording
     logger.warning("%s: file is missing, so poses come from structure from motion", archive)
-    return with_estimated_poses(recording, len(numbers), root)
+    return with_estimated_poses(recording, root)
 
 
 def _read_keyframe(root: Path, start: int | None, stop: int | None, step: int, depth: str, fps: float | None) -> Recording:

@@ -17,12 +17,7 @@ class Paint:
     def __init__(self, rng: np.random.Generator, seed: int, anatomy: Anatomy):
         first = seed == 0  # the first patient is the one of the figures: peritoneum, stomach, congested bowel
         wall, organ, lobe = (kinds[0 if first else rng.integers(len(kinds))] for kinds in (WALLS, ORGANS, LOBES))
-        tissues = (
-            wall,
-            organ,
-            wall,
-            lobe,
-        )  # of the parts in the order of their shares; the wall shines through the ligament
+        tissues = wall, organ, wall, lobe  # of the parts in the order of their shares; the wall shines through the ligament
 
         by_vertex = np.ascontiguousarray(np.moveaxis(anatomy.shares, 0, -1))
 
@@ -75,11 +70,8 @@ class Paint:
         """Draw the ligament over the wall's colour: a milky, fibrous veil with a bright free edge."""
         angle, radius = anatomy.fan_angle, anatomy.fan_radius
         fibres = np.zeros((SIDE, SIDE), np.float32)
-        for count, amplitude in (
-            (14.0, 0.8),
-            (45.0, 0.7),
-            (110.0, 0.5),
-        ):  # noise over the angle alone makes a fan of fibres
+        # Noise over the angle alone makes a fan of fibres.
+        for count, amplitude in ((14.0, 0.8), (45.0, 0.7), (110.0, 0.5)):
             line = cv2.resize(rng.standard_normal((1, 1024)).astype(np.float32), (8192, 1), interpolation=cv2.INTER_CUBIC)[0]
             position = (0.5 * count * angle + 30.0 * radius) * 8.0 + 4096.0
             fibres += amplitude * line[np.clip(position, 0, 8191).astype(np.int32)]

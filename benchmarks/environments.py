@@ -36,7 +36,7 @@ def bench_environments(
         rates = [_rate(task, scene, count, observations, device, repeats) for count in environments]
         peer = f"{environments[0]} environment{'s' * (environments[0] > 1)}"
         for count, rate in zip(environments, rates):
-            compared = () if count == environments[0] else (rate / rates[0], peer)
+            compared = (None, None) if count == environments[0] else (rate / rates[0], peer)
             rows.append(Row(f"{observations} observations, {count} environment{'s' * (count > 1)}", rate, "steps/s", *compared))
     report(f"Environments: {task} on {machine(device)}", rows, json_file)
 

@@ -119,7 +119,7 @@ def _methods(config: EvaluationConfig) -> dict[str, dict[str, Any]]:
     unlike = {name: dataclasses.asdict(preset(name, **common)) for name in config.presets}
     if config.ablation:
         for name in config.presets:
-            for part, overrides in ABLATIONS.get(name, {}).items():
+            for part, overrides in ABLATIONS[name].items() if name in ABLATIONS else ():
                 unlike[f"{name} {part}"] = dataclasses.asdict(preset(name, **{**common, **overrides}))
     return unlike
 

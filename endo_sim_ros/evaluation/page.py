@@ -142,10 +142,7 @@ def _label(name: tuple[str, str]) -> str:
 
 def _data(path: Path) -> str:
     """A picture as an address that holds it."""
-    image = cv2.imread(str(path))
-    if image is None:
-        raise ValueError(f"{path}: the picture is missing or damaged; run the evaluation again")
-    scale = min(_WIDTH / image.shape[1], 1.0)
-    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
+    data = cv2.imencode(".jpg", cv2.cvtColor(tables.small_picture(path, _WIDTH), cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[
+        1
+    ]
     return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()

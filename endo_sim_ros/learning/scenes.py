@@ -10,7 +10,7 @@ import yaml
 
 from endo_sim_ros.core.cameras import Camera, load_cameras, save_cameras
 from endo_sim_ros.core.gaussians import GaussianModel, ModelError, load_ply, save_ply
-from endo_sim_ros.learning.tasks import find_task, make_task
+from endo_sim_ros.learning.tasks import find_task
 from endo_sim_ros.physics import ControlNodes, PhysicsConfig, build_control_nodes
 from endo_sim_ros.rendering import render_depth
 
@@ -65,8 +65,9 @@ def save_scene(scene: Scene, folder: Path, task: str, seed: int = 0) -> None:
     Raises:
         ValueError: If there is no such task, or the scene is too small for it.
     """
-    physics = find_task(task).physics()
-    first = make_task(task, scene.nodes(physics), scene.camera.position)
+    kind = find_task(task)
+    physics = kind.physics()
+    first = kind(scene.nodes(physics), scene.camera.position)
     first.reset(0, np.random.default_rng(seed))
     changed = {name: value for name, value in asdict(physics).items() if value != getattr(PhysicsConfig(), name) and name != "device"}
     changed |= {"regions": list(first.regions())} if first.regions() else {}

@@ -89,6 +89,11 @@ def write_png(path: str | Path, image: np.ndarray) -> None:
         raise OSError(f"{path}: the picture cannot be written; does the folder exist?")
 
 
+def jpeg(image: np.ndarray, quality: int) -> bytes:
+    """The JPEG file of an RGB image [H, W, 3] uint8, of a quality from 0 to 100."""
+    return cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+
+
 def write_video(path: str | Path, images: Iterable[np.ndarray], fps: float, options: dict[str, str] = {"crf": "18"}) -> int:
     """Write RGB images [H, W, 3] uint8 of one size as H.264 that browsers play, and return their number.
 

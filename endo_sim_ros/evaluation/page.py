@@ -8,8 +8,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import cv2
-
+from endo_sim_ros.core import drawing
 from endo_sim_ros.evaluation import plots, tables
 from endo_sim_ros.evaluation.splits import explain_split
 from endo_sim_ros.evaluation.tables import COLUMNS, Pictures, Summary
@@ -142,7 +141,5 @@ def _label(name: tuple[str, str]) -> str:
 
 def _data(path: Path) -> str:
     """A picture as an address that holds it."""
-    data = cv2.imencode(".jpg", cv2.cvtColor(tables.small_picture(path, _WIDTH), cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[
-        1
-    ]
-    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()
+    data = drawing.jpeg(tables.small_picture(path, _WIDTH), _QUALITY)
+    return "data:image/jpeg;base64," + base64.b64encode(data).decode()

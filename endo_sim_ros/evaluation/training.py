@@ -11,7 +11,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 
@@ -32,6 +31,7 @@ from endo_sim_ros.reconstruction.triangulation import points_in_view
 from endo_sim_ros.sequences.recording import spread
 
 _SHOWN = 3  # held-out views of a cell of which pictures are kept
+_QUALITY = 92  # of these pictures, as JPEG
 _CURVE_VIEWS = 8  # held-out views measured at each moment of a curve
 
 
@@ -212,8 +212,4 @@ def _pictures(view: int, image: np.ndarray, depth: np.ndarray, frame: Frame) -> 
     }
     if frame.depth is not None:
         pictures["reference_depth"] = drawing.color_depth(frame.depth, near, far)
-    quality = [cv2.IMWRITE_JPEG_QUALITY, 92]
-    return {
-        f"{view:04d}-{name}": cv2.imencode(".jpg", cv2.cvtColor(picture.astype(np.uint8), cv2.COLOR_RGB2BGR), quality)[1].tobytes()
-        for name, picture in pictures.items()
-    }
+    return {f"{view:04d}-{name}": drawing.jpeg(picture.astype(np.uint8), _QUALITY) for name, picture in pictures.items()}

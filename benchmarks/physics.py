@@ -51,6 +51,8 @@ class Plan(NamedTuple):
 
 
 class Scene(NamedTuple):
+    """Tissue, and how it is seen and touched."""
+
     model: GaussianModel
     camera: Camera  # at the viewpoint
     tip: np.ndarray  # where the tool takes hold: the surface in the middle of the image [3], m

@@ -6,8 +6,12 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING
 
 import torch
+
+if TYPE_CHECKING:
+    import warp as wp
 
 
 def pick_device(name: str = "auto") -> str:
@@ -64,13 +68,13 @@ def on_torch_stream(device: torch.device | str) -> contextlib.AbstractContextMan
     return wp.ScopedStream(warp_stream(torch.cuda.current_stream(device)), sync_enter=False)
 
 
-def warp_stream(stream: torch.cuda.Stream):
+def warp_stream(stream: torch.cuda.Stream) -> "wp.Stream":
     """Return Warp's object for a stream of torch, the same each time: with it Warp would forget what it knows of the stream."""
     return _warp_stream(stream.device, stream.cuda_stream)
 
 
 @functools.cache
-def _warp_stream(device: torch.device, handle: int):
+def _warp_stream(device: torch.device, handle: int) -> "wp.Stream":
     import warp as wp
 
     return wp.Stream(wp.device_from_torch(device), cuda_stream=handle)

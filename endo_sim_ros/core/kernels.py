@@ -67,7 +67,7 @@ def kernel_arguments(kernel: Any, arguments: Sequence, offset: int = 0) -> list:
     return [_array(kind, x) if isinstance(x, Tensor) else x for kind, x in zip(kinds, arguments, strict=True)]
 
 
-def _array(kind, tensor: Tensor):
+def _array(kind: Any, tensor: Tensor) -> Any:
     tensor = tensor.detach()
     dims = kind.ndim + len(getattr(kind.dtype, "_shape_", ()))
     if tensor.ndim > dims:

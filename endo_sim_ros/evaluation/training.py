@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from endo_sim_ros.core import drawing
-from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.device import cpu_threads
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.evaluation import metrics
@@ -49,7 +49,7 @@ def _network(name: Backbone, weights: Path | None, device: str) -> Lpips:
 def _warm_up(device: str) -> None:
     """Load or compile every kernel, which is no part of the time of a training."""
     image = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
-    camera, poses = Camera(np.array([[60, 0, 32], [0, 60, 24], [0, 0, 1]]), 64, 48), np.tile(np.eye(4), (2, 1, 1))
+    camera, poses = Camera(intrinsic_matrix(60, 60, 32, 24), 64, 48), np.tile(np.eye(4), (2, 1, 1))
     poses[1, 0, 3] = 0.005
     frames = [Frame(i, image, camera.at(pose), depth=np.full((48, 64), 0.1, np.float32)) for i, pose in enumerate(poses)]
     with contextlib.suppress(SequenceError):  # they need not make a scene

@@ -303,7 +303,7 @@ def _to_world(wrenches: _Stream, tips: _Stream) -> _Stream:
     """Wrenches [N, 6] in world axes of ones [N, 7] whose last column says whether they are so already, else in the tip's."""
     x, y, z, w = tips.at(wrenches.stamps)[:, 3:].T[:, :, None]
     axis = np.hstack([x, y, z])
-    rotate = lambda v: v + 2 * np.cross(axis, np.cross(axis, v) + w * v)  # noqa: E731
+    rotate = lambda v: v + 2 * np.cross(axis, np.cross(axis, v) + w * v)
     vectors = wrenches.values[:, :6]
     turned = np.hstack([rotate(vectors[:, :3]), rotate(vectors[:, 3:])])
     return _Stream(wrenches.stamps, np.where(wrenches.values[:, 6:] > 0, vectors, turned))

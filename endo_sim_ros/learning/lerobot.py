@@ -196,7 +196,7 @@ class _Dataset:
         self._pa.parquet.write_table(self._pa.table(columns).replace_schema_metadata(metadata), self._path(name))
 
     def _write_json(self, name: str, values: dict) -> None:
-        plain = lambda value: value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value  # noqa: E731
+        plain = lambda value: value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
         self._path(name).write_text(json.dumps(values, indent=4, ensure_ascii=False, default=plain), "utf8")
 
     def _path(self, name: str) -> Path:

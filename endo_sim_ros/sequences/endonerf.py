@@ -13,9 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.frames import Frame, SequenceError
-from endo_sim_ros.sequences.calibration_files import intrinsic_matrix
 from endo_sim_ros.sequences.images import check_size, image_size, numbered_files, read_depth, read_image
 from endo_sim_ros.sequences.masks import MaskFiles
 from endo_sim_ros.sequences.pose_files import rigid

@@ -13,9 +13,8 @@ from typing import Any
 import cv2  # before pycolmap, whose own image library would otherwise break cv2.imwrite
 import numpy as np
 
-from endo_sim_ros.core.cameras import invert_pose
+from endo_sim_ros.core.cameras import intrinsic_matrix, invert_pose
 from endo_sim_ros.core.frames import Frame, SequenceError
-from endo_sim_ros.sequences.calibration_files import intrinsic_matrix
 from endo_sim_ros.sequences.images import image_size
 from endo_sim_ros.sequences.recording import Recording
 
@@ -158,7 +157,7 @@ def _write_images(
 
 def _run_colmap(root: Path, K: np.ndarray | None, size: tuple[int, int], count: int, baseline: float | None, threads: int) -> Any:
     """COLMAP's largest model of the images under root; with a baseline, left and right move as one rig."""
-    import pycolmap  # noqa: PLC0415  (a heavy import that only this function needs)
+    import pycolmap  # heavy, and needed here only
 
     with _quiet(pycolmap):
         pycolmap.set_random_seed(_SEED)

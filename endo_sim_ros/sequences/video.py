@@ -16,9 +16,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.frames import Frame, SequenceError
-from endo_sim_ros.sequences.calibration_files import check_calibrated_size, intrinsic_matrix, read_calibration
+from endo_sim_ros.sequences.calibration_files import check_calibrated_size, read_calibration
 from endo_sim_ros.sequences.images import numbered_files, read_gray
 from endo_sim_ros.sequences.masks import MaskFiles, lit_area, lit_now, tissue_mask, tool_is_white
 from endo_sim_ros.sequences.pose_files import read_poses

@@ -22,10 +22,10 @@ from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.evaluation.cells import Cell
 from endo_sim_ros.evaluation.deformed_views import deformed_view_psnr
 from endo_sim_ros.evaluation.held_out import difference, mean_figures, measure, model_renderer, seen_pixels
-from endo_sim_ros.evaluation.lpips import Backbone, Lpips
+from endo_sim_ros.evaluation.lpips import Lpips
 from endo_sim_ros.evaluation.measurement import machine, peak_megabytes
 from endo_sim_ros.evaluation.preparation import Prepared
-from endo_sim_ros.evaluation.splits import Split, split_views
+from endo_sim_ros.evaluation.splits import split_views
 from endo_sim_ros.reconstruction import Progress, ReconstructionConfig, ScenePoints, Trainer, prepare, reconstruct, shrink
 from endo_sim_ros.reconstruction.triangulation import points_in_view
 from endo_sim_ros.sequences.recording import spread
@@ -40,9 +40,7 @@ def _load(file: Path) -> Prepared:
     return pickle.loads(file.read_bytes())
 
 
-@functools.lru_cache(maxsize=2)
-def _network(name: Backbone, weights: Path | None, device: str) -> Lpips:
-    return Lpips(name, weights, device)
+_network = functools.lru_cache(maxsize=2)(Lpips)
 
 
 @functools.lru_cache(maxsize=1)
@@ -77,7 +75,10 @@ def train_and_measure(argument: tuple[Cell, Path | None, Prepared | Path], devic
         views = [dataclasses.replace(view, depth=None) for view in views]
     if cell.mono or split.right:
         views = [dataclasses.replace(view, right=None, baseline=None, right_K=None) for view in views]
-    held_out = [shrink(frame, config.image_width) for frame in _held_out(prepared, split)]
+    if split.right and not prepared.right:
+        raise SequenceError("split stereo: the sequence has no right images")
+    held_out = prepared.right if split.right else [prepared.frames[index] for index in split.held_out]
+    held_out = [shrink(frame, config.image_width) for frame in held_out]
     report((0, 1, "warming up"))
     _warm_up(device)
     training: dict[str, Any] = {}
@@ -134,14 +135,6 @@ def train_and_measure(argument: tuple[Cell, Path | None, Prepared | Path], devic
         "curve": training["curve"],
         "pictures": pictures,
     }
-
-
-def _held_out(prepared: Prepared, split: Split) -> list[Frame]:
-    if not split.right:
-        return [prepared.frames[index] for index in split.held_out]
-    if not prepared.right:
-        raise SequenceError("split stereo: the sequence has no right images")
-    return prepared.right
 
 
 def _reference_at_points(held_out: list[Frame], judging: np.ndarray | None) -> float | None:

@@ -121,7 +121,7 @@ def read_episode(
         if not reader.message_count:
             raise SequenceError(f"{bag}: the recording is empty; was the graph running?")
         arms = arms or _arms(reader.topics)
-        _require(reader, bag, arms)
+        reader.require(*((topic,) for topic in _needed(arms)))
         streams = _usable(bag, lambda: _streams(reader, arms, known))
     for topic in _needed(arms):
         if topic not in streams:
@@ -197,13 +197,6 @@ def _needed(arms: tuple[str, ...]) -> list[Topic]:
 
 def _commands(arm: str) -> list[Topic]:
     return [make(arm) for make in (messages.tool_pose_command, messages.tool_pose, messages.tool_wrench, messages.tool_jaw)]
-
-
-def _require(reader: BagReader, bag: Path, arms: tuple[str, ...]) -> None:
-    present = reader.topics
-    for topic in _needed(arms):
-        if f"/{topic.name}" not in present:
-            raise SequenceError(f"{bag}: no topic /{topic.name}; the bag has {', '.join(sorted(present))}")
 
 
 # --------------------------------------------------------------------------------------------------------------- streams

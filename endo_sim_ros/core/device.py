@@ -69,7 +69,7 @@ def on_torch_stream(device: torch.device | str) -> contextlib.AbstractContextMan
 
 
 def warp_stream(stream: torch.cuda.Stream) -> "wp.Stream":
-    """Return Warp's object for a stream of torch, the same each time: with it Warp would forget what it knows of the stream."""
+    """Return Warp's object for a stream of torch: one that is kept, because Warp forgets what it knows of a stream with the object."""
     return _warp_stream(stream.device, stream.cuda_stream)
 
 

@@ -22,7 +22,7 @@ _plain = contextvars.ContextVar("plain", default=False)
 
 @contextlib.contextmanager
 def plain_kernels() -> Iterator[None]:
-    """Within it, every ``backend_for`` returns for a CPU what it returns for GPUs, which runs there plainly: to compare with.
+    """Within it every ``backend_for`` gives a CPU the backend of GPUs, whose kernels run there without vectors, to compare with.
 
     It holds for the thread that entered it.
     """

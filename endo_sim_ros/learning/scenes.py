@@ -14,7 +14,7 @@ from endo_sim_ros.learning.tasks import find_task
 from endo_sim_ros.physics import ControlNodes, PhysicsConfig, build_control_nodes
 from endo_sim_ros.rendering import render_depth
 
-_CACHED = "phantom-1.ply"  # another number when the default scene becomes another
+_CACHED = "phantom-1.ply"  # raise the number when the default scene changes
 _PIECE = 0.5  # of the synthetic patient's picture, about its middle
 
 

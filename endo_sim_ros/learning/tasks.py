@@ -60,7 +60,8 @@ class Task(ABC):
     largest_stiffness = 1.0  # factor on the moduli that an episode may have
     same_tissue = True  # in all episodes, but for randomisation
     margin = 0.012  # m from tissue that is held in place to a place that is worked on
-    around, smooth = 0.012, 0.6  # that part of the places is used where the skin within a distance, m, is nearest to a plane
+    around = 0.012  # m; the skin within this distance of a place is compared with a plane
+    smooth = 0.6  # share of the places that is used: the flattest
 
     @staticmethod
     @abstractmethod

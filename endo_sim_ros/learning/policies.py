@@ -32,7 +32,6 @@ class RetractionScript:
 
     def reset(self, episodes: Sequence[int]) -> None:
         """Nothing to do: the script has no memory."""
-        pass
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Actions [B, 4] for state observations [B, n]."""
@@ -146,7 +145,6 @@ class NetworkPolicy:
 
     def reset(self, episodes: Sequence[int]) -> None:
         """Nothing to do: the network has no memory."""
-        pass
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Actions [B, 4], not clipped, for state observations [B, n]."""

@@ -1,5 +1,6 @@
 """What is trained on: a reconstructed model, the cameras that saw it, and the tissue behind it."""
 
+import contextlib
 import functools
 import os
 from dataclasses import asdict, dataclass, replace
@@ -93,18 +94,14 @@ def default_scene() -> Scene:
     K[:2, :2] /= _PIECE
     camera = replace(whole, K=K)
     path = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "endo_sim_ros" / _CACHED
-    try:
+    with contextlib.suppress(ModelError):  # there is none yet, or it was damaged
         return Scene(load_ply(path), (camera,))
-    except ModelError:  # there is none yet, or it was damaged
-        pass
     from endo_sim_ros.sequences.phantom_model import phantom_model
 
     model, _ = phantom_model(24_000, whole.width)
     pixels, _ = camera.project(model.means.double().numpy())
     inside = ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(1)
     model = model.select(np.flatnonzero(inside))
-    try:
+    with contextlib.suppress(OSError):  # of a home that cannot be written; it is rendered again next time
         save_ply(model, path)
-    except OSError:
-        pass  # a home that cannot be written; it is rendered again next time
     return Scene(model, (camera,))

@@ -99,9 +99,7 @@ def default_scene() -> Scene:
     from endo_sim_ros.sequences.phantom_model import phantom_model
 
     model, _ = phantom_model(24_000, whole.width)
-    pixels, _ = camera.project(model.means.double().numpy())
-    inside = ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(1)
-    model = model.select(np.flatnonzero(inside))
+    model = model.select(np.flatnonzero(camera.sees(model.means.double().numpy())))
     with contextlib.suppress(OSError):  # of a home that cannot be written; it is rendered again next time
         save_ply(model, path)
     return Scene(model, (camera,))

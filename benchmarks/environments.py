@@ -4,15 +4,15 @@ from pathlib import Path
 
 import numpy as np
 
-from endo_sim_ros.core.device import pick_device
+from endo_sim_ros.core.device import pick_device, single_threaded_torch
 from endo_sim_ros.evaluation.measurement import Row, machine, median_seconds, report
 from endo_sim_ros.learning.scenes import Scene, load_scene
 from endo_sim_ros.learning.task_batch import Observations, TaskBatch
-from endo_sim_ros.learning.train import single_threaded_torch
 
 _STEPS = 25  # of random actions in one measurement
 
 
+@single_threaded_torch()
 def bench_environments(
     json_file: Path | None, task: str = "retraction", environments: tuple[int, ...] = (1, 64), device: str = "auto", repeats: int = 5
 ) -> None:
@@ -31,15 +31,13 @@ def bench_environments(
     if not environments or min(environments) < 1:
         raise ValueError(f"give numbers of environments of at least 1, got {' '.join(map(str, environments)) or 'none'}")
     device, scene, rows = pick_device(device), load_scene(), []
-    with single_threaded_torch():
-        kinds: tuple[Observations, ...] = ("state", "image")
-        for observations in kinds:
-            rates = [_rate(task, scene, count, observations, device, repeats) for count in environments]
-            peer = f"{environments[0]} environment{'s' * (environments[0] > 1)}"
-            for count, rate in zip(environments, rates):
-                first = count == environments[0]
-                name = f"{observations} observations, {count} environment{'s' * (count > 1)}"
-                rows.append(Row(name, rate, "steps/s", None if first else rate / rates[0], None if first else peer))
+    kinds: tuple[Observations, ...] = ("state", "image")
+    for observations in kinds:
+        rates = [_rate(task, scene, count, observations, device, repeats) for count in environments]
+        peer = f"{environments[0]} environment{'s' * (environments[0] > 1)}"
+        for count, rate in zip(environments, rates):
+            compared = (None, None) if count == environments[0] else (rate / rates[0], peer)
+            rows.append(Row(f"{observations} observations, {count} environment{'s' * (count > 1)}", rate, "steps/s", *compared))
     report(f"Environments: {task} on {machine(device)}", rows, json_file)
 
 

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 import rclpy
-import torch
 from rclpy.utilities import try_shutdown
 from rich.progress import track
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import save_cameras
+from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.gaussians import save_ply
 from endo_sim_ros.evaluation.measurement import Row, machine, report
 from endo_sim_ros.graph.client import ARM, CHANGED, PATIENCE, WORLD, Client, Scene, tissue
@@ -207,8 +207,4 @@ def bench_graph(
                 rows += _recovery(client, group, scene, rate, device, kills)
         with _graph("lockstep", scene, rate, device, Path(logs)) as (client, _):
             rows += _in_lockstep(client, scene, commands)
-    report(f"graph, {gaussians} Gaussians, {width}×{height}, {machine(device if device != 'auto' else _device())}", rows, json_file)
-
-
-def _device() -> str:
-    return "cuda" if torch.cuda.is_available() else "cpu"
+    report(f"graph, {gaussians} Gaussians, {width}×{height}, {machine(pick_device(device))}", rows, json_file)

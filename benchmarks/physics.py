@@ -10,18 +10,17 @@ import statistics
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 import warp as wp
-from rich.progress import Progress
 
 from endo_sim_ros.core.cameras import Camera, load_cameras, look_at
-from endo_sim_ros.core.device import pick_device
+from endo_sim_ros.core.device import pick_device, single_threaded_torch
 from endo_sim_ros.core.gaussians import GaussianModel, load_ply
 from endo_sim_ros.core.kernels import plain_kernels
-from endo_sim_ros.evaluation.measurement import Row, machine, median_seconds, milliseconds, peak_megabytes, report, short
+from endo_sim_ros.evaluation.measurement import Row, Stage, machine, median_seconds, milliseconds, peak_megabytes, report, run_stages, short
 from endo_sim_ros.physics import ControlNodes, MpmSolver, PhysicsConfig, Skinning, TissueBatch, TissueSimulation, build_control_nodes
 from endo_sim_ros.physics.tools import Tools
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
@@ -52,11 +51,14 @@ class Plan(NamedTuple):
 
 
 class Scene(NamedTuple):
+    """Tissue, and how it is seen and touched."""
+
     model: GaussianModel
     camera: Camera  # at the viewpoint
     tip: np.ndarray  # where the tool takes hold: the surface in the middle of the image [3], m
 
 
+@single_threaded_torch()
 def bench_physics(
     device: str, json_file: Path | None = None, model: Path | None = None, environments: tuple[int, ...] = (), plan: Plan = Plan()
 ) -> None:
@@ -72,41 +74,25 @@ def bench_physics(
     """
     device = pick_device(device)
     environments = environments or ((1, 4, 16, 64) if device == "cpu" else (1, 4, 16, 64, 256, 1024))
-    rows, notes, threads = [], [], torch.get_num_threads()
-    torch.set_num_threads(1)  # as in the nodes: on a CPU the kernels bring their own threads
-    try:
-        with Progress(transient=True) as bar:
-            task = bar.add_task("scene", total=None)
-            scene = load_scene(model, plan.width) if model else phantom_scene(plan.gaussians, plan.width)
-            stages = _stages(scene, device, environments, plan, notes)
-            bar.update(task, total=len(stages))
-            for name, stage in stages:
-                bar.update(task, description=name)
-                rows += stage()
-                bar.advance(task)
-    finally:
-        torch.set_num_threads(threads)
-    report(f"Simulation on {machine(device)}", rows, json_file)
+    scene = load_scene(model, plan.width) if model else phantom_scene(plan.gaussians, plan.width)
+    notes: list[str] = []
+    report(f"Simulation on {machine(device)}", run_stages(_stages(scene, device, environments, plan, notes)), json_file)
     for note in notes:
         print(note)
 
 
-def _stages(
-    scene: Scene, device: str, environments: tuple[int, ...], plan: Plan, notes: list[str]
-) -> list[tuple[str, Callable[[], list[Row]]]]:
-    stages = [("dense and sparse", partial(_paper, scene, device, plan))]
-    for count in plan.node_counts:
-        stages.append((f"{short(count)} nodes", partial(_over_nodes, scene, count, device, plan.seconds)))
-    for count in plan.substeps:
-        stages.append((f"{count} substeps", partial(_over_substeps, scene, count, plan.printed_nodes, device, plan.seconds)))
-    stages.append(("contact", partial(_contact, scene, plan.printed_nodes, device, plan.seconds)))
-    for count in plan.skin_counts:
-        stages.append((f"{short(count)} Gaussians", partial(_over_gaussians, count, plan, device)))
-    for count in plan.batch_nodes:
-        stages.append((f"environments of {short(count)} nodes", partial(_many, scene, count, environments, device, plan)))
-    stages.append((f"{PEER} solver", partial(_beside_peer, scene, device, plan, notes)))
-    stages.append(("memory", partial(_memory, scene, plan.printed_nodes, device)))
-    return stages
+def _stages(scene: Scene, device: str, environments: tuple[int, ...], plan: Plan, notes: list[str]) -> list[Stage]:
+    nodes, seconds = plan.printed_nodes, plan.seconds
+    return [
+        ("dense and sparse", partial(_paper, scene, device, plan)),
+        *((f"{short(n)} nodes", partial(_over_nodes, scene, n, device, seconds)) for n in plan.node_counts),
+        *((f"{n} substeps", partial(_over_substeps, scene, n, nodes, device, seconds)) for n in plan.substeps),
+        ("contact", partial(_contact, scene, nodes, device, seconds)),
+        *((f"{short(n)} Gaussians", partial(_over_gaussians, n, plan, device)) for n in plan.skin_counts),
+        *((f"environments of {short(n)} nodes", partial(_many, scene, n, environments, device, plan)) for n in plan.batch_nodes),
+        (f"{PEER} solver", partial(_beside_peer, scene, device, plan, notes)),
+        ("memory", partial(_memory, scene, nodes, device)),
+    ]
 
 
 # ---------------------------------------------------------------- scenes
@@ -363,13 +349,14 @@ def _free_bytes(device: str) -> float:
         return math.inf
 
 
-def _arrays(holder: object) -> Iterator[wp.array]:
-    """Arrays among the attributes of an object, and of the structs among them."""
-    for value in vars(holder).values():
+def _arrays(holder: Any) -> Iterator[wp.array]:
+    """Arrays among the attributes of an object or a Warp struct, and of the structs among them."""
+    for name in holder._cls.vars if hasattr(holder, "_cls") else vars(holder):
+        value = getattr(holder, name)
         if isinstance(value, wp.array):
             yield value
-        elif hasattr(value, "_cls"):  # an instance of a Warp struct
-            yield from (getattr(value, name) for name in value._cls.vars if isinstance(getattr(value, name), wp.array))
+        elif hasattr(value, "_cls"):  # a Warp struct
+            yield from _arrays(value)
 
 
 def _bytes(arrays: Iterable[wp.array]) -> int:
@@ -385,7 +372,7 @@ def _memory(scene: Scene, count: int, device: str) -> list[Row]:
     config = PhysicsConfig(node_count=count, device=device)
     nodes = build_control_nodes(scene.model, scene.camera.position, config)
     solver = MpmSolver(nodes, config)
-    state = _bytes(getattr(solver.state, name) for name in solver.state._cls.vars)
+    state = _bytes(_arrays(solver.state))
     rows = [Row("state of a node", state / len(nodes), "B"), Row("solver per node", _bytes(_arrays(solver)) / len(nodes), "B")]
     for B in (1, 16):
         peak = peak_megabytes(lambda B=B: TissueBatch(nodes, config, B).step(), device)
@@ -449,7 +436,7 @@ def _physgaussian(nodes: ControlNodes, config: PhysicsConfig, grid: int, device:
     The nodes fill three quarters of its cube and move a little; its substeps are short, which costs the same, so that
     its finer grid is stable.
     """
-    from mpm_solver_warp import MPM_Simulator_WARP
+    from mpm_solver_warp import MPM_Simulator_WARP  # pyright: ignore[reportMissingImports]  (optional)
 
     rest = nodes.rest.astype(np.float64)
     size = 4 / 3 * float(np.ptp(rest, axis=0).max())

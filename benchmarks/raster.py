@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from rich.progress import Progress
 from torch import Tensor
 
-from endo_sim_ros.core.device import pick_device
+from endo_sim_ros.core.device import pick_device, single_threaded_torch
 from endo_sim_ros.core.kernels import plain_kernels
-from endo_sim_ros.evaluation.measurement import Row, machine, milliseconds, peak_megabytes, report, short
+from endo_sim_ros.evaluation.measurement import Row, Stage, machine, milliseconds, peak_megabytes, report, run_stages, short
 from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer, prepare
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 from endo_sim_ros.splatting import RenderOutput, _rasterize, rasterize
@@ -69,42 +68,27 @@ def tissue(count: int, width: int, height: int, device: str = "cpu", overlap: fl
     return Scene([x.to(device) for x in gaussians], torch.eye(4, device=device)[None], K[None].to(device), width, height)
 
 
+@single_threaded_torch()
 def bench_raster(device: str, json_file: Path | None = None, plan: Plan = Plan()) -> None:
     """Print the results on a device (see `pick_device`) and, if asked for, write them to a file.
 
     Times are medians in milliseconds. "Forward" is colour, depth, alpha and distortion without gradients; "backward" the
     gradients of means, quaternions, scales, opacities and colours from all of these. Peers compute colour and depth.
     """
-    device = pick_device(device)
+    device, seconds = pick_device(device), plan.seconds
     named = lambda count, size: f"{short(count)} {size[0]}x{size[1]}"
-    stages: list[tuple[str, Callable[[], list[Row]]]] = []
-    for size in plan.sizes:
-        for count in plan.counts:
-            stages.append((named(count, size), partial(_speed, named(count, size), count, size, device, plan.seconds)))
-    count, width, height = plan.reference
-    size = width, height
-    stages.append(("torch reference", partial(_against_reference, named(count, size), count, size, device, plan.seconds)))
-    stages.append(("precision", partial(_precision, count, size, device)))
-    size, count = plan.sizes[0], plan.counts[0]
-    for n in plan.curve_counts:
-        stages.append(("time and Gaussians", partial(_curve, "over Gaussians", n, size, 1.0, device, plan.seconds)))
-    for s in plan.curve_sizes:
-        stages.append(("time and pixels", partial(_curve, "over pixels", count, s, 1.0, device, plan.seconds)))
-    for overlap in plan.overlaps:
-        stages.append(("time and overlap", partial(_curve, "over overlap", count, size, overlap, device, plan.seconds)))
-    stages.append(("training", partial(_training, *plan.training, device, plan.seconds)))
-    rows, threads = [], torch.get_num_threads()
-    torch.set_num_threads(1)  # as in the nodes: on a CPU the kernels bring their own threads
-    try:
-        with Progress(transient=True) as bar:
-            task = bar.add_task("", total=len(stages))
-            for name, stage in stages:
-                bar.update(task, description=name)
-                rows += stage()
-                bar.advance(task)
-    finally:
-        torch.set_num_threads(threads)
-    report(f"Rasteriser on {machine(device)}", rows, json_file)
+    few, width, height = plan.reference
+    small, size, count = (width, height), plan.sizes[0], plan.counts[0]
+    stages: list[Stage] = [
+        *((named(n, s), partial(_speed, named(n, s), n, s, device, seconds)) for s in plan.sizes for n in plan.counts),
+        ("torch reference", partial(_against_reference, named(few, small), few, small, device, seconds)),
+        ("precision", partial(_precision, few, small, device)),
+        *(("time and Gaussians", partial(_curve, "over Gaussians", n, size, 1.0, device, seconds)) for n in plan.curve_counts),
+        *(("time and pixels", partial(_curve, "over pixels", count, s, 1.0, device, seconds)) for s in plan.curve_sizes),
+        *(("time and overlap", partial(_curve, "over overlap", count, size, x, device, seconds)) for x in plan.overlaps),
+        ("training", partial(_training, *plan.training, device, seconds)),
+    ]
+    report(f"Rasteriser on {machine(device)}", run_stages(stages), json_file)
 
 
 # ---------------------------------------------------------------- what is measured

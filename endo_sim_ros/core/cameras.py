@@ -96,6 +96,11 @@ class Camera:
         return (z > 0) & (uv >= 0).all(1) & (uv < [self.width, self.height]).all(1)
 
 
+def intrinsic_matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
+    """Intrinsics [3, 3] of focal lengths and a principal point, pixels."""
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)
+
+
 def invert_pose(pose: np.ndarray) -> np.ndarray:
     """Inverse of a rigid transform [4, 4]."""
     inverse = np.eye(4)

@@ -67,7 +67,7 @@ def unpack(chunks: dict[str, np.ndarray], vertices: dict[str, np.ndarray], harmo
         raise ValueError(f"{found} chunks or their harmonics do not fit {count} Gaussians, {CHUNK} a chunk")
     of_chunk = np.arange(count) // CHUNK
 
-    def between(shares, names):
+    def between(shares: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
         low, high = (np.stack([chunks[f"{end}_{name}"] for name in names], 1).astype(np.float64)[of_chunk] for end in ("min", "max"))
         return low + shares * (high - low)
 

@@ -124,27 +124,6 @@ def refuse_renamed_flags(words: Sequence[str], command: type) -> None:
             raise ConfigError(f"{flag} is now {new.replace('_', '-') if new.startswith('--') else new}")
 
 
-def validate(config: Any) -> None:
-    """Raise :class:`ConfigError` unless every field has its declared type and lies within its declared bounds."""
-    for option in options(type(config)):
-        if "." in option.name:
-            continue  # the nested stage has validated itself
-        value = _converted(option, getattr(config, option.name))
-        object.__setattr__(config, option.name, value)
-        where = f"{type(config).__name__}.{option.name}"
-        if not isinstance(value, option.type) or (option.type is int and isinstance(value, bool)):
-            raise ConfigError(f"{where} must be a {option.type.__name__}, got {value!r}")
-        if option.type is tuple and not all(isinstance(item, str) for item in value):
-            raise ConfigError(f"{where} must be a list of names, got {value!r}")
-        if option.type is float and not math.isfinite(value):
-            raise ConfigError(f"{where} must be finite, got {value}")
-        if option.choices and value not in option.choices:
-            raise ConfigError(f"{where} must be one of {', '.join(map(str, option.choices))}, got {value!r}")
-        if option.range and not option.range.minimum <= value <= option.range.maximum:
-            low, high, unit = option.range
-            raise ConfigError(f"{where} must lie in [{low:g}, {high:g}] {unit}, got {value:g}".replace(" ,", ","))
-
-
 def _converted(option: Option, value: Any) -> Any:
     """A value in the type of an option, where nothing is lost: a whole number for a float, a list for a tuple."""
     if option.type is float and isinstance(value, int) and not isinstance(value, bool):
@@ -154,13 +133,33 @@ def _converted(option: Option, value: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class StageConfig:
-    """Base of the stage configurations: validates on construction and converts from plain mappings."""
+    """Base of the stage configurations: validates on construction and converts from plain mappings.
+
+    Raises:
+        ConfigError: If a field has not its declared type or lies outside its declared bounds.
+    """
 
     renamed: ClassVar[dict[str, str]] = {}
     """Options that had another name: the old name, and the new one, or what to write instead in words."""
 
     def __post_init__(self):
-        validate(self)
+        for option in options(type(self)):
+            if "." in option.name:
+                continue  # the nested stage has validated itself
+            value = _converted(option, getattr(self, option.name))
+            object.__setattr__(self, option.name, value)
+            where = f"{type(self).__name__}.{option.name}"
+            if not isinstance(value, option.type) or (option.type is int and isinstance(value, bool)):
+                raise ConfigError(f"{where} must be a {option.type.__name__}, got {value!r}")
+            if option.type is tuple and not all(isinstance(item, str) for item in value):
+                raise ConfigError(f"{where} must be a list of names, got {value!r}")
+            if option.type is float and not math.isfinite(value):
+                raise ConfigError(f"{where} must be finite, got {value}")
+            if option.choices and value not in option.choices:
+                raise ConfigError(f"{where} must be one of {', '.join(map(str, option.choices))}, got {value!r}")
+            if option.range and not option.range.minimum <= value <= option.range.maximum:
+                low, high, unit = option.range
+                raise ConfigError(f"{where} must lie in [{low:g}, {high:g}] {unit}, got {value:g}".replace(" ,", ","))
 
     @classmethod
     def from_mapping(cls, values: dict[str, Any]) -> Self:
@@ -192,15 +191,11 @@ class StageConfig:
                 own[name] = value
             else:
                 unknown.append(name)
+        for name in unknown:
+            if name in self.renamed:
+                raise ConfigError(f"{type(self).__name__}: the option {name} is now {self.renamed[name]}")
         if unknown:
-            raise ConfigError(self._explain_unknown(unknown))
+            known = ", ".join(option.name for option in options(type(self)))
+            raise ConfigError(f"{type(self).__name__} has no option {', '.join(unknown)}; it has {known}")
         changed = {stage: getattr(self, stage).replaced(inner) for stage, inner in nested.items()}
         return dataclasses.replace(self, **own, **changed)
-
-    @classmethod
-    def _explain_unknown(cls, names: list[str]) -> str:
-        for name in names:
-            if name in cls.renamed:
-                return f"{cls.__name__}: the option {name} is now {cls.renamed[name]}"
-        known = ", ".join(option.name for option in options(cls))
-        return f"{cls.__name__} has no option {', '.join(names)}; it has {known}"

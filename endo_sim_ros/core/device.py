@@ -4,10 +4,14 @@ import contextlib
 import functools
 import os
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING
 
 import torch
+
+if TYPE_CHECKING:
+    import warp as wp
 
 
 def pick_device(name: str = "auto") -> str:
@@ -64,13 +68,13 @@ def on_torch_stream(device: torch.device | str) -> contextlib.AbstractContextMan
     return wp.ScopedStream(warp_stream(torch.cuda.current_stream(device)), sync_enter=False)
 
 
-def warp_stream(stream: torch.cuda.Stream):
-    """Return Warp's object for a stream of torch, the same each time: with it Warp would forget what it knows of the stream."""
+def warp_stream(stream: torch.cuda.Stream) -> "wp.Stream":
+    """Return Warp's object for a stream of torch: one that is kept, because Warp forgets what it knows of a stream with the object."""
     return _warp_stream(stream.device, stream.cuda_stream)
 
 
 @functools.cache
-def _warp_stream(device: torch.device, handle: int):
+def _warp_stream(device: torch.device, handle: int) -> "wp.Stream":
     import warp as wp
 
     return wp.Stream(wp.device_from_torch(device), cuda_stream=handle)
@@ -87,6 +91,17 @@ def cpu_threads() -> int:
     if not wanted.isdecimal():
         raise ValueError(f"ENDO_SIM_THREADS is {wanted!r}; it must be a number of threads, or 0 for as many as there are cores")
     return int(wanted) or available
+
+
+@contextlib.contextmanager
+def single_threaded_torch() -> Iterator[None]:
+    """As in the nodes: on a CPU the kernels bring their own threads. Also a decorator."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def shares(count: int, least: int) -> list[tuple[int, int]]:

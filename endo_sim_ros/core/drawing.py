@@ -89,13 +89,25 @@ def write_png(path: str | Path, image: np.ndarray) -> None:
         raise OSError(f"{path}: the picture cannot be written; does the folder exist?")
 
 
-def write_video(path: str | Path, images: Iterable[np.ndarray], fps: float) -> int:
-    """Write RGB images [H, W, 3] uint8 of one size as H.264 that browsers play, and return their number."""
+def jpeg(image: np.ndarray, quality: int) -> bytes:
+    """The JPEG file of an RGB image [H, W, 3] uint8, of a quality from 0 to 100."""
+    return cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+
+
+def write_video(path: str | Path, images: Iterable[np.ndarray], fps: float, options: dict[str, str] = {"crf": "18"}) -> int:
+    """Write RGB images [H, W, 3] uint8 of one size as H.264 that browsers play, and return their number.
+
+    Args:
+        path: File to write.
+        images: An odd last row or column is left out.
+        fps: Images per second.
+        options: Of libx264.
+    """
     import av
 
     count = 0
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000), options={"crf": "18"})
+        stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000), options=options)
         stream.pix_fmt = "yuv420p"
         for image in images:
             image = np.ascontiguousarray(image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2])  # H.264 wants even sizes

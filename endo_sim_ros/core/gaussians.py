@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -167,7 +168,7 @@ def from_columns(columns: dict[str, np.ndarray], source: str) -> GaussianModel:
     if missing:
         raise ModelError(f"{source}: missing field {', '.join(missing[:4])}; a Gaussian model has INRIA's field names")
 
-    def stack(names):
+    def stack(names: Iterable[str]) -> Tensor:
         return torch.from_numpy(np.stack([np.asarray(columns[name], np.float32) for name in names], 1))
 
     dc, rest = stack([f"f_dc_{i}" for i in range(3)]), None

@@ -22,7 +22,7 @@ _plain = contextvars.ContextVar("plain", default=False)
 
 @contextlib.contextmanager
 def plain_kernels() -> Iterator[None]:
-    """Within it, every ``backend_for`` returns for a CPU what it returns for GPUs, which runs there plainly: to compare with.
+    """Within it every ``backend_for`` gives a CPU the backend of GPUs, whose kernels run there without vectors, to compare with.
 
     It holds for the thread that entered it.
     """
@@ -67,7 +67,7 @@ def kernel_arguments(kernel: Any, arguments: Sequence, offset: int = 0) -> list:
     return [_array(kind, x) if isinstance(x, Tensor) else x for kind, x in zip(kinds, arguments, strict=True)]
 
 
-def _array(kind, tensor: Tensor):
+def _array(kind: Any, tensor: Tensor) -> Any:
     tensor = tensor.detach()
     dims = kind.ndim + len(getattr(kind.dtype, "_shape_", ()))
     if tensor.ndim > dims:

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
 
-FEATURES = 4
 _SHARPNESS = 6  # exponent of the mean that the exposure responds to: mostly to the brighter parts of a picture
 _STRIDE = 4  # pixels from one that the exposure measures to the next
 SURFACE = 0.5  # alpha above which a pixel shows a surface

@@ -2,7 +2,7 @@
 
 import functools
 import types
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -95,7 +95,7 @@ def _fixed_falloff(light: Light, rays: Tensor) -> Tensor:
     return falloff(features(here, torch.ones_like(here), rays, light.reference), _exponents(light, rays))
 
 
-def _launch(kernel, count: int, arguments: list) -> None:
+def _launch(kernel: Any, count: int, arguments: list) -> None:
     """Launch a kernel that takes 16 of count items at a time."""
     arguments = [x.contiguous().view(-1) if isinstance(x, Tensor) else x for x in arguments]
     launch_in_shares(kernel, -(-count // 16), arguments)

@@ -116,12 +116,12 @@ def _methods(config: EvaluationConfig) -> dict[str, dict[str, Any]]:
     if any(item.partition("=")[0] == "preset" for item in config.set):
         raise ConfigError("--set preset: methods are named with --presets")
     common = {"device": "auto"} | parse_values(config.set, "--set", ReconstructionConfig)
-    unlike = {name: dataclasses.asdict(preset(name, **common)) for name in config.presets}
+    methods = {name: dataclasses.asdict(preset(name, **common)) for name in config.presets}
     if config.ablation:
         for name in config.presets:
-            for part, overrides in ABLATIONS.get(name, {}).items():
-                unlike[f"{name} {part}"] = dataclasses.asdict(preset(name, **{**common, **overrides}))
-    return unlike
+            for part, overrides in ABLATIONS[name].items() if name in ABLATIONS else ():
+                methods[f"{name} {part}"] = dataclasses.asdict(preset(name, **{**common, **overrides}))
+    return methods
 
 
 def _networks(config: EvaluationConfig) -> tuple[tuple[Backbone, ...], dict[str, str]]:

@@ -19,9 +19,9 @@ log = logging.getLogger(__name__)
 _STEPS = 20  # of each move of the jaw
 _SHARE = 0.12  # of what is seen across: how far the jaw moves; half of it is the radius in which it holds control nodes
 _FINER = 2  # pixels of the surface to one of the picture, each way
-_SPREAD, _OPACITY = 0.45, 0.99  # of the Gaussian of each of them, in its width
-_MOVED = 6  # grey levels, of 255
-_ROUND = 4  # pixels about what changed
+_SPREAD, _OPACITY = 0.45, 0.99  # of the Gaussian of such a pixel: standard deviation in widths of the pixel, and opacity
+_CHANGED = 6  # difference from rest, grey levels of 255, above which a pixel has changed
+_MARGIN = 4  # pixels around those that changed, which count too
 
 
 def deformed_view_psnr(model: GaussianModel, cameras: Sequence[Camera], device: str) -> float:
@@ -69,9 +69,9 @@ def _deformed_view_psnr(model: GaussianModel, cameras: Sequence[Camera], device:
             continue
         state = simulation.state()
         picture, expected = (each.render(camera, state.positions, state.F, depth=False)[0] for each in (ours, reference))
-        changed = (np.abs(expected - at_rest).max(-1) > _MOVED).astype(np.uint8)
+        changed = (np.abs(expected - at_rest).max(-1) > _CHANGED).astype(np.uint8)
         if changed.any():
-            found.append(metrics.psnr(picture, expected, cv2.dilate(changed, np.ones((2 * _ROUND + 1,) * 2))))
+            found.append(metrics.psnr(picture, expected, cv2.dilate(changed, np.ones((2 * _MARGIN + 1,) * 2))))
     return float(np.mean(found)) if found else float("nan")
 
 

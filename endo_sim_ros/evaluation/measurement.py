@@ -4,13 +4,15 @@ import ctypes
 import json
 import platform
 import statistics
-from collections.abc import Callable, Iterable
+import time
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
 import warp as wp
 from rich.console import Console
+from rich.progress import Progress
 from rich.table import Table
 
 from endo_sim_ros.core.device import cpu_threads
@@ -27,21 +29,23 @@ class Row:
     peer: str | None = None
 
 
+Stage = tuple[str, Callable[[], list[Row]]]
+"""A part of a benchmark: its name, and what measures it."""
+
+
 def median_seconds(action: Callable[[], object], repeats: int, device: torch.device | str = "cpu", warm_up: int = 2) -> float:
     """Median duration of an action in seconds; on a GPU until its work is done."""
-    from time import perf_counter
-
     on_gpu = torch.device(device).type == "cuda"
     durations = []
     for index in range(warm_up + repeats):
         if on_gpu:
             torch.cuda.synchronize(device)
-        start = perf_counter()
+        start = time.perf_counter()
         action()
         if on_gpu:
             torch.cuda.synchronize(device)
         if index >= warm_up:
-            durations.append(perf_counter() - start)
+            durations.append(time.perf_counter() - start)
     return statistics.median(durations)
 
 
@@ -60,9 +64,26 @@ def _processor() -> str:
         return platform.processor() or platform.machine()
 
 
-def report(title: str, rows: Iterable[Row], json_file: Path | None = None) -> None:
-    """Print rows as a table and, if asked for, write them as a JSON list of name, value, unit, ratio and peer."""
-    rows = list(rows)
+def run_stages(stages: Sequence[Stage]) -> list[Row]:
+    """The rows of all stages of a benchmark."""
+    rows = []
+    with Progress(transient=True) as bar:
+        task = bar.add_task("", total=len(stages))
+        for name, stage in stages:
+            bar.update(task, description=name)
+            rows += stage()
+            bar.advance(task)
+    return rows
+
+
+def write_rows(rows: Iterable[Row], json_file: Path) -> None:
+    """Write rows as a JSON list of name, value, unit, ratio and peer."""
+    json_file.parent.mkdir(parents=True, exist_ok=True)
+    json_file.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n")
+
+
+def report(title: str, rows: Sequence[Row], json_file: Path | None = None) -> None:
+    """Print rows as a table and, if asked for, write them to a file."""
     table = Table(title=title, title_justify="left")
     for heading in ("", "value", "unit", "ratio", "to"):
         table.add_column(heading, justify="right" if heading in ("value", "ratio") else "left")
@@ -71,8 +92,7 @@ def report(title: str, rows: Iterable[Row], json_file: Path | None = None) -> No
         table.add_row(row.name, f"{row.value:.4g}", row.unit, ratio, row.peer or "")
     Console().print(table)
     if json_file is not None:
-        json_file.parent.mkdir(parents=True, exist_ok=True)
-        json_file.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n")
+        write_rows(rows, json_file)
 
 
 def short(count: int) -> str:

@@ -8,8 +8,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import cv2
-
+from endo_sim_ros.core import drawing
 from endo_sim_ros.evaluation import plots, tables
 from endo_sim_ros.evaluation.splits import explain_split
 from endo_sim_ros.evaluation.tables import COLUMNS, Pictures, Summary
@@ -142,10 +141,5 @@ def _label(name: tuple[str, str]) -> str:
 
 def _data(path: Path) -> str:
     """A picture as an address that holds it."""
-    image = cv2.imread(str(path))
-    if image is None:
-        raise ValueError(f"{path}: the picture is missing or damaged; run the evaluation again")
-    scale = min(_WIDTH / image.shape[1], 1.0)
-    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
-    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()
+    data = drawing.jpeg(tables.small_picture(path, _WIDTH), _QUALITY)
+    return "data:image/jpeg;base64," + base64.b64encode(data).decode()

@@ -19,19 +19,20 @@ from endo_sim_ros.reconstruction.scene import TrainingView
 from endo_sim_ros.sequences.folder import read_points
 
 _POINT_VIEWS = 48  # views that structure from motion is done with
-_JUDGING, _FEWEST_JUDGES = 10, 50  # one scene point in so many judges depth where nothing better does, if those are enough
-_SAME_POINT = 0.1  # of the distance between judging points, up to which another one is the same
+_JUDGING = 10  # one scene point in so many judges depth where none was recorded
+_FEWEST_JUDGES = 50  # with fewer, none does
+_SAME_POINT = 0.1  # distance between two triangulations of one point, in distances between judging points
 _POINT_ERROR = 0.003  # relative error of the depth of points that a recording brings
 
 
 class Prepared(NamedTuple):
     """A sequence as all its cells use it."""
 
-    frames: list[Frame]  # left; those that no split trains on are as small as is measured
+    frames: list[Frame]  # left images; those that no split trains on have the size at which they are measured
     right: list[Frame]  # the right images as views, for the split of that name
     depth_source: str  # where the reference depth of the frames is from: recorded, stereo matching, or none
     points: ScenePoints  # of structure from motion with all views, like the poses
-    judging: np.ndarray | None  # [N, 3] those of them kept from the methods, where there is no exact depth
+    judging: np.ndarray | None  # [N, 3] m, world: points that judge depth and are kept from the methods; None: no judges
 
 
 def prepare_sequence(cells: Sequence[Cell], bar: Progress) -> Prepared:

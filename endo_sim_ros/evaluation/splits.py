@@ -1,6 +1,7 @@
 """Which views of a sequence to train on and which to hold out."""
 
 import re
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from endo_sim_ros.core.frames import Frame, SequenceError
@@ -82,7 +83,7 @@ def _stepped(name: str) -> tuple[str, str]:
     return match[1], match[2]
 
 
-def right_views(frames: list[Frame]) -> list[Frame]:
+def right_views(frames: Sequence[Frame]) -> list[Frame]:
     """The right images of stereo frames as views of their own; a frame without one is left out.
 
     Raises:

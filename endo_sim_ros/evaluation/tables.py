@@ -1,11 +1,9 @@
 """The results of an evaluation as tables for people and files for machines."""
 
 import csv
-import json
 import statistics
 import sys
 from collections.abc import Iterable
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +15,7 @@ from rich.table import Table
 from endo_sim_ros.core import drawing
 from endo_sim_ros.evaluation import plots
 from endo_sim_ros.evaluation.held_out import FIGURES, Figure
-from endo_sim_ros.evaluation.measurement import Row
+from endo_sim_ros.evaluation.measurement import Row, write_rows
 from endo_sim_ros.evaluation.paper import PRINTED, Printed
 from endo_sim_ros.evaluation.splits import explain_split
 
@@ -148,8 +146,7 @@ def write(results: dict[str, Any], out: Path, json_file: Path | None) -> None:
     _write_strips(summaries, out)
     plots.write(summaries, out)
     if json_file is not None:
-        json_file.parent.mkdir(parents=True, exist_ok=True)
-        json_file.write_text(json.dumps([asdict(row) for row in machine_rows(summaries)], indent=1) + "\n")
+        write_rows(machine_rows(summaries), json_file)
     Console(width=None if sys.stdout.isatty() else 150).print(_terminal_table(summaries, results["missing"]))
 
 
@@ -254,7 +251,7 @@ def _write_strips(summaries: list[Summary], out: Path) -> None:
         for view, paths in views.items():
             for kind, reference in (("rendered", "reference"), ("depth", "reference_depth")):
                 keys = [("", reference), *((method, kind) for method in methods)]
-                images = [_small(out / paths[key]) if key in paths else None for key in keys]
+                images = [small_picture(out / paths[key], _STRIP_WIDTH) if key in paths else None for key in keys]
                 blank = np.zeros_like(next(image for image in images if image is not None))
                 depth = "no depth to compare with" if images[0] is None else "its depth"
                 labels = [f"view {int(view)}" if kind == "rendered" else depth, *methods]
@@ -262,10 +259,14 @@ def _write_strips(summaries: list[Summary], out: Path) -> None:
         drawing.write_png(out / "strips" / f"{drawing.slug(f'{sequence}-{split}')}.png", drawing.sheet(cells, len(methods) + 1))
 
 
-def _small(path: Path) -> np.ndarray:
+def small_picture(path: Path, width: int) -> np.ndarray:
+    """A picture of the folder of results, RGB [H, W, 3] uint8, at most so many pixels wide.
+
+    Raises:
+        ValueError: If it cannot be read.
+    """
     image = cv2.imread(str(path))
     if image is None:
-        raise OSError(f"{path}: the picture cannot be read; remove its record from cells/ and evaluate again")
-    image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-    scale = min(_STRIP_WIDTH / image.shape[1], 1.0)
-    return cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        raise ValueError(f"{path}: the picture is missing or damaged; remove its record from cells/ and evaluate again")
+    scale = min(width / image.shape[1], 1.0)
+    return cv2.resize(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)

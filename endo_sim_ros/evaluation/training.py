@@ -11,27 +11,27 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 
 from endo_sim_ros.core import drawing
-from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.device import cpu_threads
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.evaluation.cells import Cell
 from endo_sim_ros.evaluation.deformed_views import deformed_view_psnr
 from endo_sim_ros.evaluation.held_out import difference, mean_figures, measure, model_renderer, seen_pixels
-from endo_sim_ros.evaluation.lpips import Backbone, Lpips
+from endo_sim_ros.evaluation.lpips import Lpips
 from endo_sim_ros.evaluation.measurement import machine, peak_megabytes
 from endo_sim_ros.evaluation.preparation import Prepared
-from endo_sim_ros.evaluation.splits import Split, split_views
+from endo_sim_ros.evaluation.splits import split_views
 from endo_sim_ros.reconstruction import Progress, ReconstructionConfig, ScenePoints, Trainer, prepare, reconstruct, shrink
 from endo_sim_ros.reconstruction.triangulation import points_in_view
 from endo_sim_ros.sequences.recording import spread
 
 _SHOWN = 3  # held-out views of a cell of which pictures are kept
+_QUALITY = 92  # of these pictures, as JPEG
 _CURVE_VIEWS = 8  # held-out views measured at each moment of a curve
 
 
@@ -40,16 +40,14 @@ def _load(file: Path) -> Prepared:
     return pickle.loads(file.read_bytes())
 
 
-@functools.lru_cache(maxsize=2)
-def _network(name: Backbone, weights: Path | None, device: str) -> Lpips:
-    return Lpips(name, weights, device)
+_network = functools.lru_cache(maxsize=2)(Lpips)
 
 
 @functools.lru_cache(maxsize=1)
 def _warm_up(device: str) -> None:
     """Load or compile every kernel, which is no part of the time of a training."""
     image = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
-    camera, poses = Camera(np.array([[60, 0, 32], [0, 60, 24], [0, 0, 1]]), 64, 48), np.tile(np.eye(4), (2, 1, 1))
+    camera, poses = Camera(intrinsic_matrix(60, 60, 32, 24), 64, 48), np.tile(np.eye(4), (2, 1, 1))
     poses[1, 0, 3] = 0.005
     frames = [Frame(i, image, camera.at(pose), depth=np.full((48, 64), 0.1, np.float32)) for i, pose in enumerate(poses)]
     with contextlib.suppress(SequenceError):  # they need not make a scene
@@ -77,7 +75,10 @@ def train_and_measure(argument: tuple[Cell, Path | None, Prepared | Path], devic
         views = [dataclasses.replace(view, depth=None) for view in views]
     if cell.mono or split.right:
         views = [dataclasses.replace(view, right=None, baseline=None, right_K=None) for view in views]
-    held_out = [shrink(frame, config.image_width) for frame in _held_out(prepared, split)]
+    if split.right and not prepared.right:
+        raise SequenceError("split stereo: the sequence has no right images")
+    held_out = prepared.right if split.right else [prepared.frames[index] for index in split.held_out]
+    held_out = [shrink(frame, config.image_width) for frame in held_out]
     report((0, 1, "warming up"))
     _warm_up(device)
     training: dict[str, Any] = {}
@@ -134,14 +135,6 @@ def train_and_measure(argument: tuple[Cell, Path | None, Prepared | Path], devic
         "curve": training["curve"],
         "pictures": pictures,
     }
-
-
-def _held_out(prepared: Prepared, split: Split) -> list[Frame]:
-    if not split.right:
-        return [prepared.frames[index] for index in split.held_out]
-    if not prepared.right:
-        raise SequenceError("split stereo: the sequence has no right images")
-    return prepared.right
 
 
 def _reference_at_points(held_out: list[Frame], judging: np.ndarray | None) -> float | None:
@@ -212,8 +205,4 @@ def _pictures(view: int, image: np.ndarray, depth: np.ndarray, frame: Frame) -> 
     }
     if frame.depth is not None:
         pictures["reference_depth"] = drawing.color_depth(frame.depth, near, far)
-    quality = [cv2.IMWRITE_JPEG_QUALITY, 92]
-    return {
-        f"{view:04d}-{name}": cv2.imencode(".jpg", cv2.cvtColor(picture.astype(np.uint8), cv2.COLOR_RGB2BGR), quality)[1].tobytes()
-        for name, picture in pictures.items()
-    }
+    return {f"{view:04d}-{name}": drawing.jpeg(picture.astype(np.uint8), _QUALITY) for name, picture in pictures.items()}

@@ -136,7 +136,7 @@ def _attempt(job: Job, argument: Any, device: str, report: Callable[[Any], None]
 
 
 def run_in_ray(job: Job, arguments: Sequence[Any], on_gpu: bool, at_once: int) -> Iterator[Finished]:
-    """Run a job with each argument on the hosts of the Ray cluster that is running, or on this one.
+    """Run a job with each argument on the hosts of the Ray cluster that this process has joined.
 
     Args:
         job: As for `run_in_processes`; what it reports is not seen.
@@ -146,8 +146,6 @@ def run_in_ray(job: Job, arguments: Sequence[Any], on_gpu: bool, at_once: int) -
     """
     import ray  # pyright: ignore[reportMissingImports]  (optional)
 
-    if not ray.is_initialized():
-        ray.init(log_to_driver=False, logging_level="ERROR")
     share = {"num_gpus": 1 / at_once, "num_cpus": 1} if on_gpu else {"num_cpus": max((os.cpu_count() or 1) // at_once, 1)}
     threads = int(share["num_cpus"])
 

@@ -80,7 +80,7 @@ class TaskEnvironment(gymnasium.Env):
         ValueError: If an argument cannot be used, or the model is too small.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012
+    metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}
 
     def __init__(
         self,
@@ -120,7 +120,7 @@ class VectorTaskEnvironment(gymnasium.vector.VectorEnv):
         num_envs: How many.
     """
 
-    metadata = {  # noqa: RUF012
+    metadata = {
         "render_modes": ["rgb_array"], "render_fps": FPS, "autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP,
     }  # fmt: skip
 

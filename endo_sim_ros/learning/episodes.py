@@ -121,7 +121,7 @@ def read_episode(
         if not reader.message_count:
             raise SequenceError(f"{bag}: the recording is empty; was the graph running?")
         arms = arms or _arms(reader.topics)
-        _require(reader, bag, arms)
+        reader.require(*((topic,) for topic in _needed(arms)))
         streams = _usable(bag, lambda: _streams(reader, arms, known))
     for topic in _needed(arms):
         if topic not in streams:
@@ -197,13 +197,6 @@ def _needed(arms: tuple[str, ...]) -> list[Topic]:
 
 def _commands(arm: str) -> list[Topic]:
     return [make(arm) for make in (messages.tool_pose_command, messages.tool_pose, messages.tool_wrench, messages.tool_jaw)]
-
-
-def _require(reader: BagReader, bag: Path, arms: tuple[str, ...]) -> None:
-    present = reader.topics
-    for topic in _needed(arms):
-        if f"/{topic.name}" not in present:
-            raise SequenceError(f"{bag}: no topic /{topic.name}; the bag has {', '.join(sorted(present))}")
 
 
 # --------------------------------------------------------------------------------------------------------------- streams
@@ -302,7 +295,7 @@ def _to_world(wrenches: _Stream, tips: _Stream) -> _Stream:
     """Wrenches [N, 6] in world axes of ones [N, 7] whose last column says whether they are so already, else in the tip's."""
     x, y, z, w = tips.at(wrenches.stamps)[:, 3:].T[:, :, None]
     axis = np.hstack([x, y, z])
-    rotate = lambda v: v + 2 * np.cross(axis, np.cross(axis, v) + w * v)  # noqa: E731
+    rotate = lambda v: v + 2 * np.cross(axis, np.cross(axis, v) + w * v)
     vectors = wrenches.values[:, :6]
     turned = np.hstack([rotate(vectors[:, :3]), rotate(vectors[:, 3:])])
     return _Stream(wrenches.stamps, np.where(wrenches.values[:, 6:] > 0, vectors, turned))

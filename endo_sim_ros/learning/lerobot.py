@@ -13,11 +13,11 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
-import av
 import cv2
 import numpy as np
 from rich.progress import track
 
+from endo_sim_ros.core import drawing
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.learning.episodes import (
     Episode,
@@ -36,7 +36,7 @@ _VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 _EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 _CHUNK_SIZE = 1000  # files in a folder
 # Every second frame is a key frame, so that any is found fast; without frames out of order times begin at zero.
-_CODEC, _CODEC_OPTIONS = "libx264", {"g": "2", "bf": "0", "crf": "18"}
+_CODEC_OPTIONS = {"g": "2", "bf": "0", "crf": "18"}
 _QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 _GROUP = 256  # rows that are written together with their png images
 _SAMPLE = 150  # pixels along the longer side of an image that count in its statistics
@@ -141,7 +141,7 @@ class _Dataset:
         place = dict(zip(("chunk_index", "file_index"), divmod(number, _CHUNK_SIZE)))
         if self._images == "video":
             path = self._path(_VIDEO.format(video_key=IMAGE, **place))
-            _write_video(path, images, episode.fps, episode.image_size)
+            drawing.write_video(path, images, episode.fps, _CODEC_OPTIONS)
             self._pa.parquet.write_table(table, self._path(_DATA.format(**place)))
             return histogram
         kind = self._pa.struct({"bytes": self._pa.binary(), "path": self._pa.string()})
@@ -196,7 +196,7 @@ class _Dataset:
         self._pa.parquet.write_table(self._pa.table(columns).replace_schema_metadata(metadata), self._path(name))
 
     def _write_json(self, name: str, values: dict) -> None:
-        plain = lambda value: value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value  # noqa: E731
+        plain = lambda value: value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
         self._path(name).write_text(json.dumps(values, indent=4, ensure_ascii=False, default=plain), "utf8")
 
     def _path(self, name: str) -> Path:
@@ -266,16 +266,6 @@ def _info(fps: int, episodes: int, frames: int, features: dict, images: ImageFor
 
 
 # ---------------------------------------------------------------------------------------------------------------- images
-
-
-def _write_video(path: Path, images: Iterable[np.ndarray], fps: int, size: tuple[int, int]) -> None:
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream(_CODEC, rate=fps, options=_CODEC_OPTIONS)
-        stream.pix_fmt = "yuv420p"
-        stream.height, stream.width = size
-        for image in images:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")))
-        container.mux(stream.encode())
 
 
 def _png(image: np.ndarray) -> bytes:

@@ -32,7 +32,6 @@ class RetractionScript:
 
     def reset(self, episodes: Sequence[int]) -> None:
         """Nothing to do: the script has no memory."""
-        pass
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Actions [B, 4] for state observations [B, n]."""
@@ -146,7 +145,6 @@ class NetworkPolicy:
 
     def reset(self, episodes: Sequence[int]) -> None:
         """Nothing to do: the network has no memory."""
-        pass
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Actions [B, 4], not clipped, for state observations [B, n]."""
@@ -202,14 +200,14 @@ def scripted_policy(task: str, count: int = 1) -> Policy:
     return SCRIPTS[task](count)
 
 
-def make_policy(policy: str, task: str, count: int = 1) -> Policy:
+def make_policy(policy: str, task: str) -> Policy:
     """``scripted``, or the policy in a .npz file.
 
     Raises:
         ValueError: If there is no such task or script, or the file cannot be read or is for another task.
     """
     if policy == "scripted":
-        return scripted_policy(task, count)
+        return scripted_policy(task)
     loaded = NetworkPolicy.load(policy)
     if loaded.task != task:
         raise ValueError(f"{policy} was trained for {loaded.task}, not for {task}")

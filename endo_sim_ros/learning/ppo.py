@@ -9,12 +9,13 @@ import numpy as np
 import torch
 from rich.progress import Progress
 
+from endo_sim_ros.core.device import single_threaded_torch
 from endo_sim_ros.learning.config import PPOConfig, Randomisation
 from endo_sim_ros.learning.environments import Observed, VectorTaskEnvironment
 from endo_sim_ros.learning.policies import NetworkPolicy
 from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.learning.task_batch import TaskBatch
-from endo_sim_ros.learning.train import measure_policy, single_threaded_torch
+from endo_sim_ros.learning.train import measure_policy
 
 try:
     from stable_baselines3 import PPO  # pyright: ignore[reportMissingImports]  (optional)
@@ -141,6 +142,7 @@ class _Curve(BaseCallback):
         self._bar.update(self._progress, description=f"solved {tested['test_success']:.0%}")
 
 
+@single_threaded_torch()
 def train_ppo(
     task: str, scene: Scene, config: PPOConfig, randomisation: Randomisation = Randomisation(), device: str = "auto"
 ) -> tuple[NetworkPolicy, list[dict[str, float]]]:
@@ -150,7 +152,7 @@ def train_ppo(
         The policy, and its learning curve: number of training episodes and steps so far, test return and success rate, and
         seconds; first of the untrained policy, last of the one returned.
     """
-    with single_threaded_torch(), Progress() as bar:
+    with Progress() as bar:
         options = {"scene": scene, "randomisation": randomisation, "device": device}
         environments = StableEnvironments(VectorTaskEnvironment(task, config.environments, **options))
         testing = TaskBatch(task, scene, config.test_episodes, randomisation=randomisation, device=device)

@@ -1,5 +1,6 @@
 """What is trained on: a reconstructed model, the cameras that saw it, and the tissue behind it."""
 
+import contextlib
 import functools
 import os
 from dataclasses import asdict, dataclass, replace
@@ -10,11 +11,11 @@ import yaml
 
 from endo_sim_ros.core.cameras import Camera, load_cameras, save_cameras
 from endo_sim_ros.core.gaussians import GaussianModel, ModelError, load_ply, save_ply
-from endo_sim_ros.learning.tasks import find_task, make_task
+from endo_sim_ros.learning.tasks import find_task
 from endo_sim_ros.physics import ControlNodes, PhysicsConfig, build_control_nodes
 from endo_sim_ros.rendering import render_depth
 
-_CACHED = "phantom-1.ply"  # another number when the default scene becomes another
+_CACHED = "phantom-1.ply"  # raise the number when the default scene changes
 _PIECE = 0.5  # of the synthetic patient's picture, about its middle
 
 
@@ -65,8 +66,9 @@ def save_scene(scene: Scene, folder: Path, task: str, seed: int = 0) -> None:
     Raises:
         ValueError: If there is no such task, or the scene is too small for it.
     """
-    physics = find_task(task).physics()
-    first = make_task(task, scene.nodes(physics), scene.camera.position)
+    kind = find_task(task)
+    physics = kind.physics()
+    first = kind(scene.nodes(physics), scene.camera.position)
     first.reset(0, np.random.default_rng(seed))
     changed = {name: value for name, value in asdict(physics).items() if value != getattr(PhysicsConfig(), name) and name != "device"}
     changed |= {"regions": list(first.regions())} if first.regions() else {}
@@ -92,18 +94,12 @@ def default_scene() -> Scene:
     K[:2, :2] /= _PIECE
     camera = replace(whole, K=K)
     path = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "endo_sim_ros" / _CACHED
-    try:
+    with contextlib.suppress(ModelError):  # there is none yet, or it was damaged
         return Scene(load_ply(path), (camera,))
-    except ModelError:  # there is none yet, or it was damaged
-        pass
     from endo_sim_ros.sequences.phantom_model import phantom_model
 
     model, _ = phantom_model(24_000, whole.width)
-    pixels, _ = camera.project(model.means.double().numpy())
-    inside = ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(1)
-    model = model.select(np.flatnonzero(inside))
-    try:
+    model = model.select(np.flatnonzero(camera.sees(model.means.double().numpy())))
+    with contextlib.suppress(OSError):  # of a home that cannot be written; it is rendered again next time
         save_ply(model, path)
-    except OSError:
-        pass  # a home that cannot be written; it is rendered again next time
     return Scene(model, (camera,))

@@ -19,7 +19,7 @@ from endo_sim_ros.splatting import rasterize
 
 RESTING_SPEED = 1e-5  # m/s; as in TissueSimulation: one tissue slower than this, that no tool moves, is left as it is
 _AT_ONCE = 64  # images drawn together
-_BELOW = 1e-9  # keeps factors of the stiffness, rounded, within the largest that was planned for
+_BELOW = 1e-9  # share taken off random stiffness: rounded, it must not exceed what the substeps were planned for
 
 Observations = Literal["state", "image", "both"]
 

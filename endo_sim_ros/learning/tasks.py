@@ -43,6 +43,9 @@ class Task(ABC):
         nodes: The tissue at rest.
         viewpoint: Where the endoscope is [3], m, world.
         count: B.
+
+    Raises:
+        ValueError: If the tissue is too small for the task.
     """
 
     name: str
@@ -57,14 +60,15 @@ class Task(ABC):
     largest_stiffness = 1.0  # factor on the moduli that an episode may have
     same_tissue = True  # in all episodes, but for randomisation
     margin = 0.012  # m from tissue that is held in place to a place that is worked on
-    around, smooth = 0.012, 0.6  # that part of the places is used where the skin within a distance, m, is nearest to a plane
+    around = 0.012  # m; the skin within this distance of a place is compared with a plane
+    smooth = 0.6  # share of the places that is used: the flattest
 
     @staticmethod
     @abstractmethod
     def physics(device: str = "auto") -> PhysicsConfig:
         """The tissue and the tools of the task."""
 
-    def __init__(self, nodes: ControlNodes, viewpoint: np.ndarray, count: int):
+    def __init__(self, nodes: ControlNodes, viewpoint: np.ndarray, count: int = 1):
         self.nodes, self.viewpoint, self.count = nodes, np.asarray(viewpoint, np.float64), count
         self.rest = nodes.rest.astype(np.float64)  # [M, 3] m, world
         self.skin = np.flatnonzero(nodes.is_skin & ~nodes.pinned)
@@ -216,7 +220,7 @@ class Retraction(Task):
             node_count=800, layers=2, thickness=0.015, young_modulus=4e3, force_radius=Retraction.grasp_radius, device=device
         )
 
-    def __init__(self, nodes: ControlNodes, viewpoint: np.ndarray, count: int):
+    def __init__(self, nodes: ControlNodes, viewpoint: np.ndarray, count: int = 1):
         super().__init__(nodes, viewpoint, count)
         self._spot, self._moved = np.zeros((count, 3)), np.zeros((count, 3))  # from the tip, and from rest, m, task frame
         self._held = np.zeros(count, int)  # steps that the spot has been raised
@@ -273,16 +277,10 @@ class Palpation(Task):
     def physics(device: str = "auto") -> PhysicsConfig:
         """Soft tissue, and a ball that pushes."""
         return PhysicsConfig(
-            node_count=1000,
-            layers=3,
-            thickness=0.02,
-            young_modulus=4e3,
-            contact_radius=0.008,
-            friction=0.1,
-            device=device,
+            node_count=1000, layers=3, thickness=0.02, young_modulus=4e3, contact_radius=0.008, friction=0.1, device=device
         )
 
-    def __init__(self, nodes: ControlNodes, viewpoint: np.ndarray, count: int):
+    def __init__(self, nodes: ControlNodes, viewpoint: np.ndarray, count: int = 1):
         super().__init__(nodes, viewpoint, count)
         self.centre = np.zeros((count, 3))  # of the inclusion, m, task frame
         self.place = np.zeros((count, 3))  # the same in the world
@@ -335,15 +333,6 @@ class Palpation(Task):
 
 TASKS: dict[str, type[Task]] = {task.name: task for task in (Retraction, Palpation)}
 """All tasks by their names."""
-
-
-def make_task(name: str, nodes: ControlNodes, viewpoint: np.ndarray, count: int = 1) -> Task:
-    """A task by its name.
-
-    Raises:
-        ValueError: If there is no such task, or the tissue is too small for it.
-    """
-    return find_task(name)(nodes, viewpoint, count)
 
 
 def find_task(name: str) -> type[Task]:

@@ -1,17 +1,15 @@
 """Train a small policy by the cross-entropy method, many episodes at once: `endo-sim train`."""
 
-import contextlib
 import json
 import logging
 import time
-from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
-import torch
 from rich.progress import Progress
 
+from endo_sim_ros.core.device import single_threaded_torch
 from endo_sim_ros.learning.config import PPOConfig, Randomisation, TrainingConfig
 from endo_sim_ros.learning.policies import NetworkPolicy, Policy
 from endo_sim_ros.learning.scenes import Scene
@@ -46,17 +44,7 @@ def measure_policy(batch: TaskBatch, policy: Policy) -> dict[str, float]:
     return {"test_return": float(returns.mean()), "test_success": float(success.mean())}
 
 
-@contextlib.contextmanager
-def single_threaded_torch() -> Iterator[None]:
-    """As in the nodes: on a CPU the kernels bring their own threads."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
-
-
+@single_threaded_torch()
 def train(
     task: str, scene: Scene, config: TrainingConfig, randomisation: Randomisation = Randomisation(), device: str = "auto"
 ) -> tuple[NetworkPolicy, list[dict[str, float]]]:
@@ -66,13 +54,6 @@ def train(
         The policy, and its learning curve: for each generation, the first being the untrained policy, the number of
         training episodes so far, returns of population and elite, test return and success rate, and seconds.
     """
-    with single_threaded_torch():
-        return _train(task, scene, config, randomisation, device)
-
-
-def _train(
-    task: str, scene: Scene, config: TrainingConfig, randomisation: Randomisation, device: str
-) -> tuple[NetworkPolicy, list[dict[str, float]]]:
     hidden = [config.hidden] if config.hidden else []
     rng = np.random.default_rng([config.seed, 0xCE])
     batch = TaskBatch(task, scene, config.population, randomisation=randomisation, device=device)

@@ -11,7 +11,7 @@ from endo_sim_ros import messages
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.learning.policies import make_policy
 from endo_sim_ros.learning.scenes import load_scene
-from endo_sim_ros.learning.tasks import find_task, make_task
+from endo_sim_ros.learning.tasks import find_task
 from endo_sim_ros.messages import OK, STATE, WARN, PolicyState
 from endo_sim_ros.nodes.base import EndoNode, run
 from endo_sim_ros.nodes.configs import PolicyConfig, arm_names
@@ -31,8 +31,9 @@ class PolicyNode(EndoNode):
         (arm,) = arm_names([config.arm])
         try:
             scene = load_scene(config.scene or None)
-            physics = find_task(config.task).physics()
-            self._task = make_task(config.task, scene.nodes(physics), scene.camera.position)
+            task = find_task(config.task)
+            physics = task.physics()
+            self._task = task(scene.nodes(physics), scene.camera.position)
             self._policy = make_policy(config.policy, config.task)
         except ValueError as error:
             raise ConfigError(str(error)) from error

@@ -6,12 +6,10 @@ from endo_sim_ros.core.lazy import lazy_names
 
 if TYPE_CHECKING:
     from endo_sim_ros.rendering.config import RenderingConfig as RenderingConfig
-    from endo_sim_ros.rendering.renderer import DeformableRenderer as DeformableRenderer
-    from endo_sim_ros.rendering.renderer import render_depth as render_depth
-    from endo_sim_ros.rendering.renderer import turned_colors as turned_colors
+    from endo_sim_ros.rendering.renderer import (
+        DeformableRenderer as DeformableRenderer,
+        render_depth as render_depth,
+        turned_colors as turned_colors,
+    )
 
-__getattr__ = lazy_names(
-    __name__,
-    config=("RenderingConfig",),
-    renderer=("DeformableRenderer", "render_depth", "turned_colors"),
-)
+__getattr__ = lazy_names(__name__, __file__)

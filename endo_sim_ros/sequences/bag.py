@@ -41,11 +41,7 @@ def write_bag(path: str | Path, frames: Iterable[Frame]) -> int:
                 bag.write(messages.RIGHT_INFO, info, stamp)
                 bag.write(messages.RIGHT_IMAGE, messages.encode_image(frame.right, stamp, RIGHT_FRAME, types), stamp)
             if frame.depth is not None:
-                bag.write(
-                    messages.DEPTH,
-                    messages.encode_image(frame.depth.astype("float32"), stamp, LEFT_FRAME, types),
-                    stamp,
-                )
+                bag.write(messages.DEPTH, messages.encode_image(frame.depth.astype("float32"), stamp, LEFT_FRAME, types), stamp)
             if frame.mask is not None:
                 bag.write(messages.MASK, messages.encode_image(frame.mask, stamp, LEFT_FRAME, types), stamp)
             count += 1

@@ -36,8 +36,3 @@ def flush(writer: Writer) -> int:
         storage.close_chunk()
     storage.bio.flush()
     return storage.bio.tell()
-
-
-def abandon(writer: Writer) -> None:
-    """Close the file without an index."""
-    writer.abort()

@@ -95,8 +95,11 @@ class BagReader:
 
     def require_recording(self) -> None:
         """Raise SequenceError, listing what is there, unless the bag has images, camera_info and poses of the left eye."""
+        self.require((messages.LEFT_IMAGE, messages.LEFT_COMPRESSED), (messages.LEFT_INFO,), (messages.CAMERA_POSE,))
+
+    def require(self, *needed: tuple[Topic, ...]) -> None:
+        """Raise SequenceError, listing what is there, unless the bag has one topic of each tuple."""
         present = self.topics
-        needed = ((messages.LEFT_IMAGE, messages.LEFT_COMPRESSED), (messages.LEFT_INFO,), (messages.CAMERA_POSE,))
         for choices in needed:
             if not any(f"/{topic.name}" in present for topic in choices):
                 there = ", ".join(sorted(present)) or "no topics"

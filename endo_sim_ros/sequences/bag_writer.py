@@ -54,7 +54,7 @@ class BagWriter:
         finally:
             if self._failed:  # half a record would be in the way; BagReader does without the index
                 with contextlib.suppress(OSError):
-                    bag_private.abandon(self._writer)
+                    self._writer.abort()
                 os.truncate(file, self._end)
 
     @contextlib.contextmanager

@@ -5,7 +5,6 @@ import reprlib
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
 
 from endo_sim_ros.core.frames import SequenceError
@@ -51,8 +50,3 @@ def check_calibrated_size(calibration: dict[str, Any], size: tuple[int, int], pa
             f"{path}: width and height are {stated[0]}×{stated[1]}, but the images are {size[0]}×{size[1]}; "
             "scale fx, fy, cx, cy or the images"
         )
-
-
-def intrinsic_matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
-    """Intrinsics [3, 3] of focal lengths and a principal point, pixels."""
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)

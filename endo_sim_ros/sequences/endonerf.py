@@ -13,9 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.frames import Frame, SequenceError
-from endo_sim_ros.sequences.calibration_files import intrinsic_matrix
 from endo_sim_ros.sequences.images import check_size, image_size, numbered_files, read_depth, read_image
 from endo_sim_ros.sequences.masks import MaskFiles
 from endo_sim_ros.sequences.pose_files import rigid
@@ -73,21 +72,18 @@ def read_endonerf(
     masks = MaskFiles(mask_files, root / "masks", mask_polarity)
     pose_scale = depth_scale if pose_scale is None else pose_scale
 
-    def depth_of(number: int, size: tuple[int, int]) -> np.ndarray | None:
-        if number not in depths:
-            return None
-        return check_size(read_depth(depths[number], depth_scale), size, depths[number])
-
     def frames() -> Iterator[Frame]:
         for number in numbers:
             image = read_image(images[number])
-            size = image_size(image)
+            size, depth = image_size(image), None
+            if number in depths:
+                depth = check_size(read_depth(depths[number], depth_scale), size, depths[number])
             source = f"{root / POSES_FILE}: row of frame {number}"
             yield Frame(
                 stamp_ns=stamp_ns(number, fps or DEFAULT_FPS),
                 image=image,
                 camera=_camera(rows[number], size, pose_scale, source),
-                depth=depth_of(number, size),
+                depth=depth,
                 mask=masks.of(number, size),
             )
 

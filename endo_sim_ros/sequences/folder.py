@@ -17,9 +17,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.frames import Frame, SequenceError
-from endo_sim_ros.sequences.calibration_files import check_calibrated_size, intrinsic_matrix, read_calibration
+from endo_sim_ros.sequences.calibration_files import check_calibrated_size, read_calibration
 from endo_sim_ros.sequences.images import check_size, image_size, numbered_files, read_depth, read_image
 from endo_sim_ros.sequences.masks import MaskFiles, lit_area, lit_now
 from endo_sim_ros.sequences.pose_files import read_poses
@@ -123,7 +123,7 @@ def read_folder(
     if poses is not None:
         return recording
     logger.warning("%s: no %s, so poses come from structure from motion", root, " or ".join(POSE_FILES))
-    return with_estimated_poses(recording, len(numbers), root)
+    return with_estimated_poses(recording, root)
 
 
 def read_points(path: Path | str) -> tuple[np.ndarray, np.ndarray] | None:

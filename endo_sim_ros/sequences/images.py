@@ -1,7 +1,6 @@
 """Image files: colour, grey and depth images, and folders of numbered files."""
 
 import re
-from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -9,7 +8,7 @@ import numpy as np
 
 from endo_sim_ros.core.frames import SequenceError
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -57,18 +56,17 @@ def _decode(path: Path, flags: int) -> np.ndarray:
     return image
 
 
-def numbered_files(folder: Path, suffixes: Sequence[str] = IMAGE_SUFFIXES, ending: str = "") -> dict[int, Path]:
-    """Files by the last number in their name: `000012.png` and `frame-000012.mask.png` are both 12.
+def numbered_files(folder: Path, ending: str = "") -> dict[int, Path]:
+    """Image files by the last number in their name: `000012.png` and `frame-000012.mask.png` are both 12.
 
     Args:
         folder: Where to look; a folder that does not exist holds no files.
-        suffixes: File name extensions to accept, lower case.
         ending: What the name before the extension must end with, such as `l` for left images.
     """
     files: dict[int, Path] = {}
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
         digits = re.findall(r"\d+", path.stem)
-        if path.suffix.lower() not in suffixes or not path.stem.endswith(ending) or not digits:
+        if path.suffix.lower() not in _SUFFIXES or not path.stem.endswith(ending) or not digits:
             continue
         number = int(digits[-1])
         if number in files:

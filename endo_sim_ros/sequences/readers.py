@@ -19,7 +19,7 @@ from endo_sim_ros.sequences.video_files import VIDEO_SUFFIXES
 
 @dataclass(frozen=True)
 class Reader:
-    """A layout; calling it reads a recording.
+    """A layout of recordings.
 
     Args:
         read: Returns the frames of a path, with keyword options.
@@ -30,9 +30,6 @@ class Reader:
     read: Callable[..., Iterable[Frame]]
     recognises: Callable[[Path], bool]
     mark: str
-
-    def __call__(self, path: Path | str, **options) -> Iterable[Frame]:
-        return self.read(path, **options)
 
 
 def _is_scared(path: Path) -> bool:
@@ -49,17 +46,11 @@ def _is_video(path: Path) -> bool:
 # In order of how telling the mark is: a StereoMIS folder holds a video too.
 READERS: dict[str, Reader] = {
     "stereomis": Reader(
-        read_stereomis,
-        lambda path: (path / stereomis.CALIBRATION_FILE).is_file(),
-        f"the file {stereomis.CALIBRATION_FILE}",
+        read_stereomis, lambda path: (path / stereomis.CALIBRATION_FILE).is_file(), f"the file {stereomis.CALIBRATION_FILE}"
     ),
     "scared": Reader(read_scared, _is_scared, f"the file {scared.CALIBRATION_FILE} or data/frame_data.tar.gz"),
     "endonerf": Reader(read_endonerf, lambda path: (path / endonerf.POSES_FILE).is_file(), f"the file {endonerf.POSES_FILE}"),
-    "folder": Reader(
-        read_folder,
-        lambda path: (path / "left").is_dir(),
-        f"the folder left/ with images, and {folder.CALIBRATION_FILE}",
-    ),
+    "folder": Reader(read_folder, lambda path: (path / "left").is_dir(), f"the folder left/ with images, and {folder.CALIBRATION_FILE}"),
     "video": Reader(read_video, _is_video, f"a video ({', '.join(VIDEO_SUFFIXES)}), or a folder with one"),
 }
 
@@ -89,7 +80,7 @@ def open_sequence(path: Path | str, kind: str = "auto", **options) -> Iterable[F
     if kind not in READERS:
         raise SequenceError(f"{path}: unknown kind {kind!r}; choose auto, {', '.join(READERS)}")
     try:
-        return READERS[kind](path, **options)
+        return READERS[kind].read(path, **options)
     except TypeError as error:
         if "unexpected keyword argument" not in str(error):
             raise

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
@@ -17,22 +18,24 @@ FIRST_STAMP_NS = 1_000_000_000  # a ROS stamp of 0 means "unset", so recordings 
 T = TypeVar("T")
 
 
+@dataclass(frozen=True)
 class Recording:
     """A sequence of frames read lazily: every `iter()` reads the files again from the beginning.
 
-    `len()` is the number of frames expected, for progress bars; a damaged video or a frame that structure from
-    motion could not place makes the iteration shorter.
+    Args:
+        frames: Begins to read.
+        count: Number of frames expected, for progress bars; a damaged video or a frame that structure from motion could
+            not place makes the iteration shorter.
     """
 
-    def __init__(self, frames: Callable[[], Iterator[Frame]], count: int):
-        self._frames = frames
-        self._count = count
+    frames: Callable[[], Iterator[Frame]]
+    count: int
 
     def __iter__(self) -> Iterator[Frame]:
-        return self._frames()
+        return self.frames()
 
     def __len__(self) -> int:
-        return self._count
+        return self.count
 
 
 def stamp_ns(number: int, fps: float) -> int:

@@ -11,6 +11,7 @@
 The world is the keyframe's left camera. The archives are read as streams and never unpacked to disk.
 """
 
+import contextlib
 import logging
 from collections.abc import Iterator
 from pathlib import Path
@@ -99,23 +100,20 @@ def read_scared(
         depth = "keyframe"
 
     def frames() -> Iterator[Frame]:
-        scene_points = ScenePoints(points_archive) if depth == "scene_points" else None
-        try:
+        reading = contextlib.closing(ScenePoints(points_archive)) if depth == "scene_points" else contextlib.nullcontext()
+        with reading as scene_points:
             for number, image in video.frames(numbers):
                 left, right = split_stacked(image, video.path)
                 points = scene_points.of(number, size) if scene_points else None
                 if depth == "keyframe" and number == 0:
                     points = keyframe_points(root, size)
                 yield _frame(rectification, number, fps or video.fps, left, right, points, poses[number])
-        finally:
-            if scene_points:
-                scene_points.close()
 
     recording = Recording(frames, len(numbers))
     if published:
         return recording
     logger.warning("%s: file is missing, so poses come from structure from motion", archive)
-    return with_estimated_poses(recording, len(numbers), root)
+    return with_estimated_poses(recording, root)
 
 
 def _read_keyframe(root: Path, start: int | None, stop: int | None, step: int, depth: str, fps: float | None) -> Recording:

@@ -94,7 +94,7 @@ class ScenePoints:
         self._archive = archive
         self._index: dict[int, tarfile.TarInfo] | None = None
         with _readable(self._archive):
-            self._tar = tarfile.open(archive, "r|gz")  # noqa: SIM115  (closed by close)
+            self._tar = tarfile.open(archive, "r|gz")  # closed by `close`
         self._next: tuple[int, tarfile.TarInfo | None] = (-1, None)
 
     def close(self) -> None:
@@ -125,7 +125,7 @@ class ScenePoints:
                 return self._next[1]
             logger.warning("%s: frame %d is not in its place; indexing the archive, which is slow", self._archive, number)
             self._tar.close()
-            self._tar = tarfile.open(self._archive, "r:gz")  # noqa: SIM115
+            self._tar = tarfile.open(self._archive, "r:gz")
             numbered = ((_member_number(member, ".tiff"), member) for member in self._tar)
             self._index = {number: member for number, member in numbered if number is not None}
         return self._index.get(number)

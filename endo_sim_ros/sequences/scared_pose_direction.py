@@ -46,7 +46,6 @@ def find_pose_direction(
             kinematics' own error is of this size.
         least_difference: Of the two mean correlations, below which they count as alike.
     """
-    default = USUAL_DIRECTION
     size = video.width, video.height // 2
     points, colours = _sparse_points(points, _brightness(image))
     later = [n for n in sorted(published) if 0 < n < min(video.frame_count, checked_frames)]
@@ -64,15 +63,15 @@ def find_pose_direction(
             continue
         scores.append([_correlation(colours[inside], _sample(brightness, uv[inside])) for uv in pixels])
     if not scores:
-        logger.warning("%s: the camera moves too little to verify the pose direction; assuming %s", source, default)
-        return default
+        logger.warning("%s: the camera moves too little to verify the pose direction; assuming %s", source, USUAL_DIRECTION)
+        return USUAL_DIRECTION
     world_to_camera, camera_to_world = np.mean(scores, 0)
     if abs(world_to_camera - camera_to_world) < least_difference:
         logger.warning(
             "%s: both pose directions fit alike (correlation %.3f and %.3f); assuming %s, pass pose_direction if wrong",
-            source, world_to_camera, camera_to_world, default,
+            source, world_to_camera, camera_to_world, USUAL_DIRECTION,
         )  # fmt: skip
-        return default
+        return USUAL_DIRECTION
     found = "world_to_camera" if world_to_camera > camera_to_world else "camera_to_world"
     logger.info(
         "%s: camera-pose is %s (the keyframe's points correlate by %.3f as world-to-camera and %.3f as "

@@ -16,9 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.frames import Frame, SequenceError
-from endo_sim_ros.sequences.images import check_size, numbered_files, read_image
+from endo_sim_ros.sequences.images import check_size, image_size, numbered_files, read_image
 from endo_sim_ros.sequences.masks import MaskFiles
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.recording import DEFAULT_FPS, Recording, check_folder, keep_posed, select, stamp_ns
@@ -66,8 +66,10 @@ def read_stereomis(
     rectification = Rectification.stereo(calibration.resized(*images.size))
     fps = fps or images.fps
 
-    ranges = _read_split(root, split) if split else None
-    usable = images.numbers if ranges is None else [n for n in images.numbers if _in_ranges(n, ranges)]
+    usable = images.numbers
+    if split:
+        ranges = _read_split(root, split)
+        usable = [n for n in usable if any(first <= n <= last for first, last in ranges)]
     numbers = select(usable, root, start, stop, step)
     poses = None
     if (root / "groundtruth.txt").is_file():
@@ -79,10 +81,9 @@ def read_stereomis(
     mask_files = numbered_files(root / "masks", ending="l") or numbered_files(root / "masks")
     masks = MaskFiles(mask_files, root / "masks", mask_polarity)
     mask_of = _nearest_masks(numbers, mask_files, max_mask_gap)
-    if mask_files:
-        bare = sum(n not in mask_of for n in numbers)
-        if bare:
-            logger.warning("%s: %d of %d frames have no mask; tools stay visible in them", root, bare, len(numbers))
+    bare = sum(n not in mask_of for n in numbers)
+    if mask_files and bare:
+        logger.warning("%s: %d of %d frames have no mask; tools stay visible in them", root, bare, len(numbers))
 
     def frames() -> Iterator[Frame]:
         for number, left, right in images.read(numbers):
@@ -98,7 +99,7 @@ def read_stereomis(
             )
 
     recording = Recording(frames, len(numbers))
-    return recording if poses is not None else with_estimated_poses(recording, len(numbers), root)
+    return recording if poses is not None else with_estimated_poses(recording, root)
 
 
 def read_stereo_ini(path: Path) -> StereoCalibration:
@@ -127,7 +128,7 @@ def read_stereo_ini(path: Path) -> StereoCalibration:
         fx, fy, cx, cy = (number(section, name) for name in ("fc_x", "fc_y", "cc_x", "cc_y"))
         count = 8 if parser.has_option(section, "kc_7") else 5  # the rational model, where it is used
         distortion = np.array([number(section, f"kc_{i}") for i in range(count)])
-        return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), distortion
+        return intrinsic_matrix(fx, fy, cx, cy), distortion
 
     size = int(number("StereoLeft", "res_x")), int(number("StereoLeft", "res_y"))
     if min(size) < 1:
@@ -169,8 +170,7 @@ class _ExtractedFrames:
         missing = sorted(set(self._left) - set(self._right))
         if missing:
             raise SequenceError(f"{folder}: the right image of {self._left[missing[0]].name} is missing")
-        height, width = read_image(self._left[self.numbers[0]]).shape[:2]
-        self.size = width, height
+        self.size = image_size(read_image(self._left[self.numbers[0]]))
 
     def read(self, numbers: Sequence[int]) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
         for number in numbers:
@@ -197,10 +197,6 @@ def _read_split(root: Path, split: str) -> list[tuple[int, int]]:
     if not ranges:
         raise SequenceError(f"{path}: holds no ranges; expected lines `start,end`")
     return ranges
-
-
-def _in_ranges(number: int, ranges: list[tuple[int, int]]) -> bool:
-    return any(first <= number <= last for first, last in ranges)
 
 
 def _nearest_masks(numbers: list[int], masks: Iterable[int], max_gap: int) -> dict[int, int]:

@@ -13,14 +13,18 @@ from typing import Any
 import cv2  # before pycolmap, whose own image library would otherwise break cv2.imwrite
 import numpy as np
 
-from endo_sim_ros.core.cameras import invert_pose
+from endo_sim_ros.core.cameras import intrinsic_matrix, invert_pose
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.images import image_size
 from endo_sim_ros.sequences.recording import Recording
 
 logger = logging.getLogger(__name__)
 
+_ALL_PAIRS = 60  # images up to which all pairs are matched, whose number grows with their square; of more, neighbours in time
 _LONG_RUN = 300  # images, from which on a run takes tens of minutes and a warning says so
+_PEAK_THRESHOLD = 0.002  # contrast of a SIFT feature; tissue has little, and COLMAP's 0.0067 finds a third of the features
+_GUESSED_DEPTH = 0.1  # median depth of the points where no scale is known, metres: a usual working distance of a laparoscope
+_SEED = 0  # of random sampling
 
 
 @dataclass(frozen=True)
@@ -32,7 +36,6 @@ class StructureFromMotion:
             is the first one's camera frame.
         K: Intrinsics [3, 3], pixels; as given, or estimated.
         distortion: Coefficients (k1,) in OpenCV's sense, empty when K was given.
-        points: Sparse points [N, 3], world.
         reprojection_error: Mean over all observations, pixels.
         metric: False when the scale is a guess.
     """
@@ -40,7 +43,6 @@ class StructureFromMotion:
     poses: dict[int, np.ndarray]
     K: np.ndarray
     distortion: tuple[float, ...]
-    points: np.ndarray
     reprojection_error: float
     metric: bool
 
@@ -53,11 +55,6 @@ def estimate_poses(
     right_images: Iterable[np.ndarray | None] | None = None,
     baseline: float | None = None,
     scale: float | None = None,
-    matching: str = "auto",
-    exhaustive_limit: int = 60,
-    peak_threshold: float = 0.002,
-    guessed_depth: float = 0.1,
-    seed: int = 0,
     threads: int = -1,
 ) -> StructureFromMotion:
     """Estimate where the camera was for every image.
@@ -70,13 +67,7 @@ def estimate_poses(
         masks: For each image [H, W], uint8, 0 = take no features here; or None.
         right_images: Rectified right images with the same K, for a stereo camera; needs baseline.
         baseline: Distance from left to right camera, metres; makes the result metric.
-        scale: Metres per unit of the reconstruction, as a last resort where no baseline is known.
-        matching: `exhaustive` (all pairs), `sequential` (neighbours in time), or `auto` by the number of images.
-        exhaustive_limit: Images up to which `auto` matches all pairs, whose number grows with their square.
-        peak_threshold: Contrast of a SIFT feature; tissue has little, and COLMAP's 0.0067 finds a third of the features.
-        guessed_depth: Median depth of the points where neither baseline nor scale is known, metres; the default is a
-            usual working distance of a laparoscope.
-        seed: For random sampling.
+        scale: Metres per unit of the reconstruction, as a last resort where no baseline is known; without either, a guess.
         threads: -1 uses all cores; 1 makes a run repeatable to the last bit.
 
     Returns:
@@ -89,8 +80,6 @@ def estimate_poses(
         raise ValueError("estimate_poses: right_images and baseline must be given together")
     if right_images is not None and K is None:
         raise ValueError("estimate_poses: stereo images need K, because they are rectified with it")
-    if matching not in ("auto", "exhaustive", "sequential"):
-        raise ValueError(f"estimate_poses: matching must be auto, exhaustive or sequential, got {matching!r}")
     with tempfile.TemporaryDirectory(prefix="endo_sfm_") as folder:
         root = Path(folder)
         count, size = _write_images(root, images, masks, right_images)
@@ -98,47 +87,40 @@ def estimate_poses(
             raise SequenceError(f"structure from motion needs at least 2 images, got {count}; select more frames")
         if count > _LONG_RUN:
             logger.warning("structure from motion on %d images takes long; a larger step would do as well", count)
-        if matching == "auto":
-            matching = "exhaustive" if count <= exhaustive_limit else "sequential"
-        model = _run_colmap(root, K, size, baseline=baseline, matching=matching, peak_threshold=peak_threshold, seed=seed, threads=threads)
-    return _result(model, count, K, baseline=baseline, scale=scale, guessed_depth=guessed_depth)
+        model = _run_colmap(root, K, size, count, baseline, threads)
+    return _result(model, count, K, baseline, scale)
 
 
-def with_estimated_poses(frames: Iterable[Frame], count: int, source: Path, *, scale: float | None = None, threads: int = -1) -> Recording:
+def with_estimated_poses(recording: Recording, source: Path) -> Recording:
     """Frames of a calibrated camera with unknown poses, posed by structure from motion on first iteration.
 
     Args:
-        frames: The frames, re-iterable, with any pose; stereo frames make the result metric.
-        count: Their number.
-        source: The recording, for messages.
-        scale: Metres per unit of the reconstruction, where frames have no right image.
-        threads: As for `estimate_poses`.
+        recording: Its frames have any pose; stereo frames make the result metric.
+        source: Its file or folder, for messages.
     """
     poses: dict[int, np.ndarray] = {}
 
     def posed() -> Iterator[Frame]:
         if not poses:
-            logger.info("%s: has no poses; running structure from motion on %d frames", source, count)
-            first = next(iter(frames))
-            stereo = first.right is not None and scale is None
+            logger.info("%s: has no poses; running structure from motion on %d frames", source, len(recording))
+            first = next(iter(recording))
+            stereo = first.right is not None
             try:
                 result = estimate_poses(
-                    (frame.image for frame in frames),
+                    (frame.image for frame in recording),
                     first.camera.K,
-                    masks=(frame.mask for frame in frames),
-                    right_images=(frame.right for frame in frames) if stereo else None,
+                    masks=(frame.mask for frame in recording),
+                    right_images=(frame.right for frame in recording) if stereo else None,
                     baseline=first.baseline if stereo else None,
-                    scale=scale,
-                    threads=threads,
                 )
             except SequenceError as error:
                 raise SequenceError(f"{source}: {error}") from None
             poses.update(result.poses)
-        for position, frame in enumerate(frames):
+        for position, frame in enumerate(recording):
             if position in poses:
                 yield dataclasses.replace(frame, camera=frame.camera.at(poses[position]))
 
-    return Recording(posed, count)
+    return Recording(posed, len(recording))
 
 
 def _write_images(
@@ -173,22 +155,12 @@ def _write_images(
     return count, size or (0, 0)
 
 
-def _run_colmap(
-    root: Path,
-    K: np.ndarray | None,
-    size: tuple[int, int],
-    *,
-    baseline: float | None,
-    matching: str,
-    peak_threshold: float,
-    seed: int,
-    threads: int,
-) -> Any:
+def _run_colmap(root: Path, K: np.ndarray | None, size: tuple[int, int], count: int, baseline: float | None, threads: int) -> Any:
     """COLMAP's largest model of the images under root; with a baseline, left and right move as one rig."""
-    import pycolmap  # noqa: PLC0415  (a heavy import that only this function needs)
+    import pycolmap  # heavy, and needed here only
 
     with _quiet(pycolmap):
-        pycolmap.set_random_seed(seed)
+        pycolmap.set_random_seed(_SEED)
         database = root / "database.db"
         reader = pycolmap.ImageReaderOptions()
         if K is not None:
@@ -199,7 +171,7 @@ def _run_colmap(
         if (root / "masks").is_dir():
             reader.mask_path = root / "masks"
         extraction = pycolmap.FeatureExtractionOptions(num_threads=threads)
-        extraction.sift.peak_threshold = peak_threshold
+        extraction.sift.peak_threshold = _PEAK_THRESHOLD
         pycolmap.extract_features(
             database, root / "images", camera_mode=pycolmap.CameraMode.PER_FOLDER,
             reader_options=reader, extraction_options=extraction, device=pycolmap.Device.cpu,
@@ -207,16 +179,16 @@ def _run_colmap(
         if baseline is not None:
             _tie_eyes(pycolmap, database, baseline)
         verification = pycolmap.TwoViewGeometryOptions()
-        verification.ransac.random_seed = seed
+        verification.ransac.random_seed = _SEED
         verification.detect_watermark = False  # a fixed vignette or overlay is masked, and watermarks are not pairs
-        match = pycolmap.match_exhaustive if matching == "exhaustive" else pycolmap.match_sequential
+        match = pycolmap.match_exhaustive if count <= _ALL_PAIRS else pycolmap.match_sequential
         match(
             database, pycolmap.FeatureMatchingOptions(num_threads=threads),
             verification_options=verification, device=pycolmap.Device.cpu,
         )  # fmt: skip
-        options = pycolmap.IncrementalPipelineOptions(num_threads=threads, random_seed=seed, min_model_size=2)
+        options = pycolmap.IncrementalPipelineOptions(num_threads=threads, random_seed=_SEED, min_model_size=2)
         options.extract_colors = False
-        options.mapper.random_seed = options.triangulation.random_seed = seed
+        options.mapper.random_seed = options.triangulation.random_seed = _SEED
         options.mapper.num_threads = threads
         if K is not None:
             options.ba_refine_focal_length = options.ba_refine_extra_params = False
@@ -259,9 +231,7 @@ def _quiet(pycolmap: Any) -> Iterator[None]:
         pycolmap.logging.minloglevel = level
 
 
-def _result(
-    model: Any, count: int, K: np.ndarray | None, *, baseline: float | None, scale: float | None, guessed_depth: float
-) -> StructureFromMotion:
+def _result(model: Any, count: int, K: np.ndarray | None, baseline: float | None, scale: float | None) -> StructureFromMotion:
     """Scale a COLMAP model to metres and put the world into its first camera."""
     eyes: dict[str, dict[int, np.ndarray]] = {"left": {}, "right": {}}
     depths = []
@@ -291,10 +261,10 @@ def _result(
         factor = scale
     else:
         metric = False
-        factor = guessed_depth / np.median(depths)
+        factor = _GUESSED_DEPTH / np.median(depths)
         logger.warning(
             "THE SCALE IS A GUESS: one eye cannot tell size, so the median depth is set to %g m; "
-            "pass scale, or a stereo recording, where sizes and forces matter", guessed_depth,
+            "pass scale, or a stereo recording, where sizes and forces matter", _GUESSED_DEPTH,
         )  # fmt: skip
 
     to_first = invert_pose(next(iter(left.values())))
@@ -302,13 +272,12 @@ def _result(
     for number, pose in left.items():
         poses[number] = to_first @ pose
         poses[number][:3, 3] *= factor
-    xyz = np.reshape(list(points.values()), (-1, 3)) @ to_first[:3, :3].T + to_first[:3, 3]
 
     distortion: tuple[float, ...] = ()
     if K is None:
         f, cx, cy, k1 = next(iter(model.cameras.values())).params
-        K, distortion = np.array([[f, 0, cx], [0, f, cy], [0, 0, 1]]), (float(k1),)
+        K, distortion = intrinsic_matrix(f, f, cx, cy), (float(k1),)
         logger.warning("estimated a focal length of %.1f px and k1 %.3f, which may be wrong; pass the calibration if known", f, k1)
     error = float(model.compute_mean_reprojection_error())
-    logger.info("structure from motion placed %d of %d images, %d points, %.2f px", len(left), count, len(xyz), error)
-    return StructureFromMotion(poses, np.asarray(K, np.float64), distortion, xyz * factor, error, metric)
+    logger.info("structure from motion placed %d of %d images, %d points, %.2f px", len(left), count, len(points), error)
+    return StructureFromMotion(poses, np.asarray(K, np.float64), distortion, error, metric)

@@ -16,9 +16,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.frames import Frame, SequenceError
-from endo_sim_ros.sequences.calibration_files import check_calibrated_size, intrinsic_matrix, read_calibration
+from endo_sim_ros.sequences.calibration_files import check_calibrated_size, read_calibration
 from endo_sim_ros.sequences.images import numbered_files, read_gray
 from endo_sim_ros.sequences.masks import MaskFiles, lit_area, lit_now, tissue_mask, tool_is_white
 from endo_sim_ros.sequences.pose_files import read_poses
@@ -104,8 +104,9 @@ def read_video(
                 f"{path}: poses are given ({poses}), but no intrinsics; pass fx (and fy, cx, cy, distortion) or a "
                 f"calibration file, or poses={STRUCTURE_FROM_MOTION!r} to estimate both"
             )
-        factor = 1.0 if scale is None else scale
-        known = {n: _scaled(pose, factor) for n, pose in read_poses(Path(poses)).items()}
+        known = read_poses(Path(poses))
+        for pose in known.values():
+            pose[:3, 3] *= 1.0 if scale is None else scale
         numbers = keep_posed(numbers, known, Path(poses))
     else:
         if sfm_step < 1:
@@ -199,30 +200,19 @@ def _intrinsics(
 
 def _mask_reader(source: Path | str | None, polarity: str, size: tuple[int, int]) -> Callable[[int], np.ndarray]:
     """What gives the mask [H, W] of a frame number, 255 = tissue; all of it is tissue where there is no mask."""
-    constant = np.full(size[::-1], 255, np.uint8)
+    everything = np.full(size[::-1], 255, np.uint8)
     if source is None:
-        return lambda number: constant
+        return lambda number: everything
     source = Path(source)
     if not source.is_dir():
         image = read_gray(source)
-        constant = tissue_mask(image, white_is_tool=tool_is_white([image], source, polarity), size=size)
-        return lambda number: constant
+        only = tissue_mask(image, white_is_tool=tool_is_white([image], source, polarity), size=size)
+        return lambda number: only
     files = numbered_files(source)
     if not files:
         raise SequenceError(f"{source}: holds no masks named like 000000.png")
     masks = MaskFiles(files, source, polarity)
-
-    def mask_of(number: int) -> np.ndarray:
-        mask = masks.of(number, size)
-        return constant if mask is None else mask
-
-    return mask_of
-
-
-def _scaled(pose: np.ndarray, factor: float) -> np.ndarray:
-    scaled = pose.copy()
-    scaled[:3, 3] *= factor
-    return scaled
+    return lambda number: everything if (mask := masks.of(number, size)) is None else mask
 
 
 def _existing(path: Path) -> Path | None:

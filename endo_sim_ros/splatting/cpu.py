@@ -10,8 +10,7 @@ from torch import Tensor
 
 from endo_sim_ros.core.device import cpu_threads, run_in_threads
 from endo_sim_ros.core.kernels import kernel_arguments, launch_in_shares
-from endo_sim_ros.splatting import common_kernels as kernels
-from endo_sim_ros.splatting import cpu_kernels
+from endo_sim_ros.splatting import common_kernels as kernels, cpu_kernels
 from endo_sim_ros.splatting.constants import RECORD_SIZE, SPLAT_SIZE
 from endo_sim_ros.splatting.scene import Gradients, Scene, Settings, empty_images
 

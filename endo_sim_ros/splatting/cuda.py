@@ -15,8 +15,7 @@ from torch import Tensor
 
 from endo_sim_ros.core.device import on_torch_stream
 from endo_sim_ros.core.kernels import kernel_arguments
-from endo_sim_ros.splatting import common_kernels as kernels
-from endo_sim_ros.splatting import cuda_kernels
+from endo_sim_ros.splatting import common_kernels as kernels, cuda_kernels
 from endo_sim_ros.splatting.constants import RECORD_SIZE, SPLAT_SIZE
 from endo_sim_ros.splatting.scene import Gradients, Scene, Settings, empty_images
 

@@ -122,7 +122,7 @@ def test_a_dataset_is_not_overwritten_nor_left_in_halves(bag, dataset, tmp_path,
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(lerobot, "_write_video", full)
+    monkeypatch.setattr(lerobot.drawing, "write_video", full)
     with pytest.raises(OSError):
         export_lerobot([bag], tmp_path / "out", "t")
     assert not (tmp_path / "out").exists()

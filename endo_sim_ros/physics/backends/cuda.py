@@ -13,8 +13,7 @@ from torch import Tensor
 
 from endo_sim_ros.core.device import on_torch_stream
 from endo_sim_ros.core.kernels import launch
-from endo_sim_ros.physics.backends import cluster_division as cluster
-from endo_sim_ros.physics.backends import skin_kernels
+from endo_sim_ros.physics.backends import cluster_division as cluster, skin_kernels
 from endo_sim_ros.physics.backends.base import Action, Launch, SkinData, StepData, Work, array, capturing
 from endo_sim_ros.physics.backends.cluster_kernels import make_step_kernel
 from endo_sim_ros.physics.backends.cpu import cpu_action

@@ -95,6 +95,8 @@ class Transfer:
 
 @struct
 class Substep:
+    """What is the same in every substep."""
+
     dt: float  # s
     decay: float  # exp(-c Δt)
     gravity: wp.vec3  # m/s²

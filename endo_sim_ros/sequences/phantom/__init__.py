@@ -6,9 +6,7 @@ the surface, `paint` its texture, `rendering` the images and `path` the endoscop
 World frame: the wall is around z = 0.14 m and faces the endoscope, whose tip moves about the origin and looks along +z.
 """
 
-from endo_sim_ros.sequences.phantom.config import PhantomConfig
-from endo_sim_ros.sequences.phantom.path import phantom_camera, phantom_poses
-from endo_sim_ros.sequences.phantom.rendering import Phantom, build_phantom, render_phantom
-from endo_sim_ros.sequences.phantom.sequence import phantom_sequence
-
-__all__ = ["Phantom", "PhantomConfig", "build_phantom", "phantom_camera", "phantom_poses", "phantom_sequence", "render_phantom"]
+from endo_sim_ros.sequences.phantom.config import PhantomConfig as PhantomConfig
+from endo_sim_ros.sequences.phantom.path import phantom_camera as phantom_camera, phantom_poses as phantom_poses
+from endo_sim_ros.sequences.phantom.rendering import Phantom as Phantom, build_phantom as build_phantom, render_phantom as render_phantom
+from endo_sim_ros.sequences.phantom.sequence import phantom_sequence as phantom_sequence

@@ -37,7 +37,7 @@ class Anatomy:
         fillet = nearest - np.float32(0.0005) * np.log(weights.sum(0))
         self.heights = blur(fillet, 0.0004)  # no edge of tissue is sharper than this
 
-    def _wall(self, rng, x, y):
+    def _wall(self, rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """A cavity that closes in on the camera away from the axis, with hanging folds."""
         turn = rng.normal(0.0, 0.25)
         across = x * math.cos(turn) + y * math.sin(turn) + 0.012 * noise(rng, 0.06, 2)
@@ -47,7 +47,7 @@ class Anatomy:
         cavity = 0.9 * (x * x + y * y) * (1.0 + 0.3 * rng.standard_normal() * x / HALF_WIDTH)
         return 0.144 - 0.008 * folds * strength - 0.0030 * noise(rng, 0.045, 3, (0.7, 1.4)) - cavity
 
-    def _organ(self, rng, x, y):
+    def _organ(self, rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """A rounded body, hung from its apex, that turns away steeply at its outline."""
         angle = rng.uniform(0.35, 0.75)  # its long axis runs down and to the right
         long, short = rng.uniform(0.066, 0.078), rng.uniform(0.036, 0.043)
@@ -61,7 +61,7 @@ class Anatomy:
         beyond = np.maximum(radius - 1.0, 0.0) * 0.12  # falls behind the wall outside its outline
         return 0.143 - height * dome + beyond - relief * smoothstep(dome, 0.0, 0.4)
 
-    def _lobe(self, rng, x, y):
+    def _lobe(self, rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """The next organ, its rounded rim entering from below, close to the camera."""
         rim = rng.uniform(0.030, 0.040) + rng.normal(0, 0.06) * x + 0.10 * np.abs(x) * rng.uniform(0, 1)
         inside = y - rim - 0.004 * noise(rng, 0.05, 2)
@@ -69,8 +69,10 @@ class Anatomy:
         furrows = 0.0012 * noise(rng, 0.02, 3, (0.7, 1.6)) + 0.0003 * noise(rng, 0.004, 2)
         return 0.138 - rng.uniform(0.024, 0.030) * rise - furrows * rise - np.minimum(inside, 0.0) * 2.0
 
-    def _ligament(self, rng, x, y, organ, wall):
-        """A taut translucent fan from the apex of the organ up to the wall; returns its angle and radius maps, too."""
+    def _ligament(
+        self, rng: np.random.Generator, x: np.ndarray, y: np.ndarray, organ: np.ndarray, wall: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """A taut translucent fan from the apex of the organ up to the wall; with the maps of its angle and radius."""
         heading = rng.uniform(-1.75, -1.15)  # image y points down: upwards
         spread = rng.uniform(0.24, 0.34)
         dx, dy = x - self.apex[0], y - self.apex[1] - np.float32(0.012)

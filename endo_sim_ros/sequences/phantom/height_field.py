@@ -43,6 +43,7 @@ def noise(rng: np.random.Generator, scale: float, octaves: int = 1, stretch: tup
 
 
 def smoothstep(x: np.ndarray, low: float, high: float) -> np.ndarray:
+    """Rise from 0 at low to 1 at high, level at both ends."""
     t = np.clip((x - low) / (high - low), 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 

@@ -17,16 +17,11 @@ class Paint:
     def __init__(self, rng: np.random.Generator, seed: int, anatomy: Anatomy):
         first = seed == 0  # the first patient is the one of the figures: peritoneum, stomach, congested bowel
         wall, organ, lobe = (kinds[0 if first else rng.integers(len(kinds))] for kinds in (WALLS, ORGANS, LOBES))
-        tissues = (
-            wall,
-            organ,
-            wall,
-            lobe,
-        )  # of the parts in the order of their shares; the wall shines through the ligament
+        tissues = wall, organ, wall, lobe  # of the parts in the order of their shares; the wall shines through the ligament
 
         by_vertex = np.ascontiguousarray(np.moveaxis(anatomy.shares, 0, -1))
 
-        def look(name):  # one property over the whole surface [SIDE, SIDE] or, a colour, [SIDE, SIDE, 3]
+        def look(name: str) -> np.ndarray:  # one property over the whole surface [SIDE, SIDE] or, a colour, [SIDE, SIDE, 3]
             table = np.array([linear(v) if isinstance(v := getattr(tissue, name), tuple) else v for tissue in tissues], np.float32)
             return cv2.transform(by_vertex, table.reshape(len(tissues), -1).T)
 
@@ -57,7 +52,9 @@ class Paint:
         self.film = 0.00013 * noise(rng, 0.0045, 2, (0.7, 1.4)) + 0.00003 * noise(rng, 0.0012)
         """Height of the ripples in the wet film [SIDE, SIDE], metres."""
 
-    def _blood(self, rng, anatomy, vessels, capillaries):
+    def _blood(
+        self, rng: np.random.Generator, anatomy: Anatomy, vessels: np.ndarray, capillaries: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Optical depth [SIDE, SIDE] of blood at the surface and of blood deeper down; raises large vessels, too."""
         shares = anatomy.shares
         canvas = shares[anatomy.ORGAN] * self._organ_vessels(rng, anatomy) + shares[anatomy.LOBE] * self._lobe_vessels(rng)
@@ -71,15 +68,12 @@ class Paint:
         red = vessels * (1.25 * fine + 1.50 * middle + 0.80 * core + 0.45 * halo) + 0.40 * capillaries * mesh
         return red, vessels * 0.75 * core
 
-    def _veil(self, rng, anatomy, colour):
+    def _veil(self, rng: np.random.Generator, anatomy: Anatomy, colour: np.ndarray) -> None:
         """Draw the ligament over the wall's colour: a milky, fibrous veil with a bright free edge."""
         angle, radius = anatomy.fan_angle, anatomy.fan_radius
         fibres = np.zeros((SIDE, SIDE), np.float32)
-        for count, amplitude in (
-            (14.0, 0.8),
-            (45.0, 0.7),
-            (110.0, 0.5),
-        ):  # noise over the angle alone makes a fan of fibres
+        # Noise over the angle alone makes a fan of fibres.
+        for count, amplitude in ((14.0, 0.8), (45.0, 0.7), (110.0, 0.5)):
             line = cv2.resize(rng.standard_normal((1, 1024)).astype(np.float32), (8192, 1), interpolation=cv2.INTER_CUBIC)[0]
             position = (0.5 * count * angle + 30.0 * radius) * 8.0 + 4096.0
             fibres += amplitude * line[np.clip(position, 0, 8191).astype(np.int32)]
@@ -88,7 +82,7 @@ class Paint:
         alpha = np.clip(alpha, 0.0, 0.9) * anatomy.shares[anatomy.LIGAMENT]
         colour += alpha[..., None] * (linear((214, 178, 178)) * np.exp(0.06 * fibres)[..., None] - colour)
 
-    def _wall_vessels(self, rng):
+    def _wall_vessels(self, rng: np.random.Generator) -> np.ndarray:
         vessels = Vessels(rng, 0.0026)
         for _ in range(10):  # down the wall
             origin = rng.uniform(-0.12, 0.12), rng.uniform(-0.14, -0.03)
@@ -97,7 +91,7 @@ class Paint:
             vessels.grow(rng.uniform(-0.13, 0.13, 2), rng.uniform(0, 2 * math.pi), 0.00028, wander=0.4, reach=1.4)
         return vessels.canvas
 
-    def _organ_vessels(self, rng, anatomy):
+    def _organ_vessels(self, rng: np.random.Generator, anatomy: Anatomy) -> np.ndarray:
         vessels = Vessels(rng, 0.0017)
         for side in np.linspace(-0.6, 1.3, 6):  # from the hilum, left, fanning out across the body
             origin = anatomy.apex + np.array([-0.026 - 0.002 * side, 0.022 + 0.024 * side], np.float32)
@@ -107,7 +101,7 @@ class Paint:
             vessels.grow(origin, rng.uniform(0, 2 * math.pi), rng.uniform(0.00022, 0.00042), reach=1.3)
         return vessels.canvas
 
-    def _lobe_vessels(self, rng):
+    def _lobe_vessels(self, rng: np.random.Generator) -> np.ndarray:
         vessels = Vessels(rng, 0.0022)
         for x in np.linspace(-0.14, 0.14, 30):  # climbing to the rim, side by side
             origin = x + rng.normal(0.0, 0.003), rng.uniform(0.055, 0.10)

@@ -5,7 +5,7 @@ import math
 import cv2
 import numpy as np
 
-from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.sequences.phantom.config import PhantomConfig
 
 
@@ -31,5 +31,5 @@ def phantom_poses(config: PhantomConfig) -> np.ndarray:
 def phantom_camera(config: PhantomConfig, pose: np.ndarray | None = None) -> Camera:
     """The left camera of the phantom's endoscope, at a pose [4, 4] or at the origin."""
     focal = 0.5 * config.width / math.tan(math.radians(config.fov_deg) / 2)
-    K = np.array([[focal, 0.0, config.width / 2], [0.0, focal, config.height / 2], [0.0, 0.0, 1.0]])
+    K = intrinsic_matrix(focal, focal, config.width / 2, config.height / 2)
     return Camera(K, config.width, config.height, np.eye(4) if pose is None else pose)

@@ -142,4 +142,5 @@ def render_phantom(phantom: PhantomConfig | Phantom, camera: Camera) -> tuple[np
 
 
 def quantise(image: np.ndarray) -> np.ndarray:
+    """Grey levels 0-255 as uint8, rounded; what lies beyond is clamped."""
     return np.clip(np.rint(image), 0, 255).astype(np.uint8)

@@ -5,6 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
+from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import cpu_threads
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.sequences.phantom.config import PhantomConfig
@@ -39,7 +40,7 @@ def phantom_sequence(config: PhantomConfig) -> Iterator[Frame]:
     if window is not None:
         mask[window[..., 0] < 1.0] = 0
 
-    def expose(camera, rig, index, eye):
+    def expose(camera: Camera, rig: Camera, index: int, eye: int) -> tuple[np.ndarray, np.ndarray]:
         radiance, depth = radiance_and_depth(phantom, camera, rig)
         image = develop(radiance, camera, config.exposure, config.auto_exposure)
         if window is not None:

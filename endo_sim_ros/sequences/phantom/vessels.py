@@ -18,22 +18,14 @@ class Vessels:
     """
 
     CALIBRES = (0.00022, 0.00055)  # radii between fine, middle and large vessels, metres
+    SMALLEST = 0.00010  # radius at which branches end, metres
 
     def __init__(self, rng: np.random.Generator, room: float = 0.0016):
         self.canvas = np.zeros((len(self.CALIBRES) + 1, SIDE, SIDE), np.float32)  # blood of each calibre, finest first
         self._rng, self._room, self._count = rng, room, 0
         self._owners = np.zeros((int(2 * HALF_WIDTH / room) + 1,) * 2, np.int64)
 
-    def grow(
-        self,
-        origin: ArrayLike,
-        heading: float,
-        radius: float,
-        *,
-        wander: float = 0.3,
-        reach: float = 1.0,
-        smallest: float = 0.00010,
-    ) -> None:
+    def grow(self, origin: ArrayLike, heading: float, radius: float, *, wander: float = 0.3, reach: float = 1.0) -> None:
         """Draw one tree. A vessel keeps its course but wanders, tapers, and forks by Murray's law r³ = r1³ + r2³.
 
         Args:
@@ -42,7 +34,6 @@ class Vessels:
             radius: Radius at the root, metres.
             wander: How far a vessel strays from its course, radians.
             reach: Length of vessels as a multiple of the usual.
-            smallest: Radius at which branches end, metres.
         """
         rng = self._rng
         branches: list[tuple[np.ndarray, float, float, int]] = [(np.asarray(origin, np.float64), heading, radius, 0)]
@@ -53,7 +44,7 @@ class Vessels:
             name, stray, since_fork = self._count, 0.0, 0.0
             fork_after = reach * rng.uniform(0.5, 1.4) * (0.004 + 12.0 * r)
             points = [point]
-            while r > smallest and since_fork < fork_after:
+            while r > self.SMALLEST and since_fork < fork_after:
                 stray = 0.80 * stray + wander * rng.standard_normal()
                 course += 0.04 * wander * rng.standard_normal()
                 step = max(0.0007, 0.9 * r)
@@ -66,11 +57,11 @@ class Vessels:
                 if len(points) == 4:
                     strokes.append((points, r))
                     points = [point]
-                if rng.random() < 90.0 * step and r > 1.5 * smallest:  # a twig that leaves the trunk as it is
+                if rng.random() < 90.0 * step and r > 1.5 * self.SMALLEST:  # a twig that leaves the trunk as it is
                     side = rng.choice([-1.0, 1.0])
                     branches.append((point, course + side * rng.uniform(0.6, 1.3), r * rng.uniform(0.3, 0.55), name))
             else:
-                if r > smallest:
+                if r > self.SMALLEST:
                     share, side = rng.uniform(0.35, 0.65), rng.choice([-1.0, 1.0])
                     for part, sign in ((share, side), (1.0 - share, -side)):  # the weaker branch turns the farther
                         turn = sign * (0.15 + 0.8 * (1.0 - part))

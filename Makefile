@@ -1,7 +1,6 @@
 # make demo          set everything up and run the main job; BAG=path takes your own bag, results are in out/
-# make check         lint and the fast tests
-# make types         type checks
-# make test          lint and all tests
+# make check         lint, types and the fast tests
+# make test          lint, types and all tests
 # make test-minimum  the fast tests with the oldest dependencies that setup.py allows
 # make api           the API reference, built from the docstrings, in out/api/
 # make clean         remove the environments and the results
@@ -19,7 +18,7 @@ TORCH ?= torch==2.13.0
 TORCH_INDEX ?= $(shell command -v nvidia-smi >/dev/null 2>&1 || echo --extra-index-url https://download.pytorch.org/whl/cpu)
 PIP_INSTALL = python -m pip install --quiet $(if $(CONSTRAINTS),-c $(CONSTRAINTS))
 
-.PHONY: demo lint types check test test-minimum api setup clean
+.PHONY: demo lint types fast check test test-minimum api setup clean
 
 demo: setup
 	$(VENV)/bin/endo-sim demo --out $(OUT) $(if $(BAG),--bag $(BAG))
@@ -31,10 +30,13 @@ lint: setup
 types: setup
 	$(VENV)/bin/pyright --pythonpath $(VENV)/bin/python
 
-check: lint
+fast: setup
 	$(VENV)/bin/python -m pytest -n 2 --dist worksteal -q -m "$(FAST)"
 
-test: lint
+check: lint
+	@$(MAKE) --no-print-directory -j2 --output-sync types fast
+
+test: lint types
 	$(VENV)/bin/python -m pytest -n 2 --dist worksteal
 
 test-minimum:

@@ -57,6 +57,7 @@ def test_a_report_is_a_table_for_people_and_a_list_for_machines(tmp_path, capsys
     assert [Row(**row) for row in json.loads((tmp_path / "new" / "rows.json").read_text())] == rows
 
 
+@pytest.mark.slow
 def test_results_of_two_machines_are_drawn_side_by_side(tmp_path):
     matplotlib = pytest.importorskip("matplotlib")
     rows = [Row("step of 2k nodes", 4.13, "ms", 0.1, "plain"), Row("step of 2k nodes", 4.13, "ms", 0.5, "other"), Row("PSNR", 31.7, "dB")]
@@ -113,6 +114,7 @@ def rows_of_physics(tmp_path, **arguments) -> dict[tuple[str, str | None], dict]
     return {(row["name"], row["peer"]): row for row in json.loads((tmp_path / "rows.json").read_text())}
 
 
+@pytest.mark.slow
 def test_the_physics_bench_reports_every_row(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(physics.importlib.util, "find_spec", lambda name: None)  # no peer
     threads = torch.get_num_threads()
@@ -161,6 +163,7 @@ class MPM_Simulator_WARP:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("working", [True, False])
 def test_the_peer_is_measured_where_it_works_and_otherwise_noted(working, tmp_path, capsys, monkeypatch):
     (tmp_path / "mpm_solver_warp.py").write_text(PEER if working else "import warp.no_such_module")
@@ -182,6 +185,7 @@ def test_the_peer_is_measured_where_it_works_and_otherwise_noted(working, tmp_pa
         assert not rows and "PhysGaussian's solver could not be measured: ModuleNotFoundError: No module named" in out
 
 
+@pytest.mark.slow
 def test_a_model_file_is_seen_by_its_camera_or_from_the_origin(tmp_path):
     scene = phantom_scene(500, 64)
     assert 400 < len(scene.model) < 600

@@ -81,6 +81,7 @@ def test_installed_executable_starts_its_node(prefix, node):
     assert name in done.stderr and "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 def test_headers_of_kernels_are_installed(prefix):
     installed = next(prefix.glob("lib/python*/site-packages/endo_sim_ros"))
     headers = {path.relative_to(ROOT / "endo_sim_ros") for path in (ROOT / "endo_sim_ros").rglob("*.h")}
@@ -128,6 +129,7 @@ def test_names_of_a_package_are_those_that_type_checkers_see(package):
         _ = lazy.nothing
 
 
+@pytest.mark.slow
 def test_library_works_without_ros():
     """Everything but the nodes imports with the ROS packages hidden."""
     code = """

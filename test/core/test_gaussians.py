@@ -97,6 +97,7 @@ def test_a_compressed_model_looks_the_same_at_a_quarter_of_the_size(tmp_path, ti
     assert torch.equal(load_ply(tmp_path / "again.ply").means, received.means)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degree", [0, 3])
 def test_every_field_of_a_compressed_model_is_near(tmp_path, degree):
     sent = dataclasses.replace(model(n=600, degree=degree), means=torch.rand(600, 3, generator=torch.Generator().manual_seed(0)))
@@ -114,6 +115,7 @@ def test_every_field_of_a_compressed_model_is_near(tmp_path, degree):
     torch.testing.assert_close(received.sh[:, 1:], sent.sh[:, 1:].clamp(-4, 4), atol=2e-2, rtol=0)
 
 
+@pytest.mark.slow
 def test_another_implementation_reads_compressed_models_alike(tmp_path):
     gaussforge = pytest.importorskip("gaussforge", reason="GaussForge is not installed")
     sent = model(n=300, degree=2)

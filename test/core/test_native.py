@@ -19,6 +19,7 @@ def test_there_are_headers():
     assert "core/native/vector.h" in HEADERS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("header", HEADERS)
 def test_a_compiler_reads_each_header_alone(header):
     compiler = shutil.which("g++")
@@ -62,6 +63,7 @@ def test_an_edited_header_makes_kernels_compile_anew(folder):
     assert answer(native("outer.h")) == 31
 
 
+@pytest.mark.slow
 def test_a_number_that_differs_between_python_and_a_header_stops_the_compiler(folder, capfd):
     with pytest.raises(Exception, match="build failed"):
         answer(native("outer.h", HALF=0.25))
@@ -74,6 +76,7 @@ def test_a_header_that_is_not_there_is_named(folder):
         native("outer.h")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("module", [common_kernels, cuda_kernels, ssim_kernels], ids=lambda module: module.__name__.rsplit(".")[-1])
 def test_kernels_for_gpus_compile_without_one(module, tmp_path):
     init_warp()

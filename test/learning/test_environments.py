@@ -28,6 +28,7 @@ from endo_sim_ros.physics import TissueSimulation
 ROOT = Path(__file__).parents[2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("observations", ["state", "image", "both"])
 @pytest.mark.parametrize("task", TASKS)
 def test_gymnasium_finds_nothing_to_complain_about(task, observations):
@@ -70,6 +71,7 @@ for task in TASKS:
     assert runs[0] == runs[1] and len(set(runs[0].split())) == len(TASKS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS)
 def test_each_of_many_environments_is_the_single_one_with_its_seed(task):
     count, seed, steps = 3, 20, 60

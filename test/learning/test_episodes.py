@@ -135,6 +135,7 @@ BASE = np.array([[0.0, 0, 1, 0.1], [0, 1, 0, -0.05], [-1, 0, 0, 0.02], [0, 0, 0,
 FRAMES = (f"PSM1_base 0.1 -0.05 0.02 0 {0.5**0.5} 0 {0.5**0.5}",)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["PSM1_base", ""])
 def test_poses_and_wrenches_in_the_frame_of_a_base_are_turned_into_the_world(bag, tmp_path, name):
     path = realtime(tmp_path / "bag", base=(name, BASE), frame="PSM1_base")
@@ -203,6 +204,7 @@ def test_commanded_poses_are_the_action_where_there_are_any(tmp_path):
     np.testing.assert_allclose(column(episode, "PSM1.jaw"), 0.5)
 
 
+@pytest.mark.slow
 def test_two_arms_have_columns_of_their_own(two_arms):
     both, second = read_episode(two_arms), read_episode(two_arms, arms=("PSM2",))
     assert both.arms == ("PSM1", "PSM2") and both.state.shape[1] == both.action.shape[1] == 28

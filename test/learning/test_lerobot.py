@@ -104,6 +104,7 @@ def test_png_images_are_exact(bag, tmp_path):
         np.testing.assert_array_equal(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), picture(number))
 
 
+@pytest.mark.slow
 def test_episodes_that_do_not_agree_are_refused_before_anything_is_written(bag, two_arms, tmp_path):
     steps = lockstep(tmp_path / "steps", step=S // 10)
     with pytest.raises(SequenceError, match=r"two has arms \('PSM1', 'PSM2'\), .*realtime \('PSM1',\); .* must agree"):

@@ -32,6 +32,7 @@ def test_what_a_pushing_tool_feels_is_the_momentum_that_the_tissue_gets(kinemati
     assert linear[2] > 5e-4 and simulation.faults == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("young", [5e3, 10e3])
 def test_a_pressed_layer_resists_as_the_theory_of_indentation_says(young):
     """A frictionless sphere in a layer bonded to its ground: Hertz with the correction of Dimitriadis et al. (2002)."""
@@ -73,6 +74,7 @@ def test_friction_drags_and_without_it_tools_slide():
     assert 0.15 < drags[1] - drags[0] < 0.4  # about the coefficient, beside the shape of the tissue
 
 
+@pytest.mark.slow
 def test_a_capsule_touches_along_its_length_and_a_thin_one_does_not_pass_between_nodes():
     simulation = simulate(node_count=2000, contact_radius=0.004, contact_length=0.03)
     pose = pose_at(TIP - [0.015, 0, 0.003])

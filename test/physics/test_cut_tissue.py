@@ -30,6 +30,7 @@ def pull_apart(simulation: TissueSimulation, force: float = 0.4) -> tuple[np.nda
     return (state.positions - state.rest)[skin, 0], state.rest[skin]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", [contextlib.nullcontext, plain_kernels], ids=["vectorised", "plain"])
 def test_a_cut_separates_what_is_pulled_apart_and_heals_on_reset(backend):
     gaps = []
@@ -50,6 +51,7 @@ def test_a_cut_separates_what_is_pulled_apart_and_heals_on_reset(backend):
     assert gaps[2] == gaps[0]
 
 
+@pytest.mark.slow
 def test_a_cut_opens_where_the_blade_was_and_not_beyond_its_end():
     simulation = simulate(node_count=2400, layers=3, blade_length=0.03)
     cut_along(simulation, np.linspace(-0.045, 0.0, 16))
@@ -76,6 +78,7 @@ def test_momentum_is_kept_on_each_side_of_a_cut_through_free_tissue():
     np.testing.assert_allclose(momentum, [0.01 * 0.2, 0, 0], atol=2e-6)
 
 
+@pytest.mark.slow
 def test_skin_follows_its_own_side_of_a_cut():
     model = curved_sheet(4000)
     simulation = simulate(model, node_count=2400, layers=3, blade_length=0.03)

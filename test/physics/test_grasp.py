@@ -30,6 +30,7 @@ def test_reaction_of_a_grasp_grows_with_stiffness():
     assert pulls[1] / pulls[0] == pytest.approx(2, rel=0.1)
 
 
+@pytest.mark.slow
 def test_what_a_jaw_feels_hardly_depends_on_how_many_nodes_there_are():
     pulls = []
     for count, layers in ((1000, 3), (4000, 3), (12000, 5)):

@@ -29,6 +29,7 @@ def test_absurd_force_is_caught_and_the_last_good_state_restored(kinematics):
     assert simulation.faults == 1 and np.isfinite(simulation.state().positions).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("material", "relaxation"), [("neo_hookean", 0.0), ("fixed_corotated", 5.0)])
 def test_tissue_crushed_until_no_step_goes_on_comes_back_when_the_tool_has_gone(material, relaxation):
     simulation = simulate(material=material, relaxation=relaxation, contact_radius=0.05)

@@ -17,6 +17,7 @@ def affine_field(rest: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return A, rest @ A.T + [0.01, 0.02, -0.03], np.tile(A, (len(rest), 1, 1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("weighting", ["compact", "softmax"])
 def test_undeformed_nodes_leave_gaussians_untouched(weighting):
     model = curved_sheet()
@@ -160,6 +161,7 @@ def test_number_of_threads_changes_no_bit(monkeypatch, weighting):
         assert all(torch.equal(one, other) for one, other in zip(results[0], others, strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("neighbours", [1, 4, 7])
 def test_vectors_agree_with_the_equations_and_with_the_kernel_of_cuda(neighbours):
     model, rest = model_and_rest(5000)

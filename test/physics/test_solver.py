@@ -161,6 +161,7 @@ def test_tissue_that_came_to_rest_is_not_stepped_until_a_tool_acts():
     assert depth_of_dent(simulation) < 2e-5
 
 
+@pytest.mark.slow
 def test_tissue_can_be_built_in_one_thread_while_other_tissue_begins_to_move_in_another():
     points = np.random.default_rng(0).normal(size=(2000, 3))
     expected, wrong, done = sample_farthest(points, 40), [], threading.Event()

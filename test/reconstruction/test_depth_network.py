@@ -77,6 +77,7 @@ def views():
     return list(phantom_sequence(PhantomConfig(width=320, height=256, frames=3, stereo=False)))
 
 
+@pytest.mark.slow
 def test_a_networks_depth_becomes_metric(views):
     """A network that sees the exact shape, up to scale and shift, gives the exact depth."""
     frame = views[0]
@@ -89,12 +90,14 @@ def test_a_networks_depth_becomes_metric(views):
     assert network_depth(frame, lambda image: np.random.default_rng(0).random((256, 320)), known) is None
 
 
+@pytest.mark.slow
 def test_views_that_do_not_fit_are_dropped_and_none_at_all_is_an_error(views, tiny):
     points = triangulate(views)
     with pytest.raises(SequenceError, match="no view's depth fits"):
         estimate_depth(unknown(views), points, ReconstructionConfig(depth="network", depth_model=str(tiny), device="cpu"))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not ONNX.is_file(), reason="no ONNX depth network at ../shared/data/weights")
 def test_a_real_network_gives_depth_that_correlates(views):
     pytest.importorskip("onnxruntime")
@@ -103,6 +106,7 @@ def test_a_real_network_gives_depth_that_correlates(views):
     assert abs(np.corrcoef(relative.ravel(), 1 / views[0].depth.ravel())[0, 1]) > 0.3
 
 
+@pytest.mark.slow
 def test_views_that_fit_get_the_depth_of_the_network(views, monkeypatch, tmp_path):
     """The network is loaded once, whatever the views."""
     loaded, depths = [], {view.image.tobytes(): view.depth for view in views}

@@ -14,6 +14,7 @@ from endo_sim_ros.reconstruction.scene import ScenePoints
 from endo_sim_ros.reconstruction.triangulation import triangulate
 
 
+@pytest.mark.slow
 def test_stereo_depth_is_near_the_exact_depth(large):
     for view, exact in zip(estimate_depth(unknown(large[:2]), NO_POINTS, options(depth="stereo")), large):
         valid = view.depth_prior > 0
@@ -23,6 +24,7 @@ def test_stereo_depth_is_near_the_exact_depth(large):
         assert valid[:, :100].mean() > 0.3  # the columns that a matcher by itself would skip
 
 
+@pytest.mark.slow
 def test_a_wrong_principal_point_of_the_right_eye_is_found(large):
     points = triangulate(list(large))
     right = [np.ascontiguousarray(np.roll(frame.right, -3, axis=1)) for frame in large]  # as if cx were 3 pixels less
@@ -38,6 +40,7 @@ def test_no_offset_without_points(large):
     assert disparity_offsets(list(large[:1]), [np.ones((512, 640), np.float32)], NO_POINTS) == 0
 
 
+@pytest.mark.slow
 def test_depth_between_points_is_interpolated_without_the_wrong_ones(large):
     points, _, _ = triangulate(list(large))
     frame = large[0]
@@ -116,6 +119,7 @@ def test_depth_sources_are_chosen_or_refused(small):
             estimate_depth(unknown([bare(small[0])]), NO_POINTS, options(depth=source))
 
 
+@pytest.mark.slow
 def test_each_view_has_its_own_offset_where_it_sees_many_points(large):
     points = triangulate(list(large))
     moved = [dataclasses.replace(f, right=np.ascontiguousarray(np.roll(f.right, -2 - i, axis=1))) for i, f in enumerate(large[:2])]
@@ -123,6 +127,7 @@ def test_each_view_has_its_own_offset_where_it_sees_many_points(large):
     np.testing.assert_allclose(offsets, [-2, -3], atol=0.3)
 
 
+@pytest.mark.slow
 def test_an_offset_that_no_principal_point_explains_is_refused(large, caplog):
     points = triangulate(list(large))
     far = ScenePoints(2 * points.positions, points.colors, points.error)  # as of poses of twice the scale

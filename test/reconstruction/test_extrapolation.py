@@ -82,6 +82,7 @@ def test_a_picture_goes_on_as_bright_as_it_is_however_far_the_tissue_beyond_is_g
     np.testing.assert_allclose(without_distance[48:-48, -10:], without_distance[48:-48, -60:-50], rtol=0.05)
 
 
+@pytest.mark.slow
 def test_what_lies_beyond_two_views_looks_as_in_the_nearer_one(views):
     """Whichever of them comes first."""
     frame = dataclasses.replace(bare(views[4]), mask=None, depth=np.full((128, 160), 0.1, np.float32))
@@ -113,6 +114,7 @@ def test_tissue_goes_on_beyond_the_pictures_and_in_holes(views):
     assert np.median(np.abs(hole / exact - 1)) < 0.03
 
 
+@pytest.mark.slow
 def test_no_more_gaussians_than_asked_for_and_larger_ones_instead(views):
     (view,) = with_prior(views[4:5])
     nothing = GaussianModel.from_points(torch.zeros(1, 3), torch.zeros(1, 3), torch.full((1,), 1e-6), 0.5)

@@ -53,6 +53,7 @@ def test_flow_between_the_eyes_corrects_what_matching_left(large, pair):
     assert np.sqrt((error(corrected) ** 2).mean()) < 0.8 * np.sqrt((error(prior) ** 2).mean())
 
 
+@pytest.mark.slow
 def test_flow_is_found_in_finer_pixels_than_are_trained_on(large):
     (wide,) = prepare([dataclasses.replace(large[0], depth=None)], options(image_width=320)).views
     (narrow,) = refine_depth([shrink(view, 320) for view in matched(large[:1])], NO_POINTS, "stereo")
@@ -80,6 +81,7 @@ def test_reflections_of_the_light_do_not_spoil_the_depth_that_views_agree_on(lar
     assert error(lit) < 1.6 * error(frames)
 
 
+@pytest.mark.slow
 def test_pale_tissue_is_no_reflection(large):
     pale = [dataclasses.replace(frame, image=(180 + frame.image // 4).astype(np.uint8)) for frame in large[:2]]
     off = [dataclasses.replace(frame, depth=frame.depth * np.float32(1.03), right=None, baseline=None) for frame in pale]
@@ -96,12 +98,14 @@ def test_views_correct_each_others_depth(large):
     assert all(((a.depth_prior > 0) == (b.depth_prior > 0)).mean() > 0.999 for a, b in zip(corrected, views))
 
 
+@pytest.mark.slow
 def test_depth_between_points_is_believed_more_than_a_guess(large):
     off = with_prior(dataclasses.replace(frame, depth=frame.depth * np.float32(1.03)) for frame in large)
     moved = lambda source: np.abs(refine_depth(off, NO_POINTS, source)[0].depth_prior - off[0].depth_prior).mean()
     assert moved("points") < moved("network")
 
 
+@pytest.mark.slow
 def test_what_the_other_view_hides_stays_where_it_was():
     """Far tissue beside near tissue, which hides a strip of it from a second camera 5 mm to the right; depths are exact."""
     noise = np.random.default_rng(0).integers(0, 256, (2, 512, 700, 3)).astype(np.float32)

@@ -39,6 +39,7 @@ def bits(scene: PreparedScene) -> list[bytes]:
 # --------------------------------------------------------------------------------------------- the whole pipeline
 
 
+@pytest.mark.slow
 def test_what_was_measured_stays_and_the_prior_is_another_field(frames):
     scene = prepare(frames, options(depth="stereo"))
     assert all(kept is given for kept, given in zip(scene.frames, frames))
@@ -49,12 +50,14 @@ def test_what_was_measured_stays_and_the_prior_is_another_field(frames):
         assert np.abs(view.depth_prior - view.depth)[view.depth_prior > 0].max() > 1e-5
 
 
+@pytest.mark.slow
 def test_stages_report_in_order(stereo):
     reports = []
     prepare(stereo, options(), on_progress=lambda *report: reports.append(report))
     assert list(dict.fromkeys(stage for stage, _, _ in reports)) == list(STAGES)
 
 
+@pytest.mark.slow
 def test_preparing_twice_gives_the_same_bits_and_a_trainer_changes_nothing(stereo):
     config = options()
     first, second = prepare(stereo, config), prepare(stereo, config)
@@ -63,6 +66,7 @@ def test_preparing_twice_gives_the_same_bits_and_a_trainer_changes_nothing(stere
     assert bits(first) == bits(second)
 
 
+@pytest.mark.slow
 def test_reconstructing_is_preparing_and_training_with_progress_and_cancellation(frames):
     config, stages = options(), []
     model = reconstruct(frames, config, on_progress=lambda *report: stages.append(report))
@@ -81,6 +85,7 @@ def test_reconstructing_is_preparing_and_training_with_progress_and_cancellation
 # ------------------------------------------------------------------------------------------------------- decisions
 
 
+@pytest.mark.slow
 def test_decisions_are_told(frames):
     blind = dataclasses.replace(frames[1], mask=np.zeros((128, 160), np.uint8))
     scene = prepare([frames[0], blind, *frames[2:]], options())
@@ -89,6 +94,7 @@ def test_decisions_are_told(frames):
     assert f"{blind.stamp_ns * 1e-9:.3f} s left out: masked" in left_out
 
 
+@pytest.mark.slow
 def test_thresholds_of_usable_views_are_options(frames):
     dim = [dataclasses.replace(frame, image=(frame.image // 20).astype(np.uint8)) for frame in frames]
     with pytest.raises(SequenceError, match="every view is black"):

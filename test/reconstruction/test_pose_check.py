@@ -36,6 +36,7 @@ def misplaced(frame, fault):
     return dataclasses.replace(frame, camera=frame.camera.at(pose))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_wrong_pose_among_good_ones_is_found(large, fault, caplog):
     frames = [bare(frame) for frame in large]
@@ -47,6 +48,7 @@ def test_a_wrong_pose_among_good_ones_is_found(large, fault, caplog):
         assert len(scene.views) == 4 and "left out" in caplog.text
 
 
+@pytest.mark.slow
 def test_with_stereo_a_wrong_pose_among_three_is_left_out(caplog):
     views = list(phantom_sequence(PhantomConfig(width=320, height=256, frames=3, travel=0.02)))
     views = [dataclasses.replace(view, depth=None) for view in views]

@@ -27,6 +27,7 @@ def quality(model, frames) -> tuple[float, float]:
     return float(np.mean([metrics.psnr(*pair) for pair in pairs])), float(np.mean(fitted))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PRESETS)
 def test_every_preset_trains(views, name):
     points = triangulate(views)[:2]
@@ -41,6 +42,7 @@ def test_every_ablation_changes_its_preset():
             assert preset(name, **changes) != preset(name), (name, part)
 
 
+@pytest.mark.slow
 def test_the_default_beats_the_paper_on_two_views(views):
     ends, rest = [views[0], views[-1]], views[1:-1]
     short = {"iterations": 60, "max_gaussians": 6000, "refine_every": 20, "device": "cpu"}
@@ -50,6 +52,7 @@ def test_the_default_beats_the_paper_on_two_views(views):
     assert ours[0] > paper[0] + 1.5 and ours[1] > paper[1] + 1.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(161, 97), (3840, 2160)])
 def test_odd_and_large_pictures_train(size):
     frame = next(iter(phantom_sequence(PhantomConfig(width=160, height=96, frames=1))))
@@ -60,6 +63,7 @@ def test_odd_and_large_pictures_train(size):
     assert trainer.cameras[0].width == 75 and finite(trainer.run())
 
 
+@pytest.mark.slow
 def test_out_of_memory_goes_on_at_half_the_size(views, monkeypatch, caplog):
     trainer = trainer_of(views[::4], options())
     draw, widths = trainer._render, []
@@ -80,6 +84,7 @@ def test_out_of_memory_goes_on_at_half_the_size(views, monkeypatch, caplog):
         tiny.run()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["default", "3dgs", "fsgs"])
 def test_a_checkpoint_of_any_preset_goes_on_as_if_never_interrupted(views, tmp_path, name):
     make = lambda: trainer_of(views[::4], preset(name, **SHORT), triangulate(views)[:2])
@@ -117,6 +122,7 @@ def test_a_checkpoint_knows_the_options_and_not_the_preset_that_they_came_from(v
         trainer_of(views[::4], preset("paper", **SHORT), points).load_checkpoint(tmp_path / "checkpoint.pt")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "opaque"), [("default", 0.01), ("paper", 0.0)])
 def test_transparency_is_weighed_apart_by_default_and_not_as_printed(views, monkeypatch, name, opaque):
     weights = []

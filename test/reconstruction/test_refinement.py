@@ -73,6 +73,7 @@ def test_noise_moves_only_the_faint():
     assert noise[25:].abs().max() < 1e-3 * noise[:25].abs().median()
 
 
+@pytest.mark.slow
 def test_optimiser_state_follows_its_gaussians(small):
     trainer = trainer_of([small[0], small[8]], options(refine_every=1000, max_gaussians=1500))
     for _ in range(3):

@@ -1,6 +1,7 @@
 """Densification by splitting, cloning and unpooling; what no view shows."""
 
 import numpy as np
+import pytest
 import torch
 from trained import trainer_of
 
@@ -42,6 +43,7 @@ def test_steep_gaussians_are_split_or_doubled_and_dead_ones_go():
     assert len(limited) == 58
 
 
+@pytest.mark.slow
 def test_exposures_and_colours_do_not_drift_against_each_other(views):
     trainer = trainer_of(views, ReconstructionConfig(iterations=40, max_gaussians=2000, depth="topic", device="cpu"))
     before = trainer._appearance.tensors["exposures"].detach().clone()

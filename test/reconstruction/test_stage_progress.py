@@ -42,6 +42,7 @@ STAGES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", STAGES)
 def test_a_stage_reports_and_can_be_cancelled_at_any_report(small, stage):
     frames, reports = list(small[:3]), []
@@ -61,6 +62,7 @@ def test_a_stage_reports_and_can_be_cancelled_at_any_report(small, stage):
     STAGES[stage](frames, StageProgress())  # one that was cancelled leaves nothing behind
 
 
+@pytest.mark.slow
 def test_nobody_waits_for_what_runs_when_the_work_is_cancelled():
     """A call of OpenCV can take seconds, and cannot be stopped."""
     running, released, ended = threading.Event(), threading.Event(), []

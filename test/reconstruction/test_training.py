@@ -47,6 +47,7 @@ def test_adam_is_that_of_torch():
         assert not torch.equal(x, start[name])
 
 
+@pytest.mark.slow
 def test_virtual_camera_lies_between_two_views(small, monkeypatch):
     trainer = trainer_of([small[0], small[4]], options(virtual_every=1))
     first, second = (small[i].camera.position for i in (0, 4))
@@ -68,6 +69,7 @@ def test_virtual_camera_lies_between_two_views(small, monkeypatch):
         np.testing.assert_allclose(position, (1 - alpha) * first + alpha * second, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_training_improves_views_it_has_not_seen(small):
     training, rest = [small[i] for i in (0, 2, 4, 6)], [small[i] for i in (1, 3, 5)]
     noisy = [dataclasses.replace(f, depth=f.depth * np.float32(1.03 if i % 2 else 0.97)) for i, f in enumerate(training)]
@@ -89,6 +91,7 @@ def test_progress_can_stop_the_training(small):
     assert trainer.iteration == 2
 
 
+@pytest.mark.slow
 def test_same_seed_gives_the_same_bits_whatever_the_threads(small, monkeypatch):
     models = []
     for threads in ("1", "2", "3"):
@@ -104,6 +107,7 @@ def test_same_seed_gives_the_same_bits_whatever_the_threads(small, monkeypatch):
     assert not equal(models[0], other)
 
 
+@pytest.mark.slow
 def test_a_checkpoint_goes_on_as_if_never_interrupted(small, tmp_path):
     views = list(small[::4])
     whole = trainer_of(views, options()).run()
@@ -117,6 +121,7 @@ def test_a_checkpoint_goes_on_as_if_never_interrupted(small, tmp_path):
     assert equal(second.run(), whole)
 
 
+@pytest.mark.slow
 def test_checkpoints_that_do_not_fit_are_refused(small, tmp_path):
     path = tmp_path / "checkpoint.pt"
     trainer = trainer_of([small[0]], options())
@@ -136,12 +141,14 @@ def test_checkpoints_that_do_not_fit_are_refused(small, tmp_path):
         trainer.load_checkpoint(tmp_path / "absent.pt")
 
 
+@pytest.mark.slow
 def test_higher_harmonics_are_trained(small):
     model = trainer_of([small[0], small[8]], options(sh_degree=3)).run()
     assert model.sh_degree == 3
     assert model.sh[:, 1:].abs().max() > 0
 
 
+@pytest.mark.slow
 def test_reconstruction_of_a_bag_is_measured(tmp_path, small):
     write_bag(tmp_path / "bag", small)
     found = reconstruct_and_measure(tmp_path / "bag", tmp_path / "out", options(keyframes=4, image_width=80))
@@ -152,6 +159,7 @@ def test_reconstruction_of_a_bag_is_measured(tmp_path, small):
         assert (tmp_path / "out" / name).stat().st_size > 0
 
 
+@pytest.mark.slow
 def test_no_gaussian_outgrows_the_scene():
     frames = list(phantom_sequence(PhantomConfig(frames=4, width=96, height=80, border=0.1)))
     trainer = trainer_of(frames, ReconstructionConfig(iterations=60, max_gaussians=1000, device="cpu", learning_rate=5.0))

@@ -9,6 +9,7 @@ from endo_sim_ros.reconstruction.stage_configs import MatchingConfig
 from endo_sim_ros.reconstruction.triangulation import match_features, nearest_views, points_in_view, triangulate
 
 
+@pytest.mark.slow
 def test_triangulated_points_lie_on_the_surface(large):
     points, colors, error = triangulate(list(large))
     assert len(points) > 300

@@ -23,6 +23,7 @@ def test_one_view_is_enough_with_depth(small):
     assert finite(trainer_of([small[0]], options()).run())
 
 
+@pytest.mark.slow
 def test_identical_views_train(small, caplog):
     assert finite(trainer_of([small[0]] * 3, options()).run())
     assert "contradict what they see" not in caplog.text
@@ -35,6 +36,7 @@ def test_masking_everything_is_an_error(small):
     assert finite(trainer_of([small[4], hidden], options()).run())  # one of them is no obstacle
 
 
+@pytest.mark.slow
 def test_depth_with_holes_trains(small):
     depth = small[0].depth.copy()
     depth[:, :60], depth[:40] = np.nan, 0
@@ -50,12 +52,14 @@ def test_nothing_to_see_is_an_error(small):
         trainer_of([dataclasses.replace(bare(small[0]), depth=np.zeros_like(small[0].depth))], options())
 
 
+@pytest.mark.slow
 def test_views_that_face_away_from_each_other_train(small):
     away = small[4].camera.pose @ np.diag([-1.0, 1, -1, 1])
     other = dataclasses.replace(small[4], camera=small[4].camera.at(away))
     assert finite(trainer_of([small[0], other], options()).run())
 
 
+@pytest.mark.slow
 def test_points_alone_are_enough(large):
     model = trainer_of([bare(frame) for frame in large[:3]], options(image_width=160)).run()
     assert finite(model)
@@ -68,6 +72,7 @@ def test_odd_sizes_train():
     assert finite(model)
 
 
+@pytest.mark.slow
 def test_the_right_image_is_a_view_of_the_same_scene(views):
     frame = views[4]
     right = right_view(frame)
@@ -77,6 +82,7 @@ def test_the_right_image_is_a_view_of_the_same_scene(views):
     assert metrics.psnr(image, right.image, right.mask) > metrics.psnr(wrong, right.image, right.mask) + 3
 
 
+@pytest.mark.slow
 def test_pure_rotation_trains_with_depth_and_is_an_error_without(views):
     turned = []
     for frame, angle in ((views[0], 0.0), (views[0], 0.04)):
@@ -91,6 +97,7 @@ def test_pure_rotation_trains_with_depth_and_is_an_error_without(views):
         trainer_of([bare(frame) for frame in turned], options())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reason, change", {
     "overexposed": lambda frame: {"image": np.full_like(frame.image, 255)},
     "black": lambda frame: {"image": np.zeros_like(frame.image)},

@@ -14,6 +14,7 @@ def test_a_calibration_file_runs_no_code(tmp_path):
     assert not trace.exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "text, sentence",
     [

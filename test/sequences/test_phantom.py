@@ -15,6 +15,7 @@ def frames():
     return list(phantom_sequence(SMALL))
 
 
+@pytest.mark.slow
 def test_same_seed_gives_the_same_bytes(frames):
     build_phantom.cache_clear()
     for first, second in zip(frames, phantom_sequence(SMALL), strict=True):
@@ -24,12 +25,14 @@ def test_same_seed_gives_the_same_bytes(frames):
         assert first.camera.pose.tobytes() == second.camera.pose.tobytes()
 
 
+@pytest.mark.slow
 def test_other_seeds_are_other_patients(frames):
     image, depth = render_phantom(dataclasses.replace(SMALL, seed=1), frames[0].camera)
     assert np.abs(image.astype(int) - frames[0].image).mean() > 10
     assert np.abs(depth - frames[0].depth).mean() > 1e-3
 
 
+@pytest.mark.slow
 def test_sequence_is_lazy_and_stamped_by_the_frame_rate():
     endless = phantom_sequence(PhantomConfig(frames=100_000, width=32, height=24, fps=10.0, stereo=False))
     first, second = next(endless), next(endless)
@@ -38,6 +41,7 @@ def test_sequence_is_lazy_and_stamped_by_the_frame_rate():
     assert first.right is None and first.baseline is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_depth_lies_on_the_surface(seed):
     """Ray marching is in single precision; the surface it should have found is evaluated in double."""
@@ -102,6 +106,7 @@ def test_stereo_disparity_is_focal_times_baseline_over_depth():
     assert difference(disparity) < 0.5 * min(difference(disparity - 3), difference(disparity + 3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_images_look_like_tissue(seed):
     config = PhantomConfig(seed=seed, width=320, height=256, frames=2)
@@ -116,6 +121,7 @@ def test_images_look_like_tissue(seed):
     assert np.ptp(depth) > 0.02
 
 
+@pytest.mark.slow
 def test_the_surface_fills_every_view():
     for seed in range(3):
         config = PhantomConfig(seed=seed, frames=12, width=48, height=40, fov_deg=75.0, travel=0.05, stereo=False)

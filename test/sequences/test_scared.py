@@ -82,6 +82,7 @@ def scared(tmp_path):
     return root
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world_to_camera", [True, False], ids=["world_to_camera", "camera_to_world"])
 def test_scared_finds_which_way_its_poses_point(scared, world_to_camera, caplog):
     write_scared(scared, world_to_camera=world_to_camera)
@@ -94,6 +95,7 @@ def test_scared_finds_which_way_its_poses_point(scared, world_to_camera, caplog)
         assert_frame_agrees(frame, tolerance=12)
 
 
+@pytest.mark.slow
 def test_scared_pose_direction_can_be_stated(scared):
     write_scared(scared)
     wrong = list(read_scared(scared, pose_direction="camera_to_world"))[-1]
@@ -101,6 +103,7 @@ def test_scared_pose_direction_can_be_stated(scared):
     assert np.median(np.abs(wrong.image - expected)) > 15
 
 
+@pytest.mark.slow
 def test_scared_scene_points_in_any_order(scared, caplog):
     write_scared(scared, order=[3, 1, 5, 0, 2])  # frame 4 has none
     frames = list(read_scared(scared, start=1))
@@ -110,6 +113,7 @@ def test_scared_scene_points_in_any_order(scared, caplog):
     assert "not in its place" in caplog.text
 
 
+@pytest.mark.slow
 def test_scared_depth_choices(scared):
     write_scared(scared)
     keyframe = list(read_scared(scared, depth="keyframe"))
@@ -119,6 +123,7 @@ def test_scared_depth_choices(scared):
     assert all(f.depth is None for f in read_scared(scared, depth="none"))
 
 
+@pytest.mark.slow
 def test_scared_keyframe_alone(scared):
     write_scared(scared)
     (scared / "data/rgb.mp4").unlink()
@@ -127,12 +132,14 @@ def test_scared_keyframe_alone(scared):
     assert_frame_agrees(frames[0])
 
 
+@pytest.mark.slow
 def test_scared_calibration_from_frame_data(scared):
     write_scared(scared, yaml=False)
     for frame in read_scared(scared, stop=2):
         assert_frame_agrees(frame, tolerance=12)
 
 
+@pytest.mark.slow
 def test_scared_warns_when_the_camera_does_not_move(scared, caplog):
     write_scared(scared, count=1)
     assert len(list(read_scared(scared))) == 1
@@ -144,6 +151,7 @@ def damage_json(root: Path, data: bytes):
         add_member(tar, "frame_data000000.json", data)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
@@ -173,6 +181,7 @@ def test_damaged_scared_is_refused_by_name(scared, damage, message):
         list(read_scared(scared))
 
 
+@pytest.mark.slow
 def test_truncated_scene_points_are_refused_by_name(scared):
     write_scared(scared, count=3)
     archive = scared / "data/scene_points.tar.gz"
@@ -181,6 +190,7 @@ def test_truncated_scene_points_are_refused_by_name(scared):
         list(read_scared(scared))
 
 
+@pytest.mark.slow
 def test_links_in_archives_are_not_followed(scared):
     write_scared(scared, count=1)
     link = tarfile.TarInfo("frame_data000000.json")
@@ -191,6 +201,7 @@ def test_links_in_archives_are_not_followed(scared):
         read_scared(scared)
 
 
+@pytest.mark.slow
 def test_scared_dataset_folder_lists_its_keyframes(scared):
     write_scared(scared, count=1)
     with pytest.raises(SequenceError, match="pass one of its keyframes: keyframe_1"):

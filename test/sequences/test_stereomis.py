@@ -109,6 +109,7 @@ def test_stereomis_masks_of_either_polarity_mean_the_same(stereomis):
     assert forced[80, 120] == 255 and forced[20, 80] == 0
 
 
+@pytest.mark.slow
 def test_stereomis_extracted_frames_equal_the_video(stereomis):
     next(stereomis.glob("*.mp4")).unlink()
     for number, (left, right) in enumerate(stereo_images(trajectory(8))):

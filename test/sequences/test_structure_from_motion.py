@@ -76,6 +76,7 @@ def test_structure_from_motion_on_stereo_is_metric():
         assert np.abs(pose[:3, :3] - expected[:3, :3]).max() < 0.01
 
 
+@pytest.mark.slow
 def test_folder_without_poses_is_posed_and_the_guessed_scale_is_announced(tmp_path, caplog):
     pytest.importorskip("pycolmap")
     for number, image in enumerate(relief_images(ORBIT, K_RELIEF)):
@@ -101,6 +102,7 @@ def test_structure_from_motion_that_fails_says_why(tmp_path):
         estimate_poses([np.zeros((120, 160, 3), np.uint8)])
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not (SHARED / "gallbladder/endo.mp4").is_file(), reason="the gallbladder video is not at ../shared/data")
 def test_structure_from_motion_on_a_real_video(tmp_path):
     reference = read_poses(SHARED / "gallbladder/poses.txt")
@@ -120,6 +122,7 @@ def test_structure_from_motion_on_a_real_video(tmp_path):
     assert similarity_error(estimated, np.array([reference[numbers[n]][:3, 3] for n in placed])) < 0.25
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not (SHARED / "hamlyn06/left").is_dir(), reason="the hamlyn06 recording is not at ../shared/data")
 def test_structure_from_motion_on_real_stereo_is_metric(tmp_path):
     source = SHARED / "hamlyn06"

@@ -30,6 +30,7 @@ def assert_only_background(gaussians, size=(WIDTH, HEIGHT)):
     assert_close("gradient of the background", gradients[-1], cotangent, 1e-5)
 
 
+@pytest.mark.slow
 def test_no_gaussians_render_the_background(compositor):
     assert_only_background(make_gaussians(0))
 
@@ -106,6 +107,7 @@ def test_degenerate_scales_match_the_reference(scale, compositor):
     assert_matches_reference(gaussians, make_cameras(), names=["means", "quats"])
 
 
+@pytest.mark.slow
 def test_a_million_gaussians_are_all_seen():
     count, size = 1_000_000, (160, 128)
     gaussians = [x.float() for x in make_gaussians(count, seed=23)]

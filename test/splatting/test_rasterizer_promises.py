@@ -46,6 +46,7 @@ scenes = st.fixed_dictionaries(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=80, deadline=None, derandomize=True, database=None)
 @given(scenes)
 def test_any_scene_matches_the_reference(scene):
@@ -141,6 +142,7 @@ def test_render_shows_a_model_through_a_camera():
     assert torch.allclose(deformed.colors, output.colors, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_gradient_descent_recovers_a_moved_gaussian():
     viewmats, Ks = (x.float() for x in make_cameras(1))
     quats, scales = torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.015)
@@ -232,6 +234,7 @@ def test_pictures_drawn_in_several_threads_are_those_drawn_in_one(compositor):
     assert len(same) == 3 * 4 * 10 and all(same)
 
 
+@pytest.mark.slow
 def test_nothing_holds_the_memory_of_a_picture_that_is_gone(compositor):
     size = (59, 41)  # of no other test
     run(rasterize, make_gaussians(), make_cameras(), size=size, dtype=torch.float32)

@@ -37,6 +37,7 @@ def test_random_scenes_match_the_reference(seed):
     assert_matches_reference(gaussians, make_cameras(1, *size), size=size)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("device", DEVICES)
 def test_opaque_stacks_that_end_pixels_early_match_the_reference(device, compositor):
     gaussians = make_gaussians(150, seed=3)

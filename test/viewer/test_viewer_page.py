@@ -69,6 +69,7 @@ def test_stress_is_coloured_by_the_stiffness_of_each_node(page):
     assert "without regions" in viewer._notice and "/missing" in viewer._notice
 
 
+@pytest.mark.slow
 def test_lifting_pulls_towards_the_user_with_no_more_than_the_largest_force(page):
     point(page.viewer, "start", (0.5, 0.5), lifts=True)
     point(page.viewer, "update", (0.5, 0.0), lifts=True)
@@ -128,6 +129,7 @@ def test_time_stands_still_while_paused_and_goes_step_by_step(page):
     turn_until(page, lambda: page.simulation.time > before + 0.1, "time to go on")
 
 
+@pytest.mark.slow
 def test_slider_changes_the_material_under_the_hand_when_it_stands_still(page):
     slider = next(slider for slider in SLIDERS if slider.parameter == "young_modulus")
     point(page.viewer, "start", (0.5, 0.5))

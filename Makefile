@@ -44,7 +44,7 @@ test-minimum:
 	.venv-minimum/bin/python -m pytest -n 2 --dist worksteal -q -m "$(FAST)"
 
 api: setup
-	$(VENV)/bin/pdoc --docformat google --output-directory $(OUT)/api endo_sim_ros
+	$(VENV)/bin/pdoc --docformat google --output-directory $(OUT)/api endo_sim_ros '!endo_sim_ros.learning.ppo'  # which needs stable-baselines3
 
 setup: $(VENV)/.installed
 

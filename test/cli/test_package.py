@@ -3,6 +3,7 @@
 import ast
 import importlib.util
 import os
+import re
 import subprocess
 import sys
 import types
@@ -220,3 +221,15 @@ def test_replay_launch_file_hands_everything_to_the_graph(monkeypatch):
     if isinstance(bag, _Recorded):
         assert bag.args == ("bag",) and "default_value" not in bag.kwargs, "it is asked for"
         assert graph.args == (str(ROOT / "launch" / "endo_sim.launch.py"),)
+
+
+@pytest.mark.slow
+def test_the_api_reference_is_built_and_has_public_names(tmp_path):
+    pytest.importorskip("pdoc")
+    recipe = re.search(r"^api:.*\n\t(.*)", (ROOT / "Makefile").read_text(), re.M).group(1)
+    command = recipe.partition("#")[0].replace("$(VENV)/bin/pdoc", f"{sys.executable} -m pdoc").replace("$(OUT)", str(tmp_path))
+    done = subprocess.run(command, shell=True, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    pages = tmp_path / "api" / "endo_sim_ros"
+    for page, name in {"physics/simulation": "TissueBatch", "splatting/api": "rasterize", "messages/images": "encode_image"}.items():
+        assert f'id="{name}"' in (pages / f"{page}.html").read_text(), f"{page} does not show {name}"

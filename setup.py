@@ -38,7 +38,7 @@ setup(
         "torch>=2.4",
         "typing_extensions>=4.12",
         "tyro>=0.9.20",
-        "warp-lang>=1.19,<1.20",  # private parts: endo_sim_ros/core/native.py and kernels.py
+        "warp-lang>=1.19,<1.20",  # private parts: see CONTRIBUTING.md
     ],
     extras_require={
         "depth": ["onnxruntime", "transformers"],  # reconstruction with depth:=network

@@ -19,8 +19,8 @@ class Command:
     """Folder or file of the recording."""
     bag: Positional[Path]
     """Folder of the new bag; it must not exist."""
-    kind: Literal["auto", "stereomis", "scared", "endonerf", "folder", "video"] = "auto"
-    """Layout; auto recognises it."""
+    kind: str = "auto"
+    """Layout, by its name in lower case; auto recognises it."""
     start: int | None = None
     """First frame number."""
     stop: int | None = None
@@ -33,8 +33,16 @@ class Command:
     """StereoMIS: only the frame ranges of this split."""
     mask_polarity: Literal["auto", "tool", "tissue"] | None = None
     """StereoMIS, EndoNeRF, folder, video: what white means in the masks."""
+    max_mask_gap: int | None = None
+    """StereoMIS: a frame without a mask borrows one from at most this many frames away (default 1)."""
+    mask_border: bool | None = None
+    """Folder, video: ignore the black border and round vignette around the image (default true)."""
     depth_scale: float | None = None
     """EndoNeRF, folder: metres per unit of the depth images (default 0.001)."""
+    pose_scale: float | None = None
+    """EndoNeRF: metres per unit of the camera positions; default: as the depth images."""
+    depth: Literal["scene_points", "keyframe", "none"] | None = None
+    """SCARED: depth of every frame (default), of the keyframe alone, which is measured, or none."""
     pose_direction: Literal["auto", "world_to_camera", "camera_to_world"] | None = None
     """SCARED: direction of the poses; auto finds it by comparing images."""
     poses: Path | None = None
@@ -44,6 +52,8 @@ class Command:
     """Video: metres per unit of the poses."""
     sfm_step: int | None = None
     """Video: structure from motion uses every n-th frame (default 6)."""
+    threads: int | None = None
+    """Video: threads of structure from motion; -1 = all cores (default), 1 = repeatable to the last bit."""
     calibration: Path | None = None
     """Video: YAML file with fx, fy, cx, cy and optional distortion."""
     fx: float | None = None

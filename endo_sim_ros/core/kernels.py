@@ -1,7 +1,7 @@
 """What all rooms with kernels share: where kernels run, and how they are loaded and launched.
 
-A room has a `typing.Protocol` of what a backend does, and one function ``backend_for(device)`` that returns the backend of a
-device with its kernels loaded. Nothing else decides where the room's work runs.
+Beside its kernels a room has a `typing.Protocol` of what a backend does, and a function ``backend_for(device)`` that returns the
+backend of a device. What Warp does not promise to keep (`kernel.adj`, `dtype._shape_`) was seen with version 1.19.
 """
 
 import contextlib

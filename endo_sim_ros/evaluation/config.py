@@ -23,7 +23,7 @@ class EvaluationConfig:
     seeds: int = 1
     """Repetitions with other seeds; figures are then mean ± standard deviation."""
     set: tuple[str, ...] = ()
-    """Options of the reconstruction for all presets: name=value, as iterations=500 image_width=320."""
+    """Options of the reconstruction for all presets: name=value, as iterations=500 mcmc.growth=0.1."""
     train_depth: bool = False
     """Give the recorded depth images to the training, too; without it they are for measuring only."""
     mono: bool = False

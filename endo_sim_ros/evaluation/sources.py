@@ -1,8 +1,6 @@
 """Sequences as they are named on the command line: a path or `phantom:SEED`, then options of the reader as `,name=value`."""
 
-import dataclasses
 import re
-import typing
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -10,7 +8,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.core.config import ConfigError, StageConfig, options
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.bag import read_bag
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
@@ -27,14 +25,14 @@ def split_source(source: str) -> tuple[str, list[str]]:
     return place, options
 
 
-def parse_values(items: Iterable[str], where: str, of: type) -> dict[str, Any]:
-    """name=value texts as the options of a configuration."""
-    known, values = {field.name: field for field in dataclasses.fields(of)}, {}
+def parse_values(items: Iterable[str], where: str, of: type[StageConfig]) -> dict[str, Any]:
+    """Texts name=value as values of options by (dotted) name; the configuration checks both."""
+    texts, values = {option.name for option in options(of) if option.type is str}, {}
     for item in items:
         name, equals, text = item.partition("=")
-        if not equals or name not in known:
-            raise ConfigError(f"{where} {item}: give name=value with a name of {', '.join(known)}")
-        values[name] = text if typing.get_type_hints(of)[name] is str else yaml.safe_load(text)
+        if not equals:
+            raise ConfigError(f"{where} {item}: give name=value")
+        values[name] = text if name in texts else yaml.safe_load(text)
     return values
 
 
@@ -50,15 +48,15 @@ def open_named(source: str) -> Iterable[Frame]:
         if not seed.isdecimal():
             raise SequenceError(f"{place}: the synthetic patients have numbers, as {PHANTOM}0")
         # Half a round: after a whole one the last view would be the first again, and two views one.
-        config = PhantomConfig(**{"seed": int(seed), "rounds": 0.5} | parse_values(texts, place, PhantomConfig))
+        config = PhantomConfig.from_mapping({"seed": int(seed), "rounds": 0.5} | parse_values(texts, place, PhantomConfig))
         return Recording(lambda: phantom_sequence(config), config.frames)
-    options = {name: yaml.safe_load(value) for name, _, value in (text.partition("=") for text in texts)}
-    if "distortion" in options:
-        options["distortion"] = tuple(np.atleast_1d(options["distortion"]).tolist())
+    given = {name: yaml.safe_load(value) for name, _, value in (text.partition("=") for text in texts)}
+    if "distortion" in given:
+        given["distortion"] = tuple(np.atleast_1d(given["distortion"]).tolist())
     path = Path(place)
     if path.suffix == ".mcap" or (path / "metadata.yaml").is_file() or path.is_dir() and any(path.glob("*.mcap")):
-        unknown = set(options) - {"start", "stop", "step"}
+        unknown = set(given) - {"start", "stop", "step"}
         if unknown:
             raise SequenceError(f"{place}: a bag has no option {', '.join(sorted(unknown))}; it has start, stop and step")
-        return list(read_bag(path))[slice(*(options.get(name) for name in ("start", "stop", "step")))]
-    return open_sequence(path, **options)
+        return list(read_bag(path))[slice(*(given.get(name) for name in ("start", "stop", "step")))]
+    return open_sequence(path, **given)

@@ -115,6 +115,7 @@ class _Traffic:
         if topic == messages.CUT_SURFACE:
             triangles = self.scene.tip + np.array([rng.gauss(0, 0.01) for _ in range(9)]).reshape(1, 3, 3)
             return messages.encode_cut_surface(triangles, stamp, "world")
+        assert topic in (messages.tool_jaw(ARM), messages.tool_jaw_move(ARM)), topic.name
         return messages.encode_jaw(rng.uniform(-0.2, 1.0), stamp)
 
 

@@ -8,8 +8,8 @@ All lengths of a task are in its own frame: the origin on the skin, z towards th
 [4] in -1 … 1 is how far the tip moves in this step along x, y and z, in parts of `step_length`, and a fourth number that each
 task explains.
 To add a task, write a subclass of :class:`Task` and append it to :data:`TASKS`: environments, training, `endo-sim scene` and
-`endo-sim bench environments`, the policy's ROS node and every message that lists the tasks read it from there. A scripted policy
-is optional: an entry in `policies.SCRIPTS`.
+`endo-sim bench environments`, the policy's ROS node and every message that lists the tasks read it from there. Give
+it a scripted policy, an entry in `policies.SCRIPTS`: the tests play each task with it.
 
 Sums are written out, term by term, so that their bits do not depend on B.
 """

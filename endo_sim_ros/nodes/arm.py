@@ -24,7 +24,7 @@ class Arm:
     name: str
     pose: np.ndarray | None = None  # [4, 4], world
     force: np.ndarray | None = None  # [3] N, world
-    torque: np.ndarray | None = None  # [3] N·m about the tip, world
+    torque: np.ndarray | None = None  # [3] N·m about the point held, world
     heard: float = 0.0  # time of the last wrench, seconds of the clock
     acting: bool = False
     angle: float = JAW_AT_START  # of the jaw, rad

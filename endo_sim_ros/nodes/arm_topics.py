@@ -145,7 +145,7 @@ class ArmTopics:
             arm: The arm.
             pose: Pose [4, 4] of its tip, m, world.
             reaction: Force [3] of the tissue on the tool, N, world.
-            torque: Torque [3] about the tip, N·m, world.
+            torque: Torque [3], N·m, world, as `TissueSimulation.reaction` has it.
             stamp: Time of the state, ns.
         """
         axes = pose[:3, :3].T  # the reaction is given in the axes of the tool

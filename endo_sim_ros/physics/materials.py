@@ -1,4 +1,4 @@
-"""Materials: hyperelastic laws of which tissue is made.
+"""Materials: hyperelastic laws of which tissue is made, each of the deformation gradient and Lamé's two parameters alone.
 
 To add one, write under its name
 

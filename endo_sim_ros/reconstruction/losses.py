@@ -1,6 +1,7 @@
 """Loss terms of the reconstruction: each is a function here, a line in TERMS, and a weight in `ReconstructionConfig`.
 
-Images are [H, W, 3] in [0, 1], depths [H, W] in metres, masks [H, W] in {0, 1}.
+Images are [H, W, 3] in [0, 1], depths [H, W] in metres, masks [H, W] in {0, 1}. On a GPU an iteration is a graph capture, so a term
+must not wait for the GPU, as `.item()` does.
 """
 
 import math
@@ -16,7 +17,7 @@ from endo_sim_ros.reconstruction.ssim import ssim
 
 
 class Rendering(NamedTuple):
-    """What terms are computed from: one image of the Gaussians, and what it should look like."""
+    """What terms are computed from: one image of the Gaussians, and its depth prior. Colours are for `photometric` alone."""
 
     model: GaussianModel
     depth: Tensor  # [H, W] Σ w z, metres

@@ -1,6 +1,6 @@
 """Every layout that a recording may have, and how it is told from the others.
 
-A new dataset is one file with a `read_…` function and one entry in READERS.
+A new dataset is one file with a `read_…` function and one entry in READERS. `Command` in cli/convert.py has each of its options, too.
 """
 
 from collections.abc import Callable, Iterable
@@ -43,7 +43,7 @@ def _is_video(path: Path) -> bool:
     return path.is_dir() and any(p.suffix.lower() in VIDEO_SUFFIXES for p in path.iterdir())
 
 
-# In order of how telling the mark is: a StereoMIS folder holds a video too.
+# The first that recognises a path reads it, so the most telling marks come first: a StereoMIS folder holds a video, too.
 READERS: dict[str, Reader] = {
     "stereomis": Reader(
         read_stereomis, lambda path: (path / stereomis.CALIBRATION_FILE).is_file(), f"the file {stereomis.CALIBRATION_FILE}"

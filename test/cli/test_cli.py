@@ -1,5 +1,6 @@
 """The commands as a user types them."""
 
+import inspect
 import logging
 import re
 import signal
@@ -16,12 +17,14 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from endo_sim_ros import cli
+from endo_sim_ros.cli import convert
 from endo_sim_ros.core.gaussians import load_ply
 from endo_sim_ros.evaluation import held_out
 from endo_sim_ros.evaluation.held_out import reconstruct_and_measure
 from endo_sim_ros.reconstruction import ReconstructionConfig
 from endo_sim_ros.reconstruction.presets import preset
 from endo_sim_ros.sequences.bag import read_bag
+from endo_sim_ros.sequences.readers import READERS
 
 ROOT = Path(__file__).parents[2]
 
@@ -52,6 +55,12 @@ def test_every_command_explains_its_options(name, capsys):
     with pytest.raises(SystemExit) as end:
         cli.parse(name, ["--help"])
     assert end.value.code == 0 and cli.summary(name).split()[0] in capsys.readouterr().out
+
+
+def test_convert_offers_every_option_of_every_reader():
+    offered = inspect.signature(convert.Command).parameters
+    for layout, reader in READERS.items():
+        assert set(inspect.signature(reader.read).parameters) - {"path"} <= offered.keys(), layout
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from endo_sim_ros.nodes.configs import NODE_CONFIGS
 from endo_sim_ros.sequences.bag import write_bag
 
 ROOT = Path(__file__).parents[2]
-PAGES = sorted([ROOT / "README.md", ROOT / "msg_conventions.md", *(ROOT / "docs").glob("*.md")])
+PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "msg_conventions.md", *(ROOT / "docs").glob("*.md")])
 NAMES = [page.name for page in PAGES]
 
 
@@ -54,6 +54,20 @@ def test_nodes_and_their_parameters_exist(page):
         for flag, value in zip(words, words[1:]):
             if flag == "-p":
                 assert value.split(":=")[0] in section, (node, value)
+
+
+def test_what_is_named_where_something_is_added_exists():
+    section = (ROOT / "CONTRIBUTING.md").read_text().split("## Add something")[1].split("\n## ")[0]
+    folders = [ROOT / folder for folder in ("endo_sim_ros", "config", "docs", "scripts", "test")]
+    paths = [*ROOT.iterdir(), *(path for folder in folders for path in folder.rglob("*"))]
+    known = "".join(f"/{path.relative_to(ROOT)}\n" for path in paths)
+    code = "".join(path.read_text() for path in paths if path.suffix in (".py", ".h"))
+    for name in re.findall(r"`([^`]+)`", section):
+        if "/" in name or name.endswith(".md"):
+            name = name.split()[-1]  # of a command that writes a file
+            assert f"/{name.rpartition('/')[0] if 'NAME' in name else name.rstrip('/')}\n" in known, name
+        else:
+            assert all(re.search(rf"\b{word}\b", code) for word in re.findall(r"\w+", name)), name
 
 
 @pytest.mark.dds

@@ -63,7 +63,7 @@ def test_what_cannot_be_read_loses_its_own_cells_only(run):
 def test_a_split_that_a_sequence_has_not_loses_its_own_cells_only(tmp_path):
     config = EvaluationConfig(
         out=tmp_path, splits=("two-views", "stereo", "9:1"), presets=("default",), device="cpu", lpips=(),
-        set=("iterations=2", "max_gaussians=300", "image_width=96"),
+        set=("iterations=2", "max_gaussians=300", "image_width=96", "mcmc.growth=0.1"),
     )  # fmt: skip
     errors = [cell["error"] for cell in evaluate([f"{SMALL},stereo=false"], config)["cells"]]
     assert errors[:2] == [None, "split stereo: the sequence has no right images"]
@@ -130,8 +130,10 @@ def test_what_is_not_there_is_told_before_any_work(tmp_path):
         evaluate(["no/such"], EvaluationConfig(out=tmp_path))
     with pytest.raises(SequenceError, match="there is no split 'half'"):
         evaluate([SMALL], EvaluationConfig(out=tmp_path, splits=("half",)))
-    with pytest.raises(ConfigError, match="give name=value with a name of .*iterations"):
+    with pytest.raises(ConfigError, match="has no option iteration; it has .*iterations"):
         evaluate([SMALL], EvaluationConfig(out=tmp_path, set=("iteration=3",)))
+    with pytest.raises(ConfigError, match="option growth is now mcmc.growth"):
+        evaluate([SMALL], EvaluationConfig(out=tmp_path, set=("growth=0.1",)))
     with pytest.raises(ConfigError, match="methods are named with --presets"):
         evaluate([SMALL], EvaluationConfig(out=tmp_path, set=("preset=paper",)))
     with pytest.raises(ConfigError, match="workers must be 1 or more, got 0"):

@@ -7,6 +7,7 @@ from dense_sheet import sheet
 
 from endo_sim_ros.physics import PhysicsConfig, Skinning, TissueBatch, TissueSimulation, build_control_nodes
 from endo_sim_ros.physics.backends import cuda
+from endo_sim_ros.physics.materials import MATERIALS
 
 pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")]
 TIP = np.array([0.0, 0.0, 0.12])
@@ -44,7 +45,7 @@ def touch(device: str, **overrides) -> tuple[TissueSimulation, dict[str, np.ndar
 
 
 @pytest.mark.parametrize("kinematics", ["rest", "current"])
-@pytest.mark.parametrize("material", ["fixed_corotated", "neo_hookean"])
+@pytest.mark.parametrize("material", MATERIALS)
 def test_physics_agrees_step_for_step(kinematics, material):
     options = {"kinematics": kinematics, "material": material, "relaxation": 0.5}
     (simulation, cpu), (_, cuda) = touch("cpu", **options), touch("cuda", **options)

@@ -1,8 +1,10 @@
 """A scene is prepared in stages, each of which reports its progress, can be cancelled, and leaves what was recorded alone."""
 
 import dataclasses
+import re
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -55,6 +57,12 @@ def test_stages_report_in_order(stereo):
     reports = []
     prepare(stereo, options(), on_progress=lambda *report: reports.append(report))
     assert list(dict.fromkeys(stage for stage, _, _ in reports)) == list(STAGES)
+
+
+def test_the_page_lists_the_stages_in_order():
+    page = (Path(__file__).parents[2] / "docs" / "reconstruction.md").read_text()
+    table = page.split("| stage | what it does |")[1].split("\n\n")[0]
+    assert re.findall(r"^\| (\w.*?) \|", table, re.M) == list(STAGES)
 
 
 @pytest.mark.slow

@@ -1,65 +1,60 @@
-"""Every algorithm of the preparation reports its progress, and stops when it is cancelled."""
+"""Every stage of the preparation reports its progress, and stops when it is cancelled."""
 
 import dataclasses
 import threading
 
 import numpy as np
 import pytest
-import torch
 from short_training import options
-from training_views import unknown, with_prior
+from training_views import with_prior
 
-from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.reconstruction.dynamic_mask import mask_motion
-from endo_sim_ros.reconstruction.initialization import initial_model
-from endo_sim_ros.reconstruction.photometry import fit_light
-from endo_sim_ros.reconstruction.pose_check import misposed
-from endo_sim_ros.reconstruction.priors.extrapolation import extrapolate
+from endo_sim_ros.reconstruction.pipeline import STAGES
 from endo_sim_ros.reconstruction.priors.multi_view import refine_depth
 from endo_sim_ros.reconstruction.priors.sources import estimate_depth
 from endo_sim_ros.reconstruction.progress import Cancelled, StageProgress
-from endo_sim_ros.reconstruction.scene import Matches, ScenePoints
-from endo_sim_ros.reconstruction.triangulation import match_features, triangulate
+from endo_sim_ros.reconstruction.scene import PreparedScene, ScenePoints
 
 POINTS = np.random.default_rng(0).uniform([-0.03, -0.03, 0.09], [0.03, 0.03, 0.11], (400, 3))
 SCENE_POINTS = ScenePoints(POINTS, np.full((400, 3), 0.5))
-MATCHES = [Matches((0, 1), *np.random.default_rng(0).uniform(0, 128, (2, 60, 2)))] * 2
-MODEL = GaussianModel.from_points(torch.from_numpy(POINTS).float(), torch.full((400, 3), 0.5), torch.full((400,), 1e-3), 0.5)
+QUICK = ("shrinking views",)  # stages that need not report
 
-STAGES = {
-    "matching": lambda frames, progress: match_features(frames, progress=progress),
-    "triangulation": lambda frames, progress: triangulate(frames, MATCHES, progress=progress),
-    "pose check": lambda frames, progress: misposed(frames, MATCHES, progress=progress),
-    "stereo": lambda frames, progress: estimate_depth(unknown(frames), SCENE_POINTS, options(depth="stereo"), progress),
-    "points": lambda frames, progress: estimate_depth(unknown(frames), SCENE_POINTS, options(depth="points"), progress),
-    "multi-view refinement": lambda frames, progress: refine_depth(with_prior(frames), SCENE_POINTS, "network", progress=progress),
-    "dynamic mask": lambda frames, progress: mask_motion(with_prior(frames), 0.05, progress=progress),
-    "initial model": lambda frames, progress: initial_model(with_prior(frames), POINTS, SCENE_POINTS.colors, 0.05, 2000, progress=progress),
-    "light": lambda frames, progress: fit_light(with_prior(frames), POINTS, 0.1, 0.05, progress=progress),
-    "extrapolation": lambda frames, progress: extrapolate(
-        MODEL, with_prior(frames), POINTS, np.zeros(4), np.zeros((len(frames), 3)), 0.1, 0.3, 4000, progress=progress
-    ),
-}
+
+@pytest.fixture(scope="module")
+def given(small):
+    """Options, and the scenes that each stage is given: with right images, and without."""
+    cases = []
+    for source in ("stereo", "points"):
+        config, scene, scenes = options(depth=source), PreparedScene(tuple(small[::4])), {}
+        for name, stage in STAGES.items():
+            scenes[name] = scene
+            scene = stage(scene, config, StageProgress())
+        cases.append((config, scenes))
+    return cases
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stage", STAGES)
-def test_a_stage_reports_and_can_be_cancelled_at_any_report(small, stage):
-    frames, reports = list(small[:3]), []
-    STAGES[stage](frames, StageProgress(stage, lambda *report: reports.append(report)))
-    assert reports and {name for name, _, _ in reports} == {stage}
-    assert all(0 <= done <= total or total == 0 for _, done, total in reports)
-    for last in {0, len(reports) // 2}:
-        seen = []
+@pytest.mark.parametrize("name", [name for name in STAGES if name not in QUICK])
+def test_a_stage_reports_and_can_be_cancelled_at_any_report(given, name):
+    counts = []
+    for config, scenes in given:
+        reports = []
+        STAGES[name](scenes[name], config, StageProgress(name, lambda *report: reports.append(report)))
+        assert {stage for stage, _, _ in reports} <= {name}
+        assert all(0 <= done <= total or total == 0 for _, done, total in reports)
+        for last in {0, len(reports) // 2} if reports else ():
+            seen = []
 
-        def cancel(*report):
-            seen.append(report)
-            if len(seen) > last:
-                raise Cancelled
+            def cancel(*report):
+                seen.append(report)
+                if len(seen) > last:
+                    raise Cancelled
 
-        with pytest.raises(Cancelled):
-            STAGES[stage](frames, StageProgress(stage, cancel))
-    STAGES[stage](frames, StageProgress())  # one that was cancelled leaves nothing behind
+            with pytest.raises(Cancelled):
+                STAGES[name](scenes[name], config, StageProgress(name, cancel))
+        STAGES[name](scenes[name], config, StageProgress())  # one that was cancelled leaves nothing behind
+        counts.append(len(reports))
+    assert any(counts)
 
 
 @pytest.mark.slow

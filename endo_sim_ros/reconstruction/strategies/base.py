@@ -32,7 +32,7 @@ class Strategy:
         self.options, self.limit, self.scene_depth = options, limit, scene_depth
 
     def initialize_state(self, count: int, device: torch.device | str) -> dict[str, Tensor]:
-        """Statistics of so many Gaussians [..., count], float32, begun anew after each refinement; checkpoints hold them."""
+        """Statistics of so many Gaussians [..., count], finite float32, begun anew after each refinement; checkpoints hold them."""
         return {}
 
     def step_post_backward(self, state: dict[str, Tensor], steepness: Tensor) -> None:

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from tissue_scene import EYE, TIP, curved_sheet, depth_of_dent, pose_at, simulate, steps
 
-from endo_sim_ros.core.kernels import plain_kernels
+from endo_sim_ros.core.kernels import compare_plain
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation, sample_farthest
 from endo_sim_ros.physics.backends import cluster_division as cluster
 from endo_sim_ros.physics.materials import MATERIALS
 from endo_sim_ros.physics.stencils import Stencils
 
-BACKENDS = {"vectorised": contextlib.nullcontext, "plain": plain_kernels}
+BACKENDS = {"vectorised": contextlib.nullcontext, "plain": compare_plain}
 
 
 @pytest.mark.parametrize("kinematics", ["rest", "current"])

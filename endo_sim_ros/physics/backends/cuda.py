@@ -1,6 +1,6 @@
 """Physics on a GPU: a step is one captured graph, on a GPU with thread block clusters of one launch.
 
-Within `plain_kernels` the same kernels run on a CPU, to compare with the vectorised ones.
+Within `core.kernels.compare_plain` its plain kernels run on a CPU, to compare with the vectorised ones.
 """
 
 import functools
@@ -29,9 +29,9 @@ class CudaBackend:
 
     def __init__(self, device: str):
         self.device = device
-        self._on_cpu = device == "cpu"
-        self.threads = 1 if self._on_cpu else 512
-        self.prepares_early = self._on_cpu
+        self._comparing = device == "cpu"  # within `compare_plain`
+        self.threads = 1 if self._comparing else 512
+        self.prepares_early = self._comparing
 
     def substeps(self, step: StepData) -> list[Action]:
         """One launch where the control nodes fit into a cluster, otherwise two or three for each substep."""
@@ -39,7 +39,7 @@ class CudaBackend:
 
     def action(self, work: Work) -> Action:
         """A launch; several run in order."""
-        if self._on_cpu:
+        if self._comparing:
             return cpu_action(work)
         if isinstance(work, list):
             actions = [self.action(each) for each in work]
@@ -49,7 +49,7 @@ class CudaBackend:
 
     def record(self, actions: Sequence[Action]) -> Action:
         """The actions as one captured graph."""
-        if self._on_cpu:
+        if self._comparing:
             return lambda: [action() for action in actions]
         with capturing, wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
             for action in actions:
@@ -63,7 +63,7 @@ class CudaBackend:
 
     def load_for_cuts(self, material: str, kinematics: str) -> None:
         """Load the kernels of single substeps: the grid nodes of tissue that is much cut no longer fit into a cluster."""
-        if not self._on_cpu:
+        if not self._comparing:
             for kernel in (make_advance_kernel(material, kinematics), collect):
                 wp.load_module(kernel.module, self.device, block_dim=Launch.block)
 
@@ -117,7 +117,7 @@ class CudaBackend:
             ]
             actions: list[Action] = [grid_mv.zero_]
         else:
-            lanes, entries = 1 if self._on_cpu else 32, self._entries(step)
+            lanes, entries = 1 if self._comparing else 32, self._entries(step)
             inputs = [*entries, lanes, step.node_count, step.grid, decay, transfer, grid_v]
             collecting = [self.action(Launch(collect, (step.environments, len(entries[-1]), lanes), inputs))]
             actions = []

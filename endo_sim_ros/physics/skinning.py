@@ -10,9 +10,9 @@ from torch import Tensor
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.kernels import load_kernels
-from endo_sim_ros.physics import skinning_kernels as kernels
+from endo_sim_ros.physics import node_map_kernels as kernels
 from endo_sim_ros.physics.backends import backend_for
-from endo_sim_ros.physics.backends.base import Launch, SkinData, Work, array
+from endo_sim_ros.physics.backends.base import Launch, SkinData, Work, viewed
 from endo_sim_ros.physics.cutting.gaussians import CutNeighbours, clip_to_sides
 from endo_sim_ros.physics.weights import compact_weights, nearest_nodes
 
@@ -187,7 +187,7 @@ class Skinning:
             raise ValueError(f"skinning: {count} nodes on {device} cannot follow {environments} × {len(pinned)} nodes on {u.device}")
         means, covars = (rest.repeat(environments, *[1] * rest.ndim) for rest in (self.means, self.covars))
         maps = torch.zeros((environments, count, 4, 4), device=device)
-        held = array(torch.from_numpy(pinned).to(device, torch.int32))
-        inputs = [array(self.node_rest, wp.vec3), held, u, F, self._origin, array(maps.view(-1, 4, 4), wp.mat44)]
+        held = viewed(torch.from_numpy(pinned).to(device, torch.int32))
+        inputs = [viewed(self.node_rest, wp.vec3), held, u, F, self._origin, viewed(maps.view(-1, 4, 4), wp.mat44)]
         mapping = Launch(kernels.moved_node_maps, (environments, count), inputs)
         return [mapping, *self.backend.skin_work(self._at_rest(), maps, means, covars)], means, covars

@@ -1,6 +1,6 @@
 """Kernels for a CPU, vectorised: a step of the material point method, all substeps in one launch, and skinning.
 
-The maths is in `plain_kernels` and `skinning_kernels`, the code in native/cpu_step.h and native/skinning.h. Environments are
+The maths is in `plain_kernels` and `node_map_kernels`, the code in native/cpu_step.h and native/skinning.h. Environments are
 independent: different threads may step different ones.
 """
 
@@ -110,5 +110,5 @@ def skin_gaussians(
     out_means: wp.array[wp.vec3],
     out_covars: wp.array[wp.mat33],
 ):
-    """The Gaussians from the first one on, see `skinning_kernels`; the numbers of a map are one vector."""
+    """The Gaussians from the first one on, see `node_map_kernels`; the numbers of a map are one vector."""
     skin_gaussian(first + wp.tid(), means, covars, neighbours, weights, maps, origin, low, high, out_means, out_covars)

@@ -13,19 +13,19 @@ from torch import Tensor
 
 from endo_sim_ros.core.device import on_torch_stream
 from endo_sim_ros.core.kernels import launch
-from endo_sim_ros.physics.backends import cluster_division as cluster, skin_kernels
-from endo_sim_ros.physics.backends.base import Action, Launch, SkinData, StepData, Work, array, capturing
+from endo_sim_ros.physics.backends import cluster_division as cluster, plain_skinning_kernels
+from endo_sim_ros.physics.backends.base import Action, Launch, SkinData, StepData, Work, capturing, viewed
 from endo_sim_ros.physics.backends.cluster_kernels import make_step_kernel
 from endo_sim_ros.physics.backends.cpu import cpu_action
 from endo_sim_ros.physics.backends.plain_kernels import collect, make_advance_kernel, scatter, update_grid
-from endo_sim_ros.physics.backends.skin_kernels import skin_environments, skin_gaussians
+from endo_sim_ros.physics.backends.plain_skinning_kernels import skin_environments, skin_gaussians
 from endo_sim_ros.physics.backends.structs import Transfer
 
 
 class CudaBackend:
     """Plain Warp kernels, and those of a thread block cluster; see `Backend`."""
 
-    skin_modules = (skin_kernels,)
+    skin_modules = (plain_skinning_kernels,)
 
     def __init__(self, device: str):
         self.device = device
@@ -75,9 +75,9 @@ class CudaBackend:
         self.over_items(skin_gaussians, len(skin.means), [*skin[:4], maps, *skin[4:], means, covars])
 
     def skin_work(self, skin: SkinData, maps: Tensor, means: Tensor, covars: Tensor) -> list[Work]:
-        at_rest = [array(skin.means, wp.vec3), array(skin.covars, wp.mat33), array(skin.neighbours), array(skin.weights)]
-        outputs = [array(means.view(-1, 3), wp.vec3), array(covars.view(-1, 3, 3), wp.mat33)]
-        inputs = [maps.shape[1], *at_rest, array(maps.view(-1, 4, 4), wp.mat44), *skin[4:], *outputs]
+        at_rest = [viewed(skin.means, wp.vec3), viewed(skin.covars, wp.mat33), viewed(skin.neighbours), viewed(skin.weights)]
+        outputs = [viewed(means.view(-1, 3), wp.vec3), viewed(covars.view(-1, 3, 3), wp.mat33)]
+        inputs = [maps.shape[1], *at_rest, viewed(maps.view(-1, 4, 4), wp.mat44), *skin[4:], *outputs]
         return [Launch(skin_environments, (len(means), len(skin.means)), inputs)]
 
     def _clustered(self, step: StepData) -> list[Action]:

@@ -10,10 +10,12 @@ import warp as wp
 
 from endo_sim_ros.core.native import native
 from endo_sim_ros.physics.backends.structs import Grid, Loads, Nodes, RigidTools, State, Substep
+from endo_sim_ros.physics.materials import LEAST_VOLUME
 
 LANES = 16
 SCRATCH = 56  # vectors of scratch for 16 control nodes: 40 components and 16 rows of weights
-OPTIONS = {"default_grid_stride": False, "extra_build_options": native("physics/native/cpu_step.h", CPU_SCRATCH=SCRATCH)}
+HEADER = native("physics/native/cpu_step.h", CPU_SCRATCH=SCRATCH, LEAST_VOLUME=LEAST_VOLUME)
+OPTIONS = {"default_grid_stride": False, "extra_build_options": HEADER}
 SKINNING = {"default_grid_stride": False, "extra_build_options": native("physics/native/skinning.h")}
 
 wp.set_module_options({"enable_backward": False, **SKINNING})

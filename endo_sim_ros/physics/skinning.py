@@ -18,10 +18,19 @@ from endo_sim_ros.physics.weights import compact_weights, nearest_nodes
 
 
 def bind_weights(means: np.ndarray, node_rest: np.ndarray, neighbours: int, weighting: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the nearest control nodes [N, K] int32 of means [N, 3], and their weights [N, K] float32, which add up to one.
+    """Return the nearest control nodes [N, K] int32 of means, and their weights [N, K] float32, which add up to one.
 
-    ``compact``: see `compact_weights`. ``softmax``: exp(d)/Σ exp(d) with d in metres, as the paper prints it.
+    Args:
+        means: Of the Gaussians at rest [N, 3], m.
+        node_rest: Control nodes at rest [M, 3], m.
+        neighbours: K; fewer where there are no more than K control nodes.
+        weighting: ``compact``, see `compact_weights`, or ``softmax``, exp(d)/Σ exp(d) of distances d, m, as the paper prints it.
+
+    Raises:
+        ValueError: If the weighting is another.
     """
+    if weighting not in ("compact", "softmax"):
+        raise ValueError(f"skinning: weighting must be compact or softmax, not {weighting!r}")
     count = min(neighbours, max(len(node_rest) - 1, 1))
     distances, index = nearest_nodes(node_rest, means, count + 1)
     d, beyond = distances[:, :count], distances[:, count:]
@@ -46,7 +55,7 @@ class Skinning:
         device: Where to compute: auto, cpu, cuda or cuda:N.
 
     Raises:
-        ValueError: If there are no control nodes, or positions are not finite.
+        ValueError: If there are no control nodes, positions are not finite, or there is no such weighting.
     """
 
     def __init__(

@@ -200,7 +200,7 @@ def clamped_slopes(p: wp.vec3, K: wp.mat33, width: int, height: int) -> wp.vec2:
 
 @wp.func
 def projection_jacobian(slopes: wp.vec2, z: float, K: wp.mat33) -> mat23:
-    """∂(pixel)/∂(camera coordinates), pixel/m."""
+    """∂(u, v)/∂(x, y, z) [2, 3], pixel/m, of a point in the camera's frame with depth z, m, and slopes (x/z, y/z), see `clamped_slopes`."""
     fx, fy = K[0, 0] / z, K[1, 1] / z
     return mat23(fx, 0.0, -fx * slopes[0], 0.0, fy, -fy * slopes[1])
 

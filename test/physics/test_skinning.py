@@ -104,6 +104,8 @@ def test_wrong_node_shapes_are_refused():
         skinning.deform(rest, np.zeros((9, 3, 3)))
     with pytest.raises(ValueError, match=r"node_rest has shape \(0, 3\)"):
         Skinning(model, np.zeros((0, 3)), device="cpu")
+    with pytest.raises(ValueError, match="weighting must be compact or softmax, not 'linear'"):
+        Skinning(model, rest, weighting="linear", device="cpu")
 
 
 def test_simulated_dent_reaches_the_gaussians():

@@ -19,7 +19,7 @@ import warp as wp
 from endo_sim_ros.core.cameras import Camera, load_cameras, look_at
 from endo_sim_ros.core.device import pick_device, single_threaded_torch
 from endo_sim_ros.core.gaussians import GaussianModel, load_ply
-from endo_sim_ros.core.kernels import plain_kernels
+from endo_sim_ros.core.kernels import compare_plain
 from endo_sim_ros.evaluation.measurement import Row, Stage, machine, median_seconds, milliseconds, peak_megabytes, report, run_stages, short
 from endo_sim_ros.physics import ControlNodes, MpmSolver, PhysicsConfig, Skinning, TissueBatch, TissueSimulation, build_control_nodes
 from endo_sim_ros.physics.tools import Tools
@@ -248,7 +248,7 @@ def _against_plain(name: str, make: Callable[[], Callable[[], object]], device: 
     """Time of the action that `make` returns, on a CPU beside the same by plain kernels."""
     actions = [make()]
     if device == "cpu":
-        with plain_kernels():
+        with compare_plain():
             actions.append(make())
     ours, *plain = milliseconds(actions, device, seconds)
     return [Row(name, ours, "ms", ours / plain[0], PLAIN) if plain else Row(name, ours, "ms")]

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from endo_sim_ros.core.device import pick_device, single_threaded_torch
-from endo_sim_ros.core.kernels import plain_kernels
+from endo_sim_ros.core.kernels import compare_plain
 from endo_sim_ros.evaluation.measurement import Row, Stage, machine, milliseconds, peak_megabytes, report, run_stages, short
 from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer, prepare
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
@@ -213,7 +213,7 @@ def _plain(scene: Scene) -> Draw:
     """Our kernels for GPUs, on the CPU, one pixel after the other."""
 
     def draw(gaussians: list[Tensor]) -> Sequence[Tensor]:
-        with plain_kernels():
+        with compare_plain():
             return _ours(scene)(gaussians)
 
     return draw

@@ -116,7 +116,7 @@ class GaussianModel:
         return dataclasses.replace(self, **{name: value.detach() for name, value in self.tensors().items()})
 
     def select(self, index: Tensor | np.ndarray) -> GaussianModel:
-        """The Gaussians at an index or boolean mask."""
+        """Return the K Gaussians with these numbers [K], or at which a boolean mask [N] is true; the light stays."""
         return dataclasses.replace(self, **{name: value[index] for name, value in self.tensors().items()})
 
     @staticmethod

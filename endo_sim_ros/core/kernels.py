@@ -21,7 +21,7 @@ _plain = contextvars.ContextVar("plain", default=False)
 
 
 @contextlib.contextmanager
-def plain_kernels() -> Iterator[None]:
+def compare_plain() -> Iterator[None]:
     """Within it every ``backend_for`` gives a CPU the backend of GPUs, whose kernels run there without vectors, to compare with.
 
     It holds for the thread that entered it.
@@ -34,7 +34,7 @@ def plain_kernels() -> Iterator[None]:
 
 
 def vectorised(device: torch.device | str) -> bool:
-    """Return whether a device has the backend made for CPUs: every CPU has, except within `plain_kernels`."""
+    """Return whether a device has the backend made for CPUs: every CPU has, except within `compare_plain`."""
     return torch.device(device).type == "cpu" and not _plain.get()
 
 

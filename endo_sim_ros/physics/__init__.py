@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     )
     from endo_sim_ros.physics.materials import lame_parameters as lame_parameters, sound_speed as sound_speed
     from endo_sim_ros.physics.regions import TissueProperties as TissueProperties
-    from endo_sim_ros.physics.simulation import NodeState as NodeState, TissueBatch as TissueBatch, TissueSimulation as TissueSimulation
+    from endo_sim_ros.physics.simulation import TissueBatch as TissueBatch, TissueSimulation as TissueSimulation, TissueState as TissueState
     from endo_sim_ros.physics.skinning import Skinning as Skinning
     from endo_sim_ros.physics.solver import MpmSolver as MpmSolver
     from endo_sim_ros.physics.substeps import StabilityError as StabilityError, plan_substeps as plan_substeps

@@ -11,8 +11,8 @@ from endo_sim_ros.physics.regions import TissueProperties
 from endo_sim_ros.physics.stencils import Stencils
 
 
-def array(values: np.ndarray, dtype: type, device: str) -> wp.array:
-    """Return values as an array of a Warp type on a device."""
+def copied(values: np.ndarray, dtype: type, device: str) -> wp.array:
+    """Return a copy of values as an array of a Warp type on a device."""
     return wp.array(np.ascontiguousarray(values, np.int32 if dtype in (int, wp.vec3i) else np.float32), dtype=dtype, device=device)
 
 
@@ -48,18 +48,18 @@ def new_nodes(
         device: Where to.
     """
     made = Nodes()
-    made.X = array(plan.local, wp.vec3, device)
-    made.mass = array(nodes.volumes * properties.density, float, device)
-    made.volume = array(nodes.volumes, float, device)
-    made.mu, made.lam = array(mu, float, device), array(lam, float, device)
+    made.X = copied(plan.local, wp.vec3, device)
+    made.mass = copied(nodes.volumes * properties.density, float, device)
+    made.volume = copied(nodes.volumes, float, device)
+    made.mu, made.lam = copied(mu, float, device), copied(lam, float, device)
     made.stiffness = wp.zeros(environments * len(nodes), float, device=device)
     return made
 
 
 def set_stencils(nodes: Nodes, grid: Grid, stencils: Stencils, device: str) -> None:
     """Let control nodes transfer to the grid nodes of these stencils."""
-    nodes.first, nodes.row = array(stencils.first, wp.vec3i, device), array(stencils.row, int, device)
-    nodes.table = array(stencils.table.ravel() if len(stencils.table) else np.zeros(1), int, device)
+    nodes.first, nodes.row = copied(stencils.first, wp.vec3i, device), copied(stencils.row, int, device)
+    nodes.table = copied(stencils.table.ravel() if len(stencils.table) else np.zeros(1), int, device)
     grid.count = stencils.grid_count
 
 

@@ -17,6 +17,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+LEAST_VOLUME = 0.05  # of that at rest; below it the laws have no value
+
 
 def lame_parameters(young_modulus: Any, poisson_ratio: Any) -> tuple[Any, Any]:
     """Lamé's parameters (mu, lambda) in Pa of Young's modulus in Pa and Poisson's ratio; of numbers or arrays of them."""

@@ -104,7 +104,7 @@ class TissueBatch:
 
 
 @dataclass(frozen=True)
-class NodeState:
+class TissueState:
     """What the renderer needs to know, at one time; all float32, world frame."""
 
     rest: np.ndarray  # [M, 3] m
@@ -396,12 +396,12 @@ class TissueSimulation:
         self._disturbed = True
         return True
 
-    def state(self) -> NodeState:
+    def state(self) -> TissueState:
         """Positions and deformation gradients of all nodes now."""
         moving = ~self.nodes.pinned[:, None]
         positions = self.nodes.rest + self.solver.displacements() * moving
         F = np.where(moving[..., None], self.solver.deformation_gradients(), np.eye(3, dtype=np.float32))
-        return NodeState(self.nodes.rest, positions, F, self.time)
+        return TissueState(self.nodes.rest, positions, F, self.time)
 
     def _describe_tools(self) -> str:
         tools, parts = self._tools, []

@@ -10,18 +10,27 @@ from torch import Tensor
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.kernels import load_kernels
-from endo_sim_ros.physics import skinning_kernels as kernels
+from endo_sim_ros.physics import node_map_kernels as kernels
 from endo_sim_ros.physics.backends import backend_for
-from endo_sim_ros.physics.backends.base import Launch, SkinData, Work, array
+from endo_sim_ros.physics.backends.base import Launch, SkinData, Work, viewed
 from endo_sim_ros.physics.cutting.gaussians import CutNeighbours, clip_to_sides
 from endo_sim_ros.physics.weights import compact_weights, nearest_nodes
 
 
 def bind_weights(means: np.ndarray, node_rest: np.ndarray, neighbours: int, weighting: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the nearest control nodes [N, K] int32 of means [N, 3], and their weights [N, K] float32, which add up to one.
+    """Return the nearest control nodes [N, K] int32 of means, and their weights [N, K] float32, which add up to one.
 
-    ``compact``: see `compact_weights`. ``softmax``: exp(d)/Σ exp(d) with d in metres, as the paper prints it.
+    Args:
+        means: Of the Gaussians at rest [N, 3], m.
+        node_rest: Control nodes at rest [M, 3], m.
+        neighbours: K; fewer where there are no more than K control nodes.
+        weighting: ``compact``, see `compact_weights`, or ``softmax``, exp(d)/Σ exp(d) of distances d, m, as the paper prints it.
+
+    Raises:
+        ValueError: If the weighting is another.
     """
+    if weighting not in ("compact", "softmax"):
+        raise ValueError(f"skinning: weighting must be compact or softmax, not {weighting!r}")
     count = min(neighbours, max(len(node_rest) - 1, 1))
     distances, index = nearest_nodes(node_rest, means, count + 1)
     d, beyond = distances[:, :count], distances[:, count:]
@@ -46,7 +55,7 @@ class Skinning:
         device: Where to compute: auto, cpu, cuda or cuda:N.
 
     Raises:
-        ValueError: If there are no control nodes, or positions are not finite.
+        ValueError: If there are no control nodes, positions are not finite, or there is no such weighting.
     """
 
     def __init__(
@@ -187,7 +196,7 @@ class Skinning:
             raise ValueError(f"skinning: {count} nodes on {device} cannot follow {environments} × {len(pinned)} nodes on {u.device}")
         means, covars = (rest.repeat(environments, *[1] * rest.ndim) for rest in (self.means, self.covars))
         maps = torch.zeros((environments, count, 4, 4), device=device)
-        held = array(torch.from_numpy(pinned).to(device, torch.int32))
-        inputs = [array(self.node_rest, wp.vec3), held, u, F, self._origin, array(maps.view(-1, 4, 4), wp.mat44)]
+        held = viewed(torch.from_numpy(pinned).to(device, torch.int32))
+        inputs = [viewed(self.node_rest, wp.vec3), held, u, F, self._origin, viewed(maps.view(-1, 4, 4), wp.mat44)]
         mapping = Launch(kernels.moved_node_maps, (environments, count), inputs)
         return [mapping, *self.backend.skin_work(self._at_rest(), maps, means, covars)], means, covars

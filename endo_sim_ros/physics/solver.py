@@ -154,7 +154,7 @@ class MpmSolver:
         self.backend.load_for_cuts(self.config.material, self.config.kinematics)
 
     def wrap_step(self, before: list[Launch], after: list[Launch]) -> None:
-        """Make these launches part of every step, on a GPU of the one graph that it is."""
+        """Make these launches of `Tools` part of every step, on a GPU of the one graph that it is; see `_build_step`."""
         self._before, self._after = before, after
         self._change_step()
 
@@ -165,17 +165,17 @@ class MpmSolver:
 
     def _change_step(self) -> None:
         """Make the step ready anew: now, where nobody waits, or where it takes seconds, when the tissue is first touched."""
-        self._advance = self._record() if self.backend.prepares_early else None
+        self._advance = self._build_step() if self.backend.prepares_early else None
 
     def prepare(self) -> None:
         """Make ready now what the next step would otherwise begin with: on a GPU its capture, and at first its kernels."""
         if self._advance is None:
-            self._advance = self._record()
+            self._advance = self._build_step()
 
     def step(self) -> None:
         """Take one step in every environment."""
         if self._advance is None:
-            self._advance = self._record()
+            self._advance = self._build_step()
         with on_torch_stream(self.device):
             self._advance()
 
@@ -185,7 +185,7 @@ class MpmSolver:
         with on_torch_stream(self.device):
             return math.sqrt(max(float(self._speed_sq.numpy().max()), 0.0))
 
-    def _record(self) -> Callable[[], object]:
+    def _build_step(self) -> Callable[[], object]:
         """The whole step as one call; loads and tools are read from their device arrays every time."""
         backend, config = self.backend, self.config
         data = StepData(
@@ -197,11 +197,13 @@ class MpmSolver:
         end = Launch(end_step, (self.environments, backend.threads), check, backend.threads)
         return backend.record(
             [
-                *(backend.action(launch) for launch in self._before),
-                lambda: wp.copy(self._backed_up, self._saved),
-                self._given.zero_,
-                *backend.substeps(data),
-                *(backend.action(work) for work in (end, *self._after, *self._appended)),
+                *(backend.action(launch) for launch in self._before),  # 1. of `Tools`: take hold or let go, load the control nodes
+                lambda: wp.copy(self._backed_up, self._saved),  # 2. keep the state, which a bad step returns to
+                self._given.zero_,  # 3. tools have given nothing yet
+                *backend.substeps(data),  # 4. the material point method
+                backend.action(end),  # 5. undo a bad step
+                *(backend.action(launch) for launch in self._after),  # 6. of `Tools`: measure reactions
+                *(backend.action(work) for work in self._appended),  # 7. such as skinning
             ]
         )
 

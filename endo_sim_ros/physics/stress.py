@@ -3,9 +3,7 @@
 import numpy as np
 import torch
 
-from endo_sim_ros.physics.materials import energy_density, lame_parameters
-
-_LEAST_VOLUME = 0.05  # of that at rest; below it the laws have no value
+from endo_sim_ros.physics.materials import LEAST_VOLUME, energy_density, lame_parameters
 
 
 def von_mises(
@@ -25,7 +23,7 @@ def von_mises(
     mu, lam = (torch.as_tensor(each, dtype=torch.float32) for each in lame_parameters(young_modulus, poisson_ratio))
     gradients = torch.tensor(F, dtype=torch.float32)
     J = torch.linalg.det(gradients)
-    sound = J > _LEAST_VOLUME
+    sound = J > LEAST_VOLUME
     gradients = torch.where(sound[:, None, None], gradients, torch.eye(3)).requires_grad_()
     (P,) = torch.autograd.grad(energy_density(material, gradients, mu, lam).sum(), gradients)
     with torch.no_grad():

@@ -1,7 +1,5 @@
 """Tools: wrenches, jaws and rigid capsules that act on the nodes, in device memory."""
 
-from typing import Any
-
 import numpy as np
 import torch
 import warp as wp
@@ -35,39 +33,37 @@ class Tools:
         shape = (solver.environments, solver.tool_count)
         tools, entries = solver.environments * solver.tool_count, solver.environments * solver.tool_count * len(self.touchable)
 
-        self._everything: list[torch.Tensor] = []
+        self._everything: list[torch.Tensor] = []  # that commands and holds are
 
-        def tensors(struct: Any, names: str, dtype: type, count: int = tools) -> list[torch.Tensor]:
-            made = []
-            for name in names.split():
-                array = wp.zeros(count, dtype, device=solver.device)
-                setattr(struct, name, array)
-                made.append(wp.to_torch(array))
-            self._everything += made
-            return made
+        def zeros(dtype: type, count: int = tools) -> wp.array:
+            array = wp.zeros(count, dtype, device=solver.device)
+            self._everything.append(wp.to_torch(array))
+            return array
+
+        def view(array: wp.array, *rest: int) -> torch.Tensor:
+            return wp.to_torch(array).view(*shape, *rest)
 
         commands, holds, constants = Commands(), Holds(), ToolConstants()
-        # Wrench [B, T, 3], N and N·m about the point held; where it takes hold, m; the tip at the end of the step, m.
-        self.forces, self.torques, self.grasp_points, self.tips = (
-            each.view(*shape, 3) for each in tensors(commands, "force torque grasp_point tip", wp.vec3d)
-        )
-        (R,) = tensors(commands, "R", wp.mat33d)
-        self.rotations = R.view(*shape, 3, 3)  # axes of the tip [B, T, 3, 3]
-        # Whether tip and axes mean anything, and whether the jaw is to be closed [B, T], int32.
-        self.present, self.closed = (each.view(shape) for each in tensors(commands, "present closed", int))
-        tensors(holds, "contact last_tip applied_force applied_torque", wp.vec3d)
-        tensors(holds, "last_R", wp.mat33d)
-        # Whether the wrench acts, whether the jaw holds tissue, how often it slipped out [B, T], int32.
-        self.attached, self.gripping, self.slips, self._placed = (
-            each.view(shape) for each in tensors(holds, "attached gripping slips placed", int)
-        )
+        commands.force, commands.torque, commands.grasp_point, commands.tip = (zeros(wp.vec3d) for _ in range(4))
+        commands.R, commands.present, commands.closed = zeros(wp.mat33d), zeros(int), zeros(int)
+        holds.contact, holds.applied_force, holds.applied_torque = (zeros(wp.vec3d) for _ in range(3))
+        holds.reaction_force, holds.reaction_torque = zeros(wp.vec3d), zeros(wp.vec3d)
+        holds.attached, holds.gripping, holds.slips = (zeros(int) for _ in range(3))
+        holds.last_tip, holds.last_R, holds.placed = zeros(wp.vec3d), zeros(wp.mat33d), zeros(int)
+        holds.weight, holds.held = zeros(float, entries), zeros(int, entries)
+        holds.local, holds.pulled = zeros(wp.vec3d, entries), zeros(wp.vec3d, entries)
+
+        self.forces, self.torques = view(commands.force, 3), view(commands.torque, 3)  # [B, T, 3], N and N·m about the point held
+        self.grasp_points = view(commands.grasp_point, 3)  # where the wrench takes hold [B, T, 3], m
+        self.tips, self.rotations = view(commands.tip, 3), view(commands.R, 3, 3)  # at the end of the step: [B, T, 3], m; axes [B, T, 3, 3]
+        self.present = view(commands.present)  # whether tip and axes mean anything [B, T], int32
+        self.closed = view(commands.closed)  # whether the jaw is to be closed [B, T], int32
+        self.attached, self.gripping = view(holds.attached), view(holds.gripping)  # whether wrench and jaw hold tissue [B, T], int32
+        self.slips = view(holds.slips)  # how often tissue slipped out of the jaw [B, T], int32
+        self._placed = view(holds.placed)
         # What the tissue exerts back [B, T, 3], N and N·m (of a wrench about the point held, else about the tip).
-        self.reaction_forces, self.reaction_torques = (
-            each.view(*shape, 3) for each in tensors(holds, "reaction_force reaction_torque", wp.vec3d)
-        )
-        (weight,), (held,) = tensors(holds, "weight", float, entries), tensors(holds, "held", int, entries)
-        self.weights, self.held = (each.view(*shape, len(self.touchable)) for each in (weight, held))
-        tensors(holds, "local pulled", wp.vec3d, entries)
+        self.reaction_forces, self.reaction_torques = view(holds.reaction_force, 3), view(holds.reaction_torque, 3)
+        self.weights, self.held = (view(each, len(self.touchable)) for each in (holds.weight, holds.held))
         constants.touchable = wp.array(self.touchable.astype(np.int32), dtype=int, device=solver.device)
         constants.origin = wp.vec3d(*solver.origin)
         constants.radius, constants.travel, constants.duration = config.force_radius, config.travel, config.step_duration

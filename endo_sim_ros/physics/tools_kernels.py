@@ -152,6 +152,130 @@ def take_hold(
                 holds.gripping[c] = 0
 
 
+@wp.func
+def apply_wrench(
+    b: int, c: int, thread: int, threads: int, commands: Commands, holds: Holds, constants: ToolConstants,
+    nodes: Nodes, state: State, loads: Loads,
+):  # fmt: skip
+    """Add the forces of the wrench of tool c; returns what arrives of it: force, N, and torque about the point held, N·m.
+
+    They are the nodal forces f with Σ f = F and Σ r × f = τ that minimise Σ |f|²/w: f = w (F/Σw + β × s) with s
+    the offset from the weighted centroid c, β = J⁻¹ (τ − c × F), J = Σ w (|s|² 1 − s sᵀ), w scaled to Σ w = 1. Nodes on one line or point
+    resist no torque about it: the force is still exact and the torque is the nearest that the nodes can take.
+    """
+    count = nodes.X.shape[0]
+    touchable = constants.touchable.shape[0]
+    zero = wp.float64(0.0)
+    total, centre = wp.float64(0.0), wp.vec3d()
+    for s in range(thread, touchable, threads):
+        w = wp.float64(holds.weight[c * touchable + s])
+        if w > zero:
+            p = constants.touchable[s]
+            total += w
+            centre += w * (double(nodes.X[p]) + double(state.u[b * count + p]))
+    total, centre = block_sum(total), block_sum3(centre)
+    centre = centre / total
+    xx, yy, zz = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
+    xy, xz, yz = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
+    for s in range(thread, touchable, threads):
+        w = wp.float64(holds.weight[c * touchable + s]) / total
+        if w > zero:
+            p = constants.touchable[s]
+            arm = double(nodes.X[p]) + double(state.u[b * count + p]) - centre
+            xx += w * arm[0] * arm[0]
+            yy += w * arm[1] * arm[1]
+            zz += w * arm[2] * arm[2]
+            xy += w * arm[0] * arm[1]
+            xz += w * arm[0] * arm[2]
+            yz += w * arm[1] * arm[2]
+    xx, yy, zz = block_sum(xx), block_sum(yy), block_sum(zz)
+    xy, xz, yz = block_sum(xy), block_sum(xz), block_sum(yz)
+    J = wp.mat33d(yy + zz, -xy, -xz, -xy, xx + zz, -yz, -xz, -yz, xx + yy)
+    F = commands.force[c]
+    lever = -holds.contact[c]  # of the centroid about the point held
+    floor = wp.max(xx + yy + zz + wp.length_sq(lever), wp.float64(1.0e-30))
+    beta = solve_on_range(J, commands.torque[c] - wp.cross(lever, F), floor)
+    torque = wp.cross(lever, F) + J * beta
+    for s in range(thread, touchable, threads):
+        w = wp.float64(holds.weight[c * touchable + s]) / total
+        if w > zero:
+            p = constants.touchable[s]
+            arm = double(nodes.X[p]) + double(state.u[b * count + p]) - centre
+            loads.force[b * count + p] += single(w * (F + wp.cross(beta, arm)))
+    return F, torque
+
+
+@wp.func
+def pull_by_jaw(
+    b: int, t: int, c: int, thread: int, threads: int, commands: Commands, holds: Holds, constants: ToolConstants,
+    nodes: Nodes, state: State, loads: Loads, bad_nodes: wp.array[int],
+):  # fmt: skip
+    """Let springs pull the nodes that the jaw of tool t holds to where it will be; it loses tissue that it pulls too far.
+
+    A node that several jaws hold follows the last of them; when that opens, the one before has it.
+    """
+    count = nodes.X.shape[0]
+    touchable = constants.touchable.shape[0]
+    zero, one = wp.float64(0.0), wp.float64(1.0)
+    beyond = wp.float64(0.0)
+    for s in range(thread, touchable, threads):
+        if holds.held[c * touchable + s] != 0:
+            p = constants.touchable[s]
+            goal = commands.tip[c] + commands.R[c] * holds.local[c * touchable + s]
+            if wp.length(goal - constants.origin - double(nodes.X[p])) > wp.float64(SLIP) * constants.travel:
+                beyond += one
+    beyond = block_sum(beyond)
+    for s in range(thread, touchable, threads):
+        if beyond == zero and holds.held[c * touchable + s] != 0:
+            p = constants.touchable[s]
+            e = b * count + p
+            start = holds.pulled[c * touchable + s]
+            # Where the last step was undone, or another jaw had the node: pull on from where the tissue is.
+            if bad_nodes[b] > 0 or loads.holder[e] != t:
+                start = double(state.u[e])
+            goal = commands.tip[c] + commands.R[c] * holds.local[c * touchable + s] - constants.origin - double(nodes.X[p])
+            loads.spring[e] = nodes.stiffness[e]
+            loads.target[e] = single(start)
+            loads.target_v[e] = single((goal - start) / constants.duration)
+            loads.holder[e] = t
+            holds.pulled[c * touchable + s] = goal
+    if thread == 0 and beyond > zero:
+        holds.gripping[c] = 0
+        holds.slips[c] = holds.slips[c] + 1
+        commands.closed[c] = 0
+
+
+@wp.func
+def fail_if_unusable(b: int, c: int, commands: Commands, constants: ToolConstants, nodes: Nodes, loads: Loads):
+    """Make a command that is not finite fail the step, which is then counted and undone."""
+    unusable = not wp.isfinite(wp.length_sq(commands.force[c]) + wp.length_sq(commands.torque[c]))
+    if commands.present[c] != 0:
+        unusable = unusable or not wp.isfinite(wp.length_sq(commands.tip[c]) + wp.ddot(commands.R[c], commands.R[c]))
+    if unusable and constants.touchable.shape[0] > 0:
+        loads.force[b * nodes.X.shape[0] + constants.touchable[0]] = wp.vec3(wp.nan, wp.nan, wp.nan)
+
+
+@wp.func
+def move_capsule(c: int, commands: Commands, holds: Holds, constants: ToolConstants, rigid: RigidTools):
+    """Let the capsule of a tool move from where it was to where it is to be at the end of the step."""
+    rigid.radius[c] = 0.0
+    if commands.present[c] != 0:
+        if holds.placed[c] == 0:
+            holds.last_tip[c] = commands.tip[c]
+            holds.last_R[c] = commands.R[c]
+        tip, R, before, R_before = commands.tip[c], commands.R[c], holds.last_tip[c], holds.last_R[c]
+        end = tip - constants.contact_length * wp.vec3d(R[0, 2], R[1, 2], R[2, 2])
+        end_before = before - constants.contact_length * wp.vec3d(R_before[0, 2], R_before[1, 2], R_before[2, 2])
+        rigid.radius[c] = constants.contact_radius
+        rigid.tip[c] = single(before - constants.origin)
+        rigid.tip_v[c] = single((tip - before) / constants.duration)
+        rigid.end[c] = single(end_before - constants.origin)
+        rigid.end_v[c] = single((end - end_before) / constants.duration)
+        holds.last_tip[c] = tip
+        holds.last_R[c] = R
+    holds.placed[c] = commands.present[c]
+
+
 @wp.kernel(launch_bounds=512)
 def load_nodes(
     tools: int,
@@ -165,18 +289,10 @@ def load_nodes(
     rigid: RigidTools,
     bad_nodes: wp.array[int],
 ):
-    """Forces, springs and moving capsules of the next step.
-
-    A wrench becomes the nodal forces f with Σ f = F and Σ r × f = τ that minimise Σ |f|²/w: f = w (F/Σw + β × s) with s
-    the offset from the weighted centroid c, β = J⁻¹ (τ − c × F), J = Σ w (|s|² 1 − s sᵀ), w scaled to Σ w = 1. Nodes on one line or point
-    resist no torque about it: the force is still exact and the torque is the nearest that the nodes can take.
-
-    A node that several jaws hold follows the last of them; when that opens, the one before has it.
-    """
+    """Forces, springs and moving capsules of the next step."""
     b, thread = wp.tid()
     count = nodes.X.shape[0]
     touchable = constants.touchable.shape[0]
-    zero, one = wp.float64(0.0), wp.float64(1.0)
     for s in range(thread, touchable, threads):
         e = b * count + constants.touchable[s]
         loads.force[e] = wp.vec3()
@@ -185,93 +301,14 @@ def load_nodes(
         c = b * tools + t
         F, torque = wp.vec3d(), wp.vec3d()
         if holds.attached[c] != 0:
-            total, centre = wp.float64(0.0), wp.vec3d()
-            for s in range(thread, touchable, threads):
-                w = wp.float64(holds.weight[c * touchable + s])
-                if w > zero:
-                    p = constants.touchable[s]
-                    total += w
-                    centre += w * (double(nodes.X[p]) + double(state.u[b * count + p]))
-            total, centre = block_sum(total), block_sum3(centre)
-            centre = centre / total
-            xx, yy, zz = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
-            xy, xz, yz = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
-            for s in range(thread, touchable, threads):
-                w = wp.float64(holds.weight[c * touchable + s]) / total
-                if w > zero:
-                    p = constants.touchable[s]
-                    arm = double(nodes.X[p]) + double(state.u[b * count + p]) - centre
-                    xx += w * arm[0] * arm[0]
-                    yy += w * arm[1] * arm[1]
-                    zz += w * arm[2] * arm[2]
-                    xy += w * arm[0] * arm[1]
-                    xz += w * arm[0] * arm[2]
-                    yz += w * arm[1] * arm[2]
-            xx, yy, zz = block_sum(xx), block_sum(yy), block_sum(zz)
-            xy, xz, yz = block_sum(xy), block_sum(xz), block_sum(yz)
-            J = wp.mat33d(yy + zz, -xy, -xz, -xy, xx + zz, -yz, -xz, -yz, xx + yy)
-            F = commands.force[c]
-            lever = -holds.contact[c]  # of the centroid about the point held
-            floor = wp.max(xx + yy + zz + wp.length_sq(lever), wp.float64(1.0e-30))
-            beta = solve_on_range(J, commands.torque[c] - wp.cross(lever, F), floor)
-            torque = wp.cross(lever, F) + J * beta
-            for s in range(thread, touchable, threads):
-                w = wp.float64(holds.weight[c * touchable + s]) / total
-                if w > zero:
-                    p = constants.touchable[s]
-                    arm = double(nodes.X[p]) + double(state.u[b * count + p]) - centre
-                    loads.force[b * count + p] += single(w * (F + wp.cross(beta, arm)))
+            F, torque = apply_wrench(b, c, thread, threads, commands, holds, constants, nodes, state, loads)
         if holds.gripping[c] != 0:
-            beyond = wp.float64(0.0)
-            for s in range(thread, touchable, threads):
-                if holds.held[c * touchable + s] != 0:
-                    p = constants.touchable[s]
-                    goal = commands.tip[c] + commands.R[c] * holds.local[c * touchable + s]
-                    if wp.length(goal - constants.origin - double(nodes.X[p])) > wp.float64(SLIP) * constants.travel:
-                        beyond += one
-            beyond = block_sum(beyond)
-            for s in range(thread, touchable, threads):
-                if beyond == zero and holds.held[c * touchable + s] != 0:
-                    p = constants.touchable[s]
-                    e = b * count + p
-                    start = holds.pulled[c * touchable + s]
-                    # Where the last step was undone, or another jaw had the node: pull on from where the tissue is.
-                    if bad_nodes[b] > 0 or loads.holder[e] != t:
-                        start = double(state.u[e])
-                    goal = commands.tip[c] + commands.R[c] * holds.local[c * touchable + s] - constants.origin - double(nodes.X[p])
-                    loads.spring[e] = nodes.stiffness[e]
-                    loads.target[e] = single(start)
-                    loads.target_v[e] = single((goal - start) / constants.duration)
-                    loads.holder[e] = t
-                    holds.pulled[c * touchable + s] = goal
-            if thread == 0 and beyond > zero:
-                holds.gripping[c] = 0
-                holds.slips[c] = holds.slips[c] + 1
-                commands.closed[c] = 0
-        unusable = not wp.isfinite(wp.length_sq(commands.force[c]) + wp.length_sq(commands.torque[c]))
-        if commands.present[c] != 0:
-            unusable = unusable or not wp.isfinite(wp.length_sq(commands.tip[c]) + wp.ddot(commands.R[c], commands.R[c]))
-        if unusable and thread == 0 and touchable > 0:
-            loads.force[b * count + constants.touchable[0]] = wp.vec3(wp.nan, wp.nan, wp.nan)
+            pull_by_jaw(b, t, c, thread, threads, commands, holds, constants, nodes, state, loads, bad_nodes)
         if thread == 0:
+            fail_if_unusable(b, c, commands, constants, nodes, loads)
             holds.applied_force[c] = F
             holds.applied_torque[c] = torque
-            rigid.radius[c] = 0.0
-            if commands.present[c] != 0:
-                if holds.placed[c] == 0:
-                    holds.last_tip[c] = commands.tip[c]
-                    holds.last_R[c] = commands.R[c]
-                tip, R, before, R_before = commands.tip[c], commands.R[c], holds.last_tip[c], holds.last_R[c]
-                end = tip - constants.contact_length * wp.vec3d(R[0, 2], R[1, 2], R[2, 2])
-                end_before = before - constants.contact_length * wp.vec3d(R_before[0, 2], R_before[1, 2], R_before[2, 2])
-                rigid.radius[c] = constants.contact_radius
-                rigid.tip[c] = single(before - constants.origin)
-                rigid.tip_v[c] = single((tip - before) / constants.duration)
-                rigid.end[c] = single(end_before - constants.origin)
-                rigid.end_v[c] = single((end - end_before) / constants.duration)
-                holds.last_tip[c] = tip
-                holds.last_R[c] = R
-            holds.placed[c] = commands.present[c]
+            move_capsule(c, commands, holds, constants, rigid)
 
 
 @wp.kernel

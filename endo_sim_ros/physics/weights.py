@@ -1,4 +1,4 @@
-"""Weights by which what lies in the tissue follows the nearest control nodes (paper eq. 9)."""
+"""The control nodes nearest to points, and compact weights with which points follow them (in place of those of paper eq. 9)."""
 
 from typing import Any
 

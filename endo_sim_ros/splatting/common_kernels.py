@@ -200,7 +200,7 @@ def clamped_slopes(p: wp.vec3, K: wp.mat33, width: int, height: int) -> wp.vec2:
 
 @wp.func
 def projection_jacobian(slopes: wp.vec2, z: float, K: wp.mat33) -> mat23:
-    """∂(pixel)/∂(camera coordinates), pixel/m."""
+    """∂(u, v)/∂(x, y, z) [2, 3], pixel/m, of a point in the camera's frame with depth z, m, and slopes (x/z, y/z), see `clamped_slopes`."""
     fx, fy = K[0, 0] / z, K[1, 1] / z
     return mat23(fx, 0.0, -fx * slopes[0], 0.0, fy, -fy * slopes[1])
 
@@ -465,6 +465,7 @@ def project_backward(
         v_sh[n, k] = wp.vec3()
 
     for camera in range(viewmats.shape[0]):
+        # ---- Sum of the records of the splat.
         splat = camera * gaussian_count + n
         if wants_pose != 0:
             v_viewmats[camera, n] = wp.mat44()
@@ -485,6 +486,7 @@ def project_backward(
                 for k in range(10):
                     v[k] += records[i, k]
 
+            # ---- What `project` computed.
             viewmat, K = viewmats[camera], Ks[camera]
             rotation, translation = camera_rotation(viewmat), camera_translation(viewmat)
             mean = means[n]
@@ -497,7 +499,7 @@ def project_backward(
             det = cov[3]
             conic = wp.mat22(cov[2] / det, -cov[1] / det, -cov[1] / det, cov[0] / det)
 
-            # conic = cov⁻¹ and cov = T Σ Tᵀ with T = J R.
+            # ---- Covariance: conic = cov⁻¹ and cov = T Σ Tᵀ with T = J R.
             v_conic = wp.mat22(v[A], 0.5 * v[B], 0.5 * v[B], v[C])
             v_cov = -1.0 * (conic * v_conic * conic)
             v_covariance += wp.transpose(to_image) * v_cov * to_image
@@ -505,7 +507,7 @@ def project_backward(
             v_jacobian = v_to_image * wp.transpose(rotation)
             v_rotation = wp.transpose(projection_jacobian(slopes, z, K)) * v_to_image
 
-            # J depends on z and on the slopes, which depend on p unless clamped.
+            # ---- Mean in the image: J depends on z and on the slopes, which depend on p unless clamped.
             fx, fy = K[0, 0] / z, K[1, 1] / z
             v_slope_x, v_slope_y = -fx * v_jacobian[0, 2], -fy * v_jacobian[1, 2]
             v_p = wp.vec3(fx * v[X], fy * v[Y], v[Z] - (fx * v[X] * p[0] + fy * v[Y] * p[1]) / z)
@@ -517,7 +519,7 @@ def project_backward(
                 v_p += wp.vec3(0.0, v_slope_y / z, -v_slope_y * slopes[1] / z)
             v_opacity += v[OPACITY]
 
-            # Colour: c = max(Σ basis_k sh_k + 0.5, 0).
+            # ---- Colour: c = max(Σ basis_k sh_k + 0.5, 0).
             basis = vec16()
             to_gaussian = mean + wp.transpose(rotation) * translation
             distance = wp.length(to_gaussian)
@@ -541,8 +543,7 @@ def project_backward(
                 v_position = (v_direction - direction * wp.dot(direction, v_direction)) / distance
             v_mean += wp.transpose(rotation) * v_p + v_position
 
-            if wants_pose != 0:
-                # The direction is mean + Rᵀ t.
+            if wants_pose != 0:  # ---- Pose: the direction is mean + Rᵀ t.
                 v_rotation += wp.outer(v_p, mean) + wp.outer(translation, v_position)
                 v_t = v_p + rotation * v_position
                 v_viewmats[camera, n] = wp.mat44(
@@ -560,7 +561,7 @@ def project_backward(
         v_scales[n] = wp.vec3()
         v_quats[n] = wp.vec4()
     else:
-        # Σ = M Mᵀ, M = R diag(scale).
+        # ---- Scale and quaternion: Σ = M Mᵀ, M = R diag(scale).
         r = quat_to_matrix(unit_quat(quats[n]))
         scale = scales[n]
         v_m = 2.0 * (v_covariance * r * wp.diag(scale))

@@ -7,7 +7,7 @@ import pytest
 import torch
 from tissue_scene import TIP, curved_sheet, free_block, pose_at, simulate, steps
 
-from endo_sim_ros.core.kernels import plain_kernels
+from endo_sim_ros.core.kernels import compare_plain
 from endo_sim_ros.physics import Skinning, TissueSimulation
 
 
@@ -31,7 +31,7 @@ def pull_apart(simulation: TissueSimulation, force: float = 0.4) -> tuple[np.nda
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("backend", [contextlib.nullcontext, plain_kernels], ids=["vectorised", "plain"])
+@pytest.mark.parametrize("backend", [contextlib.nullcontext, compare_plain], ids=["vectorised", "plain"])
 def test_a_cut_separates_what_is_pulled_apart_and_heals_on_reset(backend):
     gaps = []
     with backend():

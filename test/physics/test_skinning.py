@@ -8,7 +8,7 @@ import torch
 from tissue_scene import EYE, TIP, curved_sheet, random_rotations, simulate, steps
 
 from endo_sim_ros.core.gaussians import GaussianModel
-from endo_sim_ros.core.kernels import plain_kernels
+from endo_sim_ros.core.kernels import compare_plain
 from endo_sim_ros.physics import PhysicsConfig, Skinning, TissueBatch, build_control_nodes, sample_farthest
 
 
@@ -105,6 +105,8 @@ def test_wrong_node_shapes_are_refused():
         skinning.deform(rest, np.zeros((9, 3, 3)))
     with pytest.raises(ValueError, match=r"node_rest has shape \(0, 3\)"):
         Skinning(model, np.zeros((0, 3)), device="cpu")
+    with pytest.raises(ValueError, match="weighting must be compact or softmax, not 'linear'"):
+        Skinning(model, rest, weighting="linear", device="cpu")
 
 
 def test_simulated_dent_reaches_the_gaussians():
@@ -176,7 +178,7 @@ def test_vectors_agree_with_the_equations_and_with_the_kernel_of_cuda(neighbours
     torch.testing.assert_close(covars.double()[healthy], expected_covars[healthy], atol=2e-11, rtol=1e-4)
     assert covars.isfinite().all()
 
-    with plain_kernels():
+    with compare_plain():
         scalar = Skinning(model, rest, neighbours=neighbours, device="cpu")
     scalar_means, scalar_covars = scalar.deform(positions, F)
     torch.testing.assert_close(means, scalar_means, atol=1e-7, rtol=0)
@@ -263,7 +265,7 @@ def test_bindings_that_make_no_sense_are_refused_and_change_nothing():
     assert torch.equal(s.neighbours, before[0]) and torch.equal(s.weights, before[1])
 
 
-@pytest.mark.parametrize("environments, backend", [(1, nullcontext), (3, nullcontext), (3, plain_kernels)])
+@pytest.mark.parametrize("environments, backend", [(1, nullcontext), (3, nullcontext), (3, compare_plain)])
 def test_skinning_within_the_step_gives_the_same_bits_as_after_it(environments, backend):
     model, _ = model_and_rest(5000)
     config = PhysicsConfig(node_count=400, device="cpu")

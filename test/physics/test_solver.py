@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from tissue_scene import EYE, TIP, curved_sheet, depth_of_dent, pose_at, simulate, steps
 
-from endo_sim_ros.core.kernels import plain_kernels
+from endo_sim_ros.core.kernels import compare_plain
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation, sample_farthest
 from endo_sim_ros.physics.backends import cluster_division as cluster
 from endo_sim_ros.physics.materials import MATERIALS
 from endo_sim_ros.physics.stencils import Stencils
 
-BACKENDS = {"vectorised": contextlib.nullcontext, "plain": plain_kernels}
+BACKENDS = {"vectorised": contextlib.nullcontext, "plain": compare_plain}
 
 
 @pytest.mark.parametrize("kinematics", ["rest", "current"])
@@ -36,24 +36,24 @@ def test_blocks_of_a_cluster_add_up_what_all_nodes_give_to_a_grid_node(count):
     expected = np.zeros(corners.max() + 1)
     np.add.at(expected, corners, given)
     assert sorted(division.nodes[division.nodes >= 0]) == list(range(len(corners)))
-    patch = division.shares.shape[2]
+    patch = division.addends.shape[2]
     inboxes = np.zeros((cluster.CLUSTER, division.inbox))
-    for nodes, places, sums, inbox in zip(division.nodes, division.places, division.sums.reshape(cluster.CLUSTER, -1, 4), inboxes):
+    for nodes, slots, sums, inbox in zip(division.nodes, division.slot_of, division.sums.reshape(cluster.CLUSTER, -1, 4), inboxes):
         memory = np.zeros(division.slots)
-        memory[places[nodes >= 0]] = given[nodes[nodes >= 0]]
-        assert not memory[-1] and len(np.unique(places[nodes >= 0])) == 27 * (nodes >= 0).sum()
+        memory[slots[nodes >= 0]] = given[nodes[nodes >= 0]]
+        assert not memory[-1] and len(np.unique(slots[nodes >= 0])) == 27 * (nodes >= 0).sum()
         for thread, (_, _, sharing, g) in enumerate(sums):
             if g >= 0:
                 threads = sums[thread : thread + cluster.BANKS * sharing : cluster.BANKS]
                 inbox[g] = sum(memory[begin : end : cluster.WARP].sum() for begin, end, _, _ in threads)
     totals = inboxes[:, :patch].copy()
-    for block, sends in enumerate(division.sends.reshape(cluster.CLUSTER, -1, 3)):
-        for g, other, place in sends[sends[:, 0] >= 0]:
+    for block, outgoing in enumerate(division.outgoing.reshape(cluster.CLUSTER, -1, 3)):
+        for g, other, place in outgoing[outgoing[:, 0] >= 0]:
             assert other != block and not inboxes[other, place]
             inboxes[other, place] = totals[block, g]
     np.testing.assert_array_equal((inboxes[:, patch:] != 0).sum(1), division.received)
-    for nodes, corners_of, shares, inbox in zip(division.nodes, division.corners, division.shares, inboxes):
-        totals = inbox[shares].sum(0)
+    for nodes, corners_of, addends, inbox in zip(division.nodes, division.corners, division.addends, inboxes):
+        totals = inbox[addends].sum(0)
         np.testing.assert_allclose(totals[corners_of[nodes >= 0]], expected[corners[nodes[nodes >= 0]]], atol=1e-12)
 
 

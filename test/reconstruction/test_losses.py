@@ -6,7 +6,7 @@ import torch
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 from endo_sim_ros.core.gaussians import GaussianModel
-from endo_sim_ros.core.kernels import plain_kernels
+from endo_sim_ros.core.kernels import compare_plain
 from endo_sim_ros.reconstruction import losses
 
 
@@ -45,7 +45,7 @@ def test_ssim_by_kernels_is_the_same(images):
     x, y, v = (image.float() for image in (*images[:2], torch.randn(images[0].shape, generator=torch.Generator().manual_seed(3))))
     ours, expected = x.clone().requires_grad_(), x.clone().requires_grad_()
     values = [losses.ssim(expected, y)]
-    with plain_kernels():
+    with compare_plain():
         values.append(losses.ssim(ours, y))
     for value in values:
         value.backward(v)

@@ -5,7 +5,7 @@ import contextlib
 import pytest
 import torch
 
-from endo_sim_ros.core.kernels import plain_kernels
+from endo_sim_ros.core.kernels import compare_plain
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -20,5 +20,5 @@ def one_torch_thread():
 @pytest.fixture(params=["vectors", "pixels"])
 def compositor(request):
     """The backend of CPUs, and that of GPUs, which runs on the CPU too."""
-    with plain_kernels() if request.param == "pixels" else contextlib.nullcontext():
+    with compare_plain() if request.param == "pixels" else contextlib.nullcontext():
         yield

@@ -25,7 +25,7 @@ from raster_scene import (
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.gaussians import GaussianModel
-from endo_sim_ros.core.kernels import plain_kernels, vectorised
+from endo_sim_ros.core.kernels import compare_plain, vectorised
 from endo_sim_ros.splatting import RenderOutput, _rasterize, api, cuda, rasterize, render
 
 scenes = st.fixed_dictionaries(
@@ -212,7 +212,7 @@ def test_pictures_drawn_in_several_threads_are_those_drawn_in_one(compositor):
     plain, scenes = not vectorised("cpu"), [(make_gaussians(400, seed=31), (70, 45)), (make_gaussians(150, seed=32), (33, 60))]
 
     def draw(turn):
-        with plain_kernels() if plain else contextlib.nullcontext():
+        with compare_plain() if plain else contextlib.nullcontext():
             leaves, losses = [], []
             for gaussians, size in scenes[::turn]:
                 leaves.append([x.float().requires_grad_() for x in gaussians])
@@ -296,7 +296,7 @@ def test_the_first_picture_on_a_cpu_has_lists():
     cuda._scratch.cache_clear()
     gaussians, cameras = make_gaussians(20, seed=33), make_cameras(1, 300, 200)
     gaussians[2] *= 10
-    with plain_kernels():
+    with compare_plain():
         run(rasterize, gaussians, cameras, size=(300, 200), dtype=torch.float32)
     scratch = cuda._scratch(torch.device("cpu"), 0)
     assert cuda._FIRST_GUESS * 20 * 1.5 < scratch.seen[0] <= scratch.capacity
@@ -309,7 +309,7 @@ def test_vectors_and_plain_numbers_draw_the_same_bits(count, opacity):
     gaussians[2] *= torch.tensor([3.0, 1.0, 0.1])
     gaussians[3] = opacity + (1 - opacity) * gaussians[3]
     expected, _ = run(rasterize, gaussians, cameras, size=(150, 90), dtype=torch.float32, median=True)
-    with plain_kernels():
+    with compare_plain():
         output, _ = run(rasterize, gaussians, cameras, size=(150, 90), dtype=torch.float32, median=True)
     assert bool((expected.alphas > 0.999).any()) == (count > 60) and expected.alphas.max() > 0.5
     for name, actual, image in zip(RenderOutput._fields, output, expected):
@@ -339,7 +339,7 @@ def test_pictures_without_lists_of_tiles_are_the_same(device, monkeypatch):
     gaussians[0][:20, 2] = -1.0
     gaussians[0][20:40, 0] = 50.0
     cameras[0][1, 2, 3] = -100.0
-    with plain_kernels():
+    with compare_plain():
         listed = run(rasterize, gaussians, cameras, device=device, dtype=torch.float32)
         monkeypatch.setattr(cuda, "_MOST", 0.01)
         monkeypatch.setattr(cuda, "_ALWAYS", 0)

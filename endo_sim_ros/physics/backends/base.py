@@ -1,4 +1,9 @@
-"""What a backend does, and which one a device has: where the solver's step and skinning run."""
+"""What a backend does: where the solver's step and skinning run.
+
+A `Launch` is data: a kernel with its arguments, which a room's other files make without knowing the device. `Work` is one, or
+several that may run at the same time. `Backend.action` makes an `Action` of it, a call with nothing left to load, and
+`Backend.record` one of many: a step.
+"""
 
 import functools
 import threading
@@ -18,8 +23,8 @@ BLOCK = 64  # threads of a GPU's block: a few thousand control nodes then reach 
 
 Action = Callable[[], object]
 
-array = functools.partial(wp.from_torch, requires_grad=False)
-"""A tensor as an array of Warp, which keeps the tensor."""
+viewed = functools.partial(wp.from_torch, requires_grad=False)
+"""A tensor as an array of Warp in the same memory, which keeps the tensor."""
 
 capturing = threading.Lock()
 """Held while a graph is captured on a GPU: what another thread launches there meanwhile would become part of it."""
@@ -113,7 +118,7 @@ class Backend(Protocol):
         ...
 
     def skin(self, skin: SkinData, maps: Tensor, means: Tensor, covars: Tensor) -> None:
-        """Move Gaussians now by the maps of their control nodes, see `skinning_kernels`.
+        """Move Gaussians now by the maps of their control nodes, see `node_map_kernels`.
 
         Args:
             skin: Gaussians at rest.

@@ -26,10 +26,10 @@ class Division(NamedTuple):
     inbox: int  # fours; the first are the totals of the patch, the last is zero
     nodes: np.ndarray  # [CLUSTER, P] nodes of each piece, -1 = none
     corners: np.ndarray  # [CLUSTER, P, 27] number in its patch of each node's grid nodes
-    places: np.ndarray  # [CLUSTER, P, 27] slot of what it gives to them
+    slot_of: np.ndarray  # [CLUSTER, P, 27] slot of what it gives to each of these
     sums: np.ndarray  # [CLUSTER, ROUNDS, BLOCK, 4] of each thread: first slot, end, threads that share a sum, its grid node or -1
-    sends: np.ndarray  # [CLUSTER, ROUNDS, BLOCK, 3] of each thread: grid node or -1, block, and place in its inbox
-    shares: np.ndarray  # [CLUSTER, K, G] places in the inbox that add up to each grid node
+    outgoing: np.ndarray  # [CLUSTER, ROUNDS, BLOCK, 3] of each thread: grid node to send or -1, block that gets it, place in its inbox
+    addends: np.ndarray  # [CLUSTER, K, G] places in the inbox of the K totals that add up to each grid node
     received: np.ndarray  # [CLUSTER] fours that other blocks send
 
 
@@ -50,7 +50,7 @@ def divide(rest_cells: np.ndarray, corners: np.ndarray) -> Division | None:
     if size > ROUNDS * BLOCK:
         return None
     nodes = np.full((CLUSTER, largest), -1, np.int32)
-    local, places = np.zeros((2, CLUSTER, largest, 27), np.int32)
+    local, slot_of = np.zeros((2, CLUSTER, largest, 27), np.int32)
     sums = np.zeros((CLUSTER, ROUNDS, BLOCK, 4), np.int32)
     slots = 0
     for i, (piece, patch) in enumerate(zip(pieces, patches)):
@@ -58,11 +58,15 @@ def divide(rest_cells: np.ndarray, corners: np.ndarray) -> Division | None:
         index = np.argsort(patch)
         local[i, : len(piece)] = index[np.searchsorted(patch, corners[piece], sorter=index)]
         # Fewer and longer sums take less time, more and shorter ones less memory, which many nodes need.
-        place, sums[i], end = _sliced(local[i, : len(piece)].ravel(), len(patch), ROUNDS if lanes == 1 else ROUNDS // 2)
-        places[i, : len(piece)] = place.reshape(-1, 27)
+        slot, sums[i], end = _sliced(local[i, : len(piece)].ravel(), len(patch), ROUNDS if lanes == 1 else ROUNDS // 2)
+        slot_of[i, : len(piece)] = slot.reshape(-1, 27)
         slots = max(slots, end + 1)
 
-    # All pairs of a grid node of a patch and the same one of any patch; those of one grid node follow each other, by block.
+    # All pairs of a grid node of a patch (mine) and the same one of any patch (theirs); those of one grid node follow each other,
+    # by block, so that all blocks add up in the same order. With the patch [7, 9] of block 0 and [9] of block 1:
+    #   numbers 7 9 9, owner 0 0 1, index 0 1 0;  pairs: mine 0 1 1 2 2, theirs 0 1 2 1 2, rank 0 0 1 0 1;
+    #   place 0 1 2 2 0: the own totals lie at 0 and 1 (block 0) and at 0 (block 1), what the other block sends at size = 2;
+    #   addends of grid node 9: places 1, 2 in block 0 and 2, 0 in block 1, both block 0's total first.
     owner, index = np.repeat(np.arange(CLUSTER), [len(patch) for patch in patches]), np.concatenate([np.arange(len(p)) for p in patches])
     numbers = np.concatenate(patches)
     order = np.flatnonzero(numbers >= 0)
@@ -82,14 +86,14 @@ def divide(rest_cells: np.ndarray, corners: np.ndarray) -> Division | None:
     sent = np.bincount(owner[theirs[foreign]], minlength=CLUSTER)
     if sent.max() > ROUNDS * BLOCK or slots + 2 * inbox + size + 1 > SHARED:
         return None
-    shares = np.full((CLUSTER, max(AT_ONCE, rank.max() + 1), size), inbox - 1, np.int32)
-    shares[owner[mine], rank, index[mine]] = place
+    addends = np.full((CLUSTER, max(AT_ONCE, rank.max() + 1), size), inbox - 1, np.int32)
+    addends[owner[mine], rank, index[mine]] = place
     source, target = owner[theirs[foreign]], owner[mine[foreign]]
     foreign = foreign[np.lexsort((place[foreign], (target - source) % CLUSTER, source))]  # not all to the same block at first
-    sends = np.full((CLUSTER, ROUNDS * BLOCK, 3), -1, np.int32)
+    outgoing = np.full((CLUSTER, ROUNDS * BLOCK, 3), -1, np.int32)
     number = np.arange(len(foreign)) - np.repeat(np.cumsum(sent) - sent, sent)
-    sends[owner[theirs[foreign]], number] = np.stack([index[theirs[foreign]], owner[mine[foreign]], place[foreign]], 1)
-    return Division(lanes, slots, inbox, nodes, local, places, sums, sends.reshape(CLUSTER, ROUNDS, BLOCK, 3), shares, received)
+    outgoing[owner[theirs[foreign]], number] = np.stack([index[theirs[foreign]], owner[mine[foreign]], place[foreign]], 1)
+    return Division(lanes, slots, inbox, nodes, local, slot_of, sums, outgoing.reshape(CLUSTER, ROUNDS, BLOCK, 3), addends, received)
 
 
 def _sliced(rows: np.ndarray, size: int, rounds: int) -> tuple[np.ndarray, np.ndarray, int]:
@@ -121,7 +125,7 @@ def _sliced(rows: np.ndarray, size: int, rounds: int) -> tuple[np.ndarray, np.nd
     entry = np.empty(len(rows), int)  # number within its row
     entry[order] = np.arange(len(rows)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
     shared = sharing[rows]
-    places = ends[slice_of[rows]] + WARP * (entry // shared) + lane_of[rows] + BANKS * (entry % shared)
+    slots = ends[slice_of[rows]] + WARP * (entry // shared) + lane_of[rows] + BANKS * (entry % shared)
 
     # The longest sums first, each to the warp that has least to do.
     sums, load, row = np.zeros((ROUNDS * BLOCK // WARP, WARP, 4), np.int32), np.zeros(BLOCK // WARP), np.empty(count, int)
@@ -136,7 +140,7 @@ def _sliced(rows: np.ndarray, size: int, rounds: int) -> tuple[np.ndarray, np.nd
     summed = np.flatnonzero(lengths)
     sums[row[slice_of[summed]], :, 2] = sharing[summed, None]
     sums[row[slice_of[summed]], lane_of[summed], 3] = summed
-    return places, sums.reshape(ROUNDS, BLOCK, 4), int(ends[-1])
+    return slots, sums.reshape(ROUNDS, BLOCK, 4), int(ends[-1])
 
 
 def _by_bank(numbers: np.ndarray, bank: np.ndarray) -> np.ndarray:

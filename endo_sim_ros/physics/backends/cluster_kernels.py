@@ -116,10 +116,10 @@ def make_step_kernel(material: str, lanes: int):
         inbox: int,
         owned: wp.array2d[int],
         corners: wp.array3d[int],
-        places: wp.array3d[int],
+        slot_of: wp.array3d[int],
         sums: wp.array4d[int],
-        sends: wp.array4d[int],
-        shares: wp.array3d[int],
+        outgoing: wp.array4d[int],
+        addends: wp.array3d[int],
         received: wp.array[int],
     ):
         thread = wp.tid()
@@ -127,7 +127,9 @@ def make_step_kernel(material: str, lanes: int):
         block = thread // BLOCK % CLUSTER
         thread = thread % BLOCK
         count = nodes.X.shape[0]
-        patch = shares.shape[2]
+        patch = addends.shape[2]
+
+        # ---- Shared memory, empty.
         wp.tile_empty(shape=wp.static(4 * SHARED), dtype=float, storage="shared")  # asks for the memory
         memory = shared_memory()
         grid_v = slots + 2 * inbox
@@ -138,7 +140,7 @@ def make_step_kernel(material: str, lanes: int):
         wait_for_cluster()
         dt = step.dt
 
-        # What stays in this thread: its share of a node,
+        # ---- What stays in this thread: its share of a node,
         owner = wp.min(thread // wp.static(lanes), owned.shape[1] - 1)
         lane = thread % wp.static(lanes)
         p = wp.max(owned[block, owner], 0)
@@ -183,17 +185,18 @@ def make_step_kernel(material: str, lanes: int):
                 stencil[3 * line + plane] = (slots - 1) << 16
                 if jk < 9 and owns != 0:
                     weights[line] = spline_at(dy[line]) * spline_at(dz[line])
-                    stencil[3 * line + plane] = corners[block, owner, 9 * plane + jk] + (places[block, owner, 9 * plane + jk] << 16)
-        # and some of the sums and of what is sent.
-        my_sums, my_sends = four_each(), three_each()
+                    stencil[3 * line + plane] = corners[block, owner, 9 * plane + jk] + (slot_of[block, owner, 9 * plane + jk] << 16)
+        # ---- and some of the sums and of what is sent.
+        my_sums, my_outgoing = four_each(), three_each()
         for i in range(ROUNDS):
             for n in range(4):
                 my_sums[4 * i + n] = sums[block, i, thread, n]
             for n in range(3):
-                my_sends[3 * i + n] = sends[block, i, thread, n]
+                my_outgoing[3 * i + n] = outgoing[block, i, thread, n]
 
         for substep in range(substeps):
             time = float(substep + 1) * dt  # at the end of the substep, since the start of the step
+            # ---- Nodes give: the update of the node, and into its slots what it gives to each of its grid nodes.
             momentum, growth, pull = wp.vec3(), wp.mat33(), wp.vec4()
             source = update(
                 tools, b * tools.count, touching, grid, step, time, X, u, v, C, F, Q, force, target, target_v,
@@ -211,6 +214,7 @@ def make_step_kernel(material: str, lanes: int):
                     store_shared(memory, stencil[3 * line + plane] >> 16, wp.vec4(wm[0], wm[1], wm[2], w * (mass + pull[3])))
             wait_for_block()
 
+            # ---- The block adds up what its nodes gave to each grid node of its patch.
             now = slots + (substep % 2) * inbox
             for i in range(ROUNDS):
                 begin, end, sharing = my_sums[4 * i], my_sums[4 * i + 1], my_sums[4 * i + 2]
@@ -223,29 +227,31 @@ def make_step_kernel(material: str, lanes: int):
                         store_shared(memory, now + my_sums[4 * i + 3], total)
             wait_for_block()
 
+            # ---- It sends totals to blocks that have the grid node too, and adds what they sent: the grid's velocities.
             for i in range(ROUNDS):
-                if my_sends[3 * i] >= 0:
-                    total = load_shared(memory, now + my_sends[3 * i])
-                    send(my_sends[3 * i + 1], memory, now + my_sends[3 * i + 2], total, barrier + 8 * (substep % 2))
-            first_shares = four_each()
+                if my_outgoing[3 * i] >= 0:
+                    total = load_shared(memory, now + my_outgoing[3 * i])
+                    send(my_outgoing[3 * i + 1], memory, now + my_outgoing[3 * i + 2], total, barrier + 8 * (substep % 2))
+            first_addends = four_each()
             for i in range(ROUNDS):
                 if thread + i * BLOCK < patch:
                     for k in range(AT_ONCE):
-                        first_shares[AT_ONCE * i + k] = shares[block, k, thread + i * BLOCK]
+                        first_addends[AT_ONCE * i + k] = addends[block, k, thread + i * BLOCK]
             receive(barrier + 8 * (substep % 2), received[block], substep // 2)
             for i in range(ROUNDS):
                 if thread + i * BLOCK < patch:
                     total = wp.vec4()
                     for k in range(AT_ONCE):
-                        total += load_shared(memory, now + first_shares[AT_ONCE * i + k])
-                    for k in range(AT_ONCE, shares.shape[1]):
-                        total += load_shared(memory, now + shares[block, k, thread + i * BLOCK])
+                        total += load_shared(memory, now + first_addends[AT_ONCE * i + k])
+                    for k in range(AT_ONCE, addends.shape[1]):
+                        total += load_shared(memory, now + addends[block, k, thread + i * BLOCK])
                     velocity = wp.vec4()
                     if total[3] > 0.0:
                         velocity = (step.decay / total[3]) * total
                     store_shared(memory, grid_v + thread + i * BLOCK, velocity)
             wait_for_block()
 
+            # ---- Nodes take: velocity and its gradient from the grid, what a tool gave, and the move.
             v = wp.vec3()
             cx, cy, cz = wp.vec3(), wp.vec3(), wp.vec3()  # columns of Σ w v_i (X_i − X_p)ᵀ
             for line in range(wp.static(lines)):
@@ -274,6 +280,7 @@ def make_step_kernel(material: str, lanes: int):
                 moment += wp.cross(X + u, felt)  # where it was given
             move(v, C, dt, u, F)
 
+        # ---- The end of the step, out of the registers.
         if leads != 0:
             if source_tool >= 0:
                 give(tools, (b * tools.count + source_tool) * count + p, impulse, moment)

@@ -11,7 +11,7 @@ from torch import Tensor
 from endo_sim_ros.core.device import cpu_threads, run_in_threads, shares
 from endo_sim_ros.core.kernels import launch_in_shares
 from endo_sim_ros.physics.backends import cpu_kernels
-from endo_sim_ros.physics.backends.base import Action, Launch, SkinData, StepData, Work, array
+from endo_sim_ros.physics.backends.base import Action, Launch, SkinData, StepData, Work, viewed
 from endo_sim_ros.physics.backends.cpu_kernels import LANES, SCRATCH, make_step_kernel, skin_gaussians
 
 SHARED_FROM = 4096  # Gaussians; fewer are done before a second thread has begun
@@ -71,10 +71,10 @@ class CpuBackend:
             covars.copy_(skin.covars)
 
     def skin_work(self, skin: SkinData, maps: Tensor, means: Tensor, covars: Tensor) -> list[Work]:
-        at_rest = [array(skin.means, wp.vec3), array(skin.covars, wp.mat33), array(skin.neighbours), array(skin.weights)]
+        at_rest = [viewed(skin.means, wp.vec3), viewed(skin.covars, wp.mat33), viewed(skin.neighbours), viewed(skin.weights)]
         done: list[Work] = []
         for b in range(len(means)):
-            inputs = [*at_rest, array(maps[b], wp.mat44), *skin[4:], array(means[b], wp.vec3), array(covars[b], wp.mat33)]
+            inputs = [*at_rest, viewed(maps[b], wp.mat44), *skin[4:], viewed(means[b], wp.vec3), viewed(covars[b], wp.mat33)]
             done.append([Launch(skin_gaussians, size, [first, *inputs]) for first, size in shares(len(skin.means), SHARED_FROM)])
         return done
 

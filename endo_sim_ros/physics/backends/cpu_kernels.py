@@ -1,6 +1,6 @@
 """Kernels for a CPU, vectorised: a step of the material point method, all substeps in one launch, and skinning.
 
-The maths is in `plain_kernels` and `skinning_kernels`, the code in native/cpu_step.h and native/skinning.h. Environments are
+The maths is in `plain_kernels` and `node_map_kernels`, the code in native/cpu_step.h and native/skinning.h. Environments are
 independent: different threads may step different ones.
 """
 
@@ -10,10 +10,12 @@ import warp as wp
 
 from endo_sim_ros.core.native import native
 from endo_sim_ros.physics.backends.structs import Grid, Loads, Nodes, RigidTools, State, Substep
+from endo_sim_ros.physics.materials import LEAST_VOLUME
 
 LANES = 16
 SCRATCH = 56  # vectors of scratch for 16 control nodes: 40 components and 16 rows of weights
-OPTIONS = {"default_grid_stride": False, "extra_build_options": native("physics/native/cpu_step.h", CPU_SCRATCH=SCRATCH)}
+HEADER = native("physics/native/cpu_step.h", CPU_SCRATCH=SCRATCH, LEAST_VOLUME=LEAST_VOLUME)
+OPTIONS = {"default_grid_stride": False, "extra_build_options": HEADER}
 SKINNING = {"default_grid_stride": False, "extra_build_options": native("physics/native/skinning.h")}
 
 wp.set_module_options({"enable_backward": False, **SKINNING})
@@ -110,5 +112,5 @@ def skin_gaussians(
     out_means: wp.array[wp.vec3],
     out_covars: wp.array[wp.mat33],
 ):
-    """The Gaussians from the first one on, see `skinning_kernels`; the numbers of a map are one vector."""
+    """The Gaussians from the first one on, see `node_map_kernels`; the numbers of a map are one vector."""
     skin_gaussian(first + wp.tid(), means, covars, neighbours, weights, maps, origin, low, high, out_means, out_covars)

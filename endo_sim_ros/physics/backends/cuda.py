@@ -1,6 +1,6 @@
 """Physics on a GPU: a step is one captured graph, on a GPU with thread block clusters of one launch.
 
-Within `plain_kernels` the same kernels run on a CPU, to compare with the vectorised ones.
+Within `core.kernels.compare_plain` its plain kernels run on a CPU, to compare with the vectorised ones.
 """
 
 import functools
@@ -13,25 +13,25 @@ from torch import Tensor
 
 from endo_sim_ros.core.device import on_torch_stream
 from endo_sim_ros.core.kernels import launch
-from endo_sim_ros.physics.backends import cluster_division as cluster, skin_kernels
-from endo_sim_ros.physics.backends.base import Action, Launch, SkinData, StepData, Work, array, capturing
+from endo_sim_ros.physics.backends import cluster_division as cluster, plain_skinning_kernels
+from endo_sim_ros.physics.backends.base import Action, Launch, SkinData, StepData, Work, capturing, viewed
 from endo_sim_ros.physics.backends.cluster_kernels import make_step_kernel
 from endo_sim_ros.physics.backends.cpu import cpu_action
 from endo_sim_ros.physics.backends.plain_kernels import collect, make_advance_kernel, scatter, update_grid
-from endo_sim_ros.physics.backends.skin_kernels import skin_environments, skin_gaussians
+from endo_sim_ros.physics.backends.plain_skinning_kernels import skin_environments, skin_gaussians
 from endo_sim_ros.physics.backends.structs import Transfer
 
 
 class CudaBackend:
     """Plain Warp kernels, and those of a thread block cluster; see `Backend`."""
 
-    skin_modules = (skin_kernels,)
+    skin_modules = (plain_skinning_kernels,)
 
     def __init__(self, device: str):
         self.device = device
-        self._on_cpu = device == "cpu"
-        self.threads = 1 if self._on_cpu else 512
-        self.prepares_early = self._on_cpu
+        self._comparing = device == "cpu"  # within `compare_plain`
+        self.threads = 1 if self._comparing else 512
+        self.prepares_early = self._comparing
 
     def substeps(self, step: StepData) -> list[Action]:
         """One launch where the control nodes fit into a cluster, otherwise two or three for each substep."""
@@ -39,7 +39,7 @@ class CudaBackend:
 
     def action(self, work: Work) -> Action:
         """A launch; several run in order."""
-        if self._on_cpu:
+        if self._comparing:
             return cpu_action(work)
         if isinstance(work, list):
             actions = [self.action(each) for each in work]
@@ -49,7 +49,7 @@ class CudaBackend:
 
     def record(self, actions: Sequence[Action]) -> Action:
         """The actions as one captured graph."""
-        if self._on_cpu:
+        if self._comparing:
             return lambda: [action() for action in actions]
         with capturing, wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
             for action in actions:
@@ -63,7 +63,7 @@ class CudaBackend:
 
     def load_for_cuts(self, material: str, kinematics: str) -> None:
         """Load the kernels of single substeps: the grid nodes of tissue that is much cut no longer fit into a cluster."""
-        if not self._on_cpu:
+        if not self._comparing:
             for kernel in (make_advance_kernel(material, kinematics), collect):
                 wp.load_module(kernel.module, self.device, block_dim=Launch.block)
 
@@ -75,9 +75,9 @@ class CudaBackend:
         self.over_items(skin_gaussians, len(skin.means), [*skin[:4], maps, *skin[4:], means, covars])
 
     def skin_work(self, skin: SkinData, maps: Tensor, means: Tensor, covars: Tensor) -> list[Work]:
-        at_rest = [array(skin.means, wp.vec3), array(skin.covars, wp.mat33), array(skin.neighbours), array(skin.weights)]
-        outputs = [array(means.view(-1, 3), wp.vec3), array(covars.view(-1, 3, 3), wp.mat33)]
-        inputs = [maps.shape[1], *at_rest, array(maps.view(-1, 4, 4), wp.mat44), *skin[4:], *outputs]
+        at_rest = [viewed(skin.means, wp.vec3), viewed(skin.covars, wp.mat33), viewed(skin.neighbours), viewed(skin.weights)]
+        outputs = [viewed(means.view(-1, 3), wp.vec3), viewed(covars.view(-1, 3, 3), wp.mat33)]
+        inputs = [maps.shape[1], *at_rest, viewed(maps.view(-1, 4, 4), wp.mat44), *skin[4:], *outputs]
         return [Launch(skin_environments, (len(means), len(skin.means)), inputs)]
 
     def _clustered(self, step: StepData) -> list[Action]:
@@ -117,7 +117,7 @@ class CudaBackend:
             ]
             actions: list[Action] = [grid_mv.zero_]
         else:
-            lanes, entries = 1 if self._on_cpu else 32, self._entries(step)
+            lanes, entries = 1 if self._comparing else 32, self._entries(step)
             inputs = [*entries, lanes, step.node_count, step.grid, decay, transfer, grid_v]
             collecting = [self.action(Launch(collect, (step.environments, len(entries[-1]), lanes), inputs))]
             actions = []

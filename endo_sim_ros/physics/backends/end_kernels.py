@@ -43,6 +43,7 @@ def end_step(
     bad, fastest = wp.float64(0.0), float(0.0)
     for p in range(thread, count, threads):
         e = b * count + p
+        # |F| of 100: tissue a hundred times as long has torn, also where its nodes are still within the travel.
         if not (wp.length_sq(state.u[e]) <= travel * travel and wp.ddot(state.F[e], state.F[e]) < 1.0e4):
             bad += wp.float64(1.0)
         fastest = wp.max(fastest, wp.length_sq(state.v[e]))

@@ -76,7 +76,7 @@ template <int unrounded = 0, class T> ENDO_SIM_INLINE T dot(const T* a, const T*
     return a[unrounded] * b[unrounded] + a[other] * b[other] + a[2] * b[2];
 }
 
-// ln x of x >= 0.05, to 1e-7: 2^n (1 + f) with a polynomial in f (that of Cephes' logf).
+// ln x of x >= LEAST_VOLUME, to 1e-7: 2^n (1 + f) with a polynomial in f (that of Cephes' logf).
 template <class T> ENDO_SIM_INLINE T logarithm(T x)
 {
     ENDO_SIM_FUSE(on)

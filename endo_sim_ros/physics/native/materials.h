@@ -9,6 +9,8 @@
 
 namespace endo_sim {
 
+constexpr float LEAST_VOLUME = 0.05f;  // det F below which logarithm and quotients are held
+
 // The cofactor matrix det(F) F⁻ᵀ, which singular F has as well; returns det F.
 template <class T> ENDO_SIM_INLINE T cofactor_of(const T* F, T* out)
 {
@@ -47,7 +49,7 @@ template <class T> ENDO_SIM_INLINE void rotation_of(const T* F, T* R)
     ENDO_SIM_FUSE(on)
     T inverse[9];
     const T J = cofactor_of(F, inverse), size = dot(F, F) + dot(F + 3, F + 3) + dot(F + 6, F + 6);
-    const auto healthy = J > 0.02f * size * root(size);
+    const auto healthy = J > 0.02f * size * root(size);  // 0.19 at rest; below 0.02 the iteration loses digits, measured
     for (int i = 0; i < 9; ++i)  // the identity where this cannot work
         R[i] = healthy ? F[i] : everywhere<T>(i % 4 == 0 ? 1.0f : 0.0f);
     for (int round = 0; round < 12; ++round) {
@@ -86,14 +88,14 @@ struct fixed_corotated {
     }
 };
 
-// P = μ (F − F⁻ᵀ) + λ ln J F⁻ᵀ; below J = 0.05 the resistance is held, as the logarithm has no value there.
+// P = μ (F − F⁻ᵀ) + λ ln J F⁻ᵀ; below LEAST_VOLUME the resistance is held, as the logarithm has no value there.
 struct neo_hookean {
     template <class T> ENDO_SIM_INLINE static T stress(const T* F, T mu, T lam, T* P)
     {
         ENDO_SIM_FUSE(on)
         T inverse_transpose[9];
         cofactor_of(F, inverse_transpose);
-        const T J = dot(F, inverse_transpose), held = larger(J, everywhere<T>(0.05f)), log_J = logarithm(held);
+        const T J = dot(F, inverse_transpose), held = larger(J, everywhere<T>(LEAST_VOLUME)), log_J = logarithm(held);
         for (int i = 0; i < 9; ++i) {
             inverse_transpose[i] /= held;
             P[i] = mu * (F[i] - inverse_transpose[i]) + lam * log_J * inverse_transpose[i];

@@ -66,7 +66,7 @@ template <class T> ENDO_SIM_INLINE void relax(const T* F, T J, float ratio, floa
     ENDO_SIM_FUSE(on)
     T cofactor[9], given[9];
     cofactor_of(F, cofactor);
-    J = larger(J, everywhere<T>(0.05f));
+    J = larger(J, everywhere<T>(LEAST_VOLUME));
     for (int r = 0; r < 3; ++r)
         for (int c = 0; c < 3; ++c) {
             const T S = (cofactor[r] * P[c] + cofactor[3 + r] * P[3 + c] + cofactor[6 + r] * P[6 + c]) / J;

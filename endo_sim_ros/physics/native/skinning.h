@@ -1,6 +1,6 @@
 // Moves one Gaussian by the maps of its control nodes. One definition, for columns in vectors of a CPU and in plain numbers.
 //
-// The maths is in skinning_kernels.py. A map is 16 numbers: the columns of B and c, each padded to four. A column has four
+// The maths is in node_map_kernels.py. A map is 16 numbers: the columns of B and c, each padded to four. A column has four
 // numbers, of which the last is zero.
 #pragma once
 #include "core/native/vector.h"

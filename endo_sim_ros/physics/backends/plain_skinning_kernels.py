@@ -1,4 +1,4 @@
-"""Kernels that move Gaussians by the maps of their control nodes, see `skinning_kernels`. For a GPU."""
+"""Plain kernels that move Gaussians by the maps of their control nodes, see `node_map_kernels`."""
 
 import warp as wp
 

@@ -38,6 +38,8 @@ class Command:
 
     def run(self) -> None:
         """Write model, cameras, checkpoint and the picture of held-out views."""
-        from endo_sim_ros.evaluation.held_out import reconstruct_and_measure
+        from endo_sim_ros.evaluation.held_out import measure_held_out
+        from endo_sim_ros.reconstruction.from_bag import reconstruct_bag
 
-        reconstruct_and_measure(self.bag, self.out, self.config, self.resume)
+        trainer, held_out = reconstruct_bag(self.bag, self.out, self.config, self.resume)
+        measure_held_out(trainer, held_out, self.out)

@@ -187,7 +187,7 @@ class Task(ABC):
         return np.ones(len(self.nodes))
 
     def regions(self) -> tuple[str, ...]:
-        """The same for the first episode, as physics_node's parameter of that name."""
+        """The stiffness of the first episode as physics_node's parameter `regions`; empty where it is 1 everywhere."""
         return ()
 
     def _to_world(self, v: np.ndarray) -> np.ndarray:

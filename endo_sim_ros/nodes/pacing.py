@@ -30,7 +30,7 @@ class Pacer:
         self.skipped = 0
 
     def note_input(self, now: float, source: Hashable = None) -> None:
-        """Input arrived that the next piece of work should use; that of all sources that stream is waited for."""
+        """Note input of a source for the next piece of work, which waits for all sources that stream."""
         self._inputs[source] = self._inputs.get(source, (float("-inf"), float("-inf")))[1], now
         self._fresh.add(source)
         self._ahead = False

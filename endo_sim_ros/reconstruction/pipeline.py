@@ -247,7 +247,7 @@ STAGES: dict[str, Callable[[PreparedScene, ReconstructionConfig, StageProgress],
     "shrinking views": shrink_views,
     "dynamic mask": mask_dynamic,
     "initial model": place_gaussians,
-    "light and exposure": fit_light,
+    "photometry": fit_light,
     "extrapolation": extrapolate_tissue,
 }
 """What `prepare` does, in this order, by the names that progress reports."""

@@ -20,7 +20,7 @@ from endo_sim_ros.core.cameras import save_cameras
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.gaussians import save_ply
 from endo_sim_ros.evaluation.measurement import Row, machine, report
-from endo_sim_ros.graph.client import ARM, CHANGED, PATIENCE, WORLD, Client, Scene, tissue
+from endo_sim_ros.graph.client import ARM, CHANGED, PATIENCE, WORLD, Client, Tissue, tissue
 from endo_sim_ros.graph.processes import NodeGroup
 from endo_sim_ros.messages import PhysicsState
 
@@ -37,7 +37,7 @@ def _parameters(mode: str, rate: float, device: str) -> dict[str, dict[str, Any]
 
 
 @contextmanager
-def _graph(mode: str, scene: Scene, rate: float, device: str, logs: Path) -> Iterator[tuple[Client, NodeGroup]]:
+def _graph(mode: str, scene: Tissue, rate: float, device: str, logs: Path) -> Iterator[tuple[Client, NodeGroup]]:
     """Physics and rendering, each its own process, with a model and a camera, and a client that saw the first image."""
     model, camera, _ = scene
     with NodeGroup(logs) as group:
@@ -63,7 +63,7 @@ def _graph(mode: str, scene: Scene, rate: float, device: str, logs: Path) -> Ite
             try_shutdown()
 
 
-def _realtime(client: Client, scene: Scene, rate: float, changes: int) -> list[Row]:
+def _realtime(client: Client, scene: Tissue, rate: float, changes: int) -> list[Row]:
     """Latency from a wrench that changes to the first image that shows it, while commands stream."""
     client.until(lambda: client.in_state("physics_node", PhysicsState.RUNNING), "the first steps")
     client.command(scene.tip, np.zeros(3), client.now_ns())  # what comes before all are connected arrives late
@@ -100,7 +100,7 @@ def _realtime(client: Client, scene: Scene, rate: float, changes: int) -> list[R
     ]
 
 
-def _in_lockstep(client: Client, scene: Scene, commands: int) -> list[Row]:
+def _in_lockstep(client: Client, scene: Tissue, commands: int) -> list[Row]:
     """Latency from a command to its image, each sent when the last was answered."""
     latencies, began = [], time.perf_counter()
     first = len(client.states)
@@ -119,7 +119,7 @@ def _in_lockstep(client: Client, scene: Scene, commands: int) -> list[Row]:
     ]
 
 
-def _recovery(client: Client, group: NodeGroup, scene: Scene, rate: float, device: str, kills: int) -> list[Row]:
+def _recovery(client: Client, group: NodeGroup, scene: Tissue, rate: float, device: str, kills: int) -> list[Row]:
     """Time from the death of a node, which is started again at once, to pictures that move with the tissue again."""
     with tempfile.TemporaryDirectory() as folder:
         save_ply(scene.model, Path(folder) / "model.ply")
@@ -146,7 +146,7 @@ def _recovery(client: Client, group: NodeGroup, scene: Scene, rate: float, devic
     return rows
 
 
-def _until_pictures_move(client: Client, scene: Scene, rate: float) -> float:
+def _until_pictures_move(client: Client, scene: Tissue, rate: float) -> float:
     """Pull and let go in turn until two pictures differ, and return when the second came."""
     images = client.images
     images.clear()

@@ -26,7 +26,7 @@ class Command:
     """Give up after this long, seconds."""
 
     def run(self) -> None:
-        """Run the demo until its results are written."""
+        """Run the demo until its results are written; raises DemoError or SequenceError if a stage fails."""
         from endo_sim_ros.graph.demo import run_demo
 
         run_demo(self.bag, self.out, self.seed, self.frames, self.width, self.iterations, self.force, self.timeout)

@@ -37,7 +37,9 @@ class Command:
     config: Annotated[ReconstructionConfig, tyro.conf.arg(name="")] = field(default_factory=_named_preset)
 
     def run(self) -> None:
-        """Write model, cameras, checkpoint and the picture of held-out views."""
-        from endo_sim_ros.evaluation.held_out import reconstruct_and_measure
+        """Write model, cameras, checkpoint and picture; raises SequenceError if bag or checkpoint cannot be used."""
+        from endo_sim_ros.evaluation.held_out import measure_held_out
+        from endo_sim_ros.reconstruction.from_bag import reconstruct_bag
 
-        reconstruct_and_measure(self.bag, self.out, self.config, self.resume)
+        trainer, held_out = reconstruct_bag(self.bag, self.out, self.config, self.resume)
+        measure_held_out(trainer, held_out, self.out)

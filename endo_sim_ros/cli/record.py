@@ -20,7 +20,7 @@ class Command:
     """Namespace of the graph; the bag has the names without it."""
 
     def run(self) -> None:
-        """Record until interrupted."""
+        """Record until interrupted; raises SequenceError or ConfigError if bag, topics or arms cannot be used."""
         from endo_sim_ros.nodes.recorder_node import record
 
         record(self.out, self.arms, self.topics, self.namespace)

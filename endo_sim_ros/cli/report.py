@@ -14,7 +14,7 @@ class Command:
     """Folder that `endo-sim evaluate` wrote; report.html goes there, too."""
 
     def run(self) -> None:
-        """Write the page and print its path."""
+        """Write the page and print its path; raises ValueError if the folder holds no results."""
         from endo_sim_ros.evaluation.page import write_page
 
         print(write_page(self.run_folder))

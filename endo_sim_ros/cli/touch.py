@@ -21,7 +21,7 @@ class Command:
     config: Annotated[PhysicsConfig, tyro.conf.arg(name="")] = field(default_factory=PhysicsConfig)
 
     def run(self) -> None:
-        """Draw the picture."""
+        """Draw the picture; raises ValueError if model, cameras or options cannot be used."""
         from endo_sim_ros.evaluation.interaction_sheet import draw_touches
 
         draw_touches(self.model, self.out, self.config)

@@ -24,7 +24,7 @@ class Command:
     """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""
 
     def run(self) -> None:
-        """Serve the page until interrupted."""
+        """Serve the page until interrupted; raises ValueError if model, cameras or options cannot be used."""
         from endo_sim_ros.viewer.standalone import view
 
         physics = PhysicsConfig(device=self.device)

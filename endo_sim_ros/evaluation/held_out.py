@@ -1,4 +1,4 @@
-"""Views that were not trained on, measured; `endo-sim reconstruct`."""
+"""Views that were not trained on, measured."""
 
 import logging
 from collections.abc import Sequence
@@ -7,23 +7,19 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from rich.progress import Progress as ProgressBar
 
 from endo_sim_ros.core import drawing
-from endo_sim_ros.core.cameras import Camera, save_cameras
+from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame
-from endo_sim_ros.core.gaussians import GaussianModel, save_ply
+from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.evaluation.lpips import Lpips
-from endo_sim_ros.reconstruction import Progress, ReconstructionConfig, Trainer, prepare, scene_points, select_keyframes, shrink
-from endo_sim_ros.reconstruction.progress import StageProgress
+from endo_sim_ros.reconstruction import Trainer, shrink
 from endo_sim_ros.reconstruction.triangulation import points_in_view
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
-from endo_sim_ros.sequences.bag import read_bag
 
 log = logging.getLogger(__name__)
 
-_REPORTS, _CHECKPOINTS = 20, 10  # iterations between looks at the progress; checkpoints of a reconstruction
 _STRIPS = 3  # held-out views shown in the picture
 _SAME_SURFACE = 0.03  # relative difference of depth within which two views see the same surface
 
@@ -145,48 +141,21 @@ def difference(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
     return np.abs(image.astype(int) - reference).clip(0, 85).astype(np.uint8) * 3
 
 
-def reconstruct_and_measure(bag: Path, out: Path, config: ReconstructionConfig, resume: bool = False) -> dict[str, float]:
-    """Reconstruct a bag, save the model, and return mean figures over the views that were not trained on.
+def measure_held_out(trainer: Trainer, frames: Sequence[Frame], out: Path) -> dict[str, float]:
+    """Mean figures over frames that were not trained on; also logs them, and draws some of the frames.
 
-    A checkpoint is written every tenth of the way; ``resume`` goes on from it, to the same model.
+    Args:
+        trainer: Finished training; `reconstruct_bag` returns it with the frames.
+        frames: Frames that were held out; those without tissue do not count.
+        out: Folder for held_out.png.
     """
-    frames = list(read_bag(bag))
-    out.mkdir(parents=True, exist_ok=True)  # before the long work
-    chosen = select_keyframes(frames, config.keyframes)
-    log.info("%d views, training on %d", len(frames), len(chosen))
-    with ProgressBar() as bar:
-        task = bar.add_task("preparing", total=None)
-
-        def on_stage(stage: str, done: int, total: int) -> None:
-            bar.update(task, description=stage, completed=done, total=total or None)
-
-        points = None
-        if len(chosen) < len(frames):
-            points = scene_points(frames, options=config.matching, progress=StageProgress("scene points", on_stage))
-        trainer = Trainer(prepare([frames[index] for index in chosen], config, points, on_stage), config)
-    if resume:
-        trainer.load_checkpoint(out / "checkpoint.pt")
-        log.info("going on after %d iterations", trainer.iteration)
-    iterations = trainer.config.iterations
-    with ProgressBar() as bar:
-        task = bar.add_task("reconstructing", total=iterations)
-
-        def on_progress(progress: Progress) -> None:
-            text = f"reconstructing, {progress.gaussians} Gaussians, loss {progress.loss:.4f}"
-            bar.update(task, completed=progress.iteration, description=text)
-            if progress.iteration % max(iterations // (_CHECKPOINTS * _REPORTS) * _REPORTS, _REPORTS) == 0:
-                trainer.save_checkpoint(out / "checkpoint.pt")
-
-        model = trainer.run(on_progress, _REPORTS)
-    save_ply(model, out / "model.ply")
-    save_cameras([frames[index].camera for index in chosen if frames[index].stamp_ns in trainer.stamps], out / "cameras.json")
-    trainer.save_checkpoint(out / "checkpoint.pt")
-    held_out = [shrink(frame, config.image_width) for index, frame in enumerate(frames) if index not in chosen]
+    held_out = [shrink(frame, trainer.config.image_width) for frame in frames]
     held_out = [frame for frame in held_out if frame.mask is None or frame.mask.any()]
     if not held_out:
-        log.info("no view was held out that shows tissue%s", "; lower keyframes" if len(chosen) > 1 else "")
+        log.info("no view was held out that shows tissue%s", "; lower keyframes" if len(trainer.stamps) > 1 else "")
         return {}
-    renderer, drift = model_renderer(model, config.device), trainer.drift
+    model, drift = trainer.model, trainer.drift
+    renderer = model_renderer(model, trainer.config.device)
     rows, pictures = [], []
     shown = {int(i) for i in np.linspace(0, len(held_out) - 1, min(_STRIPS, len(held_out)))}
     for index, frame in enumerate(held_out):

@@ -92,7 +92,7 @@ def divide_points(points: ScenePoints) -> tuple[ScenePoints, np.ndarray | None]:
 
 
 def _trusted(frame: Frame) -> np.ndarray | None:
-    """Matched depth [H, W] (m, 0 = none) where half a pixel of disparity is less than a twentieth of it; None if that is nowhere."""
+    """Matched depth [H, W] (m, 0 = none) where the disparity is above 10 pixels: half a pixel is 5 % of it. None if that is nowhere."""
     if frame.depth is None or frame.baseline is None:
         return None
     trusted = np.where(frame.depth < frame.camera.K[0, 0] * frame.baseline / 10, frame.depth, 0)

@@ -62,7 +62,11 @@ class Client(Watcher):
         self._senders[topic].publish(message)
 
     def command(self, tip: np.ndarray, force: np.ndarray, stamp: int) -> None:
-        """Send the tip's position [3] (m) and the force on the tissue [3] (N), world, with a stamp in ns."""
+        """Send the tip's position [3] (m) and the force on the tissue [3] (N), world, with a stamp in ns.
+
+        Raises:
+            RuntimeError: If nobody subscribes.
+        """
         pose = np.eye(4)
         pose[:3, 3] = tip
         self.send(messages.tool_pose(ARM), messages.encode_pose(pose, stamp, WORLD))
@@ -90,7 +94,7 @@ class Client(Watcher):
         return float(self.value(node, key, "nan"))
 
 
-class Scene(NamedTuple):
+class Tissue(NamedTuple):
     """Tissue to touch, and the camera that sees it."""
 
     model: GaussianModel
@@ -110,7 +114,7 @@ def depth_of(frame: Frame) -> np.ndarray:
     return frame.depth
 
 
-def tissue(gaussians: int, width: int, height: int) -> Scene:
+def tissue(gaussians: int, width: int, height: int) -> Tissue:
     """The synthetic patient as so many Gaussians, in an image of this size in pixels."""
     (frame,) = phantom_sequence(PhantomConfig(frames=1, width=width, height=height, stereo=False))
     depth = depth_of(frame)
@@ -124,4 +128,4 @@ def tissue(gaussians: int, width: int, height: int) -> Scene:
         torch.from_numpy(radii).float(),
         opacity=0.9,
     )
-    return Scene(model, frame.camera, points[height // 2, width // 2])
+    return Tissue(model, frame.camera, points[height // 2, width // 2])

@@ -32,7 +32,12 @@ class Scene:
         return self.cameras[0].at(self.cameras[len(self.cameras) // 2].pose)
 
     def nodes(self, config: PhysicsConfig) -> ControlNodes:
-        """The tissue's nodes: those that physics_node makes of the same files, whose cameras all have the same intrinsics."""
+        """The tissue's control nodes at rest, m, world: those that physics_node makes of the same files.
+
+        Raises:
+            ValueError: If the model gives no control nodes, as `build_control_nodes` says.
+        """
+        # On the wire all cameras have the intrinsics of one.
         cameras = [self.camera.at(camera.pose) for camera in self.cameras]
         return build_control_nodes(self.model, np.stack([camera.position for camera in cameras]), config, cameras, render_depth)
 

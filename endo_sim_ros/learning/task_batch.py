@@ -104,7 +104,7 @@ class TaskBatch:
     def step(
         self, actions: np.ndarray, renew: Sequence[int] = (), generators: Sequence[np.random.Generator] = ()
     ) -> tuple[np.ndarray | dict[str, np.ndarray], Outcome]:
-        """Take one step with actions [B, 4]; episodes to be renewed, each by its generator, are at their beginning afterwards instead.
+        """Take one step with actions [B, 4]. The episodes in ``renew`` take none: each begins anew, by the chance of its generator.
 
         Returns:
             What `observe` gives at the end of the step, and its outcome.

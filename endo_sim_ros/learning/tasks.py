@@ -161,18 +161,21 @@ class Task(ABC):
         """How near to the goal each episode is [B]; the reward of a step is how much it grows."""
 
     @abstractmethod
-    def _solved(self) -> np.ndarray:
-        """Whether each episode has reached its goal [B]."""
+    def _judge_goal(self) -> np.ndarray:
+        """Count the step towards the goal, and tell whether each episode has reached it [B]; `judge` calls this once a step."""
 
     def _ended(self) -> np.ndarray:
         """Whether an episode has ended by its own action [B]."""
         return np.zeros(self.count, bool)
 
     def judge(self) -> Outcome:
-        """The outcome of the step whose end was just observed. Reward: progress, 1 for success, -1 for too much force."""
+        """The outcome of a step. Reward: progress, 1 for success, -1 for too much force.
+
+        Call it once a step, after `observe`, which stores the force and the positions that are judged.
+        """
         hurt = _norm(self.force) > self.force_limit
         truncated = self.steps >= self.horizon
-        success = self._solved() & ~hurt
+        success = self._judge_goal() & ~hurt
         value = self._value()
         reward = value - self._potential + success - hurt
         self._potential = value
@@ -184,7 +187,7 @@ class Task(ABC):
         return np.ones(len(self.nodes))
 
     def regions(self) -> tuple[str, ...]:
-        """The same for the first episode, as physics_node's parameter of that name."""
+        """The stiffness of the first episode as physics_node's parameter `regions`; empty where it is 1 everywhere."""
         return ()
 
     def _to_world(self, v: np.ndarray) -> np.ndarray:
@@ -242,9 +245,10 @@ class Retraction(Task):
     def _value(self) -> np.ndarray:
         distance = _norm(self._spot)
         grasped = (self.fourth > 0) & (distance <= self.grasp_radius)
+        # 2 for the lift, 0.5 for the grasp, −1 for each 2 cm from the spot: coming near, grasping and lifting each pay at once.
         return np.minimum(self._moved[:, 2] / self.lift, 1.0) * 2 - distance / LENGTH + 0.5 * grasped
 
-    def _solved(self) -> np.ndarray:
+    def _judge_goal(self) -> np.ndarray:
         self._held = np.where(self._moved[:, 2] >= self.lift, self._held + 1, 0)
         return self._held >= self.hold
 
@@ -316,9 +320,10 @@ class Palpation(Task):
 
     def _value(self) -> np.ndarray:
         found = np.where(self._most > self.touch, np.maximum(1 - self._off(self._where) / self.patch, -1.0), 0.0)
+        # Up to 3 for feeling the most over the inclusion, so that the search pays before the report, which is worth up to 1.
         return 3 * found + np.where(self._ended(), 1 - self._off(self.tip[:, :2]) / self.patch, 0.0)
 
-    def _solved(self) -> np.ndarray:
+    def _judge_goal(self) -> np.ndarray:
         return self._ended() & (self._off(self.tip[:, :2]) <= self.tolerance)
 
     def stiffness(self, b: int) -> np.ndarray:

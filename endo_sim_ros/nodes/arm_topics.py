@@ -34,7 +34,7 @@ class ArmTopics:
         self._pose_topic = messages.tool_pose_command if commanded else messages.tool_pose
         self._reactions = {name: node.publisher(messages.tool_reaction(name)) for name in arms}
         shown = messages.tool_pose, messages.tool_setpoint, messages.tool_jaw_state, messages.tool_jaw_setpoint, messages.tool_state
-        self._publishers = {name: [node.publisher(topic(name)) for topic in shown] for name in arms if commanded}
+        self._publishers = {name: {topic: node.publisher(topic(name)) for topic in shown} for name in arms if commanded}
         self._told: dict[str, tuple[str, bool, bool]] = {}  # what was last said on operating_state
         several = max(depth, STREAM_DEPTH)  # for what comes once
         for arm in arms.values():
@@ -131,12 +131,12 @@ class ArmTopics:
             asked: Name of an arm that received a command: its state is published in any case, as clients of CRTK wait for
                 a message after their command.
         """
-        for name, (*_, publisher) in self._publishers.items():
+        for name, publishers in self._publishers.items():
             arm = self._arms[name]
             state = arm.state, arm.homed, arm.busy
             if name == asked or self._told.get(name) != state:
                 self._told[name] = state
-                publisher.publish(messages.encode_operating_state(*state, self._node.now_ns()))
+                publishers[messages.tool_state].publish(messages.encode_operating_state(*state, self._node.now_ns()))
 
     def publish(self, arm: Arm, pose: np.ndarray, reaction: np.ndarray, torque: np.ndarray, stamp: int) -> None:
         """Publish what an arm feels and, if it is commanded, where it is.
@@ -151,8 +151,8 @@ class ArmTopics:
         axes = pose[:3, :3].T  # the reaction is given in the axes of the tool
         self._reactions[arm.name].publish(messages.encode_wrench(axes @ reaction, axes @ torque, stamp, arm.name))
         if arm.name in self._publishers:
-            *poses, jaw_state, jaw_setpoint, _ = self._publishers[arm.name]
-            for publisher in poses:  # an ideal arm is where it is told to be
-                publisher.publish(messages.encode_pose(pose, stamp, self.options.world_frame))
-            for publisher in (jaw_state, jaw_setpoint):
-                publisher.publish(messages.encode_jaw(arm.angle, stamp))
+            publishers = self._publishers[arm.name]
+            for topic in (messages.tool_pose, messages.tool_setpoint):  # an ideal arm is where it is told to be
+                publishers[topic].publish(messages.encode_pose(pose, stamp, self.options.world_frame))
+            for topic in (messages.tool_jaw_state, messages.tool_jaw_setpoint):
+                publishers[topic].publish(messages.encode_jaw(arm.angle, stamp))

@@ -35,7 +35,7 @@ _ERROR_SHOWN = 5.0  # seconds that an error stays on /diagnostics, and that its 
 _MOST_LOGGED = 10  # different errors logged in that time: one whose text differs at 500 Hz must not flood the log
 _LONGEST_ERROR = 1000  # characters; a sentence may quote what came, and that may be megabytes
 _END_WITHIN = 3.0  # seconds that worker threads have to end before the process ends without them
-STREAM_DEPTH = 20
+STREAM_DEPTH = 20  # messages that wait for a slow subscriber: 0.7 s of a camera at 30 Hz
 
 
 class EndoNode(ConfiguredNode):
@@ -75,6 +75,9 @@ class EndoNode(ConfiguredNode):
             callback: Called with each message.
             depth: Messages that wait while a callback runs; the oldest is dropped.
             reliable: Have lost messages repeated.
+
+        Raises:
+            MessageError: If the type of the topic is not installed.
         """
 
         def guarded(message: Any) -> None:

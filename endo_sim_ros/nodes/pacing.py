@@ -5,6 +5,13 @@ from typing import Any, Generic, TypeVar
 
 MOST_WAITING = 1000  # commands; beyond it the oldest is given up, so that nothing grows without bound
 
+# In periods:
+_SET_BACK = 3  # work that ran a period early is next due in two; a clock that is further behind was set back
+_STREAMING = 3  # a source with two inputs within this time streams, even if one came late or was lost
+_STALL = 0.5  # asked more seldom, the caller was busy, and input may have come that it has not noted yet
+_BELATED = 0.5  # input that is this much older than the newest belongs to the inputs before
+_EARLIEST, _LATEST = -1.0, 0.5  # from the due time: when complete fresh input is used, and until when streaming input is waited for
+
 
 class Pacer:
     """Once a period on average, at the moment that serves best: work runs as soon as fresh input is there, up to a period
@@ -23,28 +30,28 @@ class Pacer:
         self.skipped = 0
 
     def note_input(self, now: float, source: Hashable = None) -> None:
-        """Input arrived that the next piece of work should use; that of all sources that stream is waited for."""
+        """Note input of a source for the next piece of work, which waits for all sources that stream."""
         self._inputs[source] = self._inputs.get(source, (float("-inf"), float("-inf")))[1], now
         self._fresh.add(source)
         self._ahead = False
 
     def is_due(self, now: float, period: float) -> bool:
         """Whether the work should run at this time, seconds of any clock; if so it is taken to run now."""
-        if self._due is None or now < self._due - 3 * period:  # the first time, or the clock went back
+        if self._due is None or now < self._due - _SET_BACK * period:  # the first time, or the clock went back
             self._due = now
             self._inputs.clear()
             self._fresh.clear()
         asked, self._asked = self._asked, now
-        stalled = now - asked > period / 2
-        streaming = {source for source, (before, _) in self._inputs.items() if (asked if stalled else now) - before < 3 * period}
+        stalled = now - asked > _STALL * period
+        streaming = {source for source, (before, _) in self._inputs.items() if (asked if stalled else now) - before < _STREAMING * period}
         newest = max((self._inputs[source][1] for source in self._fresh), default=now)
-        belated = {source for source in self._fresh if newest - self._inputs[source][1] > period / 2}
-        self._fresh -= belated  # they belonged to the inputs before
+        belated = {source for source in self._fresh if newest - self._inputs[source][1] > _BELATED * period}
+        self._fresh -= belated
         complete = bool(self._fresh) and streaming <= self._fresh
         if stalled and streaming and not complete:
             return False  # what came meanwhile is noted first
-        early = -1.0 if complete and not self._ahead else 0.5 if streaming else 0.0
-        if now < self._due + early * period - 1e-9:
+        offset = _EARLIEST if complete and not self._ahead else _LATEST if streaming else 0.0
+        if now < self._due + offset * period - 1e-9:
             self._ahead = complete
             return False
         missed = max(int((now - self._due) / period), 0)
@@ -110,7 +117,7 @@ class CommandQueue(Generic[Part]):
         return stamp, self._waiting.pop(stamp)
 
     def missing(self) -> tuple[int, set[Part]] | None:
-        """Stamp and missing parts of the earliest command that waits."""
+        """Stamp (ns) and missing parts of the earliest command that waits, or None."""
         if not self._waiting:
             return None
         stamp = min(self._waiting)

@@ -181,7 +181,7 @@ class PhysicsNode(EndoNode):
         self._publish(simulation, self.now_ns())
 
     def _start_timing(self) -> None:
-        """Time before this was not meant to be simulated."""
+        """Begin to measure and to pace anew: the time before this was not meant to be simulated."""
         self._pacer.restart()
         self._window, self._real_time_factor = None, 1.0
 

@@ -112,7 +112,7 @@ class RenderingNode(EndoNode):
             self._change()
 
     def _change(self) -> None:
-        """What is shown is out of date."""
+        """Mark what is shown as out of date."""
         if not self._dirty:
             self._dirty = True
             self._pacer.note_input(time.monotonic())
@@ -170,7 +170,7 @@ class RenderingNode(EndoNode):
         self._publish(*self._output, self._last_stamp)
 
     def _stamp(self, bound: BoundModel) -> int:
-        """Real time: when the state that is shown was so; now, if there was an image of that time already."""
+        """Real time: the stamp of an image, ns. It is that of the state that is shown, or now if an earlier image has that already."""
         now = self.now_ns()
         return self._nodes_stamp if bound.follows(self._nodes) and self._last_stamp < self._nodes_stamp <= now else now
 

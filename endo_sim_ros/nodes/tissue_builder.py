@@ -100,8 +100,9 @@ class TissueBuilder:
         self._background.stop()
 
     def _viewpoint(self) -> tuple[str, np.ndarray | None]:
-        """Whose position the tissue was seen from, and that position or positions [V, 3], m, world, or None as long as it
-        may still arrive: the model's own cameras, else the camera now, else the cameras of an earlier model."""
+        """From where the tissue was seen: a name, and positions [3] or [V, 3], m, world, or None while they may still arrive.
+
+        The model's own cameras come first, then the camera now, then the cameras of an earlier model."""
         stamp, poses = self._views
         own = stamp == self._model_stamp
         whole = own and (not len(poses) or self._own_cameras())

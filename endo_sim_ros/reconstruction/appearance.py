@@ -33,7 +33,7 @@ class Appearance:
         self.set(self._prior, first)
 
     def set(self, light: Tensor, exposures: Tensor) -> None:
-        """Start optimising these, as far as there is such a thing."""
+        """Start optimising the light [4] and the log exposures [V, 3], each if the options ask for it."""
         config = self._config
         self.tensors = {
             "light": light.clone().requires_grad_(config.light),

@@ -162,7 +162,7 @@ class ReconstructionConfig(StageConfig):
     device: str = "auto"
     """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""
 
-    # Of the stages that prepare the scene, in their order.
+    # Of the stages that prepare the scene, in their order. Where a switch above has the name of the stage, its options have another.
     views: UsableViewsConfig = UsableViewsConfig()
     matching: MatchingConfig = MatchingConfig()
     poses: PosesConfig = PosesConfig()

@@ -9,7 +9,7 @@ def select_keyframes(frames: list[Frame], count: int, scene_depth: float = 0.1) 
     """Indices, in order, of at most ``count`` views that spread over the camera path.
 
     Greedy farthest-point choice, beginning with the first and the last view; the distance between two poses is the
-    translation plus the shift that a rotation gives a point at ``scene_depth`` (metres).
+    translation plus the shift that a rotation gives a point at ``scene_depth`` (metres), by default a usual distance of a laparoscope.
     """
     if count >= len(frames):
         return list(range(len(frames)))

@@ -17,7 +17,7 @@ from endo_sim_ros.reconstruction.stage_configs import PhotometryConfig
 
 @dataclass(frozen=True)
 class Drift:
-    """What of the exposures of the training views their brightness does not explain, which comes and goes with time.
+    """The part of the exposures of the training views that the automatic exposure does not explain. It changes with time.
 
     Args:
         stamps_ns: Of the views [V], when they were taken.
@@ -28,7 +28,7 @@ class Drift:
     residuals: np.ndarray
 
     def at(self, light: Light | None, stamp_ns: int) -> Light | None:
-        """The light at another time of the recording: in between views as time has it, before and after as in the nearest."""
+        """The light at a time of the recording: interpolated between the views, constant before the first and after the last."""
         if light is None:
             return None
         times = sorted(set(self.stamps_ns))
@@ -61,7 +61,7 @@ def fit_light(
         reference: Distance at which brightness is the point's own, metres.
         tolerance: Relative difference from a view's depth from which on a point is taken to be hidden there.
         options: The prior, and which observations count.
-        light, exposure: Whether there is such a thing; zero without.
+        light, exposure: Whether to fit each; what is not fitted stays at zero.
         progress: Reported to by views.
     """
     points = points[:: max(-(-len(points) // options.max_points), 1)]

@@ -107,12 +107,13 @@ def match_views(scene: PreparedScene, config: ReconstructionConfig, progress: St
 
 
 def check_poses(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
-    """Leave out views whose poses contradict the others, with measured depth if there is any."""
-    while not _judged_by_stereo(scene, config):
-        depths = [frame.depth for frame in scene.frames]
-        wrong = misposed(scene.frames, scene.matches, depths, config.poses, config.matching, progress)
-        if not wrong:
-            break
+    """Leave out views whose poses contradict the others, by their matches and by measured depth if there is any.
+
+    With pairs of images, `check_poses_by_stereo` does this later: their depth tells more.
+    """
+    if _checked_by_stereo(scene, config):
+        return scene
+    while wrong := _misposed(scene, [frame.depth for frame in scene.frames], config, progress):
         scene = match_views(_without(scene, wrong), config, progress)
     return scene
 
@@ -132,12 +133,12 @@ def find_depth(scene: PreparedScene, config: ReconstructionConfig, progress: Sta
 
 def check_poses_by_stereo(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """As `check_poses`, with the depth that each view's own pair of images tells, which does not depend on the poses."""
-    while _judged_by_stereo(scene, config):
-        depths = [view.depth_prior for view in scene.views]
-        wrong = misposed(scene.views, scene.matches, depths, config.poses, config.matching, progress)
+    while _checked_by_stereo(scene, config):
+        wrong = _misposed(scene, [view.depth_prior for view in scene.views], config, progress)
         if not wrong:
             break
         scene = _without(scene, wrong)
+        # `_without` has dropped matches, points and depth. Every stage that finds them runs again, and `check_poses` if no pair is left.
         for stage in (match_views, check_poses, find_points, find_depth):
             scene = stage(scene, config, progress)
     return scene
@@ -148,8 +149,15 @@ def refine_across_views(scene: PreparedScene, config: ReconstructionConfig, prog
     if not config.multi_view_refinement or scene.depth_source in ("topic", "none"):
         return scene
     fine = [shrink(view, config.multi_view.width_factor * config.image_width) for view in scene.views]
-    options = config.multi_view, config.stereo, config.interpolation
-    refined = refine_depth(fine, scene.points, scene.depth_source, *options, progress)
+    refined = refine_depth(
+        fine,
+        scene.points,
+        scene.depth_source,
+        options=config.multi_view,
+        stereo=config.stereo,
+        interpolation=config.interpolation,
+        progress=progress,
+    )
     return replace(scene, views=tuple(refined))
 
 
@@ -166,13 +174,25 @@ def mask_dynamic(scene: PreparedScene, config: ReconstructionConfig, progress: S
 
 
 def place_gaussians(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
-    """Place the Gaussians that training starts from, and measure the depth of the scene."""
+    """Set `model` to the Gaussians that training starts from, `depth` to their median depth in the views, and `exposures` to zeros.
+
+    Raises:
+        SequenceError: If neither depth nor scene points give the scene a shape.
+    """
     most = max(int(config.initial.seen_share * config.max_gaussians) if config.extrapolation else config.max_gaussians, 1)
     views, points = scene.views, scene.points
     if config.initialization == "points":
         views = [replace(view, depth_prior=None) for view in views]
-    about = config.depth_tolerance, most, config.sh_degree, config.initial, progress
-    model = initial_model(views, points.positions, points.colors, *about)
+    model = initial_model(
+        views,
+        points.positions,
+        points.colors,
+        tolerance=config.depth_tolerance,
+        max_gaussians=most,
+        sh_degree=config.sh_degree,
+        options=config.initial,
+        progress=progress,
+    )
     positions = model.means.numpy().astype(np.float64)
     depths = np.concatenate([view.camera.project(positions)[1] for view in views])
     return replace(scene, model=model, depth=float(np.median(depths[depths > 0])), exposures=np.zeros((len(views), 3)))
@@ -182,9 +202,16 @@ def fit_light(scene: PreparedScene, config: ReconstructionConfig, progress: Stag
     """Fit the light and each view's exposure, and take both out of the Gaussians' colours."""
     if not (config.light or config.exposure):
         return scene
-    about = scene.depth, config.depth_tolerance, config.photometry
-    means = scene.model.means.numpy().astype(np.float64)
-    light, exposures = photometry.fit_light(scene.views, means, *about, light=config.light, exposure=config.exposure, progress=progress)
+    light, exposures = photometry.fit_light(
+        scene.views,
+        points=scene.model.means.numpy().astype(np.float64),
+        reference=scene.depth,
+        tolerance=config.depth_tolerance,
+        options=config.photometry,
+        light=config.light,
+        exposure=config.exposure,
+        progress=progress,
+    )
     model = photometry.remove_light(scene.model, scene.views, light, exposures, scene.depth, config.depth_tolerance)
     return replace(scene, model=model, light=light, exposures=exposures)
 
@@ -193,9 +220,19 @@ def extrapolate_tissue(scene: PreparedScene, config: ReconstructionConfig, progr
     """Add Gaussians in the holes of the depth prior and beyond the pictures."""
     if not config.extrapolation:
         return scene
-    lit = scene.light, scene.exposures, scene.depth
-    options = config.extrapolated, config.interpolation, progress
-    model = extrapolate(scene.model, scene.views, scene.points.positions, *lit, config.extrapolation, config.max_gaussians, *options)
+    model = extrapolate(
+        scene.model,
+        scene.views,
+        scene.points.positions,
+        light=scene.light,
+        exposures=scene.exposures,
+        reference=scene.depth,
+        reach=config.extrapolation,
+        max_gaussians=config.max_gaussians,
+        options=config.extrapolated,
+        interpolation=config.interpolation,
+        progress=progress,
+    )
     return replace(scene, model=model)
 
 
@@ -210,7 +247,7 @@ STAGES: dict[str, Callable[[PreparedScene, ReconstructionConfig, StageProgress],
     "shrinking views": shrink_views,
     "dynamic mask": mask_dynamic,
     "initial model": place_gaussians,
-    "light and exposure": fit_light,
+    "photometry": fit_light,
     "extrapolation": extrapolate_tissue,
 }
 """What `prepare` does, in this order, by the names that progress reports."""
@@ -251,6 +288,12 @@ def _stamps(frames: Sequence[Frame]) -> str:
     return ", ".join(f"{frame.stamp_ns * 1e-9:.3f} s" for frame in frames)
 
 
-def _judged_by_stereo(scene: PreparedScene, config: ReconstructionConfig) -> bool:
-    """Whether poses are judged with the depth of stereo matching."""
+def _misposed(
+    scene: PreparedScene, depths: Sequence[np.ndarray | None], config: ReconstructionConfig, progress: StageProgress
+) -> list[int]:
+    return misposed(scene.frames, scene.matches, depths, options=config.poses, matching=config.matching, progress=progress)
+
+
+def _checked_by_stereo(scene: PreparedScene, config: ReconstructionConfig) -> bool:
+    """Whether the check of poses waits for the depth that pairs of images give."""
     return config.depth in ("auto", "stereo") and any(frame.right is not None for frame in scene.frames)

@@ -29,9 +29,9 @@ def misposed(
 ) -> list[int]:
     """Indices of the views whose poses contradict most of the views that they share features with.
 
-    Matches of two views that fit one motion of the camera, whichever, must fit the given one; and what three views share must be one
-    point each, which a pose wrong along the line of sight fails. Where views contradict each other and nobody can tell which is
-    wrong, that is logged, and none is named.
+    Matches of two views that fit some motion of the camera must fit the given one. A feature that three views share must be one
+    point, which fails where a pose is wrong along the line of sight. Where views contradict each other and nothing tells which one
+    is wrong, that is logged, and none is named.
 
     Args:
         frames: Posed views.
@@ -113,7 +113,7 @@ class _PoseCheck:
     def outvoted(self, errors: Sequence[tuple[_Views, float]]) -> list[int]:
         """The views that most of their groups contradict, of groups of views and the error of each.
 
-        None if no more than as many others agree with each other.
+        Empty unless more other views agree with each other than are found wrong.
         """
         if not errors:
             return []

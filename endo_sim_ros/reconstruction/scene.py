@@ -135,6 +135,7 @@ def shrink(frame: AnyFrame, width: int) -> AnyFrame:
     average = lambda image: cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     # Plain INTER_NEAREST takes the corner instead of the centre.
     nearest = lambda depth: cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT)
+    all_tissue = 0.999  # share of a pixel: an average of ones may be rounded
     depths = {name: getattr(frame, name, None) for name in ("depth", "depth_prior")}
     scale = np.diag([size[0] / camera.width, size[1] / camera.height, 1])
     return dataclasses.replace(
@@ -143,6 +144,6 @@ def shrink(frame: AnyFrame, width: int) -> AnyFrame:
         camera=camera.resized(*size),
         right=None if frame.right is None else average(frame.right),
         right_K=None if frame.right_K is None else scale @ frame.right_K,
-        mask=None if frame.mask is None else np.uint8(255) * (average(np.float32(frame.mask > 0)) > 0.999),
+        mask=None if frame.mask is None else np.uint8(255) * (average(np.float32(frame.mask > 0)) > all_tissue),
         **{name: nearest(depth) for name, depth in depths.items() if depth is not None},
     )

@@ -72,7 +72,7 @@ class StereoConfig(StageConfig):
     min_area: Annotated[float, Range(0, 1)] = 0.003
     """Share of the image below which a patch of disparity that is like none around it is a wrong match."""
     max_row_offset: Annotated[float, Range(0, 0.5, "heights of the image")] = 0.01
-    """Farthest that rectification may have left the rows of the two images apart; of matches farther apart none is right."""
+    """Largest distance between the rows of a match after rectification; matches that are farther apart are wrong."""
     own_offset_points: Annotated[int, Range(1, 100_000)] = 100
     """Scene points from which on a view has an offset of its own: poses and baselines of views err differently, but their points err
     alike."""
@@ -98,13 +98,13 @@ class InterpolationConfig(StageConfig):
     cell: Annotated[float, Range(0.001, 0.2, "widths of the image")] = 1 / 80
     """Side of the cells that values are told for, and the spacing of extrapolated Gaussians."""
     pixel_error: Annotated[float, Range(0, 10, "widths of the image")] = 1 / 128
-    """How far apart tissue differs in inverse depth as much as a known pixel errs."""
+    """Error of a known pixel, as the distance in the image over which inverse depth usually changes by as much."""
     point_error: Annotated[float, Range(0, 10, "widths of the image")] = 1 / 8
-    """The same for a scene point: the larger, the smoother is what lies between them."""
+    """The same for a scene point. A larger value gives a smoother surface between the points."""
     neighbours: Annotated[int, Range(1, 1000)] = 40
     """Pixels and points, the nearest, that tell a value; time grows with the third power."""
     margin: Annotated[float, Range(0, 10)] = 0.2
-    """By how much of it inverse depth may leave the range of what is known; kriging overshoots where slopes meet a gap."""
+    """Share by which inverse depth may pass the limits of its known range; kriging overshoots where slopes meet a gap."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class MultiViewConfig(StageConfig):
     max_flow: Annotated[float, Range(1, 640, "pixels at width 640")] = 40.0
     """Longest displacement between prediction and image that is believed."""
     max_beside: Annotated[float, Range(0.01, 640, "pixels at width 640")] = 2.0
-    """Farthest beside the line along which depth moves a pixel; what is farther is no error of depth."""
+    """Largest distance of a match from the line along which depth moves its pixel; a larger one is no error of depth."""
     max_step: Annotated[float, Range(0.01, 640, "pixels at width 640")] = 1.0
     """Largest correction of a disparity by flow between the eyes: matching is off by less, or wholly wrong."""
     reflection: Annotated[int, Range(1, 255, "grey levels")] = 60
@@ -213,7 +213,7 @@ class ExtrapolationConfig(StageConfig):
     """Standard deviation of a Gaussian in spacings: with smaller ones there are gaps; the nearer of larger ones hide the others where
     tissue is steep."""
     fine_reach: Annotated[float, Range(0, 1, "widths of the image")] = 0.15
-    """Up to where around the picture Gaussians are spaced by ``interpolation.cell``, beyond it half as much farther apart. Large
-    Gaussians close to it would reach in and cover what was seen."""
+    """Distance from the picture up to which Gaussians are spaced by ``interpolation.cell``; beyond it, by 1.5 times as much. Large
+    Gaussians closer to the picture would cover what was seen."""
     min_coverage: Annotated[float, Range(0, 1)] = 0.02
     """Share of the pixels with depth from which on the surroundings of a view can be told."""

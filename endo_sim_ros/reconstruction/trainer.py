@@ -38,10 +38,10 @@ class _Inputs(NamedTuple):
 
     viewmats: Tensor  # [C, 4, 4]
     Ks: Tensor  # [C, 3, 3]
-    image: Tensor  # [H, W, 3] of the training view, and so on
-    exposure: Tensor  # [1] int64
+    image: Tensor  # [H, W, 3] of the training view, as are mask, prior and rays
+    exposure: Tensor  # [1] int64, index of the training view
     mask: Tensor | None  # [H, W]
-    prior: Tensor | None  # [H, W]
+    prior: Tensor | None  # [H, W] m
     rays: Tensor | None  # [3, H, W], for the light
     virtual_prior: Tensor | None  # [H, W] depth prior as the virtual camera sees it
 
@@ -64,7 +64,7 @@ class Trainer:
     """
 
     def __init__(self, scene: PreparedScene, config: ReconstructionConfig) -> None:
-        self.config = config = config
+        self.config = config
         self.scene_depth = scene.depth
         self.device = pick_device(config.device)
         self.stamps = [view.stamp_ns for view in scene.views]
@@ -72,7 +72,7 @@ class Trainer:
         self.iteration = 0
         self._nearest = nearest_views(scene.views, 1)
         self._load(scene.views)
-        eye = np.mean([view.camera.position for view in self._views], 0)
+        eye = np.mean([view.camera.position for view in self._device_views], 0)
         self._eye = torch.as_tensor(eye, dtype=torch.float32, device=self.device)
         self._generator = torch.Generator().manual_seed(config.seed)
         # Drawn where it is needed: a GPU that waits for numbers stands still.
@@ -105,7 +105,7 @@ class Trainer:
     @property
     def cameras(self) -> list[Camera]:
         """The training cameras at training size."""
-        return [view.camera for view in self._views]
+        return [view.camera for view in self._device_views]
 
     @property
     def progress(self) -> Progress:
@@ -143,7 +143,7 @@ class Trainer:
                 what = f"other options ({', '.join(differing)})" if differing else "other views"
                 raise SequenceError(f"{path}: the checkpoint was made with {what}; use the same or start anew")
             iteration, order = int(state["iteration"]), [int(view) for view in state["order"]]
-            if iteration < 0 or not set(order) <= set(range(len(self._views))):
+            if iteration < 0 or not set(order) <= set(range(len(self._device_views))):
                 raise ValueError("it names views or an iteration that there cannot be")
             shapes = lambda tensors: {name: value.shape for name, value in tensors.items()}
             if shapes(state["light"]) != shapes(self._appearance.tensors):
@@ -178,7 +178,7 @@ class Trainer:
         """The light and what it leaves of the views' exposures [V, 3]."""
         if self._fitted is None or self._fitted[0] != self.iteration:
             look = lambda view: self._render(*matrices([view.camera], self.device), (view.camera.width, view.camera.height))[1]
-            self._fitted = self.iteration, *self._appearance.fitted(self._views, look)
+            self._fitted = self.iteration, *self._appearance.fitted(self._device_views, look)
         return self._fitted[1:]
 
     # --------------------------------------------------------------- training
@@ -192,7 +192,7 @@ class Trainer:
             try:
                 self.step()
             except torch.OutOfMemoryError:
-                if self._frames[0].camera.width < 2 * self.config.smallest_width:
+                if self._views[0].camera.width < 2 * self.config.smallest_width:
                     raise
                 self._halve()
                 continue
@@ -203,18 +203,18 @@ class Trainer:
 
     def _halve(self) -> None:
         """Go on with images of half the size."""
-        width = self._frames[0].camera.width // 2
+        width = self._views[0].camera.width // 2
         log.warning("out of memory: going on with images %d pixels wide; fewer max_gaussians may help, too", width)
-        self._captures, self._views = {}, []
+        self._captures, self._device_views = {}, []
         torch.cuda.empty_cache()
-        self._load([shrink(view, width) for view in self._frames])
+        self._load([shrink(view, width) for view in self._views])
 
     def step(self) -> None:
         """One iteration: a training view, a virtual view, one step of the optimiser."""
         config = self.config
         if not self._order:
-            self._order = torch.randperm(len(self._views), generator=self._generator).tolist()
-        view = self._views[self._order.pop()]
+            self._order = torch.randperm(len(self._device_views), generator=self._generator).tolist()
+        view = self._device_views[self._order.pop()]
         terms = losses.active_terms(config, self.iteration)
         virtual = None
         if config.virtual_every and self.iteration % config.virtual_every == 0 and len(self.stamps) > 1:
@@ -235,7 +235,7 @@ class Trainer:
 
     def _virtual_camera(self, index: int) -> Camera:
         """Paper eq. 7: a random camera between a view and its nearest view."""
-        first, second = (self._views[i].camera for i in (index, self._nearest[index][0]))
+        first, second = (self._device_views[i].camera for i in (index, self._nearest[index][0]))
         alpha = torch.rand((), generator=self._generator).item()
         return first.at(interpolate_pose(first.pose, second.pose, alpha))
 
@@ -329,5 +329,6 @@ class Trainer:
 
     def _load(self, views: Sequence[TrainingView]) -> None:
         """Train on these from now on."""
-        self._frames, self._fitted = views, None  # and the light that was asked for last, with its iteration
-        self._views = [DeviceView.of(view, index, self.device) for index, view in enumerate(views)]
+        self._views = views
+        self._fitted = None  # the light that was asked for last, with its iteration
+        self._device_views = [DeviceView.of(view, index, self.device) for index, view in enumerate(views)]

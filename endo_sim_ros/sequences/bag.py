@@ -57,7 +57,7 @@ def read_bag(path: str | Path, tolerance: float = 0.01, world_frame: str = WORLD
     Args:
         path: A rosbag2 folder or an .mcap file.
         tolerance: Largest difference between matched stamps, seconds.
-        world_frame: The frame in which poses must be given.
+        world_frame: The coordinate frame in which poses must be given.
 
     Raises:
         SequenceError: If the bag is damaged, lacks images, camera_info or poses (the message lists what it has), holds
@@ -88,14 +88,14 @@ def _located(path: str | Path) -> Iterator[None]:
         raise SequenceError(f"{path}: {error}") from error
 
 
-def feed(synchronizer: Synchronizer, topic: Topic, message: Any, frames: str | Mapping[str, np.ndarray]) -> list[Frame]:
+def feed(synchronizer: Synchronizer, topic: Topic, message: Any, frame_poses: str | Mapping[str, np.ndarray]) -> list[Frame]:
     """The frames that become complete with one message of a recording topic.
 
     Args:
         synchronizer: What collects the streams; the message is added to it.
         topic: One of messages.RECORDING_TOPICS.
         message: Of ROS or of a bag.
-        frames: As for `messages.decode_pose`: the world frame, or transforms to it by frame.
+        frame_poses: The name of the world frame, or the poses [4, 4] of known coordinate frames in it, by name.
 
     Raises:
         MessageError: If the message cannot be decoded.
@@ -107,7 +107,7 @@ def feed(synchronizer: Synchronizer, topic: Topic, message: Any, frames: str | M
         synchronizer.add_info("left" if topic == messages.LEFT_INFO else "right", info)
         return []
     if topic == messages.CAMERA_POSE:
-        return synchronizer.add("pose", stamp, messages.decode_pose(message, frames, topic.name))
+        return synchronizer.add("pose", stamp, messages.decode_pose(message, frame_poses, topic.name))
     if topic == messages.DEPTH:
         return synchronizer.add("depth", stamp, messages.decode_depth(message, topic.name))
     if topic == messages.MASK:

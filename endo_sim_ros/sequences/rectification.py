@@ -133,7 +133,7 @@ class Rectification:
 
     @classmethod
     def mono(cls, K: np.ndarray, distortion: Sequence[float] | np.ndarray, size: tuple[int, int]) -> Rectification:
-        """Undistortion of one eye.
+        """A rectification that undistorts one eye, without rotation and baseline. Its K is zoomed so that no border is black.
 
         Args:
             K: Intrinsics [3, 3] of the raw image, this package's pixel convention (as COLMAP's).

@@ -169,7 +169,14 @@ class Browser:
     # --------------------------------------------------------------- pictures
 
     def show_splats(self, centers: np.ndarray, covariances: np.ndarray, rgbs: np.ndarray, opacities: np.ndarray) -> None:
-        """Gaussians, centimetres."""
+        """Show Gaussians.
+
+        Args:
+            centers: Their centres [N, 3], cm, world.
+            covariances: Their covariances [N, 3, 3], cm², world.
+            rgbs: Colours [N, 3] uint8.
+            opacities: Opacities [N, 1] uint8, 255 = opaque.
+        """
         if self._splats is None:
             self._splats = self.client.scene.add_gaussian_splats("/tissue", centers, covariances, rgbs, opacities)
         self._splats.visible = True

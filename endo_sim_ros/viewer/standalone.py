@@ -171,7 +171,12 @@ class Standalone:
 
 
 def view(path: Path, physics: PhysicsConfig, config: ViewerConfig) -> None:
-    """Serve the page on a PLY model, seen by the cameras in the cameras.json beside it, else from the world's origin."""
+    """Serve the page on a PLY model, seen by the cameras in the cameras.json beside it, else from the world's origin.
+
+    Raises:
+        ModelError: If the model cannot be read.
+        ValueError: If the cameras or the options cannot be used; ConfigError if the page cannot be served.
+    """
     model = load_ply(path)
     beside = path.parent / "cameras.json"
     page = Standalone(model, load_cameras(beside) if beside.is_file() else [_camera_at_origin(model)], physics, config)

@@ -166,7 +166,7 @@ class Viewer:
         self._dirty = True
 
     def show_state(self, positions: np.ndarray, F: np.ndarray, age: float = 0.0) -> bool:
-        """Where the nodes are [M, 3], m, with F [M, 3, 3]; the step to there began ``age`` seconds ago. Whether they moved."""
+        """Show nodes at positions [M, 3] (m) with F [M, 3, 3], whose step began ``age`` seconds ago; returns whether they moved."""
         old = self.state
         moved = old is None or not (np.array_equal(positions, old[0]) and np.array_equal(F, old[1]))
         self.state, self._begun = (positions, F), time.monotonic() - age
@@ -311,7 +311,7 @@ class Viewer:
             self._asked = None
 
     def splats(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Centres, covariances, colours and opacities of the Gaussians now, centimetres."""
+        """The Gaussians as they are now, as `Browser.show_splats` takes them."""
         assert self.renderer is not None  # nothing is drawn before there is a model
         model = self.renderer.model
         if self.state is None:

@@ -10,8 +10,9 @@ from trained import trainer_of
 
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.evaluation import metrics
-from endo_sim_ros.evaluation.held_out import reconstruct_and_measure
+from endo_sim_ros.evaluation.held_out import measure_held_out
 from endo_sim_ros.reconstruction import ReconstructionConfig
+from endo_sim_ros.reconstruction.from_bag import reconstruct_bag
 from endo_sim_ros.reconstruction.optimizer import Adam
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.bag import write_bag
@@ -151,7 +152,7 @@ def test_higher_harmonics_are_trained(small):
 @pytest.mark.slow
 def test_reconstruction_of_a_bag_is_measured(tmp_path, small):
     write_bag(tmp_path / "bag", small)
-    found = reconstruct_and_measure(tmp_path / "bag", tmp_path / "out", options(keyframes=4, image_width=80))
+    found = measure_held_out(*reconstruct_bag(tmp_path / "bag", tmp_path / "out", options(keyframes=4, image_width=80)), tmp_path / "out")
     assert found["held_out_views"] == 5
     assert found["psnr"] > 15
     assert found["depth_rmse"] < 0.010

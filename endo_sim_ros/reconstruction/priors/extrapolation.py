@@ -54,7 +54,7 @@ def extrapolate(
     interpolation: InterpolationConfig = InterpolationConfig(),
     progress: StageProgress = StageProgress(),
 ) -> GaussianModel:
-    """The model and what may be around it: inverse depth is the likeliest one, colour the mean of what is seen, by its distance.
+    """The model, and Gaussians where no view knows the depth: inverse depth by kriging, colour as the mean of the picture by distance.
 
     Args:
         model: What was seen.

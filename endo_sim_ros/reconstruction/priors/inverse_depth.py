@@ -1,6 +1,6 @@
 """Images of inverse depth, corrected and smoothed within edges.
 
-Windows are in pixels of an image 640 wide; images of other widths have them in proportion.
+Sizes of windows are given in pixels of an image 640 wide. `scaled` converts them to the width of the image at hand.
 """
 
 import cv2
@@ -8,17 +8,17 @@ import numpy as np
 
 
 def scaled(size: float, width: int) -> float:
-    """Pixels of an image of this width that so many of one 640 wide come to."""
+    """A size in pixels of an image of this width, from one in pixels of an image 640 wide."""
     return size * width / 640
 
 
 def blur(values: np.ndarray, size: float, width: int) -> np.ndarray:
-    """The values [H, W] blurred by a Gaussian of this standard deviation, pixels of an image 640 wide."""
+    """The values [H, W], of an image of this width, blurred by a Gaussian. Its standard deviation ``size`` is for an image 640 wide."""
     return cv2.GaussianBlur(values.astype(np.float32), (0, 0), scaled(size, width))
 
 
 def correct(inverse: np.ndarray, total: np.ndarray, weight: np.ndarray, error: np.ndarray, reach: float, limit: float) -> np.ndarray:
-    """Inverse depth [H, W] (1/m) averaged with corrections by precision; where there are none, those of the surroundings count.
+    """Inverse depth [H, W] (1/m) plus corrections, which are weighed by their precision and continued to pixels that have none.
 
     Args:
         inverse, error: Inverse depth [H, W] and its standard deviation [H, W], 1/m.
@@ -34,9 +34,9 @@ def correct(inverse: np.ndarray, total: np.ndarray, weight: np.ndarray, error: n
 
 
 def smooth(inverse: np.ndarray, size: float, edge: float) -> np.ndarray:
-    """Inverse depth [H, W] without ripples up to a size (standard deviation, pixels of an image 640 wide), edges kept.
+    """Inverse depth [H, W] (1/m) without ripples.
 
-    A relative step of more than ``edge`` is an edge.
+    Ripples up to ``size`` (standard deviation, pixels of an image 640 wide) are removed; relative steps above ``edge`` stay.
     """
     median = np.float32(np.median(inverse))
     relative = (inverse / median).astype(np.float32)

@@ -28,8 +28,8 @@ def estimate_depth(
 ) -> list[TrainingView]:
     """The views with ``depth_prior`` set to the configured prior, or None where there is none.
 
-    The prior is 0 where it has no finite positive measurement and where the mask says that there is no tissue. Where the
-    right eye's principal point turns out to be wrong, the views have it right.
+    The prior is 0 where it has no finite positive measurement and where the mask says that there is no tissue. A right eye's
+    principal point that turns out to be wrong is corrected in the views.
 
     Args:
         views: Training views, best at full size: disparities are as precise as the pixels are fine.

@@ -25,7 +25,7 @@ def stereo_depth(
     matching: MatchingConfig = MatchingConfig(),
     progress: StageProgress = StageProgress(),
 ) -> list[tuple[AnyFrame, np.ndarray | None]]:
-    """Each view with its right image on the rows of the left one and that eye's principal point corrected, and its depth [H, W].
+    """Each view, whose right image now has the rows of the left one and the right principal point, and its depth [H, W].
 
     Depth is in metres, 0 = none; None without a right image.
 

@@ -9,14 +9,14 @@ from torch import Tensor
 
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.reconstruction.strategies.base import Refined
-from endo_sim_ros.reconstruction.strategies.default import Default
+from endo_sim_ros.reconstruction.strategies.gradient import Gradient
 
 
-class Proximity(Default):
+class Proximity(Gradient):
     """New Gaussians also fill the gaps around those that lie alone; options: `ProximityConfig`."""
 
     def refine(self, model: GaussianModel, state: dict[str, Tensor], generator: torch.Generator) -> Refined:
-        """Refine as `Default` does, then `unpool`."""
+        """Refine as `Gradient` does, then `unpool`."""
         model, source, fresh = super().refine(model, state, generator)
         model, others, added = self.unpool(model)
         return Refined(model, source[others], fresh[others] | added)

@@ -10,7 +10,7 @@ from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.reconstruction.strategies.base import Refined, Strategy
 
 
-class Default(Strategy):
+class Gradient(Strategy):
     """Where image gradients are large, large Gaussians are split and small ones doubled; options: `GradientConfig`."""
 
     wants_absgrad = True

@@ -1,0 +1,67 @@
+"""From a bag to the files of a Gaussian model, with progress bars: the work of `endo-sim reconstruct`."""
+
+import logging
+from pathlib import Path
+
+from rich.progress import Progress as ProgressBar
+
+from endo_sim_ros.core.cameras import save_cameras
+from endo_sim_ros.core.frames import Frame
+from endo_sim_ros.core.gaussians import save_ply
+from endo_sim_ros.reconstruction.config import ReconstructionConfig
+from endo_sim_ros.reconstruction.keyframes import select_keyframes
+from endo_sim_ros.reconstruction.pipeline import prepare
+from endo_sim_ros.reconstruction.progress import StageProgress
+from endo_sim_ros.reconstruction.trainer import Progress, Trainer
+from endo_sim_ros.reconstruction.triangulation import scene_points
+from endo_sim_ros.sequences.bag import read_bag
+
+log = logging.getLogger(__name__)
+
+_REPORTS, _CHECKPOINTS = 20, 10  # iterations between looks at the progress; checkpoints of a reconstruction
+
+
+def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: bool = False) -> tuple[Trainer, list[Frame]]:
+    """The trainer at its end, and the frames that were held out; writes model.ply, cameras.json and checkpoint.pt.
+
+    Args:
+        bag: Bag with images, camera_info and poses.
+        out: Folder for the files; it is made if need be.
+        config: Options.
+        resume: Go on from the checkpoint in the folder, to the same model; one is written every tenth of the way.
+
+    Raises:
+        SequenceError: If the bag or the checkpoint cannot be used, or `prepare` finds nothing to start from.
+    """
+    frames = list(read_bag(bag))
+    out.mkdir(parents=True, exist_ok=True)  # before the long work
+    chosen = select_keyframes(frames, config.keyframes)
+    log.info("%d views, training on %d", len(frames), len(chosen))
+    with ProgressBar() as bar:
+        task = bar.add_task("preparing", total=None)
+
+        def on_stage(stage: str, done: int, total: int) -> None:
+            bar.update(task, description=stage, completed=done, total=total or None)
+
+        points = None
+        if len(chosen) < len(frames):
+            points = scene_points(frames, options=config.matching, progress=StageProgress("scene points", on_stage))
+        trainer = Trainer(prepare([frames[index] for index in chosen], config, points, on_stage), config)
+    if resume:
+        trainer.load_checkpoint(out / "checkpoint.pt")
+        log.info("going on after %d iterations", trainer.iteration)
+    iterations = trainer.config.iterations
+    with ProgressBar() as bar:
+        task = bar.add_task("reconstructing", total=iterations)
+
+        def on_progress(progress: Progress) -> None:
+            text = f"reconstructing, {progress.gaussians} Gaussians, loss {progress.loss:.4f}"
+            bar.update(task, completed=progress.iteration, description=text)
+            if progress.iteration % max(iterations // (_CHECKPOINTS * _REPORTS) * _REPORTS, _REPORTS) == 0:
+                trainer.save_checkpoint(out / "checkpoint.pt")
+
+        model = trainer.run(on_progress, _REPORTS)
+    save_ply(model, out / "model.ply")
+    save_cameras([frames[index].camera for index in chosen if frames[index].stamp_ns in trainer.stamps], out / "cameras.json")
+    trainer.save_checkpoint(out / "checkpoint.pt")
+    return trainer, [frame for index, frame in enumerate(frames) if index not in chosen]

@@ -204,13 +204,17 @@ class ViewerNode(Watcher):
         if not self._get.service_is_ready():
             return
 
-        def answered(future: Any) -> None:
-            with self.guard("parameters"):
-                values = [parameter_value_to_python(value) for value in future.result().values]
-                if len(values) == len(PARAMETERS):  # else another node bears that name
-                    self.viewer.show_parameters(dict(zip(PARAMETERS, values)))
+        def ask(*names: str) -> None:
+            def answered(future: Any) -> None:
+                with self.guard("parameters"):
+                    values = [parameter_value_to_python(value) for value in future.result().values]
+                    if len(values) == len(names):  # else another node bears that name
+                        self.viewer.show_parameters(dict(zip(names, values)))
 
-        self._get.call_async(GetParameters.Request(names=list(PARAMETERS))).add_done_callback(answered)
+            self._get.call_async(GetParameters.Request(names=names)).add_done_callback(answered)
+
+        ask(*(name for name in PARAMETERS if name != "regions"))
+        ask("regions")  # a list that nobody has filled has no value, and a request that names it gets none at all
 
     # ----------------------------------------------------------------- actions
 

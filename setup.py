@@ -35,7 +35,7 @@ setup(
         "rosbags>=0.11.6,<0.12",  # private parts: endo_sim_ros/sequences/bag_private.py
         "scipy>=1.11",
         "tifffile>=2023.7.10",
-        "torch>=2.4",
+        "torch>=2.11",
         "typing_extensions>=4.12",
         "tyro>=0.9.20",
         "warp-lang>=1.19,<1.20",  # private parts: see CONTRIBUTING.md

@@ -10,7 +10,7 @@ import sys
 import textwrap
 import time
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from endo_sim_ros import hear_interrupts
 
@@ -47,11 +47,14 @@ def parse(name: str, words: list[str]) -> Runnable:
     """The command with its options as the words give them; what is wrong with them ends the program with a sentence."""
     import tyro
 
-    from endo_sim_ros.core.config import refuse_renamed_flags
+    from endo_sim_ros.core.config import document_ranges, refuse_renamed_flags
 
-    command: type[Runnable] = importlib.import_module(f"endo_sim_ros.cli.{name}").Command
+    module = importlib.import_module(f"endo_sim_ros.cli.{name}")
+    command: type[Runnable] = module.Command
     refuse_renamed_flags(words, command)
-    return tyro.cli(command, prog=f"endo-sim {name}", description=summary(name), args=words)
+    document_ranges(command)
+    default: Any = module.defaults(words) if hasattr(module, "defaults") else None
+    return tyro.cli(command, prog=f"endo-sim {name}", description=summary(name), args=words, default=default)
 
 
 def main() -> int:

@@ -20,7 +20,7 @@ class Command:
         from endo_sim_ros.nodes.parameter_file import parameter_file
 
         nodes = [name if name in NODE_CONFIGS else name.removesuffix("_node") for name in self.nodes]  # executables end in _node
-        unknown = [name for name in nodes if name not in NODE_CONFIGS]
+        unknown = [given for given, name in zip(self.nodes, nodes) if name not in NODE_CONFIGS]
         if unknown:
             raise ConfigError(f"no node is called {', '.join(unknown)}; there are {', '.join(NODE_CONFIGS)}")
         print(parameter_file(nodes or tuple(NODE_CONFIGS)), end="")

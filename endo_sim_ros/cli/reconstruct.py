@@ -1,6 +1,6 @@
 """`endo-sim reconstruct`."""
 
-import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -10,15 +10,6 @@ from tyro.conf import Positional
 
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.presets import PRESETS, Preset, preset
-
-
-def _named_preset() -> ReconstructionConfig:
-    """The options of the preset that the command line names: the defaults of options that it does not give."""
-    name = "default"
-    for word, following in zip(sys.argv, [*sys.argv[1:], ""]):
-        if word == "--preset" or word.startswith("--preset="):
-            name = following if word == "--preset" else word.removeprefix("--preset=")
-    return preset(name if name in PRESETS else "default")  # the parser refuses other names
 
 
 @dataclass(frozen=True)
@@ -34,7 +25,7 @@ class Command:
     preset: Preset = "default"
     """Method: ours, ours sized for a CPU, that of the paper as printed, FSGS, or 3DGS. Options that are not given have the
     values of the preset."""
-    config: Annotated[ReconstructionConfig, tyro.conf.arg(name="")] = field(default_factory=_named_preset)
+    config: Annotated[ReconstructionConfig, tyro.conf.arg(name="")] = field(default_factory=ReconstructionConfig)
 
     def run(self) -> None:
         """Write model, cameras, checkpoint and picture; raises SequenceError if bag or checkpoint cannot be used."""
@@ -43,3 +34,12 @@ class Command:
 
         trainer, held_out = reconstruct_bag(self.bag, self.out, self.config, self.resume)
         measure_held_out(trainer, held_out, self.out)
+
+
+def defaults(words: Sequence[str]) -> Command:
+    """Return the command with the options of the preset that the words name: the values of options that they do not give."""
+    name = "default"
+    for word, following in zip(words, [*words[1:], ""]):
+        if word == "--preset" or word.startswith("--preset="):
+            name = following if word == "--preset" else word.removeprefix("--preset=")
+    return Command(tyro.MISSING, tyro.MISSING, config=preset(name if name in PRESETS else "default"))  # tyro refuses other names

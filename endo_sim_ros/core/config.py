@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from functools import cache
 from typing import Any, ClassVar, NamedTuple
 
-from typing_extensions import Self
+from typing_extensions import Doc, Self
 
 
 class Range(NamedTuple):
@@ -36,6 +36,14 @@ class Option(NamedTuple):
     description: str
     range: Range | None
     choices: tuple[str, ...] | None  # of a ``Literal`` field
+
+    @property
+    def help(self) -> str:
+        """The description with range and unit."""
+        if self.range is None:
+            return self.description
+        low, high, unit = self.range
+        return f"{self.description} [{low:g} to {high:g}{' ' * bool(unit)}{unit}]"
 
 
 class ConfigError(ValueError):
@@ -112,16 +120,34 @@ def refuse_renamed_flags(words: Sequence[str], command: type) -> None:
         ConfigError: If there is one.
     """
     renamed = {}
-    for field, hint in typing.get_type_hints(command, include_extras=True).items():
-        stage, *extras = typing.get_args(hint) if typing.get_origin(hint) is typing.Annotated else (hint,)
-        if _is_stage(stage):
-            prefix = "" if any(getattr(extra, "name", None) == "" for extra in extras) else f"{field}."
-            renamed |= {prefix + old: new if " " in new else f"--{prefix}{new}" for old, new in renamed_options(stage).items()}
+    for field, stage, extras in _stages(command):
+        prefix = "" if any(getattr(extra, "name", None) == "" for extra in extras) else f"{field}."
+        renamed |= {prefix + old: new if " " in new else f"--{prefix}{new}" for old, new in renamed_options(stage).items()}
     for flag in (word.partition("=")[0] for word in words if word.startswith("--")):
         stage, dot, option = flag.removeprefix("--").replace("-", "_").rpartition(".")
         new = renamed.get(stage + dot + option) or renamed.get(stage + dot + option.removeprefix("no_"))
         if new:
             raise ConfigError(f"{flag} is now {new.replace('_', '-') if new.startswith('--') else new}")
+
+
+def document_ranges(command: type) -> None:
+    """Let tyro's help of a command tell range and unit of each option of the stage configurations that it holds."""
+    for _, stage, _ in _stages(command):
+        hints = typing.get_type_hints(stage, include_extras=True)
+        for option in options(stage):
+            if option.range and "." not in option.name:
+                stage.__annotations__[option.name] = typing.Annotated[hints[option.name], Doc(option.help)]
+        document_ranges(stage)
+
+
+def _stages(holder: type) -> list[tuple[str, type["StageConfig"], list[Any]]]:
+    """The fields of a dataclass that are stage configurations: name, class, and what else their annotation holds."""
+    found = []
+    for field, hint in typing.get_type_hints(holder, include_extras=True).items():
+        stage, *extras = typing.get_args(hint) if typing.get_origin(hint) is typing.Annotated else (hint,)
+        if _is_stage(stage):
+            found.append((field, stage, extras))
+    return found
 
 
 def _converted(option: Option, value: Any) -> Any:

@@ -39,13 +39,7 @@ def parameter_file(nodes: Sequence[str] = tuple(NODE_CONFIGS)) -> str:
 
 def _description(option: Option) -> str:
     """What an option is, with its range or its choices."""
-    text = option.description
-    if option.range:
-        low, high, unit = option.range
-        text += f" [{low:g} to {high:g}{' ' + unit if unit else ''}]"
-    if option.choices:
-        text += f" [{', '.join(option.choices)}]"
-    return text
+    return option.help + (f" [{', '.join(option.choices)}]" if option.choices else "")
 
 
 def _yaml(value: bool | int | float | str | tuple[str, ...]) -> str:

@@ -11,7 +11,7 @@ class PhysicsConfig(StageConfig):
     """How the tissue is built from the Gaussians, what it is made of and how it is stepped."""
 
     node_count: Annotated[int, Range(8, 200_000)] = 4000
-    """Number of all simulated nodes: the skin gets node_count / (layers + 1) of them, each layer as many."""
+    """Number of control nodes: the skin gets node_count / (layers + 1) of them, each layer as many."""
     thickness: Annotated[float, Range(1e-4, 1.0, "m")] = 0.02
     """Depth of the tissue behind the reconstructed skin; the layers divide it evenly."""
     layers: Annotated[int, Range(0, 32)] = 3
@@ -21,9 +21,9 @@ class PhysicsConfig(StageConfig):
     pin_back: bool = True
     """Hold the deepest layer in place."""
     pin_rim: bool = True
-    """Hold the nodes at the border of the skin, as seen from the viewpoint, and the layers behind them."""
+    """Hold the control nodes at the border of the skin, as seen from the viewpoint, and the layers behind them."""
     min_opacity: Annotated[float, Range(0.0, 1.0)] = 0.1
-    """Gaussians fainter than this do not become nodes."""
+    """Gaussians fainter than this do not become control nodes."""
     material: Literal["fixed_corotated", "neo_hookean"] = "fixed_corotated"
     """Constitutive law."""
     young_modulus: Annotated[float, Range(1.0, 1e9, "Pa")] = 10e3
@@ -59,14 +59,14 @@ class PhysicsConfig(StageConfig):
     """Where the transfer weights are taken: at the rest positions (total Lagrangian: never fractures numerically) or
     at the current positions (updated Lagrangian, as PhysGaussian and the paper have it)."""
     grid_ratio: Annotated[float, Range(1.0, 4.0)] = 1.5
-    """Grid cell size over node spacing. Near 1 a cell holds one node and has motions that no node resists (with current
-    kinematics it fractures); above 2 dents are blurred."""
+    """Grid cell size over the spacing of control nodes. Near 1 a cell holds one control node and has motions that none resists (with
+    current kinematics it fractures); above 2 dents are blurred."""
     courant_number: Annotated[float, Range(0.05, 0.7)] = 0.5
     """Largest c Δt/h (sound speed, substep, grid cell) that ``substeps: 0`` chooses. Above 0.7 no substep is stable; the rest is
     room for tissue that stiffens where it is compressed."""
     pin_stiffness: Annotated[float, Range(1.0, 1e5)] = 100.0
     """Stiffness of the springs that pin control nodes, over the stiffness (λ + 2μ) V/h² of their tissue in a grid cell: all springs
-    of a cell together are then as stiff however many nodes share it. Stiffer ones lock tissue that is few cells thick."""
+    of a cell together are then as stiff however many control nodes share it. Stiffer ones lock tissue that is few cells thick."""
     grasp_stiffness: Annotated[float, Range(1.0, 1e5)] = 400.0
     """The same of the springs by which jaws hold and capsules push; softer ones let tissue lag behind its jaw."""
     push_out_speed: Annotated[float, Range(1e-3, 10.0, "m/s")] = 0.5
@@ -75,11 +75,11 @@ class PhysicsConfig(StageConfig):
     """Share of its deformation that is left to tissue when a step is undone right after another that was: from some states every
     step ends badly, and tissue has to give way towards rest."""
     travel: Annotated[float, Range(1e-3, 10.0, "m")] = 0.05
-    """Farthest a node may move from rest; a step that takes one farther is undone and counted as a fault."""
+    """Farthest a control node may move from rest; a step that takes one farther is undone and counted as a fault."""
     force_radius: Annotated[float, Range(1e-4, 1.0, "m")] = 0.01
-    """A tool pulls, and a closing jaw holds, the skin nodes within this distance of its tip."""
+    """A tool pulls, and a closing jaw holds, the control nodes of the skin within this distance of its tip."""
     contact_radius: Annotated[float, Range(0.0, 0.1, "m")] = 0.0
-    """Radius of the rigid capsule that each tool pushes the tissue away with, 0 = tools act by wrench and jaw only. Nodes, not
+    """Radius of the rigid capsule that each tool pushes the tissue away with, 0 = tools act by wrench and jaw only. Control nodes, not
     the skin between them, are what it touches, so a capsule thinner than 1.5 times their distance, or 0.3 of a grid cell, acts as
     one as thick as that."""
     contact_length: Annotated[float, Range(0.0, 1.0, "m")] = 0.0
@@ -90,7 +90,7 @@ class PhysicsConfig(StageConfig):
     """Length of the edge that a cutting tool sweeps through the tissue, from its tip backwards, against its z axis. A cut opens
     once it is about one cell of the grid deep; more layers make that finer."""
     dense: bool = False
-    """Simulate every Gaussian as a material point (PhysGaussian's way) instead of sparse nodes;
+    """Simulate every Gaussian as a material point (PhysGaussian's way) instead of sparse control nodes;
     layers are then ignored."""
     device: str = "auto"
     """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""

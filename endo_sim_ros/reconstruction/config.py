@@ -163,6 +163,7 @@ class ReconstructionConfig(StageConfig):
     """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""
 
     # Of the stages that prepare the scene, in their order. Where a switch above has the name of the stage, its options have another.
+
     views: UsableViewsConfig = UsableViewsConfig()
     matching: MatchingConfig = MatchingConfig()
     poses: PosesConfig = PosesConfig()
@@ -185,4 +186,6 @@ class ReconstructionConfig(StageConfig):
         "surroundings": "extrapolation",
         "still": "dynamic_mask",
         "growth": "mcmc.growth",
+        "right_views": "gone, as it made most recordings worse",
+        "confined": "gone, as it made most recordings worse",
     }

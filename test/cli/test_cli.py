@@ -18,6 +18,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 from endo_sim_ros import cli
 from endo_sim_ros.cli import convert
+from endo_sim_ros.core.config import ConfigError, options
 from endo_sim_ros.core.gaussians import load_ply
 from endo_sim_ros.evaluation import held_out
 from endo_sim_ros.reconstruction import ReconstructionConfig, from_bag
@@ -118,6 +119,30 @@ def test_options_given_beside_a_preset_count_whatever_their_value(monkeypatch):
         assert cli.main() == 0
     assert taken[0] == taken[1] == preset("paper", lambda_tv=0.0, sh_degree=3)
     assert taken[2] == ReconstructionConfig()
+
+
+def test_a_preset_is_that_of_the_words_and_not_of_the_process():
+    command = cli.parse("reconstruct", ["bag", "out", "--preset", "paper", "--mcmc.growth", "0.3"])
+    assert command.config == preset("paper").replaced({"mcmc.growth": 0.3})
+
+
+def test_help_tells_range_and_unit(capsys):
+    with pytest.raises(SystemExit):
+        cli.parse("touch", ["--help"])
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "Stiffness of the tissue. [1 to 1e+09 Pa]" in text
+    with pytest.raises(SystemExit):
+        cli.parse("reconstruct", ["--help"])
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert all(option.range is None or option.help.rpartition(" [")[2] in text for option in options(ReconstructionConfig))
+
+
+@pytest.mark.parametrize("name", ["right_views", "confined"])
+def test_an_option_that_is_gone_is_refused(name):
+    with pytest.raises(ConfigError, match=f"{name.replace('_', '.')} is now gone"):
+        cli.parse("reconstruct", ["bag", "out", f"--{name.replace('_', '-')}"])
+    with pytest.raises(ConfigError, match=f"{name} is now gone"):
+        ReconstructionConfig().replaced({name: True})
 
 
 def test_an_old_flag_is_refused_with_the_new_one(monkeypatch, capsys):

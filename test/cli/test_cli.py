@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -18,6 +19,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 from endo_sim_ros import cli
 from endo_sim_ros.cli import convert
+from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import load_ply
 from endo_sim_ros.evaluation import held_out
 from endo_sim_ros.reconstruction import ReconstructionConfig, from_bag
@@ -102,6 +104,8 @@ def test_a_killed_reconstruction_goes_on_to_the_same_model(bag, tmp_path, caplog
         process.kill()
     assert process.returncode == -9 and not (tmp_path / "killed" / "model.ply").exists()
     config = ReconstructionConfig(**values)
+    with pytest.raises(SequenceError, match=r"killed/checkpoint.pt: the checkpoint was made with other options \(seed\)"):
+        reconstruct_bag(tmp_path / "no_bag", tmp_path / "killed", replace(config, seed=1), resume=True)
     with caplog.at_level(logging.INFO):
         reconstruct_bag(bag, tmp_path / "killed", config, resume=True)
     assert re.search(r"going on after [1-9]\d* iterations", caplog.text)
@@ -149,6 +153,8 @@ def test_reconstruct_writes_a_model_and_measures_held_out_views(bag, tmp_path):
         (("convert", "no/such/thing", "no_bag"), "no/such/thing: no such file or folder"),
         (("convert", "launch", "no_bag"), "no known layout recognised"),
         (("reconstruct", "no_bag", "out"), "no_bag: no such bag"),
+        (("reconstruct", "no_bag", "no_out", "--device", "cuda:99"), "device 'cuda:99' asked for, but"),
+        (("reconstruct", "no_bag", "no_out", "--resume"), "no_out/checkpoint.pt: not a readable checkpoint"),
         (("phantom", "README.md"), "README.md exists already"),
         (("phantom", "no_bag", "--frames", "0"), r"PhantomConfig.frames must lie in \[1, 100000\], got 0"),
         (("demo", "--bag", "no_bag"), "no_bag: no such bag"),

@@ -160,6 +160,8 @@ def test_reconstruct_writes_a_model_and_measures_held_out_views(bag, tmp_path):
         (("demo", "--bag", "no_bag"), "no_bag: no such bag"),
         (("train", "no_out", "--algorithm", "cem", "--ppo.steps", "5"), "options that begin with --ppo. are for ppo, the others for cem"),
         (("reconstrut", "bag"), "there is no command reconstrut; the commands are demo, view, "),
+        (("touch", "no.ply", "--out", "t.txt"), "t.txt: no such kind of picture can be written; let the name end in .png"),
+        (("touch", "no.ply", "--out", "nowhere/t.png"), "nowhere/t.png: the picture cannot be written; does the folder exist?"),
         (("plot",), "no files to plot; give those that `endo-sim bench … --json FILE` wrote"),
         (("config", "policy_nod"), "no node is called policy_nod; there are reconstruction_node, "),
     ],

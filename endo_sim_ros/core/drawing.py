@@ -1,5 +1,6 @@
 """Pictures for people: force arrows, coloured depth, labelled sheets and videos."""
 
+import os
 import re
 from collections.abc import Iterable
 from fractions import Fraction
@@ -77,6 +78,14 @@ def sheet(pictures: list[tuple[str, np.ndarray]], columns: int = 3) -> np.ndarra
 def slug(text: str) -> str:
     """A text, such as a split's name, as part of a file's name."""
     return re.sub(r"[^\w.+-]+", "_", re.sub(r"(\d):(\d)", r"\1to\2", text))
+
+
+def require_writable(path: Path) -> None:
+    """Raise OSError if no picture can be written there: asked before long work."""
+    if not cv2.haveImageWriter(str(path)):
+        raise OSError(f"{path}: no such kind of picture can be written; let the name end in .png")
+    if not os.access(path.parent, os.W_OK):
+        raise OSError(f"{path}: the picture cannot be written; does the folder exist?")
 
 
 def write_png(path: str | Path, image: np.ndarray) -> None:

@@ -31,7 +31,9 @@ def draw_touches(model_path: Path, out: Path, config: PhysicsConfig) -> None:
 
     Raises:
         ValueError: If there is no camera, or nothing in the middle of its picture.
+        OSError: If the picture cannot be written.
     """
+    drawing.require_writable(out)
     if config.kinematics != "rest":
         raise ValueError(f"tissue with kinematics {config.kinematics} cannot be cut, as the picture shows; leave it at rest")
     model, cameras = load_ply(model_path), load_cameras(model_path.parent / "cameras.json")

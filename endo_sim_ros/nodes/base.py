@@ -22,7 +22,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.timer import Timer
 from rclpy.utilities import ok, try_shutdown
 
-from endo_sim_ros import hear_interrupts, messages
+from endo_sim_ros import messages
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ClientState, Topic
 from endo_sim_ros.nodes.errors import sentence
@@ -166,7 +166,13 @@ def quality(topic: Topic, depth: int = STREAM_DEPTH, reliable: bool = True) -> Q
 
 def run(node_class: Callable[[], EndoNode]) -> int:
     """Start ROS, spin a node until it is told to stop, and return the exit status: 2 if it could not start."""
-    hear_interrupts()
+    spinning = False
+
+    def on_interrupt(*_: Any) -> None:
+        if not spinning:
+            raise KeyboardInterrupt  # in a callback rclpy would log it as an error of that; it ends the spinning by itself
+
+    signal.signal(signal.SIGINT, on_interrupt)
     end_with_parent()
     prepare_transport()
     try:
@@ -178,6 +184,7 @@ def run(node_class: Callable[[], EndoNode]) -> int:
     try:
         node = node_class()
         gc.freeze()  # looking through all that was imported takes 0.15 s, in which nothing else happens
+        spinning = True
         spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass

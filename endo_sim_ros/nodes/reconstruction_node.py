@@ -38,6 +38,8 @@ from endo_sim_ros.sequences.synchronizer import Synchronizer
 _JUMP_BACK, _JUMP_AHEAD, _PAUSE = 1.0, 60.0, 1.0
 _CAMERAS = "cameras.json"
 
+log = logging.getLogger("reconstruction_node")  # for what is said after ROS shut down, when its own log would complain
+
 
 class ReconstructionNode(EndoNode):
     """Collects views, trains in a worker thread, publishes the model as it grows and saves it."""
@@ -199,11 +201,14 @@ class ReconstructionNode(EndoNode):
             trainer.run(on_progress, every=5)
             self._offer(trainer)
             self._save(trainer.model, trainer.cameras, trainer)  # also what an interrupted training has reached
-            self._finished = True
-            done = f"{len(trainer.model)} Gaussians after {trainer.iteration} iterations"
-            self.get_logger().info(f"reconstruction finished: {done}, saved in {self._saved}")
+            self._finished = trainer.iteration == config.iterations
+            reached = f"{len(trainer.model)} Gaussians after {trainer.iteration} of {config.iterations} iterations, saved in {self._saved}"
+            if self._finished:
+                self.get_logger().info(f"reconstruction finished: {reached}")
+            else:
+                log.info("reconstruction stopped before its end: %s", reached)
         except Cancelled:
-            self.get_logger().info("reconstruction cancelled")
+            log.info("reconstruction stopped during its preparation, nothing saved")
         except Exception as error:
             self._failure = sentence("reconstruction", error)
             if isinstance(error, (MemoryError, torch.OutOfMemoryError)):

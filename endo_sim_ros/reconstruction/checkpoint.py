@@ -1,14 +1,36 @@
 """Files of an interrupted training. Reading one runs no code that it holds, and takes no more memory than it is large."""
 
+import contextlib
 import pickle
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from endo_sim_ros.core.config import option_values
+from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.optimizer import parameters_of
+
+
+def identity(config: ReconstructionConfig) -> dict[str, Any]:
+    """The options that a training with the same views must have to go on from a checkpoint."""
+    return {name: value for name, value in option_values(config).items() if name != "device"}
+
+
+@contextlib.contextmanager
+def reading(path: str | Path) -> Iterator[None]:
+    """Context that makes a SequenceError of whatever its block raises: a damaged file can make the unpickler raise anything."""
+    try:
+        yield
+    except SequenceError:
+        raise
+    except Exception as error:
+        reason = next(iter(str(error).splitlines()), type(error).__name__)
+        raise SequenceError(f"{path}: not a readable checkpoint ({reason})") from error
 
 
 def write_checkpoint(state: dict[str, Any], path: str | Path) -> None:
@@ -20,13 +42,22 @@ def write_checkpoint(state: dict[str, Any], path: str | Path) -> None:
     partial.replace(path)
 
 
-def read_checkpoint(path: str | Path, device: str) -> dict[str, Any]:
+def read_checkpoint(path: str | Path, config: ReconstructionConfig, device: str) -> dict[str, Any]:
     """The state that was written.
 
     Raises:
-        ValueError: If the file claims more than it holds, or its parts do not fit each other. A damaged file can make the unpickler
-            raise anything else.
+        SequenceError: If the file is not a checkpoint, or one of other options.
     """
+    with reading(path):
+        state = _read_state(path, device)
+        mine, theirs = identity(config), state["config"]
+        differing = [name for name in {**mine, **theirs} if mine.get(name) != theirs.get(name)]
+    if differing:
+        raise SequenceError(f"{path}: the checkpoint was made with other options ({', '.join(differing)}); use the same or start anew")
+    return state
+
+
+def _read_state(path: str | Path, device: str) -> dict[str, Any]:
     size = Path(path).stat().st_size
     with zipfile.ZipFile(path) as archive:
         if sum(entry.file_size for entry in archive.infolist()) > size:

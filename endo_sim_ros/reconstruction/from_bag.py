@@ -6,8 +6,10 @@ from pathlib import Path
 from rich.progress import Progress as ProgressBar
 
 from endo_sim_ros.core.cameras import save_cameras
+from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.gaussians import save_ply
+from endo_sim_ros.reconstruction.checkpoint import read_checkpoint
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.keyframes import select_keyframes
 from endo_sim_ros.reconstruction.pipeline import prepare
@@ -32,7 +34,11 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
 
     Raises:
         SequenceError: If the bag or the checkpoint cannot be used, or `prepare` finds nothing to start from.
+        ValueError: If there is no such device.
     """
+    pick_device(config.device)  # what cannot be used is refused before the long work
+    if resume:
+        read_checkpoint(out / "checkpoint.pt", config, "cpu")
     frames = list(read_bag(bag))
     out.mkdir(parents=True, exist_ok=True)  # before the long work
     chosen = select_keyframes(frames, config.keyframes)

@@ -6,21 +6,20 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera, interpolate_pose
-from endo_sim_ros.core.config import option_values
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import Light, directions
 from endo_sim_ros.reconstruction import losses, photometry
 from endo_sim_ros.reconstruction.appearance import Appearance
-from endo_sim_ros.reconstruction.checkpoint import read_checkpoint, write_checkpoint
+from endo_sim_ros.reconstruction.checkpoint import identity, read_checkpoint, reading, write_checkpoint
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.device_views import DeviceView, matrices, reprojected_prior
 from endo_sim_ros.reconstruction.optimizer import PARAMETERS, Adam, model_of, parameters_of
@@ -115,7 +114,7 @@ class Trainer:
     def save_checkpoint(self, path: str | Path) -> None:
         """Write model, optimiser and random state; a training that loads them goes on as if never interrupted."""
         state = {
-            "config": self._identity(),
+            "config": identity(self.config),
             "stamps": self.stamps,
             "iteration": self.iteration,
             "order": self._order,
@@ -135,13 +134,10 @@ class Trainer:
         Raises:
             SequenceError: If the file is not a checkpoint, or one of other views or options.
         """
-        try:
-            state = read_checkpoint(path, self.device)
-            mine, theirs = self._identity(), state["config"]
-            differing = [name for name in {**mine, **theirs} if mine.get(name) != theirs.get(name)]
-            if differing or state["stamps"] != self.stamps:
-                what = f"other options ({', '.join(differing)})" if differing else "other views"
-                raise SequenceError(f"{path}: the checkpoint was made with {what}; use the same or start anew")
+        with reading(path):
+            state = read_checkpoint(path, self.config, self.device)
+            if state["stamps"] != self.stamps:
+                raise SequenceError(f"{path}: the checkpoint was made with other views; use the same or start anew")
             iteration, order = int(state["iteration"]), [int(view) for view in state["order"]]
             if iteration < 0 or not set(order) <= set(range(len(self._device_views))):
                 raise ValueError("it names views or an iteration that there cannot be")
@@ -161,15 +157,6 @@ class Trainer:
             self._appearance.optimizer.state = state["light_optimizer"]
             self._generator, self._noise = generator, noise
             self.iteration, self._order, self._fitted = iteration, order, None
-        except SequenceError:
-            raise
-        except Exception as error:  # a damaged file can make the unpickler raise anything
-            reason = next(iter(str(error).splitlines()), type(error).__name__)
-            raise SequenceError(f"{path}: not a readable checkpoint ({reason})") from error
-
-    def _identity(self) -> dict[str, Any]:
-        """The options that a training with the same views must have to go on from a checkpoint."""
-        return {name: value for name, value in option_values(self.config).items() if name != "device"}
 
     def _detached(self) -> GaussianModel:
         return model_of({name: tensor.detach().clone() for name, tensor in self._parameters.items()})

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -19,6 +20,7 @@ from mcap_ros2.decoder import DecoderFactory
 from endo_sim_ros import cli
 from endo_sim_ros.cli import convert
 from endo_sim_ros.core.config import ConfigError, options
+from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import load_ply
 from endo_sim_ros.evaluation import held_out
 from endo_sim_ros.reconstruction import ReconstructionConfig, from_bag
@@ -103,6 +105,8 @@ def test_a_killed_reconstruction_goes_on_to_the_same_model(bag, tmp_path, caplog
         process.kill()
     assert process.returncode == -9 and not (tmp_path / "killed" / "model.ply").exists()
     config = ReconstructionConfig(**values)
+    with pytest.raises(SequenceError, match=r"killed/checkpoint.pt: the checkpoint was made with other options \(seed\)"):
+        reconstruct_bag(tmp_path / "no_bag", tmp_path / "killed", replace(config, seed=1), resume=True)
     with caplog.at_level(logging.INFO):
         reconstruct_bag(bag, tmp_path / "killed", config, resume=True)
     assert re.search(r"going on after [1-9]\d* iterations", caplog.text)
@@ -174,11 +178,15 @@ def test_reconstruct_writes_a_model_and_measures_held_out_views(bag, tmp_path):
         (("convert", "no/such/thing", "no_bag"), "no/such/thing: no such file or folder"),
         (("convert", "launch", "no_bag"), "no known layout recognised"),
         (("reconstruct", "no_bag", "out"), "no_bag: no such bag"),
+        (("reconstruct", "no_bag", "no_out", "--device", "cuda:99"), "device 'cuda:99' asked for, but"),
+        (("reconstruct", "no_bag", "no_out", "--resume"), "no_out/checkpoint.pt: not a readable checkpoint"),
         (("phantom", "README.md"), "README.md exists already"),
         (("phantom", "no_bag", "--frames", "0"), r"PhantomConfig.frames must lie in \[1, 100000\], got 0"),
         (("demo", "--bag", "no_bag"), "no_bag: no such bag"),
         (("train", "no_out", "--algorithm", "cem", "--ppo.steps", "5"), "options that begin with --ppo. are for ppo, the others for cem"),
         (("reconstrut", "bag"), "there is no command reconstrut; the commands are demo, view, "),
+        (("touch", "no.ply", "--out", "t.txt"), "t.txt: no such kind of picture can be written; let the name end in .png"),
+        (("touch", "no.ply", "--out", "nowhere/t.png"), "nowhere/t.png: the picture cannot be written; does the folder exist?"),
         (("plot",), "no files to plot; give those that `endo-sim bench … --json FILE` wrote"),
         (("config", "policy_nod"), "no node is called policy_nod; there are reconstruction_node, "),
     ],

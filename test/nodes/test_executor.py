@@ -1,5 +1,7 @@
 """The loop of a node."""
 
+import subprocess
+import sys
 import threading
 
 import numpy as np
@@ -15,6 +17,22 @@ from endo_sim_ros.nodes.base import EndoNode
 from endo_sim_ros.nodes.rclpy_private import spin
 
 pytestmark = pytest.mark.dds
+
+
+INTERRUPTED = """
+import os, signal
+from endo_sim_ros.nodes.base import EndoNode, run
+class Interrupted(EndoNode):
+    def __init__(self):
+        super().__init__("interrupted")
+        self.every(0.01, lambda: os.kill(os.getpid(), signal.SIGINT))
+raise SystemExit(run(Interrupted))
+"""
+
+
+def test_ctrl_c_during_a_callback_is_not_logged_as_its_error():
+    done = subprocess.run([sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
 def test_a_node_serves_what_is_there_and_what_is_added_or_removed_meanwhile(bench):

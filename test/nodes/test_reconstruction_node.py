@@ -1,6 +1,8 @@
 """reconstruction_node: good and bad recordings, and when they come and go."""
 
 import itertools
+import logging
+import re
 import sys
 import time
 
@@ -192,7 +194,7 @@ def test_a_reconstruction_that_fails_says_so_until_the_next_one(bench, reconstru
     bench.status("reconstruction_node", "finished")
 
 
-def test_services_answer_and_callbacks_stay_quick_while_training(bench, reconstruction, small_frames):
+def test_services_answer_and_callbacks_stay_quick_while_training(bench, reconstruction, small_frames, caplog):
     send_frames(bench, small_frames)
     assert bench.set("reconstruction_node", iterations=10_000)[0]
     assert bench.call(Trigger, "/reconstruction_node/reconstruct").success
@@ -205,8 +207,11 @@ def test_services_answer_and_callbacks_stay_quick_while_training(bench, reconstr
     assert time.monotonic() - start < 5.0
     iteration = bench.status("reconstruction_node", "training, iteration", OK)[2]["iteration"]
     assert 0 < int(iteration) < 10_000
-    reconstruction._cancel.set()
-    bench.until(lambda: not reconstruction._training, "the training to stop")
+    with caplog.at_level(logging.INFO):
+        reconstruction._cancel.set()
+        bench.until(lambda: not reconstruction._training, "the training to stop")
+    assert re.search(r"stopped before its end: .* of 10000 iterations, saved in", caplog.text)
+    assert "finished" not in reconstruction.status()[1]
 
 
 def test_a_model_file_is_published_when_set_and_a_bad_one_is_refused_with_the_reason(bench, reconstruction, tmp_path):

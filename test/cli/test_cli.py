@@ -53,6 +53,7 @@ def test_help_names_every_command_and_imports_none():
     assert not {"torch", "warp", "rclpy", "numpy", "cv2", "tyro", "rich"} & set(done.stderr.split())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", cli.COMMANDS)
 def test_every_command_explains_its_options(name, capsys):
     with pytest.raises(SystemExit) as end:
@@ -114,6 +115,7 @@ def test_a_killed_reconstruction_goes_on_to_the_same_model(bag, tmp_path, caplog
     assert (tmp_path / "killed" / "model.ply").read_bytes() == (tmp_path / "whole" / "model.ply").read_bytes()
 
 
+@pytest.mark.slow
 def test_options_given_beside_a_preset_count_whatever_their_value(monkeypatch):
     taken = []
     monkeypatch.setattr(from_bag, "reconstruct_bag", lambda *arguments: (taken.append(arguments[2]), []))
@@ -130,6 +132,7 @@ def test_a_preset_is_that_of_the_words_and_not_of_the_process():
     assert command.config == preset("paper").replaced({"mcmc.growth": 0.3})
 
 
+@pytest.mark.slow
 def test_help_tells_range_and_unit(capsys):
     with pytest.raises(SystemExit):
         cli.parse("touch", ["--help"])
@@ -172,6 +175,7 @@ def test_reconstruct_writes_a_model_and_measures_held_out_views(bag, tmp_path):
     assert picture.shape[1] == 3 * 128 and picture.std() > 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments, sentence",
     [

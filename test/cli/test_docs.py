@@ -32,6 +32,7 @@ def test_links_lead_somewhere(page):
             assert (page.parent / target.split("#")[0]).exists(), target
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES, ids=NAMES)
 def test_commands_have_these_options(page):
     """Each is parsed but not run; tyro exits where it does not understand one."""
@@ -59,6 +60,7 @@ def test_nodes_and_their_parameters_exist(page):
                 assert value.split(":=")[0] in section, (node, value)
 
 
+@pytest.mark.slow
 def test_what_is_named_where_something_is_added_exists():
     section = (ROOT / "CONTRIBUTING.md").read_text().split("## Add something")[1].split("\n## ")[0]
     folders = [ROOT / folder for folder in ("endo_sim_ros", "config", "docs", "scripts", "test")]

@@ -111,6 +111,7 @@ def test_package_xml_names_what_the_code_imports():
     assert ros <= declared, ros - declared
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("module", ["endo_sim_ros.nodes.configs", "endo_sim_ros.nodes.parameter_file"])
 def test_options_of_all_nodes_need_neither_ros_nor_torch(module):
     code = f"import sys, {module}; print(sorted({{'rclpy', 'torch', 'warp'}} & set(sys.modules)))"

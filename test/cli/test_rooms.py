@@ -68,6 +68,7 @@ def test_files_import_each_other_in_no_circle():
         pytest.fail(" -> ".join(error.args[1]))
 
 
+@pytest.mark.slow
 def test_only_nodes_graph_and_messages_import_ros():
     for name, path in FILES.items():
         if room_of(name) not in ("nodes", "graph", "messages", "benchmarks"):

@@ -152,6 +152,7 @@ def test_damaged_compressed_models_are_one_sentence(tmp_path, damage, sentence):
         load_ply(path)
 
 
+@pytest.mark.slow
 def test_covariances_are_those_of_the_rotated_axes():
     sent = model()
     covariances = sent.covariances

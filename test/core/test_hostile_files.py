@@ -84,6 +84,7 @@ HOSTILE_CAMERAS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", HOSTILE_CAMERAS)
 def test_hostile_cameras_are_one_sentence(tmp_path, name):
     text, sentence = HOSTILE_CAMERAS[name]

@@ -94,6 +94,7 @@ def test_psnr_of_an_empty_mask_is_nan(pair):
 weights = pytest.mark.skipif(not (SHARED / "weights").is_dir(), reason="the weights of LPIPS are not at ../shared/data/weights")
 
 
+@pytest.mark.slow
 @weights
 @pytest.mark.parametrize("backbone, expected", [("alex", (0.722, 0.138)), ("vgg", (0.569, 0.422))])
 def test_lpips_is_that_of_its_authors(backbone, expected):

@@ -108,6 +108,7 @@ def test_many_environments_begin_anew_one_by_one_and_count_their_seeds():
         many.reset(options={"reset_mask": np.ones(3, bool)})
 
 
+@pytest.mark.slow
 def test_ended_environments_begin_anew_at_the_next_step_and_others_go_on():
     many = gymnasium.make_vec(IDS["retraction"], num_envs=2, vectorization_mode="vector_entry_point", device="cpu")
     policy = scripted_policy("retraction")
@@ -128,6 +129,7 @@ def test_ended_environments_begin_anew_at_the_next_step_and_others_go_on():
     assert o["time_left"][1] < before[-1]
 
 
+@pytest.mark.slow
 def test_pulling_too_hard_ends_the_episode(monkeypatch):
     monkeypatch.setattr(TASKS["retraction"], "force_limit", 0.3)
     environment = make()
@@ -135,6 +137,7 @@ def test_pulling_too_hard_ends_the_episode(monkeypatch):
     assert len(rewards) < 60 and not info["success"] and info["force"] > 0.3 and rewards[-1] < 0
 
 
+@pytest.mark.slow
 def test_an_inclusion_is_the_region_that_physics_node_would_paint():
     """A factor on each node's moduli gives the bits of painted properties: pins, contact and all."""
     batch = TaskBatch("palpation", load_scene(), 2, device="cpu")
@@ -159,6 +162,7 @@ def test_stiffness_beyond_what_the_substeps_were_planned_for_is_refused():
         solver.set_stiffness(slice(None), np.full((1, solver.node_count), 9.0))
 
 
+@pytest.mark.slow
 def test_randomisation_changes_what_it_names_and_nothing_else():
     scene = load_scene()
 
@@ -182,6 +186,7 @@ def test_randomisation_changes_what_it_names_and_nothing_else():
         make(randomisation={"light": 2.0})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("light, degree", [(None, 0), (None, 1), (Light(distance=0.9, angle=0.4, response=0.3), 0)])
 def test_images_are_those_of_the_renderer(light, degree):
     from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
@@ -210,6 +215,7 @@ def test_a_task_is_seen_by_the_view_in_the_middle_as_in_the_graph():
     assert np.array_equal(Scene(scene.model, tuple(scene.camera.at(pose) for pose in poses)).camera.pose, poses[1])
 
 
+@pytest.mark.slow
 def test_what_was_felt_most_is_remembered():
     batch = TaskBatch("palpation", load_scene(), 2, device="cpu")
     batch.reset([0, 1], [np.random.default_rng(s) for s in (5, 6)])

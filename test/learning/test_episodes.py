@@ -23,6 +23,7 @@ def column(episode, name):
     raise KeyError(name)
 
 
+@pytest.mark.slow
 def test_steps_in_lockstep_are_paired_by_their_stamps(tmp_path):
     episode = read_episode(lockstep(tmp_path / "bag"))
     assert episode.lockstep and episode.fps == 25 and len(episode) == 11 and episode.arms == ("PSM1",)
@@ -37,6 +38,7 @@ def test_steps_in_lockstep_are_paired_by_their_stamps(tmp_path):
     np.testing.assert_allclose(episode.action[:, 7], 0.01 * (observed + 1), atol=1e-7)
 
 
+@pytest.mark.slow
 def test_the_first_observation_needs_no_command(tmp_path):
     with Recording(tmp_path / "bag") as recording:
         recording.act(-S, 0)  # once before the steps begin, as to say where the tool is
@@ -50,6 +52,7 @@ def test_the_first_observation_needs_no_command(tmp_path):
     np.testing.assert_allclose(column(episode, "PSM1.force_z"), [-1, -2, -3, -4])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reset", [-9 * S, 3600 * S], ids=["early", "late"])
 def test_observations_after_a_reset_may_bear_any_time(tmp_path, reset, caplog):
     """In lockstep they bear the stamp of the model, whatever the policy's stamps are."""
@@ -66,6 +69,7 @@ def test_observations_after_a_reset_may_bear_any_time(tmp_path, reset, caplog):
     np.testing.assert_allclose(column(episode, "PSM1.force_z"), -np.arange(1.0 if early else 2.0, 40))
 
 
+@pytest.mark.slow
 def test_two_runs_in_one_bag_are_refused(tmp_path):
     with Recording(tmp_path / "bag") as recording:
         for _ in range(2):
@@ -104,6 +108,7 @@ def test_at_a_rate_the_last_message_counts(bag):
     np.testing.assert_allclose(column(episode, "PSM1.force_z"), -4.0 * (observed + 1))
 
 
+@pytest.mark.slow
 def test_another_rate_repeats_or_skips(bag):
     fast, slow = read_episode(bag, fps=50), read_episode(bag, fps=5)
     np.testing.assert_array_equal(fast.image_numbers, np.arange(98) // 2)
@@ -111,6 +116,7 @@ def test_another_rate_repeats_or_skips(bag):
     np.testing.assert_allclose(column(slow, "PSM1.force_z"), -20.0 * (np.arange(len(slow)) + 1))
 
 
+@pytest.mark.slow
 def test_lockstep_recordings_can_be_sampled_at_a_rate(tmp_path):
     path = lockstep(tmp_path / "bag")
     assert read_episode(path, sampling="rate").lockstep is False
@@ -121,6 +127,7 @@ def test_lockstep_recordings_can_be_sampled_at_a_rate(tmp_path):
         read_episode(path, fps=10, sampling="lockstep")
 
 
+@pytest.mark.slow
 def test_wrenches_are_turned_into_the_axes_of_the_world(bag, tmp_path):
     episode = read_episode(bag)
     np.testing.assert_allclose(column(episode, "PSM1.reaction_force_y"), np.arange(49))  # was along x of the turned tip
@@ -153,11 +160,13 @@ def test_poses_and_wrenches_in_the_frame_of_a_base_are_turned_into_the_world(bag
         read_episode(path, frames=("PSM1_base 1",))
 
 
+@pytest.mark.slow
 def test_poses_without_a_frame_are_in_the_world_when_the_base_is_not_named(bag, tmp_path):
     episode = read_episode(realtime(tmp_path / "bag", base=("", np.eye(4))))
     np.testing.assert_array_equal(episode.state, read_episode(bag).state)
 
 
+@pytest.mark.slow
 def test_stamps_shared_in_real_time_are_not_taken_for_lockstep(tmp_path, caplog):
     """As those of an arm without a robot, or of a policy that answers with the stamp of what it saw."""
     caplog.set_level("INFO")
@@ -189,6 +198,7 @@ def test_quaternions_do_not_jump(tmp_path):
     np.testing.assert_allclose(commanded[:-1], quats[1:], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_commanded_poses_are_the_action_where_there_are_any(tmp_path):
     with Recording(tmp_path / "bag") as recording:
         for number in range(8):
@@ -232,6 +242,7 @@ def test_tissue_is_summarized_around_each_tip():
     assert summarize_tissue(few, tips).shape == (16,)
 
 
+@pytest.mark.slow
 def test_images_are_those_of_their_rows(bag):
     episode = read_episode(bag, fps=50)
     shown = [image[0, 0, 0] // 2 for image in episode.images()]
@@ -259,6 +270,7 @@ def test_an_empty_recording_says_so(tmp_path):
         read_episode(tmp_path / "bag")
 
 
+@pytest.mark.slow
 def test_recordings_that_cannot_be_rows_say_why(tmp_path):
     with pytest.raises(SequenceError, match="less than 0.04 s in common; record longer"):
         read_episode(realtime(tmp_path / "short", 0.03))
@@ -280,6 +292,7 @@ def test_messages_without_a_time_do_not_count(tmp_path):
         read_episode(tmp_path / "bag")
 
 
+@pytest.mark.slow
 def test_a_foreign_frame_and_a_changed_image_size_are_one_sentence(tmp_path):
     realtime(tmp_path / "frame", 0.5, frame="base_link")
     with pytest.raises(SequenceError, match="frame: PSM1/body/servo_cf: unknown frame 'base_link'"):

@@ -34,6 +34,7 @@ def dataset(bag, tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 def test_the_layout_is_that_of_lerobot(dataset):
     info = json.loads((dataset / "meta/info.json").read_text())
     assert info["codebase_version"] == "v3.0" and info["fps"] == 25 and info["splits"] == {"train": "0:2"}
@@ -77,6 +78,7 @@ def test_episodes_and_tasks_are_described(dataset):
     assert json.loads(tasks.schema.metadata[b"pandas"])["index_columns"] == ["__index_level_0__"]
 
 
+@pytest.mark.slow
 def test_statistics_are_those_of_the_data(dataset):
     statistics = json.loads((dataset / "meta/stats.json").read_text())
     tables = read_tables(dataset, "data/*/*.parquet")
@@ -93,6 +95,7 @@ def test_statistics_are_those_of_the_data(dataset):
         np.testing.assert_allclose(statistics[IMAGE][name], expected, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_png_images_are_exact(bag, tmp_path):
     export_lerobot([bag], tmp_path / "out", "t", images="png")
     info = json.loads((tmp_path / "out/meta/info.json").read_text())
@@ -114,6 +117,7 @@ def test_episodes_that_do_not_agree_are_refused_before_anything_is_written(bag, 
     assert export_lerobot([bag, two_arms], tmp_path / "out", "t", arms=("PSM1",))[0] == 2
 
 
+@pytest.mark.slow
 def test_a_dataset_is_not_overwritten_nor_left_in_halves(bag, dataset, tmp_path, monkeypatch):
     with pytest.raises(SequenceError, match="video exists already; choose another name"):
         export_lerobot([bag], dataset, "t")
@@ -129,6 +133,7 @@ def test_a_dataset_is_not_overwritten_nor_left_in_halves(bag, dataset, tmp_path,
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_odd_images_make_no_video(tmp_path):
     with Recording(tmp_path / "bag") as recording:
         for number in range(4):

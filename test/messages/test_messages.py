@@ -17,6 +17,7 @@ from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.messages import ControlNodeCloud, MessageError, bag_types, ros_types
 
 
+@pytest.mark.slow
 def test_a_png_that_claims_gigabytes_is_no_image():
     size = 20_000
     row = zlib.compress(bytes(size * (size // 8 + 1)), 9)  # one bit a pixel
@@ -59,6 +60,7 @@ def image(height=5, width=7):
     return np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
 
 
+@pytest.mark.slow
 def test_bag_bytes_are_what_ros_reads():
     from rclpy.serialization import deserialize_message
 

@@ -15,6 +15,7 @@ def press(simulation: TissueSimulation, depth: float, over: int = 10, hold: int 
         simulation.step()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kinematics", ["rest", "current"])
 def test_what_a_pushing_tool_feels_is_the_momentum_that_the_tissue_gets(kinematics):
     simulation = free_block(kinematics=kinematics, contact_radius=0.006, contact_length=0.05, friction=0.3)
@@ -58,6 +59,7 @@ def test_a_pressed_layer_resists_as_the_theory_of_indentation_says(young):
     np.testing.assert_allclose(forces, theory, rtol=0.15)
 
 
+@pytest.mark.slow
 def test_friction_drags_and_without_it_tools_slide():
     drags = []
     for friction in (0.0, 0.3):

@@ -85,6 +85,7 @@ def test_a_viewpoint_that_is_not_finite_is_refused(viewpoint):
         build_control_nodes(curved_sheet(), np.array(viewpoint), PhysicsConfig())
 
 
+@pytest.mark.slow
 def test_tissue_is_carved_where_a_camera_sees_through_it_and_only_there():
     """A small plate in front of a wide one: what hangs behind its edge is seen from the side."""
     rng = np.random.default_rng(7)

@@ -86,6 +86,7 @@ def brute_force(a, b, triangle) -> bool:
     return u >= 0 and v >= 0 and u + v <= 1 and 0 <= t <= 1
 
 
+@pytest.mark.slow
 def test_crossings_are_those_of_brute_force():
     rng = np.random.default_rng(0)
     a, b, triangles = rng.uniform(size=(400, 3)), rng.uniform(size=(400, 3)), rng.uniform(size=(12, 3, 3))
@@ -135,6 +136,7 @@ def test_a_full_cut_leaves_two_pieces_that_share_no_grid_node(ratio, jitter):
     assert momentum_pieces(after).max() == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_an_oblique_cut_through_scattered_nodes_leaves_two_pieces(seed):
     rest, centre = block(jitter=0.4, seed=seed), np.array([0.03, 0.02, 0.01])
@@ -264,6 +266,7 @@ def test_two_crossing_cuts_leave_four_pieces(jitter):
     assert len(np.unique(4 * pieces + quadrant)) == 4
 
 
+@pytest.mark.slow
 def test_cuts_in_any_pieces_and_order_give_the_same_table():
     rest = block(jitter=0.3)
     triangles = np.concatenate([wall(y=(-0.02, 0.03)), wall(x=0.0211)[..., [1, 0, 2]]])

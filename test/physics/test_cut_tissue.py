@@ -65,6 +65,7 @@ def test_a_cut_opens_where_the_blade_was_and_not_beyond_its_end():
     assert gap(-0.03, -0.012) > 3 * gap(0.012, 0.03) > 0
 
 
+@pytest.mark.slow
 def test_momentum_is_kept_on_each_side_of_a_cut_through_free_tissue():
     simulation = free_block(layers=0, blade_length=0.05, kinematics="rest")
     x = simulation.nodes.rest[:, 0]

@@ -79,6 +79,7 @@ def test_a_grid_beyond_memory_is_refused(size):
         MpmSolver(nodes, PhysicsConfig(device="cpu"))
 
 
+@pytest.mark.slow
 def test_few_substeps_settle_where_many_do():
     dents = []
     for count in (0, 80):

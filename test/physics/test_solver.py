@@ -27,6 +27,7 @@ def test_rest_state_stays_bit_identical_without_force(kinematics, material):
     assert state.time == pytest.approx(0.12) and state.positions.dtype == np.float32
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [20, 700, 2000, 4000])
 def test_blocks_of_a_cluster_add_up_what_all_nodes_give_to_a_grid_node(count):
     solver = simulate(node_count=count).solver
@@ -79,6 +80,7 @@ def test_same_inputs_give_the_same_bits_twice(kinematics):
     np.testing.assert_array_equal(first.state().positions, second.state().positions)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kinematics", ["rest", "current"])
 @pytest.mark.parametrize("material", MATERIALS)
 def test_backends_agree_on_everything_that_acts_at_once(kinematics, material):
@@ -136,6 +138,7 @@ def test_moving_the_scene_by_metres_changes_nothing():
     assert np.abs(dents[0]).max() > 5e-4
 
 
+@pytest.mark.slow
 def test_printed_skin_only_method_and_dense_baseline_run():
     printed = simulate(layers=0, kinematics="current")
     dense = TissueSimulation(curved_sheet(), EYE, PhysicsConfig.baseline(device="cpu"))

@@ -10,6 +10,7 @@ from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.physics import PhysicsConfig, StabilityError, TissueProperties, TissueSimulation, plan_substeps
 
 
+@pytest.mark.slow
 def test_tissue_that_relaxes_holds_back_less_and_less_as_a_standard_linear_solid():
     ratio, time, forces = 1.5, 0.4, []
     simulation = simulate(relaxation=ratio, relaxation_time=time)
@@ -29,6 +30,7 @@ def test_tissue_that_relaxes_holds_back_less_and_less_as_a_standard_linear_solid
     assert forces[5] > 1.7 * forces[-1] > 0
 
 
+@pytest.mark.slow
 def test_slowly_relaxing_tissue_is_not_left_as_it_is_before_it_has_relaxed():
     held, lasting = [], []
     for relaxation, results in ((1.0, held), (0.0, lasting)):
@@ -50,6 +52,7 @@ def test_relaxing_tissue_needs_the_substeps_of_its_fast_stiffness():
         plan_substeps(dataclasses.replace(plain, relaxation=3.0, young_modulus=2e6), 0.01)
 
 
+@pytest.mark.slow
 def test_a_stiff_region_gives_way_less_and_the_tissue_beside_it_as_before():
     region = "sphere 0.025 0 0.12 0.012 young_modulus=100000"
     left, right = TIP - [0.025, 0, 0], TIP + [0.025, 0, 0]
@@ -68,6 +71,7 @@ def test_a_stiff_region_gives_way_less_and_the_tissue_beside_it_as_before():
         simulate(regions=("sphere 5 5 5 0.01 young_modulus=1e5",))
 
 
+@pytest.mark.slow
 def test_each_node_obeys_its_own_material():
     """A column of two halves in series, each shortening as its own modulus says."""
     height, spacing = 0.02, 0.0025
@@ -87,6 +91,7 @@ def test_each_node_obeys_its_own_material():
     assert moved[middle].mean() == pytest.approx(expected_half * 1.25, rel=0.12)
 
 
+@pytest.mark.slow
 def test_tissue_whose_material_changes_goes_on_from_where_it_is():
     soft, stiff = simulate(blade_length=0.03), simulate(blade_length=0.03, young_modulus=20e3)
     for y in np.linspace(-0.045, 0.0, 10):

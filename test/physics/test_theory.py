@@ -50,6 +50,7 @@ def test_released_tissue_returns_to_rest():
     assert depth_of_dent(simulation) < 0.05 * deep
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kinematics", ["rest", "current"])
 @pytest.mark.parametrize("relaxation", [0.0, 1.0])
 def test_free_tissue_keeps_its_linear_and_angular_momentum(kinematics, relaxation):
@@ -66,6 +67,7 @@ def test_free_tissue_keeps_its_linear_and_angular_momentum(kinematics, relaxatio
     assert simulation.faults == 0 and depth_of_dent(simulation) > 0.02  # it flies, turns and wobbles
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spacing", [0.005, 0.0025])
 def test_a_wide_slab_under_its_own_weight_is_a_confined_column(spacing):
     height, width = 0.02, 0.08
@@ -93,6 +95,7 @@ def test_column_under_its_own_weight_shortens_as_theory_says(kinematics, ratio):
     assert sag == pytest.approx(1000 * 9.81 * height**2 / (2 * 10e3), rel=0.06)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spacing, tolerance", [(0.005, 0.15), (0.0025, 0.06)])
 def test_cantilever_bends_as_timoshenko_says_and_better_when_finer(spacing, tolerance):
     length, side, young, force = 0.08, 0.02, 20e3, 0.008
@@ -108,6 +111,7 @@ def test_cantilever_bends_as_timoshenko_says_and_better_when_finer(spacing, tole
     assert bent == pytest.approx(theory, rel=tolerance)
 
 
+@pytest.mark.slow
 def test_dent_grows_with_force_and_shrinks_with_stiffness():
     dents = []
     for force, young in ((0.05, 10e3), (0.2, 10e3), (0.2, 20e3)):

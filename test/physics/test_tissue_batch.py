@@ -14,6 +14,7 @@ from endo_sim_ros.core.gaussians import save_ply
 from endo_sim_ros.physics import PhysicsConfig, TissueBatch, TissueSimulation, build_control_nodes
 
 
+@pytest.mark.slow
 def test_environments_are_independent_copies_on_any_number_of_threads(monkeypatch):
     nodes = build_control_nodes(curved_sheet(), EYE, PhysicsConfig(node_count=400))
     config = PhysicsConfig(device="cpu", node_count=400)

@@ -83,6 +83,7 @@ def test_grabbed_tissue_stays_grabbed_while_it_follows():
     np.testing.assert_allclose(simulation.reaction("jaw")[0], [0, 0, 0.8], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_tip_that_stays_behind_does_not_wring_the_tissue():
     simulation = simulate(force_radius=0.008)
     simulation.set_wrench("jaw", TIP, [2.0, 0.0, -1.0])

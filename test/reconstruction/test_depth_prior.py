@@ -36,6 +36,7 @@ def test_a_wrong_principal_point_of_the_right_eye_is_found(large):
     assert disparity_offsets(known, [stereo_disparity(frame) for frame in known], points).max() == pytest.approx(0, abs=0.25)
 
 
+@pytest.mark.slow
 def test_no_offset_without_points(large):
     assert disparity_offsets(list(large[:1]), [np.ones((512, 640), np.float32)], NO_POINTS) == 0
 
@@ -64,6 +65,7 @@ def _seen_at(frame, depth_of, count, random):
     return dataclasses.replace(frame, camera=camera), rays * z[:, None], z
 
 
+@pytest.mark.slow
 def test_depth_between_points_of_a_plane_is_the_plane(small):
     plane = lambda uv: 1 / (20 - uv @ [0.04, 0.03])
     frame, points, _ = _seen_at(small[0], plane, 400, np.random.default_rng(0))
@@ -73,6 +75,7 @@ def test_depth_between_points_of_a_plane_is_the_plane(small):
     np.testing.assert_allclose(depth[v, u], plane(np.column_stack([u, v]) + 0.5), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_depth_between_points_that_err_is_better_than_theirs(small):
     random, surface = np.random.default_rng(0), lambda uv: 0.08 + 0.01 * np.sin(uv[:, 0] / 30) * np.cos(uv[:, 1] / 30)
     frame, points, _ = _seen_at(small[0], surface, 1500, random)
@@ -83,6 +86,7 @@ def test_depth_between_points_that_err_is_better_than_theirs(small):
     assert np.sqrt((off**2).mean()) < 0.01
 
 
+@pytest.mark.slow
 def test_depth_between_points_stays_among_theirs(small):
     random = np.random.default_rng(0)
     slopes = lambda uv: 0.03 + 0.12 * np.abs(uv[:, 0] / small[0].camera.width - 0.5) ** 0.5
@@ -135,6 +139,7 @@ def test_an_offset_that_no_principal_point_explains_is_refused(large, caplog):
     assert "check poses, their scale and the baseline" in caplog.text
 
 
+@pytest.mark.slow
 def test_small_islands_of_disparity_are_no_surface(large):
     frame = large[0]
     clean = stereo_disparity(frame)
@@ -146,6 +151,7 @@ def test_small_islands_of_disparity_are_no_surface(large):
     assert (disparity > 0).mean() > (clean > 0).mean() - 0.02
 
 
+@pytest.mark.slow
 def test_depth_between_points_goes_through_those_that_hardly_err(small):
     random, surface = np.random.default_rng(0), lambda uv: 0.08 + 0.01 * np.sin(uv[:, 0] / 30) * np.cos(uv[:, 1] / 30)
     frame, points, _ = _seen_at(small[0], surface, 1500, random)
@@ -158,6 +164,7 @@ def test_depth_between_points_goes_through_those_that_hardly_err(small):
     assert error(0.0) < 0.7 * error(0.125)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", [-3, 2])
 def test_a_right_image_that_lies_too_high_or_too_low_is_put_on_the_rows_of_the_left(large, rows):
     moved = dataclasses.replace(large[0], right=np.roll(large[0].right, rows, axis=0))
@@ -168,6 +175,7 @@ def test_a_right_image_that_lies_too_high_or_too_low_is_put_on_the_rows_of_the_l
     assert (align_rows(far).right == far.right).all()
 
 
+@pytest.mark.slow
 def test_a_tool_is_masked_in_the_right_image_wherever_it_may_be_there(large):
     mask = np.full((512, 640), 255, np.uint8)
     mask[200:300, 300:320] = 0

@@ -27,6 +27,7 @@ def holding(frame, shown, depth=0.6, color=(150, 150, 150)):
     return dataclasses.replace(frame, image=image, depth=np.where(shown, depth * frame.depth, frame.depth).astype(np.float32))
 
 
+@pytest.mark.slow
 def test_an_instrument_in_one_of_several_views_is_left_out(views, tool, caplog):
     shown = tool & (views[4].depth > 0)
     *still, empty, held = with_prior([views[0], views[2], views[6], views[8], views[4], holding(views[4], shown)])
@@ -38,6 +39,7 @@ def test_an_instrument_in_one_of_several_views_is_left_out(views, tool, caplog):
     assert (found[4].depth_prior[hidden] == 0).all()
 
 
+@pytest.mark.slow
 def test_an_instrument_on_the_tissue_is_told_by_its_colour(views, tool):
     shown = tool & (views[4].depth > 0)
     seen = with_prior([views[0], views[2], views[6], views[8], holding(views[4], shown, 1.0, (60, 150, 160))])
@@ -45,6 +47,7 @@ def test_an_instrument_on_the_tissue_is_told_by_its_colour(views, tool):
     assert mask_motion(seen, 0.05, DynamicMaskConfig(chroma=5.0))[4] is seen[4]
 
 
+@pytest.mark.slow
 def test_nothing_is_left_out_where_nobody_can_tell_what_is_right(views, tool, caplog):
     held = holding(views[4], tool & (views[4].depth > 0))
     pair = with_prior([views[0], held])

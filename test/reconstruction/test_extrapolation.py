@@ -21,6 +21,7 @@ def initial(frame, points=None, **changes):
     return prepare([frame], options(max_gaussians=8000, light=False, exposure=False, **changes), points).model
 
 
+@pytest.mark.slow
 def test_what_goes_on_beyond_a_picture_does_not_reach_into_it(views):
     frame = bare(views[4])
     exact, pixels = views[4].depth, np.column_stack([np.full(40, 175.0), np.linspace(5, 120, 40)])
@@ -39,6 +40,7 @@ def test_what_goes_on_beyond_a_picture_does_not_reach_into_it(views):
     assert np.quantile(np.abs(rendered[border] / alone[border] - 1), 0.98) < 0.02
 
 
+@pytest.mark.slow
 def test_gaussians_around_a_picture_are_small_close_to_it_and_none_is_a_lone_scene_point(views):
     frame = dataclasses.replace(bare(views[4]), depth=views[4].depth)
     K, aside = frame.camera.K, np.array([[230.0, 20.0], [250.0, 60.0], [270.0, 100.0]])  # far beyond the right edge
@@ -53,6 +55,7 @@ def test_gaussians_around_a_picture_are_small_close_to_it_and_none_is_a_lone_sce
     assert not (np.abs(model.means.numpy()[:, None] - points).max(2) < 1e-6).any()
 
 
+@pytest.mark.slow
 def test_noise_of_scene_points_does_not_make_the_tissue_beyond_rough(views):
     (frame,) = with_prior(views[4:5])
     random, K = np.random.default_rng(0), frame.camera.K
@@ -66,6 +69,7 @@ def test_noise_of_scene_points_does_not_make_the_tissue_beyond_rough(views):
     assert np.std(around / flat) < 0.012  # points alone: 0.017
 
 
+@pytest.mark.slow
 def test_a_picture_goes_on_as_bright_as_it_is_however_far_the_tissue_beyond_is_guessed(views):
     """Tissue that rises towards the right edge and on beyond it; the light falls off with distance."""
     camera, light, exposure = views[4].camera, np.array([0.9, 3.0, 0.1, 0.0]), np.full(3, 0.2)
@@ -101,6 +105,7 @@ def test_what_lies_beyond_two_views_looks_as_in_the_nearer_one(views):
             assert where.sum() > 20 and (colors[where, nearer] > colors[where, farther]).all()
 
 
+@pytest.mark.slow
 def test_tissue_goes_on_beyond_the_pictures_and_in_holes(views):
     frame = dataclasses.replace(bare(views[4]), depth=views[4].depth.copy())
     frame.depth[50:80, 60:100] = 0  # as at a glint

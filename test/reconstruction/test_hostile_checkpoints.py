@@ -78,6 +78,7 @@ HOSTILE_CHECKPOINTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", HOSTILE_CHECKPOINTS)
 def test_a_hostile_checkpoint_is_one_sentence_runs_no_code_and_leaves_the_training_alone(trainer, tmp_path, name):
     change, sentence = HOSTILE_CHECKPOINTS[name]

@@ -28,6 +28,7 @@ def images():
     return tuple(torch.rand(37, 29, 3, generator=generator, dtype=torch.float64) for _ in range(3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-10), (torch.float32, 2e-4)])
 def test_ssim_and_its_gradient_are_those_of_the_reference(images, dtype, tolerance):
     x, y, v = images

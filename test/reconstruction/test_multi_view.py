@@ -141,6 +141,7 @@ def test_no_pixel_is_corrected_to_another_surface():
     assert 12 < corrected.max() < 12.6 and corrected.min() > 9.9
 
 
+@pytest.mark.slow
 def test_ripples_of_wide_images_are_smoothed_and_edges_are_not():
     width, noise = 1920, np.random.default_rng(0).normal(0, 0.1, (160, 1920))
     step = np.where(np.arange(width) < 960, 8.0, 12.0) + np.zeros_like(noise)
@@ -155,6 +156,7 @@ def test_larger_relative_steps_than_an_edge_are_kept():
     assert off[0] > 0.15 and off[0] > off[1] > off[2] and off[2] < 0.07
 
 
+@pytest.mark.slow
 def test_scene_points_correct_the_depth_around_them(large):
     frame = large[0]
     off = with_prior([dataclasses.replace(frame, depth=frame.depth * np.float32(1.04), right=None, baseline=None)])

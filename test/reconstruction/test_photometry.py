@@ -26,6 +26,7 @@ def lit_views(light: Light, gains, poses) -> list[TrainingView]:
     return frames
 
 
+@pytest.mark.slow
 def test_light_and_exposures_are_found_from_views_at_several_distances():
     places = ((-0.02, 0.03), (0.02, 0.0), (0.0, -0.03), (0.015, -0.05))
     poses = [look_at(np.array([x, 0.5 * x, z]), np.array([x, -x, 0.1])) for x, z in places]

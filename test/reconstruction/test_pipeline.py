@@ -113,6 +113,7 @@ def test_thresholds_of_usable_views_are_options(frames):
 # ----------------------------------------------------------------------------------------------------------- progress
 
 
+@pytest.mark.slow
 def test_cancelling_reaches_all_threads_and_begins_nothing_more(monkeypatch):
     monkeypatch.setenv("ENDO_SIM_THREADS", "2")
     begun, ended, both = [], [], threading.Barrier(2)
@@ -138,6 +139,7 @@ def test_cancelling_reaches_all_threads_and_begins_nothing_more(monkeypatch):
     assert sorted(begun) == sorted(ended) == [0, 1]
 
 
+@pytest.mark.slow
 def test_an_interrupt_reaches_the_threads():
     """Ctrl-C arrives in the main thread, while others work."""
     running = threading.Event()

@@ -60,12 +60,14 @@ def test_with_stereo_a_wrong_pose_among_three_is_left_out(caplog):
     assert "the poses of views 0 and 1 contradict" in caplog.text
 
 
+@pytest.mark.slow
 def test_swapped_poses_of_two_views_are_found(large):
     frames = [bare(frame) for frame in large]
     frames[1], frames[3] = (dataclasses.replace(frames[i], camera=frames[j].camera) for i, j in ((1, 3), (3, 1)))
     assert misposed(frames, match_features(frames)) == [1, 3]
 
 
+@pytest.mark.slow
 def test_of_two_views_neither_is_left_out(large, caplog):
     for first, second, fault in ((bare(large[0]), bare(large[1]), "turned"), (large[0], large[1], "nearer")):  # the latter takes depth
         frames = [first, misplaced(second, fault)]
@@ -74,6 +76,7 @@ def test_of_two_views_neither_is_left_out(large, caplog):
         assert "the poses of views 0 and 1 contradict" in caplog.text
 
 
+@pytest.mark.slow
 def test_what_is_near_enough_is_an_option(large):
     frames = [bare(frame) for frame in large]
     frames[2] = misplaced(frames[2], "turned")

@@ -109,6 +109,7 @@ def test_options_beside_a_preset_count_even_if_they_are_the_defaults():
         preset("paper", preset="3dgs")
 
 
+@pytest.mark.slow
 def test_a_checkpoint_knows_the_options_and_not_the_preset_that_they_came_from(views, tmp_path):
     config = preset("paper", lambda_dist=0.0, **SHORT)
     points = triangulate(views)[:2]

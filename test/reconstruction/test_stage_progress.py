@@ -77,6 +77,7 @@ def test_nobody_waits_for_what_runs_when_the_work_is_cancelled():
     released.set()
 
 
+@pytest.mark.slow
 def test_a_stage_leaves_the_views_it_is_given_as_they_are(small):
     views = with_prior(small[:3])
     before = [{name: np.copy(getattr(view, name)) for name in ("image", "depth_prior", "mask")} for view in views]

@@ -29,6 +29,7 @@ def held_out(model, frames):
     return np.mean(rows, 0)
 
 
+@pytest.mark.slow
 def test_adam_is_that_of_torch():
     g = torch.Generator().manual_seed(0)
     start = {name: torch.randn(shape, generator=g) for name, shape in (("means", (20, 3)), ("logit_opacities", (20,)))}
@@ -86,6 +87,7 @@ def test_training_improves_views_it_has_not_seen(small):
     assert reports[-1].gaussians == len(model) <= 8000
 
 
+@pytest.mark.slow
 def test_progress_can_stop_the_training(small):
     trainer = trainer_of([small[0]], options())
     trainer.run(lambda progress: False, every=2)

@@ -28,6 +28,7 @@ def test_triangulated_points_lie_on_the_surface(large):
     assert np.median(off[coarse]) > np.median(off[~coarse])  # rays that meet at a small angle tell less
 
 
+@pytest.mark.slow
 def test_views_from_one_place_give_no_points(large):
     first = large[0]
     assert len(triangulate([first, first])[0]) == 0
@@ -39,6 +40,7 @@ def test_views_from_one_place_give_no_points(large):
     assert len(triangulate([first, rotated])[0]) == 0
 
 
+@pytest.mark.slow
 def test_matches_are_of_near_views_and_no_more_than_asked_for(large):
     matches = match_features(list(large), MatchingConfig(neighbours=1, max_features=200))
     near = nearest_views(list(large), 1)

@@ -19,6 +19,7 @@ def test_no_views_is_one_clear_error():
         trainer_of([], options())
 
 
+@pytest.mark.slow
 def test_one_view_is_enough_with_depth(small):
     assert finite(trainer_of([small[0]], options()).run())
 
@@ -29,6 +30,7 @@ def test_identical_views_train(small, caplog):
     assert "contradict what they see" not in caplog.text
 
 
+@pytest.mark.slow
 def test_masking_everything_is_an_error(small):
     hidden = dataclasses.replace(small[0], mask=np.zeros_like(small[0].mask))
     with pytest.raises(SequenceError, match="masked"):
@@ -66,6 +68,7 @@ def test_points_alone_are_enough(large):
     assert len(model) > 100
 
 
+@pytest.mark.slow
 def test_odd_sizes_train():
     frames = film(161, 97, 3)
     model = trainer_of(list(frames[::2]), options(image_width=75)).run()

@@ -271,6 +271,7 @@ def test_damaged_metadata_is_one_sentence(small_bag, tmp_path, text):
         list(read_bag(tmp_path / "bag"))
 
 
+@pytest.mark.slow
 def test_flipped_bytes_are_told_or_harmless(small_bag, tmp_path):
     shutil.copytree(small_bag, tmp_path / "bag")
     file = next((tmp_path / "bag").glob("*.mcap"))
@@ -309,6 +310,7 @@ def test_missing_topics_are_named_with_what_there_is(small_bag, tmp_path, missin
         list(read_bag(tmp_path / "bag"))
 
 
+@pytest.mark.slow
 def test_a_bag_whose_stamps_never_meet_says_so(small_bag, tmp_path):
     with BagReader(small_bag) as source, BagWriter(tmp_path / "bag") as bag:
         for topic, stamp, message in source.messages(messages.RECORDING_TOPICS):
@@ -319,6 +321,7 @@ def test_a_bag_whose_stamps_never_meet_says_so(small_bag, tmp_path):
         list(read_bag(tmp_path / "bag"))
 
 
+@pytest.mark.slow
 def test_an_unusable_message_is_named_with_its_bag(small_bag, tmp_path):
     with BagReader(small_bag) as source, BagWriter(tmp_path / "bag") as bag:
         for topic, stamp, message in source.messages(messages.RECORDING_TOPICS):

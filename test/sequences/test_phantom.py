@@ -55,6 +55,7 @@ def test_depth_lies_on_the_surface(seed):
         assert np.abs(gap).max() < 2e-5
 
 
+@pytest.mark.slow
 def test_nothing_of_the_surface_is_in_front_of_the_depth(frames):
     """Of all crossings along a ray the depth is the first."""
     camera, depth = frames[1].camera, frames[1].depth
@@ -63,6 +64,7 @@ def test_nothing_of_the_surface_is_in_front_of_the_depth(frames):
         assert (points[..., 2] < build_phantom(0).height(points[..., 0], points[..., 1]) + 2e-6).all()
 
 
+@pytest.mark.slow
 def test_two_views_agree_on_the_depth():
     config = dataclasses.replace(SMALL, width=320, height=256)
     poses = phantom_poses(dataclasses.replace(config, frames=9))
@@ -84,6 +86,7 @@ def test_two_views_agree_on_the_depth():
     assert np.median(np.abs(z - seen)[visible]) < 5e-5
 
 
+@pytest.mark.slow
 def test_stereo_disparity_is_focal_times_baseline_over_depth():
     """Along a row, the right image moved by fx·B/Z shows the left image; a wrong disparity shows it much worse."""
     frame = next(phantom_sequence(PhantomConfig(width=320, height=256, frames=1, noise=0.0)))

@@ -22,6 +22,7 @@ from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.sequences.rectification import Rectification, StereoCalibration
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distortion", [NO_DISTORTION, BARREL], ids=["undistorted", "barrel"])
 def test_rectified_eyes_share_rows_and_their_disparity_gives_depth(distortion):
     R, T = rotation(0.02, -0.03, 0.015), np.array([-BASELINE, 0.0003, -0.0002])

@@ -122,6 +122,7 @@ def test_stereomis_extracted_frames_equal_the_video(stereomis):
         assert_frame_agrees(frame)
 
 
+@pytest.mark.slow
 def test_intrinsics_follow_images_of_another_resolution(stereomis):
     next(stereomis.glob("*.mp4")).unlink()
     for number, pair in enumerate(stereo_images(trajectory(2))):

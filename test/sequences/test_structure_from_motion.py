@@ -93,6 +93,7 @@ def test_folder_without_poses_is_posed_and_the_guessed_scale_is_announced(tmp_pa
     assert "SCALE" not in caplog.text  # estimated once
 
 
+@pytest.mark.slow
 def test_structure_from_motion_that_fails_says_why(tmp_path):
     pytest.importorskip("pycolmap")
     flat = itertools.repeat(np.full((120, 160, 3), 128, np.uint8), 3)

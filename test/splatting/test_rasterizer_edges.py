@@ -100,6 +100,7 @@ def test_a_gaussian_that_covers_all_tiles_matches_the_reference():
     assert_matches_reference(gaussians, make_cameras())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [[0.0, 1.0, 1.0], [0.0, 0.0, 1.0], [1e-12, 1.0, 1.0], [-1.0, 1.0, 1.0]])
 def test_degenerate_scales_match_the_reference(scale, compositor):
     gaussians = make_gaussians(seed=22)
@@ -130,6 +131,7 @@ def test_a_million_gaussians_are_all_seen():
     assert (whole.depths - depths)[unfinished].abs().max() < 1e-5
 
 
+@pytest.mark.slow
 def test_needle_gaussians_lose_no_tile(compositor):
     gaussians = make_gaussians(80, seed=10)
     gaussians[2] = gaussians[2] * torch.tensor([12.0, 0.02, 0.02])

@@ -207,6 +207,7 @@ def test_the_default_dtype_changes_nothing(compositor):
     assert torch.equal(output.colors, expected.colors)
 
 
+@pytest.mark.slow
 def test_pictures_drawn_in_several_threads_are_those_drawn_in_one(compositor):
     """Of different sizes, each with two forward passes before their backward passes."""
     plain, scenes = not vectorised("cpu"), [(make_gaussians(400, seed=31), (70, 45)), (make_gaussians(150, seed=32), (33, 60))]

@@ -22,6 +22,7 @@ from raster_scene import (
 from endo_sim_ros.splatting import RenderOutput, _rasterize, rasterize, reference
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sh_count", [1, 4, 9, 16])
 @pytest.mark.parametrize("device", DEVICES)
 def test_images_and_all_gradients_match_the_reference(device, sh_count, compositor):
@@ -60,6 +61,7 @@ def test_covariances_match_the_reference_and_give_the_picture_of_quats_and_scale
         assert_close(name, actual, image.detach().cpu(), IMAGE_TOLERANCE)
 
 
+@pytest.mark.slow
 def test_each_output_alone_has_the_gradient_of_the_reference():
     gaussians, cameras = make_gaussians(seed=6), make_cameras()
     images = run(_rasterize, gaussians, cameras)[0][:4]
@@ -72,6 +74,7 @@ def test_each_output_alone_has_the_gradient_of_the_reference():
             assert_close(f"{name} for {RenderOutput._fields[alone]}", actual, gradient, 2e-4)
 
 
+@pytest.mark.slow
 def test_camera_gradient_matches_finite_differences_of_the_reference():
     gaussians, (viewmats, Ks) = make_gaussians(40, 4, seed=7), make_cameras(1)
     cotangents = random_like(_rasterize(*gaussians, viewmats, Ks, WIDTH, HEIGHT)[:4])

@@ -32,6 +32,7 @@ def turn_until(page, condition, what):
     return wait_until(condition, 20, what, page.turn)
 
 
+@pytest.mark.slow
 def test_mouse_pulls_tissue_and_lets_go(page):
     viewer, browser = page.viewer, page.viewer.browsers[1]
     point(viewer, "start", (0.5, 0.5))
@@ -107,6 +108,7 @@ def test_picked_point_lies_on_the_tissue(page):
     np.testing.assert_allclose(picked, expected * np.array([0.1, -0.1, 1.0]), atol=1e-3)
 
 
+@pytest.mark.slow
 def test_reset_brings_tissue_back_and_lets_go(page):
     point(page.viewer, "start", (0.5, 0.5))
     point(page.viewer, "update", (0.6, 0.5))

@@ -14,6 +14,7 @@ from endo_sim_ros.nodes.base import EndoNode, run, sentence
 from endo_sim_ros.nodes.configs import BagPlayerConfig
 from endo_sim_ros.sequences.bag import BagReader
 
+_LAST_WORD_WITHIN = 2.0  # seconds that the last status has to arrive before its publisher is gone
 _DELIVERED_WITHIN = 10.0  # seconds that subscribers have, at the end, to ask again for what they missed
 _MESSAGES = {  # for people
     BagPlayerState.WAITING: "waiting for subscribers",
@@ -67,6 +68,7 @@ class BagPlayerNode(EndoNode):
             return
         self._state = BagPlayerState.DONE
         self.publish_diagnostics()
+        self._diagnostics.wait_for_all_acked(Duration(seconds=_LAST_WORD_WITHIN))
         self.get_logger().info(f"finished: {self._sent} messages")
         try_shutdown(context=self.context)
 

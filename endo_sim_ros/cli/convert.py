@@ -20,7 +20,7 @@ class Command:
     bag: Positional[Path]
     """Folder of the new bag; it must not exist."""
     kind: str = "auto"
-    """Layout, by its name in lower case; auto recognises it."""
+    """Layout: stereomis, scared, endonerf, folder or video; auto recognises it."""
     start: int | None = None
     """First frame number."""
     stop: int | None = None

@@ -130,6 +130,7 @@ def refuse_renamed_flags(words: Sequence[str], command: type) -> None:
             raise ConfigError(f"{flag} is now {new.replace('_', '-') if new.startswith('--') else new}")
 
 
+@cache
 def document_ranges(command: type) -> None:
     """Let tyro's help of a command tell range and unit of each option of the stage configurations that it holds."""
     for _, stage, _ in _stages(command):

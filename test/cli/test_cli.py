@@ -65,6 +65,7 @@ def test_convert_offers_every_option_of_every_reader():
     offered = inspect.signature(convert.Command).parameters
     for layout, reader in READERS.items():
         assert set(inspect.signature(reader.read).parameters) - {"path"} <= offered.keys(), layout
+        assert re.search(rf"Layout: .*\b{layout.lower()}\b", inspect.getsource(convert)), layout
 
 
 @pytest.fixture(scope="module")

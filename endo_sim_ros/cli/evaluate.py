@@ -26,4 +26,4 @@ class Command:
         print(f"{self.config.out}: table.md, table.csv, results.json, views.csv, strips/, plots/")
         failed = sum(cell["error"] is not None for cell in cells)
         if failed:
-            raise RuntimeError(f"{failed} of {len(cells)} cells failed, as the table says; the same command tries them again")
+            raise RuntimeError(f"{failed} of {len(cells)} cells failed; the same command tries them again")

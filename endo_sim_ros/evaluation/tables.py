@@ -139,7 +139,7 @@ def notes(results: dict[str, Any]) -> list[str]:
 
 
 def write(results: dict[str, Any], out: Path, json_file: Path | None) -> None:
-    """Print the table, and write table.md, table.csv, views.csv, strips, plots and, if asked for, rows for machines."""
+    """Print the table and why cells failed; write table.md, table.csv, views.csv, strips, plots and, if asked for, rows for machines."""
     summaries = summarise(results)
     (out / "table.md").write_text(markdown(results, summaries))
     _write_csv(results, summaries, out)
@@ -148,6 +148,10 @@ def write(results: dict[str, Any], out: Path, json_file: Path | None) -> None:
     if json_file is not None:
         write_rows(machine_rows(summaries), json_file)
     Console(width=None if sys.stdout.isatty() else 150).print(_terminal_table(summaries, results["missing"]))
+    for record in results["cells"]:
+        if record["error"] is not None:
+            reason = next(iter(record["error"].splitlines()), "without a reason")
+            print("{sequence}, {split}, {method}, seed {seed} failed: ".format(**record["cell"]) + reason)
 
 
 def markdown(results: dict[str, Any], summaries: list[Summary]) -> str:

@@ -99,6 +99,19 @@ def option_values(config: "StageConfig") -> dict[str, Any]:
     return {option.name: operator.attrgetter(option.name)(config) for option in options(type(config))}
 
 
+def unused_options(*configs: "StageConfig") -> list[str]:
+    """A sentence for each option that is not at its default, yet has no effect in any of these configurations of one class."""
+    values, found = [option_values(config) for config in configs], []
+    for option in options(type(configs[0])):
+        switch, *wanted = configs[0].needs.get(option.name.partition(".")[0], ("",))
+        if switch and any(each[option.name] != option.default for each in values):
+            now = [each[switch] for each in values]
+            if not any(value in wanted if isinstance(value, str) else value for value in now):
+                texts = " or ".join(dict.fromkeys(str(value).lower() for value in now))
+                found.append(f"{option.name} has no effect while {switch} is {texts}; set {switch} to {' or '.join(wanted)}")
+    return found
+
+
 def renamed_options(config_class: type["StageConfig"]) -> dict[str, str]:
     """What to write instead of each old name of an option; those of nested stages are dotted."""
     renamed = dict(config_class.renamed)
@@ -168,6 +181,10 @@ class StageConfig:
 
     renamed: ClassVar[dict[str, str]] = {}
     """Options that had another name: the old name, and the new one, or what to write instead in words."""
+
+    needs: ClassVar[dict[str, tuple[str, ...]]] = {}
+    """Options and nested stages that have an effect only beside some value of another: the name of that, then its values in words. Of
+    an option that is no word any value counts but zero and false."""
 
     def __post_init__(self):
         for option in options(type(self)):

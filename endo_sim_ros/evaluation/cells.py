@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from endo_sim_ros.core import drawing
-from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.core.config import ConfigError, unused_options
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.evaluation.config import EvaluationConfig
 from endo_sim_ros.evaluation.lpips import Backbone, Lpips, WeightsError
@@ -116,12 +116,14 @@ def _methods(config: EvaluationConfig) -> dict[str, dict[str, Any]]:
     if any(item.partition("=")[0] == "preset" for item in config.set):
         raise ConfigError("--set preset: methods are named with --presets")
     common = {"device": "auto"} | parse_values(config.set, "--set", ReconstructionConfig)
-    methods = {name: dataclasses.asdict(preset(name, **common)) for name in config.presets}
+    methods = {name: preset(name, **common) for name in config.presets}
     if config.ablation:
         for name in config.presets:
             for part, overrides in ABLATIONS[name].items() if name in ABLATIONS else ():
-                methods[f"{name} {part}"] = dataclasses.asdict(preset(name, **{**common, **overrides}))
-    return methods
+                methods[f"{name} {part}"] = preset(name, **{**common, **overrides})
+    for text in unused_options(*methods.values()):
+        log.warning(text)
+    return {name: dataclasses.asdict(options) for name, options in methods.items()}
 
 
 def _networks(config: EvaluationConfig) -> tuple[tuple[Backbone, ...], dict[str, str]]:

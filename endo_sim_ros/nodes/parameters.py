@@ -14,7 +14,7 @@ from rclpy.exceptions import InvalidParameterTypeException, ParameterNotDeclared
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from endo_sim_ros.core.config import ConfigError, Option, StageConfig, option_values, options, renamed_options
+from endo_sim_ros.core.config import ConfigError, Option, StageConfig, option_values, options, renamed_options, unused_options
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.nodes.configs import NODE_CONFIGS
 from endo_sim_ros.nodes.errors import sentence
@@ -67,6 +67,8 @@ class ConfiguredNode(Node):
                 raise ConfigError(f"parameter {option.name}: {error} ({option.description})") from error
         config = config_class.from_mapping(values)
         _require_device(config)
+        for text in unused_options(config):
+            self.get_logger().warning(text)
         self._configs[config_class] = config
         if len(self._configs) == 1:
             self.add_pre_set_parameters_callback(self._before_set)
@@ -120,7 +122,7 @@ class ConfiguredNode(Node):
         new = {parameter.name: parameter.value for parameter in parameters}
         requested, self._requested = self._requested, set()
         try:
-            changed = []
+            changed, unused = [], []
             for config in self._configs.values():
                 old = option_values(config)
                 candidate = config.replaced({name: new[name] for name in old.keys() & new.keys()})
@@ -131,12 +133,15 @@ class ConfiguredNode(Node):
                 if names:
                     _require_device(candidate)
                     changed.append(candidate)
+                    unused += sorted({*unused_options(candidate)} - {*unused_options(config)})
             for config in changed:
                 self.config_changed(config)
                 self._configs[type(config)] = config
         except Exception as error:
             return SetParametersResult(successful=False, reason=sentence("parameters", error))
         self._given |= requested
+        for text in unused:
+            self.get_logger().warning(text)
         return SetParametersResult(successful=True)
 
 

@@ -181,6 +181,19 @@ class ReconstructionConfig(StageConfig):
     gradient: GradientConfig = GradientConfig()
     proximity: ProximityConfig = ProximityConfig()
 
+    needs: ClassVar[dict[str, tuple[str, ...]]] = {
+        "depth_model": ("depth", "auto", "network"),
+        "network": ("depth", "auto", "network"),
+        "flat_ratio": ("lambda_flat", "more than 0"),
+        "flat_every": ("lambda_flat", "more than 0"),
+        "light_anchor": ("light", "true"),
+        "multi_view": ("multi_view_refinement", "true"),
+        "motion": ("dynamic_mask", "true"),
+        "extrapolated": ("extrapolation", "more than 0"),
+        "mcmc": ("densification", "mcmc"),
+        "gradient": ("densification", "gradient"),
+        "proximity": ("densification", "proximity"),
+    }
     renamed: ClassVar[dict[str, str]] = {
         "agreement": "multi_view_refinement",
         "surroundings": "extrapolation",

@@ -6,6 +6,7 @@ from pathlib import Path
 from rich.progress import Progress as ProgressBar
 
 from endo_sim_ros.core.cameras import save_cameras
+from endo_sim_ros.core.config import unused_options
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.gaussians import save_ply
@@ -37,6 +38,8 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
         ValueError: If there is no such device.
     """
     pick_device(config.device)  # what cannot be used is refused before the long work
+    for text in unused_options(config):
+        log.warning(text)
     if resume:
         read_checkpoint(out / "checkpoint.pt", config, "cpu")
     frames = list(read_bag(bag))

@@ -4,12 +4,14 @@ Every stage is a function of a scene, the options and a `StageProgress`; it retu
 recording do not ask for it. Inside, a stage gives the algorithm views, its own options and the progress to report to.
 """
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from endo_sim_ros.core.config import unused_options
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.reconstruction import photometry
@@ -24,6 +26,8 @@ from endo_sim_ros.reconstruction.progress import OnProgress, StageProgress
 from endo_sim_ros.reconstruction.scene import PreparedScene, ScenePoints, TrainingView, shrink
 from endo_sim_ros.reconstruction.trainer import Trainer
 from endo_sim_ros.reconstruction.triangulation import match_features, triangulate
+
+log = logging.getLogger(__name__)
 
 
 def prepare(
@@ -67,6 +71,8 @@ def reconstruct(
     on_progress: OnProgress | None = None,
 ) -> GaussianModel:
     """The trained model of posed frames; `prepare` and `Trainer` in one. Arguments and errors are those of `prepare`."""
+    for text in unused_options(config):
+        log.warning(text)
     trainer = Trainer(prepare(frames, config, points, on_progress), config)
     return trainer.run(on_progress and (lambda progress: on_progress("training", progress.iteration, progress.iterations)))
 

@@ -128,9 +128,12 @@ def test_options_given_beside_a_preset_count_whatever_their_value(monkeypatch):
     assert taken[2] == ReconstructionConfig()
 
 
-def test_a_preset_is_that_of_the_words_and_not_of_the_process():
-    command = cli.parse("reconstruct", ["bag", "out", "--preset", "paper", "--mcmc.growth", "0.3"])
+def test_a_preset_is_that_of_the_words_and_not_of_the_process(caplog):
+    command = cli.parse("reconstruct", ["no_bag", "out", "--preset", "paper", "--mcmc.growth", "0.3"])
     assert command.config == preset("paper").replaced({"mcmc.growth": 0.3})
+    with pytest.raises(SequenceError, match="no_bag: no such bag"):
+        command.run()
+    assert "mcmc.growth has no effect while densification is gradient" in caplog.text
 
 
 @pytest.mark.slow

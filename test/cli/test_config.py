@@ -10,11 +10,21 @@ import tyro
 import yaml
 
 from endo_sim_ros import cli
-from endo_sim_ros.core.config import ConfigError, Range, StageConfig, option_values, options, refuse_renamed_flags, renamed_options
+from endo_sim_ros.core.config import (
+    ConfigError,
+    Range,
+    StageConfig,
+    option_values,
+    options,
+    refuse_renamed_flags,
+    renamed_options,
+    unused_options,
+)
 from endo_sim_ros.nodes.configs import NODE_CONFIGS
 from endo_sim_ros.nodes.parameter_file import parameter_file
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.presets import PRESETS, Preset, preset
+from endo_sim_ros.reconstruction.strategies import STRATEGIES
 
 ALL = [config for configs in NODE_CONFIGS.values() for config in configs]
 FILE = Path(__file__).parents[2] / "config" / "endo_sim.yaml"
@@ -134,6 +144,35 @@ def test_a_configuration_takes_the_place_of_a_nested_stage():
     config = Nested().replaced({"example": Example(count=5), "last": 4})
     assert config == Nested(Example(count=5), 4)
     assert Nested().replaced({"example": Example(count=5), "example.count": 1}).example.count == 1
+
+
+@pytest.mark.parametrize(
+    "name, given, why",
+    [
+        ("3dgs", {"mcmc.growth": 0.1}, "densification is gradient; set densification to mcmc"),
+        ("default", {"proximity.far": 3.0}, "densification is mcmc; set densification to proximity"),
+        ("paper", {"motion.width": 100}, "dynamic_mask is false; set dynamic_mask to true"),
+        ("paper", {"extrapolated.size": 1.0}, "extrapolation is 0.0; set extrapolation to more than 0"),
+        ("default", {"network.max_error": 0.2, "depth": "points"}, "depth is points; set depth to auto or network"),
+    ],
+)
+def test_an_option_without_effect_is_told_with_what_gives_it_one(name, given, why):
+    assert unused_options(preset(name, **given)) == [f"{next(iter(given))} has no effect while {why}"]
+    users = ReconstructionConfig(), ReconstructionConfig(densification="proximity", depth="network")
+    assert not unused_options(preset(name, **given), *users), "one of several uses it"
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_have_no_option_without_effect(name):
+    assert not unused_options(preset(name))
+
+
+def test_what_options_need_can_be_had():
+    known = {option.name: option for option in options(ReconstructionConfig)}
+    for name, (switch, *wanted) in ReconstructionConfig.needs.items():
+        assert hasattr(ReconstructionConfig(), name) and switch in known
+        assert known[switch].choices is None or set(wanted) <= set(known[switch].choices)
+    assert all(ReconstructionConfig.needs[name] == ("densification", name) for name in STRATEGIES)
 
 
 @pytest.mark.parametrize("node", NODE_CONFIGS)

@@ -60,14 +60,15 @@ def test_what_cannot_be_read_loses_its_own_cells_only(run):
 
 
 @pytest.mark.dds
-def test_a_split_that_a_sequence_has_not_loses_its_own_cells_only(tmp_path, capsys):
+def test_a_split_that_a_sequence_has_not_loses_its_own_cells_only(tmp_path, capsys, caplog):
     config = EvaluationConfig(
         out=tmp_path, splits=("two-views", "stereo", "9:1"), presets=("default",), device="cpu", lpips=(),
-        set=("iterations=2", "max_gaussians=300", "image_width=96", "mcmc.growth=0.1"),
+        set=("iterations=2", "max_gaussians=300", "image_width=96", "mcmc.growth=0.1", "gradient.shrink=2"),
     )  # fmt: skip
     errors = [cell["error"] for cell in evaluate([f"{SMALL},stereo=false"], config)["cells"]]
     assert errors[:2] == [None, "split stereo: the sequence has no right images"]
     assert "leaves" in errors[2] and "0 to hold out" in errors[2]
+    assert "gradient.shrink has no effect while densification is mcmc" in caplog.text and "mcmc.growth has" not in caplog.text
     below = capsys.readouterr().out.splitlines()[-2:]
     assert below == [f"phantom:0, {split}, default, seed 0 failed: {error}" for split, error in zip(("stereo", "9:1"), errors[1:])]
 

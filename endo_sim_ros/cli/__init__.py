@@ -20,6 +20,9 @@ COMMANDS = (
     *("config", "evaluate", "report", "bench", "plot"),
 )
 
+# What the package raises for options and input that it cannot use, and Python for a path that cannot be read or written.
+_WRONGLY_GIVEN = (ValueError, FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
+
 
 class Runnable(Protocol):
     """A command with its options."""
@@ -58,7 +61,7 @@ def parse(name: str, words: list[str]) -> Runnable:
 
 
 def main() -> int:
-    """Run the command line; returns the exit status."""
+    """Run the command line; returns the exit status: 2 if options or input are wrong, 1 if something failed later, 130 after Ctrl-C."""
     hear_interrupts()
     words = sys.argv[1:]
     if not words or words[0] in ("-h", "--help"):
@@ -76,6 +79,6 @@ def main() -> int:
         return 130
     except (ImportError, RuntimeError, ValueError, OSError) as error:
         print(f"endo-sim: {str(error) or type(error).__name__}", file=sys.stderr)
-        return 1
+        return 2 if isinstance(error, _WRONGLY_GIVEN) else 1
     logging.getLogger(__name__).info("done in %.0f s", time.monotonic() - start)
     return 0

@@ -26,7 +26,7 @@ class Command:
     """Serve the page as well, on which tissue is seen and pulled with the mouse: http://localhost:8080."""
 
     def run(self) -> None:
-        """Run the graph until interrupted; raises UpError or SequenceError if something given cannot be used or all nodes are down."""
+        """Run the graph until interrupted; raises a ValueError if something given cannot be used, UpError if all are down."""
         from endo_sim_ros.graph.up import run_up
 
         run_up(self.bag, self.params_file, self.namespace, self.arms, self.model, self.logs, self.respawn, self.view)

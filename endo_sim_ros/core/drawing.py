@@ -81,11 +81,11 @@ def slug(text: str) -> str:
 
 
 def require_writable(path: Path) -> None:
-    """Raise OSError if no picture can be written there: asked before long work."""
+    """Raise ValueError if no picture can be written there: asked before long work."""
     if not cv2.haveImageWriter(str(path)):
-        raise OSError(f"{path}: no such kind of picture can be written; let the name end in .png")
+        raise ValueError(f"{path}: no such kind of picture can be written; let the name end in .png")
     if not os.access(path.parent, os.W_OK):
-        raise OSError(f"{path}: the picture cannot be written; does the folder exist?")
+        raise ValueError(f"{path}: the picture cannot be written; does the folder exist?")
 
 
 def write_png(path: str | Path, image: np.ndarray) -> None:

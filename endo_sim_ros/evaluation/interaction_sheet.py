@@ -30,8 +30,7 @@ def draw_touches(model_path: Path, out: Path, config: PhysicsConfig) -> None:
         config: Of the tissue; lengths of tools follow the size of what is seen.
 
     Raises:
-        ValueError: If there is no camera, or nothing in the middle of its picture.
-        OSError: If the picture cannot be written.
+        ValueError: If there is no camera, or nothing in the middle of its picture, or this cannot be written.
     """
     drawing.require_writable(out)
     if config.kinematics != "rest":

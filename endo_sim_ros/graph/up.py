@@ -20,6 +20,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.graph.processes import NodeGroup
 from endo_sim_ros.messages import ERROR, OK, WARN, NodeStatus
 from endo_sim_ros.nodes.transport import prepare_transport
@@ -93,7 +94,8 @@ class _Supervisor:
         """Report nodes that ended; start those that crashed again after a pause, unless they crash again and again.
 
         Raises:
-            UpError: If a node was given something it cannot use, or no node is left.
+            ConfigError: If a node was given something it cannot use.
+            UpError: If no node is left.
         """
         for name, node in list(self._graph.nodes.items()):
             status = node.exit_status
@@ -108,7 +110,7 @@ class _Supervisor:
                 self._ended.add(name)
                 continue
             if status == _CANNOT_START:
-                raise UpError(f"{_last_line(node.log) or f'{name} cannot start'}; its log is {node.log}")
+                raise ConfigError(f"{_last_line(node.log) or f'{name} cannot start'}; its log is {node.log}")
             how = f"was ended by {signal.Signals(-status).name}" if status < 0 else f"ended with status {status}"
             now = time.monotonic()
             crashes = self._crashes[name] = self._crashes.get(name, 0) + 1 if now - self._began[name] < _SOON else 1
@@ -174,7 +176,8 @@ def run_up(
     """Run reconstruction, physics and rendering, a bag player if there is a bag and the page if it is wanted, until interrupted.
 
     Raises:
-        UpError, SequenceError: If something given cannot be used, or all nodes are down; one sentence.
+        ConfigError, SequenceError: If something given cannot be used; one sentence.
+        UpError: If all nodes are down.
     """
     console, logs = Console(), logs.expanduser() / namespace.strip("/")
     if bag is not None:
@@ -182,7 +185,7 @@ def run_up(
             reader.require_recording()
     for path in (params_file, None if model in ("", "latest") else Path(model)):
         if path is not None and not path.expanduser().is_file():
-            raise UpError(f"{path}: there is no such file")
+            raise ConfigError(f"{path}: there is no such file")
     common = ["-r", f"__ns:=/{namespace.strip('/')}"] if namespace.strip("/") else []
     common += ["--params-file", str(params_file.expanduser())] if params_file else []
     prepare_transport()

@@ -133,8 +133,9 @@ def record(bag: Path, arms: tuple[str, ...], topics: tuple[str, ...], namespace:
     """Record a running graph until interrupted, with a live line of counts.
 
     Raises:
-        SequenceError: If the bag cannot be made, or the disk is full; what was written is kept.
+        SequenceError: If the bag cannot be made.
         ConfigError: If a topic or arm cannot be recorded.
+        RuntimeError: If the disk is full; what was written is kept.
     """
     if bag.exists():
         raise SequenceError(f"{bag} exists already; choose another name or remove it first")
@@ -161,7 +162,7 @@ def record(bag: Path, arms: tuple[str, ...], topics: tuple[str, ...], namespace:
         if node is not None:
             node.destroy_node()
     if node is not None and node.failure:
-        raise SequenceError(node.failure)
+        raise RuntimeError(node.failure)
     if node is not None:
         print(node.summary)
 

@@ -9,6 +9,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -159,8 +160,18 @@ def test_an_option_that_is_gone_is_refused(name):
 def test_an_old_flag_is_refused_with_the_new_one(monkeypatch, capsys):
     monkeypatch.setattr(ReconstructionConfig, "renamed", {"views": "keyframes"})
     monkeypatch.setattr(sys, "argv", "endo-sim reconstruct bag out --views 3".split())
-    assert cli.main() == 1
+    assert cli.main() == 2
     assert capsys.readouterr().err == "endo-sim: --views is now --keyframes\n"
+
+
+@pytest.mark.parametrize(
+    "error, status",
+    [(ConfigError(), 2), (PermissionError(), 2), (RuntimeError(), 1), (OSError(), 1), (ImportError(), 1), (KeyboardInterrupt(), 130)],
+)
+def test_the_status_tells_what_was_given_wrong_from_what_failed_later(error, status, monkeypatch):
+    monkeypatch.setattr(cli, "parse", Mock(side_effect=error))
+    monkeypatch.setattr(sys, "argv", ["endo-sim", "demo"])
+    assert cli.main() == status
 
 
 @pytest.mark.dds
@@ -208,7 +219,7 @@ def test_mistakes_are_one_sentence(arguments, sentence, tmp_path, monkeypatch, c
     except SystemExit as end:  # of the parser of arguments
         status = end.code
     said = capsys.readouterr()
-    assert status not in (0, None) and "Traceback" not in said.err
+    assert status == 2 and "Traceback" not in said.err
     text = " ".join((said.err + said.out).replace("│", " ").split())
     assert re.search(sentence, text), text
     assert not (ROOT / "out" / "metadata.yaml").exists()

@@ -13,6 +13,7 @@ import pytest
 from rich.console import Console
 from waiting import wait_until
 
+from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.graph import up as up_module
 from endo_sim_ros.graph.processes import NodeGroup
@@ -133,7 +134,7 @@ def test_up_without_respawn_leaves_a_dead_node_down(up):
 def test_up_refuses_what_a_node_cannot_use(up):
     """A node that cannot start would fail again: all end, with its reason."""
     run = up("--arms", "not/a name")
-    assert run.process.wait(120) == 1
+    assert run.process.wait(120) == 2
     assert re.search(r"endo-sim: .*'not/a name' cannot name topics.*; its log is \S+physics_node\.log", run.output.read_text())
     assert not run.processes()
 
@@ -155,6 +156,6 @@ def test_nodes_do_not_outlive_a_killed_up(up, when):
 def test_up_refuses_missing_files_before_it_starts_anything(tmp_path, given):
     options = {"bag": None, "params_file": None, "model": ""}
     options[given] = "/does/not/exist" if given == "model" else Path("/does/not/exist")
-    with pytest.raises((UpError, SequenceError), match="/does/not/exist"):
+    with pytest.raises((ConfigError, SequenceError), match="/does/not/exist"):
         run_up(**options, namespace="", arms=(), logs=tmp_path / "logs", respawn=True)
     assert not (tmp_path / "logs").exists()

@@ -202,6 +202,6 @@ def test_export_is_a_command(bag, tmp_path):
 )
 def test_mistakes_are_one_sentence(arguments, sentence, tmp_path):
     done = endo_sim(*(tmp_path / "out" if word == "OUT" else word for word in arguments))
-    assert done.returncode == 1 and "Traceback" not in done.stderr
+    assert done.returncode == 2 and "Traceback" not in done.stderr
     assert sentence in done.stderr and len(done.stderr.strip().splitlines()) == 1, done.stderr
     assert not (tmp_path / "out").exists()

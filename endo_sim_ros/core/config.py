@@ -18,6 +18,8 @@ from typing import Any, ClassVar, NamedTuple
 
 from typing_extensions import Doc, Self
 
+_NO_LIMIT = 1e6  # an upper bound from here on only guards against slips; help does not tell it
+
 
 class Range(NamedTuple):
     """Inclusive bounds of a numeric option and its unit, used inside ``Annotated``."""
@@ -43,7 +45,8 @@ class Option(NamedTuple):
         if self.range is None:
             return self.description
         low, high, unit = self.range
-        return f"{self.description} [{low:g} to {high:g}{' ' * bool(unit)}{unit}]"
+        unit = " " * bool(unit) + unit
+        return f"{self.description} [{f'{low:g}{unit} or more' if high >= _NO_LIMIT else f'{low:g} to {high:g}{unit}'}]"
 
 
 class ConfigError(ValueError):
@@ -203,7 +206,7 @@ class StageConfig:
                 raise ConfigError(f"{where} must be one of {', '.join(map(str, option.choices))}, got {value!r}")
             if option.range and not option.range.minimum <= value <= option.range.maximum:
                 low, high, unit = option.range
-                raise ConfigError(f"{where} must lie in [{low:g}, {high:g}] {unit}, got {value:g}".replace(" ,", ","))
+                raise ConfigError(f"{where} must lie in [{low:g}, {high:.10g}] {unit}, got {value:.10g}".replace(" ,", ","))
 
     @classmethod
     def from_mapping(cls, values: dict[str, Any]) -> Self:

@@ -68,6 +68,11 @@ def test_bad_values_are_refused_with_what_is_allowed(values, sentence):
         Example.from_mapping(values)
 
 
+def test_a_large_limit_is_told_to_the_digit_where_it_refuses():
+    with pytest.raises(ConfigError, match=r"seed must lie in \[0, 2147483647\], got 2147483648"):
+        ReconstructionConfig(seed=2**31)
+
+
 def test_whole_numbers_are_accepted_for_lengths():
     assert isinstance(Example(length=1).length, float)
 

@@ -76,12 +76,13 @@ def bench_physics(
     environments = environments or ((1, 4, 16, 64) if device == "cpu" else (1, 4, 16, 64, 256, 1024))
     scene = load_scene(model, plan.width) if model else phantom_scene(plan.gaussians, plan.width)
     notes: list[str] = []
-    report(f"Simulation on {machine(device)}", run_stages(_stages(scene, device, environments, plan, notes)), json_file)
+    report(f"Simulation on {machine(device)}", run_stages(stages(scene, device, environments, plan, notes)), json_file)
     for note in notes:
         print(note)
 
 
-def _stages(scene: Scene, device: str, environments: tuple[int, ...], plan: Plan, notes: list[str]) -> list[Stage]:
+def stages(scene: Scene, device: str, environments: tuple[int, ...], plan: Plan, notes: list[str]) -> list[Stage]:
+    """What is measured, in order."""
     nodes, seconds = plan.printed_nodes, plan.seconds
     return [
         ("dense and sparse", partial(_paper, scene, device, plan)),
@@ -90,7 +91,7 @@ def _stages(scene: Scene, device: str, environments: tuple[int, ...], plan: Plan
         ("contact", partial(_contact, scene, nodes, device, seconds)),
         *((f"{short(n)} Gaussians", partial(_over_gaussians, n, plan, device)) for n in plan.skin_counts),
         *((f"environments of {short(n)} nodes", partial(_many, scene, n, environments, device, plan)) for n in plan.batch_nodes),
-        (f"{PEER} solver", partial(_beside_peer, scene, device, plan, notes)),
+        (f"{PEER} solver", partial(beside_peer, scene, device, plan, notes)),
         ("memory", partial(_memory, scene, nodes, device)),
     ]
 
@@ -386,7 +387,7 @@ PEER = "PhysGaussian's"
 PEER_GAUSSIANS = 100_000  # of the scene that both move on a GPU, beside the plan's own
 
 
-def _beside_peer(scene: Scene, device: str, plan: Plan, notes: list[str]) -> list[Row]:
+def beside_peer(scene: Scene, device: str, plan: Plan, notes: list[str]) -> list[Row]:
     """The solver that PhysGaussian uses, where it can be imported: with the nodes that we step, and its way, with every Gaussian.
 
     All take a step of the same duration, PhysGaussian's solver and the rows that say so in 80 substeps.

@@ -16,7 +16,7 @@ from endo_sim_ros.core.kernels import compare_plain
 from endo_sim_ros.evaluation.measurement import Row, Stage, machine, milliseconds, peak_megabytes, report, run_stages, short
 from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer, prepare
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
-from endo_sim_ros.splatting import RenderOutput, _rasterize, rasterize
+from endo_sim_ros.splatting import RenderOutput, rasterize, rasterize_in_torch
 
 DEPTH = 1.0  # of the scene's centre, metres: some peers do not draw what is nearer than 0.2
 
@@ -151,14 +151,15 @@ def _forward_and_backward(draw: Draw, scene: Scene) -> Callable[[], object]:
 def _against_reference(name: str, count: int, size: tuple[int, int], device: str, seconds: float) -> list[Row]:
     """The same small scene by the kernels and by plain torch, both float32."""
     scene = tissue(count, *size, device)
-    return _compare(name, scene, {"torch reference": lambda gaussians: _rasterize(*_arguments(gaussians, scene))[:4]}, device, seconds)
+    in_torch = lambda gaussians: rasterize_in_torch(*_arguments(gaussians, scene))[:4]
+    return _compare(name, scene, {"torch reference": in_torch}, device, seconds)
 
 
 def _precision(count: int, size: tuple[int, int], device: str) -> list[Row]:
     """Errors relative to the largest value, of images and gradients, against the float64 reference on the CPU."""
     scene = tissue(count, *size)
     results = []
-    for function, where, dtype in ((rasterize, device, torch.float32), (_rasterize, "cpu", torch.float64)):
+    for function, where, dtype in ((rasterize, device, torch.float32), (rasterize_in_torch, "cpu", torch.float64)):
         leaves = [x.detach().to(where, dtype).requires_grad_() for x in (*scene.gaussians, scene.viewmats)]
         absgrad = torch.zeros(1, count, 2, dtype=dtype, device=where, requires_grad=True)
         arguments: list[Any] = [*leaves, scene.Ks.to(where, dtype), *size]

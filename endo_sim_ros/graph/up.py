@@ -63,7 +63,7 @@ class _Row(NamedTuple):
     values: str
 
 
-class _Supervisor:
+class Supervisor:
     """Starts the nodes, notices when one ends, and knows what to show of each."""
 
     def __init__(self, graph: NodeGroup, namespace: str, console: Console, respawn: bool) -> None:
@@ -191,7 +191,7 @@ def run_up(
     prepare_transport()
     with _asked_to_end() as asked, NodeGroup(logs) as graph:
         graph.environment = dict(os.environ)  # the user's own domain, which other terminals share
-        supervisor = _Supervisor(graph, namespace, console, respawn)
+        supervisor = Supervisor(graph, namespace, console, respawn)
         supervisor.start("reconstruction_node", *common, **({"model_file": model} if model else {}))
         supervisor.start("physics_node", *common, **({"arms": list(arms)} if arms else {}))
         supervisor.start("rendering_node", *common)
@@ -204,7 +204,7 @@ def run_up(
         console.print("ending all nodes")
 
 
-def _watch(supervisor: _Supervisor, console: Console, asked: threading.Event) -> None:
+def _watch(supervisor: Supervisor, console: Console, asked: threading.Event) -> None:
     """Show the nodes until asked to end."""
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)  # the signals are heard by the caller
     watcher, executor = Watcher("up"), SingleThreadedExecutor()

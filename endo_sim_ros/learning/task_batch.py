@@ -142,13 +142,14 @@ class TaskBatch:
 
     def observe(self) -> np.ndarray | dict[str, np.ndarray]:
         """Observations of all episodes now."""
-        state = self._state()
+        state = self.state()
         if self.observations == "state":
             return state
         images = self.images()
         return images if self.observations == "image" else {"state": state, "image": images}
 
-    def _state(self) -> np.ndarray:
+    def state(self) -> np.ndarray:
+        """What a policy sees of each environment, numbers alone [B, D]."""
         sites, device = torch.from_numpy(self.task.sites), self.tissue.solver.device
         rows = torch.arange(self.count)[:, None]
         moved = self.tissue.displacements[rows.to(device), sites.to(device)].cpu()

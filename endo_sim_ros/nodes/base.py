@@ -32,7 +32,7 @@ from endo_sim_ros.nodes.rclpy_private import spin
 from endo_sim_ros.nodes.transport import prepare_transport
 
 _ERROR_SHOWN = 5.0  # seconds that an error stays on /diagnostics, and that its repetitions are not logged
-_MOST_LOGGED = 10  # different errors logged in that time: one whose text differs at 500 Hz must not flood the log
+MOST_LOGGED = 10  # different errors logged in that time: one whose text differs at 500 Hz must not flood the log
 _LONGEST_ERROR = 1000  # characters; a sentence may quote what came, and that may be megabytes
 _END_WITHIN = 3.0  # seconds that worker threads have to end before the process ends without them
 STREAM_DEPTH = 20  # messages that wait for a slow subscriber: 0.7 s of a camera at 30 Hz
@@ -46,7 +46,7 @@ class EndoNode(ConfiguredNode):
         torch.set_num_threads(1)  # the kernels bring their own threads
         self._diagnostics = self.publisher(messages.DIAGNOSTICS)
         self._error_text, self._error_until, self.error_count = "", 0.0, 0
-        self._logged: dict[str, float] = {}
+        self.logged: dict[str, float] = {}
         self.every(1.0, self.publish_diagnostics)
 
     def every(self, seconds: float, callback: Callable[[], None]) -> Timer:
@@ -122,9 +122,9 @@ class EndoNode(ConfiguredNode):
         text = text if len(text) <= _LONGEST_ERROR else text[:_LONGEST_ERROR] + " …"
         self.error_count += 1
         self._error_text, self._error_until = text, now + _ERROR_SHOWN
-        self._logged = {old: when for old, when in self._logged.items() if now - when < _ERROR_SHOWN}
-        if text not in self._logged and len(self._logged) < _MOST_LOGGED:
-            self._logged[text] = now
+        self.logged = {old: when for old, when in self.logged.items() if now - when < _ERROR_SHOWN}
+        if text not in self.logged and len(self.logged) < MOST_LOGGED:
+            self.logged[text] = now
             self.get_logger().error(text)
             self.publish_diagnostics()
 

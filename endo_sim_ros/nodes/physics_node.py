@@ -32,18 +32,18 @@ class PhysicsNode(EndoNode):
     def __init__(self) -> None:
         super().__init__("physics_node")
         self._options = self.declare(PhysicsNodeConfig)
-        self._config = self.declare(PhysicsConfig)
+        self.config = self.declare(PhysicsConfig)
         self._builder = TissueBuilder()
-        self._simulation: TissueSimulation | None = None
+        self.simulation: TissueSimulation | None = None
         self._simulated_stamp = 0  # stamp of the simulated model, ns
-        self._failure = ""  # why the newest model is not simulated
-        self._paused, self._steps, self._seconds_per_step = False, 0, 0.0
+        self.failure = ""  # why the newest model is not simulated
+        self._paused, self.steps, self._seconds_per_step = False, 0, 0.0
         self._window: tuple[float, float] | None = None  # clock and simulated time where the real-time factor begins
         self._real_time_factor = 1.0
         self._pacer = Pacer()
-        self._arms = {name: Arm(name) for name in arm_names(self._options.arms)}
+        self.arms = {name: Arm(name) for name in arm_names(self._options.arms)}
         self._lockstep = self._options.mode == "lockstep"
-        self._commands = CommandQueue(frozenset((n, kind) for n in self._arms for kind in self._options.lockstep_inputs))
+        self._commands = CommandQueue(frozenset((n, kind) for n in self.arms for kind in self._options.lockstep_inputs))
         # In real time only the newest command counts, and none may queue; in lockstep none may be lost.
         depth = MOST_WAITING if self._lockstep else 1
         self._nodes_pub = self.publisher(messages.CONTROL_NODES, MOST_WAITING if self._lockstep else STREAM_DEPTH)
@@ -57,18 +57,18 @@ class PhysicsNode(EndoNode):
         )
         self.subscribe(messages.TRAINING_CAMERA_INFO, self._builder.receive_training_info)
         self.subscribe(messages.CAMERA_POSE, lambda message: self._builder.receive_camera_pose(message, self._options.frame_poses))
-        self._arm_topics = ArmTopics(self, self._arms, self._options, depth, self._on_command)
+        self._arm_topics = ArmTopics(self, self.arms, self._options, depth, self._on_command)
         self.service(Trigger, "~/reset", self._on_reset)
         self.service(Trigger, "~/step", self._on_step)
         self.service(SetBool, "~/pause", self._on_pause)
-        self._timer = self.every(_poll(self._config), self._on_timer)
+        self._timer = self.every(_poll(self.config), self._on_timer)
 
     def config_changed(self, config: PhysicsConfig | PhysicsNodeConfig) -> None:
         """New options of the physics: a simulation is built for them in the background."""
         if isinstance(config, PhysicsConfig):
-            if config.regions != self._config.regions:
+            if config.regions != self.config.regions:
                 read_regions(config.regions)  # what cannot be read is refused
-            self._config = config  # the timer builds a simulation for it
+            self.config = config  # the timer builds a simulation for it
             self._timer.timer_period_ns = int(_poll(config) * 1e9)
         else:
             self._options = self._arm_topics.options = config
@@ -80,20 +80,20 @@ class PhysicsNode(EndoNode):
         try:
             built = self._builder.take()
             if built is not None:
-                (stamp, simulation), old = built, self._simulation
+                (stamp, simulation), old = built, self.simulation
                 same_model = stamp == self._simulated_stamp
                 continued = old is not None and same_model and simulation.continue_from(old)  # only its material has changed
-                self._simulated_stamp, self._simulation, self._failure = stamp, simulation, ""
+                self._simulated_stamp, self.simulation, self.failure = stamp, simulation, ""
                 self._start_timing()
                 if not continued:
-                    for arm in self._arms.values():
+                    for arm in self.arms.values():
                         arm.acting = False
                 if self._lockstep and not continued:  # the first observation, before any command
-                    self._publish(self._simulation, self._simulated_stamp, at_rest=True)
+                    self._publish(self.simulation, self._simulated_stamp, at_rest=True)
         except Exception as error:
-            self._failure = sentence("physics", error)
-            self.report_error(self._failure)
-        self._builder.want(self._config)
+            self.failure = sentence("physics", error)
+            self.report_error(self.failure)
+        self._builder.want(self.config)
 
     # ------------------------------------------------------------------ tools
 
@@ -118,17 +118,17 @@ class PhysicsNode(EndoNode):
             parts = ", ".join(sorted(f"{name}'s {kind}" for name, kind in missing))
             self.report_error(f"the command of {stamp * 1e-9:.6f} s is given up: a later one is complete, but {parts} never came")
 
-        while self._simulation is not None and (command := self._commands.take(give_up)):
+        while self.simulation is not None and (command := self._commands.take(give_up)):
             stamp, parts = command
             for part in sorted(parts, key=lambda part: (COMMAND_PARTS.index(part[1]), part[0])):  # poses before what needs them
                 topic, act = parts[part]
                 with self.guard(topic):
                     act()
-            self._step(self._simulation)
-            self._publish(self._simulation, stamp)
+            self.step(self.simulation)
+            self._publish(self.simulation, stamp)
 
     def _apply_tools(self, simulation: TissueSimulation) -> None:
-        for name, arm in self._arms.items():
+        for name, arm in self.arms.items():
             if arm.pose is None:
                 continue
             where = f"at {np.round(arm.pose[:3, 3], 4).tolist()}"
@@ -172,11 +172,11 @@ class PhysicsNode(EndoNode):
 
     def _step_if_due(self) -> None:
         """Real time: take the next step if it is time for it."""
-        simulation, now = self._simulation, self._seconds()
+        simulation, now = self.simulation, self._seconds()
         if simulation is None or now == 0 or not self._pacer.is_due(now, simulation.step_duration):  # 0: no /clock yet
             return
         if not self._paused:
-            self._step(simulation)
+            self.step(simulation)
             self._measure(now, simulation)
         self._publish(simulation, self.now_ns())
 
@@ -194,9 +194,10 @@ class PhysicsNode(EndoNode):
             self._real_time_factor = (simulation.time - self._window[1]) / elapsed
             self._window = now, simulation.time
 
-    def _step(self, simulation: TissueSimulation) -> None:
+    def step(self, simulation: TissueSimulation) -> None:
+        """Take one step with what the arms command, and publish it."""
         start, faults, slips = time.monotonic(), simulation.faults, simulation.slips
-        for arm in self._arms.values():
+        for arm in self.arms.values():
             turning = arm.angle_goal is not None
             arm.move(simulation.step_duration, self._options.move_speed, self._options.turn_speed)
             if turning:  # else a jaw that tissue slipped out of would close again
@@ -207,9 +208,9 @@ class PhysicsNode(EndoNode):
         if simulation.slips > slips:
             travel = f"{simulation.config.travel:g} m"
             self.report_error(f"tissue slipped out of a jaw that pulled it almost {travel}; open it, come nearer, or raise travel")
-            for name, arm in self._arms.items():
+            for name, arm in self.arms.items():
                 arm.closed = arm.closed and simulation.in_reach(name)
-        self._steps += 1
+        self.steps += 1
         if simulation.faults > faults:
             self.report_error(simulation.last_fault)
         self._seconds_per_step += 0.1 * (time.monotonic() - start - self._seconds_per_step)
@@ -226,7 +227,7 @@ class PhysicsNode(EndoNode):
         cloud = ControlNodeCloud(state.rest, state.positions, state.F, self._simulated_stamp, cut)
         self._nodes_pub.publish(messages.encode_control_nodes(cloud, stamp, world))
         shown = []
-        for name, arm in self._arms.items():
+        for name, arm in self.arms.items():
             if arm.pose is None:
                 continue
             reaction, torque = simulation.reaction(name)
@@ -239,25 +240,25 @@ class PhysicsNode(EndoNode):
     # --------------------------------------------------------------- services
 
     def _on_reset(self, _: Trigger.Request) -> tuple[bool, str]:
-        if self._simulation is None:
+        if self.simulation is None:
             return False, "there is no model yet"
-        self._simulation.reset()
+        self.simulation.reset()
         self._commands.clear()
         self._start_timing()
-        for arm in self._arms.values():
+        for arm in self.arms.values():
             arm.reset()
         self._arm_topics.publish_operating_states()
-        self._publish(self._simulation, self._simulated_stamp if self._lockstep else self.now_ns(), at_rest=True)
+        self._publish(self.simulation, self._simulated_stamp if self._lockstep else self.now_ns(), at_rest=True)
         return True, "at rest"
 
     def _on_step(self, request: Trigger.Request) -> tuple[bool, str]:
-        simulation = self._simulation
+        simulation = self.simulation
         if simulation is None:
             return False, "there is no model yet"
         if not (self._paused or self._lockstep):
             return False, "running; call ~/pause with true first, or use mode lockstep"
         for _ in range(self._options.step_count):
-            self._step(simulation)
+            self.step(simulation)
             if self._lockstep:
                 self._commands.last_stamp += round(simulation.step_duration * 1e9)
             self._publish(simulation, self._commands.last_stamp if self._lockstep else self.now_ns())
@@ -274,27 +275,27 @@ class PhysicsNode(EndoNode):
 
     @property
     def _state(self) -> PhysicsState:
-        if self._simulation is not None:
+        if self.simulation is not None:
             return PhysicsState.PAUSED if self._paused else PhysicsState.RUNNING
         if self._builder.model is not None and self._builder.busy:
             return PhysicsState.BUILDING
-        return PhysicsState.FAILED if self._failure else PhysicsState.WAITING
+        return PhysicsState.FAILED if self.failure else PhysicsState.WAITING
 
     def status(self) -> tuple[int, str, dict[str, Any]]:
         """Level, message and values: the mode, and once there is tissue how its simulation goes."""
-        simulation, state = self._simulation, self._state
+        simulation, state = self.simulation, self._state
         values = {STATE: state, "mode": self._options.mode}
         if simulation is None:
             if state is PhysicsState.BUILDING:
                 return OK, "building control nodes", values
             if state is PhysicsState.FAILED:
-                return ERROR, self._failure, values
+                return ERROR, self.failure, values
             if self._builder.model is None:
                 return WARN, "waiting for a model on gaussians", values
             return WARN, "waiting for training_cameras or ECM/measured_cp to know from which side the tissue is seen", values
         values |= {
             "nodes": len(simulation.nodes.rest),
-            "steps": self._steps,
+            "steps": self.steps,
             "substeps": simulation.solver.substepping.count,
             "milliseconds per step": f"{1e3 * self._seconds_per_step:.1f}",
             "real-time factor": f"{self._real_time_factor:.2f}",
@@ -304,14 +305,14 @@ class PhysicsNode(EndoNode):
             "slips": simulation.slips,
             "cut triangles": len(simulation.cuts),
         }
-        if self._failure:
-            return ERROR, f"{self._failure}; the model before goes on", values
+        if self.failure:
+            return ERROR, f"{self.failure}; the model before goes on", values
         if state is PhysicsState.PAUSED:
             return OK, "paused", values
         if self._lockstep:
             waiting = self._commands.missing()
             if waiting is None:
-                return OK, f"in lockstep, {self._steps} steps taken, waiting for a command", values
+                return OK, f"in lockstep, {self.steps} steps taken, waiting for a command", values
             parts = ", ".join(sorted(f"{name}'s {kind}" for name, kind in waiting[1]))
             return OK, f"in lockstep, waiting for {parts} of the command of {waiting[0] * 1e-9:.6f} s", values
         if self._real_time_factor < _SLOW:

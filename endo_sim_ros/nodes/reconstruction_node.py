@@ -49,20 +49,20 @@ class ReconstructionNode(EndoNode):
     def __init__(self) -> None:
         super().__init__("reconstruction_node")
         self._options = self.declare(ReconstructionNodeConfig)
-        self._config = self.declare(ReconstructionConfig, option_values(preset(self._options.preset)))
+        self.config = self.declare(ReconstructionConfig, option_values(preset(self._options.preset)))
         logging.basicConfig(level=logging.INFO, format="%(name)s: %(message)s")
-        self._frames: list[Frame] = []
-        self._synchronizer = Synchronizer(self._options.sync_tolerance)
-        self._last_image = self._last_view = time.monotonic()  # when they arrived
+        self.frames: list[Frame] = []
+        self.synchronizer = Synchronizer(self._options.sync_tolerance)
+        self.last_image = self.last_view = time.monotonic()  # when they arrived
         self._newest_stamp = 0  # of the images of this recording
         self._longest_gap: float | None = None  # between arriving images of this recording, seconds
-        self._trained: tuple[int, int] | None = None  # first and last stamp of the recording reconstructed last
+        self.trained: tuple[int, int] | None = None  # first and last stamp of the recording reconstructed last
         self._recording_stamp = 0  # last stamp of the recording reconstructed last
         self._thread: threading.Thread | None = None
-        self._cancel = threading.Event()
+        self.cancel = threading.Event()
         self._lock = threading.Lock()
         self._stage = ("", 0, 0)  # what the worker does, how much of it is done, and how much there is
-        self._progress: Progress | None = None
+        self.progress: Progress | None = None
         self._outbox: tuple[GaussianModel, list[Camera]] | None = None  # newest model of the worker, to be published
         self._published: GaussianModel | None = None
         self._file: Path | None = None  # where the newest model that was read from a file lay
@@ -83,10 +83,10 @@ class ReconstructionNode(EndoNode):
         if isinstance(config, ReconstructionNodeConfig):
             if config.model_file != self._options.model_file:
                 self._publish_file(config.model_file)
-            self._synchronizer.tolerance_ns = int(config.sync_tolerance * 1e9)
+            self.synchronizer.tolerance_ns = int(config.sync_tolerance * 1e9)
             self._options = config
         else:
-            self._config = config  # used by the next reconstruction
+            self.config = config  # used by the next reconstruction
 
     def implied_values(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
         """A preset implies its options."""
@@ -98,20 +98,20 @@ class ReconstructionNode(EndoNode):
     def _on_recording(self, topic: Topic, message: Any) -> None:
         if topic in (messages.LEFT_IMAGE, messages.LEFT_COMPRESSED):
             self._note_image(messages.stamp_to_ns(message.header.stamp))
-        self._add_views(feed(self._synchronizer, topic, message, self._options.frame_poses))
+        self._add_views(feed(self.synchronizer, topic, message, self._options.frame_poses))
 
     def _note_image(self, stamp: int) -> None:
         """Keep track of where one recording ends and the next begins."""
-        gap = time.monotonic() - self._last_image
+        gap = time.monotonic() - self.last_image
         paused = gap > _PAUSE
-        self._last_image = time.monotonic()
+        self.last_image = time.monotonic()
         if stamp <= 0:
             return  # will be refused
         step = (stamp - self._newest_stamp) * 1e-9
         if self._newest_stamp and (step < -_JUMP_BACK or step > _JUMP_AHEAD or paused and step <= 0):
             self._end_recording()
             if paused:
-                self._trained = None  # the same recording replayed on purpose, not looped, is reconstructed again
+                self.trained = None  # the same recording replayed on purpose, not looped, is reconstructed again
         elif self._newest_stamp:
             self._longest_gap = max(gap, self._longest_gap or 0.0)
         self._newest_stamp = max(stamp, self._newest_stamp)
@@ -124,31 +124,31 @@ class ReconstructionNode(EndoNode):
 
     def _end_recording(self) -> None:
         """Reconstruct what was collected and begin again with what comes."""
-        self._flush()
+        self.flush()
         self._start_if_new()
-        self._synchronizer = Synchronizer(self._options.sync_tolerance)
-        self._frames, self._newest_stamp, self._longest_gap = [], 0, None
+        self.synchronizer = Synchronizer(self._options.sync_tolerance)
+        self.frames, self._newest_stamp, self._longest_gap = [], 0, None
 
-    def _flush(self) -> None:
+    def flush(self) -> None:
         """Take over all views that still wait for other streams."""
-        while self._synchronizer.pending:
+        while self.synchronizer.pending:
             with self.guard("synchroniser"):  # an image that cannot be used raises, and is gone
-                self._add_views(self._synchronizer.flush())
+                self._add_views(self.synchronizer.flush())
 
     def _add_views(self, frames: list[Frame]) -> None:
         if frames:
-            self._frames.extend(frames)
-            self._last_view = time.monotonic()
-        if len(self._frames) > self._options.max_views:
-            self._frames = self._frames[::2]
-        if 0 < self._options.start_views <= len(self._frames):
-            if self._trained is None or self._trained[0] != self._frames[0].stamp_ns:  # once in a recording
+            self.frames.extend(frames)
+            self.last_view = time.monotonic()
+        if len(self.frames) > self._options.max_views:
+            self.frames = self.frames[::2]
+        if 0 < self._options.start_views <= len(self.frames):
+            if self.trained is None or self.trained[0] != self.frames[0].stamp_ns:  # once in a recording
                 self._start_if_new()
 
     def _on_timer(self) -> None:
         with self.guard("reconstruction"):
-            if self._options.start_after > 0 and time.monotonic() - self._last_image > self._silence():
-                self._flush()
+            if self._options.start_after > 0 and time.monotonic() - self.last_image > self._silence():
+                self.flush()
                 self._start_if_new()
             with self._lock:
                 outbox, self._outbox = self._outbox, None
@@ -159,26 +159,27 @@ class ReconstructionNode(EndoNode):
 
     def _start_if_new(self) -> None:
         """Start training unless it runs already or these views were reconstructed before."""
-        if not self._frames or self._training:
+        if not self.frames or self.training:
             return
-        span = (self._frames[0].stamp_ns, self._frames[-1].stamp_ns)
-        if span != self._trained:
+        span = (self.frames[0].stamp_ns, self.frames[-1].stamp_ns)
+        if span != self.trained:
             self._start()
 
     @property
-    def _training(self) -> bool:
+    def training(self) -> bool:
+        """Whether the worker runs."""
         return self._thread is not None and self._thread.is_alive()
 
     def _start(self) -> None:
-        chosen = select_keyframes(self._frames, self._config.keyframes)
-        views = [self._frames[index] for index in chosen]
-        self._trained = (self._frames[0].stamp_ns, self._frames[-1].stamp_ns)
-        self._recording_stamp = self._trained[1]
-        self._progress, self._saved, self._failure, self._finished = None, "", "", False
-        self._cancel.clear()
-        self._thread = threading.Thread(target=self._train, args=(views, list(self._frames), self._config))
+        chosen = select_keyframes(self.frames, self.config.keyframes)
+        views = [self.frames[index] for index in chosen]
+        self.trained = (self.frames[0].stamp_ns, self.frames[-1].stamp_ns)
+        self._recording_stamp = self.trained[1]
+        self.progress, self._saved, self._failure, self._finished = None, "", "", False
+        self.cancel.clear()
+        self._thread = threading.Thread(target=self._train, args=(views, list(self.frames), self.config))
         self._thread.start()
-        self.get_logger().info(f"reconstructing from {len(views)} of {len(self._frames)} views")
+        self.get_logger().info(f"reconstructing from {len(views)} of {len(self.frames)} views")
 
     def _train(self, views: list[Frame], frames: list[Frame], config: ReconstructionConfig) -> None:
         try:
@@ -192,11 +193,11 @@ class ReconstructionNode(EndoNode):
 
             def on_progress(progress: Progress) -> bool:
                 nonlocal published
-                self._progress, self._stage = progress, ("training", progress.iteration, progress.iterations)
+                self.progress, self._stage = progress, ("training", progress.iteration, progress.iterations)
                 if not lockstep and time.monotonic() - published > self._options.publish_period:
                     published = time.monotonic()
                     self._offer(trainer)
-                return not self._cancel.is_set()
+                return not self.cancel.is_set()
 
             trainer.run(on_progress, every=5)
             self._offer(trainer)
@@ -217,7 +218,7 @@ class ReconstructionNode(EndoNode):
 
     def _on_stage(self, stage: str, done: int, total: int) -> None:
         """Note how far the preparation is; called from several threads."""
-        if self._cancel.is_set():
+        if self.cancel.is_set():
             raise Cancelled
         self._stage = stage, done, total
 
@@ -268,14 +269,14 @@ class ReconstructionNode(EndoNode):
     # --------------------------------------------------------------- services
 
     def _on_reconstruct(self, _: Trigger.Request) -> tuple[bool, str]:
-        if self._training:
+        if self.training:
             return False, f"a reconstruction is running: {self.status()[1]}"
-        self._flush()
-        if not self._frames:
+        self.flush()
+        if not self.frames:
             return False, f"no views yet: {self.status()[1]}"
-        if not self._training:  # start_views may have started it
+        if not self.training:  # start_views may have started it
             self._start()
-        return True, f"reconstructing from {len(self._frames)} views"
+        return True, f"reconstructing from {len(self.frames)} views"
 
     def _on_save(self, _: Trigger.Request) -> tuple[bool, str]:
         if self._published is None:
@@ -291,15 +292,15 @@ class ReconstructionNode(EndoNode):
             return ReconstructionState.FAILED
         if self._finished:
             return ReconstructionState.DONE
-        if self._training:
-            return ReconstructionState.PREPARING if self._progress is None else ReconstructionState.TRAINING
-        return ReconstructionState.COLLECTING if self._frames else ReconstructionState.WAITING
+        if self.training:
+            return ReconstructionState.PREPARING if self.progress is None else ReconstructionState.TRAINING
+        return ReconstructionState.COLLECTING if self.frames else ReconstructionState.WAITING
 
     def status(self) -> tuple[int, str, dict[str, Any]]:
         """Level, message and values: counts of views and of images that were left out, and the progress of the training."""
-        dropped, state, progress = self._synchronizer.dropped, self._state, self._progress
+        dropped, state, progress = self.synchronizer.dropped, self._state, self.progress
         counts = {f"images {reason}": count for reason, count in dropped.items()}
-        values = {STATE: state, "views": len(self._frames), **counts, "saved": self._saved}
+        values = {STATE: state, "views": len(self.frames), **counts, "saved": self._saved}
         if state is ReconstructionState.PREPARING:
             stage, done, total = self._stage
             return OK, f"preparing views: {stage}", values | {"stage": stage, "progress": f"{done / max(total, 1):.2f}"}
@@ -311,21 +312,21 @@ class ReconstructionNode(EndoNode):
             return ERROR, self._failure, values
         if state is ReconstructionState.DONE:
             return OK, f"finished, model saved in {self._saved}", values
-        if self._file is not None and self._published is not None and not self._frames and not any(dropped.values()):
+        if self._file is not None and self._published is not None and not self.frames and not any(dropped.values()):
             values["gaussians"] = len(self._published)
             return OK, f"published the model of {self._file}; a recording that comes is reconstructed", values
-        silent = time.monotonic() - self._last_view
+        silent = time.monotonic() - self.last_view
         if silent > self._options.image_timeout:
             topic = self.resolve_topic_name(messages.LEFT_IMAGE.name)
             reasons = [f"{count} {reason}" for reason, count in dropped.items() if count]
-            unusable = reasons and time.monotonic() - self._last_image < silent
+            unusable = reasons and time.monotonic() - self.last_image < silent
             why = f"images arrive but none is usable ({', '.join(reasons)})" if unusable else f"no image on {topic}"
             return WARN, f"{why} for {silent:.0f} s; play a bag, start the camera or remap the topics", values
-        return OK, f"collecting views, {len(self._frames)} so far", values
+        return OK, f"collecting views, {len(self.frames)} so far", values
 
     def destroy_node(self) -> None:
         """Cancel the training, then destroy the node."""
-        self._cancel.set()
+        self.cancel.set()
         if self._thread is not None:
             self._thread.join(timeout=2.0)
         super().destroy_node()

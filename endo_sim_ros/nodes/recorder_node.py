@@ -38,9 +38,9 @@ class RecorderNode(EndoNode):
         self._config = self.declare(RecorderConfig)
         topics = _chosen(self._config.topics, arm_names(self._config.arms))
         self.failure = ""  # why nothing is recorded any more
-        self._written, self._bytes, self._dropped = 0, 0, 0
+        self.written, self._bytes, self.dropped = 0, 0, 0
         self._heard: set[str] = set()  # topics
-        self._queue: queue.SimpleQueue = queue.SimpleQueue()
+        self.queue: queue.SimpleQueue = queue.SimpleQueue()
         self._waiting, self._lock = 0, threading.Lock()  # bytes in the queue
         self._thread = threading.Thread(target=self._write)
         self._thread.start()
@@ -54,11 +54,11 @@ class RecorderNode(EndoNode):
 
         def record(data: bytes) -> None:
             if self.failure or self._waiting > _MAX_WAITING:
-                self._dropped += 1
+                self.dropped += 1
                 return
             with self._lock:
                 self._waiting += len(data)
-            self._queue.put((absolute, data, self.now_ns()))
+            self.queue.put((absolute, data, self.now_ns()))
 
         return record
 
@@ -71,7 +71,7 @@ class RecorderNode(EndoNode):
                     if item:
                         topic, data, stamp_ns = item
                         bag.write_raw(topic, canonical_cdr(data, topic.type) if self._config.canonical else data, stamp_ns)
-                        self._written += 1
+                        self.written += 1
                         self._bytes += len(data)
                         self._heard.add(topic.name)
                         with self._lock:
@@ -82,32 +82,32 @@ class RecorderNode(EndoNode):
         except Exception as error:  # a full disk, above all
             kept = "; what was written before can be read" if isinstance(error, OSError) else ""
             self.failure = f"recording stopped: {sentence(self._config.bag, error)}{kept}"
-            self._queue = queue.SimpleQueue()  # let go of what can no longer be written
+            self.queue = queue.SimpleQueue()  # let go of what can no longer be written
             self.report_error(self.failure)
 
     def _next(self) -> tuple | None:
         """What to write next, nothing in a quiet second, None at the end."""
         try:
-            return self._queue.get(timeout=_FLUSH_EVERY)
+            return self.queue.get(timeout=_FLUSH_EVERY)
         except queue.Empty:
             return ()
 
     @property
     def summary(self) -> str:
         """What was recorded so far, in one line."""
-        dropped = f", {self._dropped} dropped" if self._dropped else ""
-        written = f"{self._written} messages of {len(self._heard)} topics"
+        dropped = f", {self.dropped} dropped" if self.dropped else ""
+        written = f"{self.written} messages of {len(self._heard)} topics"
         return f"{self._config.bag}: {written}, {self._bytes / 1e6:.1f} MB{dropped}"
 
     def status(self) -> tuple[int, str, dict[str, Any]]:
         """Level, message and values: the bag, and how many messages were written and dropped."""
         state = RecorderState.FAILED if self.failure else RecorderState.RECORDING
-        values = {STATE: state, "bag": self._config.bag, "messages": self._written, "dropped": self._dropped}
+        values = {STATE: state, "bag": self._config.bag, "messages": self.written, "dropped": self.dropped}
         return (ERROR, self.failure, values) if self.failure else (OK, "recording", values)
 
     def destroy_node(self) -> None:
         """Write what was received, then destroy the node."""
-        self._queue.put(None)
+        self.queue.put(None)
         self._thread.join()  # what was heard before the end is kept, even if the disk takes its time
         super().destroy_node()
 

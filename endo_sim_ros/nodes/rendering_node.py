@@ -27,11 +27,11 @@ class RenderingNode(EndoNode):
 
     def __init__(self) -> None:
         super().__init__("rendering_node")
-        self._options = self.declare(RenderingNodeConfig)
+        self.options = self.declare(RenderingNodeConfig)
         self._config = self.declare(RenderingConfig)
-        self._lockstep = self._options.mode == "lockstep"
+        self._lockstep = self.options.mode == "lockstep"
         depth = MOST_WAITING if self._lockstep else 1
-        self._tissue = ModelTracker(max(depth, STREAM_DEPTH))
+        self.tissue = ModelTracker(max(depth, STREAM_DEPTH))
         self._nodes: ControlNodeCloud | None = None
         self._nodes_stamp = self._last_stamp = 0  # of that state, and of the newest image in real time, ns
         self._failure = ""  # why the newest model is not shown
@@ -43,7 +43,7 @@ class RenderingNode(EndoNode):
         self._states: deque[tuple[int, ControlNodeCloud, np.ndarray | None]] = deque()
         self._poses: dict[int, np.ndarray] = {}  # lockstep_camera: poses that wait for their state, by stamp
         self._pacer = Pacer()
-        self._dirty, self._images, self._last_image = True, 0, 0.0
+        self._dirty, self.images, self._last_image = True, 0, 0.0
         self._output: tuple[np.ndarray, np.ndarray | None, Camera] | None = None
         self._seconds_per_image = 0.0
         publishers = (self.publisher(topic) for topic in messages.RENDERED_TOPICS)
@@ -55,12 +55,12 @@ class RenderingNode(EndoNode):
         self.subscribe(messages.CUT_SURFACE, self._on_cut_surface, depth)
         self.subscribe(messages.CAMERA_POSE, self._on_camera, depth)
         self.subscribe(messages.LEFT_INFO, self._on_info, depth=1)
-        self._timer = self.every(1.0 / self._options.rate / _POLLS, self._on_timer)
+        self._timer = self.every(1.0 / self.options.rate / _POLLS, self._on_timer)
 
     def config_changed(self, config: RenderingConfig | RenderingNodeConfig) -> None:
         """New options of the rendering: the model is bound anew in the background."""
         if isinstance(config, RenderingNodeConfig):
-            self._options = config
+            self.options = config
             self._timer.timer_period_ns = int(1e9 / config.rate / _POLLS)
         else:
             self._config = config  # the timer binds the model anew
@@ -68,10 +68,10 @@ class RenderingNode(EndoNode):
     # ------------------------------------------------------------------ input
 
     def _on_model(self, message: Any) -> None:
-        self._tissue.receive_model(message, self._options.world_frame)
+        self.tissue.receive_model(message, self.options.world_frame)
 
     def _on_training_cameras(self, message: Any) -> None:
-        messages.check_frame(message, (self._options.world_frame,), messages.TRAINING_CAMERAS.name)
+        messages.check_frame(message, (self.options.world_frame,), messages.TRAINING_CAMERAS.name)
         poses = messages.decode_poses(message)
         if len(poses):  # a model from a file has none; then those before are better than nothing
             self._training_pose = poses[len(poses) // 2]
@@ -82,7 +82,7 @@ class RenderingNode(EndoNode):
         self._change()
 
     def _on_nodes(self, message: Any) -> None:
-        messages.check_frame(message, (self._options.world_frame,), messages.CONTROL_NODES.name)
+        messages.check_frame(message, (self.options.world_frame,), messages.CONTROL_NODES.name)
         nodes, old = messages.decode_control_nodes(message), self._nodes
         same = (
             old is not None
@@ -99,15 +99,15 @@ class RenderingNode(EndoNode):
             if len(self._states) > MOST_WAITING:
                 self._states.popleft()
                 raise MessageError(f"{messages.CONTROL_NODES.name}: over {MOST_WAITING} states wait to be shown; one is left out")
-            self._show_states()
+            self.show_states()
         elif not same:
             self._change()
             self._show_if_due()
 
     def _on_cut_surface(self, message: Any) -> None:
-        self._tissue.receive_cut_surface(message, self._options.world_frame)
+        self.tissue.receive_cut_surface(message, self.options.world_frame)
         if self._lockstep:
-            self._show_states()
+            self.show_states()
         else:
             self._change()
 
@@ -118,14 +118,14 @@ class RenderingNode(EndoNode):
             self._pacer.note_input(time.monotonic())
 
     def _on_camera(self, message: Any) -> None:
-        pose = messages.decode_pose(message, self._options.frame_poses, messages.CAMERA_POSE.name)
+        pose = messages.decode_pose(message, self.options.frame_poses, messages.CAMERA_POSE.name)
         same = self._pose is not None and np.array_equal(pose, self._pose)
         self._pose = pose
-        if self._lockstep and self._options.lockstep_camera:
+        if self._lockstep and self.options.lockstep_camera:
             self._poses[messages.stamp_to_ns(message.header.stamp)] = pose
             while len(self._poses) > MOST_WAITING:
                 del self._poses[next(iter(self._poses))]
-            self._show_states()
+            self.show_states()
         elif not same:
             self._change()
 
@@ -149,24 +149,24 @@ class RenderingNode(EndoNode):
         with self.guard("rendering"):
             self._build()
             if self._lockstep:
-                self._show_states()
+                self.show_states()
             else:
                 self._show_if_due()
 
     def _show_if_due(self) -> None:
         """Real time: show the newest state, or what was shown once more, if it is time for it."""
         camera, now = self._camera(), time.monotonic()
-        if self._tissue.bound is None or camera is None or self.now_ns() == 0:  # with use_sim_time, before /clock
+        if self.tissue.bound is None or camera is None or self.now_ns() == 0:  # with use_sim_time, before /clock
             return
         if self._dirty or self._output is None or (self._output[1] is None and self._wants_depth()):
-            if not self._pacer.is_due(now, 1 / self._options.rate):
+            if not self._pacer.is_due(now, 1 / self.options.rate):
                 return
             self._dirty = False
-            self._output = self._render(self._tissue.bound, self._nodes, camera)
-        elif now - self._last_image < 1 / self._options.idle_rate - 0.5 / self._options.rate:
+            self._output = self._render(self.tissue.bound, self._nodes, camera)
+        elif now - self._last_image < 1 / self.options.idle_rate - 0.5 / self.options.rate:
             return
         self._last_image = now
-        self._last_stamp = self._stamp(self._tissue.bound)
+        self._last_stamp = self._stamp(self.tissue.bound)
         self._publish(*self._output, self._last_stamp)
 
     def _stamp(self, bound: BoundModel) -> int:
@@ -174,11 +174,11 @@ class RenderingNode(EndoNode):
         now = self.now_ns()
         return self._nodes_stamp if bound.follows(self._nodes) and self._last_stamp < self._nodes_stamp <= now else now
 
-    def _show_states(self) -> None:
+    def show_states(self) -> None:
         """Lockstep: one image for each state, in order, as soon as its model and its camera are there."""
-        while self._states and self._tissue.bound is not None:
+        while self._states and self.tissue.bound is not None:
             stamp, nodes, pose = self._states[0]
-            if nodes.model_stamp_ns not in (self._tissue.bound.model_stamp, self._tissue.model_stamp):
+            if nodes.model_stamp_ns not in (self.tissue.bound.model_stamp, self.tissue.model_stamp):
                 self._leave_out("belongs to a model that is gone")
                 continue
             camera = self._camera()
@@ -188,18 +188,18 @@ class RenderingNode(EndoNode):
                 self._leave_out(f"has no pose with its stamp on {messages.CAMERA_POSE.name}")
                 continue
             at_rest = stamp == nodes.model_stamp_ns  # the first observation
-            if self._options.lockstep_camera and not at_rest:
+            if self.options.lockstep_camera and not at_rest:
                 camera = camera and replace(camera, pose=self._poses[stamp] if pose is None else pose)
-            if not self._tissue.bound.follows(nodes) or not camera or not self._tissue.has_cut(nodes):
+            if not self.tissue.bound.follows(nodes) or not camera or not self.tissue.has_cut(nodes):
                 return
             self._states.popleft()
             if pose is None and not at_rest:
                 self._poses = {other: later for other, later in self._poses.items() if other > stamp}
-            self._publish(*self._render(self._tissue.bound, nodes, camera), stamp)
+            self._publish(*self._render(self.tissue.bound, nodes, camera), stamp)
 
     def _lacks_pose(self, stamp: int, nodes: ControlNodeCloud, pose: np.ndarray | None) -> bool:
         """Lockstep: whether a state still waits for its camera; the one at rest does not, as nobody sends one for it."""
-        wanted = self._options.lockstep_camera and stamp != nodes.model_stamp_ns
+        wanted = self.options.lockstep_camera and stamp != nodes.model_stamp_ns
         return wanted and pose is None and stamp not in self._poses
 
     def _end_episode(self, last: int) -> None:
@@ -221,13 +221,13 @@ class RenderingNode(EndoNode):
 
     def _build(self) -> None:
         """Bind the newest model to its control nodes in the background; the picture before stays meanwhile."""
-        if self._lockstep and self._tissue.bound is not None:
-            if self._states and self._tissue.bound.follows(self._states[0][1]):
+        if self._lockstep and self.tissue.bound is not None:
+            if self._states and self.tissue.bound.follows(self._states[0][1]):
                 return  # states of the model before come first
-            if self._nodes is None or self._nodes.model_stamp_ns != self._tissue.model_stamp:
+            if self._nodes is None or self._nodes.model_stamp_ns != self.tissue.model_stamp:
                 return  # pictures of states are wanted, not of a model at rest
         try:
-            if self._tissue.bind(self._nodes, self._config):
+            if self.tissue.bind(self._nodes, self._config):
                 self._failure = ""
                 self._change()
         except Exception as error:
@@ -244,43 +244,43 @@ class RenderingNode(EndoNode):
         state = ()
         if nodes is not None and bound.follows(nodes):
             state = (nodes.positions, nodes.F)
-            self._tissue.cut(bound, nodes)
+            self.tissue.cut(bound, nodes)
         image, depth = bound.renderer.render(camera, *state, depth=self._wants_depth())
         self._seconds_per_image += 0.1 * (time.monotonic() - start - self._seconds_per_image)
         return image, depth, camera
 
     def _publish(self, image: np.ndarray, depth: np.ndarray | None, camera: Camera, stamp: int) -> None:
-        frame = self._options.camera_frame
+        frame = self.options.camera_frame
         self._info_pub.publish(messages.encode_camera_info(camera.K, camera.width, camera.height, stamp, frame))
-        self._pose_pub.publish(messages.encode_pose(camera.pose, stamp, self._options.world_frame))
+        self._pose_pub.publish(messages.encode_pose(camera.pose, stamp, self.options.world_frame))
         self._image_pub.publish(messages.encode_image(image, stamp, frame))
         if depth is not None:
             self._depth_pub.publish(messages.encode_image(depth, stamp, frame))
-        self._images += 1
+        self.images += 1
 
     # ------------------------------------------------------------ diagnostics
 
     @property
     def _state(self) -> RenderingState:
-        if self._tissue.model is None or self._camera() is None:
+        if self.tissue.model is None or self._camera() is None:
             return RenderingState.WAITING
-        if self._tissue.bound is not None:
+        if self.tissue.bound is not None:
             return RenderingState.RENDERING
         return RenderingState.FAILED if self._failure else RenderingState.BUILDING
 
     def status(self) -> tuple[int, str, dict[str, Any]]:
         """Level, message and values: the mode, and once there is something to show how the rendering goes."""
         state = self._state
-        values = {STATE: state, "mode": self._options.mode}
-        if self._tissue.model is None:
+        values = {STATE: state, "mode": self.options.mode}
+        if self.tissue.model is None:
             return WARN, "waiting for a model on gaussians", values
         if state is RenderingState.WAITING:
             return WARN, "waiting for a camera on ECM/measured_cp and endoscope/left/camera_info", values
         values |= {
-            "gaussians": len(self._tissue.model),
-            "images": self._images,
+            "gaussians": len(self.tissue.model),
+            "images": self.images,
             "milliseconds per image": f"{1e3 * self._seconds_per_image:.1f}",
-            "following control nodes": self._tissue.bound is not None and self._tissue.bound.follows(self._nodes),
+            "following control nodes": self.tissue.bound is not None and self.tissue.bound.follows(self._nodes),
         }
         if self._failure:
             return ERROR, self._failure, values
@@ -290,12 +290,12 @@ class RenderingNode(EndoNode):
             waiting = f", {len(self._states)} states wait" if self._states else ""
             if self._states and self._lacks_pose(*self._states[0]):
                 waiting += f" for a pose on {messages.CAMERA_POSE.name} of {self._states[0][0] * 1e-9:.6f} s"
-            return OK, f"in lockstep, {self._images} images rendered{waiting}", values
+            return OK, f"in lockstep, {self.images} images rendered{waiting}", values
         return OK, "rendering", values
 
     def destroy_node(self) -> None:
         """Bind no more models, and destroy the node."""
-        self._tissue.stop()
+        self.tissue.stop()
         super().destroy_node()
 
 

@@ -30,7 +30,7 @@ class ScriptedToolNode(EndoNode):
         self._nodes: ControlNodeCloud | None = None
         self._near = np.zeros(0, int)  # indices of the nodes that are followed; the stamp of their model:
         self._near_stamp = 0
-        self._tip = self._towards_camera = self._across = np.zeros(3)
+        self.tip = self._towards_camera = self._across = np.zeros(3)
         self._began: float | None = None
         self._state, self._missing = ScriptedToolState.WAITING, "waiting for the rendered depth"  # and what for
         self.subscribe(messages.RENDERED_POSE, self._on_camera, depth=1)
@@ -81,16 +81,16 @@ class ScriptedToolNode(EndoNode):
             self._missing = "no tissue in the picture"
             return False
         row, column = seen[((seen - [row, column]) ** 2).sum(1).argmin()]  # the nearest pixel with tissue
-        self._tip = camera.backproject(depth)[row, column]
+        self.tip = camera.backproject(depth)[row, column]
         self._follow(nodes, nodes.positions)
-        self._towards_camera = camera.position - self._tip
+        self._towards_camera = camera.position - self.tip
         self._towards_camera /= np.linalg.norm(self._towards_camera)
         self._across = invert_pose(camera.pose)[0, :3]  # the image's x axis in the world
         return True
 
     def _follow(self, nodes: ControlNodeCloud, positions: np.ndarray) -> None:
         """Choose the control nodes at the grasped point, by their positions [M, 3], m, world."""
-        self._near = np.argsort(np.linalg.norm(positions - self._tip, axis=1))[:_FOLLOWED]
+        self._near = np.argsort(np.linalg.norm(positions - self.tip, axis=1))[:_FOLLOWED]
         self._near_stamp = nodes.model_stamp_ns
 
     def _publish(self, nodes: ControlNodeCloud, elapsed: float) -> None:
@@ -99,7 +99,7 @@ class ScriptedToolNode(EndoNode):
             self._follow(nodes, nodes.rest)
         moved = (nodes.positions - nodes.rest)[self._near].mean(0)
         pose = np.eye(4)
-        pose[:3, 3] = self._tip + moved
+        pose[:3, 3] = self.tip + moved
         force = self._force(elapsed)
         self._pose_pub.publish(messages.encode_pose(pose, stamp, config.world_frame))
         self._wrench_pub.publish(messages.encode_wrench(force, np.zeros(3), stamp, config.world_frame))
@@ -126,7 +126,7 @@ class ScriptedToolNode(EndoNode):
 
     def status(self) -> tuple[int, str, dict[str, Any]]:
         """Level, message and values: where the tool took hold, metres, world."""
-        values = {STATE: self._state, "tip": np.round(self._tip, 4).tolist()}
+        values = {STATE: self._state, "tip": np.round(self.tip, 4).tolist()}
         if self._state is ScriptedToolState.WAITING:
             return WARN, self._missing, values
         return OK, "finished" if self._state is ScriptedToolState.DONE else str(self._state), values

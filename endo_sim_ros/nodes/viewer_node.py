@@ -56,12 +56,12 @@ class ViewerNode(Watcher):
         self._infos: dict[str, messages.CameraInfo] = {}  # by topic
         self._rendered: dict[str, tuple[int, Any]] = {}  # stamp and content of the newest rendered messages
         self._nodes: ControlNodeCloud | None = None
-        self._asked, self._closed, self._lockstep = 0.0, False, False
-        self._paused, self._paused_until = False, 0.0  # as a service said, which counts more than diagnostics before it
+        self._asked, self._closed, self.lockstep = 0.0, False, False
+        self._paused, self.paused_until = False, 0.0  # as a service said, which counts more than diagnostics before it
         self.viewer = Viewer(config, self)
         commanded = self._options.arm_source == "commanded"
-        self._pose_pub = self.publisher((messages.tool_pose_command if commanded else messages.tool_pose)(arm))
-        self._jaw_pub = self.publisher(messages.tool_jaw(arm))
+        self.pose_publisher = self.publisher((messages.tool_pose_command if commanded else messages.tool_pose)(arm))
+        self.jaw_publisher = self.publisher(messages.tool_jaw(arm))
         name = self._options.physics_node
         self._physics = self._full_name(name)
         self._set = self.create_client(SetParameters, f"{name}/set_parameters")
@@ -147,9 +147,9 @@ class ViewerNode(Watcher):
 
     def _on_diagnostics(self, message: Any) -> None:
         super()._on_diagnostics(message)
-        if self.heard.get(self._physics, 0.0) > self._paused_until:
+        if self.heard.get(self._physics, 0.0) > self.paused_until:
             self._paused = self.in_state(self._physics, PhysicsState.PAUSED)
-            self._lockstep = self.value(self._physics, "mode") == "lockstep"
+            self.lockstep = self.value(self._physics, "mode") == "lockstep"
 
     def _full_name(self, name: str) -> str:
         """The name of a node on /diagnostics."""
@@ -220,19 +220,19 @@ class ViewerNode(Watcher):
 
     def hold(self, pose: np.ndarray, closed: bool) -> None:
         """Publish the pose [4, 4] (m, world) of the tool that the mouse moves, and close its jaw."""
-        if self._lockstep:
+        if self.lockstep:
             self.viewer.notify("in lockstep only the policy moves the arms")
             self.viewer.release()
             return
-        self._pose_pub.publish(messages.encode_pose(pose, self.now_ns(), self._options.world_frame))
+        self.pose_publisher.publish(messages.encode_pose(pose, self.now_ns(), self._options.world_frame))
         if closed:
-            self._jaw_pub.publish(messages.encode_jaw(_JAW_CLOSED, self.now_ns()))
+            self.jaw_publisher.publish(messages.encode_jaw(_JAW_CLOSED, self.now_ns()))
             self._closed = True
 
     def let_go(self) -> None:
         """Open the jaw, if it was closed here."""
         if self._closed:  # else it may be somebody else's
-            self._jaw_pub.publish(messages.encode_jaw(_JAW_OPEN, self.now_ns()))
+            self.jaw_publisher.publish(messages.encode_jaw(_JAW_OPEN, self.now_ns()))
             self._closed = False
 
     def set_parameters(self, values: dict[str, float]) -> None:
@@ -268,7 +268,7 @@ class ViewerNode(Watcher):
                 if what == "parameters":
                     self._ask_parameters()
                 elif what == "pause" and response.success:
-                    self._paused, self._paused_until = request.data, time.monotonic() + _STALE
+                    self._paused, self.paused_until = request.data, time.monotonic() + _STALE
 
         client.call_async(request).add_done_callback(answered)
 

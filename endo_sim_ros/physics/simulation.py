@@ -165,9 +165,9 @@ class TissueSimulation:
         self._slots: dict[str, int] = {}  # of tools, by name
         self._stencils: CutStencils | None = None  # from the first cut on
         self._blades: dict[str, Blade] = {}  # of tools that cut
-        self._disturbed = False  # since the last step: a tool moved, took hold or let go
+        self.disturbed = False  # since the last step: a tool moved, took hold or let go
         self._quiet = 0.0  # s since tools did anything
-        self._resting = not any(config.gravity)
+        self.resting = not any(config.gravity)
 
     @property
     def faults(self) -> int:
@@ -216,7 +216,7 @@ class TissueSimulation:
         was = bool(tools.attached[0, slot])
         if wanted != was:
             tools.take_hold()
-            self._disturbed = True
+            self.disturbed = True
         if not wanted:
             tools.reaction_forces[0, slot], tools.reaction_torques[0, slot] = 0.0, 0.0
         return not wanted or bool(tools.attached[0, slot])
@@ -247,7 +247,7 @@ class TissueSimulation:
         if closed != was:
             tools.take_hold()
         holding = bool(tools.gripping[0, slot])
-        self._disturbed |= holding != was or moved and (holding or self.contact_radius > 0)
+        self.disturbed |= holding != was or moved and (holding or self.contact_radius > 0)
         if closed and not holding:
             tools.closed[0, slot] = 0
         return holding or not closed
@@ -277,7 +277,7 @@ class TissueSimulation:
         if stencils.cut(triangles):
             with capturing:
                 self.solver.set_cut(stencils.table())
-            self._disturbed = True
+            self.disturbed = True
 
     def prepare(self) -> None:
         """Make the first step ready now; a tool would otherwise wait for it (on a GPU, for seconds when kernels are compiled)."""
@@ -341,14 +341,14 @@ class TissueSimulation:
         ``last_fault``; the tissue is then at rest where it was before, or, after several in a row, nearer to its rest state."""
         before = self.faults
         self.time += self.step_duration
-        if self._resting and not (self._disturbed or self._wrenches_act()):
+        if self.resting and not (self.disturbed or self._wrenches_act()):
             return
-        self._quiet = 0.0 if self._disturbed or self._wrenches_act() else self._quiet + self.step_duration
+        self._quiet = 0.0 if self.disturbed or self._wrenches_act() else self._quiet + self.step_duration
         self._batch.step()
-        self._disturbed = False
+        self.disturbed = False
         relaxed = not self.config.relaxation or self._quiet > _RELAXED * self.config.relaxation_time
         undone = self.faults > before
-        self._resting = relaxed and not undone and self.solver.speed < _RESTING_SPEED
+        self.resting = relaxed and not undone and self.solver.speed < _RESTING_SPEED
         if undone:
             self.last_fault = (
                 f"a step was undone: {self.solver.bad_nodes.numpy()[0]} of {len(self.nodes)} nodes ended non-finite, torn or"
@@ -367,8 +367,8 @@ class TissueSimulation:
             self._stencils.reset()
             with capturing:
                 self.solver.set_cut(None)
-        self._disturbed, self._quiet = False, 0.0
-        self._resting = not any(self.config.gravity)
+        self.disturbed, self._quiet = False, 0.0
+        self.resting = not any(self.config.gravity)
         self.time, self.last_fault = 0.0, ""
 
     def continue_from(self, other: "TissueSimulation") -> bool:
@@ -393,7 +393,7 @@ class TissueSimulation:
                 stencils.cut(other.cuts)
             with capturing:
                 self.solver.set_cut(stencils.table())
-        self._disturbed = True
+        self.disturbed = True
         return True
 
     def state(self) -> TissueState:

@@ -85,7 +85,7 @@ class MpmSolver:
         self.grid = new_grid(plan)
         self.nodes = new_nodes(nodes, plan, properties, self.mu, self.lam, environments, device)
         self.loads = new_loads(count, device)
-        self.pin_springs, self._scale = (wp.zeros(count, float, device=device) for _ in range(2))  # [B · M]; N/m, 1
+        self.pin_springs, self.scale = (wp.zeros(count, float, device=device) for _ in range(2))  # [B · M]; N/m, 1
         self.set_stiffness(slice(None), np.broadcast_to(scale.reshape(environments, -1), (environments, len(nodes))))
         self._given, self.rigid = new_tools(tools, environments, len(nodes), config.friction, config.push_out_speed, device)
         (self._saved, self.state), (self._backed_up, self._backup) = new_state(count, device), new_state(count, device)
@@ -132,7 +132,7 @@ class MpmSolver:
         factors = torch.from_numpy(stiffness.copy()).to(self.device)
         grasp = factors * self._grasp
         pins = self.config.pin_stiffness / self.config.grasp_stiffness * grasp * self._pinned
-        for array, values in ((self._scale, factors), (self.nodes.stiffness, grasp), (self.pin_springs, pins)):
+        for array, values in ((self.scale, factors), (self.nodes.stiffness, grasp), (self.pin_springs, pins)):
             wp.to_torch(array).view(self.environments, -1)[environments] = values.float()
         springs = wp.to_torch(self.loads.spring).view(self.environments, -1)
         springs[environments] = torch.where(self._pinned, pins.float(), springs[environments])
@@ -190,7 +190,7 @@ class MpmSolver:
         backend, config = self.backend, self.config
         data = StepData(
             self.environments, self.node_count, config.material, config.kinematics, self.substepping, self.nodes, self.state,
-            self.loads, self.rigid, self.grid, self._substep, self._scale, self._stencils,
+            self.loads, self.rigid, self.grid, self._substep, self.scale, self._stencils,
         )  # fmt: skip
         check = [backend.threads, self.node_count, config.travel, config.rollback_damping]
         check += [self._backup, self.state, self.bad_nodes, self._speed_sq]
@@ -237,5 +237,5 @@ class MpmSolver:
         v, C = (self._of(array, environment).astype(np.float64) for array in (self.state.v, self.state.C))
         kinetic = 0.5 * (mass * ((v**2).sum(1) + self.cell_size**2 / 4 * (C**2).sum((1, 2)))).sum()
         F = torch.from_numpy(self.deformation_gradients(environment)).double()
-        mu, lam = (torch.from_numpy(self._of(self._scale, environment) * values) for values in (self.mu, self.lam))
+        mu, lam = (torch.from_numpy(self._of(self.scale, environment) * values) for values in (self.mu, self.lam))
         return float(kinetic), float((volume * energy_density(self.config.material, F, mu, lam).numpy()).sum())

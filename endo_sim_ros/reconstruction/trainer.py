@@ -81,7 +81,7 @@ class Trainer:
         self._last_loss = torch.zeros(())
         options = getattr(config, config.densification)
         self._strategy = STRATEGIES[config.densification](options, config.max_gaussians, scene.depth)
-        self._appearance = Appearance(scene.light, scene.exposures, scene.depth, config, self.device)
+        self.appearance = Appearance(scene.light, scene.exposures, scene.depth, config, self.device)
         self._set_model(scene.model.to(self.device))
 
     # ------------------------------------------------------------------ state
@@ -109,7 +109,7 @@ class Trainer:
     @property
     def progress(self) -> Progress:
         """How far the training is; on a GPU this waits for it."""
-        return Progress(self.iteration, self.config.iterations, float(self._last_loss), len(self._parameters["means"]))
+        return Progress(self.iteration, self.config.iterations, float(self._last_loss), len(self.parameters["means"]))
 
     def save_checkpoint(self, path: str | Path) -> None:
         """Write model, optimiser and random state; a training that loads them goes on as if never interrupted."""
@@ -119,10 +119,10 @@ class Trainer:
             "iteration": self.iteration,
             "order": self._order,
             "model": self._detached().tensors(),
-            "optimizer": self._optimizer.state,
+            "optimizer": self.optimizer.state,
             "strategy": self._strategy_state,
-            "light": {name: value.detach() for name, value in self._appearance.tensors.items()},
-            "light_optimizer": self._appearance.optimizer.state,
+            "light": {name: value.detach() for name, value in self.appearance.tensors.items()},
+            "light_optimizer": self.appearance.optimizer.state,
             "generator": self._generator.get_state(),
             "noise": self._noise.get_state(),
         }
@@ -142,7 +142,7 @@ class Trainer:
             if iteration < 0 or not set(order) <= set(range(len(self._device_views))):
                 raise ValueError("it names views or an iteration that there cannot be")
             shapes = lambda tensors: {name: value.shape for name, value in tensors.items()}
-            if shapes(state["light"]) != shapes(self._appearance.tensors):
+            if shapes(state["light"]) != shapes(self.appearance.tensors):
                 raise ValueError("its light is not that of these views")
             if shapes(state["strategy"]) != shapes(self._strategy.initialize_state(len(state["model"]["means"]), "meta")):
                 raise ValueError("the state of the strategy does not fit the model")
@@ -152,20 +152,20 @@ class Trainer:
             if noise is not generator:
                 noise.set_state(state["noise"].cpu())
             self._set_model(GaussianModel(**state["model"]))  # what is refused was so before: a training goes on as it was
-            self._optimizer.state, self._strategy_state = state["optimizer"], state["strategy"]
-            self._appearance.set(**state["light"])
-            self._appearance.optimizer.state = state["light_optimizer"]
+            self.optimizer.state, self._strategy_state = state["optimizer"], state["strategy"]
+            self.appearance.set(**state["light"])
+            self.appearance.optimizer.state = state["light_optimizer"]
             self._generator, self._noise = generator, noise
             self.iteration, self._order, self._fitted = iteration, order, None
 
     def _detached(self) -> GaussianModel:
-        return model_of({name: tensor.detach().clone() for name, tensor in self._parameters.items()})
+        return model_of({name: tensor.detach().clone() for name, tensor in self.parameters.items()})
 
     def _fitted_light(self) -> tuple[Light | None, np.ndarray]:
         """The light and what it leaves of the views' exposures [V, 3]."""
         if self._fitted is None or self._fitted[0] != self.iteration:
-            look = lambda view: self._render(*matrices([view.camera], self.device), (view.camera.width, view.camera.height))[1]
-            self._fitted = self.iteration, *self._appearance.fitted(self._device_views, look)
+            look = lambda view: self.render(*matrices([view.camera], self.device), (view.camera.width, view.camera.height))[1]
+            self._fitted = self.iteration, *self.appearance.fitted(self._device_views, look)
         return self._fitted[1:]
 
     # --------------------------------------------------------------- training
@@ -206,13 +206,13 @@ class Trainer:
         virtual = None
         if config.virtual_every and self.iteration % config.virtual_every == 0 and len(self.stamps) > 1:
             virtual = self._virtual_camera(view.index)
-        self._optimizer.set_rate("means", self._step_size)
+        self.optimizer.set_rate("means", self._step_size)
         self._last_loss = self._descend(terms, self._inputs(view, virtual, terms))
         self.iteration += 1
         with torch.no_grad():
             if self.iteration <= config.refine_until * config.iterations and self.iteration % config.refine_every == 0:
-                self._refine()
-            self._strategy.perturb(self._parameters, self.iteration, self._step_size, self._noise)
+                self.refine()
+            self._strategy.perturb(self.parameters, self.iteration, self._step_size, self._noise)
 
     @property
     def _step_size(self) -> float:
@@ -246,33 +246,33 @@ class Trainer:
             return self._captures[key](*inputs)
 
     def _descend_once(self, terms: tuple[losses.Term, ...], *inputs: Tensor | None) -> Tensor:
-        config, view, appearance = self.config, _Inputs._make(inputs), self._appearance
+        config, view, appearance = self.config, _Inputs._make(inputs), self.appearance
         cameras, (height, width) = len(view.viewmats), view.image.shape[:2]
-        wanted = {name: value for name, value in (self._parameters | appearance.tensors).items() if value.requires_grad}
+        wanted = {name: value for name, value in (self.parameters | appearance.tensors).items() if value.requires_grad}
         absgrad = None
         if self._strategy.wants_absgrad:
-            wanted["absgrad"] = absgrad = torch.zeros(cameras, len(self._parameters["means"]), 2, device=self.device, requires_grad=True)
+            wanted["absgrad"] = absgrad = torch.zeros(cameras, len(self.parameters["means"]), 2, device=self.device, requires_grad=True)
         masks = None
         if view.mask is not None:
             masks = torch.stack([view.mask > 0, *[torch.ones_like(view.mask, dtype=torch.bool)] * (cameras - 1)])
-        loss = self._loss(terms, view, *self._render(view.viewmats, view.Ks, (width, height), masks, absgrad))
+        loss = self._loss(terms, view, *self.render(view.viewmats, view.Ks, (width, height), masks, absgrad))
         gradients = dict(zip(wanted, torch.autograd.grad(loss, list(wanted.values()))))
         if absgrad is not None:
             across, down = gradients["absgrad"][0].unbind(1)
             steepness = torch.hypot(across * (width / 2), down * (height / 2))
             self._strategy.step_post_backward(self._strategy_state, steepness)
-        for optimizer in (self._optimizer, appearance.optimizer):
+        for optimizer in (self.optimizer, appearance.optimizer):
             optimizer.step({name: gradients[name] for name in optimizer.parameters})
         with torch.no_grad():
-            self._parameters["log_scales"].clamp_(max=math.log(config.largest * self.scene_depth))
+            self.parameters["log_scales"].clamp_(max=math.log(config.largest * self.scene_depth))
         appearance.hold_level()
         return loss.detach()
 
-    def _render(
+    def render(
         self, viewmats: Tensor, Ks: Tensor, size: tuple[int, int], masks: Tensor | None = None, absgrad: Tensor | None = None
     ) -> tuple[GaussianModel, RenderOutput]:
         """The model, and its images of cameras, width × height pixels."""
-        model = model_of(self._parameters)
+        model = model_of(self.parameters)
         tensors = model.means, model.quats, model.scales, model.opacities, model.sh
         return model, rasterize(*tensors, viewmats, Ks, *size, masks=masks, absgrad=absgrad)
 
@@ -282,14 +282,14 @@ class Trainer:
         images = lambda camera: (model, *(images[camera] for images in (output.depths, output.alphas, output.distortions)))
         of_scene = {"eye": self._eye, "scene_depth": self.scene_depth}
         seen = losses.Rendering(*images(0), mask=view.mask, prior=view.prior, **of_scene)
-        gain = self._appearance.gain(seen.depth, seen.alpha, view.rays, view.exposure)
+        gain = self.appearance.gain(seen.depth, seen.alpha, view.rays, view.exposure)
         color = output.colors[0] if gain is None else output.colors[0] * gain
         loss = losses.photometric(color, view.image, view.mask, config.lambda_ssim)
         loss = losses.regularized(loss, terms, seen, config)
         if len(view.viewmats) > 1:
             seen = losses.Rendering(*images(1), mask=None, prior=view.virtual_prior, **of_scene)
             loss = losses.regularized(loss, terms, seen, config, virtual=True)
-        return loss + config.light_anchor * self._appearance.changes() if config.light else loss
+        return loss + config.light_anchor * self.appearance.changes() if config.light else loss
 
     # --------------------------------------------------------------- Gaussians
 
@@ -297,22 +297,20 @@ class Trainer:
         """Start optimising a model with a fresh optimiser."""
         for capture in self._captures.values():
             capture.invalidate()
-        self._parameters = {name: tensor.clone().requires_grad_() for name, tensor in parameters_of(model).items()}
-        self._optimizer = Adam(
-            self._parameters, {name: self.config.learning_rate * getattr(self.config.rates, name) for name in PARAMETERS}
-        )
+        self.parameters = {name: tensor.clone().requires_grad_() for name, tensor in parameters_of(model).items()}
+        self.optimizer = Adam(self.parameters, {name: self.config.learning_rate * getattr(self.config.rates, name) for name in PARAMETERS})
         self._strategy_state = self._strategy.initialize_state(len(model), self.device)
 
-    def _refine(self) -> None:
+    def refine(self) -> None:
         """Add, move and remove Gaussians, keeping the optimiser's state of those that stay."""
         model, source, fresh = self._strategy.refine(self._detached(), self._strategy_state, self._generator)
-        states = self._optimizer.state
+        states = self.optimizer.state
         self._set_model(model)
         for name, state in states.items():
             moved = {key: value[source] if value.ndim else value for key, value in state.items()}
             for key in ("exp_avg", "exp_avg_sq"):
                 moved[key][fresh] = 0
-            self._optimizer.state[name] = moved
+            self.optimizer.state[name] = moved
 
     def _load(self, views: Sequence[TrainingView]) -> None:
         """Train on these from now on."""

@@ -33,14 +33,14 @@ class DeformableRenderer:
         self.model = model.detach().to(self.device)
         self.config = config
         self._background = torch.full((3,), config.background, device=self.device)
-        self._skinning: Skinning | None = None
+        self.skinning: Skinning | None = None
         if node_rest is not None:
-            self._skinning = Skinning(self.model, node_rest, neighbours=config.neighbours, weighting=config.skinning, device=self.device)
+            self.skinning = Skinning(self.model, node_rest, neighbours=config.neighbours, weighting=config.skinning, device=self.device)
 
     def cut(self, triangles: np.ndarray) -> None:
         """Part the tissue along all cuts so far, triangles [T, 3, 3], metres, world, in the tissue at rest."""
-        if self._skinning is not None and not np.array_equal(triangles, self._skinning.cuts):
-            self._skinning.cut(triangles)
+        if self.skinning is not None and not np.array_equal(triangles, self.skinning.cuts):
+            self.skinning.cut(triangles)
 
     def camera(self, camera: Camera) -> Camera:
         """Return the camera at the configured image width, with the height in proportion."""
@@ -58,9 +58,9 @@ class DeformableRenderer:
         Raises:
             ValueError: If the renderer has no control nodes, or shapes disagree.
         """
-        if self._skinning is None:
+        if self.skinning is None:
             raise ValueError("this renderer has no control nodes and shows the model at rest only; give it node_rest")
-        return self._skinning.deform(positions, F)
+        return self.skinning.deform(positions, F)
 
     @overload
     def render(
@@ -111,8 +111,8 @@ class DeformableRenderer:
             if F is None:
                 raise ValueError("render: positions of control nodes go with their deformation gradients F; F is None")
             means, covars = self.deform(positions, F)
-            assert self._skinning is not None  # else deform has refused
-            sh = turned_colors(model.sh, self._skinning, means, F, camera) if model.sh_degree else model.sh
+            assert self.skinning is not None  # else deform has refused
+            sh = turned_colors(model.sh, self.skinning, means, F, camera) if model.sh_degree else model.sh
             model = GaussianModel(means, model.quats, model.log_scales, model.logit_opacities, sh)
         output = render(model, camera, background=self._background, covars=covars)
         colors, alpha = output.colors[0], output.alphas[0]

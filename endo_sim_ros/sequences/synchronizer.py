@@ -64,7 +64,7 @@ class Synchronizer:
         self.tolerance_ns = int(tolerance * 1e9)
         self._lag, self._max_pending = lag, max_pending
         self._infos: dict[str, CameraInfo] = {}
-        self._streams = {name: _Stream(max_poses if name == "pose" else max_others) for name in STREAMS}
+        self.streams = {name: _Stream(max_poses if name == "pose" else max_others) for name in STREAMS}
         self._emitted = 0  # stamp of the last image that left
         self._complete: list[Frame] = []
         self.dropped = {"without pose": 0, "without camera_info": 0, "out of order": 0, "repeated": 0, "invalid": 0, "without right eye": 0}
@@ -72,7 +72,7 @@ class Synchronizer:
     @property
     def pending(self) -> int:
         """Number of images that wait, or that are complete and wait to be fetched."""
-        return len(self._streams["image"].stamps) + len(self._complete)
+        return len(self.streams["image"].stamps) + len(self._complete)
 
     def add_info(self, eye: str, info: CameraInfo) -> None:
         """Set the camera information of the ``left`` or ``right`` eye; the latest one counts."""
@@ -92,10 +92,10 @@ class Synchronizer:
         if stream == "image" and stamp_ns <= self._emitted:
             self.dropped["out of order"] += 1
             return []
-        if stream == "image" and stamp_ns in self._streams["image"].stamps:
+        if stream == "image" and stamp_ns in self.streams["image"].stamps:
             self.dropped["repeated"] += 1
             return []
-        self._streams[stream].add(stamp_ns, value)
+        self.streams[stream].add(stamp_ns, value)
         return self._collect(final=False)
 
     def flush(self) -> list[Frame]:
@@ -107,7 +107,7 @@ class Synchronizer:
         return self._collect(final=True)
 
     def _collect(self, final: bool) -> list[Frame]:
-        images = self._streams["image"]
+        images = self.streams["image"]
         while images.stamps and (final or self._may_leave(images.stamps[0], len(images.stamps) - 1)):
             self._emitted = images.stamps[0]
             frame = self._build(self._emitted, images.pop(self._emitted))
@@ -123,7 +123,7 @@ class Synchronizer:
     def _settled(self, stamp: int) -> bool:
         """Whether every stream that is needed or has spoken has matched this stamp or moved past it."""
         for name in STREAMS[1:]:
-            latest = self._streams[name].latest
+            latest = self.streams[name].latest
             if latest is None:
                 if name == "pose":
                     return False
@@ -133,13 +133,13 @@ class Synchronizer:
 
     def _match(self, stream: str, stamp: int) -> Any | None:
         """The nearest waiting message within the tolerance."""
-        nearest = self._streams[stream].nearest(stamp)
+        nearest = self.streams[stream].nearest(stamp)
         return nearest[1] if nearest is not None and nearest[0] <= self.tolerance_ns else None
 
     def _build(self, stamp: int, image: np.ndarray) -> Frame | None:
         parts = {name: part for name in STREAMS[1:] if (part := self._match(name, stamp)) is not None}
         for name in STREAMS[1:]:  # what lies further back can match no later image
-            self._streams[name].drop_before(stamp - self.tolerance_ns)
+            self.streams[name].drop_before(stamp - self.tolerance_ns)
         info = self._infos.get("left")
         if info is None or "pose" not in parts:
             self.dropped["without camera_info" if info is None else "without pose"] += 1

@@ -1,6 +1,6 @@
 """Differentiable rasterisation of 3D Gaussians into colour, depth, alpha and distortion.
 
-`rasterize` runs Warp kernels on the CPU or a CUDA device; `reference._rasterize` computes the same in plain torch.
+`rasterize` runs Warp kernels on the CPU or a CUDA device; `reference.rasterize_in_torch` computes the same in plain torch.
 """
 
 import functools
@@ -81,7 +81,7 @@ def rasterize(
             gradients, or a mean is not finite. The last is tested on the CPU only: on CUDA the test would stall the device.
             Any other Gaussian whose projection is not finite is not drawn and gets zero gradients.
     """
-    background = _black(means.device) if background is None else background
+    background = black(means.device) if background is None else background
     scene = Scene(means, quats, scales, covars, opacities, sh, viewmats, Ks, background)
     settings = Settings(int(width), int(height), float(near), float(eps2d), bool(median))
     check_inputs("rasterize", scene, settings, masks, absgrad)
@@ -190,13 +190,15 @@ def median_depths(owners: Tensor, means: Tensor, viewmats: Tensor) -> Tensor:
 
 @functools.cache
 @torch.inference_mode(False)
-def _black(device: torch.device) -> Tensor:
+def black(device: torch.device) -> Tensor:
+    """A background, made once a device."""
     return torch.zeros(3, dtype=torch.float32, device=device)
 
 
 @functools.cache
 @torch.inference_mode(False)
-def _all_tiles(count: int, device: torch.device) -> Tensor:
+def all_tiles(count: int, device: torch.device) -> Tensor:
+    """A mask of tiles that leaves none out."""
     return torch.ones(count, dtype=torch.uint8, device=device)
 
 
@@ -204,7 +206,7 @@ def _tile_mask(masks: Tensor | None, settings: Settings, camera_count: int, devi
     """Return whether any pixel of each tile matters, uint8 [C · tiles]."""
     s = settings
     if masks is None:
-        return _all_tiles(camera_count * s.tiles_x * s.tiles_y, device)
+        return all_tiles(camera_count * s.tiles_x * s.tiles_y, device)
     padding = (0, s.tiles_x * TILE - s.width, 0, s.tiles_y * TILE - s.height)
     padded = torch.nn.functional.pad(masks.to(device, torch.bool).view(torch.uint8), padding)
     return padded.reshape(camera_count, s.tiles_y, TILE, s.tiles_x, TILE).amax((2, 4)).flatten()

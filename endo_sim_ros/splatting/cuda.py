@@ -46,7 +46,7 @@ def forward(scene: Scene, tile_mask: Tensor, settings: Settings) -> tuple[list[T
     splats, counts, ranges = scene.means.new_empty(splat_count, SPLAT_SIZE), integers(splat_count), integers((tile_count, 2))
     with _lock, on_torch_stream(device):  # the scratch memory serves one picture after the other, and Warp has one stream
         if splat_count:
-            scratch = _scratch(device, _stream(device))
+            scratch = scratch_for(device, stream_of(device))
             if device.type == "cuda" and torch.cuda.is_current_stream_capturing():
                 scratch = scratch.anew()
             scratch.reserve_splats(splat_count)
@@ -197,11 +197,13 @@ class _Scratch:
 
 
 @functools.cache
-def _scratch(device: torch.device, stream: int) -> _Scratch:
+def scratch_for(device: torch.device, stream: int) -> _Scratch:
+    """The memory that pictures on a stream share."""
     return _Scratch(device)
 
 
-def _stream(device: torch.device) -> int:
+def stream_of(device: torch.device) -> int:
+    """torch's current stream, 0 on a CPU."""
     return torch.cuda.current_stream(device).cuda_stream if device.type == "cuda" else 0
 
 

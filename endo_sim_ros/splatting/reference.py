@@ -10,7 +10,7 @@ from endo_sim_ros.splatting.constants import ALPHA_MAX, ALPHA_MIN, LOG_ALPHA_SLA
 from endo_sim_ros.splatting.scene import Scene, Settings
 
 
-def _rasterize(
+def rasterize_in_torch(
     means: Tensor,
     quats: Tensor | None,
     scales: Tensor | None,
@@ -36,10 +36,10 @@ def _rasterize(
     background = means.new_zeros(3) if background is None else background
     scene = Scene(means, quats, scales, covars, opacities, sh, viewmats, Ks, background)
     settings = Settings(width, height, near, eps2d, median)
-    check_inputs("_rasterize", scene, settings, masks, absgrad)
+    check_inputs("rasterize_in_torch", scene, settings, masks, absgrad)
     if covars is None:
         assert quats is not None and scales is not None  # else the check has refused
-        rotations = _quat_to_matrix(quats)
+        rotations = quat_to_matrix(quats)
         covars = rotations @ torch.diag_embed(scales**2) @ rotations.mT
     covars = (covars + covars.mT) / 2
     count = means.shape[-2]
@@ -52,7 +52,7 @@ def _rasterize(
     return RenderOutput(*images, medians=median_depths(owners, means, viewmats) if median else None)
 
 
-def _quat_to_matrix(quats: Tensor) -> Tensor:
+def quat_to_matrix(quats: Tensor) -> Tensor:
     """Return rotation matrices [N, 3, 3] of quaternions wxyz [N, 4]; zero means no rotation."""
     norms = quats.norm(dim=1, keepdim=True)
     identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0]).expand_as(quats)

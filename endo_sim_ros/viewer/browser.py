@@ -212,7 +212,7 @@ class Browser:
             image, shown_aspect = self._endoscope_shown
             if self._tissue.value and (picture[0] is not image or aspect != shown_aspect):
                 self._endoscope_shown = picture[0], aspect
-                self._send(_padded(*picture, aspect))
+                self._send(padded(*picture, aspect))
         elif self.view == RENDERED and self._tissue.value:
             camera = _small(self.camera())
             shown = (camera.width, camera.height, camera.K[0, 0], camera.pose.tobytes())
@@ -265,7 +265,7 @@ class VideoRecorder:
     def __init__(self, path: Path, fps: float):
         self.path, self._fps = path, fps
         self._size: tuple[int, int] | None = None
-        self._began, self._count = time.monotonic(), 0
+        self._began, self.count = time.monotonic(), 0
         self._images: SimpleQueue[np.ndarray | None] = SimpleQueue()
         self._error: Exception | None = None
         self._thread = threading.Thread(target=self._write)
@@ -284,16 +284,16 @@ class VideoRecorder:
     @property
     def due(self) -> bool:
         """Whether it is time for the next picture."""
-        return self._count <= (time.monotonic() - self._began) * self._fps
+        return self.count <= (time.monotonic() - self._began) * self._fps
 
     def add(self, image: np.ndarray) -> None:
         """The picture [H, W, 3] uint8 that is seen now."""
         self._size = self._size or image.shape[1::-1]
         if image.shape[1::-1] != self._size:
-            image = _fitted(image, *self._size)
+            image = fitted(image, *self._size)
         while self.due:
             self._images.put(image)
-            self._count += 1
+            self.count += 1
 
     def close(self) -> None:
         """Write the rest.
@@ -303,7 +303,7 @@ class VideoRecorder:
         """
         self._images.put(None)
         self._thread.join()
-        if self._error is not None or not self._count:
+        if self._error is not None or not self.count:
             raise OSError(f"{self.path}: no video was written ({self._error or 'there were no pictures'})")
 
 
@@ -313,7 +313,7 @@ def _small(camera: Camera) -> Camera:
     return camera.resized(max(round(camera.width * scale), 2), max(round(camera.height * scale), 2))
 
 
-def _fitted(image: np.ndarray, width: int, height: int) -> np.ndarray:
+def fitted(image: np.ndarray, width: int, height: int) -> np.ndarray:
     """The picture as large as there is room, undistorted, the rest black."""
     scale = min(width / image.shape[1], height / image.shape[0])
     small = cv2.resize(image, (max(round(scale * image.shape[1]), 1), max(round(scale * image.shape[0]), 1)))
@@ -330,7 +330,7 @@ def _around_axis(camera: Camera, aspect: float) -> tuple[float, float, float]:
     return square, max(width, height * aspect), max(height, width / aspect)
 
 
-def _padded(image: np.ndarray, camera: Camera, aspect: float) -> np.ndarray:
+def padded(image: np.ndarray, camera: Camera, aspect: float) -> np.ndarray:
     """The picture in a black frame, such that it fills a canvas of an aspect and its optical axis is in the middle."""
     square, width, height = _around_axis(camera, aspect)
     M = np.array([[square, 0, width / 2 - camera.K[0, 2] * square], [0, 1, height / 2 - camera.K[1, 2]]], np.float64)

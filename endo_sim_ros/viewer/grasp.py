@@ -26,7 +26,7 @@ class Grasp:
     def __init__(self, pose: np.ndarray, max_force: float, max_speed: float, longest_pull: float):
         self.start = np.array(pose, np.float64)
         self._max_force, self._max_speed, self._longest_pull = max_force, max_speed, longest_pull
-        self._target = self._pull = np.zeros(3)
+        self.target = self._pull = np.zeros(3)
         self._age = 0.0
 
     @property
@@ -43,17 +43,17 @@ class Grasp:
 
     def aim(self, target: np.ndarray) -> None:
         """Where the tip [3] shall go, m, world."""
-        self._target = _shortened(np.asarray(target, np.float64) - self.start[:3, 3], self._longest_pull)
+        self.target = _shortened(np.asarray(target, np.float64) - self.start[:3, 3], self._longest_pull)
 
     def advance(self, seconds: float, reaction: float) -> np.ndarray:
         """Pose of the tip after some time in which the tissue resisted with a force, N."""
         was_closed, self._age = self.closed, self._age + seconds
         if not was_closed:
             return self.pose
-        length, step, most = float(np.linalg.norm(self._pull)), self._target - self._pull, self._max_speed * seconds
+        length, step, most = float(np.linalg.norm(self._pull)), self.target - self._pull, self._max_speed * seconds
         if length and reaction > _FELT * self._max_force:
-            allowed = _shortened(self._target, length * self._max_force / reaction)
-            if allowed is not self._target:
+            allowed = _shortened(self.target, length * self._max_force / reaction)
+            if allowed is not self.target:
                 step = (allowed - self._pull) * (1 - np.exp(-seconds / _YIELD))
         if step @ self._pull > 0:  # gently towards the limit, as the reaction is that of a while ago
             most *= max(1 - reaction / self._max_force, _SLOWEST)

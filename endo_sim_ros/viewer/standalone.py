@@ -30,7 +30,7 @@ class Standalone:
     """
 
     def __init__(self, model: GaussianModel, cameras: list[Camera], physics: PhysicsConfig, config: ViewerConfig):
-        self._model, self._physics = model, physics
+        self.model, self._physics = model, physics
         self._camera = cameras[len(cameras) // 2]
         self._cameras = cameras
         self.simulation = self._simulate(physics)
@@ -43,11 +43,11 @@ class Standalone:
 
     def _simulate(self, physics: PhysicsConfig) -> TissueSimulation:
         viewpoint = np.stack([camera.position for camera in self._cameras])
-        return TissueSimulation(self._model, viewpoint, physics, self._cameras, render_depth)
+        return TissueSimulation(self.model, viewpoint, physics, self._cameras, render_depth)
 
     def _show_model(self) -> None:
         rest = self.simulation.nodes.rest
-        self._renderer = DeformableRenderer(self._model, rest, RenderingConfig(device=self._physics.device))
+        self._renderer = DeformableRenderer(self.model, rest, RenderingConfig(device=self._physics.device))
         self.viewer.show_model(self._renderer, rest, self._camera)
         self._show_parameters()
         self._restart_clock()
@@ -167,7 +167,7 @@ class Standalone:
 
     def _text(self) -> list[str]:
         pace = "paused" if self.viewer.paused else f"real time × {self._real_time_factor:.2f}"
-        return [f"{len(self._model)} Gaussians, {len(self.simulation.nodes.rest)} nodes", f"{self.simulation.time:.1f} s, {pace}"]
+        return [f"{len(self.model)} Gaussians, {len(self.simulation.nodes.rest)} nodes", f"{self.simulation.time:.1f} s, {pace}"]
 
 
 def view(path: Path, physics: PhysicsConfig, config: ViewerConfig) -> None:
@@ -179,12 +179,12 @@ def view(path: Path, physics: PhysicsConfig, config: ViewerConfig) -> None:
     """
     model = load_ply(path)
     beside = path.parent / "cameras.json"
-    page = Standalone(model, load_cameras(beside) if beside.is_file() else [_camera_at_origin(model)], physics, config)
+    page = Standalone(model, load_cameras(beside) if beside.is_file() else [camera_at_origin(model)], physics, config)
     print(f"open {page.viewer.url} in a browser; Ctrl-C ends", flush=True)
     page.run()
 
 
-def _camera_at_origin(model: GaussianModel) -> Camera:
+def camera_at_origin(model: GaussianModel) -> Camera:
     """A camera at the world's origin that looks at the model."""
     target = model.means.median(0).values.double().numpy()
     ahead = np.linalg.norm(target[::2]) > 0.1 * abs(target[1])

@@ -102,7 +102,7 @@ class Viewer:
 
     def __init__(self, config: ViewerConfig, actions: Actions):
         self.config = config
-        self._actions = actions
+        self.actions = actions
         self._events: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self.browsers: dict[int, Browser] = {}
         self.renderer: DeformableRenderer | None = None
@@ -114,7 +114,7 @@ class Viewer:
         self._stress_scale = 0.0  # Pa
         self._begun = 0.0  # when the step to that state began
         self._dirty, self._drawn = False, 0.0
-        self._grasp: Grasp | None = None
+        self.grasp: Grasp | None = None
         self._holder, self._resistance = 0, 0.0  # who holds, and the force in N
         self._plane: tuple[np.ndarray, np.ndarray, float] = np.zeros(3), np.zeros(3), 0.0
         self._asked: float | None = None  # when the mouse moved; its pull has not been seen yet
@@ -127,8 +127,8 @@ class Viewer:
         self._wanted_at = 0.0
         self.paused = False
         self._lines: tuple[str, ...] = ()
-        self._notice, self._notice_until = "", 0.0
-        self._server = _serve(config)
+        self.notice, self._notice_until = "", 0.0
+        self._server = serve(config)
         self._build_page()
 
     @property
@@ -140,7 +140,7 @@ class Viewer:
     @property
     def holding(self) -> bool:
         """Whether somebody holds tissue."""
-        return self._grasp is not None
+        return self.grasp is not None
 
     # ----------------------------------------------------------- what is shown
 
@@ -193,7 +193,7 @@ class Viewer:
             self._parameters, self._tissue = known, None
         for slider in SLIDERS:
             if slider.parameter in values and slider.parameter not in self._wanted:
-                self._sliders[slider.parameter].value = _on_slider(slider, values[slider.parameter])
+                self.sliders[slider.parameter].value = _on_slider(slider, values[slider.parameter])
 
     def show_text(self, *lines: str, paused: bool | None = None) -> None:
         """What there is to say about the simulation."""
@@ -204,7 +204,7 @@ class Viewer:
 
     def notify(self, text: str) -> None:
         """Tell all users something for a while."""
-        self._notice, self._notice_until = text, time.monotonic() + _NOTICE_FOR
+        self.notice, self._notice_until = text, time.monotonic() + _NOTICE_FOR
 
     # -------------------------------------------------------- what users do
 
@@ -216,19 +216,19 @@ class Viewer:
         """The mouse takes hold of tissue, moves or lets go."""
         browser = self.browsers.get(pointer.client)
         if pointer.phase == "end" or browser is None:
-            if self._grasp is not None and pointer.client == self._holder:
+            if self.grasp is not None and pointer.client == self._holder:
                 self.release()
             return
-        if pointer.phase == "start" and self._grasp is None:
+        if pointer.phase == "start" and self.grasp is None:
             self._take_hold(browser, pointer)
-        if self._grasp is None or pointer.client != self._holder:
+        if self.grasp is None or pointer.client != self._holder:
             return
         origin, ray, _ = browser.ray(*pointer.at)
         point, normal, height = self._plane
         if pointer.lifts:  # up on the screen is towards the user
-            self._grasp.aim(point - normal * height * (pointer.began_at[1] - pointer.at[1]))
+            self.grasp.aim(point - normal * height * (pointer.began_at[1] - pointer.at[1]))
         elif ray @ normal > 1e-6:
-            self._grasp.aim(origin + ray * ((point - origin) @ normal / (ray @ normal)))
+            self.grasp.aim(origin + ray * ((point - origin) @ normal / (ray @ normal)))
         if self._asked is None:
             self._asked = time.monotonic()
 
@@ -240,7 +240,7 @@ class Viewer:
         pose = camera.pose.copy()
         pose[:3, 3] = point
         longest_pull = _TRAVEL * self._parameters["travel"]
-        self._grasp = Grasp(pose, self.config.max_force, self.config.max_speed, longest_pull)
+        self.grasp = Grasp(pose, self.config.max_force, self.config.max_speed, longest_pull)
         self._holder, self._resistance = pointer.client, 0.0
         depth = (point - origin) @ camera.pose[:3, 2]
         self._plane = point, camera.pose[:3, 2], depth * camera.height / camera.K[1, 1]  # the last: height of the view there
@@ -260,15 +260,17 @@ class Viewer:
 
     def release(self) -> None:
         """Let go of the tissue."""
-        if self._grasp is not None:
-            self._grasp, self._asked = None, None
-            self._actions.let_go()
+        if self.grasp is not None:
+            self.grasp, self._asked = None, None
+            self.actions.let_go()
 
-    def _reset(self) -> None:
+    def reset(self) -> None:
+        """Let go, and bring the tissue back to rest."""
         self.release()
-        self._actions.reset()
+        self.actions.reset()
 
-    def _slide(self, slider: Slider, value: float) -> None:
+    def slide(self, slider: Slider, value: float) -> None:
+        """Take the value of a slider, in its unit; it is set when the slider stands still."""
         self._wanted[slider.parameter] = value * slider.unit
         self._wanted_at = time.monotonic()
 
@@ -279,13 +281,13 @@ class Viewer:
         while not self._events.empty():
             self._events.get()()
         now = time.monotonic()
-        if self._grasp is not None:
-            pose = self._grasp.advance(now - self._updated, self._resistance)
-            self._actions.hold(pose, self._grasp.closed)
+        if self.grasp is not None:
+            pose = self.grasp.advance(now - self._updated, self._resistance)
+            self.actions.hold(pose, self.grasp.closed)
         self._updated = now
         if self._wanted and now - self._wanted_at > _QUIET:
             wanted, self._wanted = self._wanted, {}
-            self._actions.set_parameters(wanted)
+            self.actions.set_parameters(wanted)
         if now - self._drawn >= 1 / self.config.rate and self.renderer is not None:
             self._draw(now)
         if now - self._texted >= _TEXT_EVERY:
@@ -293,7 +295,7 @@ class Viewer:
 
     def _draw(self, now: float) -> None:
         self._drawn, dirty, self._dirty = now, self._dirty, False
-        self._draw_tools()
+        self.draw_tools()
         splats = colors = None
         for browser in self.browsers.values():
             if dirty and browser.wants_splats:
@@ -352,22 +354,23 @@ class Viewer:
             image = draw_force(image, camera, tool.position, tool.force, _ARROW / CENTIMETRES)
         return image
 
-    def _draw_tools(self) -> None:
+    def draw_tools(self) -> None:
+        """Draw tips, forces and their numbers."""
         tips = np.array([tool.position for tool in self.tools.values()]).reshape(-1, 3) * CENTIMETRES
         ends = tips + _ARROW * np.array([tool.force for tool in self.tools.values()]).reshape(-1, 3)
         pulling = np.linalg.norm(ends - tips, axis=1) > 0.02
-        self._tips.visible, self._arrows.visible = bool(len(tips)), bool(pulling.any())
+        self.tips.visible, self.arrows.visible = bool(len(tips)), bool(pulling.any())
         if len(tips):
-            self._tips.points = tips.astype(np.float32)
+            self.tips.points = tips.astype(np.float32)
         if pulling.any():
-            self._arrows.points = np.stack([tips, ends], 1)[pulling].astype(np.float32)
-        for name in self._labels.keys() - self.tools.keys():
-            self._labels.pop(name).remove()
+            self.arrows.points = np.stack([tips, ends], 1)[pulling].astype(np.float32)
+        for name in self.labels.keys() - self.tools.keys():
+            self.labels.pop(name).remove()
         for name, tip in zip(self.tools, tips):
-            if name not in self._labels:
-                self._labels[name] = self._server.scene.add_label(f"/force_of/{name}", "", font_screen_scale=1.2, anchor="bottom-left")
-            self._labels[name].position = tip
-            self._labels[name].text = f"{np.linalg.norm(self.tools[name].force):.1f} N"
+            if name not in self.labels:
+                self.labels[name] = self._server.scene.add_label(f"/force_of/{name}", "", font_screen_scale=1.2, anchor="bottom-left")
+            self.labels[name].position = tip
+            self.labels[name].text = f"{np.linalg.norm(self.tools[name].force):.1f} N"
 
     def _write_text(self, now: float) -> None:
         elapsed, self._texted = now - self._texted, now
@@ -382,7 +385,7 @@ class Viewer:
         if any(browser.wants_stress for browser in self.browsers.values()):
             lines.append(f"red: von Mises stress of {self._stress_scale / 1e3:.2g} kPa")
         if now < self._notice_until:
-            lines.append(f"**{self._notice}**")
+            lines.append(f"**{self.notice}**")
         self._text.content = "  \n".join(lines)
 
     # ---------------------------------------------------------------- the page
@@ -404,31 +407,31 @@ class Viewer:
             made.on_click(lambda _: self.post(act))
             return made
 
-        self._play = button("pause", lambda: self._actions.pause(not self.paused), "Let time stand still, or go on.")
-        button("step", self._actions.step, "One step while time stands still.")
-        button("reset", self._reset, "Tissue back to rest.")
-        self._sliders = {}
+        self._play = button("pause", lambda: self.actions.pause(not self.paused), "Let time stand still, or go on.")
+        button("step", self.actions.step, "One step while time stands still.")
+        button("reset", self.reset, "Tissue back to rest.")
+        self.sliders = {}
         with gui.add_folder("tissue"):
             for slider in SLIDERS:
                 made = gui.add_slider(slider.label, slider.low, slider.high, slider.step, slider.low, hint=_SLIDER_HINT)
-                self._sliders[slider.parameter] = made
+                self.sliders[slider.parameter] = made
 
                 def slide(event: Any, slider: Slider = slider) -> None:
                     if event.client is not None:  # not set by this program
                         value = event.target.value
-                        self.post(lambda: self._slide(slider, value))
+                        self.post(lambda: self.slide(slider, value))
 
                 made.on_update(slide)
         nowhere = np.zeros((1, 3), np.float32)
-        self._tips = scene.add_point_cloud(
+        self.tips = scene.add_point_cloud(
             "/tips", nowhere, (235, 235, 235), point_size=0.25, point_shape="circle", precision="float32", visible=False
         )
-        self._arrows = scene.add_arrows(
+        self.arrows = scene.add_arrows(
             "/forces", np.eye(3)[None, :2], (255, 140, 25), shaft_radius=0.06, head_radius=0.15, head_length=0.3, visible=False
         )
-        self._labels: dict[str, Any] = {}
+        self.labels: dict[str, Any] = {}
         self._server.on_client_connect(lambda client: self.post(lambda: self._join(client)))
-        self._server.on_client_disconnect(lambda client: self.post(lambda: self._leave(client.client_id)))
+        self._server.on_client_disconnect(lambda client: self.post(lambda: self.leave(client.client_id)))
 
     def _show_model_in(self, browser: Browser) -> None:
         if self.renderer is not None and self.camera is not None:
@@ -447,7 +450,8 @@ class Viewer:
         self._show_model_in(browser)
         self._dirty = True
 
-    def _leave(self, client: int) -> None:
+    def leave(self, client: int) -> None:
+        """Forget a browser that is gone, and what it held."""
         browser = self.browsers.pop(client, None)
         if browser is not None:
             browser.close()
@@ -461,7 +465,8 @@ class Viewer:
         self._server.stop()
 
 
-def _serve(config: ViewerConfig) -> Any:
+def serve(config: ViewerConfig) -> Any:
+    """A server of the page; raises ConfigError if viser is not installed or the port is taken."""
     try:
         import viser
     except ImportError:

@@ -169,8 +169,8 @@ def test_the_peer_is_measured_where_it_works_and_otherwise_noted(working, tmp_pa
     (tmp_path / "mpm_solver_warp.py").write_text(PEER if working else "import warp.no_such_module")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "mpm_solver_warp", raising=False)
-    only_the_peer = lambda scene, device, environments, *rest: [("", partial(physics._beside_peer, scene, device, *rest))]
-    monkeypatch.setattr(physics, "_stages", only_the_peer)
+    only_the_peer = lambda scene, device, environments, *rest: [("", partial(physics.beside_peer, scene, device, *rest))]
+    monkeypatch.setattr(physics, "stages", only_the_peer)
     rows = rows_of_physics(tmp_path)
     monkeypatch.delitem(sys.modules, "mpm_solver_warp", raising=False)
     out = capsys.readouterr().out

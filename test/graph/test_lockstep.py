@@ -131,7 +131,7 @@ def test_reset_gives_the_first_observation_and_time_begins_anew(graph):
 def test_a_cut_is_shown_with_the_states_that_have_it_and_the_same_bytes_come_again(graph):
     surfaces, runs = graph.hear(messages.CUT_SURFACE), []
     assert graph.set("physics_node", blade_length=0.05)[0]
-    graph.until(lambda: graph.nodes[1]._simulation.config.blade_length == 0.05)
+    graph.until(lambda: graph.nodes[1].simulation.config.blade_length == 0.05)
     for _ in range(2):
         first = len(graph.heard[IMAGES.name])
         assert graph.call(Trigger, "/physics_node/reset").success
@@ -145,17 +145,17 @@ def test_a_cut_is_shown_with_the_states_that_have_it_and_the_same_bytes_come_aga
             force = np.array([1.0, 0, 0]) * (k >= 20)
             if k == 2:
                 graph.publish(messages.tool_cut("PSM1"), messages.encode_cut(True, k * STEP))
-                graph.until(lambda: graph.nodes[1]._arms["PSM1"].cutting)
+                graph.until(lambda: graph.nodes[1].arms["PSM1"].cutting)
             if k == 20:
                 graph.publish(messages.tool_cut("PSM1"), messages.encode_cut(False, k * STEP))
-                graph.until(lambda: not graph.nodes[1]._arms["PSM1"].cutting)
+                graph.until(lambda: not graph.nodes[1].arms["PSM1"].cutting)
             graph.publish(WRENCH, messages.encode_wrench(force, np.zeros(3), k * STEP, "world"))
             await_images(graph, first + 1 + k)
         states = [messages.decode_control_nodes(message) for message in graph.heard["control_nodes"][-22:]]
         numbers = [state.cut for state in states]
         assert numbers[0] == numbers[1] == 0 and len(set(numbers)) > 10 and numbers[-2] == numbers[-1]
         assert messages.cut_number(messages.decode_cut_surface(surfaces[-1])) == numbers[-1]
-        assert graph.nodes[2]._tissue.bound.renderer._skinning.cuts.shape == (len(graph.nodes[1]._simulation.cuts), 3, 3)
+        assert graph.nodes[2].tissue.bound.renderer.skinning.cuts.shape == (len(graph.nodes[1].simulation.cuts), 3, 3)
         assert np.abs(states[-1].positions - states[-1].rest).max() > 1e-3
         runs.append([bytes(message.data) for message in graph.heard[IMAGES.name][-22:]])
     assert runs[0] == runs[1]
@@ -165,7 +165,7 @@ def test_a_hundred_commands_at_once_are_all_taken_and_shown(graph):
     physics, rendering = graph.nodes[1:3]
     for k in range(1, 101):
         command(graph, MODEL_STAMP + k * STEP)
-    graph.until(lambda: (physics._steps, rendering._images) == (100, 101), lambda: (physics._steps, rendering._images), 60)
+    graph.until(lambda: (physics.steps, rendering.images) == (100, 101), lambda: (physics.steps, rendering.images), 60)
 
 
 def test_a_new_model_in_the_middle_loses_no_image_of_the_old_one(graph):
@@ -182,7 +182,7 @@ def test_a_new_model_in_the_middle_loses_no_image_of_the_old_one(graph):
 
 def test_an_image_may_wait_for_the_camera_of_its_stamp(graph):
     rendering = graph.nodes[2]
-    rendering._options = replace(rendering._options, lockstep_camera=True)
+    rendering.options = replace(rendering.options, lockstep_camera=True)
     assert graph.call(Trigger, "/physics_node/reset").success
     await_images(graph, 2)  # the first observation waits for no camera
     for k in (1, 2, 3):
@@ -220,14 +220,14 @@ def test_an_image_may_wait_for_the_camera_of_its_stamp(graph):
         graph.publish(messages.CAMERA_POSE, messages.encode_pose(pose, k * STEP, "world"))
         command(graph, k * STEP)
 
-    show, rendering._show_states = rendering._show_states, lambda: None  # it lags: the next episode begins before it shows this one
+    show, rendering.show_states = rendering.show_states, lambda: None  # it lags: the next episode begins before it shows this one
     for k in (1, 2, 3):
         commanded(k, 0.01 * k)
     graph.spin(0.3)
     assert graph.call(Trigger, "/physics_node/reset").success
     commanded(1, 0.05)
     graph.spin(0.3)
-    rendering._show_states = show
+    rendering.show_states = show
     commanded(2, 0.06)
     await_images(graph, 13)
     assert stamps(graph, IMAGES)[-6:] == [STEP, 2 * STEP, 3 * STEP, MODEL_STAMP, STEP, 2 * STEP]
@@ -254,7 +254,7 @@ def test_a_commanded_arm_answers_like_a_robot_and_shows_its_markers(graph):
     graph.publish(messages.tool_jaw("PSM1"), messages.encode_jaw(0.5, 1))
     command(graph, 100)
     graph.publish(messages.tool_jaw("PSM1"), messages.encode_jaw(0.7, 1))  # not part of a command: acts at once
-    graph.until(lambda: graph.nodes[1]._arms["PSM1"].angle == 0.7)
+    graph.until(lambda: graph.nodes[1].arms["PSM1"].angle == 0.7)
     command(graph, 200)
     graph.until(lambda: len(graph.heard["PSM1/jaw/measured_js"]) == 2)
     pose = messages.decode_pose(graph.heard["PSM1/measured_cp"][-1], "world", "")
@@ -289,7 +289,7 @@ def test_a_commanded_arm_moves_in_its_time_and_tells_its_state(graph):
     goal[:3, 3] = 0.003, 0, 0.1
     graph.publish(messages.tool_move("PSM1"), messages.encode_pose(goal, 1, "world"))
     graph.publish(messages.tool_jaw_move("PSM1"), messages.encode_jaw(0.5, 1))
-    graph.until(lambda: set(saying()) == {"ENABLED BUSY"} and graph.nodes[1]._arms["PSM1"].angle_goal, "the arm to be busy")
+    graph.until(lambda: set(saying()) == {"ENABLED BUSY"} and graph.nodes[1].arms["PSM1"].angle_goal, "the arm to be busy")
     told.clear()
     assert graph.call(Trigger, "/physics_node/step").success
     graph.until(lambda: len(setpoints) == len(jaws) == 4 and saying() == ["ENABLED"], lambda: f"the end of the move; {saying()}")

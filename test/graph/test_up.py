@@ -17,7 +17,7 @@ from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.graph import up as up_module
 from endo_sim_ros.graph.processes import NodeGroup
-from endo_sim_ros.graph.up import UpError, _Supervisor, run_up
+from endo_sim_ros.graph.up import Supervisor, UpError, run_up
 
 SMALL = """
 /**/reconstruction_node:
@@ -111,7 +111,7 @@ def test_a_node_that_crashes_again_and_again_stays_down_after_the_fourth_time(tm
     monkeypatch.setattr(up_module, "_FIRST_PAUSE", 0.01)
     console = Console(file=io.StringIO(), width=200)
     with NodeGroup(tmp_path) as graph:
-        supervisor = _Supervisor(graph, "", console, respawn=True)
+        supervisor = Supervisor(graph, "", console, respawn=True)
         supervisor.start("no_such_node")
         with pytest.raises(UpError, match="no node is left"):
             wait_until(supervisor.check, 30, "the end")

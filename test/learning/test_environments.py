@@ -178,7 +178,7 @@ def test_randomisation_changes_what_it_names_and_nothing_else():
         np.testing.assert_array_equal(other["state"], observed["state"])
     soft, other = first(stiffness=1.0)
     np.testing.assert_array_equal(other["image"], observed["image"])
-    factors = soft.tissue.solver._scale.numpy()
+    factors = soft.tissue.solver.scale.numpy()
     assert np.ptp(factors) == 0 and factors[0] != 1 and np.exp(-1) <= factors[0] <= np.e
     with pytest.raises(ConfigError, match="Randomisation has no option stifness; it has stiffness, "):
         make("retraction", randomisation={"stifness": 0.1})
@@ -199,7 +199,7 @@ def test_images_are_those_of_the_renderer(light, degree):
     script = scripted_policy("retraction")
     image, _ = environment.reset(seed=0)
     for _ in range(16):
-        image, *_ = environment.step(script.act(batch._state())[0])
+        image, *_ = environment.step(script.act(batch.state())[0])
     renderer = DeformableRenderer(scene.model, batch.task.nodes.rest, RenderingConfig(device="cpu"))
     pinned = torch.from_numpy(batch.task.nodes.pinned)[:, None, None]
     F = torch.where(pinned, torch.eye(3), batch.tissue.F[0])  # as on control_nodes

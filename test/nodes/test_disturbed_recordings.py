@@ -53,7 +53,7 @@ def finished(bench, node, views):
             return level == OK and "finished" in text and values["views"] == str(views) and values
 
     values = bench.until(said, lambda: f"{views} views: {bench.statuses['reconstruction_node'][-2:]}", 30)
-    assert node._trained == (node._frames[0].stamp_ns, node._frames[-1].stamp_ns)
+    assert node.trained == (node.frames[0].stamp_ns, node.frames[-1].stamp_ns)
     return values
 
 
@@ -73,8 +73,8 @@ def test_repeated_swapped_and_unposed_images_are_counted_and_the_others_reconstr
     recording.image(0)  # once more, long after it was used
     values = finished(bench, node, views=10)
     assert (values["images without pose"], values["images out of order"], values["images invalid"]) == ("2", "1", "0")
-    assert [frame.stamp_ns for frame in node._frames] == [small_frames[k].stamp_ns for k in range(12) if k not in (6, 9)]
-    for frame, k in zip(node._frames, (k for k in range(12) if k not in (6, 9)), strict=True):
+    assert [frame.stamp_ns for frame in node.frames] == [small_frames[k].stamp_ns for k in range(12) if k not in (6, 9)]
+    for frame, k in zip(node.frames, (k for k in range(12) if k not in (6, 9)), strict=True):
         np.testing.assert_allclose(frame.camera.pose, small_frames[k].camera.pose, atol=1e-6)
 
 
@@ -88,7 +88,7 @@ def test_a_recording_with_a_gap_ends_with_the_views_of_both_its_parts(bench, sma
             recording.pose(number, shift)
         recording.image(number, shift)
         if number == 5:
-            bench.until(lambda: node._trained, "the first part to be reconstructed")
+            bench.until(lambda: node.trained, "the first part to be reconstructed")
             bench.spin(1.0)
     values = finished(bench, node, views=10)
     assert values["images without pose"] == "2" and values["images out of order"] == "0"

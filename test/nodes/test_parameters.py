@@ -85,7 +85,7 @@ def options_of(node):
     """The options of the reconstruction that the parameters of a node give."""
     values = {name: node.get_parameter(name).value for name in option_values(ReconstructionConfig())}
     config = ReconstructionConfig.from_mapping(values)
-    assert node._config == config, "what the node uses is what its parameters say"
+    assert node.config == config, "what the node uses is what its parameters say"
     return config
 
 

@@ -28,7 +28,7 @@ from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera, make_pose
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.messages import ERROR, OK, WARN
-from endo_sim_ros.nodes.base import _MOST_LOGGED
+from endo_sim_ros.nodes.base import MOST_LOGGED
 from endo_sim_ros.nodes.physics_node import PhysicsNode
 from endo_sim_ros.nodes.rendering_node import RenderingNode
 from endo_sim_ros.physics.control_nodes import build_control_nodes
@@ -79,7 +79,7 @@ def test_bad_model_is_one_sentence_for_physics_and_rendering_and_a_good_one_stil
 def test_a_model_that_cannot_be_made_soft_says_so_until_a_better_one_comes(bench, physics):
     send_model(bench, sheet(8).select(torch.arange(2)), stamp=5 * S)
     bench.refused("physics_node", "tissue needs at least 4", "physics")
-    bench.until(lambda: physics._failure)
+    bench.until(lambda: physics.failure)
     assert physics.status()[0] == ERROR
     send_model(bench, stamp=6 * S)
     await_nodes(bench, 6 * S)
@@ -160,7 +160,7 @@ def test_a_rigid_tool_pushes_the_tissue_and_feels_it(bench, physics):
     send_model(bench)
     await_nodes(bench, 5 * S)
     assert bench.set("physics_node", contact_radius=0.015, friction=0.1)[0]
-    bench.until(lambda: physics._simulation.contact_radius >= 0.015)
+    bench.until(lambda: physics.simulation.contact_radius >= 0.015)
 
     def feels():
         send_tip(bench, (0, 0, 0.09), "PSM1")
@@ -168,7 +168,7 @@ def test_a_rigid_tool_pushes_the_tissue_and_feels_it(bench, physics):
         return reactions and messages.decode_wrench(reactions[-1], "")[0][2] < -0.02 and moved(bench) > 1e-3
 
     bench.until(feels, "the tissue to be pushed away from the camera, and to push back")
-    assert physics._simulation.faults == 0
+    assert physics.simulation.faults == 0
 
 
 def test_what_cannot_be_cut_says_so_and_the_tool_goes_on(bench, physics):
@@ -181,9 +181,9 @@ def test_what_cannot_be_cut_says_so_and_the_tool_goes_on(bench, physics):
     bench.publish(messages.tool_cut("PSM1"), message)
     bench.refused("physics_node", "PSM1/cut: expected a button")
     assert bench.set("physics_node", kinematics="current")[0]
-    bench.until(lambda: physics._simulation.config.kinematics == "current")
+    bench.until(lambda: physics.simulation.config.kinematics == "current")
     send_tip(bench, (0, 0, 0.1), "PSM1")
-    bench.until(lambda: physics._arms["PSM1"].pose is not None)
+    bench.until(lambda: physics.arms["PSM1"].pose is not None)
     bench.publish(messages.tool_cut("PSM1"), messages.encode_cut(True, S))
     bench.refused("physics_node", "kinematics current cannot be cut; set kinematics to rest")
     pull(bench, lambda: moved(bench) > 1e-3)
@@ -199,12 +199,12 @@ def test_services_in_every_state(bench, physics):
     assert "running; call ~/pause with true first" in call("step").message
     pull(bench, lambda: moved(bench) > 1e-3)
     assert bench.call(SetBool, "/physics_node/pause", data=True).message == "paused"
-    before = physics._simulation.time
+    before = physics.simulation.time
     assert call("step").message == f"time {before + 0.02:.4f} s"
-    assert call("reset").success and physics._simulation.time == 0
+    assert call("reset").success and physics.simulation.time == 0
     bench.until(lambda: moved(bench) == 0, "the tissue at rest")
     assert bench.call(SetBool, "/physics_node/pause", data=False).success
-    bench.until(lambda: physics._simulation.time > 0.05, "time to go on")
+    bench.until(lambda: physics.simulation.time > 0.05, "time to go on")
 
 
 def test_a_model_without_training_cameras_is_seen_from_where_the_camera_is(bench, physics):
@@ -230,7 +230,7 @@ def test_tissue_is_left_out_where_the_training_cameras_see_through_it(bench, phy
     bench.publish(messages.TRAINING_CAMERA_INFO, messages.encode_camera_info(K, WIDTH, HEIGHT, 5 * S, "endoscope_left"))
     send_model(bench, model, cameras=poses)
     cameras = [Camera(K, WIDTH, HEIGHT, pose) for pose in poses]
-    carved, whole = (build_control_nodes(model, np.stack(poses)[:, :3, 3], physics._config, seen, render_depth) for seen in (cameras, ()))
+    carved, whole = (build_control_nodes(model, np.stack(poses)[:, :3, 3], physics.config, seen, render_depth) for seen in (cameras, ()))
     assert len(carved) < len(whole)
     np.testing.assert_array_equal(await_nodes(bench, 5 * S).rest, carved.rest.astype(np.float32))
 
@@ -274,7 +274,7 @@ def test_poses_in_the_frame_of_a_robots_base_are_turned_into_the_world(bench, ph
     state = nodes_of(bench)
     shift = state.positions - state.rest
     assert shift[np.linalg.norm(shift, axis=1).argmax()].argmax() == 0  # along the world's x
-    arm = physics._arms["PSM1"]
+    arm = physics.arms["PSM1"]
     for base, z in (("PSM2_base", 0.0), ("PSM1_base", 0.2)):  # a pose without a frame is in that of the arm, or in the world
         assert bench.set("physics_node", frames=[f"{base} 0 0 0.2 0 0 0 1"])[0]
         bench.publish(messages.tool_pose("PSM1"), messages.encode_pose(np.eye(4), S, ""))
@@ -291,13 +291,13 @@ def test_physics_follows_a_simulated_clock(bench):
     assert bench.set("physics_node", use_sim_time=True)[0]
     bench.publish(messages.CLOCK, clock(100 * S))
     send_model(bench)
-    bench.until(lambda: node._simulation is not None, "the simulation")
+    bench.until(lambda: node.simulation is not None, "the simulation")
     for k in range(100):  # a second of simulated time, however long it takes
         bench.publish(messages.CLOCK, clock(100 * S + k * S // 100))
         bench.spin(0.01)
     bench.spin(0.2)
-    assert len(bench.heard["control_nodes"]) == pytest.approx(1 / node._simulation.step_duration, abs=2)
-    assert node._simulation.time == pytest.approx(1.0, abs=2 * node._simulation.step_duration)
+    assert len(bench.heard["control_nodes"]) == pytest.approx(1 / node.simulation.step_duration, abs=2)
+    assert node.simulation.time == pytest.approx(1.0, abs=2 * node.simulation.step_duration)
     assert messages.stamp_to_ns(bench.heard["control_nodes"][-1].header.stamp) <= 101 * S
     bench.publish(messages.CLOCK, clock(5 * S))  # another bag: the clock begins anew, and so does the rhythm
     count = len(bench.heard["control_nodes"])
@@ -312,9 +312,9 @@ def test_overloaded_physics_acts_on_the_newest_command(bench, physics, monkeypat
     send_model(bench)
     await_nodes(bench, 5 * S)
     send_tip(bench)
-    arm = physics._arms["PSM1"]
+    arm = physics.arms["PSM1"]
     bench.until(lambda: arm.pose is not None, "a tip")
-    sent, delays, step = 1, [], physics._step
+    sent, delays, step = 1, [], physics.step
 
     def slow(simulation):
         nonlocal sent
@@ -327,7 +327,7 @@ def test_overloaded_physics_acts_on_the_newest_command(bench, physics, monkeypat
             time.sleep(0.03)
 
     send_wrench(bench, (0, 0, -1e-3))
-    monkeypatch.setattr(physics, "_step", slow)
+    monkeypatch.setattr(physics, "step", slow)
     bench.until(lambda: len(delays) > 15, "steps", 60)
     assert max(delays) <= 6, delays  # the newest that had arrived: what is sent last may still be on its way
 
@@ -348,17 +348,17 @@ def test_parameters_act_or_are_refused_with_the_reason(bench, physics):
         assert not successful and reason in text, (name, value, text)
     assert bench.set("physics_node", arms=["PSM1", "PSM2"])[0]  # as it is already
     assert bench.set("physics_node", young_modulus=5000.0)[0]
-    bench.until(lambda: physics._simulation.config.young_modulus == 5000.0, "softer tissue")
+    bench.until(lambda: physics.simulation.config.young_modulus == 5000.0, "softer tissue")
     painted = ["sphere 0 0 0.1 0.02 young_modulus=20000"]
     assert bench.set("physics_node", regions=painted)[0]
-    bench.until(lambda: physics._simulation.config.regions == tuple(painted), "a stiffer region")
+    bench.until(lambda: physics.simulation.config.regions == tuple(painted), "a stiffer region")
     assert bench.set("physics_node", regions=[""])[0]
-    bench.until(lambda: physics._simulation.config.regions == ("",), "no region")
+    bench.until(lambda: physics.simulation.config.regions == ("",), "no region")
     assert bench.set("physics_node", substeps=1)[0]  # far too long for the material
     bench.refused("physics_node", "substep")
     count = len(bench.heard["control_nodes"])
     assert bench.set("physics_node", substeps=0)[0]
-    bench.until(lambda: len(bench.heard["control_nodes"]) > count + 5 and not physics._failure, "steps to go on")
+    bench.until(lambda: len(bench.heard["control_nodes"]) > count + 5 and not physics.failure, "steps to go on")
 
 
 def test_errors_at_500_hz_flood_neither_the_log_nor_diagnostics_nor_memory(bench, physics):
@@ -366,9 +366,9 @@ def test_errors_at_500_hz_flood_neither_the_log_nor_diagnostics_nor_memory(bench
     physics.get_logger = lambda: type("Logger", (), {"error": staticmethod(logged.append)})
     for number in range(1000):  # every text is different
         physics.report_error(f"error {number}")
-    assert len(logged) == _MOST_LOGGED == len(physics._logged)
+    assert len(logged) == MOST_LOGGED == len(physics.logged)
     bench.until(lambda: any(s[2]["errors"] == "1000" for s in bench.statuses["physics_node"]), "the count of errors")
-    assert len(bench.statuses["physics_node"]) < _MOST_LOGGED + 10
+    assert len(bench.statuses["physics_node"]) < MOST_LOGGED + 10
     assert bench.statuses["physics_node"][-1][1] == "error 999"
     physics.report_error("x" * 2_000_000)  # a frame_id of that length, quoted
     bench.until(lambda: 1000 < len(bench.statuses["physics_node"][-1][1]) < 1010, "the beginning of a long error")

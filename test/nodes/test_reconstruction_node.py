@@ -31,7 +31,7 @@ def views_arrive(bench, frames, shift_ns=S, count=12):
     send_frames(bench, frames, shift_ns)
     bench.call(Trigger, "/reconstruction_node/save")  # some round trip; then flush as the end of a recording does
     node = next(node for node in bench.nodes if isinstance(node, ReconstructionNode))
-    bench.until(lambda: (node._flush(), len(node._frames) == count)[1], lambda: f"{count} views: {node.status()}")
+    bench.until(lambda: (node.flush(), len(node.frames) == count)[1], lambda: f"{count} views: {node.status()}")
 
 
 @pytest.mark.parametrize("name", BAD_RECORDINGS)
@@ -49,7 +49,7 @@ def test_image_and_camera_info_of_different_sizes_are_refused_and_good_views_sti
     bench.publish(messages.LEFT_INFO, messages.encode_camera_info(K, 640, 512, frame.stamp_ns, "endoscope_left"))
     bench.publish(messages.CAMERA_POSE, messages.encode_pose(frame.camera.pose, frame.stamp_ns, "world"))
     bench.publish(messages.LEFT_IMAGE, messages.encode_image(frame.image, frame.stamp_ns, "endoscope_left"))
-    bench.until(lambda: reconstruction._synchronizer.pending)
+    bench.until(lambda: reconstruction.synchronizer.pending)
     assert not bench.call(Trigger, "/reconstruction_node/reconstruct").success
     bench.refused("reconstruction_node", "the image is 96×80 but camera_info says 640×512", "endoscope/left")
     views_arrive(bench, small_frames)
@@ -81,7 +81,7 @@ def test_camera_info_of_another_size_in_mid_stream_is_followed(bench, reconstruc
     big = [f.__class__(f.stamp_ns, cv2.resize(f.image, (192, 160)), f.camera.resized(192, 160),
                        depth=cv2.resize(f.depth, (192, 160))) for f in small_frames]  # fmt: skip
     views_arrive(bench, big, shift_ns=3 * S, count=24)
-    assert {frame.camera.width for frame in reconstruction._frames} == {96, 192}
+    assert {frame.camera.width for frame in reconstruction.frames} == {96, 192}
 
 
 def test_a_slow_recording_is_not_taken_for_one_that_ended(bench, reconstruction, small_frames):
@@ -89,10 +89,10 @@ def test_a_slow_recording_is_not_taken_for_one_that_ended(bench, reconstruction,
     assert bench.set("reconstruction_node", start_after=0.2, image_timeout=4.0)[0]
     for count in range(1, 4):
         send_frames(bench, small_frames[count - 1 : count])
-        bench.until(lambda: time.monotonic() - reconstruction._last_image > 0.5, "half a second")
-        assert reconstruction._trained is None
+        bench.until(lambda: time.monotonic() - reconstruction.last_image > 0.5, "half a second")
+        assert reconstruction.trained is None
     bench.status("reconstruction_node", "finished, model saved in")
-    assert len(reconstruction._frames) == 3
+    assert len(reconstruction.frames) == 3
 
 
 def test_recording_is_reconstructed_published_latched_and_saved(bench, reconstruction, small_frames, tmp_path):
@@ -119,7 +119,7 @@ def test_recording_is_reconstructed_published_latched_and_saved(bench, reconstru
     assert len(cameras[-1].poses) == 3
     count = len(models)
     time.sleep(0.5)  # nothing new came: nothing may be reconstructed again
-    bench.until(lambda: not reconstruction._training)
+    bench.until(lambda: not reconstruction.training)
     assert len(models) == count
     answer = bench.call(Trigger, "/reconstruction_node/save")
     assert answer.success and answer.message.startswith(str(tmp_path))
@@ -131,10 +131,10 @@ def test_recording_is_reconstructed_published_latched_and_saved(bench, reconstru
     assert len(cameras[-1].poses) == 3
     count = len(models)
     # A second recording with the very same stamps, after a pause, is another recording.
-    bench.until(lambda: time.monotonic() - reconstruction._last_image > 1.1)
+    bench.until(lambda: time.monotonic() - reconstruction.last_image > 1.1)
     send_frames(bench, small_frames)
     bench.until(lambda: len(models) > count, "a model of the second recording")
-    assert len(reconstruction._frames) == 12
+    assert len(reconstruction.frames) == 12
     assert messages.stamp_to_ns(models[-1].header.stamp) > messages.stamp_to_ns(models[count - 1].header.stamp)
 
 
@@ -144,25 +144,25 @@ def test_stamps_that_jump_begin_a_new_recording_and_looping_does_not_reconstruct
     long = [f.__class__(f.stamp_ns + i * S, f.image, f.camera, depth=f.depth) for i, f in enumerate(small_frames)]
     send_frames(bench, long)
     send_frames(bench, long[:6])  # the bag starts again
-    bench.until(lambda: reconstruction._trained is not None, "training at the end of the loop")
-    trained = reconstruction._trained
+    bench.until(lambda: reconstruction.trained is not None, "training at the end of the loop")
+    trained = reconstruction.trained
     assert trained == (long[0].stamp_ns, long[-1].stamp_ns)
     send_frames(bench, long[6:])
-    bench.until(lambda: not reconstruction._training)
+    bench.until(lambda: not reconstruction.training)
     send_frames(bench, long[:2])
-    bench.until(lambda: len(reconstruction._frames) <= 2)
-    assert not reconstruction._training and reconstruction._trained == trained
+    bench.until(lambda: len(reconstruction.frames) <= 2)
+    assert not reconstruction.training and reconstruction.trained == trained
     send_frames(bench, small_frames[:4], 3600 * S)  # an hour later
-    reconstruction._flush()
-    assert len(reconstruction._frames) == 4
+    reconstruction.flush()
+    assert len(reconstruction.frames) == 4
 
 
 def test_a_live_camera_is_reconstructed_once_when_enough_views_came(bench, reconstruction, small_frames):
     assert bench.set("reconstruction_node", start_views=6, iterations=5)[0]
     for index, shift in enumerate((0, S, 2 * S)):
         send_frames(bench, small_frames, shift)
-        bench.until(lambda: reconstruction._trained is not None and not reconstruction._training)
-    assert reconstruction._trained[1] < small_frames[0].stamp_ns + S  # not again with the views after the first six
+        bench.until(lambda: reconstruction.trained is not None and not reconstruction.training)
+    assert reconstruction.trained[1] < small_frames[0].stamp_ns + S  # not again with the views after the first six
 
 
 def test_a_place_that_cannot_be_written_is_told_and_the_model_is_published_all_the_same(bench, reconstruction, small_frames, tmp_path):
@@ -171,7 +171,7 @@ def test_a_place_that_cannot_be_written_is_told_and_the_model_is_published_all_t
     send_frames(bench, small_frames)
     assert bench.call(Trigger, "/reconstruction_node/reconstruct").success
     bench.refused("reconstruction_node", "the model cannot be saved", "/proc/nowhere", "set output_dir")
-    bench.until(lambda: models and not reconstruction._training, "the model, and the end of its training")
+    bench.until(lambda: models and not reconstruction.training, "the model, and the end of its training")
     assert reconstruction.status()[0] == ERROR  # still
     assert "cannot be saved" in bench.call(Trigger, "/reconstruction_node/save").message
     assert bench.set("reconstruction_node", output_dir=str(tmp_path))[0]
@@ -183,11 +183,11 @@ def test_a_reconstruction_that_fails_says_so_until_the_next_one(bench, reconstru
     dark = [f.__class__(f.stamp_ns, f.image, f.camera, mask=np.zeros((80, 96), np.uint8)) for f in small_frames]
     for frame in dark:
         bench.publish(messages.MASK, messages.encode_image(frame.mask, frame.stamp_ns, "endoscope_left"))
-    bench.until(lambda: len(reconstruction._synchronizer._streams["mask"].stamps) == 12)
+    bench.until(lambda: len(reconstruction.synchronizer.streams["mask"].stamps) == 12)
     send_frames(bench, small_frames)
     assert bench.call(Trigger, "/reconstruction_node/reconstruct").success
     bench.refused("reconstruction_node", "every pixel of every view is masked")
-    bench.until(lambda: not reconstruction._training)
+    bench.until(lambda: not reconstruction.training)
     assert reconstruction.status()[0] == ERROR
     views_arrive(bench, small_frames, 100 * S)
     assert bench.call(Trigger, "/reconstruction_node/reconstruct").success
@@ -198,18 +198,18 @@ def test_services_answer_and_callbacks_stay_quick_while_training(bench, reconstr
     send_frames(bench, small_frames)
     assert bench.set("reconstruction_node", iterations=10_000)[0]
     assert bench.call(Trigger, "/reconstruction_node/reconstruct").success
-    bench.until(lambda: reconstruction._progress is not None, "progress")
+    bench.until(lambda: reconstruction.progress is not None, "progress")
     again = bench.call(Trigger, "/reconstruction_node/reconstruct")
     assert not again.success and "a reconstruction is running: training, iteration" in again.message
     start = time.monotonic()
     send_frames(bench, small_frames, 2 * S)
-    bench.until(lambda: len(reconstruction._frames) >= 20, "views during training")
+    bench.until(lambda: len(reconstruction.frames) >= 20, "views during training")
     assert time.monotonic() - start < 5.0
     iteration = bench.status("reconstruction_node", "training, iteration", OK)[2]["iteration"]
     assert 0 < int(iteration) < 10_000
     with caplog.at_level(logging.INFO):
-        reconstruction._cancel.set()
-        bench.until(lambda: not reconstruction._training, "the training to stop")
+        reconstruction.cancel.set()
+        bench.until(lambda: not reconstruction.training, "the training to stop")
     assert re.search(r"stopped before its end: .* of 10000 iterations, saved in", caplog.text)
     assert "finished" not in reconstruction.status()[1]
 
@@ -227,11 +227,11 @@ def test_a_model_file_is_published_when_set_and_a_bad_one_is_refused_with_the_re
 def test_a_model_file_needs_no_image_and_a_recording_may_still_come(bench, reconstruction, small_frames, tmp_path):
     save_ply(sheet(5), tmp_path / "model.ply")
     assert bench.set("reconstruction_node", image_timeout=0.1, model_file=str(tmp_path / "model.ply"))[0]
-    bench.until(lambda: time.monotonic() - reconstruction._last_view > 0.2, "a long silence")
+    bench.until(lambda: time.monotonic() - reconstruction.last_view > 0.2, "a long silence")
     said = len(bench.statuses["reconstruction_node"])
     assert bench.status("reconstruction_node", f"published the model of {tmp_path}/model.ply", OK, said)[2]["gaussians"] == "25"
     send_frames(bench, small_frames, poses=False)
     for _ in range(2):  # images without poses are given up when later ones come
-        reconstruction._flush()
+        reconstruction.flush()
         bench.status("reconstruction_node", "images arrive but none is usable", WARN)
     views_arrive(bench, small_frames)

@@ -31,14 +31,14 @@ def test_a_recorder_on_a_full_disk_says_so_and_keeps_no_messages(bench, recordin
     for number in range(50):
         send_wrench(bench, (0, 0, 1.0), stamp=S + number)
         bench.executor.spin_once(timeout_sec=0.01)
-    bench.until(lambda: recorder._dropped >= 50, "messages to be dropped")
-    assert recorder._queue.qsize() < 3 and recorder.status()[0] == ERROR
+    bench.until(lambda: recorder.dropped >= 50, "messages to be dropped")
+    assert recorder.queue.qsize() < 3 and recorder.status()[0] == ERROR
 
 
 def test_a_recorder_keeps_what_was_said_and_refuses_to_overwrite(bench, recording):
     recorder = bench.add(RecorderNode)
     send_wrench(bench, (1.0, 2.0, 3.0))
-    bench.until(lambda: recorder._written >= 2, "messages to be written")
+    bench.until(lambda: recorder.written >= 2, "messages to be written")
     bench.executor.remove_node(recorder)
     bench.nodes.remove(recorder)
     recorder.destroy_node()

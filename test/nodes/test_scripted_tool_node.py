@@ -20,5 +20,5 @@ def test_scripted_tool_waits_then_pulls_and_lets_go(bench, physics, rendering):
     await_nodes(bench, 5 * S)
     bench.until(lambda: moved(bench) > 1e-3, "the tool to move tissue")
     bench.status("scripted_tool", "finished", OK)
-    assert np.linalg.norm(tool._tip - [0, 0, 0.1]) < 0.01
+    assert np.linalg.norm(tool.tip - [0, 0, 0.1]) < 0.01
     bench.until(lambda: moved(bench) < 1e-4, "the tissue to be released")

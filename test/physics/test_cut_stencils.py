@@ -31,7 +31,7 @@ def stencils_of(rest: np.ndarray, ratio: float) -> CutStencils:
 def tables(stencils: CutStencils) -> tuple[np.ndarray, np.ndarray, int]:
     """Regular stencils and those after the cuts [M, 27], and the number of regular grid nodes."""
     nx, ny, nz = stencils.shape
-    base = np.floor(stencils._cells - 0.5).astype(int)
+    base = np.floor(stencils.cells - 0.5).astype(int)
     steps = np.array([(i, j, k) for i in range(3) for j in range(3) for k in range(3)])
     i, j, k = np.moveaxis(base[:, None] + steps, 2, 0)
     regular = (i * ny + j) * nz + k
@@ -52,7 +52,7 @@ def momentum_pieces(table: np.ndarray) -> np.ndarray:
 
 def spline_weights(stencils: CutStencils) -> np.ndarray:
     """Weights of the stencils [M, 27]."""
-    x = stencils._cells - np.floor(stencils._cells - 0.5)
+    x = stencils.cells - np.floor(stencils.cells - 0.5)
     w = np.stack([0.5 * (1.5 - x) ** 2, 0.75 - (x - 1) ** 2, 0.5 * (x - 0.5) ** 2], 2)
     return np.einsum("ni,nj,nk->nijk", w[:, 0], w[:, 1], w[:, 2]).reshape(-1, 27)
 
@@ -211,7 +211,7 @@ def test_every_node_keeps_its_mass_on_copies_of_its_own_grid_nodes(jitter, y):
     assert cut.table.shape == (len(cut.affected), 27) and (np.diff(cut.affected) > 0).all()
     assert after.min() >= 0 and after.max() == grid + cut.extra - 1
     assert (cut.table >= grid).any(1).all()
-    np.testing.assert_array_equal(cut.base, np.floor(stencils._cells[cut.affected] - 0.5))
+    np.testing.assert_array_equal(cut.base, np.floor(stencils.cells[cut.affected] - 0.5))
     np.testing.assert_array_equal(after[after < grid], regular[after < grid])
     np.testing.assert_array_equal(np.unique(after[after >= grid]), np.arange(grid, grid + cut.extra))
     original = np.full(grid + cut.extra, -1)  # a copy stands for one grid node
@@ -229,7 +229,7 @@ def test_a_copy_has_three_nodes_unless_the_cut_leaves_them_no_neighbour_there(ji
     users = np.bincount(after.ravel(), minlength=after.max() + 1)
     few = np.flatnonzero(users[grid:] < 3) + grid
     assert len(few) < 0.5 * stencils.table().extra
-    links = stencils._links[~stencils._broken]
+    links = stencils.links[~stencils.broken]
     for copy in few:
         alone = (after == copy).any(1)
         others = (regular == regular[after == copy][0]).any(1) & ~alone
@@ -303,7 +303,7 @@ def test_a_single_node_cut_off_all_around_stays_with_a_neighbour():
     stencils.cut(np.array(box))
     inside = ((rest > low) & (rest < high)).all(1)
     assert inside.sum() == 1
-    links = stencils._links[stencils._broken]
+    links = stencils.links[stencils.broken]
     assert inside[links].any(1).all() and len(links) > 5
     assert momentum_pieces(tables(stencils)[1]).max() == 0
 

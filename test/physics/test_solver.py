@@ -119,7 +119,7 @@ def test_inverted_tissue_recovers_with_every_backend():
         F[chosen] = np.float32(np.diag([1.0, 1.0, -0.3]))
         F[chosen[:4]] = 0.0
         simulation.solver.state.F.assign(F)
-        simulation._disturbed = True
+        simulation.disturbed = True
         steps(simulation, 3)
         assert simulation.faults == 0
         ends.append(simulation.state().positions)

@@ -42,7 +42,7 @@ def test_slowly_relaxing_tissue_is_not_left_as_it_is_before_it_has_relaxed():
             steps(simulation, 100)  # 4 s
     assert held[1] > 1.25 * lasting[-1] and held[-1] == pytest.approx(lasting[-1], rel=0.02)
     steps(simulation, 1)
-    assert simulation._resting
+    assert simulation.resting
 
 
 def test_relaxing_tissue_needs_the_substeps_of_its_fast_stiffness():

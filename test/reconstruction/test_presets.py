@@ -66,7 +66,7 @@ def test_odd_and_large_pictures_train(size):
 @pytest.mark.slow
 def test_out_of_memory_goes_on_at_half_the_size(views, monkeypatch, caplog):
     trainer = trainer_of(views[::4], options())
-    draw, widths = trainer._render, []
+    draw, widths = trainer.render, []
 
     def short_of_memory(viewmats, Ks, size, *arguments):
         widths.append(size[0])
@@ -74,12 +74,12 @@ def test_out_of_memory_goes_on_at_half_the_size(views, monkeypatch, caplog):
             raise torch.OutOfMemoryError("CUDA out of memory")
         return draw(viewmats, Ks, size, *arguments)
 
-    monkeypatch.setattr(trainer, "_render", short_of_memory)
+    monkeypatch.setattr(trainer, "render", short_of_memory)
     assert finite(trainer.run()) and trainer.iteration == 12
     assert widths[:2] == [160, 80] and trainer.cameras[0].width == 80
     assert "80 pixels wide" in caplog.text
     tiny = trainer_of([shrink(view, 80) for view in views[::4]], options())
-    monkeypatch.setattr(tiny, "_render", lambda *_: (_ for _ in ()).throw(torch.OutOfMemoryError("CUDA out of memory")))
+    monkeypatch.setattr(tiny, "render", lambda *_: (_ for _ in ()).throw(torch.OutOfMemoryError("CUDA out of memory")))
     with pytest.raises(torch.OutOfMemoryError):
         tiny.run()
 

@@ -79,10 +79,10 @@ def test_optimiser_state_follows_its_gaussians(small):
     for _ in range(3):
         trainer.step()
     with torch.no_grad():
-        trainer._parameters["logit_opacities"][:7] = -8
-    state = lambda: trainer._optimizer.state["means"]
+        trainer.parameters["logit_opacities"][:7] = -8
+    state = lambda: trainer.optimizer.state["means"]
     moments, means = state()["exp_avg"].clone(), trainer.model.means
-    trainer._refine()
+    trainer.refine()
     kept = (trainer.model.means[: len(means)] == means).all(1) & (state()["exp_avg"][: len(means)] != 0).any(1)
     assert kept.sum() > 0.5 * len(means)
     assert not kept[:7].any()

@@ -46,9 +46,9 @@ def test_steep_gaussians_are_split_or_doubled_and_dead_ones_go():
 @pytest.mark.slow
 def test_exposures_and_colours_do_not_drift_against_each_other(views):
     trainer = trainer_of(views, ReconstructionConfig(iterations=40, max_gaussians=2000, depth="topic", device="cpu"))
-    before = trainer._appearance.tensors["exposures"].detach().clone()
+    before = trainer.appearance.tensors["exposures"].detach().clone()
     trainer.run()
-    after = trainer._appearance.tensors["exposures"].detach()
+    after = trainer.appearance.tensors["exposures"].detach()
     assert (after - before).abs().max() > 1e-5
     np.testing.assert_allclose(after.mean(0), before.mean(0), atol=1e-6)
 

@@ -54,13 +54,13 @@ def test_virtual_camera_lies_between_two_views(small, monkeypatch):
     trainer = trainer_of([small[0], small[4]], options(virtual_every=1))
     first, second = (small[i].camera.position for i in (0, 4))
     seen = []
-    draw = trainer._render
+    draw = trainer.render
 
     def spy(viewmats, *arguments):
         seen.extend(viewmats.double().inverse()[:, :3, 3].numpy())
         return draw(viewmats, *arguments)
 
-    monkeypatch.setattr(trainer, "_render", spy)
+    monkeypatch.setattr(trainer, "render", spy)
     for _ in range(3):
         trainer.step()
     virtual = seen[1::2]

@@ -23,8 +23,8 @@ def test_the_first_step_has_the_same_loss_and_gradients():
     cpu.step()
     cuda.step()
     assert cuda.progress.loss == pytest.approx(cpu.progress.loss, rel=1e-3)
-    for name, state in cpu._optimizer.state.items():
-        gradient, other = state["exp_avg"], cuda._optimizer.state[name]["exp_avg"].cpu()  # Adam's first mean is a tenth of it
+    for name, state in cpu.optimizer.state.items():
+        gradient, other = state["exp_avg"], cuda.optimizer.state[name]["exp_avg"].cpu()  # Adam's first mean is a tenth of it
         if name != "quats":  # Gaussians begin as spheres, which do not turn: that gradient is rounding
             assert 0 < gradient.norm() and (other - gradient).norm() < 0.1 * gradient.norm(), name
 

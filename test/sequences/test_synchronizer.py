@@ -140,7 +140,7 @@ def test_frames_before_and_after_a_bad_image_are_not_lost():
     for number in (1, 2, 3):
         synchronizer.add("image", number * 40 * MS, image(width=WIDTH + (number == 2)))
     for number in (1, 2, 3):  # behind the back of `add`, so that all three are still waiting
-        synchronizer._streams["pose"].add(number * 40 * MS, pose())
+        synchronizer.streams["pose"].add(number * 40 * MS, pose())
     with pytest.raises(SequenceError, match="endoscope/left: the image"):
         synchronizer.flush()
     assert [frame.stamp_ns // (40 * MS) for frame in synchronizer.flush()] == [1, 3]
@@ -223,7 +223,7 @@ def test_streams_without_images_keep_a_bounded_number_of_messages():
         synchronizer.add("pose", number * 2 * MS, pose(number))
     for number in range(1, 60):
         synchronizer.add("depth", number * 40 * MS, np.ones((HEIGHT, WIDTH), np.float32))
-    assert len(synchronizer._streams["pose"].stamps) == 200
-    assert len(synchronizer._streams["depth"].stamps) == 30
+    assert len(synchronizer.streams["pose"].stamps) == 200
+    assert len(synchronizer.streams["depth"].stamps) == 30
     synchronizer.add("image", 700 * 2 * MS, image())
     assert synchronizer.flush()[0].camera.pose[0, 3] == 700  # the newest are kept

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from endo_sim_ros.core.cameras import look_at
-from endo_sim_ros.splatting import RenderOutput, _rasterize, rasterize, reference
+from endo_sim_ros.splatting import RenderOutput, rasterize, rasterize_in_torch, reference
 
 DEVICES = ["cpu", *([pytest.param("cuda", marks=pytest.mark.gpu)] if torch.cuda.is_available() else [])]
 WIDTH, HEIGHT = 70, 45  # no multiple of the tile
@@ -41,7 +41,7 @@ def random_like(images, seed=1):
 
 def covariances(quats, scales):
     """World covariances [N, 3, 3]."""
-    rotations = reference._quat_to_matrix(quats)
+    rotations = reference.quat_to_matrix(quats)
     return rotations @ torch.diag_embed(scales**2) @ rotations.mT
 
 
@@ -75,7 +75,7 @@ GRADIENT_TOLERANCES = {"means": 5e-5, "quats": 5e-5, "scales": 5e-5, "covars": 5
 
 
 def assert_matches_reference(gaussians, cameras, device="cpu", names=GAUSSIAN_NAMES, **options):
-    expected, expected_gradients = run(_rasterize, gaussians, cameras, **options)
+    expected, expected_gradients = run(rasterize_in_torch, gaussians, cameras, **options)
     output, gradients = run(rasterize, gaussians, cameras, device=device, dtype=torch.float32, **options)
     for name, actual, image in zip(RenderOutput._fields, output, expected):
         if name not in ("radii", "medians"):

@@ -18,7 +18,7 @@ from raster_scene import (
     run,
 )
 
-from endo_sim_ros.splatting import RenderOutput, _rasterize, rasterize
+from endo_sim_ros.splatting import RenderOutput, rasterize, rasterize_in_torch
 
 
 def assert_only_background(gaussians, size=(WIDTH, HEIGHT)):
@@ -48,7 +48,7 @@ def test_one_gaussian_matches_the_reference(opacity, compositor):
     gaussians[0][:] = torch.tensor([0.01, 0.02, 0.12])
     gaussians[3][:] = opacity
     # It meets nothing, so its distortion is zero.
-    expected, expected_gradients = run(_rasterize, gaussians, make_cameras())
+    expected, expected_gradients = run(rasterize_in_torch, gaussians, make_cameras())
     output, gradients = run(rasterize, gaussians, make_cameras(), dtype=torch.float32)
     for name, actual, image in zip(RenderOutput._fields[:3], output, expected):
         assert_close(name, actual, image, IMAGE_TOLERANCE)
@@ -135,7 +135,7 @@ def test_a_million_gaussians_are_all_seen():
 def test_needle_gaussians_lose_no_tile(compositor):
     gaussians = make_gaussians(80, seed=10)
     gaussians[2] = gaussians[2] * torch.tensor([12.0, 0.02, 0.02])
-    expected, _ = run(_rasterize, gaussians, make_cameras())
+    expected, _ = run(rasterize_in_torch, gaussians, make_cameras())
     output, _ = run(rasterize, gaussians, make_cameras(), dtype=torch.float32)
     for image, other in zip(output[:4], expected):
         errors = (image.double() - other).abs() / other.abs().max()
@@ -185,7 +185,7 @@ def test_a_mean_that_is_not_finite_is_named(value):
         rasterize(*gaussians, viewmats, Ks, WIDTH, HEIGHT)
 
 
-@pytest.mark.parametrize("function", [rasterize, _rasterize])
+@pytest.mark.parametrize("function", [rasterize, rasterize_in_torch])
 def test_wrong_shapes_are_named_with_both_shapes(function):
     gaussians = make_gaussians(6)
     viewmats, Ks = make_cameras()

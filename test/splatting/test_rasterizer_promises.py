@@ -26,7 +26,7 @@ from raster_scene import (
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.kernels import compare_plain, vectorised
-from endo_sim_ros.splatting import RenderOutput, _rasterize, api, cuda, rasterize, render
+from endo_sim_ros.splatting import RenderOutput, api, cuda, rasterize, rasterize_in_torch, render
 
 scenes = st.fixed_dictionaries(
     {
@@ -64,7 +64,7 @@ def test_any_scene_matches_the_reference(scene):
     gaussians = [x.float().double() for x in gaussians]
     cameras, options = make_cameras(scene["cameras"], *scene["size"]), {"size": scene["size"], "median": scene["median"]}
     cameras = [x.float().double() for x in cameras]
-    expected, expected_gradients = run(_rasterize, gaussians, cameras, **options)
+    expected, expected_gradients = run(rasterize_in_torch, gaussians, cameras, **options)
     output, gradients = run(rasterize, gaussians, cameras, dtype=torch.float32, **options)
     assert all(gradient.isfinite().all() for gradient in gradients)
     assert (output.alphas >= 0).all() and (output.alphas <= 1).all() and (output.distortions > -1e-5).all()
@@ -100,7 +100,7 @@ def test_a_mask_that_skips_tiles_does_not_change_the_other_pixels(compositor):
     mask = torch.zeros(2, HEIGHT, WIDTH, dtype=torch.bool)
     mask[0, 20:30, 30:50] = True
     mask[1, 44, 69] = True
-    cotangents = random_like(run(_rasterize, gaussians, cameras)[0][:4])
+    cotangents = random_like(run(rasterize_in_torch, gaussians, cameras)[0][:4])
     cotangents = [x * (mask[..., None] if x.ndim == 4 else mask) for x in cotangents]
     whole, whole_gradients = run(rasterize, gaussians, cameras, dtype=torch.float32, cotangents=cotangents)
     output, gradients = run(rasterize, gaussians, cameras, dtype=torch.float32, cotangents=cotangents, masks=mask)
@@ -184,7 +184,7 @@ def test_memory_that_runs_out_is_asked_for_again(monkeypatch):
 
 
 def test_pictures_in_inference_mode_do_not_disturb_later_gradients(compositor):
-    for cache in (api._black, api._all_tiles, cuda._scratch):
+    for cache in (api.black, api.all_tiles, cuda.scratch_for):
         cache.cache_clear()
     *gaussians, viewmats, Ks = (x.float() for x in (*make_gaussians(), *make_cameras()))
     with torch.inference_mode():
@@ -197,7 +197,7 @@ def test_pictures_in_inference_mode_do_not_disturb_later_gradients(compositor):
 
 def test_the_default_dtype_changes_nothing(compositor):
     gaussians, cameras = make_gaussians(), make_cameras()
-    api._black.cache_clear()
+    api.black.cache_clear()
     expected, _ = run(rasterize, gaussians, cameras, dtype=torch.float32)
     torch.set_default_dtype(torch.float64)
     try:
@@ -252,7 +252,7 @@ def test_gaussians_of_each_camera_match_the_reference_and_the_cameras_one_by_one
     opacities = sets[0][3]
     draw = lambda function, x: function(x[0], None, None, x[2], x[3], x[4], x[5], WIDTH, HEIGHT, covars=x[1], median=True)
     everything = [means, covars, opacities, sh, viewmats, Ks]
-    expected = draw(_rasterize, everything)
+    expected = draw(rasterize_in_torch, everything)
     output = draw(rasterize, [x.to(device, torch.float32) for x in everything])
     for name, actual, image in zip(RenderOutput._fields, output, expected):
         if name == "radii":
@@ -294,12 +294,12 @@ def test_capacity_follows_what_pictures_needed():
 
 
 def test_the_first_picture_on_a_cpu_has_lists():
-    cuda._scratch.cache_clear()
+    cuda.scratch_for.cache_clear()
     gaussians, cameras = make_gaussians(20, seed=33), make_cameras(1, 300, 200)
     gaussians[2] *= 10
     with compare_plain():
         run(rasterize, gaussians, cameras, size=(300, 200), dtype=torch.float32)
-    scratch = cuda._scratch(torch.device("cpu"), 0)
+    scratch = cuda.scratch_for(torch.device("cpu"), 0)
     assert cuda._FIRST_GUESS * 20 * 1.5 < scratch.seen[0] <= scratch.capacity
 
 
@@ -346,7 +346,7 @@ def test_pictures_without_lists_of_tiles_are_the_same(device, monkeypatch):
         monkeypatch.setattr(cuda, "_ALWAYS", 0)
         unlisted = run(rasterize, gaussians, cameras, device=device, dtype=torch.float32)
         device = torch.device(f"{device}:0" if device == "cuda" else device)
-        scratch = cuda._scratch(device, cuda._stream(device))
+        scratch = cuda.scratch_for(device, cuda.stream_of(device))
     assert scratch.seen[0] > scratch.capacity
     for expected, actual in zip([*listed[0][:4], *listed[1]], [*unlisted[0][:4], *unlisted[1]]):
         assert_close("it", actual, expected.cpu(), 1e-5)

@@ -19,7 +19,7 @@ from raster_scene import (
     run,
 )
 
-from endo_sim_ros.splatting import RenderOutput, _rasterize, rasterize, reference
+from endo_sim_ros.splatting import RenderOutput, rasterize, rasterize_in_torch, reference
 
 
 @pytest.mark.slow
@@ -44,7 +44,7 @@ def test_opaque_stacks_that_end_pixels_early_match_the_reference(device, composi
     gaussians = make_gaussians(150, seed=3)
     gaussians[2] = gaussians[2] * 3
     gaussians[3] = 0.9 + 0.1 * gaussians[3]
-    expected, _ = run(_rasterize, gaussians, make_cameras())
+    expected, _ = run(rasterize_in_torch, gaussians, make_cameras())
     assert expected.alphas.max() > 1 - 1e-3
     assert_matches_reference(gaussians, make_cameras(), device)
 
@@ -64,10 +64,10 @@ def test_covariances_match_the_reference_and_give_the_picture_of_quats_and_scale
 @pytest.mark.slow
 def test_each_output_alone_has_the_gradient_of_the_reference():
     gaussians, cameras = make_gaussians(seed=6), make_cameras()
-    images = run(_rasterize, gaussians, cameras)[0][:4]
+    images = run(rasterize_in_torch, gaussians, cameras)[0][:4]
     for alone in range(4):
         cotangents = [x if i == alone else torch.zeros_like(x) for i, x in enumerate(random_like(images))]
-        _, expected = run(_rasterize, gaussians, cameras, cotangents=cotangents)
+        _, expected = run(rasterize_in_torch, gaussians, cameras, cotangents=cotangents)
         _, gradients = run(rasterize, gaussians, cameras, cotangents=cotangents, dtype=torch.float32)
         for name, actual, gradient in zip(GAUSSIAN_NAMES[:4], gradients, expected):
             assert gradient.abs().max() > 0
@@ -77,11 +77,11 @@ def test_each_output_alone_has_the_gradient_of_the_reference():
 @pytest.mark.slow
 def test_camera_gradient_matches_finite_differences_of_the_reference():
     gaussians, (viewmats, Ks) = make_gaussians(40, 4, seed=7), make_cameras(1)
-    cotangents = random_like(_rasterize(*gaussians, viewmats, Ks, WIDTH, HEIGHT)[:4])
+    cotangents = random_like(rasterize_in_torch(*gaussians, viewmats, Ks, WIDTH, HEIGHT)[:4])
     _, gradients = run(rasterize, gaussians, (viewmats, Ks), dtype=torch.float32, cotangents=cotangents)
 
     def loss(pose):
-        output = _rasterize(*gaussians, pose, Ks, WIDTH, HEIGHT, background=BACKGROUND)
+        output = rasterize_in_torch(*gaussians, pose, Ks, WIDTH, HEIGHT, background=BACKGROUND)
         return float(sum((image * cotangent).sum() for image, cotangent in zip(output, cotangents)))
 
     step = 1e-7
@@ -106,7 +106,7 @@ def test_gradients_match_finite_differences_where_nothing_is_cut_off(monkeypatch
 
     def loss(leaves):
         *gaussians, viewmats, background = leaves
-        output = _rasterize(*gaussians, viewmats, cameras[1], 20, 14, background=background)
+        output = rasterize_in_torch(*gaussians, viewmats, cameras[1], 20, 14, background=background)
         return float(sum((image * cotangent).sum() for image, cotangent in zip(output, cotangents)))
 
     leaves = [*gaussians, cameras[0], BACKGROUND]
@@ -139,7 +139,7 @@ def with_absolute_gradients(function, gaussians, cameras, device="cpu", dtype=to
 def test_absolute_gradients_match_the_reference_and_change_nothing_else(device, compositor):
     gaussians, cameras = make_gaussians(seed=17), make_cameras()
     gaussians[0][:5, 2] = -1
-    expected, _ = with_absolute_gradients(_rasterize, gaussians, cameras)
+    expected, _ = with_absolute_gradients(rasterize_in_torch, gaussians, cameras)
     actual, gradients = with_absolute_gradients(rasterize, gaussians, cameras, device, torch.float32)
     assert_close("absolute gradients", actual, expected, 5e-5)
     assert (actual >= 0).all() and not actual[:, :5].any()
@@ -163,7 +163,7 @@ def test_median_depth_and_its_gradient_match_the_reference(device, compositor):
     gaussians, (viewmats, Ks) = make_gaussians(150, seed=18), make_cameras()
     gaussians = [x.float().double() for x in gaussians]
     results = []
-    for function, where, dtype in ((_rasterize, "cpu", torch.float64), (rasterize, device, torch.float32)):
+    for function, where, dtype in ((rasterize_in_torch, "cpu", torch.float64), (rasterize, device, torch.float32)):
         leaves = [x.detach().to(where, dtype, copy=True).requires_grad_() for x in (*gaussians, viewmats)]
         medians = function(*leaves, Ks.to(where, dtype), WIDTH, HEIGHT, median=True).medians
         (medians * random_like([medians])[0].to(where, dtype)).sum().backward()

@@ -66,7 +66,7 @@ def test_in_a_browser_tissue_is_seen_dragged_and_reset(chromium, tmp_path):
         rest = seen(first)
         wait_until(lambda: difference(seen(second), rest) < 2, 30, "the second browser to show the same")
 
-        recorded = lambda: next((b._recording._count for b in page.viewer.browsers.values() if b._recording is not None), 0)
+        recorded = lambda: next((b.recording.count for b in page.viewer.browsers.values() if b.recording is not None), 0)
         first.get_by_role("button", name="record video").click()
         wait_until(recorded, 20, "a recording")
         first.keyboard.down("Shift")

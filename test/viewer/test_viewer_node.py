@@ -47,7 +47,7 @@ def graph(bench):
     bench.viewer = bench.page.viewer
     bench.viewer.browsers[1] = FakeBrowser()
     bench.until(lambda: bench.viewer.state is not None and bench.viewer.tools is not None, "the state of the tissue")
-    hand = bench.page._pose_pub, bench.page._jaw_pub
+    hand = bench.page.pose_publisher, bench.page.jaw_publisher
     bench.until(lambda: all(publisher.get_subscription_count() for publisher in hand), "physics to be found")
     bench.spin(0.5)  # each side finds the other in its own time
     return bench
@@ -70,37 +70,37 @@ def test_mouse_is_a_tool_of_the_graph(graph):
     graph.until(lambda: "PSM1" in graph.viewer.tools and graph.viewer.tools["PSM1"].force[0] > 0.1, "the force of the pull")
     places = itertools.cycle(np.linspace(0.5, 0.6, 50))
     graph.until(lambda: point(graph.viewer, "update", (next(places), 0.5)) or graph.viewer.latency > 0, "a measured latency")
-    graph.viewer.post(graph.viewer._reset)
+    graph.viewer.post(graph.viewer.reset)
     graph.until(lambda: distance(graph) == 0 and not graph.viewer.holding, "tissue at rest")
     assert graph.status("viewer_node", "showing the tissue at http://127.0.0.1")[2]["browsers"] == "1"
 
 
 def test_page_sets_and_follows_the_parameters_of_physics(graph):
-    graph.until(lambda: graph.viewer._sliders["young_modulus"].value == 10, "the slider to know")
+    graph.until(lambda: graph.viewer.sliders["young_modulus"].value == 10, "the slider to know")
     slider = next(slider for slider in SLIDERS if slider.parameter == "young_modulus")
-    graph.viewer._slide(slider, 20.0)
+    graph.viewer.slide(slider, 20.0)
     graph.until(lambda: graph.physics.get_parameter("young_modulus").value == 20e3, "the parameter")
     assert graph.set("physics_node", damping=100.0)[0]
-    graph.until(lambda: graph.viewer._sliders["damping"].value == 100, "what somebody else has set")
-    assert graph.viewer._sliders["young_modulus"].value == 20
+    graph.until(lambda: graph.viewer.sliders["damping"].value == 100, "what somebody else has set")
+    assert graph.viewer.sliders["young_modulus"].value == 20
 
 
 def test_page_stops_time_and_steps(graph):
-    graph.viewer.post(lambda: graph.viewer._actions.pause(True))
+    graph.viewer.post(lambda: graph.viewer.actions.pause(True))
     graph.until(lambda: graph.viewer.paused, "a pause")
     graph.status("physics_node", "paused")
-    before = graph.physics._simulation.time
-    graph.viewer.post(graph.viewer._actions.step)
-    graph.until(lambda: graph.physics._simulation.time == pytest.approx(before + 0.02), "one step")
-    graph.viewer.post(lambda: graph.viewer._actions.pause(False))
-    graph.until(lambda: not graph.viewer.paused and graph.physics._simulation.time > before + 0.1, "time to go on")
+    before = graph.physics.simulation.time
+    graph.viewer.post(graph.viewer.actions.step)
+    graph.until(lambda: graph.physics.simulation.time == pytest.approx(before + 0.02), "one step")
+    graph.viewer.post(lambda: graph.viewer.actions.pause(False))
+    graph.until(lambda: not graph.viewer.paused and graph.physics.simulation.time > before + 0.1, "time to go on")
 
 
 def test_in_lockstep_the_mouse_moves_no_arm(graph):
     poses, jaws = graph.hear(messages.tool_pose("PSM1")), graph.hear(messages.tool_jaw("PSM1"))
-    graph.page._lockstep, graph.page._paused_until = True, np.inf  # as physics says on /diagnostics
+    graph.page.lockstep, graph.page.paused_until = True, np.inf  # as physics says on /diagnostics
     point(graph.viewer, "start", (0.5, 0.5))
-    graph.until(lambda: not graph.viewer.holding and "lockstep" in graph.viewer._notice, "a refusal")
+    graph.until(lambda: not graph.viewer.holding and "lockstep" in graph.viewer.notice, "a refusal")
     graph.spin(0.3)
     assert not poses and not jaws
 
@@ -111,8 +111,8 @@ def test_page_survives_physics_and_new_models(graph):
     graph.executor.remove_node(graph.physics)
     graph.physics.destroy_node()
     point(graph.viewer, "end", (0.6, 0.5))
-    graph.viewer.post(graph.viewer._reset)
-    graph.until(lambda: not graph.viewer.tools and "not there" in graph.viewer._notice, "the page to notice")
+    graph.viewer.post(graph.viewer.reset)
+    graph.until(lambda: not graph.viewer.tools and "not there" in graph.viewer.notice, "the page to notice")
     graph.heard["control_nodes"].clear()
     graph.physics = graph.add(PhysicsNode)
     graph.until(lambda: graph.heard["control_nodes"], "the new physics")

@@ -12,7 +12,7 @@ from waiting import wait_until
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.drawing import draw_points
-from endo_sim_ros.viewer.browser import Pointer, _fitted, _padded
+from endo_sim_ros.viewer.browser import Pointer, fitted, padded
 from endo_sim_ros.viewer.config import ViewerConfig
 from endo_sim_ros.viewer.viewer import PARAMETERS, SLIDERS, Tool
 
@@ -67,7 +67,7 @@ def test_stress_is_coloured_by_the_stiffness_of_each_node(page):
     assert colors[stiff][0, 0] > 100 > colors[~stiff][0, 0], "red where it is stiff, blue elsewhere"
     viewer.show_parameters({"regions": ["mask /missing.png /missing.json 0 young_modulus=80000"]})
     assert len(np.unique(viewer.stress_colors(strained), axis=0)) == 1
-    assert "without regions" in viewer._notice and "/missing" in viewer._notice
+    assert "without regions" in viewer.notice and "/missing" in viewer.notice
 
 
 @pytest.mark.slow
@@ -86,12 +86,12 @@ def test_lifting_pulls_towards_the_user_with_no_more_than_the_largest_force(page
 
 def test_tissue_is_held_by_one_user_at_a_time(page):
     point(page.viewer, "start", (0.5, 0.5))
-    grasp = page.viewer._grasp
+    grasp = page.viewer.grasp
     point(page.viewer, "start", (0.4, 0.5), client=2)
     point(page.viewer, "update", (0.1, 0.5), client=2)
     point(page.viewer, "end", (0.1, 0.5), client=2)
-    assert page.viewer._grasp is grasp and np.abs(grasp._target).max() < 1e-5
-    page.viewer._leave(1)
+    assert page.viewer.grasp is grasp and np.abs(grasp.target).max() < 1e-5
+    page.viewer.leave(1)
     assert not page.viewer.holding, "who leaves lets go"
 
 
@@ -113,14 +113,14 @@ def test_reset_brings_tissue_back_and_lets_go(page):
     point(page.viewer, "start", (0.5, 0.5))
     point(page.viewer, "update", (0.6, 0.5))
     turn_until(page, lambda: moved(page) > 2e-3, "tissue to follow")
-    page.viewer.post(page.viewer._reset)
+    page.viewer.post(page.viewer.reset)
     page.turn()
     assert moved(page) == 0 and not page.viewer.holding
-    np.testing.assert_allclose(page.viewer.splats()[0], 100 * page._model.means.numpy(), atol=1e-4)
+    np.testing.assert_allclose(page.viewer.splats()[0], 100 * page.model.means.numpy(), atol=1e-4)
 
 
 def test_time_stands_still_while_paused_and_goes_step_by_step(page):
-    page.viewer._actions.pause(True)
+    page.viewer.actions.pause(True)
     before = page.simulation.time
     for _ in range(20):
         page.turn()
@@ -138,12 +138,12 @@ def test_slider_changes_the_material_under_the_hand_when_it_stands_still(page):
     point(page.viewer, "update", (0.52, 0.5))
     turn_until(page, lambda: moved(page) > 5e-4, "tissue to follow")
     for value in (20.0, 25.0, 30.0):
-        page.viewer._slide(slider, value)
+        page.viewer.slide(slider, value)
         page.turn()
         assert page.simulation.config.young_modulus == SOFT.young_modulus, "not at each move of the slider"
     turn_until(page, lambda: page.simulation.config.young_modulus == 30e3, "the new stiffness")
     assert page.viewer.holding and moved(page) > 5e-4
-    page.viewer._slide(next(slider for slider in SLIDERS if slider.parameter == "thickness"), 30)
+    page.viewer.slide(next(slider for slider in SLIDERS if slider.parameter == "thickness"), 30)
     turn_until(page, lambda: page.simulation.config.thickness == pytest.approx(0.03), "the new thickness")
     assert page.simulation.config.young_modulus == 30e3 and not page.viewer.holding and moved(page) == 0
     assert page.viewer.browsers[1].models == 0, "the model is the same, so that views stay as they are"
@@ -151,18 +151,18 @@ def test_slider_changes_the_material_under_the_hand_when_it_stands_still(page):
 
 def test_sliders_show_the_parameters_within_their_ends(page):
     page.viewer.show_parameters({"young_modulus": 5e6, "damping": 20.0})
-    assert page.viewer._sliders["young_modulus"].value == 100 and page.viewer._sliders["damping"].value == 20
+    assert page.viewer.sliders["young_modulus"].value == 100 and page.viewer.sliders["damping"].value == 20
     assert set(PARAMETERS) <= set(vars(SOFT))
 
 
 def test_tools_of_others_are_shown_and_vanish(page):
     page.viewer.show_tools({"PSM2": Tool(np.array([0, 0, 0.1]), np.array([0, 0, -2.0]))}, 0.0)
-    page.viewer._draw_tools()
-    np.testing.assert_allclose(page.viewer._arrows.points, [[[0, 0, 10], [0, 0, 8]]], atol=1e-5)
-    assert page.viewer._labels["PSM2"].text == "2.0 N"
+    page.viewer.draw_tools()
+    np.testing.assert_allclose(page.viewer.arrows.points, [[[0, 0, 10], [0, 0, 8]]], atol=1e-5)
+    assert page.viewer.labels["PSM2"].text == "2.0 N"
     page.viewer.show_tools({}, 0.0)
-    page.viewer._draw_tools()
-    assert not page.viewer._arrows.visible and not page.viewer._tips.visible and not page.viewer._labels
+    page.viewer.draw_tools()
+    assert not page.viewer.arrows.visible and not page.viewer.tips.visible and not page.viewer.labels
 
 
 def test_endoscope_picture_is_centred_at_its_optical_axis():
@@ -170,14 +170,14 @@ def test_endoscope_picture_is_centred_at_its_optical_axis():
     image = np.zeros((40, 80, 3), np.uint8)
     image[18:22, 28:32] = 255  # around the principal point
     for aspect in (0.5, 1.0, 3.0):
-        padded = _padded(image, Camera(K, 80, 40), aspect)
-        bright = np.argwhere(padded[..., 0] > 127).mean(0) + 0.5
-        np.testing.assert_allclose(bright, np.array(padded.shape[:2]) / 2, atol=0.6)
-        assert padded.shape[1] / padded.shape[0] == pytest.approx(aspect, rel=0.02)
+        centred = padded(image, Camera(K, 80, 40), aspect)
+        bright = np.argwhere(centred[..., 0] > 127).mean(0) + 0.5
+        np.testing.assert_allclose(bright, np.array(centred.shape[:2]) / 2, atol=0.6)
+        assert centred.shape[1] / centred.shape[0] == pytest.approx(aspect, rel=0.02)
 
 
 def test_pictures_of_another_shape_fit_into_a_video_and_near_nodes_hide_far_ones():
-    wide = _fitted(np.full((20, 40, 3), 200, np.uint8), 30, 60)
+    wide = fitted(np.full((20, 40, 3), 200, np.uint8), 30, 60)
     assert wide.shape == (60, 30, 3)
     lit = np.argwhere(wide[..., 0] > 0)
     np.testing.assert_array_equal([lit.min(0), lit.max(0)], [[22, 0], [36, 29]])
@@ -190,8 +190,8 @@ def test_pictures_of_another_shape_fit_into_a_video_and_near_nodes_hide_far_ones
 
 
 def test_missing_viser_is_one_sentence_that_says_how_to_install_it(monkeypatch):
-    from endo_sim_ros.viewer.viewer import _serve
+    from endo_sim_ros.viewer.viewer import serve
 
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(ConfigError, match=r"pip install 'endo_sim_ros\[viewer\]'"):
-        _serve(ViewerConfig())
+        serve(ViewerConfig())

@@ -13,7 +13,7 @@ from endo_sim_ros.core.cameras import load_cameras
 from endo_sim_ros.core.gaussians import load_ply
 from endo_sim_ros.physics import PhysicsConfig
 from endo_sim_ros.viewer.config import ViewerConfig
-from endo_sim_ros.viewer.standalone import Standalone, _camera_at_origin
+from endo_sim_ros.viewer.standalone import Standalone, camera_at_origin
 
 SIZE = 1100, 660
 ARGUMENTS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
@@ -23,7 +23,7 @@ HOLD, TO = (390, 290), (390, 200)  # where the mouse takes hold, and where it li
 def main(model: Path, out: Path) -> None:
     beside = model.parent / "cameras.json"
     gaussians = load_ply(model)
-    cameras = load_cameras(beside) if beside.is_file() else [_camera_at_origin(gaussians)]
+    cameras = load_cameras(beside) if beside.is_file() else [camera_at_origin(gaussians)]
     page = Standalone(gaussians, cameras, PhysicsConfig(node_count=6000), ViewerConfig(port=8190, max_force=4.0))
     going = threading.Event()
     going.set()

@@ -51,7 +51,7 @@ class CutStencils:
             raise ValueError(f"CutStencils: a grid of {shape} nodes is too small, expected at least 3 along each axis")
         self.core = core
         self.shape = int(shape[0]), int(shape[1]), int(shape[2])
-        self._rest, self._cells = rest, cells
+        self._rest, self.cells = rest, cells
         self._tree = KDTree(cells)
         whole = Stencils(cells, self.shape)
         self._base, self._stencils = whole.first, whole.corners()  # [M, 3], [M, 27]
@@ -64,18 +64,18 @@ class CutStencils:
         self._grid = np.flatnonzero(np.isfinite(low[:, 0]))
         self._ijk = np.stack(np.unravel_index(self._grid, self.shape), 1)
         self._centres = self._ijk.clip(low[self._grid], high[self._grid])
-        self._links = _link(cells)  # [L, 2]
-        a, b = rest[self._links[:, 0]], rest[self._links[:, 1]]
+        self.links = _link(cells)  # [L, 2]
+        a, b = rest[self.links[:, 0]], rest[self.links[:, 1]]
         self._low, self._high = np.minimum(a, b).T.copy(), np.maximum(a, b).T.copy()  # of the links [3, L]
-        self._nearness = 1 / np.linalg.norm(cells[self._links[:, 0]] - cells[self._links[:, 1]], axis=1).clip(1e-6)
+        self._nearness = 1 / np.linalg.norm(cells[self.links[:, 0]] - cells[self.links[:, 1]], axis=1).clip(1e-6)
         self._reach = float(np.linalg.norm(b - a, axis=1).max(initial=0))
         self.reset()
 
     def reset(self) -> None:
         """Heal all cuts."""
         self.triangles = np.zeros((0, 3, 3))  # of all cuts [T, 3, 3], m, world, at rest
-        self._broken = np.zeros(len(self._links), bool)
-        self._passable = ~self._broken
+        self.broken = np.zeros(len(self.links), bool)
+        self._passable = ~self.broken
         self._copies = np.zeros((len(self._rest), 27), np.int64)  # 0 is the grid node itself
 
     def cut(self, triangles: np.ndarray) -> bool:
@@ -95,18 +95,18 @@ class CutStencils:
         if not len(triangles):
             return False
         self.triangles = np.concatenate([self.triangles, triangles])
-        near = ~self._broken
+        near = ~self.broken
         for axis in range(3):
             corners = triangles[..., axis]
             near &= (self._low[axis] <= corners.max()) & (self._high[axis] >= corners.min())
         near = np.flatnonzero(near)
-        ends = self._rest[self._links[near]]
+        ends = self._rest[self.links[near]]
         broken = near[separated(ends[:, 0], ends[:, 1], triangles)]
         if not len(broken):
             return False
-        self._broken[broken] = True
+        self.broken[broken] = True
         passable = self._keep_islands()
-        changed = self._cells[self._links[passable != self._passable]]  # [B, 2, 3]
+        changed = self.cells[self.links[passable != self._passable]]  # [B, 2, 3]
         self._passable = passable
         if not len(changed):  # all of it between islands
             return False
@@ -136,18 +136,18 @@ class CutStencils:
 
     def _keep_islands(self) -> np.ndarray:
         """Links that hold [L]: the unbroken ones, and the shortest broken one of each piece that is too small to be one."""
-        passable = ~self._broken
-        degree = np.bincount(self._links[passable].ravel(), minlength=len(self._rest))
-        if (degree[self._links[self._broken]] > MIN_FRAGMENT - 2).all():  # no piece is that small
+        passable = ~self.broken
+        degree = np.bincount(self.links[passable].ravel(), minlength=len(self._rest))
+        if (degree[self.links[self.broken]] > MIN_FRAGMENT - 2).all():  # no piece is that small
             return passable
         while True:
-            piece = _components(len(self._rest), *self._links[passable].T)
+            piece = _components(len(self._rest), *self.links[passable].T)
             small = (np.bincount(piece) < MIN_FRAGMENT)[piece]
-            leaving = np.flatnonzero(~passable & small[self._links].any(1))
+            leaving = np.flatnonzero(~passable & small[self.links].any(1))
             leaving = leaving[np.argsort(-self._nearness[leaving], kind="stable")]
             if not len(leaving):
                 return passable
-            ends = self._links[leaving].ravel()
+            ends = self.links[leaving].ravel()
             islands = np.flatnonzero(small[ends])
             shortest = islands[np.unique(piece[ends[islands]], return_index=True)[1]]
             passable[leaving[shortest // 2]] = True
@@ -161,7 +161,7 @@ class CutStencils:
         sizes = np.array([len(points) for points in members])
         row, point = np.repeat(np.arange(len(rows)), sizes), np.concatenate(members).astype(np.int64)
         count = len(point)  # of pairs of a grid node and a point; they are the vertices of one graph for all grid nodes
-        radius = np.linalg.norm(self._cells[point] - centres[row], axis=1)
+        radius = np.linalg.norm(self.cells[point] - centres[row], axis=1)
         nearest = np.minimum.reduceat(radius, np.r_[0, np.cumsum(sizes)[:-1]])
         core = radius <= np.maximum(self.core, nearest)[row]
         step = self._ijk[rows][row] - self._base[point]
@@ -172,8 +172,8 @@ class CutStencils:
         vertex[point, row] = np.arange(count)
         present = np.zeros(len(self._rest), bool)
         present[point] = True
-        links = np.flatnonzero(self._passable & present[self._links].all(1))
-        p, q = vertex[self._links[links]].transpose(1, 0, 2).reshape(2, -1)  # [L' R]
+        links = np.flatnonzero(self._passable & present[self.links].all(1))
+        p, q = vertex[self.links[links]].transpose(1, 0, 2).reshape(2, -1)  # [L' R]
         held = np.flatnonzero((p | q) >= 0)
         p, q, nearness = p[held], q[held], self._nearness[links[held // len(rows)]]
         farther = radius[p] > radius[q]

@@ -50,7 +50,8 @@ scenes = st.fixed_dictionaries(
 @settings(max_examples=80, deadline=None, derandomize=True, database=None)
 @given(scenes)
 def test_any_scene_matches_the_reference(scene):
-    """Images everywhere but at pixels on a threshold; gradients where there is no such pixel."""
+    """Images everywhere but at pixels on a threshold; gradients where there is no such pixel. Of long needles close by plain torch
+    loses digits in float32 as well."""
     gaussians = make_gaussians(scene["count"], scene["sh_count"], scene["seed"])
     means, quats, scales, opacities, sh = gaussians
     means[:, 2] -= scene["nearness"]
@@ -65,21 +66,24 @@ def test_any_scene_matches_the_reference(scene):
     cameras, options = make_cameras(scene["cameras"], *scene["size"]), {"size": scene["size"], "median": scene["median"]}
     cameras = [x.float().double() for x in cameras]
     expected, expected_gradients = run(rasterize_in_torch, gaussians, cameras, **options)
+    rounded, rounded_gradients = run(rasterize_in_torch, gaussians, cameras, dtype=torch.float32, **options)
     output, gradients = run(rasterize, gaussians, cameras, dtype=torch.float32, **options)
     assert all(gradient.isfinite().all() for gradient in gradients)
     assert (output.alphas >= 0).all() and (output.alphas <= 1).all() and (output.distortions > -1e-5).all()
     assert_close("gradient of background", gradients[-1], expected_gradients[-1] + 1e-9, 2e-2)
     apart = torch.zeros_like(expected.alphas, dtype=torch.bool)
-    for name, image, other in zip(RenderOutput._fields[:4], output, expected):
-        error = (image.double() - other).abs() / other.abs().max().clamp_min(1e-3)
-        error = error.amax(-1) if error.ndim == 4 else error
+    for name, image, other, plain in zip(RenderOutput._fields[:4], output, expected, rounded):
+        errors = [(each.double() - other).abs() / other.abs().max().clamp_min(1e-3) for each in (image, plain)]
+        error, usual = (each.amax(-1) if each.ndim == 4 else each for each in errors)
         # The light of a splat that is or is not cut off: one 255th of itself, or the last 1e-4 of the transmittance.
         assert error.max() < 3e-2, name
-        apart |= error > 3e-5
+        apart |= error > 3e-5 + 2 * usual
     assert apart.sum() <= max(2, 0.01 * apart.numel())
     if not apart.any():
-        for actual, gradient in zip(gradients[:-1], expected_gradients):
-            assert (actual.double() - gradient).abs().max() <= 5e-4 * gradient.abs().max() + 1e-6 if gradient.numel() else True
+        for actual, gradient, plain in zip(gradients[:-1], expected_gradients, rounded_gradients):
+            if gradient.numel():
+                usual = (plain.double() - gradient).abs().max()
+                assert (actual.double() - gradient).abs().max() <= 5e-4 * gradient.abs().max() + 2 * usual + 1e-6
 
 
 def test_results_repeat_bit_for_bit_with_any_number_of_threads(monkeypatch):

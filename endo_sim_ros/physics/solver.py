@@ -189,7 +189,7 @@ class MpmSolver:
         """The whole step as one call; loads and tools are read from their device arrays every time."""
         backend, config = self.backend, self.config
         data = StepData(
-            self.environments, self.node_count, config.material, config.kinematics, self.substepping, self.nodes, self.state,
+            self.environments, self.node_count, config.material, config.kinematics, self.substepping.count, self.nodes, self.state,
             self.loads, self.rigid, self.grid, self._substep, self.scale, self._stencils,
         )  # fmt: skip
         check = [backend.threads, self.node_count, config.travel, config.rollback_damping]

@@ -68,6 +68,14 @@ def test_files_import_each_other_in_no_circle():
         pytest.fail(" -> ".join(error.args[1]))
 
 
+def test_backends_of_physics_import_of_it_only_what_lies_below_them():
+    inside = {name for name in FILES if name.startswith("endo_sim_ros.physics")}
+    backends = {name for name in inside if name.startswith("endo_sim_ros.physics.backends")}
+    below = {"endo_sim_ros.physics.materials", "endo_sim_ros.physics.stencils"}
+    assert not {(name, other) for name in backends for other in IMPORTS[name] & inside - backends - below}
+    assert not {(name, other) for name in below for other in IMPORTS[name] & inside}
+
+
 @pytest.mark.slow
 def test_only_nodes_graph_and_messages_import_ros():
     for name, path in FILES.items():

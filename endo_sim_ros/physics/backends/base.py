@@ -17,7 +17,6 @@ from torch import Tensor
 
 from endo_sim_ros.physics.backends.structs import Grid, Loads, Nodes, RigidTools, State, Substep
 from endo_sim_ros.physics.stencils import Stencils
-from endo_sim_ros.physics.substeps import Substepping
 
 BLOCK = 64  # threads of a GPU's block: a few thousand control nodes then reach many multiprocessors
 
@@ -52,7 +51,7 @@ class StepData:
     node_count: int  # control nodes M
     material: str
     kinematics: str
-    substepping: Substepping
+    substeps: int  # in a step
     nodes: Nodes
     state: State
     loads: Loads

@@ -37,7 +37,7 @@ class CpuBackend:
         scratch += [floats(slots * 4 * (step.grid.count + 4)) for _ in range(2)]
         scratch += [floats(slots * SCRATCH * padded), wp.zeros(slots * padded, int, device="cpu")]
         scratch += [floats(slots * 4 * padded), wp.full(slots * padded, -1, dtype=int, device="cpu")]
-        inputs = [step.nodes, step.state, step.loads, step.tools, step.grid, step.substep, step.substepping.count, step.scale]
+        inputs = [step.nodes, step.state, step.loads, step.tools, step.grid, step.substep, step.substeps, step.scale]
         ends = [step.environments * slot // slots for slot in range(slots + 1)]
         launches = [
             self.action(Launch(kernel, end - begin, [begin, slot, *inputs, *scratch]))

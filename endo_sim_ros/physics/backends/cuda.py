@@ -96,7 +96,7 @@ class CudaBackend:
         if wp.get_cuda_max_cluster_dim(kernel, device, block_dim=cluster.BLOCK, dynamic_smem_bytes=memory) < cluster.CLUSTER:
             return []
         tables = [wp.array(values, dtype=int, device=device) for values in division[3:]]
-        inputs = [step.nodes, step.state, step.loads, step.tools, step.grid, step.substep, step.substepping.count, step.scale]
+        inputs = [step.nodes, step.state, step.loads, step.tools, step.grid, step.substep, step.substeps, step.scale]
         inputs += [division.slots, division.inbox, *tables]
         return [self.action(Launch(kernel, step.environments * cluster.THREADS, inputs, cluster.BLOCK))]
 
@@ -122,10 +122,10 @@ class CudaBackend:
             collecting = [self.action(Launch(collect, (step.environments, len(entries[-1]), lanes), inputs))]
             actions = []
         constants = [step.nodes, step.state, step.loads, step.tools, transfer, step.grid, step.substep, step.scale]
-        count = step.substepping.count
+        count = step.substeps
         for substep in range(count + 1):
             halves = [int(substep > 0), int(substep < count)]
-            time = (substep + 1) * step.substepping.dt
+            time = (substep + 1) * step.substep.dt
             actions.append(self.action(Launch(advance, every, [*constants, time, *halves, grid_v])))
             if substep < count:
                 actions += collecting

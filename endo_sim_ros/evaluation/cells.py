@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from endo_sim_ros.core import drawing
 from endo_sim_ros.core.config import ConfigError, unused_options
 from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.evaluation import gsplat_trainers
 from endo_sim_ros.evaluation.config import EvaluationConfig
 from endo_sim_ros.evaluation.lpips import Backbone, Lpips, WeightsError
 from endo_sim_ros.evaluation.sources import PHANTOM, parse_values, split_source
@@ -116,7 +117,12 @@ def _methods(config: EvaluationConfig) -> dict[str, dict[str, Any]]:
     if any(item.partition("=")[0] == "preset" for item in config.set):
         raise ConfigError("--set preset: methods are named with --presets")
     common = {"device": "auto"} | parse_values(config.set, "--set", ReconstructionConfig)
-    methods = {name: preset(name, **common) for name in config.presets}
+    methods = {}
+    for name in config.presets:
+        if name in gsplat_trainers.STRATEGIES:
+            gsplat_trainers.check_installed(name)
+        # gsplat's trainers start as `3dgs` does.
+        methods[name] = preset("3dgs" if name in gsplat_trainers.STRATEGIES else name, **common)
     if config.ablation:
         for name in config.presets:
             for part, overrides in ABLATIONS[name].items() if name in ABLATIONS else ():

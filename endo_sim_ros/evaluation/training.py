@@ -21,6 +21,7 @@ from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.evaluation.cells import Cell
 from endo_sim_ros.evaluation.deformed_views import deformed_view_psnr
+from endo_sim_ros.evaluation.gsplat_trainers import STRATEGIES, GsplatTrainer
 from endo_sim_ros.evaluation.held_out import difference, mean_figures, measure, model_renderer, seen_pixels
 from endo_sim_ros.evaluation.lpips import Lpips
 from endo_sim_ros.evaluation.measurement import machine, peak_megabytes
@@ -84,7 +85,7 @@ def train_and_measure(argument: tuple[Cell, Path | None, Prepared | Path], devic
     training: dict[str, Any] = {}
 
     def train() -> None:
-        training.update(_train(views, config, prepared.points, spread(held_out, _CURVE_VIEWS), cell.curve, report))
+        training.update(_train(cell, views, config, prepared.points, spread(held_out, _CURVE_VIEWS), report))
 
     memory = peak_megabytes(train, device)
     model, drift = training.pop("model"), training.pop("drift")
@@ -151,7 +152,7 @@ def _reference_at_points(held_out: list[Frame], judging: np.ndarray | None) -> f
 
 
 def _train(
-    views: list[Frame], config: ReconstructionConfig, points: ScenePoints, probes: list[Frame], moments: int, report: Callable[[Any], None]
+    cell: Cell, views: list[Frame], config: ReconstructionConfig, points: ScenePoints, probes: list[Frame], report: Callable[[Any], None]
 ) -> dict[str, Any]:
     """Train; the seconds that it took, without those of the measurements for the curve."""
 
@@ -161,8 +162,11 @@ def _train(
         return time.perf_counter()
 
     curve, start, away = [], now(), 0.0
-    trainer = Trainer(prepare(views, config, points, lambda stage, done, total: report((done, max(total, 1), stage))), config)
-    iterations = trainer.config.iterations
+    if cell.method in STRATEGIES:
+        trainer = GsplatTrainer(views, points, config, cell.method)
+    else:
+        trainer = Trainer(prepare(views, config, points, lambda stage, done, total: report((done, max(total, 1), stage))), config)
+    iterations, moments = trainer.iterations, cell.curve
     # Quality changes fastest in the beginning.
     due = sorted({round(iterations * 50 ** (i / max(moments - 1, 1) - 1)) for i in range(moments)})
 

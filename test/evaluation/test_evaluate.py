@@ -139,6 +139,8 @@ def test_what_is_not_there_is_told_before_any_work(tmp_path):
         evaluate([SMALL], EvaluationConfig(out=tmp_path, set=("growth=0.1",)))
     with pytest.raises(ConfigError, match="methods are named with --presets"):
         evaluate([SMALL], EvaluationConfig(out=tmp_path, set=("preset=paper",)))
+    with pytest.raises(ConfigError, match="gsplat is not installed"):
+        evaluate([SMALL], EvaluationConfig(out=tmp_path, presets=("gsplat",)))
     with pytest.raises(ConfigError, match="workers must be 1 or more, got 0"):
         EvaluationConfig(workers=0)
     with pytest.raises(SequenceError, match="the synthetic patients have numbers"):

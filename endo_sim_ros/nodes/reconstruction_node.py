@@ -202,8 +202,8 @@ class ReconstructionNode(EndoNode):
             trainer.run(on_progress, every=5)
             self._offer(trainer)
             self._save(trainer.model, trainer.cameras, trainer)  # also what an interrupted training has reached
-            self._finished = trainer.iteration == config.iterations
-            reached = f"{len(trainer.model)} Gaussians after {trainer.iteration} of {config.iterations} iterations, saved in {self._saved}"
+            self._finished = trainer.iteration == trainer.iterations
+            reached = f"{len(trainer.model)} Gaussians after {trainer.iteration} of {trainer.iterations} iterations, saved in {self._saved}"
             if self._finished:
                 self.get_logger().info(f"reconstruction finished: {reached}")
             else:

@@ -15,6 +15,7 @@ from endo_sim_ros.reconstruction.stage_configs import (
     PhotometryConfig,
     PosesConfig,
     StereoConfig,
+    TrainingSizeConfig,
     UsableViewsConfig,
 )
 
@@ -91,10 +92,10 @@ class ReconstructionConfig(StageConfig):
     """Number of views to train on, spread over the camera path."""
     image_width: Annotated[int, Range(16, 8192, "pixels")] = 640
     """Views wider than this are shrunk to it before training."""
-    iterations: Annotated[int, Range(1, 1_000_000)] = 3000
-    """Optimisation steps."""
-    max_gaussians: Annotated[int, Range(1, 10_000_000)] = 60_000
-    """Largest number of Gaussians."""
+    iterations: Annotated[int, Range(0, 1_000_000)] = 0
+    """Optimisation steps; 0 = as many as the views need, by `training.*`."""
+    max_gaussians: Annotated[int, Range(0, 10_000_000)] = 0
+    """Largest number of Gaussians; 0 = as many as the views can tell of, by `training.*`."""
     sh_degree: Annotated[int, Range(0, 3)] = 0
     """Degree of the spherical harmonics; 0 is the paper's frequency regularisation."""
     initialization: Literal["depth", "points"] = "depth"
@@ -128,6 +129,10 @@ class ReconstructionConfig(StageConfig):
     """Weight of the total variation of the rendered depth, in units of the scene's median depth (paper eq. 6, third term)."""
     lambda_pearson: Annotated[float, Range(0, 1000)] = 0.0
     """Weight of 1 − correlation of depth and prior, in training views and in virtual ones to which the prior is carried (FSGS)."""
+    lambda_opacity: Annotated[float, Range(0, 1000)] = 0.01
+    """Weight of the mean opacity of the Gaussians within what the views show, as in 3DGS-MCMC: what explains nothing fades."""
+    lambda_scale: Annotated[float, Range(0, 1000)] = 0.01
+    """Weight of their mean standard deviation, in units of the scene's median depth, as in 3DGS-MCMC."""
     lambda_flat: Annotated[float, Range(0, 1000)] = 0.01
     """Weight of Gaussians being deeper than they are wide, which turns into streaks when the tissue is sheared."""
     flat_ratio: Annotated[float, Range(0.01, 100)] = 1.5
@@ -173,6 +178,7 @@ class ReconstructionConfig(StageConfig):
     multi_view: MultiViewConfig = MultiViewConfig()
     motion: DynamicMaskConfig = DynamicMaskConfig()
     initial: InitialModelConfig = InitialModelConfig()
+    training: TrainingSizeConfig = TrainingSizeConfig()
     photometry: PhotometryConfig = PhotometryConfig()
     extrapolated: ExtrapolationConfig = ExtrapolationConfig()
     # Of the training.

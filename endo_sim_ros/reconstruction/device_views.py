@@ -45,6 +45,20 @@ def matrices(cameras: Sequence[Camera], device: str) -> tuple[Tensor, Tensor]:
     return tensor([camera.viewmat for camera in cameras]), tensor([camera.K for camera in cameras])
 
 
+def shown(view: DeviceView, points: Tensor) -> Tensor:
+    """Which points [N, 3] (m, world) lie in the picture of a view, on its tissue, hidden or not [N]."""
+    camera = view.camera
+    rows, K = camera.viewmat.tolist(), camera.K
+    x, y, z = (sum(row[i] * points[:, i] for i in range(3)) + row[3] for row in rows[:3])
+    ahead = z.clamp_min(1e-6)
+    u, v = (x / ahead * K[0, 0] + K[0, 2]).floor(), (y / ahead * K[1, 1] + K[1, 2]).floor()
+    inside = (z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    if view.mask is None:
+        return inside
+    pixels = torch.where(inside, v * camera.width + u, 0).long()
+    return inside & (view.mask.reshape(-1)[pixels] > 0)
+
+
 def reprojected_prior(prior: Tensor, camera: Camera, viewmat: Tensor) -> Tensor:
     """The depth prior [H, W] of a camera as another one [4, 4] of its kind sees it [H, W], metres; 0 where nothing falls."""
     height, width = prior.shape

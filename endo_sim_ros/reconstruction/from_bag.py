@@ -59,7 +59,7 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
     if resume:
         trainer.load_checkpoint(out / "checkpoint.pt")
         log.info("going on after %d iterations", trainer.iteration)
-    iterations = trainer.config.iterations
+    iterations = trainer.iterations
     with ProgressBar() as bar:
         task = bar.add_task("reconstructing", total=iterations)
 

@@ -27,6 +27,7 @@ class Rendering(NamedTuple):
     prior: Tensor | None  # [H, W] depth prior, metres, 0 = none
     eye: Tensor  # [3] centre of the training cameras, metres, world
     scene_depth: float  # metres
+    seen: Tensor | float = 1.0  # [N] 1 = some training view shows where the Gaussian is; what none shows, no photometric loss holds
 
 
 class Term(NamedTuple):
@@ -137,6 +138,8 @@ TERMS = (
     Term("lambda_pearson", lambda of, c: c.lambda_pearson * pearson(of.depth, of.prior, of.mask), of_virtual=True, needs_prior=True),
     Term("lambda_dist", lambda of, c: c.lambda_dist * masked_mean(of.distortion, of.mask) / of.scene_depth, of_virtual=True),
     Term("lambda_tv", lambda of, c: c.lambda_tv * total_variation(of.depth, of.mask) / of.scene_depth, of_virtual=True),
+    Term("lambda_opacity", lambda of, c: c.lambda_opacity * (of.seen * of.model.opacities).mean()),
+    Term("lambda_scale", lambda of, c: c.lambda_scale / of.scene_depth * (of.seen * of.model.scales.mean(1)).mean()),
     Term("lambda_flat", lambda of, c: c.lambda_flat * depth_extent(of.model, of.eye, c.flat_ratio).mean(), every="flat_every"),
 )
 """What the photometric loss of a training view is added to, in this order."""

@@ -179,13 +179,24 @@ def mask_dynamic(scene: PreparedScene, config: ReconstructionConfig, progress: S
     return replace(scene, views=tuple(mask_motion(scene.views, config.depth_tolerance, config.motion, progress)))
 
 
+def size_training(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
+    """Decide how long to train and with how many Gaussians, where the options leave it to the views."""
+    size, views = config.training, len(scene.views)
+    pixels = sum(int((view.tissue > 0).sum()) for view in scene.views)
+    within = lambda value, least, most: int(min(max(value, least), most))
+    iterations = config.iterations or within(size.iterations_per_view * views, size.min_iterations, size.max_iterations)
+    most = config.max_gaussians or within(pixels / size.pixels_per_gaussian, size.min_gaussians, size.max_gaussians)
+    sentence = f"{views} views of {pixels / 1e6:.1f} million pixels: {iterations} iterations, {most} Gaussians at most"
+    return replace(scene, iterations=iterations, max_gaussians=most).decided(sentence, logging.INFO)
+
+
 def place_gaussians(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Set `model` to the Gaussians that training starts from, `depth` to their median depth in the views, and `exposures` to zeros.
 
     Raises:
         SequenceError: If neither depth nor scene points give the scene a shape.
     """
-    most = max(int(config.initial.seen_share * config.max_gaussians) if config.extrapolation else config.max_gaussians, 1)
+    most = max(int(config.initial.seen_share * scene.max_gaussians) if config.extrapolation else scene.max_gaussians, 1)
     views, points = scene.views, scene.points
     if config.initialization == "points":
         views = [replace(view, depth_prior=None) for view in views]
@@ -234,7 +245,7 @@ def extrapolate_tissue(scene: PreparedScene, config: ReconstructionConfig, progr
         exposures=scene.exposures,
         reference=scene.depth,
         reach=config.extrapolation,
-        max_gaussians=config.max_gaussians,
+        max_gaussians=scene.max_gaussians,
         options=config.extrapolated,
         interpolation=config.interpolation,
         progress=progress,
@@ -252,6 +263,7 @@ STAGES: dict[str, Callable[[PreparedScene, ReconstructionConfig, StageProgress],
     "multi-view refinement": refine_across_views,
     "shrinking views": shrink_views,
     "dynamic mask": mask_dynamic,
+    "training size": size_training,
     "initial model": place_gaussians,
     "photometry": fit_light,
     "extrapolation": extrapolate_tissue,

@@ -11,9 +11,11 @@ from endo_sim_ros.reconstruction.config import ReconstructionConfig
 Preset = Literal["default", "laptop", "paper", "fsgs", "3dgs"]
 
 _PLAIN = {  # 3DGS as Kerbl et al. 2023 have it, and what the others build upon
+    "iterations": 3000, "max_gaussians": 60_000,
     "virtual_every": 1,
     "initialization": "points", "densification": "gradient", "exposure": False, "light": False,
     "learning_rate": 1.0, "lambda_flat": 0.0, "lambda_opaque": 0.0,
+    "lambda_opacity": 0.0, "lambda_scale": 0.0,
     "multi_view_refinement": False, "extrapolation": 0.0, "dynamic_mask": False,
 }  # fmt: skip
 
@@ -47,6 +49,7 @@ ABLATIONS: dict[Preset, dict[str, dict[str, Any]]] = {
         "without dense initialisation": {"initialization": "points"},
         "without multi-view refinement": {"multi_view_refinement": False},
         "without flat Gaussians": {"lambda_flat": 0.0},
+        "without opacity and size": {"lambda_opacity": 0.0, "lambda_scale": 0.0},
         "without light": {"light": False},
         "without light and exposure": {"light": False, "exposure": False},
         "without extrapolation": {"extrapolation": 0.0},

@@ -96,6 +96,8 @@ class PreparedScene:
         matches: Features that the frames share.
         depth_source: Where the depth prior is from: topic, stereo, network, points or none.
         model: Gaussians to start from; none before they are placed.
+        iterations: Number of optimisation steps.
+        max_gaussians: Largest number of Gaussians.
         depth: Median depth of the scene, metres.
         light: Of the light at the camera (distance, angle, tilt_x, tilt_y) [4].
         exposures: Logarithm of each view's exposure [V, 3].
@@ -109,14 +111,16 @@ class PreparedScene:
     matches: tuple[Matches, ...] = ()
     depth_source: str = "none"
     model: GaussianModel = field(default_factory=lambda: GaussianModel.from_points(torch.empty(0, 3), torch.empty(0, 3), torch.empty(0)))
+    iterations: int = 0
+    max_gaussians: int = 0
     depth: float = 0.0
     light: np.ndarray = field(default_factory=lambda: np.zeros(4))
     exposures: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     decisions: tuple[str, ...] = ()
 
-    def decided(self, sentence: str) -> Self:
+    def decided(self, sentence: str, level: int = logging.WARNING) -> Self:
         """A copy that knows of a decision, which is logged."""
-        log.warning("%s", sentence)
+        log.log(level, "%s", sentence)
         return dataclasses.replace(self, decisions=(*self.decisions, sentence))
 
 

@@ -21,7 +21,7 @@ from endo_sim_ros.reconstruction import losses, photometry
 from endo_sim_ros.reconstruction.appearance import Appearance
 from endo_sim_ros.reconstruction.checkpoint import identity, read_checkpoint, reading, write_checkpoint
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
-from endo_sim_ros.reconstruction.device_views import DeviceView, matrices, reprojected_prior
+from endo_sim_ros.reconstruction.device_views import DeviceView, matrices, reprojected_prior, shown
 from endo_sim_ros.reconstruction.optimizer import PARAMETERS, Adam, model_of, parameters_of
 from endo_sim_ros.reconstruction.scene import PreparedScene, TrainingView, shrink
 from endo_sim_ros.reconstruction.strategies import STRATEGIES
@@ -69,6 +69,7 @@ class Trainer:
         self.stamps = [view.stamp_ns for view in scene.views]
         """When the views were taken that are trained on, nanoseconds; views that were left out are not among them."""
         self.iteration = 0
+        self.iterations = scene.iterations
         self._nearest = nearest_views(scene.views, 1)
         self._load(scene.views)
         eye = np.mean([view.camera.position for view in self._device_views], 0)
@@ -80,7 +81,7 @@ class Trainer:
         self._captures: dict[tuple, GraphCapture] = {}
         self._last_loss = torch.zeros(())
         options = getattr(config, config.densification)
-        self._strategy = STRATEGIES[config.densification](options, config.max_gaussians, scene.depth)
+        self._strategy = STRATEGIES[config.densification](options, scene.max_gaussians, scene.depth)
         self.appearance = Appearance(scene.light, scene.exposures, scene.depth, config, self.device)
         self._set_model(scene.model.to(self.device))
 
@@ -109,7 +110,7 @@ class Trainer:
     @property
     def progress(self) -> Progress:
         """How far the training is; on a GPU this waits for it."""
-        return Progress(self.iteration, self.config.iterations, float(self._last_loss), len(self.parameters["means"]))
+        return Progress(self.iteration, self.iterations, float(self._last_loss), len(self.parameters["means"]))
 
     def save_checkpoint(self, path: str | Path) -> None:
         """Write model, optimiser and random state; a training that loads them goes on as if never interrupted."""
@@ -175,7 +176,7 @@ class Trainer:
 
         Out of memory, training goes on with images of half the size, as long as they are not tiny.
         """
-        while self.iteration < self.config.iterations:
+        while self.iteration < self.iterations:
             try:
                 self.step()
             except torch.OutOfMemoryError:
@@ -183,7 +184,7 @@ class Trainer:
                     raise
                 self._halve()
                 continue
-            due = self.iteration % every == 0 or self.iteration == self.config.iterations
+            due = self.iteration % every == 0 or self.iteration == self.iterations
             if on_progress and due and on_progress(self.progress) is False:
                 break
         return self.model
@@ -210,7 +211,7 @@ class Trainer:
         self._last_loss = self._descend(terms, self._inputs(view, virtual, terms))
         self.iteration += 1
         with torch.no_grad():
-            if self.iteration <= config.refine_until * config.iterations and self.iteration % config.refine_every == 0:
+            if self.iteration <= config.refine_until * self.iterations and self.iteration % config.refine_every == 0:
                 self.refine()
             self._strategy.perturb(self.parameters, self.iteration, self._step_size, self._noise)
 
@@ -218,7 +219,7 @@ class Trainer:
     def _step_size(self) -> float:
         """Learning rate of the means, metres."""
         config, rates = self.config, self.config.rates
-        return rates.means * self.scene_depth * config.learning_rate * rates.means_decay ** (self.iteration / config.iterations)
+        return rates.means * self.scene_depth * config.learning_rate * rates.means_decay ** (self.iteration / self.iterations)
 
     def _virtual_camera(self, index: int) -> Camera:
         """Paper eq. 7: a random camera between a view and its nearest view."""
@@ -280,7 +281,7 @@ class Trainer:
         """Paper eq. 6 of a training view, the first camera, and eq. 8 of a virtual camera, the second one."""
         config = self.config
         images = lambda camera: (model, *(images[camera] for images in (output.depths, output.alphas, output.distortions)))
-        of_scene = {"eye": self._eye, "scene_depth": self.scene_depth}
+        of_scene = {"eye": self._eye, "scene_depth": self.scene_depth, "seen": self._seen}
         seen = losses.Rendering(*images(0), mask=view.mask, prior=view.prior, **of_scene)
         gain = self.appearance.gain(seen.depth, seen.alpha, view.rays, view.exposure)
         color = output.colors[0] if gain is None else output.colors[0] * gain
@@ -300,6 +301,15 @@ class Trainer:
         self.parameters = {name: tensor.clone().requires_grad_() for name, tensor in parameters_of(model).items()}
         self.optimizer = Adam(self.parameters, {name: self.config.learning_rate * getattr(self.config.rates, name) for name in PARAMETERS})
         self._strategy_state = self._strategy.initialize_state(len(model), self.device)
+        self._seen = self._seen_by_views(model.means) if self.config.lambda_opacity or self.config.lambda_scale else 1.0
+
+    @torch.no_grad()
+    def _seen_by_views(self, means: Tensor) -> Tensor:
+        """Which Gaussians lie where some training view shows tissue [N], 1.0 or 0.0."""
+        seen = torch.zeros(len(means), dtype=torch.bool, device=means.device)
+        for view in self._device_views:
+            seen |= shown(view, means)
+        return seen.float()
 
     def refine(self) -> None:
         """Add, move and remove Gaussians, keeping the optimiser's state of those that stay."""

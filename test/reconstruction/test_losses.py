@@ -5,9 +5,12 @@ import pytest
 import torch
 from torchmetrics.functional.image import structural_similarity_index_measure
 
+from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.kernels import compare_plain
-from endo_sim_ros.reconstruction import losses
+from endo_sim_ros.reconstruction import ReconstructionConfig, losses
+from endo_sim_ros.reconstruction.device_views import DeviceView, shown
+from endo_sim_ros.reconstruction.scene import TrainingView, pixels_of
 
 
 def reference_ssim(x, y):
@@ -116,6 +119,17 @@ def test_pearson_does_not_see_scale_and_shift():
     assert float(losses.pearson(spoilt, prior, None)) == pytest.approx(0, abs=1e-5)
 
 
+def test_opacity_and_size_count_only_where_a_view_shows_tissue():
+    model = GaussianModel.from_points(torch.zeros(4, 3), torch.zeros(4, 3), torch.full((4,), 0.002), opacity=0.5)
+    images = torch.ones(8, 8)
+    seen = torch.tensor([1.0, 1.0, 1.0, 0.0])
+    rendering = losses.Rendering(model, images, images, images, None, None, torch.zeros(3), scene_depth=0.1, seen=seen)
+    config = ReconstructionConfig(lambda_opacity=2.0, lambda_scale=3.0)
+    weighted = {term.weight: term.weighted for term in losses.TERMS}
+    assert float(weighted["lambda_opacity"](rendering, config)) == pytest.approx(2 * 0.5 * 3 / 4)
+    assert float(weighted["lambda_scale"](rendering, config)) == pytest.approx(3 * 0.02 * 3 / 4)
+
+
 def test_depth_extent_sees_needles_along_the_line_of_sight_only():
     eye, angle = torch.tensor([0.0, 0.0, -0.1]), np.pi / 4
     turned = [np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0]  # the z axis turns towards x
@@ -130,3 +144,16 @@ def test_depth_extent_sees_needles_along_the_line_of_sight_only():
     np.testing.assert_allclose(extent.detach(), np.maximum(expected, 0), atol=1e-5)
     extent[2].backward()
     assert model.log_scales.grad[2, 2] > 0 > model.log_scales.grad[2, 0] and not model.log_scales.grad[:2].any()
+
+
+def test_a_view_shows_what_projects_onto_its_tissue():
+    mask = np.zeros((24, 32), np.uint8)
+    mask[5:20, 4:30] = 255
+    camera = Camera(intrinsic_matrix(30, 30, 16, 12), 32, 24, np.array([[0, 0, 1, -0.4], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]]))
+    view = TrainingView(0, np.zeros((24, 32, 3), np.uint8), camera, mask=mask)
+    points = np.random.default_rng(0).normal(0, 0.3, (500, 3))
+    found = pixels_of(camera, points)
+    expected = np.zeros(500, bool)
+    expected[found.index] = mask[found.rows, found.columns] > 0
+    given = shown(DeviceView.of(view, 0, "cpu"), torch.tensor(points, dtype=torch.float32))
+    assert 20 < expected.sum() < 400 and np.array_equal(given.numpy(), expected)

@@ -98,8 +98,23 @@ def test_decisions_are_told(frames):
     blind = dataclasses.replace(frames[1], mask=np.zeros((128, 160), np.uint8))
     scene = prepare([frames[0], blind, *frames[2:]], options())
     assert len(scene.views) == 3
-    (left_out,) = scene.decisions
+    left_out, size = scene.decisions
     assert f"{blind.stamp_ns * 1e-9:.3f} s left out: masked" in left_out
+    assert size == "3 views of 0.0 million pixels: 5 iterations, 1500 Gaussians at most"
+
+
+@pytest.mark.slow
+def test_length_and_capacity_follow_the_views_unless_they_are_given(frames):
+    scene = prepare(frames, options(iterations=0, max_gaussians=0))
+    assert (scene.iterations, scene.max_gaussians) == (3000, 60_000)
+    by_views = {"training.iterations_per_view": 9, "training.min_iterations": 1}
+    by_pixels = {"training.pixels_per_gaussian": 16, "training.min_gaussians": 1}
+    scene = prepare(frames, options(iterations=0, max_gaussians=0).replaced(by_views | by_pixels))
+    assert (scene.iterations, scene.max_gaussians) == (4 * 9, 4 * 80 * 64 // 16)
+    most = {"training.max_iterations": 7, "training.max_gaussians": 900}
+    scene = prepare(frames, options(iterations=0, max_gaussians=0).replaced(by_views | by_pixels | most))
+    trainer = Trainer(scene, options(iterations=0, max_gaussians=0))
+    assert len(trainer.run()) <= 900 and trainer.progress.iteration == 7
 
 
 @pytest.mark.slow

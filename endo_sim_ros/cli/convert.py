@@ -54,7 +54,7 @@ class Command:
     pose_direction: Literal["auto", "world_to_camera", "camera_to_world"] | None = None
     """SCARED: direction of the poses; auto finds it by comparing images."""
     poses: Path | None = None
-    """StereoMIS, video: "sfm" estimates the poses by structure from motion, also where there are published ones. Video: or
+    """StereoMIS, SCARED, video: "sfm" estimates the poses by structure from motion, also where there are published ones. Video: or
     a file of camera poses (frame tx ty tz qx qy qz qw, camera-to-world); without one poses.txt beside the video is taken, and
     without that they are estimated."""
     scale: float | None = None

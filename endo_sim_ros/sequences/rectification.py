@@ -69,6 +69,10 @@ class StereoCalibration:
             object.__setattr__(self, "T", -self.R.T @ self.T)
             object.__setattr__(self, "R", self.R.T.copy())
 
+    def project_left(self, points: np.ndarray) -> np.ndarray:
+        """Pixels [N, 2] in the raw left image, OpenCV convention, of points [N, 3] in its camera's frame."""
+        return cv2.projectPoints(points, np.zeros(3), np.zeros(3), self.K_left, self.D_left)[0][:, 0]
+
     def rectified_points(self, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where pixels [N, 2] of the raw left and right images lie after `Rectification.stereo`, this package's pixel convention."""
         R_left, R_right, P_left, P_right = _stereo_rectify(self)
@@ -185,6 +189,11 @@ class Rectification:
             measured = np.isfinite(points).all(-1) & (points[..., 2] > 0)
             z = np.where(measured, points @ self.rotation[2], 0)
         return self._remap(clean_depth(z), self._left_maps, cv2.INTER_NEAREST)
+
+    def project_left(self, points: np.ndarray) -> np.ndarray:
+        """Pixels [N, 2] in the rectified left image, OpenCV convention, of points [N, 3] in the raw left camera's frame."""
+        turn = cv2.Rodrigues(self.rotation)[0]
+        return cv2.projectPoints(points, turn, np.zeros(3), self.K - HALF_PIXEL, np.zeros(5))[0][:, 0]
 
     def pose(self, pose: np.ndarray) -> np.ndarray:
         """Camera-to-world pose [4, 4] of the rectified left camera from that of the raw one."""

@@ -6,7 +6,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from endo_sim_ros.sequences.images import image_size, read_gray
+from endo_sim_ros.sequences.images import image_size
+from endo_sim_ros.sequences.masks import read_mask
 from endo_sim_ros.sequences.recording import spread
 
 Reading = tuple[bool, int]  # whether masks belong to rectified images, and the number that the first frame has among them
@@ -19,6 +20,7 @@ class MaskAlignment:
         files: Mask files by number.
         readings: What may be.
         frames: Frame numbers that there are images of.
+        size: Width and height of the images, pixels.
         masks: Masks that are compared: those in which tools move most.
         looked_at: Masks that are read to find these.
         width: Largest width of the images that are compared, pixels; the tools' outlines are good to a pixel of it.
@@ -29,6 +31,7 @@ class MaskAlignment:
         files: Mapping[int, Path],
         readings: Sequence[Reading],
         frames: Sequence[int],
+        size: tuple[int, int],
         *,
         masks: int = 16,
         looked_at: int = 64,
@@ -37,10 +40,28 @@ class MaskAlignment:
         self._readings = readings
         inside = set(frames) if len(readings) > 1 else set()  # else there is nothing to find out
         usable = [n for n in sorted(files) if all(n - first in inside for _, first in readings)]
-        motion = {number: _motion(files, number, width) for number in spread(usable, looked_at)}
+        self._files, self._size = files, size
+        looked_at_first = spread(usable, looked_at)
+        if looked_at_first:
+            width = min(width, read_mask(files[looked_at_first[0]], size).shape[1])
+        self._compared = width, round(width * size[1] / size[0])
+        motion = {number: self._motion(number) for number in looked_at_first}
         telling = sorted((n for n, value in motion.items() if value is not None), key=lambda n: motion[n] or 0.0)[-masks:]
-        self._outlines = {number: _outline(files[number], width) for number in telling}
+        self._outlines = {number: self._outline(number) for number in telling}
         self._fits: dict[int, dict[Reading, float]] = {number: {} for number in self._outlines}
+
+    def _outline(self, number: int) -> np.ndarray:
+        """Slope [H, W, 2] of a blurred mask: not zero along the outline of what is in it, and across it."""
+        mask = cv2.resize(read_mask(self._files[number], self._size), self._compared, interpolation=cv2.INTER_AREA)
+        return _slope(np.where(mask > 127, np.float32(1), np.float32(0)))
+
+    def _motion(self, number: int) -> float | None:
+        """How far the outline of a mask is from that of the next, relative to its length, 0 without a next; None where it is empty."""
+        outline = self._outline(number)
+        length = float(np.abs(outline).sum())
+        if not length:
+            return None
+        return float(np.abs(outline - self._outline(number + 1)).sum()) / length if number + 1 in self._files else 0.0
 
     @property
     def frames(self) -> list[int]:
@@ -78,23 +99,6 @@ class MaskAlignment:
         gain, share = float(np.expm1(np.abs(gains.mean()))), float(np.mean((gains < 0) == better))
         reason = f"outlines of tools lie on {gain:.0%} stronger edges so, in {share:.0%} of {len(fits)} masks"
         return (better if gain > least_gain and share >= least_share else None), reason
-
-
-def _motion(files: Mapping[int, Path], number: int, width: int) -> float | None:
-    """How far the outline of a mask is from that of the next, relative to its length, 0 without a next; None where it is empty."""
-    outline = _outline(files[number], width)
-    length = float(np.abs(outline).sum())
-    if not length:
-        return None
-    return float(np.abs(outline - _outline(files[number + 1], width)).sum()) / length if number + 1 in files else 0.0
-
-
-def _outline(file: Path, width: int) -> np.ndarray:
-    """Slope [H, W, 2] of a blurred mask: not zero along the outline of what is in it, and across it."""
-    mask = read_gray(file)
-    scale = min(1.0, width / mask.shape[1])
-    mask = cv2.resize(mask, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return _slope(np.where(mask > 127, np.float32(1), np.float32(0)))
 
 
 def _slope(image: np.ndarray) -> np.ndarray:

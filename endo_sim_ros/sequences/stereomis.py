@@ -18,6 +18,7 @@ import configparser
 import csv
 import itertools
 import logging
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -28,7 +29,7 @@ from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.images import numbered_files
 from endo_sim_ros.sequences.mask_alignment import MaskAlignment, Reading
-from endo_sim_ros.sequences.masks import MaskFiles
+from endo_sim_ros.sequences.masks import MaskFiles, read_mask
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.pose_lag import LagFinder
 from endo_sim_ros.sequences.recording import Recording, check_folder, keep_posed, select, spread, stamp_ns
@@ -89,6 +90,8 @@ def read_stereomis(
         SequenceError: If a file is missing or wrong.
     """
     root = check_folder(path)
+    if first_mask is not None and first_mask < 0:
+        raise SequenceError(f"{root}: first_mask must be 0 or more, got {first_mask}")
     estimated = wants_estimate(poses, root) or not (root / POSES_FILE).is_file()
     calibration = read_stereo_ini(root / CALIBRATION_FILE)
     images, is_rectified = _open_images(root, calibration, frames_rectified)
@@ -98,17 +101,19 @@ def read_stereomis(
     usable: Sequence[int] = images.numbers
     if split:
         ranges = _read_split(root, split)
-        usable = [n for n in usable if any(first <= n < stop for first, stop in ranges)]
+        usable = [n for n in usable if any(first <= n < end for first, end in ranges)]
+        if not usable:
+            raise SequenceError(f"{root}: the {split} split holds none of the frames {images.numbers[0]} to {images.numbers[-1]}")
     numbers = select(usable, root, start, stop, step)
     rows = None if estimated else read_poses(root / POSES_FILE)
 
     mask_files = numbered_files(root / "masks", ending="l") or numbered_files(root / "masks")
     masks = MaskFiles(mask_files, root / "masks", mask_polarity)
     for number in spread(sorted(mask_files), 2):
-        masks.of(number, images.size)  # raises where they are of other images
+        read_mask(mask_files[number], images.size)  # raises where they are of other images
     readings = _mask_readings(root, mask_files, images, is_rectified, masks_rectified, first_mask)
     surveyed = _surveyed(images.numbers, numbers)
-    alignment = MaskAlignment(mask_files, readings, surveyed)
+    alignment = MaskAlignment(mask_files, readings, surveyed, images.size)
     scale = min(1.0, _SURVEY_WIDTH / images.size[0])
     small = Camera(rectification.K, *images.size).resized(*(round(scale * side) for side in images.size))
     finder = None
@@ -171,11 +176,14 @@ def read_stereo_ini(path: Path) -> StereoCalibration:
 
     def number(section: str, name: str) -> float:
         try:
-            return float(parser[section][name])
+            value = float(parser[section][name])
+            if math.isfinite(value):
+                return value
         except KeyError:
             raise SequenceError(f"{path}: [{section}] {name} is missing") from None
         except ValueError:
-            raise SequenceError(f"{path}: [{section}] {name} is not a number: {parser[section][name]!r}") from None
+            pass
+        raise SequenceError(f"{path}: [{section}] {name} is not a number: {parser[section][name]!r}")
 
     def camera(section: str) -> tuple[np.ndarray, np.ndarray]:
         fx, fy, cx, cy = (number(section, name) for name in ("fc_x", "fc_y", "cc_x", "cc_y"))
@@ -214,7 +222,7 @@ def _open_images(root: Path, calibration: StereoCalibration, rectified: bool | N
             "%s: images are taken for %s (%s), and the number of the first frame for %d",
             folder, "rectified ones" if rectified else "raw ones",
             "their eyes share too few features to tell" if offsets is None else
-            f"rows of the eyes are {offsets[0]:.2f} px apart as they are, {offsets[1]:.2f} px if rectified", first,
+            f"rows of the eyes are {offsets[0]:.2f} px apart as they are, {offsets[1]:.2f} px after rectification", first,
         )  # fmt: skip
     return images, rectified
 
@@ -270,7 +278,7 @@ def _chosen_reading(root: Path, alignment: MaskAlignment, readings: Sequence[Rea
     """The reading of the masks that fits the images; where they do not tell, as the authors' preprocessing writes them. It is logged."""
     rectified, first = readings[0]
     of_raw, from_0 = [r for r in readings if not r[0]], [r for r in readings if r[1] == 0]
-    told, reasons = True, ["as only they can be", "as only they can be"]
+    told, reasons = True, ["nothing else fits the files and options", "no other number fits the files and options"]
     if 0 < len(of_raw) < len(readings):
         found, reasons[0] = alignment.compare([r for r in readings if r[0]], of_raw)
         rectified, told = found is not False, found is not None

@@ -257,6 +257,7 @@ def test_memory_does_not_grow_with_the_sequence(tmp_path):
             "[StereoLeft]\nres_x=1\nres_y=1\nfc_x=5",
             r"StereoCalibration.ini: \[StereoLeft\] fc_y",
         ),
+        ("StereoCalibration.ini", "[StereoLeft]\nres_x=inf\nres_y=9", r"\[StereoLeft\] res_x is not a number: 'inf'"),
         ("StereoCalibration.ini", "no ini at all", "StereoCalibration.ini: not a readable ini"),
         ("groundtruth.txt", "0 0 0 0 0 0 1", "groundtruth.txt: line 1 has 7 numbers, expected 8"),
         ("groundtruth.txt", "0 0 0 0 0 0 0 0", "groundtruth.txt: line 1 is not a pose"),
@@ -271,7 +272,7 @@ def test_memory_does_not_grow_with_the_sequence(tmp_path):
         ("second.mp4", "", "more than one video"),
         ("train_split.csv", "start,end\n9,2\n", "train_split.csv: line 2 is not a range"),
         ("train_split.csv", "start,end\n2,2\n", "train_split.csv: line 2 is not a range"),
-        ("train_split.csv", "start,end\n1000000,2000000\n", "no frame"),
+        ("train_split.csv", "start,end\n1000000,2000000\n", "the train split holds none of the frames 0 to 7"),
         ("train_split.csv", None, "train_split.csv: file is missing"),
     ],
 )
@@ -287,12 +288,14 @@ def test_damaged_stereomis_is_refused_by_name(plane, name, text, message):
     ("damage", "message"),
     [
         (lambda masks: write_rgb(masks / "000001l.png", np.zeros((64, 64), np.uint8)), "000001l.png: is 64×64, but the images are 160×128"),
+        (lambda masks: write_rgb(masks / "000004l.png", np.zeros((64, 64), np.uint8)), "000004l.png: is 64×64, but the images are 160×128"),
         (lambda masks: (masks / "000001l.png").write_bytes(b"no image"), "000001l.png: not a readable image"),
         (lambda masks: write_rgb(masks / "P1_1l.png", np.zeros((64, 80), np.uint8)), "have the same number"),
     ],
 )
 def test_damaged_masks_are_refused_by_name(plane, damage, message):
-    write_rgb(plane / "masks/000001l.png", np.zeros((64, 80), np.uint8))
+    for number in range(1, 9):
+        write_rgb(plane / f"masks/{number:06d}l.png", np.zeros((64, 80), np.uint8))
     damage(plane / "masks")
     with pytest.raises(SequenceError, match=message):
         read_stereomis(plane)

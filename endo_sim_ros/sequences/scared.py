@@ -97,7 +97,7 @@ def read_scared(
     if (root / "data/rgb.mp4").is_file():
         images, is_rectified = StackedVideo(root / "data/rgb.mp4"), False
     elif left := numbered_files(root / "data/left_finalpass"):
-        images, is_rectified = StereoFiles(root / "data", left, numbered_files(root / "data/right_finalpass")), True
+        images, is_rectified = StereoFiles(root / "data/left_finalpass", left, numbered_files(root / "data/right_finalpass")), True
     else:
         return _read_keyframe(root, start, stop, step, depth, fps)
 

@@ -216,7 +216,7 @@ def _open_images(root: Path, calibration: StereoCalibration, rectified: bool | N
     images = StereoFiles(folder, left, numbered_files(folder, ending="r"), first)
     if rectified is None:
         offsets = row_offsets(images, calibration.resized(*images.size))
-        rectified = offsets is None or offsets[0] < offsets[1]
+        rectified = offsets is None or offsets[0] < offsets[1] + _SURE_ROWS  # as the authors' preprocessing writes them
         logger.log(
             logging.INFO if offsets and abs(offsets[0] - offsets[1]) > _SURE_ROWS else logging.WARNING,
             "%s: images are taken for %s (%s), and the number of the first frame for %d",

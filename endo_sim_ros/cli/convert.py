@@ -31,10 +31,18 @@ class Command:
     """Frame rate, Hz; default: that of the recording."""
     split: Literal["train", "test"] | None = None
     """StereoMIS: only the frame ranges of this split."""
+    pose_lag: int | None = None
+    """StereoMIS: frame n has the pose in row n - pose_lag of groundtruth.txt; default: found from the images."""
     mask_polarity: Literal["auto", "tool", "tissue"] | None = None
     """StereoMIS, EndoNeRF, folder, video: what white means in the masks."""
     max_mask_gap: int | None = None
     """StereoMIS: a frame without a mask borrows one from at most this many frames away (default 1)."""
+    first_mask: int | None = None
+    """StereoMIS: number of the first frame's mask, 0 or 1; default: found from the images."""
+    masks_rectified: bool | None = None
+    """StereoMIS: whether the masks belong to rectified images; default: found from the images."""
+    frames_rectified: bool | None = None
+    """StereoMIS: whether the images in video_frames are rectified; default: found from them."""
     mask_border: bool | None = None
     """Folder, video: ignore the black border and round vignette around the image (default true)."""
     depth_scale: float | None = None
@@ -46,8 +54,9 @@ class Command:
     pose_direction: Literal["auto", "world_to_camera", "camera_to_world"] | None = None
     """SCARED: direction of the poses; auto finds it by comparing images."""
     poses: Path | None = None
-    """Video: file of camera poses (frame tx ty tz qx qy qz qw, camera-to-world). Without one poses.txt beside the video
-    is taken, and without that, or with "sfm", they are estimated by structure from motion."""
+    """StereoMIS, SCARED, video: "sfm" estimates the poses by structure from motion, also where there are published ones. Video: or
+    a file of camera poses (frame tx ty tz qx qy qz qw, camera-to-world); without one poses.txt beside the video is taken, and
+    without that they are estimated."""
     scale: float | None = None
     """Video: metres per unit of the poses."""
     sfm_step: int | None = None

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.features import epipolar_distance, slopes
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import Matches
@@ -70,7 +71,7 @@ class _PoseCheck:
         none = np.zeros(len(matches.first), bool)
         if len(none) < self._matching.min_points:
             return none
-        here, there = _slopes(first, matches.first), _slopes(second, matches.second)
+        here, there = slopes(first, matches.first), slopes(second, matches.second)
         found: Any = cv2.findEssentialMat(here, there, np.eye(3), cv2.RANSAC, 0.999, self._matching.reprojection_error / second.K[0, 0])
         if found[1] is None:
             return none
@@ -81,7 +82,7 @@ class _PoseCheck:
     def error_in_two(self, matches: Matches) -> float:
         """How far matches are from where the poses, and depth if there is any, expect them: the median."""
         (i, j), here, there = matches
-        errors = [np.median(_epipolar_distance(self._cameras[i], self._cameras[j], here, there))]
+        errors = [np.median(epipolar_distance(self._cameras[i], self._cameras[j], here, there))]
         for one, other, here, there in ((i, j, here, there), (j, i, there, here)):
             depth = self._depths[one]
             if depth is None:
@@ -100,7 +101,7 @@ class _PoseCheck:
             return 0.0  # from one place any point on a ray would do
         rows = []
         for camera, uv in zip(cameras, pixels):
-            x, y = _slopes(camera, uv).T[..., None]
+            x, y = slopes(camera, uv).T[..., None]
             rows += [x * camera.viewmat[2] - camera.viewmat[0], y * camera.viewmat[2] - camera.viewmat[1]]
         homogeneous = np.linalg.svd(np.stack(rows, 1))[2][:, -1]
         points = homogeneous[:, :3] / np.where(np.abs(homogeneous[:, 3:]) < 1e-9, 1e-9, homogeneous[:, 3:])
@@ -143,11 +144,6 @@ class _PoseCheck:
         return wrong
 
 
-def _slopes(camera: Camera, uv: np.ndarray) -> np.ndarray:
-    """x/z and y/z [M, 2] of pixels [M, 2]."""
-    return (uv - camera.K[:2, 2]) / camera.K.diagonal()[:2]
-
-
 def _tracks(matches: Sequence[Matches], least: int) -> list[tuple[_Views, list[np.ndarray]]]:
     """Three views each, with their pixels [M, 2] of the features that the first shares with both others, if they are enough."""
     ends: dict[int, list[tuple[int, np.ndarray, np.ndarray]]] = {}
@@ -161,17 +157,3 @@ def _tracks(matches: Sequence[Matches], least: int) -> list[tuple[_Views, list[n
             if len(of_j) >= least:
                 found.append(((view, j, k), [here_j[of_j], there_j[of_j], there_k[of_k]]))
     return found
-
-
-def _epipolar_distance(first: Camera, second: Camera, uv_1: np.ndarray, uv_2: np.ndarray) -> np.ndarray:
-    """Pixels [M] from a feature in the second view to where the first view's feature may appear there: a piece of a line."""
-    near, far = 1e-3, 1e3  # metres, between which lies whatever an endoscope sees
-    rays = np.column_stack([_slopes(first, uv_1), np.ones(len(uv_1))]) @ first.pose[:3, :3].T
-    start, rise = (first.position - second.position) @ second.pose[:3, 2], rays @ second.pose[:3, 2]
-    nearest = np.maximum(near, (near / 2 - start) / np.maximum(rise, 1e-6))  # where both cameras have it in front of them
-    ends = [second.project(first.position + depth * rays) for depth in (nearest[:, None], far)]
-    (near_end, z_near), (far_end, z_far) = ends
-    along = far_end - near_end
-    t = ((uv_2 - near_end) * along).sum(1) / np.maximum((along * along).sum(1), 1e-12)
-    distance = np.linalg.norm(uv_2 - near_end - t.clip(0, 1)[:, None] * along, axis=1)
-    return np.where((z_near > 0) & (z_far > 0), distance, np.inf)

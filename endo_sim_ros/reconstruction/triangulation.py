@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (it is public)
 
 from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.features import detect, match_pair
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import Matches, ScenePoints
@@ -18,33 +19,13 @@ def match_features(
     frames: Sequence[Frame], options: MatchingConfig = MatchingConfig(), progress: StageProgress = StageProgress()
 ) -> list[Matches]:
     """SIFT features matched between each view and the nearest others; pairs of views that share none are left out."""
-    features = progress.map(lambda frame: detect(frame.image, frame.mask, options), frames)
+    features = progress.map(lambda frame: detect(frame.image, frame.mask, options.max_features), frames)
 
     def match(pair: tuple[int, int]) -> Matches:
-        return Matches(pair, *match_pair(features[pair[0]], features[pair[1]], options))
+        return Matches(pair, *match_pair(features[pair[0]], features[pair[1]], options.ratio))
 
     pairs = sorted({(min(i, j), max(i, j)) for i, near in enumerate(nearest_views(frames, options.neighbours)) for j in near})
     return [found for found in progress.map(match, pairs) if len(found.first)]
-
-
-def detect(image: np.ndarray, mask: np.ndarray | None, options: MatchingConfig) -> tuple[np.ndarray, np.ndarray | None]:
-    """Pixels [N, 2] and descriptors [N, 128] of the SIFT features of an RGB image [H, W, 3] where a mask [H, W] is not 0."""
-    # A quarter of OpenCV's threshold: tissue has little contrast.
-    sift = cv2.SIFT.create(nfeatures=options.max_features, contrastThreshold=0.01)
-    keys, descriptors = sift.detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), mask)
-    return np.array([key.pt for key in keys]).reshape(-1, 2) + 0.5, descriptors  # OpenCV counts from the centre of the first pixel
-
-
-def match_pair(
-    first: tuple[np.ndarray, np.ndarray | None], second: tuple[np.ndarray, np.ndarray | None], options: MatchingConfig
-) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels [M, 2] in the first and the second image of the features, as `detect` gives them, that pass the ratio test."""
-    (uv_1, descriptors_1), (uv_2, descriptors_2) = first, second
-    if descriptors_1 is None or descriptors_2 is None or len(descriptors_2) < 2:
-        return np.empty((0, 2)), np.empty((0, 2))
-    matches = cv2.BFMatcher(cv2.NORM_L2).knnMatch(descriptors_1, descriptors_2, k=2)
-    good = [best for best, second_best in matches if best.distance < options.ratio * second_best.distance]
-    return uv_1[[match.queryIdx for match in good]], uv_2[[match.trainIdx for match in good]]
 
 
 def nearest_views(frames: Sequence[Frame], count: int) -> list[list[int]]:

@@ -51,6 +51,21 @@ def tissue_mask(mask: np.ndarray, *, white_is_tool: bool, size: tuple[int, int])
     return tissue if tissue.shape[::-1] == size else cv2.resize(tissue, size, interpolation=cv2.INTER_NEAREST)
 
 
+def read_mask(file: Path, size: tuple[int, int]) -> np.ndarray:
+    """The mask [H, W] in a file, uint8, that belongs to an image of a size (width, height), and may be smaller.
+
+    Raises:
+        SequenceError: If it cannot be read, or has not the shape of the image.
+    """
+    mask = read_gray(file)
+    if abs(mask.shape[1] * size[1] / (mask.shape[0] * size[0]) - 1) > 0.01:
+        raise SequenceError(
+            f"{file}: is {mask.shape[1]}×{mask.shape[0]}, but the images are {size[0]}×{size[1]}; "
+            "a mask may be smaller than its image, but not of another shape"
+        )
+    return mask
+
+
 class MaskFiles:
     """Masks in files, one per frame; not every frame need have one.
 
@@ -58,6 +73,9 @@ class MaskFiles:
         files: Image files by frame number.
         source: Their folder, for messages.
         polarity: What white means in them: `tool`, `tissue`, or `auto` to find out from 20 of them.
+
+    Raises:
+        SequenceError: If one of these cannot be read.
     """
 
     def __init__(self, files: Mapping[int, Path], source: Path, polarity: str):
@@ -66,10 +84,14 @@ class MaskFiles:
         self._white_is_tool = bool(files) and tool_is_white(sample, source, polarity)
 
     def of(self, number: int, size: tuple[int, int]) -> np.ndarray | None:
-        """Mask [H, W] of a frame at an image's size (width, height), 255 = tissue; None where it has no file."""
+        """Mask [H, W] of a frame at an image's size (width, height), 255 = tissue; None where it has no file.
+
+        Raises:
+            SequenceError: If it cannot be read, or has not the shape of the image.
+        """
         if number not in self._files:
             return None
-        return tissue_mask(read_gray(self._files[number]), white_is_tool=self._white_is_tool, size=size)
+        return tissue_mask(read_mask(self._files[number], size), white_is_tool=self._white_is_tool, size=size)
 
 
 def lit_area(images: Iterable[np.ndarray], threshold: int = 16) -> np.ndarray:

@@ -33,8 +33,8 @@ class Reader:
 
 
 def _is_scared(path: Path) -> bool:
-    names = (scared.CALIBRATION_FILE, "data/frame_data.tar.gz", "left_depth_map.tiff")
-    return any((path / name).is_file() for name in names) or any(path.glob("keyframe_*/"))
+    names = (scared.CALIBRATION_FILE, "data/frame_data.tar.gz", "data/frame_data", "left_depth_map.tiff")
+    return any((path / name).exists() for name in names) or any(path.glob("keyframe_*/"))
 
 
 def _is_video(path: Path) -> bool:
@@ -48,7 +48,7 @@ READERS: dict[str, Reader] = {
     "stereomis": Reader(
         read_stereomis, lambda path: (path / stereomis.CALIBRATION_FILE).is_file(), f"the file {stereomis.CALIBRATION_FILE}"
     ),
-    "scared": Reader(read_scared, _is_scared, f"the file {scared.CALIBRATION_FILE} or data/frame_data.tar.gz"),
+    "scared": Reader(read_scared, _is_scared, f"the file {scared.CALIBRATION_FILE} or data/frame_data[.tar.gz]"),
     "endonerf": Reader(read_endonerf, lambda path: (path / endonerf.POSES_FILE).is_file(), f"the file {endonerf.POSES_FILE}"),
     "folder": Reader(read_folder, lambda path: (path / "left").is_dir(), f"the folder left/ with images, and {folder.CALIBRATION_FILE}"),
     "video": Reader(read_video, _is_video, f"a video ({', '.join(VIDEO_SUFFIXES)}), or a folder with one"),

@@ -69,6 +69,17 @@ class StereoCalibration:
             object.__setattr__(self, "T", -self.R.T @ self.T)
             object.__setattr__(self, "R", self.R.T.copy())
 
+    def project_left(self, points: np.ndarray) -> np.ndarray:
+        """Pixels [N, 2] in the raw left image, OpenCV convention, of points [N, 3] in its camera's frame."""
+        return cv2.projectPoints(points, np.zeros(3), np.zeros(3), self.K_left, self.D_left)[0][:, 0]
+
+    def rectified_points(self, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where pixels [N, 2] of the raw left and right images lie after `Rectification.stereo`, this package's pixel convention."""
+        R_left, R_right, P_left, P_right = _stereo_rectify(self)
+        eyes = ((left, self.K_left, self.D_left, R_left, P_left), (right, self.K_right, self.D_right, R_right, P_right))
+        moved = [cv2.undistortPoints(uv[:, None] - 0.5, K, D, R=R, P=P)[:, 0] + 0.5 for uv, K, D, R, P in eyes]
+        return moved[0], moved[1]
+
     def resized(self, width: int, height: int) -> StereoCalibration:
         """The calibration for images of another size with the same field of view."""
         if (width, height) == self.size:
@@ -118,12 +129,15 @@ class Rectification:
             self.valid = np.where(inside, np.uint8(255), np.uint8(0))
 
     @classmethod
-    def stereo(cls, calibration: StereoCalibration) -> Rectification:
-        """Rows aligned, one K and no disparity at infinity for both eyes, no larger border than needed (alpha 0)."""
+    def stereo(cls, calibration: StereoCalibration, alpha: float = 0) -> Rectification:
+        """Rows aligned, one K and no disparity at infinity for both eyes.
+
+        Args:
+            calibration: Of both eyes.
+            alpha: As OpenCV's: 0 zooms until nothing outside the raw images is seen; −1, its default, does not zoom.
+        """
         c, size = calibration, calibration.size
-        R_left, R_right, P_left, P_right, *_ = cv2.stereoRectify(
-            c.K_left, c.D_left, c.K_right, c.D_right, size, c.R, c.T[:, None], flags=cv2.CALIB_ZERO_DISPARITY, alpha=0
-        )
+        R_left, R_right, P_left, P_right = _stereo_rectify(c, alpha)
         baseline = -P_right[0, 3] / P_right[0, 0]
         if not np.isfinite(P_left).all() or not baseline > 0:
             raise SequenceError(f"{c.source}: the two cameras cannot be rectified; check R and T")
@@ -176,6 +190,11 @@ class Rectification:
             z = np.where(measured, points @ self.rotation[2], 0)
         return self._remap(clean_depth(z), self._left_maps, cv2.INTER_NEAREST)
 
+    def project_left(self, points: np.ndarray) -> np.ndarray:
+        """Pixels [N, 2] in the rectified left image, OpenCV convention, of points [N, 3] in the raw left camera's frame."""
+        turn = cv2.Rodrigues(self.rotation)[0]
+        return cv2.projectPoints(points, turn, np.zeros(3), self.K - HALF_PIXEL, np.zeros(5))[0][:, 0]
+
     def pose(self, pose: np.ndarray) -> np.ndarray:
         """Camera-to-world pose [4, 4] of the rectified left camera from that of the raw one."""
         turned = pose.copy()
@@ -186,3 +205,10 @@ class Rectification:
         if image.shape[1::-1] != tuple(self.size):
             raise SequenceError(f"image is {image.shape[1]}×{image.shape[0]}, but its calibration is for {self.size[0]}×{self.size[1]}")
         return image if maps is None else cv2.remap(image, maps[0], maps[1], interpolation)
+
+
+def _stereo_rectify(c: StereoCalibration, alpha: float = 0) -> Sequence[np.ndarray]:
+    """Rotations [3, 3] of both eyes and their new projections [3, 4], OpenCV's pixel convention."""
+    return cv2.stereoRectify(
+        c.K_left, c.D_left, c.K_right, c.D_right, c.size, c.R, c.T[:, None], flags=cv2.CALIB_ZERO_DISPARITY, alpha=alpha
+    )[:4]

@@ -8,11 +8,18 @@
       data/frame_data.tar.gz        frame_data%06d.json: camera-pose 4×4 in millimetres, camera-calibration
       data/scene_points.tar.gz      scene_points%06d.tiff: the keyframe's points moved by the kinematics, both eyes
 
+and, as others prepare it:
+
+      data/frame_data/, data/scene_points/          the archives, extracted
+      data/left_finalpass/, data/right_finalpass/   frame_data%06d.png: rectified images, read where there is no rgb.mp4
+      data/disparity/                               frame_data%06d.tiff: of these, read where there are no points
+
 The world is the keyframe's left camera. The archives are read as streams and never unpacked to disk.
 """
 
 import contextlib
 import logging
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -23,13 +30,22 @@ from numpy.typing import ArrayLike
 
 from endo_sim_ros.core.cameras import Camera, invert_pose
 from endo_sim_ros.core.frames import Frame, SequenceError
-from endo_sim_ros.sequences.images import image_size, read_image
+from endo_sim_ros.sequences.images import clean_depth, image_size, numbered_files, read_image
 from endo_sim_ros.sequences.recording import DEFAULT_FPS, Recording, check_folder, keep_posed, select, stamp_ns
 from endo_sim_ros.sequences.rectification import Rectification, StereoCalibration
-from endo_sim_ros.sequences.scared_archives import ScenePoints, keyframe_points, published_pose, read_frame_data, read_point_map
-from endo_sim_ros.sequences.scared_pose_direction import USUAL_DIRECTION, find_pose_direction
-from endo_sim_ros.sequences.structure_from_motion import with_estimated_poses
-from endo_sim_ros.sequences.video_files import Video, split_stacked
+from endo_sim_ros.sequences.scared_archives import (
+    PointFiles,
+    ScenePoints,
+    keyframe_points,
+    numbered,
+    published_pose,
+    read_disparity,
+    read_frame_data,
+    read_point_map,
+)
+from endo_sim_ros.sequences.scared_pose_direction import USUAL_DIRECTION, Projection, find_pose_direction
+from endo_sim_ros.sequences.stereo_images import StackedVideo, StereoFiles, StereoImages
+from endo_sim_ros.sequences.structure_from_motion import wants_estimate, with_estimated_poses
 
 logger = logging.getLogger(__name__)
 
@@ -45,6 +61,7 @@ def read_scared(
     stop: int | None = None,
     step: int = 1,
     depth: str = "scene_points",
+    poses: Path | str | None = None,
     pose_direction: str = "auto",
     fps: float | None = None,
 ) -> Recording:
@@ -56,13 +73,14 @@ def read_scared(
         step: Take every step-th frame.
         depth: `scene_points` (every frame; follows the kinematics, so it is a few pixels off in places), `keyframe`
             (the first frame only, measured), or `none`.
+        poses: `sfm` estimates the poses; None takes the published ones, and estimates them where there are none.
         pose_direction: What the published camera-pose does: `world_to_camera`, `camera_to_world`, or `auto` to find
             out which one carries the keyframe onto later frames; the finding is logged.
-        fps: Frames per second; None takes the video's.
+        fps: Frames per second; None takes the video's, or 25 for extracted frames.
 
     Returns:
-        Rectified stereo frames; those without a pose are skipped. Without data/rgb.mp4, the keyframe alone;
-        without frame_data.tar.gz (test sets), the poses are estimated.
+        Rectified stereo frames; those without a pose are skipped. Without a video or extracted frames, the keyframe alone;
+        without frame data (test sets), the poses are estimated.
 
     Raises:
         SequenceError: If a file is missing or wrong.
@@ -74,73 +92,114 @@ def read_scared(
     keyframes = sorted(p.name for p in root.glob("keyframe_*"))
     if keyframes:
         raise SequenceError(f"{root}: is a whole dataset; pass one of its keyframes: {', '.join(keyframes)}")
-    if not (root / "data/rgb.mp4").is_file():
+    estimated = wants_estimate(poses, root)
+    _tell_defects(root)
+    if (root / "data/rgb.mp4").is_file():
+        images, is_rectified = StackedVideo(root / "data/rgb.mp4"), False
+    elif left := numbered_files(root / "data/left_finalpass"):
+        images, is_rectified = StereoFiles(root / "data/left_finalpass", left, numbered_files(root / "data/right_finalpass")), True
+    else:
         return _read_keyframe(root, start, stop, step, depth, fps)
 
-    video = Video(root / "data/rgb.mp4")
-    archive = root / "data/frame_data.tar.gz"
-    documents = read_frame_data(archive) if archive.is_file() else {}
-    published = {n: published_pose(document, archive, n) for n, document in documents.items()}
-    size = video.width, video.height // 2
-    calibration = _calibration(root, documents).resized(*size)
-    rectification = Rectification.stereo(calibration)
+    frame_data = _archive_or_folder(root, "frame_data")
+    documents = read_frame_data(frame_data) if frame_data.exists() else {}
+    published = {} if estimated else {n: published_pose(document, frame_data, n) for n, document in documents.items()}
+    calibration = _calibration(root, documents, images.size).resized(*images.size)
+    # Those who prepare left_finalpass leave OpenCV's alpha at its default.
+    rectification = Rectification.stereo(calibration, alpha=-1 if is_rectified else 0)
 
-    numbers = select(range(video.frame_count), video.path, start, stop, step)
-    poses = dict.fromkeys(numbers, np.eye(4))
+    numbers = select(images.numbers, images.source, start, stop, step)
+    pose_of = dict.fromkeys(numbers, np.eye(4))
     if published:
-        numbers = keep_posed(numbers, published, archive)
+        numbers = keep_posed(numbers, published, frame_data)
         if pose_direction == "auto":
-            pose_direction = _pose_direction(root, video, published, calibration)
+            project = rectification.project_left if is_rectified else calibration.project_left
+            pose_direction = _pose_direction(root, images, published, project)
         for n in numbers:
-            poses[n] = published[n] if pose_direction == "camera_to_world" else invert_pose(published[n])
+            pose_of[n] = published[n] if pose_direction == "camera_to_world" else invert_pose(published[n])
 
-    points_archive = root / "data/scene_points.tar.gz"
-    if depth == "scene_points" and not points_archive.is_file():
-        logger.warning("%s: file is missing; only the keyframe's own depth is used", points_archive)
-        depth = "keyframe"
+    points_source = _archive_or_folder(root, "scene_points")
+    disparities: dict[int, Path] = {}
+    if depth == "scene_points" and not points_source.exists():
+        disparities = numbered(root / "data/disparity", ".tiff") if is_rectified else {}
+        logger.warning(
+            "%s: file is missing; %s", points_source,
+            "depth comes from data/disparity, which is made without the rotation that rectifies, and so some pixels off" if disparities
+            else "only the keyframe's own depth is used",
+        )  # fmt: skip
+        depth = "disparity" if disparities else "keyframe"
+
+    def depth_of(number: int, points: PointFiles | ScenePoints | None) -> np.ndarray | None:
+        if number in disparities:
+            with np.errstate(divide="ignore"):
+                return clean_depth(rectification.K[0, 0] * (rectification.baseline or 0) / read_disparity(disparities[number], images.size))
+        if depth == "keyframe" and number == 0:
+            found = keyframe_points(root, images.size)
+        else:
+            found = points.of(number, images.size) if points else None
+        return None if found is None else rectification.depth(found)
 
     def frames() -> Iterator[Frame]:
-        reading = contextlib.closing(ScenePoints(points_archive)) if depth == "scene_points" else contextlib.nullcontext()
-        with reading as scene_points:
-            for number, image in video.frames(numbers):
-                left, right = split_stacked(image, video.path)
-                points = scene_points.of(number, size) if scene_points else None
-                if depth == "keyframe" and number == 0:
-                    points = keyframe_points(root, size)
-                yield _frame(rectification, number, fps or video.fps, left, right, points, poses[number])
+        opened = (PointFiles if points_source.is_dir() else ScenePoints)(points_source) if depth == "scene_points" else None
+        with contextlib.closing(opened) if opened else contextlib.nullcontext() as points:
+            for number, left, right in images.read(numbers):
+                if not is_rectified:
+                    left, right = rectification.left(left), rectification.right(right)
+                yield _frame(rectification, number, fps or images.fps, left, right, depth_of(number, points), pose_of[number])
 
     recording = Recording(frames, len(numbers))
     if published:
         return recording
-    logger.warning("%s: file is missing, so poses come from structure from motion", archive)
+    if not estimated:
+        logger.warning("%s: file is missing, so poses come from structure from motion", frame_data)
     return with_estimated_poses(recording, root)
+
+
+def _tell_defects(root: Path) -> None:
+    """Say what is known to be wrong with the dataset that a keyframe's folder, or the one around it, is named after."""
+    dataset = re.search(r"dataset_?([45])(?!\d)", "/".join(root.resolve().parts[-2:]))
+    if dataset:
+        logger.warning(
+            "%s: the published calibration of dataset %s is known to be wrong: rows of the rectified eyes disagree, and depth does not "
+            "fit the images; results of this dataset mean little", root, dataset[1],
+        )  # fmt: skip
+
+
+def _archive_or_folder(root: Path, name: str) -> Path:
+    """The archive of this name, or the folder that it was extracted to where there is only that."""
+    archive, folder = root / f"data/{name}.tar.gz", root / "data" / name
+    return folder if folder.is_dir() and not archive.is_file() else archive
 
 
 def _read_keyframe(root: Path, start: int | None, stop: int | None, step: int, depth: str, fps: float | None) -> Recording:
     left, right = root / "Left_Image.png", root / "Right_Image.png"
     if not left.is_file():
-        raise SequenceError(f"{root}: holds neither data/rgb.mp4 nor Left_Image.png; pass a keyframe folder of SCARED")
+        raise SequenceError(
+            f"{root}: holds neither data/rgb.mp4 nor data/left_finalpass nor Left_Image.png; pass a keyframe folder of SCARED"
+        )
     size = image_size(read_image(left))
-    rectification = Rectification.stereo(_calibration(root, {}).resized(*size))
+    rectification = Rectification.stereo(_calibration(root, {}, size).resized(*size))
     select([0], root, start, stop, step)
     if not right.is_file():
         raise SequenceError(f"{right}: file is missing")
 
     def frames() -> Iterator[Frame]:
         points = None if depth == "none" else keyframe_points(root, size)
-        yield _frame(rectification, 0, fps or DEFAULT_FPS, read_image(left), read_image(right), points, np.eye(4))
+        eyes = rectification.left(read_image(left)), rectification.right(read_image(right))
+        measured = None if points is None else rectification.depth(points)
+        yield _frame(rectification, 0, fps or DEFAULT_FPS, *eyes, measured, np.eye(4))
 
     return Recording(frames, 1)
 
 
-def _pose_direction(root: Path, video: Video, published: dict[int, np.ndarray], calibration: StereoCalibration) -> str:
+def _pose_direction(root: Path, images: StereoImages, published: dict[int, np.ndarray], project: Projection) -> str:
     """The direction of the published poses, from the keyframe where it is there."""
     keyframe, depth_map = root / "Left_Image.png", root / "left_depth_map.tiff"
     if not keyframe.is_file() or not depth_map.is_file():
         logger.warning("%s: no keyframe depth to verify the pose direction with; assuming %s", root, USUAL_DIRECTION)
         return USUAL_DIRECTION
-    points = read_point_map(depth_map, str(depth_map), (video.width, video.height // 2))
-    return find_pose_direction(points, read_image(keyframe), video, published, calibration, root)
+    points = read_point_map(depth_map, str(depth_map), images.size)
+    return find_pose_direction(points, read_image(keyframe), images, published, project, root)
 
 
 def _frame(
@@ -149,16 +208,16 @@ def _frame(
     fps: float,
     left: np.ndarray,
     right: np.ndarray,
-    points: np.ndarray | None,
+    depth: np.ndarray | None,
     pose: np.ndarray,
 ) -> Frame:
     return Frame(
         stamp_ns=stamp_ns(number, fps),
-        image=rectification.left(left),
+        image=left,
         camera=Camera(rectification.K, *rectification.size, rectification.pose(pose)),
-        right=rectification.right(right),
+        right=right,
         baseline=rectification.baseline,
-        depth=None if points is None else rectification.depth(points),
+        depth=depth,
         mask=rectification.mask(None),
     )
 
@@ -166,19 +225,23 @@ def _frame(
 # ------------------------------------------------------------------------------------------------------ calibration
 
 
-def _calibration(root: Path, documents: dict[int, Any]) -> StereoCalibration:
-    """From endoscope_calibration.yaml, or from the first frame's JSON where that file is missing."""
-    path = root / CALIBRATION_FILE
+def _calibration(root: Path, documents: dict[int, Any], size: tuple[int, int]) -> StereoCalibration:
+    """From endoscope_calibration.yaml, or from the first frame's JSON where that file is missing.
+
+    It belongs to images of the keyframe's size, or of that of the recording (width, height) where there is no keyframe.
+    """
+    path, keyframe = root / CALIBRATION_FILE, root / "Left_Image.png"
+    size = image_size(read_image(keyframe)) if keyframe.is_file() else size
     if path.is_file():
-        return read_stereo_yaml(path, _image_size(root))
+        return read_stereo_yaml(path, size)
     if not documents:
         raise SequenceError(f"{path}: file is missing; it holds the calibration of both cameras")
     number, document = min(documents.items())
-    source = f"{root / 'data/frame_data.tar.gz'}: camera-calibration of frame {number}"
+    source = f"{_archive_or_folder(root, 'frame_data')}: camera-calibration of frame {number}"
     fields = document.get("camera-calibration") if isinstance(document, dict) else None
     fields = fields if isinstance(fields, dict) else {}
     values = [_matrix(fields.get(name), f"{source}: {name}") for name in ("KL", "DL", "KR", "DR", "R", "T")]
-    return _stereo_calibration(source, _image_size(root), values)
+    return _stereo_calibration(source, size, values)
 
 
 def read_stereo_yaml(path: Path, size: tuple[int, int]) -> StereoCalibration:
@@ -213,11 +276,3 @@ def _matrix(value: ArrayLike | None, source: str) -> np.ndarray:
         return np.asarray(value, np.float64)
     except (TypeError, ValueError):
         raise SequenceError(f"{source} is not a matrix of numbers") from None
-
-
-def _image_size(root: Path) -> tuple[int, int]:
-    """Width and height that the calibration belongs to: those of the keyframe, or of one eye of the video."""
-    if (root / "Left_Image.png").is_file():
-        return image_size(read_image(root / "Left_Image.png"))
-    video = Video(root / "data/rgb.mp4")
-    return video.width, video.height // 2

@@ -1,4 +1,4 @@
-"""The archives and maps of points of SCARED: read as streams, never unpacked to disk."""
+"""What SCARED has of each frame: JSON documents and maps of points, in archives that are read as streams, or in folders."""
 
 import contextlib
 import io
@@ -7,7 +7,7 @@ import logging
 import re
 import tarfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ import numpy as np
 import tifffile
 
 from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.sequences.images import clean_depth
 from endo_sim_ros.sequences.pose_files import rigid
 
 logger = logging.getLogger(__name__)
@@ -45,27 +46,47 @@ def _readable(archive: Path) -> Iterator[None]:
         raise SequenceError(f"{archive}: not a readable .tar.gz archive ({error}); copy it again") from None
 
 
-def read_frame_data(archive: Path) -> dict[int, Any]:
-    """The JSON documents of frame_data.tar.gz by frame number.
+def numbered(folder: Path, suffix: str) -> dict[int, Path]:
+    """The files of a folder with a suffix such as `.json`, by the number in their name; none where there is no such folder."""
+    matches = ((re.fullmatch(r"\D*(\d+)" + re.escape(suffix), path.name), path) for path in sorted(folder.glob(f"*{suffix}")))
+    return {int(match[1]): path for match, path in matches if match}
+
+
+def read_frame_data(source: Path) -> dict[int, Any]:
+    """The JSON documents of frame_data.tar.gz, or of the folder that it was extracted to, by frame number.
 
     Raises:
-        SequenceError: If the archive cannot be read or holds none.
+        SequenceError: If one cannot be read, or there are none.
     """
     documents = {}
-    with _readable(archive), tarfile.open(archive, "r|gz") as tar:
+    for number, name, data in _json_files(source):
+        try:
+            documents[number] = json.loads(data)
+        except ValueError as error:
+            raise SequenceError(f"{source}: {name} is not valid JSON ({error})") from None
+    if not documents:
+        raise SequenceError(f"{source}: holds no frame_data000000.json")
+    return documents
+
+
+def _json_files(source: Path) -> Iterator[tuple[int, str, bytes]]:
+    """Frame number, name and content of each JSON file of an archive or a folder."""
+
+    def check(name: str, size: int) -> None:
+        if size > _MOST_JSON_BYTES:
+            raise SequenceError(f"{source}: {name} has {size} bytes, far more than a camera needs")
+
+    if source.is_dir():
+        for number, path in numbered(source, ".json").items():
+            check(path.name, path.stat().st_size)
+            yield number, path.name, path.read_bytes()
+        return
+    with _readable(source), tarfile.open(source, "r|gz") as tar:
         for member in tar:
             number = _member_number(member, ".json")
-            if number is None:
-                continue
-            if member.size > _MOST_JSON_BYTES:
-                raise SequenceError(f"{archive}: {member.name} has {member.size} bytes, far more than a camera needs")
-            try:
-                documents[number] = json.loads(_content(tar, member))
-            except ValueError as error:
-                raise SequenceError(f"{archive}: {member.name} is not valid JSON ({error})") from None
-    if not documents:
-        raise SequenceError(f"{archive}: holds no frame_data000000.json")
-    return documents
+            if number is not None:
+                check(member.name, member.size)
+                yield number, member.name, _content(tar, member)
 
 
 def published_pose(document: Any, archive: Path, number: int) -> np.ndarray:
@@ -81,6 +102,21 @@ def published_pose(document: Any, archive: Path, number: int) -> np.ndarray:
     pose = rigid(matrix, source)
     pose[:3, 3] *= 1e-3
     return pose
+
+
+class PointFiles:
+    """Reads the maps of points in an extracted folder scene_points."""
+
+    def __init__(self, folder: Path):
+        self._files = numbered(folder, ".tiff")
+
+    def of(self, number: int, size: tuple[int, int]) -> np.ndarray | None:
+        """As `ScenePoints.of`."""
+        file = self._files.get(number)
+        return None if file is None else read_point_map(file, str(file), size)
+
+    def close(self) -> None:
+        """Nothing is held open."""
 
 
 class ScenePoints:
@@ -152,14 +188,28 @@ def read_point_map(file: Path | io.BytesIO, source: str, size: tuple[int, int]) 
         SequenceError: If it is no such TIFF.
     """
     width, height = size
+    points = _read_tiff(file, source, "points", ((height, width, 3), (2 * height, width, 3)))
+    return points[:height].astype(np.float32) * 1e-3
+
+
+def read_disparity(file: Path, size: tuple[int, int]) -> np.ndarray:
+    """A disparity image [H, W], pixels, 0 = none, of rectified images of a size (width, height).
+
+    Raises:
+        SequenceError: If it is no such TIFF.
+    """
+    return clean_depth(_read_tiff(file, str(file), "disparity", (size[::-1],)))
+
+
+def _read_tiff(file: Path | io.BytesIO, source: str, what: str, shapes: Sequence[tuple[int, ...]]) -> np.ndarray:
     try:
         with tifffile.TiffFile(file) as tiff:
             page = tiff.pages[0]
-            if page.shape not in ((height, width, 3), (2 * height, width, 3)):
-                raise SequenceError(f"{source}: expected points of shape [{height} or {2 * height}, {width}, 3], got {list(page.shape)}")
-            points = page.asarray()
+            if page.shape not in shapes:
+                allowed = " or ".join(str(list(shape)) for shape in shapes)
+                raise SequenceError(f"{source}: expected {what} of shape {allowed}, got {list(page.shape)}")
+            return page.asarray()
     except SequenceError:
         raise
     except Exception as error:  # tifffile raises whatever its decoders do
-        raise SequenceError(f"{source}: not a readable TIFF of points ({error}); copy it again") from None
-    return points[:height].astype(np.float32) * 1e-3
+        raise SequenceError(f"{source}: not a readable TIFF of {what} ({error}); copy it again") from None

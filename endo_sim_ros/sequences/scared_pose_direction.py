@@ -1,7 +1,7 @@
 """Whether SCARED's published poses are world-to-camera or camera-to-world."""
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import cv2
@@ -9,10 +9,11 @@ import numpy as np
 
 from endo_sim_ros.core.cameras import invert_pose
 from endo_sim_ros.sequences.recording import spread
-from endo_sim_ros.sequences.rectification import StereoCalibration
-from endo_sim_ros.sequences.video_files import Video, split_stacked
+from endo_sim_ros.sequences.stereo_images import StereoImages
 
 logger = logging.getLogger(__name__)
+
+Projection = Callable[[np.ndarray], np.ndarray]
 
 USUAL_DIRECTION = "world_to_camera"  # what the published re-implementations found
 
@@ -20,9 +21,9 @@ USUAL_DIRECTION = "world_to_camera"  # what the published re-implementations fou
 def find_pose_direction(
     points: np.ndarray,
     image: np.ndarray,
-    video: Video,
+    images: StereoImages,
     published: Mapping[int, np.ndarray],
-    calibration: StereoCalibration,
+    project: Projection,
     source: Path,
     *,
     checked_frames: int = 400,
@@ -37,31 +38,32 @@ def find_pose_direction(
     Args:
         points: Points of the keyframe [H, W, 3], metres, in its raw left camera.
         image: Its left RGB image [H, W, 3], uint8.
-        video: The recording, left eye stacked on top of right.
+        images: Those of the recording.
         published: Poses [4, 4] by frame number, translation in metres.
-        calibration: Of the raw images.
+        project: Where points [N, 3] in the raw left camera, metres, are in its images: pixels [N, 2], OpenCV convention.
         source: The recording's folder, for messages.
         checked_frames: How far into the video to look: later, tissue has moved and the keyframe's points are wrong.
         least_motion: Median distance of the two readings, pixels, from which on a frame tells them apart; the
             kinematics' own error is of this size.
         least_difference: Of the two mean correlations, below which they count as alike.
     """
-    size = video.width, video.height // 2
     points, colours = _sparse_points(points, _brightness(image))
-    later = [n for n in sorted(published) if 0 < n < min(video.frame_count, checked_frames)]
+    later = [n for n in images.numbers if 0 < n < checked_frames and n in published]
     moved = []
     for number in spread(later, 24):
-        forward, backward = (_project(points, pose, calibration) for pose in _readings(published[number]))
+        forward, backward = (_seen(points, pose, project) for pose in _readings(published[number]))
         if np.median(np.linalg.norm(forward - backward, axis=1)) > least_motion:
             moved.append(number)
     scores = []
-    for number, image in video.frames(spread(moved, 6)) if moved else ():
-        brightness = _brightness(split_stacked(image, video.path)[0])
-        pixels = [_project(points, pose, calibration) for pose in _readings(published[number])]
-        inside = np.all([((uv >= 0) & (uv <= np.array(size) - 1)).all(1) for uv in pixels], axis=0)
+    for number, left, _ in images.read(spread(moved, 6)):
+        brightness = _brightness(left)
+        pixels = [_seen(points, pose, project) for pose in _readings(published[number])]
+        inside = np.all([((uv >= 0) & (uv <= np.array(images.size) - 1)).all(1) for uv in pixels], axis=0)
         if inside.sum() < 50:
             continue
-        scores.append([_correlation(colours[inside], _sample(brightness, uv[inside])) for uv in pixels])
+        score = [_correlation(colours[inside], _sample(brightness, uv[inside])) for uv in pixels]
+        if np.isfinite(score).all():  # what is not a number decides nothing
+            scores.append(score)
     if not scores:
         logger.warning("%s: the camera moves too little to verify the pose direction; assuming %s", source, USUAL_DIRECTION)
         return USUAL_DIRECTION
@@ -100,11 +102,10 @@ def _sparse_points(points: np.ndarray, brightness: np.ndarray) -> tuple[np.ndarr
     return points[rows, columns].astype(np.float64), brightness[rows, columns]
 
 
-def _project(points: np.ndarray, view: np.ndarray, calibration: StereoCalibration) -> np.ndarray:
-    """Pixels [N, 2] of points [N, 3] in the raw left image of a camera with a world-to-camera transform."""
+def _seen(points: np.ndarray, view: np.ndarray, project: Projection) -> np.ndarray:
+    """Pixels [N, 2] of points [N, 3] in the left image of a camera with a world-to-camera transform; −1 of those behind it."""
     local = points @ view[:3, :3].T + view[:3, 3]
-    uv, _ = cv2.projectPoints(local, np.zeros(3), np.zeros(3), calibration.K_left, calibration.D_left)
-    return np.where(local[:, 2:] > 0, uv[:, 0], -1.0)
+    return np.where(local[:, 2:] > 0, project(local), -1.0)
 
 
 def _sample(image: np.ndarray, uv: np.ndarray) -> np.ndarray:

@@ -1,34 +1,52 @@
 """StereoMIS: da Vinci recordings with kinematic camera poses.
 
 P1/
-  *.mp4                     left eye stacked on top of right; or video_frames/%06dl.png, %06dr.png
+  *.mp4                     left eye stacked on top of right
+  video_frames/             %06dl.png, %06dr.png: what the authors' preprocessing writes, rectified, at half the size, numbered
+                            from 1; read where there is no video
   StereoCalibration.ini     both cameras, OpenCV; T in millimetres
-  groundtruth.txt           frame tx ty tz qx qy qz qw, camera-to-world, metres; not every frame
-  masks/%06dl.png           instruments; not every frame, sometimes at half resolution
-  train_split.csv, test_split.csv      start,end of the usable ranges, both inclusive
+  groundtruth.txt           row tx ty tz qx qy qz qw, camera-to-world, metres; not every row; some frames behind the images
+  masks/%06dl.png           instruments, not of every frame; of the preprocessing's images, numbered from 1 or from 0
+  train_split.csv, test_split.csv      start,end of the usable ranges; end is the frame to stop before
+
+Copies differ in the polarity and the numbers of the masks, and in whether images and masks are rectified. These and the lag of
+the poses are found from the images and logged; an option overrules each.
 """
 
+import bisect
 import configparser
 import csv
+import itertools
 import logging
-from collections.abc import Iterable, Iterator, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.frames import Frame, SequenceError
-from endo_sim_ros.sequences.images import check_size, image_size, numbered_files, read_image
-from endo_sim_ros.sequences.masks import MaskFiles
+from endo_sim_ros.sequences.images import numbered_files
+from endo_sim_ros.sequences.mask_alignment import MaskAlignment, Reading
+from endo_sim_ros.sequences.masks import MaskFiles, read_mask
 from endo_sim_ros.sequences.pose_files import read_poses
-from endo_sim_ros.sequences.recording import DEFAULT_FPS, Recording, check_folder, keep_posed, select, stamp_ns
+from endo_sim_ros.sequences.pose_lag import LagFinder
+from endo_sim_ros.sequences.recording import Recording, check_folder, keep_posed, select, spread, stamp_ns
 from endo_sim_ros.sequences.rectification import Rectification, StereoCalibration
-from endo_sim_ros.sequences.structure_from_motion import with_estimated_poses
-from endo_sim_ros.sequences.video_files import Video, find_video, split_stacked
+from endo_sim_ros.sequences.stereo_images import StackedVideo, StereoFiles, StereoImages, row_offsets
+from endo_sim_ros.sequences.structure_from_motion import wants_estimate, with_estimated_poses
+from endo_sim_ros.sequences.video_files import find_video
 
 logger = logging.getLogger(__name__)
 
 CALIBRATION_FILE = "StereoCalibration.ini"
+POSES_FILE = "groundtruth.txt"
+USUAL_LAG = 4  # frames: what the authors' own evaluation uses; others found 2 to 6 over seven sequences
+
+_SURVEYED = 1500  # frames that are looked at when fewer are chosen: a minute of video, in which the camera moves
+_SURE_ROWS = 0.5  # pixels by which one of two readings of the images must have the rows of the eyes closer together
+_SURVEY_WIDTH = 640  # pixels; larger images make features no better and take memory
 
 
 def read_stereomis(
@@ -38,68 +56,108 @@ def read_stereomis(
     stop: int | None = None,
     step: int = 1,
     split: str | None = None,
+    poses: Path | str | None = None,
+    pose_lag: int | None = None,
     mask_polarity: str = "auto",
     max_mask_gap: int = 1,
+    first_mask: int | None = None,
+    masks_rectified: bool | None = None,
+    frames_rectified: bool | None = None,
     fps: float | None = None,
 ) -> Recording:
     """Read a StereoMIS sequence.
 
     Args:
         path: The sequence's folder.
-        start, stop: First frame number, and the one to stop before.
+        start, stop: First frame number, and the one to stop before; the video's first frame is 0.
         step: Take every step-th frame.
         split: `train` or `test` keeps the frames of that split file only; None keeps all.
+        poses: `sfm` estimates the poses; None takes those in groundtruth.txt, and estimates them where it is missing.
+        pose_lag: Frame n has the pose in row n − pose_lag of groundtruth.txt; None finds it from the images, and takes 4 where they
+            do not tell.
         mask_polarity: What white means in the masks: `tool`, `tissue`, or `auto` to find out.
         max_mask_gap: A frame without a mask borrows one from at most this many frames away; further off, tools stay
             visible in it.
+        first_mask: The number that frame 0 has among the masks, 0 or 1; None finds out.
+        masks_rectified: Whether the masks belong to rectified images; None finds out.
+        frames_rectified: Whether the images in video_frames are rectified; None finds out.
         fps: Frames per second; None takes the video's, or 25 for extracted frames.
 
     Returns:
-        Rectified stereo frames; those without a pose are skipped. Without groundtruth.txt the poses are estimated.
+        Rectified stereo frames; those without a pose are skipped.
 
     Raises:
         SequenceError: If a file is missing or wrong.
     """
     root = check_folder(path)
+    if first_mask is not None and first_mask < 0:
+        raise SequenceError(f"{root}: first_mask must be 0 or more, got {first_mask}")
+    estimated = wants_estimate(poses, root) or not (root / POSES_FILE).is_file()
     calibration = read_stereo_ini(root / CALIBRATION_FILE)
-    images = _StackedVideo(root) if not (root / "video_frames").is_dir() else _ExtractedFrames(root / "video_frames")
+    images, is_rectified = _open_images(root, calibration, frames_rectified)
     rectification = Rectification.stereo(calibration.resized(*images.size))
     fps = fps or images.fps
 
-    usable = images.numbers
+    usable: Sequence[int] = images.numbers
     if split:
         ranges = _read_split(root, split)
-        usable = [n for n in usable if any(first <= n <= last for first, last in ranges)]
+        usable = [n for n in usable if any(first <= n < end for first, end in ranges)]
+        if not usable:
+            raise SequenceError(f"{root}: the {split} split holds none of the frames {images.numbers[0]} to {images.numbers[-1]}")
     numbers = select(usable, root, start, stop, step)
-    poses = None
-    if (root / "groundtruth.txt").is_file():
-        poses = read_poses(root / "groundtruth.txt")
-        numbers = keep_posed(numbers, poses, root / "groundtruth.txt")
-    else:
-        logger.warning("%s: no groundtruth.txt, so poses come from structure from motion", root)
+    rows = None if estimated else read_poses(root / POSES_FILE)
 
     mask_files = numbered_files(root / "masks", ending="l") or numbered_files(root / "masks")
     masks = MaskFiles(mask_files, root / "masks", mask_polarity)
-    mask_of = _nearest_masks(numbers, mask_files, max_mask_gap)
-    bare = sum(n not in mask_of for n in numbers)
+    for number in spread(sorted(mask_files), 2):
+        read_mask(mask_files[number], images.size)  # raises where they are of other images
+    readings = _mask_readings(root, mask_files, images, is_rectified, masks_rectified, first_mask)
+    surveyed = _surveyed(images.numbers, numbers)
+    alignment = MaskAlignment(mask_files, readings, surveyed, images.size)
+    scale = min(1.0, _SURVEY_WIDTH / images.size[0])
+    small = Camera(rectification.K, *images.size).resized(*(round(scale * side) for side in images.size))
+    finder = None
+    if rows is not None and pose_lag is None:
+        finder = LagFinder({row: rectification.pose(pose) for row, pose in rows.items()}, small, surveyed)
+    views = _look(images, is_rectified, rectification, alignment, finder, (small.width, small.height))
+
+    masks_rectified, first_mask = _chosen_reading(root, alignment, readings) if mask_files else readings[0]
+    masked = np.array(sorted(mask_files), np.int64) - first_mask  # frames, increasing
+    beyond = np.count_nonzero(~np.isin(masked, images.numbers))
+    if beyond:
+        logger.warning("%s: %d of %d masks have numbers of no frame", root / "masks", beyond, len(masked))
+
+    def tissue(number: int) -> np.ndarray:
+        nearest = _nearest(masked, number, max_mask_gap)
+        mask = None if nearest is None else masks.of(nearest + first_mask, images.size)
+        return rectification.mask(mask) if mask is None or not masks_rectified else cv2.bitwise_and(mask, rectification.valid)
+
+    if finder is not None:
+        pose_lag = _told_lag(
+            root, *finder.find(views, lambda n: cv2.resize(tissue(n), (small.width, small.height), interpolation=cv2.INTER_NEAREST))
+        )
+    del views
+    posed = {row + (pose_lag or 0): pose for row, pose in (rows or {}).items()}
+    if rows is not None:
+        numbers = keep_posed(numbers, posed, root / POSES_FILE)
+    bare = sum(_nearest(masked, n, max_mask_gap) is None for n in numbers)
     if mask_files and bare:
         logger.warning("%s: %d of %d frames have no mask; tools stay visible in them", root, bare, len(numbers))
 
     def frames() -> Iterator[Frame]:
         for number, left, right in images.read(numbers):
-            mask = masks.of(mask_of[number], images.size) if number in mask_of else None
-            pose = np.eye(4) if poses is None else rectification.pose(poses[number])
+            pose = np.eye(4) if rows is None else rectification.pose(posed[number])
             yield Frame(
                 stamp_ns=stamp_ns(number, fps),
-                image=rectification.left(left),
+                image=left if is_rectified else rectification.left(left),
                 camera=Camera(rectification.K, *images.size, pose),
-                right=rectification.right(right),
+                right=right if is_rectified else rectification.right(right),
                 baseline=rectification.baseline,
-                mask=rectification.mask(mask),
+                mask=tissue(number),
             )
 
     recording = Recording(frames, len(numbers))
-    return recording if poses is not None else with_estimated_poses(recording, root)
+    return recording if rows is not None else with_estimated_poses(recording, root)
 
 
 def read_stereo_ini(path: Path) -> StereoCalibration:
@@ -118,11 +176,14 @@ def read_stereo_ini(path: Path) -> StereoCalibration:
 
     def number(section: str, name: str) -> float:
         try:
-            return float(parser[section][name])
+            value = float(parser[section][name])
+            if math.isfinite(value):
+                return value
         except KeyError:
             raise SequenceError(f"{path}: [{section}] {name} is missing") from None
         except ValueError:
-            raise SequenceError(f"{path}: [{section}] {name} is not a number: {parser[section][name]!r}") from None
+            pass
+        raise SequenceError(f"{path}: [{section}] {name} is not a number: {parser[section][name]!r}")
 
     def camera(section: str) -> tuple[np.ndarray, np.ndarray]:
         fx, fy, cx, cy = (number(section, name) for name in ("fc_x", "fc_y", "cc_x", "cc_y"))
@@ -139,47 +200,114 @@ def read_stereo_ini(path: Path) -> StereoCalibration:
     return StereoCalibration(str(path), size, *left, *right, rotation, translation)
 
 
-class _StackedVideo:
-    """The images as published: one video with the eyes stacked."""
-
-    def __init__(self, root: Path):
-        path = find_video(root)
-        if path is None:
-            raise SequenceError(f"{root}: holds neither a video (*.mp4) nor a folder video_frames; copy one of them in")
-        self._video = Video(path)
-        self.fps = self._video.fps
-        self.numbers = list(range(self._video.frame_count))
-        self.size = self._video.width, self._video.height // 2
-
-    def read(self, numbers: Sequence[int]) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-        for number, image in self._video.frames(numbers):
-            yield number, *split_stacked(image, self._video.path)
+# ---------------------------------------------------------------------------------------------- what copies differ in
 
 
-class _ExtractedFrames:
-    """The images as extracted: `%06dl.png` and `%06dr.png`."""
+def _open_images(root: Path, calibration: StereoCalibration, rectified: bool | None) -> tuple[StereoImages, bool]:
+    """The video, or the extracted images where there is none; and whether they are rectified already."""
+    video = find_video(root)
+    if video is not None:
+        return StackedVideo(video), False
+    folder = root / "video_frames"
+    left = numbered_files(folder, ending="l")
+    if not left:
+        raise SequenceError(f"{root}: holds neither a video (*.mp4) nor images like video_frames/000001l.png; copy one of them in")
+    first = 0 if 0 in left else 1
+    images = StereoFiles(folder, left, numbered_files(folder, ending="r"), first)
+    if rectified is None:
+        offsets = row_offsets(images, calibration.resized(*images.size))
+        rectified = offsets is None or offsets[0] < offsets[1] + _SURE_ROWS  # as the authors' preprocessing writes them
+        logger.log(
+            logging.INFO if offsets and abs(offsets[0] - offsets[1]) > _SURE_ROWS else logging.WARNING,
+            "%s: images are taken for %s (%s), and the number of the first frame for %d",
+            folder, "rectified ones" if rectified else "raw ones",
+            "their eyes share too few features to tell" if offsets is None else
+            f"rows of the eyes are {offsets[0]:.2f} px apart as they are, {offsets[1]:.2f} px after rectification", first,
+        )  # fmt: skip
+    return images, rectified
 
-    fps = DEFAULT_FPS
 
-    def __init__(self, folder: Path):
-        self._left = numbered_files(folder, ending="l")
-        self._right = numbered_files(folder, ending="r")
-        self.numbers = sorted(self._left)
-        if not self.numbers:
-            raise SequenceError(f"{folder}: holds no left images named like 000000l.png")
-        missing = sorted(set(self._left) - set(self._right))
-        if missing:
-            raise SequenceError(f"{folder}: the right image of {self._left[missing[0]].name} is missing")
-        self.size = image_size(read_image(self._left[self.numbers[0]]))
+def _surveyed(numbers: Sequence[int], chosen: Sequence[int]) -> Sequence[int]:
+    """The frame numbers from the first to the last chosen one, and some around them where these are few."""
+    first, stop = bisect.bisect_left(numbers, chosen[0]), bisect.bisect_right(numbers, chosen[-1])
+    first = max(0, min(first, stop - _SURVEYED))  # rather those before, which are decoded anyway
+    return numbers[first : max(stop, first + _SURVEYED)]
 
-    def read(self, numbers: Sequence[int]) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-        for number in numbers:
-            left, right = (check_size(read_image(files[number]), self.size, files[number]) for files in (self._left, self._right))
-            yield number, left, right
+
+def _look(
+    images: StereoImages,
+    is_rectified: bool,
+    rectification: Rectification,
+    alignment: MaskAlignment,
+    finder: LagFinder | None,
+    size: tuple[int, int],
+) -> dict[int, np.ndarray]:
+    """Show the images to who wants to see them, in one pass; the finder's are returned, rectified, at a size (width, height)."""
+    of_lag = set(finder.frames) if finder else set()
+    wanted = sorted(of_lag.union(alignment.frames))
+    views = {}
+    if wanted:
+        logger.info("%s: looking at %d of the frames %d to %d", images.source, len(wanted), wanted[0], wanted[-1])
+    for number, left, _ in images.read(wanted):
+        straight = left if is_rectified else rectification.left(left)
+        alignment.see(number, left, straight)
+        if number in of_lag:
+            views[number] = cv2.resize(straight, size, interpolation=cv2.INTER_AREA)
+    return views
+
+
+def _mask_readings(
+    root: Path, files: Mapping[int, Path], images: StereoImages, is_rectified: bool, rectified: bool | None, first: int | None
+) -> list[Reading]:
+    """What the masks may belong to: rectified images or raw ones, and with which number of the first frame."""
+    kinds = [rectified] if rectified is not None else [True] if is_rectified else [True, False]
+    firsts = [1, 0] if first is None else [first]
+    if first is None and files:
+        from_0, from_1 = 0 in files, images.numbers[-1] + 1 in files
+        if from_0 and from_1:
+            logger.warning(
+                "%s: numbers go from 0 to %d, which are more than the frames 0 to %d; some masks are not of this sequence",
+                root / "masks", max(files), images.numbers[-1],
+            )  # fmt: skip
+        elif from_0 or from_1:
+            firsts = [0] if from_0 else [1]
+    return list(itertools.product(kinds, firsts))
+
+
+def _chosen_reading(root: Path, alignment: MaskAlignment, readings: Sequence[Reading]) -> Reading:
+    """The reading of the masks that fits the images; where they do not tell, as the authors' preprocessing writes them. It is logged."""
+    rectified, first = readings[0]
+    of_raw, from_0 = [r for r in readings if not r[0]], [r for r in readings if r[1] == 0]
+    told, reasons = True, ["nothing else fits the files and options", "no other number fits the files and options"]
+    if 0 < len(of_raw) < len(readings):
+        found, reasons[0] = alignment.compare([r for r in readings if r[0]], of_raw)
+        rectified, told = found is not False, found is not None
+    if 0 < len(from_0) < len(readings):
+        found, reasons[1] = alignment.compare([(rectified, 1)], [(rectified, 0)])
+        first, told = int(found is not False), told and found is not None
+    logger.log(
+        logging.INFO if told else logging.WARNING,
+        "%s: masks are taken for those of %s images (%s), numbered from %d (%s)%s",
+        root / "masks", "rectified" if rectified else "raw", reasons[0], first, reasons[1],
+        "" if told else "; state masks_rectified and first_mask if they are not",
+    )  # fmt: skip
+    return rectified, first
+
+
+def _told_lag(root: Path, lag: int | None, basis: str) -> int:
+    """The lag that was found, or the usual one; which of them is logged."""
+    if lag is None:
+        logger.warning(
+            "%s: the lag of the poses cannot be told from the images (%s); %d frames are assumed, which its authors found; "
+            "pass pose_lag if it is another", root, basis, USUAL_LAG,
+        )  # fmt: skip
+        return USUAL_LAG
+    logger.info("%s: poses lag the images by %d frames: %s", root, lag, basis)
+    return lag
 
 
 def _read_split(root: Path, split: str) -> list[tuple[int, int]]:
-    """Inclusive frame ranges of `train_split.csv` or `test_split.csv`."""
+    """Frame ranges, first and the one to stop before, of `train_split.csv` or `test_split.csv`."""
     if split not in ("train", "test"):
         raise SequenceError(f"{root}: split must be train, test or None, got {split!r}")
     path = root / f"{split}_split.csv"
@@ -191,20 +319,16 @@ def _read_split(root: Path, split: str) -> list[tuple[int, int]]:
             words = [word.strip() for word in row if word.strip()]
             if not words or (count == 1 and not words[0].lstrip("-").isdigit()):
                 continue  # an empty line or the heading
-            if len(words) < 2 or not (words[0].isdigit() and words[1].isdigit()) or int(words[0]) > int(words[1]):
-                raise SequenceError(f"{path}: line {count} is not a range `start,end`: {','.join(row)!r}")
+            if len(words) < 2 or not (words[0].isdigit() and words[1].isdigit()) or int(words[0]) >= int(words[1]):
+                raise SequenceError(f"{path}: line {count} is not a range `start,end` of frames before end: {','.join(row)!r}")
             ranges.append((int(words[0]), int(words[1])))
     if not ranges:
         raise SequenceError(f"{path}: holds no ranges; expected lines `start,end`")
     return ranges
 
 
-def _nearest_masks(numbers: list[int], masks: Iterable[int], max_gap: int) -> dict[int, int]:
-    """Number of the mask of each frame: its own, or the nearest within max_gap frames."""
-    available = np.array(sorted(masks), np.int64)
-    nearest = {}
-    for number in numbers if len(available) else ():
-        closest = int(available[np.argmin(np.abs(available - number))])
-        if abs(closest - number) <= max_gap:
-            nearest[number] = closest
-    return nearest
+def _nearest(numbers: np.ndarray, number: int, max_gap: int) -> int | None:
+    """The nearest to a number among increasing numbers [N], if it is at most max_gap away."""
+    at = np.searchsorted(numbers, number)
+    near = min(numbers[max(at - 1, 0) : at + 1].tolist(), key=lambda other: abs(other - number), default=None)
+    return near if near is not None and abs(near - number) <= max_gap else None

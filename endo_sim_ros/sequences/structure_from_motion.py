@@ -20,6 +20,8 @@ from endo_sim_ros.sequences.recording import Recording
 
 logger = logging.getLogger(__name__)
 
+STRUCTURE_FROM_MOTION = "sfm"  # what the readers' option `poses` says to ask for it
+
 _ALL_PAIRS = 60  # images up to which all pairs are matched, whose number grows with their square; of more, neighbours in time
 _LONG_RUN = 300  # images, from which on a run takes tens of minutes and a warning says so
 _PEAK_THRESHOLD = 0.002  # contrast of a SIFT feature; tissue has little, and COLMAP's 0.0067 finds a third of the features
@@ -91,6 +93,17 @@ def estimate_poses(
     return _result(model, count, K, baseline, scale)
 
 
+def wants_estimate(poses: Path | str | None, source: Path) -> bool:
+    """Whether a reader's option `poses` asks for structure from motion.
+
+    Raises:
+        SequenceError: If it is anything else but None, which takes the published poses.
+    """
+    if poses is not None and str(poses) != STRUCTURE_FROM_MOTION:
+        raise SequenceError(f"{source}: poses must be {STRUCTURE_FROM_MOTION!r} or left out for the published ones, got {str(poses)!r}")
+    return poses is not None
+
+
 def with_estimated_poses(recording: Recording, source: Path) -> Recording:
     """Frames of a calibrated camera with unknown poses, posed by structure from motion on first iteration.
 
@@ -102,7 +115,7 @@ def with_estimated_poses(recording: Recording, source: Path) -> Recording:
 
     def posed() -> Iterator[Frame]:
         if not poses:
-            logger.info("%s: has no poses; running structure from motion on %d frames", source, len(recording))
+            logger.info("%s: running structure from motion on %d frames", source, len(recording))
             first = next(iter(recording))
             stereo = first.right is not None
             try:

@@ -24,12 +24,10 @@ from endo_sim_ros.sequences.masks import MaskFiles, lit_area, lit_now, tissue_ma
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.recording import Recording, keep_posed, select, spread, stamp_ns
 from endo_sim_ros.sequences.rectification import Rectification
-from endo_sim_ros.sequences.structure_from_motion import estimate_poses
+from endo_sim_ros.sequences.structure_from_motion import STRUCTURE_FROM_MOTION, estimate_poses
 from endo_sim_ros.sequences.video_files import Video, find_video
 
 logger = logging.getLogger(__name__)
-
-STRUCTURE_FROM_MOTION = "sfm"
 
 
 def read_video(

@@ -12,10 +12,12 @@ import pytest
 import tifffile
 from plane_scene import (
     BARREL,
+    HEIGHT,
     K_LEFT,
     K_RIGHT,
     R_EYES,
     T_EYES,
+    WIDTH,
     assert_frame_agrees,
     plane_colours,
     pose_of,
@@ -27,8 +29,12 @@ from plane_scene import (
 )
 
 from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.sequences import scared as scared_reader
 from endo_sim_ros.sequences.readers import open_sequence
 from endo_sim_ros.sequences.scared import read_scared
+from endo_sim_ros.sequences.scared_archives import published_pose, read_frame_data
+from endo_sim_ros.sequences.scared_pose_direction import find_pose_direction
+from endo_sim_ros.sequences.stereo_images import StackedVideo
 
 
 def add_member(tar, name: str, data: bytes):
@@ -73,6 +79,37 @@ def write_scared(root: Path, *, world_to_camera=True, order=None, yaml=True, cou
             _, points = see_plane(K_LEFT, BARREL, poses[number])
             add_member(tar, f"./scene_points{number:06d}.tiff", tiff_bytes(1000 * np.vstack([points, points])))
     return root
+
+
+def extract(root: Path, *names: str):
+    """Replace archives by the folders that they unpack to."""
+    for name in names:
+        archive = root / f"data/{name}.tar.gz"
+        with tarfile.open(archive) as tar:
+            tar.extractall(root / "data" / name, filter="data")
+        archive.unlink()
+
+
+def preprocess(root: Path, *, disparity=False):
+    """Replace the video by what is commonly prepared of it: images rectified with OpenCV's defaults, and their disparity."""
+    size = (WIDTH, HEIGHT)
+    R1, R2, P1, P2, Q, *_ = cv2.stereoRectify(K_LEFT, BARREL, K_RIGHT, BARREL, size, R_EYES, 1000 * T_EYES[:, None])
+    maps = [cv2.initUndistortRectifyMap(K, BARREL, R, P, size, cv2.CV_32FC1) for K, R, P in ((K_LEFT, R1, P1), (K_RIGHT, R2, P2))]
+    poses = [
+        published_pose(document, root, number) for number, document in sorted(read_frame_data(root / "data/frame_data.tar.gz").items())
+    ]
+    for number, pose in enumerate(map(np.linalg.inv, poses)):
+        for eye, image, where in zip(("left", "right"), next(iter(stereo_images({0: pose}))), maps, strict=True):
+            write_rgb(root / f"data/{eye}_finalpass/frame_data{number:06d}.png", cv2.remap(image, *where, cv2.INTER_LINEAR))
+        if disparity:  # of the raw camera's points, without the rotation that rectifies
+            x, y, z = 1000 * np.moveaxis(see_plane(K_LEFT, BARREL, pose)[1], -1, 0)
+            u, v = (P1[0, 0] * x / z + P1[0, 2]).astype(int), (P1[0, 0] * y / z + P1[1, 2]).astype(int)
+            inside = (u >= 0) & (u < WIDTH) & (v >= 0) & (v < HEIGHT)
+            values = np.zeros((HEIGHT, WIDTH), np.float32)
+            values[v[inside], u[inside]] = (Q[2, 3] / Q[3, 2] / z)[inside]
+            (root / "data/disparity").mkdir(exist_ok=True)
+            tifffile.imwrite(root / f"data/disparity/frame_data{number:06d}.tiff", values)
+    (root / "data/rgb.mp4").unlink()
 
 
 @pytest.fixture
@@ -124,6 +161,92 @@ def test_scared_depth_choices(scared):
 
 
 @pytest.mark.slow
+def test_extracted_folders_are_the_archives(scared):
+    write_scared(scared)
+    published = list(read_scared(scared))
+    extract(scared, "frame_data", "scene_points")
+    (scared / "data/frame_data/notes.json").write_text("{}")  # has no number
+    for frame, expected in zip(open_sequence(scared), published, strict=True):
+        np.testing.assert_array_equal(frame.image, expected.image)
+        np.testing.assert_array_equal(frame.depth, expected.depth)
+        np.testing.assert_array_equal(frame.camera.pose, expected.camera.pose)
+    (scared / "data/scene_points/scene_points000003.tiff").write_bytes(b"no tiff")
+    with pytest.raises(SequenceError, match="scene_points000003.tiff: not a readable TIFF"):
+        list(read_scared(scared))
+    (scared / "data/frame_data/frame_data000001.json").write_text("{")
+    with pytest.raises(SequenceError, match="data/frame_data: frame_data000001.json is not valid JSON"):
+        read_scared(scared)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("extracted", [False, True], ids=["archives", "folders"])
+def test_images_that_are_rectified_already_are_not_rectified_again(scared, extracted, caplog):
+    write_scared(scared)
+    preprocess(scared)
+    if extracted:
+        extract(scared, "frame_data", "scene_points")
+    with caplog.at_level(logging.INFO):
+        frames = list(open_sequence(scared))
+    assert "camera-pose is world_to_camera" in caplog.text
+    assert len(frames) == 6
+    for frame in frames:
+        assert frame.baseline == pytest.approx(np.linalg.norm(T_EYES), rel=1e-6)
+        assert_frame_agrees(frame, tolerance=12)
+
+
+@pytest.mark.slow
+def test_disparity_is_read_where_there_are_no_points(scared, caplog):
+    write_scared(scared, count=2)
+    preprocess(scared, disparity=True)
+    (scared / "data/scene_points.tar.gz").unlink()
+    for frame in read_scared(scared):
+        _, depth = plane_colours(frame)
+        measured = frame.depth > 0
+        assert measured.mean() > 0.5
+        assert np.median(np.abs(frame.depth / depth - 1)[measured]) < 0.05
+    assert "depth comes from data/disparity" in caplog.text
+    tifffile.imwrite(scared / "data/disparity/frame_data000001.tiff", np.zeros((8, 8), np.float32))
+    with pytest.raises(SequenceError, match="frame_data000001.tiff: expected disparity of shape"):
+        list(read_scared(scared))
+
+
+@pytest.mark.slow
+def test_poses_can_be_estimated_instead_of_the_published(scared, monkeypatch):
+    write_scared(scared)
+    asked = []
+    monkeypatch.setattr(scared_reader, "with_estimated_poses", lambda recording, source: asked.append(source) or recording)
+    frames = list(read_scared(scared, poses="sfm"))
+    assert asked == [scared] and len(frames) == 6
+    assert all(np.array_equal(frame.camera.pose, frames[0].camera.pose) for frame in frames)
+
+
+@pytest.mark.slow
+def test_correlation_that_is_no_number_decides_nothing(scared, caplog):
+    write_scared(scared)
+    poses = {n: published_pose(document, scared, n) for n, document in read_frame_data(scared / "data/frame_data.tar.gz").items()}
+    images, keyframe = StackedVideo(scared / "data/rgb.mp4"), np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    points = np.dstack([np.zeros((HEIGHT, WIDTH, 2)), np.full((HEIGHT, WIDTH), 0.08)])
+    monkey = pytest.MonkeyPatch()
+    monkey.setattr("endo_sim_ros.sequences.scared_pose_direction._correlation", lambda a, b: float("nan"))
+    project = lambda local: 40 * local[:, :2] / local[:, 2:] + [80, 64] + 1000 * local[:, :2]
+    assert find_pose_direction(points, keyframe, images, poses, project, scared) == "world_to_camera"
+    monkey.undo()
+    assert "to verify the pose direction" in caplog.text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("folder", "told"), [("dataset_4/keyframe_1", True), ("dataset_5_keyframe_2", True), ("dataset_1/keyframe_4", False)]
+)
+def test_known_defects_are_told(tmp_path, folder, told, caplog):
+    root = tmp_path / folder
+    root.mkdir(parents=True)
+    write_scared(root, count=1)
+    read_scared(root)
+    assert ("is known to be wrong" in caplog.text) == told
+
+
+@pytest.mark.slow
 def test_scared_keyframe_alone(scared):
     write_scared(scared)
     (scared / "data/rgb.mp4").unlink()
@@ -163,6 +286,14 @@ def damage_json(root: Path, data: bytes):
         (lambda r: (r / "data/frame_data.tar.gz").write_bytes(b"no archive"), "frame_data.tar.gz: not a readable"),
         (lambda r: damage_json(r, b"{"), "frame_data000000.json is not valid JSON"),
         (lambda r: damage_json(r, b"[]"), "camera-pose of frame 0 is missing"),
+        (
+            lambda r: damage_json(r, b'{"camera-pose": [[NaN,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}'),
+            "camera-pose of frame 0: expected a finite",
+        ),
+        (
+            lambda r: (r / "data/frame_data.tar.gz").write_bytes((r / "data/frame_data.tar.gz").read_bytes()[:400]),
+            "frame_data.tar.gz: not a read",
+        ),
         (lambda r: damage_json(r, b'{"camera-pose": [[1]]}'), "camera-pose of frame 0: expected a finite 4×4"),
         (lambda r: damage_json(r, b" " * (2 << 20)), "far more than a camera needs"),
         (lambda r: (r / "data/scene_points.tar.gz").write_bytes(b"no archive"), "scene_points.tar.gz: not a readable"),

@@ -1,12 +1,15 @@
-"""The reader of StereoMIS, on a small exact copy of its layout."""
+"""The reader of StereoMIS: a textured plane for what is exact, and copies of the layout in every form in which it is found."""
 
 import logging
+import re
 import shutil
+import tracemalloc
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import stereomis_copy
 from plane_scene import (
     BARREL,
     HEIGHT,
@@ -16,16 +19,17 @@ from plane_scene import (
     T_EYES,
     WIDTH,
     assert_frame_agrees,
-    plane_colours,
     stereo_images,
     trajectory,
     write_poses,
     write_rgb,
     write_video,
 )
+from stereomis_copy import COUNT, FPS, write_stereomis
 
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.sequences.stereomis import read_stereomis
+from endo_sim_ros.sequences.rectification import Rectification
+from endo_sim_ros.sequences.stereomis import read_stereo_ini, read_stereomis
 
 
 def write_ini(path: Path):
@@ -38,32 +42,32 @@ def write_ini(path: Path):
     path.write_text("\n".join(lines))
 
 
+def numbers_of(frames, fps=20.0) -> list[int]:
+    return [round((frame.stamp_ns - 1_000_000_000) * fps / 1e9) for frame in frames]
+
+
 @pytest.fixture(scope="module")
-def stereomis_source(tmp_path_factory):
+def plane_source(tmp_path_factory):
     root = tmp_path_factory.mktemp("stereomis") / "P1"
     root.mkdir()
     poses = trajectory(8)
     write_ini(root / "StereoCalibration.ini")
     write_video(root / "IFBS_ENDOSCOPE-part0001.mp4", (np.vstack(pair) for pair in stereo_images(poses)), fps=20.0)
     write_poses(root / "groundtruth.txt", {n: pose for n, pose in poses.items() if n != 3})
-    (root / "train_split.csv").write_text("start,end\n0,1\n4,5\n")
-    (root / "test_split.csv").write_text("start,end\n6,7\n")
-    for number in (0, 4):
-        tool = np.zeros((HEIGHT // 2, WIDTH // 2), np.uint8)
-        tool[30:50, 30:] = 255
-        write_rgb(root / f"masks/{number:06d}l.png", tool)
+    (root / "train_split.csv").write_text("start,end\n0,1\n4,6\n")
+    (root / "test_split.csv").write_text("start,end\n6,8\n")
     return root
 
 
 @pytest.fixture
-def stereomis(stereomis_source, tmp_path):
+def plane(plane_source, tmp_path):
     """A copy that a test may damage."""
-    return Path(shutil.copytree(stereomis_source, tmp_path / "P1"))
+    return Path(shutil.copytree(plane_source, tmp_path / "P1"))
 
 
-def test_stereomis_frames_are_rectified_posed_and_timed(stereomis_source):
-    frames = list(read_stereomis(stereomis_source))
-    assert len(frames) == len(read_stereomis(stereomis_source)) == 7  # frame 3 has no pose
+def test_frames_are_rectified_posed_and_timed(plane_source):
+    frames = list(read_stereomis(plane_source, pose_lag=0))
+    assert len(frames) == len(read_stereomis(plane_source, pose_lag=0)) == 7  # frame 3 has no pose
     assert [f.stamp_ns for f in frames] == [1_000_000_000 + n * 50_000_000 for n in (0, 1, 2, 4, 5, 6, 7)]
     for frame in frames:
         assert frame.baseline == pytest.approx(np.linalg.norm(T_EYES), rel=1e-6)
@@ -71,76 +75,177 @@ def test_stereomis_frames_are_rectified_posed_and_timed(stereomis_source):
         assert_frame_agrees(frame, tolerance=12)
 
 
-def test_stereomis_counts_frames_without_pose_in_the_log(stereomis_source, caplog):
+def test_lag_that_is_stated_shifts_the_rows(plane_source):
+    assert numbers_of(read_stereomis(plane_source, pose_lag=2)) == [2, 3, 4, 6, 7]
+    assert numbers_of(read_stereomis(plane_source, pose_lag=-5)) == [0, 1, 2]
+
+
+def test_lag_of_too_short_a_sequence_is_assumed(plane_source, caplog):
+    assert numbers_of(read_stereomis(plane_source)) == [4, 5, 6]
+    assert "the lag of the poses cannot be told from the images" in caplog.text and "4 frames are assumed" in caplog.text
+
+
+def test_frames_without_pose_are_counted_in_the_log(plane_source, caplog):
     with caplog.at_level(logging.INFO):
-        read_stereomis(stereomis_source)
+        read_stereomis(plane_source, pose_lag=0)
     assert "groundtruth.txt: 1 of 8 frames have no pose" in caplog.text
-    assert "white is taken for tools" in caplog.text
 
 
-@pytest.mark.parametrize(("split", "numbers"), [("train", [0, 1, 4, 5]), ("test", [6, 7]), (None, [0, 1, 2, 4, 5, 6, 7])])
-def test_stereomis_splits_are_inclusive_ranges(stereomis_source, split, numbers):
-    frames = read_stereomis(stereomis_source, split=split)
-    assert [(f.stamp_ns - 1_000_000_000) // 50_000_000 for f in frames] == numbers
+@pytest.mark.parametrize(("split", "numbers"), [("train", [0, 4, 5]), ("test", [6, 7]), (None, [0, 1, 2, 4, 5, 6, 7])])
+def test_splits_end_before_their_end(plane_source, split, numbers):
+    assert numbers_of(read_stereomis(plane_source, split=split, pose_lag=0)) == numbers
 
 
-def test_stereomis_range_and_step(stereomis_source):
-    frames = read_stereomis(stereomis_source, start=1, stop=7, step=2)
-    assert [(f.stamp_ns - 1_000_000_000) // 50_000_000 for f in frames] == [1, 5]  # 3 has no pose
+def test_range_and_step(plane_source):
+    assert numbers_of(read_stereomis(plane_source, start=1, stop=7, step=2, pose_lag=0)) == [1, 5]  # 3 has no pose
 
 
-def test_stereomis_mask_ignores_the_tool_at_full_resolution_and_is_borrowed_from_a_neighbour(stereomis_source):
-    frames = {(f.stamp_ns - 1_000_000_000) // 50_000_000: f for f in read_stereomis(stereomis_source)}
+def test_reading_is_lazy_and_repeatable(plane):
+    write_rgb(plane / "masks/000001l.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    write_rgb(plane / "masks/000005l.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    write_rgb(plane / "masks/000008l.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    recording = read_stereomis(plane, mask_polarity="tool", masks_rectified=True, pose_lag=0)
+    first = next(iter(recording))
+    (plane / "masks/000005l.png").write_bytes(b"damaged")
+    assert next(iter(recording)).stamp_ns == first.stamp_ns
+    with pytest.raises(SequenceError, match="000005l.png"):
+        list(recording)
+
+
+def test_mask_is_borrowed_from_a_neighbour_only(plane, caplog):
+    tool = np.zeros((HEIGHT, WIDTH), np.uint8)
+    tool[60:100, 60:] = 255
+    for number in (0, 4):
+        write_rgb(plane / f"masks/{number:06d}l.png", tool)
+    frames = dict(zip((0, 1, 2, 4, 5, 6, 7), read_stereomis(plane, pose_lag=0, masks_rectified=False), strict=True))
     for number in (0, 1, 4, 5):
         mask = frames[number].mask
         assert mask.shape == (HEIGHT, WIDTH) and set(np.unique(mask)) == {0, 255}
         assert mask[80, 120] == 0  # the tool
         assert mask[20, 80] == 255
     assert frames[2].mask[80, 120] == frames[7].mask[80, 120] == 255  # no mask within one frame
+    assert "3 of 7 frames have no mask" in caplog.text
 
 
-def test_stereomis_masks_of_either_polarity_mean_the_same(stereomis):
-    usual = [f.mask for f in read_stereomis(stereomis)]
-    for path in (stereomis / "masks").glob("*.png"):
-        cv2.imwrite(str(path), 255 - cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
-    for mask, inverted in zip(usual, (f.mask for f in read_stereomis(stereomis)), strict=True):
-        np.testing.assert_array_equal(mask, inverted)
-    forced = next(iter(read_stereomis(stereomis, mask_polarity="tool"))).mask
-    assert forced[80, 120] == 255 and forced[20, 80] == 0
+# ------------------------------------------------------------------------------------ the forms in which copies are found
+
+
+def assert_masks_and_poses_fit(root: Path, recording, lag: int, size: tuple[int, int]):
+    """Masks are where the tools are in rectified images, and poses those at which the frames were rendered."""
+    frames = list(recording)
+    numbers = numbers_of(frames, FPS)
+    assert numbers == [n for n in range(COUNT) if 0 <= n - lag < COUNT and n - lag not in (7, 8, 21)]
+    raw = Rectification.stereo(read_stereo_ini(root / "StereoCalibration.ini"))
+    for number, frame in zip(numbers, frames, strict=True):
+        assert (frame.camera.width, frame.camera.height) == size
+        np.testing.assert_allclose(frame.camera.pose, raw.pose(stereomis_copy.pose_of_frame(number)), atol=1e-6)
+        left, _, tool = stereomis_copy.raw_frame(number)
+        truth = cv2.resize(raw.left(tool), size, interpolation=cv2.INTER_NEAREST) > 0
+        masked = (frame.mask == 0) & (cv2.resize(raw.valid, size, interpolation=cv2.INTER_NEAREST) > 0)
+        assert (truth & masked).sum() / (truth | masked).sum() > 0.85  # a pixel off is 0.9; rectified again 0.3
+        expected = cv2.resize(raw.left(left), size, interpolation=cv2.INTER_AREA).astype(float)
+        assert np.median(np.abs(frame.image - expected)) < 4
+
+
+FORMS = {
+    "as published": ({}, 4, "rectified images", 1),
+    "masks from 0": ({"first_mask": 0, "lag": 2, "masked": range(2, 37)}, 2, "rectified images", 0),
+    "masks from 1": ({"masked": range(2, 37), "lag": 6}, 6, "rectified images", 1),
+    "every third mask": ({"masked": range(3, 37, 3), "lag": -3}, -3, "rectified images", 1),
+    "masks of tissue": ({"white": "tissue"}, 4, "rectified images", 1),
+    "raw masks": ({"masks": "raw", "first_mask": 0, "lag": 0}, 0, "raw images", 0),
+    "frames beside the video": ({"frames": "rectified"}, 4, "rectified images", 1),
+    "frames alone": ({"frames": "rectified", "video": False}, 4, "rectified images", 1),
+    "frames alone, masks from 0": (
+        {"frames": "rectified", "video": False, "first_mask": 0, "masked": range(2, 37)},
+        4,
+        "rectified images",
+        0,
+    ),
+    "raw frames": ({"frames": "raw", "video": False, "masks": "raw", "first_mask": 0}, 4, "raw images", 0),
+}
 
 
 @pytest.mark.slow
-def test_stereomis_extracted_frames_equal_the_video(stereomis):
-    next(stereomis.glob("*.mp4")).unlink()
-    for number, (left, right) in enumerate(stereo_images(trajectory(8))):
-        write_rgb(stereomis / f"video_frames/{number:06d}l.png", left)
-        write_rgb(stereomis / f"video_frames/{number:06d}r.png", right)
-    frames = list(read_stereomis(stereomis))
-    assert len(frames) == 7
-    assert frames[1].stamp_ns - frames[0].stamp_ns == 40_000_000  # extracted frames have no rate; 25 Hz
-    for frame in frames:
-        assert_frame_agrees(frame)
+@pytest.mark.parametrize("form", FORMS)
+def test_every_form_is_recognised_from_its_data(form, tmp_path, caplog):
+    options, lag, kind, first = FORMS[form]
+    root = write_stereomis(tmp_path / "P2_1", **options)
+    with caplog.at_level(logging.INFO):
+        recording = read_stereomis(root, max_mask_gap=3)
+    small = not options.get("video", True) and options["frames"] == "rectified"
+    if "every" not in form:  # frames between masks have that of a neighbour
+        assert_masks_and_poses_fit(root, recording, lag, stereomis_copy.SMALL if small else (stereomis_copy.WIDTH, stereomis_copy.HEIGHT))
+    assert f"poses lag the images by {lag} frames" in caplog.text
+    assert re.search(rf"masks are taken for those of {kind} \(.*, numbered from {first} \(", caplog.text)
+    assert f"white is taken for {options.get('white', 'tool').replace('tool', 'tools')}" in caplog.text
+    if small:
+        assert "images are taken for rectified ones" in caplog.text
+    assert not [record for record in caplog.records if record.levelno > logging.INFO and "no mask" not in record.message]
 
 
 @pytest.mark.slow
-def test_intrinsics_follow_images_of_another_resolution(stereomis):
-    next(stereomis.glob("*.mp4")).unlink()
-    for number, pair in enumerate(stereo_images(trajectory(2))):
-        for eye, image in zip("lr", pair, strict=True):
-            write_rgb(stereomis / f"video_frames/{number:06d}{eye}.png", cv2.resize(image, None, fx=2, fy=2))
-    frame = next(iter(read_stereomis(stereomis)))
-    assert frame.image.shape == (2 * HEIGHT, 2 * WIDTH, 3)
-    expected, _ = plane_colours(frame)
-    assert np.median(np.abs(frame.image - expected)) < 3
+def test_options_overrule_what_images_tell(tmp_path, caplog):
+    root = write_stereomis(tmp_path / "P2_1")
+    with caplog.at_level(logging.INFO):
+        stated = read_stereomis(root, pose_lag=0, first_mask=0, masks_rectified=False)
+    assert "looking at" not in caplog.text
+    found = read_stereomis(root)
+    assert numbers_of(stated, FPS)[0] == 0 and numbers_of(found, FPS)[0] == 4
+    assert not np.array_equal(next(iter(stated)).mask, next(iter(found)).mask)
 
 
-def test_reading_is_lazy_and_repeatable(stereomis):
-    recording = read_stereomis(stereomis, mask_polarity="tool")
-    first = next(iter(recording))
-    (stereomis / "masks/000004l.png").write_bytes(b"damaged")
-    assert next(iter(recording)).stamp_ns == first.stamp_ns
-    with pytest.raises(SequenceError, match="000004l.png"):
-        list(recording)
+@pytest.mark.slow
+def test_camera_at_rest_does_not_tell_the_lag(tmp_path, caplog):
+    root = write_stereomis(tmp_path / "P2_1", lag=None)
+    write_poses(root / "groundtruth.txt", {row: stereomis_copy.pose_of_frame(5) for row in range(COUNT)})
+    assert numbers_of(read_stereomis(root), FPS)[0] == 4
+    assert "the camera moves too little" in caplog.text
+
+
+@pytest.mark.slow
+def test_poses_of_another_recording_do_not_tell_the_lag(tmp_path, caplog):
+    root = write_stereomis(tmp_path / "P2_1", lag=None)
+    write_poses(root / "groundtruth.txt", {row: stereomis_copy.true_poses()[-1 - row] for row in range(COUNT)})
+    read_stereomis(root)
+    assert "the lag of the poses cannot be told from the images (poses and images fit with none" in caplog.text
+
+
+@pytest.mark.slow
+def test_poses_can_be_estimated_instead(tmp_path):
+    root = write_stereomis(tmp_path / "P2_1")
+    frames = list(read_stereomis(root, poses="sfm", start=4, stop=34, step=6))
+    first = np.linalg.inv(frames[0].camera.pose) @ frames[-1].camera.pose
+    raw = Rectification.stereo(read_stereo_ini(root / "StereoCalibration.ini"))
+    one, other = (raw.pose(stereomis_copy.pose_of_frame(n)) for n in (4, 28))
+    truth = np.linalg.inv(one) @ other
+    assert len(frames) == 5
+    assert np.linalg.norm(first[:3, 3] - truth[:3, 3]) < 0.15 * np.linalg.norm(truth[:3, 3])
+    with pytest.raises(SequenceError, match="poses must be 'sfm'"):
+        read_stereomis(root, poses="colmap")
+
+
+@pytest.mark.slow
+def test_memory_does_not_grow_with_the_sequence(tmp_path):
+    root = write_stereomis(tmp_path / "P2_1")
+    video, masks = next(root.glob("*.mp4")), root / "masks"
+
+    def peak() -> float:
+        tracemalloc.start()
+        for _ in read_stereomis(root):
+            pass
+        _, most = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        return most
+
+    short = peak()
+    images = [np.vstack(stereomis_copy.raw_frame(n)[:2]) for n in range(COUNT)]
+    write_video(video, (images[n % COUNT] for n in range(10 * COUNT)), fps=FPS)
+    poses = {row: stereomis_copy.pose_of_frame(row % COUNT + 4) for row in range(10 * COUNT)}
+    write_poses(root / "groundtruth.txt", poses)
+    for number in range(COUNT + 1, 10 * COUNT + 1):
+        shutil.copy(masks / f"{(number - 1) % COUNT + 1:06d}l.png", masks / f"{number:06d}l.png")
+    assert peak() < short + 40e6  # ten times as many whole frames would be 100 MB; the images that are looked at are bounded
 
 
 @pytest.mark.parametrize(
@@ -152,6 +257,7 @@ def test_reading_is_lazy_and_repeatable(stereomis):
             "[StereoLeft]\nres_x=1\nres_y=1\nfc_x=5",
             r"StereoCalibration.ini: \[StereoLeft\] fc_y",
         ),
+        ("StereoCalibration.ini", "[StereoLeft]\nres_x=inf\nres_y=9", r"\[StereoLeft\] res_x is not a number: 'inf'"),
         ("StereoCalibration.ini", "no ini at all", "StereoCalibration.ini: not a readable ini"),
         ("groundtruth.txt", "0 0 0 0 0 0 1", "groundtruth.txt: line 1 has 7 numbers, expected 8"),
         ("groundtruth.txt", "0 0 0 0 0 0 0 0", "groundtruth.txt: line 1 is not a pose"),
@@ -160,16 +266,51 @@ def test_reading_is_lazy_and_repeatable(stereomis):
         ("groundtruth.txt", "0 0 0 0 0 0 0 1\nx y", "groundtruth.txt: line 2 is not made of numbers"),
         ("groundtruth.txt", "", "groundtruth.txt: holds no poses"),
         ("groundtruth.txt", "99 0 0 0 0 0 0 1", "groundtruth.txt: holds no pose for any of the 8"),
+        ("groundtruth.txt", "1000000000 0 0 0 0 0 0 1", "groundtruth.txt: holds no pose for any of the 8"),
         ("IFBS_ENDOSCOPE-part0001.mp4", "not a video", "part0001.mp4: not a readable video"),
         ("IFBS_ENDOSCOPE-part0001.mp4", None, "holds neither a video"),
         ("second.mp4", "", "more than one video"),
         ("train_split.csv", "start,end\n9,2\n", "train_split.csv: line 2 is not a range"),
+        ("train_split.csv", "start,end\n2,2\n", "train_split.csv: line 2 is not a range"),
+        ("train_split.csv", "start,end\n1000000,2000000\n", "the train split holds none of the frames 0 to 7"),
         ("train_split.csv", None, "train_split.csv: file is missing"),
     ],
 )
-def test_damaged_stereomis_is_refused_by_name(stereomis, name, text, message):
-    (stereomis / name).unlink(missing_ok=True)
+def test_damaged_stereomis_is_refused_by_name(plane, name, text, message):
+    (plane / name).unlink(missing_ok=True)
     if text is not None:
-        (stereomis / name).write_text(text)
+        (plane / name).write_text(text)
     with pytest.raises(SequenceError, match=message):
-        read_stereomis(stereomis, split="train" if "split" in name else None)
+        read_stereomis(plane, split="train" if "split" in name else None)
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda masks: write_rgb(masks / "000001l.png", np.zeros((64, 64), np.uint8)), "000001l.png: is 64×64, but the images are 160×128"),
+        (lambda masks: write_rgb(masks / "000004l.png", np.zeros((64, 64), np.uint8)), "000004l.png: is 64×64, but the images are 160×128"),
+        (lambda masks: (masks / "000001l.png").write_bytes(b"no image"), "000001l.png: not a readable image"),
+        (lambda masks: write_rgb(masks / "P1_1l.png", np.zeros((64, 80), np.uint8)), "have the same number"),
+    ],
+)
+def test_damaged_masks_are_refused_by_name(plane, damage, message):
+    for number in range(1, 9):
+        write_rgb(plane / f"masks/{number:06d}l.png", np.zeros((64, 80), np.uint8))
+    damage(plane / "masks")
+    with pytest.raises(SequenceError, match=message):
+        read_stereomis(plane)
+
+
+def test_masks_of_another_sequence_are_told(plane, caplog):
+    for number in (0, 8, 10**6):
+        write_rgb(plane / f"masks/{number:06d}l.png", np.zeros((64, 80), np.uint8))
+    read_stereomis(plane, pose_lag=0)
+    assert "numbers go from 0 to 1000000, which are more than the frames 0 to 7" in caplog.text
+    assert "2 of 3 masks have numbers of no frame" in caplog.text
+
+
+def test_right_images_must_be_there(plane):
+    next(plane.glob("*.mp4")).unlink()
+    write_rgb(plane / "video_frames/000001l.png", np.zeros((64, 80, 3), np.uint8))
+    with pytest.raises(SequenceError, match="video_frames: the right image of 000001l.png is missing"):
+        read_stereomis(plane)

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 
 from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.features import detect, match_pair
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import AnyFrame, ScenePoints, pixels_of
 from endo_sim_ros.reconstruction.stage_configs import MatchingConfig, StereoConfig
-from endo_sim_ros.reconstruction.triangulation import detect, match_pair
 from endo_sim_ros.sequences.masks import lit_area
 
 log = logging.getLogger(__name__)
@@ -70,7 +70,8 @@ def align_rows(view: AnyFrame, options: StereoConfig = StereoConfig(), matching:
     The image moves by whole pixels, the right eye's principal point by the rest: rectification is seldom that good.
     """
     assert view.right is not None
-    left, right = match_pair(detect(view.image, view.mask, matching), detect(view.right, None, matching), matching)
+    count = matching.max_features
+    left, right = match_pair(detect(view.image, view.mask, count), detect(view.right, None, count), matching.ratio)
     shifts = right[:, 1] - left[:, 1]
     shifts = shifts[np.abs(shifts) < options.max_row_offset * view.camera.height]
     if len(shifts) < matching.min_points:

@@ -1,0 +1,65 @@
+"""Features that two images share, and how far they are from where known cameras expect them."""
+
+import cv2
+import numpy as np
+
+from endo_sim_ros.core.cameras import Camera
+
+Features = tuple[np.ndarray, np.ndarray | None]  # pixels [N, 2] and descriptors [N, 128]
+
+
+def detect(image: np.ndarray, mask: np.ndarray | None, count: int) -> Features:
+    """Pixels [N, 2] and descriptors [N, 128] of the SIFT features of an RGB image [H, W, 3] where a mask [H, W] is not 0.
+
+    Args:
+        image: uint8.
+        mask: uint8; None takes features everywhere.
+        count: Features at most; the strongest are kept.
+    """
+    # A quarter of OpenCV's threshold: tissue has little contrast.
+    sift = cv2.SIFT.create(nfeatures=count, contrastThreshold=0.01)
+    keys, descriptors = sift.detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), mask)
+    return np.array([key.pt for key in keys]).reshape(-1, 2) + 0.5, descriptors  # OpenCV counts from the centre of the first pixel
+
+
+def match_pair(first: Features, second: Features, ratio: float) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels [M, 2] in the first and the second image of the features, as `detect` gives them, that pass the ratio test.
+
+    Args:
+        first, second: Features of two images.
+        ratio: Largest ratio of the distances of a feature's best and second-best match.
+    """
+    (uv_1, descriptors_1), (uv_2, descriptors_2) = first, second
+    if descriptors_1 is None or descriptors_2 is None or len(descriptors_2) < 2:
+        return np.empty((0, 2)), np.empty((0, 2))
+    matches = cv2.BFMatcher(cv2.NORM_L2).knnMatch(descriptors_1, descriptors_2, k=2)
+    good = [best for best, second_best in matches if best.distance < ratio * second_best.distance]
+    return uv_1[[match.queryIdx for match in good]], uv_2[[match.trainIdx for match in good]]
+
+
+def slopes(camera: Camera, uv: np.ndarray) -> np.ndarray:
+    """x/z and y/z [M, 2] of pixels [M, 2]."""
+    return (uv - camera.K[:2, 2]) / camera.K.diagonal()[:2]
+
+
+def epipolar_distance(
+    first: Camera, second: Camera, uv_1: np.ndarray, uv_2: np.ndarray, near: float = 1e-3, far: float = 1e3
+) -> np.ndarray:
+    """Pixels [M] from a feature in the second view to where the first view's feature may appear there: a piece of a line.
+
+    Where the camera only turns the piece is a point, so that turns are checked as well.
+
+    Args:
+        first, second: Cameras with poses.
+        uv_1, uv_2: Pixels [M, 2] of matched features.
+        near, far: Depths between which the features lie in the first view, metres; by default whatever an endoscope sees.
+    """
+    rays = np.column_stack([slopes(first, uv_1), np.ones(len(uv_1))]) @ first.pose[:3, :3].T
+    start, rise = (first.position - second.position) @ second.pose[:3, 2], rays @ second.pose[:3, 2]
+    nearest = np.maximum(near, (near / 2 - start) / np.maximum(rise, 1e-6))  # where both cameras have it in front of them
+    ends = [second.project(first.position + depth * rays) for depth in (nearest[:, None], far)]
+    (near_end, z_near), (far_end, z_far) = ends
+    along = far_end - near_end
+    t = ((uv_2 - near_end) * along).sum(1) / np.maximum((along * along).sum(1), 1e-12)
+    distance = np.linalg.norm(uv_2 - near_end - t.clip(0, 1)[:, None] * along, axis=1)
+    return np.where((z_near > 0) & (z_far > 0), distance, np.inf)

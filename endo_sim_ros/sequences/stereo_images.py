@@ -1,0 +1,108 @@
+"""The images of both eyes of a recording: stacked in a video, or in two sets of files."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from endo_sim_ros.core.features import detect, match_pair
+from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.sequences.images import check_size, image_size, read_image
+from endo_sim_ros.sequences.recording import DEFAULT_FPS, spread
+from endo_sim_ros.sequences.rectification import StereoCalibration
+from endo_sim_ros.sequences.video_files import Video, split_stacked
+
+
+class StereoImages(ABC):
+    """Numbered images of both eyes, read forwards.
+
+    Attributes:
+        source: Their file or folder, for messages.
+        numbers: The frame numbers that there are, increasing.
+        size: Width and height of an eye, pixels.
+        fps: Frames per second.
+    """
+
+    source: Path
+    numbers: Sequence[int]
+    size: tuple[int, int]
+    fps: float
+
+    @abstractmethod
+    def read(self, numbers: Sequence[int]) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+        """Number, left and right RGB image [H, W, 3], uint8, of given frames, whose numbers increase."""
+
+
+class StackedVideo(StereoImages):
+    """A video with the left eye stacked on top of the right one; see `StereoImages`."""
+
+    def __init__(self, path: Path):
+        self.source = path
+        self._video = Video(path)
+        if self._video.height % 2:
+            raise SequenceError(f"{path}: a stacked stereo video must have an even height, got {self._video.height}")
+        self.numbers: Sequence[int] = range(self._video.frame_count)
+        self.size = self._video.width, self._video.height // 2
+        self.fps = self._video.fps
+
+    def read(self, numbers: Sequence[int]) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:  # noqa: D102
+        for number, image in self._video.frames(numbers):
+            yield number, *split_stacked(image, self.source)
+
+
+class StereoFiles(StereoImages):
+    """Image files of both eyes; see `StereoImages`.
+
+    Args:
+        source: Their folder, for messages.
+        left, right: Files by the number in their name.
+        first: The number that frame 0 has in the files' names.
+    """
+
+    fps = DEFAULT_FPS
+
+    def __init__(self, source: Path, left: Mapping[int, Path], right: Mapping[int, Path], first: int = 0):
+        missing = sorted(set(left) - set(right))
+        if missing:
+            raise SequenceError(f"{source}: the right image of {left[missing[0]].name} is missing")
+        self.source = source
+        self._files = {number - first: (left[number], right[number]) for number in sorted(left)}
+        self.numbers: Sequence[int] = list(self._files)
+        self.size = image_size(read_image(self._files[self.numbers[0]][0]))
+
+    def read(self, numbers: Sequence[int]) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:  # noqa: D102
+        for number in numbers:
+            left, right = (check_size(read_image(file), self.size, file) for file in self._files[number])
+            yield number, left, right
+
+
+def row_offsets(
+    images: StereoImages,
+    calibration: StereoCalibration,
+    *,
+    pairs: int = 5,
+    features: int = 2000,
+    ratio: float = 0.8,
+    least_matches: int = 30,
+) -> tuple[float, float] | None:
+    """How many pixels apart the rows of matched features of both eyes are: as the images are, and after rectification.
+
+    Args:
+        images: Raw, or rectified already: the smaller number tells.
+        calibration: Of the raw cameras, for images of this size.
+        pairs: Pairs of images that are looked at.
+        features, ratio: As in `detect` and `match_pair`.
+        least_matches: Fewer tell nothing.
+
+    Returns:
+        Medians over all matches, or None where there are too few.
+    """
+    found = []
+    for _, left, right in images.read(spread(images.numbers, pairs)):
+        found.append(match_pair(detect(left, None, features), detect(right, None, features), ratio))
+    left, right = (np.concatenate(eye) for eye in zip(*found, strict=True))
+    if len(left) < least_matches:
+        return None
+    straight = calibration.rectified_points(left, right)
+    return tuple(float(np.median(np.abs(one[:, 1] - other[:, 1]))) for one, other in ((left, right), straight))  # pyright: ignore

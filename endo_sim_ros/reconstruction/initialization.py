@@ -1,5 +1,6 @@
 """The Gaussians that training starts from: depth back-projected from every view, checked between views."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -12,7 +13,7 @@ from endo_sim_ros.core.device import map_in_threads
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.reconstruction.progress import StageProgress
-from endo_sim_ros.reconstruction.scene import TrainingView, fill_holes
+from endo_sim_ros.reconstruction.scene import TrainingView, fill_holes, pixels_of
 from endo_sim_ros.reconstruction.stage_configs import InitialModelConfig
 
 
@@ -68,6 +69,12 @@ def initial_model(
         )
     tensors = [torch.from_numpy(array[:max_gaussians].astype(np.float32)) for array in (positions, *others)]
     return GaussianModel.from_points(*tensors, opacity=options.opacity, sh_degree=sh_degree)
+
+
+def rough_depth(views: Sequence[TrainingView], points: np.ndarray) -> float:
+    """Median depth (m) of the scene points [N, 3] in the views; NaN if fewer than three are in any, which may be stray."""
+    depths = [pixels_of(view.camera, points).depth for view in views]
+    return float(np.median(np.concatenate(depths))) if max(map(len, depths)) >= 3 else math.nan
 
 
 def _surface_pixels(views: list[TrainingView], tolerance: float, progress: StageProgress) -> list[np.ndarray]:

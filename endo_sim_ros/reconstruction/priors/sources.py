@@ -69,10 +69,22 @@ def estimate_depth(
         found = progress.map(lambda view: _with_prior(view, interpolate_points(view, points.positions, *options)), views)
         without = sum(view.depth_prior is None for view in found)
         if without:
-            text = "%d of %d views see fewer than %d scene points that agree and go without depth"
-            log.warning(text, without, len(views), config.matching.min_points)
+            log.warning("%d of %d views see fewer than %d scene points that agree", without, len(views), config.matching.min_points)
         return found
     return [_with_prior(view, None) for view in views]
+
+
+def borrow_depth(views: Sequence[TrainingView], config: ReconstructionConfig) -> list[TrainingView]:
+    """The views; those without a depth prior get one interpolated between what the others know, as between scene points."""
+    parts = []
+    for view in views:
+        stride = max(int(config.interpolation.cell * view.camera.width), 1)
+        taken = np.zeros(view.surface.shape, bool)
+        taken[::stride, ::stride] = view.surface[::stride, ::stride] > 0
+        parts.append(view.camera.backproject(view.surface)[taken])
+    points = np.concatenate(parts)
+    depth = lambda view: interpolate_points(view, points, config.interpolation, config.matching)
+    return [view if view.depth_prior is not None else _with_prior(view, depth(view)) for view in views]
 
 
 def depth_source(frames: Sequence[Frame], config: ReconstructionConfig) -> str:

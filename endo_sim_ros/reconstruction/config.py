@@ -113,9 +113,10 @@ class ReconstructionConfig(StageConfig):
     """Iterations after which that degree rises by one, from 0 on: 3DGS takes 1000, 0 = it is there from the start."""
     initialization: Literal["depth", "points"] = "depth"
     """What training starts from: the depth prior of every view, checked between views, or triangulated points alone."""
-    depth: Literal["auto", "topic", "stereo", "network", "points", "none"] = "auto"
-    """Depth prior: the depth topic, matching with the right image, a network that sees relative depth in one image,
-    interpolation between triangulated points, none, or the first of these that exists."""
+    depth: Literal["auto", "topic", "stereo", "network", "points", "none", "network_first"] = "auto"
+    """Depth prior: the depth topic, matching with the right image, a network that sees depth in one image, interpolation
+    between triangulated points, none, or the first of these that exists; network_first is auto, but with the network first, as the
+    paper has it, and a warning where there is none."""
     depth_model: str = ""
     """network: folder of a Depth-Anything-V2 checkpoint (transformers) or ONNX file; nothing is ever downloaded. Empty:
     one that Hugging Face's cache holds."""
@@ -207,8 +208,8 @@ class ReconstructionConfig(StageConfig):
     proximity: ProximityConfig = ProximityConfig()
 
     needs: ClassVar[dict[str, tuple[str, ...]]] = {
-        "depth_model": ("depth", "auto", "network"),
-        "network": ("depth", "auto", "network"),
+        "depth_model": ("depth", "auto", "network", "network_first"),
+        "network": ("depth", "auto", "network", "network_first"),
         "flat_ratio": ("lambda_flat", "more than 0"),
         "flat_every": ("lambda_flat", "more than 0"),
         "light_anchor": ("light", "true"),

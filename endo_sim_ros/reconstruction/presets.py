@@ -27,14 +27,14 @@ PRESETS: dict[Preset, dict[str, Any]] = {
     "default": {},
     # The same in a minute or two on a CPU.
     "laptop": {"image_width": 320, "iterations": 600, "learning_rate": 0.3, "max_gaussians": 15_000, "refine_every": 50},
-    # As printed (Yang): triangulated points, L1 depth, distortion and total variation, virtual cameras. Its weights are not
-    # printed, but adjusted to the scene: these of 19 tried have the most PSNR on average of four scenes.
-    "paper": _PLAIN | {"lambda_depth": 0.3, "lambda_dist": 0.01, "lambda_tv": 0.003},
+    # As printed (Yang): points of structure from motion, L1 depth of a network, distortion and total variation, virtual cameras.
+    # Its weights are not printed, but adjusted to the scene: these of 19 tried have the most PSNR on average of four scenes.
+    "paper": _PLAIN | {"depth": "network_first", "lambda_depth": 0.3, "lambda_dist": 0.01, "lambda_tv": 0.003},
     # Zhu et al. 2024: correlation with the depth prior, in pseudo-views too, and new Gaussians between those that lie alone. With
     # pseudo-views as often as it has them for three views (LLFF).
     "fsgs": _PUBLISHED | {
         "iterations": 10_000, "schedule": 10_000, "refine_until": 0.999, "sh_every": 500,
-        "lambda_pearson": 0.05, "virtual_every": 1, "virtual_from": 2000, "virtual_weight": 10.0,
+        "depth": "network_first", "lambda_pearson": 0.05, "virtual_every": 1, "virtual_from": 2000, "virtual_weight": 10.0,
         "densification": "proximity", "proximity.absolute": False, "proximity.threshold": 5e-4, "proximity.unpool_until": 2000,
         "proximity.reset_every": 3000, "proximity.reset_first": 2001, "proximity.reset_to": 0.05,
     },

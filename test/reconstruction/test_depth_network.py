@@ -1,5 +1,6 @@
 """Depth by a network: tiny ones built here go through the real loading code; what they see is made metric."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -7,9 +8,9 @@ import pytest
 from training_views import unknown
 
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.reconstruction import ReconstructionConfig
+from endo_sim_ros.reconstruction import ReconstructionConfig, prepare, preset
 from endo_sim_ros.reconstruction.priors.network import align, load_network, network_depth
-from endo_sim_ros.reconstruction.priors.sources import estimate_depth
+from endo_sim_ros.reconstruction.priors.sources import depth_source, estimate_depth
 from endo_sim_ros.reconstruction.stage_configs import NetworkDepthConfig
 from endo_sim_ros.reconstruction.triangulation import triangulate
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
@@ -95,6 +96,20 @@ def test_views_that_do_not_fit_are_dropped_and_none_at_all_is_an_error(views, ti
     points = triangulate(views)
     with pytest.raises(SequenceError, match="no view's depth fits"):
         estimate_depth(unknown(views), points, ReconstructionConfig(depth="network", depth_model=str(tiny), device="cpu"))
+
+
+@pytest.mark.slow
+def test_published_methods_take_a_network_first_and_say_what_they_take_instead(monkeypatch, tmp_path, caplog):
+    frames = list(phantom_sequence(PhantomConfig(width=160, height=128, frames=3)))
+    without = [dataclasses.replace(frame, depth=None) for frame in frames]
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path))
+    for name, config in (("paper", preset("paper", device="cpu")), ("fsgs", preset("fsgs", device="cpu"))):
+        scene = prepare(without, config, triangulate(frames))
+        assert scene.depth_source == "stereo", name
+        assert [text for text in scene.decisions if "NOT AS PUBLISHED" in text and "it is from stereo" in text] == [*scene.decisions], name
+    assert caplog.text.count("NOT AS PUBLISHED") == 2
+    checkpoint = preset("paper", depth_model=str(tmp_path))
+    assert depth_source(frames, checkpoint) == "network" != depth_source(frames, ReconstructionConfig(depth_model=str(tmp_path)))
 
 
 @pytest.mark.slow

@@ -18,8 +18,9 @@ _PLAIN = {  # points, colours and nothing else, with the densification of AbsGS:
 }  # fmt: skip
 
 _PUBLISHED = _PLAIN | {  # what the code of 3DGS and that of FSGS, which builds upon it, have alike. Opacities learn by 0.05, as in both;
-    # 3DGS halved that later. Neither limits the size of Gaussians, nor their number: a million only guards the memory.
-    "sh_degree": 3, "unit": "cameras", "max_gaussians": 1_000_000, "largest": 100.0, "refine_from": 500, "initial.opacity": 0.1,
+    # 3DGS halved that later. Neither limits the size of Gaussians, nor their number: a million only guards the memory. Their cameras stand
+    # around the scene, so that the extent of those is its depth; an endoscope's move by little, and `unit` is the depth here.
+    "sh_degree": 3, "max_gaussians": 1_000_000, "largest": 100.0, "refine_from": 500, "initial.opacity": 0.1,
     "rates.log_scales": 5e-3, "rates.sh_base": 2.5e-3, "lambda_depth": 0.0,
 }  # fmt: skip
 

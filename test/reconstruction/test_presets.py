@@ -63,15 +63,16 @@ def test_spherical_harmonics_rise_and_opacities_fall_as_planned(views):
 
 @pytest.mark.slow
 def test_learning_rates_follow_the_schedule_and_the_unit(views):
-    trainer = trainer_of(views[::4], preset("3dgs", **SHORT), triangulate(views)[:2])
+    trainer = trainer_of(views[::4], preset("3dgs", unit="cameras", **SHORT), triangulate(views)[:2])
     positions = np.array([camera.position for camera in trainer.cameras])
     extent = 1.1 * np.linalg.norm(positions - positions.mean(0), axis=1).max()
     trainer.run()
     trainer.step()
     assert trainer.optimizer.rates["means"] == pytest.approx(1.6e-4 * extent * 0.01 ** (12 / 30_000), rel=1e-6)
-    alone = trainer_of(views[:1], preset("3dgs", **SHORT), triangulate(views)[:2])
-    alone.step()
-    assert alone.optimizer.rates["means"] == pytest.approx(1.6e-4 * alone.scene_depth, rel=1e-6)
+    for frames, unit in ((views[::4], "depth"), (views[:1], "cameras")):  # one camera has no extent
+        other = trainer_of(frames, preset("3dgs", unit=unit, **SHORT), triangulate(views)[:2])
+        other.step()
+        assert other.optimizer.rates["means"] == pytest.approx(1.6e-4 * other.scene_depth, rel=1e-6)
 
 
 @pytest.mark.slow

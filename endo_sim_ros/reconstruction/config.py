@@ -118,8 +118,8 @@ class ReconstructionConfig(StageConfig):
     between triangulated points, none, or the first of these that exists; network_first is auto, but with the network first, as the
     paper has it, and a warning where there is none."""
     depth_model: str = ""
-    """network: folder of a Depth-Anything-V2 checkpoint (transformers) or ONNX file; nothing is ever downloaded. Empty:
-    one that Hugging Face's cache holds."""
+    """network: folder of a checkpoint of Depth-Anything-V2 or another depth network (transformers), or ONNX file; nothing is ever
+    downloaded. Empty: the Depth-Anything-V2 that Hugging Face's cache holds."""
     multi_view_refinement: bool = True
     """Correct the depth of stereo, network or points by scene points and by how the right image and the other views show the
     same tissue."""

@@ -133,7 +133,13 @@ def find_points(scene: PreparedScene, config: ReconstructionConfig, progress: St
 
 def find_depth(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Give each view its depth prior, and a right image that is rectified well."""
-    source, found = depth_source(scene.frames, config), estimate_depth(scene.views, scene.points, config, progress)
+    source = depth_source(scene.frames, config)
+    if config.depth == "network_first" and source != "network" and scene.depth_source == "none":  # else it has been said
+        scene = scene.decided(
+            f"DEPTH IS NOT AS PUBLISHED: the method takes it from a network, and no checkpoint of one is here, so it is from {source}; "
+            "give one as depth_model"
+        )
+    found = estimate_depth(scene.views, scene.points, config, progress)
     missing = [i for i, view in enumerate(found) if view.depth_prior is None]
     if missing and source != "none":
         found = borrow_depth(found, config)
@@ -325,4 +331,5 @@ def _misposed(
 
 def _checked_by_stereo(scene: PreparedScene, config: ReconstructionConfig) -> bool:
     """Whether the check of poses waits for the depth that pairs of images give."""
-    return config.depth in ("auto", "stereo") and any(frame.right is not None for frame in scene.frames)
+    paired = any(frame.right is not None for frame in scene.frames)
+    return paired and config.depth in ("auto", "stereo", "network_first") and depth_source(scene.frames, config) != "network"

@@ -35,7 +35,7 @@ def estimate_depth(
         views: Training views, best at full size: disparities are as precise as the pixels are fine.
         points: Triangulated scene points, to interpolate between, or to find a constant disparity offset of stereo matching.
         config: ``depth`` names the source; ``auto`` takes the depth topic, else stereo, else a network if there is one,
-            else the points. Each source has its own options.
+            else the points; ``network_first`` likewise after a network. Each source has its own options.
         progress: Reported to by views.
 
     Raises:
@@ -88,14 +88,17 @@ def borrow_depth(views: Sequence[TrainingView], config: ReconstructionConfig) ->
 
 
 def depth_source(frames: Sequence[Frame], config: ReconstructionConfig) -> str:
-    """Where the depth of these views is from: the source that is configured, or what ``auto`` finds."""
-    if config.depth != "auto":
+    """Where the depth of these views is from: the source that is configured, or what ``auto`` or ``network_first`` finds."""
+    if config.depth not in ("auto", "network_first"):
         return config.depth
+    has_network = lambda: bool(config.depth_model or cached_checkpoint())
+    if config.depth == "network_first" and has_network():
+        return "network"
     if _has_topic(frames):
         return "topic"
     if any(frame.right is not None for frame in frames):
         return "stereo"
-    return "network" if config.depth_model or cached_checkpoint() else "points"
+    return "network" if has_network() else "points"
 
 
 def interpolate_points(

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from endo_sim_ros.core.config import unused_options
+from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.reconstruction import photometry
@@ -226,6 +227,7 @@ def place_gaussians(scene: PreparedScene, config: ReconstructionConfig, progress
         sh_degree=config.sh_degree,
         options=config.initial,
         progress=progress,
+        device=pick_device(config.device),
     )
     positions = model.means.numpy().astype(np.float64)
     depths = np.concatenate([view.camera.project(positions)[1] for view in views])

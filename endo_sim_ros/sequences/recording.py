@@ -26,10 +26,12 @@ class Recording:
         frames: Begins to read.
         count: Number of frames expected, for progress bars; a damaged video or a frame that structure from motion could
             not place makes the iteration shorter.
+        points: Returns scene points [N, 3] (m, world of the frames) and their RGB [N, 3] in [0, 1], of structure from motion, or None.
     """
 
     frames: Callable[[], Iterator[Frame]]
     count: int
+    points: Callable[[], tuple[np.ndarray, np.ndarray] | None] = lambda: None
 
     def __iter__(self) -> Iterator[Frame]:
         return self.frames()

@@ -1,7 +1,6 @@
 """Camera poses from the images alone, by COLMAP's incremental structure from motion."""
 
 import contextlib
-import dataclasses
 import itertools
 import logging
 import tempfile
@@ -14,9 +13,8 @@ import cv2  # before pycolmap, whose own image library would otherwise break cv2
 import numpy as np
 
 from endo_sim_ros.core.cameras import intrinsic_matrix, invert_pose
-from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.sequences.images import image_size
-from endo_sim_ros.sequences.recording import Recording
 
 logger = logging.getLogger(__name__)
 
@@ -40,6 +38,7 @@ class StructureFromMotion:
         distortion: Coefficients (k1,) in OpenCV's sense, empty when K was given.
         reprojection_error: Mean over all observations, pixels.
         metric: False when the scale is a guess.
+        points: Scene points [N, 3] (m, world) and their RGB [N, 3] in [0, 1]; None where only poses were estimated.
     """
 
     poses: dict[int, np.ndarray]
@@ -47,6 +46,7 @@ class StructureFromMotion:
     distortion: tuple[float, ...]
     reprojection_error: float
     metric: bool
+    points: tuple[np.ndarray, np.ndarray] | None = None
 
 
 def estimate_poses(
@@ -91,49 +91,6 @@ def estimate_poses(
             logger.warning("structure from motion on %d images takes long; a larger step would do as well", count)
         model = _run_colmap(root, K, size, count, baseline, threads)
     return _result(model, count, K, baseline, scale)
-
-
-def wants_estimate(poses: Path | str | None, source: Path) -> bool:
-    """Whether a reader's option `poses` asks for structure from motion.
-
-    Raises:
-        SequenceError: If it is anything else but None, which takes the published poses.
-    """
-    if poses is not None and str(poses) != STRUCTURE_FROM_MOTION:
-        raise SequenceError(f"{source}: poses must be {STRUCTURE_FROM_MOTION!r} or left out for the published ones, got {str(poses)!r}")
-    return poses is not None
-
-
-def with_estimated_poses(recording: Recording, source: Path) -> Recording:
-    """Frames of a calibrated camera with unknown poses, posed by structure from motion on first iteration.
-
-    Args:
-        recording: Its frames have any pose; stereo frames make the result metric.
-        source: Its file or folder, for messages.
-    """
-    poses: dict[int, np.ndarray] = {}
-
-    def posed() -> Iterator[Frame]:
-        if not poses:
-            logger.info("%s: running structure from motion on %d frames", source, len(recording))
-            first = next(iter(recording))
-            stereo = first.right is not None
-            try:
-                result = estimate_poses(
-                    (frame.image for frame in recording),
-                    first.camera.K,
-                    masks=(frame.mask for frame in recording),
-                    right_images=(frame.right for frame in recording) if stereo else None,
-                    baseline=first.baseline if stereo else None,
-                )
-            except SequenceError as error:
-                raise SequenceError(f"{source}: {error}") from None
-            poses.update(result.poses)
-        for position, frame in enumerate(recording):
-            if position in poses:
-                yield dataclasses.replace(frame, camera=frame.camera.at(poses[position]))
-
-    return Recording(posed, len(recording))
 
 
 def _write_images(
@@ -200,7 +157,6 @@ def _run_colmap(root: Path, K: np.ndarray | None, size: tuple[int, int], count: 
             verification_options=verification, device=pycolmap.Device.cpu,
         )  # fmt: skip
         options = pycolmap.IncrementalPipelineOptions(num_threads=threads, random_seed=_SEED, min_model_size=2)
-        options.extract_colors = False
         options.mapper.random_seed = options.triangulation.random_seed = _SEED
         options.mapper.num_threads = threads
         if K is not None:
@@ -265,26 +221,16 @@ def _result(model: Any, count: int, K: np.ndarray | None, baseline: float | None
         shown = ", ".join(map(str, lost[:10])) + (", …" if len(lost) > 10 else "")
         logger.warning("structure from motion could not place %d of %d images: %s", len(lost), count, shown)
 
-    metric = True
-    pairs = [np.linalg.norm(eyes["right"][n][:3, 3] - left[n][:3, 3]) for n in left if n in eyes["right"]]
-    if baseline is not None and pairs:
-        factor = baseline / np.median(pairs)
-        logger.info("scale from the baseline of %d stereo pairs", len(pairs))
-    elif scale is not None:
-        factor = scale
-    else:
-        metric = False
-        factor = _GUESSED_DEPTH / np.median(depths)
-        logger.warning(
-            "THE SCALE IS A GUESS: one eye cannot tell size, so the median depth is set to %g m; "
-            "pass scale, or a stereo recording, where sizes and forces matter", _GUESSED_DEPTH,
-        )  # fmt: skip
+    pairs = [float(np.linalg.norm(eyes["right"][n][:3, 3] - left[n][:3, 3])) for n in left if n in eyes["right"]]
+    factor, metric = scale_to_metres(pairs, baseline, scale, np.array(depths))
 
     to_first = invert_pose(next(iter(left.values())))
     poses = {}
     for number, pose in left.items():
         poses[number] = to_first @ pose
         poses[number][:3, 3] *= factor
+    colors = np.array([point.color for point in model.points3D.values()]) / 255
+    scene_points = factor * (np.array(list(points.values())) @ to_first[:3, :3].T + to_first[:3, 3])
 
     distortion: tuple[float, ...] = ()
     if K is None:
@@ -293,4 +239,25 @@ def _result(model: Any, count: int, K: np.ndarray | None, baseline: float | None
         logger.warning("estimated a focal length of %.1f px and k1 %.3f, which may be wrong; pass the calibration if known", f, k1)
     error = float(model.compute_mean_reprojection_error())
     logger.info("structure from motion placed %d of %d images, %d points, %.2f px", len(left), count, len(points), error)
-    return StructureFromMotion(poses, np.asarray(K, np.float64), distortion, error, metric)
+    return StructureFromMotion(poses, np.asarray(K, np.float64), distortion, error, metric, (scene_points, colors))
+
+
+def scale_to_metres(pairs: list[float], baseline: float | None, scale: float | None, depths: np.ndarray) -> tuple[float, bool]:
+    """Metres per unit of a reconstruction, and whether they are more than a guess.
+
+    Args:
+        pairs: Distances between the eyes, in those units.
+        baseline: The same, metres.
+        scale: Metres per unit where there are no pairs.
+        depths: Of what is seen, in those units; without any of the above their median is taken for a usual one.
+    """
+    if baseline is not None and len(pairs):
+        logger.info("scale from the baseline of %d stereo pairs", len(pairs))
+        return float(baseline / np.median(pairs)), True
+    if scale is not None:
+        return scale, True
+    logger.warning(
+        "THE SCALE IS A GUESS: one eye cannot tell size, so the median depth is set to %g m; "
+        "pass scale, or a stereo recording, where sizes and forces matter", _GUESSED_DEPTH,
+    )  # fmt: skip
+    return float(_GUESSED_DEPTH / np.median(depths)), False

@@ -1,13 +1,16 @@
 """A recording, read lazily: which of its frames are taken, and when each was exposed."""
 
+import itertools
 import logging
+import pickle
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
+from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame, SequenceError
 
 logger = logging.getLogger(__name__)
@@ -36,6 +39,62 @@ class Recording:
 
     def __len__(self) -> int:
         return self.count
+
+    def take(self, positions: Container[int], count: int) -> "Recording":
+        """The frames at these positions alone, so many; the others are read again, but not held."""
+        chosen = lambda: (frame for position, frame in enumerate(self.frames()) if position in positions)
+        return Recording(lambda: itertools.islice(chosen(), count), count)
+
+
+class Glance(NamedTuple):
+    """What is kept of a frame whose images are not: there may be ten thousand."""
+
+    stamp_ns: int
+    camera: Camera
+    tissue: bool  # whether the mask leaves any
+
+    @classmethod
+    def at(cls, frame: Frame) -> "Glance":
+        """Of a frame."""
+        return cls(frame.stamp_ns, frame.camera, frame.mask is None or bool(frame.mask.any()))
+
+
+def survey(frames: Iterable[Frame], sample: int) -> tuple[list[Glance], list[Frame]]:
+    """A glance at every frame, and some of those with tissue, evenly spread: `sample` to twice as many where there are enough.
+
+    No more than these are held.
+    """
+    glances, held, step, shown = [], [], 1, 0
+    for frame in frames:
+        glances.append(Glance.at(frame))
+        if not glances[-1].tissue:
+            continue
+        if shown % step == 0:
+            held.append(frame)
+        if len(held) > 2 * sample:
+            held, step = held[::2], 2 * step
+        shown += 1
+    return glances, held
+
+
+@dataclass(frozen=True, eq=False)
+class StoredFrame:
+    """A frame in a file of this machine."""
+
+    stamp_ns: int
+    camera: Camera
+    file: Path
+
+    def load(self) -> Frame:
+        """The frame."""
+        return pickle.loads(self.file.read_bytes())
+
+
+def store(frame: Frame, file: Path) -> StoredFrame:
+    """Write a frame to a file, from which it is read again when it is needed."""
+    with file.open("wb") as out:
+        pickle.dump(frame, out, pickle.HIGHEST_PROTOCOL)
+    return StoredFrame(frame.stamp_ns, frame.camera, file)
 
 
 def stamp_ns(number: int, fps: float) -> int:

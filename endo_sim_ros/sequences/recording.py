@@ -4,7 +4,7 @@ import itertools
 import logging
 import pickle
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -28,7 +28,7 @@ class Recording:
     Args:
         frames: Begins to read.
         count: Number of frames expected, for progress bars; a damaged video or a frame that structure from motion could
-            not place makes the iteration shorter.
+            not place makes the iteration shorter. 0 = unknown.
     """
 
     frames: Callable[[], Iterator[Frame]]
@@ -83,18 +83,24 @@ class StoredFrame:
 
     stamp_ns: int
     camera: Camera
+    depth: bool  # whether it has any
     file: Path
+    content: bytes = b""  # of the file, where there is none
 
     def load(self) -> Frame:
         """The frame."""
-        return pickle.loads(self.file.read_bytes())
+        return pickle.loads(self.content or self.file.read_bytes())
+
+    def carried(self) -> "StoredFrame":
+        """The same for another machine."""
+        return replace(self, content=self.file.read_bytes())
 
 
 def store(frame: Frame, file: Path) -> StoredFrame:
     """Write a frame to a file, from which it is read again when it is needed."""
     with file.open("wb") as out:
         pickle.dump(frame, out, pickle.HIGHEST_PROTOCOL)
-    return StoredFrame(frame.stamp_ns, frame.camera, file)
+    return StoredFrame(frame.stamp_ns, frame.camera, frame.depth is not None, file)
 
 
 def stamp_ns(number: int, fps: float) -> int:

@@ -50,9 +50,9 @@ def test_a_camera_that_hardly_moves_has_eight_keyframes_and_a_flight_as_many_as_
     assert len(select_keyframes(flight(0.001))) == 8
     assert len(select_keyframes(flight(0.001, 5))) == 5
     caplog.set_level("INFO")
-    far, farther = (len(select_keyframes(flight(length))) for length in (0.3, 0.6))
-    assert 0.3 / (2 * 0.025 * 0.1067) <= far <= 0.3 / (0.02 * 0.1067)  # views are a millimetre apart
-    assert 1.5 * far < farther <= 200
+    far, farther = (len(select_keyframes(flight(length))) for length in (0.1, 0.2))
+    assert 0.1 / (2 * 0.02 * 0.1067) <= far <= 0.1 / (0.015 * 0.1067)  # views are a third of a millimetre apart
+    assert 1.3 * far < farther <= 200
     assert len(select_keyframes(flight(3.0))) == 200
     assert "keyframes of 300 views, enough" in caplog.text and "as many as coverage.max_keyframes allows" in caplog.text
 

@@ -109,7 +109,8 @@ def unused_options(*configs: "StageConfig") -> list[str]:
         switch, *wanted = configs[0].needs.get(option.name.partition(".")[0], ("",))
         if switch and any(each[option.name] != option.default for each in values):
             now = [each[switch] for each in values]
-            if not any(value in wanted if isinstance(value, str) else value for value in now):
+            # A number or a switch has to be on, unless 0 is what is wanted.
+            if not any(str(value) in wanted or not isinstance(value, str) and value and "0" not in wanted for value in now):
                 texts = " or ".join(dict.fromkeys(str(value).lower() for value in now))
                 found.append(f"{option.name} has no effect while {switch} is {texts}; set {switch} to {' or '.join(wanted)}")
     return found

@@ -35,6 +35,7 @@ class Cell(NamedTuple):
     mono: bool
     lpips: tuple[Backbone, ...]  # networks whose weights are there
     curve: int
+    most_held_out: int  # views that are measured
 
     @property
     def stem(self) -> str:
@@ -57,7 +58,13 @@ def list_cells(sequences: Sequence[str], config: EvaluationConfig) -> tuple[list
         check_split(split)
     networks, missing = _networks(config)
     methods = _methods(config)
-    given = {"train_depth": config.train_depth, "mono": config.mono, "lpips": networks, "curve": config.curve}
+    given = {
+        "train_depth": config.train_depth,
+        "mono": config.mono,
+        "lpips": networks,
+        "curve": config.curve,
+        "most_held_out": config.held_out,
+    }
     cells = [
         Cell(name, split, method, seed, options | {"seed": options["seed"] + seed}, source, **given)
         for name, source in names.items()

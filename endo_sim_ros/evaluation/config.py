@@ -20,6 +20,8 @@ class EvaluationConfig:
     """Presets of the trainer."""
     ablation: bool = False
     """Also each preset without one of its parts at a time."""
+    held_out: int = 1000
+    """Held-out views that are measured at most, evenly spread: of ten thousand frames the others would tell nothing new."""
     seeds: int = 1
     """Repetitions with other seeds; figures are then mean ± standard deviation."""
     set: tuple[str, ...] = ()
@@ -44,7 +46,7 @@ class EvaluationConfig:
     """File for the means as a list of rows; ratio is to 3dgs."""
 
     def __post_init__(self):
-        for name, least in (("seeds", 1), ("workers", 1), ("curve", 0)):
+        for name, least in (("held_out", 1), ("seeds", 1), ("workers", 1), ("curve", 0)):
             if getattr(self, name) < least:
                 raise ConfigError(f"--{name} must be {least} or more, got {getattr(self, name)}")
         for name in ("splits", "presets"):

@@ -7,6 +7,7 @@ this file runs the cells and gathers the results.
 import json
 import logging
 import pickle
+import shutil
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -16,7 +17,6 @@ from typing import Any
 import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from endo_sim_ros.core import drawing
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.evaluation import tables
 from endo_sim_ros.evaluation.cells import Cell, finished_record, list_cells, save_record
@@ -80,8 +80,9 @@ def _run(cells: list[Cell], config: EvaluationConfig) -> Iterator[tuple[Cell, Fi
         task = bar.add_task("cells", total=len(cells))
         for sequence in dict.fromkeys(cell.sequence for cell in cells):
             ours = [cell for cell in cells if cell.sequence == sequence]
+            files = Path(tempfile.mkdtemp(dir=folder))
             try:
-                prepared = prepare_sequence(ours, bar)
+                prepared = prepare_sequence(ours, bar, files)
             except (ValueError, OSError, RuntimeError) as error:
                 log.warning("%s failed: %s", sequence, error)
                 for index, cell in enumerate(ours):
@@ -93,11 +94,11 @@ def _run(cells: list[Cell], config: EvaluationConfig) -> Iterator[tuple[Cell, Fi
 
                 if not ray.is_initialized():
                     ray.init(log_to_driver=False, logging_level="ERROR")
-                shared = ray.put(prepared)
+                shared = ray.put(prepared.carried())
                 arguments = [(cell, config.weights, shared) for cell in ours]
                 events = run_in_ray(train_and_measure, arguments, devices[0] != "cpu", config.workers)
             else:
-                file = Path(folder) / f"{drawing.slug(sequence)}.pickle"
+                file = files / "prepared"
                 file.write_bytes(pickle.dumps(prepared))
                 events = run_in_processes(train_and_measure, [(cell, config.weights, file) for cell in ours], devices)
             del prepared
@@ -117,3 +118,4 @@ def _run(cells: list[Cell], config: EvaluationConfig) -> Iterator[tuple[Cell, Fi
                 if event.error:
                     log.warning("%s, %s, %s, seed %d failed: %s", *cell[:4], event.error)
                 yield cell, event
+            shutil.rmtree(files)

@@ -17,6 +17,7 @@ from endo_sim_ros.evaluation.lpips import Lpips
 from endo_sim_ros.reconstruction import Trainer, shrink
 from endo_sim_ros.reconstruction.triangulation import points_in_view
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
+from endo_sim_ros.sequences.recording import Recording
 
 log = logging.getLogger(__name__)
 
@@ -141,24 +142,22 @@ def difference(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
     return np.abs(image.astype(int) - reference).clip(0, 85).astype(np.uint8) * 3
 
 
-def measure_held_out(trainer: Trainer, frames: Sequence[Frame], out: Path) -> dict[str, float]:
+def measure_held_out(trainer: Trainer, frames: Sequence[Frame] | Recording, out: Path) -> dict[str, float]:
     """Mean figures over frames that were not trained on; also logs them, and draws some of the frames.
 
     Args:
         trainer: Finished training; `reconstruct_bag` returns it with the frames.
-        frames: Frames that were held out; those without tissue do not count.
+        frames: Frames that were held out, one of which is in memory at a time; those without tissue do not count.
         out: Folder for held_out.png.
     """
-    held_out = [shrink(frame, trainer.config.image_width) for frame in frames]
-    held_out = [frame for frame in held_out if frame.mask is None or frame.mask.any()]
-    if not held_out:
-        log.info("no view was held out that shows tissue%s", "; lower keyframes" if len(trainer.stamps) > 1 else "")
-        return {}
     model, drift = trainer.model, trainer.drift
     renderer = model_renderer(model, trainer.config.device)
     rows, pictures = [], []
-    shown = {int(i) for i in np.linspace(0, len(held_out) - 1, min(_STRIPS, len(held_out)))}
-    for index, frame in enumerate(held_out):
+    shown = {int(i) for i in np.linspace(0, len(frames) - 1, min(_STRIPS, len(frames)))}
+    for index, frame in enumerate(frames):
+        frame = shrink(frame, trainer.config.image_width)
+        if frame.mask is not None and not frame.mask.any():
+            continue
         image, depth = renderer.render(frame.camera, light=drift.at(model.light, frame.stamp_ns))
         rows.append(measure(image, depth, frame))
         if index in shown:
@@ -168,8 +167,11 @@ def measure_held_out(trainer: Trainer, frames: Sequence[Frame], out: Path) -> di
                 ("difference × 3", difference(image, frame.image)),
                 ("rendered depth", drawing.color_depth(depth)),
             ]
+    if not rows:
+        log.info("no view was held out that shows tissue%s", "; lower keyframes" if len(trainer.stamps) > 1 else "")
+        return {}
     drawing.write_png(out / "held_out.png", drawing.sheet(pictures, columns=4))
     found = mean_figures(rows)
     for name, value in found.items():
         log.info("%-30s %.4g", FIGURES[name].title, value)
-    return found | {"held_out_views": float(len(held_out))}
+    return found | {"held_out_views": float(len(rows))}

@@ -2,7 +2,8 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Sequence, Sized
+from collections.abc import Iterable, Iterator, Sequence, Sized
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -12,68 +13,105 @@ from scipy.spatial import KDTree
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.evaluation.cells import Cell
 from endo_sim_ros.evaluation.sources import open_named, split_source
-from endo_sim_ros.evaluation.splits import STEREO, right_views, split_views
+from endo_sim_ros.evaluation.splits import right_views, split_views
 from endo_sim_ros.reconstruction import ReconstructionConfig, ScenePoints, scene_points, shrink
 from endo_sim_ros.reconstruction.priors.sources import estimate_depth
 from endo_sim_ros.reconstruction.scene import TrainingView
 from endo_sim_ros.sequences.folder import read_points
-from endo_sim_ros.sequences.recording import Recording
+from endo_sim_ros.sequences.recording import Recording, StoredFrame, spread, store
 
 _POINT_VIEWS = 48  # views that structure from motion is done with
+_HELD = 48  # frames in memory at a time while their depth is matched, which needs three times their size
 _JUDGING = 10  # one scene point in so many judges depth where none was recorded
 _FEWEST_JUDGES = 50  # with fewer, none does
 _SAME_POINT = 0.1  # distance between two triangulations of one point, in distances between judging points
 
 
 class Prepared(NamedTuple):
-    """A sequence as all its cells use it."""
+    """A sequence as all its cells use it: its frames are in files until they are needed."""
 
-    frames: list[Frame]  # left images; those that no split trains on have the size at which they are measured
-    right: list[Frame]  # the right images as views, for the split of that name
+    count: int  # frames that show tissue; views are numbered by these
+    frames: dict[int, StoredFrame]  # left images of the views in some split; those that none trains on have the size of measuring
+    right: dict[int, StoredFrame]  # the right images as views, for the split of that name
     depth_source: str  # where the reference depth of the frames is from: recorded, stereo matching, or none
     points: ScenePoints  # of structure from motion with all views, like the poses
     judging: np.ndarray | None  # [N, 3] m, world: points that judge depth and are kept from the methods; None: no judges
 
+    def carried(self) -> "Prepared":
+        """The same for another machine."""
+        frames, right = ({number: frame.carried() for number, frame in views.items()} for views in (self.frames, self.right))
+        return self._replace(frames=frames, right=right)
 
-def prepare_sequence(cells: Sequence[Cell], bar: Progress) -> Prepared:
-    """Read the sequence of these cells; what is the same for all of them is done here, once."""
-    source = cells[0].source
-    frames, opened = [], open_named(source)
-    task = bar.add_task(f"reading {cells[0].sequence}", total=len(opened) if isinstance(opened, Sized) else None)
-    for frame in opened:
-        frames.append(frame)
-        bar.advance(task)
-    bar.remove_task(task)
-    frames = [frame for frame in frames if frame.mask is None or frame.mask.any()]
-    splits = {cell.split for cell in cells}
-    trained: set[int] = set()
+
+def prepare_sequence(cells: Sequence[Cell], bar: Progress, folder: Path) -> Prepared:
+    """Read the sequence of these cells; what is the same for all of them is done here, once.
+
+    A long one is read twice, first to count, then for the frames that some cell uses; no more than a few dozen are held.
+
+    Args:
+        cells: Cells of one sequence.
+        bar: Shows what is done.
+        folder: Empty; the frames are written to it.
+    """
+    source, stored, count = cells[0].source, {}, 0
+    opened, splits = open_named(source), {cell.split for cell in cells}
+    expected = len(opened) if isinstance(opened, Sized) else 0
+    at_once = 0 < expected <= cells[0].most_held_out
+    for frame in _tissue(opened, bar, f"reading {cells[0].sequence}", expected):
+        if at_once:
+            stored[count] = store(frame, folder / str(count))
+        count += 1
+    trained, measured, paired = set(), set(), set()  # numbers of views; paired: whose right image is measured
     for split in splits:
         with contextlib.suppress(SequenceError):  # too few views for this one: its own cells say so
-            trained.update(split_views(split, len(frames)).train)
+            parts = split_views(split, count, cells[0].most_held_out)
+            trained.update(parts.train)
+            (paired if parts.right else measured).update(parts.held_out)
+    pointed = spread(range(count), _POINT_VIEWS)
+    wanted = trained | measured | paired | set(pointed)
+    if not at_once:
+        for number, frame in enumerate(_tissue(opened, bar, f"reading {cells[0].sequence} again", expected)):
+            if number in wanted:
+                stored[number] = store(frame, folder / str(number))
     task = bar.add_task(f"scene points of {cells[0].sequence}", total=None)
     known = opened.points() if isinstance(opened, Recording) else read_points(split_source(source)[0])  # else a bag
-    points = ScenePoints.recorded(*known) if known else scene_points(frames, _POINT_VIEWS)
+    points = ScenePoints.recorded(*known) if known else scene_points([stored[number].load() for number in pointed], _POINT_VIEWS)
     bar.remove_task(task)
-    depth_source, matched, judging = "none", frames, None
-    recorded = any(frame.depth is not None and (frame.depth > 0).any() for frame in frames)
+    recorded = any(frame.depth and (frame.load().depth > 0).any() for frame in stored.values())
+    judging = None
     if not recorded:
         points, judging = divide_points(points)
-    if any(frame.right is not None for frame in frames) and (STEREO in splits or not recorded):
-        task = bar.add_task(f"stereo matching of {cells[0].sequence}", total=None)
-        views = estimate_depth([TrainingView.of(frame) for frame in frames], points, ReconstructionConfig(depth="stereo"))
-        matched = [dataclasses.replace(view, depth=view.depth_prior) for view in views]
-        bar.remove_task(task)
-    if recorded:
-        depth_source = "recorded"
-    elif matched is not frames:
-        frames = [dataclasses.replace(frame, depth=_trusted(match)) for frame, match in zip(frames, matched)]
-        if any(frame.depth is not None for frame in frames):
-            depth_source = "stereo matching"
     width = max(cell.options["image_width"] for cell in cells)
-    paired = STEREO in splits and any(frame.right is not None for frame in frames)
-    right = [shrink(frame, width) for frame in right_views(matched)] if paired else []
     small = lambda frame: shrink(dataclasses.replace(frame, right=None, baseline=None, right_K=None), width)
-    return Prepared([f if i in trained else small(f) for i, f in enumerate(frames)], right, depth_source, points, judging)
+    numbers, right, matched = sorted(stored), {}, False
+    task = bar.add_task(f"depth of {cells[0].sequence}", total=len(numbers))
+    for start in range(0, len(numbers), _HELD):
+        some = numbers[start : start + _HELD]
+        frames = [stored[number].load() for number in some]
+        if any(frame.right is not None for frame in frames) and (paired or not recorded):
+            views = estimate_depth([TrainingView.of(frame) for frame in frames], points, ReconstructionConfig(depth="stereo"))
+            if both := {number: view for number, view in zip(some, views) if view.right is not None and number in paired}:
+                for number, view in zip(both, right_views(list(both.values()))):
+                    right[number] = store(shrink(view, width), folder / f"right-{number}")
+            if not recorded:
+                frames = [dataclasses.replace(frame, depth=_trusted(view)) for frame, view in zip(frames, views)]
+                matched |= any(frame.depth is not None for frame in frames)
+        for number, frame in zip(some, frames):
+            stored[number] = store(frame if number in trained else small(frame), folder / str(number))
+        bar.advance(task, len(some))
+    bar.remove_task(task)
+    depth_source = "recorded" if recorded else "stereo matching" if matched else "none"
+    return Prepared(count, stored, right, depth_source, points, judging)
+
+
+def _tissue(frames: Iterable[Frame], bar: Progress, text: str, expected: int) -> Iterator[Frame]:
+    """Those of the frames whose mask leaves tissue."""
+    task = bar.add_task(text, total=expected or None)
+    for frame in frames:
+        bar.advance(task)
+        if frame.mask is None or frame.mask.any():
+            yield frame
+    bar.remove_task(task)
 
 
 def divide_points(points: ScenePoints) -> tuple[ScenePoints, np.ndarray | None]:
@@ -91,9 +129,9 @@ def divide_points(points: ScenePoints) -> tuple[ScenePoints, np.ndarray | None]:
     return ScenePoints(points.positions[kept], points.colors[kept], error[kept] if error.ndim else points.error), judging
 
 
-def _trusted(frame: Frame) -> np.ndarray | None:
+def _trusted(view: TrainingView) -> np.ndarray | None:
     """Matched depth [H, W] (m, 0 = none) where the disparity is above 10 pixels: half a pixel is 5 % of it. None if that is nowhere."""
-    if frame.depth is None or frame.baseline is None:
+    if view.depth_prior is None or view.baseline is None:
         return None
-    trusted = np.where(frame.depth < frame.camera.K[0, 0] * frame.baseline / 10, frame.depth, 0)
+    trusted = np.where(view.depth_prior < view.camera.K[0, 0] * view.baseline / 10, view.depth_prior, 0)
     return trusted if trusted.any() else None

@@ -1,5 +1,6 @@
 """Sequences as they are named on the command line: a path or `phantom:SEED`, then options of the reader as `,name=value`."""
 
+import itertools
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -58,5 +59,8 @@ def open_named(source: str) -> Iterable[Frame]:
         unknown = set(given) - {"start", "stop", "step"}
         if unknown:
             raise SequenceError(f"{place}: a bag has no option {', '.join(sorted(unknown))}; it has start, stop and step")
-        return list(read_bag(path))[slice(*(given.get(name) for name in ("start", "stop", "step")))]
+        part = [given.get(name) for name in ("start", "stop", "step")]
+        if any(value is not None and not value >= least for value, least in zip(part, (0, 0, 1))):
+            raise SequenceError(f"{place}: start and stop are 0 or more, step is 1 or more")
+        return Recording(lambda: itertools.islice(read_bag(path), *part), 0)
     return open_sequence(path, **given)

@@ -29,7 +29,7 @@ def check_split(name: str) -> None:
         raise SequenceError(f"there is no split {name!r}; give {_HELP}")
 
 
-def split_views(name: str, count: int) -> Split:
+def split_views(name: str, count: int, most: int | None = None) -> Split:
     """Divide ``count`` views.
 
     Args:
@@ -37,14 +37,16 @@ def split_views(name: str, count: int) -> Split:
             train. `every-12th`: every twelfth trains, from the first on. `all-but-12th`: every twelfth is held out instead.
             `stereo`: every left image trains, every right image is held out.
         count: Number of views of the sequence.
+        most: Views to hold out at most, evenly spread; the others count nowhere.
 
     Raises:
         SequenceError: If there is no such split, or it leaves no view to train on or none to hold out.
     """
     check_split(name)
     everything = list(range(count))
+    fewer = lambda views: views if most is None else spread(views, most)
     if name == STEREO:
-        return Split(everything, everything, right=True)
+        return Split(everything, fewer(everything), right=True)
     if name == TWO_VIEWS:
         trains = lambda i: i in (0, count - 1)
     elif ratio := re.fullmatch(_RATIO, name):
@@ -57,7 +59,7 @@ def split_views(name: str, count: int) -> Split:
     held_out = sorted(set(everything) - set(train))
     if not train or not held_out:
         raise SequenceError(f"split {name} of {count} views leaves {len(train)} to train on and {len(held_out)} to hold out")
-    return Split(train, held_out)
+    return Split(train, fewer(held_out))
 
 
 def explain_split(name: str) -> str:

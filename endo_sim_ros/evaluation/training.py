@@ -70,66 +70,75 @@ def train_and_measure(argument: tuple[Cell, Path | None, Prepared | Path], devic
     if isinstance(prepared, Path):
         prepared = _load(prepared)
     config = ReconstructionConfig.from_mapping(cell.options | {"device": device})
-    split = split_views(cell.split, len(prepared.frames))
-    views = [prepared.frames[index] for index in split.train]
+    split = split_views(cell.split, prepared.count, cell.most_held_out)
+    views = [prepared.frames[number].load() for number in split.train]
     if not (cell.train_depth and prepared.depth_source == "recorded"):
         views = [dataclasses.replace(view, depth=None) for view in views]
     if cell.mono or split.right:
         views = [dataclasses.replace(view, right=None, baseline=None, right_K=None) for view in views]
     if split.right and not prepared.right:
         raise SequenceError("split stereo: the sequence has no right images")
-    held_out = prepared.right if split.right else [prepared.frames[index] for index in split.held_out]
-    held_out = [shrink(frame, config.image_width) for frame in held_out]
+    held_out = prepared.right if split.right else {number: prepared.frames[number] for number in split.held_out}
+    load = lambda number: shrink(held_out[number].load(), config.image_width)
+    given = [
+        *["right images"] * any(view.right is not None for view in views),
+        *["recorded depth"] * any(view.depth is not None for view in views),
+    ]
     report((0, 1, "warming up"))
     _warm_up(device)
     training: dict[str, Any] = {}
 
     def train() -> None:
-        training.update(_train(cell, views, config, prepared.points, spread(held_out, _CURVE_VIEWS), report))
+        probes = [load(number) for number in spread(list(held_out), _CURVE_VIEWS)] if cell.curve else []
+        training.update(_train(cell, views, config, prepared.points, probes, report))
 
     memory = peak_megabytes(train, device)
+    views.clear()  # they are large
     model, drift = training.pop("model"), training.pop("drift")
     report((0, len(held_out), "measuring"))
     networks = [_network(name, weights, device) for name in cell.lpips]
-    seen_by = [shrink(prepared.frames[index], config.image_width) for index in split.train]
+    trained = [prepared.frames[number] for number in split.train]
+    seen_by = [dataclasses.replace(shrink(view.load(), config.image_width), right=None) for view in trained]
     renderer = model_renderer(model, device)
-    shown = set(spread(range(len(held_out)), _SHOWN))
+    shown = set(spread(list(held_out), _SHOWN))
     # Without reference depth that of the model tells what was seen.
-    known = all(frame.depth is not None for frame in [*held_out, *seen_by])
+    known = all(frame.depth for frame in [*held_out.values(), *trained])
     depth_of = lambda view: view.depth if known else renderer.render(view.camera)[1]
     surfaces = [(view.camera, depth_of(view), view.mask) for view in seen_by]
 
-    def of_view(index: int, image: np.ndarray, depth: np.ndarray) -> tuple[dict[str, float], dict[str, bytes]]:
-        frame, number = held_out[index], split.held_out[index]
+    def of_view(number: int, frame: Frame, image: np.ndarray, depth: np.ndarray) -> tuple[dict[str, float], dict[str, bytes], float]:
         seen = seen_pixels(frame.camera, depth if frame.depth is None or not known else frame.depth, surfaces)
         found = measure(image, depth, frame, seen, networks, prepared.judging)
         row = {"view": number} | {name: value for name, value in found.items() if np.isfinite(value)}
-        return row, _pictures(number, image, depth, frame) if index in shown else {}
+        pictures = _pictures(number, image, depth, frame) if number in shown else {}
+        return row, pictures, _reference_at_points(frame, prepared.judging)
 
     deformed = {"psnr_deformed": deformed_view_psnr(model, [view.camera for view in seen_by], device)}
     deformed = {name: value for name, value in deformed.items() if np.isfinite(value)}
-    rows, pictures = [], {}
+    rows, pictures, off, masked, size = [], {}, [], False, [0, 0]
     with ThreadPoolExecutor(cpu_threads()) as pool:  # measuring takes longer than drawing
         waiting = deque()
-        for index, frame in enumerate(held_out):
-            waiting.append(pool.submit(of_view, index, *renderer.render(frame.camera, light=drift.at(model.light, frame.stamp_ns))))
+        for index, number in enumerate(held_out):
+            frame = load(number)
+            size = [frame.camera.width, frame.camera.height]
+            masked |= frame.mask is not None and not frame.mask.all()
+            drawn = renderer.render(frame.camera, light=drift.at(model.light, frame.stamp_ns))
+            waiting.append(pool.submit(of_view, number, frame, *drawn))
             while len(waiting) > 2 * cpu_threads() or waiting and index == len(held_out) - 1:
-                row, new = waiting.popleft().result()
+                row, new, error = waiting.popleft().result()
                 rows.append(row)
                 pictures |= new
+                off += [error] * bool(np.isfinite(error))
                 report((len(rows), len(held_out), "measuring"))
     return {
         "machine": machine(device),
-        "size": [held_out[0].camera.width, held_out[0].camera.height],
+        "size": size,
         "train": split.train,
         "held_out": len(held_out),
-        "masked": any(frame.mask is not None and not frame.mask.all() for frame in held_out),
+        "masked": bool(masked),
         "depth_source": "none" if split.right else prepared.depth_source,
-        "given": [
-            *["right images"] * any(view.right is not None for view in views),
-            *["recorded depth"] * any(view.depth is not None for view in views),
-        ],
-        "reference_at_points": _reference_at_points(held_out, prepared.judging),
+        "given": given,
+        "reference_at_points": float(np.mean(off)) if off else None,
         "seen_by": "reference" if known else "model",
         "figures": mean_figures(rows) | deformed | {"seconds": training["seconds"], "gaussians": len(model), "megabytes": memory},
         "views": rows,
@@ -138,17 +147,11 @@ def train_and_measure(argument: tuple[Cell, Path | None, Prepared | Path], devic
     }
 
 
-def _reference_at_points(held_out: list[Frame], judging: np.ndarray | None) -> float | None:
-    """How far the reference depth is off at the scene points that judge, metres; None if there are not both."""
-    if judging is None:
-        return None
-    off = [
-        metrics.depth_at_points(frame.depth, *points_in_view(frame.camera, judging), frame.mask)
-        for frame in held_out
-        if frame.depth is not None
-    ]
-    off = [value for value in off if np.isfinite(value)]
-    return float(np.mean(off)) if off else None
+def _reference_at_points(frame: Frame, judging: np.ndarray | None) -> float:
+    """How far the reference depth is off at the scene points that judge, metres; NaN if there are not both."""
+    if judging is None or frame.depth is None:
+        return np.nan
+    return metrics.depth_at_points(frame.depth, *points_in_view(frame.camera, judging), frame.mask)
 
 
 def _train(

@@ -127,6 +127,7 @@ def _touch_over_dds(
             "reconstruction_node",
             start_after=0.0,  # asked to, below
             output_dir=out / "models",
+            keyframes=8,
             image_width=width,
             iterations=iterations,
             max_gaussians=30_000,

@@ -67,8 +67,8 @@ class ReconstructionNodeConfig(WorldConfig):
     on a call of the service ~/reconstruct."""
     start_views: Annotated[int, Range(0, 100_000)] = 0
     """Reconstruct once when this many views arrived (for a live camera, whose stream does not end); 0 = off."""
-    max_views: Annotated[int, Range(2, 100_000)] = 300
-    """Views kept in memory; above it every second one is dropped."""
+    max_views: Annotated[int, Range(2, 100_000)] = 500
+    """Views kept, in files of the folder TMPDIR (/tmp); above it every second one is dropped."""
     image_timeout: Annotated[float, Range(0.1, 3600, "s")] = 10.0
     """Warn when no view arrived for this long; also the longest wait for a slow recording to go on."""
     publish_period: Annotated[float, Range(0.1, 3600, "s")] = 5.0

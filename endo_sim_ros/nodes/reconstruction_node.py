@@ -1,8 +1,10 @@
 """Images and poses in, Gaussian model out."""
 
 import logging
+import tempfile
 import threading
 import time
+import weakref
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -25,13 +27,14 @@ from endo_sim_ros.reconstruction import (
     Progress,
     ReconstructionConfig,
     Trainer,
+    choose_views,
     prepare,
     preset,
-    scene_points,
-    select_keyframes,
 )
 from endo_sim_ros.reconstruction.progress import StageProgress
+from endo_sim_ros.reconstruction.triangulation import POINT_VIEWS
 from endo_sim_ros.sequences.bag import feed
+from endo_sim_ros.sequences.recording import StoredFrame, spread, store
 from endo_sim_ros.sequences.synchronizer import Synchronizer
 
 # Seconds by which stamps must jump to mean that another recording began; after a pause any step back means it.
@@ -51,7 +54,9 @@ class ReconstructionNode(EndoNode):
         self._options = self.declare(ReconstructionNodeConfig)
         self.config = self.declare(ReconstructionConfig, option_values(preset(self._options.preset)))
         logging.basicConfig(level=logging.INFO, format="%(name)s: %(message)s")
-        self.frames: list[Frame] = []
+        self._folder = tempfile.TemporaryDirectory(prefix="endo_sim_")
+        self._stored = 0  # frames so far, which number the files
+        self.frames: list[StoredFrame] = []
         self.synchronizer = Synchronizer(self._options.sync_tolerance)
         self.last_image = self.last_view = time.monotonic()  # when they arrived
         self._newest_stamp = 0  # of the images of this recording
@@ -136,8 +141,15 @@ class ReconstructionNode(EndoNode):
                 self._add_views(self.synchronizer.flush())
 
     def _add_views(self, frames: list[Frame]) -> None:
-        if frames:
-            self.frames.extend(frames)
+        for frame in frames:
+            self._stored += 1
+            try:
+                stored = store(frame, Path(self._folder.name) / str(self._stored))
+            except OSError as error:
+                raise SequenceError(f"{self._folder.name}: a view cannot be kept ({error}); lower max_views or set TMPDIR") from error
+            # The training may still read what is dropped here.
+            weakref.finalize(stored, stored.file.unlink, missing_ok=True)
+            self.frames.append(stored)
             self.last_view = time.monotonic()
         if len(self.frames) > self._options.max_views:
             self.frames = self.frames[::2]
@@ -171,22 +183,22 @@ class ReconstructionNode(EndoNode):
         return self._thread is not None and self._thread.is_alive()
 
     def _start(self) -> None:
-        chosen = select_keyframes(self.frames, self.config.keyframes)
-        views = [self.frames[index] for index in chosen]
         self.trained = (self.frames[0].stamp_ns, self.frames[-1].stamp_ns)
         self._recording_stamp = self.trained[1]
         self.progress, self._saved, self._failure, self._finished = None, "", "", False
         self.cancel.clear()
-        self._thread = threading.Thread(target=self._train, args=(views, list(self.frames), self.config))
+        self._thread = threading.Thread(target=self._train, args=(list(self.frames), self.config))
         self._thread.start()
-        self.get_logger().info(f"reconstructing from {len(views)} of {len(self.frames)} views")
+        self.get_logger().info(f"reconstructing from {len(self.frames)} views")
 
-    def _train(self, views: list[Frame], frames: list[Frame], config: ReconstructionConfig) -> None:
+    def _train(self, frames: list[StoredFrame], config: ReconstructionConfig) -> None:
         try:
-            points = None
-            if len(views) < len(frames):
-                points = scene_points(frames, options=config.matching, progress=StageProgress("scene points", self._on_stage))
+            progress = StageProgress("scene points", self._on_stage)
+            chosen, points = choose_views(frames, progress.map(StoredFrame.load, spread(frames, POINT_VIEWS)), config, progress)
+            log.info("training on %d of %d views", len(chosen), len(frames))
+            views = [frames[index].load() for index in chosen]
             trainer, lockstep = Trainer(prepare(views, config, points, self._on_stage), config), self._options.mode == "lockstep"
+            del views
             if not lockstep:
                 self._offer(trainer)
             published = time.monotonic()
@@ -329,6 +341,7 @@ class ReconstructionNode(EndoNode):
         self.cancel.set()
         if self._thread is not None:
             self._thread.join(timeout=2.0)
+        self._folder.cleanup()
         super().destroy_node()
 
 

@@ -5,6 +5,7 @@ from typing import Annotated, ClassVar, Literal
 
 from endo_sim_ros.core.config import Range, StageConfig
 from endo_sim_ros.reconstruction.stage_configs import (
+    CoverageConfig,
     DynamicMaskConfig,
     ExtrapolationConfig,
     InitialModelConfig,
@@ -100,8 +101,8 @@ class ProximityConfig(GradientConfig):
 class ReconstructionConfig(StageConfig):
     """From sparse posed views to a Gaussian model."""
 
-    keyframes: Annotated[int, Range(1, 1000)] = 8
-    """Number of views to train on, spread over the camera path."""
+    keyframes: Annotated[int, Range(0, 1000)] = 0
+    """Number of views to train on, spread over the camera path; 0 = as many as it takes to cover that (coverage.*)."""
     image_width: Annotated[int, Range(16, 8192, "pixels")] = 640
     """Views wider than this are shrunk to it before training."""
     iterations: Annotated[int, Range(0, 1_000_000)] = 0
@@ -195,6 +196,7 @@ class ReconstructionConfig(StageConfig):
 
     # Of the stages that prepare the scene, in their order. Where a switch above has the name of the stage, its options have another.
 
+    coverage: CoverageConfig = CoverageConfig()
     views: UsableViewsConfig = UsableViewsConfig()
     matching: MatchingConfig = MatchingConfig()
     poses: PosesConfig = PosesConfig()
@@ -214,6 +216,7 @@ class ReconstructionConfig(StageConfig):
     proximity: ProximityConfig = ProximityConfig()
 
     needs: ClassVar[dict[str, tuple[str, ...]]] = {
+        "coverage": ("keyframes", "0"),
         "depth_model": ("depth", "auto", "network", "network_first"),
         "network": ("depth", "auto", "network", "network_first"),
         "flat_ratio": ("lambda_flat", "more than 0"),

@@ -8,26 +8,29 @@ from rich.progress import Progress as ProgressBar
 from endo_sim_ros.core.cameras import save_cameras
 from endo_sim_ros.core.config import unused_options
 from endo_sim_ros.core.device import pick_device
-from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.gaussians import save_ply
 from endo_sim_ros.reconstruction.checkpoint import read_checkpoint
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
-from endo_sim_ros.reconstruction.keyframes import select_keyframes
+from endo_sim_ros.reconstruction.keyframes import choose_views
 from endo_sim_ros.reconstruction.pipeline import prepare
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import ScenePoints
 from endo_sim_ros.reconstruction.trainer import Progress, Trainer
-from endo_sim_ros.reconstruction.triangulation import scene_points
+from endo_sim_ros.reconstruction.triangulation import POINT_VIEWS
 from endo_sim_ros.sequences.bag import read_bag
 from endo_sim_ros.sequences.folder import read_points
+from endo_sim_ros.sequences.recording import Recording, spread, survey
 
 log = logging.getLogger(__name__)
 
+_MEASURED = 300  # views held out, evenly spread: more hardly change a mean, and take minutes
 _REPORTS, _CHECKPOINTS = 20, 10  # iterations between looks at the progress; checkpoints of a reconstruction
 
 
-def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: bool = False) -> tuple[Trainer, list[Frame]]:
-    """The trainer at its end, and the frames that were held out; writes model.ply, cameras.json and checkpoint.pt.
+def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: bool = False) -> tuple[Trainer, Recording]:
+    """The trainer at its end, and up to 300 frames with tissue that were held out; writes model.ply, cameras.json and checkpoint.pt.
+
+    The bag is read twice, and once more for the frames held out, so that no more than the keyframes are held in memory.
 
     Args:
         bag: Bag with images, camera_info and poses.
@@ -44,21 +47,21 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
         log.warning(text)
     if resume:
         read_checkpoint(out / "checkpoint.pt", config, "cpu")
-    frames = list(read_bag(bag))
-    out.mkdir(parents=True, exist_ok=True)  # before the long work
-    chosen = select_keyframes(frames, config.keyframes)
-    log.info("%d views, training on %d", len(frames), len(chosen))
+    recording = Recording(lambda: read_bag(bag), 0)
     with ProgressBar() as bar:
-        task = bar.add_task("preparing", total=None)
+        task = bar.add_task(f"reading {bag.name}", total=None)
+        views, sample = survey(recording, POINT_VIEWS)
+        out.mkdir(parents=True, exist_ok=True)  # before the long work
 
         def on_stage(stage: str, done: int, total: int) -> None:
             bar.update(task, description=stage, completed=done, total=total or None)
 
         known = read_points(bag)
-        points = None if known is None else ScenePoints.recorded(*known)
-        if points is None and len(chosen) < len(frames):
-            points = scene_points(frames, options=config.matching, progress=StageProgress("scene points", on_stage))
-        trainer = Trainer(prepare([frames[index] for index in chosen], config, points, on_stage), config)
+        given = ScenePoints.recorded(*known) if known else None
+        chosen, points = choose_views(views, sample, config, StageProgress("scene points", on_stage), given)
+        del sample
+        log.info("%d views, training on %d", len(views), len(chosen))
+        trainer = Trainer(prepare(list(recording.take(set(chosen), len(chosen))), config, points, on_stage), config)
     if resume:
         trainer.load_checkpoint(out / "checkpoint.pt")
         log.info("going on after %d iterations", trainer.iteration)
@@ -74,6 +77,7 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
 
         model = trainer.run(on_progress, _REPORTS)
     save_ply(model, out / "model.ply")
-    save_cameras([frames[index].camera for index in chosen if frames[index].stamp_ns in trainer.stamps], out / "cameras.json")
+    save_cameras([views[index].camera for index in chosen if views[index].stamp_ns in trainer.stamps], out / "cameras.json")
     trainer.save_checkpoint(out / "checkpoint.pt")
-    return trainer, [frame for index, frame in enumerate(frames) if index not in chosen]
+    held_out = spread(sorted({index for index, view in enumerate(views) if view.tissue} - set(chosen)), _MEASURED)
+    return trainer, recording.take(set(held_out), len(held_out))

@@ -11,7 +11,7 @@ from endo_sim_ros.reconstruction.config import ReconstructionConfig
 Preset = Literal["default", "laptop", "paper", "fsgs", "3dgs", "fsgs-sh0", "3dgs-sh0"]
 
 _PLAIN = {  # points, colours and nothing else, with the densification of AbsGS: what the others build upon
-    "iterations": 3000, "max_gaussians": 60_000,
+    "keyframes": 8, "iterations": 3000, "max_gaussians": 60_000,
     "virtual_every": 1,
     "initialization": "points", "densification": "gradient", "exposure": False, "light": False,
     "learning_rate": 1.0, "lambda_flat": 0.0, "lambda_opaque": 0.0,
@@ -29,7 +29,7 @@ _PUBLISHED = _PLAIN | {  # what the code of 3DGS and that of FSGS, which builds 
 PRESETS: dict[Preset, dict[str, Any]] = {
     "default": {},
     # The same in a minute or two on a CPU.
-    "laptop": {"image_width": 320, "iterations": 600, "learning_rate": 0.3, "max_gaussians": 15_000, "refine_every": 50},
+    "laptop": {"keyframes": 8, "image_width": 320, "iterations": 600, "learning_rate": 0.3, "max_gaussians": 15_000, "refine_every": 50},
     # As printed (Yang): points of structure from motion, L1 depth of a network, distortion and total variation, virtual cameras.
     # Its weights are not printed, but adjusted to the scene: these of 19 tried have the most PSNR on average of four scenes.
     "paper": _PLAIN | {"depth": "network_first", "lambda_depth": 0.3, "lambda_dist": 0.01, "lambda_tv": 0.003},

@@ -7,6 +7,19 @@ from endo_sim_ros.core.config import Range, StageConfig
 
 
 @dataclass(frozen=True)
+class CoverageConfig(StageConfig):
+    """How many views of a recording are trained on: so many that each of the others has one nearby."""
+
+    new_share: Annotated[float, Range(0.001, 1, "widths of the picture")] = 0.015
+    """How much of a view may be new to the nearest keyframe: by how much of its picture's width the camera moved or what it looks at.
+    This is 2 mm at the usual distance. It gives a camera that sways 26 views, and one that flies over 30 cm 80 to 160."""
+    min_keyframes: Annotated[int, Range(1, 1000)] = 8
+    """Fewest keyframes: those of a camera that hardly moves still tell depth, exposure and what moves."""
+    max_keyframes: Annotated[int, Range(1, 1000)] = 200
+    """Most keyframes: the preparation takes time and memory for each; beyond it they only lie farther apart."""
+
+
+@dataclass(frozen=True)
 class UsableViewsConfig(StageConfig):
     """Which views show enough tissue to be trained on."""
 

@@ -14,6 +14,9 @@ from endo_sim_ros.reconstruction.scene import Matches, ScenePoints
 from endo_sim_ros.reconstruction.stage_configs import MatchingConfig
 from endo_sim_ros.sequences.recording import spread
 
+POINT_VIEWS = 24
+"""Views of a recording from which its scene points are triangulated."""
+
 
 def match_features(
     frames: Sequence[Frame], options: MatchingConfig = MatchingConfig(), progress: StageProgress = StageProgress()
@@ -62,7 +65,7 @@ def triangulate(
 
 
 def scene_points(
-    frames: Sequence[Frame], views: int = 24, options: MatchingConfig = MatchingConfig(), progress: StageProgress = StageProgress()
+    frames: Sequence[Frame], views: int = POINT_VIEWS, options: MatchingConfig = MatchingConfig(), progress: StageProgress = StageProgress()
 ) -> ScenePoints:
     """Points of a whole recording, triangulated from so many of its views: more of the scene than those one trains on show."""
     shown = spread([frame for frame in frames if frame.mask is None or frame.mask.any()], views)

@@ -1,13 +1,16 @@
 """A recording, read lazily: which of its frames are taken, and when each was exposed."""
 
+import itertools
 import logging
+import pickle
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
+from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame, SequenceError
 
 logger = logging.getLogger(__name__)
@@ -25,7 +28,7 @@ class Recording:
     Args:
         frames: Begins to read.
         count: Number of frames expected, for progress bars; a damaged video or a frame that structure from motion could
-            not place makes the iteration shorter.
+            not place makes the iteration shorter. 0 = unknown.
         points: Returns scene points [N, 3] (m, world of the frames) and their RGB [N, 3] in [0, 1], of structure from motion, or None.
     """
 
@@ -38,6 +41,68 @@ class Recording:
 
     def __len__(self) -> int:
         return self.count
+
+    def take(self, positions: Container[int], count: int) -> "Recording":
+        """The frames at these positions alone, so many; the others are read again, but not held."""
+        chosen = lambda: (frame for position, frame in enumerate(self.frames()) if position in positions)
+        return Recording(lambda: itertools.islice(chosen(), count), count)
+
+
+class Glance(NamedTuple):
+    """What is kept of a frame whose images are not: there may be ten thousand."""
+
+    stamp_ns: int
+    camera: Camera
+    tissue: bool  # whether the mask leaves any
+
+    @classmethod
+    def at(cls, frame: Frame) -> "Glance":
+        """Of a frame."""
+        return cls(frame.stamp_ns, frame.camera, frame.mask is None or bool(frame.mask.any()))
+
+
+def survey(frames: Iterable[Frame], sample: int) -> tuple[list[Glance], list[Frame]]:
+    """A glance at every frame, and some of those with tissue, evenly spread: `sample` to twice as many where there are enough.
+
+    No more than these are held.
+    """
+    glances, held, step, shown = [], [], 1, 0
+    for frame in frames:
+        glances.append(Glance.at(frame))
+        if not glances[-1].tissue:
+            continue
+        if shown % step == 0:
+            held.append(frame)
+        if len(held) > 2 * sample:
+            held, step = held[::2], 2 * step
+        shown += 1
+    return glances, held
+
+
+@dataclass(frozen=True, eq=False)
+class StoredFrame:
+    """A frame in a file of this machine."""
+
+    stamp_ns: int
+    camera: Camera
+    depth: bool  # whether it has any
+    file: Path
+    content: bytes = b""  # of the file, where there is none
+
+    def load(self) -> Frame:
+        """The frame."""
+        return pickle.loads(self.content or self.file.read_bytes())
+
+    def carried(self) -> "StoredFrame":
+        """The same for another machine."""
+        return replace(self, content=self.file.read_bytes())
+
+
+def store(frame: Frame, file: Path) -> StoredFrame:
+    """Write a frame to a file, from which it is read again when it is needed."""
+    with file.open("wb") as out:
+        pickle.dump(frame, out, pickle.HIGHEST_PROTOCOL)
+    return StoredFrame(frame.stamp_ns, frame.camera, frame.depth is not None, file)
 
 
 def stamp_ns(number: int, fps: float) -> int:

@@ -5,6 +5,7 @@ import logging
 import re
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -235,3 +236,16 @@ def test_a_model_file_needs_no_image_and_a_recording_may_still_come(bench, recon
         reconstruction.flush()
         bench.status("reconstruction_node", "images arrive but none is usable", WARN)
     views_arrive(bench, small_frames)
+
+
+def test_views_wait_in_files_that_go_with_them(bench, reconstruction, small_frames):
+    assert bench.set("reconstruction_node", max_views=6)[0]
+    last = small_frames[-1].stamp_ns
+    send_frames(bench, small_frames)
+    bench.until(lambda: (reconstruction.flush(), reconstruction.frames and reconstruction.frames[-1].stamp_ns == last)[1], "all views")
+    folder: Path = reconstruction.frames[0].file.parent
+    assert len(reconstruction.frames) <= 6
+    assert {frame.file for frame in reconstruction.frames} == set(folder.iterdir())
+    np.testing.assert_array_equal(reconstruction.frames[0].load().image, small_frames[0].image)
+    reconstruction.destroy_node()
+    assert not folder.exists()

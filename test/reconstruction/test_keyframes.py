@@ -6,7 +6,8 @@ import numpy as np
 
 from endo_sim_ros.core.cameras import Camera, look_at
 from endo_sim_ros.core.frames import Frame
-from endo_sim_ros.reconstruction import select_keyframes, shrink
+from endo_sim_ros.reconstruction import ReconstructionConfig, ScenePoints, choose_views, select_keyframes, shrink
+from endo_sim_ros.reconstruction.stage_configs import CoverageConfig
 
 
 def blank(pose, size=(32, 24), **changes):
@@ -38,6 +39,56 @@ def test_keyframes_spread_over_rotations_too():
 
 def test_keyframes_of_identical_poses_are_different_frames():
     assert len(set(select_keyframes([blank(np.eye(4))] * 5, 3))) == 3
+
+
+def flight(length, count=300):
+    """Glances of a camera, a picture of 10 cm wide at 9.4 cm, that moves sideways."""
+    return [blank(at(x)) for x in np.linspace(0, length, count)]
+
+
+def test_a_camera_that_hardly_moves_has_eight_keyframes_and_a_flight_as_many_as_it_is_long(caplog):
+    assert len(select_keyframes(flight(0.001))) == 8
+    assert len(select_keyframes(flight(0.001, 5))) == 5
+    caplog.set_level("INFO")
+    far, farther = (len(select_keyframes(flight(length))) for length in (0.1, 0.2))
+    assert 0.1 / (2 * 0.02 * 0.1067) <= far <= 0.1 / (0.015 * 0.1067)  # views are a third of a millimetre apart
+    assert 1.3 * far < farther <= 200
+    assert len(select_keyframes(flight(3.0))) == 200
+    assert "keyframes of 300 views, enough" in caplog.text and "as many as coverage.max_keyframes allows" in caplog.text
+
+
+def test_no_view_is_farther_from_a_keyframe_than_the_share_that_may_be_new():
+    frames, options = flight(0.3), CoverageConfig(new_share=0.1)
+    chosen = select_keyframes(frames, options=options)
+    x = np.linspace(0, 0.3, 300)
+    assert np.abs(x[:, None] - x[chosen]).min(1).max() <= 0.1 * 0.1 * 32 / 30
+    assert chosen == select_keyframes(frames, options=options)
+
+
+def test_the_nearer_the_tissue_the_more_keyframes():
+    """Scene points tell how far away it is."""
+    grid = np.stack(np.meshgrid(np.linspace(-0.1, 0.4, 60), np.linspace(-0.02, 0.02, 9)), -1).reshape(-1, 2)
+    points = lambda z: ScenePoints(np.column_stack([grid, np.full(len(grid), z)]), np.zeros((len(grid), 3)))
+    near, far = (len(select_keyframes(flight(0.3), points=points(z))) for z in (0.05, 0.2))
+    assert near > 2 * far
+
+
+def test_turning_and_going_nearer_need_keyframes_too():
+    turning = [blank(look_at(np.zeros(3), np.array([x, 0.0, 0.1]))) for x in np.linspace(-0.05, 0.05, 100)]
+    ahead = []
+    for z in np.linspace(0, 0.05, 100):
+        pose = np.eye(4)
+        pose[2, 3] = z
+        ahead.append(blank(pose))
+    assert len(select_keyframes(turning)) > 12 and len(select_keyframes(ahead)) > 12
+
+
+def test_views_are_chosen_by_coverage_with_points_of_the_sample():
+    frames = flight(0.002, 20)
+    chosen, points = choose_views(frames, frames[::5], ReconstructionConfig())
+    assert len(chosen) == 8 and points is not None
+    assert choose_views(frames[:8], [], ReconstructionConfig()) == (list(range(8)), None)
+    assert len(choose_views(frames, frames[::5], ReconstructionConfig(keyframes=3))[0]) == 3
 
 
 def test_shrinking_keeps_pixels_and_intrinsics_together():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from endo_sim_ros.sequences.phantom import PhantomConfig, build_phantom, phantom_camera, phantom_poses, phantom_sequence, render_phantom
+from endo_sim_ros.sequences.phantom.height_field import CELL
 
 SMALL = PhantomConfig(frames=3, width=160, height=128)
 
@@ -161,6 +162,22 @@ def test_half_a_round_ends_elsewhere_and_a_whole_one_at_the_beginning():
     half, whole = (phantom_poses(PhantomConfig(frames=9, rounds=rounds))[:, :3, 3] for rounds in (0.5, 1.0))
     assert np.linalg.norm(half[-1] - half[0]) > 0.005
     np.testing.assert_allclose(whole[-1], whole[0], atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_flight_sees_tissue_all_the_way_with_exact_depth():
+    config = PhantomConfig(flight=0.3, frames=7, width=64, height=52, noise=0.0)
+    assert config.sections == 2 and SMALL.sections == 1
+    surface, seen = build_phantom(config.seed, config.sections), []
+    for frame in phantom_sequence(config):
+        points = frame.camera.backproject(frame.depth.astype(np.float64))
+        gap = points[..., 2] - surface.height(points[..., 0], points[..., 1])
+        assert np.percentile(np.abs(gap), 99) < 2e-6 and (frame.depth > 0.05).all()
+        assert frame.image.std() > 25
+        seen.append(points[..., 0])
+    assert 0.28 < np.ptp(phantom_poses(config)[:, 0, 3]) < 0.34
+    reach = (surface.heights.shape[1] - 1) / 2 * CELL  # where the surface is mirrored
+    assert 0.2 < np.max(np.abs(seen)) < reach
 
 
 def test_border_is_black_masked_and_without_depth():

@@ -2,7 +2,7 @@
 
 import dataclasses
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import cv2
 import numpy as np
@@ -24,8 +24,8 @@ def stereo_depth(
     options: StereoConfig = StereoConfig(),
     matching: MatchingConfig = MatchingConfig(),
     progress: StageProgress = StageProgress(),
-) -> list[tuple[AnyFrame, np.ndarray | None]]:
-    """Each view, whose right image now has the rows of the left one and the right principal point, and its depth [H, W].
+) -> Iterator[tuple[AnyFrame, np.ndarray | None]]:
+    """Each view, whose right image now has the rows of the left one and the right principal point, and its depth [H, W], in turn.
 
     Depth is in metres, 0 = none; None without a right image.
 
@@ -39,10 +39,9 @@ def stereo_depth(
     aligned = progress.map(lambda view: view if view.right is None else align_rows(view, options, matching), views)
     disparities = progress.map(lambda view: None if view.right is None else stereo_disparity(view, options), aligned)
     offsets = disparity_offsets(aligned, disparities, points, options, matching)
-    return [
-        (view, None) if found is None else (_with_right_K(view, column=offset), disparity_to_depth(view, found, offset, options))
-        for view, found, offset in zip(aligned, disparities, offsets)
-    ]
+    for view, offset in zip(aligned, offsets):
+        found = disparities.pop(0)  # which takes as much memory as the depth
+        yield (view, None) if found is None else (_with_right_K(view, column=offset), disparity_to_depth(view, found, offset, options))
 
 
 def right_camera(frame: Frame) -> Camera:

@@ -1,5 +1,6 @@
 """Options of the synthetic patient and of the endoscope that films it."""
 
+import math
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -24,6 +25,9 @@ class PhantomConfig(StageConfig):
     """Horizontal field of view."""
     travel: Annotated[float, Range(0.0, 0.06, "m")] = 0.03
     """How far the tip of the endoscope moves sideways, end to end; it dives in and out by half as much."""
+    flight: Annotated[float, Range(0.0, 1.0, "m")] = 0.0
+    """How far the endoscope also flies to the right over the tissue, which goes on as far: another organ every 28 cm. 0 = it
+    stays in front of one organ."""
     rounds: Annotated[float, Range(0.05, 10.0)] = 1.0
     """How often it goes round its path; after whole rounds it is back where it began."""
     lever: Annotated[float, Range(0.05, 0.5, "m")] = 0.14
@@ -40,3 +44,8 @@ class PhantomConfig(StageConfig):
     """Standard deviation of the sensor noise in 8-bit grey levels."""
     border: Annotated[float, Range(0.0, 0.3)] = 0.0
     """Black frame with round corners, as a fraction of the image height; masked out, without depth."""
+
+    @property
+    def sections(self) -> int:
+        """Organs side by side, so that the surface reaches 10 cm beyond the flight on both sides, where the views end."""
+        return max(math.ceil((self.flight + 0.16) / 0.28), 1)

@@ -1,14 +1,16 @@
 """The grid of vertices on which the surface is built, and smooth noise over it."""
 
 import math
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
 
-CELLS = 2048  # of the height field, a side: a power of two
-HALF_WIDTH = 0.16  # metres from the centre to where the surface is mirrored
+CELLS = 2048  # of one section of the surface, a side: a power of two
+HALF_WIDTH = 0.16  # metres from the centre of a section to its border, where the surface is mirrored or the next section begins
 CELL = 2 * HALF_WIDTH / CELLS
 SIDE = CELLS + 1  # vertices
+SEAM = 256  # cells over which two sections pass into each other, 4 cm: a multiple of the coarsest cells of the renderer
 
 
 def noise(rng: np.random.Generator, scale: float, octaves: int = 1, stretch: tuple[float, float] = (1.0, 1.0)) -> np.ndarray:
@@ -63,3 +65,18 @@ def vertices() -> tuple[np.ndarray, np.ndarray]:
     """World x and y of every vertex, each [SIDE, SIDE], metres."""
     axis = np.linspace(-HALF_WIDTH, HALF_WIDTH, SIDE, dtype=np.float32)
     return np.meshgrid(axis, axis)
+
+
+def joined(sections: Sequence[np.ndarray], seams: Sequence[np.ndarray]) -> np.ndarray:
+    """Fields [SIDE, SIDE, ...] side by side along x, as one [SIDE, columns, ...].
+
+    Args:
+        sections: From left to right.
+        seams: Between them, the share [SIDE, SEAM + 1] of the section on the right, from 0 to 1.
+    """
+    whole = sections[0]
+    for section, seam in zip(sections[1:], seams, strict=True):
+        share = seam.reshape(seam.shape + (1,) * (section.ndim - 2))
+        left, right = whole[:, -SEAM - 1 :], section[:, : SEAM + 1]
+        whole = np.concatenate([whole[:, : -SEAM - 1], left + share * (right - left), section[:, SEAM + 1 :]], 1)
+    return whole

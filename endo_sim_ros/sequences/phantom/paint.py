@@ -7,16 +7,17 @@ import numpy as np
 
 from endo_sim_ros.sequences.phantom.anatomy import Anatomy
 from endo_sim_ros.sequences.phantom.height_field import SIDE, blur, noise, smoothstep
-from endo_sim_ros.sequences.phantom.palette import BLOOD, DEEP_BLOOD, LOBES, ORGANS, WALLS, linear
+from endo_sim_ros.sequences.phantom.palette import BLOOD, DEEP_BLOOD, LOBES, ORGANS, WALLS, Tissue, linear
 from endo_sim_ros.sequences.phantom.vessels import Vessels
 
 
 class Paint:
-    """Albedo, wetness and micro-relief of the surface, from its anatomy."""
+    """Albedo, wetness and micro-relief of a section of the surface, from its anatomy; the wall may be that of another section."""
 
-    def __init__(self, rng: np.random.Generator, seed: int, anatomy: Anatomy):
-        first = seed == 0  # the first patient is the one of the figures: peritoneum, stomach, congested bowel
-        wall, organ, lobe = (kinds[0 if first else rng.integers(len(kinds))] for kinds in (WALLS, ORGANS, LOBES))
+    def __init__(self, rng: np.random.Generator, seed: int, anatomy: Anatomy, wall: Tissue | None = None):
+        first = seed == 0 and wall is None  # the first patient is the one of the figures: peritoneum, stomach, congested bowel
+        own_wall, organ, lobe = (kinds[0 if first else rng.integers(len(kinds))] for kinds in (WALLS, ORGANS, LOBES))
+        self.wall = wall = wall or own_wall
         tissues = wall, organ, wall, lobe  # of the parts in the order of their shares; the wall shines through the ligament
 
         by_vertex = np.ascontiguousarray(np.moveaxis(anatomy.shares, 0, -1))

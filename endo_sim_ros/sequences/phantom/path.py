@@ -21,10 +21,12 @@ def phantom_poses(config: PhantomConfig) -> np.ndarray:
     depth = config.lever + 0.25 * config.travel * np.sin(phase + rng.uniform(0.0, 2.0 * math.pi))
     roll = 0.06 * np.sin(phase + rng.uniform(0.0, 2.0 * math.pi))
     poses = np.tile(np.eye(4), (config.frames, 1, 1))
-    for pose, a, b, c, d in zip(poses, yaw, pitch, roll, depth):
+    along = config.flight * (phase / (config.rounds * 2.0 * math.pi) - 0.5)
+    for pose, a, b, c, d, x in zip(poses, yaw, pitch, roll, depth, along):
         turn = cv2.Rodrigues(np.array([0.0, a, 0.0]))[0] @ cv2.Rodrigues(np.array([b, 0.0, 0.0]))[0]
         pose[:3, :3] = turn @ cv2.Rodrigues(np.array([0.0, 0.0, c]))[0]
         pose[:3, 3] = turn[:, 2] * d - [0.0, 0.0, config.lever]
+        pose[0, 3] += x
     return poses
 
 

@@ -11,29 +11,37 @@ from endo_sim_ros.core.device import init_warp
 from endo_sim_ros.sequences.phantom import surface_kernels as kernels
 from endo_sim_ros.sequences.phantom.anatomy import Anatomy
 from endo_sim_ros.sequences.phantom.config import PhantomConfig
-from endo_sim_ros.sequences.phantom.height_field import CELL, CELLS
+from endo_sim_ros.sequences.phantom.height_field import CELL, CELLS, SEAM, joined, noise, smoothstep
 from endo_sim_ros.sequences.phantom.paint import Paint
 
 
 class Phantom:
-    """One synthetic patient, ready to be seen from anywhere; `build_phantom` makes it once per seed.
+    """One synthetic patient, ready to be seen from anywhere; `build_phantom` makes it once.
 
     Args:
         seed: What everything about the patient follows from.
+        sections: How many organs lie side by side along x, each before its section of the wall, 28 cm apart.
     """
 
-    def __init__(self, seed: int):
+    def __init__(self, seed: int, sections: int = 1):
         init_warp()
-        rng = np.random.default_rng([seed, 0x7155])
-        anatomy = Anatomy(rng)
-        paint = Paint(rng, seed, anatomy)
-        self.heights = np.ascontiguousarray(anatomy.heights - paint.relief, np.float32)
+        parts, seams, wall = [], [], None
+        for number in range(sections):
+            rng = np.random.default_rng([seed, 0x7155] + [number] * (number > 0))
+            if number:  # the border between two sections bends
+                along = np.linspace(0.0, 1.0, SEAM + 1) + 0.25 * np.clip(noise(rng, 0.02, 2)[:, : SEAM + 1], -1.0, 1.0)
+                seams.append(smoothstep(along, 0.25, 0.75).astype(np.float32))
+            anatomy = Anatomy(rng)
+            paint = Paint(rng, seed, anatomy, wall)
+            wall = paint.wall  # one all over
+            parts.append((anatomy.heights - paint.relief, np.concatenate([paint.colour, paint.wetness[..., None]], -1), paint.film))
+        heights, colours, film = (joined(fields, seams) for fields in zip(*parts))
+        self.heights = np.ascontiguousarray(heights, np.float32)
         """Depth coordinate z of the surface over the vertices of its grid [y, x], metres, world."""
 
-        slopes = np.stack([_slope(self.heights, 1), _slope(self.heights, 0), -_slope(paint.film, 1), -_slope(paint.film, 0)], -1)
-        colours = np.concatenate([paint.colour, paint.wetness[..., None]], -1)
+        slopes = np.stack([_slope(self.heights, 1), _slope(self.heights, 0), -_slope(film, 1), -_slope(film, 0)], -1)
         surface = kernels.Surface()
-        surface.n, surface.cell = CELLS, CELL
+        surface.rows, surface.columns, surface.cell = CELLS, self.heights.shape[1] - 1, CELL
         surface.lowest, surface.highest = float(self.heights.min()), float(self.heights.max())
         surface.heights = wp.array(self.heights.ravel(), dtype=float, device="cpu", copy=False)
         surface.nearest = wp.array(_minimum_pyramid(self.heights), dtype=float, device="cpu", copy=False)
@@ -43,17 +51,18 @@ class Phantom:
 
     def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """World z of the surface, metres, at world x and y (any common shape), in double precision."""
-        u, v = (np.abs((np.asarray(c, np.float64) / CELL + 1.5 * CELLS) % (2 * CELLS) - CELLS) for c in (x, y))
-        i, j = np.minimum(u.astype(int), CELLS - 1), np.minimum(v.astype(int), CELLS - 1)
+        sides = self.heights.shape[1] - 1, CELLS
+        u, v = (np.abs((np.asarray(c, np.float64) / CELL + 1.5 * side) % (2 * side) - side) for c, side in zip((x, y), sides))
+        i, j = np.minimum(u.astype(int), sides[0] - 1), np.minimum(v.astype(int), sides[1] - 1)
         a, b = u - i, v - j
         z = self.heights.astype(np.float64)
         return (1 - b) * ((1 - a) * z[j, i] + a * z[j, i + 1]) + b * ((1 - a) * z[j + 1, i] + a * z[j + 1, i + 1])
 
 
 @functools.lru_cache(maxsize=4)
-def build_phantom(seed: int) -> Phantom:
-    """The patient of a seed; the last few are kept."""
-    return Phantom(seed)
+def build_phantom(seed: int, sections: int = 1) -> Phantom:
+    """The patient of a seed, with as many organs side by side; the last few are kept."""
+    return Phantom(seed, sections)
 
 
 def _slope(field: np.ndarray, axis: int) -> np.ndarray:
@@ -62,7 +71,7 @@ def _slope(field: np.ndarray, axis: int) -> np.ndarray:
 
 
 def _minimum_pyramid(heights: np.ndarray) -> np.ndarray:
-    """Minimal height over every cell of every level, flat; level l has (CELLS >> l)² cells."""
+    """Minimal height over every cell of every level, flat; level l has (CELLS >> l) cells along y."""
     level = np.minimum(np.minimum(heights[:-1, :-1], heights[:-1, 1:]), np.minimum(heights[1:, :-1], heights[1:, 1:]))
     levels = [level.ravel()]
     while len(level) > CELLS >> kernels.TOP_LEVEL:
@@ -72,7 +81,7 @@ def _minimum_pyramid(heights: np.ndarray) -> np.ndarray:
 
 
 def _detail_pyramid(texture: np.ndarray) -> np.ndarray:
-    """Levels of detail of a texture [SIDE, SIDE, 4] on the surface's vertices, flat [sum, 4]."""
+    """Levels of detail of a texture [rows, columns, 4] on the surface's vertices, flat [sum, 4]."""
     levels: list[np.ndarray] = [texture.astype(np.float32)]
     for _ in range(5):
         levels.append(cv2.pyrDown(levels[-1]))
@@ -128,7 +137,7 @@ def render_phantom(phantom: PhantomConfig | Phantom, camera: Camera) -> tuple[np
     """What an endoscope at any pose sees of the patient, without noise or border.
 
     Args:
-        phantom: The configuration (its seed, exposure and auto_exposure count), or a built phantom.
+        phantom: The configuration (its seed, flight, exposure and auto_exposure count), or a built phantom.
         camera: Where to look from; its light moves with it.
 
     Returns:
@@ -136,7 +145,7 @@ def render_phantom(phantom: PhantomConfig | Phantom, camera: Camera) -> tuple[np
         camera looks past the surface.
     """
     config = phantom if isinstance(phantom, PhantomConfig) else PhantomConfig()
-    built = build_phantom(config.seed) if isinstance(phantom, PhantomConfig) else phantom
+    built = build_phantom(config.seed, config.sections) if isinstance(phantom, PhantomConfig) else phantom
     radiance, depth = radiance_and_depth(built, camera, camera)
     return quantise(develop(radiance, camera, config.exposure, config.auto_exposure)), depth
 

@@ -34,7 +34,7 @@ def phantom_sequence(config: PhantomConfig) -> Iterator[Frame]:
     Yields:
         Frames `1 / fps` apart from stamp 1 s on. The depth is exact and positive everywhere but under the border.
     """
-    phantom = build_phantom(config.seed)
+    phantom = build_phantom(config.seed, config.sections)
     window = _border(config)[..., None] if config.border > 0 else None
     mask = np.full((config.height, config.width), 255, np.uint8)
     if window is not None:

@@ -1,8 +1,9 @@
 """Ray casting and shading of the phantom's height field, one thread per pixel.
 
-The surface is z = h(x, y): a grid of (n + 1)² vertices `cell` metres apart, bilinear in between, centred on the z axis
-and repeated as in a mirror beyond its border, without end. Grid coordinates are u = x / cell + n / 2, v alike.
-Maps with several levels of detail are stored flat, level after level; level l has (n >> l) + 1 vertices a side.
+The surface is z = h(x, y): a grid of (rows + 1) × (columns + 1) vertices `cell` metres apart, bilinear in between, centred
+on the z axis and repeated as in a mirror beyond its border, without end. Grid coordinates are u = x / cell + columns / 2,
+v alike with rows. Maps with several levels of detail are stored flat, level after level; level l has (columns >> l) + 1
+vertices along x.
 
 Along a ray p(t) = o + t d (t is the depth, since camera-frame rays have unit z), z(t) - h(u(t), v(t)) is a quadratic in
 t within one cell, so hits are found exactly. Cells are skipped with a pyramid of their minimal heights
@@ -21,12 +22,13 @@ FAR = wp.constant(1.0e9)
 class Surface:
     """The height field and what it looks like; see the module's header for the layout."""
 
-    n: int  # cells a side, a power of two
+    rows: int  # cells along y and along x, multiples of the coarsest cells
+    columns: int
     cell: float  # width of a cell, metres
     lowest: float  # bounds of the heights, metres
     highest: float
-    heights: wp.array[float]  # [(n + 1)²] metres
-    nearest: wp.array[float]  # minimum of the heights over every cell, levels of (n >> l)² cells, flat
+    heights: wp.array[float]  # [(rows + 1) (columns + 1)] metres
+    nearest: wp.array[float]  # minimum of the heights over every cell, levels of (rows >> l) (columns >> l) cells, flat
     colours: wp.array[wp.vec4]  # linear albedo and wetness, levels of detail, flat
     slopes: wp.array[wp.vec4]  # dh/dx, dh/dy, and the same of the wet film on top; levels of detail, flat
 
@@ -66,34 +68,34 @@ def mirrored_cell(i: int, n: int):
 
 @wp.func
 def height_at(surface: Surface, u: float, v: float):
-    fu, _ = mirrored(u, float(surface.n))
-    fv, _ = mirrored(v, float(surface.n))
-    i = wp.min(int(fu), surface.n - 1)
-    j = wp.min(int(fv), surface.n - 1)
+    fu, _ = mirrored(u, float(surface.columns))
+    fv, _ = mirrored(v, float(surface.rows))
+    i = wp.min(int(fu), surface.columns - 1)
+    j = wp.min(int(fv), surface.rows - 1)
     a = fu - float(i)
     b = fv - float(j)
-    k = j * (surface.n + 1) + i
+    k = j * (surface.columns + 1) + i
     near = (1.0 - a) * surface.heights[k] + a * surface.heights[k + 1]
-    k += surface.n + 1
+    k += surface.columns + 1
     return (1.0 - b) * near + b * ((1.0 - a) * surface.heights[k] + a * surface.heights[k + 1])
 
 
 @wp.func
-def sample(texture: wp.array[wp.vec4], n: int, level: int, u: float, v: float):
+def sample(texture: wp.array[wp.vec4], rows: int, columns: int, level: int, u: float, v: float):
     """Bilinear value of one level of detail at folded grid coordinates of level 0."""
     offset = int(0)
     for coarser in range(level):
-        side = (n >> coarser) + 1
-        offset += side * side
-    side = n >> level
+        offset += ((rows >> coarser) + 1) * ((columns >> coarser) + 1)
+    rows = rows >> level
+    columns = columns >> level
     scale = 1.0 / float(1 << level)
-    i = wp.min(int(u * scale), side - 1)
-    j = wp.min(int(v * scale), side - 1)
+    i = wp.min(int(u * scale), columns - 1)
+    j = wp.min(int(v * scale), rows - 1)
     a = u * scale - float(i)
     b = v * scale - float(j)
-    k = offset + j * (side + 1) + i
+    k = offset + j * (columns + 1) + i
     near = (1.0 - a) * texture[k] + a * texture[k + 1]
-    k += side + 1
+    k += columns + 1
     return (1.0 - b) * near + b * ((1.0 - a) * texture[k] + a * texture[k + 1])
 
 
@@ -126,9 +128,8 @@ def hit_in_cell(surface: Surface, u: float, v: float, z: float, du: float, dv: f
 @wp.func
 def cast(surface: Surface, origin: wp.vec3, ray: wp.vec3):
     """Depth at which a ray first meets the surface, 0 if it never does."""
-    n = surface.n
-    u = origin[0] / surface.cell + 0.5 * float(n)
-    v = origin[1] / surface.cell + 0.5 * float(n)
+    u = origin[0] / surface.cell + 0.5 * float(surface.columns)
+    v = origin[1] / surface.cell + 0.5 * float(surface.rows)
     du = ray[0] / surface.cell
     dv = ray[1] / surface.cell
     if ray[2] <= 1.0e-3:
@@ -156,9 +157,10 @@ def cast(surface: Surface, origin: wp.vec3, ray: wp.vec3):
         leave = wp.min(wp.max(wp.min(exit_u, exit_v), t), last)
         offset = int(0)
         for finer in range(level):
-            offset += (n >> finer) * (n >> finer)
-        side = n >> level
-        nearest = surface.nearest[offset + mirrored_cell(int(j), side) * side + mirrored_cell(int(i), side)]
+            offset += (surface.rows >> finer) * (surface.columns >> finer)
+        rows = surface.rows >> level
+        columns = surface.columns >> level
+        nearest = surface.nearest[offset + mirrored_cell(int(j), rows) * columns + mirrored_cell(int(i), columns)]
         reach = (nearest - origin[2]) / ray[2]  # the depth at which the ray gets down to the cell's nearest point
         if reach > leave:
             t = leave + nudge
@@ -178,16 +180,18 @@ def cast(surface: Surface, origin: wp.vec3, ray: wp.vec3):
 @wp.func
 def shade(surface: Surface, light: Light, point: wp.vec3, eye: wp.vec3, footprint: float):
     """Linear radiance towards the eye of a surface point, filtered over a footprint in metres."""
-    u, sign_u = mirrored(point[0] / surface.cell + 0.5 * float(surface.n), float(surface.n))
-    v, sign_v = mirrored(point[1] / surface.cell + 0.5 * float(surface.n), float(surface.n))
+    rows = surface.rows
+    columns = surface.columns
+    u, sign_u = mirrored(point[0] / surface.cell + 0.5 * float(columns), float(columns))
+    v, sign_v = mirrored(point[1] / surface.cell + 0.5 * float(rows), float(rows))
     detail = wp.clamp(wp.log2(footprint / surface.cell), 0.0, 4.999)
     level = int(detail)
     blend = detail - float(level)
-    colour = sample(surface.colours, surface.n, level, u, v)
-    slope = sample(surface.slopes, surface.n, level, u, v)
+    colour = sample(surface.colours, rows, columns, level, u, v)
+    slope = sample(surface.slopes, rows, columns, level, u, v)
     if blend > 0.02:
-        colour += blend * (sample(surface.colours, surface.n, level + 1, u, v) - colour)
-        slope += blend * (sample(surface.slopes, surface.n, level + 1, u, v) - slope)
+        colour += blend * (sample(surface.colours, rows, columns, level + 1, u, v) - colour)
+        slope += blend * (sample(surface.slopes, rows, columns, level + 1, u, v) - slope)
     normal = wp.normalize(wp.vec3(sign_u * slope[0], sign_v * slope[1], -1.0))
     film = wp.normalize(wp.vec3(sign_u * (slope[0] + slope[2]), sign_v * (slope[1] + slope[3]), -1.0))
     to_eye = wp.normalize(eye - point)

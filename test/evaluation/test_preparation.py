@@ -1,0 +1,76 @@
+"""Sequences as cells use them: what is read, what is kept, and how much memory it takes."""
+
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.progress import Progress
+
+from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
+from endo_sim_ros.core.frames import Frame
+from endo_sim_ros.evaluation.cells import list_cells
+from endo_sim_ros.evaluation.config import EvaluationConfig
+from endo_sim_ros.evaluation.preparation import prepare_sequence
+from endo_sim_ros.sequences.bag import write_bag
+
+WIDTH, HEIGHT = 256, 192
+
+
+def long_bag(path: Path, count: int) -> Path:
+    """A bag of a camera that moves sideways; every tenth frame is masked whole."""
+    rng = np.random.default_rng(0)
+    images = rng.integers(0, 255, (4, HEIGHT, WIDTH, 3), np.uint8)
+    camera = Camera(intrinsic_matrix(250, 250, WIDTH / 2, HEIGHT / 2), WIDTH, HEIGHT)
+
+    def frame(number: int) -> Frame:
+        pose = np.eye(4)
+        pose[0, 3] = 1e-4 * number
+        mask = np.full((HEIGHT, WIDTH), 255 * (number % 10 != 9), np.uint8)
+        return Frame((number + 1) * 40_000_000, images[number % 4], camera.at(pose), depth=np.full((HEIGHT, WIDTH), 0.1), mask=mask)
+
+    write_bag(path, map(frame, range(count)))
+    return path
+
+
+def peak_of(action) -> float:
+    """Megabytes that an action held at its worst."""
+    tracemalloc.start()
+    try:
+        action()
+        return tracemalloc.get_traced_memory()[1] / 1e6
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("bags")
+    return [long_bag(folder / str(count), count) for count in (150, 450)]
+
+
+def prepared(bag, folder, **options):
+    config = EvaluationConfig(splits=("two-views", "1:49"), presets=("default",), lpips=(), set=("image_width=64", "device=cpu"), **options)
+    cells, _ = list_cells([str(bag)], config)
+    folder.mkdir()
+    return prepare_sequence(cells, Progress(disable=True), folder)
+
+
+@pytest.mark.slow
+def test_memory_of_an_evaluation_does_not_grow_with_the_recording(bags, tmp_path):
+    short, long = (peak_of(lambda bag=bag: prepared(bag, tmp_path / bag.name, held_out=20)) for bag in bags)
+    assert long < short + 0.1 * 300 * WIDTH * HEIGHT * 8 / 1e6, "a tenth of the 300 frames more"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("held_out", [20, 1000])
+def test_frames_that_cells_need_are_kept_at_the_size_that_they_need(bags, tmp_path, held_out):
+    found = prepared(bags[0], tmp_path / "frames", held_out=held_out)
+    assert found.count == 135 and found.depth_source == "recorded"
+    assert (len(found.frames) < 100) == (held_out == 20)
+    for number in (0, 50, 134):
+        frame = found.frames[number].load()
+        assert frame.camera.width == WIDTH
+        np.testing.assert_allclose(frame.camera.position[0], 1e-4 * (number // 9 * 10 + number % 9))
+    assert {frame.camera.width for number, frame in found.frames.items() if number not in (0, 50, 100, 134)} == {64}
+    assert found.carried().frames[0].content

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from rich.progress import track
+from rich.progress import Progress, track
 from tyro.conf import Positional
 
 from endo_sim_ros.core.frames import SequenceError
@@ -82,6 +82,7 @@ class Command:
         """Write the bag; raises SequenceError if it exists or the recording cannot be read."""
         from endo_sim_ros.sequences.bag import write_bag
         from endo_sim_ros.sequences.readers import open_sequence
+        from endo_sim_ros.sequences.recording import Recording
 
         if self.bag.exists():  # before any work
             raise SequenceError(f"{self.bag} exists already; choose another name or remove it first")
@@ -90,6 +91,10 @@ class Command:
         fixed = ("source", "bag", "kind")
         options = {name: value for name, value in vars(self).items() if name not in fixed and value is not None}
         frames = open_sequence(self.source, self.kind, **options)
+        if isinstance(frames, Recording) and frames.prepare:
+            with Progress() as bar:
+                task = bar.add_task("poses", total=None)
+                frames.prepare(lambda stage, done, total: bar.update(task, description=stage, completed=done, total=total or None))
         try:
             count = write_bag(self.bag, track(frames, f"converting {self.source.name}"))
         except BaseException:  # half a conversion would only be in the way of the next try

@@ -7,7 +7,6 @@ endo.mp4, or a folder with
   mask.png            optional, one for all frames; or masks/%06d.png; 255 = tissue
 """
 
-import functools
 import itertools
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,7 +21,7 @@ from endo_sim_ros.sequences.calibration_files import check_calibrated_size, read
 from endo_sim_ros.sequences.images import numbered_files, read_gray
 from endo_sim_ros.sequences.masks import MaskFiles, lit_area, lit_now, tissue_mask, tool_is_white
 from endo_sim_ros.sequences.pose_files import read_poses
-from endo_sim_ros.sequences.recording import Recording, keep_posed, select, spread, stamp_ns
+from endo_sim_ros.sequences.recording import OnProgress, Recording, keep_posed, select, spread, stamp_ns
 from endo_sim_ros.sequences.rectification import Rectification
 from endo_sim_ros.sequences.structure_from_motion import STRUCTURE_FROM_MOTION, estimate_poses
 from endo_sim_ros.sequences.video_files import Video, find_video
@@ -112,9 +111,14 @@ def read_video(
         numbers = numbers[::sfm_step]
         logger.info("%s: poses of every %d-th frame come from structure from motion", path, step * sfm_step)
 
-    @functools.cache
-    def prepare() -> tuple[np.ndarray, Rectification, Mapping[int, np.ndarray]]:
+    prepared: list[tuple[np.ndarray, Rectification, Mapping[int, np.ndarray]]] = []
+
+    def prepare(on_progress: OnProgress | None = None) -> None:
         """Lit area, rectification and poses: what takes a pass over the video is found once, on first iteration."""
+        if not prepared:
+            prepared.append(find(on_progress))
+
+    def find(on_progress: OnProgress | None) -> tuple[np.ndarray, Rectification, Mapping[int, np.ndarray]]:
         lit = np.full(size[::-1], 255, np.uint8)
         if mask_border:
             lit = lit_area(image for _, image in video.frames(spread(numbers, 10)))
@@ -128,11 +132,13 @@ def read_video(
             lambda n, image: cv2.bitwise_and(lit_now(lit, image), mask_of(n)),
             scale=scale,
             threads=threads,
+            on_progress=on_progress,
         )
         return lit, rectification, placed
 
     def frames() -> Iterator[Frame]:
-        lit, rectification, placed = prepare()
+        prepare()
+        lit, rectification, placed = prepared[0]
         for number, image in video.frames([n for n in numbers if n in placed]):
             yield Frame(
                 stamp_ns=stamp_ns(number, fps),
@@ -141,7 +147,7 @@ def read_video(
                 mask=rectification.mask(cv2.bitwise_and(lit_now(lit, image), mask_of(number))),
             )
 
-    return Recording(frames, len(numbers))
+    return Recording(frames, len(numbers), prepare if known is None else None)
 
 
 def _estimate(
@@ -152,6 +158,7 @@ def _estimate(
     *,
     scale: float | None,
     threads: int,
+    on_progress: OnProgress | None,
 ) -> tuple[dict[int, np.ndarray], Rectification]:
     """Poses by frame number and the rectification, which is estimated too where it is None."""
     undistort = rectification or Rectification.mono(np.eye(3), (), (video.width, video.height))
@@ -163,6 +170,8 @@ def _estimate(
             masks=(undistort.mask(mask_of(*numbered)) for numbered in for_masks),
             scale=scale,
             threads=threads,
+            count=len(numbers),
+            on_progress=on_progress,
         )
     except SequenceError as error:
         raise SequenceError(f"{video.path}: {error}") from None

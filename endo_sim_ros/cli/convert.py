@@ -53,10 +53,10 @@ class Command:
     """SCARED: depth of every frame (default), of the keyframe alone, which is measured, or none."""
     pose_direction: Literal["auto", "world_to_camera", "camera_to_world"] | None = None
     """SCARED: direction of the poses; auto finds it by comparing images."""
-    poses: Path | None = None
-    """StereoMIS, SCARED, video: "sfm" estimates the poses by structure from motion, also where there are published ones. Video: or
-    a file of camera poses (frame tx ty tz qx qy qz qw, camera-to-world); without one poses.txt beside the video is taken, and
-    without that they are estimated."""
+    poses: str | None = None
+    """All but EndoNeRF: "sfm" estimates camera poses by structure from motion (COLMAP), "vggt" or "vggt:FOLDER" by that network, of
+    whose checkpoint it is the folder; default: those of the recording, else sfm. Video: also a file of poses (frame tx ty tz qx qy
+    qz qw, camera-to-world); default: poses.txt beside the video."""
     scale: float | None = None
     """Video: metres per unit of the poses."""
     sfm_step: int | None = None
@@ -81,6 +81,7 @@ class Command:
     def run(self) -> None:
         """Write the bag; raises SequenceError if it exists or the recording cannot be read."""
         from endo_sim_ros.sequences.bag import write_bag
+        from endo_sim_ros.sequences.folder import write_points
         from endo_sim_ros.sequences.readers import open_sequence
         from endo_sim_ros.sequences.recording import Recording
 
@@ -97,6 +98,9 @@ class Command:
                 frames.prepare(lambda stage, done, total: bar.update(task, description=stage, completed=done, total=total or None))
         try:
             count = write_bag(self.bag, track(frames, f"converting {self.source.name}"))
+            points = frames.points() if isinstance(frames, Recording) else None
+            if points is not None:
+                write_points(self.bag, *points)
         except BaseException:  # half a conversion would only be in the way of the next try
             shutil.rmtree(self.bag, ignore_errors=True)
             raise

@@ -23,8 +23,8 @@ class Command:
     resume: bool = False
     """Go on from the checkpoint.pt that an interrupted reconstruction of the same bag with the same options left in that folder."""
     preset: Preset = "default"
-    """Method: ours, ours sized for a CPU, that of the paper as printed, FSGS, or 3DGS. Options that are not given have the
-    values of the preset."""
+    """Method: ours, ours sized for a CPU, that of the paper as printed, FSGS or 3DGS as published, or these two with one colour for
+    all directions of view (sh0). Options that are not given have the values of the preset."""
     config: Annotated[ReconstructionConfig, tyro.conf.arg(name="")] = field(default_factory=ReconstructionConfig)
 
     def run(self) -> None:

@@ -17,12 +17,12 @@ from endo_sim_ros.reconstruction import ReconstructionConfig, ScenePoints, scene
 from endo_sim_ros.reconstruction.priors.sources import estimate_depth
 from endo_sim_ros.reconstruction.scene import TrainingView
 from endo_sim_ros.sequences.folder import read_points
+from endo_sim_ros.sequences.recording import Recording
 
 _POINT_VIEWS = 48  # views that structure from motion is done with
 _JUDGING = 10  # one scene point in so many judges depth where none was recorded
 _FEWEST_JUDGES = 50  # with fewer, none does
 _SAME_POINT = 0.1  # distance between two triangulations of one point, in distances between judging points
-_POINT_ERROR = 0.003  # relative error of the depth of points that a recording brings
 
 
 class Prepared(NamedTuple):
@@ -51,8 +51,8 @@ def prepare_sequence(cells: Sequence[Cell], bar: Progress) -> Prepared:
         with contextlib.suppress(SequenceError):  # too few views for this one: its own cells say so
             trained.update(split_views(split, len(frames)).train)
     task = bar.add_task(f"scene points of {cells[0].sequence}", total=None)
-    known = read_points(split_source(source)[0])
-    points = ScenePoints(*known, _POINT_ERROR) if known else scene_points(frames, _POINT_VIEWS)
+    known = opened.points() if isinstance(opened, Recording) else read_points(split_source(source)[0])  # else a bag
+    points = ScenePoints.recorded(*known) if known else scene_points(frames, _POINT_VIEWS)
     bar.remove_task(task)
     depth_source, matched, judging = "none", frames, None
     recorded = any(frame.depth is not None and (frame.depth > 0).any() for frame in frames)

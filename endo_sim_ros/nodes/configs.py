@@ -53,8 +53,8 @@ class ReconstructionNodeConfig(WorldConfig):
     """Options of reconstruction_node beside those of the reconstruction."""
 
     preset: Preset = "default"
-    """Method: ours, ours sized for a CPU, that of the paper as printed, FSGS, or 3DGS. Options that are not given have the
-    values of the preset."""
+    """Method: ours, ours sized for a CPU, that of the paper as printed, FSGS or 3DGS as published, or these two with one colour for
+    all directions of view (sh0). Options that are not given have the values of the preset."""
     mode: Literal["realtime", "lockstep"] = "realtime"
     """realtime: intermediate models are published while they train, stamped by the clock. lockstep: the final model only,
     stamped by the newest image (models read from files: from one nanosecond on): one bag gives the same bytes in every run."""

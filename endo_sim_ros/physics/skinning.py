@@ -16,6 +16,8 @@ from endo_sim_ros.physics.backends.base import Launch, SkinData, Work, viewed
 from endo_sim_ros.physics.cutting.gaussians import CutNeighbours, clip_to_sides
 from endo_sim_ros.physics.weights import compact_weights, nearest_nodes
 
+_UNBOUNDED = (-1e18, 1e18)  # of F; infinite bounds would make numbers that are none of zeros
+
 
 def bind_weights(means: np.ndarray, node_rest: np.ndarray, neighbours: int, weighting: str) -> tuple[np.ndarray, np.ndarray]:
     """Return the nearest control nodes [N, K] int32 of means, and their weights [N, K] float32, which add up to one.
@@ -51,7 +53,7 @@ class Skinning:
         neighbours: Number of nearest control nodes K that move one Gaussian.
         weighting: ``compact`` (with F_k) or the paper's ``softmax`` (with R_k), see :func:`bind_weights`.
         stretch: Bounds that the singular values of every Gaussian's F are clamped to; beyond them a picture shows needles
-            or holes, not tissue.
+            or holes, not tissue. None takes F as it is, as the paper prints it.
         device: Where to compute: auto, cpu, cuda or cuda:N.
 
     Raises:
@@ -65,13 +67,13 @@ class Skinning:
         *,
         neighbours: int = 4,
         weighting: Literal["compact", "softmax"] = "compact",
-        stretch: tuple[float, float] = (0.2, 4.0),
+        stretch: tuple[float, float] | None = (0.2, 4.0),
         device: str = "auto",
     ):
         self.device = pick_device(device)
         self.backend = backend_for(self.device)
         load_kernels((kernels, *self.backend.skin_modules), self.device)
-        self.weighting, self.stretch = weighting, stretch
+        self.weighting, self.stretch = weighting, stretch or _UNBOUNDED
         rest = torch.as_tensor(node_rest).detach().cpu().double().numpy()
         means = model.means.detach().cpu().double().numpy()
         if rest.ndim != 2 or rest.shape[1] != 3 or not len(rest):

@@ -72,6 +72,16 @@ class GradientConfig(StageConfig):
     """Standard deviation above which a Gaussian is split, up to which it is doubled; that of 3DGS."""
     shrink: Annotated[float, Range(1, 10)] = 1.6
     """Factor by which the halves of a split Gaussian are smaller; that of 3DGS."""
+    absolute: bool = True
+    """Gradients of pixels count without their signs, as AbsGS has it, so that they do not cancel as those of 3DGS do."""
+    reset_every: Annotated[int, Range(0, 1_000_000)] = 0
+    """Iterations after which opacities fall to reset_to, so that what is not needed can fade; 3DGS takes 3000, 0 = never."""
+    reset_first: Annotated[int, Range(0, 1_000_000)] = 0
+    """Iteration in which they fall first; 0 = reset_every."""
+    reset_to: Annotated[float, Range(0.001, 1)] = 0.01
+    """Highest opacity after that; that of 3DGS."""
+    oversize: Annotated[float, Range(0, 100, "scene depths")] = 0.0
+    """Standard deviation above which a Gaussian is removed once opacities have fallen; 3DGS takes 0.1, 0 = none is."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +92,8 @@ class ProximityConfig(GradientConfig):
     """Number of nearest neighbours that tell how lonely a Gaussian is, and halfway to which new ones come; that of FSGS."""
     far: Annotated[float, Range(1, 100)] = 2.0
     """Mean distance from them above which a Gaussian is lonely, in medians over all, so that it fits scenes of any size."""
+    unpool_until: Annotated[int, Range(0, 1_000_000)] = 0
+    """Iteration from which on no more come between those that are lonely; FSGS takes 2000, 0 = as long as any are added."""
 
 
 @dataclass(frozen=True)
@@ -98,14 +110,17 @@ class ReconstructionConfig(StageConfig):
     """Largest number of Gaussians; 0 = as many as the views can tell of, by `training.*`."""
     sh_degree: Annotated[int, Range(0, 3)] = 0
     """Degree of the spherical harmonics; 0 is the paper's frequency regularisation."""
+    sh_every: Annotated[int, Range(0, 100_000)] = 0
+    """Iterations after which that degree rises by one, from 0 on: 3DGS takes 1000, 0 = it is there from the start."""
     initialization: Literal["depth", "points"] = "depth"
     """What training starts from: the depth prior of every view, checked between views, or triangulated points alone."""
-    depth: Literal["auto", "topic", "stereo", "network", "points", "none"] = "auto"
-    """Depth prior: the depth topic, matching with the right image, a network that sees relative depth in one image,
-    interpolation between triangulated points, none, or the first of these that exists."""
+    depth: Literal["auto", "topic", "stereo", "network", "points", "none", "network_first"] = "auto"
+    """Depth prior: the depth topic, matching with the right image, a network that sees depth in one image, interpolation
+    between triangulated points, none, or the first of these that exists; network_first is auto, but with the network first, as the
+    paper has it, and a warning where there is none."""
     depth_model: str = ""
-    """network: folder of a Depth-Anything-V2 checkpoint (transformers) or ONNX file; nothing is ever downloaded. Empty:
-    one that Hugging Face's cache holds."""
+    """network: folder of a checkpoint of Depth-Anything-V2 or another depth network (transformers), or ONNX file; nothing is ever
+    downloaded. Empty: the Depth-Anything-V2 that Hugging Face's cache holds."""
     multi_view_refinement: bool = True
     """Correct the depth of stereo, network or points by scene points and by how the right image and the other views show the
     same tissue."""
@@ -142,6 +157,10 @@ class ReconstructionConfig(StageConfig):
     virtual_every: Annotated[int, Range(0, 1000)] = 0
     """A virtual camera regularises every n-th iteration (paper eq. 7, 8), by what of the distortion, total variation and
     correlation has a weight; 0 = never."""
+    virtual_from: Annotated[int, Range(0, 1_000_000)] = 0
+    """Iterations before the first virtual camera."""
+    virtual_weight: Annotated[float, Range(0, 1000)] = 1.0
+    """Factor on those weights in virtual cameras."""
     exposure: bool = True
     """Each view has an exposure of its own, from which that of unseen views is predicted as a camera's automatic one would be."""
     light: bool = True
@@ -153,8 +172,15 @@ class ReconstructionConfig(StageConfig):
     between those that lie alone (FSGS)."""
     refine_every: Annotated[int, Range(1, 100_000)] = 100
     """Iterations between relocations of dead Gaussians and growth."""
+    refine_from: Annotated[int, Range(0, 1_000_000)] = 0
+    """Iterations before the first one."""
     refine_until: Annotated[float, Range(0, 1)] = 0.8
     """Share of the iterations after which the number of Gaussians stays, so that the last ones settle."""
+    schedule: Annotated[int, Range(0, 1_000_000)] = 0
+    """Iterations that refine_until and rates.means_decay are meant for, however many are trained; 0 = those that are trained."""
+    unit: Literal["depth", "cameras"] = "depth"
+    """What a scene depth is for rates.means and for the sizes that densification compares with: the median depth of the scene, or
+    3DGS's extent of the cameras, 1.1 times the largest distance from their mean (the median depth where they are in one place)."""
     largest: Annotated[float, Range(1e-4, 100, "scene depths")] = 0.06
     """Largest standard deviation of a Gaussian. Nothing else limits those where every view is masked, and a large one smears the
     deformed scene."""
@@ -188,11 +214,14 @@ class ReconstructionConfig(StageConfig):
     proximity: ProximityConfig = ProximityConfig()
 
     needs: ClassVar[dict[str, tuple[str, ...]]] = {
-        "depth_model": ("depth", "auto", "network"),
-        "network": ("depth", "auto", "network"),
+        "depth_model": ("depth", "auto", "network", "network_first"),
+        "network": ("depth", "auto", "network", "network_first"),
         "flat_ratio": ("lambda_flat", "more than 0"),
         "flat_every": ("lambda_flat", "more than 0"),
         "light_anchor": ("light", "true"),
+        "sh_every": ("sh_degree", "more than 0"),
+        "virtual_from": ("virtual_every", "more than 0"),
+        "virtual_weight": ("virtual_every", "more than 0"),
         "multi_view": ("multi_view_refinement", "true"),
         "motion": ("dynamic_mask", "true"),
         "extrapolated": ("extrapolation", "more than 0"),

@@ -15,9 +15,11 @@ from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.keyframes import select_keyframes
 from endo_sim_ros.reconstruction.pipeline import prepare
 from endo_sim_ros.reconstruction.progress import StageProgress
+from endo_sim_ros.reconstruction.scene import ScenePoints
 from endo_sim_ros.reconstruction.trainer import Progress, Trainer
 from endo_sim_ros.reconstruction.triangulation import scene_points
 from endo_sim_ros.sequences.bag import read_bag
+from endo_sim_ros.sequences.folder import read_points
 
 log = logging.getLogger(__name__)
 
@@ -52,8 +54,9 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
         def on_stage(stage: str, done: int, total: int) -> None:
             bar.update(task, description=stage, completed=done, total=total or None)
 
-        points = None
-        if len(chosen) < len(frames):
+        known = read_points(bag)
+        points = None if known is None else ScenePoints.recorded(*known)
+        if points is None and len(chosen) < len(frames):
             points = scene_points(frames, options=config.matching, progress=StageProgress("scene points", on_stage))
         trainer = Trainer(prepare([frames[index] for index in chosen], config, points, on_stage), config)
     if resume:

@@ -1,5 +1,6 @@
 """The Gaussians that training starts from: depth back-projected from every view, checked between views."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -8,12 +9,12 @@ import torch
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (it is public)
 
 from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.core.device import map_in_threads
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.reconstruction.progress import StageProgress
-from endo_sim_ros.reconstruction.scene import TrainingView, fill_holes
+from endo_sim_ros.reconstruction.scene import TrainingView, fill_holes, pixels_of
 from endo_sim_ros.reconstruction.stage_configs import InitialModelConfig
+from endo_sim_ros.reconstruction.surfaces import Surfaces
 
 
 class _Points(NamedTuple):
@@ -33,6 +34,7 @@ def initial_model(
     sh_degree: int = 0,
     options: InitialModelConfig = InitialModelConfig(),
     progress: StageProgress = StageProgress(),
+    device: str = "cpu",
 ) -> GaussianModel:
     """Isotropic Gaussians at the back-projected depth of the views, and at triangulated points where no depth reaches.
 
@@ -44,18 +46,22 @@ def initial_model(
         sh_degree: Degree of the spherical harmonics.
         options: Opacity, and which points float before the surface.
         progress: Reported to by views.
+        device: Where views are compared.
 
     Raises:
         SequenceError: If neither depth nor points give the scene a shape.
     """
     surfaces = [view for view in views if (view.surface > 0).any()]
-    chosen = _surface_pixels(surfaces, tolerance, progress)
-    stride = _stride(chosen, max_gaussians)
-    taken = [pixels & _lattice(pixels.shape, stride) for pixels in chosen]
     parts = [_Points(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))]
-    for done, pixels in enumerate(taken):
-        progress(len(surfaces) + done, 2 * len(surfaces))
-        parts.append(_back_project(surfaces, done, pixels, stride, tolerance))
+    chosen: list[np.ndarray] = []
+    if surfaces:
+        compared = Surfaces(surfaces, device)
+        chosen = compared.chosen(tolerance, progress)
+        stride = _stride(chosen, max_gaussians)
+        taken = [pixels & _lattice(pixels.shape, stride) for pixels in chosen]
+        for view, pixels, seen in zip(surfaces, taken, compared.mean_colors(taken, tolerance, progress)):
+            spacing = stride * view.surface[pixels].astype(np.float64) / view.camera.K[0, 0]
+            parts.append(_Points(view.camera.backproject(view.surface)[pixels], seen, spacing))
     useful = ~_afloat(surfaces, points, tolerance, options)
     if any(pixels.any() for pixels in chosen):  # lone points beyond the views would reach into them; see `extrapolate`
         useful &= np.any([view.camera.sees(points) for view in views], 0)
@@ -70,29 +76,10 @@ def initial_model(
     return GaussianModel.from_points(*tensors, opacity=options.opacity, sh_degree=sh_degree)
 
 
-def _surface_pixels(views: list[TrainingView], tolerance: float, progress: StageProgress) -> list[np.ndarray]:
-    """Which pixels [H, W] of each view to back-project, so that every piece of surface is there once.
-
-    The view that sees a piece from nearest provides it. A pixel whose point floats in front of the surface that another
-    view sees, by more than the relative tolerance, is contradicted and left out.
-    """
-    chosen = [np.zeros(view.surface.shape, bool) for view in views]
-    fineness = [np.median(view.surface[view.surface > 0]) / view.camera.K[0, 0] for view in views]
-    done: list[int] = []
-    for i in np.argsort(fineness, kind="stable"):
-        progress(len(done), 2 * len(views))
-        view = views[i]
-        pixels = (view.surface > 0) & (view.tissue > 0)
-        points = view.camera.backproject(view.surface)[pixels]
-
-        def keeps(j: int) -> np.ndarray:
-            progress.check()
-            z, surface, _ = _look_up(views[j].camera, views[j].surface, points)  # noqa: B023
-            return (surface <= 0) | (z >= surface * (1 + tolerance if j in done else 1 - tolerance))
-
-        chosen[i][pixels] = np.all([np.ones(len(points), bool), *map_in_threads(keeps, [j for j in range(len(views)) if j != i])], 0)
-        done.append(i)
-    return chosen
+def rough_depth(views: Sequence[TrainingView], points: np.ndarray) -> float:
+    """Median depth (m) of the scene points [N, 3] in the views; NaN if fewer than three are in any, which may be stray."""
+    depths = [pixels_of(view.camera, points).depth for view in views]
+    return float(np.median(np.concatenate(depths))) if max(map(len, depths)) >= 3 else math.nan
 
 
 def _look_up(camera: Camera, depth: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -118,22 +105,6 @@ def _lattice(shape: tuple[int, int], stride: float) -> np.ndarray:
     """A regular choice of pixels [H, W], one in every ``stride``² (not necessarily a whole number)."""
     rows, columns = (np.diff(np.floor(np.arange(-1, n) / stride)) > 0 for n in shape)
     return rows[:, None] & columns
-
-
-def _back_project(views: list[TrainingView], index: int, pixels: np.ndarray, stride: float, tolerance: float) -> _Points:
-    """Points of the given pixels [H, W] of one view, with the mean colour of the views that see them.
-
-    The light moves with the endoscope: colours of one view alone would show where the next view's piece begins.
-    """
-    view = views[index]
-    points, colors = view.camera.backproject(view.surface)[pixels], view.image[pixels] / 255.0
-    count = np.ones((len(points), 1))
-    for j, other in enumerate(views):
-        if j != index:
-            z, surface, seen = _look_up(other.camera, other.surface, points)
-            agrees = ((surface > 0) & (np.abs(z - surface) < tolerance * surface))[:, None]
-            colors, count = colors + agrees * (other.image.reshape(-1, 3)[seen] / 255.0), count + agrees
-    return _Points(points, colors / count, stride * view.surface[pixels].astype(np.float64) / view.camera.K[0, 0])
 
 
 def _afloat(views: list[TrainingView], points: np.ndarray, tolerance: float, options: InitialModelConfig) -> np.ndarray:

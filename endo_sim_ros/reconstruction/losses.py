@@ -54,6 +54,8 @@ def regularized(loss: Tensor, terms: Sequence[Term], rendering: Rendering, confi
         value = term.weighted(rendering, config)
         if term.every is not None:
             value = getattr(config, term.every) * value
+        if virtual:
+            value = config.virtual_weight * value
         loss = loss + value
     return loss
 

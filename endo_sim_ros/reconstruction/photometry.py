@@ -3,10 +3,12 @@
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
+from scipy import sparse
 
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
 from endo_sim_ros.core.light import Light, features_at
@@ -76,8 +78,8 @@ def fit_light(
     count, prior = len(views), np.array([options.distance, options.angle, 0.0, 0.0]) * light
     if not len(view):
         return prior, np.zeros((count, 3))
-    gains = np.eye(count)[view]
-    A = np.concatenate([quantities, gains], 1)
+    gains: Any = sparse.csr_matrix((np.ones(len(view)), (np.arange(len(view)), view)), (len(view), count))
+    A: Any = sparse.hstack([quantities, gains], format="csr")  # all views' gains would fill the memory
     # Standard deviations of the prior; what is not to be fitted has next to none. Views of one recording differ by a factor of two.
     off = 1e-6
     spread = np.concatenate([[0.3, 6.0, 0.3, 0.3] if light else np.full(4, off), np.full(count, 0.7 if exposure else off)])
@@ -158,9 +160,9 @@ def _well_seen(
 
 
 def _solve(
-    A: np.ndarray, y: np.ndarray, index: np.ndarray, count: int, prior: np.ndarray, spread: np.ndarray, noise: float
+    A: Any, y: np.ndarray, index: np.ndarray, count: int, prior: np.ndarray, spread: np.ndarray, noise: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """x [P] that minimises Σ w (y − A x − own_index)² / noise² + Σ (x − prior)² / spread², and the weights w [M].
+    """x [P] that minimises Σ w (y − A x − own_index)² / noise² + Σ (x − prior)² / spread², and the weights w [M]; A [M, P] is sparse.
 
     Each point's own value is eliminated; w falls for observations that do not fit (Cauchy).
     """
@@ -169,12 +171,15 @@ def _solve(
     weights, x = np.ones(len(y)), prior
     for _ in range(10):
         total = np.bincount(index, weights, count).clip(1e-9)
-        mean = lambda values: (np.bincount(index, weights * values, count) / total)[index]  # noqa: B023
-        centred = A - np.stack([mean(column) for column in A.T], 1)
-        rest = y - mean(y)
-        normal = trust * (centred * weights[:, None]).T @ centred + np.diag(1 / spread**2)
-        x = np.linalg.solve(normal, trust * centred.T @ (weights * rest) + prior / spread**2)
-        residual = rest - centred @ x
+        about = lambda values: (np.bincount(index, weights * values, count) / total)[index]  # noqa: B023
+        by_point: Any = sparse.csr_matrix((weights, (index, np.arange(len(y)))), (count, len(y))) @ A
+        weighted = A.multiply(weights[:, None]).tocsr()
+        normal = (A.T @ weighted - by_point.T @ by_point.multiply(1 / total[:, None]).tocsr()).toarray()
+        rest = y - about(y)
+        normal, right = trust * normal + np.diag(1 / spread**2), trust * (weighted.T @ rest) + prior / spread**2
+        x = np.linalg.solve(normal, right)
+        fitted = A @ x
+        residual = rest - fitted + about(fitted)
         scale = max(1.4826 * np.median(np.abs(residual)), 1e-3)
         weights = 1 / (1 + (residual / (2 * scale)) ** 2)
     return x, weights

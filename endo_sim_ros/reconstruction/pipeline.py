@@ -12,16 +12,17 @@ from typing import Any
 import numpy as np
 
 from endo_sim_ros.core.config import unused_options
+from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.reconstruction import photometry
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.dynamic_mask import mask_motion
-from endo_sim_ros.reconstruction.initialization import initial_model
+from endo_sim_ros.reconstruction.initialization import initial_model, rough_depth
 from endo_sim_ros.reconstruction.pose_check import misposed
 from endo_sim_ros.reconstruction.priors.extrapolation import extrapolate
 from endo_sim_ros.reconstruction.priors.multi_view import refine_depth
-from endo_sim_ros.reconstruction.priors.sources import depth_source, estimate_depth
+from endo_sim_ros.reconstruction.priors.sources import borrow_depth, depth_source, estimate_depth
 from endo_sim_ros.reconstruction.progress import OnProgress, StageProgress
 from endo_sim_ros.reconstruction.scene import PreparedScene, ScenePoints, TrainingView, shrink
 from endo_sim_ros.reconstruction.trainer import Trainer
@@ -133,8 +134,20 @@ def find_points(scene: PreparedScene, config: ReconstructionConfig, progress: St
 
 def find_depth(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Give each view its depth prior, and a right image that is rectified well."""
-    found = tuple(estimate_depth(scene.views, scene.points, config, progress))
-    return replace(scene, views=found, depth_source=depth_source(scene.frames, config))
+    source = depth_source(scene.frames, config)
+    if config.depth == "network_first" and source != "network" and scene.depth_source == "none":  # else it has been said
+        scene = scene.decided(
+            f"DEPTH IS NOT AS PUBLISHED: the method takes it from a network, and no checkpoint of one is here, so it is from {source}; "
+            "give one as depth_model"
+        )
+    found = estimate_depth(scene.views, scene.points, config, progress)
+    missing = [i for i, view in enumerate(found) if view.depth_prior is None]
+    if missing and source != "none":
+        found = borrow_depth(found, config)
+        borrowed = [found[i] for i in missing if found[i].depth_prior is not None]
+        if borrowed:
+            scene = scene.decided(f"views at {_stamps(borrowed)} have no depth of their own: they get that of the other views")
+    return replace(scene, views=tuple(found), depth_source=source)
 
 
 def check_poses_by_stereo(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
@@ -197,9 +210,14 @@ def place_gaussians(scene: PreparedScene, config: ReconstructionConfig, progress
         SequenceError: If neither depth nor scene points give the scene a shape.
     """
     most = max(int(config.initial.seen_share * scene.max_gaussians) if config.extrapolation else scene.max_gaussians, 1)
-    views, points = scene.views, scene.points
+    views, points = list(scene.views), scene.points
     if config.initialization == "points":
         views = [replace(view, depth_prior=None) for view in views]
+    elif scene.depth_source != "none" and not any((view.surface > 0).any() for view in views):
+        depth = rough_depth(views, points.positions)
+        if np.isfinite(depth):
+            scene = scene.decided(f"no view sees enough scene points for a depth prior: training starts from a plane {depth:.3g} m away")
+            views = [replace(view, depth_prior=np.full(view.image.shape[:2], depth, np.float32)) for view in views]
     model = initial_model(
         views,
         points.positions,
@@ -209,6 +227,7 @@ def place_gaussians(scene: PreparedScene, config: ReconstructionConfig, progress
         sh_degree=config.sh_degree,
         options=config.initial,
         progress=progress,
+        device=pick_device(config.device),
     )
     positions = model.means.numpy().astype(np.float64)
     depths = np.concatenate([view.camera.project(positions)[1] for view in views])
@@ -314,4 +333,5 @@ def _misposed(
 
 def _checked_by_stereo(scene: PreparedScene, config: ReconstructionConfig) -> bool:
     """Whether the check of poses waits for the depth that pairs of images give."""
-    return config.depth in ("auto", "stereo") and any(frame.right is not None for frame in scene.frames)
+    paired = any(frame.right is not None for frame in scene.frames)
+    return paired and config.depth in ("auto", "stereo", "network_first") and depth_source(scene.frames, config) != "network"

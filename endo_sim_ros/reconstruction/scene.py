@@ -26,6 +26,11 @@ class ScenePoints(NamedTuple):
     error: np.ndarray | float = 0.01  # [N] of the depth, relative, that a pixel's error makes
 
     @classmethod
+    def recorded(cls, positions: np.ndarray, colors: np.ndarray) -> "ScenePoints":
+        """Points that a recording brings, of structure from motion with all its views, whose depth errs less."""
+        return cls(positions, colors, 0.003)
+
+    @classmethod
     def none(cls) -> "ScenePoints":
         """No points at all."""
         return cls(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))

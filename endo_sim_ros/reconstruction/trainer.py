@@ -74,6 +74,9 @@ class Trainer:
         self._load(scene.views)
         eye = np.mean([view.camera.position for view in self._device_views], 0)
         self._eye = torch.as_tensor(eye, dtype=torch.float32, device=self.device)
+        extent = 1.1 * max(float(np.linalg.norm(camera.position - eye)) for camera in self.cameras)
+        self._unit = extent if config.unit == "cameras" and extent else scene.depth  # metres
+        self._schedule = config.schedule or scene.iterations
         self._generator = torch.Generator().manual_seed(config.seed)
         # Drawn where it is needed: a GPU that waits for numbers stands still.
         self._noise = self._generator if self.device == "cpu" else torch.Generator(self.device).manual_seed(config.seed)
@@ -81,7 +84,7 @@ class Trainer:
         self._captures: dict[tuple, GraphCapture] = {}
         self._last_loss = torch.zeros(())
         options = getattr(config, config.densification)
-        self._strategy = STRATEGIES[config.densification](options, scene.max_gaussians, scene.depth)
+        self._strategy = STRATEGIES[config.densification](options, scene.max_gaussians, self._unit)
         self.appearance = Appearance(scene.light, scene.exposures, scene.depth, config, self.device)
         self._set_model(scene.model.to(self.device))
 
@@ -205,21 +208,32 @@ class Trainer:
         view = self._device_views[self._order.pop()]
         terms = losses.active_terms(config, self.iteration)
         virtual = None
-        if config.virtual_every and self.iteration % config.virtual_every == 0 and len(self.stamps) > 1:
+        due = self.iteration >= config.virtual_from and config.virtual_every and self.iteration % config.virtual_every == 0
+        if due and len(self.stamps) > 1:
             virtual = self._virtual_camera(view.index)
         self.optimizer.set_rate("means", self._step_size)
         self._last_loss = self._descend(terms, self._inputs(view, virtual, terms))
         self.iteration += 1
         with torch.no_grad():
-            if self.iteration <= config.refine_until * self.iterations and self.iteration % config.refine_every == 0:
-                self.refine()
+            if self.iteration <= config.refine_until * self._schedule:
+                if self.iteration > config.refine_from and self.iteration % config.refine_every == 0:
+                    self.refine()
+                self._strategy.reset(self.parameters, self.optimizer.state, self.iteration)
             self._strategy.perturb(self.parameters, self.iteration, self._step_size, self._noise)
 
     @property
     def _step_size(self) -> float:
         """Learning rate of the means, metres."""
         config, rates = self.config, self.config.rates
-        return rates.means * self.scene_depth * config.learning_rate * rates.means_decay ** (self.iteration / self.iterations)
+        progress = min(self.iteration / self._schedule, 1.0)
+        return rates.means * self._unit * config.learning_rate * rates.means_decay**progress
+
+    @property
+    def _sh_count(self) -> int:
+        """Number of coefficients of the degree that the spherical harmonics have by now."""
+        config = self.config
+        degree = min(config.sh_degree, (self.iteration + 1) // config.sh_every) if config.sh_every else config.sh_degree
+        return (degree + 1) ** 2
 
     def _virtual_camera(self, index: int) -> Camera:
         """Paper eq. 7: a random camera between a view and its nearest view."""
@@ -240,7 +254,7 @@ class Trainer:
         function = functools.partial(self._descend_once, terms)
         if self.device == "cpu":
             return function(*inputs)
-        key = (terms, *(None if x is None else x.shape for x in inputs))
+        key = (terms, self._sh_count, *(None if x is None else x.shape for x in inputs))
         if key not in self._captures:
             self._captures[key] = GraphCapture(function)
         with torch.cuda.device(self.device):
@@ -274,8 +288,8 @@ class Trainer:
     ) -> tuple[GaussianModel, RenderOutput]:
         """The model, and its images of cameras, width × height pixels."""
         model = model_of(self.parameters)
-        tensors = model.means, model.quats, model.scales, model.opacities, model.sh
-        return model, rasterize(*tensors, viewmats, Ks, *size, masks=masks, absgrad=absgrad)
+        tensors = model.means, model.quats, model.scales, model.opacities, model.sh[:, : self._sh_count]
+        return model, rasterize(*tensors, viewmats, Ks, *size, masks=masks, absgrad=absgrad, signed=self._strategy.signed)
 
     def _loss(self, terms: tuple[losses.Term, ...], view: _Inputs, model: GaussianModel, output: RenderOutput) -> Tensor:
         """Paper eq. 6 of a training view, the first camera, and eq. 8 of a virtual camera, the second one."""
@@ -313,7 +327,7 @@ class Trainer:
 
     def refine(self) -> None:
         """Add, move and remove Gaussians, keeping the optimiser's state of those that stay."""
-        model, source, fresh = self._strategy.refine(self._detached(), self._strategy_state, self._generator)
+        model, source, fresh = self._strategy.refine(self._detached(), self._strategy_state, self._generator, self.iteration)
         states = self.optimizer.state
         self._set_model(model)
         for name, state in states.items():

@@ -16,6 +16,9 @@ class RenderingConfig(StageConfig):
     """Grey level where there is no tissue."""
     skinning: Literal["compact", "softmax"] = "compact"
     """Weights from nodes to Gaussians: compact (1 - (d/d5)²)² with F, or the paper's printed softmax(d) with R."""
+    clamp_stretch: bool = True
+    """Keep what stretches each Gaussian, the singular values of its F, between 0.2 and 4; false takes F as the paper prints it, and
+    tissue that is torn or turned inside out shows needles and holes."""
     neighbours: Annotated[int, Range(1, 32)] = 4
     """Number of nodes that move one Gaussian."""
     device: str = "auto"

@@ -1,6 +1,6 @@
 """Images and depth of a Gaussian model, at rest or as it follows its control nodes, in a camera."""
 
-from typing import Literal, overload
+from typing import Any, Literal, overload
 
 import numpy as np
 import torch
@@ -35,7 +35,10 @@ class DeformableRenderer:
         self._background = torch.full((3,), config.background, device=self.device)
         self.skinning: Skinning | None = None
         if node_rest is not None:
-            self.skinning = Skinning(self.model, node_rest, neighbours=config.neighbours, weighting=config.skinning, device=self.device)
+            options: dict[str, Any] = {"neighbours": config.neighbours, "weighting": config.skinning, "device": self.device}
+            if not config.clamp_stretch:
+                options["stretch"] = None
+            self.skinning = Skinning(self.model, node_rest, **options)
 
     def cut(self, triangles: np.ndarray) -> None:
         """Part the tissue along all cuts so far, triangles [T, 3, 3], metres, world, in the tissue at rest."""

@@ -20,12 +20,12 @@ import numpy as np
 from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.calibration_files import check_calibrated_size, read_calibration
+from endo_sim_ros.sequences.estimated_poses import with_estimated_poses
 from endo_sim_ros.sequences.images import check_size, image_size, numbered_files, read_depth, read_image
 from endo_sim_ros.sequences.masks import MaskFiles, lit_area, lit_now
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.recording import DEFAULT_FPS, Recording, check_folder, keep_posed, select, spread, stamp_ns
 from endo_sim_ros.sequences.rectification import Rectification
-from endo_sim_ros.sequences.structure_from_motion import with_estimated_poses
 
 logger = logging.getLogger(__name__)
 
@@ -44,6 +44,7 @@ def read_folder(
     mask_polarity: str = "tissue",
     mask_border: bool = True,
     fps: float | None = None,
+    poses: str | None = None,
 ) -> Recording:
     """Read a folder of images.
 
@@ -55,6 +56,8 @@ def read_folder(
         mask_polarity: What white means in the masks: `tool`, `tissue`, or `auto` to find out.
         mask_border: Ignore the black border that rectification or a round vignette leaves.
         fps: Frames per second that frame numbers count in; None takes the calibration's, or 25.
+        poses: `sfm`, `vggt` or `vggt:FOLDER` estimates the poses, see `pose_estimator`; None takes those of the recording if there are any,
+            else structure from motion.
 
     Returns:
         Undistorted frames, of both eyes where there is right/; those without a pose are skipped.
@@ -76,11 +79,11 @@ def read_folder(
     rate: float = fps or calibration.get("fps", DEFAULT_FPS)
 
     numbers = select(left, root / "left", start, stop, step)
-    poses = None
+    recorded = None
     pose_file = next((root / name for name in POSE_FILES if (root / name).is_file()), None)
-    if pose_file:
-        poses = read_poses(pose_file)
-        numbers = keep_posed(numbers, poses, pose_file)
+    if pose_file and poses is None:
+        recorded = read_poses(pose_file)
+        numbers = keep_posed(numbers, recorded, pose_file)
     missing = [n for n in numbers if right and n not in right]
     if missing:
         raise SequenceError(f"{root / 'right'}: the right image of {left[missing[0]].name} is missing")
@@ -108,7 +111,7 @@ def read_folder(
                 z = read_depth(depths[number], depth_scale)
                 check_size(z, size, depths[number])
                 depth = rectification.depth(np.dstack([np.zeros_like(z)] * 2 + [z]))
-            pose = np.eye(4) if poses is None else poses[number]
+            pose = np.eye(4) if recorded is None else recorded[number]
             yield Frame(
                 stamp_ns=stamp_ns(number, rate),
                 image=rectification.left(image),
@@ -119,22 +122,23 @@ def read_folder(
                 mask=rectification.mask(mask),
             )
 
-    recording = Recording(frames, len(numbers))
-    if poses is not None:
+    recording = Recording(frames, len(numbers), lambda: read_points(root))  # of the poses recorded
+    if recorded is not None:
         return recording
-    logger.warning("%s: no %s, so poses come from structure from motion", root, " or ".join(POSE_FILES))
-    return with_estimated_poses(recording, root)
+    if poses is None:
+        logger.warning("%s: no %s, so poses come from structure from motion", root, " or ".join(POSE_FILES))
+    return with_estimated_poses(recording, root, poses)
 
 
 def read_points(path: Path | str) -> tuple[np.ndarray, np.ndarray] | None:
-    """Scene points [N, 3] (m, world of the poses) and their RGB [N, 3] in [0, 1] of a folder; None if it has none, or no poses.
+    """Scene points [N, 3] (m, world) and their RGB [N, 3] in [0, 1] of a folder of images or a bag; None if it has none.
 
     Raises:
         SequenceError: If they cannot be read.
     """
     root = Path(path)
     file = root / POINTS_FILE
-    if not file.is_file() or not any((root / name).is_file() for name in POSE_FILES):
+    if not file.is_file():
         return None
     try:
         values = np.loadtxt(file, usecols=range(6), ndmin=2)
@@ -144,3 +148,8 @@ def read_points(path: Path | str) -> tuple[np.ndarray, np.ndarray] | None:
     if not len(values) or not np.isfinite(values).all() or values[:, 3:].min() < 0 or values[:, 3:].max() > 255:
         raise SequenceError(f"{file}: expected finite x y z and colours r g b from 0 to 255; correct or remove it")
     return values[:, :3], values[:, 3:] / 255
+
+
+def write_points(path: Path | str, points: np.ndarray, colors: np.ndarray) -> None:
+    """Write scene points [N, 3] (m, world) and their RGB [N, 3] in [0, 1] into a folder of images or a bag."""
+    np.savetxt(Path(path) / POINTS_FILE, np.column_stack([points, np.round(255 * colors)]), "%.7g", header="x y z r g b")

@@ -30,6 +30,7 @@ from numpy.typing import ArrayLike
 
 from endo_sim_ros.core.cameras import Camera, invert_pose
 from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.sequences.estimated_poses import with_estimated_poses
 from endo_sim_ros.sequences.images import clean_depth, image_size, numbered_files, read_image
 from endo_sim_ros.sequences.recording import DEFAULT_FPS, Recording, check_folder, keep_posed, select, stamp_ns
 from endo_sim_ros.sequences.rectification import Rectification, StereoCalibration
@@ -45,7 +46,6 @@ from endo_sim_ros.sequences.scared_archives import (
 )
 from endo_sim_ros.sequences.scared_pose_direction import USUAL_DIRECTION, Projection, find_pose_direction
 from endo_sim_ros.sequences.stereo_images import StackedVideo, StereoFiles, StereoImages
-from endo_sim_ros.sequences.structure_from_motion import wants_estimate, with_estimated_poses
 
 logger = logging.getLogger(__name__)
 
@@ -61,7 +61,7 @@ def read_scared(
     stop: int | None = None,
     step: int = 1,
     depth: str = "scene_points",
-    poses: Path | str | None = None,
+    poses: str | None = None,
     pose_direction: str = "auto",
     fps: float | None = None,
 ) -> Recording:
@@ -73,7 +73,8 @@ def read_scared(
         step: Take every step-th frame.
         depth: `scene_points` (every frame; follows the kinematics, so it is a few pixels off in places), `keyframe`
             (the first frame only, measured), or `none`.
-        poses: `sfm` estimates the poses; None takes the published ones, and estimates them where there are none.
+        poses: `sfm`, `vggt` or `vggt:FOLDER` estimates the poses, see `pose_estimator`; None takes those of the recording if there are any,
+            else structure from motion.
         pose_direction: What the published camera-pose does: `world_to_camera`, `camera_to_world`, or `auto` to find
             out which one carries the keyframe onto later frames; the finding is logged.
         fps: Frames per second; None takes the video's, or 25 for extracted frames.
@@ -92,7 +93,6 @@ def read_scared(
     keyframes = sorted(p.name for p in root.glob("keyframe_*"))
     if keyframes:
         raise SequenceError(f"{root}: is a whole dataset; pass one of its keyframes: {', '.join(keyframes)}")
-    estimated = wants_estimate(poses, root)
     _tell_defects(root)
     if (root / "data/rgb.mp4").is_file():
         images, is_rectified = StackedVideo(root / "data/rgb.mp4"), False
@@ -103,7 +103,7 @@ def read_scared(
 
     frame_data = _archive_or_folder(root, "frame_data")
     documents = read_frame_data(frame_data) if frame_data.exists() else {}
-    published = {} if estimated else {n: published_pose(document, frame_data, n) for n, document in documents.items()}
+    published = {} if poses is not None else {n: published_pose(document, frame_data, n) for n, document in documents.items()}
     calibration = _calibration(root, documents, images.size).resized(*images.size)
     # Those who prepare left_finalpass leave OpenCV's alpha at its default.
     rectification = Rectification.stereo(calibration, alpha=-1 if is_rectified else 0)
@@ -150,9 +150,9 @@ def read_scared(
     recording = Recording(frames, len(numbers))
     if published:
         return recording
-    if not estimated:
+    if poses is None:
         logger.warning("%s: file is missing, so poses come from structure from motion", frame_data)
-    return with_estimated_poses(recording, root)
+    return with_estimated_poses(recording, root, poses)
 
 
 def _tell_defects(root: Path) -> None:

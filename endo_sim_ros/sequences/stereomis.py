@@ -27,6 +27,7 @@ import numpy as np
 
 from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.sequences.estimated_poses import with_estimated_poses
 from endo_sim_ros.sequences.images import numbered_files
 from endo_sim_ros.sequences.mask_alignment import MaskAlignment, Reading
 from endo_sim_ros.sequences.masks import MaskFiles, read_mask
@@ -35,7 +36,6 @@ from endo_sim_ros.sequences.pose_lag import LagFinder
 from endo_sim_ros.sequences.recording import Recording, check_folder, keep_posed, select, spread, stamp_ns
 from endo_sim_ros.sequences.rectification import Rectification, StereoCalibration
 from endo_sim_ros.sequences.stereo_images import StackedVideo, StereoFiles, StereoImages, row_offsets
-from endo_sim_ros.sequences.structure_from_motion import wants_estimate, with_estimated_poses
 from endo_sim_ros.sequences.video_files import find_video
 
 logger = logging.getLogger(__name__)
@@ -56,7 +56,7 @@ def read_stereomis(
     stop: int | None = None,
     step: int = 1,
     split: str | None = None,
-    poses: Path | str | None = None,
+    poses: str | None = None,
     pose_lag: int | None = None,
     mask_polarity: str = "auto",
     max_mask_gap: int = 1,
@@ -72,7 +72,8 @@ def read_stereomis(
         start, stop: First frame number, and the one to stop before; the video's first frame is 0.
         step: Take every step-th frame.
         split: `train` or `test` keeps the frames of that split file only; None keeps all.
-        poses: `sfm` estimates the poses; None takes those in groundtruth.txt, and estimates them where it is missing.
+        poses: `sfm`, `vggt` or `vggt:FOLDER` estimates the poses, see `pose_estimator`; None takes those of the recording if there are any,
+            else structure from motion.
         pose_lag: Frame n has the pose in row n − pose_lag of groundtruth.txt; None finds it from the images, and takes 4 where they
             do not tell.
         mask_polarity: What white means in the masks: `tool`, `tissue`, or `auto` to find out.
@@ -92,7 +93,7 @@ def read_stereomis(
     root = check_folder(path)
     if first_mask is not None and first_mask < 0:
         raise SequenceError(f"{root}: first_mask must be 0 or more, got {first_mask}")
-    estimated = wants_estimate(poses, root) or not (root / POSES_FILE).is_file()
+    estimated = poses is not None or not (root / POSES_FILE).is_file()
     calibration = read_stereo_ini(root / CALIBRATION_FILE)
     images, is_rectified = _open_images(root, calibration, frames_rectified)
     rectification = Rectification.stereo(calibration.resized(*images.size))
@@ -157,7 +158,11 @@ def read_stereomis(
             )
 
     recording = Recording(frames, len(numbers))
-    return recording if rows is not None else with_estimated_poses(recording, root)
+    if rows is not None:
+        return recording
+    if poses is None:
+        logger.warning("%s: no %s, so poses come from structure from motion", root, POSES_FILE)
+    return with_estimated_poses(recording, root, poses)
 
 
 def read_stereo_ini(path: Path) -> StereoCalibration:

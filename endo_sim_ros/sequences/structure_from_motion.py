@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,11 +20,11 @@ import numpy as np
 from endo_sim_ros.core.cameras import intrinsic_matrix, invert_pose
 from endo_sim_ros.core.device import cpu_threads
 from endo_sim_ros.core.features import detect  # imports cv2, before pycolmap, whose own image library would otherwise break cv2.imwrite
-from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.sequences import colmap_process
 from endo_sim_ros.sequences.colmap_process import ColmapJob
 from endo_sim_ros.sequences.images import image_size
-from endo_sim_ros.sequences.recording import OnProgress, Recording
+from endo_sim_ros.sequences.recording import OnProgress
 
 logger = logging.getLogger(__name__)
 
@@ -47,6 +47,7 @@ class StructureFromMotion:
         distortion: Coefficients (k1,) in OpenCV's sense, empty when K was given.
         reprojection_error: Mean over all observations, pixels.
         metric: False when the scale is a guess.
+        points: Scene points [N, 3] (m, world) and their RGB [N, 3] in [0, 1]; None where only poses were estimated.
     """
 
     poses: dict[int, np.ndarray]
@@ -54,6 +55,7 @@ class StructureFromMotion:
     distortion: tuple[float, ...]
     reprojection_error: float
     metric: bool
+    points: tuple[np.ndarray, np.ndarray] | None = None
 
 
 def estimate_poses(
@@ -97,61 +99,13 @@ def estimate_poses(
     with tempfile.TemporaryDirectory(prefix="endo_sfm_") as folder:
         root = Path(folder)
         database = root / colmap_process.DATABASE
-        count, size = _write_features(database, images, K, masks, right_images, baseline, threads, on_progress, count)
+        count, size, colors = _write_features(database, images, K, masks, right_images, baseline, threads, on_progress, count)
         if count < 2:
             raise SequenceError(f"structure from motion needs at least 2 images, got {count}; select more frames")
         if count > _LONG_RUN:
             logger.warning("structure from motion on %d images takes long; a larger step would do as well", count)
         model = _run_colmap(root, K is not None, baseline is not None, size, count, threads, on_progress)
-    return _result(model, count, K, baseline, scale)
-
-
-def wants_estimate(poses: Path | str | None, source: Path) -> bool:
-    """Whether a reader's option `poses` asks for structure from motion.
-
-    Raises:
-        SequenceError: If it is anything else but None, which takes the published poses.
-    """
-    if poses is not None and str(poses) != STRUCTURE_FROM_MOTION:
-        raise SequenceError(f"{source}: poses must be {STRUCTURE_FROM_MOTION!r} or left out for the published ones, got {str(poses)!r}")
-    return poses is not None
-
-
-def with_estimated_poses(recording: Recording, source: Path) -> Recording:
-    """Frames of a calibrated camera with unknown poses, posed by structure from motion on first iteration.
-
-    Args:
-        recording: Its frames have any pose; stereo frames make the result metric.
-        source: Its file or folder, for messages.
-    """
-    poses: dict[int, np.ndarray] = {}
-
-    def prepare(on_progress: OnProgress | None = None) -> None:
-        if not poses:
-            logger.info("%s: running structure from motion on %d frames", source, len(recording))
-            first = next(iter(recording))
-            stereo = first.right is not None
-            try:
-                result = estimate_poses(
-                    (frame.image for frame in recording),
-                    first.camera.K,
-                    masks=(frame.mask for frame in recording),
-                    right_images=(frame.right for frame in recording) if stereo else None,
-                    baseline=first.baseline if stereo else None,
-                    count=len(recording),
-                    on_progress=on_progress,
-                )
-            except SequenceError as error:
-                raise SequenceError(f"{source}: {error}") from None
-            poses.update(result.poses)
-
-    def posed() -> Iterator[Frame]:
-        prepare()
-        for position, frame in enumerate(recording):
-            if position in poses:
-                yield dataclasses.replace(frame, camera=frame.camera.at(poses[position]))
-
-    return Recording(posed, len(recording), prepare)
+    return _result(model, count, colors, K, baseline, scale)
 
 
 def _write_features(
@@ -164,18 +118,24 @@ def _write_features(
     threads: int,
     on_progress: OnProgress,
     expected: int,
-) -> tuple[int, tuple[int, int]]:
-    """Write cameras, images (`left/000000`, `right/000000`) and features into a new database; returns count and size of the images."""
+) -> tuple[int, tuple[int, int], dict[str, np.ndarray]]:
+    """Write cameras, images (`left/000000`, `right/000000`) and features into a new database.
+
+    Returns:
+        Count and size of the images, and by their names the RGB [N, 3], uint8, of the features: COLMAP sees no image.
+    """
     import pycolmap  # heavy, and needed here only
 
-    def find(task: tuple[str, np.ndarray, np.ndarray | None]) -> tuple[str, np.ndarray, np.ndarray]:
+    def find(task: tuple[str, np.ndarray, np.ndarray | None]) -> tuple[str, np.ndarray, np.ndarray, np.ndarray]:
         eye, image, mask = task
         uv, descriptors = detect(image, mask, _MAX_FEATURES)
-        return eye, uv, np.zeros((0, 128), np.float32) if descriptors is None else descriptors
+        column, row = uv.astype(int).T
+        color = image[row.clip(0, image.shape[0] - 1), column.clip(0, image.shape[1] - 1)]
+        return eye, uv, np.zeros((0, 128), np.float32) if descriptors is None else descriptors, color
 
     absent = itertools.repeat(None)
     workers = min(threads, cpu_threads()) if threads > 0 else cpu_threads()
-    count, size, cameras = 0, None, {}
+    count, size, cameras, colors = 0, None, {}, {}
     frames = zip(images, masks or absent, right_images or absent, strict=False)
     with pycolmap.Database.open(database) as opened, ThreadPoolExecutor(workers) as pool:
         on_progress("features", 0, expected)
@@ -190,11 +150,13 @@ def _write_features(
                 if right is not None:  # the left mask's border serves both eyes; its tools are shifted, which matching survives
                     tasks.append(("right", right, mask))
             number = count - 1
-            for eye, uv, descriptors in pool.map(find, tasks):
+            for eye, uv, descriptors, color in pool.map(find, tasks):
                 number += eye == "left"
                 if eye not in cameras:
                     cameras[eye] = _write_camera(pycolmap, opened, K, size or (0, 0))
-                _write_image(pycolmap, opened, cameras[eye], f"{eye}/{number:06d}", uv, descriptors)
+                name = f"{eye}/{number:06d}"
+                colors[name] = color
+                _write_image(pycolmap, opened, cameras[eye], name, uv, descriptors)
             count += len(batch)
             on_progress("features", count, expected)
         if baseline is not None and count:
@@ -202,7 +164,7 @@ def _write_features(
             pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value  # it prints a line for each pair
             _tie_eyes(pycolmap, opened, baseline)
             pycolmap.logging.minloglevel = level
-    return count, size or (0, 0)
+    return count, size or (0, 0), colors
 
 
 def _write_camera(pycolmap: Any, database: Any, K: np.ndarray | None, size: tuple[int, int]) -> tuple[Any, int]:
@@ -288,8 +250,10 @@ def _run_colmap(root: Path, fixed: bool, stereo: bool, size: tuple[int, int], co
     return pycolmap.Reconstruction(root / colmap_process.MODEL)
 
 
-def _result(model: Any, count: int, K: np.ndarray | None, baseline: float | None, scale: float | None) -> StructureFromMotion:
-    """Scale a COLMAP model to metres and put the world into its first camera."""
+def _result(
+    model: Any, count: int, colors: dict[str, np.ndarray], K: np.ndarray | None, baseline: float | None, scale: float | None
+) -> StructureFromMotion:
+    """Scale a COLMAP model to metres, put the world into its first camera, and colour its points by the features of each."""
     eyes: dict[str, dict[int, np.ndarray]] = {"left": {}, "right": {}}
     depths = []
     points = {key: point.xyz for key, point in model.points3D.items()}
@@ -309,26 +273,18 @@ def _result(model: Any, count: int, K: np.ndarray | None, baseline: float | None
         shown = ", ".join(map(str, lost[:10])) + (", …" if len(lost) > 10 else "")
         logger.warning("structure from motion could not place %d of %d images: %s", len(lost), count, shown)
 
-    metric = True
-    pairs = [np.linalg.norm(eyes["right"][n][:3, 3] - left[n][:3, 3]) for n in left if n in eyes["right"]]
-    if baseline is not None and pairs:
-        factor = baseline / np.median(pairs)
-        logger.info("scale from the baseline of %d stereo pairs", len(pairs))
-    elif scale is not None:
-        factor = scale
-    else:
-        metric = False
-        factor = _GUESSED_DEPTH / np.median(depths)
-        logger.warning(
-            "THE SCALE IS A GUESS: one eye cannot tell size, so the median depth is set to %g m; "
-            "pass scale, or a stereo recording, where sizes and forces matter", _GUESSED_DEPTH,
-        )  # fmt: skip
+    pairs = [float(np.linalg.norm(eyes["right"][n][:3, 3] - left[n][:3, 3])) for n in left if n in eyes["right"]]
+    factor, metric = scale_to_metres(pairs, baseline, scale, np.array(depths))
 
     to_first = invert_pose(next(iter(left.values())))
     poses = {}
     for number, pose in left.items():
         poses[number] = to_first @ pose
         poses[number][:3, 3] *= factor
+    names = {number: image.name for number, image in model.images.items()}
+    tracks = ([(names[e.image_id], e.point2D_idx) for e in point.track.elements] for point in model.points3D.values())
+    point_colors = np.array([np.mean([colors[name][feature] for name, feature in track], 0) for track in tracks]) / 255
+    scene_points = factor * (np.array(list(points.values())) @ to_first[:3, :3].T + to_first[:3, 3])
 
     distortion: tuple[float, ...] = ()
     if K is None:
@@ -337,4 +293,25 @@ def _result(model: Any, count: int, K: np.ndarray | None, baseline: float | None
         logger.warning("estimated a focal length of %.1f px and k1 %.3f, which may be wrong; pass the calibration if known", f, k1)
     error = float(model.compute_mean_reprojection_error())
     logger.info("structure from motion placed %d of %d images, %d points, %.2f px", len(left), count, len(points), error)
-    return StructureFromMotion(poses, np.asarray(K, np.float64), distortion, error, metric)
+    return StructureFromMotion(poses, np.asarray(K, np.float64), distortion, error, metric, (scene_points, point_colors))
+
+
+def scale_to_metres(pairs: list[float], baseline: float | None, scale: float | None, depths: np.ndarray) -> tuple[float, bool]:
+    """Metres per unit of a reconstruction, and whether they are more than a guess.
+
+    Args:
+        pairs: Distances between the eyes, in those units.
+        baseline: The same, metres.
+        scale: Metres per unit where there are no pairs.
+        depths: Of what is seen, in those units; without any of the above their median is taken for a usual one.
+    """
+    if baseline is not None and len(pairs):
+        logger.info("scale from the baseline of %d stereo pairs", len(pairs))
+        return float(baseline / np.median(pairs)), True
+    if scale is not None:
+        return scale, True
+    logger.warning(
+        "THE SCALE IS A GUESS: one eye cannot tell size, so the median depth is set to %g m; "
+        "pass scale, or a stereo recording, where sizes and forces matter", _GUESSED_DEPTH,
+    )  # fmt: skip
+    return float(_GUESSED_DEPTH / np.median(depths)), False

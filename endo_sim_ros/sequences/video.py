@@ -18,15 +18,18 @@ import numpy as np
 from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.calibration_files import check_calibrated_size, read_calibration
+from endo_sim_ros.sequences.estimated_poses import pose_estimator
 from endo_sim_ros.sequences.images import numbered_files, read_gray
 from endo_sim_ros.sequences.masks import MaskFiles, lit_area, lit_now, tissue_mask, tool_is_white
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.recording import OnProgress, Recording, keep_posed, select, spread, stamp_ns
 from endo_sim_ros.sequences.rectification import Rectification
-from endo_sim_ros.sequences.structure_from_motion import STRUCTURE_FROM_MOTION, estimate_poses
+from endo_sim_ros.sequences.structure_from_motion import STRUCTURE_FROM_MOTION, StructureFromMotion
 from endo_sim_ros.sequences.video_files import Video, find_video
 
 logger = logging.getLogger(__name__)
+
+Points = tuple[np.ndarray, np.ndarray] | None  # as in `Recording`
 
 
 def read_video(
@@ -58,7 +61,7 @@ def read_video(
         step: Take every step-th frame.
         poses: File of lines `frame tx ty tz qx qy qz qw` (camera-to-world, metres unless scale is given); frames that
             it leaves out are skipped. None takes `poses.txt` beside the video if there is one, and structure from
-            motion otherwise; `sfm` insists on the latter.
+            motion otherwise; `sfm` insists on the latter, `vggt` or `vggt:FOLDER` takes a network, see `pose_estimator`.
         calibration: YAML file with fx, fy, cx, cy, optional distortion; None takes `calibration.yaml` beside the video.
         fx, fy, cx, cy: Intrinsics instead of a file, pixels, pixel (0, 0) centred at (0.5, 0.5) as in COLMAP.
             fy = fx and the image centre where left out.
@@ -95,12 +98,14 @@ def read_video(
     mask_of = _mask_reader(mask, mask_polarity, size)
 
     known = None
-    if poses is not None and str(poses) != STRUCTURE_FROM_MOTION:
+    estimate = pose_estimator(STRUCTURE_FROM_MOTION if poses is None else str(poses))
+    if estimate is None:
         if K is None:
             raise SequenceError(
                 f"{path}: poses are given ({poses}), but no intrinsics; pass fx (and fy, cx, cy, distortion) or a "
                 f"calibration file, or poses={STRUCTURE_FROM_MOTION!r} to estimate both"
             )
+        assert poses is not None  # else structure from motion estimates
         known = read_poses(Path(poses))
         for pose in known.values():
             pose[:3, 3] *= 1.0 if scale is None else scale
@@ -109,23 +114,29 @@ def read_video(
         if sfm_step < 1:
             raise SequenceError(f"{path}: sfm_step must be 1 or more, got {sfm_step}")
         numbers = numbers[::sfm_step]
-        logger.info("%s: poses of every %d-th frame come from structure from motion", path, step * sfm_step)
+        logger.info("%s: poses of every %d-th frame are estimated", path, step * sfm_step)
 
-    prepared: list[tuple[np.ndarray, Rectification, Mapping[int, np.ndarray]]] = []
+    results: list[tuple[np.ndarray, Rectification, Mapping[int, np.ndarray], Points]] = []
 
     def prepare(on_progress: OnProgress | None = None) -> None:
-        """Lit area, rectification and poses: what takes a pass over the video is found once, on first iteration."""
-        if not prepared:
-            prepared.append(find(on_progress))
+        if not results:
+            results.append(find(on_progress))
 
-    def find(on_progress: OnProgress | None) -> tuple[np.ndarray, Rectification, Mapping[int, np.ndarray]]:
+    def prepared() -> tuple[np.ndarray, Rectification, Mapping[int, np.ndarray], Points]:
+        prepare()
+        return results[0]
+
+    def find(on_progress: OnProgress | None) -> tuple[np.ndarray, Rectification, Mapping[int, np.ndarray], Points]:
+        """Lit area, rectification, poses and scene points: what takes a pass over the video is found once, on first iteration."""
         lit = np.full(size[::-1], 255, np.uint8)
         if mask_border:
             lit = lit_area(image for _, image in video.frames(spread(numbers, 10)))
         rectification = None if K is None else Rectification.mono(K, distortion, size)
-        if known is not None and rectification is not None:
-            return lit, rectification, known
-        placed, rectification = _estimate(
+        if estimate is None:
+            assert known is not None and rectification is not None
+            return lit, rectification, known, None
+        placed, rectification, points = _estimate(
+            estimate,
             video,
             numbers,
             rectification,
@@ -134,11 +145,10 @@ def read_video(
             threads=threads,
             on_progress=on_progress,
         )
-        return lit, rectification, placed
+        return lit, rectification, placed, points
 
     def frames() -> Iterator[Frame]:
-        prepare()
-        lit, rectification, placed = prepared[0]
+        lit, rectification, placed, _ = prepared()
         for number, image in video.frames([n for n in numbers if n in placed]):
             yield Frame(
                 stamp_ns=stamp_ns(number, fps),
@@ -147,10 +157,11 @@ def read_video(
                 mask=rectification.mask(cv2.bitwise_and(lit_now(lit, image), mask_of(number))),
             )
 
-    return Recording(frames, len(numbers), prepare if known is None else None)
+    return Recording(frames, len(numbers), lambda: prepared()[3], prepare=prepare if known is None else None)
 
 
 def _estimate(
+    estimate: Callable[..., StructureFromMotion],
     video: Video,
     numbers: list[int],
     rectification: Rectification | None,
@@ -159,12 +170,12 @@ def _estimate(
     scale: float | None,
     threads: int,
     on_progress: OnProgress | None,
-) -> tuple[dict[int, np.ndarray], Rectification]:
-    """Poses by frame number and the rectification, which is estimated too where it is None."""
+) -> tuple[dict[int, np.ndarray], Rectification, Points]:
+    """Poses by frame number, the rectification, which is estimated too where it is None, and scene points."""
     undistort = rectification or Rectification.mono(np.eye(3), (), (video.width, video.height))
     for_images, for_masks = itertools.tee(video.frames(numbers))  # read side by side, so that each frame is decoded once
     try:
-        result = estimate_poses(
+        result = estimate(
             (undistort.left(image) for _, image in for_images),
             None if rectification is None else rectification.K,
             masks=(undistort.mask(mask_of(*numbered)) for numbered in for_masks),
@@ -177,7 +188,7 @@ def _estimate(
         raise SequenceError(f"{video.path}: {error}") from None
     if rectification is None:
         rectification = Rectification.mono(result.K, result.distortion, (video.width, video.height))
-    return {numbers[position]: pose for position, pose in result.poses.items()}, rectification
+    return {numbers[position]: pose for position, pose in result.poses.items()}, rectification, result.points
 
 
 def _intrinsics(

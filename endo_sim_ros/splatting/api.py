@@ -43,6 +43,7 @@ def rasterize(
     background: Tensor | None = None,
     masks: Tensor | None = None,
     absgrad: Tensor | None = None,
+    signed: bool = False,
     median: bool = False,
     near: float = 1e-3,
     eps2d: float = 0.3,
@@ -69,6 +70,7 @@ def rasterize(
         absgrad: Receives the statistics of AbsGS densification: its values are not used, its gradient is
             Σ_pixels |∂L/∂mean2d| per image coordinate [C, N, 2], 1/pixel (Ye et al. 2024). Costs time only where it
             requires a gradient.
+        signed: Whether that gradient is Σ_pixels ∂L/∂mean2d instead, the statistics of 3DGS.
         median: Whether to compute median depths. Their gradient is that of the depth of the Gaussian at the median.
         near: Gaussians nearer than this are not drawn, metres.
         eps2d: Added to the variances in the image, pixel²: no splat is thinner than about a pixel.
@@ -83,7 +85,7 @@ def rasterize(
     """
     background = black(means.device) if background is None else background
     scene = Scene(means, quats, scales, covars, opacities, sh, viewmats, Ks, background)
-    settings = Settings(int(width), int(height), float(near), float(eps2d), bool(median))
+    settings = Settings(int(width), int(height), float(near), float(eps2d), bool(median), bool(signed))
     check_inputs("rasterize", scene, settings, masks, absgrad)
     if means.device.type == "cpu" and not means.isfinite().all():
         index = tuple((~means.detach().isfinite()).any(-1).nonzero()[0].tolist())
@@ -131,7 +133,7 @@ def check_inputs(name: str, scene: Scene, settings: Settings, masks: Tensor | No
             and both shapes.
     """
     means, quats, scales, covars, opacities, sh, viewmats, Ks, background = scene
-    width, height, near, eps2d, _ = settings
+    width, height, near, eps2d, *_ = settings
     if means.ndim not in (2, 3) or means.shape[-1] != 3:
         raise ValueError(f"{name}: means shape {tuple(means.shape)} != expected shape (N, 3)")
     if viewmats.ndim != 3 or viewmats.shape[1:] != (4, 4):
@@ -230,15 +232,15 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx: Any, *v_outputs: Tensor):
         scene, images = Scene(*ctx.saved_tensors[:-4]), ctx.saved_tensors[-4:]
         v_images = [v.float().contiguous() for v in v_outputs[:4]]
-        wants_absolute, wants_pose, wants_background = (ctx.needs_input_grad[i] for i in (2, 9, 11))
-        v = Gradients.empty(scene, wants_pose, wants_absolute)
+        wants_image, wants_pose, wants_background = (ctx.needs_input_grad[i] for i in (2, 9, 11))
+        v = Gradients.empty(scene, wants_pose, wants_image)
         ctx.backend.backward(scene, ctx.state, ctx.settings, images, v_images, v)
         v_viewmats = v_background = None
         if v.camera_shares is not None:
             v_viewmats = _repeatable_sum(v.camera_shares, 1)
         if wants_background:
             v_background = _repeatable_sum((v_images[0] * (1 - images[2])[..., None]).view(-1, 3), 0)
-        return None, None, v.absolutes, *v[:6], v_viewmats, None, v_background
+        return None, None, v.image, *v[:6], v_viewmats, None, v_background
 
 
 def _repeatable_sum(x: Tensor, dim: int) -> Tensor:

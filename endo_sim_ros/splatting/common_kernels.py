@@ -441,7 +441,7 @@ def project_backward(
     firsts: wp.array[int],
     records: wp.array2d[float],
     wants_pose: int,
-    wants_absolute: int,
+    image_column: int,  # of the records, which v_image adds up: ABSOLUTE, X for signed ones, below 0 for none
     v_means: wp.array[wp.vec3],  # out, as all below
     v_quats: wp.array[wp.vec4],
     v_scales: wp.array[wp.vec3],
@@ -449,7 +449,7 @@ def project_backward(
     v_opacities: wp.array[float],
     v_sh: wp.array2d[wp.vec3],
     v_viewmats: wp.array2d[wp.mat44],  # [C, N], each Gaussian's share, filled when wants_pose
-    v_absolute: wp.array2d[wp.vec2],  # [C, N], sums of absolute gradients of the mean in the image, filled when wants_absolute
+    v_image: wp.array2d[wp.vec2],  # [C, N], sums of gradients of the mean in the image
 ):
     """Gradients of Gaussian n over all cameras: adds up the records of its splats and goes back through `project`."""
     n = offset + wp.tid()
@@ -474,11 +474,11 @@ def project_backward(
         if by_splat == 0:
             first = firsts[splat] + 0
             end = first + counts[splat]
-        if wants_absolute != 0:
+        if image_column >= 0:
             total = wp.vec2()
             for i in range(first, end):
-                total += wp.vec2(records[i, ABSOLUTE], records[i, ABSOLUTE + 1])
-            v_absolute[camera, n] = total
+                total += wp.vec2(records[i, image_column], records[i, image_column + 1])
+            v_image[camera, n] = total
         if counts[splat] > 0:
             drawn = 1
             v = vec10()

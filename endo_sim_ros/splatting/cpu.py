@@ -48,10 +48,10 @@ def backward(
 ) -> None:
     """Fill the gradients of a scene, as `RasterBackend` says."""
     records = scene.means.new_empty(len(state.owners), RECORD_SIZE)
-    arguments = [*_image_arguments(state, scene, settings, images), *v_images, int(gradients.absolutes is not None), records]
+    arguments = [*_image_arguments(state, scene, settings, images), *v_images, gradients.wants_absolute(settings), records]
     _launch_tiles(cpu_kernels.render_tiles_backward, len(state.starts) - 1, arguments)
     arguments = [*scene.gaussian_arguments(), scene.sh, scene.viewmats, scene.Ks, settings.width, settings.height, settings.eps2d]
-    arguments += [state.counts, 0, state.firsts, records, *gradients.arguments()]
+    arguments += [state.counts, 0, state.firsts, records, *gradients.arguments(settings)]
     launch_in_shares(kernels.project_backward, len(scene.means), arguments)
 
 

@@ -79,10 +79,10 @@ def backward(
     """Fill the gradients of a scene, as `RasterBackend` says."""
     records = scene.means.new_zeros(scene.splat_count, RECORD_SIZE)
     with _lock, on_torch_stream(scene.means.device):
-        arguments = [*_image_arguments(state, scene, settings, images), *v_images, int(gradients.absolutes is not None), records]
+        arguments = [*_image_arguments(state, scene, settings, images), *v_images, gradients.wants_absolute(settings), records]
         _launch(cuda_kernels.render_pixels_backward, len(state.ranges) * cuda_kernels.BLOCK, arguments)
         arguments = [0, *scene.gaussian_arguments(), *_cameras(scene, settings)[1:], settings.eps2d, state.counts, 1, None, records]
-        _launch(kernels.project_backward, len(scene.means), [*arguments, *gradients.arguments()])
+        _launch(kernels.project_backward, len(scene.means), [*arguments, *gradients.arguments(settings)])
 
 
 def _cameras(scene: Scene, settings: Settings) -> list:

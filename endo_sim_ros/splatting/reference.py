@@ -25,6 +25,7 @@ def rasterize_in_torch(
     background: Tensor | None = None,
     masks: Tensor | None = None,
     absgrad: Tensor | None = None,
+    signed: bool = False,
     median: bool = False,
     near: float = 1e-3,
     eps2d: float = 0.3,
@@ -35,7 +36,7 @@ def rasterize_in_torch(
     """
     background = means.new_zeros(3) if background is None else background
     scene = Scene(means, quats, scales, covars, opacities, sh, viewmats, Ks, background)
-    settings = Settings(width, height, near, eps2d, median)
+    settings = Settings(width, height, near, eps2d, median, signed)
     check_inputs("rasterize_in_torch", scene, settings, masks, absgrad)
     if covars is None:
         assert quats is not None and scales is not None  # else the check has refused
@@ -110,7 +111,7 @@ def _render_camera(scene: Scene, settings: Settings, camera: int, covars: Tensor
         means, covars = means[camera], covars[camera]
     if sh.ndim == 4:
         sh = sh[camera]
-    width, height, near, eps2d, _ = settings
+    width, height, near, eps2d, *_ = settings
     rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     points = means @ rotation.T + translation
@@ -131,6 +132,9 @@ def _render_camera(scene: Scene, settings: Settings, camera: int, covars: Tensor
     xx, xy, yy = cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
     det = xx * yy - xy * xy
     center_x, center_y = fx * x / z + cx, fy * y / z + cy
+    if settings.signed:
+        probe = (absgrad - absgrad.detach())[index]
+        center_x, center_y, absgrad = center_x + probe[:, 0], center_y + probe[:, 1], absgrad.detach()
 
     level = 2 * ((255 * opacities).log() + LOG_ALPHA_SLACK)
     extent_x, extent_y = (level * xx).sqrt(), (level * yy).sqrt()

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from endo_sim_ros.splatting.constants import TILE
+from endo_sim_ros.splatting.constants import RECORD_SIZE, TILE
 
 
 class Scene(NamedTuple):
@@ -49,6 +49,7 @@ class Settings(NamedTuple):
     near: float  # m
     eps2d: float  # pixel²
     median: bool  # whether medians are computed
+    signed: bool = False  # whether gradients of the mean in the image are added up with their signs
 
     @property
     def tiles_x(self) -> int:
@@ -71,20 +72,25 @@ class Gradients(NamedTuple):
     opacities: Tensor
     sh: Tensor
     camera_shares: Tensor | None  # [C, N, 4, 4] what each Gaussian adds to the gradient of each camera's viewmat
-    absolutes: Tensor | None  # [C, N, 2] Σ_pixels |∂L/∂mean2d|, 1/pixel
+    image: Tensor | None  # [C, N, 2] Σ_pixels |∂L/∂mean2d|, or Σ_pixels ∂L/∂mean2d, 1/pixel
 
     @classmethod
-    def empty(cls, scene: Scene, wants_pose: bool, wants_absolute: bool) -> "Gradients":
+    def empty(cls, scene: Scene, wants_pose: bool, wants_image: bool) -> "Gradients":
         """Return memory for the gradients of a scene, not initialised."""
         gradients = [None if x is None else torch.empty_like(x) for x in scene[:6]]
         size = (len(scene.viewmats), scene.gaussian_count)
         shares = scene.means.new_empty(*size, 4, 4) if wants_pose else None
-        absolutes = scene.means.new_empty(*size, 2) if wants_absolute else None
-        return cls._make([*gradients, shares, absolutes])
+        image = scene.means.new_empty(*size, 2) if wants_image else None
+        return cls._make([*gradients, shares, image])
 
-    def arguments(self) -> list:
+    def wants_absolute(self, settings: Settings) -> int:
+        """Return whether absolute gradients of the mean in the image are wanted, 0 or 1."""
+        return int(self.image is not None and not settings.signed)
+
+    def arguments(self, settings: Settings) -> list:
         """Return the last arguments of the kernel `project_backward`."""
-        return [int(self.camera_shares is not None), int(self.absolutes is not None), *self]
+        column = -1 if self.image is None else 0 if settings.signed else RECORD_SIZE - 2
+        return [int(self.camera_shares is not None), column, *self]
 
 
 def empty_images(scene: Scene, settings: Settings) -> tuple[list[Tensor], Tensor]:

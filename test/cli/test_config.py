@@ -158,7 +158,7 @@ def test_a_configuration_takes_the_place_of_a_nested_stage():
         ("default", {"proximity.far": 3.0}, "densification is mcmc; set densification to proximity"),
         ("paper", {"motion.width": 100}, "dynamic_mask is false; set dynamic_mask to true"),
         ("paper", {"extrapolated.size": 1.0}, "extrapolation is 0.0; set extrapolation to more than 0"),
-        ("default", {"network.max_error": 0.2, "depth": "points"}, "depth is points; set depth to auto or network"),
+        ("default", {"network.max_error": 0.2, "depth": "points"}, "depth is points; set depth to auto or network or network_first"),
     ],
 )
 def test_an_option_without_effect_is_told_with_what_gives_it_one(name, given, why):

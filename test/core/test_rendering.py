@@ -48,6 +48,19 @@ def test_moving_all_nodes_rigidly_is_moving_the_camera_back(degree):
     assert np.abs(unmoved.astype(int) - rest).mean() > 3
 
 
+def test_the_clamp_of_stretches_matters_to_wild_tissue_alone():
+    model = sheet()
+    rest = model.means[::5].numpy()
+    pictures = {}
+    for clamp in (True, False):
+        renderer = DeformableRenderer(model, rest, RenderingConfig(device="cpu", clamp_stretch=clamp))
+        for stretch in (1.5, 9.0):
+            F = np.tile(np.diag([stretch, 1.0, 1.0]), (len(rest), 1, 1))
+            pictures[stretch, clamp] = renderer.deform(rest, F)[1]
+    assert torch.equal(pictures[1.5, True], pictures[1.5, False])
+    assert pictures[9.0, False].amax() > 4 * pictures[9.0, True].amax()
+
+
 def test_background_and_empty_pixels():
     renderer = DeformableRenderer(sheet(), None, RenderingConfig(device="cpu", background=0.5))
     image, depth = renderer.render(CAMERA.at(make_pose([0, 0, 0], [0, 0, 1, 0])))  # looking away

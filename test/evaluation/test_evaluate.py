@@ -157,7 +157,12 @@ def test_a_reader_takes_its_options_from_the_name(small_bag, small_frames, tmp_p
 
 
 def test_the_papers_numbers_are_complete():
-    assert len(paper.PRINTED) == 30 and len({row[:3] for row in paper.PRINTED}) == 30
+    assert len(paper.PRINTED) == 48 and len({row[:3] for row in paper.PRINTED}) == 48
+    methods = {"EndoGaussian", "EndoGS", "3dgs", "MVSGaussian", "fsgs", "paper"}
+    for dataset in ("SCARED", "StereoMIS"):
+        assert {row.method for row in tables.printed_rows("1:49", ()) if row.dataset == dataset} == methods
+    minutes = {row.method: row.figures["seconds"] / 60 for row in tables.printed_rows("1:99", ()) if "seconds" in row.figures}
+    assert minutes == {"EndoGaussian": 3, "EndoGS": 5, "3dgs": 6, "MVSGaussian": 2, "fsgs": 4, "paper": 2}
     assert all(15 < row.psnr < 30 and 0.6 < row.ssim < 0.9 and 0.2 < row.lpips < 0.5 for row in paper.PRINTED)
 
 

@@ -166,7 +166,7 @@ def test_a_preset_that_is_set_later_changes_what_nobody_gave(start):
 
 def test_a_parameter_without_effect_is_told_at_start_and_later(start, capfd):
     sentence = "mcmc.growth has no effect while densification is gradient; set densification to mcmc"
-    node = start(ReconstructionNode, "-p", "preset:=3dgs", "-p", "mcmc.growth:=0.1")
+    node = start(ReconstructionNode, "-p", "preset:=3dgs-sh0", "-p", "mcmc.growth:=0.1")
     assert sentence in capfd.readouterr().err
     assert set_parameter(node, "densification", "mcmc").successful and set_parameter(node, "seed", 1).successful
     assert not capfd.readouterr().err

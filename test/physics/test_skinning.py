@@ -87,6 +87,17 @@ def test_wild_nodes_give_bounded_gaussians():
         assert 0.199 < stretch.min() and stretch.max() < 4.01
 
 
+@pytest.mark.parametrize("plain", [False, True], ids=["vectors", "the kernel of CUDA"])
+@pytest.mark.parametrize("F", [np.diag([9.0, 1.0, 1.0]), np.diag([1.0, 1.0, -1.0]), np.zeros((3, 3)), np.diag([1.0, 1.0, 1e-6])])
+def test_f_is_taken_as_it_is_without_the_clamp(F, plain):
+    model = curved_sheet(300)
+    rest = model.means[::5].numpy()
+    with compare_plain() if plain else nullcontext():
+        skinning = Skinning(model, rest, stretch=None, device="cpu")
+    _, covars = skinning.deform(rest, np.tile(F, (len(rest), 1, 1)))
+    torch.testing.assert_close(covars, torch.from_numpy(F @ skinning.covars.numpy() @ F.T).float(), rtol=1e-4, atol=1e-12)
+
+
 def test_few_nodes_and_no_gaussians_are_fine():
     model = curved_sheet(50)
     for count in (1, 2, 3):

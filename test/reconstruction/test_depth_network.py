@@ -1,5 +1,6 @@
 """Depth by a network: tiny ones built here go through the real loading code; what they see is made metric."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -7,9 +8,9 @@ import pytest
 from training_views import unknown
 
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.reconstruction import ReconstructionConfig
+from endo_sim_ros.reconstruction import ReconstructionConfig, prepare, preset
 from endo_sim_ros.reconstruction.priors.network import align, load_network, network_depth
-from endo_sim_ros.reconstruction.priors.sources import estimate_depth
+from endo_sim_ros.reconstruction.priors.sources import depth_source, estimate_depth
 from endo_sim_ros.reconstruction.stage_configs import NetworkDepthConfig
 from endo_sim_ros.reconstruction.triangulation import triangulate
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
@@ -40,6 +41,52 @@ def test_a_checkpoint_is_read_from_a_folder_or_the_cache(tiny, monkeypatch):
     assert depth.shape == (60, 83) and depth.dtype == np.float32 and np.isfinite(depth).all()
     monkeypatch.setenv("HF_HUB_CACHE", str(tiny.parents[2]))
     np.testing.assert_array_equal(load_network("", "cpu")(image), depth)
+
+
+@pytest.fixture(scope="module")
+def tiny_networks(tiny, tmp_path_factory):
+    """Checkpoints of other architectures with random weights: metric, ZoeDepth, DPT."""
+    transformers = pytest.importorskip("transformers")
+    folders = {name: tmp_path_factory.mktemp(name) for name in ("metric", "zoedepth", "dpt")}
+    metric = transformers.DepthAnythingForDepthEstimation.from_pretrained(tiny)
+    metric.config.depth_estimation_type, metric.config.max_depth = "metric", 20
+    metric.save_pretrained(folders["metric"])
+    beit = transformers.BeitConfig(
+        image_size=64, patch_size=16, hidden_size=16, num_hidden_layers=4, num_attention_heads=2, intermediate_size=32,
+        out_features=["stage1", "stage2", "stage3", "stage4"], reshape_hidden_states=False, use_relative_position_bias=True,
+    )  # fmt: skip
+    zoe = transformers.ZoeDepthConfig(
+        backbone_config=beit, backbone_hidden_size=16, neck_hidden_sizes=[8, 8, 16, 16], fusion_hidden_size=8, bottleneck_features=8,
+        num_relative_features=4, bin_embedding_dim=8, num_attractors=[4, 2, 2, 1], num_patch_transformer_layers=1,
+        patch_transformer_hidden_size=8, patch_transformer_intermediate_size=16, patch_transformer_num_attention_heads=2,
+        bin_configurations=[{"n_bins": 8, "min_depth": 0.001, "max_depth": 10.0, "name": "nyu"}],
+    )  # fmt: skip
+    transformers.ZoeDepthForDepthEstimation(zoe).save_pretrained(folders["zoedepth"])
+    transformers.ZoeDepthImageProcessor(size={"height": 64, "width": 64}).save_pretrained(folders["zoedepth"])
+    dpt = transformers.DPTConfig(
+        hidden_size=16, num_hidden_layers=4, num_attention_heads=2, intermediate_size=32, image_size=64, patch_size=16,
+        backbone_out_indices=[0, 1, 2, 3], neck_hidden_sizes=[8, 8, 16, 16], fusion_hidden_size=8, is_hybrid=False,
+    )  # fmt: skip
+    transformers.DPTForDepthEstimation(dpt).save_pretrained(folders["dpt"])
+    transformers.DPTImageProcessor(size={"height": 64, "width": 64}).save_pretrained(folders["dpt"])
+    return folders
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["zoedepth", "dpt"])
+def test_any_depth_network_of_transformers_is_read_with_its_own_preprocessing(tiny_networks, name):
+    image = np.random.default_rng(0).integers(0, 255, (60, 83, 3), np.uint8)
+    inverse = load_network(str(tiny_networks[name]), "cpu")(image)
+    assert inverse.shape == (60, 83) and inverse.dtype == np.float32 and np.isfinite(inverse).all()
+    if name == "zoedepth":  # metres of a room
+        assert 0.09 < inverse.min() <= inverse.max() < 1001
+
+
+def test_metric_depth_is_inverted(tiny, tiny_networks):
+    image = np.random.default_rng(0).integers(0, 255, (60, 83, 3), np.uint8)
+    inverse = load_network(str(tiny_networks["metric"]), "cpu")(image)
+    assert 1 / 20 <= inverse.min() and np.isfinite(inverse).all()
+    assert not np.allclose(inverse, load_network(str(tiny), "cpu")(image))
 
 
 def test_an_absent_or_damaged_network_is_one_clear_error(tmp_path, monkeypatch):
@@ -95,6 +142,20 @@ def test_views_that_do_not_fit_are_dropped_and_none_at_all_is_an_error(views, ti
     points = triangulate(views)
     with pytest.raises(SequenceError, match="no view's depth fits"):
         estimate_depth(unknown(views), points, ReconstructionConfig(depth="network", depth_model=str(tiny), device="cpu"))
+
+
+@pytest.mark.slow
+def test_published_methods_take_a_network_first_and_say_what_they_take_instead(monkeypatch, tmp_path, caplog):
+    frames = list(phantom_sequence(PhantomConfig(width=160, height=128, frames=3)))
+    without = [dataclasses.replace(frame, depth=None) for frame in frames]
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path))
+    for name, config in (("paper", preset("paper", device="cpu")), ("fsgs", preset("fsgs", device="cpu"))):
+        scene = prepare(without, config, triangulate(frames))
+        assert scene.depth_source == "stereo", name
+        assert [text for text in scene.decisions if "NOT AS PUBLISHED" in text and "it is from stereo" in text] == [*scene.decisions], name
+    assert caplog.text.count("NOT AS PUBLISHED") == 2
+    checkpoint = preset("paper", depth_model=str(tmp_path))
+    assert depth_source(frames, checkpoint) == "network" != depth_source(frames, ReconstructionConfig(depth_model=str(tmp_path)))
 
 
 @pytest.mark.slow

@@ -9,6 +9,8 @@ from training_views import with_prior
 
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.reconstruction.initialization import initial_model
+from endo_sim_ros.reconstruction.progress import StageProgress
+from endo_sim_ros.reconstruction.surfaces import Surfaces
 
 TOLERANCE = 0.05
 
@@ -80,3 +82,33 @@ def test_too_few_points_are_one_clear_error(small):
     with pytest.raises(SequenceError, match="only 9 scene points could be found in 1 views; give depth"):
         placed([empty], points=np.random.default_rng(0).random((9, 3)))
     assert len(placed([empty], points=np.random.default_rng(0).random((10, 3)))) == 10
+
+
+@pytest.mark.slow
+def test_surfaces_are_compared_as_by_plain_numpy(small):
+    random = np.random.default_rng(0)
+    noisy = lambda depth: (depth * random.normal(1, 0.03, depth.shape)).astype(np.float32)
+    views, tolerance = with_prior([dataclasses.replace(frame, depth=noisy(frame.depth)) for frame in small[::3]]), TOLERANCE
+    surfaces = Surfaces(views, "cpu")
+    chosen = surfaces.chosen(tolerance, StageProgress())
+    colors = surfaces.mean_colors(chosen, tolerance, StageProgress())
+    finest = np.argsort([np.median(view.surface[view.surface > 0]) for view in views], kind="stable").tolist()
+    for i, view in enumerate(views):
+        known = (view.surface > 0) & (view.tissue > 0)
+        points = view.camera.backproject(view.surface.astype(np.float64))
+        kept, total, count = known.copy(), view.image / 255.0, np.ones((*known.shape, 1))
+        for j, other in enumerate(views):
+            if i == j:
+                continue
+            uv, z = other.camera.project(points.reshape(-1, 3))
+            inside = other.camera.sees(points.reshape(-1, 3))
+            u, v = np.where(inside, np.floor(uv).astype(int).T, 0)
+            surface = np.where(inside, other.surface[v, u], 0).reshape(known.shape)
+            z, before = z.reshape(known.shape), finest.index(j) < finest.index(i)
+            kept &= (surface <= 0) | (z >= surface * (1 + tolerance if before else 1 - tolerance))
+            agrees = ((surface > 0) & (np.abs(z - surface) < tolerance * surface))[..., None]
+            total, count = total + agrees * (other.image[v, u] / 255.0).reshape(*known.shape, 3), count + agrees
+        assert 0 < kept.sum() < known.sum() or i == finest[0]
+        assert (kept != chosen[i]).mean() < 1e-3  # at the edges of pixels float32 rounds otherwise
+        off = np.abs(colors[i] - (total / count)[chosen[i]]).max(1)
+        assert (off > 1e-5).mean() < 1e-3

@@ -33,7 +33,63 @@ def test_every_preset_trains(views, name):
     points = triangulate(views)[:2]
     model = trainer_of(views[::4], preset(name, **SHORT), points).run()
     assert finite(model) and len(model) <= 2000
-    assert (model.light is None) == (name in ("paper", "fsgs", "3dgs"))
+    assert (model.light is None) == (name not in ("default", "laptop"))
+
+
+@pytest.mark.parametrize("name", ["3dgs", "fsgs"])
+def test_the_originals_have_no_frequency_regularisation(name):
+    original, ours = preset(name), preset(f"{name}-sh0")
+    assert (original.sh_degree, ours.sh_degree) == (3, 0)
+    options = getattr(original, original.densification)
+    assert not options.absolute and options.reset_every == 3000
+
+
+@pytest.mark.slow
+def test_spherical_harmonics_rise_and_opacities_fall_as_planned(views):
+    plan = {"sh_every": 4, "gradient.reset_every": 6, "refine_from": 5, "refine_every": 3, "schedule": 14, "gradient.threshold": 0.0}
+    trainer = trainer_of(views[::4], preset("3dgs", **SHORT | {"max_gaussians": 4000} | plan), triangulate(views)[:2])
+    learnt, counts, opacities = [], [], []
+    while trainer.iteration < 12:
+        trainer.step()
+        learnt.append([bool(trainer.model.sh[:, k:].any()) for k in (1, 4, 9)])
+        counts.append(len(trainer.model))
+        opacities.append(float(trainer.model.opacities.max()))
+    assert learnt[2] == [False] * 3 and learnt[3] == [True, False, False]  # the fourth iteration has the first degree
+    assert learnt[7] == [True, True, False] and learnt[11] == [True] * 3
+    assert counts[4] == counts[0] < counts[5], "refinement begins after the fifth iteration"
+    assert counts[5] == counts[-1], "and ends before the seventh, the middle of the schedule"
+    assert opacities[4] > 0.05 > 0.0101 > opacities[5] and opacities[11] > opacities[5]
+
+
+@pytest.mark.slow
+def test_learning_rates_follow_the_schedule_and_the_unit(views):
+    trainer = trainer_of(views[::4], preset("3dgs", unit="cameras", **SHORT), triangulate(views)[:2])
+    positions = np.array([camera.position for camera in trainer.cameras])
+    extent = 1.1 * np.linalg.norm(positions - positions.mean(0), axis=1).max()
+    trainer.run()
+    trainer.step()
+    assert trainer.optimizer.rates["means"] == pytest.approx(1.6e-4 * extent * 0.01 ** (12 / 30_000), rel=1e-6)
+    for frames, unit in ((views[::4], "depth"), (views[:1], "cameras")):  # one camera has no extent
+        other = trainer_of(frames, preset("3dgs", unit=unit, **SHORT), triangulate(views)[:2])
+        other.step()
+        assert other.optimizer.rates["means"] == pytest.approx(1.6e-4 * other.scene_depth, rel=1e-6)
+
+
+@pytest.mark.slow
+def test_virtual_cameras_begin_and_weigh_as_told(views, monkeypatch):
+    weights, trained = [], losses.regularized
+
+    def note(loss, terms, rendering, config, virtual=False):
+        after = trained(loss, terms, rendering, config, virtual)
+        if virtual:
+            (term,) = [term for term in terms if term.of_virtual]
+            weights.append(((after - loss) / term.weighted(rendering, config)).item())
+        return after
+
+    monkeypatch.setattr(losses, "regularized", note)
+    trainer = trainer_of(views[:3], preset("fsgs", **SHORT, virtual_from=10), triangulate(views)[:2])
+    trainer.run()
+    np.testing.assert_allclose(weights, [10.0, 10.0], rtol=1e-3)
 
 
 def test_every_ablation_changes_its_preset():

@@ -22,6 +22,33 @@ def split_and_clone(model, gradients, limit):
     return STRATEGIES["gradient"](GradientConfig(), limit, 1.0).refine(model, state, torch.Generator().manual_seed(0))
 
 
+def test_opacities_fall_with_their_moments_and_what_is_too_large_goes_after_that():
+    model, options = cloud(), GradientConfig(reset_every=100, oversize=0.04)
+    strategy = STRATEGIES["gradient"](options, 1000, 1.0)
+    parameters = {"logit_opacities": torch.tensor([3.0, -6.0])}
+    states = {"logit_opacities": {"exp_avg": torch.ones(2), "exp_avg_sq": torch.ones(2), "step": torch.tensor(7.0)}}
+    strategy.reset(parameters, states, 150)
+    assert parameters["logit_opacities"].tolist() == [3.0, -6.0]
+    strategy.reset(parameters, states, 200)
+    torch.testing.assert_close(parameters["logit_opacities"].sigmoid(), torch.tensor([0.01, 0.00247]), rtol=1e-2, atol=0)
+    assert not states["logit_opacities"]["exp_avg"].any() and float(states["logit_opacities"]["step"]) == 7
+    model.log_scales[10:15] = np.log(0.05)
+    gradients = torch.zeros(60)
+    gradients[10] = 1.0  # its halves are small enough
+    state = {"gradients": torch.stack([gradients, torch.ones(60)])}
+    sizes = [len(strategy.refine(model, state, torch.Generator().manual_seed(0), iteration).model) for iteration in (100, 101)]
+    assert sizes == [61, 57]
+
+
+def test_unpooling_ends():
+    strategy = STRATEGIES["proximity"](ProximityConfig(unpool_until=2000), 1000, 1.0)
+    model = cloud()
+    model.means[0] = torch.tensor([3.0, 3.0, 3.0])
+    state = {"gradients": torch.zeros(2, 60)}
+    sizes = [len(strategy.refine(model, state, torch.Generator().manual_seed(0), iteration).model) for iteration in (1900, 2000)]
+    assert sizes[0] > 60 and sizes[1] == 60
+
+
 def unpool(model, limit):
     return STRATEGIES["proximity"](ProximityConfig(), limit, 1.0).unpool(model)
 

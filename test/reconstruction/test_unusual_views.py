@@ -10,6 +10,7 @@ from trained import trainer_of
 
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.evaluation import metrics
+from endo_sim_ros.reconstruction import prepare
 from endo_sim_ros.reconstruction.priors.stereo import right_view
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 
@@ -44,6 +45,29 @@ def test_depth_with_holes_trains(small):
     depth[:, :60], depth[:40] = np.nan, 0
     empty = dataclasses.replace(small[4], depth=np.zeros_like(depth))
     assert finite(trainer_of([dataclasses.replace(small[0], depth=depth), empty], options()).run())
+
+
+@pytest.mark.slow
+def test_a_view_without_depth_of_its_own_gets_that_of_the_others(large):
+    views = [dataclasses.replace(frame, depth=None) for frame in large[:3]]
+    views[1] = bare(views[1])  # its right image is lost
+    scene = prepare(views, options(image_width=640))
+    prior = scene.views[1].depth_prior
+    known = prior > 0
+    assert known.mean() > 0.5 and np.median(np.abs(prior / large[1].depth - 1)[known]) < 0.02
+    assert any("get that of the other views" in decision for decision in scene.decisions)
+
+
+@pytest.mark.slow
+def test_a_handful_of_points_starts_from_a_plane(small):
+    frame = small[4]
+    v, u = np.mgrid[20:110:30, 20:140:40].reshape(2, -1)
+    points = frame.camera.backproject(frame.depth)[v, u]
+    scene = prepare([bare(small[0]), bare(small[8])], options(), (points, np.full_like(points, 0.5)))
+    assert len(scene.model) > 500
+    assert "from a plane" in "".join(scene.decisions)
+    depths = np.concatenate([small[i].camera.project(scene.model.means.numpy().astype(float))[1] for i in (0, 8)])
+    assert np.median(depths) == pytest.approx(np.median(frame.camera.project(points)[1]), rel=0.1)
 
 
 def test_nothing_to_see_is_an_error(small):

@@ -18,7 +18,7 @@ from plane_scene import (
 )
 
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.sequences.folder import read_folder, read_points
+from endo_sim_ros.sequences.folder import read_folder, read_points, write_points
 from endo_sim_ros.sequences.readers import open_sequence
 
 CALIBRATION = f"width: {WIDTH}\nheight: {HEIGHT}\nfx: 150\nfy: 150\ncx: {WIDTH / 2}\ncy: {HEIGHT / 2}\n"
@@ -66,8 +66,13 @@ def test_points_of_a_folder_are_those_of_its_poses(folder):
         (folder / "points.txt").write_text(text)
         with pytest.raises(SequenceError, match=f"points.txt: .*{reason}"):
             read_points(folder)
-    (folder / "poses_left.txt").unlink()
-    assert read_points(folder) is None
+        with pytest.raises(SequenceError, match=f"points.txt: .*{reason}"):
+            read_folder(folder).points()
+    write_points(folder, points, colors)
+    again = read_folder(folder).points()
+    assert again is not None
+    np.testing.assert_allclose(again[0], points)
+    np.testing.assert_allclose(again[1], colors)
 
 
 def test_image_folder_with_left_images_only(folder):

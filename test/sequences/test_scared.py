@@ -214,9 +214,9 @@ def test_disparity_is_read_where_there_are_no_points(scared, caplog):
 def test_poses_can_be_estimated_instead_of_the_published(scared, monkeypatch):
     write_scared(scared)
     asked = []
-    monkeypatch.setattr(scared_reader, "with_estimated_poses", lambda recording, source: asked.append(source) or recording)
+    monkeypatch.setattr(scared_reader, "with_estimated_poses", lambda recording, *how: asked.append(how) or recording)
     frames = list(read_scared(scared, poses="sfm"))
-    assert asked == [scared] and len(frames) == 6
+    assert asked == [(scared, "sfm")] and len(frames) == 6
     assert all(np.array_equal(frame.camera.pose, frames[0].camera.pose) for frame in frames)
 
 

@@ -80,6 +80,11 @@ def test_structure_from_motion_on_stereo_is_metric():
         expected = np.linalg.inv(ORBIT[0]) @ ORBIT[number]
         assert np.linalg.norm(pose[:3, 3] - expected[:3, 3]) < 1e-3
         assert np.abs(pose[:3, :3] - expected[:3, :3]).max() < 0.01
+    points, colors = result.points
+    world = points @ ORBIT[0][:3, :3].T + ORBIT[0][:3, 3]
+    surface = 0.1 + 0.012 * np.sin(world[:, 0] / 0.012) * np.cos(world[:, 1] / 0.015)
+    assert len(points) > 100 and np.median(np.abs(world[:, 2] - surface)) < 1e-3
+    assert colors.shape == points.shape and 0 <= colors.min() < colors.max() <= 1 and colors.std() > 0.05
 
 
 def test_pairs_tie_every_image_to_its_neighbours_and_to_far_ones():
@@ -155,14 +160,16 @@ def test_unknown_intrinsics_are_estimated():
 
 
 @pytest.mark.slow
-def test_folder_without_poses_is_posed_and_the_guessed_scale_is_announced(tmp_path, caplog):
+def test_folder_is_posed_on_request_and_the_guessed_scale_is_announced(tmp_path, caplog):
     pytest.importorskip("pycolmap")
     for number, image in enumerate(relief_images(ORBIT, K_RELIEF)):
         write_rgb(tmp_path / f"left/{number:06d}.png", image)
     (tmp_path / "calibration.yaml").write_text("fx: 300\nfy: 300\ncx: 160\ncy: 120\n")
-    recording = read_folder(tmp_path)
+    (tmp_path / "poses_left.txt").write_text("0 0 0 0 0 0 0 1\n")
+    assert len(list(read_folder(tmp_path))) == 1
+    recording = read_folder(tmp_path, poses="sfm")  # although there are some
     frames = list(recording)
-    assert len(frames) == 6
+    assert len(frames) == 6 and recording.points() is not None
     positions = np.array([frame.camera.position for frame in frames])
     assert similarity_error(positions, np.array([pose[:3, 3] for pose in ORBIT])) < 0.01
     assert "THE SCALE IS A GUESS" in caplog.text

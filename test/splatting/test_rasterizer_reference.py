@@ -148,6 +148,21 @@ def test_absolute_gradients_match_the_reference_and_change_nothing_else(device, 
         assert all(torch.equal(first, other) for first, other in zip(gradients, plain))
 
 
+@pytest.mark.parametrize("device", DEVICES)
+def test_signed_gradients_match_the_reference_and_change_nothing_else(device, compositor):
+    gaussians, cameras = make_gaussians(seed=17), make_cameras()
+    gaussians[0][:5, 2] = -1
+    expected, others = with_absolute_gradients(rasterize_in_torch, gaussians, cameras, signed=True)
+    actual, gradients = with_absolute_gradients(rasterize, gaussians, cameras, device, torch.float32, signed=True)
+    assert_close("signed gradients", actual, expected, 5e-5)
+    assert actual.min() < 0 and not actual[:, :5].any()
+    _, plain = run(rasterize_in_torch, gaussians, cameras)
+    assert all(torch.equal(first, other) for first, other in zip(others, plain))
+    _, plain = run(rasterize, gaussians, cameras, device=device, dtype=torch.float32)
+    if device == "cpu":
+        assert all(torch.equal(first, other) for first, other in zip(gradients, plain))
+
+
 def test_absolute_gradients_do_not_cancel():
     means, K = torch.tensor([[0.0, 0.0, 0.1]]), torch.tensor([[[100.0, 0, 8.5], [0, 100, 8.5], [0, 0, 1]]])
     gaussian = [means.requires_grad_(), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.003), torch.tensor([0.5])]

@@ -61,7 +61,8 @@ def flow_correction(inverse: np.ndarray, own: EyeImage, other: EyeImage, options
     if not inside.any() or min(inside.shape) < 16:  # pixels, which optical flow needs
         return None
     predicted = np.where(inside, _sample(other.grey, u, v), own.grey)
-    flow, back = _flow(own.grey, predicted), _flow(predicted, own.grey)
+    # The way back, a mere check, is told in images of half the size: a fifth of all the time, and a hundredth of the precision.
+    flow, back = _flow(own.grey, predicted), _flow(predicted, own.grey, finest=1)
     # A pixel is seen where the prediction took the pixel from that flow leads to.
     rows, columns = np.mgrid[: inverse.shape[0], : inverse.shape[1]].astype(np.float32) + np.float32(0.5)
     columns, rows = columns + flow[..., 0], rows + flow[..., 1]
@@ -81,10 +82,10 @@ def flow_correction(inverse: np.ndarray, own: EyeImage, other: EyeImage, options
     return FlowCorrection((along_u * off_u + along_v * off_v) / speed, precision)
 
 
-def _flow(image: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """By how many pixels [H, W, 2] what an image shows lies elsewhere in another."""
+def _flow(image: np.ndarray, other: np.ndarray, finest: int = 0) -> np.ndarray:
+    """By how many pixels [H, W, 2] what an image shows lies elsewhere in another; ``finest`` halvings of the images are left out."""
     flow: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    flow.setFinestScale(0)
+    flow.setFinestScale(finest)
     return flow.calc(image, other, None)
 
 

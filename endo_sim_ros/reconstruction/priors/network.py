@@ -1,12 +1,14 @@
 """Depth from one image by a network such as Depth-Anything-V2, made metric by what is known of the scene.
 
-Networks of this kind see inverse depth up to a scale and a shift. Checkpoints are read from this machine and never downloaded.
+Networks of this kind see inverse depth up to a scale and a shift. Those that claim to see metres learnt them in rooms and streets: their
+depth is inverted and fitted alike. Checkpoints are read from this machine and never downloaded.
 """
 
 import logging
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,6 +21,7 @@ log = logging.getLogger(__name__)
 
 # Of Depth-Anything-V2: the shorter side that it was trained at, pixels, and what sides are multiples of.
 _SIDE, _PATCH = 518, 14
+_METRIC = ("glpn", "zoedepth")  # architectures that give depth in metres; others do if their configuration says so
 
 Network = Callable[[np.ndarray], np.ndarray]
 
@@ -38,7 +41,8 @@ def load_network(path: str, device: str) -> Network:
         where = place or _cache()
         raise SequenceError(
             f"{where}: there is no Depth-Anything-V2 checkpoint; copy the folder Depth-Anything-V2-Small-hf (config.json and "
-            "model.safetensors) or an ONNX export of it to this machine and give its path as depth_model"
+            "model.safetensors), that of another depth network of transformers, or an ONNX export to this machine and give its path as "
+            "depth_model"
         )
     try:
         return _onnx(place) if place.is_file() else _transformers(place, device)
@@ -63,16 +67,28 @@ def _cache() -> Path:
 
 
 def _transformers(folder: Path, device: str) -> Network:
-    from transformers import AutoModelForDepthEstimation  # pyright: ignore[reportMissingImports]  (optional)
+    os.environ.setdefault("HF_HUB_OFFLINE", "1")  # a configuration may name a backbone that is elsewhere
+    from transformers import AutoImageProcessor, AutoModelForDepthEstimation  # pyright: ignore[reportMissingImports]  (optional)
 
-    model = AutoModelForDepthEstimation.from_pretrained(folder, local_files_only=True).eval().to(device)
+    model: Any = AutoModelForDepthEstimation.from_pretrained(folder, local_files_only=True).eval().to(device)
+    kind = model.config.model_type
+    metric = kind in _METRIC or getattr(model.config, "depth_estimation_type", "") == "metric"
+    processor: Any = None
+    if kind != "depth_anything":  # others want pictures of other sizes and colours
+        processor = AutoImageProcessor.from_pretrained(folder, local_files_only=True)
+    whole = {"do_pad": False} if kind == "zoedepth" else {}  # so that the depth is that of the picture alone
 
     def predict(image: np.ndarray) -> np.ndarray:
-        scale = _SIDE / min(image.shape[:2])
-        height, width = (max(round(side * scale / _PATCH), 1) * _PATCH for side in image.shape[:2])
+        if processor is None:
+            scale = _SIDE / min(image.shape[:2])
+            height, width = (max(round(side * scale / _PATCH), 1) * _PATCH for side in image.shape[:2])
+            pixels = torch.from_numpy(_normalised(image, width, height))
+        else:
+            pixels = processor(image, return_tensors="pt", **whole).pixel_values
         with torch.no_grad():
-            output = model(pixel_values=torch.from_numpy(_normalised(image, width, height)).to(device))
-        return _enlarged(output.predicted_depth[0].float().cpu().numpy(), image)
+            output = model(pixel_values=pixels.to(device))
+        seen = output.predicted_depth[0].float().cpu().numpy()
+        return _enlarged(1 / np.maximum(seen, 1e-3 * seen.max()) if metric else seen, image)
 
     return predict
 

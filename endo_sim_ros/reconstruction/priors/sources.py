@@ -35,7 +35,7 @@ def estimate_depth(
         views: Training views, best at full size: disparities are as precise as the pixels are fine.
         points: Triangulated scene points, to interpolate between, or to find a constant disparity offset of stereo matching.
         config: ``depth`` names the source; ``auto`` takes the depth topic, else stereo, else a network if there is one,
-            else the points. Each source has its own options.
+            else the points; ``network_first`` likewise after a network. Each source has its own options.
         progress: Reported to by views.
 
     Raises:
@@ -69,21 +69,36 @@ def estimate_depth(
         found = progress.map(lambda view: _with_prior(view, interpolate_points(view, points.positions, *options)), views)
         without = sum(view.depth_prior is None for view in found)
         if without:
-            text = "%d of %d views see fewer than %d scene points that agree and go without depth"
-            log.warning(text, without, len(views), config.matching.min_points)
+            log.warning("%d of %d views see fewer than %d scene points that agree", without, len(views), config.matching.min_points)
         return found
     return [_with_prior(view, None) for view in views]
 
 
+def borrow_depth(views: Sequence[TrainingView], config: ReconstructionConfig) -> list[TrainingView]:
+    """The views; those without a depth prior get one interpolated between what the others know, as between scene points."""
+    parts = []
+    for view in views:
+        stride = max(int(config.interpolation.cell * view.camera.width), 1)
+        taken = np.zeros(view.surface.shape, bool)
+        taken[::stride, ::stride] = view.surface[::stride, ::stride] > 0
+        parts.append(view.camera.backproject(view.surface)[taken])
+    points = np.concatenate(parts)
+    depth = lambda view: interpolate_points(view, points, config.interpolation, config.matching)
+    return [view if view.depth_prior is not None else _with_prior(view, depth(view)) for view in views]
+
+
 def depth_source(frames: Sequence[Frame], config: ReconstructionConfig) -> str:
-    """Where the depth of these views is from: the source that is configured, or what ``auto`` finds."""
-    if config.depth != "auto":
+    """Where the depth of these views is from: the source that is configured, or what ``auto`` or ``network_first`` finds."""
+    if config.depth not in ("auto", "network_first"):
         return config.depth
+    has_network = lambda: bool(config.depth_model or cached_checkpoint())
+    if config.depth == "network_first" and has_network():
+        return "network"
     if _has_topic(frames):
         return "topic"
     if any(frame.right is not None for frame in frames):
         return "stereo"
-    return "network" if config.depth_model or cached_checkpoint() else "points"
+    return "network" if has_network() else "points"
 
 
 def interpolate_points(

@@ -22,11 +22,13 @@ class Strategy:
     Args:
         options: Options of the strategy, as `ReconstructionConfig` nests them under its name.
         limit: Largest number of Gaussians.
-        scene_depth: Median depth of the scene, metres: the unit of sizes.
+        scene_depth: Unit of sizes, metres: the median depth of the scene, or what `ReconstructionConfig.unit` says.
     """
 
     wants_absgrad = False
     """Whether `step_post_backward` is to get the gradients of image positions, which costs time."""
+    signed = False
+    """Whether those of pixels are added up with their signs."""
 
     def __init__(self, options: Any, limit: int, scene_depth: float) -> None:
         self.options, self.limit, self.scene_depth = options, limit, scene_depth
@@ -40,13 +42,17 @@ class Strategy:
 
         Args:
             state: Statistics.
-            steepness: Σ_pixels |∂L/∂mean2d| [N] of the training view, image coordinates in units of half the image.
+            steepness: Σ_pixels |∂L/∂mean2d| [N] of the training view, or |Σ_pixels ∂L/∂mean2d| where `signed`; image coordinates in
+                units of half the image.
         """
 
-    def refine(self, model: GaussianModel, state: dict[str, Tensor], generator: torch.Generator) -> Refined:
-        """Add, move and remove Gaussians, every `refine_every` iterations."""
+    def refine(self, model: GaussianModel, state: dict[str, Tensor], generator: torch.Generator, iteration: int = 0) -> Refined:
+        """Add, move and remove Gaussians, every `refine_every` iterations; ``iteration`` is the number of steps so far."""
         everything = torch.arange(len(model), device=model.means.device)
         return Refined(model, everything, torch.zeros_like(everything, dtype=torch.bool))
+
+    def reset(self, parameters: dict[str, Tensor], states: dict[str, dict[str, Tensor]], iteration: int) -> None:
+        """Change the Gaussians and the optimiser's state of them in place, after a step in the time of refinements."""
 
     def perturb(self, parameters: dict[str, Tensor], iteration: int, step_size: float, generator: torch.Generator) -> None:
         """Change the Gaussians in place, after every step of the optimiser.

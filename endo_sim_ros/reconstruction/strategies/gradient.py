@@ -1,4 +1,4 @@
-"""The strategy of 3DGS (Kerbl et al. 2023), with the gradients of AbsGS (Ye et al. 2024)."""
+"""The strategy of 3DGS (Kerbl et al. 2023), with its gradients or with those of AbsGS (Ye et al. 2024)."""
 
 import dataclasses
 import math
@@ -15,6 +15,15 @@ class Gradient(Strategy):
 
     wants_absgrad = True
 
+    @property
+    def signed(self) -> bool:
+        """As the options say."""
+        return not self.options.absolute
+
+    @property
+    def _first_reset(self) -> int:
+        return self.options.reset_first or self.options.reset_every
+
     def initialize_state(self, count: int, device: torch.device | str) -> dict[str, Tensor]:
         """Of each Gaussian, Σ of its image gradients, and the number of iterations in which it had any."""
         return {"gradients": torch.zeros(2, count, device=device)}
@@ -23,7 +32,15 @@ class Gradient(Strategy):
         """Add up the image gradients."""
         state["gradients"] += torch.stack([steepness, (steepness > 0).to(steepness.dtype)])
 
-    def refine(self, model: GaussianModel, state: dict[str, Tensor], generator: torch.Generator) -> Refined:
+    def reset(self, parameters: dict[str, Tensor], states: dict[str, dict[str, Tensor]], iteration: int) -> None:
+        """Let opacities fall, every `reset_every` iterations: what a view needs becomes opaque again, the rest can be removed."""
+        options, since = self.options, iteration - self._first_reset
+        if options.reset_every and since >= 0 and since % options.reset_every == 0:
+            parameters["logit_opacities"].clamp_(max=math.log(options.reset_to / (1 - options.reset_to)))
+            for moment in ("exp_avg", "exp_avg_sq"):
+                states["logit_opacities"][moment].zero_()
+
+    def refine(self, model: GaussianModel, state: dict[str, Tensor], generator: torch.Generator, iteration: int = 0) -> Refined:
         """Remove dead Gaussians; where images ask for more, split the large ones in two and double the small ones.
 
         Above the limit, the steepest come first.
@@ -50,4 +67,9 @@ class Gradient(Strategy):
         means[halves:] += steps
         log_scales[halves:] -= math.log(options.shrink)
         fresh = torch.arange(len(source), device=device) >= len(indices[0])
-        return Refined(dataclasses.replace(new, means=means, log_scales=log_scales), source, fresh)
+        new = dataclasses.replace(new, means=means, log_scales=log_scales)
+        if options.oversize and options.reset_every and iteration > self._first_reset:
+            small = (new.scales.amax(1) <= options.oversize * self.scene_depth).nonzero()[:, 0]
+            if len(small):
+                return Refined(new.select(small), source[small], fresh[small])
+        return Refined(new, source, fresh)

@@ -14,7 +14,7 @@ from endo_sim_ros.reconstruction.strategies.base import Refined, Strategy
 class Mcmc(Strategy):
     """Gaussians are samples of where the scene is; options: `McmcConfig`."""
 
-    def refine(self, model: GaussianModel, state: dict[str, Tensor], generator: torch.Generator) -> Refined:
+    def refine(self, model: GaussianModel, state: dict[str, Tensor], generator: torch.Generator, iteration: int = 0) -> Refined:
         """Move dead Gaussians onto live ones and add a share of new ones, up to the limit."""
         n, device, least = len(model), model.means.device, self.options.dead_opacity
         opacities = model.opacities

@@ -15,11 +15,13 @@ from endo_sim_ros.reconstruction.strategies.gradient import Gradient
 class Proximity(Gradient):
     """New Gaussians also fill the gaps around those that lie alone; options: `ProximityConfig`."""
 
-    def refine(self, model: GaussianModel, state: dict[str, Tensor], generator: torch.Generator) -> Refined:
+    def refine(self, model: GaussianModel, state: dict[str, Tensor], generator: torch.Generator, iteration: int = 0) -> Refined:
         """Refine as `Gradient` does, then `unpool`."""
-        model, source, fresh = super().refine(model, state, generator)
-        model, others, added = self.unpool(model)
-        return Refined(model, source[others], fresh[others] | added)
+        refined = super().refine(model, state, generator, iteration)
+        if self.options.unpool_until and iteration >= self.options.unpool_until:
+            return refined
+        model, others, added = self.unpool(refined.model)
+        return Refined(model, refined.source[others], refined.fresh[others] | added)
 
     def unpool(self, model: GaussianModel) -> Refined:
         """Add Gaussians halfway to the neighbours of those that lie alone."""

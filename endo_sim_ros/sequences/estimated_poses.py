@@ -1,0 +1,79 @@
+"""Recordings whose poses are estimated from the images, and the ways to do so."""
+
+import dataclasses
+import functools
+import logging
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.sequences.recording import OnProgress, Recording
+from endo_sim_ros.sequences.structure_from_motion import STRUCTURE_FROM_MOTION, StructureFromMotion, estimate_poses
+
+logger = logging.getLogger(__name__)
+
+VGGT = "vggt"  # what the readers' option `poses` says to ask for it
+
+
+def pose_estimator(poses: str) -> Callable[..., StructureFromMotion] | None:
+    """What estimates poses by a name: `estimate_poses` of sfm, that with a network of vggt or vggt:FOLDER (of its checkpoint).
+
+    None for any other text, as the name of a file.
+    """
+    name, _, folder = poses.partition(":")
+    if name == VGGT:
+        from endo_sim_ros.sequences.vggt import estimate_poses_with_vggt  # needs torch
+
+        return functools.partial(estimate_poses_with_vggt, checkpoint=folder)
+    return estimate_poses if poses == STRUCTURE_FROM_MOTION else None
+
+
+def with_estimated_poses(recording: Recording, source: Path, poses: str | None = None) -> Recording:
+    """Frames of a calibrated camera with unknown poses, which are estimated on first iteration.
+
+    Args:
+        recording: Its frames have any pose; stereo frames make the result metric.
+        source: Its file or folder, for messages.
+        poses: How, see `pose_estimator`; None: by structure from motion.
+
+    Raises:
+        SequenceError: If there is no such way.
+    """
+    estimate = pose_estimator(STRUCTURE_FROM_MOTION if poses is None else poses)
+    if estimate is None:
+        raise SequenceError(f"{source}: poses must be {STRUCTURE_FROM_MOTION}, {VGGT} or {VGGT}:FOLDER, got {poses!r}")
+
+    results: list[StructureFromMotion] = []
+
+    def prepare(on_progress: OnProgress | None = None) -> None:
+        if not results:
+            results.append(find(on_progress))
+
+    def estimated() -> StructureFromMotion:
+        prepare()
+        return results[0]
+
+    def find(on_progress: OnProgress | None) -> StructureFromMotion:
+        logger.info("%s: estimating the poses of %d frames", source, len(recording))
+        first = next(iter(recording))
+        stereo = first.right is not None
+        try:
+            return estimate(
+                (frame.image for frame in recording),
+                first.camera.K,
+                masks=(frame.mask for frame in recording),
+                right_images=(frame.right for frame in recording) if stereo else None,
+                baseline=first.baseline if stereo else None,
+                count=len(recording),
+                on_progress=on_progress,
+            )
+        except SequenceError as error:
+            raise SequenceError(f"{source}: {error}") from None
+
+    def posed() -> Iterator[Frame]:
+        placed = estimated().poses
+        for position, frame in enumerate(recording):
+            if position in placed:
+                yield dataclasses.replace(frame, camera=frame.camera.at(placed[position]))
+
+    return Recording(posed, len(recording), lambda: estimated().points, prepare=prepare)

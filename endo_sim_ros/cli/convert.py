@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from rich.progress import track
+from rich.progress import Progress, track
 from tyro.conf import Positional
 
 from endo_sim_ros.core.frames import SequenceError
@@ -92,6 +92,10 @@ class Command:
         fixed = ("source", "bag", "kind")
         options = {name: value for name, value in vars(self).items() if name not in fixed and value is not None}
         frames = open_sequence(self.source, self.kind, **options)
+        if isinstance(frames, Recording) and frames.prepare:
+            with Progress() as bar:
+                task = bar.add_task("poses", total=None)
+                frames.prepare(lambda stage, done, total: bar.update(task, description=stage, completed=done, total=total or None))
         try:
             count = write_bag(self.bag, track(frames, f"converting {self.source.name}"))
             points = frames.points() if isinstance(frames, Recording) else None

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from endo_sim_ros.core.frames import Frame, SequenceError
-from endo_sim_ros.sequences.recording import Recording
+from endo_sim_ros.sequences.recording import OnProgress, Recording
 from endo_sim_ros.sequences.structure_from_motion import STRUCTURE_FROM_MOTION, StructureFromMotion, estimate_poses
 
 logger = logging.getLogger(__name__)
@@ -43,8 +43,17 @@ def with_estimated_poses(recording: Recording, source: Path, poses: str | None =
     if estimate is None:
         raise SequenceError(f"{source}: poses must be {STRUCTURE_FROM_MOTION}, {VGGT} or {VGGT}:FOLDER, got {poses!r}")
 
-    @functools.cache
+    results: list[StructureFromMotion] = []
+
+    def prepare(on_progress: OnProgress | None = None) -> None:
+        if not results:
+            results.append(find(on_progress))
+
     def estimated() -> StructureFromMotion:
+        prepare()
+        return results[0]
+
+    def find(on_progress: OnProgress | None) -> StructureFromMotion:
         logger.info("%s: estimating the poses of %d frames", source, len(recording))
         first = next(iter(recording))
         stereo = first.right is not None
@@ -55,6 +64,8 @@ def with_estimated_poses(recording: Recording, source: Path, poses: str | None =
                 masks=(frame.mask for frame in recording),
                 right_images=(frame.right for frame in recording) if stereo else None,
                 baseline=first.baseline if stereo else None,
+                count=len(recording),
+                on_progress=on_progress,
             )
         except SequenceError as error:
             raise SequenceError(f"{source}: {error}") from None
@@ -65,4 +76,4 @@ def with_estimated_poses(recording: Recording, source: Path, poses: str | None =
             if position in placed:
                 yield dataclasses.replace(frame, camera=frame.camera.at(placed[position]))
 
-    return Recording(posed, len(recording), lambda: estimated().points)
+    return Recording(posed, len(recording), lambda: estimated().points, prepare=prepare)

@@ -20,6 +20,9 @@ FIRST_STAMP_NS = 1_000_000_000  # a ROS stamp of 0 means "unset", so recordings 
 
 T = TypeVar("T")
 
+OnProgress = Callable[[str, int, int], None]
+"""``on_progress(stage, done, total)``; total is 0 where it is unknown."""
+
 
 @dataclass(frozen=True)
 class Recording:
@@ -30,11 +33,14 @@ class Recording:
         count: Number of frames expected, for progress bars; a damaged video or a frame that structure from motion could
             not place makes the iteration shorter. 0 = unknown.
         points: Returns scene points [N, 3] (m, world of the frames) and their RGB [N, 3] in [0, 1], of structure from motion, or None.
+        prepare: Does what takes long before the first frame, telling its progress, unless it is done; otherwise the first
+            iteration does it silently. None where nothing takes long.
     """
 
     frames: Callable[[], Iterator[Frame]]
     count: int
     points: Callable[[], tuple[np.ndarray, np.ndarray] | None] = lambda: None
+    prepare: Callable[[OnProgress], None] | None = None
 
     def __iter__(self) -> Iterator[Frame]:
         return self.frames()

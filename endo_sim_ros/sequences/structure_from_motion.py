@@ -1,30 +1,39 @@
-"""Camera poses from the images alone, by COLMAP's incremental structure from motion."""
+"""Camera poses from the images alone: OpenCV's features, COLMAP's matching and mapping."""
 
-import contextlib
+import dataclasses
 import itertools
+import json
 import logging
+import os
+import signal
+import subprocess
+import sys
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2  # before pycolmap, whose own image library would otherwise break cv2.imwrite
 import numpy as np
 
 from endo_sim_ros.core.cameras import intrinsic_matrix, invert_pose
+from endo_sim_ros.core.device import cpu_threads
+from endo_sim_ros.core.features import detect  # imports cv2, before pycolmap, whose own image library would otherwise break cv2.imwrite
 from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.sequences import colmap_process
+from endo_sim_ros.sequences.colmap_process import ColmapJob
 from endo_sim_ros.sequences.images import image_size
+from endo_sim_ros.sequences.recording import OnProgress
 
 logger = logging.getLogger(__name__)
 
 STRUCTURE_FROM_MOTION = "sfm"  # what the readers' option `poses` says to ask for it
 
-_ALL_PAIRS = 60  # images up to which all pairs are matched, whose number grows with their square; of more, neighbours in time
 _LONG_RUN = 300  # images, from which on a run takes tens of minutes and a warning says so
-_PEAK_THRESHOLD = 0.002  # contrast of a SIFT feature; tissue has little, and COLMAP's 0.0067 finds a third of the features
+_MAX_FEATURES = 8192  # of an image, as COLMAP takes; matching takes time with their square
+_GUESSED_FOCAL = 1.2  # focal length to start from where none is known, larger sides of the image: COLMAP's
 _GUESSED_DEPTH = 0.1  # median depth of the points where no scale is known, metres: a usual working distance of a laparoscope
-_SEED = 0  # of random sampling
 
 
 @dataclass(frozen=True)
@@ -58,6 +67,8 @@ def estimate_poses(
     baseline: float | None = None,
     scale: float | None = None,
     threads: int = -1,
+    count: int = 0,
+    on_progress: OnProgress | None = None,
 ) -> StructureFromMotion:
     """Estimate where the camera was for every image.
 
@@ -71,6 +82,8 @@ def estimate_poses(
         baseline: Distance from left to right camera, metres; makes the result metric.
         scale: Metres per unit of the reconstruction, as a last resort where no baseline is known; without either, a guess.
         threads: -1 uses all cores; 1 makes a run repeatable to the last bit.
+        count: How many images are expected, for the progress; 0 where unknown.
+        on_progress: Called in this thread with features, matching and mapping; what it raises ends the work at once.
 
     Returns:
         The recovered poses; images that could not be placed are missing from them and logged.
@@ -82,98 +95,108 @@ def estimate_poses(
         raise ValueError("estimate_poses: right_images and baseline must be given together")
     if right_images is not None and K is None:
         raise ValueError("estimate_poses: stereo images need K, because they are rectified with it")
+    on_progress = on_progress or (lambda stage, done, total: None)
     with tempfile.TemporaryDirectory(prefix="endo_sfm_") as folder:
         root = Path(folder)
-        count, size = _write_images(root, images, masks, right_images)
+        database = root / colmap_process.DATABASE
+        count, size, colors = _write_features(database, images, K, masks, right_images, baseline, threads, on_progress, count)
         if count < 2:
             raise SequenceError(f"structure from motion needs at least 2 images, got {count}; select more frames")
         if count > _LONG_RUN:
             logger.warning("structure from motion on %d images takes long; a larger step would do as well", count)
-        model = _run_colmap(root, K, size, count, baseline, threads)
-    return _result(model, count, K, baseline, scale)
+        model = _run_colmap(root, K is not None, baseline is not None, size, count, threads, on_progress)
+    return _result(model, count, colors, K, baseline, scale)
 
 
-def _write_images(
-    root: Path,
+def _write_features(
+    database: Path,
     images: Iterable[np.ndarray],
+    K: np.ndarray | None,
     masks: Iterable[np.ndarray | None] | None,
     right_images: Iterable[np.ndarray | None] | None,
-) -> tuple[int, tuple[int, int]]:
-    """Lay the images out as COLMAP reads them: `left/000000.png`, its mask `masks/left/000000.png.png`."""
-    for folder in ("images/left", "images/right", "masks/left", "masks/right"):
-        (root / folder).mkdir(parents=True)
-    count, size, masked = 0, None, False
-    absent = itertools.repeat(None)
-    for image, mask, right in zip(images, masks or absent, right_images or absent, strict=False):
-        size = size or image_size(image)
-        if image_size(image) != size:
-            raise SequenceError(f"image {count} is {image.shape[1]}×{image.shape[0]}, but the first one is {size[0]}×{size[1]}")
-        name = f"{count:06d}.png"
-        cv2.imwrite(str(root / "images/left" / name), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-        if right is not None:
-            cv2.imwrite(str(root / "images/right" / name), cv2.cvtColor(right, cv2.COLOR_RGB2BGR))
-        if mask is not None:
-            # The border of the left mask serves the right eye too; its tools are shifted, which matching survives.
-            masked = True
-            for eye in ("left", "right") if right is not None else ("left",):
-                cv2.imwrite(str(root / f"masks/{eye}" / f"{name}.png"), mask)
-        count += 1
-    if not masked:
-        for eye in ("left", "right"):
-            (root / "masks" / eye).rmdir()
-        (root / "masks").rmdir()
-    return count, size or (0, 0)
+    baseline: float | None,
+    threads: int,
+    on_progress: OnProgress,
+    expected: int,
+) -> tuple[int, tuple[int, int], dict[str, np.ndarray]]:
+    """Write cameras, images (`left/000000`, `right/000000`) and features into a new database.
 
-
-def _run_colmap(root: Path, K: np.ndarray | None, size: tuple[int, int], count: int, baseline: float | None, threads: int) -> Any:
-    """COLMAP's largest model of the images under root; with a baseline, left and right move as one rig."""
+    Returns:
+        Count and size of the images, and by their names the RGB [N, 3], uint8, of the features: COLMAP sees no image.
+    """
     import pycolmap  # heavy, and needed here only
 
-    with _quiet(pycolmap):
-        pycolmap.set_random_seed(_SEED)
-        database = root / "database.db"
-        reader = pycolmap.ImageReaderOptions()
-        if K is not None:
-            reader.camera_model = "PINHOLE"
-            reader.camera_params = ",".join(repr(float(v)) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
-        else:
-            reader.camera_model = "SIMPLE_RADIAL"
-        if (root / "masks").is_dir():
-            reader.mask_path = root / "masks"
-        extraction = pycolmap.FeatureExtractionOptions(num_threads=threads)
-        extraction.sift.peak_threshold = _PEAK_THRESHOLD
-        pycolmap.extract_features(
-            database, root / "images", camera_mode=pycolmap.CameraMode.PER_FOLDER,
-            reader_options=reader, extraction_options=extraction, device=pycolmap.Device.cpu,
-        )  # fmt: skip
-        if baseline is not None:
-            _tie_eyes(pycolmap, database, baseline)
-        verification = pycolmap.TwoViewGeometryOptions()
-        verification.ransac.random_seed = _SEED
-        verification.detect_watermark = False  # a fixed vignette or overlay is masked, and watermarks are not pairs
-        match = pycolmap.match_exhaustive if count <= _ALL_PAIRS else pycolmap.match_sequential
-        match(
-            database, pycolmap.FeatureMatchingOptions(num_threads=threads),
-            verification_options=verification, device=pycolmap.Device.cpu,
-        )  # fmt: skip
-        options = pycolmap.IncrementalPipelineOptions(num_threads=threads, random_seed=_SEED, min_model_size=2)
-        options.mapper.random_seed = options.triangulation.random_seed = _SEED
-        options.mapper.num_threads = threads
-        if K is not None:
-            options.ba_refine_focal_length = options.ba_refine_extra_params = False
-            options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
-        models = pycolmap.incremental_mapping(database, root / "images", root, options)
-    if not models:
-        raise SequenceError(
-            "structure from motion found no pair of images with enough matches and parallax; "
-            f"select frames in which the camera moves and the tissue is in focus ({size[0]}×{size[1]} images)"
-        )
-    if len(models) > 1:
-        logger.warning("structure from motion fell apart into %d pieces; only the largest is used", len(models))
-    return max(models.values(), key=lambda model: model.num_reg_images())
+    def find(task: tuple[str, np.ndarray, np.ndarray | None]) -> tuple[str, np.ndarray, np.ndarray, np.ndarray]:
+        eye, image, mask = task
+        uv, descriptors = detect(image, mask, _MAX_FEATURES)
+        column, row = uv.astype(int).T
+        color = image[row.clip(0, image.shape[0] - 1), column.clip(0, image.shape[1] - 1)]
+        return eye, uv, np.zeros((0, 128), np.float32) if descriptors is None else descriptors, color
+
+    absent = itertools.repeat(None)
+    workers = min(threads, cpu_threads()) if threads > 0 else cpu_threads()
+    count, size, cameras, colors = 0, None, {}, {}
+    frames = zip(images, masks or absent, right_images or absent, strict=False)
+    with pycolmap.Database.open(database) as opened, ThreadPoolExecutor(workers) as pool:
+        on_progress("features", 0, expected)
+        while batch := list(itertools.islice(frames, workers)):  # a few at a time: there may be more images than memory
+            tasks = []
+            for offset, (image, mask, right) in enumerate(batch):
+                size = size or image_size(image)
+                if image_size(image) != size:
+                    shape = f"{image.shape[1]}×{image.shape[0]}"
+                    raise SequenceError(f"image {count + offset} is {shape}, but the first one is {size[0]}×{size[1]}")
+                tasks.append(("left", image, mask))
+                if right is not None:  # the left mask's border serves both eyes; its tools are shifted, which matching survives
+                    tasks.append(("right", right, mask))
+            number = count - 1
+            for eye, uv, descriptors, color in pool.map(find, tasks):
+                number += eye == "left"
+                if eye not in cameras:
+                    cameras[eye] = _write_camera(pycolmap, opened, K, size or (0, 0))
+                name = f"{eye}/{number:06d}"
+                colors[name] = color
+                _write_image(pycolmap, opened, cameras[eye], name, uv, descriptors)
+            count += len(batch)
+            on_progress("features", count, expected)
+        if baseline is not None and count:
+            level = pycolmap.logging.minloglevel
+            pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value  # it prints a line for each pair
+            _tie_eyes(pycolmap, opened, baseline)
+            pycolmap.logging.minloglevel = level
+    return count, size or (0, 0), colors
 
 
-def _tie_eyes(pycolmap: Any, database: Path, baseline: float) -> None:
+def _write_camera(pycolmap: Any, database: Any, K: np.ndarray | None, size: tuple[int, int]) -> tuple[Any, int]:
+    """A new camera of the database, and the number of its rig."""
+    width, height = size
+    camera = pycolmap.Camera(model="PINHOLE" if K is not None else "SIMPLE_RADIAL", width=width, height=height)
+    if K is not None:
+        camera.params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+        camera.has_prior_focal_length = True
+    else:
+        camera.params = [_GUESSED_FOCAL * max(size), width / 2, height / 2, 0.0]
+    camera.camera_id = database.write_camera(camera)
+    rig = pycolmap.Rig()
+    rig.add_ref_sensor(camera.sensor_id)
+    return camera, database.write_rig(rig)
+
+
+def _write_image(pycolmap: Any, database: Any, sensor: tuple[Any, int], name: str, uv: np.ndarray, descriptors: np.ndarray) -> None:
+    camera, rig = sensor
+    number = database.write_image(pycolmap.Image(name=name, camera_id=camera.camera_id))
+    frame = pycolmap.Frame()
+    frame.rig_id = rig
+    frame.add_data_id(pycolmap.data_t(camera.sensor_id, number))
+    database.write_frame(frame)
+    database.write_keypoints(number, uv.astype(np.float32))
+    # As COLMAP keeps them: the roots of the shares (RootSIFT, Arandjelovic and Zisserman 2012) in 8 bits.
+    roots = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-9))
+    values = np.minimum(np.round(512 * roots), 255).astype(np.uint8)
+    database.write_descriptors(number, pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, values))
+
+
+def _tie_eyes(pycolmap: Any, database: Any, baseline: float) -> None:
     """Make each stereo pair one rigid body, which starts rectified and is refined as one for all pairs.
 
     Pairs placed one by one would drift, because the parallax between the eyes is only a degree or two.
@@ -185,23 +208,52 @@ def _tie_eyes(pycolmap: Any, database: Path, baseline: float) -> None:
             pycolmap.RigConfigCamera(ref_sensor=False, image_prefix="right/", cam_from_rig=right_from_left),
         ]
     )
-    with pycolmap.Database.open(database) as opened:
-        pycolmap.apply_rig_config([rig], opened)
+    pycolmap.apply_rig_config([rig], database)
 
 
-@contextlib.contextmanager
-def _quiet(pycolmap: Any) -> Iterator[None]:
-    """Keep COLMAP's progress off the terminal; its errors still show."""
-    level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
-    try:
-        yield
-    finally:
-        pycolmap.logging.minloglevel = level
+def _run_colmap(root: Path, fixed: bool, stereo: bool, size: tuple[int, int], count: int, threads: int, on_progress: OnProgress) -> Any:
+    """COLMAP's largest model of the features under root, made by `colmap_process` in a process of its own.
+
+    COLMAP's calls take from seconds to minutes and hear no Ctrl-C; a process can be ended at any time.
+    """
+    import pycolmap
+
+    job = ColmapJob(str(root), count, fixed, stereo, threads)
+    # The package is found where this process has found it.
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
+    process = subprocess.Popen(
+        [sys.executable, "-m", colmap_process.__name__, json.dumps(dataclasses.asdict(job))],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment, start_new_session=True,
+    )  # fmt: skip
+    models = 0
+    with process:  # waits for its end and closes the pipes
+        try:
+            for line in process.stdout or ():
+                stage, done, total = line.rsplit(" ", 2)
+                if stage == "models":
+                    models = int(done)
+                else:
+                    on_progress(stage, int(done), int(total))
+            status = process.wait()
+        finally:
+            process.kill()
+    if status:
+        cause = f"was ended by {signal.Signals(-status).name}" if status < 0 else f"ended with status {status}"
+        raise SequenceError(f"structure from motion failed: its process {cause}; what it printed above tells more")
+    if not models:
+        raise SequenceError(
+            "structure from motion found no pair of images with enough matches and parallax; "
+            f"select frames in which the camera moves and the tissue is in focus ({size[0]}×{size[1]} images)"
+        )
+    if models > 1:
+        logger.warning("structure from motion fell apart into %d pieces; only the largest is used", models)
+    return pycolmap.Reconstruction(root / colmap_process.MODEL)
 
 
-def _result(model: Any, count: int, K: np.ndarray | None, baseline: float | None, scale: float | None) -> StructureFromMotion:
-    """Scale a COLMAP model to metres and put the world into its first camera."""
+def _result(
+    model: Any, count: int, colors: dict[str, np.ndarray], K: np.ndarray | None, baseline: float | None, scale: float | None
+) -> StructureFromMotion:
+    """Scale a COLMAP model to metres, put the world into its first camera, and colour its points by the features of each."""
     eyes: dict[str, dict[int, np.ndarray]] = {"left": {}, "right": {}}
     depths = []
     points = {key: point.xyz for key, point in model.points3D.items()}
@@ -229,7 +281,9 @@ def _result(model: Any, count: int, K: np.ndarray | None, baseline: float | None
     for number, pose in left.items():
         poses[number] = to_first @ pose
         poses[number][:3, 3] *= factor
-    colors = np.array([point.color for point in model.points3D.values()]) / 255
+    names = {number: image.name for number, image in model.images.items()}
+    tracks = ([(names[e.image_id], e.point2D_idx) for e in point.track.elements] for point in model.points3D.values())
+    point_colors = np.array([np.mean([colors[name][feature] for name, feature in track], 0) for track in tracks]) / 255
     scene_points = factor * (np.array(list(points.values())) @ to_first[:3, :3].T + to_first[:3, 3])
 
     distortion: tuple[float, ...] = ()
@@ -239,7 +293,7 @@ def _result(model: Any, count: int, K: np.ndarray | None, baseline: float | None
         logger.warning("estimated a focal length of %.1f px and k1 %.3f, which may be wrong; pass the calibration if known", f, k1)
     error = float(model.compute_mean_reprojection_error())
     logger.info("structure from motion placed %d of %d images, %d points, %.2f px", len(left), count, len(points), error)
-    return StructureFromMotion(poses, np.asarray(K, np.float64), distortion, error, metric, (scene_points, colors))
+    return StructureFromMotion(poses, np.asarray(K, np.float64), distortion, error, metric, (scene_points, point_colors))
 
 
 def scale_to_metres(pairs: list[float], baseline: float | None, scale: float | None, depths: np.ndarray) -> tuple[float, bool]:

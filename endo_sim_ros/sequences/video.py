@@ -7,7 +7,6 @@ endo.mp4, or a folder with
   mask.png            optional, one for all frames; or masks/%06d.png; 255 = tissue
 """
 
-import functools
 import itertools
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -23,7 +22,7 @@ from endo_sim_ros.sequences.estimated_poses import pose_estimator
 from endo_sim_ros.sequences.images import numbered_files, read_gray
 from endo_sim_ros.sequences.masks import MaskFiles, lit_area, lit_now, tissue_mask, tool_is_white
 from endo_sim_ros.sequences.pose_files import read_poses
-from endo_sim_ros.sequences.recording import Recording, keep_posed, select, spread, stamp_ns
+from endo_sim_ros.sequences.recording import OnProgress, Recording, keep_posed, select, spread, stamp_ns
 from endo_sim_ros.sequences.rectification import Rectification
 from endo_sim_ros.sequences.structure_from_motion import STRUCTURE_FROM_MOTION, StructureFromMotion
 from endo_sim_ros.sequences.video_files import Video, find_video
@@ -117,8 +116,17 @@ def read_video(
         numbers = numbers[::sfm_step]
         logger.info("%s: poses of every %d-th frame are estimated", path, step * sfm_step)
 
-    @functools.cache
-    def prepare() -> tuple[np.ndarray, Rectification, Mapping[int, np.ndarray], Points]:
+    results: list[tuple[np.ndarray, Rectification, Mapping[int, np.ndarray], Points]] = []
+
+    def prepare(on_progress: OnProgress | None = None) -> None:
+        if not results:
+            results.append(find(on_progress))
+
+    def prepared() -> tuple[np.ndarray, Rectification, Mapping[int, np.ndarray], Points]:
+        prepare()
+        return results[0]
+
+    def find(on_progress: OnProgress | None) -> tuple[np.ndarray, Rectification, Mapping[int, np.ndarray], Points]:
         """Lit area, rectification, poses and scene points: what takes a pass over the video is found once, on first iteration."""
         lit = np.full(size[::-1], 255, np.uint8)
         if mask_border:
@@ -135,11 +143,12 @@ def read_video(
             lambda n, image: cv2.bitwise_and(lit_now(lit, image), mask_of(n)),
             scale=scale,
             threads=threads,
+            on_progress=on_progress,
         )
         return lit, rectification, placed, points
 
     def frames() -> Iterator[Frame]:
-        lit, rectification, placed, _ = prepare()
+        lit, rectification, placed, _ = prepared()
         for number, image in video.frames([n for n in numbers if n in placed]):
             yield Frame(
                 stamp_ns=stamp_ns(number, fps),
@@ -148,7 +157,7 @@ def read_video(
                 mask=rectification.mask(cv2.bitwise_and(lit_now(lit, image), mask_of(number))),
             )
 
-    return Recording(frames, len(numbers), lambda: prepare()[3])
+    return Recording(frames, len(numbers), lambda: prepared()[3], prepare=prepare if known is None else None)
 
 
 def _estimate(
@@ -160,6 +169,7 @@ def _estimate(
     *,
     scale: float | None,
     threads: int,
+    on_progress: OnProgress | None,
 ) -> tuple[dict[int, np.ndarray], Rectification, Points]:
     """Poses by frame number, the rectification, which is estimated too where it is None, and scene points."""
     undistort = rectification or Rectification.mono(np.eye(3), (), (video.width, video.height))
@@ -171,6 +181,8 @@ def _estimate(
             masks=(undistort.mask(mask_of(*numbered)) for numbered in for_masks),
             scale=scale,
             threads=threads,
+            count=len(numbers),
+            on_progress=on_progress,
         )
     except SequenceError as error:
         raise SequenceError(f"{video.path}: {error}") from None

@@ -1,6 +1,10 @@
 """Structure from motion, on a relief and on real recordings."""
 
 import itertools
+import json
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -9,6 +13,8 @@ import pytest
 from plane_scene import BASELINE, pose_of, write_rgb
 
 from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.sequences import structure_from_motion
+from endo_sim_ros.sequences.colmap_process import pairs
 from endo_sim_ros.sequences.folder import read_folder
 from endo_sim_ros.sequences.masks import lit_area
 from endo_sim_ros.sequences.pose_files import read_poses
@@ -79,6 +85,78 @@ def test_structure_from_motion_on_stereo_is_metric():
     surface = 0.1 + 0.012 * np.sin(world[:, 0] / 0.012) * np.cos(world[:, 1] / 0.015)
     assert len(points) > 100 and np.median(np.abs(world[:, 2] - surface)) < 1e-3
     assert colors.shape == points.shape and 0 <= colors.min() < colors.max() <= 1 and colors.std() > 0.05
+
+
+def test_pairs_tie_every_image_to_its_neighbours_and_to_far_ones():
+    assert len(pairs(30, stereo=False)) == 30 * 29 // 2
+    many = pairs(600, stereo=True)
+    assert len(set(many)) == len(many) < 15 * 600
+    assert {("left/000000", "left/000010"), ("left/000000", "left/000580"), ("left/000599", "right/000599")} <= set(many)
+    assert ("left/000000", "left/000011") not in many
+
+
+@pytest.mark.slow
+def test_progress_is_told_and_its_error_ends_the_work_at_once(tmp_path, monkeypatch):
+    pytest.importorskip("pycolmap")
+    monkeypatch.setattr(structure_from_motion.tempfile, "tempdir", str(tmp_path))
+    processes = []
+
+    class Recorded(subprocess.Popen):
+        def __init__(self, *arguments, **options):
+            super().__init__(*arguments, **options)
+            processes.append(self)
+
+    monkeypatch.setattr(structure_from_motion.subprocess, "Popen", Recorded)
+    told = []
+
+    def stop(stage, done, total):
+        told.append((stage, done, total))
+        if stage == "mapping":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        estimate_poses(relief_images(ORBIT, K_RELIEF), K_RELIEF, count=6, on_progress=stop)
+    assert {("features", 6, 6), ("matching", 0, 15), ("mapping", 0, 0)} <= set(told)
+    assert [process.returncode for process in processes] == [-signal.SIGKILL]
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_the_process_of_colmap_ends_with_its_parent(tmp_path):
+    pytest.importorskip("pycolmap")
+    job = json.dumps({"folder": str(tmp_path), "count": 0, "fixed": True, "stereo": False, "threads": 1})
+    code = "import sys, time; from endo_sim_ros.sequences import colmap_process as c; c.run = lambda *_: time.sleep(60); c.main()"
+    with subprocess.Popen([sys.executable, "-c", code, job], stdin=subprocess.PIPE) as process:
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(1)
+        assert process.stdin is not None
+        process.stdin.close()
+        assert process.wait(30) == 1
+
+
+@pytest.mark.slow
+def test_colmap_that_dies_is_told(monkeypatch):
+    pytest.importorskip("pycolmap")
+    monkeypatch.setattr(structure_from_motion.sys, "executable", "/bin/false")
+    with pytest.raises(SequenceError, match="its process ended with status 1"):
+        estimate_poses(itertools.islice(relief_images(ORBIT, K_RELIEF), 2), K_RELIEF)
+
+
+@pytest.mark.slow
+def test_one_thread_gives_the_same_bits():
+    pytest.importorskip("pycolmap")
+    first, second = (estimate_poses(relief_images(ORBIT, K_RELIEF), K_RELIEF, threads=1) for _ in range(2))
+    assert len(first.poses) == 6
+    for number, pose in first.poses.items():
+        assert pose.tobytes() == second.poses[number].tobytes()
+
+
+@pytest.mark.slow
+def test_unknown_intrinsics_are_estimated():
+    pytest.importorskip("pycolmap")
+    result = estimate_poses(relief_images(ORBIT, K_RELIEF))
+    assert len(result.poses) == 6 and len(result.distortion) == 1
+    assert result.reprojection_error < 1
 
 
 @pytest.mark.slow

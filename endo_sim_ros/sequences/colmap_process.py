@@ -1,0 +1,155 @@
+"""COLMAP's matching and mapping, in a process of their own: `python -m endo_sim_ros.sequences.colmap_process JOB`.
+
+It prints a line `stage done total` for each step, at the end `models`, and writes the largest model to the job's folder.
+"""
+
+import json
+import os
+import sys
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+DATABASE, MODEL = "features.db", "model"  # in the job's folder
+
+_NEAR = 10  # images before and after each one that it is matched with: COLMAP's overlap of sequences
+_FAR = 30  # images, spread over all, that are matched with one another, so that a camera that comes back is recognised
+_CHUNKS = 20  # calls of the matching, between which progress is told
+_SEED = 0  # of random sampling
+
+
+@dataclass(frozen=True)
+class ColmapJob:
+    """What to do.
+
+    Args:
+        folder: Holds the database of features, whose images are named `left/000000`, `right/000000`; gets the model.
+        count: Left images.
+        fixed: The intrinsics are known and stay as they are.
+        stereo: Each left image has a right one.
+        threads: -1 uses all cores.
+    """
+
+    folder: str
+    count: int
+    fixed: bool
+    stereo: bool
+    threads: int
+
+
+def pairs(count: int, stereo: bool) -> list[tuple[str, str]]:
+    """Names of the images to match: left ones near in time, spread left ones with one another, and the eyes of each stereo pair.
+
+    More pairs with the right eyes bring nothing: a feature of theirs is in the track of the left one.
+    Up to `_FAR` images these are all left pairs; beyond, their number grows with the images, not with their square.
+    """
+    spread = -(-count // _FAR)
+    left = [
+        (f"left/{i:06d}", f"left/{j:06d}")
+        for i in range(count)
+        for j in range(i + 1, count)
+        if j - i <= _NEAR or i % spread == j % spread == 0
+    ]
+    return left + [(f"left/{i:06d}", f"right/{i:06d}") for i in range(count) if stereo]
+
+
+def run(job: ColmapJob, report: Callable[[str, int, int], None]) -> int:
+    """Match, map, and write the largest model; returns how many models came out."""
+    import cv2  # noqa: F401  (before pycolmap, see structure_from_motion.py)
+    import pycolmap
+
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value  # COLMAP's own progress
+    pycolmap.set_random_seed(_SEED)
+    root = Path(job.folder)
+    _match(pycolmap, job, root, report)
+    models = []
+    # Without intrinsics the global mapper would have to guess a focal length that it cannot correct.
+    if job.fixed:
+        report("mapping", 0, 0)
+        models = _global_models(pycolmap, job, root)
+    if max((_placed(model) for model in models), default=0) < job.count:
+        models = max(models, _incremental_models(pycolmap, job, root, report), key=lambda m: max(map(_placed, m), default=0))
+    if models:
+        (root / MODEL).mkdir()
+        max(models, key=_placed).write(root / MODEL)
+    return len(models)
+
+
+def _match(pycolmap: Any, job: ColmapJob, root: Path, report: Callable[[str, int, int], None]) -> None:
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = _SEED
+    verification.detect_watermark = False  # a fixed vignette or overlay is masked, and watermarks are not pairs
+    todo = pairs(job.count, job.stereo)
+    chunk = -(-len(todo) // _CHUNKS)
+    pairing = pycolmap.ImportedPairingOptions(match_list_path=root / "pairs.txt")
+    for done in range(0, len(todo), chunk):
+        report("matching", done, len(todo))
+        (root / "pairs.txt").write_text("".join(f"{first} {second}\n" for first, second in todo[done : done + chunk]))
+        pycolmap.match_image_pairs(
+            root / DATABASE, pycolmap.FeatureMatchingOptions(num_threads=job.threads), pairing_options=pairing,
+            verification_options=verification, device=pycolmap.Device.cpu,
+        )  # fmt: skip
+
+
+def _global_models(pycolmap: Any, job: ColmapJob, root: Path) -> list[Any]:
+    """Models of global mapping (GLOMAP, Pan et al. 2024), which places all images at once."""
+    options = pycolmap.GlobalPipelineOptions(num_threads=job.threads, random_seed=_SEED)
+    mapper = options.mapper
+    mapper.num_threads = job.threads
+    mapper.random_seed = mapper.rotation_averaging.random_seed = mapper.global_positioning.random_seed = _SEED
+    mapper.bundle_adjustment.refine_focal_length = mapper.bundle_adjustment.refine_extra_params = False
+    mapper.bundle_adjustment.refine_sensor_from_rig = True  # rectification is never exact; not the default of COLMAP 4.0
+    mapper.global_positioning.use_gpu = mapper.bundle_adjustment.ceres.use_gpu = False
+    (root / "global").mkdir()
+    try:
+        return list(pycolmap.global_mapping(root / DATABASE, root, root / "global", options).values())
+    except RuntimeError as error:  # its checks of what it was given; incremental mapping is more patient
+        print(f"global mapping failed: {error}", file=sys.stderr)
+        return []
+
+
+def _incremental_models(pycolmap: Any, job: ColmapJob, root: Path, report: Callable[[str, int, int], None]) -> list[Any]:
+    options = pycolmap.IncrementalPipelineOptions(num_threads=job.threads, random_seed=_SEED, min_model_size=2)
+    options.extract_colors = False
+    options.mapper.random_seed = options.triangulation.random_seed = _SEED
+    options.mapper.num_threads = job.threads
+    if job.fixed:
+        options.ba_refine_focal_length = options.ba_refine_extra_params = False
+        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+    placed = 0
+
+    def next_image() -> None:
+        nonlocal placed
+        placed = min(placed + 1, job.count)
+        report("mapping", placed, job.count)
+
+    (root / "incremental").mkdir()
+    models = pycolmap.incremental_mapping(root / DATABASE, root, root / "incremental", options, next_image_callback=next_image)
+    return list(models.values())
+
+
+def _placed(model: Any) -> int:
+    """Left images that have a pose."""
+    return sum(image.has_pose and image.name.startswith("left/") for image in model.images.values())
+
+
+def _end_with_parent() -> None:
+    sys.stdin.read()  # ends when the parent does, however it ended
+    os._exit(1)
+
+
+def main() -> None:
+    """Do the job of the command line."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+    def report(stage: str, done: int, total: int) -> None:
+        print(stage, done, total, flush=True)
+
+    models = run(ColmapJob(**json.loads(sys.argv[1])), report)
+    report("models", models, models)
+
+
+if __name__ == "__main__":
+    main()

@@ -199,8 +199,11 @@ def size_training(scene: PreparedScene, config: ReconstructionConfig, progress: 
     within = lambda value, least, most: int(min(max(value, least), most))
     iterations = config.iterations or within(size.iterations_per_view * views, size.min_iterations, size.max_iterations)
     most = config.max_gaussians or within(pixels / size.pixels_per_gaussian, size.min_gaussians, size.max_gaussians)
-    sentence = f"{views} views of {pixels / 1e6:.1f} million pixels: {iterations} iterations, {most} Gaussians at most"
-    return replace(scene, iterations=iterations, max_gaussians=most).decided(sentence, logging.INFO)
+    scene = replace(scene, iterations=iterations, max_gaussians=most)
+    if config.iterations and config.max_gaussians:
+        return scene
+    sentence = f"{views} views of {pixels / 1e6:.3g} million pixels: {iterations} iterations, {most} Gaussians at most"
+    return scene.decided(sentence, logging.INFO)
 
 
 def place_gaussians(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:

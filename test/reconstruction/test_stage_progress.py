@@ -17,7 +17,7 @@ from endo_sim_ros.reconstruction.scene import PreparedScene, ScenePoints
 
 POINTS = np.random.default_rng(0).uniform([-0.03, -0.03, 0.09], [0.03, 0.03, 0.11], (400, 3))
 SCENE_POINTS = ScenePoints(POINTS, np.full((400, 3), 0.5))
-QUICK = ("shrinking views",)  # stages that need not report
+QUICK = ("shrinking views", "training size")  # stages that need not report
 
 
 @pytest.fixture(scope="module")

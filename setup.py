@@ -36,7 +36,7 @@ setup(
         "scipy>=1.11",
         "tifffile>=2023.7.10",
         "torch>=2.11",
-        "typing_extensions>=4.12",
+        "typing_extensions>=4.13",
         "tyro>=0.9.20",
         "warp-lang>=1.19,<1.20",  # private parts: see CONTRIBUTING.md
     ],

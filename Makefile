@@ -36,8 +36,9 @@ fast: setup
 check: lint
 	@$(MAKE) --no-print-directory -j2 --output-sync types fast
 
+# Three workers on two cores: while a test waits for the processes of a graph, another one works.
 test: lint types
-	$(VENV)/bin/python -m pytest -n 2 --dist worksteal
+	$(VENV)/bin/python -m pytest -n 3 --dist worksteal
 
 test-minimum:
 	$(MAKE) setup VENV=.venv-minimum CONSTRAINTS=constraints-minimum.txt

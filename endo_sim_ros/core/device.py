@@ -4,7 +4,7 @@ import contextlib
 import functools
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
@@ -125,9 +125,3 @@ def run_in_threads(jobs: Sequence[Callable[[], object]]) -> None:
     jobs[-1]()
     for future in futures:
         future.result()
-
-
-def map_in_threads(function: Callable, items: Iterable) -> list:
-    """Return the results of a function, which mostly waits for OpenCV or numpy, for each of the items, several at a time."""
-    with ThreadPoolExecutor(cpu_threads(), "endo_sim") as pool:
-        return list(pool.map(function, items))

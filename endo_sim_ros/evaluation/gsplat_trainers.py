@@ -121,5 +121,5 @@ class GsplatTrainer:
             extra = {"lr": rate} if self._mcmc else {"packed": False}
             self._strategy.step_post_backward(p, self._optimizers, self._state, step, info, **extra)
             if (step + 1) % every == 0:
-                on_progress(Progress(step + 1, _ITERATIONS, float(loss), len(p["means"])))
+                on_progress(Progress(step + 1, _ITERATIONS, float(loss.detach()), len(p["means"])))
         return self.model

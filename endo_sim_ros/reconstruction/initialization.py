@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (it is public)
 
-from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.reconstruction.progress import StageProgress
@@ -82,16 +81,6 @@ def rough_depth(views: Sequence[TrainingView], points: np.ndarray) -> float:
     return float(np.median(np.concatenate(depths))) if max(map(len, depths)) >= 3 else math.nan
 
 
-def _look_up(camera: Camera, depth: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Depth [N] (m) of points [N, 3] in a view, depth [N] (m, 0 = none) of the surface that it sees there by its depth image
-    [H, W], and which of its pixels that is [N]."""
-    uv, z = camera.project(points)
-    u, v = uv.T
-    inside = (z > 0) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
-    pixels = np.where(inside, v, 0).astype(int) * camera.width + np.where(inside, u, 0).astype(int)
-    return z, np.where(inside, depth.reshape(-1)[pixels], 0.0), pixels
-
-
 def _stride(chosen: list[np.ndarray], limit: int) -> float:
     """Smallest distance (pixels, at least 1) of a lattice that takes no more than ``limit`` of the chosen pixels."""
     total = sum(int(pixels.sum()) for pixels in chosen)
@@ -116,8 +105,9 @@ def _afloat(views: list[TrainingView], points: np.ndarray, tolerance: float, opt
     for view in views:
         depth, distance = fill_holes(view.surface)
         beside = (depth * (1 - tolerance - options.max_slope * distance / view.camera.K[0, 0])).astype(np.float32)
-        z, surface, _ = _look_up(view.camera, np.maximum(beside, 0), points)
-        floats |= (surface > 0) & (z < surface)
+        found = pixels_of(view.camera, points)
+        surface = np.maximum(beside, 0)[found.rows, found.columns]
+        floats[found.index] |= (surface > 0) & (found.depth < surface)
     return floats
 
 

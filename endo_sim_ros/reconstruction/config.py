@@ -14,6 +14,7 @@ from endo_sim_ros.reconstruction.stage_configs import (
     MultiViewConfig,
     NetworkDepthConfig,
     PhotometryConfig,
+    PlaneSweepConfig,
     PosesConfig,
     StereoConfig,
     TrainingSizeConfig,
@@ -122,6 +123,8 @@ class ReconstructionConfig(StageConfig):
     depth_model: str = ""
     """network: folder of a checkpoint of Depth-Anything-V2 or another depth network (transformers), or ONNX file; nothing is ever
     downloaded. Empty: the Depth-Anything-V2 that Hugging Face's cache holds."""
+    plane_sweep: bool = True
+    """Believe depth that is interpolated close to scene points alone; elsewhere match the views plane by plane."""
     multi_view_refinement: bool = True
     """Correct the depth of stereo, network or points by scene points and by how the right image and the other views show the
     same tissue."""
@@ -203,6 +206,7 @@ class ReconstructionConfig(StageConfig):
     stereo: StereoConfig = StereoConfig()
     network: NetworkDepthConfig = NetworkDepthConfig()
     interpolation: InterpolationConfig = InterpolationConfig()
+    sweep: PlaneSweepConfig = PlaneSweepConfig()
     multi_view: MultiViewConfig = MultiViewConfig()
     motion: DynamicMaskConfig = DynamicMaskConfig()
     initial: InitialModelConfig = InitialModelConfig()
@@ -225,6 +229,7 @@ class ReconstructionConfig(StageConfig):
         "sh_every": ("sh_degree", "more than 0"),
         "virtual_from": ("virtual_every", "more than 0"),
         "virtual_weight": ("virtual_every", "more than 0"),
+        "sweep": ("plane_sweep", "true"),
         "multi_view": ("multi_view_refinement", "true"),
         "motion": ("dynamic_mask", "true"),
         "extrapolated": ("extrapolation", "more than 0"),

@@ -22,6 +22,7 @@ from endo_sim_ros.reconstruction.initialization import initial_model, rough_dept
 from endo_sim_ros.reconstruction.pose_check import misposed
 from endo_sim_ros.reconstruction.priors.extrapolation import extrapolate
 from endo_sim_ros.reconstruction.priors.multi_view import refine_depth
+from endo_sim_ros.reconstruction.priors.plane_sweep import sweep_depth
 from endo_sim_ros.reconstruction.priors.sources import borrow_depth, depth_source, estimate_depth
 from endo_sim_ros.reconstruction.progress import OnProgress, StageProgress
 from endo_sim_ros.reconstruction.scene import PreparedScene, ScenePoints, TrainingView, shrink
@@ -148,6 +149,20 @@ def find_depth(scene: PreparedScene, config: ReconstructionConfig, progress: Sta
         if borrowed:
             scene = scene.decided(f"views at {_stamps(borrowed)} have no depth of their own: they get that of the other views")
     return replace(scene, views=tuple(found), depth_source=source)
+
+
+def sweep_planes(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
+    """Where no scene point is near, replace interpolated depth by what the views show on plane after plane."""
+    if not config.plane_sweep or scene.depth_source != "points":
+        return scene
+    device = pick_device(config.device)
+    swept = sweep_depth(scene.views, scene.points.positions, config.depth_tolerance, config.sweep, config.matching, device, progress)
+    pixels, before, after, other = np.sum([_depth_shares(*pair) for pair in zip(scene.views, swept)], 0)
+    sentence = (
+        f"of {before / pixels:.0%} of the tissue with interpolated depth {(after - other) / pixels:.0%} stay, being near scene points; "
+        f"the views matched plane by plane tell {other / pixels:.0%}"
+    )
+    return replace(scene, views=tuple(swept)).decided(sentence, logging.INFO)
 
 
 def check_poses_by_stereo(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
@@ -281,6 +296,7 @@ STAGES: dict[str, Callable[[PreparedScene, ReconstructionConfig, StageProgress],
     "checking poses": check_poses,
     "scene points": find_points,
     "depth prior": find_depth,
+    "plane sweep": sweep_planes,
     "checking poses by stereo": check_poses_by_stereo,
     "multi-view refinement": refine_across_views,
     "shrinking views": shrink_views,
@@ -322,6 +338,12 @@ def _without(scene: PreparedScene, wrong: Sequence[int]) -> PreparedScene:
     why = "their poses contradict what they share with the others, or much of the tissue moved"
     scene = scene.decided(f"views at {stamps} left out: {why}")
     return _of_frames(scene, [frame for index, frame in enumerate(scene.frames) if index not in wrong])
+
+
+def _depth_shares(view: TrainingView, swept: TrainingView) -> tuple[int, int, int, int]:
+    """Pixels of tissue, those with depth before and after a sweep, and those with another depth than before."""
+    known = swept.surface > 0
+    return (view.tissue > 0).sum(), (view.surface > 0).sum(), known.sum(), (known & (swept.surface != view.surface)).sum()
 
 
 def _stamps(frames: Sequence[Frame]) -> str:

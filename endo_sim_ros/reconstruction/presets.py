@@ -16,7 +16,7 @@ _PLAIN = {  # points, colours and nothing else, with the densification of AbsGS:
     "initialization": "points", "densification": "gradient", "exposure": False, "light": False,
     "learning_rate": 1.0, "lambda_flat": 0.0, "lambda_opaque": 0.0,
     "lambda_opacity": 0.0, "lambda_scale": 0.0,
-    "multi_view_refinement": False, "extrapolation": 0.0, "dynamic_mask": False,
+    "plane_sweep": False, "multi_view_refinement": False, "extrapolation": 0.0, "dynamic_mask": False,
 }  # fmt: skip
 
 _PUBLISHED = _PLAIN | {  # what the code of 3DGS and that of FSGS, which builds upon it, have alike. Opacities learn by 0.05, as in both;
@@ -67,6 +67,7 @@ ABLATIONS: dict[Preset, dict[str, dict[str, Any]]] = {
         "without depth": {"lambda_depth": 0.0},
         "with composited depth": {"lambda_opaque": 0.0},
         "without dense initialisation": {"initialization": "points"},
+        "without plane sweep": {"plane_sweep": False},
         "without multi-view refinement": {"multi_view_refinement": False},
         "without flat Gaussians": {"lambda_flat": 0.0},
         "without opacity and size": {"lambda_opacity": 0.0, "lambda_scale": 0.0},

@@ -121,6 +121,44 @@ class InterpolationConfig(StageConfig):
 
 
 @dataclass(frozen=True)
+class PlaneSweepConfig(StageConfig):
+    """Depth away from scene points, by matching views on plane after plane."""
+
+    width: Annotated[int, Range(32, 4096, "pixels")] = 320
+    """Width at which views are matched: finer, tissue has little to match, and the refinement between views corrects fractions of it."""
+    neighbours: Annotated[int, Range(2, 100)] = 6
+    """Views that each view is matched with: the nearest in space."""
+    point_reach: Annotated[float, Range(0, 1, "widths of the image")] = 0.04
+    """Distance from a scene point up to which depth is interpolated. Farther off the surface may have an edge that no point tells of."""
+    window: Annotated[int, Range(3, 101, "pixels")] = 9
+    """Side of the square that is compared."""
+    noise: Annotated[float, Range(0.1, 50, "grey levels")] = 3.0
+    """Standard deviation of a picture's noise: what differs by less is alike on any plane."""
+    margin: Annotated[float, Range(0, 10)] = 0.35
+    """How far the planes go on nearer and farther than the scene points, in median inverse depths."""
+    min_planes: Annotated[int, Range(4, 1000)] = 32
+    """Fewest planes; else there is one for each pixel by which the picture of the farthest neighbour moves."""
+    max_planes: Annotated[int, Range(4, 1000)] = 160
+    """Most planes: time and memory grow with their number."""
+    small_penalty: Annotated[float, Range(0, 10)] = 0.05
+    """Cost of a step by one plane between neighbouring pixels; that of what is not alike at all is 1."""
+    large_penalty: Annotated[float, Range(0, 10)] = 0.4
+    """Cost of a larger step: an edge."""
+    max_cost: Annotated[float, Range(0, 1)] = 0.3
+    """1 − correlation above which views do not show the same: interpolated depth is right more often than a match that is less sure."""
+    min_views: Annotated[int, Range(1, 100)] = 2
+    """Other views that must have found the same surface: one may agree by accident, and two views alone tell less than their points."""
+    tolerance: Annotated[float, Range(0.1, 100, "planes")] = 1.5
+    """How far apart surfaces are the same."""
+    min_area: Annotated[float, Range(0, 1)] = 0.003
+    """Share of the image below which a patch of depth that is like none around it is a wrong match."""
+    smoothing: Annotated[float, Range(1, 640, "pixels at width 640")] = 12.0
+    """Standard deviation of the window over which the steps between planes are smoothed."""
+    edge: Annotated[float, Range(0.001, 1)] = 0.1
+    """Relative step of the depth that is an edge, and stays."""
+
+
+@dataclass(frozen=True)
 class MultiViewConfig(StageConfig):
     """Refinement of the depth prior by other images of the same tissue."""
 

@@ -1,0 +1,204 @@
+"""Plane sweep: depth away from scene points, by matching each view with others on plane after plane (Collins 1996).
+
+Between scene points interpolated depth has no edges; a wall behind an organ becomes a ramp. Here each view is compared with what others
+would show if all tissue lay on a plane, for planes at one distance after the other; semi-global aggregation (Hirschmüller 2008) chooses.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.kernels import launch, load_kernels
+from endo_sim_ros.reconstruction.priors import sweep_kernels
+from endo_sim_ros.reconstruction.priors.interpolation import fit_plane
+from endo_sim_ros.reconstruction.priors.inverse_depth import smooth
+from endo_sim_ros.reconstruction.progress import StageProgress
+from endo_sim_ros.reconstruction.scene import TrainingView, pixels_of, shrink
+from endo_sim_ros.reconstruction.stage_configs import MatchingConfig, PlaneSweepConfig
+from endo_sim_ros.reconstruction.triangulation import nearest_views, points_in_view
+
+_DIRECTIONS = [(down, across) for down in (-1, 0, 1) for across in (-1, 0, 1) if (down, across) != (0, 0)]
+_CENTRED = np.array([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # pixels as OpenCV counts them, from the centre of the first, to ours
+
+
+class _Picture(NamedTuple):
+    """A view at the width of the sweep, with the means and variances over windows that every comparison needs."""
+
+    camera: Camera
+    grey: np.ndarray  # [H, W] float32
+    tissue: np.ndarray  # [H, W] float32, 1 or 0
+    mean: np.ndarray  # [H, W]
+    variance: np.ndarray  # [H, W]
+
+
+class _Matched(NamedTuple):
+    """What the sweep of a view found."""
+
+    inverse: np.ndarray  # [H, W] inverse depth, 1/m
+    step: float  # 1/m, between two planes
+    alike: np.ndarray  # [H, W] bool, where others show the same at that depth
+
+
+def sweep_depth(
+    views: Sequence[TrainingView],
+    points: np.ndarray,
+    tolerance: float,
+    options: PlaneSweepConfig = PlaneSweepConfig(),
+    matching: MatchingConfig = MatchingConfig(),
+    device: str = "cpu",
+    progress: StageProgress = StageProgress(),
+) -> list[TrainingView]:
+    """The views with interpolated depth kept near scene points alone, and that of the sweep where it is sure and there is none or another.
+
+    Points count that are as deep as what was interpolated. The sweep is sure where enough other views show the same, and their own sweeps
+    found the same surface. Where neither tells of depth there is none.
+
+    Args:
+        views: Views with depth that is interpolated between scene points.
+        points: Scene points [N, 3] (m, world).
+        tolerance: Relative difference of depth at which points, interpolation and sweep contradict each other.
+        options: How to match and what to believe.
+        matching: How many points a view must see.
+        device: Where costs are aggregated.
+        progress: Reported to by views.
+    """
+    load_kernels((sweep_kernels,), device)
+    pictures = progress.map(lambda view: _picture(shrink(view, options.width), options), views)
+    near = nearest_views(views, options.neighbours)
+
+    def swept(index: int) -> _Matched | None:
+        seen = points_in_view(pictures[index].camera, points, matching)
+        if len(near[index]) < options.min_views or len(seen[0]) < matching.min_points:
+            return None
+        return _sweep(pictures[index], [pictures[j] for j in near[index]], *seen, options, device, progress)
+
+    matched = progress.map(swept, range(len(views)))
+
+    def with_depth(index: int) -> TrainingView:
+        view = views[index]
+        if view.depth_prior is None:
+            return view
+        depth = np.where(_near_points(view, points, tolerance, options), view.surface, 0)
+        if (own := matched[index]) is not None:
+            others = [(pictures[j].camera, matched[j]) for j in near[index] if matched[j] is not None]
+            believed = own.alike & (_confirmed(pictures[index].camera, own, others, options) >= options.min_views)
+            inverse = np.where(believed, smooth(own.inverse, options.smoothing, options.edge), 0)
+            inverse = cv2.resize(inverse, (view.camera.width, view.camera.height), interpolation=cv2.INTER_NEAREST_EXACT)
+            other = (inverse > 0) & (view.tissue > 0) & (np.abs(depth * inverse - 1) > tolerance)  # 0 is another depth, too
+            depth[other] = 1 / inverse[other]
+        return dataclasses.replace(view, depth_prior=depth.astype(np.float32))
+
+    return progress.map(with_depth, range(len(views)))
+
+
+def _near_points(view: TrainingView, points: np.ndarray, tolerance: float, options: PlaneSweepConfig) -> np.ndarray:
+    """Where a scene point is close in a view [H, W], the nearest one being as deep as the depth that was interpolated between all."""
+    _, rows, columns, depth = pixels_of(view.camera, points)
+    agrees = np.abs(view.surface[rows, columns] / depth - 1) < tolerance
+
+    def distance(which: np.ndarray) -> np.ndarray:
+        away = np.ones(view.surface.shape, np.uint8)
+        away[rows[which], columns[which]] = 0
+        return cv2.distanceTransform(away, cv2.DIST_L2, cv2.DIST_MASK_5)
+
+    return distance(agrees) < np.minimum(options.point_reach * view.camera.width, distance(~agrees))
+
+
+def _picture(view: TrainingView, options: PlaneSweepConfig) -> _Picture:
+    grey = cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    return _Picture(view.camera, grey, (view.tissue > 0).astype(np.float32), *_moments(grey, options))
+
+
+def _mean(values: np.ndarray, options: PlaneSweepConfig) -> np.ndarray:
+    return cv2.blur(values, (options.window, options.window))
+
+
+def _moments(grey: np.ndarray, options: PlaneSweepConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and variance [H, W] of a picture over windows; the variance includes that of noise."""
+    mean = _mean(grey, options)
+    return mean, np.maximum(_mean(grey * grey, options) - mean * mean, 0) + options.noise**2
+
+
+def _sweep(
+    own: _Picture, others: list[_Picture], uv: np.ndarray, z: np.ndarray, options: PlaneSweepConfig, device: str, progress: StageProgress
+) -> _Matched:
+    """Match a view with others; its scene points at pixels uv [N, 2] have depths z [N] (m)."""
+    # The planes are tilted as the points are on the whole: tissue that faces the camera askew stays alike within a window.
+    slope_u, slope_v, level = fit_plane(uv[:, 0], uv[:, 1], 1 / z)
+    apart = 1 / z - (slope_u * uv[:, 0] + slope_v * uv[:, 1] + level)
+    beyond = options.margin * np.median(1 / z)
+    low, high = np.percentile(apart, 1) - beyond, np.percentile(apart, 99) + beyond
+    pixels = (high - low) * max(_speed(own.camera, other.camera, float(np.median(1 / z))) for other in others)
+    levels = np.linspace(low, high, int(np.clip(np.ceil(pixels), options.min_planes, options.max_planes)))
+    costs = np.empty((*own.grey.shape, len(levels)), np.float32)
+    for index, offset in enumerate(levels):
+        progress.check()
+        costs[..., index] = _cost(own, others, np.array([slope_u, slope_v, level + offset]), options)
+    totals = _aggregated(costs, options, device)
+    best = totals.argmin(2)
+    inner = np.clip(best, 1, len(levels) - 2)[..., None]
+    before, there, after = (np.take_along_axis(totals, inner + step, 2)[..., 0] for step in (-1, 0, 1))
+    bend = np.maximum(before - 2 * there + after, 1e-6)  # of a parabola through the three
+    exact = best == inner[..., 0]
+    place = best + np.where(exact, np.clip(0.5 * (before - after) / bend, -0.5, 0.5), 0)
+    step = float(levels[1] - levels[0])
+    rows, columns = np.mgrid[: len(best), : best.shape[1]] + 0.5
+    inverse = np.maximum(slope_u * columns + slope_v * rows + level + low + place * step, 1e-6).astype(np.float32)
+    cost = np.take_along_axis(costs, best[..., None], 2)[..., 0]
+    alike = exact & (own.tissue > 0) & (cost < options.max_cost)
+    sixteenths = np.where(alike, 16 * (best + 1), 0).astype(np.int16)  # what is left of wrong matches are islands
+    cv2.filterSpeckles(sixteenths, 0, int(options.min_area * alike.size), 16)
+    return _Matched(inverse, step, sixteenths > 0)
+
+
+def _speed(camera: Camera, other: Camera, inverse: float) -> float:
+    """By how many pixels another view's picture moves for each 1/m of inverse depth, about the one given; median over the picture."""
+    points = lambda value: camera.backproject(np.full((camera.height, camera.width), 1 / value))[::32, ::32].reshape(-1, 3)
+    moved = other.project(points(1.01 * inverse))[0] - other.project(points(inverse))[0]
+    return float(np.median(np.hypot(*moved.T))) / (0.01 * inverse)
+
+
+def _cost(own: _Picture, others: list[_Picture], plane: np.ndarray, options: PlaneSweepConfig) -> np.ndarray:
+    """1 − correlation [H, W] with the better half of the other views, if all tissue has the inverse depth plane · (u, v, 1).
+
+    What one view hides others may show. 1 where there is nothing to compare with.
+    """
+    rays, size = np.linalg.inv(own.camera.K), own.grey.shape[::-1]
+    inside, found = _mean(own.tissue, options) > 0.95, []
+    for other in others:
+        motion = (other.camera.viewmat @ own.camera.pose)[:3]
+        homography = np.linalg.inv(_CENTRED) @ other.camera.K @ (motion[:, :3] @ rays + np.outer(motion[:, 3], plane)) @ _CENTRED
+        seen = lambda picture: cv2.warpPerspective(picture, homography, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+        grey = seen(other.grey)
+        mean, variance = _moments(grey, options)
+        correlation = (_mean(own.grey * grey, options) - own.mean * mean) / np.sqrt(own.variance * variance)
+        comparable = inside & (_mean(seen(other.tissue), options) > 0.95)
+        found.append(np.where(comparable, np.minimum(1 - correlation, 1), 1))
+    return np.sort(np.stack(found), 0)[: (len(found) + 1) // 2].mean(0)
+
+
+def _aggregated(costs: np.ndarray, options: PlaneSweepConfig, device: str) -> np.ndarray:
+    """Σ of the costs [H, W, L] along paths from eight directions."""
+    height, width, levels = costs.shape
+    given = torch.from_numpy(costs).to(device)
+    totals, scratch = torch.zeros_like(given), torch.empty(height + width, 2, levels, device=device)
+    for down, across in _DIRECTIONS:
+        arguments = [given, down, across, options.small_penalty, options.large_penalty, scratch, totals]
+        launch(sweep_kernels.aggregate, height + width, arguments, device)
+    return totals.cpu().numpy()
+
+
+def _confirmed(camera: Camera, own: _Matched, others: list[tuple[Camera, _Matched]], options: PlaneSweepConfig) -> np.ndarray:
+    """By how many other sweeps the surface that a sweep found [H, W] is where they found it, too."""
+    points = camera.backproject(1 / own.inverse).reshape(-1, 3)
+    count = np.zeros(len(points), int)
+    for other_camera, other in others:
+        found = pixels_of(other_camera, points)
+        apart = np.abs(other.inverse[found.rows, found.columns] - 1 / found.depth)
+        count[found.index[apart < options.tolerance * max(own.step, other.step)]] += 1
+    return count.reshape(own.inverse.shape)

@@ -1,0 +1,131 @@
+"""Depth away from scene points, by matching views plane by plane."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from short_training import options
+
+from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
+from endo_sim_ros.core.kernels import launch, load_kernels
+from endo_sim_ros.reconstruction.pipeline import sweep_planes
+from endo_sim_ros.reconstruction.priors import sweep_kernels
+from endo_sim_ros.reconstruction.priors.plane_sweep import sweep_depth
+from endo_sim_ros.reconstruction.priors.sources import estimate_depth
+from endo_sim_ros.reconstruction.progress import StageProgress
+from endo_sim_ros.reconstruction.scene import PreparedScene, ScenePoints, TrainingView
+
+NEAR, FAR = 0.06, 0.1  # m
+WIDTH, HEIGHT = 160, 128
+
+
+def texture(seed, contrast=60):
+    noise = np.random.default_rng(seed).normal(size=(600, 600, 3)).astype(np.float32)
+    return np.clip(128 + contrast * 3 * cv2.GaussianBlur(noise, (0, 0), 3), 0, 255).astype(np.uint8)
+
+
+def wall_behind_a_band(x, contrast=60):
+    """A view from x (m), with its true depth: a wall, and before it a band that is 2 cm wide."""
+    pose = np.eye(4)
+    pose[0, 3] = x
+    camera = Camera(intrinsic_matrix(150, 150, WIDTH / 2, HEIGHT / 2), WIDTH, HEIGHT, pose)
+    image, depth = None, None
+    for z, painted in ((FAR, texture(0, contrast)), (NEAR, texture(1, contrast))):
+        places = camera.backproject(np.full((HEIGHT, WIDTH), z))
+        u, v = ((places[..., axis] * 3000 + 300).astype(np.float32) for axis in (0, 1))
+        seen = cv2.remap(painted, u, v, cv2.INTER_LINEAR)
+        band = np.abs(places[..., 0]) < 0.01
+        image = seen if image is None else np.where(band[..., None], seen, image)
+        depth = np.full((HEIGHT, WIDTH), z, np.float32) if depth is None else np.where(band, np.float32(z), depth)
+    return TrainingView(0, np.ascontiguousarray(image), camera), depth
+
+
+def interpolated(count=5, contrast=60, along=12):
+    """Views, true depths, points in two rows of the picture on either side of the band and on it, and views with depth between those."""
+    views, truths = zip(*(wall_behind_a_band(x, contrast) for x in np.linspace(-0.006, 0.006, count)))
+    xs, ys = np.meshgrid([-0.03, -0.024, -0.005, 0.0, 0.005, 0.024, 0.03], np.linspace(-0.02, 0.02, along))
+    zs = np.where(np.abs(xs) < 0.01, NEAR, FAR)
+    points = np.stack([xs, ys, zs], -1).reshape(-1, 3)
+    found = ScenePoints.recorded(points, np.full(points.shape, 0.5))
+    return list(views), truths, found, estimate_depth(views, found, options(depth="points"))
+
+
+def share_right(view, truth, of=slice(None)):
+    """Share of the pixels whose depth is right to 3 %, of those with depth."""
+    known = view.depth_prior[of] > 0
+    return (np.abs(view.depth_prior[of] / truth[of] - 1) < 0.03)[known].mean()
+
+
+def test_the_sweep_finds_the_edges_that_interpolation_blurs():
+    _, truths, points, views = interpolated()
+    swept = sweep_depth(views, points.positions, 0.05)
+    for before, after, truth in zip(views, swept, truths):
+        assert share_right(before, truth) < 0.5
+        assert share_right(after, truth) > 0.88
+        assert (after.depth_prior > 0).mean() > 0.75
+
+
+def test_interpolated_depth_stays_near_points_alone_where_nothing_can_be_matched():
+    _, truths, points, views = interpolated(contrast=0)
+    for before, after, truth in zip(views, sweep_depth(views, points.positions, 0.05), truths):
+        known = after.depth_prior > 0
+        assert (after.depth_prior[known] == before.depth_prior[known]).all()
+        assert known.mean() < 0.6 * (before.depth_prior > 0).mean()
+        assert share_right(after, truth) > share_right(before, truth)
+
+
+def test_two_views_are_not_swept():
+    """One other view may agree by accident."""
+    _, _, points, views = interpolated(count=2)
+    for before, after in zip(views, sweep_depth(views, points.positions, 0.05)):
+        known = after.depth_prior > 0
+        assert known.any() and (after.depth_prior[known] == before.depth_prior[known]).all()
+
+
+def test_masked_pixels_are_neither_matched_nor_given_depth():
+    _, truths, points, views = interpolated()
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[:, :40] = 0
+    masked = [dataclasses.replace(view, mask=mask, depth_prior=np.where(mask > 0, view.depth_prior, 0)) for view in views]
+    for after, truth in zip(sweep_depth(masked, points.positions, 0.05), truths):
+        assert not after.depth_prior[:, :40].any()
+        assert share_right(after, truth) > 0.88
+
+
+@pytest.mark.parametrize(("given", "swept"), [({}, True), ({"plane_sweep": False}, False)])
+def test_the_stage_sweeps_interpolated_depth_and_tells_so(given, swept):
+    frames, _, points, views = interpolated()
+    scene = PreparedScene(tuple(frames), tuple(views), points=points, depth_source="points")
+    after = sweep_planes(scene, options(**given), StageProgress())
+    assert (after.views is not scene.views) == swept
+    assert any("plane by plane" in sentence for sentence in after.decisions) == swept
+    measured = dataclasses.replace(scene, depth_source="stereo")
+    assert sweep_planes(measured, options(**given), StageProgress()) is measured
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=pytest.mark.gpu)])
+def test_costs_are_aggregated_as_published(device):
+    """Hirschmüller 2008, eq. 13, pixel by pixel."""
+    if device != "cpu" and not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    costs = np.random.default_rng(0).random((7, 9, 5)).astype(np.float32)
+    height, width, levels = costs.shape
+    small, large = 0.1, 0.3
+    load_kernels((sweep_kernels,), device)
+    for down, across in [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1)]:
+        expected = costs.astype(np.float64)
+        rows = range(height) if down >= 0 else reversed(range(height))
+        for row in rows:
+            for column in range(width) if across >= 0 else reversed(range(width)):
+                if not (0 <= row - down < height and 0 <= column - across < width):
+                    continue
+                before = expected[row - down, column - across]
+                steps = np.pad(before, 1, constant_values=np.inf)
+                best = np.minimum.reduce([before, steps[:-2] + small, steps[2:] + small, np.full(levels, before.min() + large)])
+                expected[row, column] += best - before.min()
+        given, totals = torch.from_numpy(costs).to(device), torch.zeros(costs.shape, device=device)
+        scratch = torch.empty(height + width, 2, levels, device=device)
+        launch(sweep_kernels.aggregate, height + width, [given, down, across, small, large, scratch, totals], device)
+        np.testing.assert_allclose(totals.cpu().numpy(), expected, atol=1e-5)

@@ -196,9 +196,8 @@ class ReconstructionNode(EndoNode):
             progress = StageProgress("scene points", self._on_stage)
             chosen, points = choose_views(frames, progress.map(StoredFrame.load, spread(frames, POINT_VIEWS)), config, progress)
             log.info("training on %d of %d views", len(chosen), len(frames))
-            views = [frames[index].load() for index in chosen]
+            views = (frames[index].load() for index in chosen)
             trainer, lockstep = Trainer(prepare(views, config, points, self._on_stage), config), self._options.mode == "lockstep"
-            del views
             if not lockstep:
                 self._offer(trainer)
             published = time.monotonic()

@@ -61,7 +61,7 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
         chosen, points = choose_views(views, sample, config, StageProgress("scene points", on_stage), given)
         del sample
         log.info("%d views, training on %d", len(views), len(chosen))
-        trainer = Trainer(prepare(list(recording.take(set(chosen), len(chosen))), config, points, on_stage), config)
+        trainer = Trainer(prepare(recording.take(set(chosen), len(chosen)), config, points, on_stage), config)
     if resume:
         trainer.load_checkpoint(out / "checkpoint.pt")
         log.info("going on after %d iterations", trainer.iteration)

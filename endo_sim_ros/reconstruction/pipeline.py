@@ -5,7 +5,7 @@ recording do not ask for it. Inside, a stage gives the algorithm views, its own 
 """
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 
 
 def prepare(
-    frames: Sequence[Frame],
+    frames: Iterable[Frame],
     config: ReconstructionConfig,
     points: ScenePoints | tuple | None = None,
     on_progress: OnProgress | None = None,
@@ -41,7 +41,8 @@ def prepare(
     """Everything that a training needs, of posed frames.
 
     Args:
-        frames: Training views; every one is used (see `select_keyframes`).
+        frames: Training views; every one is used (see `select_keyframes`). Of many large ones give an iterator: it does not hold them
+            longer than they are needed.
         config: Options.
         points: Scene points: positions [N, 3] (m, world), RGB [N, 3] in [0, 1] and, if known, error (see `ScenePoints`), for
             instance of structure from motion with more views than these; None triangulates these views.
@@ -53,21 +54,22 @@ def prepare(
             those given are not finite.
         Cancelled: If the callback raised it.
     """
-    if not frames:
-        raise SequenceError("there are no views to reconstruct from; check the image, camera_info and pose topics")
-
     scene = PreparedScene(tuple(frames))
+    if not scene.frames:
+        raise SequenceError("there are no views to reconstruct from; check the image, camera_info and pose topics")
     if points is not None:
         scene = replace(scene, points=_checked(points), given_points=True)
+    handed_over = [scene]
+    del scene  # a stage lets go of what it replaces
     for name, stage in STAGES.items():
         progress = StageProgress(name, on_progress)
         progress.check()
-        scene = stage(scene, config, progress)
-    return scene
+        handed_over.append(stage(handed_over.pop(), config, progress))
+    return handed_over.pop()
 
 
 def reconstruct(
-    frames: Sequence[Frame],
+    frames: Iterable[Frame],
     config: ReconstructionConfig,
     points: ScenePoints | tuple | None = None,
     on_progress: OnProgress | None = None,
@@ -166,7 +168,10 @@ def sweep_planes(scene: PreparedScene, config: ReconstructionConfig, progress: S
 
 
 def check_poses_by_stereo(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
-    """As `check_poses`, with the depth that each view's own pair of images tells, which does not depend on the poses."""
+    """As `check_poses`, with the depth that each view's own pair of images tells, which does not depend on the poses.
+
+    Frames as recorded are not needed after it, and let go of.
+    """
     while _checked_by_stereo(scene, config):
         wrong = _misposed(scene, [view.depth_prior for view in scene.views], config, progress)
         if not wrong:
@@ -175,21 +180,24 @@ def check_poses_by_stereo(scene: PreparedScene, config: ReconstructionConfig, pr
         # `_without` has dropped matches, points and depth. Every stage that finds them runs again, and `check_poses` if no pair is left.
         for stage in (match_views, check_poses, find_points, find_depth):
             scene = stage(scene, config, progress)
-    return scene
+    return replace(scene, frames=())
 
 
 def refine_across_views(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Correct the depth prior by scene points and the other images of the same tissue."""
     if not config.multi_view_refinement or scene.depth_source in ("topic", "none"):
         return scene
-    fine = [shrink(view, config.multi_view.width_factor * config.image_width) for view in scene.views]
+    width = config.multi_view.width_factor * config.image_width
+    views = (shrink(view, width) for view in scene.views)
+    scene = replace(scene, views=())  # what holds them now is the iterator
     refined = refine_depth(
-        fine,
+        views,
         scene.points,
         scene.depth_source,
         options=config.multi_view,
         stereo=config.stereo,
         interpolation=config.interpolation,
+        width=config.image_width,
         progress=progress,
     )
     return replace(scene, views=tuple(refined))

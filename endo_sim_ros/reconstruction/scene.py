@@ -94,7 +94,7 @@ class PreparedScene:
     """What the stages of a preparation have found so far; after the last one, what a training needs.
 
     Args:
-        frames: Usable frames, as they were recorded.
+        frames: Usable frames, as they were recorded; none when poses are checked and depth is known, since they take much memory.
         views: The same as they are trained on: shrunk, with depth prior, rectified right image and mask of what is still.
         points: Scene points; none before they are found.
         given_points: Whether the caller gave them.

@@ -63,6 +63,15 @@ def test_flow_is_found_in_finer_pixels_than_are_trained_on(large):
 
 
 @pytest.mark.slow
+def test_views_come_back_as_narrow_as_asked_for(large):
+    views = matched(large[:2])
+    shrunk, alone = refine_depth(iter(views), NO_POINTS, "stereo", width=160), refine_depth(views, NO_POINTS, "stereo")
+    for view, full in zip(shrunk, alone):
+        assert view.image.shape == (128, 160, 3) and full.image.shape == (512, 640, 3)
+        np.testing.assert_array_equal(view.depth_prior, shrink(full, 160).depth_prior)
+
+
+@pytest.mark.slow
 def test_reflections_of_the_light_do_not_spoil_the_depth_that_views_agree_on(large):
     """A reflection is seen where the tissue is not: through another view's depth it lies beside where that view has it."""
     frames = matched(large[:2])

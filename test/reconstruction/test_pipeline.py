@@ -4,6 +4,7 @@ import dataclasses
 import re
 import threading
 import time
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -44,12 +45,32 @@ def bits(scene: PreparedScene) -> list[bytes]:
 @pytest.mark.slow
 def test_what_was_measured_stays_and_the_prior_is_another_field(frames):
     scene = prepare(frames, options(depth="stereo"))
-    assert all(kept is given for kept, given in zip(scene.frames, frames))
     for view, frame in zip(scene.views, frames):
         assert view.depth_prior.shape == view.depth.shape == view.image.shape[:2] == (64, 80)
         exact = frame.depth[1::2, 1::2]
         assert np.abs(view.depth - exact).max() < 0.01 * exact.max()
         assert np.abs(view.depth_prior - view.depth)[view.depth_prior > 0].max() > 1e-5
+
+
+@pytest.mark.slow
+def test_full_size_images_are_let_go_of_as_soon_as_they_are_not_needed(stereo):
+    """Of an iterator nobody else holds the frames; an image is an array of its own, known by whether it is still there."""
+    left, right, alive = [], [], {}
+
+    def given():
+        for frame in stereo:
+            copy = dataclasses.replace(frame, image=frame.image.copy(), right=np.roll(frame.right, 1, 0))  # on other rows
+            left.append(weakref.ref(copy.image))
+            right.append(weakref.ref(copy.right))
+            yield copy
+
+    def on_progress(stage, done, total):
+        alive.setdefault(stage, [sum(image() is not None for image in images) for images in (left, right)])
+
+    prepare(given(), options(), on_progress=on_progress)
+    assert alive["checking poses by stereo"] == [len(stereo), len(stereo)]
+    assert alive["multi-view refinement"] == [len(stereo), 0]  # but for the copy that has the rows of the left image
+    assert alive["dynamic mask"] == [0, 0]
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ lies beside where another view's depth and pose expect it tells that depth sever
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 import cv2
 import numpy as np
@@ -16,18 +16,19 @@ from endo_sim_ros.reconstruction.priors.interpolation import inverse_distance_we
 from endo_sim_ros.reconstruction.priors.inverse_depth import blur, correct, scaled, smooth
 from endo_sim_ros.reconstruction.priors.stereo import right_view
 from endo_sim_ros.reconstruction.progress import StageProgress
-from endo_sim_ros.reconstruction.scene import ScenePoints, TrainingView, pixels_of
+from endo_sim_ros.reconstruction.scene import ScenePoints, TrainingView, pixels_of, shrink
 from endo_sim_ros.reconstruction.stage_configs import InterpolationConfig, MultiViewConfig, StereoConfig
 from endo_sim_ros.reconstruction.triangulation import nearest_views
 
 
 def refine_depth(
-    views: Sequence[TrainingView],
+    views: Iterable[TrainingView],
     points: ScenePoints,
     source: str,
     options: MultiViewConfig = MultiViewConfig(),
     stereo: StereoConfig = StereoConfig(),
     interpolation: InterpolationConfig = InterpolationConfig(),
+    width: int = 0,
     progress: StageProgress = StageProgress(),
 ) -> list[TrainingView]:
     """The views with their depth prior corrected by scene points and by what neighbouring views show.
@@ -39,18 +40,20 @@ def refine_depth(
     right image is corrected likewise by that image. Reflections of the light count between the eyes alone. Holes stay holes.
 
     Args:
-        views: Views with a depth prior.
+        views: Views with a depth prior; if only an iterator holds them, each is let go of when its depth is corrected.
         points: Scene points.
         source: Where the prior is from, as `depth_source` tells, on which its error depends.
         options: Errors, and what flow to believe.
         stereo: How right images were matched.
         interpolation: How holes are filled, for what lies beside them.
+        width: Views come back shrunk to it, pixels; 0 leaves them as they are.
         progress: Reported to by views.
     """
+    views = list(views)
     images = progress.map(lambda view: eye_image(view, options), views)
     near = nearest_views(views, options.neighbours)
 
-    def refine(i: int) -> np.ndarray | None:
+    def corrected(i: int) -> np.ndarray | None:
         view, camera = views[i], views[i].camera
         known = view.surface > 0
         if not known.any():
@@ -59,8 +62,7 @@ def refine_depth(
         inverse = inverse_distance_weighted(inverse, known, camera.width, interpolation)[..., 0]
         error = (options.points_error if source == "points" else options.prior_error) * inverse
         if source == "stereo" and view.right is not None:
-            right = eye_image(right_view(view, stereo), options)
-            inverse, error = _refine_by_eyes(inverse, images[i], right, camera.K[0, 0] * view.baseline, options, stereo)
+            inverse, error = _refine_by_eyes(inverse, view, images[i], options, stereo)
         total, weight = _point_corrections(camera, inverse, error, points, options)
         for j in near[i]:
             progress.check()
@@ -71,22 +73,30 @@ def refine_depth(
         good = known & np.isfinite(inverse) & (inverse > 0)
         return np.where(good, 1 / np.where(good, inverse, 1), 0).astype(np.float32)
 
-    refined = progress.map(refine, range(len(views)))
-    return [dataclasses.replace(view, depth_prior=depth) for view, depth in zip(views, refined)]
+    def refine(i: int) -> None:
+        view = dataclasses.replace(views[i], depth_prior=corrected(i))
+        views[i] = shrink(view, width) if width else view  # the others need its image only, which `images` has
+
+    progress.map(refine, range(len(views)))
+    return views
 
 
 def _refine_by_eyes(
-    inverse: np.ndarray, left: EyeImage, right: EyeImage, pixel: float, options: MultiViewConfig, stereo: StereoConfig
+    inverse: np.ndarray, view: TrainingView, left: EyeImage, options: MultiViewConfig, stereo: StereoConfig
 ) -> tuple[np.ndarray, np.ndarray]:
     """Inverse depth [H, W] (1/m) of matching, corrected by the flow that it leaves between the eyes, and its error [H, W].
 
     Semi-global matching prefers whole pixels and goes in steps; optical flow does neither, but errs wildly where there is little to
-    see. A disparity of one pixel is an inverse depth of 1 / ``pixel``.
+    see.
     """
+    assert view.baseline is not None
+    pixel, other = left.camera.K[0, 0] * view.baseline, right_view(view, stereo)  # a disparity of one pixel is 1 / pixel
     width, matched = left.camera.width, np.full(inverse.shape, stereo.disparity_error / pixel, np.float32)
     inverse = smooth(inverse, options.matched_window, options.matched_edge)
     # Between the eyes reflections hardly move.
-    found = flow_correction(inverse, left._replace(matte=left.tissue), right._replace(matte=right.tissue), options)
+    left = left._replace(matte=view.tissue.astype(np.uint8))
+    right = eye_image(other, options)._replace(matte=other.tissue.astype(np.uint8))
+    found = flow_correction(inverse, left, right, options)
     if found is None:
         return inverse, matched
     believed = np.abs(found.correction) * pixel < scaled(options.max_step, width)

@@ -77,7 +77,7 @@ def align_rows(view: AnyFrame, options: StereoConfig = StereoConfig(), matching:
         return view
     shift = float(np.median(shifts))
     rows = round(shift)
-    moved = view.right[np.clip(np.arange(len(view.right)) + rows, 0, len(view.right) - 1)]
+    moved = view.right[np.clip(np.arange(len(view.right)) + rows, 0, len(view.right) - 1)] if rows else view.right
     return _with_right_K(dataclasses.replace(view, right=moved), row=shift - rows)
 
 

@@ -57,10 +57,9 @@ def initial_model(
         compared = Surfaces(surfaces, device)
         chosen = compared.chosen(tolerance, progress)
         stride = _stride(chosen, max_gaussians)
-        apart = [_apart(view, pixels, stride, options) for view, pixels in zip(surfaces, chosen)]
-        taken = [distances > 0 for distances in apart]
-        for view, distances, pixels, seen in zip(surfaces, apart, taken, compared.mean_colors(taken, tolerance, progress)):
-            spacing = distances[pixels] * view.surface[pixels].astype(np.float64) / view.camera.K[0, 0]
+        taken = [pixels & _lattice(pixels.shape, stride) for pixels in chosen]
+        for view, pixels, seen in zip(surfaces, taken, compared.mean_colors(taken, tolerance, progress)):
+            spacing = stride * view.surface[pixels].astype(np.float64) / view.camera.K[0, 0]
             parts.append(_Points(view.camera.backproject(view.surface)[pixels], seen, spacing))
     useful = ~_afloat(surfaces, points, tolerance, options)
     if any(pixels.any() for pixels in chosen):  # lone points beyond the views would reach into them; see `extrapolate`
@@ -91,32 +90,9 @@ def _stride(chosen: list[np.ndarray], limit: int) -> float:
     return stride
 
 
-def _apart(view: TrainingView, chosen: np.ndarray, stride: float, options: InitialModelConfig) -> np.ndarray:
-    """How far apart (pixels) the Gaussians are at the pixels [H, W] that get one; 0 at the others.
-
-    They stand on a lattice of the chosen pixels; one stands for a whole block of it where picture and surface are smooth.
-    """
-    apart = np.where(chosen & _lattice(chosen.shape, stride), stride, 0.0)
-    grey = view.image.mean(2, dtype=np.float64)
-    inverse = np.where(chosen, 1 / np.where(chosen, view.surface, 1), 0).astype(np.float64)
-    for doubling in range(1, options.doublings + 1):
-        side = stride * 2**doubling
-        rows, columns = (np.floor(np.arange(n) / side).astype(int) for n in chosen.shape)
-        block = rows[:, None] * (columns[-1] + 1) + columns  # [H, W] which one a pixel lies in
-        count, middle = np.bincount(block.ravel()), _lattice(chosen.shape, side)
-        whole = np.bincount(block[middle & chosen], minlength=len(count)) > 0  # enough of it to have a middle
-        mean = lambda values: np.bincount(block.ravel(), values.ravel()) / count
-        spread = lambda values: np.sqrt(np.maximum(mean(values**2) - mean(values) ** 2, 0))
-        smooth = (
-            whole & (mean(chosen) == 1) & (spread(grey) < options.smooth_color) & (spread(inverse) <= options.smooth_depth * mean(inverse))
-        )
-        apart = np.where(smooth[block], np.where(middle, side, 0), apart)
-    return apart
-
-
 def _lattice(shape: tuple[int, int], stride: float) -> np.ndarray:
-    """A regular choice of pixels [H, W], amid blocks of ``stride``² (not necessarily a whole number)."""
-    rows, columns = (np.diff(np.floor(np.arange(n + 1) / stride - 0.5)) > 0 for n in shape)
+    """A regular choice of pixels [H, W], one in every ``stride``² (not necessarily a whole number)."""
+    rows, columns = (np.diff(np.floor(np.arange(-1, n) / stride)) > 0 for n in shape)
     return rows[:, None] & columns
 
 

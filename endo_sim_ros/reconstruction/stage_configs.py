@@ -229,12 +229,6 @@ class InitialModelConfig(StageConfig):
     """Opacity of the Gaussians; 3DGS starts with 0.1, but of these most lie on the surface."""
     seen_share: Annotated[float, Range(0.01, 1)] = 0.8
     """Share of ``max_gaussians`` that stand for what the training views see; the others are left to extrapolation."""
-    doublings: Annotated[int, Range(0, 10)] = 3
-    """How often the distance between Gaussians may double where picture and surface are smooth; training adds what is missing."""
-    smooth_color: Annotated[float, Range(0, 255, "grey levels")] = 3.0
-    """Standard deviation of brightness up to which a block of the picture is smooth: noise is as large."""
-    smooth_depth: Annotated[float, Range(0, 1)] = 0.03
-    """Relative standard deviation of inverse depth up to which it has no edge."""
     max_slope: Annotated[float, Range(0, 100)] = 2.0
     """Slope of a surface across the line of sight in holes of the depth prior; a point that it would have to rise more for floats before
     the surface."""

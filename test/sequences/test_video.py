@@ -56,7 +56,11 @@ def test_video_mask_for_all_frames_and_per_frame(video):
         ({"fx": 150.0, "start": 100}, "no frame between start=100"),
         ({"fx": 150.0, "poses": "absent.txt"}, "absent.txt: file is missing"),
         ({"fx": 150.0, "mask": "absent.png"}, "absent.png: file is missing"),
-        ({"fx": 150.0, "colour": 1}, "video layout has no option 'colour'"),
+        ({"fx": 150.0, "colour": 1}, "video layout has no option 'colour'; it has start, stop"),
+        ({"fx": 150.0, "step": "x"}, "step must be a whole number, got 'x'"),
+        ({"fx": 150.0, "step": 1.5}, "step must be a whole number, got 1.5"),
+        ({"fx": True}, "fx must be a number, got True"),
+        ({"fx": 150.0, "mask_border": 1}, "mask_border must be true or false, got 1"),
     ],
 )
 def test_wrong_video_options_are_explained(video, options, message):

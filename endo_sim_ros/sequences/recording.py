@@ -148,6 +148,13 @@ def keep_posed(numbers: list[int], poses: Container[int], pose_file: Path) -> li
     return posed
 
 
+def tell_lacking(numbers: Sequence[int], files: Container[int], folder: Path) -> None:
+    """Log how many of the frames have no file in a folder of masks or depth; nothing where there is no such folder."""
+    lacking = sum(number not in files for number in numbers)
+    if lacking and folder.is_dir():
+        logger.warning("%s: %d of %d frames have no image there", folder, lacking, len(numbers))
+
+
 def spread(items: Sequence[T], count: int) -> list[T]:
     """At most count items, evenly spread from the first to the last."""
     if len(items) <= count:

@@ -142,7 +142,7 @@ def read_stereomis(
     if rows is not None:
         numbers = keep_posed(numbers, posed, root / POSES_FILE)
     bare = sum(_nearest(masked, n, max_mask_gap) is None for n in numbers)
-    if mask_files and bare:
+    if bare:
         logger.warning("%s: %d of %d frames have no mask; tools stay visible in them", root, bare, len(numbers))
 
     def frames() -> Iterator[Frame]:

@@ -45,6 +45,17 @@ def folder(tmp_path):
     return root
 
 
+def test_image_folder_tells_which_files_are_lacking(folder, caplog):
+    (folder / "depth/00051.png").unlink()
+    read_folder(folder)
+    assert "masks: 2 of 3 frames have no image there" in caplog.text and "depth: 1 of 3 frames have no image there" in caplog.text
+    caplog.clear()
+    shutil.rmtree(folder / "depth")
+    (folder / "masks/00051.png").unlink()
+    read_folder(folder)
+    assert "masks: 3 of 3 frames have no image there" in caplog.text and "depth" not in caplog.text
+
+
 def test_image_folder_frames(folder):
     frames = list(open_sequence(folder))
     assert [f.stamp_ns for f in frames] == [1_040_000_000, 3_040_000_000, 5_040_000_000]

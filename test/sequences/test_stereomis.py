@@ -125,6 +125,10 @@ def test_mask_is_borrowed_from_a_neighbour_only(plane, caplog):
         assert mask[20, 80] == 255
     assert frames[2].mask[80, 120] == frames[7].mask[80, 120] == 255  # no mask within one frame
     assert "3 of 7 frames have no mask" in caplog.text
+    for file in (plane / "masks").iterdir():
+        file.unlink()
+    read_stereomis(plane, pose_lag=0)
+    assert "7 of 7 frames have no mask" in caplog.text
 
 
 # ------------------------------------------------------------------------------------ the forms in which copies are found

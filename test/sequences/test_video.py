@@ -36,7 +36,7 @@ def test_video_pose_scale_and_calibration_file(video):
     np.testing.assert_allclose(frames[1].camera.position, 0.1 * trajectory(4)[3][:3, 3], atol=1e-9)
 
 
-def test_video_mask_for_all_frames_and_per_frame(video):
+def test_video_mask_for_all_frames_and_per_frame(video, caplog):
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[:, :80] = 255
     write_rgb(video / "mask.png", mask)
@@ -44,6 +44,7 @@ def test_video_mask_for_all_frames_and_per_frame(video):
     write_rgb(video / "tools/000003.png", mask)
     frames = list(read_video(video, mask=video / "tools", mask_polarity="tool", **INTRINSICS))
     assert [f.mask[60, 20] for f in frames] == [255, 0, 255]
+    assert "tools: 2 of 3 frames have no image there" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -85,8 +85,6 @@ class Command:
 
         if self.bag.exists():  # before any work
             raise SequenceError(f"{self.bag} exists already; choose another name or remove it first")
-        if self.fps is not None and not self.fps > 0:
-            raise SequenceError(f"--fps must be positive, got {self.fps:g}")
         fixed = ("source", "bag", "kind")
         options = {name: value for name, value in vars(self).items() if name not in fixed and value is not None}
         frames = open_sequence(self.source, self.kind, **options)

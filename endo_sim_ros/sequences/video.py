@@ -22,7 +22,7 @@ from endo_sim_ros.sequences.estimated_poses import pose_estimator
 from endo_sim_ros.sequences.images import numbered_files, read_gray
 from endo_sim_ros.sequences.masks import MaskFiles, lit_area, lit_now, tissue_mask, tool_is_white
 from endo_sim_ros.sequences.pose_files import read_poses
-from endo_sim_ros.sequences.recording import OnProgress, Recording, keep_posed, select, spread, stamp_ns, tell_lacking
+from endo_sim_ros.sequences.recording import OnProgress, Recording, check_positive, keep_posed, select, spread, stamp_ns, tell_lacking
 from endo_sim_ros.sequences.rectification import Rectification
 from endo_sim_ros.sequences.structure_from_motion import STRUCTURE_FROM_MOTION, StructureFromMotion
 from endo_sim_ros.sequences.video_files import Video, find_video
@@ -90,6 +90,7 @@ def read_video(
         poses = poses or _existing(folder / "poses.txt")
         calibration = calibration or (_existing(folder / "calibration.yaml") if fx is None else None)
         mask = mask or _existing(folder / "mask.png") or _existing(folder / "masks")
+    check_positive(path, fps=fps, scale=scale)
     video = Video(path)
     size = video.width, video.height
     fps = fps or video.fps

@@ -305,6 +305,11 @@ def test_damaged_masks_are_refused_by_name(plane, damage, message):
         read_stereomis(plane)
 
 
+def test_negative_gap_of_masks_is_refused(plane):
+    with pytest.raises(SequenceError, match="max_mask_gap must be 0 or more, got -1"):
+        read_stereomis(plane, max_mask_gap=-1)
+
+
 def test_masks_of_another_sequence_are_told(plane, caplog):
     for number in (0, 8, 10**6):
         write_rgb(plane / f"masks/{number:06d}l.png", np.zeros((64, 80), np.uint8))

@@ -18,6 +18,7 @@ from endo_sim_ros.evaluation.splits import check_split
 from endo_sim_ros.evaluation.workers import Finished
 from endo_sim_ros.reconstruction import ReconstructionConfig
 from endo_sim_ros.reconstruction.presets import ABLATIONS, preset
+from endo_sim_ros.reconstruction.priors.network import find_network
 
 log = logging.getLogger(__name__)
 
@@ -125,6 +126,8 @@ def _methods(config: EvaluationConfig) -> dict[str, dict[str, Any]]:
     if any(item.partition("=")[0] == "preset" for item in config.set):
         raise ConfigError("--set preset: methods are named with --presets")
     common = {"device": "auto"} | parse_values(config.set, "--set", ReconstructionConfig)
+    if common.get("depth_model"):
+        find_network(common["depth_model"])
     methods = {}
     for name in config.presets:
         if name in gsplat_trainers.STRATEGIES:

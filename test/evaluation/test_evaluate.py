@@ -142,6 +142,10 @@ def test_what_is_not_there_is_told_before_any_work(tmp_path):
         evaluate([SMALL], EvaluationConfig(out=tmp_path, set=("preset=paper",)))
     with pytest.raises(ConfigError, match="gsplat is not installed"):
         evaluate([SMALL], EvaluationConfig(out=tmp_path, presets=("gsplat",)))
+    with pytest.raises(SequenceError, match="there is no checkpoint of a depth network"):
+        evaluate([SMALL], EvaluationConfig(out=tmp_path, set=(f"depth_model={tmp_path}",)))
+    with pytest.raises(ValueError, match="unknown device 'tpu'"):
+        evaluate([SMALL], EvaluationConfig(out=tmp_path / "out", device="tpu"))
     with pytest.raises(ConfigError, match="workers must be 1 or more, got 0"):
         EvaluationConfig(workers=0)
     with pytest.raises(SequenceError, match="the synthetic patients have numbers"):

@@ -27,7 +27,7 @@ import numpy as np
 
 from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.frames import Frame, SequenceError
-from endo_sim_ros.sequences.estimated_poses import with_estimated_poses
+from endo_sim_ros.sequences.estimated_poses import known_estimator, with_estimated_poses
 from endo_sim_ros.sequences.images import numbered_files
 from endo_sim_ros.sequences.mask_alignment import MaskAlignment, Reading
 from endo_sim_ros.sequences.masks import MaskFiles, read_mask
@@ -96,6 +96,7 @@ def read_stereomis(
         raise SequenceError(f"{root}: max_mask_gap must be 0 or more, got {max_mask_gap}")
     if first_mask is not None and first_mask < 0:
         raise SequenceError(f"{root}: first_mask must be 0 or more, got {first_mask}")
+    known_estimator(poses, root)  # what is wrong is told before the images are looked at
     estimated = poses is not None or not (root / POSES_FILE).is_file()
     calibration = read_stereo_ini(root / CALIBRATION_FILE)
     images, is_rectified = _open_images(root, calibration, frames_rectified)

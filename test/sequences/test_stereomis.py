@@ -28,6 +28,7 @@ from plane_scene import (
 from stereomis_copy import COUNT, FPS, write_stereomis
 
 from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.sequences import stereomis
 from endo_sim_ros.sequences.rectification import Rectification
 from endo_sim_ros.sequences.stereomis import read_stereo_ini, read_stereomis
 
@@ -303,6 +304,15 @@ def test_damaged_masks_are_refused_by_name(plane, damage, message):
     damage(plane / "masks")
     with pytest.raises(SequenceError, match=message):
         read_stereomis(plane)
+
+
+@pytest.mark.parametrize(
+    ("poses", "message"), [("slam", "poses must be sfm, vggt or"), ("vggt:nowhere", "nowhere: there is no checkpoint")]
+)
+def test_unknown_ways_to_poses_are_refused_before_the_images_are_looked_at(plane, poses, message, monkeypatch):
+    monkeypatch.setattr(stereomis, "_look", None)
+    with pytest.raises(SequenceError, match=message):
+        read_stereomis(plane, poses=poses)
 
 
 def test_negative_gap_of_masks_is_refused(plane):

@@ -6,6 +6,7 @@ Only the file of the command that runs is imported, and nothing heavy before its
 import ast
 import importlib
 import logging
+import signal
 import sys
 import textwrap
 import time
@@ -61,8 +62,14 @@ def parse(name: str, words: list[str]) -> Runnable:
 
 
 def main() -> int:
-    """Run the command line; returns the exit status: 2 if options or input are wrong, 1 if something failed later, 130 after Ctrl-C."""
+    """Run the command line; returns the exit status: 2 if options or input are wrong, 1 if something failed later, 130 after Ctrl-C.
+
+    SIGTERM and SIGHUP raise SystemExit with 143 and 129.
+    """
     hear_interrupts()
+    for number in (signal.SIGTERM, signal.SIGHUP):  # of a job's end and a closed terminal: what Ctrl-C cleans up, they do
+        if signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, lambda number, frame: sys.exit(128 + number))
     words = sys.argv[1:]
     if not words or words[0] in ("-h", "--help"):
         print(overview())

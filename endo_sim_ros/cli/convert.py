@@ -1,6 +1,5 @@
 """`endo-sim convert`."""
 
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -81,14 +80,11 @@ class Command:
     def run(self) -> None:
         """Write the bag; raises SequenceError if it exists or the recording cannot be read."""
         from endo_sim_ros.sequences.bag import write_bag
-        from endo_sim_ros.sequences.folder import write_points
         from endo_sim_ros.sequences.readers import open_sequence
         from endo_sim_ros.sequences.recording import Recording
 
         if self.bag.exists():  # before any work
             raise SequenceError(f"{self.bag} exists already; choose another name or remove it first")
-        if self.fps is not None and not self.fps > 0:
-            raise SequenceError(f"--fps must be positive, got {self.fps:g}")
         fixed = ("source", "bag", "kind")
         options = {name: value for name, value in vars(self).items() if name not in fixed and value is not None}
         frames = open_sequence(self.source, self.kind, **options)
@@ -96,12 +92,6 @@ class Command:
             with Progress() as bar:
                 task = bar.add_task("poses", total=None)
                 frames.prepare(lambda stage, done, total: bar.update(task, description=stage, completed=done, total=total or None))
-        try:
-            count = write_bag(self.bag, track(frames, f"converting {self.source.name}"))
-            points = frames.points() if isinstance(frames, Recording) else None
-            if points is not None:
-                write_points(self.bag, *points)
-        except BaseException:  # half a conversion would only be in the way of the next try
-            shutil.rmtree(self.bag, ignore_errors=True)
-            raise
+        points = frames.points() if isinstance(frames, Recording) else None  # what is wrong with them is told first
+        count = write_bag(self.bag, track(frames, f"converting {self.source.name}"), points)
         print(f"{self.bag}: {count} frames")

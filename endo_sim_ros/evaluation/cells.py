@@ -13,11 +13,12 @@ from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.evaluation import gsplat_trainers
 from endo_sim_ros.evaluation.config import EvaluationConfig
 from endo_sim_ros.evaluation.lpips import Backbone, Lpips, WeightsError
-from endo_sim_ros.evaluation.sources import PHANTOM, parse_values, split_source
+from endo_sim_ros.evaluation.sources import PHANTOM, find_named, parse_values, split_source
 from endo_sim_ros.evaluation.splits import check_split
 from endo_sim_ros.evaluation.workers import Finished
 from endo_sim_ros.reconstruction import ReconstructionConfig
 from endo_sim_ros.reconstruction.presets import ABLATIONS, preset
+from endo_sim_ros.reconstruction.priors.network import find_network
 
 log = logging.getLogger(__name__)
 
@@ -108,6 +109,7 @@ def _names(sequences: Sequence[str]) -> dict[str, str]:
         place = split_source(source)[0]
         if not place.startswith(PHANTOM) and not Path(place).exists():
             raise SequenceError(f"{place}: no such file or folder; give a bag, a recording, or {PHANTOM}0")
+        find_named(source)
         parts = [place] if place.startswith(PHANTOM) else list(Path(place).resolve().parts)
         for length in range(1, len(parts) + 1):
             name = "/".join(parts[-length:])
@@ -124,6 +126,8 @@ def _methods(config: EvaluationConfig) -> dict[str, dict[str, Any]]:
     if any(item.partition("=")[0] == "preset" for item in config.set):
         raise ConfigError("--set preset: methods are named with --presets")
     common = {"device": "auto"} | parse_values(config.set, "--set", ReconstructionConfig)
+    if common.get("depth_model"):
+        find_network(common["depth_model"])
     methods = {}
     for name in config.presets:
         if name in gsplat_trainers.STRATEGIES:

@@ -42,6 +42,7 @@ def evaluate(sequences: Sequence[str], config: EvaluationConfig) -> dict[str, An
         SequenceError, ConfigError: If a sequence, a split or an option is not there. What fails later is in the table, with why.
     """
     cells, missing = list_cells(sequences, config)
+    device = pick_device(config.device)  # one that is not there is refused before any work
     for folder in ("cells", "pictures"):
         (config.out / folder).mkdir(parents=True, exist_ok=True)
     finished = {cell.stem: finished_record(config.out, cell) for cell in cells}
@@ -52,7 +53,7 @@ def evaluate(sequences: Sequence[str], config: EvaluationConfig) -> dict[str, An
         for cell, outcome in _run(open_cells, config):
             finished[cell.stem] = save_record(config.out, cell, outcome)
     results = {
-        "machine": machine(pick_device(config.device)),
+        "machine": machine(device),
         "date": time.strftime("%Y-%m-%d"),
         "missing": missing,
         "cells": [finished[cell.stem] for cell in cells],

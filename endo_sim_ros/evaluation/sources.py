@@ -1,8 +1,9 @@
 """Sequences as they are named on the command line: a path or `phantom:SEED`, then options of the reader as `,name=value`."""
 
+import contextlib
 import itertools
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from endo_sim_ros.core.config import ConfigError, StageConfig, options
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.bag import read_bag
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
-from endo_sim_ros.sequences.readers import open_sequence
+from endo_sim_ros.sequences.readers import check_option, find_reader
 from endo_sim_ros.sequences.recording import Recording
 
 PHANTOM = "phantom:"
@@ -33,15 +34,33 @@ def parse_values(items: Iterable[str], where: str, of: type[StageConfig]) -> dic
         name, equals, text = item.partition("=")
         if not equals:
             raise ConfigError(f"{where} {item}: give name=value")
-        values[name] = text if name in texts else yaml.safe_load(text)
+        values[name] = text if name in texts else _value(text)
     return values
+
+
+def _value(text: str) -> Any:
+    """A text in the type that YAML sees in it; YAML takes 1e-3 for a word, but nobody else does."""
+    value = yaml.safe_load(text)
+    if isinstance(value, str):
+        with contextlib.suppress(ValueError):
+            return float(value)
+    return value
 
 
 def open_named(source: str) -> Iterable[Frame]:
     """The frames of a sequence as it is named on the command line.
 
     Raises:
-        SequenceError: If there is no such sequence or option.
+        SequenceError, ConfigError: If there is no such sequence or option, or the reader finds a fault.
+    """
+    return find_named(source)()
+
+
+def find_named(source: str) -> Callable[[], Iterable[Frame]]:
+    """What opens a sequence; nothing of it is read yet.
+
+    Raises:
+        SequenceError, ConfigError: If there is no such sequence or option.
     """
     place, texts = split_source(source)
     if place.startswith(PHANTOM):
@@ -50,8 +69,8 @@ def open_named(source: str) -> Iterable[Frame]:
             raise SequenceError(f"{place}: the synthetic patients have numbers, as {PHANTOM}0")
         # Half a round: after a whole one the last view would be the first again, and two views one.
         config = PhantomConfig.from_mapping({"seed": int(seed), "rounds": 0.5} | parse_values(texts, place, PhantomConfig))
-        return Recording(lambda: phantom_sequence(config), config.frames)
-    given = {name: yaml.safe_load(value) for name, _, value in (text.partition("=") for text in texts)}
+        return lambda: Recording(lambda: phantom_sequence(config), config.frames)
+    given = {name: _value(value) for name, _, value in (text.partition("=") for text in texts)}
     if "distortion" in given:
         given["distortion"] = tuple(np.atleast_1d(given["distortion"]).tolist())
     path = Path(place)
@@ -60,7 +79,9 @@ def open_named(source: str) -> Iterable[Frame]:
         if unknown:
             raise SequenceError(f"{place}: a bag has no option {', '.join(sorted(unknown))}; it has start, stop and step")
         part = [given.get(name) for name in ("start", "stop", "step")]
+        for name, value in given.items():
+            check_option(place, name, value, int)
         if any(value is not None and not value >= least for value, least in zip(part, (0, 0, 1))):
             raise SequenceError(f"{place}: start and stop are 0 or more, step is 1 or more")
-        return Recording(lambda: itertools.islice(read_bag(path), *part), 0)
-    return open_sequence(path, **given)
+        return lambda: Recording(lambda: itertools.islice(read_bag(path), *part), 0)
+    return find_reader(path, "auto", given)

@@ -13,6 +13,7 @@ from endo_sim_ros.reconstruction.checkpoint import read_checkpoint
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.keyframes import choose_views
 from endo_sim_ros.reconstruction.pipeline import prepare
+from endo_sim_ros.reconstruction.priors.network import find_network
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import ScenePoints
 from endo_sim_ros.reconstruction.trainer import Progress, Trainer
@@ -43,6 +44,8 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
         ValueError: If there is no such device.
     """
     pick_device(config.device)  # what cannot be used is refused before the long work
+    if config.depth_model:
+        find_network(config.depth_model)
     for text in unused_options(config):
         log.warning(text)
     if resume:

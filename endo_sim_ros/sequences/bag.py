@@ -13,6 +13,7 @@ from endo_sim_ros.core.frames import LEFT_FRAME, RIGHT_FRAME, WORLD_FRAME, Frame
 from endo_sim_ros.messages import Topic, bag_types
 from endo_sim_ros.sequences.bag_reader import BagReader, RawMessage
 from endo_sim_ros.sequences.bag_writer import BagWriter, canonical_cdr
+from endo_sim_ros.sequences.folder import write_points
 from endo_sim_ros.sequences.synchronizer import Synchronizer
 
 __all__ = [
@@ -21,33 +22,49 @@ __all__ = [
 ]  # fmt: skip
 
 
-def write_bag(path: str | Path, frames: Iterable[Frame]) -> int:
-    """The number of frames written as a bag with the recording topics of the contract.
+def write_bag(path: str | Path, frames: Iterable[Frame], points: tuple[np.ndarray, np.ndarray] | None = None) -> int:
+    """The number of frames written as a bag with the recording topics of the contract; it is removed if that ends with an error.
+
+    Args:
+        path: Folder of the new bag.
+        frames: What to write.
+        points: Scene points and colours as in `Recording`, for its points.txt.
 
     Raises:
         SequenceError: If the path exists or there are no frames.
     """
+    bag = BagWriter(path)
+    try:
+        with bag:
+            count = _write_frames(bag, frames)
+        if not count:
+            raise SequenceError(f"{path}: the sequence has no frames; check its frame range and poses")
+        if points is not None:
+            write_points(path, *points)
+    except BaseException:  # it would only be in the way of the next attempt
+        shutil.rmtree(path, ignore_errors=True)
+        raise
+    return count
+
+
+def _write_frames(bag: BagWriter, frames: Iterable[Frame]) -> int:
     count, types = 0, bag_types()
-    with BagWriter(path) as bag:
-        for frame in frames:
-            stamp, camera = frame.stamp_ns, frame.camera
-            size = (camera.width, camera.height)
-            bag.write(messages.LEFT_INFO, messages.encode_camera_info(camera.K, *size, stamp, LEFT_FRAME, types=types), stamp)
-            bag.write(messages.CAMERA_POSE, messages.encode_pose(camera.pose, stamp, WORLD_FRAME, types), stamp)
-            bag.write(messages.LEFT_IMAGE, messages.encode_image(frame.image, stamp, LEFT_FRAME, types), stamp)
-            if frame.right is not None and frame.baseline is not None:
-                K = camera.K if frame.right_K is None else frame.right_K
-                info = messages.encode_camera_info(K, *size, stamp, RIGHT_FRAME, frame.baseline, types)
-                bag.write(messages.RIGHT_INFO, info, stamp)
-                bag.write(messages.RIGHT_IMAGE, messages.encode_image(frame.right, stamp, RIGHT_FRAME, types), stamp)
-            if frame.depth is not None:
-                bag.write(messages.DEPTH, messages.encode_image(frame.depth.astype("float32"), stamp, LEFT_FRAME, types), stamp)
-            if frame.mask is not None:
-                bag.write(messages.MASK, messages.encode_image(frame.mask, stamp, LEFT_FRAME, types), stamp)
-            count += 1
-    if not count:
-        shutil.rmtree(path)  # an empty bag would only be in the way of the next attempt
-        raise SequenceError(f"{path}: the sequence has no frames; check its frame range and poses")
+    for frame in frames:
+        stamp, camera = frame.stamp_ns, frame.camera
+        size = (camera.width, camera.height)
+        bag.write(messages.LEFT_INFO, messages.encode_camera_info(camera.K, *size, stamp, LEFT_FRAME, types=types), stamp)
+        bag.write(messages.CAMERA_POSE, messages.encode_pose(camera.pose, stamp, WORLD_FRAME, types), stamp)
+        bag.write(messages.LEFT_IMAGE, messages.encode_image(frame.image, stamp, LEFT_FRAME, types), stamp)
+        if frame.right is not None and frame.baseline is not None:
+            K = camera.K if frame.right_K is None else frame.right_K
+            info = messages.encode_camera_info(K, *size, stamp, RIGHT_FRAME, frame.baseline, types)
+            bag.write(messages.RIGHT_INFO, info, stamp)
+            bag.write(messages.RIGHT_IMAGE, messages.encode_image(frame.right, stamp, RIGHT_FRAME, types), stamp)
+        if frame.depth is not None:
+            bag.write(messages.DEPTH, messages.encode_image(frame.depth.astype("float32"), stamp, LEFT_FRAME, types), stamp)
+        if frame.mask is not None:
+            bag.write(messages.MASK, messages.encode_image(frame.mask, stamp, LEFT_FRAME, types), stamp)
+        count += 1
     return count
 
 

@@ -7,7 +7,6 @@ pulling_soft_tissues/
   masks/               white = tool, optional
 """
 
-import logging
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,9 +17,7 @@ from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.images import check_size, image_size, numbered_files, read_depth, read_image
 from endo_sim_ros.sequences.masks import MaskFiles
 from endo_sim_ros.sequences.pose_files import rigid
-from endo_sim_ros.sequences.recording import DEFAULT_FPS, Recording, check_folder, select, stamp_ns
-
-logger = logging.getLogger(__name__)
+from endo_sim_ros.sequences.recording import DEFAULT_FPS, Recording, check_folder, check_positive, select, stamp_ns, tell_lacking
 
 POSES_FILE = "poses_bounds.npy"
 
@@ -54,6 +51,7 @@ def read_endonerf(
         SequenceError: If a file is missing or wrong.
     """
     root = check_folder(path)
+    check_positive(root, fps=fps, depth_scale=depth_scale, pose_scale=pose_scale)
     images = numbered_files(root / "images")
     if not images:
         raise SequenceError(f"{root / 'images'}: holds no images named like 000000.png")
@@ -66,9 +64,7 @@ def read_endonerf(
     numbers = select(images, root, start, stop, step)
     depths, mask_files = numbered_files(root / "depth"), numbered_files(root / "masks")
     for name, files in (("depth", depths), ("masks", mask_files)):
-        lacking = [n for n in numbers if n not in files]
-        if files and lacking:
-            logger.warning("%s: %d of %d frames have no image there", root / name, len(lacking), len(numbers))
+        tell_lacking(numbers, files, root / name)
     masks = MaskFiles(mask_files, root / "masks", mask_polarity)
     pose_scale = depth_scale if pose_scale is None else pose_scale
 

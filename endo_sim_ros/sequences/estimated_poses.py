@@ -19,13 +19,25 @@ def pose_estimator(poses: str) -> Callable[..., StructureFromMotion] | None:
     """What estimates poses by a name: `estimate_poses` of sfm, that with a network of vggt or vggt:FOLDER (of its checkpoint).
 
     None for any other text, as the name of a file.
+
+    Raises:
+        SequenceError: If the network has no checkpoint.
     """
     name, _, folder = poses.partition(":")
     if name == VGGT:
-        from endo_sim_ros.sequences.vggt import estimate_poses_with_vggt  # needs torch
+        from endo_sim_ros.sequences.vggt import estimate_poses_with_vggt, find_checkpoint  # needs torch
 
+        find_checkpoint(folder)
         return functools.partial(estimate_poses_with_vggt, checkpoint=folder)
     return estimate_poses if poses == STRUCTURE_FROM_MOTION else None
+
+
+def known_estimator(poses: str | None, source: Path) -> Callable[..., StructureFromMotion]:
+    """As `pose_estimator`, structure from motion where None is given; any other text raises SequenceError, with the recording's path."""
+    estimate = pose_estimator(STRUCTURE_FROM_MOTION if poses is None else poses)
+    if estimate is None:
+        raise SequenceError(f"{source}: poses must be {STRUCTURE_FROM_MOTION}, {VGGT} or {VGGT}:FOLDER, got {poses!r}")
+    return estimate
 
 
 def with_estimated_poses(recording: Recording, source: Path, poses: str | None = None) -> Recording:
@@ -39,10 +51,7 @@ def with_estimated_poses(recording: Recording, source: Path, poses: str | None =
     Raises:
         SequenceError: If there is no such way.
     """
-    estimate = pose_estimator(STRUCTURE_FROM_MOTION if poses is None else poses)
-    if estimate is None:
-        raise SequenceError(f"{source}: poses must be {STRUCTURE_FROM_MOTION}, {VGGT} or {VGGT}:FOLDER, got {poses!r}")
-
+    estimate = known_estimator(poses, source)
     results: list[StructureFromMotion] = []
 
     def prepare(on_progress: OnProgress | None = None) -> None:

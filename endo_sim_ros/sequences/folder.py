@@ -24,7 +24,17 @@ from endo_sim_ros.sequences.estimated_poses import with_estimated_poses
 from endo_sim_ros.sequences.images import check_size, image_size, numbered_files, read_depth, read_image
 from endo_sim_ros.sequences.masks import MaskFiles, lit_area, lit_now
 from endo_sim_ros.sequences.pose_files import read_poses
-from endo_sim_ros.sequences.recording import DEFAULT_FPS, Recording, check_folder, keep_posed, select, spread, stamp_ns
+from endo_sim_ros.sequences.recording import (
+    DEFAULT_FPS,
+    Recording,
+    check_folder,
+    check_positive,
+    keep_posed,
+    select,
+    spread,
+    stamp_ns,
+    tell_lacking,
+)
 from endo_sim_ros.sequences.rectification import Rectification
 
 logger = logging.getLogger(__name__)
@@ -66,6 +76,7 @@ def read_folder(
         SequenceError: If a file is missing or wrong.
     """
     root = check_folder(path)
+    check_positive(root, fps=fps, depth_scale=depth_scale)
     left, right = numbered_files(root / "left"), numbered_files(root / "right")
     if not left:
         raise SequenceError(f"{root / 'left'}: holds no images named like 000001.png")
@@ -91,8 +102,10 @@ def read_folder(
     size = image_size(read_image(left[numbers[0]]))
     check_calibrated_size(calibration, size, root / CALIBRATION_FILE)
     rectification = Rectification.mono(K, calibration["distortion"], size)
-    depths = numbered_files(root / "depth")
-    masks = MaskFiles(numbered_files(root / "masks"), root / "masks", mask_polarity)
+    depths, mask_files = numbered_files(root / "depth"), numbered_files(root / "masks")
+    for name, files in (("depth", depths), ("masks", mask_files)):
+        tell_lacking(numbers, files, root / name)
+    masks = MaskFiles(mask_files, root / "masks", mask_polarity)
 
     def image_of(file: Path) -> np.ndarray:
         return check_size(read_image(file), size, file)

@@ -3,9 +3,14 @@
 A new dataset is one file with a `read_…` function and one entry in READERS. `Command` in cli/convert.py has each of its options, too.
 """
 
-from collections.abc import Callable, Iterable
+import functools
+import numbers
+import types
+import typing
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences import endonerf, folder, scared, stereomis
@@ -69,6 +74,11 @@ def open_sequence(path: Path | str, kind: str = "auto", **options) -> Iterable[F
     Raises:
         SequenceError: If nothing is there, no layout matches, or the reader finds a fault.
     """
+    return find_reader(path, kind, options)()
+
+
+def find_reader(path: Path | str, kind: str, options: Mapping[str, Any]) -> Callable[[], Iterable[Frame]]:
+    """What opens a recording; nothing of it is read yet. Arguments and errors are those of `open_sequence`."""
     path = Path(path)
     if not path.exists():
         raise SequenceError(f"{path}: no such file or folder")
@@ -79,10 +89,30 @@ def open_sequence(path: Path | str, kind: str = "auto", **options) -> Iterable[F
             raise SequenceError(f"{path}: no known layout recognised. Layouts and what each is recognised by: {marks}")
     if kind not in READERS:
         raise SequenceError(f"{path}: unknown kind {kind!r}; choose auto, {', '.join(READERS)}")
-    try:
-        return READERS[kind].read(path, **options)
-    except TypeError as error:
-        if "unexpected keyword argument" not in str(error):
-            raise
-        option = str(error).rsplit("argument", 1)[1].strip()
-        raise SequenceError(f"{path}: the {kind} layout has no option {option}") from None
+    read = READERS[kind].read
+    hints = {name: hint for name, hint in typing.get_type_hints(read).items() if name not in ("path", "return")}
+    for name, value in options.items():
+        if name not in hints:
+            raise SequenceError(f"{path}: the {kind} layout has no option {name!r}; it has {', '.join(hints)}")
+        check_option(path, name, value, hints[name])
+    return functools.partial(read, path, **options)
+
+
+_WORDS: dict[Any, str] = {
+    bool: "true or false",
+    numbers.Integral: "a whole number",
+    numbers.Real: "a number",
+    str: "a word",
+    Path: "a path",
+    Sequence: "a list of numbers",
+}
+_NUMBERS: dict[Any, Any] = {int: numbers.Integral, float: numbers.Real}  # those of numpy, too
+
+
+def check_option(source: Path | str, name: str, value: Any, hint: Any) -> None:
+    """Raise SequenceError if the value of an option has not the type that its annotation says."""
+    allowed = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    kinds = tuple(_NUMBERS.get(kind, typing.get_origin(kind) or kind) for kind in allowed)
+    if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
+        words = ", ".join(str(_WORDS.get(kind, kind)) for kind in kinds if kind is not types.NoneType)
+        raise SequenceError(f"{source}: {name} must be {words}, got {value!r}")

@@ -2,6 +2,7 @@
 
 import itertools
 import logging
+import math
 import pickle
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -17,6 +18,7 @@ logger = logging.getLogger(__name__)
 
 DEFAULT_FPS = 25.0  # of the datasets whose files do not state it
 FIRST_STAMP_NS = 1_000_000_000  # a ROS stamp of 0 means "unset", so recordings begin at one second
+_STAMPS_END_NS = 2**31 * 10**9  # a ROS stamp counts seconds in 32 bits
 
 T = TypeVar("T")
 
@@ -112,8 +114,22 @@ def store(frame: Frame, file: Path) -> StoredFrame:
 
 
 def stamp_ns(number: int, fps: float) -> int:
-    """Time of exposure of a frame number, nanoseconds; frame 0 is at one second."""
-    return round(number / fps * 1e9) + FIRST_STAMP_NS
+    """Time of exposure of a frame number, nanoseconds; frame 0 is at one second.
+
+    Raises:
+        SequenceError: If it is later than a ROS stamp can be.
+    """
+    stamp = round(number / fps * 1e9) + FIRST_STAMP_NS
+    if stamp >= _STAMPS_END_NS:
+        raise SequenceError(f"frame {number} at {fps:g} Hz comes after 68 years, which no ROS stamp can say; number frames from 0")
+    return stamp
+
+
+def check_positive(source: Path | str, **values: float | None) -> None:
+    """Raise SequenceError if one of the options that are given is not a positive number."""
+    for name, value in values.items():
+        if value is not None and not 0 < value < math.inf:
+            raise SequenceError(f"{source}: {name} must be positive, got {value:g}")
 
 
 def check_folder(path: Path | str) -> Path:
@@ -146,6 +162,13 @@ def keep_posed(numbers: list[int], poses: Container[int], pose_file: Path) -> li
     if len(posed) < len(numbers):
         logger.info("%s: %d of %d frames have no pose and are skipped", pose_file, len(numbers) - len(posed), len(numbers))
     return posed
+
+
+def tell_lacking(numbers: Sequence[int], files: Container[int], folder: Path) -> None:
+    """Log how many of the frames have no file in a folder of masks or depth; nothing where there is no such folder."""
+    lacking = sum(number not in files for number in numbers)
+    if lacking and folder.is_dir():
+        logger.warning("%s: %d of %d frames have no image there", folder, lacking, len(numbers))
 
 
 def spread(items: Sequence[T], count: int) -> list[T]:

@@ -32,7 +32,16 @@ from endo_sim_ros.core.cameras import Camera, invert_pose
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.estimated_poses import with_estimated_poses
 from endo_sim_ros.sequences.images import clean_depth, image_size, numbered_files, read_image
-from endo_sim_ros.sequences.recording import DEFAULT_FPS, Recording, check_folder, keep_posed, select, stamp_ns
+from endo_sim_ros.sequences.recording import (
+    DEFAULT_FPS,
+    Recording,
+    check_folder,
+    check_positive,
+    keep_posed,
+    select,
+    stamp_ns,
+    tell_lacking,
+)
 from endo_sim_ros.sequences.rectification import Rectification, StereoCalibration
 from endo_sim_ros.sequences.scared_archives import (
     PointFiles,
@@ -87,6 +96,7 @@ def read_scared(
         SequenceError: If a file is missing or wrong.
     """
     root = check_folder(path)
+    check_positive(root, fps=fps)
     for name, value, allowed in (("depth", depth, DEPTHS), ("pose_direction", pose_direction, DIRECTIONS)):
         if value not in allowed:
             raise SequenceError(f"{root}: {name} must be one of {', '.join(allowed)}, got {value!r}")
@@ -99,6 +109,7 @@ def read_scared(
     elif left := numbered_files(root / "data/left_finalpass"):
         images, is_rectified = StereoFiles(root / "data/left_finalpass", left, numbered_files(root / "data/right_finalpass")), True
     else:
+        logger.info("%s: holds no data/rgb.mp4 and no images in data/left_finalpass, so the keyframe alone is read", root)
         return _read_keyframe(root, start, stop, step, depth, fps)
 
     frame_data = _archive_or_folder(root, "frame_data")
@@ -128,6 +139,8 @@ def read_scared(
             else "only the keyframe's own depth is used",
         )  # fmt: skip
         depth = "disparity" if disparities else "keyframe"
+    elif depth == "scene_points" and points_source.is_dir():
+        tell_lacking(numbers, numbered(points_source, ".tiff"), points_source)
 
     def depth_of(number: int, points: PointFiles | ScenePoints | None) -> np.ndarray | None:
         if number in disparities:

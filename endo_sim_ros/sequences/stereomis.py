@@ -27,13 +27,13 @@ import numpy as np
 
 from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.frames import Frame, SequenceError
-from endo_sim_ros.sequences.estimated_poses import with_estimated_poses
+from endo_sim_ros.sequences.estimated_poses import known_estimator, with_estimated_poses
 from endo_sim_ros.sequences.images import numbered_files
 from endo_sim_ros.sequences.mask_alignment import MaskAlignment, Reading
 from endo_sim_ros.sequences.masks import MaskFiles, read_mask
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.pose_lag import LagFinder
-from endo_sim_ros.sequences.recording import Recording, check_folder, keep_posed, select, spread, stamp_ns
+from endo_sim_ros.sequences.recording import Recording, check_folder, check_positive, keep_posed, select, spread, stamp_ns
 from endo_sim_ros.sequences.rectification import Rectification, StereoCalibration
 from endo_sim_ros.sequences.stereo_images import StackedVideo, StereoFiles, StereoImages, row_offsets
 from endo_sim_ros.sequences.video_files import find_video
@@ -91,8 +91,12 @@ def read_stereomis(
         SequenceError: If a file is missing or wrong.
     """
     root = check_folder(path)
+    check_positive(root, fps=fps)
+    if max_mask_gap < 0:
+        raise SequenceError(f"{root}: max_mask_gap must be 0 or more, got {max_mask_gap}")
     if first_mask is not None and first_mask < 0:
         raise SequenceError(f"{root}: first_mask must be 0 or more, got {first_mask}")
+    known_estimator(poses, root)  # what is wrong is told before the images are looked at
     estimated = poses is not None or not (root / POSES_FILE).is_file()
     calibration = read_stereo_ini(root / CALIBRATION_FILE)
     images, is_rectified = _open_images(root, calibration, frames_rectified)
@@ -142,7 +146,7 @@ def read_stereomis(
     if rows is not None:
         numbers = keep_posed(numbers, posed, root / POSES_FILE)
     bare = sum(_nearest(masked, n, max_mask_gap) is None for n in numbers)
-    if mask_files and bare:
+    if bare:
         logger.warning("%s: %d of %d frames have no mask; tools stay visible in them", root, bare, len(numbers))
 
     def frames() -> Iterator[Frame]:

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -125,6 +126,9 @@ def _write_features(
         Count and size of the images, and by their names the RGB [N, 3], uint8, of the features: COLMAP sees no image.
     """
     import pycolmap  # heavy, and needed here only
+
+    if threading.current_thread() is threading.main_thread():  # its logging hears SIGTERM in Python's stead
+        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
 
     def find(task: tuple[str, np.ndarray, np.ndarray | None]) -> tuple[str, np.ndarray, np.ndarray, np.ndarray]:
         eye, image, mask = task

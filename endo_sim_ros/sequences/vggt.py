@@ -71,14 +71,24 @@ def estimate_poses_with_vggt(
     return StructureFromMotion(placed, np.asarray(K, np.float64), (), float("nan"), metric)
 
 
-def _load(checkpoint: str) -> tuple[Any, Any]:
-    """The network, and what makes cameras of its encoding of poses."""
+def find_checkpoint(checkpoint: str) -> Path:
+    """The folder of a checkpoint; of facebook/VGGT-1B in Hugging Face's cache where that is empty.
+
+    Raises:
+        SequenceError: If there is none; the message says where to put one.
+    """
     home = Path(os.environ.get("HF_HUB_CACHE", Path(os.environ.get("HF_HOME", "~/.cache/huggingface")) / "hub")).expanduser()
     cached = sorted(home.glob("models--facebook--VGGT-1B/snapshots/*"))
     folder = Path(checkpoint).expanduser() if checkpoint else cached[-1] if cached else home
     if not (folder / "config.json").is_file():
         advice = "copy facebook/VGGT-1B (config.json and model.safetensors) to this machine and pass poses=vggt:FOLDER"
         raise SequenceError(f"{folder}: there is no checkpoint of VGGT; {advice}")
+    return folder
+
+
+def _load(checkpoint: str) -> tuple[Any, Any]:
+    """The network, and what makes cameras of its encoding of poses."""
+    folder = find_checkpoint(checkpoint)
     os.environ.setdefault("HF_HUB_OFFLINE", "1")
     try:
         from vggt.models.vggt import VGGT  # pyright: ignore[reportMissingImports]  (optional)

@@ -22,7 +22,7 @@ from endo_sim_ros.sequences.estimated_poses import pose_estimator
 from endo_sim_ros.sequences.images import numbered_files, read_gray
 from endo_sim_ros.sequences.masks import MaskFiles, lit_area, lit_now, tissue_mask, tool_is_white
 from endo_sim_ros.sequences.pose_files import read_poses
-from endo_sim_ros.sequences.recording import OnProgress, Recording, keep_posed, select, spread, stamp_ns
+from endo_sim_ros.sequences.recording import OnProgress, Recording, check_positive, keep_posed, select, spread, stamp_ns, tell_lacking
 from endo_sim_ros.sequences.rectification import Rectification
 from endo_sim_ros.sequences.structure_from_motion import STRUCTURE_FROM_MOTION, StructureFromMotion
 from endo_sim_ros.sequences.video_files import Video, find_video
@@ -90,12 +90,12 @@ def read_video(
         poses = poses or _existing(folder / "poses.txt")
         calibration = calibration or (_existing(folder / "calibration.yaml") if fx is None else None)
         mask = mask or _existing(folder / "mask.png") or _existing(folder / "masks")
+    check_positive(path, fps=fps, scale=scale)
     video = Video(path)
     size = video.width, video.height
     fps = fps or video.fps
     K, distortion = _intrinsics(path, calibration, (fx, fy, cx, cy), distortion, size)
     numbers = select(range(video.frame_count), path, start, stop, step)
-    mask_of = _mask_reader(mask, mask_polarity, size)
 
     known = None
     estimate = pose_estimator(STRUCTURE_FROM_MOTION if poses is None else str(poses))
@@ -116,6 +116,7 @@ def read_video(
         numbers = numbers[::sfm_step]
         logger.info("%s: poses of every %d-th frame are estimated", path, step * sfm_step)
 
+    mask_of = _mask_reader(mask, mask_polarity, size, numbers)
     results: list[tuple[np.ndarray, Rectification, Mapping[int, np.ndarray], Points]] = []
 
     def prepare(on_progress: OnProgress | None = None) -> None:
@@ -216,8 +217,8 @@ def _intrinsics(
     return intrinsic_matrix(fx, fy, cx, cy), distortion
 
 
-def _mask_reader(source: Path | str | None, polarity: str, size: tuple[int, int]) -> Callable[[int], np.ndarray]:
-    """What gives the mask [H, W] of a frame number, 255 = tissue; all of it is tissue where there is no mask."""
+def _mask_reader(source: Path | str | None, polarity: str, size: tuple[int, int], numbers: Sequence[int]) -> Callable[[int], np.ndarray]:
+    """What gives the mask [H, W] of one of the frame numbers, 255 = tissue; all of it is tissue where there is no mask."""
     everything = np.full(size[::-1], 255, np.uint8)
     if source is None:
         return lambda number: everything
@@ -229,6 +230,7 @@ def _mask_reader(source: Path | str | None, polarity: str, size: tuple[int, int]
     files = numbered_files(source)
     if not files:
         raise SequenceError(f"{source}: holds no masks named like 000000.png")
+    tell_lacking(numbers, files, source)
     masks = MaskFiles(files, source, polarity)
     return lambda number: everything if (mask := masks.of(number, size)) is None else mask
 

@@ -17,6 +17,7 @@ import pytest
 from endo_sim_command import endo_sim
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from waiting import wait_until
 
 from endo_sim_ros import cli
 from endo_sim_ros.cli import convert
@@ -43,6 +44,20 @@ def test_an_interrupt_while_a_program_starts_ends_it_without_a_traceback(module)
     program.send_signal(signal.SIGINT)
     said, _ = program.communicate(timeout=30)
     assert b"Traceback" not in said and program.returncode in (-signal.SIGINT, 130, 0)
+
+
+@pytest.mark.dds
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_command_that_is_told_to_end_cleans_up(number, tmp_path):
+    heard = lambda: signal.signal(number, signal.SIG_DFL)
+    bag = tmp_path / "bag"
+    command = [sys.executable, "-m", "endo_sim_ros.cli", "phantom", str(bag), "--frames", "5000"]
+    program = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, preexec_fn=heard)
+    wait_until(bag.exists, 30, "the bag")
+    program.send_signal(number)
+    _, said = program.communicate(timeout=30)
+    assert program.returncode == 128 + number and b"Traceback" not in said
+    assert not bag.exists()
 
 
 def test_help_names_every_command_and_imports_none():

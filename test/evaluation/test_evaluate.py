@@ -14,7 +14,8 @@ from endo_sim_ros.evaluation import paper, tables
 from endo_sim_ros.evaluation.config import EvaluationConfig
 from endo_sim_ros.evaluation.evaluate import evaluate
 from endo_sim_ros.evaluation.page import write_page
-from endo_sim_ros.evaluation.sources import open_named
+from endo_sim_ros.evaluation.sources import open_named, parse_values
+from endo_sim_ros.reconstruction import ReconstructionConfig
 
 SMALL = "phantom:0,frames=6,width=96,height=80"
 
@@ -141,10 +142,16 @@ def test_what_is_not_there_is_told_before_any_work(tmp_path):
         evaluate([SMALL], EvaluationConfig(out=tmp_path, set=("preset=paper",)))
     with pytest.raises(ConfigError, match="gsplat is not installed"):
         evaluate([SMALL], EvaluationConfig(out=tmp_path, presets=("gsplat",)))
+    with pytest.raises(SequenceError, match="there is no checkpoint of a depth network"):
+        evaluate([SMALL], EvaluationConfig(out=tmp_path, set=(f"depth_model={tmp_path}",)))
+    with pytest.raises(ValueError, match="unknown device 'tpu'"):
+        evaluate([SMALL], EvaluationConfig(out=tmp_path / "out", device="tpu"))
     with pytest.raises(ConfigError, match="workers must be 1 or more, got 0"):
         EvaluationConfig(workers=0)
     with pytest.raises(SequenceError, match="the synthetic patients have numbers"):
-        open_named("phantom:liver")
+        evaluate(["phantom:liver"], EvaluationConfig(out=tmp_path))
+    with pytest.raises(ConfigError, match="PhantomConfig has no option frame; it has seed, frames"):
+        evaluate([SMALL, "phantom:1,frame=3"], EvaluationConfig(out=tmp_path))
     assert not any(tmp_path.iterdir())
 
 
@@ -152,8 +159,14 @@ def test_a_reader_takes_its_options_from_the_name(small_bag, small_frames, tmp_p
     assert [f.stamp_ns for f in open_named(f"{small_bag},start=2,step=4")] == [f.stamp_ns for f in small_frames[2::4]]
     with pytest.raises(SequenceError, match="a bag has no option fps"):
         open_named(f"{small_bag},fps=3")
+    with pytest.raises(SequenceError, match="step must be a whole number, got 2.5"):
+        open_named(f"{small_bag},step=2.5")
     assert len(open_named(SMALL)) == 6
     assert open_named("phantom:2,frames=3,border=0.1") is not None
+    assert parse_values(["lambda_depth=1e-3", "depth_model=1e3"], "--set", ReconstructionConfig) == {
+        "lambda_depth": 1e-3,
+        "depth_model": "1e3",
+    }
 
 
 def test_the_papers_numbers_are_complete():

@@ -9,6 +9,7 @@ from training_views import unknown
 
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.reconstruction import ReconstructionConfig, prepare, preset
+from endo_sim_ros.reconstruction.from_bag import reconstruct_bag
 from endo_sim_ros.reconstruction.priors.network import align, load_network, network_depth
 from endo_sim_ros.reconstruction.priors.sources import depth_source, estimate_depth
 from endo_sim_ros.reconstruction.stage_configs import NetworkDepthConfig
@@ -89,13 +90,22 @@ def test_metric_depth_is_inverted(tiny, tiny_networks):
     assert not np.allclose(inverse, load_network(str(tiny), "cpu")(image))
 
 
-def test_an_absent_or_damaged_network_is_one_clear_error(tmp_path, monkeypatch):
-    pytest.importorskip("transformers"), pytest.importorskip("onnxruntime")
+def test_an_absent_network_is_told_before_any_work(tmp_path, monkeypatch):
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path))
-    with pytest.raises(SequenceError, match="no Depth-Anything-V2 checkpoint; copy the folder"):
+    (tmp_path / "images").mkdir()
+    with pytest.raises(SequenceError, match="no checkpoint of a depth network; copy the folder"):
         load_network("", "cpu")
-    with pytest.raises(SequenceError, match=r"nowhere.*give its path as depth_model"):
-        load_network(str(tmp_path / "nowhere"), "cpu")
+    for name in ("nowhere", "images"):
+        path = str(tmp_path / name)
+        with pytest.raises(SequenceError, match=f"{name}: there is no .* give its path as depth_model"):
+            load_network(path, "cpu")
+        with pytest.raises(SequenceError, match=f"{name}: there is no .* give its path as depth_model"):
+            reconstruct_bag(tmp_path / "no_bag", tmp_path / "out", ReconstructionConfig(depth_model=path))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_damaged_network_is_one_clear_error(tmp_path):
+    pytest.importorskip("onnxruntime")
     (tmp_path / "bad.onnx").write_bytes(b"nothing")
     with pytest.raises(SequenceError, match=r"bad.onnx: not a readable depth network"):
         load_network(str(tmp_path / "bad.onnx"), "cpu")

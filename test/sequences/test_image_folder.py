@@ -45,6 +45,25 @@ def folder(tmp_path):
     return root
 
 
+def test_image_folder_tells_which_files_are_lacking(folder, caplog):
+    (folder / "depth/00051.png").unlink()
+    read_folder(folder)
+    assert "masks: 2 of 3 frames have no image there" in caplog.text and "depth: 1 of 3 frames have no image there" in caplog.text
+    caplog.clear()
+    shutil.rmtree(folder / "depth")
+    (folder / "masks/00051.png").unlink()
+    read_folder(folder)
+    assert "masks: 3 of 3 frames have no image there" in caplog.text and "depth" not in caplog.text
+
+
+def test_image_folder_refuses_units_and_times_that_cannot_be(folder):
+    for name, value in (("fps", np.nan), ("depth_scale", -1e-3)):
+        with pytest.raises(SequenceError, match=f"recording: {name} must be positive"):
+            read_folder(folder, **{name: value})
+    with pytest.raises(SequenceError, match="frame 51 at 1e-08 Hz comes after 68 years"):
+        list(read_folder(folder, start=2, fps=1e-8))
+
+
 def test_image_folder_frames(folder):
     frames = list(open_sequence(folder))
     assert [f.stamp_ns for f in frames] == [1_040_000_000, 3_040_000_000, 5_040_000_000]

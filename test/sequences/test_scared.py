@@ -161,7 +161,7 @@ def test_scared_depth_choices(scared):
 
 
 @pytest.mark.slow
-def test_extracted_folders_are_the_archives(scared):
+def test_extracted_folders_are_the_archives(scared, caplog):
     write_scared(scared)
     published = list(read_scared(scared))
     extract(scared, "frame_data", "scene_points")
@@ -170,6 +170,10 @@ def test_extracted_folders_are_the_archives(scared):
         np.testing.assert_array_equal(frame.image, expected.image)
         np.testing.assert_array_equal(frame.depth, expected.depth)
         np.testing.assert_array_equal(frame.camera.pose, expected.camera.pose)
+    assert "no image there" not in caplog.text
+    (scared / "data/scene_points/scene_points000002.tiff").unlink()
+    read_scared(scared)
+    assert "data/scene_points: 1 of 6 frames have no image there" in caplog.text
     (scared / "data/scene_points/scene_points000003.tiff").write_bytes(b"no tiff")
     with pytest.raises(SequenceError, match="scene_points000003.tiff: not a readable TIFF"):
         list(read_scared(scared))
@@ -247,11 +251,13 @@ def test_known_defects_are_told(tmp_path, folder, told, caplog):
 
 
 @pytest.mark.slow
-def test_scared_keyframe_alone(scared):
+def test_scared_keyframe_alone(scared, caplog):
+    caplog.set_level("INFO")
     write_scared(scared)
     (scared / "data/rgb.mp4").unlink()
     frames = list(open_sequence(scared))
     assert len(frames) == 1 and frames[0].stamp_ns == 1_000_000_000
+    assert "so the keyframe alone is read" in caplog.text
     assert_frame_agrees(frames[0])
 
 

@@ -28,6 +28,7 @@ from plane_scene import (
 from stereomis_copy import COUNT, FPS, write_stereomis
 
 from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.sequences import stereomis
 from endo_sim_ros.sequences.rectification import Rectification
 from endo_sim_ros.sequences.stereomis import read_stereo_ini, read_stereomis
 
@@ -125,6 +126,10 @@ def test_mask_is_borrowed_from_a_neighbour_only(plane, caplog):
         assert mask[20, 80] == 255
     assert frames[2].mask[80, 120] == frames[7].mask[80, 120] == 255  # no mask within one frame
     assert "3 of 7 frames have no mask" in caplog.text
+    for file in (plane / "masks").iterdir():
+        file.unlink()
+    read_stereomis(plane, pose_lag=0)
+    assert "7 of 7 frames have no mask" in caplog.text
 
 
 # ------------------------------------------------------------------------------------ the forms in which copies are found
@@ -299,6 +304,20 @@ def test_damaged_masks_are_refused_by_name(plane, damage, message):
     damage(plane / "masks")
     with pytest.raises(SequenceError, match=message):
         read_stereomis(plane)
+
+
+@pytest.mark.parametrize(
+    ("poses", "message"), [("slam", "poses must be sfm, vggt or"), ("vggt:nowhere", "nowhere: there is no checkpoint")]
+)
+def test_unknown_ways_to_poses_are_refused_before_the_images_are_looked_at(plane, poses, message, monkeypatch):
+    monkeypatch.setattr(stereomis, "_look", None)
+    with pytest.raises(SequenceError, match=message):
+        read_stereomis(plane, poses=poses)
+
+
+def test_negative_gap_of_masks_is_refused(plane):
+    with pytest.raises(SequenceError, match="max_mask_gap must be 0 or more, got -1"):
+        read_stereomis(plane, max_mask_gap=-1)
 
 
 def test_masks_of_another_sequence_are_told(plane, caplog):

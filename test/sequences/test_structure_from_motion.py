@@ -96,6 +96,21 @@ def test_pairs_tie_every_image_to_its_neighbours_and_to_far_ones():
 
 
 @pytest.mark.slow
+def test_the_program_goes_on_hearing_sigterm():
+    pytest.importorskip("pycolmap")
+    code = """if True:
+        import os, signal, sys
+        from endo_sim_ros.sequences.structure_from_motion import estimate_poses
+        signal.signal(signal.SIGTERM, lambda *_: sys.exit(9))
+        try:
+            estimate_poses([])
+        except ValueError:
+            os.kill(os.getpid(), signal.SIGTERM)
+    """
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 9
+
+
+@pytest.mark.slow
 def test_progress_is_told_and_its_error_ends_the_work_at_once(tmp_path, monkeypatch):
     pytest.importorskip("pycolmap")
     monkeypatch.setattr(structure_from_motion.tempfile, "tempdir", str(tmp_path))

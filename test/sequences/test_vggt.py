@@ -100,9 +100,9 @@ def test_one_eye_gives_a_guessed_scale_and_the_focal_length_that_the_network_see
 def test_what_is_missing_is_one_clear_sentence(package, checkpoint, tmp_path, monkeypatch):
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "nothing"))
     with pytest.raises(SequenceError, match=r"nothing: there is no checkpoint of VGGT; copy facebook/VGGT-1B .* poses=vggt:FOLDER"):
-        pose_estimator("vggt")(images(1, 2))
+        pose_estimator("vggt")
     with pytest.raises(SequenceError, match="2 or more images"):
-        pose_estimator("vggt")(images(1))
+        pose_estimator(f"vggt:{checkpoint}")(images(1))
     (checkpoint / "weights.pt").write_bytes(b"nothing")
     with pytest.raises(SequenceError, match="VGGT-1B: not a readable checkpoint"):
         pose_estimator(f"vggt:{checkpoint}")(images(1, 2))

@@ -36,7 +36,7 @@ def test_video_pose_scale_and_calibration_file(video):
     np.testing.assert_allclose(frames[1].camera.position, 0.1 * trajectory(4)[3][:3, 3], atol=1e-9)
 
 
-def test_video_mask_for_all_frames_and_per_frame(video):
+def test_video_mask_for_all_frames_and_per_frame(video, caplog):
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[:, :80] = 255
     write_rgb(video / "mask.png", mask)
@@ -44,6 +44,7 @@ def test_video_mask_for_all_frames_and_per_frame(video):
     write_rgb(video / "tools/000003.png", mask)
     frames = list(read_video(video, mask=video / "tools", mask_polarity="tool", **INTRINSICS))
     assert [f.mask[60, 20] for f in frames] == [255, 0, 255]
+    assert "tools: 2 of 3 frames have no image there" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -56,7 +57,14 @@ def test_video_mask_for_all_frames_and_per_frame(video):
         ({"fx": 150.0, "start": 100}, "no frame between start=100"),
         ({"fx": 150.0, "poses": "absent.txt"}, "absent.txt: file is missing"),
         ({"fx": 150.0, "mask": "absent.png"}, "absent.png: file is missing"),
-        ({"fx": 150.0, "colour": 1}, "video layout has no option 'colour'"),
+        ({"fx": 150.0, "colour": 1}, "video layout has no option 'colour'; it has start, stop"),
+        ({"fx": 150.0, "step": "x"}, "step must be a whole number, got 'x'"),
+        ({"fx": 150.0, "step": 1.5}, "step must be a whole number, got 1.5"),
+        ({"fx": 150.0, "fps": 0.0}, "fps must be positive, got 0"),
+        ({"fx": 150.0, "fps": np.inf}, "fps must be positive, got inf"),
+        ({"fx": 150.0, "scale": -1.0}, "scale must be positive, got -1"),
+        ({"fx": True}, "fx must be a number, got True"),
+        ({"fx": 150.0, "mask_border": 1}, "mask_border must be true or false, got 1"),
     ],
 )
 def test_wrong_video_options_are_explained(video, options, message):

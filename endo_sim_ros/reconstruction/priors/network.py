@@ -36,14 +36,7 @@ def load_network(path: str, device: str) -> Network:
     Raises:
         SequenceError: If there is no such checkpoint or it cannot be read; the message says where to put one.
     """
-    place = Path(path).expanduser() if path else cached_checkpoint()
-    if place is None or not place.exists():
-        where = place or _cache()
-        raise SequenceError(
-            f"{where}: there is no Depth-Anything-V2 checkpoint; copy the folder Depth-Anything-V2-Small-hf (config.json and "
-            "model.safetensors), that of another depth network of transformers, or an ONNX export to this machine and give its path as "
-            "depth_model"
-        )
+    place = find_network(path)
     try:
         return _onnx(place) if place.is_file() else _transformers(place, device)
     except ImportError as error:
@@ -51,6 +44,23 @@ def load_network(path: str, device: str) -> Network:
     except Exception as error:  # whatever a damaged file makes the libraries raise
         reason = next(iter(str(error).splitlines()), type(error).__name__)
         raise SequenceError(f"{place}: not a readable depth network ({reason})") from error
+
+
+def find_network(path: str) -> Path:
+    """The folder of a transformers checkpoint, or ONNX file, at a path, or in Hugging Face's cache where that is empty.
+
+    Raises:
+        SequenceError: If there is none; the message says where to put one.
+    """
+    place = Path(path).expanduser() if path else cached_checkpoint()
+    if place is None or not (place.is_file() or (place / "config.json").is_file()):
+        where = place or _cache()
+        raise SequenceError(
+            f"{where}: there is no checkpoint of a depth network; copy the folder Depth-Anything-V2-Small-hf (config.json and "
+            "model.safetensors), that of another depth network of transformers, or an ONNX export to this machine and give its path as "
+            "depth_model"
+        )
+    return place
 
 
 def cached_checkpoint() -> Path | None:

@@ -101,6 +101,8 @@ def test_the_stage_sweeps_interpolated_depth_and_tells_so(given, swept):
     after = sweep_planes(scene, options(**given), StageProgress())
     assert (after.views is not scene.views) == swept
     assert any("plane by plane" in sentence for sentence in after.decisions) == swept
+    unknown = dataclasses.replace(scene, views=tuple(dataclasses.replace(view, depth_prior=None) for view in views))
+    assert sweep_planes(unknown, options(**given), StageProgress()) is unknown
     measured = dataclasses.replace(scene, depth_source="stereo")
     assert sweep_planes(measured, options(**given), StageProgress()) is measured
 

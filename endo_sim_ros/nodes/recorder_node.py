@@ -143,6 +143,7 @@ def record(bag: Path, arms: tuple[str, ...], topics: tuple[str, ...], namespace:
     values = {"bag": str(bag), "arms": list(arms), "topics": list(topics)}
     parameters = [word for name, value in values.items() for word in ("-p", f"{name}:={json.dumps(value)}")]
     remapped = ["-r", f"__ns:=/{namespace.strip('/')}"] if namespace.strip("/") else []
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # rclpy hears it, and ends the recording as on Ctrl-C
     rclpy.init(args=["--ros-args", *remapped, *parameters])
     node = None
     try:

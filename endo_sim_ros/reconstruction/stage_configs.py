@@ -135,7 +135,8 @@ class PlaneSweepConfig(StageConfig):
     noise: Annotated[float, Range(0.1, 50, "grey levels")] = 3.0
     """Standard deviation of a picture's noise: what differs by less is alike on any plane."""
     margin: Annotated[float, Range(0, 10)] = 0.35
-    """How far the planes go on nearer and farther than the scene points, in median inverse depths."""
+    """How far the planes go on nearer and farther than the scene points, in median inverse depths; what seems farther than the median
+    depth divided by it, and than the points, is believed to be dirt on the lens."""
     min_planes: Annotated[int, Range(4, 1000)] = 32
     """Fewest planes; else there is one for each pixel by which the picture of the farthest neighbour moves."""
     max_planes: Annotated[int, Range(4, 1000)] = 160
@@ -148,8 +149,8 @@ class PlaneSweepConfig(StageConfig):
     """1 − correlation above which views do not show the same: interpolated depth is right more often than a match that is less sure."""
     min_views: Annotated[int, Range(1, 100)] = 2
     """Other views that must have found the same surface: one may agree by accident, and two views alone tell less than their points."""
-    tolerance: Annotated[float, Range(0.1, 100, "planes")] = 1.5
-    """How far apart surfaces are the same."""
+    same_surface: Annotated[float, Range(0.1, 100, "planes")] = 1.5
+    """Largest distance between what two views found that still is one surface: either is off by half a plane, and smoothness by more."""
     min_area: Annotated[float, Range(0, 1)] = 0.003
     """Share of the image below which a patch of depth that is like none around it is a wrong match."""
     smoothing: Annotated[float, Range(1, 640, "pixels at width 640")] = 12.0

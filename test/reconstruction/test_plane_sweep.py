@@ -16,6 +16,7 @@ from endo_sim_ros.reconstruction.priors.plane_sweep import sweep_depth
 from endo_sim_ros.reconstruction.priors.sources import estimate_depth
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import PreparedScene, ScenePoints, TrainingView
+from endo_sim_ros.reconstruction.stage_configs import PlaneSweepConfig
 
 NEAR, FAR = 0.06, 0.1  # m
 WIDTH, HEIGHT = 160, 128
@@ -92,6 +93,16 @@ def test_masked_pixels_are_neither_matched_nor_given_depth():
     for after, truth in zip(sweep_depth(masked, points.positions, 0.05), truths):
         assert not after.depth_prior[:, :40].any()
         assert share_right(after, truth) > 0.88
+
+
+def test_dirt_on_the_lens_is_not_tissue_far_away():
+    """It stands still in all pictures, as what is infinitely far does."""
+    _, _, points, views = interpolated()
+    dirt = texture(2)[:40, :40]
+    for view in views:
+        view.image[:40, :40] = dirt
+    for view in sweep_depth(views, points.positions, 0.05, PlaneSweepConfig(margin=1.5)):
+        assert view.depth_prior.max() < 2 * FAR
 
 
 @pytest.mark.parametrize(("given", "swept"), [({}, True), ({"plane_sweep": False}, False)])

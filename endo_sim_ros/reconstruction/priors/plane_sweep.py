@@ -32,6 +32,7 @@ class _Picture(NamedTuple):
     camera: Camera
     grey: np.ndarray  # [H, W] float32
     tissue: np.ndarray  # [H, W] float32, 1 or 0
+    inside: np.ndarray  # [H, W] bool, where a window shows nothing but tissue
     mean: np.ndarray  # [H, W]
     variance: np.ndarray  # [H, W]
 
@@ -111,11 +112,16 @@ def _near_points(view: TrainingView, points: np.ndarray, tolerance: float, optio
 
 def _picture(view: TrainingView, options: PlaneSweepConfig) -> _Picture:
     grey = cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    return _Picture(view.camera, grey, (view.tissue > 0).astype(np.float32), *_moments(grey, options))
+    tissue = (view.tissue > 0).astype(np.float32)
+    return _Picture(view.camera, grey, tissue, _whole(tissue, options), *_moments(grey, options))
 
 
 def _mean(values: np.ndarray, options: PlaneSweepConfig) -> np.ndarray:
     return cv2.blur(values, (options.window, options.window))
+
+
+def _whole(tissue: np.ndarray, options: PlaneSweepConfig) -> np.ndarray:
+    return _mean(tissue, options) > 0.95  # warping blurs the edges of a mask
 
 
 def _moments(grey: np.ndarray, options: PlaneSweepConfig) -> tuple[np.ndarray, np.ndarray]:
@@ -150,7 +156,9 @@ def _sweep(
     rows, columns = np.mgrid[: len(best), : best.shape[1]] + 0.5
     inverse = np.maximum(slope_u * columns + slope_v * rows + level + low + place * step, 1e-6).astype(np.float32)
     cost = np.take_along_axis(costs, best[..., None], 2)[..., 0]
-    alike = exact & (own.tissue > 0) & (cost < options.max_cost)
+    # As good as infinitely far is what stands still in the picture: dirt on the lens, the edge of the light.
+    farthest = min(np.percentile(1 / z, 1), beyond)
+    alike = exact & (own.tissue > 0) & (cost < options.max_cost) & (inverse > farthest)
     sixteenths = np.where(alike, 16 * (best + 1), 0).astype(np.int16)  # what is left of wrong matches are islands
     cv2.filterSpeckles(sixteenths, 0, int(options.min_area * alike.size), 16)
     return _Matched(inverse, step, sixteenths > 0)
@@ -169,7 +177,7 @@ def _cost(own: _Picture, others: list[_Picture], plane: np.ndarray, options: Pla
     What one view hides others may show. 1 where there is nothing to compare with.
     """
     rays, size = np.linalg.inv(own.camera.K), own.grey.shape[::-1]
-    inside, found = _mean(own.tissue, options) > 0.95, []
+    found = []
     for other in others:
         motion = (other.camera.viewmat @ own.camera.pose)[:3]
         homography = np.linalg.inv(_CENTRED) @ other.camera.K @ (motion[:, :3] @ rays + np.outer(motion[:, 3], plane)) @ _CENTRED
@@ -177,7 +185,7 @@ def _cost(own: _Picture, others: list[_Picture], plane: np.ndarray, options: Pla
         grey = seen(other.grey)
         mean, variance = _moments(grey, options)
         correlation = (_mean(own.grey * grey, options) - own.mean * mean) / np.sqrt(own.variance * variance)
-        comparable = inside & (_mean(seen(other.tissue), options) > 0.95)
+        comparable = own.inside & _whole(seen(other.tissue), options)
         found.append(np.where(comparable, np.minimum(1 - correlation, 1), 1))
     return np.sort(np.stack(found), 0)[: (len(found) + 1) // 2].mean(0)
 
@@ -200,5 +208,5 @@ def _confirmed(camera: Camera, own: _Matched, others: list[tuple[Camera, _Matche
     for other_camera, other in others:
         found = pixels_of(other_camera, points)
         apart = np.abs(other.inverse[found.rows, found.columns] - 1 / found.depth)
-        count[found.index[apart < options.tolerance * max(own.step, other.step)]] += 1
+        count[found.index[apart < options.same_surface * max(own.step, other.step)]] += 1
     return count.reshape(own.inverse.shape)

@@ -135,6 +135,9 @@ class ReconstructionConfig(StageConfig):
     """Relative depth difference at which two views contradict each other."""
     dynamic_mask: bool = True
     """Leave out of a view what contradicts two others: an instrument that is there in it alone, for instance."""
+    dropout: Annotated[float, Range(0, 0.9)] = 0.1
+    """Share of the Gaussians that an iteration leaves out at random, the others being denser for it, as in DropGaussian (Park et al. 2025),
+    so that they do not memorise few views together. It rises with the iterations from 0 on, and is 0 again after refine_until."""
     lambda_ssim: Annotated[float, Range(0, 1)] = 0.2
     """Share of 1 − SSIM in the photometric loss; the rest is L1."""
     lambda_depth: Annotated[float, Range(0, 1000)] = 1.0

@@ -212,6 +212,9 @@ class Trainer:
         if due and len(self.stamps) > 1:
             virtual = self._virtual_camera(view.index)
         self.optimizer.set_rate("means", self._step_size)
+        if self._kept is not None:
+            share = self._dropout
+            self._kept.uniform_(generator=self._noise).ge_(share).div_(1 - share)
         self._last_loss = self._descend(terms, self._inputs(view, virtual, terms))
         self.iteration += 1
         with torch.no_grad():
@@ -227,6 +230,12 @@ class Trainer:
         config, rates = self.config, self.config.rates
         progress = min(self.iteration / self._schedule, 1.0)
         return rates.means * self._unit * config.learning_rate * rates.means_decay**progress
+
+    @property
+    def _dropout(self) -> float:
+        """Share of the Gaussians that an iteration leaves out: the longer views are trained on, the more they are memorised."""
+        progress = self.iteration / self._schedule
+        return self.config.dropout * progress if progress < self.config.refine_until else 0.0
 
     @property
     def _sh_count(self) -> int:
@@ -270,7 +279,7 @@ class Trainer:
         masks = None
         if view.mask is not None:
             masks = torch.stack([view.mask > 0, *[torch.ones_like(view.mask, dtype=torch.bool)] * (cameras - 1)])
-        loss = self._loss(terms, view, *self.render(view.viewmats, view.Ks, (width, height), masks, absgrad))
+        loss = self._loss(terms, view, *self.render(view.viewmats, view.Ks, (width, height), masks, absgrad, self._kept))
         gradients = dict(zip(wanted, torch.autograd.grad(loss, list(wanted.values()))))
         if absgrad is not None:
             across, down = gradients["absgrad"][0].unbind(1)
@@ -284,11 +293,18 @@ class Trainer:
         return loss.detach()
 
     def render(
-        self, viewmats: Tensor, Ks: Tensor, size: tuple[int, int], masks: Tensor | None = None, absgrad: Tensor | None = None
+        self,
+        viewmats: Tensor,
+        Ks: Tensor,
+        size: tuple[int, int],
+        masks: Tensor | None = None,
+        absgrad: Tensor | None = None,
+        kept: Tensor | None = None,
     ) -> tuple[GaussianModel, RenderOutput]:
-        """The model, and its images of cameras, width × height pixels."""
+        """The model, and its images of cameras, width × height pixels; ``kept`` are factors on its opacities."""
         model = model_of(self.parameters)
-        tensors = model.means, model.quats, model.scales, model.opacities, model.sh[:, : self._sh_count]
+        opacities = model.opacities if kept is None else model.opacities * kept
+        tensors = model.means, model.quats, model.scales, opacities, model.sh[:, : self._sh_count]
         return model, rasterize(*tensors, viewmats, Ks, *size, masks=masks, absgrad=absgrad, signed=self._strategy.signed)
 
     def _loss(self, terms: tuple[losses.Term, ...], view: _Inputs, model: GaussianModel, output: RenderOutput) -> Tensor:
@@ -315,6 +331,8 @@ class Trainer:
         self.parameters = {name: tensor.clone().requires_grad_() for name, tensor in parameters_of(model).items()}
         self.optimizer = Adam(self.parameters, {name: self.config.learning_rate * getattr(self.config.rates, name) for name in PARAMETERS})
         self._strategy_state = self._strategy.initialize_state(len(model), self.device)
+        # Of each Gaussian, 0 where an iteration leaves it out, else what makes up for those; a captured step reads what it is by then.
+        self._kept = torch.ones(len(model), device=self.device) if self.config.dropout else None
         self._seen = self._seen_by_views(model.means) if self.config.lambda_opacity or self.config.lambda_scale else 1.0
 
     @torch.no_grad()

@@ -72,6 +72,18 @@ def test_virtual_camera_lies_between_two_views(small, monkeypatch):
 
 
 @pytest.mark.slow
+def test_dropout_rises_with_the_iterations_and_ends_before_the_last_ones(small, monkeypatch):
+    trainer = trainer_of([small[0], small[4]], options(iterations=10, refine_until=0.8, dropout=0.5))
+    factors, render = [], trainer.render
+    monkeypatch.setattr(trainer, "render", lambda *given: factors.append(given[-1].clone()) or render(*given))
+    while trainer.iteration < trainer.iterations:
+        trainer.step()
+    shares = np.array([0.05 * iteration if iteration < 8 else 0 for iteration in range(10)])
+    np.testing.assert_allclose([float((kept == 0).float().mean()) for kept in factors], shares, atol=0.04)
+    np.testing.assert_allclose([float(kept.max()) for kept in factors], 1 / (1 - shares), rtol=1e-6)
+
+
+@pytest.mark.slow
 def test_training_improves_views_it_has_not_seen(small):
     training, rest = [small[i] for i in (0, 2, 4, 6)], [small[i] for i in (1, 3, 5)]
     noisy = [dataclasses.replace(f, depth=f.depth * np.float32(1.03 if i % 2 else 0.97)) for i, f in enumerate(training)]

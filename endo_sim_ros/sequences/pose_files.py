@@ -10,7 +10,10 @@ from endo_sim_ros.core.frames import SequenceError
 
 
 def read_poses(path: Path) -> dict[int, np.ndarray]:
-    """Camera-to-world poses [4, 4] by frame number, from lines `frame tx ty tz qx qy qz qw`; # begins a comment."""
+    """Camera-to-world poses [4, 4] by frame number, from lines `frame tx ty tz qx qy qz qw`; # begins a comment.
+
+    One that is not finite, or whose quaternion is no unit, is NaN: `keep_posed` refuses it where its frame is asked for.
+    """
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
@@ -32,19 +35,16 @@ def read_poses(path: Path) -> dict[int, np.ndarray]:
     positions, quats = table[:, 1:4], table[:, [7, 4, 5, 6]]
     with np.errstate(invalid="ignore"):
         whole = (table[:, 0] >= 0) & (table[:, 0] < 2**53) & (table[:, 0] % 1 == 0)
-        good = whole & np.isfinite(table).all(1) & (np.abs(np.linalg.norm(quats, axis=1) - 1) <= 0.05)
-    if not good.all():
-        count = line_of(np.argmin(good))
-        raise SequenceError(
-            f"{path}: line {count} is not a pose; expected a whole frame number, a finite position and a unit "
-            f"quaternion, got {text.splitlines()[count - 1].strip()!r}"
-        )
+        good = np.isfinite(table).all(1) & (np.abs(np.linalg.norm(quats, axis=1) - 1) <= 0.05)
+    if not whole.all():
+        row = int(np.argmin(whole))
+        raise SequenceError(f"{path}: line {line_of(row)} is not a pose; expected a whole frame number first, got {table[row, 0]:.10g}")
     numbers, first = np.unique(table[:, 0], return_index=True)
     if len(numbers) < len(table):
         row = int(np.setdiff1d(np.arange(len(table)), first)[0])
         raise SequenceError(f"{path}: line {line_of(row)} repeats frame {int(table[row, 0])}; keep one pose per frame")
     poses = np.tile(np.eye(4), (len(table), 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = quat_to_matrix(quats), positions
+    poses[:, :3, :3], poses[:, :3, 3] = quat_to_matrix(np.where(good[:, None], quats, np.nan)), positions
     return dict(zip(table[:, 0].astype(int).tolist(), poses))
 
 

@@ -74,6 +74,15 @@ def test_wrong_video_options_are_explained(video, options, message):
         open_sequence(video, **options)
 
 
+@pytest.mark.parametrize("line", ["6 0 0 nan 0 0 0 1", "6 0 0 0 0 0 0 0"])
+def test_a_pose_that_is_none_matters_only_where_its_frame_is_asked_for(video, line):
+    lines = (video / "poses.txt").read_text().splitlines()
+    (video / "poses.txt").write_text("\n".join([*lines[:-1], line]))
+    assert len(list(read_video(video, stop=6, **INTRINSICS))) == 2
+    with pytest.raises(SequenceError, match="poses.txt: number 6 is not a pose; expected a finite position and a rotation"):
+        read_video(video, **INTRINSICS)
+
+
 def test_video_that_ends_early_is_reported(video, caplog):
     source = Video(video / "endo.mp4")
     assert [number for number, _ in source.frames([6, 7, 8, 9])] == [6, 7]

@@ -98,6 +98,8 @@ def read_stereomis(
         raise SequenceError(f"{root}: first_mask must be 0 or more, got {first_mask}")
     known_estimator(poses, root)  # what is wrong is told before the images are looked at
     estimated = poses is not None or not (root / POSES_FILE).is_file()
+    if estimated and pose_lag is not None:
+        logger.warning("%s: pose_lag has no effect while poses are estimated; it is that of the poses in %s", root, POSES_FILE)
     calibration = read_stereo_ini(root / CALIBRATION_FILE)
     images, is_rectified = _open_images(root, calibration, frames_rectified)
     rectification = Rectification.stereo(calibration.resized(*images.size))

@@ -253,6 +253,14 @@ def test_memory_does_not_grow_with_the_sequence(tmp_path):
     assert peak() < short + 40e6  # ten times as many whole frames would be 100 MB; the images that are looked at are bounded
 
 
+def test_a_lag_of_poses_that_are_estimated_is_told(plane, caplog):
+    read_stereomis(plane, poses="sfm", pose_lag=100)
+    assert "pose_lag has no effect while poses are estimated" in caplog.text
+    caplog.clear()
+    read_stereomis(plane, poses="sfm")
+    assert "pose_lag" not in caplog.text
+
+
 @pytest.mark.parametrize("lag", [None, 4])
 def test_a_pose_that_is_none_matters_only_where_its_frame_is_asked_for(plane, lag):
     lines = (plane / "groundtruth.txt").read_text().splitlines()

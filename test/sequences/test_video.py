@@ -66,6 +66,8 @@ def test_video_mask_for_all_frames_and_per_frame(video, caplog):
         ({"fx": 150.0, "fps": np.inf}, "fps must be positive, got inf"),
         ({"fx": 150.0, "scale": -1.0}, "scale must be positive, got -1"),
         ({"fx": True}, "fx must be a number, got True"),
+        ({"fx": 150.0, "threads": 0}, "threads must be -1 for all cores, or 1 or more, got 0"),
+        ({"fx": 150.0, "threads": -2}, "threads must be -1 for all cores, or 1 or more, got -2"),
         ({"fx": 150.0, "mask_border": 1}, "mask_border must be true or false, got 1"),
     ],
 )

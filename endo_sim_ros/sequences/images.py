@@ -1,12 +1,6 @@
 """Image files: colour, grey and depth images, and folders of numbered files."""
 
-import contextlib
-import logging
-import os
 import re
-import tempfile
-import threading
-from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -14,10 +8,7 @@ import numpy as np
 
 from endo_sim_ros.core.frames import SequenceError
 
-logger = logging.getLogger(__name__)
-
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-_one_at_a_time = threading.Lock()  # there is one error stream
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -59,32 +50,10 @@ def clean_depth(depth: np.ndarray) -> np.ndarray:
 def _decode(path: Path, flags: int) -> np.ndarray:
     if not path.is_file():
         raise SequenceError(f"{path}: file is missing")
-    with complaints_of_libraries() as complaints:
-        image = cv2.imread(str(path), flags)
+    image = cv2.imread(str(path), flags)
     if image is None:
         raise SequenceError(f"{path}: not a readable image; the file is damaged, copy it again")
-    if complaints:
-        logger.warning("%s: part of the image is damaged; copy it again", path)
     return image
-
-
-@contextlib.contextmanager
-def complaints_of_libraries() -> Iterator[list[str]]:
-    """What the libraries beneath OpenCV write to the error stream meanwhile, but for warnings; the lines are there after the block.
-
-    They have no other way to tell that a file is damaged, and name no file.
-    """
-    complaints: list[str] = []
-    with _one_at_a_time, tempfile.TemporaryFile() as file:
-        stream = os.dup(2)
-        os.dup2(file.fileno(), 2)
-        try:
-            yield complaints
-        finally:
-            os.dup2(stream, 2)
-            os.close(stream)
-            file.seek(0)
-            complaints += [line for line in file.read().decode(errors="replace").splitlines() if "warn" not in line.lower()]
 
 
 def numbered_files(folder: Path, ending: str = "") -> dict[int, Path]:

@@ -2,6 +2,7 @@
 
 import logging
 import math
+import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -9,9 +10,9 @@ import cv2
 import numpy as np
 
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.sequences.images import complaints_of_libraries
 from endo_sim_ros.sequences.recording import DEFAULT_FPS
 
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # its lines name no file; errors here do. Set it to 48 to see them
 logger = logging.getLogger(__name__)
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg")
@@ -31,7 +32,6 @@ class Video:
 
     def __init__(self, path: Path):
         self.path = path
-        self._damage_told = False
         if not path.is_file():
             raise SequenceError(f"{path}: file is missing")
         capture = self._open()
@@ -45,10 +45,7 @@ class Video:
             raise SequenceError(f"{path}: holds no video frames; the file is damaged, copy it again")
 
     def _open(self) -> cv2.VideoCapture:
-        with complaints_of_libraries():  # the sentence below says it
-            capture = cv2.VideoCapture(str(self.path), cv2.CAP_ANY, [cv2.CAP_PROP_N_THREADS, 1])  # others complain at any time
-            if not capture.isOpened():  # where OpenCV has no FFmpeg
-                capture.open(str(self.path))
+        capture = cv2.VideoCapture(str(self.path))
         if not capture.isOpened():
             raise SequenceError(f"{self.path}: not a readable video; the file is damaged or its codec is unknown")
         return capture
@@ -56,20 +53,11 @@ class Video:
     def frames(self, numbers: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
         """RGB images [H, W, 3] of the given frame numbers, which must increase."""
         capture, position = self._open(), 0
-        damaged: list[int] = []
-
-        def next_frame() -> bool:
-            with complaints_of_libraries() as complaints:
-                there = capture.grab()
-            if there and complaints:
-                damaged.append(position)
-            return there
-
         try:
             for done, number in enumerate(numbers):
-                while position < number and next_frame():
+                while position < number and capture.grab():
                     position += 1
-                ok, image = capture.retrieve() if position == number and next_frame() else (False, None)
+                ok, image = capture.read() if position == number else (False, None)
                 if not ok or image is None:
                     if not done:
                         raise SequenceError(f"{self.path}: frame {number} cannot be decoded; the video is damaged")
@@ -82,12 +70,6 @@ class Video:
                 yield number, cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
         finally:
             capture.release()
-            if damaged and not self._damage_told:
-                self._damage_told = True
-                logger.warning(
-                    "%s: the video is damaged at %d of the first %d frames, first at frame %d; copy it again, or leave that part out",
-                    self.path, len(damaged), position, damaged[0],
-                )  # fmt: skip
 
 
 def split_stacked(image: np.ndarray, source: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,7 @@ from plane_scene import pose_of, write_poses
 from endo_sim_ros.core.cameras import matrix_to_quat, quat_to_matrix
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.sequences import pose_files
-from endo_sim_ros.sequences.images import numbered_files, read_image
+from endo_sim_ros.sequences.images import numbered_files
 from endo_sim_ros.sequences.masks import lit_area, lit_now, tool_is_white
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.readers import READERS, open_sequence
@@ -115,18 +115,3 @@ def test_unknown_layouts_are_listed(tmp_path):
         open_sequence(tmp_path, kind="nerf")
     with pytest.raises(SequenceError, match="no such file or folder"):
         open_sequence(tmp_path / "absent")
-
-
-@pytest.mark.parametrize("ending", ["png", "jpg", "tif", "bmp"])
-def test_half_an_image_is_told_in_a_sentence_and_not_by_a_library(ending, tmp_path, caplog, capfd):
-    path = tmp_path / f"1.{ending}"
-    cv2.imwrite(str(path), np.random.default_rng(0).integers(255, size=(40, 60, 3), dtype=np.uint8))
-    whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) // 2])
-    if ending == "jpg":
-        assert read_image(path).shape == (40, 60, 3)
-        assert f"{path}: part of the image is damaged; copy it again" in caplog.text
-    else:
-        with pytest.raises(SequenceError, match="not a readable image"):
-            read_image(path)
-    assert not capfd.readouterr().err

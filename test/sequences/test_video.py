@@ -1,7 +1,5 @@
 """The reader of videos."""
 
-import re
-
 import numpy as np
 import pytest
 from plane_scene import BARREL, HEIGHT, K_LEFT, WIDTH, assert_frame_agrees, see_plane, trajectory, write_poses, write_rgb, write_video
@@ -93,20 +91,8 @@ def test_video_that_ends_early_is_reported(video, caplog):
         list(source.frames([50]))
 
 
-@pytest.mark.parametrize(
-    "damaged, sentence",
-    [
-        (lambda data: data, None),
-        (lambda data: data[:1500] + bytes(20) + data[1520:], r"the video is damaged at \d of the first 8 frames, first at frame \d"),
-        (lambda data: bytes(40), "endo.mp4: not a readable video"),
-    ],
-)
-def test_damage_is_told_in_a_sentence_and_not_by_the_decoder(video, damaged, sentence, caplog, capfd):
-    (video / "endo.mp4").write_bytes(damaged((video / "endo.mp4").read_bytes()))
-    try:
-        opened = Video(video / "endo.mp4")
-        assert len(list(opened.frames(range(8)))) == len(list(opened.frames(range(8)))) == 8
-    except SequenceError as error:
-        caplog.handler.stream.write(str(error))
-    assert re.fullmatch(rf"(.*{sentence}.*\s*)", caplog.text) if sentence else not caplog.text  # once
+def test_what_is_no_video_is_told_in_a_sentence_and_not_by_the_decoder(video, capfd):
+    (video / "endo.mp4").write_bytes(bytes(40))
+    with pytest.raises(SequenceError, match="endo.mp4: not a readable video"):
+        Video(video / "endo.mp4")
     assert not capfd.readouterr().err

@@ -20,9 +20,11 @@ class Command:
 
     def run(self) -> None:
         """Run the evaluation; raises RuntimeError at the end if a cell failed."""
+        from endo_sim_ros.core.folders import leaving_none_empty
         from endo_sim_ros.evaluation.evaluate import evaluate
 
-        cells = evaluate(self.sequences, self.config)["cells"]
+        with leaving_none_empty(*(self.config.out / name for name in ("cells", "pictures", "strips", "plots"))):
+            cells = evaluate(self.sequences, self.config)["cells"]
         print(f"{self.config.out}: table.md, table.csv, results.json, views.csv, strips/, plots/")
         failed = sum(cell["error"] is not None for cell in cells)
         if failed:

@@ -29,11 +29,13 @@ class Command:
 
     def run(self) -> None:
         """Write model, cameras, checkpoint and picture; raises SequenceError if bag or checkpoint cannot be used."""
+        from endo_sim_ros.core.folders import leaving_none_empty
         from endo_sim_ros.evaluation.held_out import measure_held_out
         from endo_sim_ros.reconstruction.from_bag import reconstruct_bag
 
-        trainer, held_out = reconstruct_bag(self.bag, self.out, self.config, self.resume)
-        measure_held_out(trainer, held_out, self.out)
+        with leaving_none_empty(self.out):
+            trainer, held_out = reconstruct_bag(self.bag, self.out, self.config, self.resume)
+            measure_held_out(trainer, held_out, self.out)
 
 
 def defaults(words: Sequence[str]) -> Command:

@@ -33,6 +33,7 @@ class Command:
 
     def run(self) -> None:
         """Train and save; raises ConfigError if options of the other algorithm are given."""
+        from endo_sim_ros.core.folders import leaving_none_empty
         from endo_sim_ros.learning.scenes import load_scene
         from endo_sim_ros.learning.train import save_training, train
 
@@ -43,8 +44,9 @@ class Command:
             config, unused, learn = self.ppo, self.config, partial(train_ppo, config=self.ppo)
         if unused != type(unused)():
             raise ConfigError(f"options that begin with --ppo. are for ppo, the others for cem; --algorithm is {self.algorithm}")
-        self.out.mkdir(parents=True, exist_ok=True)  # before the long work
-        policy, curve = learn(self.task, load_scene(self.model), randomisation=self.vary, device=self.device)
-        save_training(self.out, policy, curve, config)
+        with leaving_none_empty(self.out):
+            self.out.mkdir(parents=True, exist_ok=True)  # before the long work
+            policy, curve = learn(self.task, load_scene(self.model), randomisation=self.vary, device=self.device)
+            save_training(self.out, policy, curve, config)
         last = curve[-1]
         print(f"{self.out}: {last['test_success']:.0%} of test episodes solved after {last['episodes']} episodes")

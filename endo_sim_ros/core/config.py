@@ -106,7 +106,8 @@ def unused_options(*configs: "StageConfig") -> list[str]:
     """A sentence for each option that is not at its default, yet has no effect in any of these configurations of one class."""
     values, found = [option_values(config) for config in configs], []
     for option in options(type(configs[0])):
-        switch, *wanted = configs[0].needs.get(option.name.partition(".")[0], ("",))
+        needs = configs[0].needs
+        switch, *wanted = needs.get(option.name) or needs.get(option.name.partition(".")[0], ("",))
         if switch and any(each[option.name] != option.default for each in values):
             now = [each[switch] for each in values]
             # A number or a switch has to be on, unless 0 is what is wanted.
@@ -187,8 +188,8 @@ class StageConfig:
     """Options that had another name: the old name, and the new one, or what to write instead in words."""
 
     needs: ClassVar[dict[str, tuple[str, ...]]] = {}
-    """Options and nested stages that have an effect only beside some value of another: the name of that, then its values in words. Of
-    an option that is no word any value counts but zero and false."""
+    """Options, also dotted ones, and nested stages that have an effect only beside some value of another: the name of that, then its
+    values in words. Of an option that is no word any value counts but zero and false."""
 
     def __post_init__(self):
         for option in options(type(self)):

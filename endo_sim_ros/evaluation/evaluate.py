@@ -78,17 +78,16 @@ def _run(cells: list[Cell], config: EvaluationConfig) -> Iterator[tuple[Cell, Fi
     with_ray = config.pool == "ray" or config.pool == "auto" and ray_is_installed()
     bar = Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with bar, tempfile.TemporaryDirectory(prefix="endo_sim_") as folder:
-        task = bar.add_task("cells", total=len(cells))
+        task, failed = bar.add_task("cells", total=len(cells)), 0
         for sequence in dict.fromkeys(cell.sequence for cell in cells):
             ours = [cell for cell in cells if cell.sequence == sequence]
             files = Path(tempfile.mkdtemp(dir=folder))
             try:
                 prepared = prepare_sequence(ours, bar, files)
             except (ValueError, OSError, RuntimeError) as error:
-                log.warning("%s failed: %s", sequence, error)
-                for index, cell in enumerate(ours):
-                    bar.advance(task)
-                    yield cell, Finished(index, error=str(error))
+                failed += len(ours)
+                bar.update(task, advance=len(ours), description=f"cells, {failed} failed")  # why is told below the table
+                yield from ((cell, Finished(index, error=str(error))) for index, cell in enumerate(ours))
                 continue
             if with_ray:
                 import ray  # pyright: ignore[reportMissingImports]  (optional)
@@ -115,8 +114,7 @@ def _run(cells: list[Cell], config: EvaluationConfig) -> Iterator[tuple[Cell, Fi
                     continue
                 if event.index in running:
                     bar.remove_task(running.pop(event.index))
-                bar.advance(task)
-                if event.error:
-                    log.warning("%s, %s, %s, seed %d failed: %s", *cell[:4], event.error)
+                failed += event.error is not None
+                bar.update(task, advance=1, description=f"cells, {failed} failed" if failed else "cells")
                 yield cell, event
             shutil.rmtree(files)

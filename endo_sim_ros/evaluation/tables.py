@@ -149,10 +149,26 @@ def write(results: dict[str, Any], out: Path, json_file: Path | None) -> None:
     if json_file is not None:
         write_rows(machine_rows(summaries), json_file)
     Console(width=None if sys.stdout.isatty() else 150).print(_terminal_table(summaries, results["missing"]))
+    for sentence in failures(results):
+        print(sentence)
+
+
+def failures(results: dict[str, Any]) -> list[str]:
+    """Why cells failed: a sentence for each reason in a sequence, which names what the cells with that reason alone share."""
+    parts = lambda cell: (cell["split"], cell["method"], f"seed {cell['seed']}")
+    all_parts = [set(each) for each in zip(*(parts(record["cell"]) for record in results["cells"]))]
+    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for record in results["cells"]:
         if record["error"] is not None:
             reason = next(iter(record["error"].splitlines()), "without a reason")
-            print("{sequence}, {split}, {method}, seed {seed} failed: ".format(**record["cell"]) + reason)
+            groups.setdefault((record["cell"]["sequence"], reason), []).append(record["cell"])
+    sentences = []
+    for (sequence, reason), cells in groups.items():
+        several = len(cells) > 1
+        theirs = [set(each) for each in zip(*map(parts, cells))]
+        shared = [min(names) for names, every in zip(theirs, all_parts) if len(names) == 1 and (names != every or not several)]
+        sentences.append(f"{', '.join([sequence, *shared])}{f': {len(cells)} cells' * several} failed: {reason}")
+    return sentences
 
 
 def markdown(results: dict[str, Any], summaries: list[Summary]) -> str:

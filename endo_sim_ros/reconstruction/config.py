@@ -236,6 +236,8 @@ class ReconstructionConfig(StageConfig):
         "multi_view": ("multi_view_refinement", "true"),
         "motion": ("dynamic_mask", "true"),
         "extrapolated": ("extrapolation", "more than 0"),
+        **{f"training.{name}": ("iterations", "0") for name in ("iterations_per_view", "min_iterations", "max_iterations")},
+        **{f"training.{name}": ("max_gaussians", "0") for name in ("pixels_per_gaussian", "min_gaussians", "max_gaussians")},
         "mcmc": ("densification", "mcmc"),
         "gradient": ("densification", "gradient"),
         "proximity": ("densification", "proximity"),

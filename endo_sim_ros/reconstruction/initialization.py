@@ -7,13 +7,18 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (it is public)
+from scipy.spatial.distance import pdist
 
+from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.reconstruction.keyframes import USUAL_DEPTH
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import TrainingView, fill_holes, pixels_of
 from endo_sim_ros.reconstruction.stage_configs import InitialModelConfig
 from endo_sim_ros.reconstruction.surfaces import Surfaces
+
+_TOO_NEAR = 0.002  # metres; a guess below it says that the camera has hardly moved
 
 
 class _Points(NamedTuple):
@@ -79,6 +84,18 @@ def rough_depth(views: Sequence[TrainingView], points: np.ndarray) -> float:
     """Median depth (m) of the scene points [N, 3] in the views; NaN if fewer than three are in any, which may be stray."""
     depths = [pixels_of(view.camera, points).depth for view in views]
     return float(np.median(np.concatenate(depths))) if max(map(len, depths)) >= 3 else math.nan
+
+
+def guessed_depth(cameras: Sequence[Camera], shift: float) -> float:
+    """A depth (m) where nothing tells one: there the picture moves by so many of its widths between two cameras, in the median.
+
+    It has the unit of the poses, whatever that is. Of cameras in one place it is `USUAL_DEPTH`, at which they see the same as at any.
+    """
+    distances = pdist([camera.position for camera in cameras])
+    apart = distances[distances > 0]
+    focal = np.median([camera.K[0, 0] / camera.width for camera in cameras])
+    depth = float(np.median(apart) * focal / shift) if len(apart) else 0.0
+    return depth if depth > _TOO_NEAR else USUAL_DEPTH
 
 
 def _stride(chosen: list[np.ndarray], limit: int) -> float:

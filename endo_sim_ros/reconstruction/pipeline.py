@@ -18,7 +18,7 @@ from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.reconstruction import photometry
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.dynamic_mask import mask_motion
-from endo_sim_ros.reconstruction.initialization import initial_model, rough_depth
+from endo_sim_ros.reconstruction.initialization import guessed_depth, initial_model, rough_depth
 from endo_sim_ros.reconstruction.pose_check import misposed
 from endo_sim_ros.reconstruction.priors.extrapolation import extrapolate
 from endo_sim_ros.reconstruction.priors.multi_view import refine_depth
@@ -50,8 +50,7 @@ def prepare(
             raising `Cancelled`.
 
     Raises:
-        SequenceError: If there are no views, all pixels are masked or white, the views give no scene points to start from, or
-            those given are not finite.
+        SequenceError: If there are no views, all pixels are masked or white, or scene points that are given are not finite.
         Cancelled: If the callback raised it.
     """
     scene = PreparedScene(tuple(frames))
@@ -230,20 +229,17 @@ def size_training(scene: PreparedScene, config: ReconstructionConfig, progress: 
 
 
 def place_gaussians(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
-    """Set `model` to the Gaussians that training starts from, `depth` to their median depth in the views, and `exposures` to zeros.
-
-    Raises:
-        SequenceError: If neither depth nor scene points give the scene a shape.
-    """
+    """Set `model` to the Gaussians that training starts from, `depth` to their median depth in the views, and `exposures` to zeros."""
     most = max(int(config.initial.seen_share * scene.max_gaussians) if config.extrapolation else scene.max_gaussians, 1)
     views, points = list(scene.views), scene.points
-    if config.initialization == "points":
+    fewest = config.matching.min_points
+    if len(points.positions) >= fewest and (config.initialization == "points" or scene.depth_source == "none"):
         views = [replace(view, depth_prior=None) for view in views]
-    elif scene.depth_source != "none" and not any((view.surface > 0).any() for view in views):
-        depth = rough_depth(views, points.positions)
-        if np.isfinite(depth):
-            scene = scene.decided(f"no view sees enough scene points for a depth prior: training starts from a plane {depth:.3g} m away")
-            views = [replace(view, depth_prior=np.full(view.image.shape[:2], depth, np.float32)) for view in views]
+    elif sum(int((view.surface > 0).sum()) for view in views) < fewest:  # pixels
+        scene, depth = _plane_depth(scene, config)
+        views = [replace(view, depth_prior=np.full(view.image.shape[:2], depth, np.float32)) for view in views]
+    elif config.initialization == "points":
+        scene = scene.decided(f"only {len(points.positions)} scene points could be found: training starts from the depth of the views")
     model = initial_model(
         views,
         points.positions,
@@ -352,6 +348,19 @@ def _depth_shares(view: TrainingView, swept: TrainingView) -> tuple[int, int, in
     """Pixels of tissue, those with depth before and after a sweep, and those with another depth than before."""
     known = swept.surface > 0
     return (view.tissue > 0).sum(), (view.surface > 0).sum(), known.sum(), (known & (swept.surface != view.surface)).sum()
+
+
+def _plane_depth(scene: PreparedScene, config: ReconstructionConfig) -> tuple[PreparedScene, float]:
+    """The scene, and the depth (m) of the plane that training starts from where there is next to no depth and few scene points."""
+    depth = rough_depth(scene.views, scene.points.positions)
+    if np.isfinite(depth):
+        return scene.decided(f"no view sees enough scene points for a depth prior: training starts from a plane {depth:.3g} m away"), depth
+    depth = guessed_depth([view.camera for view in scene.views], config.initial.guessed_shift)
+    sentence = (
+        f"NO DEPTH IS KNOWN, neither measured nor of points that views share: training starts from a plane {depth:.3g} m away, which is a "
+        "guess; give depth or a right image, views that overlap from different positions, or check the poses"
+    )
+    return scene.decided(sentence), depth
 
 
 def _stamps(frames: Sequence[Frame]) -> str:

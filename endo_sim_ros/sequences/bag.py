@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from endo_sim_ros import messages
+from endo_sim_ros.core.folders import leaving_none_empty
 from endo_sim_ros.core.frames import LEFT_FRAME, RIGHT_FRAME, WORLD_FRAME, Frame, SequenceError
 from endo_sim_ros.messages import Topic, bag_types
 from endo_sim_ros.sequences.bag_reader import BagReader, RawMessage
@@ -34,16 +35,17 @@ def write_bag(path: str | Path, frames: Iterable[Frame], points: tuple[np.ndarra
         SequenceError: If the path exists or there are no frames.
     """
     bag = BagWriter(path)
-    try:
-        with bag:
-            count = _write_frames(bag, frames)
-        if not count:
-            raise SequenceError(f"{path}: the sequence has no frames; check its frame range and poses")
-        if points is not None:
-            write_points(path, *points)
-    except BaseException:  # it would only be in the way of the next attempt
-        shutil.rmtree(path, ignore_errors=True)
-        raise
+    with leaving_none_empty(bag.path.parent):
+        try:
+            with bag:
+                count = _write_frames(bag, frames)
+            if not count:
+                raise SequenceError(f"{path}: the sequence has no frames; check its frame range and poses")
+            if points is not None:
+                write_points(path, *points)
+        except BaseException:  # it would only be in the way of the next attempt
+            shutil.rmtree(path, ignore_errors=True)
+            raise
     return count
 
 

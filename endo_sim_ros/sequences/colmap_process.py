@@ -60,7 +60,7 @@ def run(job: ColmapJob, report: Callable[[str, int, int], None]) -> int:
     import cv2  # noqa: F401  (before pycolmap, see structure_from_motion.py)
     import pycolmap
 
-    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value  # COLMAP's own progress
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value  # what comes out at the end tells if it failed
     pycolmap.set_random_seed(_SEED)
     root = Path(job.folder)
     _match(pycolmap, job, root, report)
@@ -105,8 +105,7 @@ def _global_models(pycolmap: Any, job: ColmapJob, root: Path) -> list[Any]:
     (root / "global").mkdir()
     try:
         return list(pycolmap.global_mapping(root / DATABASE, root, root / "global", options).values())
-    except RuntimeError as error:  # its checks of what it was given; incremental mapping is more patient
-        print(f"global mapping failed: {error}", file=sys.stderr)
+    except RuntimeError:  # its checks of what it was given; incremental mapping is more patient
         return []
 
 

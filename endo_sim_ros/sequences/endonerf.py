@@ -17,7 +17,16 @@ from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.images import check_size, image_size, numbered_files, read_depth, read_image
 from endo_sim_ros.sequences.masks import MaskFiles
 from endo_sim_ros.sequences.pose_files import rigid
-from endo_sim_ros.sequences.recording import DEFAULT_FPS, Recording, check_folder, check_positive, select, stamp_ns, tell_lacking
+from endo_sim_ros.sequences.recording import (
+    DEFAULT_FPS,
+    Recording,
+    check_folder,
+    check_positive,
+    keep_posed,
+    select,
+    stamp_ns,
+    tell_lacking,
+)
 
 POSES_FILE = "poses_bounds.npy"
 
@@ -62,6 +71,7 @@ def read_endonerf(
         )
     rows = dict(zip(sorted(images), table, strict=True))
     numbers = select(images, root, start, stop, step)
+    keep_posed(numbers, rows, root / POSES_FILE)
     depths, mask_files = numbered_files(root / "depth"), numbered_files(root / "masks")
     for name, files in (("depth", depths), ("masks", mask_files)):
         tell_lacking(numbers, files, root / name)
@@ -94,8 +104,8 @@ def _read_table(path: Path) -> np.ndarray:
         table = np.load(path, allow_pickle=False, mmap_mode="r")  # a false header must not take memory
     except (ValueError, OSError, EOFError) as error:
         raise SequenceError(f"{path}: not a readable NumPy array ({error})") from None
-    if table.ndim != 2 or table.shape[1] != 17 or not np.isfinite(table).all():
-        raise SequenceError(f"{path}: expected finite numbers of shape [frames, 17], got shape {list(table.shape)}")
+    if table.ndim != 2 or table.shape[1] != 17:
+        raise SequenceError(f"{path}: expected numbers of shape [frames, 17], got shape {list(table.shape)}")
     return table.astype(np.float64)
 
 

@@ -5,43 +5,71 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from endo_sim_ros.core.cameras import make_pose
+from endo_sim_ros.core.cameras import quat_to_matrix
 from endo_sim_ros.core.frames import SequenceError
 
 
 def read_poses(path: Path) -> dict[int, np.ndarray]:
-    """Camera-to-world poses [4, 4] by frame number, from lines `frame tx ty tz qx qy qz qw`; # begins a comment."""
+    """Camera-to-world poses [4, 4] by frame number, from lines `frame tx ty tz qx qy qz qw`; # begins a comment.
+
+    One that is not finite, or whose quaternion is no unit, is NaN: `keep_posed` refuses it where its frame is asked for.
+    """
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise SequenceError(f"{path}: file is missing") from None
     except (OSError, UnicodeDecodeError) as error:
         raise SequenceError(f"{path}: not a readable text file ({error})") from None
-    poses: dict[int, np.ndarray] = {}
-    for count, raw_line in enumerate(text.splitlines(), 1):
-        line = raw_line.split("#")[0].replace(",", " ")
-        if not line.strip():
-            continue
-        try:
-            values = np.array([float(word) for word in line.split()])
-        except ValueError:
-            if not poses and count == 1:
-                continue  # a heading
-            raise SequenceError(f"{path}: line {count} is not made of numbers: {raw_line.strip()!r}") from None
-        if len(values) != 8:
-            raise SequenceError(f"{path}: line {count} has {len(values)} numbers, expected 8: frame tx ty tz qx qy qz qw")
-        number, position, quat = int(values[0]) if np.isfinite(values[0]) else -1, values[1:4], values[[7, 4, 5, 6]]
-        if not np.isfinite(values).all() or abs(np.linalg.norm(quat) - 1) > 0.05 or number != values[0] or number < 0:
-            raise SequenceError(
-                f"{path}: line {count} is not a pose; expected a whole frame number, a finite position and a unit "
-                f"quaternion, got {raw_line.strip()!r}"
-            )
-        if number in poses:
-            raise SequenceError(f"{path}: line {count} repeats frame {number}; keep one pose per frame")
-        poses[number] = make_pose(position, quat)
-    if not poses:
+    lines = text.replace(",", " ").splitlines()
+    if lines and not _are_numbers(lines[0]):
+        lines[0] = ""  # a heading
+    line_of = lambda row: [count for count, line in enumerate(lines, 1) if _content(line)][row]
+    if not any(map(_content, lines)):
         raise SequenceError(f"{path}: holds no poses; expected lines `frame tx ty tz qx qy qz qw`")
-    return poses
+    try:
+        table = np.loadtxt(lines, ndmin=2)
+    except ValueError:
+        table = np.empty((0, 0))
+    if table.shape[1] != 8:
+        raise _malformed(path, lines)
+    positions, quats = table[:, 1:4], table[:, [7, 4, 5, 6]]
+    with np.errstate(invalid="ignore"):
+        whole = (table[:, 0] >= 0) & (table[:, 0] < 2**53) & (table[:, 0] % 1 == 0)
+        good = np.isfinite(table).all(1) & (np.abs(np.linalg.norm(quats, axis=1) - 1) <= 0.05)
+    if not whole.all():
+        row = int(np.argmin(whole))
+        raise SequenceError(f"{path}: line {line_of(row)} is not a pose; expected a whole frame number first, got {table[row, 0]:.10g}")
+    numbers, first = np.unique(table[:, 0], return_index=True)
+    if len(numbers) < len(table):
+        row = int(np.setdiff1d(np.arange(len(table)), first)[0])
+        raise SequenceError(f"{path}: line {line_of(row)} repeats frame {int(table[row, 0])}; keep one pose per frame")
+    poses = np.tile(np.eye(4), (len(table), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = quat_to_matrix(np.where(good[:, None], quats, np.nan)), positions
+    return dict(zip(table[:, 0].astype(int).tolist(), poses))
+
+
+def _content(line: str) -> str:
+    """A line without its comment."""
+    return line.split("#")[0].strip()
+
+
+def _are_numbers(line: str) -> bool:
+    try:
+        list(map(float, _content(line).split()))
+    except ValueError:
+        return False
+    return True
+
+
+def _malformed(path: Path, lines: list[str]) -> SequenceError:
+    """What is wrong with the first line that is not eight numbers."""
+    for count, line in enumerate(lines, 1):
+        if not _are_numbers(line):
+            return SequenceError(f"{path}: line {count} is not made of numbers: {line.strip()!r}")
+        if len(_content(line).split()) not in (0, 8):
+            found = len(_content(line).split())
+            return SequenceError(f"{path}: line {count} has {found} numbers, expected 8: frame tx ty tz qx qy qz qw")
+    return SequenceError(f"{path}: not made of numbers as 1.5 or -2e-3")
 
 
 def rigid(matrix: ArrayLike, source: str) -> np.ndarray:

@@ -4,7 +4,7 @@ import itertools
 import logging
 import math
 import pickle
-from collections.abc import Callable, Container, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple, TypeVar
@@ -154,11 +154,25 @@ def select(numbers: Iterable[int], source: Path, start: int | None, stop: int | 
     return inside[::step]
 
 
-def keep_posed(numbers: list[int], poses: Container[int], pose_file: Path) -> list[int]:
-    """The frame numbers that have a pose; the others are counted in the log."""
+def keep_posed(numbers: list[int], poses: Mapping[int, np.ndarray], pose_file: Path, lag: int = 0) -> list[int]:
+    """The frame numbers that have a pose; the others are counted in the log.
+
+    Args:
+        numbers: Frames that are asked for.
+        poses: Poses, or what they are made from, by frame number.
+        pose_file: Where they are from.
+        lag: The file has that of frame n under the number n − lag.
+
+    Raises:
+        SequenceError: If there are none, or the pose of one is not finite.
+    """
     posed = [n for n in numbers if n in poses]
     if not posed:
         raise SequenceError(f"{pose_file}: holds no pose for any of the {len(numbers)} chosen frames")
+    finite = np.isfinite([poses[n] for n in posed]).reshape(len(posed), -1).all(1)
+    if not finite.all():
+        number = posed[np.argmin(finite)] - lag
+        raise SequenceError(f"{pose_file}: number {number} is not a pose; expected a finite position and a rotation; correct or remove it")
     if len(posed) < len(numbers):
         logger.info("%s: %d of %d frames have no pose and are skipped", pose_file, len(numbers) - len(posed), len(numbers))
     return posed

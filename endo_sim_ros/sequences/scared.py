@@ -114,14 +114,15 @@ def read_scared(
 
     frame_data = _archive_or_folder(root, "frame_data")
     documents = read_frame_data(frame_data) if frame_data.exists() else {}
-    published = {} if poses is not None else {n: published_pose(document, frame_data, n) for n, document in documents.items()}
     calibration = _calibration(root, documents, images.size).resized(*images.size)
     # Those who prepare left_finalpass leave OpenCV's alpha at its default.
     rectification = Rectification.stereo(calibration, alpha=-1 if is_rectified else 0)
 
     numbers = select(images.numbers, images.source, start, stop, step)
     pose_of = dict.fromkeys(numbers, np.eye(4))
-    if published:
+    posed = bool(documents) and poses is None
+    if posed:
+        published = _published_poses(documents, frame_data, set(numbers))
         numbers = keep_posed(numbers, published, frame_data)
         if pose_direction == "auto":
             project = rectification.project_left if is_rectified else calibration.project_left
@@ -161,7 +162,7 @@ def read_scared(
                 yield _frame(rectification, number, fps or images.fps, left, right, depth_of(number, points), pose_of[number])
 
     recording = Recording(frames, len(numbers))
-    if published:
+    if posed:
         return recording
     if poses is None:
         logger.warning("%s: file is missing, so poses come from structure from motion", frame_data)
@@ -203,6 +204,18 @@ def _read_keyframe(root: Path, start: int | None, stop: int | None, step: int, d
         yield _frame(rectification, 0, fps or DEFAULT_FPS, *eyes, measured, np.eye(4))
 
     return Recording(frames, 1)
+
+
+def _published_poses(documents: dict[int, Any], frame_data: Path, wanted: set[int]) -> dict[int, np.ndarray]:
+    """The published poses [4, 4] by frame number; one that cannot be used is an error if its frame is wanted, and else left out."""
+    published = {}
+    for number, document in documents.items():
+        try:
+            published[number] = published_pose(document, frame_data, number)
+        except SequenceError:
+            if number in wanted:
+                raise
+    return published
 
 
 def _pose_direction(root: Path, images: StereoImages, published: dict[int, np.ndarray], project: Projection) -> str:

@@ -98,6 +98,8 @@ def read_stereomis(
         raise SequenceError(f"{root}: first_mask must be 0 or more, got {first_mask}")
     known_estimator(poses, root)  # what is wrong is told before the images are looked at
     estimated = poses is not None or not (root / POSES_FILE).is_file()
+    if estimated and pose_lag is not None:
+        logger.warning("%s: pose_lag has no effect while poses are estimated; it is that of the poses in %s", root, POSES_FILE)
     calibration = read_stereo_ini(root / CALIBRATION_FILE)
     images, is_rectified = _open_images(root, calibration, frames_rectified)
     rectification = Rectification.stereo(calibration.resized(*images.size))
@@ -123,7 +125,7 @@ def read_stereomis(
     small = Camera(rectification.K, *images.size).resized(*(round(scale * side) for side in images.size))
     finder = None
     if rows is not None and pose_lag is None:
-        finder = LagFinder({row: rectification.pose(pose) for row, pose in rows.items()}, small, surveyed)
+        finder = LagFinder({row: rectification.pose(pose) for row, pose in rows.items() if np.isfinite(pose).all()}, small, surveyed)
     views = _look(images, is_rectified, rectification, alignment, finder, (small.width, small.height))
 
     masks_rectified, first_mask = _chosen_reading(root, alignment, readings) if mask_files else readings[0]
@@ -144,7 +146,7 @@ def read_stereomis(
     del views
     posed = {row + (pose_lag or 0): pose for row, pose in (rows or {}).items()}
     if rows is not None:
-        numbers = keep_posed(numbers, posed, root / POSES_FILE)
+        numbers = keep_posed(numbers, posed, root / POSES_FILE, pose_lag or 0)
     bare = sum(_nearest(masked, n, max_mask_gap) is None for n in numbers)
     if bare:
         logger.warning("%s: %d of %d frames have no mask; tools stay visible in them", root, bare, len(numbers))

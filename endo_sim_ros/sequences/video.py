@@ -91,6 +91,8 @@ def read_video(
         calibration = calibration or (_existing(folder / "calibration.yaml") if fx is None else None)
         mask = mask or _existing(folder / "mask.png") or _existing(folder / "masks")
     check_positive(path, fps=fps, scale=scale)
+    if threads < 1 and threads != -1:
+        raise SequenceError(f"{path}: threads must be -1 for all cores, or 1 or more, got {threads}")
     video = Video(path)
     size = video.width, video.height
     fps = fps or video.fps

@@ -24,11 +24,11 @@ from endo_sim_ros.cli import convert
 from endo_sim_ros.core.config import ConfigError, options
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import load_ply
-from endo_sim_ros.evaluation import held_out
+from endo_sim_ros.evaluation import held_out, plots
 from endo_sim_ros.reconstruction import ReconstructionConfig, from_bag
 from endo_sim_ros.reconstruction.from_bag import reconstruct_bag
 from endo_sim_ros.reconstruction.presets import preset
-from endo_sim_ros.sequences.bag import read_bag
+from endo_sim_ros.sequences.bag import read_bag, write_bag
 from endo_sim_ros.sequences.readers import READERS
 
 ROOT = Path(__file__).parents[2]
@@ -170,6 +170,20 @@ def test_an_option_that_is_gone_is_refused(name):
         cli.parse("reconstruct", ["bag", "out", f"--{name.replace('_', '-')}"])
     with pytest.raises(ConfigError, match=f"{name} is now gone"):
         ReconstructionConfig().replaced({name: True})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("words", ["reconstruct black results/a/b", "train results/a/b --model none.ply", "evaluate damaged.mcap"])
+def test_a_command_that_is_refused_leaves_no_empty_folder(words, small_frames, tmp_path, monkeypatch, capsys):
+    write_bag(tmp_path / "black", [replace(frame, image=np.zeros_like(frame.image)) for frame in small_frames[:3]])
+    (tmp_path / "damaged.mcap").write_bytes(b"no bag")
+    (tmp_path / "kept").mkdir()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["endo-sim", *words.split(), *("--device", "cpu")])
+    monkeypatch.setattr(plots, "available", lambda: True)
+    assert cli.main() in (1, 2)
+    assert [path.name for path in tmp_path.rglob("*") if path.is_dir() and not any(path.iterdir())] == ["kept"], capsys.readouterr().err
+    assert (tmp_path / "evaluation" / "table.md").exists() == (words == "evaluate damaged.mcap")
 
 
 def test_an_old_flag_is_refused_with_the_new_one(monkeypatch, capsys):

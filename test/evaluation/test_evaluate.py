@@ -74,6 +74,18 @@ def test_a_split_that_a_sequence_has_not_loses_its_own_cells_only(tmp_path, caps
     assert below == [f"phantom:0, {split}, default, seed 0 failed: {error}" for split, error in zip(("stereo", "9:1"), errors[1:])]
 
 
+@pytest.mark.dds
+def test_what_is_wrong_with_a_sequence_is_told_once(tmp_path, capfd, caplog):
+    (tmp_path / "damaged.mcap").write_bytes(b"no bag")
+    config = EvaluationConfig(out=tmp_path, splits=("1:1", "two-views"), presets=("default", "3dgs"), seeds=2, device="cpu", lpips=())
+    results = evaluate([str(tmp_path / "damaged.mcap")], config)
+    told = capfd.readouterr().out + caplog.text
+    assert told.count("the bag cannot be read") == 1 and "\ndamaged.mcap: 8 cells failed: " in told
+    for record in results["cells"]:
+        record["error"] = "too large" if record["cell"]["method"] == "3dgs" else None
+    assert tables.failures(results) == ["damaged.mcap, 3dgs: 4 cells failed: too large"]
+
+
 @pytest.mark.slow
 @pytest.mark.dds
 def test_finished_cells_are_not_done_again(run):

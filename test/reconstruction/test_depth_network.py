@@ -12,6 +12,7 @@ from endo_sim_ros.reconstruction import ReconstructionConfig, prepare, preset
 from endo_sim_ros.reconstruction.from_bag import reconstruct_bag
 from endo_sim_ros.reconstruction.priors.network import align, load_network, network_depth
 from endo_sim_ros.reconstruction.priors.sources import depth_source, estimate_depth
+from endo_sim_ros.reconstruction.scene import ScenePoints
 from endo_sim_ros.reconstruction.stage_configs import NetworkDepthConfig
 from endo_sim_ros.reconstruction.triangulation import triangulate
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
@@ -152,6 +153,10 @@ def test_views_that_do_not_fit_are_dropped_and_none_at_all_is_an_error(views, ti
     points = triangulate(views)
     with pytest.raises(SequenceError, match="no view's depth fits"):
         estimate_depth(unknown(views), points, ReconstructionConfig(depth="network", depth_model=str(tiny), device="cpu"))
+    with pytest.raises(SequenceError, match="no view's depth fits"):
+        estimate_depth(unknown(views), points, ReconstructionConfig(depth_model=str(tiny), device="cpu"))
+    unscaled = estimate_depth(unknown(views), ScenePoints.none(), ReconstructionConfig(depth_model=str(tiny), device="cpu"))
+    assert all(view.depth_prior is None for view in unscaled)
 
 
 @pytest.mark.slow

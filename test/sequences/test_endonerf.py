@@ -75,3 +75,12 @@ def test_damaged_endonerf_is_refused_by_name(endonerf, damage, message):
     damage(endonerf)
     with pytest.raises(SequenceError, match=message):
         list(read_endonerf(endonerf))
+
+
+def test_a_pose_that_is_none_matters_only_where_its_frame_is_asked_for(endonerf):
+    table = np.load(endonerf / "poses_bounds.npy")
+    table[3] = np.nan
+    np.save(endonerf / "poses_bounds.npy", table)
+    assert len(list(read_endonerf(endonerf, stop=3))) == 3
+    with pytest.raises(SequenceError, match="poses_bounds.npy: number 3 is not a pose"):
+        read_endonerf(endonerf)

@@ -1,12 +1,15 @@
 """What readers share: poses, numbers, masks, the lit area."""
 
+from unittest.mock import Mock
+
 import cv2
 import numpy as np
 import pytest
 from plane_scene import pose_of, write_poses
 
-from endo_sim_ros.core.cameras import matrix_to_quat
+from endo_sim_ros.core.cameras import matrix_to_quat, quat_to_matrix
 from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.sequences import pose_files
 from endo_sim_ros.sequences.images import numbered_files
 from endo_sim_ros.sequences.masks import lit_area, lit_now, tool_is_white
 from endo_sim_ros.sequences.pose_files import read_poses
@@ -20,6 +23,36 @@ def test_pose_file_is_xyzw_and_camera_to_world(tmp_path):
     w, x, y, z = matrix_to_quat(expected[:3, :3])
     (tmp_path / "poses.csv").write_text(f"frame,tx,ty,tz,qx,qy,qz,qw\n7,.1,.2,.3,{x},{y},{z},{w}\n")
     np.testing.assert_allclose(read_poses(tmp_path / "poses.csv")[7], expected, atol=1e-9)
+
+
+def test_a_table_of_poses_is_converted_at_once(tmp_path, monkeypatch):
+    """Row by row a million of them took half a minute."""
+    convert = Mock(wraps=quat_to_matrix)
+    monkeypatch.setattr(pose_files, "quat_to_matrix", convert)
+    (tmp_path / "poses.txt").write_text("frame x y z\n# none\n\n9, 1, 2 3e0 0 0 0 1 # last\n ,, \n4 0 0 0 1 0 0 0\r\n")
+    poses = read_poses(tmp_path / "poses.txt")
+    assert list(poses) == [9, 4] and convert.call_count == 1
+    np.testing.assert_array_equal(poses[9][:3], np.column_stack([np.eye(3), [1, 2, 3]]))
+    np.testing.assert_array_equal(poses[4], np.diag([1, -1, -1, 1]))
+
+
+@pytest.mark.parametrize(
+    "text, sentence",
+    [
+        ("# none\n", "holds no poses"),
+        ("1 2 3\n1 2 3\n", "line 1 has 3 numbers, expected 8"),
+        ("1 0 0 0 0 0 0 1\n\n2 0 0\n", "line 3 has 3 numbers, expected 8"),
+        ("# none\n1.5 0 0 0 0 0 0 1\n", "line 2 is not a pose; expected a whole frame number first, got 1.5"),
+        ("nan 0 0 0 0 0 0 1\n", "line 1 is not a pose"),
+        ("1e300 0 0 0 0 0 0 1\n", "line 1 is not a pose"),
+        ("1 0 0 0 0 0 0 1_0\n", "not made of numbers"),
+        ("3 0 0 0 0 0 0 1\n#\n3 0 0 0 0 0 0 1\n3 0 0 0 0 0 0 1\n", "line 3 repeats frame 3"),
+    ],
+)
+def test_what_is_wrong_with_a_table_of_poses_is_told_by_line(text, sentence, tmp_path):
+    (tmp_path / "poses.txt").write_text(text)
+    with pytest.raises(SequenceError, match=f"poses.txt: {sentence}"):
+        read_poses(tmp_path / "poses.txt")
 
 
 def test_numbers_in_file_names(tmp_path):

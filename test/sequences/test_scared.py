@@ -343,3 +343,13 @@ def test_scared_dataset_folder_lists_its_keyframes(scared):
     write_scared(scared, count=1)
     with pytest.raises(SequenceError, match="pass one of its keyframes: keyframe_1"):
         open_sequence(scared.parent)
+
+
+def test_a_pose_that_is_none_matters_only_where_its_frame_is_asked_for(scared):
+    write_scared(scared, count=3)
+    extract(scared, "frame_data")
+    file = scared / "data/frame_data/frame_data000000.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"camera-pose": np.full((4, 4), np.nan).tolist()}))
+    assert len(list(read_scared(scared, start=1))) == 2
+    with pytest.raises(SequenceError, match="camera-pose of frame 0: expected a finite"):
+        read_scared(scared)

@@ -253,6 +253,24 @@ def test_memory_does_not_grow_with_the_sequence(tmp_path):
     assert peak() < short + 40e6  # ten times as many whole frames would be 100 MB; the images that are looked at are bounded
 
 
+def test_a_lag_of_poses_that_are_estimated_is_told(plane, caplog):
+    read_stereomis(plane, poses="sfm", pose_lag=100)
+    assert "pose_lag has no effect while poses are estimated" in caplog.text
+    caplog.clear()
+    read_stereomis(plane, poses="sfm")
+    assert "pose_lag" not in caplog.text
+
+
+@pytest.mark.parametrize("lag", [None, 4])
+def test_a_pose_that_is_none_matters_only_where_its_frame_is_asked_for(plane, lag):
+    lines = (plane / "groundtruth.txt").read_text().splitlines()
+    row = next(int(line.split()[0]) for line in lines[2:])
+    (plane / "groundtruth.txt").write_text("\n".join(line if line.split()[0] != str(row) else f"{row} 0 0 nan 0 0 0 1" for line in lines))
+    assert len(list(read_stereomis(plane, stop=row + 4, pose_lag=lag))) > 0
+    with pytest.raises(SequenceError, match=f"groundtruth.txt: number {row} is not a pose"):
+        read_stereomis(plane, pose_lag=lag)
+
+
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
@@ -265,8 +283,8 @@ def test_memory_does_not_grow_with_the_sequence(tmp_path):
         ("StereoCalibration.ini", "[StereoLeft]\nres_x=inf\nres_y=9", r"\[StereoLeft\] res_x is not a number: 'inf'"),
         ("StereoCalibration.ini", "no ini at all", "StereoCalibration.ini: not a readable ini"),
         ("groundtruth.txt", "0 0 0 0 0 0 1", "groundtruth.txt: line 1 has 7 numbers, expected 8"),
-        ("groundtruth.txt", "0 0 0 0 0 0 0 0", "groundtruth.txt: line 1 is not a pose"),
-        ("groundtruth.txt", "0 0 0 0 0 0 0 1\n0 0 0 nan 0 0 0 1", "groundtruth.txt: line 2 is not a pose"),
+        ("groundtruth.txt", "0 0 0 0 0 0 0 0", "groundtruth.txt: number 0 is not a pose"),
+        ("groundtruth.txt", "0 0 0 0 0 0 0 1\n1 0 0 nan 0 0 0 1", "groundtruth.txt: number 1 is not a pose"),
         ("groundtruth.txt", "0 0 0 0 0 0 0 1\n0 0 0 1 0 0 0 1", "groundtruth.txt: line 2 repeats frame 0"),
         ("groundtruth.txt", "0 0 0 0 0 0 0 1\nx y", "groundtruth.txt: line 2 is not made of numbers"),
         ("groundtruth.txt", "", "groundtruth.txt: holds no poses"),

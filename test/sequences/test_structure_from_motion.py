@@ -194,11 +194,12 @@ def test_folder_is_posed_on_request_and_the_guessed_scale_is_announced(tmp_path,
 
 
 @pytest.mark.slow
-def test_structure_from_motion_that_fails_says_why(tmp_path):
+def test_structure_from_motion_that_fails_says_why(tmp_path, capfd):
     pytest.importorskip("pycolmap")
     flat = itertools.repeat(np.full((120, 160, 3), 128, np.uint8), 3)
     with pytest.raises(SequenceError, match="found no pair of images"):
         estimate_poses(flat)
+    assert not capfd.readouterr().err  # of COLMAP
     with pytest.raises(SequenceError, match="needs at least 2 images, got 1"):
         estimate_poses([np.zeros((120, 160, 3), np.uint8)])
 

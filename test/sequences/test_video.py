@@ -64,6 +64,8 @@ def test_video_mask_for_all_frames_and_per_frame(video, caplog):
         ({"fx": 150.0, "fps": np.inf}, "fps must be positive, got inf"),
         ({"fx": 150.0, "scale": -1.0}, "scale must be positive, got -1"),
         ({"fx": True}, "fx must be a number, got True"),
+        ({"fx": 150.0, "threads": 0}, "threads must be -1 for all cores, or 1 or more, got 0"),
+        ({"fx": 150.0, "threads": -2}, "threads must be -1 for all cores, or 1 or more, got -2"),
         ({"fx": 150.0, "mask_border": 1}, "mask_border must be true or false, got 1"),
     ],
 )
@@ -72,9 +74,25 @@ def test_wrong_video_options_are_explained(video, options, message):
         open_sequence(video, **options)
 
 
+@pytest.mark.parametrize("line", ["6 0 0 nan 0 0 0 1", "6 0 0 0 0 0 0 0"])
+def test_a_pose_that_is_none_matters_only_where_its_frame_is_asked_for(video, line):
+    lines = (video / "poses.txt").read_text().splitlines()
+    (video / "poses.txt").write_text("\n".join([*lines[:-1], line]))
+    assert len(list(read_video(video, stop=6, **INTRINSICS))) == 2
+    with pytest.raises(SequenceError, match="poses.txt: number 6 is not a pose; expected a finite position and a rotation"):
+        read_video(video, **INTRINSICS)
+
+
 def test_video_that_ends_early_is_reported(video, caplog):
     source = Video(video / "endo.mp4")
     assert [number for number, _ in source.frames([6, 7, 8, 9])] == [6, 7]
     assert "ends before frame 8; 2 frames are missing" in caplog.text
     with pytest.raises(SequenceError, match="frame 50 cannot be decoded"):
         list(source.frames([50]))
+
+
+def test_what_is_no_video_is_told_in_a_sentence_and_not_by_the_decoder(video, capfd):
+    (video / "endo.mp4").write_bytes(bytes(40))
+    with pytest.raises(SequenceError, match="endo.mp4: not a readable video"):
+        Video(video / "endo.mp4")
+    assert not capfd.readouterr().err

@@ -59,7 +59,7 @@ def estimate_depth(
                 return _with_prior(view, network_depth(view, network(), known, config.network))
 
         found = progress.map(by_network, views)
-        if all(view.depth_prior is None for view in found):
+        if all(view.depth_prior is None for view in found) and (config.depth == "network" or len(points.positions)):
             raise SequenceError(
                 "depth=network, but no view's depth fits the scene points; check the poses, give views that overlap, or use depth=points"
             )

@@ -16,8 +16,7 @@ class EyeImage(NamedTuple):
 
     camera: Camera
     grey: np.ndarray  # [H, W] uint8, freed of light and contrast
-    tissue: np.ndarray  # [H, W] bool as uint8: all views are held at once
-    matte: np.ndarray  # the same without reflections of the light
+    matte: np.ndarray  # [H, W] bool as uint8: tissue without reflections of the light
 
 
 class FlowCorrection(NamedTuple):
@@ -36,8 +35,7 @@ def eye_image(frame: Frame, options: MultiViewConfig) -> EyeImage:
     mean = around(grey * tissue) / share
     variance = np.maximum(around(grey * grey * tissue) / share - mean * mean, 0)
     grey = np.clip(128 + 40 * (grey - mean) / np.sqrt(variance + 4), 0, 255).astype(np.uint8)  # 2 grey levels are noise
-    there = tissue.astype(np.uint8)
-    return EyeImage(frame.camera, grey, there, there * ~_reflections(frame.image, tissue, options))
+    return EyeImage(frame.camera, grey, tissue.astype(np.uint8) * ~_reflections(frame.image, tissue, options))
 
 
 def _reflections(image: np.ndarray, tissue: np.ndarray, options: MultiViewConfig) -> np.ndarray:

@@ -25,7 +25,7 @@ def stereo_depth(
     matching: MatchingConfig = MatchingConfig(),
     progress: StageProgress = StageProgress(),
 ) -> Iterator[tuple[AnyFrame, np.ndarray | None]]:
-    """Each view, whose right image now has the rows of the left one and the right principal point, and its depth [H, W], in turn.
+    """Each view, now with the right eye's principal point as its matches tell it, and its depth [H, W], in turn.
 
     Depth is in metres, 0 = none; None without a right image.
 
@@ -64,10 +64,7 @@ def right_view(frame: Frame, options: StereoConfig = StereoConfig()) -> Frame:
 
 
 def align_rows(view: AnyFrame, options: StereoConfig = StereoConfig(), matching: MatchingConfig = MatchingConfig()) -> AnyFrame:
-    """The view with matched features of its right image on the rows where the left image has them.
-
-    The image moves by whole pixels, the right eye's principal point by the rest: rectification is seldom that good.
-    """
+    """The view with the right eye's principal point on the row that matched features tell: rectification is seldom that good."""
     assert view.right is not None
     count = matching.max_features
     left, right = match_pair(detect(view.image, view.mask, count), detect(view.right, None, count), matching.ratio)
@@ -75,16 +72,13 @@ def align_rows(view: AnyFrame, options: StereoConfig = StereoConfig(), matching:
     shifts = shifts[np.abs(shifts) < options.max_row_offset * view.camera.height]
     if len(shifts) < matching.min_points:
         return view
-    shift = float(np.median(shifts))
-    rows = round(shift)
-    moved = view.right[np.clip(np.arange(len(view.right)) + rows, 0, len(view.right) - 1)] if rows else view.right
-    return _with_right_K(dataclasses.replace(view, right=moved), row=shift - rows)
+    return _with_right_K(view, row=float(np.median(shifts)) + view.camera.K[1, 2] - _right_K(view)[1, 2])
 
 
 def stereo_disparity(frame: Frame, options: StereoConfig = StereoConfig()) -> np.ndarray:
     """Disparity [H, W] float32 in pixels (0 = none) of a rectified pair by semi-global matching, checked both ways.
 
-    A difference of the principal points of the two eyes is removed, so that disparity = fx·B/z.
+    A difference of the principal points of the two eyes is removed, so that disparity = fx·B/z; rows move by whole pixels.
     """
     assert frame.right is not None
     fx, width = frame.camera.K[0, 0], frame.camera.width
@@ -100,6 +94,8 @@ def stereo_disparity(frame: Frame, options: StereoConfig = StereoConfig()) -> np
     pad = lambda image: cv2.copyMakeBorder(image, 0, 0, levels, 0, cv2.BORDER_REPLICATE)
     match = lambda a, b: matcher.compute(pad(a), pad(b))[:, levels:].astype(np.float32) / 16
     left, right = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (frame.image, frame.right))
+    rows = round(_right_K(frame)[1, 2] - frame.camera.K[1, 2])
+    right = right[np.clip(np.arange(len(right)) + rows, 0, len(right) - 1)] if rows else right
     disparity = match(left, right)
     # The right image's own disparity, by matching the mirrored pair, must lead back to the same pixel.
     back = match(np.ascontiguousarray(right[:, ::-1]), np.ascontiguousarray(left[:, ::-1]))[:, ::-1]

@@ -1,4 +1,5 @@
 """Arms of the da Vinci and their instruments: parameter files, kinematics, and where they stand in a scene."""
 
 from endo_sim_ros.instruments.arm_files import arm_names as arm_names, load_arm as load_arm, tool_names as tool_names
+from endo_sim_ros.instruments.inverse import Reach as Reach, ReachConfig as ReachConfig, solve_inverse as solve_inverse
 from endo_sim_ros.instruments.kinematics import ArmKinematics as ArmKinematics, Joint as Joint

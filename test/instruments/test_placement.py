@@ -108,6 +108,6 @@ def test_what_cannot_be_placed_is_one_sentence(name, depth, fov, sentence):
 
 
 def test_the_code_of_the_page_runs(capsys):
-    (code,) = re.findall(r"```python\n(.+?)```", PAGE.read_text(), re.S)
+    code = "\n".join(re.findall(r"```python\n(.+?)```", PAGE.read_text(), re.S))
     exec(compile(code, str(PAGE), "exec"), {})
     assert capsys.readouterr().out == "\n".join(re.findall(r"# prints (.+)", code)) + "\n"

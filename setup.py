@@ -62,6 +62,11 @@ setup(
         # `ros2 run` looks for executables here; console scripts would land in bin/ under pip.
         (f"lib/{NAME}", sorted(map(str, Path("scripts").glob("*_node")))),
     ],
-    package_data={NAME: ["*/native/*.h"], f"{NAME}.evaluation": ["page.html"], f"{NAME}.nodes": ["fastdds.xml"]},
+    package_data={
+        NAME: ["*/native/*.h"],
+        f"{NAME}.evaluation": ["page.html"],
+        f"{NAME}.instruments": ["parameters/*.json"],
+        f"{NAME}.nodes": ["fastdds.xml"],
+    },
     zip_safe=False,
 )

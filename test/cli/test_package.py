@@ -89,6 +89,13 @@ def test_headers_of_kernels_are_installed(prefix):
     assert headers and headers == {path.relative_to(installed) for path in installed.rglob("*.h")}
 
 
+@pytest.mark.slow
+def test_parameters_of_arms_are_installed(prefix):
+    installed = next(prefix.glob("lib/python*/site-packages/endo_sim_ros/instruments/parameters"))
+    names = {path.name for path in (ROOT / "endo_sim_ros" / "instruments" / "parameters").iterdir()}
+    assert "PSM.json" in names and names == {path.name for path in installed.iterdir()}
+
+
 @pytest.mark.dds
 def test_command_line_is_installed(prefix):
     assert os.access(prefix / "bin" / "endo-sim", os.X_OK)

@@ -1,0 +1,352 @@
+"""The shapes of instruments: closed triangle meshes for pictures, and capsules for contact, built from a few dimensions of each tool.
+
+Every part moves with one link, in whose frame its vertices are: ``roll``, ``wrist_pitch`` and ``wrist_yaw`` are the frames of these joints
+(`ArmKinematics.link_frames`); ``jaw_left`` and ``jaw_right`` are that of the wrist's yaw turned about its z by minus and plus half the
+opening angle.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.instruments.kinematics import ArmKinematics
+
+_DISTAL_Z = np.eye(3)
+"""Axes of a frame whose z points at the tip, in which shafts are built."""
+_DISTAL_X = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+"""From those axes to the frame of the wrist's pitch, which turns about z and whose x points at the tip."""
+_DISTAL_Y = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+"""From those axes to the frame of the wrist's yaw and the jaws, which turn about z and whose y points at the tip."""
+
+
+class Material(IntEnum):
+    """What a surface is made of."""
+
+    STEEL = 0
+    SHAFT = 1
+    """Carbon-fibre composite: black, dull."""
+    INSULATION = 2
+    """Polymer sleeves and covers of instruments for electrosurgery."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A rigid piece of an instrument.
+
+    Args:
+        link: Name of the link that it moves with.
+        material: What it is made of.
+        vertices: Corners [V, 3], m, in the frame of the link.
+        faces: Triangles [F, 3], whose corners go round counter-clockwise seen from outside.
+    """
+
+    link: str
+    material: Material
+    vertices: np.ndarray
+    faces: np.ndarray
+
+
+@dataclass(frozen=True)
+class Capsule:
+    """All points nearer than ``radius`` (m) to the line between ``start`` and ``end`` [3] (m, in the frame of the link)."""
+
+    link: str
+    start: np.ndarray
+    end: np.ndarray
+    radius: float
+
+
+@dataclass(frozen=True)
+class JawShape:
+    """One of two jaws, or of two blades; lengths in metres.
+
+    Args:
+        length: From the axis of the wrist's yaw to the tip.
+        base, tip: Width along that axis, and height across it, next to the axis and at the tip.
+        curve: How far the tip lies off along that axis: dissectors and scissors are curved sideways.
+        tooth: Distance between teeth of the gripping face; 0 = smooth.
+        slot: Share of the width that a slot takes, as in fenestrated jaws; 0 = none.
+        blade: Whether it is one of two blades that pass each other, side by side.
+    """
+
+    length: float
+    base: tuple[float, float]
+    tip: tuple[float, float]
+    curve: float = 0.0
+    tooth: float = 0.0
+    slot: float = 0.0
+    blade: bool = False
+
+
+@dataclass(frozen=True)
+class ToolShape:
+    """The dimensions of a tool, metres.
+
+    Args:
+        jaws: Its two jaws, or None where a hook takes their place.
+        hook: Length of the hook and of its bend, if there is one.
+        radius: Of the shaft: 4 mm, or 2.5 mm of small instruments.
+        cover: Whether a polymer sleeve covers the wrist.
+        shaft: Length of shaft that is modelled; more is never in a picture.
+    """
+
+    jaws: JawShape | None = None
+    hook: tuple[float, float] | None = None
+    radius: float = 4.0e-3
+    cover: bool = False
+    shaft: float = 0.3
+
+
+SHAPES: dict[str, ToolShape] = {
+    "LARGE_NEEDLE_DRIVER": ToolShape(JawShape(10.2e-3, (4.2e-3, 2.4e-3), (2.6e-3, 1.3e-3), tooth=0.5e-3)),
+    "PROGRASP_FORCEPS": ToolShape(JawShape(17.5e-3, (4.6e-3, 2.4e-3), (3.6e-3, 1.5e-3), tooth=1.0e-3, slot=0.34)),
+    "MARYLAND_BIPOLAR_FORCEPS": ToolShape(JawShape(20.0e-3, (4.2e-3, 2.2e-3), (1.5e-3, 0.9e-3), curve=4.0e-3, tooth=0.9e-3), cover=True),
+    "CURVED_SCISSORS": ToolShape(JawShape(15.0e-3, (1.7e-3, 2.9e-3), (0.7e-3, 0.8e-3), curve=2.6e-3, blade=True), cover=True),
+    "PERMANENT_CAUTERY_HOOK": ToolShape(hook=(12.0e-3, 4.5e-3), cover=True),
+}
+"""Dimensions of tools by the name of their kind, read off published photographs and drawings: right to about a millimetre."""
+
+
+@dataclass
+class _Builder:
+    parts: list[Part] = field(default_factory=list)
+    capsules: list[Capsule] = field(default_factory=list)
+
+    def loft(self, link: str, material: Material, rings: Sequence[np.ndarray] | np.ndarray, axes: np.ndarray = _DISTAL_Z) -> None:
+        """A closed tube through rings [S, K, 3], turned into the link's axes."""
+        vertices, faces = lofted(np.asarray(rings))
+        self.parts.append(Part(link, material, (vertices @ axes.T).astype(np.float32), faces))
+
+    def capsule(self, link: str, start: ArrayLike, end: ArrayLike, radius: float, axes: np.ndarray = _DISTAL_Z) -> None:
+        """A capsule between two points in the axes of a shaft, turned into the link's axes."""
+        self.capsules.append(Capsule(link, axes @ np.asarray(start), axes @ np.asarray(end), radius))
+
+
+def build_instrument(arm: ArmKinematics, shape: ToolShape | None = None) -> tuple[list[Part], list[Capsule]]:
+    """The parts and capsules of the instrument of an arm: some thousand triangles.
+
+    Args:
+        arm: An arm with a wrist, such as a PSM.
+        shape: Its dimensions; None = those in `SHAPES` of its tool.
+
+    Raises:
+        ConfigError: If nobody knows the shape of the tool, or the arm has no wrist.
+    """
+    shape = shape or SHAPES.get(arm.tool.rstrip("0123456789").rstrip("_:"))
+    if shape is None or "wrist_yaw" not in (joint.name for joint in arm.joints):
+        raise ConfigError(f"{arm.name}: there is no shape of {arm.tool or 'its tool'}; give one, or a tool among {', '.join(SHAPES)}")
+    build, r = _Builder(), shape.radius
+    wrist = next(joint.a for joint in arm.joints if joint.name == "wrist_yaw")
+    _shaft(build, shape)
+    # Two ears hold the pin of the pitch; between them turns the second clevis, which holds that of the yaw.
+    _clevis(build, "roll", -2.2 * r, 0.0, 0.92 * r, 0.62 * r, across=1, axes=_DISTAL_Z)
+    _block(build, "wrist_pitch", 0.0, wrist, 0.9 * r, 0.5 * r, axes=_DISTAL_X)
+    build.capsule("wrist_pitch", (0, 0, 0), (0, 0, wrist), 0.8 * r, _DISTAL_X)
+    if shape.cover:
+        sleeve = [_circle(k * r, s * wrist, 40) for k, s in ((0.74, 0.3), (0.86, 0.38), (0.86, 0.68), (0.66, 0.82))]
+        build.loft("wrist_pitch", Material.INSULATION, sleeve, _DISTAL_X)
+    if shape.jaws:
+        _jaw(build, "jaw_left", shape.jaws, 1.0, r)
+        _jaw(build, "jaw_right", shape.jaws, -1.0, r)
+    if shape.hook:
+        _hook(build, shape)
+    return build.parts, build.capsules
+
+
+def link_poses(arm: ArmKinematics, joints: ArrayLike, jaw: ArrayLike = 0.0) -> dict[str, np.ndarray]:
+    """Poses [..., 4, 4] in the base frame of the links that parts and capsules move with, by name.
+
+    Args:
+        arm: An arm with a wrist.
+        joints: Joint positions [..., n], rad and m.
+        jaw: Angle between the jaws [...], rad.
+
+    Raises:
+        ValueError: As `ArmKinematics.check_joints` does.
+    """
+    frames = arm.link_frames(joints)
+    poses = {joint.name: frames[..., i, :, :] for i, joint in enumerate(arm.joints)}
+    for name, side in (("jaw_left", -0.5), ("jaw_right", 0.5)):
+        angle = side * np.broadcast_to(np.asarray(jaw, np.float64), frames.shape[:-3])
+        turn = np.zeros((*angle.shape, 4, 4))
+        turn[..., 0, 0], turn[..., 0, 1], turn[..., 1, 0], turn[..., 1, 1] = np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)
+        turn[..., 2, 2] = turn[..., 3, 3] = 1
+        poses[name] = poses["wrist_yaw"] @ turn
+    return poses
+
+
+def lofted(rings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [S·K + 2, 3] and faces [F, 3] of a closed tube through rings [S, K, 3], whose ends are fans about their means.
+
+    Faces go round counter-clockwise seen from outside, whichever way the rings go round.
+    """
+    count, size = rings.shape[:2]
+    vertices = np.concatenate([rings.reshape(-1, 3), rings[[0, -1]].mean(1)])
+    step, around = size * np.arange(count - 1)[:, None], np.arange(size)
+    a, b = (step + around).ravel(), (step + np.roll(around, -1)).ravel()
+    sides = np.concatenate([np.stack([a, b, b + size], 1), np.stack([a, b + size, a + size], 1)])
+    last, following = size * (count - 1), np.roll(around, -1)
+    first_cap = np.stack([np.full(size, count * size), following, around], 1)
+    last_cap = np.stack([np.full(size, count * size + 1), last + around, last + following], 1)
+    faces = np.concatenate([sides, first_cap, last_cap]).astype(np.int32)
+    corners = vertices[faces]
+    volume = np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
+    return vertices, faces if volume > 0 else faces[:, ::-1]
+
+
+def _circle(radius: float, z: float, count: int = 32) -> np.ndarray:
+    angle = 2 * np.pi * np.arange(count) / count
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(count, z)], 1)
+
+
+def _shaft(build: _Builder, shape: ToolShape) -> None:
+    r, end = shape.radius, -2.2 * shape.radius
+    stations = np.concatenate([[-shape.shaft], np.linspace(-0.06, end - 1.6e-3, 4)])
+    build.loft("roll", Material.SHAFT, [_circle(r, z, 40) for z in stations])
+    collar = [(0.99, 0.0), (1.03, 0.25e-3), (1.03, 1.3e-3), (0.93, 1.6e-3)]
+    build.loft("roll", Material.STEEL, [_circle(k * r, end - 1.6e-3 + z, 40) for k, z in collar])
+    build.capsule("roll", (0, 0, -shape.shaft), (0, 0, end), r)
+
+
+def _stadium(half: float, start: float, end: float, count: int = 12) -> np.ndarray:
+    """Outline [K, 2] of a strip from ``start`` to a round end about ``end``, in (across, distal), counter-clockwise."""
+    angle = np.linspace(0, np.pi, count)
+    return np.concatenate([[[-half, start], [half, start]], np.stack([half * np.cos(angle), end + half * np.sin(angle)], 1)])
+
+
+def _slab(outline: np.ndarray, low: float, high: float, across: int, within: float = np.inf, bevel: float = 0.25e-3) -> np.ndarray:
+    """Rings of an outline [K, 2] in (sideways, distal), extruded along the axis ``across`` (0 = x, 1 = y) with bevelled rims.
+
+    Nothing reaches out of a cylinder of radius ``within`` about z.
+    """
+    middle = outline.mean(0)
+    rings = []
+    for at in np.concatenate([[low], np.linspace(low + bevel, high - bevel, 5), [high]]):
+        rim = bevel if at in (low, high) else 0.0
+        points = middle + (outline - middle) * (1 - rim / np.abs(outline - middle).max())
+        side = np.sqrt(max(within**2 - at**2, 0.0))
+        ring = np.empty((len(points), 3))
+        ring[:, across], ring[:, 1 - across], ring[:, 2] = at, points[:, 0].clip(-side, side), points[:, 1]
+        rings.append(ring)
+    return np.array(rings)
+
+
+def _pin(build: _Builder, link: str, at: float, half: float, radius: float, across: int, axes: np.ndarray) -> None:
+    """A cylinder along the axis ``across``, the pin about which the next link turns."""
+    rings = []
+    for share, k in ((-1.0, 0.8), (-0.96, 1.0), (0.96, 1.0), (1.0, 0.8)):
+        circle = _circle(k * radius, 0.0, 24)
+        ring = np.empty_like(circle)
+        ring[:, across], ring[:, 1 - across], ring[:, 2] = share * half, circle[:, 0], at + circle[:, 1]
+        rings.append(ring)
+    build.loft(link, Material.STEEL, rings, axes)
+
+
+def _clevis(build: _Builder, link: str, start: float, end: float, half: float, gap: float, across: int, axes: np.ndarray) -> None:
+    """A base with two ears whose pin at ``end`` lies along the axis ``across``; the next link turns in the gap between them."""
+    base = [_circle(k * half, start + z, 40) for k, z in ((1.0, 0.0), (1.0, 0.35 * (end - start)), (0.9, 0.45 * (end - start)))]
+    build.loft(link, Material.STEEL, base, axes)
+    outline = _stadium(0.72 * half, start + 0.3 * (end - start), end)
+    for side in (-1.0, 1.0):
+        low, high = sorted((side * gap, side * 0.88 * half))
+        build.loft(link, Material.STEEL, _slab(outline, low, high, across, half), axes)
+    _pin(build, link, end, 0.92 * half, 0.3 * half, across, axes)
+
+
+def _block(build: _Builder, link: str, start: float, end: float, half: float, inner: float, axes: np.ndarray) -> None:
+    """The second clevis: a hub about the pin of the pitch (z of its frame), and ears for that of the yaw, square to it."""
+    hub, ears = 0, 1  # axes square to the tip's direction: the pitch turns about the first, the yaw about the second
+    build.loft(link, Material.STEEL, _slab(_round(0.62 * half, start), -0.6 * half, 0.6 * half, hub), axes)
+    base = [_circle(k * half, start + s * (end - start), 40) for k, s in ((0.6, 0.15), (0.8, 0.3), (0.8, 0.5), (0.7, 0.6))]
+    build.loft(link, Material.STEEL, base, axes)
+    outline = _stadium(0.62 * half, start + 0.35 * (end - start), end)
+    for side in (-1.0, 1.0):
+        low, high = sorted((side * inner, side * 0.8 * half))
+        build.loft(link, Material.STEEL, _slab(outline, low, high, ears, half), axes)
+    _pin(build, link, end, 0.84 * half, 0.28 * half, ears, axes)
+
+
+def _round(radius: float, at: float, count: int = 28) -> np.ndarray:
+    return _circle(radius, 0.0, count)[:, :2] + [0.0, at]
+
+
+def _jaw(build: _Builder, link: str, shape: JawShape, side: float, radius: float) -> None:
+    """One jaw: a hub about the pin of the yaw and a beam that tapers to the tip; its gripping face lies in the plane x = 0."""
+    half = 0.4 * radius / 2  # a hub takes one half of the gap between the ears
+    middle = side * half if not shape.blade else side * shape.base[0] / 2
+    turn = lambda ring: ring if side > 0 else ring * [-1, 1, 1]  # the other jaw is the mirror image
+    build.loft(link, Material.STEEL, _slab(_round(0.5 * radius, 0.0), middle - half, middle + half, 1), _DISTAL_Y)
+    count = max(int(shape.length / shape.tooth) * 2, 12) if shape.tooth else 24
+    stations = np.linspace(0.15, 1.0, count + 1)
+    for low, high in _prongs(shape.slot):
+        rings = [turn(_beam(shape, s, i, low, high, side)) for i, s in enumerate(stations)]
+        build.loft(link, Material.STEEL, rings, _DISTAL_Y)
+    bend = lambda s: np.array([side * 0.25 * (shape.base[1] + shape.tip[1]), _bend(shape, s, side), s * shape.length])
+    thick = lambda s: 0.5 * min(_mix(shape.base, shape.tip, s))
+    for s in (0.0, 0.5):
+        build.capsule(link, bend(s), bend(s + 0.5), thick(s + 0.25), _DISTAL_Y)
+
+
+def _prongs(slot: float) -> list[tuple[float, float]]:
+    """Shares of the width, from −1 to 1, that the beams of a jaw take."""
+    return [(-1.0, -slot), (slot, 1.0)] if slot else [(-1.0, 1.0)]
+
+
+def _mix(base: tuple[float, float], tip: tuple[float, float], share: float) -> tuple[float, float]:
+    """Width and height at a share of the length; they taper late, and round off in the end."""
+    taper = share**1.4
+    close = np.sqrt(max(1 - max(share - 0.93, 0) ** 2 / 0.0064, 0.12))
+    width, height = (a + (b - a) * taper for a, b in zip(base, tip))
+    return width * close, height * close
+
+
+def _bend(shape: JawShape, share: float, side: float) -> float:
+    """Where the middle of a jaw lies along the axis of the yaw, at a share of its length."""
+    return shape.curve * share**2 + (side * shape.base[0] / 2 * (1 - 0.6 * share) if shape.blade else 0.0)
+
+
+def _beam(shape: JawShape, share: float, index: int, low: float, high: float, side: float) -> np.ndarray:
+    """The section [K, 3] of the jaw on the side of positive x at a share of its length; every second one is the bottom of a tooth."""
+    width, height = _mix(shape.base, shape.tip, share)
+    face = 0.12 * height * (index % 2) if shape.tooth and 0.3 < share < 0.97 else 0.0
+    back = np.linspace(0, np.pi, 9)
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    # Round on its back, flat on the face; a blade is a wedge whose edge lies on the face.
+    x = face + (height - face) * (0.35 + 0.65 * np.sin(back)) if not shape.blade else height * (0.25 + 0.75 * np.sin(back) ** 0.7)
+    y = 0.5 * width * (middle - half * np.cos(back))
+    x, y = np.concatenate([[face], x, [face]]), np.concatenate([[y[0]], y, [y[-1]]])
+    if shape.blade:
+        x[0] = x[-1] = -0.15 * height  # blades overlap, so that they shear
+    return np.stack([x, y[::-1] + _bend(shape, share, side), np.full(len(x), share * shape.length)], 1)
+
+
+def _hook(build: _Builder, shape: ToolShape) -> None:
+    """An L-shaped wire that leaves an insulated cone."""
+    assert shape.hook
+    length, bend = shape.hook
+    r = shape.radius
+    cone = [_circle(k * r, z, 32) for k, z in ((0.55, -0.3 * r), (0.6, 0.3 * r), (0.34, 0.35 * length), (0.3, 0.5 * length))]
+    build.loft("jaw_left", Material.INSULATION, cone, _DISTAL_Y)
+    wire, turn = 0.6e-3, 1.6e-3
+    path = [np.array([0.0, 0, z]) for z in np.linspace(0.45, 1.0, 6) * (length - turn)]
+    path += [np.array([turn * (1 - np.cos(a)), 0, length - turn + turn * np.sin(a)]) for a in np.linspace(0.2, np.pi / 2, 8)]
+    path += [np.array([x, 0, length]) for x in np.linspace(turn, bend, 4)[1:]]
+    build.loft("jaw_left", Material.STEEL, _swept(np.array(path), lambda s: wire * (1.0 if s < 0.9 else 1.0 - 4 * (s - 0.9))), _DISTAL_Y)
+    build.capsule("jaw_left", (0, 0, 0), (0, 0, 0.5 * length), 0.35 * r, _DISTAL_Y)
+    build.capsule("jaw_left", (0, 0, 0.5 * length), (0, 0, length), wire, _DISTAL_Y)
+    build.capsule("jaw_left", (0, 0, length), (bend, 0, length), wire, _DISTAL_Y)
+
+
+def _swept(path: np.ndarray, radius: Callable[[float], float]) -> np.ndarray:
+    """Circles [S, K, 3] about a path [S, 3] in the plane of x and z, of a radius that depends on the share of the way."""
+    along = np.gradient(path, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    side = np.stack([along[:, 2], np.zeros(len(path)), -along[:, 0]], 1)
+    angle = 2 * np.pi * np.arange(20) / 20
+    shares = np.linspace(0, 1, len(path))
+    circles = [radius(s) * (np.cos(angle)[:, None] * x + np.sin(angle)[:, None] * np.array([0.0, 1, 0])) for s, x in zip(shares, side)]
+    return path[:, None] + np.array(circles)

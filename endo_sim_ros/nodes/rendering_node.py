@@ -94,6 +94,8 @@ class RenderingNode(EndoNode):
         last, self._nodes, self._nodes_stamp = self._nodes_stamp, nodes, messages.stamp_to_ns(message.header.stamp)
         if self._lockstep:
             if self._nodes_stamp == nodes.model_stamp_ns and old is not None and old.model_stamp_ns == nodes.model_stamp_ns:
+                if self._states and last == nodes.model_stamp_ns:
+                    self._states.pop()  # a reset after a reset that was not shown yet
                 self._end_episode(last)
             self._states.append((self._nodes_stamp, nodes, None))
             if len(self._states) > MOST_WAITING:

@@ -46,11 +46,11 @@ class PhysicsNode(EndoNode):
         self._commands = CommandQueue(frozenset((n, kind) for n in self.arms for kind in self._options.lockstep_inputs))
         # In real time only the newest command counts, and none may queue; in lockstep none may be lost.
         depth = MOST_WAITING if self._lockstep else 1
-        self._nodes_pub = self.publisher(messages.CONTROL_NODES, MOST_WAITING if self._lockstep else STREAM_DEPTH)
-        self._cut_pub = self.publisher(messages.CUT_SURFACE, depth)
+        self._nodes_pub = self.publisher(messages.CONTROL_NODES, MOST_WAITING if self._lockstep else STREAM_DEPTH, alone=True)
+        self._cut_pub = self.publisher(messages.CUT_SURFACE, depth, alone=True)
         self._published_cut = 0  # number of the newest surface that was published
-        self._markers_pub = self.publisher(messages.TOOL_MARKERS)
-        self._clock_pub = self.publisher(messages.CLOCK) if self._lockstep else None
+        self._markers_pub = self.publisher(messages.TOOL_MARKERS, alone=True)
+        self._clock_pub = self.publisher(messages.CLOCK, alone=True) if self._lockstep else None
         self.subscribe(messages.GAUSSIANS, lambda message: self._builder.receive_model(message, self._options.world_frame))
         self.subscribe(
             messages.TRAINING_CAMERAS, lambda message: self._builder.receive_training_cameras(message, self._options.world_frame)

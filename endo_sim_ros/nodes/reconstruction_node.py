@@ -74,7 +74,7 @@ class ReconstructionNode(EndoNode):
         self._model_stamp = 0
         self._saved, self._failure, self._finished = "", "", False  # how the last reconstruction ended
         self._cameras: list[Camera] = []  # of the newest published model
-        self._model_pub, self._cameras_pub, self._info_pub = (self.publisher(topic) for topic in messages.MODEL_TOPICS)
+        self._model_pub, self._cameras_pub, self._info_pub = (self.publisher(topic, alone=True) for topic in messages.MODEL_TOPICS)
         for topic in messages.RECORDING_TOPICS:
             self.subscribe(topic, partial(self._on_recording, topic), 50, self._options.reliable)
         self.service(Trigger, "~/reconstruct", self._on_reconstruct)

@@ -46,7 +46,7 @@ class RenderingNode(EndoNode):
         self._dirty, self.images, self._last_image = True, 0, 0.0
         self._output: tuple[np.ndarray, np.ndarray | None, Camera] | None = None
         self._seconds_per_image = 0.0
-        publishers = (self.publisher(topic) for topic in messages.RENDERED_TOPICS)
+        publishers = (self.publisher(topic, alone=True) for topic in messages.RENDERED_TOPICS)
         self._info_pub, self._pose_pub, self._depth_pub, self._image_pub = publishers
         self.subscribe(messages.GAUSSIANS, self._on_model)
         self.subscribe(messages.TRAINING_CAMERAS, self._on_training_cameras)

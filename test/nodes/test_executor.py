@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from ros_bench import S, send_camera
 from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
+from endo_sim_ros.messages import OK, WARN
+from endo_sim_ros.nodes import base
 from endo_sim_ros.nodes.base import EndoNode
 from endo_sim_ros.nodes.rclpy_private import spin
 
@@ -33,6 +36,36 @@ raise SystemExit(run(Interrupted))
 def test_ctrl_c_during_a_callback_is_not_logged_as_its_error():
     done = subprocess.run([sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+@pytest.mark.parametrize("when", ["before", "later"])
+def test_a_second_publisher_of_a_topic_of_ones_own_is_told_until_it_is_gone(bench, monkeypatch, when):
+    """One that was there first may be dead: a killed node stays known for a while."""
+    monkeypatch.setattr(base, "_DISCOVERED", 1.5)
+    monkeypatch.setattr(base, "_FORGOTTEN", 4.0)
+    other, elsewhere = rclpy.create_node("twin"), rclpy.create_node("twin", namespace="left")
+    arguments = messages.ros_class(messages.GAUSSIANS.type), messages.GAUSSIANS.name, 1
+    elsewhere.create_publisher(*arguments)  # another topic
+    began = time.monotonic()
+    try:
+        if when == "before":
+            other.create_publisher(*arguments)
+        node = EndoNode("owner")
+        bench.nodes.append(node)
+        bench.executor.add_node(node)
+        node.publisher(messages.GAUSSIANS, alone=True)
+        bench.spin(2.5)
+        assert {level for level, *_ in bench.statuses["owner"]} == {OK}
+        if when == "later":
+            other.create_publisher(*arguments)
+        _, text, _ = bench.status("owner", "running; more than one node publishes /gaussians (", WARN)
+        assert "/owner" in text and "/twin" in text and "ROS_DOMAIN_ID" in text and "left" not in text
+        assert when == "later" or time.monotonic() - began > 4.0
+    finally:
+        other.destroy_node()
+        elsewhere.destroy_node()
+    seen = len(bench.statuses["owner"])
+    bench.until(lambda: [s for s in bench.statuses["owner"][seen:] if s[0] == OK], "the end of the warning")
 
 
 def test_a_node_serves_what_is_there_and_what_is_added_or_removed_meanwhile(bench):

@@ -51,6 +51,7 @@ _VALUES = {
     "rendering_node": ("images", "milliseconds per image", "errors"),
     "bag_player_node": ("messages", "of", "errors"),
 }
+_LEARNER, _PLAYER = "reconstruction_node", "bag_player_node"
 _NODE_NAMES = {"bag_player_node": "bag_player"}  # where the node is not called like its module
 
 
@@ -81,6 +82,7 @@ class Supervisor:
         self._ended: set[str] = set()
         self._said: dict[str, tuple[str, str]] = {}
         self._set: dict[str, dict[str, Any]] = {}  # parameters of each node, by its full name, that were set while it ran
+        self._replay = False  # the bag, as soon as the one that learns from it listens
 
     def start(self, name: str, *ros_arguments: str, **parameters: Any) -> None:
         """Start a node, and remember its arguments for when it crashes."""
@@ -119,6 +121,7 @@ class Supervisor:
                 live = {key: _quoted(value) for key, value in self._set.get(self.full_name(name), {}).items()}
                 self._began[name] = time.monotonic()
                 self._graph.start(name, *ros_arguments, **parameters | live)
+                self._replay |= name == _LEARNER and _PLAYER in self._arguments
                 continue
             if status is None or name in self._ended or name in self._due:
                 continue
@@ -148,8 +151,22 @@ class Supervisor:
                 self._due[name] = now + pause
             else:
                 self._ended.add(name)
-        if self._ended >= self._graph.nodes.keys() - {"bag_player_node"}:
+        if self._ended >= self._graph.nodes.keys() - {_PLAYER}:
             raise UpError("no node is left")
+
+    def replay(self, watcher: Watcher) -> None:
+        """Play the bag again for a reconstruction_node that was started again: it knows nothing of what came before."""
+        if not self._replay or watcher.heard.get(self.full_name(_LEARNER), 0.0) < self._began[_LEARNER]:
+            return
+        self._replay = False
+        player, (ros_arguments, parameters) = self._graph.nodes[_PLAYER], self._arguments[_PLAYER]
+        if player.exit_status is None:
+            player.process.send_signal(signal.SIGINT)
+            player.wait()
+        self._ended.discard(_PLAYER)
+        self._due.pop(_PLAYER, None)
+        self.start(_PLAYER, *ros_arguments, **parameters)
+        self._console.print(f"{_PLAYER} plays the bag again for the new {_LEARNER}", highlight=False)
 
     def rows(self, watcher: Watcher) -> list[_Row]:
         """The state of each node."""
@@ -241,6 +258,7 @@ def _watch(supervisor: Supervisor, console: Console, asked: threading.Event) -> 
             while (left := deadline - time.monotonic()) > 0 and not asked.is_set():
                 executor.spin_once(timeout_sec=left)
             supervisor.check()
+            supervisor.replay(watcher)
             if not warned and not supervisor.restarted and (twins := supervisor.twins(watcher)):
                 warned = True  # after a restart the one that crashed is still known to others for a while
                 text = f"{', '.join(twins)}: there more than once; does another graph run in this ROS domain?"

@@ -108,6 +108,18 @@ def test_up_reports_a_node_that_dies_and_starts_it_again(up):
     assert run.end(signal.SIGTERM)[0] == 0
 
 
+@pytest.mark.slow
+@pytest.mark.dds
+def test_a_reconstruction_that_is_started_again_gets_the_bag_again(up, small_bag):
+    run = up("--bag", str(small_bag))
+    run.says(r"bag_player_node +ended +finished")
+    run.says(r"reconstruction_node +ok +(preparing|training|finished)")
+    os.kill(run.processes()["reconstruction_node"], signal.SIGKILL)
+    run.says(r"reconstruction_node was ended by SIGKILL; it is started again(.*\n)*reconstruction_node +ok +finished")
+    assert "bag_player_node plays the bag again for the new reconstruction_node" in run.output.read_text()
+    assert run.end()[0] == 0
+
+
 @pytest.mark.dds
 def test_a_node_that_is_started_again_has_what_was_set_while_it_ran(up, bench):
     run = up("--namespace", "left")

@@ -272,9 +272,9 @@ class ReconstructionNode(EndoNode):
             save_cameras(cameras, folder / _CAMERAS)
             if trainer is not None:
                 trainer.save_checkpoint(folder / "checkpoint.pt")
-        except (OSError, RuntimeError) as error:  # torch turns a full disk into a RuntimeError
-            reason = getattr(error, "strerror", None) or str(error)
-            raise SequenceError(f"{folder}: the model cannot be saved ({reason}); set output_dir") from error
+        except OSError as error:
+            reason = error.strerror or str(error)
+            raise SequenceError(f"{folder}: the model cannot be saved ({reason}); set output_dir and call ~/save") from error
         self._saved = str(folder)
 
     # --------------------------------------------------------------- services

@@ -9,6 +9,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import rclpy
@@ -21,12 +22,14 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.timer import Timer
-from rclpy.utilities import ok, try_shutdown
+from rclpy.utilities import ok, remove_ros_args, try_shutdown
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ClientState, Topic
+from endo_sim_ros.nodes.configs import NODE_CONFIGS
 from endo_sim_ros.nodes.errors import sentence
+from endo_sim_ros.nodes.parameter_file import parameter_file
 from endo_sim_ros.nodes.parameters import ConfiguredNode
 from endo_sim_ros.nodes.process import end_with_parent
 from endo_sim_ros.nodes.rclpy_private import spin
@@ -200,8 +203,21 @@ def quality(topic: Topic, depth: int = STREAM_DEPTH, reliable: bool = True) -> Q
 
 
 def run(node_class: Callable[[], EndoNode]) -> int:
-    """Start ROS, spin a node until it is told to stop, and return the exit status: 2 if it could not start."""
+    """Start ROS, spin a node until it is told to stop, and return the exit status: 2 if it could not start.
+
+    With --help it only tells the parameters.
+    """
     spinning = False
+    name, words = Path(sys.argv[0]).stem, []
+    with contextlib.suppress(RuntimeError):  # arguments that ROS does not understand are told below
+        words = remove_ros_args(sys.argv)[1:]
+    if {"-h", "--help"} & {*words}:
+        print(_help(name, node_class))
+        return 0
+    if words:
+        where = "parameters are given as --ros-args -p NAME:=VALUE, and --help lists them"
+        print(f"{name}: unknown argument {' '.join(words)}; {where}", file=sys.stderr)
+        return 2
 
     def on_interrupt(*_: Any) -> None:
         if not spinning:
@@ -241,6 +257,13 @@ def run(node_class: Callable[[], EndoNode]) -> int:
     watchdog.daemon = True
     watchdog.start()
     return status
+
+
+def _help(name: str, node_class: Callable[[], EndoNode]) -> str:
+    """What --help prints: what a node does, and its parameters as a file for --params-file."""
+    node = name if name in NODE_CONFIGS else name.removesuffix("_node")
+    usage = f"usage: ros2 run endo_sim_ros {name} [--ros-args [-p NAME:=VALUE]... [--params-file FILE]... [-r FROM:=TO]...]"
+    return f"{usage}\n\n{node_class.__doc__}\n\nIts parameters with their defaults, as a parameter file:\n\n{parameter_file((node,))}"
 
 
 def _one_line(error: Exception) -> str:

@@ -4,19 +4,23 @@ import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 import rclpy
+import yaml
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException
 from ros_bench import S, send_camera
 from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
+from endo_sim_ros.core.config import options
 from endo_sim_ros.messages import OK, WARN
 from endo_sim_ros.nodes import base
-from endo_sim_ros.nodes.base import EndoNode
+from endo_sim_ros.nodes.base import EndoNode, run
+from endo_sim_ros.nodes.configs import NODE_CONFIGS
 from endo_sim_ros.nodes.rclpy_private import spin
 
 pytestmark = pytest.mark.dds
@@ -31,6 +35,21 @@ class Interrupted(EndoNode):
         self.every(0.01, lambda: os.kill(os.getpid(), signal.SIGINT))
 raise SystemExit(run(Interrupted))
 """
+
+
+@pytest.mark.parametrize("node", sorted(path.name for path in (Path(__file__).parents[2] / "scripts").glob("*_node")))
+def test_help_lists_the_parameters_and_unknown_arguments_are_refused(node, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [f"/somewhere/{node}.py", "--help"])
+    assert run(EndoNode) == 0
+    said = capsys.readouterr().out
+    assert said.startswith(f"usage: ros2 run endo_sim_ros {node} ") and not rclpy.ok()
+    (section,) = yaml.safe_load(said[said.index("/**/") :]).values()
+    configs = NODE_CONFIGS.get(node) or NODE_CONFIGS[node.removesuffix("_node")]
+    assert section["ros__parameters"].keys() <= {option.name for config in configs for option in options(config)}
+    assert all(f"{option.name}: " in said for config in configs for option in options(config))
+    monkeypatch.setattr(sys, "argv", [f"/somewhere/{node}.py", "--nonsense", "--ros-args", "-p", "world_frame:=map"])
+    assert run(EndoNode) == 2 and not rclpy.ok()
+    assert capsys.readouterr().err.startswith(f"{node}: unknown argument --nonsense; parameters are given as --ros-args -p ")
 
 
 def test_ctrl_c_during_a_callback_is_not_logged_as_its_error():

@@ -20,13 +20,24 @@ def test_absurd_force_is_caught_and_the_last_good_state_restored(kinematics):
     simulation.set_wrench("probe", TIP, [0.0, 0.0, -1e7])
     simulation.step()
     bad = simulation.state()
-    assert simulation.faults == 1 and "undone" in simulation.last_fault and "1e+07 N" in simulation.last_fault
+    assert simulation.faults == 1 and "undone" in simulation.last_fault and "(probe 1e+07 N); use less force" in simulation.last_fault
     np.testing.assert_array_equal(bad.positions, good.positions)
     np.testing.assert_array_equal(bad.F, good.F)
     assert not np.any(simulation.solver.momentum()[0])
     simulation.set_wrench("probe", TIP, [0.0, 0.0, 0.1])
     steps(simulation, 2)
     assert simulation.faults == 1 and np.isfinite(simulation.state().positions).all()
+
+
+def test_an_absurd_torque_is_said_to_be_one():
+    simulation = simulate()
+    simulation.set_wrench("probe", TIP, [0.0, 0.0, 0.1], [0.0, 1e6, 0.0])
+    simulation.step()
+    assert "(probe 0.1 N and 1e+06 N·m); use less torque or more travel" in simulation.last_fault
+    simulation.reset()
+    simulation.set_wrench("probe", TIP, [0.0, 0.0, 0.0], [0.0, 1e6, 0.0])
+    simulation.step()
+    assert "(probe 1e+06 N·m); use less torque or" in simulation.last_fault
 
 
 @pytest.mark.slow

@@ -22,6 +22,8 @@ from plane_scene import (
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.physics import regions
+from endo_sim_ros.sequences import calibration_files
+from endo_sim_ros.sequences.bag import read_bag, write_bag
 from endo_sim_ros.sequences.folder import read_folder, read_points, write_points
 from endo_sim_ros.sequences.images import read_image
 from endo_sim_ros.sequences.readers import open_sequence
@@ -142,3 +144,16 @@ def test_a_huge_image_is_one_sentence(tmp_path):
         read_image(tmp_path / "1.png")
     with pytest.raises(ConfigError, match=r"1.png has over 64 megapixels"):
         regions._read_mask(str(tmp_path / "1.png"))
+
+
+def test_a_baseline_in_millimetres_is_told(folder, caplog):
+    calibration_files.warn_of_baseline.cache_clear()
+    list(read_folder(folder))
+    assert "apart" not in caplog.text
+    (folder / "calibration.yaml").write_text(CALIBRATION + "baseline_m: 5.4\n")
+    for _ in range(2):
+        frames = list(read_folder(folder))
+    assert caplog.text.count("calibration.yaml: baseline_m: the two eyes would be 5.4 m apart; give metres, this is probably millim") == 1
+    write_bag(folder.parent / "bag", frames)
+    list(read_bag(folder.parent / "bag"))
+    assert "endoscope/right/camera_info: P: the two eyes would be 5.4 m apart" in caplog.text

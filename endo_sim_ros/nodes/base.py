@@ -234,6 +234,7 @@ def run(node_class: Callable[[], EndoNode]) -> int:
     node, status = None, 0
     try:
         node = node_class()
+        node.get_logger().info(f"ready; {node.status()[1]}")
         gc.freeze()  # looking through all that was imported takes 0.15 s, in which nothing else happens
         spinning = True
         spin(node)

@@ -309,7 +309,8 @@ class TissueSimulation:
     def reaction(self, tool: str) -> tuple[np.ndarray, np.ndarray]:
         """Force [3] N and torque [3] N·m that the tissue exerts back on a tool, world: minus what its wrench applies
         (torque about the point held) and the mean over the last step of what its jaw and its capsule gave (about the tip);
-        zero for a tool that is out of reach, has let go or is unknown."""
+        zero for a tool that is out of reach, has let go or is unknown. In a step that is undone it stays for a tool that holds
+        tissue, so that it does not vanish where the tissue can follow no farther."""
         if tool not in self._slots:
             return np.zeros(3), np.zeros(3)
         slot, tools = self._slots[tool], self._tools

@@ -18,7 +18,7 @@ TORCH ?= torch==2.13.0
 TORCH_INDEX ?= $(shell command -v nvidia-smi >/dev/null 2>&1 || echo --extra-index-url https://download.pytorch.org/whl/cpu)
 PIP_INSTALL = python -m pip install --quiet $(if $(CONSTRAINTS),-c $(CONSTRAINTS))
 
-.PHONY: demo lint types fast check test test-minimum api setup clean
+.PHONY: demo lint types fast check test test-minimum api setup links clean
 
 demo: setup
 	$(VENV)/bin/endo-sim demo --out $(OUT) $(if $(BAG),--bag $(BAG))
@@ -47,7 +47,7 @@ test-minimum:
 api: setup
 	$(VENV)/bin/pdoc --docformat google --output-directory $(OUT)/api endo_sim_ros '!endo_sim_ros.learning.ppo'  # which needs stable-baselines3
 
-setup: $(VENV)/.installed
+setup: links
 
 $(VENV)/.installed: setup.py setup.cfg package.xml $(CONSTRAINTS)
 	@echo "setting up $(VENV), about a minute ..."
@@ -56,6 +56,17 @@ $(VENV)/.installed: setup.py setup.cfg package.xml $(CONSTRAINTS)
 	$(VENV)/bin/$(PIP_INSTALL) --retries 0 $(TORCH_INDEX) '$(TORCH)'
 	$(VENV)/bin/$(PIP_INSTALL) -e '.[test]'
 	touch $@
+
+# pip leaves out the data files of an editable package: `ros2 run` and `ros2 launch` find the package by them, and by AMENT_PREFIX_PATH.
+SHARE = $(VENV)/share/endo_sim_ros
+links: $(VENV)/.installed
+	@mkdir -p $(VENV)/lib/endo_sim_ros $(SHARE)/launch $(SHARE)/config/sros2 $(VENV)/share/ament_index/resource_index/packages
+	@ln -sf $(CURDIR)/scripts/*_node $(VENV)/lib/endo_sim_ros
+	@ln -sf $(CURDIR)/resource/endo_sim_ros $(VENV)/share/ament_index/resource_index/packages
+	@ln -sf $(CURDIR)/package.xml $(CURDIR)/msg_conventions.md $(SHARE)
+	@ln -sf $(CURDIR)/launch/*.py $(SHARE)/launch
+	@ln -sf $(CURDIR)/config/*.* $(SHARE)/config
+	@ln -sf $(CURDIR)/config/sros2/*.xml $(SHARE)/config/sros2
 
 clean:
 	rm -rf .venv .venv-minimum $(OUT)

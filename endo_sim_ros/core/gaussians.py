@@ -216,11 +216,15 @@ def save_ply(model: GaussianModel, path: str | Path) -> None:
         lines += [f"element {name} {len(array)}", *(f"property {kind} {field}" for field in fields)]
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".part")
-    with partial.open("wb") as file:
-        file.write("\n".join([*lines, "end_header", ""]).encode())
-        for *_, array in elements:
-            file.write(np.ascontiguousarray(array).data)
-    partial.replace(path)
+    try:
+        with partial.open("wb") as file:
+            file.write("\n".join([*lines, "end_header", ""]).encode())
+            for *_, array in elements:
+                file.write(np.ascontiguousarray(array).data)
+        partial.replace(path)
+    except OSError:
+        partial.unlink(missing_ok=True)
+        raise
 
 
 def load_ply(path: str | Path) -> GaussianModel:

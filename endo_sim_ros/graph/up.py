@@ -1,5 +1,6 @@
 """The whole graph from one terminal, where `ros2 launch` is not installed, with a live view of what each node says."""
 
+import json
 import os
 import re
 import shlex
@@ -8,11 +9,15 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import rclpy
+from rcl_interfaces.msg import ParameterEvent
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from rclpy.qos import qos_profile_parameter_events
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import try_shutdown
 from rich.console import Console
@@ -46,6 +51,7 @@ _VALUES = {
     "rendering_node": ("images", "milliseconds per image", "errors"),
     "bag_player_node": ("messages", "of", "errors"),
 }
+_LEARNER, _PLAYER = "reconstruction_node", "bag_player_node"
 _NODE_NAMES = {"bag_player_node": "bag_player"}  # where the node is not called like its module
 
 
@@ -75,6 +81,8 @@ class Supervisor:
         self.restarted: set[str] = set()
         self._ended: set[str] = set()
         self._said: dict[str, tuple[str, str]] = {}
+        self._set: dict[str, dict[str, Any]] = {}  # parameters of each node, by its full name, that were set while it ran
+        self._replay = False  # the bag, as soon as the one that learns from it listens
 
     def start(self, name: str, *ros_arguments: str, **parameters: Any) -> None:
         """Start a node, and remember its arguments for when it crashes."""
@@ -90,6 +98,14 @@ class Supervisor:
         there = ["/".join((space.strip("/"), name)).lstrip("/") for name, space in watcher.get_node_names_and_namespaces()]
         return [name for name in map(self.full_name, self._graph.nodes) if there.count(name) > 1]
 
+    def note_parameters(self, event: ParameterEvent, watcher: Watcher) -> None:
+        """Remember what was set while a node ran, for when it crashes."""
+        name, changed = event.node.lstrip("/"), list(event.changed_parameters)
+        node = next((each for each in self._graph.nodes if self.full_name(each) == name), None)
+        if node is not None and watcher.heard.get(name, 0.0) > self._began[node]:  # before, all that it declares is new
+            changed += event.new_parameters  # a list that had no value yet
+        self._set.setdefault(name, {}).update({each.name: Parameter.from_parameter_msg(each).value for each in changed})
+
     def check(self) -> None:
         """Report nodes that ended; start those that crashed again after a pause, unless they crash again and again.
 
@@ -102,7 +118,10 @@ class Supervisor:
             if name in self._due and time.monotonic() >= self._due[name]:
                 del self._due[name]
                 ros_arguments, parameters = self._arguments[name]
-                self.start(name, *ros_arguments, **parameters)
+                live = {key: _quoted(value) for key, value in self._set.get(self.full_name(name), {}).items()}
+                self._began[name] = time.monotonic()
+                self._graph.start(name, *ros_arguments, **parameters | live)
+                self._replay |= name == _LEARNER and _PLAYER in self._arguments
                 continue
             if status is None or name in self._ended or name in self._due:
                 continue
@@ -120,6 +139,10 @@ class Supervisor:
                 log = node.log.replace(node.log.with_suffix(".crashed.log"))
             pause = _FIRST_PAUSE * 2 ** (crashes - 1)
             what = f"it is started again in {pause:g} s" if again else "it stays down"
+            if again and (live := self._set.get(self.full_name(name))):
+                if crashes > 1:  # they may be why
+                    del self._set[self.full_name(name)]
+                what += f", {'without' if crashes > 1 else 'with'} what was set while it ran: {', '.join(live)}"
             if crashes == _MOST_CRASHES:
                 how += f", {crashes} times in a row within {_SOON:g} s of its start"
             self._console.print(Text.assemble((f"{name} {how}", "red"), f"; {what}; its log is {log}"), soft_wrap=True)
@@ -128,8 +151,22 @@ class Supervisor:
                 self._due[name] = now + pause
             else:
                 self._ended.add(name)
-        if self._ended >= self._graph.nodes.keys() - {"bag_player_node"}:
+        if self._ended >= self._graph.nodes.keys() - {_PLAYER}:
             raise UpError("no node is left")
+
+    def replay(self, watcher: Watcher) -> None:
+        """Play the bag again for a reconstruction_node that was started again: it knows nothing of what came before."""
+        if not self._replay or watcher.heard.get(self.full_name(_LEARNER), 0.0) < self._began[_LEARNER]:
+            return
+        self._replay = False
+        player, (ros_arguments, parameters) = self._graph.nodes[_PLAYER], self._arguments[_PLAYER]
+        if player.exit_status is None:
+            player.process.send_signal(signal.SIGINT)
+            player.wait()
+        self._ended.discard(_PLAYER)
+        self._due.pop(_PLAYER, None)
+        self.start(_PLAYER, *ros_arguments, **parameters)
+        self._console.print(f"{_PLAYER} plays the bag again for the new {_LEARNER}", highlight=False)
 
     def rows(self, watcher: Watcher) -> list[_Row]:
         """The state of each node."""
@@ -208,6 +245,8 @@ def _watch(supervisor: Supervisor, console: Console, asked: threading.Event) -> 
     """Show the nodes until asked to end."""
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)  # the signals are heard by the caller
     watcher, executor = Watcher("up"), SingleThreadedExecutor()
+    on_event = partial(supervisor.note_parameters, watcher=watcher)
+    watcher.create_subscription(ParameterEvent, "/parameter_events", on_event, qos_profile_parameter_events)
     executor.add_node(watcher)
     warned = False
     live = Live(console=console, auto_refresh=False) if console.is_terminal else None
@@ -219,6 +258,7 @@ def _watch(supervisor: Supervisor, console: Console, asked: threading.Event) -> 
             while (left := deadline - time.monotonic()) > 0 and not asked.is_set():
                 executor.spin_once(timeout_sec=left)
             supervisor.check()
+            supervisor.replay(watcher)
             if not warned and not supervisor.restarted and (twins := supervisor.twins(watcher)):
                 warned = True  # after a restart the one that crashed is still known to others for a while
                 text = f"{', '.join(twins)}: there more than once; does another graph run in this ROS domain?"
@@ -235,6 +275,13 @@ def _watch(supervisor: Supervisor, console: Console, asked: threading.Event) -> 
         executor.shutdown()
         watcher.destroy_node()
         try_shutdown()
+
+
+def _quoted(value: Any) -> Any:
+    """A value of a parameter whose strings no parser takes for something else."""
+    if isinstance(value, str):
+        return json.dumps(value)
+    return value if isinstance(value, (bool, int, float)) else [_quoted(each) for each in value]
 
 
 def _table(rows: list[_Row]) -> Table:

@@ -32,9 +32,9 @@ class ArmTopics:
         self._node, self._arms, self._deliver = node, arms, deliver
         commanded = options.arm_source == "commanded"
         self._pose_topic = messages.tool_pose_command if commanded else messages.tool_pose
-        self._reactions = {name: node.publisher(messages.tool_reaction(name)) for name in arms}
+        self._reactions = {name: node.publisher(messages.tool_reaction(name), alone=True) for name in arms}
         shown = messages.tool_pose, messages.tool_setpoint, messages.tool_jaw_state, messages.tool_jaw_setpoint, messages.tool_state
-        self._publishers = {name: {topic: node.publisher(topic(name)) for topic in shown} for name in arms if commanded}
+        self._publishers = {name: {topic: node.publisher(topic(name), alone=True) for topic in shown} for name in arms if commanded}
         self._told: dict[str, tuple[str, bool, bool]] = {}  # what was last said on operating_state
         several = max(depth, STREAM_DEPTH)  # for what comes once
         for arm in arms.values():

@@ -7,7 +7,9 @@ import signal
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import rclpy
@@ -20,12 +22,14 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.timer import Timer
-from rclpy.utilities import ok, try_shutdown
+from rclpy.utilities import ok, remove_ros_args, try_shutdown
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ClientState, Topic
+from endo_sim_ros.nodes.configs import NODE_CONFIGS
 from endo_sim_ros.nodes.errors import sentence
+from endo_sim_ros.nodes.parameter_file import parameter_file
 from endo_sim_ros.nodes.parameters import ConfiguredNode
 from endo_sim_ros.nodes.process import end_with_parent
 from endo_sim_ros.nodes.rclpy_private import spin
@@ -35,6 +39,9 @@ _ERROR_SHOWN = 5.0  # seconds that an error stays on /diagnostics, and that its 
 MOST_LOGGED = 10  # different errors logged in that time: one whose text differs at 500 Hz must not flood the log
 _LONGEST_ERROR = 1000  # characters; a sentence may quote what came, and that may be megabytes
 _END_WITHIN = 3.0  # seconds that worker threads have to end before the process ends without them
+# A killed node stays known for 20 seconds. Whoever starts in its place must not take it for one that lives.
+_DISCOVERED = 5.0  # seconds after the start in which those are found that were there before
+_FORGOTTEN = 25.0  # seconds after which one of those that is still there is alive
 STREAM_DEPTH = 20  # messages that wait for a slow subscriber: 0.7 s of a camera at 30 Hz
 
 
@@ -47,6 +54,10 @@ class EndoNode(ConfiguredNode):
         self._diagnostics = self.publisher(messages.DIAGNOSTICS)
         self._error_text, self._error_until, self.error_count = "", 0.0, 0
         self.logged: dict[str, float] = {}
+        self._started = time.monotonic()
+        self._alone: list[Publisher] = []  # publishers of topics that nobody else may publish
+        self._mixed: dict[str, float] = {}  # those of their topics that others publish, and since when, as far as is known
+        self._mixed_text = ""
         self.every(1.0, self.publish_diagnostics)
 
     def every(self, seconds: float, callback: Callable[[], None]) -> Timer:
@@ -55,17 +66,21 @@ class EndoNode(ConfiguredNode):
 
     # ----------------------------------------------------------------- topics
 
-    def publisher(self, topic: Topic, depth: int = STREAM_DEPTH) -> Publisher:
+    def publisher(self, topic: Topic, depth: int = STREAM_DEPTH, alone: bool = False) -> Publisher:
         """A publisher of a topic.
 
         Args:
             topic: The topic.
             depth: Messages that are kept for subscribers that are slow.
+            alone: Warn on /diagnostics when anybody else publishes it: subscribers would take the one for the other.
 
         Raises:
             MessageError: If the type of the topic is not installed.
         """
-        return self.create_publisher(messages.ros_class(topic.type), topic.name, quality(topic, depth))
+        publisher = self.create_publisher(messages.ros_class(topic.type), topic.name, quality(topic, depth))
+        if alone:
+            self._alone.append(publisher)
+        return publisher
 
     def subscribe(self, topic: Topic, callback: Callable[[Any], None], depth: int = STREAM_DEPTH, reliable: bool = True) -> None:
         """Subscribe with a callback whose errors are reported, with the name of the topic, instead of raised.
@@ -136,6 +151,8 @@ class EndoNode(ConfiguredNode):
         """Publish the status of the node now, or the newest error for a while; also called once a second."""
         try:
             level, text, values = self.status()
+            if level != ERROR and (mixed := self._mixing()):
+                level, text = WARN, f"{text}; {mixed}"
         except Exception as error:  # a fault in describing the state must not end the node
             level, text, values = ERROR, sentence("status", error), {}
         if self._unknown and level != ERROR:
@@ -153,6 +170,27 @@ class EndoNode(ConfiguredNode):
             if self.context.ok():  # otherwise a worker came to its end after the node
                 raise
 
+    def _mixing(self) -> str:
+        """Which topics of this node others publish as well, in words."""
+        now, found = time.monotonic(), [publisher.topic_name for publisher in self._alone]
+        found = [topic for topic in found if self.count_publishers(topic) > 1]
+        self._mixed = {topic: self._mixed.get(topic, now) for topic in found}
+        late = now - self._started > _FORGOTTEN
+        topics = [topic for topic, since in self._mixed.items() if late or since - self._started > _DISCOVERED]
+        if not topics:
+            self._mixed_text = ""
+        elif not self._mixed_text:
+            infos = self.get_publishers_info_by_topic(topics[0])
+            names = Counter(f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in infos)
+            who = ", ".join(f"{name} {count} times" if count > 1 else name for name, count in names.items())
+            more = f" and {len(topics) - 1} more topics" if len(topics) > 1 else ""
+            self._mixed_text = (
+                f"more than one node publishes {topics[0]}{more} ({who}), and their messages mix; "
+                "end one of them, or give each graph a namespace or a ROS_DOMAIN_ID of its own"
+            )
+            self.get_logger().warning(self._mixed_text)
+        return self._mixed_text
+
 
 def quality(topic: Topic, depth: int = STREAM_DEPTH, reliable: bool = True) -> QoSProfile:
     """Quality of service of a topic: reliable; latched topics keep their last message, or the depth asked for, for late joiners."""
@@ -165,8 +203,21 @@ def quality(topic: Topic, depth: int = STREAM_DEPTH, reliable: bool = True) -> Q
 
 
 def run(node_class: Callable[[], EndoNode]) -> int:
-    """Start ROS, spin a node until it is told to stop, and return the exit status: 2 if it could not start."""
+    """Start ROS, spin a node until it is told to stop, and return the exit status: 2 if it could not start.
+
+    With --help it only tells the parameters.
+    """
     spinning = False
+    name, words = Path(sys.argv[0]).stem, []
+    with contextlib.suppress(RuntimeError):  # arguments that ROS does not understand are told below
+        words = remove_ros_args(sys.argv)[1:]
+    if {"-h", "--help"} & {*words}:
+        print(_help(name, node_class))
+        return 0
+    if words:
+        where = "parameters are given as --ros-args -p NAME:=VALUE, and --help lists them"
+        print(f"{name}: unknown argument {' '.join(words)}; {where}", file=sys.stderr)
+        return 2
 
     def on_interrupt(*_: Any) -> None:
         if not spinning:
@@ -183,6 +234,7 @@ def run(node_class: Callable[[], EndoNode]) -> int:
     node, status = None, 0
     try:
         node = node_class()
+        node.get_logger().info(f"ready; {node.status()[1]}")
         gc.freeze()  # looking through all that was imported takes 0.15 s, in which nothing else happens
         spinning = True
         spin(node)
@@ -206,6 +258,13 @@ def run(node_class: Callable[[], EndoNode]) -> int:
     watchdog.daemon = True
     watchdog.start()
     return status
+
+
+def _help(name: str, node_class: Callable[[], EndoNode]) -> str:
+    """What --help prints: what a node does, and its parameters as a file for --params-file."""
+    node = name if name in NODE_CONFIGS else name.removesuffix("_node")
+    usage = f"usage: ros2 run endo_sim_ros {name} [--ros-args [-p NAME:=VALUE]... [--params-file FILE]... [-r FROM:=TO]...]"
+    return f"{usage}\n\n{node_class.__doc__}\n\nIts parameters with their defaults, as a parameter file:\n\n{parameter_file((node,))}"
 
 
 def _one_line(error: Exception) -> str:

@@ -241,13 +241,17 @@ NODE_CONFIGS: dict[str, tuple[type[StageConfig], ...]] = {
 
 
 def arm_names(names: Iterable[str]) -> tuple[str, ...]:
-    """The names in the parameter `arms` without spaces and repetitions.
+    """The names in the parameter `arms` without spaces.
 
     Raises:
-        ConfigError: If a name cannot be part of the name of a topic.
+        ConfigError: If there is none, one is there twice, or one cannot be part of the name of a topic.
     """
-    names = tuple(dict.fromkeys(name.strip() for name in names))
+    names = tuple(name.strip() for name in names)
+    if not names:
+        raise ConfigError("arms: the list is empty; name at least one arm, such as [PSM1]")
     for name in names:
         if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*", name):
             raise ConfigError(f"arms: {name!r} cannot name topics; use letters, digits and _")
+        if names.count(name) > 1:
+            raise ConfigError(f"arms: {name} is there {names.count(name)} times; give each arm a name of its own")
     return names

@@ -19,6 +19,7 @@ from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
 from endo_sim_ros.physics.regions import read_regions
 
 _SLOW = 0.5  # real-time factor below which the node warns
+_FAST = 1.5  # times real speed from which a clock is to blame for that
 _POLLS = 4  # times per step that the timer asks whether a step is due
 _LONGEST_POLL = 0.1  # seconds; models and parameters must not wait for steps that take minutes
 _WINDOW = 1.0  # seconds over which the real-time factor is measured
@@ -38,19 +39,20 @@ class PhysicsNode(EndoNode):
         self._simulated_stamp = 0  # stamp of the simulated model, ns
         self.failure = ""  # why the newest model is not simulated
         self._paused, self.steps, self._seconds_per_step = False, 0, 0.0
-        self._window: tuple[float, float] | None = None  # clock and simulated time where the real-time factor begins
-        self._real_time_factor = 1.0
+        self._window: tuple[float, float, float] | None = None  # clock, simulated and wall time where the real-time factor begins
+        self._real_time_factor = self._clock_speed = 1.0  # the clock's is that against the wall's
+        self._asked = 0.0  # time of the clock when it was last asked for a step
         self._pacer = Pacer()
         self.arms = {name: Arm(name) for name in arm_names(self._options.arms)}
         self._lockstep = self._options.mode == "lockstep"
         self._commands = CommandQueue(frozenset((n, kind) for n in self.arms for kind in self._options.lockstep_inputs))
         # In real time only the newest command counts, and none may queue; in lockstep none may be lost.
         depth = MOST_WAITING if self._lockstep else 1
-        self._nodes_pub = self.publisher(messages.CONTROL_NODES, MOST_WAITING if self._lockstep else STREAM_DEPTH)
-        self._cut_pub = self.publisher(messages.CUT_SURFACE, depth)
+        self._nodes_pub = self.publisher(messages.CONTROL_NODES, MOST_WAITING if self._lockstep else STREAM_DEPTH, alone=True)
+        self._cut_pub = self.publisher(messages.CUT_SURFACE, depth, alone=True)
         self._published_cut = 0  # number of the newest surface that was published
-        self._markers_pub = self.publisher(messages.TOOL_MARKERS)
-        self._clock_pub = self.publisher(messages.CLOCK) if self._lockstep else None
+        self._markers_pub = self.publisher(messages.TOOL_MARKERS, alone=True)
+        self._clock_pub = self.publisher(messages.CLOCK, alone=True) if self._lockstep else None
         self.subscribe(messages.GAUSSIANS, lambda message: self._builder.receive_model(message, self._options.world_frame))
         self.subscribe(
             messages.TRAINING_CAMERAS, lambda message: self._builder.receive_training_cameras(message, self._options.world_frame)
@@ -171,14 +173,28 @@ class PhysicsNode(EndoNode):
                 self._step_if_due()
 
     def _step_if_due(self) -> None:
-        """Real time: take the next step if it is time for it."""
+        """Real time: take the next step if it is time for it; the steps of a whole leap of a simulated clock, in time for the next."""
         simulation, now = self.simulation, self._seconds()
-        if simulation is None or now == 0 or not self._pacer.is_due(now, simulation.step_duration):  # 0: no /clock yet
+        if simulation is None or now == 0:  # 0: no /clock yet
             return
-        if not self._paused:
-            self.step(simulation)
-            self._measure(now, simulation)
-        self._publish(simulation, self.now_ns())
+        step, before, began = simulation.step_duration, self._asked, time.monotonic()
+        self._asked = now
+        leaping = self.get_parameter("use_sim_time").value and 0 < now - before < _WINDOW
+        moments = [*np.arange(before + step, now, step), now] if leaping else [now]
+        due = False
+        for moment in moments:
+            if time.monotonic() - began > _LONGEST_POLL:
+                moment = now  # what is left is skipped
+            if self._pacer.is_due(moment, step):
+                due = True
+                if not self._paused:
+                    self.step(simulation)
+            if moment == now:
+                break
+        if due:
+            if not self._paused:
+                self._measure(now, simulation)
+            self._publish(simulation, self.now_ns())
 
     def _start_timing(self) -> None:
         """Begin to measure and to pace anew: the time before this was not meant to be simulated."""
@@ -187,12 +203,14 @@ class PhysicsNode(EndoNode):
 
     def _measure(self, now: float, simulation: TissueSimulation) -> None:
         """Real-time factor: simulated over elapsed time."""
+        wall = time.monotonic()
         if self._window is None or now < self._window[0] or simulation.time < self._window[1]:
-            self._window = now, simulation.time
+            self._window = now, simulation.time, wall
         elapsed = now - self._window[0]
         if elapsed > _WINDOW:
             self._real_time_factor = (simulation.time - self._window[1]) / elapsed
-            self._window = now, simulation.time
+            self._clock_speed = elapsed / max(wall - self._window[2], 1e-3)
+            self._window = now, simulation.time, wall
 
     def step(self, simulation: TissueSimulation) -> None:
         """Take one step with what the arms command, and publish it."""
@@ -315,6 +333,9 @@ class PhysicsNode(EndoNode):
                 return OK, f"in lockstep, {self.steps} steps taken, waiting for a command", values
             parts = ", ".join(sorted(f"{name}'s {kind}" for name, kind in waiting[1]))
             return OK, f"in lockstep, waiting for {parts} of the command of {waiting[0] * 1e-9:.6f} s", values
+        if self._real_time_factor < _SLOW and self._clock_speed > _FAST:
+            text = f"slower than /clock, which runs at {self._clock_speed:.1f} times real speed; let it run slower, or lower node_count"
+            return WARN, text, values
         if self._real_time_factor < _SLOW:
             return WARN, "slower than real time; lower node_count or young_modulus, or use a GPU", values
         return OK, "running", values

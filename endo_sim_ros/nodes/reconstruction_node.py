@@ -74,7 +74,7 @@ class ReconstructionNode(EndoNode):
         self._model_stamp = 0
         self._saved, self._failure, self._finished = "", "", False  # how the last reconstruction ended
         self._cameras: list[Camera] = []  # of the newest published model
-        self._model_pub, self._cameras_pub, self._info_pub = (self.publisher(topic) for topic in messages.MODEL_TOPICS)
+        self._model_pub, self._cameras_pub, self._info_pub = (self.publisher(topic, alone=True) for topic in messages.MODEL_TOPICS)
         for topic in messages.RECORDING_TOPICS:
             self.subscribe(topic, partial(self._on_recording, topic), 50, self._options.reliable)
         self.service(Trigger, "~/reconstruct", self._on_reconstruct)
@@ -272,9 +272,9 @@ class ReconstructionNode(EndoNode):
             save_cameras(cameras, folder / _CAMERAS)
             if trainer is not None:
                 trainer.save_checkpoint(folder / "checkpoint.pt")
-        except (OSError, RuntimeError) as error:  # torch turns a full disk into a RuntimeError
-            reason = getattr(error, "strerror", None) or str(error)
-            raise SequenceError(f"{folder}: the model cannot be saved ({reason}); set output_dir") from error
+        except OSError as error:
+            reason = error.strerror or str(error)
+            raise SequenceError(f"{folder}: the model cannot be saved ({reason}); set output_dir and call ~/save") from error
         self._saved = str(folder)
 
     # --------------------------------------------------------------- services

@@ -46,7 +46,8 @@ class RenderingNode(EndoNode):
         self._dirty, self.images, self._last_image = True, 0, 0.0
         self._output: tuple[np.ndarray, np.ndarray | None, Camera] | None = None
         self._seconds_per_image = 0.0
-        publishers = (self.publisher(topic) for topic in messages.RENDERED_TOPICS)
+        self._blind: np.ndarray | None = None  # position [3], m, world, of the newest camera, if it sees no tissue
+        publishers = (self.publisher(topic, alone=True) for topic in messages.RENDERED_TOPICS)
         self._info_pub, self._pose_pub, self._depth_pub, self._image_pub = publishers
         self.subscribe(messages.GAUSSIANS, self._on_model)
         self.subscribe(messages.TRAINING_CAMERAS, self._on_training_cameras)
@@ -94,6 +95,8 @@ class RenderingNode(EndoNode):
         last, self._nodes, self._nodes_stamp = self._nodes_stamp, nodes, messages.stamp_to_ns(message.header.stamp)
         if self._lockstep:
             if self._nodes_stamp == nodes.model_stamp_ns and old is not None and old.model_stamp_ns == nodes.model_stamp_ns:
+                if self._states and last == nodes.model_stamp_ns:
+                    self._states.pop()  # a reset after a reset that was not shown yet
                 self._end_episode(last)
             self._states.append((self._nodes_stamp, nodes, None))
             if len(self._states) > MOST_WAITING:
@@ -247,6 +250,7 @@ class RenderingNode(EndoNode):
             self.tissue.cut(bound, nodes)
         image, depth = bound.renderer.render(camera, *state, depth=self._wants_depth())
         self._seconds_per_image += 0.1 * (time.monotonic() - start - self._seconds_per_image)
+        self._blind = None if bound.renderer.sees_tissue else camera.position
         return image, depth, camera
 
     def _publish(self, image: np.ndarray, depth: np.ndarray | None, camera: Camera, stamp: int) -> None:
@@ -286,6 +290,10 @@ class RenderingNode(EndoNode):
             return ERROR, self._failure, values
         if state is RenderingState.BUILDING:
             return OK, "preparing the model", values
+        if self._blind is not None:
+            camera, tissue = (np.round(each, 4).tolist() for each in (self._blind, self.tissue.model.means.mean(0).numpy()))
+            what = f"the camera at {camera} sees no tissue, the middle of which is at {tissue}, metres"
+            return WARN, f"{what}; check the poses on {messages.CAMERA_POSE.name}, their unit is metres", values
         if self._lockstep:
             waiting = f", {len(self._states)} states wait" if self._states else ""
             if self._states and self._lacks_pose(*self._states[0]):

@@ -49,7 +49,7 @@ class ViewerNode(Watcher):
         self._options = self.declare(ViewerNodeConfig)
         config, self._rendering = self.declare(ViewerConfig), self.declare(RenderingConfig)
         (arm,) = arm_names([self._options.arm])
-        self._arms = {name: _Arm() for name in arm_names((*self._options.arms, arm))}
+        self._arms = {name: _Arm() for name in dict.fromkeys((*arm_names(self._options.arms), arm))}
         self._hand = arm
         self._tissue = ModelTracker()
         self._cameras: np.ndarray | None = None  # [V, 4, 4], of the training views

@@ -276,7 +276,10 @@ def _read_mask(path: str) -> np.ndarray:
         data = np.fromfile(Path(path).expanduser(), np.uint8)
     except OSError as error:
         raise ConfigError(f"mask image {path} cannot be read ({error.strerror})") from error
-    mask = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH) if data.size else None
+    try:
+        mask = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH) if data.size else None
+    except cv2.error:  # its size is beyond OPENCV_IO_MAX_IMAGE_PIXELS
+        raise ConfigError(f"{path} has over 64 megapixels, or is damaged; make the image smaller") from None
     if mask is None:
         raise ConfigError(f"{path} is not an image")
     return mask

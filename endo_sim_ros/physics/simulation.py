@@ -309,7 +309,8 @@ class TissueSimulation:
     def reaction(self, tool: str) -> tuple[np.ndarray, np.ndarray]:
         """Force [3] N and torque [3] N·m that the tissue exerts back on a tool, world: minus what its wrench applies
         (torque about the point held) and the mean over the last step of what its jaw and its capsule gave (about the tip);
-        zero for a tool that is out of reach, has let go or is unknown."""
+        zero for a tool that is out of reach, has let go or is unknown. In a step that is undone it stays for a tool that holds
+        tissue, so that it does not vanish where the tissue can follow no farther."""
         if tool not in self._slots:
             return np.zeros(3), np.zeros(3)
         slot, tools = self._slots[tool], self._tools
@@ -350,9 +351,11 @@ class TissueSimulation:
         undone = self.faults > before
         self.resting = relaxed and not undone and self.solver.speed < _RESTING_SPEED
         if undone:
+            turned = float(self._tools.torques.norm()) > float(self._tools.forces.norm())  # with levers below a metre
+            less = "torque" if turned else "force"
             self.last_fault = (
                 f"a step was undone: {self.solver.bad_nodes.numpy()[0]} of {len(self.nodes)} nodes ended non-finite, torn or"
-                f" over {self.config.travel:g} m from rest ({self._describe_tools()}); use less force or more travel"
+                f" over {self.config.travel:g} m from rest ({self._describe_tools()}); use less {less} or more travel"
             )
 
     def _wrenches_act(self) -> bool:
@@ -406,9 +409,10 @@ class TissueSimulation:
     def _describe_tools(self) -> str:
         tools, parts = self._tools, []
         for name, slot in self._slots.items():
-            force = float(tools.forces[0, slot].norm())
-            if force or bool(tools.torques[0, slot].any()):
-                parts.append(f"{name} {force:.3g} N")
+            force, torque = float(tools.forces[0, slot].norm()), float(tools.torques[0, slot].norm())
+            acting = [f"{value:.3g} {unit}" for value, unit in ((force, "N"), (torque, "N·m")) if value]
+            if acting:
+                parts.append(f"{name} {' and '.join(acting)}")
             if tools.gripping[0, slot]:
                 parts.append(f"{name} grasping")
             elif self.contact_radius and tools.present[0, slot]:

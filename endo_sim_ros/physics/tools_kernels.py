@@ -246,12 +246,18 @@ def pull_by_jaw(
 
 
 @wp.func
+def is_finite(c: int, commands: Commands) -> bool:
+    """Whether the command of a tool can be used."""
+    finite = wp.isfinite(wp.length_sq(commands.force[c]) + wp.length_sq(commands.torque[c]))
+    if commands.present[c] != 0:
+        finite = finite and wp.isfinite(wp.length_sq(commands.tip[c]) + wp.ddot(commands.R[c], commands.R[c]))
+    return finite
+
+
+@wp.func
 def fail_if_unusable(b: int, c: int, commands: Commands, constants: ToolConstants, nodes: Nodes, loads: Loads):
     """Make a command that is not finite fail the step, which is then counted and undone."""
-    unusable = not wp.isfinite(wp.length_sq(commands.force[c]) + wp.length_sq(commands.torque[c]))
-    if commands.present[c] != 0:
-        unusable = unusable or not wp.isfinite(wp.length_sq(commands.tip[c]) + wp.ddot(commands.R[c], commands.R[c]))
-    if unusable and constants.touchable.shape[0] > 0:
+    if not is_finite(c, commands) and constants.touchable.shape[0] > 0:
         loads.force[b * nodes.X.shape[0] + constants.touchable[0]] = wp.vec3(wp.nan, wp.nan, wp.nan)
 
 
@@ -324,7 +330,8 @@ def measure_reactions(
     bad_nodes: wp.array[int],
     faults: wp.array[int],
 ):
-    """What the tissue exerts back on each tool: minus its wrench, and minus the mean of what jaw and contact gave."""
+    """What the tissue exerts back on each tool: minus its wrench, and minus the mean of what jaw and contact gave; of a tool that holds
+    tissue in a step that was undone, what it was before."""
     b, thread = wp.tid()
     count = nodes.X.shape[0]
     for t in range(tools):
@@ -341,9 +348,13 @@ def measure_reactions(
             torque = moment - wp.cross(commands.tip[c] - constants.origin, force)
             force += holds.applied_force[c]
             torque += holds.applied_torque[c]
-            if bad_nodes[b] > 0:  # the step was undone, and all that tools did in it
+            undone = bad_nodes[b] > 0  # and all that tools did in it
+            if undone:
                 force, torque = wp.vec3d(), wp.vec3d()
-            holds.reaction_force[c] = -force
-            holds.reaction_torque[c] = -torque
+            # A tool that still holds tissue feels what it felt last: tissue at its limit does not vanish.
+            holding = (holds.attached[c] != 0 or holds.gripping[c] != 0) and is_finite(c, commands)
+            if not (undone and holding):
+                holds.reaction_force[c] = -force
+                holds.reaction_torque[c] = -torque
     if thread == 0 and bad_nodes[b] > 0:
         faults[b] = faults[b] + 1

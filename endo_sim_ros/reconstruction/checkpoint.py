@@ -34,12 +34,21 @@ def reading(path: str | Path) -> Iterator[None]:
 
 
 def write_checkpoint(state: dict[str, Any], path: str | Path) -> None:
-    """Write the state of a training; what was there before stays until it is complete."""
+    """Write the state of a training; what was there before stays until it is complete.
+
+    Raises:
+        OSError: If it cannot be written, as on a full disk; nothing is left of it then.
+    """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".part")
-    torch.save(state, partial)
-    partial.replace(path)
+    try:
+        torch.save(state, partial)
+        partial.replace(path)
+    except (OSError, RuntimeError) as error:  # torch turns a full disk into a RuntimeError
+        partial.unlink(missing_ok=True)
+        reason = getattr(error, "strerror", None) or next(iter(str(error).splitlines()), "")
+        raise OSError(f"{path}: the checkpoint cannot be written ({reason}); is the disk full?") from error
 
 
 def read_checkpoint(path: str | Path, config: ReconstructionConfig, device: str) -> dict[str, Any]:

@@ -1,14 +1,16 @@
 """From a bag to the files of a Gaussian model, with progress bars: the work of `endo-sim reconstruct`."""
 
 import logging
+import shutil
+import tempfile
 from pathlib import Path
 
 from rich.progress import Progress as ProgressBar
 
-from endo_sim_ros.core.cameras import save_cameras
+from endo_sim_ros.core.cameras import Camera, save_cameras
 from endo_sim_ros.core.config import unused_options
 from endo_sim_ros.core.device import pick_device
-from endo_sim_ros.core.gaussians import save_ply
+from endo_sim_ros.core.gaussians import GaussianModel, save_ply
 from endo_sim_ros.reconstruction.checkpoint import read_checkpoint
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.keyframes import choose_views
@@ -42,6 +44,7 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
     Raises:
         SequenceError: If the bag or the checkpoint cannot be used, or `prepare` finds nothing to start from.
         ValueError: If there is no such device.
+        RuntimeError: If the folder takes no files, as on a full disk; the model is then in another, which is named.
     """
     pick_device(config.device)  # what cannot be used is refused before the long work
     if config.depth_model:
@@ -76,11 +79,46 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
             text = f"reconstructing, {progress.gaussians} Gaussians, loss {progress.loss:.4f}"
             bar.update(task, completed=progress.iteration, description=text)
             if progress.iteration % max(iterations // (_CHECKPOINTS * _REPORTS) * _REPORTS, _REPORTS) == 0:
-                trainer.save_checkpoint(out / "checkpoint.pt")
+                _save_checkpoint(trainer, out)
 
         model = trainer.run(on_progress, _REPORTS)
-    save_ply(model, out / "model.ply")
-    save_cameras([views[index].camera for index in chosen if views[index].stamp_ns in trainer.stamps], out / "cameras.json")
-    trainer.save_checkpoint(out / "checkpoint.pt")
+    _save(model, [views[index].camera for index in chosen if views[index].stamp_ns in trainer.stamps], out)
+    _save_checkpoint(trainer, out)
     held_out = spread(sorted({index for index, view in enumerate(views) if view.tissue} - set(chosen)), _MEASURED)
     return trainer, recording.take(set(held_out), len(held_out))
+
+
+def _save_checkpoint(trainer: Trainer, out: Path) -> None:
+    """Write the checkpoint; without room for it the training, and its model, still count."""
+    try:
+        trainer.save_checkpoint(out / "checkpoint.pt")
+    except OSError as error:
+        log.warning(str(error))
+
+
+def _save(model: GaussianModel, cameras: list[Camera], out: Path) -> None:
+    """Write model and cameras into a folder or, where that cannot be, into one that can."""
+    try:
+        _write(model, cameras, out)
+        return
+    except OSError as error:
+        reason = error.strerror or str(error)
+    elsewhere = dict.fromkeys(map(Path, (tempfile.gettempdir(), Path.home(), Path.cwd())))
+    for parent in elsewhere:
+        try:
+            folder = Path(tempfile.mkdtemp(prefix="endo_sim_", dir=parent))
+        except OSError:
+            continue
+        try:
+            _write(model, cameras, folder)
+        except OSError:
+            shutil.rmtree(folder, ignore_errors=True)
+            continue
+        raise RuntimeError(f"{out}: the model cannot be saved there ({reason}); it is in {folder}")
+    others = ", ".join(map(str, elsewhere))
+    raise RuntimeError(f"{out}: the model cannot be saved there ({reason}), nor in {others}; make room and start again with --resume")
+
+
+def _write(model: GaussianModel, cameras: list[Camera], folder: Path) -> None:
+    save_ply(model, folder / "model.ply")
+    save_cameras(cameras, folder / "cameras.json")

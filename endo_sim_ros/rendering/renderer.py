@@ -24,6 +24,9 @@ class DeformableRenderer:
         node_rest: Control nodes at rest [M, 3], metres, world; None renders the model at rest only.
         config: Options.
 
+    Attributes:
+        sees_tissue: Whether the newest image shows any.
+
     Raises:
         ValueError: If the device is not there, there are no nodes, or positions are not finite.
     """
@@ -32,6 +35,7 @@ class DeformableRenderer:
         self.device = pick_device(config.device)
         self.model = model.detach().to(self.device)
         self.config = config
+        self.sees_tissue = True
         self._background = torch.full((3,), config.background, device=self.device)
         self.skinning: Skinning | None = None
         if node_rest is not None:
@@ -123,6 +127,7 @@ class DeformableRenderer:
         if light is not None:
             colors = shade(light, colors, output.depths[0], alpha, camera)
         image = to_bytes(colors).cpu().numpy()
+        self.sees_tissue = bool((alpha > SURFACE).any())
         if not depth:
             return image, None
         return image, torch.where(alpha > SURFACE, output.depths[0] / alpha.clamp_min(1e-6), 0.0).cpu().numpy()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import functools
+import logging
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,6 +16,8 @@ from endo_sim_ros import messages
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.messages import Topic, bag_types
 from endo_sim_ros.sequences.bag_unfinished import UnfinishedMcap, is_finished
+
+log = logging.getLogger(__name__)
 
 
 class RawMessage(NamedTuple):
@@ -44,20 +48,23 @@ def _no_bag(path: str | Path) -> str:
 
 
 def _open_reader(path: Path) -> Reader | UnfinishedMcap:
-    """Reader of a bag; without metadata.yaml, which is written last, that of its only file."""
-    folder = path if path.is_dir() else path.parent
-    files = list(folder.glob("*.mcap")) if path.is_dir() else [path]
-    if (folder / "metadata.yaml").exists() or len(files) != 1:
-        return Reader(path)
-    (file,) = files
-    return UnfinishedMcap(file) if file.suffix == ".mcap" and not is_finished(file) else Reader(file)
+    """Reader of a bag, of its only file where that has no end."""
+    files = list(path.glob("*.mcap")) if path.is_dir() else [path]
+    if len(files) == 1 and files[0].suffix == ".mcap" and not is_finished(files[0]):
+        return UnfinishedMcap(files[0])
+    return Reader(path)
+
+
+@functools.cache  # a bag is opened several times
+def _warn(text: str) -> None:
+    log.warning(text)
 
 
 class BagReader:
     """Reads a rosbag2 folder or a single .mcap file. Use as a context manager.
 
-    A recording that was cut short, by a killed process or a full disk, is read as far as it was written. (Where there is
-    a metadata.yaml, which a recorder writes last, a file that ends early is damaged instead.)
+    A recording that was cut short, by a killed process or a full disk, is read as far as it was written. Where there is
+    a metadata.yaml, which a recorder writes last, the file was cut later, and a warning says so.
 
     Raises:
         SequenceError: If there is no such bag or it is damaged.
@@ -73,6 +80,11 @@ class BagReader:
     def __enter__(self) -> BagReader:
         with _readable(self.path):
             self._reader.open()
+        if isinstance(self._reader, UnfinishedMcap) and (self._reader.path.parent / "metadata.yaml").exists():
+            _warn(
+                f"{self._reader.path}: the file is cut off; its {self.message_count} whole messages, {self.duration:.1f} s, are read;"
+                " copy or record it again for the rest"
+            )
         return self
 
     def __exit__(self, *_: Any) -> None:

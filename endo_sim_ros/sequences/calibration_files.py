@@ -1,5 +1,7 @@
 """The calibration file of image folders and videos."""
 
+import functools
+import logging
 import math
 import reprlib
 from pathlib import Path
@@ -8,6 +10,8 @@ from typing import Any
 import yaml
 
 from endo_sim_ros.core.frames import SequenceError
+
+log = logging.getLogger(__name__)
 
 _MOST_BYTES = 65_536  # of a calibration file; one takes 200
 
@@ -39,7 +43,17 @@ def read_calibration(path: Path) -> dict[str, Any]:
         raise SequenceError(f"{path}: distortion must be a list of numbers") from None
     if not all(map(math.isfinite, fields["distortion"])):
         raise SequenceError(f"{path}: distortion must be finite, got {fields['distortion']}")
+    if "baseline_m" in fields:
+        warn_of_baseline(f"{path}: baseline_m", fields["baseline_m"])
     return fields
+
+
+@functools.cache  # a recording is read several times
+def warn_of_baseline(where: str, baseline: float) -> None:
+    """Log a warning if the two eyes of an endoscope are never this far apart, metres."""
+    if not 0.5e-3 < baseline < 0.05:
+        unit = "millimetres" if baseline > 1 else "another unit"
+        log.warning("%s: the two eyes would be %.3g m apart; give metres, this is probably %s", where, baseline, unit)
 
 
 def check_calibrated_size(calibration: dict[str, Any], size: tuple[int, int], path: Path) -> None:

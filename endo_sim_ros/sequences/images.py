@@ -50,7 +50,10 @@ def clean_depth(depth: np.ndarray) -> np.ndarray:
 def _decode(path: Path, flags: int) -> np.ndarray:
     if not path.is_file():
         raise SequenceError(f"{path}: file is missing")
-    image = cv2.imread(str(path), flags)
+    try:
+        image = cv2.imread(str(path), flags)
+    except cv2.error:  # its size is beyond OPENCV_IO_MAX_IMAGE_PIXELS
+        raise SequenceError(f"{path}: the image has over 64 megapixels, or is damaged; make it smaller or copy it again") from None
     if image is None:
         raise SequenceError(f"{path}: not a readable image; the file is damaged, copy it again")
     return image

@@ -9,6 +9,7 @@ import numpy as np
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.messages import CameraInfo
+from endo_sim_ros.sequences.calibration_files import warn_of_baseline
 
 STREAMS = ("image", "pose", "right", "depth", "mask")
 
@@ -79,6 +80,8 @@ class Synchronizer:
         old = self._infos.get(eye)
         if old is None or not old.same_as(info):  # an equal one keeps its rectification maps
             self._infos[eye] = info
+            if eye == "right" and info.baseline > 0:
+                warn_of_baseline("endoscope/right/camera_info: P", info.baseline)
 
     def add(self, stream: str, stamp_ns: int, value: Any) -> list[Frame]:
         """Add one decoded message of a stream and return the frames that became complete, in order.

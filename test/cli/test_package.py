@@ -38,27 +38,33 @@ def prefix(tmp_path_factory) -> Path:
     return target
 
 
-@pytest.mark.dds
-def test_nodes_are_executables_where_ros2_run_looks(prefix):
-    for node in NODES:
-        path = prefix / "lib" / "endo_sim_ros" / node
-        assert path.is_file() and os.access(path, os.X_OK), node
+@pytest.fixture(scope="module")
+def linked(tmp_path_factory) -> Path:
+    """What `make` adds to the environment, in which pip has put an editable package."""
+    target = tmp_path_factory.mktemp("linked")
+    (target / ".installed").touch()
+    done = subprocess.run(["make", "-C", ROOT, "links", f"VENV={target}"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return target
 
 
 @pytest.mark.dds
-def test_ament_index_finds_the_package(prefix):
+@pytest.mark.parametrize("install", ["prefix", "linked"])
+def test_nodes_are_executables_where_ros2_run_looks(install, request):
+    folder = request.getfixturevalue(install) / "lib" / "endo_sim_ros"
+    found = {path.name for path in folder.iterdir() if path.is_file() and os.access(path, os.X_OK)}
+    assert found == {path.name for path in (ROOT / "scripts").glob("*_node")} > set(NODES)
+
+
+@pytest.mark.dds
+@pytest.mark.parametrize("install", ["prefix", "linked"])
+def test_ament_index_finds_the_package(install, request, monkeypatch):
     from ament_index_python.packages import get_package_prefix, get_package_share_directory
 
-    before = os.environ.get("AMENT_PREFIX_PATH")
-    os.environ["AMENT_PREFIX_PATH"] = str(prefix)
-    try:
-        assert Path(get_package_prefix("endo_sim_ros")) == prefix
-        share = Path(get_package_share_directory("endo_sim_ros"))
-    finally:
-        if before is None:
-            del os.environ["AMENT_PREFIX_PATH"]
-        else:
-            os.environ["AMENT_PREFIX_PATH"] = before
+    prefix = request.getfixturevalue(install)
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(prefix))
+    assert Path(get_package_prefix("endo_sim_ros")) == prefix
+    share = Path(get_package_share_directory("endo_sim_ros"))
     for name in (
         "package.xml", "msg_conventions.md", "config/endo_sim.yaml", "config/endo_sim.rviz", "config/endo_sim.foxglove.json",
         "config/sros2/endo_sim.policy.xml", "launch/endo_sim.launch.py", "launch/replay.launch.py",

@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+import time
 from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
@@ -126,6 +127,24 @@ def test_reset_gives_the_first_observation_and_time_begins_anew(graph):
     assert stamps(graph, IMAGES)[-2:] == [MODEL_STAMP, 7]
     first, again = (messages.decode_image(graph.heard[IMAGES.name][k]) for k in (0, 4))
     np.testing.assert_array_equal(first, again)
+
+
+def test_resets_that_the_renderer_has_not_shown_yet_give_one_image(bench):
+    bench.add(PhysicsNode)
+    rendering = bench.add(RenderingNode)
+    send_model(bench, sheet(tilt=0.3), MODEL_STAMP)  # there is no camera yet
+    bench.until(lambda: stamps(bench, messages.CONTROL_NODES) == [MODEL_STAMP], "the state at rest")
+    for _ in range(5):
+        assert bench.call(Trigger, "/physics_node/reset").success
+    command(bench, 100)
+    assert bench.call(Trigger, "/physics_node/reset").success  # after a command: another episode
+    bench.until(lambda: len(stamps(bench, messages.CONTROL_NODES)) == 8, "all states")
+    bench.spin(0.3)
+    send_camera(bench)
+    await_images(bench, 3)
+    bench.until(lambda: not rendering._states, "the end of what waits")
+    bench.spin(0.3)
+    assert stamps(bench, IMAGES) == [MODEL_STAMP, 100, MODEL_STAMP]
 
 
 def test_a_cut_is_shown_with_the_states_that_have_it_and_the_same_bytes_come_again(graph):
@@ -380,18 +399,38 @@ def test_the_same_bag_gives_the_same_model_in_every_run(tmp_path, small_bag):
     assert first.data == second.data
 
 
-def test_the_policy_in_the_guide_runs(tmp_path):
+@pytest.mark.parametrize("last", ["policy", "renderer"])
+def test_the_policy_in_the_guide_runs(tmp_path, last):
     guide = (Path(__file__).parents[2] / "docs" / "graph.md").read_text()
     (code,) = re.findall(r"```python\n(.+?)```", guide, re.S)
     (tmp_path / "policy.py").write_text(code)
     save_ply(sheet(tilt=0.3), tmp_path / "model.ply")
     camera = Camera(K, WIDTH, HEIGHT, np.eye(4))
     save_cameras([camera], tmp_path / "cameras.json")
-    with NodeGroup(tmp_path / "logs") as group:
-        group.start("physics_node", arm_source="commanded", **PARAMETERS["physics_node"])
-        group.start("rendering_node", **PARAMETERS["rendering_node"])
-        group.start("reconstruction_node", mode="lockstep", model_file=tmp_path / "model.ply", output_dir=tmp_path)
-        command = [sys.executable, tmp_path / "policy.py"]
-        done = subprocess.run(command, env=group.environment, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
-    assert int(done.stdout.split("pixels that changed:")[1]) > 20
+    bench = Bench()
+    states = bench.hear(messages.CONTROL_NODES)
+    try:
+        with NodeGroup(tmp_path / "logs") as group:
+            group.start("physics_node", arm_source="commanded", **PARAMETERS["physics_node"])
+            group.start("reconstruction_node", mode="lockstep", model_file=tmp_path / "model.ply", output_dir=tmp_path)
+            if last == "policy":
+                group.start("rendering_node", **PARAMETERS["rendering_node"])
+            command = [sys.executable, tmp_path / "policy.py"]
+            policy = subprocess.Popen(command, env=group.environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+            try:
+                if last == "renderer":
+                    bench.until(lambda: len(states) > 3, "resets by the policy", 60)
+                    began, many = time.monotonic(), len(states)
+                    bench.spin(3.0)
+                    assert len(states) - many < 3 * (time.monotonic() - began)
+                    group.start("rendering_node", **PARAMETERS["rendering_node"])
+                deadline = time.monotonic() + 120
+                while policy.poll() is None and time.monotonic() < deadline:
+                    bench.spin(0.2)
+            finally:
+                policy.kill()
+                output, errors = policy.communicate()
+    finally:
+        bench.close()
+    assert policy.returncode == 0, errors
+    assert int(output.split("pixels that changed:")[1]) > 20

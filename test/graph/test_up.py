@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
+from rcl_interfaces.srv import GetParameters
 from rich.console import Console
 from waiting import wait_until
 
@@ -25,6 +26,7 @@ SMALL = """
 /**/physics_node:
   ros__parameters: {node_count: 300, arms: [PSM1]}
 """
+INCLUSION = "sphere 0 0 0.12 0.01 young_modulus=40000"
 
 
 class Up:
@@ -104,6 +106,42 @@ def test_up_reports_a_node_that_dies_and_starts_it_again(up):
     assert second != first
     assert run.process.poll() is None and "physics_node" in run.processes(), "the others go on"
     assert run.end(signal.SIGTERM)[0] == 0
+
+
+@pytest.mark.slow
+@pytest.mark.dds
+def test_a_reconstruction_that_is_started_again_gets_the_bag_again(up, small_bag):
+    run = up("--bag", str(small_bag))
+    run.says(r"bag_player_node +ended +finished")
+    run.says(r"reconstruction_node +ok +(preparing|training|finished)")
+    os.kill(run.processes()["reconstruction_node"], signal.SIGKILL)
+    run.says(r"reconstruction_node was ended by SIGKILL; it is started again(.*\n)*reconstruction_node +ok +finished")
+    assert "bag_player_node plays the bag again for the new reconstruction_node" in run.output.read_text()
+    assert run.end()[0] == 0
+
+
+@pytest.mark.dds
+def test_a_node_that_is_started_again_has_what_was_set_while_it_ran(up, bench):
+    run = up("--namespace", "left")
+    run.says(r"physics_node +warn")
+    assert bench.set("left/physics_node", young_modulus=40000.0)[0]
+    assert bench.set("left/physics_node", regions=[INCLUSION])[0]
+    time.sleep(1.0)
+    os.kill(run.processes()["physics_node"], signal.SIGKILL)
+    run.says(r"physics_node was ended by SIGKILL; it is started again in 1 s, with what was set while it ran: young_modulus, regions; ")
+    wait_until(lambda: run.processes().get("physics_node"), 30, "a new physics_node")
+
+    def value(name):
+        ask = lambda: bench.call(GetParameters, "/left/physics_node/get_parameters", names=[name]).values  # noqa: E731
+        return wait_until(ask, 30, f"the parameter {name}")[0]
+
+    assert value("young_modulus").double_value == 40000.0 and list(value("regions").string_array_value) == [INCLUSION]
+    run.says(r"physics_node +starting\s(.*\n)*physics_node +warn")
+    os.kill(run.processes()["physics_node"], signal.SIGKILL)
+    run.says(r"physics_node was ended by SIGKILL; it is started again in 2 s, without what was set while it ran: young_modulus, regions; ")
+    wait_until(lambda: run.processes().get("physics_node"), 30, "a new physics_node")
+    assert value("young_modulus").double_value == 10000.0
+    assert run.end()[0] == 0
 
 
 @pytest.mark.dds

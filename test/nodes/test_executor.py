@@ -3,17 +3,24 @@
 import subprocess
 import sys
 import threading
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 import rclpy
+import yaml
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException
 from ros_bench import S, send_camera
 from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
-from endo_sim_ros.nodes.base import EndoNode
+from endo_sim_ros.core.config import options
+from endo_sim_ros.messages import OK, WARN
+from endo_sim_ros.nodes import base
+from endo_sim_ros.nodes.base import EndoNode, run
+from endo_sim_ros.nodes.configs import NODE_CONFIGS
 from endo_sim_ros.nodes.rclpy_private import spin
 
 pytestmark = pytest.mark.dds
@@ -30,9 +37,56 @@ raise SystemExit(run(Interrupted))
 """
 
 
+@pytest.mark.parametrize("node", sorted(path.name for path in (Path(__file__).parents[2] / "scripts").glob("*_node")))
+def test_help_lists_the_parameters_and_unknown_arguments_are_refused(node, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [f"/somewhere/{node}.py", "--help"])
+    assert run(EndoNode) == 0
+    said = capsys.readouterr().out
+    assert said.startswith(f"usage: ros2 run endo_sim_ros {node} ") and not rclpy.ok()
+    (section,) = yaml.safe_load(said[said.index("/**/") :]).values()
+    configs = NODE_CONFIGS.get(node) or NODE_CONFIGS[node.removesuffix("_node")]
+    assert section["ros__parameters"].keys() <= {option.name for config in configs for option in options(config)}
+    assert all(f"{option.name}: " in said for config in configs for option in options(config))
+    monkeypatch.setattr(sys, "argv", [f"/somewhere/{node}.py", "--nonsense", "--ros-args", "-p", "world_frame:=map"])
+    assert run(EndoNode) == 2 and not rclpy.ok()
+    assert capsys.readouterr().err.startswith(f"{node}: unknown argument --nonsense; parameters are given as --ros-args -p ")
+
+
 def test_ctrl_c_during_a_callback_is_not_logged_as_its_error():
     done = subprocess.run([sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, timeout=60)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    assert (done.returncode, done.stdout) == (0, "")
+    (ready,) = done.stderr.splitlines()
+    assert ready.startswith("[INFO]") and ready.endswith("[interrupted]: ready; running")
+
+
+@pytest.mark.parametrize("when", ["before", "later"])
+def test_a_second_publisher_of_a_topic_of_ones_own_is_told_until_it_is_gone(bench, monkeypatch, when):
+    """One that was there first may be dead: a killed node stays known for a while."""
+    monkeypatch.setattr(base, "_DISCOVERED", 1.5)
+    monkeypatch.setattr(base, "_FORGOTTEN", 4.0)
+    other, elsewhere = rclpy.create_node("twin"), rclpy.create_node("twin", namespace="left")
+    arguments = messages.ros_class(messages.GAUSSIANS.type), messages.GAUSSIANS.name, 1
+    elsewhere.create_publisher(*arguments)  # another topic
+    began = time.monotonic()
+    try:
+        if when == "before":
+            other.create_publisher(*arguments)
+        node = EndoNode("owner")
+        bench.nodes.append(node)
+        bench.executor.add_node(node)
+        node.publisher(messages.GAUSSIANS, alone=True)
+        bench.spin(2.5)
+        assert {level for level, *_ in bench.statuses["owner"]} == {OK}
+        if when == "later":
+            other.create_publisher(*arguments)
+        _, text, _ = bench.status("owner", "running; more than one node publishes /gaussians (", WARN)
+        assert "/owner" in text and "/twin" in text and "ROS_DOMAIN_ID" in text and "left" not in text
+        assert when == "later" or time.monotonic() - began > 4.0
+    finally:
+        other.destroy_node()
+        elsewhere.destroy_node()
+    seen = len(bench.statuses["owner"])
+    bench.until(lambda: [s for s in bench.statuses["owner"][seen:] if s[0] == OK], "the end of the warning")
 
 
 def test_a_node_serves_what_is_there_and_what_is_added_or_removed_meanwhile(bench):

@@ -12,6 +12,7 @@ from rclpy.parameter import Parameter
 
 from endo_sim_ros.core.config import ConfigError, Range, StageConfig, option_values
 from endo_sim_ros.nodes.parameters import ConfiguredNode
+from endo_sim_ros.nodes.physics_node import PhysicsNode
 from endo_sim_ros.nodes.reconstruction_node import ReconstructionNode
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.presets import preset
@@ -188,3 +189,17 @@ def test_what_was_refused_does_not_count_as_given(start):
     assert not set_parameter(node, "device", "tpu").successful
     assert set_parameter(node, "preset", "laptop").successful
     assert options_of(node) == preset("laptop")
+
+
+@pytest.mark.parametrize(
+    "arms, sentence",
+    [("[]", "the list is empty"), ("[PSM1, PSM2, ' PSM1']", "PSM1 is there 2 times"), ("['']", "'' cannot name topics")],
+    ids=["none", "twice", "nameless"],
+)
+def test_arms_without_a_name_of_their_own_end_the_node_at_start(arms, sentence):
+    rclpy.init(args=["--ros-args", "-p", f"arms:={arms}"])
+    try:
+        with pytest.raises(ConfigError, match=f"^arms: {sentence}"):
+            PhysicsNode()
+    finally:
+        rclpy.shutdown()

@@ -307,6 +307,27 @@ def test_physics_follows_a_simulated_clock(bench):
     assert len(bench.heard["control_nodes"]) >= count + 5
 
 
+def test_physics_takes_the_steps_of_a_clock_that_leaps(bench, physics):
+    send_model(bench)
+    bench.until(lambda: physics.simulation is not None, "tissue")
+    assert bench.set("physics_node", use_sim_time=True)[0]
+    for tenth in range(10, 40):  # five steps each
+        bench.publish(messages.CLOCK, messages.encode_clock(tenth * S // 10))
+        bench.until(lambda: physics.now_ns() == tenth * S // 10, "the time")
+        bench.spin(0.02)
+    assert physics._real_time_factor > 0.7
+
+
+def test_a_clock_that_is_too_fast_is_blamed_for_missed_steps(bench, physics, monkeypatch):
+    send_model(bench)
+    bench.until(lambda: physics.simulation is not None, "tissue")
+    monkeypatch.setattr(physics, "_measure", lambda *_: None)
+    physics._real_time_factor, physics._clock_speed = 0.3, 10.0
+    bench.status("physics_node", "slower than /clock, which runs at 10.0 times real speed; let it run slower", WARN)
+    physics._clock_speed = 1.0
+    bench.status("physics_node", "slower than real time; lower node_count", WARN)
+
+
 def test_overloaded_physics_acts_on_the_newest_command(bench, physics, monkeypatch):
     """Each step takes longer than it should, and meanwhile three commands come, numbered by their force in millinewtons."""
     send_model(bench)

@@ -46,6 +46,18 @@ def test_bad_camera_is_one_sentence_and_a_good_one_still_renders(bench, renderin
     assert await_image(bench, lambda image: image.max() > 100).shape == (HEIGHT, WIDTH, 3)
 
 
+def test_a_camera_that_sees_no_tissue_is_told_until_one_does(bench, rendering):
+    send_model(bench)
+    pose = np.eye(4)
+    pose[:3, 3] = 20.0, 0, 60.0  # millimetres
+    send_camera(bench, pose)
+    _, text, values = bench.status("rendering_node", "the camera at [20.0, 0.0, 60.0] sees no tissue, the middle of which is at [", WARN)
+    assert "ECM/measured_cp" in text and "metres" in text and values["state"] == "rendering"
+    send_camera(bench)
+    await_image(bench, lambda image: image.max() > 100)
+    bench.status("rendering_node", "rendering", OK, since=len(bench.statuses["rendering_node"]))
+
+
 def test_control_nodes_that_are_damaged_or_of_another_model_leave_the_picture_alone(bench, rendering):
     send_model(bench)
     send_camera(bench)

@@ -20,13 +20,39 @@ def test_absurd_force_is_caught_and_the_last_good_state_restored(kinematics):
     simulation.set_wrench("probe", TIP, [0.0, 0.0, -1e7])
     simulation.step()
     bad = simulation.state()
-    assert simulation.faults == 1 and "undone" in simulation.last_fault and "1e+07 N" in simulation.last_fault
+    assert simulation.faults == 1 and "undone" in simulation.last_fault and "(probe 1e+07 N); use less force" in simulation.last_fault
     np.testing.assert_array_equal(bad.positions, good.positions)
     np.testing.assert_array_equal(bad.F, good.F)
     assert not np.any(simulation.solver.momentum()[0])
     simulation.set_wrench("probe", TIP, [0.0, 0.0, 0.1])
     steps(simulation, 2)
     assert simulation.faults == 1 and np.isfinite(simulation.state().positions).all()
+
+
+def test_the_reaction_of_tissue_that_can_follow_no_farther_stays():
+    simulation, felt = simulate(), []
+    for k in range(1, 81):
+        simulation.set_wrench("probe", TIP, [0.0, 0.0, -0.2 * k])
+        simulation.step()
+        felt.append(simulation.reaction("probe")[0][2])
+    assert simulation.faults > 0
+    np.testing.assert_allclose(felt[:50], 0.2 * np.arange(1, 51))
+    assert min(felt[50:]) >= 10.0 and felt[-1] < 16.0
+    simulation.set_wrench("probe", TIP, [0.0, 0.0, 0.0])
+    assert not simulation.reaction("probe")[0].any()
+    simulation.step()
+    assert not simulation.reaction("probe")[0].any()
+
+
+def test_an_absurd_torque_is_said_to_be_one():
+    simulation = simulate()
+    simulation.set_wrench("probe", TIP, [0.0, 0.0, 0.1], [0.0, 1e6, 0.0])
+    simulation.step()
+    assert "(probe 0.1 N and 1e+06 N·m); use less torque or more travel" in simulation.last_fault
+    simulation.reset()
+    simulation.set_wrench("probe", TIP, [0.0, 0.0, 0.0], [0.0, 1e6, 0.0])
+    simulation.step()
+    assert "(probe 1e+06 N·m); use less torque or" in simulation.last_fault
 
 
 @pytest.mark.slow

@@ -1,6 +1,9 @@
 """Short trainings on the phantom: quality, repeatability, checkpoints."""
 
 import dataclasses
+import resource
+import tempfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,10 +11,12 @@ import torch
 from short_training import equal, options
 from trained import trainer_of
 
+from endo_sim_ros.core.cameras import load_cameras
 from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.core.gaussians import load_ply, save_ply
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.evaluation.held_out import measure_held_out
-from endo_sim_ros.reconstruction import ReconstructionConfig
+from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer, from_bag
 from endo_sim_ros.reconstruction.from_bag import reconstruct_bag
 from endo_sim_ros.reconstruction.optimizer import Adam
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
@@ -172,6 +177,48 @@ def test_reconstruction_of_a_bag_is_measured(tmp_path, small):
     assert found["depth_rmse"] < 0.010
     for name in ("model.ply", "checkpoint.pt", "held_out.png"):
         assert (tmp_path / "out" / name).stat().st_size > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("room", ["nowhere", "elsewhere"])
+def test_a_full_disk_loses_no_trained_model(tmp_path, small, room, monkeypatch, caplog):
+    out, other = tmp_path / "out", tmp_path / "other"
+    other.mkdir()
+    save = from_bag.save_ply
+
+    def full(model, path):
+        if out in path.parents or room == "nowhere":
+            raise OSError(28, "No space left on device")
+        save(model, path)
+
+    def no_checkpoint(self, path):
+        raise OSError(f"{path}: the checkpoint cannot be written")
+
+    monkeypatch.setattr(from_bag, "save_ply", full)
+    monkeypatch.setattr(Trainer, "save_checkpoint", no_checkpoint)
+    monkeypatch.setattr(tempfile, "tempdir", str(other))
+    write_bag(tmp_path / "bag", small)
+    with pytest.raises(RuntimeError, match=r"out: the model cannot be saved there \(No space left on device\)") as caught:
+        reconstruct_bag(tmp_path / "bag", out, options(iterations=20, keyframes=4, image_width=80))
+    assert "out/checkpoint.pt: the checkpoint cannot be written" in caplog.text  # the training went on
+    if room == "elsewhere":
+        folder = Path(str(caught.value).split("it is in ")[1])
+        assert folder.parent == other and len(load_ply(folder / "model.ply")) and load_cameras(folder / "cameras.json")
+    else:
+        assert "start again with --resume" in str(caught.value) and not list(other.iterdir())
+
+
+def test_what_found_no_room_leaves_nothing_behind(tmp_path, small):
+    trainer, limits = trainer_of([small[0], small[8]], options()), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (5000, limits[1]))
+    try:
+        with pytest.raises(OSError, match="checkpoint.pt: the checkpoint cannot be written"):
+            trainer.save_checkpoint(tmp_path / "checkpoint.pt")
+        with pytest.raises(OSError, match="File too large"):
+            save_ply(trainer.model, tmp_path / "model.ply")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow

@@ -1,6 +1,8 @@
 """The reader of image folders."""
 
 import shutil
+import struct
+import zlib
 
 import numpy as np
 import pytest
@@ -17,8 +19,13 @@ from plane_scene import (
     write_rgb,
 )
 
+from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.physics import regions
+from endo_sim_ros.sequences import calibration_files
+from endo_sim_ros.sequences.bag import read_bag, write_bag
 from endo_sim_ros.sequences.folder import read_folder, read_points, write_points
+from endo_sim_ros.sequences.images import read_image
 from endo_sim_ros.sequences.readers import open_sequence
 
 CALIBRATION = f"width: {WIDTH}\nheight: {HEIGHT}\nfx: 150\nfy: 150\ncx: {WIDTH / 2}\ncy: {HEIGHT / 2}\n"
@@ -124,3 +131,29 @@ def test_damaged_image_folder_is_refused_by_name(folder, name, text, message):
         (folder / name).write_text(text)
     with pytest.raises(SequenceError, match=message):
         list(read_folder(folder))
+
+
+def test_a_huge_image_is_one_sentence(tmp_path):
+    def chunk(kind, data):
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = struct.pack(">IIBBBBB", 60_000, 60_000, 8, 0, 0, 0, 0)
+    parts = chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(bytes(1000))), chunk(b"IEND", b"")
+    (tmp_path / "1.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(parts))
+    with pytest.raises(SequenceError, match=r"1.png: the image has over 64 megapixels"):
+        read_image(tmp_path / "1.png")
+    with pytest.raises(ConfigError, match=r"1.png has over 64 megapixels"):
+        regions._read_mask(str(tmp_path / "1.png"))
+
+
+def test_a_baseline_in_millimetres_is_told(folder, caplog):
+    calibration_files.warn_of_baseline.cache_clear()
+    list(read_folder(folder))
+    assert "apart" not in caplog.text
+    (folder / "calibration.yaml").write_text(CALIBRATION + "baseline_m: 5.4\n")
+    for _ in range(2):
+        frames = list(read_folder(folder))
+    assert caplog.text.count("calibration.yaml: baseline_m: the two eyes would be 5.4 m apart; give metres, this is probably millim") == 1
+    write_bag(folder.parent / "bag", frames)
+    list(read_bag(folder.parent / "bag"))
+    assert "endoscope/right/camera_info: P: the two eyes would be 5.4 m apart" in caplog.text

@@ -1,4 +1,4 @@
-"""Arms of the da Vinci and their instruments: parameter files, kinematics, shapes, and where they stand in a scene."""
+"""Arms of the da Vinci and their instruments: parameter files, kinematics, shapes, pictures, and where they stand in a scene."""
 
 from endo_sim_ros.instruments.arm_files import arm_names as arm_names, load_arm as load_arm, tool_names as tool_names
 from endo_sim_ros.instruments.inverse import Reach as Reach, ReachConfig as ReachConfig, solve_inverse as solve_inverse

@@ -205,7 +205,7 @@ def _circle(radius: float, z: float, count: int = 32) -> np.ndarray:
 
 def _shaft(build: _Builder, shape: ToolShape) -> None:
     r, end = shape.radius, -2.2 * shape.radius
-    stations = np.concatenate([[-shape.shaft], np.linspace(-0.06, end - 1.6e-3, 4)])
+    stations = np.linspace(-shape.shaft, end - 1.6e-3, 13)  # long triangles would vanish whole where one corner is behind the lens
     build.loft("roll", Material.SHAFT, [_circle(r, z, 40) for z in stations])
     collar = [(0.99, 0.0), (1.03, 0.25e-3), (1.03, 1.3e-3), (0.93, 1.6e-3)]
     build.loft("roll", Material.STEEL, [_circle(k * r, end - 1.6e-3 + z, 40) for k, z in collar])

@@ -1,0 +1,104 @@
+"""Instruments in a picture: their outline is that of the projected mesh, and what is nearer hides what is farther."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
+from endo_sim_ros.instruments import Material, Part, build_instrument, link_poses, load_arm, place_arm
+from endo_sim_ros.instruments.drawing import FIRST_LINK, TISSUE, InstrumentDrawing, corner_normals
+from endo_sim_ros.instruments.shapes import lofted
+
+CAMERA = Camera(intrinsic_matrix(560, 560, 320, 256), 640, 512)
+
+
+def tissue(depth=0.1, color=(0.6, 0.3, 0.3)):
+    return torch.tensor(color).expand(512, 640, 3).contiguous(), torch.full((512, 640), depth), torch.ones(512, 640)
+
+
+def scene(tool="LARGE_NEEDLE_DRIVER"):
+    arm = load_arm("PSM", tool)
+    parts, _ = build_instrument(arm)
+    place = place_arm("PSM1", arm, CAMERA, 0.08)
+    poses = {link: place.base @ pose for link, pose in link_poses(arm, place.joints + [0, 0, 0, 0.3, 0.4, -0.3], 0.7).items()}
+    return parts, poses
+
+
+def cylinder(radius, start, end, count=256):
+    angle = 2 * np.pi * np.arange(count) / count
+    rings = [np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(count, z)], 1) for z in (start, end)]
+    return Part("roll", Material.STEEL, *lofted(np.array(rings)))
+
+
+def test_the_outline_is_that_of_the_projected_triangles():
+    parts, poses = scene()
+    labels = InstrumentDrawing([parts], device="cpu").draw([poses], CAMERA, *tissue(0.3)).labels.numpy()
+    fine = 8
+    silhouette = np.zeros((512 * fine, 640 * fine), np.uint8)
+    for part in parts:
+        local = part.vertices @ poses[part.link][:3, :3].T + poses[part.link][:3, 3]
+        uv, z = CAMERA.project(local)
+        for face in part.faces[(z[part.faces] > 2e-3).all(1)]:
+            corners = np.round((uv[face] * fine - 0.5) * 16).astype(np.int64)
+            if (np.abs(corners) < 2**24).all():
+                cv2.fillConvexPoly(silhouette, corners.astype(np.int32), 1, shift=4)
+    expected = cv2.resize(silhouette.astype(np.float32), (640, 512), interpolation=cv2.INTER_AREA) > 0.5
+    drawn = labels >= FIRST_LINK
+    assert 0.03 < drawn.mean() < 0.5
+    assert (drawn & expected).sum() / (drawn | expected).sum() > 0.99
+
+
+def test_depth_is_that_of_the_surface():
+    pose = np.eye(4)
+    pose[:3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]  # across the picture
+    pose[:3, 3] = 0, 0, 0.06
+    picture = InstrumentDrawing([[cylinder(5e-3, -0.1, 0.1)]], device="cpu").draw([{"roll": pose}], CAMERA, *tissue())
+    rays = CAMERA.rays()[:, 320]  # z = 1
+    y = rays[:, 1]
+    # |(y z, z - 0.06)| = 0.005
+    a, b, c = y**2 + 1, -2 * 0.06, 0.06**2 - 0.005**2
+    root = b * b - 4 * a * c
+    depth = np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / (2 * a), 0.1)
+    inside = cv2.erode((root > 0).astype(np.uint8)[:, None], np.ones((3, 1))).ravel() > 0  # pixels at the rim show both
+    np.testing.assert_allclose(picture.depths[:, 320].numpy()[inside], depth[inside], atol=5e-5)
+    assert (picture.labels[:, 320].numpy()[inside] == FIRST_LINK).all()
+
+
+@pytest.mark.parametrize("before", [True, False])
+def test_what_is_nearer_hides_what_is_farther(before):
+    colors, depths, alphas = tissue(0.1 if before else 0.03)
+    parts, poses = scene()
+    picture = InstrumentDrawing([parts], device="cpu").draw([poses], CAMERA, colors, depths, alphas)
+    changed = (picture.colors != colors).any(-1)
+    assert bool(changed.any()) == before == bool((picture.labels >= FIRST_LINK).any())
+    if not before:
+        assert torch.equal(picture.depths, depths) and bool((picture.labels == TISSUE).all())
+
+
+def test_edges_are_as_soft_as_a_pixel():
+    parts, poses = scene()
+    colors, depths, alphas = tissue(0.3, (0.0, 1.0, 0.0))
+    picture = InstrumentDrawing([parts], device="cpu").draw([poses], CAMERA, colors, depths, alphas)
+    share = 1 - (picture.colors[..., 1] - picture.colors[..., 0]).clamp(0, 1)  # steel and plastic are grey
+    rim = (share > 0.1) & (share < 0.9)
+    assert 300 < int(rim.sum()) < 12_000
+
+
+def test_smooth_where_faces_go_on_and_sharp_where_they_do_not():
+    part = cylinder(4e-3, 0.0, 0.02, 40)
+    normals, corners = corner_normals(part), part.vertices[part.faces]
+    side = np.abs(normals[:, 0, 2]) < 0.5
+    outwards = corners[side][..., :2] / 4e-3
+    np.testing.assert_allclose(normals[side][..., :2], outwards, atol=0.09)
+    np.testing.assert_allclose(np.abs(normals[~side][..., 2]), 1, atol=1e-6)
+
+
+def test_two_instruments_have_labels_of_their_own_and_repeat():
+    parts, poses = scene()
+    moved = {link: np.array([[1, 0, 0, -0.01], [0, 1, 0, -0.01], [0, 0, 1, 0.01], [0, 0, 0, 1]]) @ pose for link, pose in poses.items()}
+    drawing = InstrumentDrawing([parts, parts], device="cpu")
+    first, second = (drawing.draw([poses, moved], CAMERA, *tissue(0.3)) for _ in range(2))
+    found = set(first.labels.unique().tolist()) - {TISSUE}
+    assert {drawing.links[label - FIRST_LINK][0] for label in found} == {0, 1}
+    assert torch.equal(first.colors, second.colors)

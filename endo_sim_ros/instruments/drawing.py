@@ -23,7 +23,7 @@ SURFACES = {
     Material.SHAFT: (0.035, 0.035, 0.038, 0.5, 0.10),
     Material.INSULATION: (0.20, 0.19, 0.17, 0.55, 0.10),
 }
-"""Red, green and blue at the model's reference distance, roughness, and strength of the shine."""
+"""Red, green and blue at the model's reference distance, roughness, and strength of the shine; by eye beside real instruments."""
 
 _CREASE = np.cos(np.radians(35))  # faces that meet at a smaller angle are one smooth surface
 _NEAREST = 2e-3  # metres from the plane of the lens

@@ -33,7 +33,7 @@ class Look:
 
 @wp.func
 def offset(sample: int) -> wp.vec2:
-    return wp.vec2((0.375 + 0.5 * float(sample)) % 1.0, 0.125 + 0.25 * float(sample))
+    return wp.vec2((0.375 + 0.5 * float(sample) - 0.25 * float(sample // 2)) % 1.0, 0.125 + 0.25 * float(sample))
 
 
 @wp.kernel

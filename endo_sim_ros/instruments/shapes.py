@@ -136,15 +136,14 @@ def build_instrument(arm: ArmKinematics, shape: ToolShape | None = None) -> tupl
     Raises:
         ConfigError: If nobody knows the shape of the tool, or the arm has no wrist.
     """
-    shape = shape or SHAPES.get(arm.tool.rstrip("0123456789").rstrip("_:"))
-    if shape is None or "wrist_yaw" not in (joint.name for joint in arm.joints):
+    shape = shape or SHAPES.get(arm.tool.rstrip("_0123456789"))
+    if shape is None or len(arm.joints) < 6:
         raise ConfigError(f"{arm.name}: there is no shape of {arm.tool or 'its tool'}; give one, or a tool among {', '.join(SHAPES)}")
-    build, r = _Builder(), shape.radius
-    wrist = next(joint.a for joint in arm.joints if joint.name == "wrist_yaw")
+    build, r, wrist = _Builder(), shape.radius, arm.joints[5].a
     _shaft(build, shape)
     # Two ears hold the pin of the pitch; between them turns the second clevis, which holds that of the yaw.
-    _clevis(build, "roll", -2.2 * r, 0.0, 0.92 * r, 0.62 * r, across=1, axes=_DISTAL_Z)
-    _block(build, "wrist_pitch", 0.0, wrist, 0.9 * r, 0.5 * r, axes=_DISTAL_X)
+    _clevis(build, -2.2 * r, 0.92 * r, 0.62 * r)
+    _block(build, wrist, 0.9 * r, 0.5 * r)
     build.capsule("wrist_pitch", (0, 0, 0), (0, 0, wrist), 0.8 * r, _DISTAL_X)
     if shape.cover:
         sleeve = [_circle(k * r, s * wrist, 40) for k, s in ((0.74, 0.3), (0.86, 0.38), (0.86, 0.68), (0.66, 0.82))]
@@ -169,7 +168,7 @@ def link_poses(arm: ArmKinematics, joints: ArrayLike, jaw: ArrayLike = 0.0) -> d
         ValueError: As `ArmKinematics.check_joints` does.
     """
     frames = arm.link_frames(joints)
-    poses = {joint.name: frames[..., i, :, :] for i, joint in enumerate(arm.joints)}
+    poses = {name: frames[..., i, :, :] for i, name in enumerate(("roll", "wrist_pitch", "wrist_yaw"), 3)}  # files may name them otherwise
     for name, side in (("jaw_left", -0.5), ("jaw_right", 0.5)):
         angle = side * np.broadcast_to(np.asarray(jaw, np.float64), frames.shape[:-3])
         turn = np.zeros((*angle.shape, 4, 4))
@@ -212,7 +211,7 @@ def _shaft(build: _Builder, shape: ToolShape) -> None:
     build.capsule("roll", (0, 0, -shape.shaft), (0, 0, end), r)
 
 
-def _stadium(half: float, start: float, end: float, count: int = 12) -> np.ndarray:
+def _stadium(half: float, start: float, end: float, count: int = 13) -> np.ndarray:
     """Outline [K, 2] of a strip from ``start`` to a round end about ``end``, in (across, distal), counter-clockwise."""
     angle = np.linspace(0, np.pi, count)
     return np.concatenate([[[-half, start], [half, start]], np.stack([half * np.cos(angle), end + half * np.sin(angle)], 1)])
@@ -235,39 +234,31 @@ def _slab(outline: np.ndarray, low: float, high: float, across: int, within: flo
     return np.array(rings)
 
 
-def _pin(build: _Builder, link: str, at: float, half: float, radius: float, across: int, axes: np.ndarray) -> None:
-    """A cylinder along the axis ``across``, the pin about which the next link turns."""
-    rings = []
-    for share, k in ((-1.0, 0.8), (-0.96, 1.0), (0.96, 1.0), (1.0, 0.8)):
-        circle = _circle(k * radius, 0.0, 24)
-        ring = np.empty_like(circle)
-        ring[:, across], ring[:, 1 - across], ring[:, 2] = share * half, circle[:, 0], at + circle[:, 1]
-        rings.append(ring)
-    build.loft(link, Material.STEEL, rings, axes)
+def _fork(build: _Builder, link: str, ear: np.ndarray, inner: float, outer: float, half: float, pin: float, axes: np.ndarray) -> None:
+    """Two ears, whose outline [K, 2] ends round about the next link's origin, and along y a pin, about which that turns.
 
-
-def _clevis(build: _Builder, link: str, start: float, end: float, half: float, gap: float, across: int, axes: np.ndarray) -> None:
-    """A base with two ears whose pin at ``end`` lies along the axis ``across``; the next link turns in the gap between them."""
-    base = [_circle(k * half, start + z, 40) for k, z in ((1.0, 0.0), (1.0, 0.35 * (end - start)), (0.9, 0.45 * (end - start)))]
-    build.loft(link, Material.STEEL, base, axes)
-    outline = _stadium(0.72 * half, start + 0.3 * (end - start), end)
+    They reach from ``inner`` to ``outer`` on either side of the middle, within a cylinder of radius ``half``; ``pin`` is that of the pin.
+    """
     for side in (-1.0, 1.0):
-        low, high = sorted((side * gap, side * 0.88 * half))
-        build.loft(link, Material.STEEL, _slab(outline, low, high, across, half), axes)
-    _pin(build, link, end, 0.92 * half, 0.3 * half, across, axes)
+        build.loft(link, Material.STEEL, _slab(ear, *sorted((side * inner, side * outer)), across=1, within=half), axes)
+    end = ear[:, 1].max() - np.abs(ear[:, 0]).max()
+    rim = 1.05 * outer
+    build.loft(link, Material.STEEL, _slab(_round(pin, end), -rim, rim, across=1), axes)
 
 
-def _block(build: _Builder, link: str, start: float, end: float, half: float, inner: float, axes: np.ndarray) -> None:
-    """The second clevis: a hub about the pin of the pitch (z of its frame), and ears for that of the yaw, square to it."""
-    hub, ears = 0, 1  # axes square to the tip's direction: the pitch turns about the first, the yaw about the second
-    build.loft(link, Material.STEEL, _slab(_round(0.62 * half, start), -0.6 * half, 0.6 * half, hub), axes)
-    base = [_circle(k * half, start + s * (end - start), 40) for k, s in ((0.6, 0.15), (0.8, 0.3), (0.8, 0.5), (0.7, 0.6))]
-    build.loft(link, Material.STEEL, base, axes)
-    outline = _stadium(0.62 * half, start + 0.35 * (end - start), end)
-    for side in (-1.0, 1.0):
-        low, high = sorted((side * inner, side * 0.8 * half))
-        build.loft(link, Material.STEEL, _slab(outline, low, high, ears, half), axes)
-    _pin(build, link, end, 0.84 * half, 0.28 * half, ears, axes)
+def _clevis(build: _Builder, start: float, half: float, gap: float) -> None:
+    """The end of the shaft: a base and a fork in the gap of which the wrist pitches."""
+    base = [_circle(k * half, start * (1 - s), 40) for k, s in ((1.0, 0.0), (1.0, 0.35), (0.9, 0.45))]
+    build.loft("roll", Material.STEEL, base)
+    _fork(build, "roll", _stadium(0.72 * half, 0.7 * start, 0.0), gap, 0.88 * half, half, 0.3 * half, _DISTAL_Z)
+
+
+def _block(build: _Builder, end: float, half: float, gap: float) -> None:
+    """The wrist: a hub about the pin of the pitch, and a fork, square to it, in the gap of which the jaws turn."""
+    build.loft("wrist_pitch", Material.STEEL, _slab(_round(0.62 * half, 0.0), -0.6 * half, 0.6 * half, across=0), _DISTAL_X)
+    base = [_circle(k * half, s * end, 40) for k, s in ((0.6, 0.15), (0.8, 0.3), (0.8, 0.5), (0.7, 0.6))]
+    build.loft("wrist_pitch", Material.STEEL, base, _DISTAL_X)
+    _fork(build, "wrist_pitch", _stadium(0.62 * half, 0.35 * end, end), gap, 0.8 * half, half, 0.28 * half, _DISTAL_X)
 
 
 def _round(radius: float, at: float, count: int = 28) -> np.ndarray:
@@ -330,15 +321,15 @@ def _hook(build: _Builder, shape: ToolShape) -> None:
     length, bend = shape.hook
     r = shape.radius
     cone = [_circle(k * r, z, 32) for k, z in ((0.55, -0.3 * r), (0.6, 0.3 * r), (0.34, 0.35 * length), (0.3, 0.5 * length))]
-    build.loft("jaw_left", Material.INSULATION, cone, _DISTAL_Y)
+    build.loft("wrist_yaw", Material.INSULATION, cone, _DISTAL_Y)
     wire, turn = 0.6e-3, 1.6e-3
     path = [np.array([0.0, 0, z]) for z in np.linspace(0.45, 1.0, 6) * (length - turn)]
     path += [np.array([turn * (1 - np.cos(a)), 0, length - turn + turn * np.sin(a)]) for a in np.linspace(0.2, np.pi / 2, 8)]
     path += [np.array([x, 0, length]) for x in np.linspace(turn, bend, 4)[1:]]
-    build.loft("jaw_left", Material.STEEL, _swept(np.array(path), lambda s: wire * (1.0 if s < 0.9 else 1.0 - 4 * (s - 0.9))), _DISTAL_Y)
-    build.capsule("jaw_left", (0, 0, 0), (0, 0, 0.5 * length), 0.35 * r, _DISTAL_Y)
-    build.capsule("jaw_left", (0, 0, 0.5 * length), (0, 0, length), wire, _DISTAL_Y)
-    build.capsule("jaw_left", (0, 0, length), (bend, 0, length), wire, _DISTAL_Y)
+    build.loft("wrist_yaw", Material.STEEL, _swept(np.array(path), lambda s: wire * (1.0 if s < 0.9 else 1.0 - 4 * (s - 0.9))), _DISTAL_Y)
+    build.capsule("wrist_yaw", (0, 0, 0), (0, 0, 0.5 * length), 0.35 * r, _DISTAL_Y)
+    build.capsule("wrist_yaw", (0, 0, 0.5 * length), (0, 0, length), wire, _DISTAL_Y)
+    build.capsule("wrist_yaw", (0, 0, length), (bend, 0, length), wire, _DISTAL_Y)
 
 
 def _swept(path: np.ndarray, radius: Callable[[float], float]) -> np.ndarray:

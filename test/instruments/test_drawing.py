@@ -76,6 +76,19 @@ def test_what_is_nearer_hides_what_is_farther(before):
         assert torch.equal(picture.depths, depths) and bool((picture.labels == TISSUE).all())
 
 
+@pytest.mark.parametrize("axis", [(1.0, 0.01, 0.0), (0.01, 1.0, 0.0)])
+def test_level_and_upright_edges_have_every_shade(axis):
+    pose = np.eye(4)
+    pose[:3, 2] = axis / np.linalg.norm(axis)  # its edge crosses a row or column of pixels within a hundred
+    pose[:3, 0] = 0, 0, 1
+    pose[:3, 1] = np.cross(pose[:3, 2], pose[:3, 0])
+    pose[2, 3] = 0.06
+    colors, depths, alphas = tissue(0.3)
+    picture = InstrumentDrawing([[cylinder(5e-3, -0.1, 0.1)]], device="cpu").draw([{"roll": pose}], CAMERA, colors, depths, 0 * alphas)
+    counts = (4 * picture.alphas).round().int().flatten().bincount(minlength=5)
+    assert len(counts) == 5 and bool((counts[1:4] > 100).all())
+
+
 def test_edges_are_as_soft_as_a_pixel():
     parts, poses = scene()
     colors, depths, alphas = tissue(0.3, (0.0, 1.0, 0.0))

@@ -1,5 +1,7 @@
 """The shapes of instruments: closed, hinged where the kinematics says, and alike as triangles and as capsules."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -78,6 +80,13 @@ def test_an_arm_of_many_positions_has_as_many_poses():
     for i, one in enumerate((link_poses(arm, JOINTS, 0.2), link_poses(arm, 0.5 * JOINTS, 0.9))):
         for link, pose in one.items():
             np.testing.assert_allclose(many[link][i], pose, atol=1e-15)
+
+
+def test_own_files_may_name_joints_as_they_like():
+    arm = load_arm("PSM", "LARGE_NEEDLE_DRIVER")
+    other = replace(arm, joints=tuple(replace(joint, name=f"outer_{joint.name}") for joint in arm.joints))
+    parts, _ = build_instrument(other)
+    assert {part.link for part in parts} <= link_poses(other, JOINTS).keys() == link_poses(arm, JOINTS).keys()
 
 
 def test_what_has_no_shape_is_refused():

@@ -144,6 +144,7 @@ def build_instrument(arm: ArmKinematics, shape: ToolShape | None = None) -> tupl
     # Two ears hold the pin of the pitch; between them turns the second clevis, which holds that of the yaw.
     _clevis(build, -2.2 * r, 0.92 * r, 0.62 * r)
     _block(build, wrist, 0.9 * r, 0.5 * r)
+    build.capsule("roll", (0, 0, -2.2 * r), (0, 0, -0.3 * r), 0.66 * r)
     build.capsule("wrist_pitch", (0, 0, 0), (0, 0, wrist), 0.8 * r, _DISTAL_X)
     if shape.cover:
         sleeve = [_circle(k * r, s * wrist, 40) for k, s in ((0.74, 0.3), (0.86, 0.38), (0.86, 0.68), (0.66, 0.82))]
@@ -205,7 +206,7 @@ def _circle(radius: float, z: float, count: int = 32) -> np.ndarray:
 def _shaft(build: _Builder, shape: ToolShape) -> None:
     r, end = shape.radius, -2.2 * shape.radius
     stations = np.linspace(-shape.shaft, end - 1.6e-3, 13)  # long triangles would vanish whole where one corner is behind the lens
-    build.loft("roll", Material.SHAFT, [_circle(r, z, 40) for z in stations])
+    build.loft("roll", Material.SHAFT, [_circle(r, z, 28) for z in stations])
     collar = [(0.99, 0.0), (1.03, 0.25e-3), (1.03, 1.3e-3), (0.93, 1.6e-3)]
     build.loft("roll", Material.STEEL, [_circle(k * r, end - 1.6e-3 + z, 40) for k, z in collar])
     build.capsule("roll", (0, 0, -shape.shaft), (0, 0, end), r)

@@ -62,6 +62,7 @@ from endo_sim_ros.messages.tools import (
     encode_cut as encode_cut,
     encode_jaw as encode_jaw,
     encode_operating_state as encode_operating_state,
+    encode_text as encode_text,
     encode_tool_markers as encode_tool_markers,
     encode_wrench as encode_wrench,
 )
@@ -97,6 +98,7 @@ from endo_sim_ros.messages.topics import (
     tool_jaw_move as tool_jaw_move,
     tool_jaw_setpoint as tool_jaw_setpoint,
     tool_jaw_state as tool_jaw_state,
+    tool_links as tool_links,
     tool_move as tool_move,
     tool_pose as tool_pose,
     tool_pose_command as tool_pose_command,
@@ -104,6 +106,7 @@ from endo_sim_ros.messages.topics import (
     tool_setpoint as tool_setpoint,
     tool_state as tool_state,
     tool_state_command as tool_state_command,
+    tool_type as tool_type,
     tool_wrench as tool_wrench,
 )
 from endo_sim_ros.messages.types import (

@@ -81,6 +81,11 @@ def encode_operating_state(state: str, homed: bool, busy: bool, stamp_ns: int) -
     return kind(header=make_header(ros_types(), stamp_ns, ""), state=state, is_homed=homed, is_busy=busy)
 
 
+def encode_text(text: str, types: MessageTypes = ros_types()) -> Message:
+    """String of a text."""
+    return types.String(data=text)
+
+
 def decode_state_command(message: Message) -> str:
     """Command in a CRTK StringStamped or a String."""
     return (message.data if hasattr(message, "data") else message.string).strip()

@@ -67,6 +67,15 @@ tool_cut = _of_arm("cut", "sensor_msgs/msg/Joy")
 """Whether an arm's edge cuts."""
 
 
+tool_links = _of_arm("link_poses", "geometry_msgs/msg/PoseArray")
+"""Poses of the links of an arm's instrument."""
+
+
+def tool_type(arm: str) -> Topic:
+    """Name and number, or path of the file, of the tool on an arm."""
+    return Topic(f"{arm}/tool_type", "std_msgs/msg/String", "latched")
+
+
 def tool_state(arm: str) -> Topic:
     """CRTK operating state of an arm."""
     return Topic(f"{arm}/operating_state", crtk_type("OperatingState"), "latched")
@@ -83,7 +92,7 @@ RECORDING_TOPICS = (
 MODEL_TOPICS = (GAUSSIANS, TRAINING_CAMERAS, TRAINING_CAMERA_INFO)
 TOOL_TOPICS = (  # of one arm; without its operating state, whose type is not installed everywhere
     tool_pose, tool_pose_command, tool_move, tool_setpoint, tool_wrench, tool_jaw, tool_jaw_move, tool_jaw_state, tool_jaw_setpoint,
-    tool_cut, tool_reaction,
+    tool_cut, tool_reaction, tool_links, tool_type,
 )  # fmt: skip
 RENDERED_TOPICS = (RENDERED_INFO, RENDERED_POSE, RENDERED_DEPTH, RENDERED_IMAGE)
 

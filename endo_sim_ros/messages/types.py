@@ -21,7 +21,7 @@ Message = Any  # an instance of a message class, of ROS or of rosbags: both have
 MESSAGE_PACKAGES = {
     "builtin_interfaces": ("Time",),
     "rosgraph_msgs": ("Clock",),
-    "std_msgs": ("Header", "ColorRGBA"),
+    "std_msgs": ("Header", "ColorRGBA", "String"),
     "geometry_msgs": ("Point", "Quaternion", "Pose", "PoseStamped", "PoseArray", "Vector3", "Wrench", "WrenchStamped"),
     "sensor_msgs": ("Image", "CompressedImage", "CameraInfo", "RegionOfInterest", "PointCloud2", "PointField", "JointState", "Joy"),
     "visualization_msgs": ("Marker", "MarkerArray"),

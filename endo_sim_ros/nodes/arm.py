@@ -32,6 +32,7 @@ class Arm:
     cutting: bool = False
     state: str = ENABLED
     homed: bool = True
+    acts: bool = True  # False at a start where nobody has commanded it yet: it touches nothing there
     pose_goal: np.ndarray | None = None  # [4, 4], world; None while no move is under way
     angle_goal: float | None = None  # rad
 
@@ -67,6 +68,11 @@ class Arm:
             what = "resume" if self.state == PAUSED else "enable"
             raise ValueError(f"{self.name} is {self.state}; send {what} on {self.name}/state_command")
 
+    def reach(self, pose: np.ndarray) -> str:
+        """Put the tip at a pose [4, 4], world; returns what is missing, in a sentence, or nothing."""
+        self.pose, self.acts = pose, True
+        return ""
+
     def stop(self) -> None:
         """End all moves where they are."""
         self.pose_goal = self.angle_goal = None
@@ -80,9 +86,10 @@ class Arm:
             angle = np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))
             needed = float(max(np.linalg.norm(self.pose_goal[:3, 3] - self.pose[:3, 3]) / speed, angle / turn_speed))
             if needed <= seconds * _ROUNDED:
-                self.pose, self.pose_goal = self.pose_goal, None
+                goal, self.pose_goal = self.pose_goal, None
+                self.reach(goal)
             else:
-                self.pose = interpolate_pose(self.pose, self.pose_goal, seconds / needed)
+                self.reach(interpolate_pose(self.pose, self.pose_goal, seconds / needed))
         if self.angle_goal is not None:
             way, most = self.angle_goal - self.angle, seconds * turn_speed
             if abs(way) <= most * _ROUNDED:

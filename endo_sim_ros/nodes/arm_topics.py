@@ -11,6 +11,8 @@ from endo_sim_ros.messages import Topic
 from endo_sim_ros.nodes.arm import Arm
 from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode
 from endo_sim_ros.nodes.configs import PhysicsNodeConfig
+from endo_sim_ros.nodes.jointed_arm import JointedArm
+from endo_sim_ros.nodes.pacing import MOST_WAITING
 
 Deliver = Callable[[str, str, Any, str, Callable[[], None]], None]
 
@@ -35,6 +37,12 @@ class ArmTopics:
         self._reactions = {name: node.publisher(messages.tool_reaction(name), alone=True) for name in arms}
         shown = messages.tool_pose, messages.tool_setpoint, messages.tool_jaw_state, messages.tool_jaw_setpoint, messages.tool_state
         self._publishers = {name: {topic: node.publisher(topic(name), alone=True) for topic in shown} for name in arms if commanded}
+        jointed = {name: arm for name, arm in arms.items() if isinstance(arm, JointedArm)}
+        links_depth = MOST_WAITING if options.mode == "lockstep" else STREAM_DEPTH
+        self._links = [(arm, node.publisher(messages.tool_links(name), links_depth, alone=True)) for name, arm in jointed.items()]
+        self._tool_types = [node.publisher(messages.tool_type(name), alone=True) for name in jointed]
+        for publisher, arm in zip(self._tool_types, jointed.values()):
+            publisher.publish(messages.encode_text(arm.tool_type))
         self._told: dict[str, tuple[str, bool, bool]] = {}  # what was last said on operating_state
         several = max(depth, STREAM_DEPTH)  # for what comes once
         for arm in arms.values():
@@ -60,8 +68,11 @@ class ArmTopics:
 
         def act() -> None:
             arm.require_enabled()
-            arm.pose, arm.pose_goal = pose, None
+            arm.pose_goal = None
+            missing = arm.reach(pose)
             self.publish_operating_states()
+            if missing:
+                raise ValueError(missing)
 
         self._deliver(arm.name, "pose", message, topic, act)
 
@@ -120,6 +131,7 @@ class ArmTopics:
         arm.require_enabled()
         if arm.pose is None:
             raise ValueError(f"a {what} came before any pose on {self._pose_topic(arm.name).name}; publish the tip's pose")
+        arm.acts = True
         return arm.pose
 
     # ------------------------------------------------------------------ states
@@ -137,6 +149,12 @@ class ArmTopics:
             if name == asked or self._told.get(name) != state:
                 self._told[name] = state
                 publishers[messages.tool_state].publish(messages.encode_operating_state(*state, self._node.now_ns()))
+
+    def publish_links(self, stamp: int) -> None:
+        """Publish where the links of the instruments are, at the time of a state, ns."""
+        for arm, publisher in self._links:
+            if links := arm.links():
+                publisher.publish(messages.encode_poses(links, stamp, self.options.world_frame))
 
     def publish(self, arm: Arm, pose: np.ndarray, reaction: np.ndarray, torque: np.ndarray, stamp: int) -> None:
         """Publish what an arm feels and, if it is commanded, where it is.

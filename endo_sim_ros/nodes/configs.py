@@ -97,6 +97,11 @@ class PhysicsNodeConfig(WorldConfig):
     arm_source: Literal["measured", "commanded"] = "measured"
     """measured: tool tips follow measured_cp, as robots and their simulators publish it. commanded: there is no robot; tips
     follow servo_cp at once and move_cp at move_speed, and this node publishes measured_cp and jaw/measured_js as an arm does."""
+    instruments: tuple[str, ...] = ("LARGE_NEEDLE_DRIVER",)
+    """Tool of each arm in the order of arms, or one for all: a name of the dVRK, such as PROGRASP_FORCEPS or PROGRASP_FORCEPS:420093,
+    or the path of a tool file of the dVRK. none = a tip without joints, which reaches every pose."""
+    arm_models: tuple[str, ...] = ("PSM",)
+    """Kind of each arm in the order of arms, or one for all: PSM, PSM_Si, or the path of a kinematic file of the dVRK."""
     move_speed: Annotated[float, Range(1e-4, 10, "m/s")] = 0.05
     """Speed of a tool tip that moves to the goal of move_cp."""
     turn_speed: Annotated[float, Range(1e-2, 100, "rad/s")] = 1.5

@@ -8,11 +8,12 @@ import numpy as np
 from std_srvs.srv import SetBool, Trigger
 
 from endo_sim_ros import messages
+from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ControlNodeCloud, PhysicsState
-from endo_sim_ros.nodes.arm import Arm
 from endo_sim_ros.nodes.arm_topics import ArmTopics
 from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode, run, sentence
 from endo_sim_ros.nodes.configs import COMMAND_PARTS, PhysicsNodeConfig, arm_names
+from endo_sim_ros.nodes.jointed_arm import make_arms, place_arms
 from endo_sim_ros.nodes.pacing import MOST_WAITING, CommandQueue, Pacer
 from endo_sim_ros.nodes.tissue_builder import TissueBuilder
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
@@ -28,7 +29,7 @@ _WINDOW = 1.0  # seconds over which the real-time factor is measured
 class PhysicsNode(EndoNode):
     """Samples control nodes from the latest model and steps them at the rate of the simulation."""
 
-    read_at_start = frozenset({"arms", "arm_source", "mode", "lockstep_inputs"})
+    read_at_start = frozenset({"arms", "arm_source", "instruments", "arm_models", "mode", "lockstep_inputs"})
 
     def __init__(self) -> None:
         super().__init__("physics_node")
@@ -43,7 +44,11 @@ class PhysicsNode(EndoNode):
         self._real_time_factor = self._clock_speed = 1.0  # the clock's is that against the wall's
         self._asked = 0.0  # time of the clock when it was last asked for a step
         self._pacer = Pacer()
-        self.arms = {name: Arm(name) for name in arm_names(self._options.arms)}
+        given = self._options
+        self.arms = make_arms(arm_names(given.arms), given.instruments, given.arm_models, given.arm_source == "commanded")
+        self._view: tuple[Camera, float] | None = None  # a camera of the newest model and the depth of the tissue that it sees, m
+        self._unplaced = ""  # why arms have no place
+        self._place_arms()
         self._lockstep = self._options.mode == "lockstep"
         self._commands = CommandQueue(frozenset((n, kind) for n in self.arms for kind in self._options.lockstep_inputs))
         # In real time only the newest command counts, and none may queue; in lockstep none may be lost.
@@ -73,7 +78,10 @@ class PhysicsNode(EndoNode):
             self.config = config  # the timer builds a simulation for it
             self._timer.timer_period_ns = int(_poll(config) * 1e9)
         else:
+            moved = config.frames != self._options.frames
             self._options = self._arm_topics.options = config
+            if moved:
+                self._place_arms()
 
     # ------------------------------------------------------------------ model
 
@@ -82,7 +90,7 @@ class PhysicsNode(EndoNode):
         try:
             built = self._builder.take()
             if built is not None:
-                (stamp, simulation), old = built, self.simulation
+                (stamp, simulation, view), old = built, self.simulation
                 same_model = stamp == self._simulated_stamp
                 continued = old is not None and same_model and simulation.continue_from(old)  # only its material has changed
                 self._simulated_stamp, self.simulation, self.failure = stamp, simulation, ""
@@ -90,6 +98,9 @@ class PhysicsNode(EndoNode):
                 if not continued:
                     for arm in self.arms.values():
                         arm.acting = False
+                if not same_model:
+                    self._view = view
+                    self._place_arms()
                 if self._lockstep and not continued:  # the first observation, before any command
                     self._publish(self.simulation, self._simulated_stamp, at_rest=True)
         except Exception as error:
@@ -98,6 +109,12 @@ class PhysicsNode(EndoNode):
         self._builder.want(self.config)
 
     # ------------------------------------------------------------------ tools
+
+    def _place_arms(self) -> None:
+        """Put the arms where `frames` or the camera of the newest model says, those without a robot at their start."""
+        before, self._unplaced = self._unplaced, place_arms(self.arms, self._options.frame_poses, self._view)
+        if self._unplaced and self._unplaced != before and self.simulation is not None:
+            self.get_logger().warning(self._unplaced)
 
     def _on_command(self, name: str, kind: str, message: Any, topic: str, act: Callable[[], None]) -> None:
         """Let a part of a command act now or, in lockstep, in the step that its stamp names."""
@@ -131,7 +148,7 @@ class PhysicsNode(EndoNode):
 
     def _apply_tools(self, simulation: TissueSimulation) -> None:
         for name, arm in self.arms.items():
-            if arm.pose is None:
+            if arm.pose is None or not arm.acts:
                 continue
             where = f"at {np.round(arm.pose[:3, 3], 4).tolist()}"
             if not simulation.set_grasp(name, arm.pose, arm.closed):
@@ -242,6 +259,7 @@ class PhysicsNode(EndoNode):
         if cut != self._published_cut:  # before the state that has it
             self._cut_pub.publish(messages.encode_cut_surface(simulation.cuts, self._simulated_stamp, world))
             self._published_cut = cut
+        self._arm_topics.publish_links(stamp)  # before the state with the same stamp, as who draws both waits for that
         cloud = ControlNodeCloud(state.rest, state.positions, state.F, self._simulated_stamp, cut)
         self._nodes_pub.publish(messages.encode_control_nodes(cloud, stamp, world))
         shown = []
@@ -338,7 +356,7 @@ class PhysicsNode(EndoNode):
             return WARN, text, values
         if self._real_time_factor < _SLOW:
             return WARN, "slower than real time; lower node_count or young_modulus, or use a GPU", values
-        return OK, "running", values
+        return (WARN, f"running; {self._unplaced}", values) if self._unplaced else (OK, "running", values)
 
     def destroy_node(self) -> None:
         """Build no more tissue, and destroy the node."""

@@ -133,7 +133,7 @@ def _touch_over_dds(
             max_gaussians=30_000,
         )
         graph.start("physics_node", arms=[_ARM])
-        graph.start("rendering_node", image_width=width, idle_rate=1.0)
+        graph.start("rendering_node", image_width=width, idle_rate=1.0, arms=[_ARM])
         names = {"recorder", "reconstruction_node", "physics_node", "rendering_node"}
         wait("starting", lambda: names <= watcher.statuses.keys(), "recorder")
         player = graph.start("bag_player_node", bag=bag)

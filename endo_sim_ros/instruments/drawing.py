@@ -3,18 +3,18 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.core.config import Range, StageConfig
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.kernels import launch, launch_in_shares, load_kernels, vectorised
 from endo_sim_ros.core.light import SURFACE
 from endo_sim_ros.instruments import drawing_kernels, resolving_kernels
+from endo_sim_ros.instruments.config import DrawingConfig as DrawingConfig
 from endo_sim_ros.instruments.shadow_kernels import MOST
 from endo_sim_ros.instruments.shapes import Capsule, Material, Part
 
@@ -31,28 +31,6 @@ SURFACES = {
 _CREASE = np.cos(np.radians(35))  # faces that meet at a smaller angle are one smooth surface
 _STRIDE = 8  # pixels from one that the hue of the tissue is taken from to the next
 _NEAREST = 2e-3  # metres from the plane of the lens
-
-
-@dataclass(frozen=True)
-class DrawingConfig(StageConfig):
-    """How instruments are lit and meet the tissue."""
-
-    lamp_x: Annotated[float, Range(-0.05, 0.05, "m")] = 0.003
-    """Where the lamp is beside the lens, to the right in the picture."""
-    lamp_y: Annotated[float, Range(-0.05, 0.05, "m")] = -0.002
-    """The same downwards."""
-    lamp_size: Annotated[float, Range(0, 0.05, "m")] = 0.0015
-    """Radius of the lamp, the end of a bundle of fibres: the larger, the softer are shadows."""
-    shadows: bool = True
-    """Whether instruments keep light from the tissue and from each other."""
-    ambient: Annotated[float, Range(0, 1)] = 0.2
-    """Share of the light that comes from all around: wet tissue reflects and scatters much of the lamp's."""
-    mirror: Annotated[float, Range(0, 2)] = 0.15
-    """Brightness of the tissue that steel mirrors, as part of what the lamp gives."""
-    softness: Annotated[float, Range(1e-5, 0.01, "m")] = 4e-4
-    """Depth over which an instrument comes out of the tissue; splats have no sharper surface."""
-    blur: Annotated[float, Range(1, 3, "pixels")] = 1.5
-    """Side of the square from which a pixel takes light: 1 is sharper than any lens, and than pictures whose colours were interpolated."""
 
 
 @dataclass(frozen=True)

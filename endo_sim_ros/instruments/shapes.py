@@ -15,6 +15,9 @@ from numpy.typing import ArrayLike
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.instruments.kinematics import ArmKinematics
 
+LINKS = ("roll", "wrist_pitch", "wrist_yaw", "jaw_left", "jaw_right")
+"""Names of the links, in the order in which `link_poses` gives them."""
+
 _DISTAL_Z = np.eye(3)
 """Axes of a frame whose z points at the tip, in which shafts are built."""
 _DISTAL_X = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
@@ -169,8 +172,8 @@ def link_poses(arm: ArmKinematics, joints: ArrayLike, jaw: ArrayLike = 0.0) -> d
         ValueError: As `ArmKinematics.check_joints` does.
     """
     frames = arm.link_frames(joints)
-    poses = {name: frames[..., i, :, :] for i, name in enumerate(("roll", "wrist_pitch", "wrist_yaw"), 3)}  # files may name them otherwise
-    for name, side in (("jaw_left", -0.5), ("jaw_right", 0.5)):
+    poses = {name: frames[..., i, :, :] for i, name in enumerate(LINKS[:3], 3)}  # files may name them otherwise
+    for name, side in zip(LINKS[3:], (-0.5, 0.5)):
         angle = side * np.broadcast_to(np.asarray(jaw, np.float64), frames.shape[:-3])
         turn = np.zeros((*angle.shape, 4, 4))
         turn[..., 0, 0], turn[..., 0, 1], turn[..., 1, 0], turn[..., 1, 1] = np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)

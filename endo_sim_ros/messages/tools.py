@@ -86,6 +86,11 @@ def encode_text(text: str, types: MessageTypes = ros_types()) -> Message:
     return types.String(data=text)
 
 
+def decode_text(message: Message) -> str:
+    """Text of a String."""
+    return message.data.strip()
+
+
 def decode_state_command(message: Message) -> str:
     """Command in a CRTK StringStamped or a String."""
     return (message.data if hasattr(message, "data") else message.string).strip()

@@ -33,6 +33,11 @@ RENDERED_IMAGE = Topic("rendered/image_raw", "sensor_msgs/msg/Image")
 RENDERED_INFO = Topic("rendered/camera_info", "sensor_msgs/msg/CameraInfo")
 RENDERED_POSE = Topic("rendered/camera_pose", "geometry_msgs/msg/PoseStamped")
 RENDERED_DEPTH = Topic("rendered/depth/image", "sensor_msgs/msg/Image")
+RENDERED_SEGMENTATION = Topic("rendered/segmentation/image", "sensor_msgs/msg/Image")
+RENDERED_COMPRESSED = Topic("rendered/image_raw/compressed", "sensor_msgs/msg/CompressedImage")
+RENDERED_RIGHT_IMAGE = Topic("rendered/right/image_raw", "sensor_msgs/msg/Image")
+RENDERED_RIGHT_COMPRESSED = Topic("rendered/right/image_raw/compressed", "sensor_msgs/msg/CompressedImage")
+RENDERED_RIGHT_INFO = Topic("rendered/right/camera_info", "sensor_msgs/msg/CameraInfo")
 TOOL_MARKERS = Topic("tool_markers", "visualization_msgs/msg/MarkerArray")
 DIAGNOSTICS = Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
 CLOCK = Topic("/clock", "rosgraph_msgs/msg/Clock")
@@ -97,7 +102,18 @@ TOOL_TOPICS = (  # of one arm; without its operating state, whose type is not in
 RENDERED_TOPICS = (RENDERED_INFO, RENDERED_POSE, RENDERED_DEPTH, RENDERED_IMAGE)
 
 
+EXTRA_RENDERED_TOPICS = (RENDERED_COMPRESSED, RENDERED_SEGMENTATION, RENDERED_RIGHT_INFO, RENDERED_RIGHT_IMAGE, RENDERED_RIGHT_COMPRESSED)
+"""What is rendered only for those who ask."""
+
+
 def all_topics(arms: tuple[str, ...] = ("PSM1",)) -> tuple[Topic, ...]:
-    """Every topic of the contract that is recorded, for the given arms."""
+    """Every topic of the contract that can be recorded, for the given arms."""
     tools = tuple(make(arm) for arm in arms for make in TOOL_TOPICS)
-    return RECORDING_TOPICS + MODEL_TOPICS + (CONTROL_NODES, CUT_SURFACE) + RENDERED_TOPICS + tools + (TOOL_MARKERS, DIAGNOSTICS, CLOCK)
+    graph = RECORDING_TOPICS + MODEL_TOPICS + (CONTROL_NODES, CUT_SURFACE) + RENDERED_TOPICS + EXTRA_RENDERED_TOPICS
+    return graph + tools + (TOOL_MARKERS, DIAGNOSTICS, CLOCK)
+
+
+def recorded_topics(arms: tuple[str, ...] = ("PSM1",), compressed: bool = True) -> tuple[Topic, ...]:
+    """What a recorder of everything records: rendered images in one form, and nothing that would be rendered for it alone."""
+    others = {RENDERED_IMAGE if compressed else RENDERED_COMPRESSED, *EXTRA_RENDERED_TOPICS} - {RENDERED_COMPRESSED if compressed else None}
+    return tuple(topic for topic in all_topics(arms) if topic not in others)

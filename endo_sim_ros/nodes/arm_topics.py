@@ -151,10 +151,9 @@ class ArmTopics:
                 publishers[messages.tool_state].publish(messages.encode_operating_state(*state, self._node.now_ns()))
 
     def publish_links(self, stamp: int) -> None:
-        """Publish where the links of the instruments are, at the time of a state, ns."""
+        """Publish where the links of the instruments are, at the time of a state, ns; nowhere while nobody knows."""
         for arm, publisher in self._links:
-            if links := arm.links():
-                publisher.publish(messages.encode_poses(links, stamp, self.options.world_frame))
+            publisher.publish(messages.encode_poses(arm.links(), stamp, self.options.world_frame))
 
     def publish(self, arm: Arm, pose: np.ndarray, reaction: np.ndarray, torque: np.ndarray, stamp: int) -> None:
         """Publish what an arm feels and, if it is commanded, where it is.

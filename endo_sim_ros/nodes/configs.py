@@ -10,7 +10,8 @@ import numpy as np
 
 from endo_sim_ros.core.cameras import parse_frames
 from endo_sim_ros.core.config import ConfigError, Range, StageConfig
-from endo_sim_ros.core.frames import LEFT_FRAME
+from endo_sim_ros.core.frames import LEFT_FRAME, RIGHT_FRAME
+from endo_sim_ros.instruments.config import DrawingConfig
 from endo_sim_ros.nodes.pacing import MOST_WAITING
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
@@ -137,6 +138,16 @@ class RenderingNodeConfig(WorldConfig):
     """Images published per second while nothing in the image changes."""
     camera_frame: str = LEFT_FRAME
     """Frame in the headers of rendered images."""
+    right_frame: str = RIGHT_FRAME
+    """The same of the right eye."""
+    instruments: bool = True
+    """Draw the instruments of the arms where link_poses says they are."""
+    arms: tuple[str, ...] = ("PSM1",)
+    """Names of the arms whose instruments are drawn; one that nobody publishes is not."""
+    jpeg_quality: Annotated[int, Range(1, 100)] = 90
+    """Quality of compressed images; at 90 the eye sees no difference."""
+    drawing: DrawingConfig = DrawingConfig()
+    """How instruments are lit."""
 
 
 @dataclass(frozen=True)
@@ -162,7 +173,10 @@ class RecorderConfig(StageConfig):
     arms: tuple[str, ...] = ("PSM1",)
     """Names of the tool arms."""
     topics: tuple[str, ...] = (ALL_TOPICS,)
-    """Names of the topics to record, of those in msg_conventions.md; all records every one."""
+    """Names of the topics to record, of those in msg_conventions.md. all records every one but what would be rendered for the recorder
+    alone: segmentation, the right eye, and one of the two forms of the images."""
+    images: Literal["compressed", "raw"] = "compressed"
+    """Form of the rendered images where all topics are recorded; raw ones are exact and take about twelve times the room."""
     canonical: bool = True
     """Write zeros into the padding between the fields of a message, so that equal messages have equal bytes."""
 

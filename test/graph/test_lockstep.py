@@ -33,6 +33,7 @@ PARAMETERS = {
 }
 IMAGES = messages.RENDERED_IMAGE
 POSE, WRENCH = messages.tool_pose_command("PSM1"), messages.tool_wrench("PSM1")
+SHOWN = (messages.RENDERED_IMAGE, messages.RENDERED_SEGMENTATION)  # recorded only where they are named
 STATES = (messages.CONTROL_NODES, messages.tool_reaction("PSM1"), messages.CLOCK, *messages.RENDERED_TOPICS)
 
 
@@ -332,7 +333,7 @@ def record(tmp_path, name, model):
     try:
         with NodeGroup(tmp_path / "logs") as group:
             group.environment |= {"ENDO_SIM_THREADS": "2" if name == "second" else "1"}
-            group.start("recorder_node", bag=bag)
+            group.start("recorder_node", bag=bag, topics=["all", *(topic.name for topic in SHOWN)])
             group.start("physics_node", **PARAMETERS["physics_node"])
             group.start("rendering_node", **PARAMETERS["rendering_node"])
             bench.status("recorder", "recording", OK)
@@ -370,10 +371,12 @@ def record(tmp_path, name, model):
 def test_the_same_commands_give_the_same_bytes_in_every_run(tmp_path):
     save_ply(sheet(tilt=0.3), tmp_path / "model.ply")
     first, second = (record(tmp_path, name, tmp_path / "model.ply") for name in ("first", "second"))
-    for topic in STATES:
+    for topic in (*STATES, *SHOWN, messages.RENDERED_COMPRESSED, messages.tool_links("PSM1")):
         ours, theirs = (episode[f"/{topic.name.lstrip('/')}"] for episode in (first, second))
         assert len(ours) >= 8 and ours[-8:] == theirs[-8:], topic.name
     assert len(set(first["/rendered/image_raw"][-8:])) == 8  # the tissue moves
+    labels = np.frombuffer(first[f"/{messages.RENDERED_SEGMENTATION.name}"][-1], np.uint8)[-WIDTH * HEIGHT :]
+    assert (labels >= 2).sum() > 50  # the instrument is in the picture
 
 
 def test_the_same_bag_gives_the_same_model_in_every_run(tmp_path, small_bag):

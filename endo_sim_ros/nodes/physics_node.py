@@ -10,10 +10,10 @@ from std_srvs.srv import SetBool, Trigger
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ControlNodeCloud, PhysicsState
+from endo_sim_ros.nodes.arm_setup import CAMERA_ARM, make_arms, place_arms
 from endo_sim_ros.nodes.arm_topics import ArmTopics
 from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode, run, sentence
-from endo_sim_ros.nodes.configs import COMMAND_PARTS, PhysicsNodeConfig, arm_names
-from endo_sim_ros.nodes.jointed_arm import make_arms, place_arms
+from endo_sim_ros.nodes.configs import COMMAND_PARTS, PhysicsNodeConfig
 from endo_sim_ros.nodes.pacing import MOST_WAITING, CommandQueue, Pacer
 from endo_sim_ros.nodes.tissue_builder import TissueBuilder
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
@@ -44,13 +44,12 @@ class PhysicsNode(EndoNode):
         self._real_time_factor = self._clock_speed = 1.0  # the clock's is that against the wall's
         self._asked = 0.0  # time of the clock when it was last asked for a step
         self._pacer = Pacer()
-        given = self._options
-        self.arms = make_arms(arm_names(given.arms), given.instruments, given.arm_models, given.arm_source == "commanded")
+        self.arms = make_arms(self._options)
+        self._tools = {name: arm for name, arm in self.arms.items() if name != CAMERA_ARM}
         self._view: tuple[Camera, float] | None = None  # a camera of the newest model and the depth of the tissue that it sees, m
         self._unplaced = ""  # why arms have no place
-        self._place_arms()
         self._lockstep = self._options.mode == "lockstep"
-        self._commands = CommandQueue(frozenset((n, kind) for n in self.arms for kind in self._options.lockstep_inputs))
+        self._commands = CommandQueue(frozenset((n, kind) for n in self._tools for kind in self._options.lockstep_inputs))
         # In real time only the newest command counts, and none may queue; in lockstep none may be lost.
         depth = MOST_WAITING if self._lockstep else 1
         self._nodes_pub = self.publisher(messages.CONTROL_NODES, MOST_WAITING if self._lockstep else STREAM_DEPTH, alone=True)
@@ -63,8 +62,9 @@ class PhysicsNode(EndoNode):
             messages.TRAINING_CAMERAS, lambda message: self._builder.receive_training_cameras(message, self._options.world_frame)
         )
         self.subscribe(messages.TRAINING_CAMERA_INFO, self._builder.receive_training_info)
-        self.subscribe(messages.CAMERA_POSE, lambda message: self._builder.receive_camera_pose(message, self._options.frame_poses))
+        self.subscribe(messages.CAMERA_POSE, self._on_camera_pose)
         self._arm_topics = ArmTopics(self, self.arms, self._options, depth, self._on_command)
+        self._place_arms()
         self.service(Trigger, "~/reset", self._on_reset)
         self.service(Trigger, "~/step", self._on_step)
         self.service(SetBool, "~/pause", self._on_pause)
@@ -79,11 +79,17 @@ class PhysicsNode(EndoNode):
             self._timer.timer_period_ns = int(_poll(config) * 1e9)
         else:
             moved = config.frames != self._options.frames
-            self._options = self._arm_topics.options = config
+            self._options = config
+            self._arm_topics.change_options(config)
             if moved:
                 self._place_arms()
 
     # ------------------------------------------------------------------ model
+
+    def _on_camera_pose(self, message: Any) -> None:
+        camera = self.arms.get(CAMERA_ARM)
+        if camera is None or camera.pose is None:  # else it is that of our own arm
+            self._arm_topics.camera_pose = self._builder.receive_camera_pose(message, self._options.frame_poses)
 
     def _build(self) -> None:
         """Build a simulation of the newest model in the background; the old one goes on meanwhile."""
@@ -113,6 +119,7 @@ class PhysicsNode(EndoNode):
     def _place_arms(self) -> None:
         """Put the arms where `frames` or the camera of the newest model says, those without a robot at their start."""
         before, self._unplaced = self._unplaced, place_arms(self.arms, self._options.frame_poses, self._view)
+        self._arm_topics.describe()
         if self._unplaced and self._unplaced != before and self.simulation is not None:
             self.get_logger().warning(self._unplaced)
 
@@ -147,7 +154,7 @@ class PhysicsNode(EndoNode):
             self._publish(self.simulation, stamp)
 
     def _apply_tools(self, simulation: TissueSimulation) -> None:
-        for name, arm in self.arms.items():
+        for name, arm in self._tools.items():
             if arm.pose is None or not arm.acts:
                 continue
             where = f"at {np.round(arm.pose[:3, 3], 4).tolist()}"
@@ -234,16 +241,17 @@ class PhysicsNode(EndoNode):
         start, faults, slips = time.monotonic(), simulation.faults, simulation.slips
         for arm in self.arms.values():
             turning = arm.angle_goal is not None
-            arm.move(simulation.step_duration, self._options.move_speed, self._options.turn_speed)
+            self._arm_topics.warn(arm, arm.move(simulation.step_duration, self._options.move_speed, self._options.turn_speed))
             if turning:  # else a jaw that tissue slipped out of would close again
                 arm.hold(self._options.jaw_closed, self._options.jaw_open)
-        self._arm_topics.publish_operating_states()
         self._apply_tools(simulation)
         simulation.step()
+        for name, arm in self._tools.items():
+            self._arm_topics.limit_force(arm, lambda name=name: simulation.reaction(name)[0])
         if simulation.slips > slips:
             travel = f"{simulation.config.travel:g} m"
             self.report_error(f"tissue slipped out of a jaw that pulled it almost {travel}; open it, come nearer, or raise travel")
-            for name, arm in self.arms.items():
+            for name, arm in self._tools.items():
                 arm.closed = arm.closed and simulation.in_reach(name)
         self.steps += 1
         if simulation.faults > faults:
@@ -259,19 +267,21 @@ class PhysicsNode(EndoNode):
         if cut != self._published_cut:  # before the state that has it
             self._cut_pub.publish(messages.encode_cut_surface(simulation.cuts, self._simulated_stamp, world))
             self._published_cut = cut
-        self._arm_topics.publish_links(stamp)  # before the state with the same stamp, as who draws both waits for that
+        self._arm_topics.publish_views(stamp)  # before the state with the same stamp, as who draws them waits for that
         cloud = ControlNodeCloud(state.rest, state.positions, state.F, self._simulated_stamp, cut)
         self._nodes_pub.publish(messages.encode_control_nodes(cloud, stamp, world))
         shown = []
-        for name, arm in self.arms.items():
+        for name, arm in self._tools.items():
             if arm.pose is None:
                 continue
             reaction, torque = simulation.reaction(name)
             self._arm_topics.publish(arm, arm.pose, reaction, torque, stamp)
             force = arm.force if arm.acting and arm.force is not None else np.zeros(3)
             shown.append(messages.ToolDisplay(name, arm.pose[:3, 3], force, reaction, simulation.held(name)))
+        self._arm_topics.publish_joint_states(stamp)
         if shown and self._markers_pub.get_subscription_count():
             self._markers_pub.publish(messages.encode_tool_markers(shown, stamp, world))
+        self._arm_topics.publish_operating_states()  # at last: who waits for the end of a move then asks where the arm is
 
     # --------------------------------------------------------------- services
 
@@ -283,7 +293,6 @@ class PhysicsNode(EndoNode):
         self._start_timing()
         for arm in self.arms.values():
             arm.reset()
-        self._arm_topics.publish_operating_states()
         self._publish(self.simulation, self._simulated_stamp if self._lockstep else self.now_ns(), at_rest=True)
         return True, "at rest"
 

@@ -72,8 +72,8 @@ class TissueBuilder:
         info = messages.decode_camera_info(message, messages.TRAINING_CAMERA_INFO.name)
         self._view_info = messages.stamp_to_ns(message.header.stamp), info
 
-    def receive_camera_pose(self, message: Any, frames: Mapping[str, np.ndarray]) -> None:
-        """Decode and keep a message of the topic of the camera's pose.
+    def receive_camera_pose(self, message: Any, frames: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Decode, keep and return a message of the topic of the camera's pose: camera-to-world [4, 4], m.
 
         Args:
             message: The message.
@@ -83,6 +83,7 @@ class TissueBuilder:
             MessageError: If it cannot be used.
         """
         self._camera_pose = messages.decode_pose(message, frames, messages.CAMERA_POSE.name)
+        return self._camera_pose
 
     def take(self) -> tuple[int, TissueSimulation, tuple[Camera, float] | None] | None:
         """The stamp of a model, ns, its simulation, and a camera with the depth of the tissue in the middle of its picture, m, or

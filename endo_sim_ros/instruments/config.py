@@ -22,6 +22,9 @@ class DrawingConfig(StageConfig):
     """Share of the light that comes from all around: wet tissue reflects and scatters much of the lamp's."""
     mirror: Annotated[float, Range(0, 2)] = 0.15
     """Brightness of the tissue that steel mirrors, as part of what the lamp gives."""
+    white: Annotated[float, Range(0.1, 10)] = 1.0
+    """Brightest shine, in the scale of the model's colours: what saturates the camera. Without it a glint would darken the whole picture
+    through the exposure."""
     softness: Annotated[float, Range(1e-5, 0.01, "m")] = 4e-4
     """Depth over which an instrument comes out of the tissue; splats have no sharper surface."""
     blur: Annotated[float, Range(1, 3, "pixels")] = 1.5

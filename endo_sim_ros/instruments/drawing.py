@@ -161,12 +161,12 @@ class InstrumentDrawing:
         frame.several, frame.spread, frame.nearest = int(len({i for i, _ in self.links}) > 1), config.blur, _NEAREST
         frame.stride = _stride(frame.across * frame.down * frame.down)
         look.ambient, look.softness = config.ambient, config.softness
-        look.lamp_size, look.mirror = config.lamp_size, config.mirror
+        look.lamp_size, look.mirror, look.white = config.lamp_size, config.mirror, config.white
         lamps = np.tile((config.lamp_x, config.lamp_y, 0.0), (count, 1)) if lamps is None else lamps
         views = [(*(float(c.K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2))), *lamp) for c, lamp in zip(cameras, lamps, strict=True)]
-        move = lambda arrays: torch.as_tensor(np.asarray(arrays, np.float32), device=self.device)
-        views = move(views)
-        local = move([c.viewmat @ np.stack([own[i][link] for i, link in self.links]) for own, c in zip(poses, cameras, strict=True)])
+        views = self._upload(views)
+        local = [camera.viewmat @ np.stack([own[i][link] for i, link in self.links]) for own, camera in zip(poses, cameras, strict=True)]
+        local = self._upload(local)
         room = self._buffers(count, frame)
         labels = (alphas > SURFACE).to(torch.uint8)
         coarse, seen = colors[:, ::_STRIDE, ::_STRIDE], (alphas[:, ::_STRIDE, ::_STRIDE] > SURFACE)[..., None]
@@ -186,6 +186,11 @@ class InstrumentDrawing:
             self._launch(drawing_kernels.cover_faces, count * frame.faces, drawn)
             self._launch(resolving_kernels.resolve_pixels, count * width * height, scene)
         return labels
+
+    def _upload(self, values: Sequence) -> Tensor:
+        """Numbers as float32 on the device, without waiting for what that does at the moment."""
+        tensor = torch.from_numpy(np.asarray(values, np.float32))
+        return tensor if torch.device(self.device).type == "cpu" else tensor.pin_memory().to(self.device, non_blocking=True)
 
     def _buffers(self, count: int, frame: Any) -> dict[str, Tensor]:
         """What kernels write for each other; samples are left empty by each picture for the next."""

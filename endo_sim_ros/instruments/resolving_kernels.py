@@ -18,6 +18,7 @@ class Look:
     ambient: float  # share of the light that comes from all around
     softness: float  # m: over such a depth an instrument comes out of the tissue
     lamp_size: float  # m: radius of the lamp
+    white: float  # of encoded colours: what is brighter saturates the camera
     mirror: float  # how much of the tissue shines back from what is polished
 
 
@@ -57,7 +58,8 @@ def reflected(
     total = wp.vec3(0.0, 0.0, 0.0)
     for k in range(3):
         diffuse = surfaces[material, k] * (light + look.ambient * left[1] * around[k])
-        total[k] = encoded(diffuse + surfaces[material, 4] * ((1.0 - look.ambient) * lobe + mirrored * around[k]))
+        shine = surfaces[material, 4] * ((1.0 - look.ambient) * lobe + mirrored * around[k])
+        total[k] = wp.min(encoded(diffuse + shine), look.white)
     return total
 
 

@@ -99,8 +99,11 @@ def near(
             a, b = ends[first + c, 0], ends[first + c, 1]
             where = closest(a, b, lamp, at)
             gap = wp.length(lamp + where[1] * (at - lamp) - a - where[0] * (b - a))
-            beside = closest(a, b, at, at)
-            if gap < radii[c] + size + slack or wp.length(a + beside[0] * (b - a) - at) < REACH * radii[c] + slack:
+            reached = gap < radii[c] + size + slack
+            if not reached and gap < REACH * radii[c] + slack:  # the whole way from the lamp is as near as its end at least
+                beside = closest(a, b, at, at)
+                reached = wp.length(a + beside[0] * (b - a) - at) < REACH * radii[c] + slack
+            if reached:
                 found = found | (wp.uint64(1) << wp.uint64(c))
     return found
 

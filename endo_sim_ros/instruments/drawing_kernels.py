@@ -27,9 +27,11 @@ class Frame:
 
 
 @wp.func
-def offset(sample: int, spread: float) -> wp.vec2:
+def offset(sample: int, row: int, column: int, spread: float) -> wp.vec2:
     """Where in a pixel a sample lies, from its corner."""
     u = (0.375 + 0.5 * float(sample) - 0.25 * float(sample // 2)) % 1.0
+    if (row + column) % 2 == 1:  # the mirror image, as along an edge of slope 1 : 2 two samples are as one
+        u = 1.0 - u
     return wp.vec2(0.5 + spread * (u - 0.5), 0.5 + spread * (0.125 + 0.25 * float(sample) - 0.5))
 
 
@@ -147,7 +149,7 @@ def cover(
             here = weights(a, b, c, float(column), float(row))
             pixel = (picture * frame.height + row) * frame.width + column
             for sample in range(SAMPLES):
-                beside = offset(sample, frame.spread)
+                beside = offset(sample, row, column, frame.spread)
                 w = here + beside[0] * by_u + beside[1] * by_v
                 if wp.max(wp.max(w[0], w[1]), w[2]) <= 0.0:
                     inverse = (w[0] * a[2] + w[1] * b[2] + w[2] * c[2]) * per_area

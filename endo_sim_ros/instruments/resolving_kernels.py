@@ -120,7 +120,7 @@ def blend(
                     before = face
                     i = 3 * (picture * frame.faces + face)
                     a, b, c = corner(screen, i), corner(screen, i + 1), corner(screen, i + 2)
-                    beside = offset(sample, frame.spread)
+                    beside = offset(sample, row, column, frame.spread)
                     w = wp.cw_mul(weights(a, b, c, u - 0.5 + beside[0], v - 0.5 + beside[1]), wp.vec3(a[2], b[2], c[2]))
                     bent = wp.normalize(-w[0] * normals[i] - w[1] * normals[i + 1] - w[2] * normals[i + 2])
                     # Light costs more than all else: what lies as the sample before has its colour.

@@ -12,6 +12,7 @@ from endo_sim_ros.nodes.arm import Arm
 _ROUNDED = 1 + 1e-9  # a way that takes a whole number of steps must not take one more
 _WITHIN = 1e-6  # rad, m: how far a command may leave the limits, as what is sent back was rounded
 _LEAP = 10.0  # times the speed of a joint: the straight way passes a singularity or goes on with another bend of the wrist
+_TRIES = 4  # to find how far the tip gets in a step; one or two are enough where joints follow in proportion
 _CAMERA_REACH = ReachConfig(radian_length=1e-4)  # the direction of an endoscope follows from its place
 _CAMERA_THERE = 1e-4  # m: nearer is at the pose
 
@@ -174,18 +175,18 @@ class JointedArm(Arm):
     def _move_straight(self, seconds: float, speed: float, turn_speed: float) -> None:
         pose, goal, joints, share = self.pose, self.pose_goal, self.joints, 1.0
         assert joints is not None and goal is not None and self.base is not None
-        while True:
+        for _ in range(_TRIES):
             self._move_tip(share * seconds, speed, turn_speed)
             self.settle()  # of what lies between two poses in reach some may be out of it: the nearest will do
             haste = self._haste(joints, seconds)
-            if haste <= _ROUNDED or share < 1 / _LEAP:
+            if haste <= _ROUNDED:
                 return
             self.pose, self._posed, self.pose_goal, self.joints = pose, pose, goal, joints
             if haste > _LEAP:
-                self.joint_goal, self.pose_goal = solve_inverse(self.kinematics, invert_pose(self.base) @ goal, joints).joints, None
-                self._move_joints(seconds)
-                return
+                break
             share /= 1.01 * haste  # a little less, so that it is enough where joints do not follow in proportion
+        self.joint_goal, self.pose_goal = solve_inverse(self.kinematics, invert_pose(self.base) @ goal, joints).joints, None
+        self._move_joints(seconds)
 
     # ------------------------------------------------------------------ states
 

@@ -136,7 +136,9 @@ class RenderingNode(EndoNode):
         same = self._pose is not None and np.array_equal(pose, self._pose)
         self._pose = pose
         if self._lockstep and self.options.lockstep_camera:
-            self._poses[messages.stamp_to_ns(message.header.stamp)] = pose
+            stamp = messages.stamp_to_ns(message.header.stamp)
+            if stamp != self.tissue.model_stamp:  # that of the state at rest, which comes before or after those of all steps
+                self._poses[stamp] = pose
             while len(self._poses) > MOST_WAITING:
                 del self._poses[next(iter(self._poses))]
             self.show_states()

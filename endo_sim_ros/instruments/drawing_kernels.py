@@ -6,6 +6,7 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 SAMPLES = wp.constant(4)  # of a pixel, on a rotated grid: as many levels of grey along any edge
 EMPTY = wp.constant(wp.int64(0x7FFFFFFFFFFFFFFF))
+BEYOND = wp.constant(1.0e6)  # pixels: float32 cannot tell on which side of an edge a sample lies from so far
 TILE = wp.constant(16)  # pixels a side: what one item takes on a CPU
 
 
@@ -59,9 +60,10 @@ def project(
     rows[i] = wp.vec2i(1, 0)
     for k in range(3):
         at = wp.transform_point(pose, corners[3 * face + k])
-        if at[2] <= frame.nearest:
+        u, v = view[0] * at[0] / at[2] + view[2], view[1] * at[1] / at[2] + view[3]
+        if not (at[2] > frame.nearest and wp.abs(u) < BEYOND and wp.abs(v) < BEYOND):  # nor if it is not a number
             return
-        screen[3 * i + k] = wp.vec3(view[0] * at[0] / at[2] + view[2], view[1] * at[1] / at[2] + view[3], 1.0 / at[2])
+        screen[3 * i + k] = wp.vec3(u, v, 1.0 / at[2])
     a, b, c = corner(screen, 3 * i), corner(screen, 3 * i + 1), corner(screen, 3 * i + 2)
     if (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]) >= 0.0:  # rows count downwards: it turns its back
         return

@@ -45,7 +45,7 @@ def hidden(a: wp.vec3, b: wp.vec3, radius: float, lamp: wp.vec3, size: float, at
     where = closest(a, b, lamp, at)
     gap = wp.length(lamp + where[1] * (at - lamp) - a - where[0] * (b - a))
     half = wp.max(size * (1.0 - where[1]), blur)
-    if gap > radius + half:
+    if not (gap <= radius + half):  # nor if it is not a number
         return 0.0
     return disc_below((gap + radius) / half) - disc_below((gap - radius) / half)
 
@@ -65,7 +65,7 @@ def covered(a: wp.vec3, b: wp.vec3, radius: float, at: wp.vec3, normal: wp.vec3)
     share = wp.clamp(wp.dot(at - a, axis) / wp.max(length * length, 1.0e-14), 0.0, 1.0)
     way = a + share * axis - at
     distance = wp.length(way)
-    if distance > REACH * radius:
+    if not (distance <= REACH * radius):
         return 0.0
     if length < 1.0e-6:
         off = wp.max(distance, radius)

@@ -1,5 +1,6 @@
 """Shadows of instruments against what rays from the lamp say, and several pictures at once."""
 
+import contextlib
 from dataclasses import replace
 
 import numpy as np
@@ -131,6 +132,18 @@ def test_an_instrument_out_of_sight_changes_nothing():
     colors, depths, alphas = tissue(0.09)
     picture = drawing.draw(away, CAMERA, colors, depths, alphas)
     assert torch.equal(picture.colors, colors) and torch.equal(picture.depths, depths) and bool((picture.labels == TISSUE).all())
+
+
+@pytest.mark.parametrize("absurd", [1e6, 1e30, 1e300, np.nan])
+@pytest.mark.parametrize("plain", [False, True])
+def test_absurd_poses_change_nothing(absurd, plain):
+    drawing, poses = both()
+    shift = np.diag([1.0, 1, 1, 1])
+    shift[:3, 3] = absurd
+    colors, depths, alphas = tissue(0.09)
+    with np.errstate(over="ignore"), compare_plain() if plain else contextlib.nullcontext():
+        picture = drawing.draw([{link: shift @ pose for link, pose in own.items()} for own in poses], CAMERA, colors, depths, alphas)
+    assert torch.equal(picture.colors, colors) and bool((picture.labels == TISSUE).all())
 
 
 def test_too_many_capsules_are_refused():

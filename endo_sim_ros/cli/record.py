@@ -17,9 +17,9 @@ class Command:
     """Names of the tool arms."""
     topics: tuple[str, ...] = ("all",)
     """Names of the topics to record, such as rendered/image_raw; all records every topic of msg_conventions.md but what would be
-    rendered for the recorder alone: segmentation, the right eye, and one of the two forms of the images."""
+    rendered for the recorder alone: depth, segmentation, the right eye, and one of the two forms of the images. Name these beside all."""
     images: Literal["compressed", "raw"] = "compressed"
-    """Form of the rendered images where all topics are recorded; raw ones are exact and take about twelve times the room."""
+    """Form of the rendered images where all topics are recorded; raw ones are exact and take fifteen times the room."""
     namespace: str = ""
     """Namespace of the graph; the bag has the names without it."""
 

@@ -155,5 +155,5 @@ def all_topics(arms: tuple[str, ...] = ("PSM1",)) -> tuple[Topic, ...]:
 def recorded_topics(arms: tuple[str, ...] = ("PSM1",), compressed: bool = True) -> tuple[Topic, ...]:
     """What a recorder of everything records: rendered images in one form, and nothing that would be rendered for it alone."""
     form = RENDERED_COMPRESSED if compressed else RENDERED_IMAGE
-    others = {RENDERED_IMAGE, *EXTRA_RENDERED_TOPICS} - {form}
+    others = {RENDERED_IMAGE, RENDERED_DEPTH, *EXTRA_RENDERED_TOPICS} - {form}
     return tuple(topic for topic in all_topics(arms) if topic not in others)

@@ -186,9 +186,9 @@ class RecorderConfig(StageConfig):
     """Names of the tool arms."""
     topics: tuple[str, ...] = (ALL_TOPICS,)
     """Names of the topics to record, of those in msg_conventions.md. all records every one but what would be rendered for the recorder
-    alone: segmentation, the right eye, and one of the two forms of the images."""
+    alone: depth, segmentation, the right eye, and one of the two forms of the images. Name these beside all."""
     images: Literal["compressed", "raw"] = "compressed"
-    """Form of the rendered images where all topics are recorded; raw ones are exact and take about twelve times the room."""
+    """Form of the rendered images where all topics are recorded; raw ones are exact and take fifteen times the room."""
     canonical: bool = True
     """Write zeros into the padding between the fields of a message, so that equal messages have equal bytes."""
 

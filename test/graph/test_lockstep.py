@@ -33,7 +33,7 @@ PARAMETERS = {
 }
 IMAGES = messages.RENDERED_IMAGE
 POSE, WRENCH = messages.tool_pose_command("PSM1"), messages.tool_wrench("PSM1")
-SHOWN = (messages.RENDERED_IMAGE, messages.RENDERED_SEGMENTATION)  # recorded only where they are named
+SHOWN = (messages.RENDERED_IMAGE, messages.RENDERED_DEPTH, messages.RENDERED_SEGMENTATION)  # recorded only where they are named
 STATES = (messages.CONTROL_NODES, messages.tool_reaction("PSM1"), messages.CLOCK, *messages.RENDERED_TOPICS)
 
 

@@ -134,8 +134,9 @@ def test_types_and_quality_of_service_are_those_of_the_nodes(ends):
 def test_the_recorder_subscribes_to_all_that_is_recorded(ends):
     (depth,) = re.findall(r"recorder\nsubscribes to every topic with a depth of (\d+)", CONVENTIONS)
     heard = {topic: profile.depth for kind, node, _, topic, _, profile in ends if (kind, node) == ("subscribers", "recorder")}
-    asked = {messages.RENDERED_IMAGE, *messages.EXTRA_RENDERED_TOPICS} - {messages.RENDERED_COMPRESSED}  # recorded where named
-    expected = {f"/{name.lstrip('/')}" for name in TOPICS} - {f"/{topic.name}" for topic in (*NOT_RECORDED, *asked)}
+    # Recorded only where they are named.
+    named = {messages.RENDERED_IMAGE, messages.RENDERED_DEPTH, *messages.EXTRA_RENDERED_TOPICS} - {messages.RENDERED_COMPRESSED}
+    expected = {f"/{name.lstrip('/')}" for name in TOPICS} - {f"/{topic.name}" for topic in (*NOT_RECORDED, *named)}
     assert heard == dict.fromkeys(expected, int(depth))
 
 

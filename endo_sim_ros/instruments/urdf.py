@@ -1,6 +1,6 @@
 """Arms as a robot description (URDF), for RViz and robot_state_publisher."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from xml.etree import ElementTree
 
 import numpy as np
@@ -15,34 +15,40 @@ _EFFORT, _TURNS, _SLIDES = "10", "10", "1"  # URDF asks for limits of effort (NÂ
 _NOWHERE = np.eye(4)
 
 
-def robot_description(arms: Mapping[str, tuple[ArmKinematics, np.ndarray]], world: str = "world", name: str = "endo_sim") -> str:
+def arm_capsules(arm: ArmKinematics) -> list[Capsule]:
+    """The shape of an arm's tool as capsules: of an instrument as in `build_instrument`, none if nobody knows it; of an endoscope a rod."""
+    if len(arm.joints) == 4:
+        radius, length = _ENDOSCOPE
+        return [Capsule("roll", np.array([0.0, 0, -length]), np.zeros(3), radius)]
+    try:
+        return build_instrument(arm)[1]
+    except ConfigError:
+        return []  # it has joints all the same
+
+
+def robot_description(
+    arms: Mapping[str, tuple[ArmKinematics, np.ndarray, Sequence[Capsule]]], world: str = "world", name: str = "endo_sim"
+) -> str:
     """One URDF of arms that stand in the world.
 
     Links and joints are named ``PSM1_yaw`` and so on; ``PSM1_base`` is the base and ``PSM1_tip`` the tip. The joint ``PSM1_jaw`` is the
-    angle between the jaws, each of which mimics half of it. Shapes are the capsules of the instrument, as cylinders.
+    angle between the jaws, each of which mimics half of it.
 
     Args:
-        arms: Each arm with its tool and the pose [4, 4] of its base in the world, by name.
+        arms: Each arm with its tool, the pose [4, 4] of its base in the world, and its shape, drawn as cylinders, by name.
         world: Name of the root link.
         name: Name of the robot.
     """
     robot = ElementTree.Element("robot", name=name)
     ElementTree.SubElement(robot, "link", name=world)
-    for arm, (kinematics, base) in arms.items():
-        _add_arm(robot, world, arm.replace("/", "_"), kinematics, base)
+    for arm, (kinematics, base, capsules) in arms.items():
+        _add_arm(robot, world, arm.replace("/", "_"), kinematics, base, capsules)
     return ElementTree.tostring(robot, encoding="unicode")
 
 
-def _add_arm(robot: ElementTree.Element, world: str, arm: str, kinematics: ArmKinematics, base: np.ndarray) -> None:
-    capsules: list[Capsule] = []
-    if len(kinematics.joints) == 4:
-        radius, length = _ENDOSCOPE
-        capsules = [Capsule("roll", np.array([0.0, 0, -length]), np.zeros(3), radius)]
-    else:
-        try:
-            capsules = build_instrument(kinematics)[1]
-        except ConfigError:
-            pass  # a tool of whose shape nobody knows has joints all the same
+def _add_arm(
+    robot: ElementTree.Element, world: str, arm: str, kinematics: ArmKinematics, base: np.ndarray, capsules: Sequence[Capsule]
+) -> None:
     # The shapes' names of the frames of the wrist; parameter files may name them otherwise.
     link_of: dict[str, str] = dict(zip(("roll", "wrist_pitch", "wrist_yaw"), (joint.name for joint in kinematics.joints[3:])))
 

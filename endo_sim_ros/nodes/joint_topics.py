@@ -6,7 +6,7 @@ import numpy as np
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import invert_pose
-from endo_sim_ros.instruments.urdf import robot_description
+from endo_sim_ros.instruments.urdf import arm_capsules, robot_description
 from endo_sim_ros.messages import Topic
 from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode
 from endo_sim_ros.nodes.configs import PhysicsNodeConfig
@@ -27,7 +27,8 @@ class JointTopics:
 
     def __init__(self, node: EndoNode, arms: Mapping[str, JointedArm], options: PhysicsNodeConfig) -> None:
         self.options = options
-        self._node, self._arms, self._described = node, arms, ""
+        self._arms, self._described = arms, ""
+        self._capsules = {name: arm_capsules(arm.kinematics) for name, arm in arms.items()}  # takes longer than a step may be late
         instruments = {name: arm for name, arm in arms.items() if not isinstance(arm, CameraArm)}
         depth = MOST_WAITING if options.mode == "lockstep" else STREAM_DEPTH
         self._links = [(arm, node.publisher(messages.tool_links(name), depth, alone=True)) for name, arm in instruments.items()]
@@ -43,7 +44,7 @@ class JointTopics:
 
     def describe(self) -> None:
         """Publish what the arms look like and where they stand, if that has changed."""
-        placed = {name: (arm.kinematics, arm.base) for name, arm in self._arms.items() if arm.base is not None}
+        placed = {name: (arm.kinematics, arm.base, self._capsules[name]) for name, arm in self._arms.items() if arm.base is not None}
         text = robot_description(placed, self.options.world_frame) if placed else ""
         if text != self._described:
             self._described = text

@@ -123,8 +123,8 @@ class JointedArm(Arm):
     def move(self, seconds: float, speed: float, turn_speed: float) -> str:
         """Go on for some seconds towards the goals, or take the pose last commanded, with joints within their limits.
 
-        The tip moves straight, and as slowly as the fastest joint needs. Where the straight way asks a joint to leap, the rest of it
-        is a move of the joints.
+        The tip moves straight, and as slowly as the fastest joint needs. Where the straight way leaves what the joints reach, or asks
+        one to leap, the rest of it is a move of the joints.
 
         Returns:
             What the arm misses of the pose that it is told, in a sentence; empty if nothing.
@@ -177,12 +177,12 @@ class JointedArm(Arm):
         assert joints is not None and goal is not None and self.base is not None
         for _ in range(_TRIES):
             self._move_tip(share * seconds, speed, turn_speed)
-            self.settle()  # of what lies between two poses in reach some may be out of it: the nearest will do
+            left = bool(self.settle())  # what lies between two poses in reach may be out of it
             haste = self._haste(joints, seconds)
-            if haste <= _ROUNDED:
+            if haste <= _ROUNDED and not left:
                 return
             self.pose, self._posed, self.pose_goal, self.joints = pose, pose, goal, joints
-            if haste > _LEAP:
+            if haste > _LEAP or left:
                 break
             share /= 1.01 * haste  # a little less, so that it is enough where joints do not follow in proportion
         self.joint_goal, self.pose_goal = solve_inverse(self.kinematics, invert_pose(self.base) @ goal, joints).joints, None

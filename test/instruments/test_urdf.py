@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from endo_sim_ros.core.cameras import make_pose
 from endo_sim_ros.instruments import build_instrument, link_poses, load_arm
-from endo_sim_ros.instruments.urdf import robot_description
+from endo_sim_ros.instruments.urdf import arm_capsules, robot_description
 
 BASE = make_pose([0.1, -0.2, 0.3], [0.5, 0.1, -0.7, 0.3])
 
@@ -43,7 +43,7 @@ def poses_of_links(text, positions):
 ])  # fmt: skip
 def test_links_are_where_the_kinematics_has_them(model, tool):
     arm, random = load_arm(model, tool), np.random.default_rng(3)
-    text = robot_description({"left/A": (arm, BASE)}, "map")
+    text = robot_description({"left/A": (arm, BASE, arm_capsules(arm))}, "map")
     for _ in range(5):
         joints, jaw = random.uniform(arm.lower, arm.upper), 0.6
         positions = {f"left_A_{joint.name}": value for joint, value in zip(arm.joints, joints)} | {"left_A_jaw": jaw}
@@ -63,7 +63,7 @@ def test_links_are_where_the_kinematics_has_them(model, tool):
 
 def test_shapes_are_the_capsules_of_the_instrument():
     arm = load_arm("PSM", "PROGRASP_FORCEPS")
-    robot = ElementTree.fromstring(robot_description({"PSM1": (arm, np.eye(4))}))
+    robot = ElementTree.fromstring(robot_description({"PSM1": (arm, np.eye(4), arm_capsules(arm))}))
     _, capsules = build_instrument(arm)
     assert len(robot.findall("link/visual")) == len(capsules)
     for capsule in capsules:

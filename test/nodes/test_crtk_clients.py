@@ -37,7 +37,8 @@ def after(move):  # topics overtake one another
     time.sleep(0.1)
     return done
 
-told = {"enabled": psm.enable(10), "homed": psm.home(10) and ecm.home(10)}
+told = {"enabled": any(psm.enable(2) for _ in range(5))}  # what is sent before the topics have found one another is lost
+told["homed"] = any(psm.home(2) for _ in range(5)) and any(ecm.home(2) for _ in range(5))
 start = psm.measured_jp(wait_timeout=5)[0]
 told["moved"] = after(psm.move_jp(start))  # to where it is
 goal = start + numpy.array([0.1, -0.1, 0.02, 0.2, 0.1, -0.1])
@@ -92,7 +93,7 @@ def test_unmodified_clients_command_the_arms(graph):
     out, err = process.communicate()
     assert process.returncode == 0, err
     told = json.loads(out.splitlines()[-1])
-    assert told["enabled"] and told["homed"] and told["moved"] and told["disabled"]
+    assert all(told[what] for what in ("enabled", "homed", "moved", "disabled")), told
     assert told["lengths"] == [6, 6, 6]
     for goal, there in (told["joints"], told["camera"]):
         np.testing.assert_allclose(there, goal, atol=1e-9)

@@ -149,3 +149,19 @@ def test_absurd_poses_change_nothing(absurd, plain):
 def test_too_many_capsules_are_refused():
     with pytest.raises(ValueError, match="65 capsules throw shadows, and at most 64 can"):
         InstrumentDrawing([[cylinder(1e-3, 0, 0.01)]], device="cpu", capsules=[[CAPSULES["rod"]] * 65])
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_a_gpu_draws_the_picture_of_the_cpu():
+    drawing, poses = both()
+    parts, capsules = build_instrument(load_arm("PSM", "LARGE_NEEDLE_DRIVER"))
+    on_gpu = InstrumentDrawing([parts, parts], device="cuda", capsules=[capsules, capsules])
+    expected = drawing.draw(poses, CAMERA, *tissue(0.09))
+    found = on_gpu.draw(poses, CAMERA, *(x.cuda() for x in tissue(0.09)))
+    again = on_gpu.draw(poses, CAMERA, *(x.cuda() for x in tissue(0.09)))
+    for name, mine in vars(expected).items():
+        other = getattr(found, name).cpu()
+        far = (mine.float() - other.float()).abs() > 1e-3
+        assert far.float().mean() < 2e-3, name
+        assert torch.equal(getattr(found, name), getattr(again, name)), name

@@ -153,31 +153,52 @@ class InstrumentDrawing:
         Returns:
             Labels [B, H, W], uint8, as in `Picture`.
         """
-        config, count, (width, height) = self.config, len(cameras), (cameras[0].width, cameras[0].height)
+        local = [camera.viewmat @ np.stack([own[i][link] for i, link in self.links]) for own, camera in zip(poses, cameras, strict=True)]
+        return self.draw_links(np.stack(local), lenses(cameras), colors, depths, alphas, lamps)
+
+    def draw_links(
+        self,
+        local: np.ndarray,
+        lenses: np.ndarray,
+        colors: Tensor,
+        depths: Tensor,
+        alphas: Tensor,
+        lamps: np.ndarray | None = None,
+        surfaces: np.ndarray | None = None,
+    ) -> Tensor:
+        """Draw the instruments into B pictures at once, as `draw_into`, from arrays.
+
+        Args:
+            local: Poses [B, L, 4, 4] in the camera of each picture of all `links` in their order.
+            lenses: fx, fy, cx, cy of each [B, 4], pixels.
+            colors, depths, alphas, lamps: As for `draw_into`.
+            surfaces: What the materials of each are like [B, M, 5], as `SURFACES`; those by default.
+        """
+        config, count, (height, width) = self.config, len(local), colors.shape[1:3]
         frame, look = drawing_kernels.Frame(), resolving_kernels.Look()
         tile = int(drawing_kernels.TILE)
         frame.width, frame.height, frame.across, frame.down = width, height, -(-width // tile), -(-height // tile)
         frame.faces, frame.links, frame.capsules = len(self._links), len(self.links), len(self._radii)
         frame.several, frame.spread, frame.nearest = int(len({i for i, _ in self.links}) > 1), config.blur, _NEAREST
         frame.stride = _stride(frame.across * frame.down * frame.down)
+        frame.surfaces = 0 if surfaces is None else len(Material)
         look.ambient, look.softness = config.ambient, config.softness
         look.lamp_size, look.mirror, look.white = config.lamp_size, config.mirror, config.white
         lamps = np.tile((config.lamp_x, config.lamp_y, 0.0), (count, 1)) if lamps is None else lamps
-        views = [(*(float(c.K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2))), *lamp) for c, lamp in zip(cameras, lamps, strict=True)]
-        views = self._upload(views)
-        local = [camera.viewmat @ np.stack([own[i][link] for i, link in self.links]) for own, camera in zip(poses, cameras, strict=True)]
-        local = self._upload(local)
+        views, placed = self._upload(np.concatenate([lenses, lamps], 1)), self._upload(local)
+        materials = self._surfaces if surfaces is None else self._upload(surfaces.reshape(-1, surfaces.shape[-1]))
         room = self._buffers(count, frame)
         labels = (alphas > SURFACE).to(torch.uint8)
         coarse, seen = colors[:, ::_STRIDE, ::_STRIDE], (alphas[:, ::_STRIDE, ::_STRIDE] > SURFACE)[..., None]
-        around = (coarse * coarse * seen).sum((1, 2)) + 1e-6  # the hue of the tissue in linear light
-        around = (around / around.amax(1, keepdim=True)).contiguous()
-        corners = [self._corners, self._normals, self._links, local, views, frame]
+        # The hue of the tissue in linear light; in float64, so that the order of the sum, which depends on B, does not show.
+        around = (coarse * coarse * seen).sum((1, 2), dtype=torch.float64) + 1e-6
+        around = (around / around.amax(1, keepdim=True)).float().contiguous()
+        corners = [self._corners, self._normals, self._links, placed, views, frame]
         ends, drawn = room["ends"], [room["screen"], room["rows"], frame, room["samples"], room["marks"]]
         self._launch(drawing_kernels.project, count * frame.faces, [*corners, room["screen"], room["turned"], room["rows"]])
-        self._launch(drawing_kernels.place, count * frame.capsules, [self._starts, self._capsule_links, local, frame, ends])
+        self._launch(drawing_kernels.place, count * frame.capsules, [self._starts, self._capsule_links, placed, frame, ends])
         flat = [colors.view(-1, 3), depths.view(-1), alphas.view(-1), labels.view(-1)]
-        scene = [room["samples"], room["screen"], room["turned"], self._links, self._owners, self._materials, self._surfaces]
+        scene = [room["samples"], room["screen"], room["turned"], self._links, self._owners, self._materials, materials]
         scene += [ends, self._radii, self._capsule_owners, views, around, frame, look, *flat]
         if vectorised(self.device):
             self._launch(drawing_kernels.cover_rows, count * frame.down, drawn, least=4)
@@ -187,7 +208,7 @@ class InstrumentDrawing:
             self._launch(resolving_kernels.resolve_pixels, count * width * height, scene)
         return labels
 
-    def _upload(self, values: Sequence) -> Tensor:
+    def _upload(self, values: np.ndarray) -> Tensor:
         """Numbers as float32 on the device, without waiting for what that does at the moment."""
         tensor = torch.from_numpy(np.asarray(values, np.float32))
         return tensor if torch.device(self.device).type == "cpu" else tensor.pin_memory().to(self.device, non_blocking=True)
@@ -195,7 +216,7 @@ class InstrumentDrawing:
     def _buffers(self, count: int, frame: Any) -> dict[str, Tensor]:
         """What kernels write for each other; samples are left empty by each picture for the next."""
         key = (count, frame.width, frame.height)
-        if self._room[0] != key:
+        if self._room[0][1:] != key[1:] or self._room[0][0] < count:
             new = lambda shape, kind, value=0: torch.full(shape, value, dtype=kind, device=self.device)
             triangles, pixels = count * frame.faces, count * frame.width * frame.height
             self._room = (
@@ -216,6 +237,11 @@ class InstrumentDrawing:
             launch_in_shares(kernel, count, arguments, least)
         elif count:
             launch(kernel, count, [0, *arguments], self.device)
+
+
+def lenses(cameras: Sequence[Camera]) -> np.ndarray:
+    """fx, fy, cx, cy [B, 4] of cameras, pixels."""
+    return np.array([[camera.K[i] for i in ((0, 0), (1, 1), (0, 2), (1, 2))] for camera in cameras])
 
 
 def _stride(count: int) -> int:

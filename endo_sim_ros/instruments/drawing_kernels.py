@@ -25,6 +25,7 @@ class Frame:
     stride: int  # tiles are taken in steps of it, so that threads share the work evenly
     spread: float  # pixels: side of the square from which a pixel takes light
     nearest: float  # m: what is nearer to the plane of the lens is not drawn
+    surfaces: int  # rows of surfaces from those of one picture to the next; 0 = all have the same
 
 
 @wp.func

@@ -40,14 +40,14 @@ def encoded(light: float) -> float:
 
 @wp.func
 def reflected(
-    normal: wp.vec3, at: wp.vec3, lamp: wp.vec3, surfaces: wp.array2d[float], material: int, around: wp.vec3, left: wp.vec2, look: Look
+    normal: wp.vec3, at: wp.vec3, lamp: wp.vec3, surfaces: wp.array2d[float], row: int, around: wp.vec3, left: wp.vec2, look: Look
 ) -> wp.vec3:
     """Colour of a surface: diffuse, a microfacet lobe (GGX) of its roughness, and the tissue that it mirrors."""
     to_eye, to_lamp = wp.normalize(-at), wp.normalize(lamp - at)
     middle = wp.normalize(to_eye + to_lamp)
     facing = wp.max(wp.dot(normal, to_lamp), 0.0) * left[0]
     aligned = wp.max(wp.dot(normal, middle), 0.0)
-    rough = surfaces[material, 3] * surfaces[material, 3]
+    rough = surfaces[row, 3] * surfaces[row, 3]
     spread = rough * rough
     steep = aligned * aligned * (spread - 1.0) + 1.0
     lobe = wp.min(0.25 * spread / (steep * steep), 1.0e3) * facing
@@ -57,8 +57,8 @@ def reflected(
     light = (1.0 - look.ambient) * facing
     total = wp.vec3(0.0, 0.0, 0.0)
     for k in range(3):
-        diffuse = surfaces[material, k] * (light + look.ambient * left[1] * around[k])
-        shine = surfaces[material, 4] * ((1.0 - look.ambient) * lobe + mirrored * around[k])
+        diffuse = surfaces[row, k] * (light + look.ambient * left[1] * around[k])
+        shine = surfaces[row, 4] * ((1.0 - look.ambient) * lobe + mirrored * around[k])
         total[k] = wp.min(encoded(diffuse + shine), look.white)
     return total
 
@@ -77,7 +77,7 @@ def blend(
     links: wp.array[int],  # [F]
     owners: wp.array[int],  # [F] numbers of the instruments
     materials: wp.array[int],  # [F]
-    surfaces: wp.array2d[float],  # [M, 5] red, green, blue, roughness, strength of the shine
+    surfaces: wp.array2d[float],  # [M or B M, 5] red, green, blue, roughness, strength of the shine
     ends: wp.array2d[wp.vec3],
     radii: wp.array[float],
     capsule_owners: wp.array[int],
@@ -134,7 +134,7 @@ def blend(
                                 on_links, at, normal, 0.5 * z / view[0], lamp, look.lamp_size,
                                 picture * frame.capsules, frame.capsules, ends, radii, capsule_owners, owners[face],
                             )  # fmt: skip
-                        lit = reflected(normal, at, lamp, surfaces, material, around[picture], left, look)
+                        lit = reflected(normal, at, lamp, surfaces, picture * frame.surfaces + material, around[picture], left, look)
                 color += seen * lit
                 depth += seen * z
                 total += seen

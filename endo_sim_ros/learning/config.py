@@ -1,7 +1,7 @@
 """Parameters of environments and of training."""
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 from endo_sim_ros.core.config import Range, StageConfig
 
@@ -20,6 +20,24 @@ class Randomisation(StageConfig):
     """The endoscope is moved by up to this along each axis, m."""
     camera_angle: Annotated[float, Range(0, 45, "deg")] = 0.0
     """The endoscope is turned by up to this about each axis, degrees."""
+
+
+@dataclass(frozen=True)
+class SightConfig(StageConfig):
+    """What the endoscope shows."""
+
+    image_width: Annotated[int, Range(1, 8192, "pixels")] = 64
+    """Width of the pictures; the height follows from the scene's camera."""
+    instrument: bool = True
+    """Draw the tool, with its shadow; without it pictures show the tissue alone."""
+    tool: str = ""
+    """Name or file of the tool, as `endo_sim_ros.instruments.load_arm` takes it; empty = that of the task."""
+    eyes: Literal[1, 2] = 1
+    """2: the picture of the right eye, too."""
+    baseline: Annotated[float, Range(0.0005, 0.05, "m")] = 0.00414
+    """Distance between the eyes; 4.14 mm is that of the endoscope of a da Vinci Xi, from the calibration of SCARED (datasets 1 to 3)."""
+    segmentation: bool = False
+    """What is in each pixel, too."""
 
 
 @dataclass(frozen=True)

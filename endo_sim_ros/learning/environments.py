@@ -7,11 +7,12 @@ one batched simulation. Environment i of those, with seed s + i, is the single o
 
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-from endo_sim_ros.learning.config import Randomisation
+from endo_sim_ros.learning.config import Randomisation, SightConfig
+from endo_sim_ros.learning.pictures import IMAGE, IMAGE_RIGHT, SEGMENTATION
 from endo_sim_ros.learning.scenes import Scene, load_scene
 from endo_sim_ros.learning.task_batch import Observations, TaskBatch
 from endo_sim_ros.learning.tasks import BOUND, TASKS, Outcome
@@ -25,18 +26,19 @@ except ImportError as error:
 FPS = 25
 """Steps and images of an episode per second."""
 Observed = np.ndarray | dict[str, np.ndarray]
-"""Observations: state or image, or both in a dict."""
+"""Observations: state or image, or what there is in a dict."""
 
 
 def _make(
     task: str,
-    scene: Scene | Path | str | None,
     count: int,
+    scene: Scene | Path | str | None,
     observations: Observations,
     randomisation: Randomisation | dict[str, float] | None,
     image_width: int,
     device: str,
     render_mode: str | None,
+    **sight: Any,
 ) -> tuple[TaskBatch, gymnasium.Space]:
     """The simulation, and the space of the observations of one environment."""
     if observations not in ("state", "image", "both"):
@@ -45,14 +47,21 @@ def _make(
         raise ValueError(f"render_mode must be rgb_array or None, got {render_mode!r}")
     if image_width < 1:
         raise ValueError(f"image_width must be at least 1, got {image_width}")
+    if sight["eyes"] == 2 and observations == "state":
+        raise ValueError("eyes is 2, but observations is state, which has no images; ask for image or both")
     randomisation = Randomisation.from_mapping(randomisation) if isinstance(randomisation, dict) else randomisation or Randomisation()
     scene = scene if isinstance(scene, Scene) else load_scene(scene)
-    images = render_mode is not None or observations != "state"
-    batch = TaskBatch(task, scene, count, observations, randomisation, image_width, device, images=images)
-    state = gymnasium.spaces.Box(-BOUND, BOUND, (len(batch.task.observation_names),), np.float32)
-    image = gymnasium.spaces.Box(0, 255, (batch.camera.height, batch.camera.width, 3), np.uint8)
-    spaces = {"state": state, "image": image, "both": gymnasium.spaces.Dict({"state": state, "image": image})}
-    return batch, spaces[observations]
+    shown = SightConfig(image_width=image_width, **sight)
+    batch = TaskBatch(task, scene, count, observations, randomisation, shown, device, images=render_mode is not None)
+    spaces: dict[str, gymnasium.Space] = {}
+    if observations != "image":
+        spaces["state"] = gymnasium.spaces.Box(-BOUND, BOUND, (len(batch.task.observation_names),), np.float32)
+    if batch.pictures is not None:
+        camera = batch.pictures.camera
+        names = ((IMAGE, 3), (IMAGE_RIGHT, 3))[: shown.eyes] if observations != "state" else ()
+        for name, channels in (*names, *(((SEGMENTATION, 1),) if shown.segmentation else ())):
+            spaces[name] = gymnasium.spaces.Box(0, 255, (camera.height, camera.width, channels), np.uint8)
+    return batch, gymnasium.spaces.Dict(spaces) if len(spaces) > 1 else next(iter(spaces.values()))
 
 
 _ACTIONS = gymnasium.spaces.Box(-1.0, 1.0, (4,), np.float32)
@@ -70,11 +79,18 @@ class TaskEnvironment(gymnasium.Env):
         task: Name of the task, one of :data:`endo_sim_ros.learning.tasks.TASKS`.
         scene: A PLY model with its cameras.json, or the folder of a model.ply, or a :class:`Scene`; default: a piece of the
             synthetic patient.
-        observations: ``state``, ``image`` (the endoscope's, without the tool), or ``both`` in a dict.
+        observations: ``state``, ``image`` (the endoscope's), or ``both``. One alone is an array. More are a dict: ``state`` [n],
+            ``image`` and ``image_right`` [H, W, 3], ``segmentation`` [H, W, 1].
         randomisation: How episodes differ from the scene, as :class:`Randomisation` or its values in a dict.
         image_width: Pixels; the height follows from the scene's camera.
         device: Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N.
         render_mode: ``rgb_array`` for images by :meth:`render`.
+        instrument: Whether images show the tool, with its shadow. States and rewards do not depend on it.
+        tool: Name or file of the tool that is shown, as `endo_sim_ros.instruments.load_arm` takes it; default: that of the task.
+        eyes: 2 adds the image of the right eye, ``image_right``.
+        baseline: Distance between the eyes, m; default: that of the endoscope of a da Vinci Xi.
+        segmentation: Add ``segmentation``, what is in each pixel: 0 nothing, 1 tissue, and from 2 on the links of the instrument,
+            `endo_sim_ros.instruments.LINKS`.
 
     Raises:
         ValueError: If an argument cannot be used, or the model is too small.
@@ -91,8 +107,16 @@ class TaskEnvironment(gymnasium.Env):
         image_width: int = 64,
         device: str = "auto",
         render_mode: str | None = None,
+        instrument: bool = True,
+        tool: str = "",
+        eyes: Literal[1, 2] = 1,
+        baseline: float = SightConfig.baseline,
+        segmentation: bool = False,
     ):
-        self.batch, self.observation_space = _make(task, scene, 1, observations, randomisation, image_width, device, render_mode)
+        self.batch, self.observation_space = _make(
+            task, 1, scene, observations, randomisation, image_width, device, render_mode,
+            instrument=instrument, tool=tool, eyes=eyes, baseline=baseline, segmentation=segmentation,
+        )  # fmt: skip
         self.action_space, self.render_mode = _ACTIONS, render_mode
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observed, dict[str, Any]]:
@@ -134,9 +158,16 @@ class VectorTaskEnvironment(gymnasium.vector.VectorEnv):
         image_width: int = 64,
         device: str = "auto",
         render_mode: str | None = None,
+        instrument: bool = True,
+        tool: str = "",
+        eyes: Literal[1, 2] = 1,
+        baseline: float = SightConfig.baseline,
+        segmentation: bool = False,
     ):
-        made = _make(task, scene, num_envs, observations, randomisation, image_width, device, render_mode)
-        self.batch, self.single_observation_space = made
+        self.batch, self.single_observation_space = _make(
+            task, num_envs, scene, observations, randomisation, image_width, device, render_mode,
+            instrument=instrument, tool=tool, eyes=eyes, baseline=baseline, segmentation=segmentation,
+        )  # fmt: skip
         self.num_envs, self.single_action_space, self.render_mode = num_envs, _ACTIONS, render_mode
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(_ACTIONS, num_envs)

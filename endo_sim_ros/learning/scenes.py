@@ -31,6 +31,20 @@ class Scene:
         """The endoscope that looks at a task: as in the graph at the pose of the view in the middle, with the intrinsics of the first."""
         return self.cameras[0].at(self.cameras[len(self.cameras) // 2].pose)
 
+    @functools.cached_property
+    def depth(self) -> float:
+        """Depth of the tissue in the middle of the endoscope's picture, m, world.
+
+        Raises:
+            ValueError: If there is none.
+        """
+        depth = render_depth(self.model, self.camera)
+        rows, columns = (slice(side // 4, side - side // 4) for side in depth.shape)
+        seen = depth[rows, columns][depth[rows, columns] > 0]
+        if not len(seen):
+            raise ValueError("the endoscope sees no tissue in the middle of its picture; check the poses in cameras.json")
+        return float(np.median(seen))
+
     def nodes(self, config: PhysicsConfig) -> ControlNodes:
         """The tissue's control nodes at rest, m, world: those that physics_node makes of the same files.
 

@@ -62,6 +62,9 @@ class Task(ABC):
     margin = 0.012  # m from tissue that is held in place to a place that is worked on
     around = 0.012  # m; the skin within this distance of a place is compared with a plane
     smooth = 0.6  # share of the places that is used: the flattest
+    tool = "LARGE_NEEDLE_DRIVER"  # what is seen of it; what it does is up to the physics
+    tool_share = 1.0  # where on its jaws it works: from their hinge, 0, to their points, 1
+    open_jaw, closed_jaw = 1.0, 0.0  # rad: as they are commanded
 
     @staticmethod
     @abstractmethod
@@ -114,6 +117,10 @@ class Task(ABC):
     def _reset(self, b: int, rng: np.random.Generator) -> None:
         """What else begins anew."""
 
+    def tips(self) -> np.ndarray:
+        """Where the tips are [B, 3], m, world."""
+        return self.origin + self._to_world(self.tip)
+
     def act(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where the tips shall be at the end of the step [B, 3], m, world, and whether jaws are closed [B], for actions [B, 4].
 
@@ -131,7 +138,7 @@ class Task(ABC):
         self.fourth = actions[:, 3]
         self.raised = np.where(self.fourth > 0, self.raised + 1, 0)
         self.steps = self.steps + 1
-        return self.origin + self._to_world(self.tip), self._closed()
+        return self.tips(), self._closed()
 
     def _closed(self) -> np.ndarray:
         return np.zeros(self.count, bool)
@@ -212,6 +219,7 @@ class Retraction(Task):
     )  # fmt: skip
     horizon, force_limit = 60, 3.0
     working_fourth = 1.0
+    tool, tool_share = "PROGRASP_FORCEPS", 0.85  # what it grasps lies between its jaws, not at their points
     low, high = (-0.02, -0.02, -0.004), (0.02, 0.02, 0.025)
     lift, hold = 0.006, 3  # m, steps
     grasp_radius = 0.008  # m; the jaw holds control nodes within it
@@ -271,6 +279,7 @@ class Palpation(Task):
     step_length = 0.003
     low, high = (-0.025, -0.025, -0.02), (0.025, 0.025, 0.03)
     same_tissue = False
+    open_jaw = 0.2  # rad: it feels with jaws that are as good as closed, but do not grasp
     largest_stiffness = ratio = 8.0  # a power of two: as a factor or as a modulus, it gives the same bits
     patch, radius, depth, tolerance = 0.016, 0.008, 0.005, 0.007  # m
     margin, around, smooth = 0.02, 0.024, 0.5

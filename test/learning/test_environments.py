@@ -11,12 +11,10 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
-import torch
 from gymnasium.utils.env_checker import check_env
 from played_tasks import IDS, VARIED, make, play
 
 from endo_sim_ros.core.config import ConfigError
-from endo_sim_ros.core.light import Light
 from endo_sim_ros.learning import environments
 from endo_sim_ros.learning.config import Randomisation
 from endo_sim_ros.learning.policies import scripted_policy
@@ -35,6 +33,8 @@ def test_gymnasium_finds_nothing_to_complain_about(task, observations):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(make(task, observations=observations, render_mode="rgb_array", randomisation=VARIED).unwrapped)
+        eyes = 1 if observations == "state" else 2
+        check_env(make(task, observations=observations, eyes=eyes, segmentation=True).unwrapped)
 
 
 def test_observations_have_names_and_units():
@@ -186,28 +186,6 @@ def test_randomisation_changes_what_it_names_and_nothing_else():
         make(randomisation={"light": 2.0})
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("light, degree", [(None, 0), (None, 1), (Light(distance=0.9, angle=0.4, response=0.3), 0)])
-def test_images_are_those_of_the_renderer(light, degree):
-    from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
-
-    scene = load_scene()
-    sh = torch.cat([scene.model.sh, torch.randn(len(scene.model), 3, 3, generator=torch.Generator().manual_seed(0))], 1)
-    scene = replace(scene, model=replace(scene.model, light=light, sh=sh[:, : (degree + 1) ** 2]))
-    environment = make(observations="image", scene=scene)
-    batch = environment.unwrapped.batch
-    script = scripted_policy("retraction")
-    image, _ = environment.reset(seed=0)
-    for _ in range(16):
-        image, *_ = environment.step(script.act(batch.state())[0])
-    renderer = DeformableRenderer(scene.model, batch.task.nodes.rest, RenderingConfig(device="cpu"))
-    pinned = torch.from_numpy(batch.task.nodes.pinned)[:, None, None]
-    F = torch.where(pinned, torch.eye(3), batch.tissue.F[0])  # as on control_nodes
-    expected, _ = renderer.render(batch.camera, batch.tissue.positions()[0], F)
-    assert batch.tissue.displacements.abs().max() > 1e-3
-    np.testing.assert_array_equal(image, expected)
-
-
 def test_a_task_is_seen_by_the_view_in_the_middle_as_in_the_graph():
     scene = load_scene()
     poses = [np.eye(4), scene.camera.pose, np.eye(4)]
@@ -248,6 +226,9 @@ def test_a_report_is_ten_steps_that_say_so():
         ({"scene": "no/such/model.ply"}, "no/such/model.ply: no such file"),
         ({"device": "abacus"}, "unknown device 'abacus'"),
         ({"observations": "image", "image_width": 0}, "image_width must be at least 1, got 0"),
+        ({"eyes": 2}, "eyes is 2, but observations is state, which has no images; ask for image or both"),
+        ({"observations": "image", "eyes": 3}, "SightConfig.eyes must be one of 1, 2"),
+        ({"observations": "image", "tool": "SPOON"}, "tool must be the path of a .json file or one of CURVED_SCISSORS_400178"),
     ],
 )
 def test_mistakes_are_one_sentence(options, sentence):

@@ -1,0 +1,136 @@
+"""The instruments of B episodes: where they stand, and the joints that put their tips where a task has them.
+
+A task moves a tip without a shape. Here it is a place on the jaws of an instrument, which comes into the picture as
+`endo_sim_ros.instruments.place_arm` has it, and keeps its direction in the world while the tip moves.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from endo_sim_ros.core.cameras import invert_pose, matrix_to_quat, parse_frames
+from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.instruments import ArmKinematics, Capsule, Part, build_instrument, link_poses, load_arm, place_arm, solve_inverse
+from endo_sim_ros.learning.scenes import Scene
+from endo_sim_ros.learning.tasks import Task
+
+ARM = "PSM1"
+WITHDRAWN = 0.02  # m: how far from the middle of the tissue physics_node's arm waits for its first command
+_WORLD = "world"
+
+
+@dataclass(frozen=True)
+class HeldTool:
+    """A tool on its arm, as a task holds it.
+
+    Args:
+        arm: Its tip is where the task works with the tool; the axes of the tip are those of the world at the start.
+        base: Pose [4, 4] of the base in the world, m.
+    """
+
+    arm: ArmKinematics
+    base: np.ndarray
+
+    @cached_property
+    def start(self) -> np.ndarray:
+        """Joint positions [6] before the first command, rad and m; as physics_node has them for an arm with a known base."""
+        joints = np.clip(np.zeros(len(self.arm.joints)), self.arm.lower, self.arm.upper)
+        joints[2] = np.clip(0.5 * (self.arm.lower[2] + self.arm.upper[2]) - WITHDRAWN, self.arm.lower[2], self.arm.upper[2])
+        return joints
+
+    @cached_property
+    def frame(self) -> str:
+        """The base as an option `frames` of the ROS nodes names it."""
+        return _frame(self.base)
+
+    @cached_property
+    def shape(self) -> tuple[list[Part], list[Capsule]]:
+        """Its parts and capsules."""
+        return build_instrument(self.arm)
+
+    def jaw(self, angles: np.ndarray) -> np.ndarray:
+        """Angles between the jaws [B], rad, as far as they open; closed jaws press, they do not overlap."""
+        return np.clip(angles, 0.0, self.arm.jaw[1] if self.arm.jaw else 0.0)
+
+
+def hold_tool(task: type[Task], scene: Scene, tool: str = "") -> HeldTool:
+    """The tool of a task in a scene, on an arm that comes from the lower right of the picture.
+
+    Args:
+        task: What it is held for.
+        scene: Where.
+        tool: Name or file of the tool; empty = that of the task.
+
+    Raises:
+        ValueError: If there is no such tool, nobody knows its shape, or the arm does not reach the tissue in the picture.
+    """
+    arm, camera = load_arm("PSM", tool or task.tool), scene.camera
+    _, capsules = build_instrument(arm)
+    try:
+        placed = place_arm(ARM, arm, camera, scene.depth)
+    except ConfigError as error:
+        raise ConfigError(f"{error}; or make the environment with instrument=False") from error
+    base = parse_frames(_WORLD, [_frame(placed.base)])[f"{ARM}_base"]  # with the bits that physics_node has
+    # The tip moves from the hinge to where the jaws work: in the axes of the hinge, and then in those of the world.
+    point = (invert_pose(arm.tooltip_offset) @ np.append(task.tool_share * capsules[-1].end, 1.0))[:3]
+    hinge = (base @ arm.tip_pose(placed.joints))[:3, :3]
+    # A ball that pushes has no picture: the tool touches where the ball meets what lies ahead of it.
+    ahead = task.physics().contact_radius * camera.pose[:3, 2]
+    mount = np.eye(4)
+    mount[:3, :3], mount[:3, 3] = hinge, ahead - hinge @ point
+    return HeldTool(replace(arm, tooltip_offset=arm.tooltip_offset @ invert_pose(mount)), base)
+
+
+def _frame(base: np.ndarray) -> str:
+    w, *xyz = matrix_to_quat(base[:3, :3])
+    return " ".join([f"{ARM}_base", *(repr(float(value)) for value in (*base[:3, 3], *xyz, w))])
+
+
+class HeldTools:
+    """The tools of B episodes of one task.
+
+    Args:
+        tools: Those that an episode may have.
+        task: The task.
+        count: B.
+    """
+
+    def __init__(self, tools: Sequence[HeldTool], task: type[Task], count: int):
+        self.tools = tuple(tools)
+        self._task = task
+        self.which = np.zeros(count, int)  # number of each episode's tool
+        self.bases = np.tile(tools[0].base, (count, 1, 1))  # [B, 4, 4] world
+        self.joints = np.tile(tools[0].start, (count, 1))  # [B, 6] rad and m
+        self.angles = np.full(count, task.open_jaw)  # between the jaws [B], rad
+
+    def begin(self, episodes: np.ndarray, poses: np.ndarray) -> None:
+        """Begin these episodes anew with their tips at poses [n, 4, 4], world."""
+        self.joints[episodes] = np.array([tool.start for tool in self.tools])[self.which[episodes]]
+        self.move(episodes, poses, np.zeros(len(episodes), bool))
+
+    def move(self, episodes: np.ndarray, poses: np.ndarray, closed: np.ndarray) -> None:
+        """Move the tips of these episodes to poses [n, 4, 4], world, or as near as they get, and close their jaws or not [n]."""
+        for number, tool in enumerate(self.tools):
+            chosen = self.which[episodes] == number
+            if chosen.any():
+                own = episodes[chosen]
+                reach = solve_inverse(tool.arm, invert_poses(self.bases[own]) @ poses[chosen], self.joints[own])
+                self.joints[own] = reach.joints
+        self.angles[episodes] = np.where(closed, self._task.closed_jaw, self._task.open_jaw)
+
+    def links(self, number: int, episodes: np.ndarray) -> dict[str, np.ndarray]:
+        """Poses [n, 4, 4] of the links, world, by name, of episodes that have the tool of a number."""
+        tool = self.tools[number]
+        poses = link_poses(tool.arm, self.joints[episodes], tool.jaw(self.angles[episodes]))
+        return {name: self.bases[episodes] @ pose for name, pose in poses.items()}
+
+
+def invert_poses(poses: np.ndarray) -> np.ndarray:
+    """The inverses of rigid transforms [B, 4, 4]."""
+    inverse = np.zeros_like(poses)
+    inverse[:, :3, :3] = np.swapaxes(poses[:, :3, :3], 1, 2)
+    inverse[:, :3, 3] = -(inverse[:, :3, :3] @ poses[:, :3, 3:])[..., 0]
+    inverse[:, 3, 3] = 1
+    return inverse

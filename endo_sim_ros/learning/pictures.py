@@ -1,0 +1,187 @@
+"""What the endoscope shows of B episodes: the tissue as it is now and the tool in it, for both eyes and as labels."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.light import SURFACE
+from endo_sim_ros.core.shading import shade, to_bytes
+from endo_sim_ros.instruments import LINKS
+from endo_sim_ros.instruments.drawing import BACKGROUND, FIRST_LINK, TISSUE, InstrumentDrawing, lenses
+from endo_sim_ros.learning.config import Randomisation, SightConfig
+from endo_sim_ros.learning.held_tools import HeldTools
+from endo_sim_ros.learning.scenes import Scene
+from endo_sim_ros.physics import Skinning, TissueBatch
+from endo_sim_ros.rendering import turned_colors
+from endo_sim_ros.splatting import rasterize
+
+IMAGE, IMAGE_RIGHT, SEGMENTATION = "image", "image_right", "segmentation"
+"""Names of the pictures."""
+
+_AT_ONCE = 64  # images rasterised together, and on a CPU drawn into
+
+
+@dataclass
+class _View:
+    """How one episode is seen."""
+
+    cameras: tuple[Camera, ...]  # of each eye
+    light: np.ndarray | None = None  # [H, W, 1] factor, None = 1
+    contrast: float = 1.0  # factor on the colours' coefficients
+    lamps: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # [E, 3] m, in the camera of each eye
+
+
+class Pictures:
+    """Draws B episodes.
+
+    Args:
+        scene: What is seen.
+        tissue: How it moves.
+        count: B.
+        sight: What is shown.
+        randomisation: How episodes differ.
+        held: The tools, or None where pictures show the tissue alone.
+    """
+
+    def __init__(
+        self, scene: Scene, tissue: TissueBatch, count: int, sight: SightConfig, randomisation: Randomisation, held: HeldTools | None
+    ):
+        self._sight, self._by, self._held, self._count = sight, randomisation, held, count
+        camera, nodes = scene.camera, tissue.nodes
+        self.camera = camera.resized(sight.image_width, max(round(camera.height * sight.image_width / camera.width), 1))
+        self._device = device = tissue.solver.device
+        self._model = scene.model.detach().to(device)
+        self._tissue = tissue
+        self._skinning = Skinning(self._model, nodes.rest, device=device)
+        self._means, self._covars = tissue.append_skinning(self._skinning)
+        self._pinned = torch.from_numpy(nodes.pinned).to(device)[:, None, None]
+        self._drawings = (
+            [InstrumentDrawing([tool.shape[0]], device=device, capsules=[tool.shape[1]]) for tool in held.tools] if held else []
+        )
+        self._tables = [torch.from_numpy(_labels(drawing)).to(device) for drawing in self._drawings]
+        self._at_once = _AT_ONCE if torch.device(device).type == "cpu" else max(count, 1)
+        self._views = [self._view(np.zeros(10)) for _ in range(count)]
+
+    def reset(self, episodes: Tensor, chances: Sequence[np.ndarray]) -> None:
+        """Show these episodes [n] at rest, each by its chance [10] in -1 … 1."""
+        for b, chance in zip(episodes.tolist(), chances):
+            self._views[b] = self._view(chance)
+        self._means[episodes], self._covars[episodes] = self._skinning.means, self._skinning.covars
+
+    @torch.no_grad()
+    def draw(self, right: bool = False, labels: bool = False) -> dict[str, np.ndarray]:
+        """What the endoscope sees of all episodes: ``image`` and ``image_right`` [B, H, W, 3], ``segmentation`` [B, H, W, 1], uint8.
+
+        Args:
+            right: Whether the right eye's are wanted.
+            labels: Whether labels are: 0 background, 1 tissue, and then the links of the instrument in the order of `LINKS`.
+        """
+        parts = [
+            self._render(np.arange(i, min(i + self._at_once, self._count)), right, labels) for i in range(0, self._count, self._at_once)
+        ]
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+    def _render(self, own: np.ndarray, right: bool, labels: bool) -> dict[str, np.ndarray]:
+        eyes, views = range(1 + right), [self._views[b] for b in own]
+        cameras = [view.cameras[eye] for eye in eyes for view in views]
+        seen = [self._rasterize(own[i : i + _AT_ONCE], eye) for eye in eyes for i in range(0, len(own), _AT_ONCE)]
+        colors, depths, alphas = seen[0] if len(seen) == 1 else map(torch.cat, zip(*seen))
+        marks = (alphas[: len(own)] > SURFACE).to(torch.uint8) if labels else None
+        if self._held is not None:
+            marks = self._draw_tools(self._held, own, cameras, (colors, depths, alphas))
+        if self._model.light is not None:
+            colors = torch.stack([shade(self._model.light, *picture) for picture in zip(colors, depths, alphas, cameras)])
+        if self._by.light:
+            one = np.ones((1, 1, 1), np.float32)
+            factors = [np.broadcast_to(one if view.light is None else view.light, (*colors.shape[1:3], 1)) for view in views]
+            colors = colors * self._move(factors * len(eyes))
+        images = to_bytes(colors).cpu().numpy()
+        found: dict[str, np.ndarray] = dict(zip((IMAGE, IMAGE_RIGHT), np.split(images, len(eyes))))
+        if labels and marks is not None:
+            found[SEGMENTATION] = marks[: len(own), ..., None].cpu().numpy()
+        return found
+
+    def _rasterize(self, own: np.ndarray, eye: int) -> tuple[Tensor, Tensor, Tensor]:
+        rows, cameras = slice(own[0], own[-1] + 1), [self._views[b].cameras[eye] for b in own]
+        seen = rasterize(
+            self._means[rows], None, None, self._model.opacities, self._colors(rows, cameras),
+            self._move([camera.viewmat for camera in cameras]), self._move([camera.K for camera in cameras]),
+            self.camera.width, self.camera.height, covars=self._covars[rows],
+        )  # fmt: skip
+        return seen.colors, seen.depths, seen.alphas
+
+    def _move(self, arrays: Sequence[np.ndarray]) -> Tensor:
+        return torch.from_numpy(np.stack(arrays).astype(np.float32)).to(self._device)
+
+    def _colors(self, rows: slice, cameras: Sequence[Camera]) -> Tensor:
+        """Colours of all these episodes [N, K, 3], or of each [b, N, K, 3], as `rasterize` takes them."""
+        views, sh = self._views[rows], self._model.sh
+        if self._model.sh_degree:
+            F = torch.where(self._pinned, torch.eye(3, device=sh.device), self._tissue.F[rows])  # as on control_nodes
+            sh = torch.stack([turned_colors(sh, self._skinning, *each) for each in zip(self._means[rows], F, cameras)])
+        if self._by.texture:
+            sh = sh * sh.new_tensor([view.contrast for view in views])[:, None, None, None]
+        return sh
+
+    def _draw_tools(self, held: HeldTools, own: np.ndarray, cameras: Sequence[Camera], pictures: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+        """Draw the tools into the colours, depths and alphas of these episodes, eye after eye; returns their labels [E b, H, W]."""
+        eyes, which = len(cameras) // len(own), held.which[own]
+        viewmats = np.stack([camera.viewmat for camera in cameras])
+        lens = lenses(cameras)
+        lamps = np.concatenate([[self._views[b].lamps[eye] for b in own] for eye in range(eyes)])
+        labels = torch.empty_like(pictures[2], dtype=torch.uint8)
+        for number in np.unique(which):
+            drawing, at = self._drawings[number], np.flatnonzero(which == number)
+            links = held.links(number, own[at])
+            poses = np.stack([links[link] for _, link in drawing.links], 1)
+            rows = np.concatenate([at + eye * len(own) for eye in range(eyes)])
+            local = viewmats[rows, None] @ np.concatenate([poses] * eyes)
+            if len(at) == len(own):
+                return self._tables[number][drawing.draw_links(local, lens, *pictures, lamps).int()]
+            chosen = torch.from_numpy(rows).to(self._device)
+            parts = [picture[chosen] for picture in pictures]
+            labels[chosen] = self._tables[number][drawing.draw_links(local, lens[rows], *parts, lamps[rows]).int()]
+            for whole, part in zip(pictures, parts):
+                whole[chosen] = part
+        return labels
+
+    def _view(self, chance: np.ndarray) -> _View:
+        """How an episode is seen, by numbers [10] in -1 … 1."""
+        by, camera = self._by, self.camera
+        pose = camera.pose.copy()
+        pose[:3, 3] += by.camera_position * chance[1:4]
+        pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(np.radians(by.camera_angle) * chance[4:7]).as_matrix()
+        light = None
+        if by.light:
+            centred = (camera.rays()[..., :2] / np.abs(camera.rays()[..., :2]).max((0, 1))) ** 2
+            falloff = by.light * 0.5 * (1 + chance[8])
+            light = ((1 + by.light * chance[7]) * (1 - falloff * centred.sum(-1, keepdims=True) / 2)).astype(np.float32)
+        camera = replace(camera, pose=pose) if by.camera_position or by.camera_angle else camera
+        cameras = (camera,) if self._sight.eyes == 1 else (camera, right_of(camera, self._sight.baseline))
+        view = _View(cameras, light, 1 + by.texture * float(chance[9]))
+        if self._drawings:
+            config = self._drawings[0].config
+            lamp = camera.pose @ np.array([config.lamp_x, config.lamp_y, 0.0, 1.0])
+            view.lamps = np.stack([(each.viewmat @ lamp)[:3] for each in cameras])
+        return view
+
+
+def right_of(left: Camera, baseline: float) -> Camera:
+    """The right eye beside a left one, at a distance in metres."""
+    pose = left.pose.copy()
+    pose[:3, 3] += baseline * pose[:3, 0]
+    return left.at(pose)
+
+
+def _labels(drawing: InstrumentDrawing) -> np.ndarray:
+    """The labels [256] that are shown for those of a drawing: as on rendered/segmentation/image, whatever parts the tool has."""
+    table = np.arange(256, dtype=np.uint8)
+    table[[BACKGROUND, TISSUE]] = BACKGROUND, TISSUE
+    for label, (_, link) in enumerate(drawing.links, FIRST_LINK):
+        table[label] = FIRST_LINK + LINKS.index(link)
+    return table

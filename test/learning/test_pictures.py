@@ -1,0 +1,97 @@
+"""What the endoscope shows of the environments: the tool, both eyes, labels."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from played_tasks import make, play
+
+from endo_sim_ros.core.light import Light
+from endo_sim_ros.instruments import LINKS
+from endo_sim_ros.instruments.drawing import FIRST_LINK, InstrumentDrawing
+from endo_sim_ros.learning.policies import scripted_policy
+from endo_sim_ros.learning.scenes import load_scene
+from endo_sim_ros.learning.tasks import TASKS
+from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
+
+JAWS = [FIRST_LINK + LINKS.index(link) for link in ("jaw_left", "jaw_right")]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("instrument", [False, True])
+@pytest.mark.parametrize("light, degree", [(None, 0), (None, 1), (Light(distance=0.9, angle=0.4, response=0.3), 0)])
+def test_pictures_are_those_of_the_renderer(light, degree, instrument):
+    scene = load_scene()
+    sh = torch.cat([scene.model.sh, torch.randn(len(scene.model), 3, 3, generator=torch.Generator().manual_seed(0))], 1)
+    scene = replace(scene, model=replace(scene.model, light=light, sh=sh[:, : (degree + 1) ** 2]))
+    environment = make(observations="image", scene=scene, instrument=instrument, eyes=2, segmentation=True, baseline=0.005)
+    batch = environment.unwrapped.batch
+    script = scripted_policy("retraction")
+    seen, _ = environment.reset(seed=0)
+    for _ in range(16):
+        seen, *_ = environment.step(script.act(batch.state())[0])
+    renderer = DeformableRenderer(scene.model, batch.task.nodes.rest, RenderingConfig(device="cpu"))
+    pinned = torch.from_numpy(batch.task.nodes.pinned)[:, None, None]
+    F = torch.where(pinned, torch.eye(3), batch.tissue.F[0])  # as on control_nodes
+    camera = batch.pictures.camera
+    right = camera.at(camera.pose + [[0, 0, 0, 0.005], [0] * 4, [0] * 4, [0] * 4])
+    posed = None
+    if instrument:
+        parts, capsules = batch.tools.tools[0].shape
+        drawing = InstrumentDrawing([parts], device="cpu", capsules=[capsules])
+        posed = drawing.at([{link: poses[0] for link, poses in batch.tools.links(0, np.array([0])).items()}])
+    views = renderer.views([camera, right], batch.tissue.positions()[0], F, labels=True, instruments=posed)
+    assert batch.tissue.displacements.abs().max() > 1e-3
+    np.testing.assert_array_equal(seen["image"], views[0].image)
+    np.testing.assert_array_equal(seen["image_right"], views[1].image)
+    assert np.abs(views[0].image.astype(int) - views[1].image).mean() > 1
+    assert set(np.unique(seen["segmentation"])) & set(JAWS) if instrument else seen["segmentation"].max() == 1
+    np.testing.assert_array_equal(seen["segmentation"][..., 0] > 1, views[0].labels > 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", TASKS)
+def test_the_tool_is_seen_and_changes_nothing_else(task):
+    runs = [play(make(task, observations="both", instrument=shown), scripted_policy(task), 3, 30)[:2] for shown in (True, False)]
+    (shown, rewards), (bare, others) = runs
+    assert rewards == others
+    for a, b in zip(shown, bare, strict=True):
+        np.testing.assert_array_equal(a["state"], b["state"])
+    assert (shown[-1]["image"] != bare[-1]["image"]).any(2).mean() > 0.02
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", TASKS)
+def test_the_tool_is_where_the_actions_put_its_tip(task):
+    environment = make(task, observations="both", segmentation=True, image_width=200)
+    batch = environment.unwrapped.batch
+    observation, _ = environment.reset(seed=5)
+    scripts, found = scripted_policy(task), 0
+    for _ in range(20):
+        at = batch.task.tips()[0] + [0, 0, batch.task.physics().contact_radius]  # the camera looks along z
+        seen = batch.pictures.camera.K @ at
+        column, row = (seen[:2] / seen[2]).astype(int)
+        jaws = np.argwhere(np.isin(observation["segmentation"][..., 0], JAWS))
+        if len(jaws) > 50:  # not out of the picture
+            closed = batch.tools.angles[0] < 0.3  # open jaws are around their tip
+            assert np.linalg.norm(jaws - [row, column], axis=1).min() < (4 if closed else 30)
+            found += closed
+        tool = batch.tools.tools[0]
+        np.testing.assert_allclose(batch.tools.bases[0] @ tool.arm.tip_pose(batch.tools.joints[0]), batch._poses()[0], atol=1e-9)
+        observation, *_ = environment.step(scripts.act(observation["state"][None])[0])
+    assert found > 5
+
+
+def test_every_place_of_a_task_is_in_reach():
+    for name in TASKS:
+        environment = make(name, observations="image")
+        batch = environment.unwrapped.batch
+        for seed in range(6):
+            environment.reset(seed=seed)
+            corners = np.array(np.meshgrid(*zip(batch.task.low, batch.task.high), indexing="ij")).reshape(3, -1).T
+            for corner in corners:
+                batch.task.tip[0] = corner
+                batch.tools.move(np.array([0]), batch._poses(), np.array([False]))
+                at = batch.tools.bases[0] @ batch.tools.tools[0].arm.tip_pose(batch.tools.joints[0])
+                np.testing.assert_allclose(at, batch._poses()[0], atol=1e-8)

@@ -7,14 +7,14 @@ one batched simulation. Environment i of those, with seed s + i, is the single o
 
 import math
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from endo_sim_ros.learning.config import Randomisation, SightConfig
 from endo_sim_ros.learning.pictures import IMAGE, IMAGE_RIGHT, SEGMENTATION
 from endo_sim_ros.learning.scenes import Scene, load_scene
-from endo_sim_ros.learning.task_batch import Observations, TaskBatch
+from endo_sim_ros.learning.task_batch import Actions, Observations, TaskBatch
 from endo_sim_ros.learning.tasks import BOUND, TASKS, Outcome
 
 try:
@@ -38,6 +38,7 @@ def _make(
     image_width: int,
     device: str,
     render_mode: str | None,
+    actions: Actions,
     **sight: Any,
 ) -> tuple[TaskBatch, gymnasium.Space]:
     """The simulation, and the space of the observations of one environment."""
@@ -45,6 +46,8 @@ def _make(
         raise ValueError(f"observations must be state, image or both, got {observations!r}")
     if render_mode not in (None, "rgb_array"):
         raise ValueError(f"render_mode must be rgb_array or None, got {render_mode!r}")
+    if actions not in get_args(Actions):
+        raise ValueError(f"actions must be {', '.join(get_args(Actions)[:-1])} or {get_args(Actions)[-1]}, got {actions!r}")
     if image_width < 1:
         raise ValueError(f"image_width must be at least 1, got {image_width}")
     if sight["eyes"] == 2 and observations == "state":
@@ -52,10 +55,10 @@ def _make(
     randomisation = Randomisation.from_mapping(randomisation) if isinstance(randomisation, dict) else randomisation or Randomisation()
     scene = scene if isinstance(scene, Scene) else load_scene(scene)
     shown = SightConfig(image_width=image_width, **sight)
-    batch = TaskBatch(task, scene, count, observations, randomisation, shown, device, images=render_mode is not None)
+    batch = TaskBatch(task, scene, count, observations, randomisation, shown, device, render_mode is not None, actions)
     spaces: dict[str, gymnasium.Space] = {}
     if observations != "image":
-        spaces["state"] = gymnasium.spaces.Box(-BOUND, BOUND, (len(batch.task.observation_names),), np.float32)
+        spaces["state"] = gymnasium.spaces.Box(-BOUND, BOUND, (len(batch.observation_names),), np.float32)
     if batch.pictures is not None:
         camera = batch.pictures.camera
         names = ((IMAGE, 3), (IMAGE_RIGHT, 3))[: shown.eyes] if observations != "state" else ()
@@ -64,7 +67,8 @@ def _make(
     return batch, gymnasium.spaces.Dict(spaces) if len(spaces) > 1 else next(iter(spaces.values()))
 
 
-_ACTIONS = gymnasium.spaces.Box(-1.0, 1.0, (4,), np.float32)
+def _action_space(batch: TaskBatch) -> gymnasium.spaces.Box:
+    return gymnasium.spaces.Box(-1.0, 1.0, (batch.action_size,), np.float32)
 
 
 def _info(batch: TaskBatch, outcome: Outcome | None = None) -> dict[str, np.ndarray]:
@@ -91,6 +95,7 @@ class TaskEnvironment(gymnasium.Env):
         baseline: Distance between the eyes, m; default: that of the endoscope of a da Vinci Xi.
         segmentation: Add ``segmentation``, what is in each pixel: 0 nothing, 1 tissue, and from 2 on the links of the instrument,
             `endo_sim_ros.instruments.LINKS`.
+        actions: ``cartesian``, ``joints`` or ``joint_positions``, see :class:`TaskBatch`.
 
     Raises:
         ValueError: If an argument cannot be used, or the model is too small.
@@ -112,12 +117,13 @@ class TaskEnvironment(gymnasium.Env):
         eyes: Literal[1, 2] = 1,
         baseline: float = SightConfig.baseline,
         segmentation: bool = False,
+        actions: Actions = "cartesian",
     ):
         self.batch, self.observation_space = _make(
-            task, 1, scene, observations, randomisation, image_width, device, render_mode,
+            task, 1, scene, observations, randomisation, image_width, device, render_mode, actions,
             instrument=instrument, tool=tool, eyes=eyes, baseline=baseline, segmentation=segmentation,
         )  # fmt: skip
-        self.action_space, self.render_mode = _ACTIONS, render_mode
+        self.action_space, self.render_mode = _action_space(self.batch), render_mode
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observed, dict[str, Any]]:
         """Begin an episode; return its first observation and its info. A seed makes it repeatable."""
@@ -126,7 +132,7 @@ class TaskEnvironment(gymnasium.Env):
         return _first(self.batch.observe()), _first(_info(self.batch))
 
     def step(self, action: np.ndarray) -> tuple[Observed, float, bool, bool, dict[str, Any]]:
-        """Return observation, reward, terminated, truncated and info after an action [4] in -1 … 1."""
+        """Return observation, reward, terminated, truncated and info after an action [4 or 7] in -1 … 1."""
         observations, outcome = self.batch.step(np.asarray(action)[None])
         ended = bool(outcome.terminated[0]), bool(outcome.truncated[0])
         return _first(observations), float(outcome.reward[0]), *ended, _first(_info(self.batch, outcome))
@@ -163,14 +169,15 @@ class VectorTaskEnvironment(gymnasium.vector.VectorEnv):
         eyes: Literal[1, 2] = 1,
         baseline: float = SightConfig.baseline,
         segmentation: bool = False,
+        actions: Actions = "cartesian",
     ):
         self.batch, self.single_observation_space = _make(
-            task, num_envs, scene, observations, randomisation, image_width, device, render_mode,
+            task, num_envs, scene, observations, randomisation, image_width, device, render_mode, actions,
             instrument=instrument, tool=tool, eyes=eyes, baseline=baseline, segmentation=segmentation,
         )  # fmt: skip
-        self.num_envs, self.single_action_space, self.render_mode = num_envs, _ACTIONS, render_mode
+        self.num_envs, self.single_action_space, self.render_mode = num_envs, _action_space(self.batch), render_mode
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(_ACTIONS, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
         self._generators = [np.random.default_rng() for _ in range(num_envs)]
         self._ended = np.zeros(num_envs, bool)
 
@@ -200,7 +207,7 @@ class VectorTaskEnvironment(gymnasium.vector.VectorEnv):
         return self.renew(np.flatnonzero(chosen)), _info(self.batch)
 
     def step(self, actions: np.ndarray) -> tuple[Observed, np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-        """Return observations, rewards, terminated, truncated [B, …] and infos after actions [B, 4]; ended episodes begin anew."""
+        """Return observations, rewards, terminated, truncated [B, …] and infos after actions [B, 4 or 7]; ended episodes begin anew."""
         renew = np.flatnonzero(self._ended)
         observations, outcome = self.batch.step(actions, renew.tolist(), [self._generators[i] for i in renew])
         self._ended = outcome.terminated | outcome.truncated

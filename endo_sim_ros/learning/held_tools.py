@@ -19,6 +19,8 @@ from endo_sim_ros.learning.tasks import Task
 ARM = "PSM1"
 WITHDRAWN = 0.02  # m: how far from the middle of the tissue physics_node's arm waits for its first command
 _WORLD = "world"
+_LEVER = 0.1  # m: about how far the tip is from the remote centre, about which yaw and pitch turn it
+_WRIST_STEP = 0.05  # rad a step of 0.04 s: about half the speed that the dVRK allows
 
 
 @dataclass(frozen=True)
@@ -118,7 +120,46 @@ class HeldTools:
                 own = episodes[chosen]
                 reach = solve_inverse(tool.arm, invert_poses(self.bases[own]) @ poses[chosen], self.joints[own])
                 self.joints[own] = reach.joints
-        self.angles[episodes] = np.where(closed, self._task.closed_jaw, self._task.open_jaw)
+        self.angles[episodes] = self._angles(closed)
+
+    def hold(self, closed: np.ndarray) -> None:
+        """Close the jaws or not [B]."""
+        self.angles = self._angles(closed)
+
+    def _angles(self, closed: np.ndarray) -> np.ndarray:
+        return np.where(closed, self._task.closed_jaw, self._task.open_jaw)
+
+    def reach(self, actions: np.ndarray, relative: bool) -> np.ndarray:
+        """Joint positions [B, 6] within their limits that actions [B, 6] in -1 … 1 ask for, rad and m.
+
+        Args:
+            actions: How far each joint moves, in units of `steps`, or where it is between its limits.
+            relative: Which of the two.
+        """
+        arms = [tool.arm for tool in self.tools]
+        lower, upper = (np.array([getattr(arm, side) for arm in arms])[self.which] for side in ("lower", "upper"))
+        wanted = self.joints + self.steps * actions if relative else lower + 0.5 * (actions + 1) * (upper - lower)
+        return np.clip(wanted, lower, upper)
+
+    @cached_property
+    def steps(self) -> np.ndarray:
+        """How far actions of 1 move the joints [6], rad and m: the first three about as far as they move the tip along an axis."""
+        turn = self._task.step_length / _LEVER
+        return np.array([turn, turn, self._task.step_length, _WRIST_STEP, _WRIST_STEP, _WRIST_STEP])
+
+    def scaled(self) -> np.ndarray:
+        """Joint positions [B, 6] as parts of their ranges, -1 … 1."""
+        arms = [tool.arm for tool in self.tools]
+        lower, upper = (np.array([getattr(arm, side) for arm in arms])[self.which] for side in ("lower", "upper"))
+        return 2 * (self.joints - lower) / (upper - lower) - 1
+
+    def poses(self) -> np.ndarray:
+        """Poses of the tips [B, 4, 4], world, at the joints."""
+        poses = np.empty((len(self.which), 4, 4))
+        for number, tool in enumerate(self.tools):
+            own = self.which == number
+            poses[own] = self.bases[own] @ tool.arm.tip_pose(self.joints[own])
+        return poses
 
     def links(self, number: int, episodes: np.ndarray) -> dict[str, np.ndarray]:
         """Poses [n, 4, 4] of the links, world, by name, of episodes that have the tool of a number."""

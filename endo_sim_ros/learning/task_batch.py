@@ -17,6 +17,9 @@ RESTING_SPEED = 1e-5  # m/s; as in TissueSimulation: one tissue slower than this
 _BELOW = 1e-9  # share taken off random stiffness: rounded, it must not exceed what the substeps were planned for
 
 Observations = Literal["state", "image", "both"]
+Actions = Literal["cartesian", "joints", "joint_positions"]
+JOINTS = ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw")
+"""Names of the joints, in the order of actions."""
 
 
 class TaskBatch:
@@ -34,6 +37,10 @@ class TaskBatch:
         sight: What the endoscope shows.
         device: Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N.
         images: Make `images` possible also where images are not observed.
+        actions: ``cartesian``: four numbers, see `Task`. ``joints``: how far the six joints of the tool's arm move, in units of
+            `HeldTools.steps`, and the fourth number of the task. ``joint_positions``: where they are, -1 and 1 being their limits,
+            and the same. With joints the state ends with their positions as parts of their ranges. A tip that would leave where
+            the task allows it comes as near as its joints get.
 
     Raises:
         ValueError: If there is no such task or tool, the scene is too small for it, or an arm does not reach it.
@@ -49,6 +56,7 @@ class TaskBatch:
         sight: SightConfig = SightConfig(),
         device: str = "auto",
         images: bool = False,
+        actions: Actions = "cartesian",
     ):
         kind = find_task(task)
         config = kind.physics(device)
@@ -63,11 +71,14 @@ class TaskBatch:
         self.sight = sight
         self.tools: HeldTools | None = None
         self.pictures: Pictures | None = None
+        self.actions = actions
+        self.action_size = 4 if actions == "cartesian" else len(JOINTS) + 1
+        self._rotations = np.tile(np.eye(3), (count, 1, 1))  # of the tips, world
         shown = images or observations != "state" or sight.segmentation
-        if shown and sight.instrument:
+        if shown and sight.instrument or actions != "cartesian":
             self.tools = HeldTools([hold_tool(kind, scene, sight.tool)], kind, count)
         if shown:
-            self.pictures = Pictures(scene, self.tissue, count, sight, randomisation, self.tools)
+            self.pictures = Pictures(scene, self.tissue, count, sight, randomisation, self.tools if sight.instrument else None)
 
     def reset(self, episodes: Sequence[int], generators: Sequence[np.random.Generator]) -> None:
         """Begin these episodes anew, each by the chance of its generator."""
@@ -82,6 +93,7 @@ class TaskBatch:
         chosen = torch.as_tensor(list(episodes), dtype=torch.long, device=self.tissue.solver.device)
         self.tissue.reset(chosen)
         self._resting, self._placed = True, False
+        self._rotations[list(episodes)] = np.eye(3)
         if self.tools is not None:
             self.tools.begin(chosen.cpu().numpy(), self._poses()[list(episodes)])
         if self.pictures is not None:
@@ -90,13 +102,18 @@ class TaskBatch:
     def _poses(self) -> np.ndarray:
         """Poses of the tips [B, 4, 4], world."""
         poses = np.tile(np.eye(4), (self.count, 1, 1))
-        poses[:, :3, 3] = self.task.tips()
+        poses[:, :3, :3], poses[:, :3, 3] = self._rotations, self.task.tips()
         return poses
+
+    @property
+    def observation_names(self) -> tuple[str, ...]:
+        """Names of the numbers of the state."""
+        return self.task.observation_names + (JOINTS if self.actions != "cartesian" else ())
 
     def step(
         self, actions: np.ndarray, renew: Sequence[int] = (), generators: Sequence[np.random.Generator] = ()
     ) -> tuple[np.ndarray | dict[str, np.ndarray], Outcome]:
-        """Take one step with actions [B, 4]. The episodes in ``renew`` take none: each begins anew, by the chance of its generator.
+        """Take one step with actions [B, 4 or 7]. The episodes in ``renew`` take none: each begins anew, by the chance of its generator.
 
         Returns:
             What `observe` gives at the end of the step, and its outcome.
@@ -106,27 +123,46 @@ class TaskBatch:
         return observations, self.task.judge()
 
     def _advance(self, actions: np.ndarray, renew: Sequence[int], generators: Sequence[np.random.Generator]) -> None:
-        tips, closed = self.task.act(actions)
+        tips, closed = self.task.act(actions) if self.actions == "cartesian" else self._act_by_joints(actions)
         if len(renew):
             self.reset(renew, generators)
         tools = self.tissue.tools
         tips = torch.from_numpy(tips)[:, None].to(tools.tips.device)
-        moved = not self._placed or not torch.equal(tips, tools.tips)
+        turned = torch.from_numpy(self._rotations)[:, None].to(tools.tips.device)
+        moved = not self._placed or not (torch.equal(tips, tools.tips) and torch.equal(turned, tools.rotations))
         present = torch.ones((self.count, 1), dtype=torch.int32)
         present[list(renew)] = 0
         tools.tips.copy_(tips)
-        tools.rotations.copy_(torch.eye(3, dtype=torch.float64).expand_as(tools.rotations))
+        tools.rotations.copy_(turned)
         tools.present.copy_(present)
         tools.closed.copy_(torch.from_numpy(closed.astype(np.int32))[:, None] * present)
         self._placed = True
         step = self.count > 1 or not self._rests(moved)
         if step:
             self.tissue.step()
-        if self.tools is not None:  # while a GPU takes the step
+        if self.tools is not None and self.actions == "cartesian":  # while a GPU takes the step
             going = np.setdiff1d(np.arange(self.count), renew)
             self.tools.move(going, self._poses()[going], closed[going])
         if step:
             self._resting = self.count == 1 and self.tissue.solver.speed < RESTING_SPEED
+
+    def _act_by_joints(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What `Task.act` returns, for actions [B, 7] of joints."""
+        assert self.tools is not None
+        actions, tools = self.task.check_actions(actions, self.action_size), self.tools
+        tools.joints = tools.reach(actions[:, :-1], self.actions == "joints")
+        poses = tools.poses()
+        asked = self.task.find(poses[:, :3, 3])
+        tips, closed = self.task.go(asked, actions[:, -1])
+        outside = np.flatnonzero((self.task.tip != asked).any(1))
+        if len(outside):
+            poses[outside, :3, 3] = tips[outside]
+            tools.move(outside, poses[outside], closed[outside])
+            poses = tools.poses()
+            self.task.tip[outside] = self.task.find(poses[:, :3, 3])[outside]
+        tools.hold(closed)
+        self._rotations = poses[:, :3, :3].copy()
+        return poses[:, :3, 3].copy(), closed
 
     def _rests(self, moved: bool) -> bool:
         """Whether a single tissue is left as it is, as TissueSimulation does, so that the graph gives the same bits."""
@@ -138,7 +174,8 @@ class TaskBatch:
 
     def observe(self) -> np.ndarray | dict[str, np.ndarray]:
         """Observations of all episodes now."""
-        found = {"state": self.state()} if self.observations != "image" else {}
+        state = self.state()  # which is judged, too
+        found = {"state": state} if self.observations != "image" else {}
         seen = self.observations != "state"
         if self.pictures is not None and (seen or self.sight.segmentation):
             drawn = self.pictures.draw(right=seen and self.sight.eyes == 2, labels=self.sight.segmentation)
@@ -151,7 +188,10 @@ class TaskBatch:
         rows = torch.arange(self.count)[:, None]
         moved = self.tissue.displacements[rows.to(device), sites.to(device)].cpu()
         positions = (self._rest[sites] + moved).numpy()
-        return self.task.observe(positions, self.tissue.tools.reaction_forces[:, 0].cpu().numpy())
+        state = self.task.observe(positions, self.tissue.tools.reaction_forces[:, 0].cpu().numpy())
+        if self.actions == "cartesian" or self.tools is None:
+            return state
+        return np.concatenate([state, self.tools.scaled().astype(np.float32)], 1)
 
     def images(self) -> np.ndarray:
         """What the left eye of the endoscope sees of all episodes [B, H, W, 3], uint8.

@@ -127,18 +127,39 @@ class Task(ABC):
         Raises:
             ValueError: If actions have another shape, or are not finite; nothing has changed then.
         """
+        actions = self.check_actions(actions, 4)
+        return self.go(self.tip + self.step_length * actions[:, :3], actions[:, 3])
+
+    def check_actions(self, actions: np.ndarray, size: int) -> np.ndarray:
+        """Actions [B, size], each number within -1 … 1, float64.
+
+        Raises:
+            ValueError: If they have another shape, or are not finite.
+        """
         actions = np.asarray(actions, np.float64)
-        if actions.shape != (self.count, 4):
-            raise ValueError(f"{self.name}: actions must be {self.count} × 4 numbers, got the shape {actions.shape}")
+        if actions.shape != (self.count, size):
+            raise ValueError(f"{self.name}: actions must be {self.count} × {size} numbers, got the shape {actions.shape}")
         if not np.isfinite(actions).all():
             wrong = int((~np.isfinite(actions)).any(1).argmax())
             raise ValueError(f"{self.name}: the action of episode {wrong} is not finite: {actions[wrong].tolist()}; has learning diverged?")
-        actions = np.clip(actions, -1.0, 1.0)
-        self.tip = np.clip(self.tip + self.step_length * actions[:, :3], self.low, self.high)
-        self.fourth = actions[:, 3]
+        return np.clip(actions, -1.0, 1.0)
+
+    def go(self, tips: np.ndarray, fourth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Take a step with the tips at places [B, 3], m, task frame, as far as they may be there; returns what `act` does.
+
+        Args:
+            tips: The places.
+            fourth: What the fourth number of actions means [B].
+        """
+        self.tip = np.clip(tips, self.low, self.high)
+        self.fourth = fourth
         self.raised = np.where(self.fourth > 0, self.raised + 1, 0)
         self.steps = self.steps + 1
         return self.tips(), self._closed()
+
+    def find(self, places: np.ndarray) -> np.ndarray:
+        """Places [B, 3] of the world, m, in the task frame."""
+        return self._to_task(places - self.origin)
 
     def _closed(self) -> np.ndarray:
         return np.zeros(self.count, bool)

@@ -20,6 +20,18 @@ class Randomisation(StageConfig):
     """The endoscope is moved by up to this along each axis, m."""
     camera_angle: Annotated[float, Range(0, 45, "deg")] = 0.0
     """The endoscope is turned by up to this about each axis, degrees."""
+    tool: Annotated[float, Range(0, 1)] = 0.0
+    """Share of episodes that have any of the five tools that are known, whatever the task's is."""
+    trocar_angle: Annotated[float, Range(0, 30, "deg")] = 0.0
+    """The remote centre, where the instrument enters, is turned by up to this about each axis through the tissue in the middle of the
+    picture, degrees."""
+    trocar_position: Annotated[float, Range(0, 0.05, "m")] = 0.0
+    """The remote centre is moved by up to this along each axis of the world, m."""
+    metal: Annotated[float, Range(0, 0.9)] = 0.0
+    """What the surfaces of the tool give back of the light, and their roughness, are each multiplied by a factor between 1 - x and
+    1 + x."""
+    lamp: Annotated[float, Range(0, 0.02, "m")] = 0.0
+    """The lamp beside the lens is moved by up to this along each axis of the camera, m."""
 
 
 @dataclass(frozen=True)

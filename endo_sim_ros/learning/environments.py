@@ -73,7 +73,8 @@ def _action_space(batch: TaskBatch) -> gymnasium.spaces.Box:
 
 def _info(batch: TaskBatch, outcome: Outcome | None = None) -> dict[str, np.ndarray]:
     success = np.zeros(batch.count, bool) if outcome is None else outcome.success
-    return {"success": success, "force": np.sqrt((batch.task.force**2).sum(1)), "faults": batch.tissue.tools.faults.cpu().numpy().copy()}
+    force, faults = np.sqrt((batch.task.force**2).sum(1)), batch.tissue.tools.faults.cpu().numpy().copy()
+    return {"success": success, "force": force, "faults": faults} | {name: values.copy() for name, values in batch.varied.items()}
 
 
 class TaskEnvironment(gymnasium.Env):
@@ -228,7 +229,7 @@ def _first(values: Any) -> Any:
     """Of the first environment, out of batched arrays."""
     if isinstance(values, dict):
         return {name: _first(value) for name, value in values.items()}
-    return values[0].item() if values.ndim == 1 else values[0]
+    return values[0] if values.ndim > 1 or values.dtype == object else values[0].item()
 
 
 for _name in TASKS:

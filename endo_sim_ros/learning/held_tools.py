@@ -13,8 +13,10 @@ import numpy as np
 from endo_sim_ros.core.cameras import invert_pose, matrix_to_quat, parse_frames
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.instruments import ArmKinematics, Capsule, Part, build_instrument, link_poses, load_arm, place_arm, solve_inverse
+from endo_sim_ros.instruments.shapes import SHAPES
 from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.learning.tasks import Task
+from endo_sim_ros.learning.variation import Variation
 
 ARM = "PSM1"
 WITHDRAWN = 0.02  # m: how far from the middle of the tissue physics_node's arm waits for its first command
@@ -30,10 +32,14 @@ class HeldTool:
     Args:
         arm: Its tip is where the task works with the tool; the axes of the tip are those of the world at the start.
         base: Pose [4, 4] of the base in the world, m.
+        centre: The tissue in the middle of the picture [3], m, world.
+        name: Name of the tool, or the path of its file.
     """
 
     arm: ArmKinematics
     base: np.ndarray
+    centre: np.ndarray
+    name: str
 
     @cached_property
     def start(self) -> np.ndarray:
@@ -82,7 +88,13 @@ def hold_tool(task: type[Task], scene: Scene, tool: str = "") -> HeldTool:
     ahead = task.physics().contact_radius * camera.pose[:3, 2]
     mount = np.eye(4)
     mount[:3, :3], mount[:3, 3] = hinge, ahead - hinge @ point
-    return HeldTool(replace(arm, tooltip_offset=arm.tooltip_offset @ invert_pose(mount)), base)
+    centre = camera.position + scene.depth * camera.pose[:3, 2]
+    return HeldTool(replace(arm, tooltip_offset=arm.tooltip_offset @ invert_pose(mount)), base, centre, tool or task.tool)
+
+
+def hold_tools(task: type[Task], scene: Scene, tool: str = "") -> list[HeldTool]:
+    """The tool of a task, as `hold_tool` has it, and then all those in `SHAPES`; raises as that does."""
+    return [hold_tool(task, scene, tool), *(hold_tool(task, scene, name) for name in SHAPES)]
 
 
 def _frame(base: np.ndarray) -> str:
@@ -94,7 +106,7 @@ class HeldTools:
     """The tools of B episodes of one task.
 
     Args:
-        tools: Those that an episode may have.
+        tools: That of the task, and then all others that an episode may have.
         task: The task.
         count: B.
     """
@@ -106,6 +118,13 @@ class HeldTools:
         self.bases = np.tile(tools[0].base, (count, 1, 1))  # [B, 4, 4] world
         self.joints = np.tile(tools[0].start, (count, 1))  # [B, 6] rad and m
         self.angles = np.full(count, task.open_jaw)  # between the jaws [B], rad
+
+    def vary(self, episode: int, variation: Variation) -> None:
+        """Give an episode its tool and the place of its arm."""
+        number = variation.tool(len(self.tools) - 1)
+        self.which[episode] = 0 if number is None else number + 1
+        tool = self.tools[self.which[episode]]
+        self.bases[episode] = variation.trocar(tool.base, tool.centre)
 
     def begin(self, episodes: np.ndarray, poses: np.ndarray) -> None:
         """Begin these episodes anew with their tips at poses [n, 4, 4], world."""

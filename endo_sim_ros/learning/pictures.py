@@ -5,17 +5,18 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.light import SURFACE
 from endo_sim_ros.core.shading import shade, to_bytes
-from endo_sim_ros.instruments import LINKS
-from endo_sim_ros.instruments.drawing import BACKGROUND, FIRST_LINK, TISSUE, InstrumentDrawing, lenses
+from endo_sim_ros.instruments import LINKS, Material
+from endo_sim_ros.instruments.config import DrawingConfig
+from endo_sim_ros.instruments.drawing import BACKGROUND, FIRST_LINK, SURFACES, TISSUE, InstrumentDrawing, lenses
 from endo_sim_ros.learning.config import Randomisation, SightConfig
 from endo_sim_ros.learning.held_tools import HeldTools
 from endo_sim_ros.learning.scenes import Scene
+from endo_sim_ros.learning.variation import Variation
 from endo_sim_ros.physics import Skinning, TissueBatch
 from endo_sim_ros.rendering import turned_colors
 from endo_sim_ros.splatting import rasterize
@@ -23,6 +24,7 @@ from endo_sim_ros.splatting import rasterize
 IMAGE, IMAGE_RIGHT, SEGMENTATION = "image", "image_right", "segmentation"
 """Names of the pictures."""
 
+_ROUGHNESS = 0.1, 1.0  # smoother metal would be a mirror, which the drawing has none of
 _AT_ONCE = 64  # images rasterised together, and on a CPU drawn into
 
 
@@ -34,6 +36,7 @@ class _View:
     light: np.ndarray | None = None  # [H, W, 1] factor, None = 1
     contrast: float = 1.0  # factor on the colours' coefficients
     lamps: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # [E, 3] m, in the camera of each eye
+    metal: np.ndarray = field(default_factory=lambda: np.ones(2))  # factors on what surfaces give back and on their roughness
 
 
 class Pictures:
@@ -65,12 +68,15 @@ class Pictures:
         )
         self._tables = [torch.from_numpy(_labels(drawing)).to(device) for drawing in self._drawings]
         self._at_once = _AT_ONCE if torch.device(device).type == "cpu" else max(count, 1)
-        self._views = [self._view(np.zeros(10)) for _ in range(count)]
+        options = DrawingConfig()
+        self._lamp = np.array([options.lamp_x, options.lamp_y, 0.0, 1.0])  # m, camera
+        self._surfaces = np.array([SURFACES[material] for material in Material])  # [M, 5]
+        self._views = [self._view(None) for _ in range(count)]
 
-    def reset(self, episodes: Tensor, chances: Sequence[np.ndarray]) -> None:
-        """Show these episodes [n] at rest, each by its chance [10] in -1 … 1."""
-        for b, chance in zip(episodes.tolist(), chances):
-            self._views[b] = self._view(chance)
+    def reset(self, episodes: Tensor, variations: Sequence[Variation]) -> None:
+        """Show these episodes [n] at rest, each with its variation."""
+        for b, variation in zip(episodes.tolist(), variations):
+            self._views[b] = self._view(variation)
         self._means[episodes], self._covars[episodes] = self._skinning.means, self._skinning.covars
 
     @torch.no_grad()
@@ -134,6 +140,11 @@ class Pictures:
         viewmats = np.stack([camera.viewmat for camera in cameras])
         lens = lenses(cameras)
         lamps = np.concatenate([[self._views[b].lamps[eye] for b in own] for eye in range(eyes)])
+        surfaces = None
+        if self._by.metal:
+            factors = np.stack([self._views[b].metal for b in own] * eyes)  # [E b, 2]: of all but the roughness, and of that
+            surfaces = self._surfaces * factors[:, None, [0, 0, 0, 1, 0]]
+            surfaces[..., 3] = surfaces[..., 3].clip(*_ROUGHNESS)
         labels = torch.empty_like(pictures[2], dtype=torch.uint8)
         for number in np.unique(which):
             drawing, at = self._drawings[number], np.flatnonzero(which == number)
@@ -142,32 +153,34 @@ class Pictures:
             rows = np.concatenate([at + eye * len(own) for eye in range(eyes)])
             local = viewmats[rows, None] @ np.concatenate([poses] * eyes)
             if len(at) == len(own):
-                return self._tables[number][drawing.draw_links(local, lens, *pictures, lamps).int()]
+                return self._tables[number][drawing.draw_links(local, lens, *pictures, lamps, surfaces).int()]
             chosen = torch.from_numpy(rows).to(self._device)
             parts = [picture[chosen] for picture in pictures]
-            labels[chosen] = self._tables[number][drawing.draw_links(local, lens[rows], *parts, lamps[rows]).int()]
+            own_surfaces = None if surfaces is None else surfaces[rows]
+            labels[chosen] = self._tables[number][drawing.draw_links(local, lens[rows], *parts, lamps[rows], own_surfaces).int()]
             for whole, part in zip(pictures, parts):
                 whole[chosen] = part
         return labels
 
-    def _view(self, chance: np.ndarray) -> _View:
-        """How an episode is seen, by numbers [10] in -1 … 1."""
-        by, camera = self._by, self.camera
-        pose = camera.pose.copy()
-        pose[:3, 3] += by.camera_position * chance[1:4]
-        pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(np.radians(by.camera_angle) * chance[4:7]).as_matrix()
-        light = None
-        if by.light:
-            centred = (camera.rays()[..., :2] / np.abs(camera.rays()[..., :2]).max((0, 1))) ** 2
-            falloff = by.light * 0.5 * (1 + chance[8])
-            light = ((1 + by.light * chance[7]) * (1 - falloff * centred.sum(-1, keepdims=True) / 2)).astype(np.float32)
-        camera = replace(camera, pose=pose) if by.camera_position or by.camera_angle else camera
-        cameras = (camera,) if self._sight.eyes == 1 else (camera, right_of(camera, self._sight.baseline))
-        view = _View(cameras, light, 1 + by.texture * float(chance[9]))
-        if self._drawings:
-            config = self._drawings[0].config
-            lamp = camera.pose @ np.array([config.lamp_x, config.lamp_y, 0.0, 1.0])
-            view.lamps = np.stack([(each.viewmat @ lamp)[:3] for each in cameras])
+    def _view(self, variation: Variation | None) -> _View:
+        """How an episode is seen; without a variation as the scene is."""
+        camera, view = self.camera, _View((self.camera,))
+        lamp = self._lamp
+        if variation is not None:
+            by, varied = self._by, variation.camera
+            pose = camera.pose.copy()
+            pose[:3, 3] += varied[:3, 3]
+            pose[:3, :3] = pose[:3, :3] @ varied[:3, :3]
+            if by.light:
+                brightness, falloff = variation.light
+                centred = (camera.rays()[..., :2] / np.abs(camera.rays()[..., :2]).max((0, 1))) ** 2
+                view.light = (brightness * (1 - falloff * centred.sum(-1, keepdims=True) / 2)).astype(np.float32)
+            camera = replace(camera, pose=pose) if by.camera_position or by.camera_angle else camera
+            view.contrast, lamp = variation.texture, lamp + np.append(variation.lamp, 0.0)
+            view.metal = variation.metal
+        view.cameras = (camera,) if self._sight.eyes == 1 else (camera, right_of(camera, self._sight.baseline))
+        lamp = camera.pose @ lamp
+        view.lamps = np.stack([(each.viewmat @ lamp)[:3] for each in view.cameras])
         return view
 
 

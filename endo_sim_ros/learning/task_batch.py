@@ -1,20 +1,20 @@
 """B episodes of a task in the simulation: one batched solver, one renderer, no framework; what environments and training share."""
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
 
 from endo_sim_ros.learning.config import Randomisation, SightConfig
-from endo_sim_ros.learning.held_tools import HeldTools, hold_tool
+from endo_sim_ros.learning.held_tools import HeldTools, hold_tool, hold_tools
 from endo_sim_ros.learning.pictures import IMAGE, SEGMENTATION, Pictures
 from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.learning.tasks import Outcome, find_task
+from endo_sim_ros.learning.variation import Variation
 from endo_sim_ros.physics import TissueBatch
 
 RESTING_SPEED = 1e-5  # m/s; as in TissueSimulation: one tissue slower than this, that no tool moves, is left as it is
-_BELOW = 1e-9  # share taken off random stiffness: rounded, it must not exceed what the substeps were planned for
 
 Observations = Literal["state", "image", "both"]
 Actions = Literal["cartesian", "joints", "joint_positions"]
@@ -73,23 +73,28 @@ class TaskBatch:
         self.pictures: Pictures | None = None
         self.actions = actions
         self.action_size = 4 if actions == "cartesian" else len(JOINTS) + 1
+        self.varied: dict[str, np.ndarray] = {}
+        """What each episode has of each kind of randomisation that there is [B, …], by the names of the options."""
         self._rotations = np.tile(np.eye(3), (count, 1, 1))  # of the tips, world
         shown = images or observations != "state" or sight.segmentation
         if shown and sight.instrument or actions != "cartesian":
-            self.tools = HeldTools([hold_tool(kind, scene, sight.tool)], kind, count)
+            held = hold_tools(kind, scene, sight.tool) if randomisation.tool else [hold_tool(kind, scene, sight.tool)]
+            self.tools = HeldTools(held, kind, count)
         if shown:
             self.pictures = Pictures(scene, self.tissue, count, sight, randomisation, self.tools if sight.instrument else None)
 
     def reset(self, episodes: Sequence[int], generators: Sequence[np.random.Generator]) -> None:
         """Begin these episodes anew, each by the chance of its generator."""
-        chances = []
+        variations = []
         for b, rng in zip(episodes, generators):
             self.task.reset(b, rng)
-            chance = rng.uniform(-1, 1, 10)  # always as many, so that what is randomised does not change the task
+            variation = Variation.draw(self.randomisation, rng)
             if self._varies:
-                factor = np.exp(self.randomisation.stiffness * chance[0]) * (1 - _BELOW * (self.randomisation.stiffness > 0))
-                self.tissue.solver.set_stiffness(slice(b, b + 1), factor * self.task.stiffness(b)[None])
-            chances.append(chance)
+                self.tissue.solver.set_stiffness(slice(b, b + 1), variation.stiffness * self.task.stiffness(b)[None])
+            if self.tools is not None:
+                self.tools.vary(b, variation)
+            self._note(b, variation)
+            variations.append(variation)
         chosen = torch.as_tensor(list(episodes), dtype=torch.long, device=self.tissue.solver.device)
         self.tissue.reset(chosen)
         self._resting, self._placed = True, False
@@ -97,7 +102,18 @@ class TaskBatch:
         if self.tools is not None:
             self.tools.begin(chosen.cpu().numpy(), self._poses()[list(episodes)])
         if self.pictures is not None:
-            self.pictures.reset(chosen, chances)
+            self.pictures.reset(chosen, variations)
+
+    def _note(self, b: int, variation: Variation) -> None:
+        """Keep what an episode has."""
+        values: dict[str, Any] = dict(variation.values())
+        if self.randomisation.tool and self.tools is not None:
+            values["tool"] = self.tools.tools[self.tools.which[b]].name
+        for name, value in values.items():
+            if name not in self.varied:
+                kind = object if isinstance(value, str) else np.float64
+                self.varied[name] = np.zeros((self.count, *np.shape(value)), kind)
+            self.varied[name][b] = value
 
     def _poses(self) -> np.ndarray:
         """Poses of the tips [B, 4, 4], world."""

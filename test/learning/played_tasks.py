@@ -8,7 +8,10 @@ from endo_sim_ros.learning.policies import NetworkPolicy
 from endo_sim_ros.learning.tasks import TASKS
 
 IDS = {name: f"endo_sim_ros/{name.capitalize()}-v0" for name in TASKS}
-VARIED = {"stiffness": 0.4, "light": 0.5, "texture": 0.5, "camera_position": 0.005, "camera_angle": 5.0}
+VARIED = {
+    "stiffness": 0.4, "light": 0.5, "texture": 0.5, "camera_position": 0.005, "camera_angle": 5.0,
+    "tool": 0.8, "trocar_angle": 15.0, "trocar_position": 0.01, "metal": 0.5, "lamp": 0.004,
+}  # fmt: skip
 
 
 def make(task="retraction", **options):

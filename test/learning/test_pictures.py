@@ -10,6 +10,7 @@ from played_tasks import make, play
 from endo_sim_ros.core.light import Light
 from endo_sim_ros.instruments import LINKS
 from endo_sim_ros.instruments.drawing import FIRST_LINK, InstrumentDrawing
+from endo_sim_ros.instruments.shapes import SHAPES
 from endo_sim_ros.learning.policies import scripted_policy
 from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.learning.tasks import TASKS
@@ -95,3 +96,28 @@ def test_every_place_of_a_task_is_in_reach():
                 batch.tools.move(np.array([0]), batch._poses(), np.array([False]))
                 at = batch.tools.bases[0] @ batch.tools.tools[0].arm.tip_pose(batch.tools.joints[0])
                 np.testing.assert_allclose(at, batch._poses()[0], atol=1e-8)
+
+
+@pytest.mark.slow
+def test_tools_trocars_metal_and_lamps_vary_and_are_told():
+    def first(seed=5, **kinds):
+        environment = make(observations="both", randomisation=kinds, image_width=128)
+        observation, info = environment.reset(seed=seed)
+        environment.unwrapped.batch.task.tip[:] = 0, 0, 0.01  # in the picture
+        batch = environment.unwrapped.batch
+        batch.tools.begin(np.array([0]), batch._poses())
+        return batch, batch.pictures.draw()["image"][0], observation["state"], info
+
+    plain, image, state, info = first()
+    assert set(info) == {"success", "force", "faults"}
+    for name, most in {"trocar_angle": 20.0, "trocar_position": 0.02, "metal": 0.8, "lamp": 0.01}.items():
+        batch, other, same, info = first(**{name: most})
+        np.testing.assert_array_equal(same, state)
+        assert (other != image).any(2).mean() > 0.01, name
+        drawn = np.abs(info[name] - 1 if name == "metal" else info[name])
+        assert 0.1 * most < drawn.max() < most
+    moved = first(trocar_position=0.02)[0].tools.bases[0, :3, 3] - plain.tools.bases[0, :3, 3]
+    np.testing.assert_allclose(moved, first(trocar_position=0.02)[3]["trocar_position"], atol=1e-12)
+    names = {first(seed, tool=1.0)[3]["tool"] for seed in range(12)}
+    assert len(names) > 3 and names <= set(SHAPES)
+    assert {first(seed, tool=0.01)[3]["tool"] for seed in range(4)} == {TASKS["retraction"].tool}

@@ -5,10 +5,12 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
+from endo_sim_ros.learning.config import SightConfig
+
 
 @dataclass(frozen=True)
 class Command:
-    """Write what starts the graph on a task to learn: model.ply, cameras.json and parameters.yaml for its nodes."""
+    """Write what starts the graph on a task to learn: model.ply, cameras.json, the tool's file and parameters.yaml for its nodes."""
 
     out: Positional[Path]
     """Folder to write; it may exist."""
@@ -18,10 +20,20 @@ class Command:
     """PLY model with its cameras.json; default: a piece of the synthetic patient."""
     seed: int = 0
     """Of the first episode."""
+    image_width: int = SightConfig.image_width
+    """Width of the pictures, pixels."""
+    instrument: bool = SightConfig.instrument
+    """Show the tool; without it an arm is a tip that reaches every pose."""
+    tool: str = ""
+    """Name or file of the tool; default: that of the task."""
+    baseline: float = SightConfig.baseline
+    """Distance between the eyes, m."""
 
     def run(self) -> None:
-        """Write the scene; raises ValueError if there is no such task or the model is too small."""
-        from endo_sim_ros.learning.scenes import load_scene, save_scene
+        """Write the scene; raises ValueError if there is no such task or tool, or the model is too small or out of reach."""
+        from endo_sim_ros.learning.graph_files import save_scene
+        from endo_sim_ros.learning.scenes import load_scene
 
-        save_scene(load_scene(self.model), self.out, self.task, self.seed)
+        sight = SightConfig(image_width=self.image_width, instrument=self.instrument, tool=self.tool, baseline=self.baseline)
+        save_scene(load_scene(self.model), self.out, self.task, self.seed, sight)
         print(f"{self.out}: model.ply, cameras.json, parameters.yaml")

@@ -69,6 +69,26 @@ def load_arm(arm: str = "PSM", tool: str = "") -> ArmKinematics:
     return ArmKinematics(Path(arm).stem, path.stem if tool else "", tuple(joints), offset, jaw, coupling)
 
 
+def save_tool(path: Path, arm: ArmKinematics) -> None:
+    """Write the tool of an arm as a file that `load_arm` reads. Its name names the tool, and with it the shape.
+
+    Args:
+        path: The file, such as ``LARGE_NEEDLE_DRIVER_400006.json``.
+        arm: An arm with a wrist.
+    """
+    joints = [
+        {"name": joint.name, "type": joint.kind, "alpha": joint.alpha, "A": joint.a, "theta": joint.angle, "D": joint.shift}
+        | {"offset": 0, "qmin": joint.lower, "qmax": joint.upper}
+        for joint in arm.joints[3:]
+    ]
+    fields: dict[str, Any] = {"DH": {"convention": "modified", "joints": joints}, "tooltip_offset": arm.tooltip_offset.tolist()}
+    if arm.jaw is not None:
+        fields["jaw"] = {"qmin": arm.jaw[0], "qmax": arm.jaw[1]}
+    if arm.coupling is not None:
+        fields["coupling"] = {"ActuatorToJointPosition": arm.coupling.tolist()}
+    path.write_text(json.dumps(fields, indent=1) + "\n", "utf-8")
+
+
 def _find(what: str, name: str, known: list[str]) -> Path:
     if name in known:
         return _SHIPPED / f"{name}.json"

@@ -79,7 +79,7 @@ def hold_tool(task: type[Task], scene: Scene, tool: str = "") -> HeldTool:
     try:
         placed = place_arm(ARM, arm, camera, scene.depth)
     except ConfigError as error:
-        raise ConfigError(f"{error}; or make the environment with instrument=False") from error
+        raise ConfigError(f"{error}; or leave out the tool (instrument off)") from error
     base = parse_frames(_WORLD, [_frame(placed.base)])[f"{ARM}_base"]  # with the bits that physics_node has
     # The tip moves from the hinge to where the jaws work: in the axes of the hinge, and then in those of the world.
     point = (invert_pose(arm.tooltip_offset) @ np.append(task.tool_share * capsules[-1].end, 1.0))[:3]

@@ -3,15 +3,13 @@
 import contextlib
 import functools
 import os
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import yaml
 
-from endo_sim_ros.core.cameras import Camera, load_cameras, save_cameras
+from endo_sim_ros.core.cameras import Camera, load_cameras
 from endo_sim_ros.core.gaussians import GaussianModel, ModelError, load_ply, save_ply
-from endo_sim_ros.learning.tasks import find_task
 from endo_sim_ros.physics import ControlNodes, PhysicsConfig, build_control_nodes
 from endo_sim_ros.rendering import render_depth
 
@@ -71,37 +69,6 @@ def load_scene(path: str | Path | None = None) -> Scene:
     if not cameras:
         raise ValueError(f"{path.parent / 'cameras.json'} has no camera; a task needs to know from where the tissue is seen")
     return Scene(model, tuple(cameras))
-
-
-def save_scene(scene: Scene, folder: Path, task: str, seed: int = 0) -> None:
-    """Write model.ply, cameras.json and parameters.yaml, which start the graph in lockstep on a task in this scene.
-
-    Args:
-        scene: What to write.
-        folder: Where; it is made if need be.
-        task: Name of the task.
-        seed: Of the first episode.
-
-    Raises:
-        ValueError: If there is no such task, or the scene is too small for it.
-    """
-    kind = find_task(task)
-    physics = kind.physics()
-    first = kind(scene.nodes(physics), scene.camera.position)
-    first.reset(0, np.random.default_rng(seed))
-    changed = {name: value for name, value in asdict(physics).items() if value != getattr(PhysicsConfig(), name) and name != "device"}
-    changed |= {"regions": list(first.regions())} if first.regions() else {}
-    save_ply(scene.model, folder / "model.ply")
-    save_cameras(list(scene.cameras), folder / "cameras.json")
-    bare = {"instruments": ["none"]}  # the tool of a task is a tip that reaches every pose and is not seen
-    parameters = {
-        "reconstruction_node": {"mode": "lockstep", "model_file": str(folder.resolve() / "model.ply")},
-        "physics_node": {"mode": "lockstep", "arm_source": "commanded", "lockstep_inputs": ["pose", "jaw"], **bare, **changed},
-        "rendering_node": {"mode": "lockstep"},
-        "policy": {"task": task, "scene": str(folder.resolve()), "seed": seed},
-    }
-    sections = {f"/**/{node}": {"ros__parameters": values} for node, values in parameters.items()}
-    (folder / "parameters.yaml").write_text(yaml.safe_dump(sections, sort_keys=False))
 
 
 @functools.cache

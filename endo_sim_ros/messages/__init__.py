@@ -43,6 +43,7 @@ from endo_sim_ros.messages.headers import check_frame as check_frame, encode_clo
 from endo_sim_ros.messages.images import (
     decode_depth as decode_depth,
     decode_image as decode_image,
+    decode_labels as decode_labels,
     decode_mask as decode_mask,
     encode_compressed as encode_compressed,
     encode_image as encode_image,

@@ -5,7 +5,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from endo_sim_ros.messages.headers import make_header
-from endo_sim_ros.messages.topics import DEPTH, LEFT_IMAGE, MASK
+from endo_sim_ros.messages.topics import DEPTH, LEFT_IMAGE, MASK, RENDERED_SEGMENTATION
 from endo_sim_ros.messages.types import Message, MessageError, MessageTypes, ros_types
 
 _COLOR_CHANNELS = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "8UC1": 1, "8UC3": 3}
@@ -70,6 +70,17 @@ def decode_depth(message: Message, topic: str = DEPTH.name) -> np.ndarray:
     else:
         raise MessageError(f"{topic}: encoding {message.encoding!r} is not supported; publish 32FC1 (metres) or 16UC1 (millimetres)")
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+
+
+def decode_labels(message: Message, topic: str = RENDERED_SEGMENTATION.name) -> np.ndarray:
+    """What is in each pixel [H, W] uint8, of a mono8 Image.
+
+    Raises:
+        MessageError: If the encoding is not supported, or size and data disagree.
+    """
+    if message.encoding not in ("mono8", "8UC1"):
+        raise MessageError(f"{topic}: encoding {message.encoding!r} is not supported; publish mono8, a label for each pixel")
+    return _pixels(message, np.uint8, 1, topic)[..., 0]
 
 
 def decode_mask(message: Message, topic: str = MASK.name) -> np.ndarray:

@@ -152,6 +152,8 @@ class RenderingNodeConfig(WorldConfig):
     """Frame in the headers of rendered images."""
     right_frame: str = RIGHT_FRAME
     """The same of the right eye."""
+    baseline: Annotated[float, Range(0, 0.05, "m")] = 0.0
+    """Distance between the eyes where endoscope/right/camera_info does not say it; 0 = no right eye then."""
     instruments: bool = True
     """Draw the instruments of the arms where link_poses says they are."""
     arms: tuple[str, ...] = ("PSM1",)

@@ -50,6 +50,8 @@ class PhysicsNode(EndoNode):
         self._unplaced = ""  # why arms have no place
         self._lockstep = self._options.mode == "lockstep"
         self._commands = CommandQueue(frozenset((n, kind) for n in self._tools for kind in self._options.lockstep_inputs))
+        self._placing = CommandQueue(self._commands.needed)  # lockstep: what puts the arms where an episode begins
+        self._at_rest = False  # whether no step was taken of the simulation
         # In real time only the newest command counts, and none may queue; in lockstep none may be lost.
         depth = MOST_WAITING if self._lockstep else 1
         self._nodes_pub = self.publisher(messages.CONTROL_NODES, MOST_WAITING if self._lockstep else STREAM_DEPTH, alone=True)
@@ -129,7 +131,8 @@ class PhysicsNode(EndoNode):
             stamp = messages.stamp_to_ns(message.header.stamp)
             if stamp <= 0:
                 raise ValueError("a stamp of zero; in lockstep all parts of a command bear its stamp")
-            self._commands.put(stamp, (name, kind), (topic, act))
+            placing = self._at_rest and stamp == self._simulated_stamp
+            (self._placing if placing else self._commands).put(stamp, (name, kind), (topic, act))
             self._run_commands()
             return
         act()
@@ -138,20 +141,22 @@ class PhysicsNode(EndoNode):
             self._step_if_due()
 
     def _run_commands(self) -> None:
-        """Lockstep: one step for each complete command."""
+        """Lockstep: one step for each complete command, but none for one with the stamp of the state at rest."""
 
         def give_up(stamp: int, missing: set) -> None:
             parts = ", ".join(sorted(f"{name}'s {kind}" for name, kind in missing))
             self.report_error(f"the command of {stamp * 1e-9:.6f} s is given up: a later one is complete, but {parts} never came")
 
-        while self.simulation is not None and (command := self._commands.take(give_up)):
+        while self.simulation is not None and (command := self._placing.take(give_up) or self._commands.take(give_up)):
             stamp, parts = command
             for part in sorted(parts, key=lambda part: (COMMAND_PARTS.index(part[1]), part[0])):  # poses before what needs them
                 topic, act = parts[part]
                 with self.guard(topic):
                     act()
-            self.step(self.simulation)
-            self._publish(self.simulation, stamp)
+            placing = self._at_rest and stamp == self._simulated_stamp
+            if not placing:
+                self.step(self.simulation)
+            self._publish(self.simulation, stamp, at_rest=placing)
 
     def _apply_tools(self, simulation: TissueSimulation) -> None:
         for name, arm in self._tools.items():
@@ -260,7 +265,7 @@ class PhysicsNode(EndoNode):
 
     def _publish(self, simulation: TissueSimulation, stamp: int, at_rest: bool = False) -> None:
         """The state, the reactions and what belongs to them, all with one stamp; the state at rest is no moment in time."""
-        world, state = self._options.world_frame, simulation.state()
+        world, state, self._at_rest = self._options.world_frame, simulation.state(), at_rest
         if self._clock_pub is not None and not at_rest:
             self._clock_pub.publish(messages.encode_clock(stamp))
         cut = messages.cut_number(simulation.cuts)
@@ -290,6 +295,7 @@ class PhysicsNode(EndoNode):
             return False, "there is no model yet"
         self.simulation.reset()
         self._commands.clear()
+        self._placing.clear()
         self._start_timing()
         for arm in self.arms.values():
             arm.reset()

@@ -16,7 +16,6 @@ from endo_sim_ros.messages import OK, STATE, WARN, PolicyState
 from endo_sim_ros.nodes.base import EndoNode, run
 from endo_sim_ros.nodes.configs import PolicyConfig, arm_names
 
-_OPEN, _CLOSED = 1.0, 0.0  # rad
 _PATIENCE = 30.0  # seconds; a request to a physics_node that was killed just now is never answered
 
 
@@ -45,6 +44,7 @@ class PolicyNode(EndoNode):
         self._resetting = self.create_client(Trigger, f"{config.physics_node}/reset")
         self._state, self._missing = PolicyState.WAITING, ""  # and what for
         self._solved, self._done = 0, 0
+        self._model_stamp = 0  # ns, which the state at rest has
         self._stamp = 0  # of the command whose answer is awaited; 0 = the state at rest
         self._heard: dict[str, Any] = {}  # parts of that answer
         self._rows: list[tuple[np.ndarray, np.ndarray, float, bool, int]] = []
@@ -92,6 +92,7 @@ class PolicyNode(EndoNode):
             if not np.array_equal(cloud.rest, self._task.nodes.rest):
                 text = f"the tissue on control_nodes, {len(cloud.rest)} nodes, is not that of the scene and the task"
                 raise ValueError(f"{text}, {len(self._task.nodes)} nodes; start the graph with what `endo-sim scene` wrote")
+            self._model_stamp = stamp
             self._answer("nodes", cloud.positions)
         elif stamp == self._stamp:
             self._answer("nodes", cloud.positions)
@@ -115,6 +116,8 @@ class PolicyNode(EndoNode):
         if ended:
             self._end(outcome.success[0])
         else:
+            if not self._stamp:  # the tool begins where the task has it, and is seen there
+                self._command(self._task.tips(), np.zeros(1, bool), self._model_stamp)
             self._seen = observation[0]
             self._act(observation)
 
@@ -123,11 +126,15 @@ class PolicyNode(EndoNode):
         self._action = actions[0]
         tips, closed = self._task.act(actions)
         self._stamp, self._heard = self._stamp + self._step_ns, {}
+        self._state = PolicyState.WORKING
+        self._command(tips, closed, self._stamp)
+
+    def _command(self, tips: np.ndarray, closed: np.ndarray, stamp: int) -> None:
+        """Publish where the tip shall be [1, 3], m, world, and whether the jaw is closed [1]."""
         pose = np.eye(4)
         pose[:3, 3] = tips[0]
-        self._state = PolicyState.WORKING
-        self._pose_pub.publish(messages.encode_pose(pose, self._stamp, self._config.world_frame))
-        self._jaw_pub.publish(messages.encode_jaw(_CLOSED if closed[0] else _OPEN, self._stamp))
+        self._pose_pub.publish(messages.encode_pose(pose, stamp, self._config.world_frame))
+        self._jaw_pub.publish(messages.encode_jaw(self._task.closed_jaw if closed[0] else self._task.open_jaw, stamp))
 
     def _end(self, success: bool) -> None:
         self._done += 1

@@ -1,6 +1,6 @@
 """The topics of rendered pictures: what is asked for, and how it is published."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -40,6 +40,13 @@ def right_camera(left: Camera, info: CameraInfo) -> Camera:
     pose = left.pose.copy()
     pose[:3, 3] += info.baseline * pose[:3, 0]
     return Camera(info.P[:, :3], info.width, info.height, pose).resized(left.width, left.height)
+
+
+def beside(left: CameraInfo, baseline: float) -> CameraInfo:
+    """A right eye like a left one, at a distance from it, metres."""
+    P = left.P.copy()
+    P[0, 3] = -P[0, 0] * baseline
+    return replace(left, P=P)
 
 
 class RenderedTopics:

@@ -16,7 +16,7 @@ from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode, run, sentence
 from endo_sim_ros.nodes.configs import RenderingNodeConfig, arm_names
 from endo_sim_ros.nodes.model_tracker import BoundModel, ModelTracker
 from endo_sim_ros.nodes.pacing import MOST_WAITING, Pacer
-from endo_sim_ros.nodes.rendered_topics import RenderedTopics, Shown, right_camera
+from endo_sim_ros.nodes.rendered_topics import RenderedTopics, Shown, beside, right_camera
 from endo_sim_ros.nodes.shown_instruments import ShownInstruments
 from endo_sim_ros.rendering import RenderingConfig
 
@@ -178,6 +178,13 @@ class RenderingNode(EndoNode):
             return None
         return Camera(info.P[:, :3], info.width, info.height, pose)
 
+    def _right(self) -> CameraInfo | None:
+        """The right eye asked for, if there is one."""
+        left = self._info or self._training_info
+        if self._right_info is not None or not self.options.baseline or left is None:
+            return self._right_info
+        return beside(left, self.options.baseline)
+
     # ----------------------------------------------------------------- images
 
     def _on_timer(self) -> None:
@@ -193,7 +200,7 @@ class RenderingNode(EndoNode):
         camera, now = self._camera(), time.monotonic()
         if self.tissue.bound is None or camera is None or self.now_ns() == 0:  # with use_sim_time, before /clock
             return
-        if self._dirty or self._output is None or not self._topics.wanted(self._right_info).within(self._output.wanted):
+        if self._dirty or self._output is None or not self._topics.wanted(self._right()).within(self._output.wanted):
             if not self._pacer.is_due(now, 1 / self.options.rate):
                 return
             self._dirty = False
@@ -307,9 +314,10 @@ class RenderingNode(EndoNode):
         if nodes is not None and bound.follows(nodes):
             state = (nodes.positions, nodes.F)
             self.tissue.cut(bound, nodes)
-        wanted, cameras = self._topics.wanted(self._right_info), [camera]
-        if wanted.right and self._right_info is not None:
-            cameras.append(right_camera(camera, self._right_info))
+        right = self._right()
+        wanted, cameras = self._topics.wanted(right), [camera]
+        if wanted.right and right is not None:
+            cameras.append(right_camera(camera, right))
         views = bound.renderer.views(cameras, *state, depth=wanted.depth, labels=wanted.labels, instruments=instruments)
         labels = views[0].labels
         shown = Shown(views, cameras, wanted, None if labels is None else self.instruments.labels(instruments, labels))

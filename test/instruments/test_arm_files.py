@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from endo_sim_ros.core.config import ConfigError
-from endo_sim_ros.instruments import arm_names, load_arm, tool_names
+from endo_sim_ros.instruments import arm_names, load_arm, save_tool, tool_names
 
 JOINT = {"name": "roll", "type": "revolute", "alpha": 0, "A": 0, "D": 0.4, "qmin": -1, "qmax": 1}
 
@@ -75,6 +75,19 @@ def test_a_rounded_tooltip_offset_is_made_a_rotation(tmp_path):
     offset = load_arm("ECM", str(tmp_path / "scope.json")).tooltip_offset
     np.testing.assert_allclose(offset[:3, :3] @ offset[:3, :3].T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(offset, rows, atol=1e-4)
+
+
+@pytest.mark.parametrize("tool", ["PROGRASP_FORCEPS", "PERMANENT_CAUTERY_HOOK"])
+def test_a_tool_with_another_tip_is_saved_and_loaded(tool, tmp_path):
+    arm = load_arm("PSM", tool)
+    moved = np.eye(4)
+    moved[:3, 3] = 0.001, 0.002, 0.01
+    arm = replace(arm, tooltip_offset=arm.tooltip_offset @ moved)
+    save_tool(tmp_path / f"{arm.tool}.json", arm)
+    loaded = load_arm("PSM", str(tmp_path / f"{arm.tool}.json"))
+    assert replace(loaded, tooltip_offset=0, coupling=0) == replace(arm, tooltip_offset=0, coupling=0)
+    np.testing.assert_allclose(loaded.tooltip_offset, arm.tooltip_offset, atol=1e-15)
+    np.testing.assert_array_equal(loaded.coupling, arm.coupling)
 
 
 def test_discs_turn_joints_and_back(arms):

@@ -1,0 +1,54 @@
+"""A task in a scene as the files that start the graph of ROS nodes on it."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from endo_sim_ros.core.cameras import save_cameras
+from endo_sim_ros.core.gaussians import save_ply
+from endo_sim_ros.instruments import save_tool
+from endo_sim_ros.learning.config import SightConfig
+from endo_sim_ros.learning.held_tools import hold_tool
+from endo_sim_ros.learning.scenes import Scene
+from endo_sim_ros.learning.tasks import find_task
+from endo_sim_ros.physics import PhysicsConfig
+
+
+def save_scene(scene: Scene, folder: Path, task: str, seed: int = 0, sight: SightConfig = SightConfig()) -> None:
+    """Write model.ply, cameras.json, the tool's file and parameters.yaml, which start the graph in lockstep on a task in this scene.
+
+    Args:
+        scene: What to write.
+        folder: Where; it is made if need be.
+        task: Name of the task.
+        seed: Of the first episode.
+        sight: What the endoscope shows. Which of the pictures are rendered is up to who subscribes to them.
+
+    Raises:
+        ValueError: If there is no such task or tool, the scene is too small for it, or an arm does not reach it.
+    """
+    kind = find_task(task)
+    physics = kind.physics()
+    first = kind(scene.nodes(physics), scene.camera.position)
+    first.reset(0, np.random.default_rng(seed))
+    changed = {name: value for name, value in asdict(physics).items() if value != getattr(PhysicsConfig(), name) and name != "device"}
+    changed |= {"regions": list(first.regions())} if first.regions() else {}
+    save_ply(scene.model, folder / "model.ply")
+    save_cameras(list(scene.cameras), folder / "cameras.json")
+    arm: dict[str, Any] = {"instruments": ["none"]}  # a tip that reaches every pose and is not seen
+    if sight.instrument:
+        held = hold_tool(kind, scene, sight.tool)
+        tool = folder.resolve() / f"{held.arm.tool}.json"
+        save_tool(tool, held.arm)
+        arm = {"instruments": [str(tool)], "frames": [held.frame]}
+    parameters = {
+        "reconstruction_node": {"mode": "lockstep", "model_file": str(folder.resolve() / "model.ply")},
+        "physics_node": {"mode": "lockstep", "arm_source": "commanded", "lockstep_inputs": ["pose", "jaw"], **arm, **changed},
+        "rendering_node": {"mode": "lockstep", "image_width": sight.image_width, "baseline": sight.baseline},
+        "policy": {"task": task, "scene": str(folder.resolve()), "seed": seed},
+    }
+    sections = {f"/**/{node}": {"ros__parameters": values} for node, values in parameters.items()}
+    (folder / "parameters.yaml").write_text(yaml.safe_dump(sections, sort_keys=False))

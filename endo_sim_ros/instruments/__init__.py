@@ -7,7 +7,7 @@ from endo_sim_ros.instruments.arm_files import (
     tool_names as tool_names,
 )
 from endo_sim_ros.instruments.inverse import Reach as Reach, ReachConfig as ReachConfig, solve_inverse as solve_inverse
-from endo_sim_ros.instruments.kinematics import ArmKinematics as ArmKinematics, Joint as Joint
+from endo_sim_ros.instruments.kinematics import JOINTS as JOINTS, ArmKinematics as ArmKinematics, Joint as Joint
 from endo_sim_ros.instruments.placement import Placement as Placement, PlacementConfig as PlacementConfig, place_arm as place_arm
 from endo_sim_ros.instruments.shapes import (
     LINKS as LINKS,

@@ -11,6 +11,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+JOINTS = ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw")
+"""Names of the joints of an arm with an instrument."""
+
 
 @dataclass(frozen=True)
 class Joint:

@@ -12,13 +12,15 @@ state               pose of the tip (x y z qx qy qz qw), jaw, reaction (force x 
 environment_state   of all control nodes: mean displacement x y z, largest displacement; then per arm, over the
                     `NEAREST` nodes nearest to its tip: mean offset from the tip x y z, mean displacement x y z
 action              commanded pose of the tip (x y z qx qy qz qw), jaw, wrench (force x y z, torque x y z) on the tissue
+joints              yaw, pitch, insertion (m), roll, wrist_pitch, wrist_yaw, where all arms say them
 ==================  ==========================================================================================
+
+Beside these: the pose of the camera (x y z qx qy qz qw), the right eye and what is in each pixel, where they were recorded.
 """
 
 import functools
 import logging
-from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -27,37 +29,64 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from endo_sim_ros import messages
-from endo_sim_ros.core.cameras import matrix_to_quat, parse_frames
+from endo_sim_ros.core.cameras import parse_frames
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.messages import ControlNodeCloud, MessageError, Topic, stamp_to_ns
+from endo_sim_ros.instruments import JOINTS
+from endo_sim_ros.learning.streams import Stream, continuous, read_streams, same_sign
+from endo_sim_ros.messages import ControlNodeCloud, MessageError, Topic
 from endo_sim_ros.sequences.bag import WORLD_FRAME, BagReader
 
 NEAREST = 8  # control nodes around a tip; averages over them do not jump when one takes another's place
 JAW_OPEN = 1.0  # rad, where no jaw was ever commanded; nothing is held then
 DEFAULT_FPS = 25
-_JUMP = 500_000_000  # ns; messages that are merely late step back by less
 _EVEN = 10_000  # ns; within it the steps of a policy are even, and those of a clock in real time are not
 
-_POSE, _XYZ = ("x", "y", "z", "qx", "qy", "qz", "qw"), ("x", "y", "z")
+POSE_NAMES, _XYZ = ("x", "y", "z", "qx", "qy", "qz", "qw"), ("x", "y", "z")
 _WRENCH = tuple(f"{kind}_{axis}" for kind in ("force", "torque") for axis in _XYZ)
+
+_FORMS = (  # of images, raw and compressed
+    (messages.RENDERED_IMAGE, messages.RENDERED_COMPRESSED),
+    (messages.RENDERED_RIGHT_IMAGE, messages.RENDERED_RIGHT_COMPRESSED),
+)
+_PICTURES = dict(zip([*_FORMS[0], *_FORMS[1], messages.RENDERED_SEGMENTATION], ["left", "left", "right", "right", "segmentation"]))
 
 Sampling = Literal["auto", "rate", "lockstep"]
 
 
 def state_names(arms: tuple[str, ...]) -> list[str]:
     """Names of the columns of `Episode.state`."""
-    return [f"{arm}.{name}" for arm in arms for name in (*_POSE, "jaw", *(f"reaction_{part}" for part in _WRENCH))]
+    return [f"{arm}.{name}" for arm in arms for name in (*POSE_NAMES, "jaw", *(f"reaction_{part}" for part in _WRENCH))]
 
 
 def action_names(arms: tuple[str, ...]) -> list[str]:
     """Names of the columns of `Episode.action`."""
-    return [f"{arm}.{name}" for arm in arms for name in (*_POSE, "jaw", *_WRENCH)]
+    return [f"{arm}.{name}" for arm in arms for name in (*POSE_NAMES, "jaw", *_WRENCH)]
 
 
 def environment_names(arms: tuple[str, ...]) -> list[str]:
     """Names of the columns of `Episode.environment_state`."""
     near = (f"{arm}.near_{what}_{axis}" for arm in arms for what in ("offset", "displacement") for axis in _XYZ)
     return [*(f"mean_displacement_{axis}" for axis in _XYZ), "max_displacement", *near]
+
+
+def joint_names(arms: tuple[str, ...]) -> list[str]:
+    """Names of the columns of `Episode.joints`."""
+    return [f"{arm}.{name}" for arm in arms for name in JOINTS]
+
+
+@dataclass(frozen=True)
+class Shown:
+    """The pictures of one topic, a row each.
+
+    Args:
+        topic: Where they were recorded.
+        size: Height and width, pixels.
+        numbers: Which of the messages of the topic each row [T] shows.
+    """
+
+    topic: Topic
+    size: tuple[int, int]
+    numbers: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -71,24 +100,32 @@ class Episode:
     state: np.ndarray  # [T, 14·A] float32
     environment_state: np.ndarray  # [T, 4 + 6·A] float32
     action: np.ndarray  # [T, 14·A] float32
-    image_size: tuple[int, int]  # height, width
-    image_numbers: np.ndarray  # [T] which of the bag's rendered images is shown
-    image_topic: Topic = messages.RENDERED_IMAGE  # or that of compressed images
+    left: Shown  # rendered images
+    right: Shown | None = None  # those of the right eye
+    segmentation: Shown | None = None  # what is in each pixel
+    joints: np.ndarray | None = None  # [T, 6·A] float32
+    camera_pose: np.ndarray | None = None  # [T, 7] float32, world
 
     def __len__(self) -> int:
         return len(self.state)
 
-    def images(self) -> Iterator[np.ndarray]:
-        """The T rendered images, RGB [H, W, 3] uint8.
+    @property
+    def content(self) -> tuple[str, ...]:
+        """What there is beside what all episodes have."""
+        return tuple(name for name in ("right", "segmentation", "joints", "camera_pose") if getattr(self, name) is not None)
+
+    def images(self, shown: Shown | None = None) -> Iterator[np.ndarray]:
+        """The T rendered images, RGB [H, W, 3] uint8, or other pictures of the episode; labels are [H, W].
 
         Raises:
             SequenceError: If one cannot be used or has another size than the first.
         """
-        topic = self.image_topic
-        for message in _picked(self.bag, topic, self.image_numbers):
-            image = _usable(self.bag, lambda message=message: messages.decode_image(message, topic.name))
-            if image.shape[:2] != self.image_size:
-                (h, w), (height, width) = image.shape[:2], self.image_size
+        shown = shown or self.left
+        decode = messages.decode_labels if shown is self.segmentation else messages.decode_image
+        for message in _picked(self.bag, shown.topic, shown.numbers):
+            image = _usable(self.bag, lambda message=message: decode(message, shown.topic.name))
+            if image.shape[:2] != self.left.size:
+                (h, w), (height, width) = image.shape[:2], self.left.size
                 raise SequenceError(f"{self.bag}: rendered images change from {width}×{height} to {w}×{h}; record them apart")
             yield image
 
@@ -122,9 +159,10 @@ def read_episode(
         if not reader.message_count:
             raise SequenceError(f"{bag}: the recording is empty; was the graph running?")
         arms = arms or _arms(reader.topics)
-        pictures = _image_topic(reader.topics)
-        reader.require(*((topic,) for topic in _needed(arms, pictures)))
-        streams = _usable(bag, lambda: _streams(reader, arms, known, pictures))
+        pictures = _picture_topics(reader.topics)
+        reader.require(*((topic,) for topic in _needed(arms, pictures[:1])))
+        streams = _usable(bag, lambda: read_streams(reader, arms, known, pictures))
+    pictures = tuple(topic for topic in pictures if topic == pictures[0] or topic in streams)
     for topic in _needed(arms, pictures):
         if topic not in streams:
             raise SequenceError(f"{bag}: no message with a time on /{topic.name}; record while the graph runs")
@@ -134,27 +172,33 @@ def read_episode(
     tips, state, action = [], [], []
     for arm in arms:
         tip = streams[messages.tool_pose(arm)]
-        jaw_state = streams.get(messages.tool_jaw_state(arm), _Stream.constant([JAW_OPEN]))
+        jaw_state = streams.get(messages.tool_jaw_state(arm), Stream.constant([JAW_OPEN]))
         jaw_command = streams.get(messages.tool_jaw(arm), jaw_state)
         jaw = streams.get(messages.tool_jaw_state(arm), jaw_command)
-        pose = _continuous(tip.at(times))
+        pose = continuous(tip.at(times))
         command = streams.get(messages.tool_pose_command(arm), tip).at(times, before=tip)
-        command = _same_sign(command, pose)
-        wrench = streams.get(messages.tool_wrench(arm), _Stream.constant(np.zeros(6)))
+        command = same_sign(command, pose)
+        wrench = streams.get(messages.tool_wrench(arm), Stream.constant(np.zeros(6)))
         reaction = streams[messages.tool_reaction(arm)]
-        state += [pose[:-1], jaw.at(now, before=_Stream.constant([JAW_OPEN])), reaction.at(now)]
+        state += [pose[:-1], jaw.at(now, before=Stream.constant([JAW_OPEN])), reaction.at(now)]
         action += [
             command[1:],
-            jaw_command.at(following, before=_Stream.constant([JAW_OPEN])),
-            wrench.at(following, before=_Stream.constant(np.zeros(6))),
+            jaw_command.at(following, before=Stream.constant([JAW_OPEN])),
+            wrench.at(following, before=Stream.constant(np.zeros(6))),
         ]
         tips.append(pose[:-1, :3])
     summaries = [
         summarize_tissue(_usable(bag, lambda message=message: messages.decode_control_nodes(message)), tip)
         for message, tip in zip(_picked(bag, messages.CONTROL_NODES, nodes), np.stack(tips, 1), strict=True)
     ]
-    numbers = streams[pictures].at(now).astype(int)
-    height, width = numbers[0, 1:]
+    found: dict[str, Any] = {}
+    for topic in pictures:
+        rows = streams[topic].at(now).astype(int)
+        found[_PICTURES[topic]] = Shown(topic, (int(rows[0, 1]), int(rows[0, 2])), rows[:, 0])
+    if all(messages.tool_joints(arm) in streams for arm in arms):
+        found["joints"] = np.hstack([streams[messages.tool_joints(arm)].at(now) for arm in arms]).astype(np.float32)
+    if messages.RENDERED_POSE in streams:
+        found["camera_pose"] = continuous(streams[messages.RENDERED_POSE].at(now)).astype(np.float32)
     return Episode(
         bag,
         arms,
@@ -163,9 +207,7 @@ def read_episode(
         np.hstack(state).astype(np.float32),
         np.array(summaries, np.float32),
         np.hstack(action).astype(np.float32),
-        (int(height), int(width)),
-        numbers[:, 0],
-        pictures,
+        **found,
     )
 
 
@@ -189,141 +231,27 @@ def _arms(present: dict[str, str]) -> tuple[str, ...]:
     return tuple(sorted(found[0] & found[1])) or ("PSM1",)
 
 
-def _image_topic(present: dict[str, str]) -> Topic:
-    """The topic of the rendered images: raw ones, where they were recorded, are exact."""
-    raw, compressed = messages.RENDERED_IMAGE, messages.RENDERED_COMPRESSED
-    return compressed if f"/{compressed.name}" in present and f"/{raw.name}" not in present else raw
+def _picture_topics(present: dict[str, str]) -> tuple[Topic, ...]:
+    """The topics of the pictures: of the left eye, and of what else was recorded. Raw ones, where they were recorded, are exact."""
+    recorded = lambda topic: f"/{topic.name}" in present
+    found = []
+    for raw, compressed in _FORMS:
+        form = compressed if recorded(compressed) and not recorded(raw) else raw
+        found += [form] if recorded(form) or raw == messages.RENDERED_IMAGE else []
+    return (*found, *([messages.RENDERED_SEGMENTATION] if recorded(messages.RENDERED_SEGMENTATION) else []))
 
 
-def _observed(arms: tuple[str, ...], pictures: Topic) -> list[Topic]:
+def _observed(arms: tuple[str, ...], pictures: tuple[Topic, ...]) -> list[Topic]:
     """What the simulation says in each step."""
-    return [pictures, messages.CONTROL_NODES, *map(messages.tool_reaction, arms)]
+    return [*pictures, messages.CONTROL_NODES, *map(messages.tool_reaction, arms)]
 
 
-def _needed(arms: tuple[str, ...], pictures: Topic) -> list[Topic]:
+def _needed(arms: tuple[str, ...], pictures: tuple[Topic, ...]) -> list[Topic]:
     return [*_observed(arms, pictures), *map(messages.tool_pose, arms)]
 
 
 def _commands(arm: str) -> list[Topic]:
     return [make(arm) for make in (messages.tool_pose_command, messages.tool_pose, messages.tool_wrench, messages.tool_jaw)]
-
-
-# --------------------------------------------------------------------------------------------------------------- streams
-
-
-class _Stream(NamedTuple):
-    """The messages of a topic by the time in their headers."""
-
-    stamps: np.ndarray  # [N] int64, ns, not decreasing
-    values: np.ndarray  # [N, D]
-
-    @classmethod
-    def constant(cls, value: Any) -> "_Stream":
-        return cls(np.array([np.iinfo(np.int64).min]), np.array([value], np.float64))
-
-    def at(self, times: np.ndarray, before: "_Stream | None" = None) -> np.ndarray:
-        """The last values [T, D] at times [T]; ahead of the first, those of another stream."""
-        indices = np.searchsorted(self.stamps, times, "right") - 1
-        values = self.values[np.maximum(indices, 0)]
-        return values if before is None else np.where((indices >= 0)[:, None], values, before.at(times))
-
-
-def _streams(reader: BagReader, arms: tuple[str, ...], frames: Mapping[str, np.ndarray], pictures: Topic) -> dict[Topic, _Stream]:
-    """Streams of the topics that have messages; of images (number, height, width), of control nodes the number.
-
-    Frames are taken as physics_node does. What is large is only numbered here, in the order of the bag, and read again when it is wanted.
-    """
-    decoders = {}
-    for arm in arms:
-        for make in (messages.tool_pose, messages.tool_pose_command):
-            decoders[make(arm)] = lambda m, topic, arm=arm: _pose_row(messages.decode_tip(m, frames, arm, topic))
-        for make in (messages.tool_jaw, messages.tool_jaw_state):
-            decoders[make(arm)] = lambda m, topic: [messages.decode_jaw(m, topic)]
-        for make in (messages.tool_wrench, messages.tool_reaction):
-            decoders[make(arm)] = lambda m, topic, arm=arm: _wrench_row(m, topic, arm, frames)
-    rows: dict[Topic, list] = defaultdict(list)
-    numbers, size = {pictures: -1, messages.CONTROL_NODES: -1}, ()
-    for topic, _, message in reader.messages((*numbers, *decoders)):
-        if topic in numbers:
-            numbers[topic] += 1
-            if topic == pictures and not size:  # that of the others is compared when they are read
-                raw = topic == messages.RENDERED_IMAGE
-                size = (message.height, message.width) if raw else messages.decode_image(message, topic.name).shape[:2]
-            row = [numbers[topic], *(size if topic == pictures else ())]
-        else:
-            row = decoders[topic](message, topic.name)
-        if stamp := stamp_to_ns(message.header.stamp):  # zero marks an invalid message
-            rows[topic].append((stamp, row))
-    reactions = {stamp for arm in arms for stamp, _ in rows[messages.tool_reaction(arm)]}
-    streams = {}
-    for topic, pairs in rows.items():
-        if not pairs:
-            continue
-        if topic in numbers:
-            pairs = _one_run(topic, pairs, reactions)
-        pairs.sort(key=lambda pair: pair[0])
-        if topic in numbers:  # they are read in the order of the bag: what came late is left out
-            highest = np.maximum.accumulate([row[0] for _, row in pairs])
-            pairs = [pair for pair, number in zip(pairs, highest) if pair[1][0] == number]
-        streams[topic] = _Stream(np.array([s for s, _ in pairs], np.int64), np.array([row for _, row in pairs], np.float64))
-    for arm in arms:
-        tip = streams.get(messages.tool_pose(arm))
-        for topic in (messages.tool_wrench(arm), messages.tool_reaction(arm)):
-            if tip is not None and topic in streams:
-                streams[topic] = _to_world(streams[topic], tip)
-    return streams
-
-
-def _one_run(topic: Topic, pairs: list, reactions: set[int]) -> list:
-    """The observations (stamp, row) of the only run of a simulation. Lone ones, as after a reset, may lie about it in time.
-
-    Raises:
-        MessageError: If there are several runs.
-    """
-    stamps = np.array([stamp for stamp, _ in pairs])
-    runs = np.split(np.arange(len(pairs)), np.flatnonzero(np.diff(stamps) < -_JUMP) + 1)
-    if len(runs) == 1:
-        return pairs
-    runs = [run for run in runs if len(reactions.intersection(stamps[run].tolist())) > 1]
-    if len(runs) > 1:
-        raise MessageError(f"/{topic.name}: time goes back, as after a reset; record each episode into a bag of its own")
-    return [pairs[index] for run in runs for index in run]
-
-
-def _pose_row(pose: np.ndarray) -> np.ndarray:
-    """Position and quaternion xyzw, [7]."""
-    w, *xyz = matrix_to_quat(pose[:3, :3])
-    return np.array([*pose[:3, 3], *xyz, w])
-
-
-def _wrench_row(message: Any, topic: str, arm: str, frames: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Force and torque in world axes and 1 or, in those of the tip, and 0, [7]."""
-    frame = messages.check_frame(message, (arm, "", *frames), topic)
-    R = frames.get(frame, np.eye(4))[:3, :3]  # any other is the tool's own
-    return np.array([*(vector for part in messages.decode_wrench(message, topic) for vector in R @ part), frame in frames])
-
-
-def _to_world(wrenches: _Stream, tips: _Stream) -> _Stream:
-    """Wrenches [N, 6] in world axes of ones [N, 7] whose last column says whether they are so already, else in the tip's."""
-    x, y, z, w = tips.at(wrenches.stamps)[:, 3:].T[:, :, None]
-    axis = np.hstack([x, y, z])
-    rotate = lambda v: v + 2 * np.cross(axis, np.cross(axis, v) + w * v)
-    vectors = wrenches.values[:, :6]
-    turned = np.hstack([rotate(vectors[:, :3]), rotate(vectors[:, 3:])])
-    return _Stream(wrenches.stamps, np.where(wrenches.values[:, 6:] > 0, vectors, turned))
-
-
-def _same_sign(poses: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Poses [T, 7] whose quaternions have the sign that is nearer to the reference's."""
-    sign = np.where((poses[:, 3:] * reference[:, 3:]).sum(1, keepdims=True) < 0, -1, 1)
-    return np.hstack([poses[:, :3], poses[:, 3:] * sign])
-
-
-def _continuous(poses: np.ndarray) -> np.ndarray:
-    """Poses [T, 7] whose quaternions do not change their sign from row to row."""
-    flips = (poses[1:, 3:] * poses[:-1, 3:]).sum(1) < 0
-    sign = np.cumprod(np.concatenate([[1], np.where(flips, -1, 1)]))[:, None]
-    return np.hstack([poses[:, :3], poses[:, 3:] * sign])
 
 
 # ----------------------------------------------------------------------------------------------------------------- times
@@ -335,7 +263,7 @@ class _Rate(NamedTuple):
 
 
 def _frame_times(
-    bag: Path, streams: dict[Topic, _Stream], arms: tuple[str, ...], fps: int | None, sampling: Sampling, pictures: Topic
+    bag: Path, streams: dict[Topic, Stream], arms: tuple[str, ...], fps: int | None, sampling: Sampling, pictures: tuple[Topic, ...]
 ) -> tuple[np.ndarray, _Rate]:
     """Times [T + 1] (ns) of the rows and of what follows the last one."""
     if sampling != "rate":
@@ -376,7 +304,7 @@ def _even(steps: np.ndarray) -> bool:
     return bool((np.abs(gaps - period * np.round(gaps / period)) < _EVEN).all())
 
 
-def _steps(streams: dict[Topic, _Stream], arms: tuple[str, ...], pictures: Topic) -> np.ndarray:
+def _steps(streams: dict[Topic, Stream], arms: tuple[str, ...], pictures: tuple[Topic, ...]) -> np.ndarray:
     """Stamps that all observations bear, and a command of each arm; of the first, which nothing led to, no command."""
     stamps = functools.reduce(np.intersect1d, (streams[topic].stamps for topic in _observed(arms, pictures)))
     commanded = stamps

@@ -2,8 +2,9 @@
 
 Written here and not by the lerobot library, which wants older torch, numpy and OpenCV than this package runs with; tests
 read the result with it where it is installed. Each recording is an episode with files of its own. Columns beside those that
-every LeRobot dataset has: `observation.images.endoscope`, and `observation.state`, `observation.environment_state` and
-`action` as described in `episodes`.
+every LeRobot dataset has: `observation.images.endoscope.left`, and `observation.state`, `observation.environment_state` and
+`action` as described in `episodes`. What else was recorded is in `observation.images.endoscope.right`, `observation.segmentation`,
+`observation.joints` and `observation.camera_pose`. The cameras have the names of the Open-H datasets of da Vinci robots.
 """
 
 import json
@@ -20,17 +21,23 @@ from rich.progress import track
 from endo_sim_ros.core import drawing
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.learning.episodes import (
+    POSE_NAMES,
     Episode,
     Sampling,
     action_names,
     environment_names,
+    joint_names,
     read_episode,
     state_names,
 )
 from endo_sim_ros.sequences.bag import WORLD_FRAME
 
 VERSION = "v3.0"
-IMAGE = "observation.images.endoscope"
+IMAGE = "observation.images.endoscope.left"
+IMAGE_RIGHT = "observation.images.endoscope.right"
+SEGMENTATION = "observation.segmentation"
+JOINTS, CAMERA_POSE = "observation.joints", "observation.camera_pose"
+_PICTURES = {IMAGE: "left", IMAGE_RIGHT: "right", SEGMENTATION: "segmentation"}  # of an `Episode`
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 _EPISODES = "meta/episodes/chunk-000/file-000.parquet"
@@ -80,8 +87,8 @@ def export_lerobot(
     for bag in bags:  # all of them before anything is written
         episodes.append(read_episode(bag, fps, arms, sampling, world_frame, frames))
         _check_alike(episodes[0], episodes[-1])
-    if images == "video" and any(side % 2 for side in episodes[0].image_size):
-        height, width = episodes[0].image_size
+    if images == "video" and any(side % 2 for side in episodes[0].left.size):
+        height, width = episodes[0].left.size
         raise SequenceError(f"{bags[0]}: {width}×{height} images make no video, which needs even sides; export them as png")
     try:
         _Dataset(out, parquet, task, images).write(episodes)
@@ -101,11 +108,16 @@ def _pyarrow() -> Any:
 
 
 def _check_alike(first: Episode, other: Episode) -> None:
-    for what in ("arms", "fps", "image_size"):
-        mine, others = getattr(first, what), getattr(other, what)
+    traits = {
+        "arms": lambda episode: episode.arms,
+        "fps": lambda episode: episode.fps,
+        "image size": lambda episode: episode.left.size,
+        "beside the rest": lambda episode: ", ".join(episode.content) or "nothing",
+    }
+    for what, trait in traits.items():
+        mine, others = trait(first), trait(other)
         if mine != others:
-            text = f"{what.replace('_', ' ')} {others}, {first.bag} {mine}"
-            raise SequenceError(f"{other.bag} has {text}; the episodes of one dataset must agree")
+            raise SequenceError(f"{other.bag} has {what} {others}, {first.bag} {mine}; the episodes of one dataset must agree")
 
 
 class _Dataset:
@@ -120,38 +132,45 @@ class _Dataset:
         rows, histograms, all_columns, begin = [], [], [], 0
         for number, episode in enumerate(episodes):
             columns = _columns(episode, number, begin)
-            histogram = self._write_files(episode, number, columns, features)
-            rows.append(self._episode_row(episode, number, begin) | _flat(_statistics(columns, histogram, len(episode))))
+            own = self._write_files(episode, number, columns, features)
+            rows.append(self._episode_row(episode, number, begin) | _flat(_statistics(columns, own, len(episode))))
             all_columns.append(columns)
-            histograms.append(histogram)
+            histograms.append(own)
             begin += len(episode)
         merged = {key: np.concatenate([columns[key] for columns in all_columns]) for key in all_columns[0]}
-        statistics = _statistics(merged, np.sum(histograms, axis=0), begin)
+        statistics = _statistics(merged, {key: np.sum([each[key] for each in histograms], axis=0) for key in histograms[0]}, begin)
         self._write_json("meta/stats.json", statistics)
         self._write_json("meta/info.json", _info(episodes[0].fps, len(episodes), begin, features, self._images))
         self._write_table(_EPISODES, {key: self._pa.array([row[key] for row in rows]) for key in rows[0]})
         self._write_tasks()
 
-    def _write_files(self, episode: Episode, number: int, columns: dict[str, np.ndarray], features: dict) -> np.ndarray:
-        """Write table and images of an episode and return the histogram [3, 256] of its images."""
-        histogram = np.zeros((3, 256), np.int64)
-        images = track(episode.images(), description=f"writing {episode.bag.name}", total=len(episode))
-        images = _counted(images, histogram)
+    def _write_files(self, episode: Episode, number: int, columns: dict[str, np.ndarray], features: dict) -> dict[str, np.ndarray]:
+        """Write table and pictures of an episode and return the histograms [C, 256] of its pictures by their keys."""
+        histograms, cells = {}, {}
         table = self._pa.table({key: self._column(columns[key], features[key]) for key in columns})
         place = dict(zip(("chunk_index", "file_index"), divmod(number, _CHUNK_SIZE)))
-        if self._images == "video":
-            path = self._path(_VIDEO.format(video_key=IMAGE, **place))
-            drawing.write_video(path, images, episode.fps, _CODEC_OPTIONS)
-            self._pa.parquet.write_table(table, self._path(_DATA.format(**place)))
-            return histogram
+        for key in filter(features.__contains__, _PICTURES):
+            histograms[key] = np.zeros((features[key]["shape"][2], 256), np.int64)
+            pictures = episode.images(getattr(episode, _PICTURES[key]))
+            pictures = track(pictures, description=f"writing {episode.bag.name}", total=len(episode)) if key == IMAGE else pictures
+            pictures = _counted(pictures, histograms[key])
+            if features[key]["dtype"] == "image":
+                cells[key] = pictures
+            else:
+                path = self._path(_VIDEO.format(video_key=key, **place))
+                drawing.write_video(path, pictures, episode.fps, _CODEC_OPTIONS)
         kind = self._pa.struct({"bytes": self._pa.binary(), "path": self._pa.string()})
-        schema = table.schema.append(self._pa.field(IMAGE, kind))
+        schema = table.schema
+        for key in cells:
+            schema = schema.append(self._pa.field(key, kind))
         with self._pa.parquet.ParquetWriter(self._path(_DATA.format(**place)), schema) as file:
             for begin in range(0, len(episode), _GROUP):  # the images of a long episode do not fit into memory
                 part = table.slice(begin, _GROUP)
-                cells = [{"bytes": _png(image), "path": None} for image in islice(images, len(part))]
-                file.write_table(part.append_column(IMAGE, self._pa.array(cells, kind)))
-        return histogram
+                for key, pictures in cells.items():
+                    own = [{"bytes": _png(picture), "path": None} for picture in islice(pictures, len(part))]
+                    part = part.append_column(key, self._pa.array(own, kind))
+                file.write_table(part)
+        return histograms
 
     def _column(self, values: np.ndarray, feature: dict) -> Any:
         """Column of scalars [T], or of vectors [T, D]."""
@@ -171,9 +190,9 @@ class _Dataset:
             "meta/episodes/chunk_index": 0,
             "meta/episodes/file_index": 0,
         }
-        if self._images == "video":
+        for key in [key for key, name in _PICTURES.items() if getattr(episode, name) and _kind(key, self._images) == "video"]:
             video = {"chunk_index": chunk, "file_index": file, "from_timestamp": 0.0, "to_timestamp": len(episode) / episode.fps}
-            row |= {f"videos/{IMAGE}/{key}": value for key, value in video.items()}
+            row |= {f"videos/{key}/{name}": value for name, value in video.items()}
         return row
 
     def _write_tasks(self) -> None:
@@ -208,9 +227,11 @@ class _Dataset:
 def _columns(episode: Episode, number: int, begin: int) -> dict[str, np.ndarray]:
     """The table of an episode without its images: scalars [T] and vectors [T, D]."""
     frames = np.arange(len(episode))
+    more = {JOINTS: episode.joints, CAMERA_POSE: episode.camera_pose}
     return {
         "observation.state": episode.state,
         "observation.environment_state": episode.environment_state,
+        **{key: values for key, values in more.items() if values is not None},
         "action": episode.action,
         "timestamp": (frames / episode.fps).astype(np.float32),
         "frame_index": frames,
@@ -220,28 +241,39 @@ def _columns(episode: Episode, number: int, begin: int) -> dict[str, np.ndarray]
     }
 
 
+def _kind(key: str, images: ImageFormat) -> str:
+    """How pictures are kept: labels exactly, whatever the images are."""
+    return "image" if images == "png" or key == SEGMENTATION else "video"
+
+
 def _features(episode: Episode, images: ImageFormat) -> dict[str, dict]:
     """What the columns are."""
-    height, width = episode.image_size
-    image = {"dtype": "image" if images == "png" else "video", "shape": [height, width, 3]}
-    image["names"] = ["height", "width", "channels"]
-    if images == "video":
-        image["info"] = {
-            "video.height": height,
-            "video.width": width,
-            "video.codec": "h264",
-            "video.pix_fmt": "yuv420p",
-            "video.is_depth_map": False,
-            "video.fps": episode.fps,
-            "video.channels": 3,
-            "has_audio": False,
-        }
+    height, width = episode.left.size
+    pictures: dict[str, dict] = {}
+    for key, name in _PICTURES.items():
+        if getattr(episode, name):
+            channels = 1 if key == SEGMENTATION else 3
+            kind = _kind(key, images)
+            pictures[key] = {"dtype": kind, "shape": [height, width, channels], "names": ["height", "width", "channels"]}
+            if kind == "video":
+                pictures[key]["info"] = {
+                    "video.height": height,
+                    "video.width": width,
+                    "video.codec": "h264",
+                    "video.pix_fmt": "yuv420p",
+                    "video.is_depth_map": False,
+                    "video.fps": episode.fps,
+                    "video.channels": channels,
+                    "has_audio": False,
+                }
     vectors = {
         "observation.state": state_names(episode.arms),
         "observation.environment_state": environment_names(episode.arms),
         "action": action_names(episode.arms),
     }
-    features = {IMAGE: image}
+    vectors |= {JOINTS: joint_names(episode.arms)} if episode.joints is not None else {}
+    vectors |= {CAMERA_POSE: list(POSE_NAMES)} if episode.camera_pose is not None else {}
+    features = pictures
     features |= {key: {"dtype": "float32", "shape": [len(names)], "names": names} for key, names in vectors.items()}
     kinds = {name: "float32" if name == "timestamp" else "int64" for name in _INDICES}
     return features | {name: {"dtype": kind, "shape": [1], "names": None} for name, kind in kinds.items()}
@@ -269,25 +301,26 @@ def _info(fps: int, episodes: int, frames: int, features: dict, images: ImageFor
 
 
 def _png(image: np.ndarray) -> bytes:
-    return cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
+    return cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image)[1].tobytes()
 
 
 def _counted(images: Iterable[np.ndarray], histogram: np.ndarray) -> Iterator[np.ndarray]:
-    """Pass images on and add a sample of their pixels to a histogram [3, 256]."""
+    """Pass pictures on and add a sample of their pixels to a histogram [C, 256]."""
     for image in images:
         every = max(max(image.shape) // _SAMPLE, 1)
-        for channel in range(3):
-            histogram[channel] += np.bincount(image[::every, ::every, channel].reshape(-1), minlength=256)
+        sample = image[::every, ::every].reshape(-1, len(histogram))
+        for channel in range(len(histogram)):
+            histogram[channel] += np.bincount(sample[:, channel], minlength=256)
         yield image
 
 
 # ------------------------------------------------------------------------------------------------------------ statistics
 
 
-def _statistics(columns: dict[str, np.ndarray], histogram: np.ndarray, frames: int) -> dict[str, dict[str, np.ndarray]]:
+def _statistics(columns: dict[str, np.ndarray], histograms: dict[str, np.ndarray], frames: int) -> dict[str, dict[str, np.ndarray]]:
     """Minimum, maximum, mean, standard deviation, count and quantiles of every column; of images per channel, 0 to 1."""
     count = np.array([frames])
-    statistics = {IMAGE: _image_statistics(histogram) | {"count": count}}
+    statistics = {key: _image_statistics(histogram) | {"count": count} for key, histogram in histograms.items()}
     for key, column in columns.items():
         values = column.reshape(len(column), -1).astype(np.float64)
         found = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0), "std": values.std(0), "count": count}
@@ -305,7 +338,7 @@ def _image_statistics(histogram: np.ndarray) -> dict[str, np.ndarray]:
         "mean": mean,
         "std": np.sqrt(np.maximum(share @ levels**2 - mean**2, 0)),
     } | {name: [levels[np.searchsorted(row, q)] for row in below] for name, q in _QUANTILES.items()}
-    return {name: np.reshape(values, (3, 1, 1)) for name, values in found.items()}
+    return {name: np.reshape(values, (-1, 1, 1)) for name, values in found.items()}
 
 
 def _flat(statistics: dict[str, dict[str, np.ndarray]]) -> dict[str, list]:

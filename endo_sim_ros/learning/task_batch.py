@@ -6,6 +6,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
+from endo_sim_ros.instruments import JOINTS
 from endo_sim_ros.learning.config import Randomisation, SightConfig
 from endo_sim_ros.learning.held_tools import HeldTools, hold_tool, hold_tools
 from endo_sim_ros.learning.pictures import IMAGE, SEGMENTATION, Pictures
@@ -18,8 +19,6 @@ RESTING_SPEED = 1e-5  # m/s; as in TissueSimulation: one tissue slower than this
 
 Observations = Literal["state", "image", "both"]
 Actions = Literal["cartesian", "joints", "joint_positions"]
-JOINTS = ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw")
-"""Names of the joints, in the order of actions."""
 
 
 class TaskBatch:

@@ -3,6 +3,7 @@
 import numpy as np
 
 from endo_sim_ros import messages
+from endo_sim_ros.instruments import JOINTS
 from endo_sim_ros.messages import ControlNodeCloud, bag_types
 from endo_sim_ros.sequences.bag import BagWriter
 
@@ -19,6 +20,18 @@ def picture(number):
     image[..., 0] = 2 * number % 256
     image[:, : WIDTH // 2, 1] = 200
     return image
+
+
+def labels(number):
+    """What is in each pixel of the picture of a number."""
+    found = np.ones((HEIGHT, WIDTH), np.uint8)
+    found[:, number % WIDTH] = 2 + number % 5
+    return found
+
+
+def joints(number):
+    """Joints of an arm, rad and m."""
+    return np.array([0.01, 0.02, 0.001, 0.03, 0.04, 0.05]) * number
 
 
 REST = np.stack(np.meshgrid(*[np.linspace(-0.02, 0.02, 4)] * 2, [0.1], indexing="ij"), -1).reshape(-1, 3).astype(np.float32)
@@ -63,6 +76,19 @@ class Recording:
             said.append((messages.tool_reaction(arm), reaction))
         self.write(said, leave_out)
 
+    def see(self, time_ns, number, arms=("PSM1",)):
+        """What the graph says beside that, of a step."""
+        stamp, types = BEGIN + time_ns, self.types
+        right = (messages.RENDERED_RIGHT_IMAGE, messages.encode_image(picture(number)[:, ::-1], stamp, "camera", types))
+        if self.compressed:
+            right = (messages.RENDERED_RIGHT_COMPRESSED, messages.encode_compressed(picture(number)[:, ::-1], stamp, "camera", 95, types))
+        said = [right, (messages.RENDERED_SEGMENTATION, messages.encode_image(labels(number), stamp, "camera", types))]
+        said.append((messages.RENDERED_POSE, messages.encode_pose(tip(number), stamp, "world", types)))
+        for arm in arms:
+            none = np.zeros(0)
+            said.append((messages.tool_joints(arm), messages.encode_joints(JOINTS, joints(number), none, none, stamp, types)))
+        self.write(said)
+
     def act(self, time_ns, number, arms=("PSM1",), leave_out=(), frame="world", base=None):
         """What a policy says; poses in the world, or in the frame of a robot's base with its pose in the world."""
         stamp = BEGIN + time_ns
@@ -83,15 +109,19 @@ class Recording:
                 self.bag.write(topic, message, self.clock)
 
 
-def lockstep(path, steps=12, missing=(), step=STEP, compressed=False, **options):
-    """A first observation, then commands with the observations that they lead to, with equal stamps."""
+def lockstep(path, steps=12, missing=(), step=STEP, compressed=False, everything=False, **options):
+    """A first observation, then commands with the observations that they lead to, with equal stamps; everything: what `see` writes."""
     with Recording(path, compressed) as recording:
         recording.act(0, 0, **options)
         recording.observe(0, 0)
+        if everything:
+            recording.see(0, 0)
         for number in range(1, steps):
             if number not in missing:
                 recording.act(step * number, number, **options)
                 recording.observe(step * number, number)
+                if everything:
+                    recording.see(step * number, number)
     return path
 
 

@@ -28,7 +28,7 @@ def test_steps_in_lockstep_are_paired_by_their_stamps(tmp_path):
     episode = read_episode(lockstep(tmp_path / "bag"))
     assert episode.lockstep and episode.fps == 25 and len(episode) == 11 and episode.arms == ("PSM1",)
     observed = np.arange(11)
-    np.testing.assert_array_equal(episode.image_numbers, observed)
+    np.testing.assert_array_equal(episode.left.numbers, observed)
     np.testing.assert_allclose(column(episode, "mean_displacement_x"), 1e-4 * observed * 17 / 16, atol=1e-8)
     np.testing.assert_allclose(column(episode, "PSM1.x"), 1e-3 * observed, atol=1e-8)
     # the action of a row made the observation of the next
@@ -48,7 +48,7 @@ def test_the_first_observation_needs_no_command(tmp_path):
             recording.observe(STEP * number, number)
     episode = read_episode(tmp_path / "bag")
     assert episode.lockstep and len(episode) == 4
-    np.testing.assert_array_equal(episode.image_numbers, [0, 1, 2, 3])
+    np.testing.assert_array_equal(episode.left.numbers, [0, 1, 2, 3])
     np.testing.assert_allclose(column(episode, "PSM1.force_z"), [-1, -2, -3, -4])
 
 
@@ -65,7 +65,7 @@ def test_observations_after_a_reset_may_bear_any_time(tmp_path, reset, caplog):
     episode = read_episode(tmp_path / "bag")
     early = reset < 0  # then it is the first observation
     assert episode.lockstep and len(episode) == 38 + early and not caplog.text
-    np.testing.assert_array_equal(episode.image_numbers, np.arange(0 if early else 1, 39))
+    np.testing.assert_array_equal(episode.left.numbers, np.arange(0 if early else 1, 39))
     np.testing.assert_allclose(column(episode, "PSM1.force_z"), -np.arange(1.0 if early else 2.0, 40))
 
 
@@ -103,7 +103,7 @@ def test_at_a_rate_the_last_message_counts(bag):
     assert not episode.lockstep and episode.fps == 25
     assert len(episode) == 49  # 50 observations from 0.003 s; the last has no action
     observed = np.arange(49)
-    np.testing.assert_array_equal(episode.image_numbers, observed)
+    np.testing.assert_array_equal(episode.left.numbers, observed)
     np.testing.assert_allclose(column(episode, "PSM1.x"), 1e-3 * 4 * observed, atol=1e-8)  # tick 4k came at 0.04 k + 0.001
     np.testing.assert_allclose(column(episode, "PSM1.force_z"), -4.0 * (observed + 1))
 
@@ -111,8 +111,8 @@ def test_at_a_rate_the_last_message_counts(bag):
 @pytest.mark.slow
 def test_another_rate_repeats_or_skips(bag):
     fast, slow = read_episode(bag, fps=50), read_episode(bag, fps=5)
-    np.testing.assert_array_equal(fast.image_numbers, np.arange(98) // 2)
-    np.testing.assert_array_equal(slow.image_numbers, np.arange(len(slow)) * 5)
+    np.testing.assert_array_equal(fast.left.numbers, np.arange(98) // 2)
+    np.testing.assert_array_equal(slow.left.numbers, np.arange(len(slow)) * 5)
     np.testing.assert_allclose(column(slow, "PSM1.force_z"), -20.0 * (np.arange(len(slow)) + 1))
 
 
@@ -246,13 +246,13 @@ def test_tissue_is_summarized_around_each_tip():
 def test_images_are_those_of_their_rows(bag):
     episode = read_episode(bag, fps=50)
     shown = [image[0, 0, 0] // 2 for image in episode.images()]
-    np.testing.assert_array_equal(shown, episode.image_numbers)
+    np.testing.assert_array_equal(shown, episode.left.numbers)
 
 
 def test_compressed_images_do_as_well(tmp_path):
     raw, compressed = (read_episode(lockstep(tmp_path / str(each), compressed=each)) for each in (False, True))
-    assert compressed.image_topic == messages.RENDERED_COMPRESSED and compressed.image_size == raw.image_size
-    for name in ("state", "action", "environment_state", "image_numbers"):
+    assert compressed.left.topic == messages.RENDERED_COMPRESSED and compressed.left.size == raw.left.size
+    for name in ("state", "action", "environment_state"):
         np.testing.assert_array_equal(getattr(raw, name), getattr(compressed, name))
     for exact, near in zip(raw.images(), compressed.images(), strict=True):
         assert np.abs(exact.astype(int) - near).mean() < 3

@@ -8,8 +8,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from played_tasks import IDS, make, play
 
+from endo_sim_ros.instruments import JOINTS
 from endo_sim_ros.learning.policies import scripted_policy
-from endo_sim_ros.learning.task_batch import JOINTS
 from endo_sim_ros.learning.tasks import TASKS
 
 

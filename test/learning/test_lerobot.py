@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 import pytest
 from endo_sim_command import endo_sim
-from made_recordings import BEGIN, HEIGHT, STEP, WIDTH, Recording, lockstep, picture, realtime
+from made_recordings import BEGIN, HEIGHT, STEP, WIDTH, Recording, joints, labels, lockstep, picture, realtime
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.learning import lerobot
 from endo_sim_ros.learning.episodes import action_names, environment_names, read_episode, state_names
-from endo_sim_ros.learning.lerobot import IMAGE, export_lerobot
+from endo_sim_ros.learning.lerobot import CAMERA_POSE, IMAGE, IMAGE_RIGHT, JOINTS, SEGMENTATION, export_lerobot
 
 S = 1_000_000_000
 
@@ -117,12 +117,49 @@ def test_recordings_with_raw_and_with_compressed_images_make_one_dataset(bag, tm
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("compressed", [False, True], ids=["raw", "compressed"])
+@pytest.mark.parametrize("images", ["video", "png"])
+def test_joints_both_eyes_labels_and_the_camera_are_exported(images, compressed, tmp_path):
+    bag = lockstep(tmp_path / "bag", compressed=compressed, everything=True)
+    assert export_lerobot([bag, bag], tmp_path / "out", "t", images=images) == (2, 22)
+    info = json.loads((tmp_path / "out/meta/info.json").read_text())
+    features = info["features"]
+    assert features[JOINTS]["names"] == [f"PSM1.{name}" for name in ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw")]
+    assert features[CAMERA_POSE] == {"dtype": "float32", "shape": [7], "names": ["x", "y", "z", "qx", "qy", "qz", "qw"]}
+    assert features[SEGMENTATION]["dtype"] == "image" and features[SEGMENTATION]["shape"] == [HEIGHT, WIDTH, 1]
+    assert features[IMAGE_RIGHT] == features[IMAGE] and features[IMAGE]["dtype"] == ("image" if images == "png" else "video")
+    statistics = json.loads((tmp_path / "out/meta/stats.json").read_text())
+    assert set(statistics) == set(features) and np.shape(statistics[SEGMENTATION]["mean"]) == (1, 1, 1)
+    for number, table in enumerate(read_tables(tmp_path / "out", "data/*/*.parquet")):
+        np.testing.assert_allclose(table.column(JOINTS).to_pylist(), [joints(k) for k in range(11)], atol=1e-6)
+        np.testing.assert_allclose(np.array(table.column(CAMERA_POSE).to_pylist())[:, 0], 1e-3 * np.arange(11), atol=1e-7)
+        np.testing.assert_allclose(np.array(table.column("observation.state").to_pylist())[1:, 7], 0.01 * np.arange(1, 11), atol=1e-7)
+        for k, cell in enumerate(table.column(SEGMENTATION).to_pylist()):
+            np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(cell["bytes"], np.uint8), cv2.IMREAD_UNCHANGED), labels(k))
+        for key, flip in ((IMAGE, 1), (IMAGE_RIGHT, -1)):
+            if images == "png":
+                cells = [np.frombuffer(cell["bytes"], np.uint8) for cell in table.column(key).to_pylist()]
+                shown = [cv2.imdecode(cell, cv2.IMREAD_COLOR)[..., ::-1] for cell in cells]
+            else:
+                place = {"chunk_index": 0, "file_index": number}
+                with av.open(str(tmp_path / "out" / info["video_path"].format(video_key=key, **place))) as container:
+                    shown = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+            assert len(shown) == 11
+            for k, image in enumerate(shown):
+                exact = images == "png" and not compressed
+                assert np.abs(image.astype(int) - picture(k)[:, ::flip]).mean() <= (0 if exact else 4)
+
+
+@pytest.mark.slow
 def test_episodes_that_do_not_agree_are_refused_before_anything_is_written(bag, two_arms, tmp_path):
     steps = lockstep(tmp_path / "steps", step=S // 10)
     with pytest.raises(SequenceError, match=r"two has arms \('PSM1', 'PSM2'\), .*realtime \('PSM1',\); .* must agree"):
         export_lerobot([bag, two_arms], tmp_path / "out", "t")
     with pytest.raises(SequenceError, match="steps has fps 10, .*realtime 25; the episodes of one dataset must agree"):
         export_lerobot([bag, steps], tmp_path / "out", "t")
+    both = lockstep(tmp_path / "both", everything=True)
+    with pytest.raises(SequenceError, match="both has beside the rest right, segmentation, joints, camera_pose, .* nothing; the epis"):
+        export_lerobot([lockstep(tmp_path / "plain"), both], tmp_path / "out", "t")
     assert export_lerobot([bag, two_arms], tmp_path / "out", "t", arms=("PSM1",))[0] == 2
 
 
@@ -187,6 +224,22 @@ def test_lerobot_itself_reads_the_dataset(bag, tmp_path, images, monkeypatch):
     assert item[IMAGE].shape == (2, 3, HEIGHT, WIDTH) and item["action_is_pad"].tolist() == [False, True, True]
     only = loader.LeRobotDataset("local/out", root=tmp_path / "out", episodes=[1], video_backend="pyav")
     assert len(only) == 49 and only[0]["index"] == 49
+
+
+@pytest.mark.parametrize("images", ["video", "png"])
+def test_lerobot_itself_reads_both_eyes_labels_joints_and_the_camera(tmp_path, images, monkeypatch):
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    monkeypatch.setenv("HF_HOME", str(tmp_path / "home"))
+    loader = pytest.importorskip(
+        "lerobot.datasets.lerobot_dataset", reason="lerobot is not installed; it wants other versions of torch and numpy"
+    )
+    export_lerobot([lockstep(tmp_path / "bag", everything=True)], tmp_path / "out", "pull", images=images)
+    data = loader.LeRobotDataset("local/out", root=tmp_path / "out", video_backend="pyav")
+    item = data[5]
+    assert item[IMAGE_RIGHT].shape == (3, HEIGHT, WIDTH) and item[SEGMENTATION].shape == (1, HEIGHT, WIDTH)
+    np.testing.assert_array_equal(np.round(255 * item[SEGMENTATION][0].numpy()), labels(5))
+    np.testing.assert_allclose(item[JOINTS], joints(5), atol=1e-6)
+    assert item[CAMERA_POSE].shape == (7,)
 
 
 @pytest.mark.dds

@@ -1,0 +1,143 @@
+"""The messages of a recording as streams of numbers by the time in their headers."""
+
+from collections import defaultdict
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from endo_sim_ros import messages
+from endo_sim_ros.core.cameras import matrix_to_quat
+from endo_sim_ros.instruments import JOINTS
+from endo_sim_ros.messages import MessageError, Topic, stamp_to_ns
+from endo_sim_ros.sequences.bag import BagReader
+
+_JUMP = 500_000_000  # ns; messages that are merely late step back by less
+
+
+class Stream(NamedTuple):
+    """The messages of a topic by the time in their headers."""
+
+    stamps: np.ndarray  # [N] int64, ns, not decreasing
+    values: np.ndarray  # [N, D]
+
+    @classmethod
+    def constant(cls, value: Any) -> "Stream":
+        """One value [D] at all times."""
+        return cls(np.array([np.iinfo(np.int64).min]), np.array([value], np.float64))
+
+    def at(self, times: np.ndarray, before: "Stream | None" = None) -> np.ndarray:
+        """The last values [T, D] at times [T]; ahead of the first, those of another stream."""
+        indices = np.searchsorted(self.stamps, times, "right") - 1
+        values = self.values[np.maximum(indices, 0)]
+        return values if before is None else np.where((indices >= 0)[:, None], values, before.at(times))
+
+
+def read_streams(
+    reader: BagReader, arms: tuple[str, ...], frames: Mapping[str, np.ndarray], pictures: tuple[Topic, ...]
+) -> dict[Topic, Stream]:
+    """Streams of the topics that have messages; of pictures (number, height, width), of control nodes the number.
+
+    Frames are taken as physics_node does. What is large is only numbered here, in the order of the bag, and read again when it is wanted.
+    """
+    decoders = {}
+    for arm in arms:
+        for make in (messages.tool_pose, messages.tool_pose_command):
+            decoders[make(arm)] = lambda m, topic, arm=arm: _pose_row(messages.decode_tip(m, frames, arm, topic))
+        for make in (messages.tool_jaw, messages.tool_jaw_state):
+            decoders[make(arm)] = lambda m, topic: [messages.decode_jaw(m, topic)]
+        for make in (messages.tool_wrench, messages.tool_reaction):
+            decoders[make(arm)] = lambda m, topic, arm=arm: _wrench_row(m, topic, arm, frames)
+        decoders[messages.tool_joints(arm)] = _joint_row
+    decoders[messages.RENDERED_POSE] = lambda m, topic: _pose_row(messages.decode_pose(m, frames, topic))
+    rows: dict[Topic, list] = defaultdict(list)
+    numbers, sizes = dict.fromkeys((*pictures, messages.CONTROL_NODES), -1), dict[Topic, tuple[int, ...]]()
+    for topic, _, message in reader.messages((*numbers, *decoders)):
+        if topic in numbers:
+            numbers[topic] += 1
+            if topic in pictures and topic not in sizes:  # that of the others is compared when they are read
+                raw = hasattr(message, "encoding")
+                sizes[topic] = (message.height, message.width) if raw else messages.decode_image(message, topic.name).shape[:2]
+            row = [numbers[topic], *sizes.get(topic, ())]
+        else:
+            row = decoders[topic](message, topic.name)
+        if stamp := stamp_to_ns(message.header.stamp):  # zero marks an invalid message
+            rows[topic].append((stamp, row))
+    reactions = {stamp for arm in arms for stamp, _ in rows[messages.tool_reaction(arm)]}
+    streams = {}
+    for topic, pairs in rows.items():
+        if not pairs:
+            continue
+        if topic in numbers:
+            pairs = _one_run(topic, pairs, reactions)
+        pairs.sort(key=lambda pair: pair[0])
+        if topic in numbers:  # they are read in the order of the bag: what came late is left out
+            highest = np.maximum.accumulate([row[0] for _, row in pairs])
+            pairs = [pair for pair, number in zip(pairs, highest) if pair[1][0] == number]
+        streams[topic] = Stream(np.array([s for s, _ in pairs], np.int64), np.array([row for _, row in pairs], np.float64))
+    for arm in arms:
+        tip = streams.get(messages.tool_pose(arm))
+        for topic in (messages.tool_wrench(arm), messages.tool_reaction(arm)):
+            if tip is not None and topic in streams:
+                streams[topic] = _to_world(streams[topic], tip)
+    return streams
+
+
+def _one_run(topic: Topic, pairs: list, reactions: set[int]) -> list:
+    """The observations (stamp, row) of the only run of a simulation. Lone ones, as after a reset, may lie about it in time.
+
+    Raises:
+        MessageError: If there are several runs.
+    """
+    stamps = np.array([stamp for stamp, _ in pairs])
+    runs = np.split(np.arange(len(pairs)), np.flatnonzero(np.diff(stamps) < -_JUMP) + 1)
+    if len(runs) == 1:
+        return pairs
+    runs = [run for run in runs if len(reactions.intersection(stamps[run].tolist())) > 1]
+    if len(runs) > 1:
+        raise MessageError(f"/{topic.name}: time goes back, as after a reset; record each episode into a bag of its own")
+    return [pairs[index] for run in runs for index in run]
+
+
+def _pose_row(pose: np.ndarray) -> np.ndarray:
+    """Position and quaternion xyzw, [7]."""
+    w, *xyz = matrix_to_quat(pose[:3, :3])
+    return np.array([*pose[:3, 3], *xyz, w])
+
+
+def _joint_row(message: Any, topic: str) -> np.ndarray:
+    """Joint positions [6], rad and m."""
+    joints = messages.decode_joints(message, topic)
+    if len(joints) != len(JOINTS):
+        raise MessageError(f"{topic}: {len(joints)} positions; an arm with an instrument has {len(JOINTS)}")
+    return joints
+
+
+def _wrench_row(message: Any, topic: str, arm: str, frames: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Force and torque in world axes and 1 or, in those of the tip, and 0, [7]."""
+    frame = messages.check_frame(message, (arm, "", *frames), topic)
+    R = frames.get(frame, np.eye(4))[:3, :3]  # any other is the tool's own
+    return np.array([*(vector for part in messages.decode_wrench(message, topic) for vector in R @ part), frame in frames])
+
+
+def _to_world(wrenches: Stream, tips: Stream) -> Stream:
+    """Wrenches [N, 6] in world axes of ones [N, 7] whose last column says whether they are so already, else in the tip's."""
+    x, y, z, w = tips.at(wrenches.stamps)[:, 3:].T[:, :, None]
+    axis = np.hstack([x, y, z])
+    rotate = lambda v: v + 2 * np.cross(axis, np.cross(axis, v) + w * v)
+    vectors = wrenches.values[:, :6]
+    turned = np.hstack([rotate(vectors[:, :3]), rotate(vectors[:, 3:])])
+    return Stream(wrenches.stamps, np.where(wrenches.values[:, 6:] > 0, vectors, turned))
+
+
+def same_sign(poses: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Poses [T, 7] whose quaternions have the sign that is nearer to the reference's."""
+    sign = np.where((poses[:, 3:] * reference[:, 3:]).sum(1, keepdims=True) < 0, -1, 1)
+    return np.hstack([poses[:, :3], poses[:, 3:] * sign])
+
+
+def continuous(poses: np.ndarray) -> np.ndarray:
+    """Poses [T, 7] whose quaternions do not change their sign from row to row."""
+    flips = (poses[1:, 3:] * poses[:-1, 3:]).sum(1) < 0
+    sign = np.cumprod(np.concatenate([[1], np.where(flips, -1, 1)]))[:, None]
+    return np.hstack([poses[:, :3], poses[:, 3:] * sign])

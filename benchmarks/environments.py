@@ -6,6 +6,7 @@ import numpy as np
 
 from endo_sim_ros.core.device import pick_device, single_threaded_torch
 from endo_sim_ros.evaluation.measurement import Row, machine, median_seconds, report
+from endo_sim_ros.learning.config import SightConfig
 from endo_sim_ros.learning.scenes import Scene, load_scene
 from endo_sim_ros.learning.task_batch import Observations, TaskBatch
 
@@ -31,19 +32,27 @@ def bench_environments(
     if not environments or min(environments) < 1:
         raise ValueError(f"give numbers of environments of at least 1, got {' '.join(map(str, environments)) or 'none'}")
     device, scene, rows = pick_device(device), load_scene(), []
-    kinds: tuple[Observations, ...] = ("state", "image")
-    for observations in kinds:
-        rates = [_rate(task, scene, count, observations, device, repeats) for count in environments]
-        peer = f"{environments[0]} environment{'s' * (environments[0] > 1)}"
-        for count, rate in zip(environments, rates):
-            compared = (None, None) if count == environments[0] else (rate / rates[0], peer)
-            rows.append(Row(f"{observations} observations, {count} environment{'s' * (count > 1)}", rate, "steps/s", *compared))
+    peer = f"{environments[0]} environment{'s' * (environments[0] > 1)}"
+    kinds: dict[str, tuple[Observations, SightConfig]] = {
+        "state observations": ("state", SightConfig()),
+        "image observations": ("image", SightConfig(instrument=False)),
+        "images with the tool": ("image", SightConfig()),
+        "both eyes and labels": ("image", SightConfig(eyes=2, segmentation=True)),
+    }
+    measured: dict[str, list[float]] = {}
+    for name, (observations, sight) in kinds.items():
+        rates = measured[name] = [_rate(task, scene, count, observations, sight, device, repeats) for count in environments]
+        for i, (count, rate) in enumerate(zip(environments, rates)):
+            compared = (None, None) if i == 0 else (rate / rates[0], peer)
+            if sight.instrument and observations == "image":
+                compared = rate / measured["image observations"][i], "without the tool"
+            rows.append(Row(f"{name}, {count} environment{'s' * (count > 1)}", rate, "steps/s", *compared))
     report(f"Environments: {task} on {machine(device)}", rows, json_file)
 
 
-def _rate(task: str, scene: Scene, count: int, observations: Observations, device: str, repeats: int) -> float:
+def _rate(task: str, scene: Scene, count: int, observations: Observations, sight: SightConfig, device: str, repeats: int) -> float:
     """Steps per second of all environments together, the tools at work in the tissue."""
-    batch, rng = TaskBatch(task, scene, count, observations, device=device), np.random.default_rng(0)
+    batch, rng = TaskBatch(task, scene, count, observations, sight=sight, device=device), np.random.default_rng(0)
     everyone = range(count)
 
     def episode() -> None:

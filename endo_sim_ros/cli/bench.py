@@ -94,7 +94,7 @@ class BenchGraph(Measured):
 
 @dataclass(frozen=True)
 class BenchEnvironments(Measured):
-    """The environments to learn in: steps per second, with states and with images."""
+    """The environments to learn in: steps per second, with states, with images, and with the tool in them."""
 
     task: str = "retraction"
     """Name of the task, such as retraction or palpation; an unknown one is answered with the list."""

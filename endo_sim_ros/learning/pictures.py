@@ -71,13 +71,23 @@ class Pictures:
         options = DrawingConfig()
         self._lamp = np.array([options.lamp_x, options.lamp_y, 0.0, 1.0])  # m, camera
         self._surfaces = np.array([SURFACES[material] for material in Material])  # [M, 5]
-        self._views = [self._view(None) for _ in range(count)]
+        self._lens = lenses([self.camera])
+        # What each picture needs in arrays, as it changes with episodes, not with steps.
+        self._viewmats = np.zeros((sight.eyes, count, 4, 4))
+        self._lamps = np.zeros((sight.eyes, count, 3))  # m, in the camera of each eye
+        self._views = [self._view(None)] * count
+        for b in range(count):
+            self._show(b, self._views[b])
 
     def reset(self, episodes: Tensor, variations: Sequence[Variation]) -> None:
         """Show these episodes [n] at rest, each with its variation."""
         for b, variation in zip(episodes.tolist(), variations):
-            self._views[b] = self._view(variation)
+            self._show(b, self._view(variation))
         self._means[episodes], self._covars[episodes] = self._skinning.means, self._skinning.covars
+
+    def _show(self, b: int, view: _View) -> None:
+        self._views[b], self._lamps[:, b] = view, view.lamps
+        self._viewmats[:, b] = [camera.viewmat for camera in view.cameras]
 
     @torch.no_grad()
     def draw(self, right: bool = False, labels: bool = False) -> dict[str, np.ndarray]:
@@ -94,13 +104,14 @@ class Pictures:
 
     def _render(self, own: np.ndarray, right: bool, labels: bool) -> dict[str, np.ndarray]:
         eyes, views = range(1 + right), [self._views[b] for b in own]
-        cameras = [view.cameras[eye] for eye in eyes for view in views]
         seen = [self._rasterize(own[i : i + _AT_ONCE], eye) for eye in eyes for i in range(0, len(own), _AT_ONCE)]
         colors, depths, alphas = seen[0] if len(seen) == 1 else map(torch.cat, zip(*seen))
-        marks = (alphas[: len(own)] > SURFACE).to(torch.uint8) if labels else None
         if self._held is not None:
-            marks = self._draw_tools(self._held, own, cameras, (colors, depths, alphas))
+            marks = self._draw_tools(self._held, own, len(eyes), (colors, depths, alphas))
+        else:
+            marks = (alphas > SURFACE).to(torch.uint8)
         if self._model.light is not None:
+            cameras = [view.cameras[eye] for eye in eyes for view in views]
             colors = torch.stack([shade(self._model.light, *picture) for picture in zip(colors, depths, alphas, cameras)])
         if self._by.light:
             one = np.ones((1, 1, 1), np.float32)
@@ -108,38 +119,39 @@ class Pictures:
             colors = colors * self._move(factors * len(eyes))
         images = to_bytes(colors).cpu().numpy()
         found: dict[str, np.ndarray] = dict(zip((IMAGE, IMAGE_RIGHT), np.split(images, len(eyes))))
-        if labels and marks is not None:
+        if labels:
             found[SEGMENTATION] = marks[: len(own), ..., None].cpu().numpy()
         return found
 
     def _rasterize(self, own: np.ndarray, eye: int) -> tuple[Tensor, Tensor, Tensor]:
-        rows, cameras = slice(own[0], own[-1] + 1), [self._views[b].cameras[eye] for b in own]
+        rows = slice(own[0], own[-1] + 1)
         seen = rasterize(
-            self._means[rows], None, None, self._model.opacities, self._colors(rows, cameras),
-            self._move([camera.viewmat for camera in cameras]), self._move([camera.K for camera in cameras]),
+            self._means[rows], None, None, self._model.opacities, self._colors(rows, eye),
+            self._move(self._viewmats[eye, rows]), self._move([self.camera.K] * len(own)),
             self.camera.width, self.camera.height, covars=self._covars[rows],
         )  # fmt: skip
         return seen.colors, seen.depths, seen.alphas
 
-    def _move(self, arrays: Sequence[np.ndarray]) -> Tensor:
-        return torch.from_numpy(np.stack(arrays).astype(np.float32)).to(self._device)
+    def _move(self, arrays: Sequence[np.ndarray] | np.ndarray) -> Tensor:
+        return torch.from_numpy(np.asarray(arrays).astype(np.float32)).to(self._device)
 
-    def _colors(self, rows: slice, cameras: Sequence[Camera]) -> Tensor:
+    def _colors(self, rows: slice, eye: int) -> Tensor:
         """Colours of all these episodes [N, K, 3], or of each [b, N, K, 3], as `rasterize` takes them."""
         views, sh = self._views[rows], self._model.sh
         if self._model.sh_degree:
             F = torch.where(self._pinned, torch.eye(3, device=sh.device), self._tissue.F[rows])  # as on control_nodes
-            sh = torch.stack([turned_colors(sh, self._skinning, *each) for each in zip(self._means[rows], F, cameras)])
+            sh = torch.stack(
+                [turned_colors(sh, self._skinning, *each) for each in zip(self._means[rows], F, (view.cameras[eye] for view in views))]
+            )
         if self._by.texture:
             sh = sh * sh.new_tensor([view.contrast for view in views])[:, None, None, None]
         return sh
 
-    def _draw_tools(self, held: HeldTools, own: np.ndarray, cameras: Sequence[Camera], pictures: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+    def _draw_tools(self, held: HeldTools, own: np.ndarray, eyes: int, pictures: tuple[Tensor, Tensor, Tensor]) -> Tensor:
         """Draw the tools into the colours, depths and alphas of these episodes, eye after eye; returns their labels [E b, H, W]."""
-        eyes, which = len(cameras) // len(own), held.which[own]
-        viewmats = np.stack([camera.viewmat for camera in cameras])
-        lens = lenses(cameras)
-        lamps = np.concatenate([[self._views[b].lamps[eye] for b in own] for eye in range(eyes)])
+        which = held.which[own]
+        viewmats, lamps = (each[:eyes, own].reshape(-1, *each.shape[2:]) for each in (self._viewmats, self._lamps))
+        lens = np.tile(self._lens, (len(lamps), 1))
         surfaces = None
         if self._by.metal:
             factors = np.stack([self._views[b].metal for b in own] * eyes)  # [E b, 2]: of all but the roughness, and of that

@@ -144,7 +144,8 @@ class TaskBatch:
         tools = self.tissue.tools
         tips = torch.from_numpy(tips)[:, None].to(tools.tips.device)
         turned = torch.from_numpy(self._rotations)[:, None].to(tools.tips.device)
-        moved = not self._placed or not (torch.equal(tips, tools.tips) and torch.equal(turned, tools.rotations))
+        # Of one alone: a comparison waits for a GPU.
+        moved = self.count == 1 and not (self._placed and torch.equal(tips, tools.tips) and torch.equal(turned, tools.rotations))
         present = torch.ones((self.count, 1), dtype=torch.int32)
         present[list(renew)] = 0
         tools.tips.copy_(tips)

@@ -11,9 +11,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import pick_device, single_threaded_torch
 from endo_sim_ros.core.kernels import compare_plain
 from endo_sim_ros.evaluation.measurement import Row, Stage, machine, milliseconds, peak_megabytes, report, run_stages, short
+from endo_sim_ros.instruments import build_instrument, link_poses, load_arm, place_arm
+from endo_sim_ros.instruments.drawing import DrawingConfig, InstrumentDrawing
 from endo_sim_ros.reconstruction import ReconstructionConfig, Trainer, prepare
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 from endo_sim_ros.splatting import RenderOutput, rasterize, rasterize_in_torch
@@ -83,6 +86,7 @@ def bench_raster(device: str, json_file: Path | None = None, plan: Plan = Plan()
         *((named(n, s), partial(_speed, named(n, s), n, s, device, seconds)) for s in plan.sizes for n in plan.counts),
         ("torch reference", partial(_against_reference, named(few, small), few, small, device, seconds)),
         ("precision", partial(_precision, few, small, device)),
+        ("instruments", partial(_instruments, count, size, device, seconds)),
         *(("time and Gaussians", partial(_curve, "over Gaussians", n, size, 1.0, device, seconds)) for n in plan.curve_counts),
         *(("time and pixels", partial(_curve, "over pixels", count, s, 1.0, device, seconds)) for s in plan.curve_sizes),
         *(("time and overlap", partial(_curve, "over overlap", count, size, x, device, seconds)) for x in plan.overlaps),
@@ -174,6 +178,28 @@ def _precision(count: int, size: tuple[int, int], device: str) -> list[Row]:
         errors = ((actual - expected).abs() / expected.abs().max()).flatten()
         rows.append(Row(f"error of {name}, 95 %", float(errors.quantile(0.95)), "relative"))
         rows.append(Row(f"error of {name}, max", float(errors.max()), "relative"))
+    return rows
+
+
+def _instruments(count: int, size: tuple[int, int], device: str, seconds: float) -> list[Row]:
+    """Drawing instruments, with and without their shadows, beside rasterising the tissue that they are drawn into."""
+    scene = tissue(count, *size, device)
+    draw = _ours(scene)
+    with torch.no_grad():
+        colors, depths, alphas, *_ = draw(scene.gaussians)
+    depths = 0.1 * depths  # tissue at 10 cm, and instruments at 8
+    camera, rows = Camera(scene.Ks[0].cpu().numpy(), *size), []
+    for arms in (("PSM1",), ("PSM1", "PSM2")):
+        psm = load_arm("PSM", "LARGE_NEEDLE_DRIVER")
+        parts, capsules = build_instrument(psm)
+        places = [place_arm(arm, psm, camera, 0.08) for arm in arms]
+        poses = [{link: place.base @ pose for link, pose in link_poses(psm, place.joints, 0.6).items()} for place in places]
+        for shadows in (False, True):
+            drawing = InstrumentDrawing([parts] * len(arms), DrawingConfig(shadows=shadows), device, [capsules] * len(arms))
+            action = partial(drawing.draw, poses, camera, colors[0], depths[0], alphas[0])
+            ours, theirs = milliseconds([action, _forward(draw, scene)], device, seconds)
+            what = f"{len(arms)} instrument{'s' * (len(arms) > 1)}{' with shadows' * shadows}"
+            rows.append(Row(f"{what} {size[0]}x{size[1]}", ours, "ms", ours / theirs, f"image of {short(count)} Gaussians"))
     return rows
 
 

@@ -50,7 +50,7 @@ def _actions(context: LaunchContext) -> list[Node]:
         actions.append(Node(package="rviz2", executable="rviz2", namespace=given["namespace"], arguments=arguments))
     actions.append(node("reconstruction_node", model_file=given["model"]))
     actions.append(node("physics_node", arms=arms))
-    actions.append(node("rendering_node"))
+    actions.append(node("rendering_node", arms=arms))
     if wanted("view"):
         actions.append(node("viewer_node", arm="".join(arms[:1]), arms=arms))
     if given["bag"]:

@@ -15,6 +15,7 @@ from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.sequences.bag import BagReader
 
 _ARROW_PIXELS = 0.3  # length of the largest force's arrow, in image widths
+_RENDERED = (*messages.RENDERED_TOPICS, messages.RENDERED_COMPRESSED)  # of the two forms of images either will do
 _MOMENTS = (0.33, 0.6, 0.9)  # of the time in which the tool acts
 
 
@@ -31,7 +32,7 @@ class TouchReport:
 
     def __init__(self, recording: Path, arm: str):
         tip, wrench = messages.tool_pose(arm), messages.tool_wrench(arm)
-        wanted = (messages.LEFT_IMAGE, messages.CAMERA_POSE, messages.MASK, *messages.RENDERED_TOPICS, tip, wrench)
+        wanted = (messages.LEFT_IMAGE, messages.CAMERA_POSE, messages.MASK, *_RENDERED, tip, wrench)
         self._inputs: dict[float, dict[str, np.ndarray]] = {}  # image, pose and mask of the recording by time
         self._rendered: dict[float, dict[str, np.ndarray]] = {}  # image, pose, K and depth by time
         tips, forces = [], []  # (time, vector), world
@@ -43,8 +44,9 @@ class TouchReport:
                     tips.append((time, messages.decode_pose(message, "world", topic.name)[:3, 3]))
                 elif topic == wrench:
                     forces.append((time, messages.decode_wrench(message, topic.name)[0]))
-                elif topic in messages.RENDERED_TOPICS:
-                    self._rendered.setdefault(time, {})[topic.name] = _decode(topic, message)
+                elif topic in _RENDERED:
+                    name = messages.RENDERED_IMAGE.name if topic == messages.RENDERED_COMPRESSED else topic.name
+                    self._rendered.setdefault(time, {})[name] = _decode(topic, message)
                 else:
                     self._inputs.setdefault(time, {})[topic.name] = _decode(topic, message)
         names = [topic.name for topic in messages.RENDERED_TOPICS]
@@ -119,7 +121,7 @@ class _Track:
 
 
 def _decode(topic: messages.Topic, message: Any) -> np.ndarray:
-    if topic in (messages.LEFT_IMAGE, messages.RENDERED_IMAGE):
+    if topic in (messages.LEFT_IMAGE, messages.RENDERED_IMAGE, messages.RENDERED_COMPRESSED):
         return messages.decode_image(message, topic.name).copy()
     if topic in (messages.CAMERA_POSE, messages.RENDERED_POSE):
         return messages.decode_pose(message, "world", topic.name)

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from std_srvs.srv import Trigger
 
+from endo_sim_ros import messages
 from endo_sim_ros.core import drawing
 from endo_sim_ros.evaluation.interaction_report import TouchReport
 from endo_sim_ros.graph.processes import NodeGroup
@@ -122,7 +123,7 @@ def _touch_over_dds(
         progress.update(task, completed=1, total=1)
 
     try:
-        graph.start("recorder_node", bag=out / "recording", arms=[_ARM])
+        graph.start("recorder_node", bag=out / "recording", arms=[_ARM], topics=["all", messages.RENDERED_DEPTH.name])
         graph.start(
             "reconstruction_node",
             start_after=0.0,  # asked to, below
@@ -133,7 +134,7 @@ def _touch_over_dds(
             max_gaussians=30_000,
         )
         graph.start("physics_node", arms=[_ARM])
-        graph.start("rendering_node", image_width=width, idle_rate=1.0)
+        graph.start("rendering_node", image_width=width, idle_rate=1.0, arms=[_ARM])
         names = {"recorder", "reconstruction_node", "physics_node", "rendering_node"}
         wait("starting", lambda: names <= watcher.statuses.keys(), "recorder")
         player = graph.start("bag_player_node", bag=bag)

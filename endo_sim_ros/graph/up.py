@@ -231,7 +231,7 @@ def run_up(
         supervisor = Supervisor(graph, namespace, console, respawn)
         supervisor.start("reconstruction_node", *common, **({"model_file": model} if model else {}))
         supervisor.start("physics_node", *common, **({"arms": list(arms)} if arms else {}))
-        supervisor.start("rendering_node", *common)
+        supervisor.start("rendering_node", *common, **({"arms": list(arms)} if arms else {}))
         if view:
             supervisor.start("viewer_node", *common, **({"arm": arms[0], "arms": list(arms)} if arms else {}))
         if bag is not None:

@@ -5,6 +5,7 @@ from endo_sim_ros.instruments.inverse import Reach as Reach, ReachConfig as Reac
 from endo_sim_ros.instruments.kinematics import ArmKinematics as ArmKinematics, Joint as Joint
 from endo_sim_ros.instruments.placement import Placement as Placement, PlacementConfig as PlacementConfig, place_arm as place_arm
 from endo_sim_ros.instruments.shapes import (
+    LINKS as LINKS,
     Capsule as Capsule,
     JawShape as JawShape,
     Material as Material,

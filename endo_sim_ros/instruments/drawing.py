@@ -1,46 +1,36 @@
 """Instruments drawn into a picture of the tissue: what is nearer hides what is farther, both ways."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.core.config import Range, StageConfig
 from endo_sim_ros.core.device import pick_device
-from endo_sim_ros.core.kernels import launch, launch_in_shares, load_kernels
-from endo_sim_ros.instruments import drawing_kernels as kernels
-from endo_sim_ros.instruments.shapes import Material, Part
+from endo_sim_ros.core.kernels import launch, launch_in_shares, load_kernels, vectorised
+from endo_sim_ros.core.light import SURFACE
+from endo_sim_ros.instruments import drawing_kernels, resolving_kernels
+from endo_sim_ros.instruments.config import DrawingConfig as DrawingConfig
+from endo_sim_ros.instruments.shadow_kernels import MOST
+from endo_sim_ros.instruments.shapes import Capsule, Material, Part
 
 BACKGROUND, TISSUE, FIRST_LINK = 0, 1, 2
 """Labels of pixels; links of the instruments follow in their order."""
 
 SURFACES = {
-    Material.STEEL: (0.20, 0.20, 0.21, 0.42, 0.42),
-    Material.SHAFT: (0.035, 0.035, 0.038, 0.5, 0.10),
-    Material.INSULATION: (0.20, 0.19, 0.17, 0.55, 0.10),
+    Material.STEEL: (0.01, 0.01, 0.011, 0.36, 0.5),
+    Material.SHAFT: (0.002, 0.002, 0.0023, 0.55, 0.03),
+    Material.INSULATION: (0.04, 0.036, 0.029, 0.6, 0.03),
 }
-"""Red, green and blue at the model's reference distance, roughness, and strength of the shine; by eye beside real instruments."""
+"""Red, green and blue of what is scattered, roughness, and share of light that is mirrored; by eye beside real instruments."""
 
 _CREASE = np.cos(np.radians(35))  # faces that meet at a smaller angle are one smooth surface
+_STRIDE = 8  # pixels from one that the hue of the tissue is taken from to the next
 _NEAREST = 2e-3  # metres from the plane of the lens
-
-
-@dataclass(frozen=True)
-class DrawingConfig(StageConfig):
-    """How instruments are lit and meet the tissue."""
-
-    lamp_x: Annotated[float, Range(-0.05, 0.05, "m")] = 0.003
-    """Where the lamp is beside the lens, to the right in the picture."""
-    lamp_y: Annotated[float, Range(-0.05, 0.05, "m")] = -0.002
-    """The same downwards."""
-    ambient: Annotated[float, Range(0, 1)] = 0.12
-    """Share of the light that comes from all around: wet tissue reflects much of the lamp's."""
-    softness: Annotated[float, Range(1e-5, 0.01, "m")] = 4e-4
-    """Depth over which an instrument comes out of the tissue; splats have no sharper surface."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +50,26 @@ class Picture:
     labels: Tensor
 
 
+@dataclass(frozen=True)
+class PosedInstruments:
+    """Instruments at one moment.
+
+    Args:
+        drawing: What draws them.
+        poses: Of each the poses [4, 4] of its links, world, m.
+    """
+
+    drawing: "InstrumentDrawing"
+    poses: Sequence[Mapping[str, np.ndarray]]
+
+    def draw_into(self, cameras: Sequence[Camera], colors: Tensor, depths: Tensor, alphas: Tensor) -> Tensor:
+        """Draw them into the pictures of the eyes of one endoscope, whose lamp is beside the first; see `InstrumentDrawing.draw_into`."""
+        config = self.drawing.config
+        lamp = cameras[0].pose @ np.array([config.lamp_x, config.lamp_y, 0.0, 1.0])
+        lamps = np.stack([(camera.viewmat @ lamp)[:3] for camera in cameras])
+        return self.drawing.draw_into([self.poses] * len(cameras), cameras, colors, depths, alphas, lamps)
+
+
 class InstrumentDrawing:
     """Draws instruments.
 
@@ -67,9 +77,19 @@ class InstrumentDrawing:
         instruments: The parts of each.
         config: Options.
         device: Compute device.
+        capsules: The capsules of each, which throw shadows; without them there are none.
+
+    Raises:
+        ValueError: If there are more than 64 capsules.
     """
 
-    def __init__(self, instruments: Sequence[Sequence[Part]], config: DrawingConfig = DrawingConfig(), device: str = "auto") -> None:
+    def __init__(
+        self,
+        instruments: Sequence[Sequence[Part]],
+        config: DrawingConfig = DrawingConfig(),
+        device: str = "auto",
+        capsules: Sequence[Sequence[Capsule]] = (),
+    ) -> None:
         self.config, self.device = config, pick_device(device)
         self.links = tuple(dict.fromkeys((i, part.link) for i, parts in enumerate(instruments) for part in parts))
         """The number of an instrument and the name of a link, in the order of the labels."""
@@ -84,10 +104,22 @@ class InstrumentDrawing:
         self._corners = move(np.concatenate(corners).reshape(-1, 3), torch.float32)
         self._normals = move(np.concatenate(normals).reshape(-1, 3), torch.float32)
         self._links, self._materials = move(links, torch.int32), move(materials, torch.int32)
+        self._owners = move([self.links[link][0] for link in links], torch.int32)
         self._surfaces = move([SURFACES[material] for material in Material], torch.float32)
-        self._screen, self._turned = torch.empty_like(self._corners), torch.empty_like(self._corners)
-        self._samples = torch.empty(0, dtype=torch.int64, device=self.device)
-        load_kernels((kernels,), self.device)
+        thrown = [(i, capsule) for i, own in enumerate(capsules) for capsule in own] if config.shadows else []
+        if len(thrown) > int(MOST):
+            raise ValueError(f"{len(thrown)} capsules throw shadows, and at most {int(MOST)} can; draw fewer instruments")
+        ends = np.array([(capsule.start, capsule.end) for _, capsule in thrown]).reshape(-1, 2, 3)
+        self._starts = move(ends, torch.float32)
+        self._capsule_links = move([self.links.index((i, capsule.link)) for i, capsule in thrown], torch.int32)
+        self._capsule_owners = move([i for i, _ in thrown], torch.int32)
+        self._radii = move([capsule.radius for _, capsule in thrown], torch.float32)
+        self._room: tuple[tuple[int, int, int], dict[str, Tensor]] = (0, 0, 0), {}
+        load_kernels((drawing_kernels, resolving_kernels), self.device)
+
+    def at(self, poses: Sequence[Mapping[str, np.ndarray]]) -> PosedInstruments:
+        """The instruments where the poses [4, 4] of their links, world, put them."""
+        return PosedInstruments(self, poses)
 
     def draw(self, poses: Sequence[Mapping[str, np.ndarray]], camera: Camera, colors: Tensor, depths: Tensor, alphas: Tensor) -> Picture:
         """The picture of the tissue with the instruments in it.
@@ -97,37 +129,101 @@ class InstrumentDrawing:
             camera: What the tissue was rendered for.
             colors, depths, alphas: Rendered tissue [H, W, 3] and [H, W], before light and exposure.
         """
-        K, width, height = camera.K, camera.width, camera.height
-        view = kernels.View()
-        view.fx, view.fy, view.cx, view.cy = (float(value) for value in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
-        view.width, view.height, view.nearest = width, height, _NEAREST
-        look = kernels.Look()
-        look.lamp, look.ambient, look.softness = (self.config.lamp_x, self.config.lamp_y, 0.0), self.config.ambient, self.config.softness
-        local = np.stack([camera.viewmat @ poses[i][link] for i, link in self.links])
-        local = torch.as_tensor(local, dtype=torch.float32, device=self.device)
-        faces, pixels = len(self._links), width * height
-        if len(self._samples) != pixels * int(kernels.SAMPLES):
-            self._samples = torch.full((pixels * int(kernels.SAMPLES),), int(kernels.EMPTY), dtype=torch.int64, device=self.device)
-        picture = Picture(colors.clone(), depths.clone(), alphas.clone(), torch.zeros(height, width, dtype=torch.uint8, device=self.device))
-        flat = [
-            x.reshape(-1) if x.ndim == 2 else x.reshape(-1, 3) for x in (picture.colors, picture.depths, picture.alphas, picture.labels)
-        ]
-        self._launch(kernels.project, 3 * faces, [self._corners, self._normals, self._links, local, view, self._screen, self._turned])
-        if self.device == "cpu":
-            launch_in_shares(
-                kernels.cover_rows, -(-height // int(kernels.BLOCK)), [faces, self._screen, view, self._samples, flat[3]], least=4
-            )
-        else:
-            self._launch(kernels.cover_faces, faces, [faces, self._screen, view, self._samples, flat[3]])
-        scene = [self._samples, self._screen, self._turned, self._links, self._materials, self._surfaces, view, look]
-        self._launch(kernels.resolve, pixels, [*scene, *flat])
-        return picture
+        colors, depths, alphas = colors.clone()[None], depths.clone()[None], alphas.clone()[None]
+        labels = self.draw_into([poses], [camera], colors, depths, alphas)
+        return Picture(colors[0], depths[0], alphas[0], labels[0])
 
-    def _launch(self, kernel: object, count: int, arguments: list) -> None:
-        if self.device == "cpu":
-            launch_in_shares(kernel, count, arguments)
+    def draw_into(
+        self,
+        poses: Sequence[Sequence[Mapping[str, np.ndarray]]],
+        cameras: Sequence[Camera],
+        colors: Tensor,
+        depths: Tensor,
+        alphas: Tensor,
+        lamps: np.ndarray | None = None,
+    ) -> Tensor:
+        """Draw the instruments into B pictures at once, such as those of two eyes or of as many copies of a scene.
+
+        Args:
+            poses: For each picture of each instrument the poses [4, 4] of its links, world.
+            cameras: What each was rendered for, all of one size.
+            colors, depths, alphas: Rendered tissue [B, H, W, 3] and [B, H, W], contiguous; the instruments come into them.
+            lamps: Where the lamp of each is in its camera [B, 3], m; that of the options by default.
+
+        Returns:
+            Labels [B, H, W], uint8, as in `Picture`.
+        """
+        config, count, (width, height) = self.config, len(cameras), (cameras[0].width, cameras[0].height)
+        frame, look = drawing_kernels.Frame(), resolving_kernels.Look()
+        tile = int(drawing_kernels.TILE)
+        frame.width, frame.height, frame.across, frame.down = width, height, -(-width // tile), -(-height // tile)
+        frame.faces, frame.links, frame.capsules = len(self._links), len(self.links), len(self._radii)
+        frame.several, frame.spread, frame.nearest = int(len({i for i, _ in self.links}) > 1), config.blur, _NEAREST
+        frame.stride = _stride(frame.across * frame.down * frame.down)
+        look.ambient, look.softness = config.ambient, config.softness
+        look.lamp_size, look.mirror, look.white = config.lamp_size, config.mirror, config.white
+        lamps = np.tile((config.lamp_x, config.lamp_y, 0.0), (count, 1)) if lamps is None else lamps
+        views = [(*(float(c.K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2))), *lamp) for c, lamp in zip(cameras, lamps, strict=True)]
+        views = self._upload(views)
+        local = [camera.viewmat @ np.stack([own[i][link] for i, link in self.links]) for own, camera in zip(poses, cameras, strict=True)]
+        local = self._upload(local)
+        room = self._buffers(count, frame)
+        labels = (alphas > SURFACE).to(torch.uint8)
+        coarse, seen = colors[:, ::_STRIDE, ::_STRIDE], (alphas[:, ::_STRIDE, ::_STRIDE] > SURFACE)[..., None]
+        around = (coarse * coarse * seen).sum((1, 2)) + 1e-6  # the hue of the tissue in linear light
+        around = (around / around.amax(1, keepdim=True)).contiguous()
+        corners = [self._corners, self._normals, self._links, local, views, frame]
+        ends, drawn = room["ends"], [room["screen"], room["rows"], frame, room["samples"], room["marks"]]
+        self._launch(drawing_kernels.project, count * frame.faces, [*corners, room["screen"], room["turned"], room["rows"]])
+        self._launch(drawing_kernels.place, count * frame.capsules, [self._starts, self._capsule_links, local, frame, ends])
+        flat = [colors.view(-1, 3), depths.view(-1), alphas.view(-1), labels.view(-1)]
+        scene = [room["samples"], room["screen"], room["turned"], self._links, self._owners, self._materials, self._surfaces]
+        scene += [ends, self._radii, self._capsule_owners, views, around, frame, look, *flat]
+        if vectorised(self.device):
+            self._launch(drawing_kernels.cover_rows, count * frame.down, drawn, least=4)
+            self._launch(resolving_kernels.resolve_tiles, count * frame.across * frame.down, [room["marks"], *scene], least=4)
         else:
+            self._launch(drawing_kernels.cover_faces, count * frame.faces, drawn)
+            self._launch(resolving_kernels.resolve_pixels, count * width * height, scene)
+        return labels
+
+    def _upload(self, values: Sequence) -> Tensor:
+        """Numbers as float32 on the device, without waiting for what that does at the moment."""
+        tensor = torch.from_numpy(np.asarray(values, np.float32))
+        return tensor if torch.device(self.device).type == "cpu" else tensor.pin_memory().to(self.device, non_blocking=True)
+
+    def _buffers(self, count: int, frame: Any) -> dict[str, Tensor]:
+        """What kernels write for each other; samples are left empty by each picture for the next."""
+        key = (count, frame.width, frame.height)
+        if self._room[0] != key:
+            new = lambda shape, kind, value=0: torch.full(shape, value, dtype=kind, device=self.device)
+            triangles, pixels = count * frame.faces, count * frame.width * frame.height
+            self._room = (
+                key,
+                {
+                    "screen": new((3 * triangles, 3), torch.float32),
+                    "turned": new((3 * triangles, 3), torch.float32),
+                    "rows": new((triangles, 2), torch.int32),
+                    "samples": new((pixels * int(drawing_kernels.SAMPLES),), torch.int64, int(drawing_kernels.EMPTY)),
+                    "marks": new((count * frame.across * frame.down,), torch.uint8),
+                    "ends": new((count * frame.capsules, 2, 3), torch.float32),
+                },
+            )
+        return self._room[1]
+
+    def _launch(self, kernel: object, count: int, arguments: list, least: int = 1024) -> None:
+        if torch.device(self.device).type == "cpu":
+            launch_in_shares(kernel, count, arguments, least)
+        elif count:
             launch(kernel, count, [0, *arguments], self.device)
+
+
+def _stride(count: int) -> int:
+    """A step near the golden section of a count that has no factor in common with it, so that steps visit everything once."""
+    step = max(int(0.618 * count), 1)
+    while math.gcd(step, count) > 1:
+        step += 1
+    return step
 
 
 def corner_normals(part: Part) -> np.ndarray:

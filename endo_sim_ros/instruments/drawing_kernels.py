@@ -1,4 +1,4 @@
-"""Kernels of `drawing`: triangles to samples, the nearest in each, and samples to pixels."""
+"""Kernels of `drawing`, for B pictures at once: triangles to samples, the nearest in each. `resolving_kernels` makes pixels of them."""
 
 import warp as wp
 
@@ -6,34 +6,39 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 SAMPLES = wp.constant(4)  # of a pixel, on a rotated grid: as many levels of grey along any edge
 EMPTY = wp.constant(wp.int64(0x7FFFFFFFFFFFFFFF))
-BLOCK = wp.constant(32)  # rows that one item of `cover_rows` takes
+BEYOND = wp.constant(1.0e6)  # pixels: float32 cannot tell on which side of an edge a sample lies from so far
+TILE = wp.constant(16)  # pixels a side: what one item takes on a CPU
 
 
 @wp.struct
-class View:
-    """A camera and the size of its picture."""
+class Frame:
+    """Sizes of the pictures and of what is drawn into each."""
 
-    fx: float
-    fy: float
-    cx: float
-    cy: float
     width: int
     height: int
+    across: int  # tiles in a row
+    down: int
+    faces: int
+    links: int
+    capsules: int
+    several: int  # whether there is more than one instrument
+    stride: int  # tiles are taken in steps of it, so that threads share the work evenly
+    spread: float  # pixels: side of the square from which a pixel takes light
     nearest: float  # m: what is nearer to the plane of the lens is not drawn
 
 
-@wp.struct
-class Look:
-    """How instruments are lit."""
-
-    lamp: wp.vec3  # m, camera
-    ambient: float  # share of the light that comes from all around
-    softness: float  # m: over such a depth an instrument comes out of the tissue
+@wp.func
+def offset(sample: int, row: int, column: int, spread: float) -> wp.vec2:
+    """Where in a pixel a sample lies, from its corner."""
+    u = (0.375 + 0.5 * float(sample) - 0.25 * float(sample // 2)) % 1.0
+    if (row + column) % 2 == 1:  # the mirror image, as along an edge of slope 1 : 2 two samples are as one
+        u = 1.0 - u
+    return wp.vec2(0.5 + spread * (u - 0.5), 0.5 + spread * (0.125 + 0.25 * float(sample) - 0.5))
 
 
 @wp.func
-def offset(sample: int) -> wp.vec2:
-    return wp.vec2((0.375 + 0.5 * float(sample) - 0.25 * float(sample // 2)) % 1.0, 0.125 + 0.25 * float(sample))
+def lens(views: wp.array2d[float], picture: int) -> wp.vec4:
+    return wp.vec4(views[picture, 0], views[picture, 1], views[picture, 2], views[picture, 3])
 
 
 @wp.kernel
@@ -42,18 +47,47 @@ def project(
     corners: wp.array[wp.vec3],  # [3 F] m, in the frame of the link
     normals: wp.array[wp.vec3],  # [3 F]
     links: wp.array[int],  # [F]
-    poses: wp.array[wp.mat44],  # [L], in the camera
-    view: View,
-    screen: wp.array[wp.vec3],  # out [3 F]: column and row in pixels, and one over the depth, 0 behind the lens
-    turned: wp.array[wp.vec3],  # out [3 F]: normals, camera
+    poses: wp.array[wp.mat44],  # [B L], in the camera
+    views: wp.array2d[float],  # [B, 7] fx fy cx cy, and the lamp, m, camera
+    frame: Frame,
+    screen: wp.array[wp.vec3],  # out [3 B F]: column and row in pixels, and one over the depth
+    turned: wp.array[wp.vec3],  # out [3 B F]: normals, camera
+    rows: wp.array[wp.vec2i],  # out [B F]: the first and the last row that a triangle may reach; none if it is not seen
 ):
     i = first + wp.tid()
-    pose = poses[links[i // 3]]
-    at = wp.transform_point(pose, corners[i])
-    turned[i] = wp.transform_vector(pose, normals[i])
-    screen[i] = wp.vec3(0.0, 0.0, 0.0)
-    if at[2] > view.nearest:
-        screen[i] = wp.vec3(view.fx * at[0] / at[2] + view.cx, view.fy * at[1] / at[2] + view.cy, 1.0 / at[2])
+    picture, face = i // frame.faces, i % frame.faces
+    pose, view = poses[picture * frame.links + links[face]], lens(views, picture)
+    rows[i] = wp.vec2i(1, 0)
+    for k in range(3):
+        at = wp.transform_point(pose, corners[3 * face + k])
+        u, v = view[0] * at[0] / at[2] + view[2], view[1] * at[1] / at[2] + view[3]
+        if not (at[2] > frame.nearest and wp.abs(u) < BEYOND and wp.abs(v) < BEYOND):  # nor if it is not a number
+            return
+        screen[3 * i + k] = wp.vec3(u, v, 1.0 / at[2])
+    a, b, c = corner(screen, 3 * i), corner(screen, 3 * i + 1), corner(screen, 3 * i + 2)
+    if (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]) >= 0.0:  # rows count downwards: it turns its back
+        return
+    margin = 0.5 * (frame.spread - 1.0)
+    top = wp.floor(wp.clamp(wp.min(wp.min(a[1], b[1]), c[1]) - margin, 0.0, float(frame.height)))
+    bottom = wp.floor(wp.clamp(wp.max(wp.max(a[1], b[1]), c[1]) + margin, -1.0, float(frame.height) - 0.5))
+    rows[i] = wp.vec2i(int(top), int(bottom))
+    for k in range(3):
+        turned[3 * i + k] = wp.transform_vector(pose, normals[3 * face + k])
+
+
+@wp.kernel
+def place(
+    first: int,
+    starts: wp.array2d[wp.vec3],  # [C, 2] ends of capsules, m, in the frame of the link
+    links: wp.array[int],  # [C]
+    poses: wp.array[wp.mat44],
+    frame: Frame,
+    ends: wp.array2d[wp.vec3],  # out [B C, 2], camera
+):
+    i = first + wp.tid()
+    pose = poses[i // frame.capsules * frame.links + links[i % frame.capsules]]
+    for k in range(2):
+        ends[i, k] = wp.transform_point(pose, starts[i % frame.capsules, k])
 
 
 @wp.func
@@ -67,16 +101,16 @@ def weights(a: wp.vec3, b: wp.vec3, c: wp.vec3, u: float, v: float) -> wp.vec3:
 
 
 @wp.func
-def corner(screen: wp.array[wp.vec3], face: int, i: int) -> wp.vec3:
-    return screen[3 * face + i]
+def corner(screen: wp.array[wp.vec3], i: int) -> wp.vec3:
+    return screen[i]
 
 
 @wp.func
-def span(a: wp.vec3, b: wp.vec3, row: int, columns: wp.vec2) -> wp.vec2:
-    """What of the columns from one to another may lie on the inner side of the edge from a to b, anywhere in a row."""
+def span(a: wp.vec3, b: wp.vec3, row: int, spread: float, columns: wp.vec2) -> wp.vec2:
+    """What of the middles of pixels from one column to another may see the inner side of the edge from a to b."""
     slope = a[1] - b[1]  # of the weight, by columns
     here = a[0] * b[1] - a[1] * b[0] + (b[0] - a[0]) * (float(row) + 0.5)  # at column 0
-    at_best = here - 0.5 * wp.abs(b[0] - a[0])
+    at_best = here - 0.5 * spread * (wp.abs(b[0] - a[0]) + wp.abs(slope))
     if slope > 0.0:
         return wp.vec2(columns[0], wp.min(columns[1], -at_best / slope))
     if slope < 0.0:
@@ -85,125 +119,80 @@ def span(a: wp.vec3, b: wp.vec3, row: int, columns: wp.vec2) -> wp.vec2:
 
 
 @wp.func
-def cover(face: int, low: int, high: int, screen: wp.array[wp.vec3], view: View, samples: wp.array[wp.int64], marks: wp.array[wp.uint8]):
-    """Enter a triangle into the samples of rows from ``low`` to below ``high``, and mark their pixels."""
-    a, b, c = corner(screen, face, 0), corner(screen, face, 1), corner(screen, face, 2)
-    if wp.min(wp.min(a[2], b[2]), c[2]) <= 0.0:
-        return
-    if wp.max(wp.max(a[1], b[1]), c[1]) < float(low) or wp.min(wp.min(a[1], b[1]), c[1]) > float(high):
-        return
-    area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
-    if area >= 0.0:  # rows count downwards: it turns its back
-        return
-    top = wp.max(int(wp.floor(wp.min(wp.min(a[1], b[1]), c[1]))), low)
-    bottom = wp.min(int(wp.floor(wp.max(wp.max(a[1], b[1]), c[1]))), high - 1)
-    for row in range(top, bottom + 1):
-        columns = wp.vec2(0.0, float(view.width) - 0.5)
-        columns = span(a, b, row, span(b, c, row, span(c, a, row, columns)))
-        for column in range(int(columns[0]), int(wp.floor(columns[1])) + 1):
-            for sample in range(SAMPLES):
-                beside = offset(sample)
-                w = weights(a, b, c, float(column) + beside[0], float(row) + beside[1])
-                if wp.max(wp.max(w[0], w[1]), w[2]) <= 0.0:
-                    depth = area / (w[0] * a[2] + w[1] * b[2] + w[2] * c[2])
-                    key = (wp.int64(wp.cast(depth, wp.int32)) << wp.int64(32)) | wp.int64(face)
-                    wp.atomic_min(samples, (row * view.width + column) * SAMPLES + sample, key)
-                    marks[row * view.width + column] = wp.uint8(1)
-
-
-@wp.kernel
-def cover_rows(first: int, faces: int, screen: wp.array[wp.vec3], view: View, samples: wp.array[wp.int64], marks: wp.array[wp.uint8]):
-    """On a CPU: some rows, to which no other thread writes."""
-    low = BLOCK * (first + wp.tid())
-    high = wp.min(low + BLOCK, view.height)
-    for face in range(faces):
-        cover(face, low, high, screen, view, samples, marks)
-
-
-@wp.kernel
-def cover_faces(first: int, faces: int, screen: wp.array[wp.vec3], view: View, samples: wp.array[wp.int64], marks: wp.array[wp.uint8]):
-    """On a GPU: one triangle."""
-    cover(first + wp.tid(), 0, view.height, screen, view, samples, marks)
-
-
-@wp.func
-def reflected(normal: wp.vec3, at: wp.vec3, color: wp.vec3, roughness: float, strength: float, look: Look) -> wp.vec3:
-    """Colour of a surface with the light at the lamp: diffuse, and a microfacet lobe (GGX) of its roughness."""
-    to_eye, to_lamp = wp.normalize(-at), wp.normalize(look.lamp - at)
-    half = wp.normalize(to_eye + to_lamp)
-    facing = wp.max(wp.dot(normal, to_lamp), 0.0)
-    aligned = wp.max(wp.dot(normal, half), 0.0)
-    spread = roughness * roughness
-    lobe = spread / wp.pow(aligned * aligned * (spread * spread - 1.0) + 1.0, 2.0) * spread
-    diffuse = look.ambient + (1.0 - look.ambient) * wp.pow(facing, 0.4545)  # pictures are gamma-compressed
-    shine = strength * wp.pow(wp.min(0.25 * lobe * facing, 1.0e3), 0.4545)
-    return color * diffuse + wp.vec3(shine, shine, shine)
-
-
-@wp.kernel
-def resolve(
-    first: int,
-    samples: wp.array[wp.int64],  # [P · 4], left empty for the next picture
+def cover(
+    i: int,  # of B F triangles
+    low: int,
+    high: int,
+    alone: int,  # whether no other thread writes to these rows
     screen: wp.array[wp.vec3],
-    normals: wp.array[wp.vec3],
-    links: wp.array[int],
-    materials: wp.array[int],  # [F]
-    surfaces: wp.array2d[float],  # [M, 5] red, green, blue, roughness, strength of the shine
-    view: View,
-    look: Look,
-    colors: wp.array[wp.vec3],  # in and out [P], as are the next two
-    depths: wp.array[float],  # Σ w z, m
-    alphas: wp.array[float],  # Σ w
-    labels: wp.array[wp.uint8],  # in and out [P]: marks at first
+    rows: wp.array[wp.vec2i],
+    frame: Frame,
+    samples: wp.array[wp.int64],
+    marks: wp.array[wp.uint8],
 ):
-    pixel = first + wp.tid()
-    alpha = alphas[pixel]
-    marked = labels[pixel] != wp.uint8(0)
-    labels[pixel] = wp.where(alpha > 0.5, wp.uint8(1), wp.uint8(0))
-    if not marked:
+    """Enter a triangle into the samples of rows from ``low`` to ``high``, and mark their tiles."""
+    a, b, c = corner(screen, 3 * i), corner(screen, 3 * i + 1), corner(screen, 3 * i + 2)
+    picture, face = i // frame.faces, i % frame.faces
+    per_area = 1.0 / ((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
+    by_u = wp.vec3(b[1] - c[1], c[1] - a[1], a[1] - b[1])  # of the weights
+    by_v = wp.vec3(c[0] - b[0], a[0] - c[0], b[0] - a[0])
+    margin = 0.5 * frame.spread
+    leftmost = wp.max(wp.min(wp.min(a[0], b[0]), c[0]) - margin, 0.5)
+    rightmost = wp.min(wp.max(wp.max(a[0], b[0]), c[0]) + margin, float(frame.width) - 0.5)
+    if leftmost > rightmost:
         return
-    tissue = float(1.0e9)
-    if alpha > 0.5:
-        tissue = depths[pixel] / alpha
-    total = float(0.0)
-    depth = float(0.0)
-    color = wp.vec3(0.0, 0.0, 0.0)
-    normal = wp.vec3(0.0, 0.0, 0.0)
-    polish = wp.vec2(0.0, 0.0)
-    nearest = float(1.0e9)
-    link = int(0)
-    for sample in range(SAMPLES):
-        key = samples[SAMPLES * pixel + sample]
-        if key != EMPTY:
-            samples[SAMPLES * pixel + sample] = EMPTY
-            face = int(key & wp.int64(0xFFFFFFFF))
-            a, b, c = corner(screen, face, 0), corner(screen, face, 1), corner(screen, face, 2)
-            beside = offset(sample)
-            u, v = float(pixel % view.width) + beside[0], float(pixel // view.width) + beside[1]
-            w = wp.cw_mul(weights(a, b, c, u, v), wp.vec3(a[2], b[2], c[2]))
-            share = w / (w[0] + w[1] + w[2])
-            z = wp.cast(wp.int32(key >> wp.int64(32)), wp.float32)
-            seen = wp.clamp(0.5 + (tissue - z) / look.softness, 0.0, 1.0)
-            if seen > 0.0:
-                bent = share[0] * normals[3 * face] + share[1] * normals[3 * face + 1] + share[2] * normals[3 * face + 2]
-                normal += seen * wp.normalize(bent)
-                surface = surfaces[materials[face]]
-                color += seen * wp.vec3(surface[0], surface[1], surface[2])
-                polish += seen * wp.vec2(surface[3], surface[4])
-                depth += seen * z
-                total += seen
-                if z < nearest:
-                    nearest = z
-                    link = links[face]
-    if total > 0.0:
-        # Lit once, as the mean of what its samples show: light costs more than all else.
-        z = depth / total
-        x = (float(pixel % view.width) + 0.5 - view.cx) / view.fx * z
-        y = (float(pixel // view.width) + 0.5 - view.cy) / view.fy * z
-        lit = reflected(wp.normalize(normal), wp.vec3(x, y, z), color / total, polish[0] / total, polish[1] / total, look)
-        kept = 1.0 - total / float(SAMPLES)
-        colors[pixel] = kept * colors[pixel] + (1.0 - kept) * lit
-        depths[pixel] = kept * depths[pixel] + depth / float(SAMPLES)
-        alphas[pixel] = kept * alpha + total / float(SAMPLES)
-        if kept < 0.5:
-            labels[pixel] = wp.uint8(2 + link)
+    for row in range(wp.max(rows[i][0], low), wp.min(rows[i][1], high) + 1):
+        columns = wp.vec2(leftmost, rightmost)
+        columns = span(a, b, row, frame.spread, columns)
+        columns = span(b, c, row, frame.spread, columns)
+        columns = span(c, a, row, frame.spread, columns)
+        tile = (picture * frame.down + row // TILE) * frame.across
+        for column in range(int(wp.ceil(columns[0] - 0.5)), int(wp.floor(columns[1] - 0.5)) + 1):
+            here = weights(a, b, c, float(column), float(row))
+            pixel = (picture * frame.height + row) * frame.width + column
+            for sample in range(SAMPLES):
+                beside = offset(sample, row, column, frame.spread)
+                w = here + beside[0] * by_u + beside[1] * by_v
+                if wp.max(wp.max(w[0], w[1]), w[2]) <= 0.0:
+                    inverse = (w[0] * a[2] + w[1] * b[2] + w[2] * c[2]) * per_area
+                    # Of positive floats the bits order as they do: what is nearest has the least key.
+                    key = (wp.int64(0x7FFFFFFF - wp.cast(inverse, wp.int32)) << wp.int64(32)) | wp.int64(face)
+                    if key < samples[pixel * SAMPLES + sample]:
+                        if alone != 0:
+                            samples[pixel * SAMPLES + sample] = key
+                        else:
+                            wp.atomic_min(samples, pixel * SAMPLES + sample, key)
+                        marks[tile + column // TILE] = wp.uint8(1)
+
+
+@wp.kernel
+def cover_rows(
+    first: int,
+    screen: wp.array[wp.vec3],
+    rows: wp.array[wp.vec2i],
+    frame: Frame,
+    samples: wp.array[wp.int64],
+    marks: wp.array[wp.uint8],
+):
+    """On a CPU: the rows of some tiles, to which no other thread writes."""
+    i = first + wp.tid()
+    picture, low = i // frame.down, TILE * ((i % frame.down * frame.stride) % frame.down)
+    for face in range(picture * frame.faces, (picture + 1) * frame.faces):
+        reached = rows[face]
+        if reached[0] < low + TILE and reached[1] >= low and reached[0] <= reached[1]:
+            cover(face, low, low + TILE - 1, 1, screen, rows, frame, samples, marks)
+
+
+@wp.kernel
+def cover_faces(
+    first: int,
+    screen: wp.array[wp.vec3],
+    rows: wp.array[wp.vec2i],
+    frame: Frame,
+    samples: wp.array[wp.int64],
+    marks: wp.array[wp.uint8],
+):
+    """On a GPU: one triangle."""
+    i = first + wp.tid()
+    if rows[i][0] <= rows[i][1]:
+        cover(i, 0, frame.height - 1, 0, screen, rows, frame, samples, marks)

@@ -15,6 +15,9 @@ from numpy.typing import ArrayLike
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.instruments.kinematics import ArmKinematics
 
+LINKS = ("roll", "wrist_pitch", "wrist_yaw", "jaw_left", "jaw_right")
+"""Names of the links, in the order in which `link_poses` gives them."""
+
 _DISTAL_Z = np.eye(3)
 """Axes of a frame whose z points at the tip, in which shafts are built."""
 _DISTAL_X = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
@@ -144,6 +147,7 @@ def build_instrument(arm: ArmKinematics, shape: ToolShape | None = None) -> tupl
     # Two ears hold the pin of the pitch; between them turns the second clevis, which holds that of the yaw.
     _clevis(build, -2.2 * r, 0.92 * r, 0.62 * r)
     _block(build, wrist, 0.9 * r, 0.5 * r)
+    build.capsule("roll", (0, 0, -2.2 * r), (0, 0, -0.3 * r), 0.66 * r)
     build.capsule("wrist_pitch", (0, 0, 0), (0, 0, wrist), 0.8 * r, _DISTAL_X)
     if shape.cover:
         sleeve = [_circle(k * r, s * wrist, 40) for k, s in ((0.74, 0.3), (0.86, 0.38), (0.86, 0.68), (0.66, 0.82))]
@@ -168,8 +172,8 @@ def link_poses(arm: ArmKinematics, joints: ArrayLike, jaw: ArrayLike = 0.0) -> d
         ValueError: As `ArmKinematics.check_joints` does.
     """
     frames = arm.link_frames(joints)
-    poses = {name: frames[..., i, :, :] for i, name in enumerate(("roll", "wrist_pitch", "wrist_yaw"), 3)}  # files may name them otherwise
-    for name, side in (("jaw_left", -0.5), ("jaw_right", 0.5)):
+    poses = {name: frames[..., i, :, :] for i, name in enumerate(LINKS[:3], 3)}  # files may name them otherwise
+    for name, side in zip(LINKS[3:], (-0.5, 0.5)):
         angle = side * np.broadcast_to(np.asarray(jaw, np.float64), frames.shape[:-3])
         turn = np.zeros((*angle.shape, 4, 4))
         turn[..., 0, 0], turn[..., 0, 1], turn[..., 1, 0], turn[..., 1, 1] = np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)
@@ -205,7 +209,7 @@ def _circle(radius: float, z: float, count: int = 32) -> np.ndarray:
 def _shaft(build: _Builder, shape: ToolShape) -> None:
     r, end = shape.radius, -2.2 * shape.radius
     stations = np.linspace(-shape.shaft, end - 1.6e-3, 13)  # long triangles would vanish whole where one corner is behind the lens
-    build.loft("roll", Material.SHAFT, [_circle(r, z, 40) for z in stations])
+    build.loft("roll", Material.SHAFT, [_circle(r, z, 28) for z in stations])
     collar = [(0.99, 0.0), (1.03, 0.25e-3), (1.03, 1.3e-3), (0.93, 1.6e-3)]
     build.loft("roll", Material.STEEL, [_circle(k * r, end - 1.6e-3 + z, 40) for k, z in collar])
     build.capsule("roll", (0, 0, -shape.shaft), (0, 0, end), r)

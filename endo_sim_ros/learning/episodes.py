@@ -73,6 +73,7 @@ class Episode:
     action: np.ndarray  # [T, 14·A] float32
     image_size: tuple[int, int]  # height, width
     image_numbers: np.ndarray  # [T] which of the bag's rendered images is shown
+    image_topic: Topic = messages.RENDERED_IMAGE  # or that of compressed images
 
     def __len__(self) -> int:
         return len(self.state)
@@ -83,7 +84,7 @@ class Episode:
         Raises:
             SequenceError: If one cannot be used or has another size than the first.
         """
-        topic = messages.RENDERED_IMAGE
+        topic = self.image_topic
         for message in _picked(self.bag, topic, self.image_numbers):
             image = _usable(self.bag, lambda message=message: messages.decode_image(message, topic.name))
             if image.shape[:2] != self.image_size:
@@ -121,12 +122,13 @@ def read_episode(
         if not reader.message_count:
             raise SequenceError(f"{bag}: the recording is empty; was the graph running?")
         arms = arms or _arms(reader.topics)
-        reader.require(*((topic,) for topic in _needed(arms)))
-        streams = _usable(bag, lambda: _streams(reader, arms, known))
-    for topic in _needed(arms):
+        pictures = _image_topic(reader.topics)
+        reader.require(*((topic,) for topic in _needed(arms, pictures)))
+        streams = _usable(bag, lambda: _streams(reader, arms, known, pictures))
+    for topic in _needed(arms, pictures):
         if topic not in streams:
             raise SequenceError(f"{bag}: no message with a time on /{topic.name}; record while the graph runs")
-    times, rate = _frame_times(bag, streams, arms, fps, sampling)
+    times, rate = _frame_times(bag, streams, arms, fps, sampling, pictures)
     now, following = times[:-1], times[1:]
     nodes = streams[messages.CONTROL_NODES].at(now)[:, 0].astype(int)
     tips, state, action = [], [], []
@@ -151,7 +153,7 @@ def read_episode(
         summarize_tissue(_usable(bag, lambda message=message: messages.decode_control_nodes(message)), tip)
         for message, tip in zip(_picked(bag, messages.CONTROL_NODES, nodes), np.stack(tips, 1), strict=True)
     ]
-    numbers = streams[messages.RENDERED_IMAGE].at(now).astype(int)
+    numbers = streams[pictures].at(now).astype(int)
     height, width = numbers[0, 1:]
     return Episode(
         bag,
@@ -163,6 +165,7 @@ def read_episode(
         np.hstack(action).astype(np.float32),
         (int(height), int(width)),
         numbers[:, 0],
+        pictures,
     )
 
 
@@ -186,13 +189,19 @@ def _arms(present: dict[str, str]) -> tuple[str, ...]:
     return tuple(sorted(found[0] & found[1])) or ("PSM1",)
 
 
-def _observed(arms: tuple[str, ...]) -> list[Topic]:
+def _image_topic(present: dict[str, str]) -> Topic:
+    """The topic of the rendered images: raw ones, where they were recorded, are exact."""
+    raw, compressed = messages.RENDERED_IMAGE, messages.RENDERED_COMPRESSED
+    return compressed if f"/{compressed.name}" in present and f"/{raw.name}" not in present else raw
+
+
+def _observed(arms: tuple[str, ...], pictures: Topic) -> list[Topic]:
     """What the simulation says in each step."""
-    return [messages.RENDERED_IMAGE, messages.CONTROL_NODES, *map(messages.tool_reaction, arms)]
+    return [pictures, messages.CONTROL_NODES, *map(messages.tool_reaction, arms)]
 
 
-def _needed(arms: tuple[str, ...]) -> list[Topic]:
-    return [*_observed(arms), *map(messages.tool_pose, arms)]
+def _needed(arms: tuple[str, ...], pictures: Topic) -> list[Topic]:
+    return [*_observed(arms, pictures), *map(messages.tool_pose, arms)]
 
 
 def _commands(arm: str) -> list[Topic]:
@@ -219,7 +228,7 @@ class _Stream(NamedTuple):
         return values if before is None else np.where((indices >= 0)[:, None], values, before.at(times))
 
 
-def _streams(reader: BagReader, arms: tuple[str, ...], frames: Mapping[str, np.ndarray]) -> dict[Topic, _Stream]:
+def _streams(reader: BagReader, arms: tuple[str, ...], frames: Mapping[str, np.ndarray], pictures: Topic) -> dict[Topic, _Stream]:
     """Streams of the topics that have messages; of images (number, height, width), of control nodes the number.
 
     Frames are taken as physics_node does. What is large is only numbered here, in the order of the bag, and read again when it is wanted.
@@ -233,11 +242,14 @@ def _streams(reader: BagReader, arms: tuple[str, ...], frames: Mapping[str, np.n
         for make in (messages.tool_wrench, messages.tool_reaction):
             decoders[make(arm)] = lambda m, topic, arm=arm: _wrench_row(m, topic, arm, frames)
     rows: dict[Topic, list] = defaultdict(list)
-    numbers = {messages.RENDERED_IMAGE: -1, messages.CONTROL_NODES: -1}
+    numbers, size = {pictures: -1, messages.CONTROL_NODES: -1}, ()
     for topic, _, message in reader.messages((*numbers, *decoders)):
         if topic in numbers:
             numbers[topic] += 1
-            row = [numbers[topic], *((message.height, message.width) if topic == messages.RENDERED_IMAGE else ())]
+            if topic == pictures and not size:  # that of the others is compared when they are read
+                raw = topic == messages.RENDERED_IMAGE
+                size = (message.height, message.width) if raw else messages.decode_image(message, topic.name).shape[:2]
+            row = [numbers[topic], *(size if topic == pictures else ())]
         else:
             row = decoders[topic](message, topic.name)
         if stamp := stamp_to_ns(message.header.stamp):  # zero marks an invalid message
@@ -323,11 +335,11 @@ class _Rate(NamedTuple):
 
 
 def _frame_times(
-    bag: Path, streams: dict[Topic, _Stream], arms: tuple[str, ...], fps: int | None, sampling: Sampling
+    bag: Path, streams: dict[Topic, _Stream], arms: tuple[str, ...], fps: int | None, sampling: Sampling, pictures: Topic
 ) -> tuple[np.ndarray, _Rate]:
     """Times [T + 1] (ns) of the rows and of what follows the last one."""
     if sampling != "rate":
-        steps = _steps(streams, arms)
+        steps = _steps(streams, arms, pictures)
         if sampling == "auto" and len(steps) > 1 and not _even(steps):
             text = "%s: stamps that commands share with images are not even, as in real time; it is sampled at a rate"
             logging.getLogger(__name__).info(text, bag)
@@ -348,7 +360,7 @@ def _frame_times(
         elif sampling == "lockstep":
             raise SequenceError(f"{bag}: images, state and commands share no stamps; sample at a rate instead")
     fps = fps or DEFAULT_FPS
-    needed = [streams[topic].stamps for topic in _needed(arms)]
+    needed = [streams[topic].stamps for topic in _needed(arms, pictures)]
     begin, end = max(stamps[0] for stamps in needed), min(stamps[-1] for stamps in needed)
     count = int((end - begin) * fps * 1e-9) + 1
     if count < 2:
@@ -364,9 +376,9 @@ def _even(steps: np.ndarray) -> bool:
     return bool((np.abs(gaps - period * np.round(gaps / period)) < _EVEN).all())
 
 
-def _steps(streams: dict[Topic, _Stream], arms: tuple[str, ...]) -> np.ndarray:
+def _steps(streams: dict[Topic, _Stream], arms: tuple[str, ...], pictures: Topic) -> np.ndarray:
     """Stamps that all observations bear, and a command of each arm; of the first, which nothing led to, no command."""
-    stamps = functools.reduce(np.intersect1d, (streams[topic].stamps for topic in _observed(arms)))
+    stamps = functools.reduce(np.intersect1d, (streams[topic].stamps for topic in _observed(arms, pictures)))
     commanded = stamps
     for arm in arms:
         given = [streams[topic].stamps for topic in _commands(arm) if topic in streams]

@@ -79,9 +79,10 @@ def save_scene(scene: Scene, folder: Path, task: str, seed: int = 0) -> None:
     changed |= {"regions": list(first.regions())} if first.regions() else {}
     save_ply(scene.model, folder / "model.ply")
     save_cameras(list(scene.cameras), folder / "cameras.json")
+    bare = {"instruments": ["none"]}  # the tool of a task is a tip that reaches every pose and is not seen
     parameters = {
         "reconstruction_node": {"mode": "lockstep", "model_file": str(folder.resolve() / "model.ply")},
-        "physics_node": {"mode": "lockstep", "arm_source": "commanded", "lockstep_inputs": ["pose", "jaw"], **changed},
+        "physics_node": {"mode": "lockstep", "arm_source": "commanded", "lockstep_inputs": ["pose", "jaw"], **bare, **changed},
         "rendering_node": {"mode": "lockstep"},
         "policy": {"task": task, "scene": str(folder.resolve()), "seed": seed},
     }

@@ -102,3 +102,10 @@ def encode_image(pixels: np.ndarray, stamp_ns: int, frame_id: str, types: Messag
         step=pixels.shape[1] * channels * pixels.itemsize,
         data=types.sequence(np.ascontiguousarray(pixels).reshape(-1).view(np.uint8)),
     )
+
+
+def encode_compressed(pixels: np.ndarray, stamp_ns: int, frame_id: str, quality: int, types: MessageTypes = ros_types()) -> Message:
+    """CompressedImage (JPEG) of an RGB image [H, W, 3] uint8; quality 1 to 100."""
+    _, data = cv2.imencode(".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    header = make_header(types, stamp_ns, frame_id)
+    return types.CompressedImage(header=header, format="rgb8; jpeg compressed bgr8", data=types.sequence(data.reshape(-1)))

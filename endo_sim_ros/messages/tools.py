@@ -1,6 +1,6 @@
 """Wrenches, jaws, cuts, arm states, and the markers that show tools."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,9 +24,18 @@ def decode_wrench(message: Message, topic: str) -> tuple[np.ndarray, np.ndarray]
 
 def encode_wrench(force: np.ndarray, torque: np.ndarray, stamp_ns: int, frame_id: str, types: MessageTypes = ros_types()) -> Message:
     """WrenchStamped of a force [3] (N) and a torque [3] (N·m), in the axes of the frame."""
-    vector = lambda v: types.Vector3(x=float(v[0]), y=float(v[1]), z=float(v[2]))  # noqa: E731
-    wrench = types.Wrench(force=vector(force), torque=vector(torque))
+    wrench = types.Wrench(force=_vector(types, force), torque=_vector(types, torque))
     return types.WrenchStamped(header=make_header(types, stamp_ns, frame_id), wrench=wrench)
+
+
+def encode_twist(linear: np.ndarray, angular: np.ndarray, stamp_ns: int, frame_id: str, types: MessageTypes = ros_types()) -> Message:
+    """TwistStamped of a velocity [3] (m/s) and an angular velocity [3] (rad/s), in the axes of the frame."""
+    twist = types.Twist(linear=_vector(types, linear), angular=_vector(types, angular))
+    return types.TwistStamped(header=make_header(types, stamp_ns, frame_id), twist=twist)
+
+
+def _vector(types: MessageTypes, values: np.ndarray) -> Message:
+    return types.Vector3(x=float(values[0]), y=float(values[1]), z=float(values[2]))
 
 
 def decode_jaw(message: Message, topic: str) -> float:
@@ -43,13 +52,36 @@ def decode_jaw(message: Message, topic: str) -> float:
 
 def encode_jaw(angle: float, stamp_ns: int, types: MessageTypes = ros_types()) -> Message:
     """JointState of a jaw's opening angle, radians."""
-    empty = types.sequence(np.zeros(0))
+    return encode_joints(["jaw"], np.array([angle]), np.zeros(0), np.zeros(0), stamp_ns, types)
+
+
+def decode_joints(message: Message, topic: str) -> np.ndarray:
+    """Positions [n] of a JointState, rad and m, in the order of the arm's joints; whether the arm has as many is not checked.
+
+    Raises:
+        MessageError: If there is none, or one is not finite.
+    """
+    positions = np.asarray(message.position, np.float64)
+    if not positions.size or not np.isfinite(positions).all():
+        raise MessageError(f"{topic}: expected finite joint positions, rad and m, got {positions.tolist()!s:.200}")
+    return positions
+
+
+def encode_joints(
+    names: Sequence[str],
+    positions: np.ndarray,
+    velocities: np.ndarray,
+    efforts: np.ndarray,
+    stamp_ns: int,
+    types: MessageTypes = ros_types(),
+) -> Message:
+    """JointState of joints by name: positions [n] (rad, m), velocities [n] (rad/s, m/s) and efforts [n] (N·m, N), or [0] for none."""
     return types.JointState(
         header=make_header(types, stamp_ns, ""),
-        name=["jaw"],
-        position=types.sequence(np.array([angle], np.float64)),
-        velocity=empty,
-        effort=empty,
+        name=list(names),
+        position=types.sequence(np.asarray(positions, np.float64)),
+        velocity=types.sequence(np.asarray(velocities, np.float64)),
+        effort=types.sequence(np.asarray(efforts, np.float64)),
     )
 
 
@@ -79,6 +111,22 @@ def encode_operating_state(state: str, homed: bool, busy: bool, stamp_ns: int) -
     if kind.__name__ == "String":
         return kind(data=f"{state} BUSY" if busy else state)
     return kind(header=make_header(ros_types(), stamp_ns, ""), state=state, is_homed=homed, is_busy=busy)
+
+
+def encode_report(text: str, stamp_ns: int) -> Message:
+    """CRTK StringStamped, without crtk_msgs a String, of a text."""
+    kind = ros_class(crtk_type("StringStamped"))
+    return kind(data=text) if kind.__name__ == "String" else kind(header=make_header(ros_types(), stamp_ns, ""), string=text)
+
+
+def encode_text(text: str, types: MessageTypes = ros_types()) -> Message:
+    """String of a text."""
+    return types.String(data=text)
+
+
+def decode_text(message: Message) -> str:
+    """Text of a String."""
+    return message.data.strip()
 
 
 def decode_state_command(message: Message) -> str:

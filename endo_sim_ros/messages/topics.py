@@ -33,6 +33,11 @@ RENDERED_IMAGE = Topic("rendered/image_raw", "sensor_msgs/msg/Image")
 RENDERED_INFO = Topic("rendered/camera_info", "sensor_msgs/msg/CameraInfo")
 RENDERED_POSE = Topic("rendered/camera_pose", "geometry_msgs/msg/PoseStamped")
 RENDERED_DEPTH = Topic("rendered/depth/image", "sensor_msgs/msg/Image")
+RENDERED_SEGMENTATION = Topic("rendered/segmentation/image", "sensor_msgs/msg/Image")
+RENDERED_COMPRESSED = Topic("rendered/image_raw/compressed", "sensor_msgs/msg/CompressedImage")
+RENDERED_RIGHT_IMAGE = Topic("rendered/right/image_raw", "sensor_msgs/msg/Image")
+RENDERED_RIGHT_COMPRESSED = Topic("rendered/right/image_raw/compressed", "sensor_msgs/msg/CompressedImage")
+RENDERED_RIGHT_INFO = Topic("rendered/right/camera_info", "sensor_msgs/msg/CameraInfo")
 TOOL_MARKERS = Topic("tool_markers", "visualization_msgs/msg/MarkerArray")
 DIAGNOSTICS = Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
 CLOCK = Topic("/clock", "rosgraph_msgs/msg/Clock")
@@ -67,6 +72,29 @@ tool_cut = _of_arm("cut", "sensor_msgs/msg/Joy")
 """Whether an arm's edge cuts."""
 
 
+tool_joints = _of_arm("measured_js", "sensor_msgs/msg/JointState")
+"""Measured positions, velocities and efforts of an arm's joints."""
+tool_joint_setpoint = _of_arm("setpoint_js", "sensor_msgs/msg/JointState")
+"""Current setpoint of an arm's joints."""
+tool_joint_command = _of_arm("servo_jp", "sensor_msgs/msg/JointState")
+"""Commanded positions of an arm's joints, reached at once."""
+tool_joint_move = _of_arm("move_jp", "sensor_msgs/msg/JointState")
+"""Goal to which an arm's joints move."""
+tool_velocity = _of_arm("measured_cv", "geometry_msgs/msg/TwistStamped")
+"""Measured velocity of an arm's tip."""
+tool_local_pose = _of_arm("local/measured_cp", "geometry_msgs/msg/PoseStamped")
+"""Measured pose of an arm's tip in its base."""
+tool_local_setpoint = _of_arm("local/setpoint_cp", "geometry_msgs/msg/PoseStamped")
+"""Current setpoint of an arm's tip in its base."""
+tool_links = _of_arm("link_poses", "geometry_msgs/msg/PoseArray")
+"""Poses of the links of an arm's instrument."""
+
+
+def tool_type(arm: str) -> Topic:
+    """Name and number, or path of the file, of the tool on an arm."""
+    return Topic(f"{arm}/tool_type", "std_msgs/msg/String", "latched")
+
+
 def tool_state(arm: str) -> Topic:
     """CRTK operating state of an arm."""
     return Topic(f"{arm}/operating_state", crtk_type("OperatingState"), "latched")
@@ -77,18 +105,55 @@ def tool_state_command(arm: str) -> Topic:
     return Topic(f"{arm}/state_command", crtk_type("StringStamped"))
 
 
+def tool_state_name(arm: str) -> Topic:
+    """CRTK state of an arm by its name alone."""
+    return Topic(f"{arm}/state", crtk_type("StringStamped"), "latched")
+
+
+def tool_info(arm: str) -> Topic:
+    """What an arm tells people."""
+    return Topic(f"{arm}/info", crtk_type("StringStamped"))
+
+
+def tool_warning(arm: str) -> Topic:
+    """What an arm warns people of."""
+    return Topic(f"{arm}/warning", crtk_type("StringStamped"))
+
+
+def tool_error(arm: str) -> Topic:
+    """What an arm refused, or what ended its move."""
+    return Topic(f"{arm}/error", crtk_type("StringStamped"))
+
+
+JOINT_STATES = Topic("joint_states", "sensor_msgs/msg/JointState")
+ROBOT_DESCRIPTION = Topic("robot_description", "std_msgs/msg/String", "latched")
+
 RECORDING_TOPICS = (
     LEFT_IMAGE, LEFT_COMPRESSED, LEFT_INFO, RIGHT_IMAGE, RIGHT_COMPRESSED, RIGHT_INFO, DEPTH, MASK, CAMERA_POSE,
 )  # fmt: skip
 MODEL_TOPICS = (GAUSSIANS, TRAINING_CAMERAS, TRAINING_CAMERA_INFO)
-TOOL_TOPICS = (  # of one arm; without its operating state, whose type is not installed everywhere
+TOOL_TOPICS = (  # of one arm; without those whose type is not installed everywhere
     tool_pose, tool_pose_command, tool_move, tool_setpoint, tool_wrench, tool_jaw, tool_jaw_move, tool_jaw_state, tool_jaw_setpoint,
-    tool_cut, tool_reaction,
+    tool_cut, tool_reaction, tool_links, tool_type, tool_joints, tool_joint_setpoint, tool_joint_command, tool_joint_move, tool_velocity,
+    tool_local_pose, tool_local_setpoint,
 )  # fmt: skip
 RENDERED_TOPICS = (RENDERED_INFO, RENDERED_POSE, RENDERED_DEPTH, RENDERED_IMAGE)
 
 
+EXTRA_RENDERED_TOPICS = (RENDERED_COMPRESSED, RENDERED_SEGMENTATION, RENDERED_RIGHT_INFO, RENDERED_RIGHT_IMAGE, RENDERED_RIGHT_COMPRESSED)
+"""What is rendered only for those who ask."""
+
+
 def all_topics(arms: tuple[str, ...] = ("PSM1",)) -> tuple[Topic, ...]:
-    """Every topic of the contract that is recorded, for the given arms."""
+    """Every topic of the contract that can be recorded, for the given arms."""
     tools = tuple(make(arm) for arm in arms for make in TOOL_TOPICS)
-    return RECORDING_TOPICS + MODEL_TOPICS + (CONTROL_NODES, CUT_SURFACE) + RENDERED_TOPICS + tools + (TOOL_MARKERS, DIAGNOSTICS, CLOCK)
+    scene = MODEL_TOPICS + (CONTROL_NODES, CUT_SURFACE) + RENDERED_TOPICS + EXTRA_RENDERED_TOPICS
+    found = RECORDING_TOPICS + scene + tools + (TOOL_MARKERS, JOINT_STATES, ROBOT_DESCRIPTION, DIAGNOSTICS, CLOCK)
+    return tuple(dict.fromkeys(found))  # the pose of an ECM among the arms is that of the camera
+
+
+def recorded_topics(arms: tuple[str, ...] = ("PSM1",), compressed: bool = True) -> tuple[Topic, ...]:
+    """What a recorder of everything records: rendered images in one form, and nothing that would be rendered for it alone."""
+    form = RENDERED_COMPRESSED if compressed else RENDERED_IMAGE
+    others = {RENDERED_IMAGE, RENDERED_DEPTH, *EXTRA_RENDERED_TOPICS} - {form}
+    return tuple(topic for topic in all_topics(arms) if topic not in others)

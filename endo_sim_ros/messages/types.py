@@ -21,8 +21,19 @@ Message = Any  # an instance of a message class, of ROS or of rosbags: both have
 MESSAGE_PACKAGES = {
     "builtin_interfaces": ("Time",),
     "rosgraph_msgs": ("Clock",),
-    "std_msgs": ("Header", "ColorRGBA"),
-    "geometry_msgs": ("Point", "Quaternion", "Pose", "PoseStamped", "PoseArray", "Vector3", "Wrench", "WrenchStamped"),
+    "std_msgs": ("Header", "ColorRGBA", "String"),
+    "geometry_msgs": (
+        "Point",
+        "Quaternion",
+        "Pose",
+        "PoseStamped",
+        "PoseArray",
+        "Vector3",
+        "Wrench",
+        "WrenchStamped",
+        "Twist",
+        "TwistStamped",
+    ),  # fmt: skip
     "sensor_msgs": ("Image", "CompressedImage", "CameraInfo", "RegionOfInterest", "PointCloud2", "PointField", "JointState", "Joy"),
     "visualization_msgs": ("Marker", "MarkerArray"),
     "diagnostic_msgs": ("DiagnosticArray", "DiagnosticStatus", "KeyValue"),

@@ -32,13 +32,15 @@ class Arm:
     cutting: bool = False
     state: str = ENABLED
     homed: bool = True
+    felt: float = 0.0  # reaction in the last step of a move, N
+    acts: bool = True  # False at a start where nobody has commanded it yet: it touches nothing there
     pose_goal: np.ndarray | None = None  # [4, 4], world; None while no move is under way
     angle_goal: float | None = None  # rad
 
     @property
     def busy(self) -> bool:
         """Whether a move is under way."""
-        return self.pose_goal is not None or self.angle_goal is not None
+        return self.moving or self.angle_goal is not None
 
     def command_state(self, command: str) -> None:
         """Follow a state command of CRTK: enable, disable, pause, resume, home or unhome.
@@ -67,28 +69,59 @@ class Arm:
             what = "resume" if self.state == PAUSED else "enable"
             raise ValueError(f"{self.name} is {self.state}; send {what} on {self.name}/state_command")
 
+    @property
+    def moving(self) -> bool:
+        """Whether the tip is on its way to a goal."""
+        return self.pose_goal is not None
+
+    def servo(self, pose: np.ndarray) -> None:
+        """Put the tip at a pose [4, 4], world, now."""
+        self.pose, self.pose_goal, self.acts = pose, None, True
+
+    def move_to(self, pose: np.ndarray) -> str:
+        """Let the tip move to a pose [4, 4], world; returns what it will miss, in a sentence."""
+        self.pose_goal, self.acts = pose, True
+        return ""
+
     def stop(self) -> None:
         """End all moves where they are."""
         self.pose_goal = self.angle_goal = None
 
-    def move(self, seconds: float, speed: float, turn_speed: float) -> None:
-        """Go on for some seconds towards the goals, with at most these speeds, m/s and rad/s."""
-        if self.pose_goal is not None:
-            if self.pose is None:  # nobody knows where it comes from
-                self.pose = self.pose_goal
-            turn = self.pose[:3, :3].T @ self.pose_goal[:3, :3]
-            angle = np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))
-            needed = float(max(np.linalg.norm(self.pose_goal[:3, 3] - self.pose[:3, 3]) / speed, angle / turn_speed))
-            if needed <= seconds * _ROUNDED:
-                self.pose, self.pose_goal = self.pose_goal, None
-            else:
-                self.pose = interpolate_pose(self.pose, self.pose_goal, seconds / needed)
-        if self.angle_goal is not None:
-            way, most = self.angle_goal - self.angle, seconds * turn_speed
-            if abs(way) <= most * _ROUNDED:
-                self.angle, self.angle_goal = self.angle_goal, None
-            else:
-                self.angle += float(np.copysign(most, way))
+    def halt(self) -> None:
+        """End the move of the tip where it is; the jaw goes on."""
+        self.pose_goal = None
+
+    def move(self, seconds: float, speed: float, turn_speed: float) -> str:
+        """Go on for some seconds towards the goals, with at most these speeds, m/s and rad/s.
+
+        Returns:
+            What the arm misses of the pose that it is told, in a sentence; empty if nothing.
+        """
+        self._move_tip(seconds, speed, turn_speed)
+        self._move_jaw(seconds, turn_speed)
+        return ""
+
+    def _move_tip(self, seconds: float, speed: float, turn_speed: float) -> None:
+        if self.pose_goal is None:
+            return
+        if self.pose is None:  # nobody knows where it comes from
+            self.pose = self.pose_goal
+        turn = self.pose[:3, :3].T @ self.pose_goal[:3, :3]
+        angle = np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))
+        needed = float(max(np.linalg.norm(self.pose_goal[:3, 3] - self.pose[:3, 3]) / speed, angle / turn_speed))
+        if needed <= seconds * _ROUNDED:
+            self.pose, self.pose_goal = self.pose_goal, None
+        else:
+            self.pose = interpolate_pose(self.pose, self.pose_goal, seconds / needed)
+
+    def _move_jaw(self, seconds: float, turn_speed: float) -> None:
+        if self.angle_goal is None:
+            return
+        way, most = self.angle_goal - self.angle, seconds * turn_speed
+        if abs(way) <= most * _ROUNDED:
+            self.angle, self.angle_goal = self.angle_goal, None
+        else:
+            self.angle += float(np.copysign(most, way))
 
     def hold(self, closed_at: float, open_at: float) -> None:
         """Close or open the jaw by its angle; between the two it stays as it is."""

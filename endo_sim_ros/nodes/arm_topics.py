@@ -1,18 +1,29 @@
-"""The topics of the tool arms of physics_node: commands in, states out."""
+"""The topics of the arms of physics_node: commands in, states out."""
 
-from collections.abc import Callable
-from functools import partial
+import contextlib
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 
 from endo_sim_ros import messages
+from endo_sim_ros.core.cameras import invert_pose
 from endo_sim_ros.messages import Topic
 from endo_sim_ros.nodes.arm import Arm
-from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode
+from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode, sentence
 from endo_sim_ros.nodes.configs import PhysicsNodeConfig
+from endo_sim_ros.nodes.joint_topics import JointTopics
+from endo_sim_ros.nodes.jointed_arm import CameraArm, JointedArm
+from endo_sim_ros.nodes.pacing import MOST_WAITING
+
+ECM_VIEW = "ECM_view"
+_TURNED = np.diag([-1.0, -1.0, 1.0, 1.0])  # the dVRK's frame of a camera in the optical one: x to the left and y up in the picture
 
 Deliver = Callable[[str, str, Any, str, Callable[[], None]], None]
+
+
+class _Told(messages.MessageError):
+    """A sentence that has been published on the topic of its arm."""
 
 
 class ArmTopics:
@@ -21,59 +32,189 @@ class ArmTopics:
     Args:
         node: The ROS node that the topics belong to.
         arms: The arms by name.
-        options: Options of the node; assign `options` when they change.
+        options: Options of the node; tell `change_options` when they change.
         depth: Length of the queues of commands.
         deliver: Called with the name of an arm, the part of a command ("pose", "wrench", "jaw", "cut"), its message, its
             topic, and a function that lets the part act on the arm; decides when that is called.
+
+    Attributes:
+        camera_pose: Newest pose [4, 4] of a camera that is no arm of this node, world, or None.
     """
 
     def __init__(self, node: EndoNode, arms: dict[str, Arm], options: PhysicsNodeConfig, depth: int, deliver: Deliver) -> None:
-        self.options = options
         self._node, self._arms, self._deliver = node, arms, deliver
+        self.camera_pose: np.ndarray | None = None
         commanded = options.arm_source == "commanded"
         self._pose_topic = messages.tool_pose_command if commanded else messages.tool_pose
-        self._reactions = {name: node.publisher(messages.tool_reaction(name), alone=True) for name in arms}
-        shown = messages.tool_pose, messages.tool_setpoint, messages.tool_jaw_state, messages.tool_jaw_setpoint, messages.tool_state
-        self._publishers = {name: {topic: node.publisher(topic(name), alone=True) for topic in shown} for name in arms if commanded}
+        self._camera = next((arm for arm in arms.values() if isinstance(arm, CameraArm)), None)
+        tools = [arm for arm in arms.values() if arm is not self._camera]
+        self._reactions = {arm.name: node.publisher(messages.tool_reaction(arm.name), alone=True) for arm in tools}
+        self._publishers = {arm.name: self._make_publishers(arm, options) for arm in arms.values() if commanded}
         self._told: dict[str, tuple[str, bool, bool]] = {}  # what was last said on operating_state
+        self._short: set[str] = set()  # arms that have said that they do not reach their pose
         several = max(depth, STREAM_DEPTH)  # for what comes once
         for arm in arms.values():
             self._hear(arm, self._pose_topic, self._on_pose, depth)
+            if commanded:
+                self._hear(arm, messages.tool_move, self._on_move, several)
+                self._hear(arm, messages.tool_state_command, self._on_state_command, STREAM_DEPTH)
+                if isinstance(arm, JointedArm):
+                    self._hear(arm, messages.tool_joint_command, self._on_joints, depth)
+                    self._hear(arm, messages.tool_joint_move, self._on_joint_move, several)
+        for arm in tools:
             self._hear(arm, messages.tool_wrench, self._on_wrench, depth)
             self._hear(arm, messages.tool_jaw, self._on_jaw, several)
             self._hear(arm, messages.tool_jaw_move, self._on_jaw_move, several)
             self._hear(arm, messages.tool_cut, self._on_cut, several)
-            if commanded:
-                self._hear(arm, messages.tool_move, self._on_move, several)
-                self._hear(arm, messages.tool_state_command, self._on_state_command, STREAM_DEPTH)
+        self._joints = JointTopics(node, {name: arm for name, arm in arms.items() if isinstance(arm, JointedArm)}, options)
+        self.change_options(options)
         self.publish_operating_states()
+
+    def change_options(self, options: PhysicsNodeConfig) -> None:
+        """Use new options of the node."""
+        self.options = self._joints.options = options
+        for arm in self._arms.values():
+            if isinstance(arm, JointedArm):
+                arm.joint_speed, arm.slide_speed = options.joint_speed, options.slide_speed
+
+    def _make_publishers(self, arm: Arm, options: PhysicsNodeConfig) -> dict[Callable[[str], Topic], Any]:
+        shown = [messages.tool_setpoint, messages.tool_state, messages.tool_state_name]
+        shown += [messages.tool_info, messages.tool_warning, messages.tool_error]
+        if arm is not self._camera:
+            shown += [messages.tool_jaw_state, messages.tool_jaw_setpoint]
+        # A renderer in lockstep waits for each pose of the camera.
+        depth = MOST_WAITING if arm is self._camera and options.mode == "lockstep" else STREAM_DEPTH
+        publishers = {topic: self._node.publisher(topic(arm.name), alone=True) for topic in shown}
+        return publishers | {messages.tool_pose: self._node.publisher(messages.tool_pose(arm.name), depth, alone=True)}
+
+    # ------------------------------------------------------------------ frames
+
+    def _view(self) -> np.ndarray | None:
+        """Pose [4, 4] of ECM_view in the world, or None while nobody has told the camera's."""
+        pose = self._camera.pose if self._camera is not None else self.camera_pose
+        return None if pose is None else pose @ _TURNED
+
+    def _frames(self, arm: Arm) -> dict[str, np.ndarray]:
+        """Poses [4, 4] in the world of the frames that a command to an arm may be in, by name; one without a name is in ``""``."""
+        given, view = self.options.frame_poses, self._view()
+        found = dict(given)
+        for name, other in self._arms.items():
+            if isinstance(other, JointedArm) and other.base is not None:
+                found.setdefault(f"{name}_base", other.base)
+        if view is not None:
+            found.setdefault(ECM_VIEW, view)
+        if self.options.cartesian_frame != ECM_VIEW or arm is self._camera:
+            found[""] = given.get(f"{arm.name}_base", np.eye(4))
+        elif view is not None:
+            found[""] = view
+        return found
+
+    def _shown_in(self, arm: Arm) -> tuple[str, np.ndarray]:
+        """Name and pose [4, 4] of the frame in which the pose of an arm is published."""
+        view = self._view()
+        if self.options.cartesian_frame == ECM_VIEW and arm is not self._camera and view is not None:
+            return ECM_VIEW, view
+        return self.options.world_frame, np.eye(4)
 
     # ---------------------------------------------------------------- commands
 
     def _hear(self, arm: Arm, topic_of: Callable[[str], Topic], callback: Callable[[Arm, str, Any], None], depth: int) -> None:
         """Call back with the arm, the topic's name and each message; a ValueError is reported under that name."""
         topic = topic_of(arm.name)
-        self._node.subscribe(topic, partial(callback, arm, topic.name), depth)
+
+        def heard(message: Any) -> None:
+            with self._telling(arm, topic.name):
+                callback(arm, topic.name, message)
+
+        self._node.subscribe(topic, heard, depth)
+
+    @contextlib.contextmanager
+    def _telling(self, arm: Arm, topic: str) -> Iterator[None]:
+        """Context that also tells the errors of its block on the topic of the arm."""
+        try:
+            yield
+        except _Told:
+            raise
+        except ValueError as error:
+            text = sentence(topic, error)
+            self._tell(arm, messages.tool_error, text)
+            raise _Told(text) from error
+
+    def _tell(self, arm: Arm, topic: Callable[[str], Topic], text: str) -> None:
+        if arm.name in self._publishers:
+            self._publishers[arm.name][topic].publish(messages.encode_report(text, self._node.now_ns()))
+
+    def warn(self, arm: Arm, text: str, again: bool = False) -> None:
+        """Report what an arm misses of its pose, if anything; on its own topic once until it reaches one.
+
+        Args:
+            arm: The arm.
+            text: The sentence, or nothing.
+            again: Tell it on that topic, too, if it has been told.
+        """
+        if not text:
+            self._short.discard(arm.name)
+            return
+        if again or arm.name not in self._short:
+            self._tell(arm, messages.tool_warning, text)
+        self._short.add(arm.name)
+        self._node.report_error(text)
+
+    def _deliver_part(self, arm: Arm, kind: str, message: Any, topic: str, act: Callable[[], None]) -> None:
+        """Let a part of a command act on an arm when it is time; on the camera's, which has no part in the tissue, now."""
+
+        def telling() -> None:
+            with self._telling(arm, topic):
+                act()
+
+        if arm is self._camera:
+            telling()
+        else:
+            self._deliver(arm.name, kind, message, topic, telling)
+
+    def _decode_pose(self, arm: Arm, topic: str, message: Any) -> np.ndarray:
+        frames = self._frames(arm)
+        if "" not in frames and not message.header.frame_id:
+            raise ValueError(f"a pose in {ECM_VIEW}, but no pose of a camera came on {messages.CAMERA_POSE.name}; add ECM to arms")
+        return messages.decode_pose(message, frames, topic)
 
     def _on_pose(self, arm: Arm, topic: str, message: Any) -> None:
-        pose = messages.decode_tip(message, self.options.frame_poses, arm.name, topic)
+        pose = self._decode_pose(arm, topic, message)
 
         def act() -> None:
             arm.require_enabled()
-            arm.pose, arm.pose_goal = pose, None
+            arm.servo(pose)
             self.publish_operating_states()
 
-        self._deliver(arm.name, "pose", message, topic, act)
+        self._deliver_part(arm, "pose", message, topic, act)
 
     def _on_move(self, arm: Arm, topic: str, message: Any) -> None:
-        goal = messages.decode_tip(message, self.options.frame_poses, arm.name, topic)
+        goal = self._decode_pose(arm, topic, message)
         arm.require_enabled()
-        arm.pose_goal = goal
+        self.warn(arm, arm.move_to(goal), again=True)
+        self.publish_operating_states(arm.name)
+
+    def _on_joints(self, arm: Arm, topic: str, message: Any) -> None:
+        assert isinstance(arm, JointedArm)
+        joints = arm.check_joints(messages.decode_joints(message, topic))
+
+        def act() -> None:
+            arm.require_enabled()
+            arm.servo_joints(joints)
+            self.publish_operating_states()
+
+        self._deliver_part(arm, "pose", message, topic, act)
+
+    def _on_joint_move(self, arm: Arm, topic: str, message: Any) -> None:
+        assert isinstance(arm, JointedArm)
+        goal = messages.decode_joints(message, topic)
+        arm.require_enabled()
+        arm.move_joints(goal)
         self.publish_operating_states(arm.name)
 
     def _on_wrench(self, arm: Arm, topic: str, message: Any) -> None:
         force, torque = messages.decode_wrench(message, topic)
-        frames = self.options.frame_poses
+        frames = {name: pose for name, pose in self._frames(arm).items() if name}
         frame = messages.check_frame(message, ("", arm.name, *frames), topic)
 
         def act() -> None:
@@ -81,7 +222,7 @@ class ArmTopics:
             R = frames.get(frame, pose)[:3, :3]  # any other is the tool's own
             arm.force, arm.torque, arm.heard = R @ force, R @ torque, self._node.now_ns() * 1e-9
 
-        self._deliver(arm.name, "wrench", message, topic, act)
+        self._deliver_part(arm, "wrench", message, topic, act)
 
     def _on_jaw(self, arm: Arm, topic: str, message: Any) -> None:
         angle = messages.decode_jaw(message, topic)
@@ -92,7 +233,7 @@ class ArmTopics:
             arm.hold(self.options.jaw_closed, self.options.jaw_open)
             self.publish_operating_states()
 
-        self._deliver(arm.name, "jaw", message, topic, act)
+        self._deliver_part(arm, "jaw", message, topic, act)
 
     def _on_jaw_move(self, arm: Arm, topic: str, message: Any) -> None:
         goal = messages.decode_jaw(message, topic)
@@ -107,11 +248,13 @@ class ArmTopics:
             self._require_pose(arm, "cut")
             arm.cutting = cutting
 
-        self._deliver(arm.name, "cut", message, topic, act)
+        self._deliver_part(arm, "cut", message, topic, act)
 
     def _on_state_command(self, arm: Arm, topic: str, message: Any) -> None:
         try:
-            arm.command_state(messages.decode_state_command(message))
+            command = messages.decode_state_command(message)
+            arm.command_state(command)
+            self._tell(arm, messages.tool_info, f"{arm.name} is {arm.state} after {command}")
         finally:
             self.publish_operating_states(arm.name)
 
@@ -120,7 +263,26 @@ class ArmTopics:
         arm.require_enabled()
         if arm.pose is None:
             raise ValueError(f"a {what} came before any pose on {self._pose_topic(arm.name).name}; publish the tip's pose")
+        arm.acts = True
         return arm.pose
+
+    def limit_force(self, arm: Arm, reaction: Callable[[], np.ndarray]) -> None:
+        """End the move of an arm with joints that the tissue pushes back, more than in the step before and than the limit allows.
+
+        Args:
+            arm: The arm.
+            reaction: Gives the force [3] of the tissue on its tip, N.
+        """
+        limit = self.options.force_limit
+        if not limit or not arm.moving or not isinstance(arm, JointedArm):
+            arm.felt = 0.0
+            return
+        before, arm.felt = arm.felt, float(np.linalg.norm(reaction()))
+        if arm.felt > max(limit, before):
+            arm.halt()
+            text = f"{arm.name}: the move ended at {arm.felt:.1f} N, above force_limit = {limit:g} N; move back, or raise the limit"
+            self._tell(arm, messages.tool_error, text)
+            self._node.report_error(text)
 
     # ------------------------------------------------------------------ states
 
@@ -132,14 +294,30 @@ class ArmTopics:
                 a message after their command.
         """
         for name, publishers in self._publishers.items():
-            arm = self._arms[name]
+            arm, before = self._arms[name], self._told.get(name)
             state = arm.state, arm.homed, arm.busy
-            if name == asked or self._told.get(name) != state:
+            if name == asked or before != state:
                 self._told[name] = state
                 publishers[messages.tool_state].publish(messages.encode_operating_state(*state, self._node.now_ns()))
+            if before is None or before[0] != arm.state:
+                publishers[messages.tool_state_name].publish(messages.encode_report(arm.state, self._node.now_ns()))
+
+    def describe(self) -> None:
+        """Publish what the arms look like and where they stand, if that has changed."""
+        self._joints.describe()
+
+    def publish_views(self, stamp: int) -> None:
+        """Publish what pictures of a state need, at its time, ns: the camera's pose if it has an arm here, and the links."""
+        if self._camera is not None and self._camera.pose is not None:
+            self._publish_motion(self._camera, self._camera.pose, np.zeros(3), np.zeros(3), stamp)
+        self._joints.publish_links(stamp)
+
+    def publish_joint_states(self, stamp: int) -> None:
+        """Publish the joints of all arms in one message, while somebody subscribes."""
+        self._joints.publish_joint_states(stamp)
 
     def publish(self, arm: Arm, pose: np.ndarray, reaction: np.ndarray, torque: np.ndarray, stamp: int) -> None:
-        """Publish what an arm feels and, if it is commanded, where it is.
+        """Publish what a tool arm feels and, if it is commanded, where it is.
 
         Args:
             arm: The arm.
@@ -151,8 +329,14 @@ class ArmTopics:
         axes = pose[:3, :3].T  # the reaction is given in the axes of the tool
         self._reactions[arm.name].publish(messages.encode_wrench(axes @ reaction, axes @ torque, stamp, arm.name))
         if arm.name in self._publishers:
-            publishers = self._publishers[arm.name]
-            for topic in (messages.tool_pose, messages.tool_setpoint):  # an ideal arm is where it is told to be
-                publishers[topic].publish(messages.encode_pose(pose, stamp, self.options.world_frame))
+            self._publish_motion(arm, pose, reaction, torque, stamp)
             for topic in (messages.tool_jaw_state, messages.tool_jaw_setpoint):
-                publishers[topic].publish(messages.encode_jaw(arm.angle, stamp))
+                self._publishers[arm.name][topic].publish(messages.encode_jaw(arm.angle, stamp))
+
+    def _publish_motion(self, arm: Arm, pose: np.ndarray, force: np.ndarray, torque: np.ndarray, stamp: int) -> None:
+        frame, origin = self._shown_in(arm)
+        shown = pose if frame == self.options.world_frame else invert_pose(origin) @ pose
+        for topic in (messages.tool_pose, messages.tool_setpoint):  # an arm without a robot is where it is told to be
+            self._publishers[arm.name][topic].publish(messages.encode_pose(shown, stamp, frame))
+        if isinstance(arm, JointedArm):
+            self._joints.publish(arm, force, torque, stamp, frame, origin[:3, :3])

@@ -10,7 +10,8 @@ import numpy as np
 
 from endo_sim_ros.core.cameras import parse_frames
 from endo_sim_ros.core.config import ConfigError, Range, StageConfig
-from endo_sim_ros.core.frames import LEFT_FRAME
+from endo_sim_ros.core.frames import LEFT_FRAME, RIGHT_FRAME
+from endo_sim_ros.instruments.config import DrawingConfig
 from endo_sim_ros.nodes.pacing import MOST_WAITING
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
@@ -93,14 +94,31 @@ class PhysicsNodeConfig(WorldConfig):
     step_count: Annotated[int, Range(1, MOST_WAITING)] = 1
     """Steps that one call of ~/step takes."""
     arms: tuple[str, ...] = ("PSM1",)
-    """Names of the tool arms; the topics of an arm are under its name."""
+    """Names of the arms; the topics of an arm are under its name. ECM is the arm of the camera, with arm_source commanded only."""
     arm_source: Literal["measured", "commanded"] = "measured"
     """measured: tool tips follow measured_cp, as robots and their simulators publish it. commanded: there is no robot; tips
     follow servo_cp at once and move_cp at move_speed, and this node publishes measured_cp and jaw/measured_js as an arm does."""
+    instruments: tuple[str, ...] = ("LARGE_NEEDLE_DRIVER",)
+    """Tool of each arm in the order of arms, or one for all: a name of the dVRK, such as PROGRASP_FORCEPS or PROGRASP_FORCEPS:420093,
+    or the path of a tool file of the dVRK. none = a tip without joints, which reaches every pose. One for all leaves the ECM its
+    straight endoscope."""
+    arm_models: tuple[str, ...] = ("PSM",)
+    """Kind of each arm in the order of arms, or one for all: PSM, PSM_Si, or the path of a kinematic file of the dVRK. PSM for all
+    makes the ECM an ECM."""
     move_speed: Annotated[float, Range(1e-4, 10, "m/s")] = 0.05
     """Speed of a tool tip that moves to the goal of move_cp."""
     turn_speed: Annotated[float, Range(1e-2, 100, "rad/s")] = 1.5
     """Speed at which a tool tip turns to the goal of move_cp, and at which a jaw turns to the goal of jaw/move_jp."""
+    joint_speed: Annotated[float, Range(1e-2, 100, "rad/s")] = 2.0
+    """Largest speed of a joint that turns, during moves; 2 is about that of the dVRK."""
+    slide_speed: Annotated[float, Range(1e-4, 10, "m/s")] = 0.2
+    """Largest speed of a joint that slides, during moves; 0.2 is about that of the dVRK."""
+    force_limit: Annotated[float, Range(0, 1000, "N")] = 10.0
+    """A growing reaction above this ends the move of an arm with joints where it is; 10 N is more than instruments exert in surgery.
+    0 = none."""
+    cartesian_frame: Literal["world", "ECM_view"] = "world"
+    """Frame of measured_cp, setpoint_cp and measured_cv of commanded tool arms. ECM_view: that of the camera now, x to the left and
+    y up in the picture as on a dVRK; poses without a frame are in it, too."""
     command_timeout: Annotated[float, Range(0, 3600, "s")] = 0.5
     """A wrench that is not repeated for this long is dropped; 0 = held until changed."""
     jaw_closed: Annotated[float, Range(-3.2, 3.2, "rad")] = 0.1
@@ -132,6 +150,16 @@ class RenderingNodeConfig(WorldConfig):
     """Images published per second while nothing in the image changes."""
     camera_frame: str = LEFT_FRAME
     """Frame in the headers of rendered images."""
+    right_frame: str = RIGHT_FRAME
+    """The same of the right eye."""
+    instruments: bool = True
+    """Draw the instruments of the arms where link_poses says they are."""
+    arms: tuple[str, ...] = ("PSM1",)
+    """Names of the arms whose instruments are drawn; one that nobody publishes is not."""
+    jpeg_quality: Annotated[int, Range(1, 100)] = 90
+    """Quality of compressed images; at 90 the eye sees no difference."""
+    drawing: DrawingConfig = DrawingConfig()
+    """How instruments are lit."""
 
 
 @dataclass(frozen=True)
@@ -157,7 +185,10 @@ class RecorderConfig(StageConfig):
     arms: tuple[str, ...] = ("PSM1",)
     """Names of the tool arms."""
     topics: tuple[str, ...] = (ALL_TOPICS,)
-    """Names of the topics to record, of those in msg_conventions.md; all records every one."""
+    """Names of the topics to record, of those in msg_conventions.md. all records every one but what would be rendered for the recorder
+    alone: depth, segmentation, the right eye, and one of the two forms of the images. Name these beside all."""
+    images: Literal["compressed", "raw"] = "compressed"
+    """Form of the rendered images where all topics are recorded; raw ones are exact and take fifteen times the room."""
     canonical: bool = True
     """Write zeros into the padding between the fields of a message, so that equal messages have equal bytes."""
 

@@ -8,11 +8,12 @@ import numpy as np
 from std_srvs.srv import SetBool, Trigger
 
 from endo_sim_ros import messages
+from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ControlNodeCloud, PhysicsState
-from endo_sim_ros.nodes.arm import Arm
+from endo_sim_ros.nodes.arm_setup import CAMERA_ARM, make_arms, place_arms
 from endo_sim_ros.nodes.arm_topics import ArmTopics
 from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode, run, sentence
-from endo_sim_ros.nodes.configs import COMMAND_PARTS, PhysicsNodeConfig, arm_names
+from endo_sim_ros.nodes.configs import COMMAND_PARTS, PhysicsNodeConfig
 from endo_sim_ros.nodes.pacing import MOST_WAITING, CommandQueue, Pacer
 from endo_sim_ros.nodes.tissue_builder import TissueBuilder
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
@@ -28,7 +29,7 @@ _WINDOW = 1.0  # seconds over which the real-time factor is measured
 class PhysicsNode(EndoNode):
     """Samples control nodes from the latest model and steps them at the rate of the simulation."""
 
-    read_at_start = frozenset({"arms", "arm_source", "mode", "lockstep_inputs"})
+    read_at_start = frozenset({"arms", "arm_source", "instruments", "arm_models", "mode", "lockstep_inputs"})
 
     def __init__(self) -> None:
         super().__init__("physics_node")
@@ -43,9 +44,12 @@ class PhysicsNode(EndoNode):
         self._real_time_factor = self._clock_speed = 1.0  # the clock's is that against the wall's
         self._asked = 0.0  # time of the clock when it was last asked for a step
         self._pacer = Pacer()
-        self.arms = {name: Arm(name) for name in arm_names(self._options.arms)}
+        self.arms = make_arms(self._options)
+        self._tools = {name: arm for name, arm in self.arms.items() if name != CAMERA_ARM}
+        self._view: tuple[Camera, float] | None = None  # a camera of the newest model and the depth of the tissue that it sees, m
+        self._unplaced = ""  # why arms have no place
         self._lockstep = self._options.mode == "lockstep"
-        self._commands = CommandQueue(frozenset((n, kind) for n in self.arms for kind in self._options.lockstep_inputs))
+        self._commands = CommandQueue(frozenset((n, kind) for n in self._tools for kind in self._options.lockstep_inputs))
         # In real time only the newest command counts, and none may queue; in lockstep none may be lost.
         depth = MOST_WAITING if self._lockstep else 1
         self._nodes_pub = self.publisher(messages.CONTROL_NODES, MOST_WAITING if self._lockstep else STREAM_DEPTH, alone=True)
@@ -58,8 +62,9 @@ class PhysicsNode(EndoNode):
             messages.TRAINING_CAMERAS, lambda message: self._builder.receive_training_cameras(message, self._options.world_frame)
         )
         self.subscribe(messages.TRAINING_CAMERA_INFO, self._builder.receive_training_info)
-        self.subscribe(messages.CAMERA_POSE, lambda message: self._builder.receive_camera_pose(message, self._options.frame_poses))
+        self.subscribe(messages.CAMERA_POSE, self._on_camera_pose)
         self._arm_topics = ArmTopics(self, self.arms, self._options, depth, self._on_command)
+        self._place_arms()
         self.service(Trigger, "~/reset", self._on_reset)
         self.service(Trigger, "~/step", self._on_step)
         self.service(SetBool, "~/pause", self._on_pause)
@@ -73,16 +78,25 @@ class PhysicsNode(EndoNode):
             self.config = config  # the timer builds a simulation for it
             self._timer.timer_period_ns = int(_poll(config) * 1e9)
         else:
-            self._options = self._arm_topics.options = config
+            moved = config.frames != self._options.frames
+            self._options = config
+            self._arm_topics.change_options(config)
+            if moved:
+                self._place_arms()
 
     # ------------------------------------------------------------------ model
+
+    def _on_camera_pose(self, message: Any) -> None:
+        camera = self.arms.get(CAMERA_ARM)
+        if camera is None or camera.pose is None:  # else it is that of our own arm
+            self._arm_topics.camera_pose = self._builder.receive_camera_pose(message, self._options.frame_poses)
 
     def _build(self) -> None:
         """Build a simulation of the newest model in the background; the old one goes on meanwhile."""
         try:
             built = self._builder.take()
             if built is not None:
-                (stamp, simulation), old = built, self.simulation
+                (stamp, simulation, view), old = built, self.simulation
                 same_model = stamp == self._simulated_stamp
                 continued = old is not None and same_model and simulation.continue_from(old)  # only its material has changed
                 self._simulated_stamp, self.simulation, self.failure = stamp, simulation, ""
@@ -90,6 +104,9 @@ class PhysicsNode(EndoNode):
                 if not continued:
                     for arm in self.arms.values():
                         arm.acting = False
+                if not same_model:
+                    self._view = view
+                    self._place_arms()
                 if self._lockstep and not continued:  # the first observation, before any command
                     self._publish(self.simulation, self._simulated_stamp, at_rest=True)
         except Exception as error:
@@ -98,6 +115,13 @@ class PhysicsNode(EndoNode):
         self._builder.want(self.config)
 
     # ------------------------------------------------------------------ tools
+
+    def _place_arms(self) -> None:
+        """Put the arms where `frames` or the camera of the newest model says, those without a robot at their start."""
+        before, self._unplaced = self._unplaced, place_arms(self.arms, self._options.frame_poses, self._view)
+        self._arm_topics.describe()
+        if self._unplaced and self._unplaced != before and self.simulation is not None:
+            self.get_logger().warning(self._unplaced)
 
     def _on_command(self, name: str, kind: str, message: Any, topic: str, act: Callable[[], None]) -> None:
         """Let a part of a command act now or, in lockstep, in the step that its stamp names."""
@@ -130,8 +154,8 @@ class PhysicsNode(EndoNode):
             self._publish(self.simulation, stamp)
 
     def _apply_tools(self, simulation: TissueSimulation) -> None:
-        for name, arm in self.arms.items():
-            if arm.pose is None:
+        for name, arm in self._tools.items():
+            if arm.pose is None or not arm.acts:
                 continue
             where = f"at {np.round(arm.pose[:3, 3], 4).tolist()}"
             if not simulation.set_grasp(name, arm.pose, arm.closed):
@@ -217,16 +241,17 @@ class PhysicsNode(EndoNode):
         start, faults, slips = time.monotonic(), simulation.faults, simulation.slips
         for arm in self.arms.values():
             turning = arm.angle_goal is not None
-            arm.move(simulation.step_duration, self._options.move_speed, self._options.turn_speed)
+            self._arm_topics.warn(arm, arm.move(simulation.step_duration, self._options.move_speed, self._options.turn_speed))
             if turning:  # else a jaw that tissue slipped out of would close again
                 arm.hold(self._options.jaw_closed, self._options.jaw_open)
-        self._arm_topics.publish_operating_states()
         self._apply_tools(simulation)
         simulation.step()
+        for name, arm in self._tools.items():
+            self._arm_topics.limit_force(arm, lambda name=name: simulation.reaction(name)[0])
         if simulation.slips > slips:
             travel = f"{simulation.config.travel:g} m"
             self.report_error(f"tissue slipped out of a jaw that pulled it almost {travel}; open it, come nearer, or raise travel")
-            for name, arm in self.arms.items():
+            for name, arm in self._tools.items():
                 arm.closed = arm.closed and simulation.in_reach(name)
         self.steps += 1
         if simulation.faults > faults:
@@ -242,18 +267,21 @@ class PhysicsNode(EndoNode):
         if cut != self._published_cut:  # before the state that has it
             self._cut_pub.publish(messages.encode_cut_surface(simulation.cuts, self._simulated_stamp, world))
             self._published_cut = cut
+        self._arm_topics.publish_views(stamp)  # before the state with the same stamp, as who draws them waits for that
         cloud = ControlNodeCloud(state.rest, state.positions, state.F, self._simulated_stamp, cut)
         self._nodes_pub.publish(messages.encode_control_nodes(cloud, stamp, world))
         shown = []
-        for name, arm in self.arms.items():
+        for name, arm in self._tools.items():
             if arm.pose is None:
                 continue
             reaction, torque = simulation.reaction(name)
             self._arm_topics.publish(arm, arm.pose, reaction, torque, stamp)
             force = arm.force if arm.acting and arm.force is not None else np.zeros(3)
             shown.append(messages.ToolDisplay(name, arm.pose[:3, 3], force, reaction, simulation.held(name)))
+        self._arm_topics.publish_joint_states(stamp)
         if shown and self._markers_pub.get_subscription_count():
             self._markers_pub.publish(messages.encode_tool_markers(shown, stamp, world))
+        self._arm_topics.publish_operating_states()  # at last: who waits for the end of a move then asks where the arm is
 
     # --------------------------------------------------------------- services
 
@@ -265,7 +293,6 @@ class PhysicsNode(EndoNode):
         self._start_timing()
         for arm in self.arms.values():
             arm.reset()
-        self._arm_topics.publish_operating_states()
         self._publish(self.simulation, self._simulated_stamp if self._lockstep else self.now_ns(), at_rest=True)
         return True, "at rest"
 
@@ -338,7 +365,7 @@ class PhysicsNode(EndoNode):
             return WARN, text, values
         if self._real_time_factor < _SLOW:
             return WARN, "slower than real time; lower node_count or young_modulus, or use a GPU", values
-        return OK, "running", values
+        return (WARN, f"running; {self._unplaced}", values) if self._unplaced else (OK, "running", values)
 
     def destroy_node(self) -> None:
         """Build no more tissue, and destroy the node."""

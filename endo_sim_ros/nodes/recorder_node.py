@@ -31,12 +31,12 @@ _FLUSH_EVERY = 1.0  # seconds; what was heard longer ago outlives a killed recor
 class RecorderNode(EndoNode):
     """Writes every topic of the contract, or those that were chosen, as it comes."""
 
-    read_at_start = frozenset({"bag", "arms", "topics", "canonical"})
+    read_at_start = frozenset({"bag", "arms", "topics", "images", "canonical"})
 
     def __init__(self) -> None:
         super().__init__("recorder")
         self._config = self.declare(RecorderConfig)
-        topics = _chosen(self._config.topics, arm_names(self._config.arms))
+        topics = _chosen(self._config.topics, arm_names(self._config.arms), self._config.images == "compressed")
         self.failure = ""  # why nothing is recorded any more
         self.written, self._bytes, self.dropped = 0, 0, 0
         self._heard: set[str] = set()  # topics
@@ -112,16 +112,16 @@ class RecorderNode(EndoNode):
         super().destroy_node()
 
 
-def _chosen(names: tuple[str, ...], arms: tuple[str, ...]) -> list[Topic]:
-    """The topics of the contract with these names.
+def _chosen(names: tuple[str, ...], arms: tuple[str, ...], compressed: bool) -> list[Topic]:
+    """The topics of the contract with these names; of all, rendered images are compressed or not.
 
     Raises:
         ConfigError: If there is no such topic.
     """
     known = {topic.name.lstrip("/"): topic for topic in messages.all_topics(arms)}
+    wanted = dict.fromkeys(name.strip().lstrip("/") for name in names if name != ALL_TOPICS)
     if ALL_TOPICS in names:
-        return list(known.values())
-    wanted = dict.fromkeys(name.strip().lstrip("/") for name in names)
+        wanted |= dict.fromkeys(topic.name.lstrip("/") for topic in messages.recorded_topics(arms, compressed))
     unknown = [name for name in wanted if name not in known]
     if unknown or not wanted:
         what = ", ".join(map(repr, unknown)) or "topic of no name"
@@ -129,7 +129,7 @@ def _chosen(names: tuple[str, ...], arms: tuple[str, ...]) -> list[Topic]:
     return [known[name] for name in wanted]
 
 
-def record(bag: Path, arms: tuple[str, ...], topics: tuple[str, ...], namespace: str = "") -> None:
+def record(bag: Path, arms: tuple[str, ...], topics: tuple[str, ...], namespace: str = "", images: str = "compressed") -> None:
     """Record a running graph until interrupted, with a live line of counts.
 
     Raises:
@@ -140,7 +140,7 @@ def record(bag: Path, arms: tuple[str, ...], topics: tuple[str, ...], namespace:
     if bag.exists():
         raise SequenceError(f"{bag} exists already; choose another name or remove it first")
     prepare_transport()
-    values = {"bag": str(bag), "arms": list(arms), "topics": list(topics)}
+    values = {"bag": str(bag), "arms": list(arms), "topics": list(topics), "images": images}
     parameters = [word for name, value in values.items() for word in ("-p", f"{name}:={json.dumps(value)}")]
     remapped = ["-r", f"__ns:=/{namespace.strip('/')}"] if namespace.strip("/") else []
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # rclpy hears it, and ends the recording as on Ctrl-C

@@ -3,17 +3,21 @@
 import time
 from collections import deque
 from dataclasses import replace
-from typing import Any
+from functools import partial
+from typing import Any, Literal
 
 import numpy as np
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.instruments.drawing import PosedInstruments
 from endo_sim_ros.messages import ERROR, OK, STATE, WARN, CameraInfo, ControlNodeCloud, MessageError, RenderingState
 from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode, run, sentence
-from endo_sim_ros.nodes.configs import RenderingNodeConfig
+from endo_sim_ros.nodes.configs import RenderingNodeConfig, arm_names
 from endo_sim_ros.nodes.model_tracker import BoundModel, ModelTracker
 from endo_sim_ros.nodes.pacing import MOST_WAITING, Pacer
+from endo_sim_ros.nodes.rendered_topics import RenderedTopics, Shown, right_camera
+from endo_sim_ros.nodes.shown_instruments import ShownInstruments
 from endo_sim_ros.rendering import RenderingConfig
 
 _MAX_SIDE = 8192  # pixels; a damaged camera_info must not make the node ask for all memory
@@ -23,7 +27,7 @@ _POLLS = 4  # times per image that the timer asks whether one is due
 class RenderingNode(EndoNode):
     """Keeps the newest model, node state and camera, and renders them at its own rate, or state by state in lockstep."""
 
-    read_at_start = frozenset({"mode", "lockstep_camera"})
+    read_at_start = frozenset({"mode", "lockstep_camera", "arms"})
 
     def __init__(self) -> None:
         super().__init__("rendering_node")
@@ -38,17 +42,19 @@ class RenderingNode(EndoNode):
         self._pose: np.ndarray | None = None
         self._training_pose: np.ndarray | None = None
         self._info: CameraInfo | None = None
+        self._right_info: CameraInfo | None = None
         self._training_info: CameraInfo | None = None
         # Lockstep: stamps and states still to be shown, with their poses if a reset came since.
         self._states: deque[tuple[int, ControlNodeCloud, np.ndarray | None]] = deque()
         self._poses: dict[int, np.ndarray] = {}  # lockstep_camera: poses that wait for their state, by stamp
         self._pacer = Pacer()
         self._dirty, self.images, self._last_image = True, 0, 0.0
-        self._output: tuple[np.ndarray, np.ndarray | None, Camera] | None = None
+        self._output: Shown | None = None
         self._seconds_per_image = 0.0
         self._blind: np.ndarray | None = None  # position [3], m, world, of the newest camera, if it sees no tissue
-        publishers = (self.publisher(topic, alone=True) for topic in messages.RENDERED_TOPICS)
-        self._info_pub, self._pose_pub, self._depth_pub, self._image_pub = publishers
+        self._topics = RenderedTopics(self)
+        self.instruments = ShownInstruments(arm_names(self.options.arms), self._lockstep)
+        self._awaited = ""  # lockstep: the arm whose links are awaited
         self.subscribe(messages.GAUSSIANS, self._on_model)
         self.subscribe(messages.TRAINING_CAMERAS, self._on_training_cameras)
         self.subscribe(messages.TRAINING_CAMERA_INFO, self._on_training_info)
@@ -56,6 +62,10 @@ class RenderingNode(EndoNode):
         self.subscribe(messages.CUT_SURFACE, self._on_cut_surface, depth)
         self.subscribe(messages.CAMERA_POSE, self._on_camera, depth)
         self.subscribe(messages.LEFT_INFO, self._on_info, depth=1)
+        self.subscribe(messages.RIGHT_INFO, self._on_right_info, depth=1)
+        for arm in self.instruments.arms:
+            self.subscribe(messages.tool_type(arm), partial(self._on_tool_type, arm))
+            self.subscribe(messages.tool_links(arm), partial(self._on_links, arm), depth)
         self._timer = self.every(1.0 / self.options.rate / _POLLS, self._on_timer)
 
     def config_changed(self, config: RenderingConfig | RenderingNodeConfig) -> None:
@@ -63,6 +73,7 @@ class RenderingNode(EndoNode):
         if isinstance(config, RenderingNodeConfig):
             self.options = config
             self._timer.timer_period_ns = int(1e9 / config.rate / _POLLS)
+            self._change()
         else:
             self._config = config  # the timer binds the model anew
 
@@ -96,11 +107,11 @@ class RenderingNode(EndoNode):
         if self._lockstep:
             if self._nodes_stamp == nodes.model_stamp_ns and old is not None and old.model_stamp_ns == nodes.model_stamp_ns:
                 if self._states and last == nodes.model_stamp_ns:
-                    self._states.pop()  # a reset after a reset that was not shown yet
+                    self.instruments.forget(self._states.pop()[0])  # a reset after a reset that was not shown yet
                 self._end_episode(last)
             self._states.append((self._nodes_stamp, nodes, None))
             if len(self._states) > MOST_WAITING:
-                self._states.popleft()
+                self.instruments.forget(self._states.popleft()[0])
                 raise MessageError(f"{messages.CONTROL_NODES.name}: over {MOST_WAITING} states wait to be shown; one is left out")
             self.show_states()
         elif not same:
@@ -125,7 +136,9 @@ class RenderingNode(EndoNode):
         same = self._pose is not None and np.array_equal(pose, self._pose)
         self._pose = pose
         if self._lockstep and self.options.lockstep_camera:
-            self._poses[messages.stamp_to_ns(message.header.stamp)] = pose
+            stamp = messages.stamp_to_ns(message.header.stamp)
+            if stamp != self.tissue.model_stamp:  # that of the state at rest, which comes before or after those of all steps
+                self._poses[stamp] = pose
             while len(self._poses) > MOST_WAITING:
                 del self._poses[next(iter(self._poses))]
             self.show_states()
@@ -137,6 +150,25 @@ class RenderingNode(EndoNode):
         self._info = info
         if old is None or not info.same_as(old):
             self._change()
+
+    def _on_right_info(self, message: Any) -> None:
+        info, old = _decode_info(message, messages.RIGHT_INFO.name), self._right_info
+        self._right_info = info
+        if old is None or not info.same_as(old):
+            self._change()
+
+    def _on_tool_type(self, arm: str, message: Any) -> None:
+        try:
+            self.instruments.receive_type(arm, message)
+        finally:
+            self._change()
+
+    def _on_links(self, arm: str, message: Any) -> None:
+        moved = self.instruments.receive_links(arm, message, self.options.world_frame)
+        if self._lockstep:
+            self.show_states()
+        elif moved:
+            self._change()  # the state of this moment is about to come and shows it, else the timer does
 
     def _camera(self) -> Camera | None:
         """The camera asked for; until there is one, a training camera."""
@@ -161,16 +193,19 @@ class RenderingNode(EndoNode):
         camera, now = self._camera(), time.monotonic()
         if self.tissue.bound is None or camera is None or self.now_ns() == 0:  # with use_sim_time, before /clock
             return
-        if self._dirty or self._output is None or (self._output[1] is None and self._wants_depth()):
+        if self._dirty or self._output is None or not self._topics.wanted(self._right_info).within(self._output.wanted):
             if not self._pacer.is_due(now, 1 / self.options.rate):
                 return
             self._dirty = False
-            self._output = self._render(self.tissue.bound, self._nodes, camera)
+            instruments = self._posed(self.tissue.bound, self.instruments.newest())
+            self._output = self._render(self.tissue.bound, self._nodes, camera, instruments or None)
+            if instruments is False:  # the tissue alone meanwhile
+                self._change()
         elif now - self._last_image < 1 / self.options.idle_rate - 0.5 / self.options.rate:
             return
         self._last_image = now
         self._last_stamp = self._stamp(self.tissue.bound)
-        self._publish(*self._output, self._last_stamp)
+        self._publish(self._output, self._last_stamp)
 
     def _stamp(self, bound: BoundModel) -> int:
         """Real time: the stamp of an image, ns. It is that of the state that is shown, or now if an earlier image has that already."""
@@ -195,10 +230,36 @@ class RenderingNode(EndoNode):
                 camera = camera and replace(camera, pose=self._poses[stamp] if pose is None else pose)
             if not self.tissue.bound.follows(nodes) or not camera or not self.tissue.has_cut(nodes):
                 return
+            instruments = self._await_instruments(stamp, self.tissue.bound)
+            if instruments is False:
+                return
             self._states.popleft()
+            self.instruments.forget(stamp)
             if pose is None and not at_rest:
                 self._poses = {other: later for other, later in self._poses.items() if other > stamp}
-            self._publish(*self._render(self.tissue.bound, nodes, camera), stamp)
+            self._publish(self._render(self.tissue.bound, nodes, camera, instruments), stamp)
+
+    def _await_instruments(self, stamp: int, bound: BoundModel) -> PosedInstruments | None | Literal[False]:
+        """Lockstep: the instruments at the time of the first state that waits; False while links or their drawing are awaited."""
+        self._awaited = ""
+        if not self.options.instruments:
+            return None
+        awaited = [arm for arm in self.instruments.arms if self.count_publishers(messages.tool_links(arm).name)]
+        links = self.instruments.at(stamp, [later for later, *_ in self._states if later != stamp], awaited)
+        if isinstance(links, str):
+            self._awaited = links
+            return False
+        return self._posed(bound, links)
+
+    def _posed(self, bound: BoundModel, links: dict[str, np.ndarray]) -> PosedInstruments | None | Literal[False]:
+        """What draws the instruments, False while it is prepared; without it the tissue is shown alone, and an error says so."""
+        if not self.options.instruments:
+            return None
+        try:
+            return self.instruments.posed(links, self.options.drawing, bound.renderer.device)
+        except Exception as error:
+            self.report_error(sentence("instruments", error))
+            return None
 
     def _lacks_pose(self, stamp: int, nodes: ControlNodeCloud, pose: np.ndarray | None) -> bool:
         """Lockstep: whether a state still waits for its camera; the one at rest does not, as nobody sends one for it."""
@@ -220,6 +281,7 @@ class RenderingNode(EndoNode):
 
     def _leave_out(self, why: str) -> None:
         stamp = self._states.popleft()[0]
+        self.instruments.forget(stamp)
         self.report_error(f"the state of {stamp * 1e-9:.6f} s is not shown: it {why}")
 
     def _build(self) -> None:
@@ -237,10 +299,7 @@ class RenderingNode(EndoNode):
             self._failure = sentence("rendering", error)
             self.report_error(self._failure)
 
-    def _wants_depth(self) -> bool:
-        return self._depth_pub.get_subscription_count() > 0  # else a megabyte would only delay the next image
-
-    def _render(self, bound: BoundModel, nodes: ControlNodeCloud | None, camera: Camera) -> tuple[np.ndarray, np.ndarray | None, Camera]:
+    def _render(self, bound: BoundModel, nodes: ControlNodeCloud | None, camera: Camera, instruments: PosedInstruments | None) -> Shown:
         start, camera = time.monotonic(), bound.renderer.camera(camera)
         if max(camera.width, camera.height) > _MAX_SIDE:
             raise MessageError(f"images of {camera.width}×{camera.height} are too large; set image_width")
@@ -248,18 +307,18 @@ class RenderingNode(EndoNode):
         if nodes is not None and bound.follows(nodes):
             state = (nodes.positions, nodes.F)
             self.tissue.cut(bound, nodes)
-        image, depth = bound.renderer.render(camera, *state, depth=self._wants_depth())
+        wanted, cameras = self._topics.wanted(self._right_info), [camera]
+        if wanted.right and self._right_info is not None:
+            cameras.append(right_camera(camera, self._right_info))
+        views = bound.renderer.views(cameras, *state, depth=wanted.depth, labels=wanted.labels, instruments=instruments)
+        labels = views[0].labels
+        shown = Shown(views, cameras, wanted, None if labels is None else self.instruments.labels(instruments, labels))
         self._seconds_per_image += 0.1 * (time.monotonic() - start - self._seconds_per_image)
         self._blind = None if bound.renderer.sees_tissue else camera.position
-        return image, depth, camera
+        return shown
 
-    def _publish(self, image: np.ndarray, depth: np.ndarray | None, camera: Camera, stamp: int) -> None:
-        frame = self.options.camera_frame
-        self._info_pub.publish(messages.encode_camera_info(camera.K, camera.width, camera.height, stamp, frame))
-        self._pose_pub.publish(messages.encode_pose(camera.pose, stamp, self.options.world_frame))
-        self._image_pub.publish(messages.encode_image(image, stamp, frame))
-        if depth is not None:
-            self._depth_pub.publish(messages.encode_image(depth, stamp, frame))
+    def _publish(self, shown: Shown, stamp: int) -> None:
+        self._topics.publish(shown, stamp, self.options)
         self.images += 1
 
     # ------------------------------------------------------------ diagnostics
@@ -298,12 +357,15 @@ class RenderingNode(EndoNode):
             waiting = f", {len(self._states)} states wait" if self._states else ""
             if self._states and self._lacks_pose(*self._states[0]):
                 waiting += f" for a pose on {messages.CAMERA_POSE.name} of {self._states[0][0] * 1e-9:.6f} s"
+            elif self._states and self._awaited:
+                waiting += f" for {messages.tool_links(self._awaited).name} of {self._states[0][0] * 1e-9:.6f} s"
             return OK, f"in lockstep, {self.images} images rendered{waiting}", values
         return OK, "rendering", values
 
     def destroy_node(self) -> None:
         """Bind no more models, and destroy the node."""
         self.tissue.stop()
+        self.instruments.stop()
         super().destroy_node()
 
 

@@ -7,12 +7,15 @@ from typing import Any
 import numpy as np
 
 from endo_sim_ros import messages
-from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.nodes.background import Background
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
 from endo_sim_ros.rendering import render_depth
 
+# A view as wide as an endoscope's, for a camera whose intrinsics nobody has told:
+_USUAL_VIEW = intrinsic_matrix(560.0, 560.0, 320.0, 256.0), 640, 512
+_PIXELS_OF_DEPTH = 64  # columns of the picture in which the depth of the tissue is looked for
 _CAMERAS_LATE = 1.0  # seconds after a model in which its training cameras may still be on their way
 
 
@@ -29,7 +32,7 @@ class TissueBuilder:
         self._views: tuple[int | None, np.ndarray] = None, np.zeros((0, 4, 4))  # stamp and poses of the newest training_cameras
         self._earlier_views: np.ndarray | None = None  # the newest poses [V, 4, 4] that were any
         self._view_info: tuple[int, messages.CameraInfo] | None = None  # stamp and intrinsics of the newest training cameras
-        self._camera_position: np.ndarray | None = None  # [3] m, world
+        self._camera_pose: np.ndarray | None = None  # [4, 4] m, world
         self._background = Background()
 
     @property
@@ -69,8 +72,8 @@ class TissueBuilder:
         info = messages.decode_camera_info(message, messages.TRAINING_CAMERA_INFO.name)
         self._view_info = messages.stamp_to_ns(message.header.stamp), info
 
-    def receive_camera_pose(self, message: Any, frames: Mapping[str, np.ndarray]) -> None:
-        """Decode and keep a message of the topic of the camera's pose.
+    def receive_camera_pose(self, message: Any, frames: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Decode, keep and return a message of the topic of the camera's pose: camera-to-world [4, 4], m.
 
         Args:
             message: The message.
@@ -79,28 +82,30 @@ class TissueBuilder:
         Raises:
             MessageError: If it cannot be used.
         """
-        pose = messages.decode_pose(message, frames, messages.CAMERA_POSE.name)
-        self._camera_position = pose[:3, 3]
+        self._camera_pose = messages.decode_pose(message, frames, messages.CAMERA_POSE.name)
+        return self._camera_pose
 
-    def take(self) -> tuple[int, TissueSimulation] | None:
-        """The stamp of a model, ns, and its simulation, once when it is built, else None. Raises what the building raised."""
+    def take(self) -> tuple[int, TissueSimulation, tuple[Camera, float] | None] | None:
+        """The stamp of a model, ns, its simulation, and a camera with the depth of the tissue in the middle of its picture, m, or
+        None where it sees none; once when they are made, else None. Raises what the making raised."""
         built = self._background.take()
         return None if built is None else built[1]
 
     def want(self, config: PhysicsConfig) -> None:
         """Build what was received last with these options, unless that was done; call it periodically."""
-        origin, viewpoint = self._viewpoint()
-        if self.model is not None and viewpoint is not None:
+        origin, poses = self._viewpoint()
+        if self.model is not None and poses is not None:
             model, stamp, cameras = self.model, self._model_stamp, self._own_cameras()
+            viewpoint, camera = poses[:, :3, 3], cameras[0] if cameras else Camera(*_USUAL_VIEW, poses[0])
             key = self._model_number, origin, bool(cameras), config
-            self._background.want(key, lambda: (stamp, _tissue(model, viewpoint, config, cameras)))
+            self._background.want(key, lambda: (stamp, _tissue(model, viewpoint, config, cameras), _view(model, camera)))
 
     def stop(self) -> None:
         """Build nothing more."""
         self._background.stop()
 
     def _viewpoint(self) -> tuple[str, np.ndarray | None]:
-        """From where the tissue was seen: a name, and positions [3] or [V, 3], m, world, or None while they may still arrive.
+        """From where the tissue was seen: a name, and poses [V, 4, 4], m, world, or None while they may still arrive.
 
         The model's own cameras come first, then the camera now, then the cameras of an earlier model."""
         stamp, poses = self._views
@@ -109,10 +114,10 @@ class TissueBuilder:
         if not whole and time.monotonic() - self._model_came < _CAMERAS_LATE:
             return "", None
         if own and len(poses):
-            return "own cameras", poses[:, :3, 3]
-        if self._camera_position is not None:
-            return "camera", self._camera_position
-        return "earlier cameras", None if self._earlier_views is None else self._earlier_views[:, :3, 3]
+            return "own cameras", poses
+        if self._camera_pose is not None:
+            return "camera", self._camera_pose[None]
+        return "earlier cameras", self._earlier_views
 
     def _own_cameras(self) -> list[Camera]:
         """The cameras of the newest model, if all about them has arrived."""
@@ -129,3 +134,12 @@ def _tissue(model: GaussianModel, viewpoint: np.ndarray, config: PhysicsConfig, 
     if config.kinematics == "rest" and not config.dense:
         simulation.prepare_cutting()
     return simulation
+
+
+def _view(model: GaussianModel, camera: Camera) -> tuple[Camera, float] | None:
+    """The camera, and how deep the tissue lies in the middle of its picture, m; None where it shows none."""
+    small = camera.resized(_PIXELS_OF_DEPTH, max(round(_PIXELS_OF_DEPTH * camera.height / camera.width), 4))
+    depth = render_depth(model, small)
+    rows, columns = (slice(side // 4, side - side // 4) for side in depth.shape)
+    seen = depth[rows, columns][depth[rows, columns] > 0]
+    return (camera, float(np.median(seen))) if seen.size else None

@@ -12,10 +12,12 @@ from std_srvs.srv import SetBool, Trigger
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.instruments.config import DrawingConfig
 from endo_sim_ros.messages import OK, STATE, WARN, ControlNodeCloud, PhysicsState, ViewerState
 from endo_sim_ros.nodes.base import run
 from endo_sim_ros.nodes.configs import ViewerNodeConfig, arm_names
 from endo_sim_ros.nodes.model_tracker import ModelTracker
+from endo_sim_ros.nodes.shown_instruments import ShownInstruments
 from endo_sim_ros.nodes.watcher import Watcher
 from endo_sim_ros.rendering import RenderingConfig
 from endo_sim_ros.viewer.config import ViewerConfig
@@ -52,6 +54,7 @@ class ViewerNode(Watcher):
         self._arms = {name: _Arm() for name in dict.fromkeys((*arm_names(self._options.arms), arm))}
         self._hand = arm
         self._tissue = ModelTracker()
+        self._instruments, self._moved = ShownInstruments(tuple(self._arms), lockstep=False), False
         self._cameras: np.ndarray | None = None  # [V, 4, 4], of the training views
         self._infos: dict[str, messages.CameraInfo] = {}  # by topic
         self._rendered: dict[str, tuple[int, Any]] = {}  # stamp and content of the newest rendered messages
@@ -79,6 +82,8 @@ class ViewerNode(Watcher):
         for name in self._arms:
             self.subscribe(messages.tool_pose(name), partial(self._on_tool_pose, name), depth=1)
             self.subscribe(messages.tool_reaction(name), partial(self._on_reaction, name), depth=1)
+            self.subscribe(messages.tool_type(name), partial(self._on_tool_type, name))
+            self.subscribe(messages.tool_links(name), partial(self._on_links, name), depth=1)
         self.every(_PERIOD, self._on_timer)
         self.get_logger().info(f"open {self.viewer.url} in a browser")
 
@@ -145,6 +150,20 @@ class ViewerNode(Watcher):
         self._arms[name].reaction, _ = messages.decode_wrench(message, messages.tool_reaction(name).name)
         self._arms[name].heard = time.monotonic()
 
+    def _on_tool_type(self, name: str, message: Any) -> None:
+        self._moved = True
+        self._instruments.receive_type(name, message)
+
+    def _on_links(self, name: str, message: Any) -> None:
+        self._moved |= self._instruments.receive_links(name, message, self._options.world_frame)
+
+    def _show_instruments(self, device: str) -> None:
+        """Show the instruments where they are now, once what draws them is prepared."""
+        posed = self._instruments.posed(self._instruments.newest(), DrawingConfig(), device) if self._moved else False
+        if posed is not False:
+            self._moved = False
+            self.viewer.show_instruments(posed)
+
     def _on_diagnostics(self, message: Any) -> None:
         super()._on_diagnostics(message)
         if self.heard.get(self._physics, 0.0) > self.paused_until:
@@ -161,6 +180,9 @@ class ViewerNode(Watcher):
         with self.guard("viewer"):
             if self._tissue.bind(self._nodes, self._rendering) and (bound := self._tissue.bound) is not None:
                 self.viewer.show_model(bound.renderer, bound.node_rest, self._camera())
+            if (bound := self._tissue.bound) is not None:
+                with self.guard("instruments"):
+                    self._show_instruments(bound.renderer.device)
             now = time.monotonic()
             tools = {
                 name: Tool(arm.pose[:3, 3], -arm.pose[:3, :3] @ arm.reaction)
@@ -291,6 +313,7 @@ class ViewerNode(Watcher):
     def destroy_node(self) -> None:
         """Stop serving the page, then destroy the node."""
         self._tissue.stop()
+        self._instruments.stop()
         self.viewer.stop()
         super().destroy_node()
 

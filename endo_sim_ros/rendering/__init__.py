@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from endo_sim_ros.rendering.config import RenderingConfig as RenderingConfig
     from endo_sim_ros.rendering.renderer import (
         DeformableRenderer as DeformableRenderer,
+        View as View,
         render_depth as render_depth,
         turned_colors as turned_colors,
     )

@@ -1,5 +1,7 @@
 """Images and depth of a Gaussian model, at rest or as it follows its control nodes, in a camera."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Literal, overload
 
 import numpy as np
@@ -11,9 +13,26 @@ from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
 from endo_sim_ros.core.light import SURFACE, Light
 from endo_sim_ros.core.shading import shade, to_bytes
+from endo_sim_ros.instruments.drawing import PosedInstruments
 from endo_sim_ros.physics.skinning import Skinning
 from endo_sim_ros.rendering.config import RenderingConfig
-from endo_sim_ros.splatting import render, sh_basis
+from endo_sim_ros.splatting import RenderOutput, render, sh_basis
+
+
+@dataclass(frozen=True)
+class View:
+    """What one eye sees.
+
+    Args:
+        image: RGB [H, W, 3], uint8.
+        depth: Of the tissue or the instrument in each pixel [H, W], float32, m, 0 = no surface; None unless asked for.
+        labels: What is in each pixel [H, W], uint8: 0 nothing, 1 tissue, 2 and up the links of the instruments, as
+            `instruments.drawing.InstrumentDrawing.links` lists them; None unless asked for.
+    """
+
+    image: np.ndarray
+    depth: np.ndarray | None
+    labels: np.ndarray | None
 
 
 class DeformableRenderer:
@@ -113,24 +132,66 @@ class DeformableRenderer:
         Raises:
             ValueError: If the renderer has no control nodes, F is missing, or shapes disagree.
         """
+        (view,) = self.views([camera], positions, F, depth=depth, light=light)
+        return view.image, view.depth
+
+    @torch.no_grad()
+    def views(
+        self,
+        cameras: Sequence[Camera],
+        positions: np.ndarray | None = None,
+        F: np.ndarray | None = None,
+        *,
+        depth: bool = True,
+        labels: bool = False,
+        light: Light | None = None,
+        instruments: PosedInstruments | None = None,
+    ) -> list[View]:
+        """Return what the eyes of an endoscope see, with instruments in front of the tissue, within it and behind it.
+
+        Light and exposure come after the instruments, so that they count in both. The lamp is where the first camera is.
+
+        Args:
+            cameras: One, or one for each eye, all of one size.
+            positions, F, light: As for `render`.
+            depth, labels: Whether to return these; None otherwise.
+            instruments: What is drawn beside the tissue, on the device of the renderer; None = nothing.
+
+        Raises:
+            ValueError: As from `render`.
+        """
         model, covars = self.model, None
+        means = model.means
         if positions is not None:
             if F is None:
                 raise ValueError("render: positions of control nodes go with their deformation gradients F; F is None")
             means, covars = self.deform(positions, F)
-            assert self.skinning is not None  # else deform has refused
+        seen = [self._render_tissue(camera, means, covars, F) for camera in cameras]
+        sees_tissue = (seen[0].alphas[0] > SURFACE).any()
+        pictures = [(each.colors, each.depths, each.alphas) for each in seen]
+        colors, depths, alphas = pictures[0] if len(seen) == 1 else map(torch.cat, zip(*pictures))
+        marks = None
+        if instruments is not None:
+            marks = instruments.draw_into(cameras, colors, depths, alphas)
+        elif labels:
+            marks = (alphas > SURFACE).to(torch.uint8)
+        light, found = light or self.model.light, []
+        for i, camera in enumerate(cameras):
+            lit = colors[i] if light is None else shade(light, colors[i], depths[i], alphas[i], camera)
+            image, distance = to_bytes(lit).cpu().numpy(), None
+            if depth:
+                distance = torch.where(alphas[i] > SURFACE, depths[i] / alphas[i].clamp_min(1e-6), 0.0).cpu().numpy()
+            found.append(View(image, distance, marks[i].cpu().numpy() if labels and marks is not None else None))
+        self.sees_tissue = bool(sees_tissue)
+        return found
+
+    def _render_tissue(self, camera: Camera, means: Tensor, covars: Tensor | None, F: np.ndarray | None) -> RenderOutput:
+        model = self.model
+        if covars is not None:
+            assert self.skinning is not None and F is not None  # else there are no covariances
             sh = turned_colors(model.sh, self.skinning, means, F, camera) if model.sh_degree else model.sh
             model = GaussianModel(means, model.quats, model.log_scales, model.logit_opacities, sh)
-        output = render(model, camera, background=self._background, covars=covars)
-        colors, alpha = output.colors[0], output.alphas[0]
-        light = light or self.model.light
-        if light is not None:
-            colors = shade(light, colors, output.depths[0], alpha, camera)
-        image = to_bytes(colors).cpu().numpy()
-        self.sees_tissue = bool((alpha > SURFACE).any())
-        if not depth:
-            return image, None
-        return image, torch.where(alpha > SURFACE, output.depths[0] / alpha.clamp_min(1e-6), 0.0).cpu().numpy()
+        return render(model, camera, background=self._background, covars=covars)
 
 
 @torch.no_grad()

@@ -16,6 +16,7 @@ import torch
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.drawing import draw_force
+from endo_sim_ros.instruments.drawing import PosedInstruments
 from endo_sim_ros.physics import PhysicsConfig
 from endo_sim_ros.physics.regions import TissueProperties, paint_regions
 from endo_sim_ros.physics.stress import von_mises
@@ -110,6 +111,7 @@ class Viewer:
         self.endoscope: tuple[np.ndarray, Camera] | None = None  # its newest picture
         self.state: tuple[np.ndarray, np.ndarray] | None = None  # positions [M, 3] and F [M, 3, 3] of the nodes, None at rest
         self.tools: dict[str, Tool] = {}
+        self.instruments: PosedInstruments | None = None
         self._node_size = 0.0  # cm
         self._stress_scale = 0.0  # Pa
         self._begun = 0.0  # when the step to that state began
@@ -164,6 +166,10 @@ class Viewer:
             if not same:
                 self._show_model_in(browser)
         self._dirty = True
+
+    def show_instruments(self, instruments: PosedInstruments | None) -> None:
+        """Show instruments in the pictures that are rendered here, not in those that browsers draw."""
+        self.instruments, self._dirty = instruments, True
 
     def show_state(self, positions: np.ndarray, F: np.ndarray, age: float = 0.0) -> bool:
         """Show nodes at positions [M, 3] (m) with F [M, 3, 3], whose step began ``age`` seconds ago; returns whether they moved."""
@@ -441,7 +447,7 @@ class Viewer:
         """The tissue as it is now [H, W, 3] uint8, seen by a camera."""
         if self.renderer is None:
             return np.zeros((camera.height, camera.width, 3), np.uint8)
-        return self.renderer.render(camera, *(self.state or ()))[0]
+        return self.renderer.views([camera], *(self.state or ()), depth=False, instruments=self.instruments)[0].image
 
     def _join(self, client: Any) -> None:
         browser = self.browsers[client.client_id] = Browser(client, self.post, self.point)

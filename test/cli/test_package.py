@@ -215,7 +215,8 @@ def test_launch_file_starts_the_graph_with_what_is_given(monkeypatch):
     names, nodes = names[1:], nodes[1:]
     given = [node["parameters"][1] for node in nodes]
     arms = ["PSM1", "PSM2"]
-    assert given == [{"model_file": "latest"}, {"arms": arms}, {}, {"arm": "PSM1", "arms": arms}, {"bag": "b", "rate": 2.0, "loop": True}]
+    page, player = {"arm": "PSM1", "arms": arms}, {"bag": "b", "rate": 2.0, "loop": True}
+    assert given == [{"model_file": "latest"}, {"arms": arms}, {"arms": arms}, page, player]
     assert [node["ros_arguments"] for node in nodes] == [["--enclave", f"/e/{name}"] for name in names]
     with pytest.raises(FileNotFoundError, match="params"):
         start(params="/does/not/exist.yaml")

@@ -1,11 +1,17 @@
 """A model that follows its nodes."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
 
 from endo_sim_ros.core.cameras import Camera, make_pose
 from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.core.light import Light
+from endo_sim_ros.instruments import Capsule, Material, Part
+from endo_sim_ros.instruments.drawing import DrawingConfig, InstrumentDrawing
+from endo_sim_ros.instruments.shapes import lofted
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 
 CAMERA = Camera(np.array([[120.0, 0, 48], [0, 120, 40], [0, 0, 1]]), 96, 80)
@@ -71,3 +77,62 @@ def test_width_sets_the_size_and_keeps_the_shape():
     renderer = DeformableRenderer(sheet(), None, RenderingConfig(device="cpu", image_width=48))
     image, _ = renderer.render(renderer.camera(CAMERA))
     assert image.shape == (40, 48, 3)
+
+
+def instruments(at=(0.0, 0.0, 0.06), config=DrawingConfig()):
+    """A short steel cylinder across the view, posed."""
+    angle = 2 * np.pi * np.arange(64) / 64
+    rings = np.array([np.stack([4e-3 * np.cos(angle), 4e-3 * np.sin(angle), np.full(64, z)], 1) for z in (-8e-3, 8e-3)])
+    capsule = Capsule("roll", np.array([0.0, 0, -8e-3]), np.array([0.0, 0, 8e-3]), 4e-3)
+    drawing = InstrumentDrawing([[Part("roll", Material.STEEL, *lofted(rings))]], config, "cpu", [[capsule]])
+    pose = np.array([[0, 0, 1.0, at[0]], [0, 1, 0, at[1]], [-1, 0, 0, at[2]], [0, 0, 0, 1]])
+    return drawing.at([{"roll": pose}])
+
+
+def lit_sheet(response=0.0):
+    model = sheet()
+    return dataclasses.replace(model, light=Light(distance=0.9, response=response, level_r=-0.2, level_g=-0.2, level_b=-0.2))
+
+
+def test_without_instruments_views_are_what_render_gives():
+    renderer = DeformableRenderer(lit_sheet(1.0), NODES, CPU)
+    image, depth = renderer.render(CAMERA, NODES, IDENTITY)
+    (view,) = renderer.views([CAMERA], NODES, IDENTITY, labels=True)
+    assert np.array_equal(image, view.image) and np.array_equal(depth, view.depth) and set(np.unique(view.labels)) <= {0, 1}
+    (behind,) = renderer.views([CAMERA], NODES, IDENTITY, labels=True, instruments=instruments((0.0, 0.0, -0.06)))
+    assert np.array_equal(image, behind.image) and np.array_equal(depth, behind.depth) and np.array_equal(view.labels, behind.labels)
+
+
+def test_light_and_exposure_see_the_instrument():
+    pictures = {}
+    for response in (0.0, 1.0):
+        renderer = DeformableRenderer(lit_sheet(response), None, CPU)
+        for z in (0.02, 0.06, None):
+            posed = None if z is None else instruments((0.0, 0.0, z), DrawingConfig(shadows=False))
+            pictures[response, z] = renderer.views([CAMERA], labels=True, instruments=posed)[0]
+    steel = {z: pictures[0.0, z].image[pictures[0.0, z].labels == 2].mean() for z in (0.02, 0.06)}
+    assert steel[0.02] > 1.5 * steel[0.06]  # nearer to the lamp
+    corner = lambda response, z: pictures[response, z].image[:8, :8].astype(float).mean()
+    assert corner(0.0, 0.02) == corner(0.0, None)
+    assert abs(corner(1.0, 0.02) / corner(1.0, None) - 1) > 0.05  # what is bright in the middle darkens the rest, or the other way round
+
+
+def test_two_eyes_see_a_point_as_far_apart_as_its_depth_says():
+    baseline, z = 0.005, 0.05
+    renderer = DeformableRenderer(sheet(), None, CPU)
+    right = CAMERA.at(make_pose([baseline, 0, 0], [1, 0, 0, 0]))
+    views = renderer.views([CAMERA, right], labels=True, instruments=instruments((0.0, 0.0, z)))
+    middles = [np.argwhere(view.labels == 2).mean(0) for view in views]
+    nearest = z - 4e-3  # the outline lies between the middle and the front
+    assert 120 * baseline / z - 0.1 < middles[0][1] - middles[1][1] < 120 * baseline / nearest + 0.1
+    assert abs(middles[0][0] - middles[1][0]) < 0.1
+    for view in views:
+        assert view.depth[view.labels == 2].min() == pytest.approx(nearest, abs=1e-4)
+    (alone,) = renderer.views([CAMERA], labels=True, instruments=instruments((0.0, 0.0, z)))
+    assert np.array_equal(alone.image, views[0].image) and np.array_equal(alone.labels, views[0].labels)
+    for view, eye in zip(views, (CAMERA, right)):  # one lamp for both: what is dark lies behind the instrument seen from it
+        (plain,) = renderer.views([eye])
+        dark = (view.labels == 1) & (view.image.astype(int).sum(-1) < 0.8 * plain.image.astype(int).sum(-1))
+        points, lamp = eye.backproject(plain.depth)[dark], np.array([0.003, -0.002, 0])
+        passed = lamp + (z - lamp[2]) / (points[:, 2:] - lamp[2]) * (points - lamp)  # where the light came through its plane
+        assert dark.sum() > 20 and np.abs(passed[:, 1]).max() < 5.5e-3 and np.abs(passed[:, 0]).max() < 13.5e-3

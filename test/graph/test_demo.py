@@ -25,5 +25,12 @@ def test_demo_runs_the_whole_graph_and_leaves_its_results(tmp_path):
     with next((tmp_path / "recording").glob("*.mcap")).open("rb") as file:
         summary = make_reader(file).get_summary()
         counts = {summary.channels[i].topic: n for i, n in summary.statistics.channel_message_counts.items()}
-    for topic in ("gaussians", "control_nodes", "PSM1/body/servo_cf", "PSM1/body/measured_cf", "rendered/image_raw", "diagnostics"):
+    for topic in (
+        "gaussians",
+        "control_nodes",
+        "PSM1/body/servo_cf",
+        "PSM1/body/measured_cf",
+        "rendered/image_raw/compressed",
+        "diagnostics",
+    ):
         assert counts[f"/{topic}"] > 0, topic

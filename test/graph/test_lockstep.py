@@ -33,6 +33,7 @@ PARAMETERS = {
 }
 IMAGES = messages.RENDERED_IMAGE
 POSE, WRENCH = messages.tool_pose_command("PSM1"), messages.tool_wrench("PSM1")
+SHOWN = (messages.RENDERED_IMAGE, messages.RENDERED_DEPTH, messages.RENDERED_SEGMENTATION)  # recorded only where they are named
 STATES = (messages.CONTROL_NODES, messages.tool_reaction("PSM1"), messages.CLOCK, *messages.RENDERED_TOPICS)
 
 
@@ -93,9 +94,9 @@ def test_each_command_is_one_step_and_one_image_with_its_stamp(graph):
     for k, stamp in enumerate(sent):  # all at once: none may be lost, whatever the order of the parts
         command(graph, stamp, parts=(POSE, WRENCH) if k % 2 else (WRENCH, POSE))
     await_images(graph, 21)
-    graph.until(lambda: len(graph.heard["PSM1/body/measured_cf"]) == 20)
+    graph.until(lambda: len(graph.heard["PSM1/body/measured_cf"]) == 21)
     for topic in STATES:
-        expected = sent if topic.name in ("PSM1/body/measured_cf", "/clock") else [MODEL_STAMP, *sent]
+        expected = sent if topic is messages.CLOCK else [MODEL_STAMP, *sent]
         assert stamps(graph, topic) == expected, topic.name
     images = [messages.decode_image(image).astype(int) for image in graph.heard[IMAGES.name]]
     assert np.abs(images[-1] - images[0]).max() > 8  # each shows its own state
@@ -275,11 +276,11 @@ def test_a_commanded_arm_answers_like_a_robot_and_shows_its_markers(graph):
     graph.publish(messages.tool_jaw("PSM1"), messages.encode_jaw(0.7, 1))  # not part of a command: acts at once
     graph.until(lambda: graph.nodes[1].arms["PSM1"].angle == 0.7)
     command(graph, 200)
-    graph.until(lambda: len(graph.heard["PSM1/jaw/measured_js"]) == 2)
+    graph.until(lambda: len(graph.heard["PSM1/jaw/measured_js"]) == 3)
     pose = messages.decode_pose(graph.heard["PSM1/measured_cp"][-1], "world", "")
     np.testing.assert_allclose(pose[:3, 3], [0, 0, 0.1])
     assert messages.decode_jaw(graph.heard["PSM1/jaw/measured_js"][-1], "") == 0.7
-    assert stamps(graph, messages.tool_pose("PSM1")) == [100, 200]
+    assert stamps(graph, messages.tool_pose("PSM1")) == [MODEL_STAMP, 100, 200]  # first at its start
     tip, force, reaction, held = graph.heard["tool_markers"][-1].markers
     assert (tip.ns, tip.header.frame_id, tip.action) == ("PSM1", "world", tip.ADD)
     arrow = np.array([[p.x, p.y, p.z] for p in force.points])
@@ -332,7 +333,7 @@ def record(tmp_path, name, model):
     try:
         with NodeGroup(tmp_path / "logs") as group:
             group.environment |= {"ENDO_SIM_THREADS": "2" if name == "second" else "1"}
-            group.start("recorder_node", bag=bag)
+            group.start("recorder_node", bag=bag, topics=["all", *(topic.name for topic in SHOWN)])
             group.start("physics_node", **PARAMETERS["physics_node"])
             group.start("rendering_node", **PARAMETERS["rendering_node"])
             bench.status("recorder", "recording", OK)
@@ -370,10 +371,12 @@ def record(tmp_path, name, model):
 def test_the_same_commands_give_the_same_bytes_in_every_run(tmp_path):
     save_ply(sheet(tilt=0.3), tmp_path / "model.ply")
     first, second = (record(tmp_path, name, tmp_path / "model.ply") for name in ("first", "second"))
-    for topic in STATES:
+    for topic in (*STATES, *SHOWN, messages.RENDERED_COMPRESSED, messages.tool_links("PSM1")):
         ours, theirs = (episode[f"/{topic.name.lstrip('/')}"] for episode in (first, second))
         assert len(ours) >= 8 and ours[-8:] == theirs[-8:], topic.name
     assert len(set(first["/rendered/image_raw"][-8:])) == 8  # the tissue moves
+    labels = np.frombuffer(first[f"/{messages.RENDERED_SEGMENTATION.name}"][-1], np.uint8)[-WIDTH * HEIGHT :]
+    assert (labels >= 2).sum() > 50  # the instrument is in the picture
 
 
 def test_the_same_bag_gives_the_same_model_in_every_run(tmp_path, small_bag):

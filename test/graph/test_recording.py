@@ -91,7 +91,7 @@ def read_stamps(path, topic):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL], ids=lambda number: number.name)
 def test_what_was_recorded_outlives_the_recorder(graph, tmp_path, number):
     path = tmp_path / "my récording"  # a name that must be quoted
-    recorder = start("endo_sim_ros.cli", "record", path, "--arms", "PSM1", "PSM2")
+    recorder = start("endo_sim_ros.cli", "record", path, "--images", "raw", "--arms", "PSM1", "PSM2")
     try:
         wait_until(graph.heard, 30, "the recorder", graph.step)
         begin = time.monotonic() + 1.5  # each side of a topic finds the other in its own time
@@ -142,7 +142,7 @@ def test_chosen_topics_alone_are_recorded_with_canonical_bytes(graph, tmp_path):
 @pytest.mark.parametrize("graph", ["left"], indirect=True)
 def test_a_graph_in_a_namespace_is_recorded_under_the_names_without_it(graph, tmp_path):
     other = graph.node.publisher(messages.tool_pose("PSM1")._replace(name="/PSM1/measured_cp"))  # a graph without a namespace
-    arguments = ("--arms", "PSM1", "PSM2", "--namespace", "/left/")
+    arguments = ("--images", "raw", "--arms", "PSM1", "PSM2", "--namespace", "/left/")
     recorder = start("endo_sim_ros.cli", "record", tmp_path / "bag", *arguments)
     try:
         wait_until(graph.heard, 30, "the recorder", graph.step)
@@ -187,7 +187,7 @@ def full_disk(request, tmp_path):
 
 def test_a_recorder_on_a_full_disk_says_so_lives_on_and_keeps_what_it_wrote(graph, full_disk):
     disk, options, reason = full_disk
-    parameters = ("-p", f"bag:={disk / 'bag'}", "-p", "arms:=[PSM1, PSM2]")
+    parameters = ("-p", f"bag:={disk / 'bag'}", "-p", "arms:=[PSM1, PSM2]", "-p", "images:=raw")
     recorder = start("endo_sim_ros.nodes.recorder_node", "--ros-args", *parameters, **options)
     try:
         wait_until(graph.heard, 30, "the recorder", graph.step)
@@ -212,7 +212,7 @@ def test_a_recorder_on_a_full_disk_says_so_lives_on_and_keeps_what_it_wrote(grap
 
 def test_record_on_a_full_disk_ends_with_the_sentence(graph, tmp_path):
     limit = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (1_500_000, 1_500_000))  # noqa: E731
-    recorder = start("endo_sim_ros.cli", "record", tmp_path / "bag", "--arms", "PSM1", "PSM2", preexec_fn=limit)
+    recorder = start("endo_sim_ros.cli", "record", tmp_path / "bag", "--images", "raw", "--arms", "PSM1", "PSM2", preexec_fn=limit)
     try:
         wait_until(graph.heard, 30, "the recorder", graph.step)
         wait_until(lambda: recorder.poll() is not None, 30, "the recorder to end", graph.say)

@@ -76,10 +76,10 @@ def test_what_is_nearer_hides_what_is_farther(before):
         assert torch.equal(picture.depths, depths) and bool((picture.labels == TISSUE).all())
 
 
-@pytest.mark.parametrize("axis", [(1.0, 0.01, 0.0), (0.01, 1.0, 0.0)])
-def test_level_and_upright_edges_have_every_shade(axis):
+@pytest.mark.parametrize("axis", [(1.0, 0.01, 0.0), (0.01, 1.0, 0.0), (1.0, 0.5, 0.0), (1.0, -0.5, 0.0), (0.5, 1.0, 0.0)])
+def test_edges_have_every_shade(axis):
     pose = np.eye(4)
-    pose[:3, 2] = axis / np.linalg.norm(axis)  # its edge crosses a row or column of pixels within a hundred
+    pose[:3, 2] = axis / np.linalg.norm(axis)  # level and upright edges cross a row or column of pixels within a hundred
     pose[:3, 0] = 0, 0, 1
     pose[:3, 1] = np.cross(pose[:3, 2], pose[:3, 0])
     pose[2, 3] = 0.06

@@ -39,10 +39,10 @@ def tip(number, arm="PSM1"):
 
 
 class Recording:
-    """Writes messages of a graph; times in nanoseconds since the beginning."""
+    """Writes messages of a graph, images as JPEG or raw; times in nanoseconds since the beginning."""
 
-    def __init__(self, path):
-        self.bag, self.types, self.clock = BagWriter(path), bag_types(), 7 * S
+    def __init__(self, path, compressed=False):
+        self.bag, self.types, self.clock, self.compressed = BagWriter(path), bag_types(), 7 * S, compressed
 
     def __enter__(self):
         self.bag.__enter__()
@@ -54,10 +54,10 @@ class Recording:
     def observe(self, time_ns, number, arms=("PSM1",), leave_out=()):
         """What the graph says in a step."""
         stamp = BEGIN + time_ns
-        said = [
-            (messages.CONTROL_NODES, messages.encode_control_nodes(nodes(number), stamp, "world", self.types)),
-            (messages.RENDERED_IMAGE, messages.encode_image(picture(number), stamp, "camera", self.types)),
-        ]
+        image = (messages.RENDERED_IMAGE, messages.encode_image(picture(number), stamp, "camera", self.types))
+        if self.compressed:
+            image = (messages.RENDERED_COMPRESSED, messages.encode_compressed(picture(number), stamp, "camera", 95, self.types))
+        said = [(messages.CONTROL_NODES, messages.encode_control_nodes(nodes(number), stamp, "world", self.types)), image]
         for arm in arms:
             reaction = messages.encode_wrench((number, 0, 0), (0, 0, number), stamp, arm, self.types)  # in axes of the tip
             said.append((messages.tool_reaction(arm), reaction))
@@ -83,9 +83,9 @@ class Recording:
                 self.bag.write(topic, message, self.clock)
 
 
-def lockstep(path, steps=12, missing=(), step=STEP, **options):
+def lockstep(path, steps=12, missing=(), step=STEP, compressed=False, **options):
     """A first observation, then commands with the observations that they lead to, with equal stamps."""
-    with Recording(path) as recording:
+    with Recording(path, compressed) as recording:
         recording.act(0, 0, **options)
         recording.observe(0, 0)
         for number in range(1, steps):

@@ -249,6 +249,15 @@ def test_images_are_those_of_their_rows(bag):
     np.testing.assert_array_equal(shown, episode.image_numbers)
 
 
+def test_compressed_images_do_as_well(tmp_path):
+    raw, compressed = (read_episode(lockstep(tmp_path / str(each), compressed=each)) for each in (False, True))
+    assert compressed.image_topic == messages.RENDERED_COMPRESSED and compressed.image_size == raw.image_size
+    for name in ("state", "action", "environment_state", "image_numbers"):
+        np.testing.assert_array_equal(getattr(raw, name), getattr(compressed, name))
+    for exact, near in zip(raw.images(), compressed.images(), strict=True):
+        assert np.abs(exact.astype(int) - near).mean() < 3
+
+
 @pytest.mark.parametrize(
     "topic", [messages.RENDERED_IMAGE, messages.CONTROL_NODES, messages.tool_reaction("PSM1"), messages.tool_pose("PSM1")]
 )

@@ -108,6 +108,15 @@ def test_png_images_are_exact(bag, tmp_path):
 
 
 @pytest.mark.slow
+def test_recordings_with_raw_and_with_compressed_images_make_one_dataset(bag, tmp_path):
+    export_lerobot([bag, lockstep(tmp_path / "jpeg", compressed=True)], tmp_path / "out", "t", fps=25, images="png")
+    tables = read_tables(tmp_path / "out", "data/*/*.parquet")
+    cell = tables[1].column(IMAGE).to_pylist()[3]
+    image = cv2.cvtColor(cv2.imdecode(np.frombuffer(cell["bytes"], np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+    assert len(tables) == 2 and 0 < np.abs(image.astype(int) - picture(3)).mean() < 3
+
+
+@pytest.mark.slow
 def test_episodes_that_do_not_agree_are_refused_before_anything_is_written(bag, two_arms, tmp_path):
     steps = lockstep(tmp_path / "steps", step=S // 10)
     with pytest.raises(SequenceError, match=r"two has arms \('PSM1', 'PSM2'\), .*realtime \('PSM1',\); .* must agree"):

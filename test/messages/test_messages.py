@@ -66,6 +66,8 @@ def test_bag_bytes_are_what_ros_reads():
 
     for make, name in (
         (lambda t: messages.encode_image(image(), STAMP, "cam", t), "sensor_msgs/msg/Image"),
+        (lambda t: messages.encode_compressed(image(), STAMP, "cam", 90, t), "sensor_msgs/msg/CompressedImage"),
+        (lambda t: messages.encode_text("LARGE_NEEDLE_DRIVER:400006", t), "std_msgs/msg/String"),
         (lambda t: messages.encode_gaussians(model(), STAMP, "world", t), "sensor_msgs/msg/PointCloud2"),
         (lambda t: messages.encode_camera_info(K, 640, 512, STAMP, "cam", 0.005, t), "sensor_msgs/msg/CameraInfo"),
         (lambda t: messages.encode_pose(np.eye(4), STAMP, "world", t), "geometry_msgs/msg/PoseStamped"),
@@ -101,6 +103,14 @@ def test_every_color_encoding_becomes_rgb(encoding, channels, padding):
     message = messages.encode_image(rgb, STAMP, "cam")
     message.encoding, message.step, message.data = encoding, rows.shape[1], ros_types().sequence(rows.reshape(-1))
     np.testing.assert_array_equal(messages.decode_image(message), rgb)
+
+
+def test_an_image_survives_its_compression(wire):
+    types, transport = wire
+    smooth = np.repeat(np.linspace(0, 250, 64).astype(np.uint8)[None, :, None], 48, 0) * np.array([1, 0, 0], np.uint8)
+    message = transport(messages.encode_compressed(smooth, STAMP, "cam", 95, types), "sensor_msgs/msg/CompressedImage")
+    assert "jpeg" in message.format and message.header.frame_id == "cam"
+    assert np.abs(messages.decode_image(message).astype(int) - smooth).mean() < 3  # red is still red
 
 
 def test_compressed_image_becomes_rgb():

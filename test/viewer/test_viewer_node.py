@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import rclpy
 from fake_browser import MOST, PORT, FakeBrowser, point
-from ros_bench import Bench, S, send_camera, send_model, sheet
+from ros_bench import HEIGHT, WIDTH, Bench, K, S, send_camera, send_model, send_tip, sheet
 
 from endo_sim_ros import messages
+from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.nodes.physics_node import PhysicsNode
 from endo_sim_ros.nodes.rendering_node import RenderingNode
 from endo_sim_ros.viewer.browser import VIEWS
@@ -143,3 +144,16 @@ def test_endoscope_view_shows_what_rendering_published(graph):
     image, camera = graph.viewer.endoscope
     assert image.shape == (80, 96, 3) and image.std() > 10 and camera.width == 96
     np.testing.assert_allclose(camera.pose, np.eye(4), atol=1e-6)
+
+
+def test_pictures_that_are_rendered_here_show_the_instruments(graph):
+    """physics_node knows where the links are as soon as it knows where the tip is."""
+    look = lambda: graph.viewer._render(Camera(K, WIDTH, HEIGHT)).astype(int)
+    alone = look()
+
+    def shown():
+        send_tip(graph, (0.0, 0.0, 0.07))
+        return graph.viewer.instruments is not None and np.abs(look() - alone).max() > 60
+
+    graph.until(shown, "the instrument", 60)
+    assert not graph.page.logged

@@ -1,0 +1,289 @@
+"""Kernels of `drawing`, for B pictures at once: samples to pixels, lit and in each other's shadow."""
+
+import warp as wp
+
+from endo_sim_ros.instruments.drawing_kernels import EMPTY, SAMPLES, TILE, Frame, corner, lens, offset, weights
+from endo_sim_ros.instruments.shadow_kernels import light_left, near
+
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
+
+ALL = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))
+ALIKE = wp.constant(0.99)  # cosine of the angle between normals that are lit as one
+
+
+@wp.struct
+class Look:
+    """How instruments and tissue are lit."""
+
+    ambient: float  # share of the light that comes from all around
+    softness: float  # m: over such a depth an instrument comes out of the tissue
+    lamp_size: float  # m: radius of the lamp
+    white: float  # of encoded colours: what is brighter saturates the camera
+    mirror: float  # how much of the tissue shines back from what is polished
+
+
+@wp.func
+def depth_of(key: wp.int64) -> float:
+    return 1.0 / wp.cast(0x7FFFFFFF - wp.int32(key >> wp.int64(32)), wp.float32)
+
+
+@wp.func
+def point(view: wp.vec4, column: float, row: float, z: float) -> wp.vec3:
+    return wp.vec3((column - view[2]) / view[0] * z, (row - view[3]) / view[1] * z, z)
+
+
+@wp.func
+def encoded(light: float) -> float:
+    """Pictures are gamma-compressed; a root is near enough to 1/2.2, and fast."""
+    return wp.sqrt(wp.max(light, 0.0))
+
+
+@wp.func
+def reflected(
+    normal: wp.vec3, at: wp.vec3, lamp: wp.vec3, surfaces: wp.array2d[float], material: int, around: wp.vec3, left: wp.vec2, look: Look
+) -> wp.vec3:
+    """Colour of a surface: diffuse, a microfacet lobe (GGX) of its roughness, and the tissue that it mirrors."""
+    to_eye, to_lamp = wp.normalize(-at), wp.normalize(lamp - at)
+    middle = wp.normalize(to_eye + to_lamp)
+    facing = wp.max(wp.dot(normal, to_lamp), 0.0) * left[0]
+    aligned = wp.max(wp.dot(normal, middle), 0.0)
+    rough = surfaces[material, 3] * surfaces[material, 3]
+    spread = rough * rough
+    steep = aligned * aligned * (spread - 1.0) + 1.0
+    lobe = wp.min(0.25 * spread / (steep * steep), 1.0e3) * facing
+    # Straight back lies the dark lens, ahead the lit tissue: what is rough mirrors a mean about its direction.
+    ahead = 0.5 + 0.5 * (2.0 * wp.dot(normal, to_eye) * normal[2] - to_eye[2])
+    mirrored = look.mirror * ahead * ahead * left[1]
+    light = (1.0 - look.ambient) * facing
+    total = wp.vec3(0.0, 0.0, 0.0)
+    for k in range(3):
+        diffuse = surfaces[material, k] * (light + look.ambient * left[1] * around[k])
+        shine = surfaces[material, 4] * ((1.0 - look.ambient) * lobe + mirrored * around[k])
+        total[k] = wp.min(encoded(diffuse + shine), look.white)
+    return total
+
+
+@wp.func
+def blend(
+    pixel: int,  # of all pictures, as are column and row of its own
+    column: int,
+    row: int,
+    picture: int,
+    on_tissue: wp.uint64,  # capsules that may keep light from the tissue here
+    on_links: wp.uint64,  # and from instruments
+    samples: wp.array[wp.int64],  # [P · 4], left empty for the next picture
+    screen: wp.array[wp.vec3],
+    normals: wp.array[wp.vec3],
+    links: wp.array[int],  # [F]
+    owners: wp.array[int],  # [F] numbers of the instruments
+    materials: wp.array[int],  # [F]
+    surfaces: wp.array2d[float],  # [M, 5] red, green, blue, roughness, strength of the shine
+    ends: wp.array2d[wp.vec3],
+    radii: wp.array[float],
+    capsule_owners: wp.array[int],
+    views: wp.array2d[float],
+    around: wp.array[wp.vec3],  # [B] light that comes from the tissue
+    frame: Frame,
+    look: Look,
+    colors: wp.array[wp.vec3],
+    depths: wp.array[float],
+    alphas: wp.array[float],
+    labels: wp.array[wp.uint8],
+):
+    """One pixel: the tissue in the shadow of instruments, and what is seen of them."""
+    view = lens(views, picture)
+    lamp = wp.vec3(views[picture, 4], views[picture, 5], views[picture, 6])
+    u, v = float(column) + 0.5, float(row) + 0.5
+    alpha = alphas[pixel]
+    tissue = float(1.0e9)
+    if alpha > 0.5:
+        tissue = depths[pixel] / alpha
+    total = float(0.0)
+    depth = float(0.0)
+    color = wp.vec3(0.0, 0.0, 0.0)
+    lit = wp.vec3(0.0, 0.0, 0.0)
+    normal = wp.vec3(0.0, 0.0, 0.0)
+    material = int(-1)
+    nearest = float(1.0e9)
+    nearest_face = int(0)
+    second = float(0.0)  # what is seen in the second sample
+    before = int(-1)
+    for sample in range(SAMPLES):
+        key = samples[SAMPLES * pixel + sample]
+        if key != EMPTY:
+            samples[SAMPLES * pixel + sample] = EMPTY
+            face = int(key & wp.int64(0xFFFFFFFF))
+            z = depth_of(key)
+            seen = wp.clamp(0.5 + (tissue - z) / look.softness, 0.0, 1.0)
+            if seen > 0.0:
+                if face != before:
+                    before = face
+                    i = 3 * (picture * frame.faces + face)
+                    a, b, c = corner(screen, i), corner(screen, i + 1), corner(screen, i + 2)
+                    beside = offset(sample, row, column, frame.spread)
+                    w = wp.cw_mul(weights(a, b, c, u - 0.5 + beside[0], v - 0.5 + beside[1]), wp.vec3(a[2], b[2], c[2]))
+                    bent = wp.normalize(-w[0] * normals[i] - w[1] * normals[i + 1] - w[2] * normals[i + 2])
+                    # Light costs more than all else: what lies as the sample before has its colour.
+                    if wp.dot(bent, normal) < ALIKE or materials[face] != material:
+                        normal = bent
+                        material = materials[face]
+                        at = point(view, u, v, z)
+                        left = wp.vec2(1.0, 1.0)
+                        if on_links != wp.uint64(0):
+                            left = light_left(
+                                on_links, at, normal, 0.5 * z / view[0], lamp, look.lamp_size,
+                                picture * frame.capsules, frame.capsules, ends, radii, capsule_owners, owners[face],
+                            )  # fmt: skip
+                        lit = reflected(normal, at, lamp, surfaces, material, around[picture], left, look)
+                color += seen * lit
+                depth += seen * z
+                total += seen
+                if sample == 1:
+                    second = seen
+                if z < nearest:
+                    nearest = z
+                    nearest_face = face
+    kept = 1.0 - total / float(SAMPLES)
+    behind = colors[pixel]
+    if kept > 0.0 and alpha > 0.5 and on_tissue != wp.uint64(0):
+        at = point(view, u, v, tissue)
+        left = light_left(
+            on_tissue, at, wp.normalize(-at), 0.5 * tissue / view[0], lamp, look.lamp_size,
+            picture * frame.capsules, frame.capsules, ends, radii, capsule_owners, -1,
+        )  # fmt: skip
+        behind *= encoded((1.0 - look.ambient) * left[0] + look.ambient * left[1])
+    if total > 0.0:
+        behind = kept * behind + color / float(SAMPLES)
+        depths[pixel] = kept * depths[pixel] + depth / float(SAMPLES)
+        alphas[pixel] = kept * alpha + total / float(SAMPLES)
+        if kept < 0.5 or kept == 0.5 and second > 0.5:  # of halves every other one, so that outlines neither grow nor shrink
+            labels[pixel] = wp.uint8(2 + links[nearest_face])
+    colors[pixel] = behind
+
+
+@wp.func
+def about(
+    picture: int,
+    left: int,
+    top: int,
+    low: float,
+    high: float,
+    ends: wp.array2d[wp.vec3],
+    radii: wp.array[float],
+    owners: wp.array[int],
+    views: wp.array2d[float],
+    frame: Frame,
+    look: Look,
+) -> wp.uint64:
+    """Capsules that may keep light from what a tile shows between two depths."""
+    if low > high:
+        return wp.uint64(0)
+    view = lens(views, picture)
+    lamp = wp.vec3(views[picture, 4], views[picture, 5], views[picture, 6])
+    half = 0.5 * float(TILE)
+    at = point(view, float(left) + half, float(top) + half, 0.5 * (low + high))
+    across = wp.length(wp.vec2(half / view[0], half / view[1])) * high
+    slack = across + 0.5 * (high - low) * wp.length(at) / at[2] + high / view[0]
+    return near(at, slack, lamp, look.lamp_size, picture * frame.capsules, frame.capsules, ends, radii, owners, -1)
+
+
+@wp.kernel
+def resolve_tiles(
+    first: int,
+    marks: wp.array[wp.uint8],  # left at zero
+    samples: wp.array[wp.int64],
+    screen: wp.array[wp.vec3],
+    normals: wp.array[wp.vec3],
+    links: wp.array[int],
+    owners: wp.array[int],
+    materials: wp.array[int],
+    surfaces: wp.array2d[float],
+    ends: wp.array2d[wp.vec3],
+    radii: wp.array[float],
+    capsule_owners: wp.array[int],
+    views: wp.array2d[float],
+    around: wp.array[wp.vec3],
+    frame: Frame,
+    look: Look,
+    colors: wp.array[wp.vec3],
+    depths: wp.array[float],
+    alphas: wp.array[float],
+    labels: wp.array[wp.uint8],
+):
+    """On a CPU: a tile, most of which nothing happens to."""
+    each = frame.across * frame.down
+    i = first + wp.tid()
+    picture, number = i // each, (i % each * frame.stride) % each
+    left, top = TILE * (number % frame.across), TILE * (number // frame.across)
+    right, bottom = wp.min(left + TILE, frame.width), wp.min(top + TILE, frame.height)
+    start = picture * frame.height * frame.width
+    marked = marks[picture * each + number] != wp.uint8(0)
+    on_tissue = wp.uint64(0)
+    on_links = wp.uint64(0)
+    if frame.capsules > 0:
+        low = float(1.0e9)
+        high = float(0.0)
+        for row in range(top, bottom):
+            for pixel in range(start + row * frame.width + left, start + row * frame.width + right):
+                if alphas[pixel] > 0.5:
+                    z = depths[pixel] / alphas[pixel]
+                    low, high = wp.min(low, z), wp.max(high, z)
+        on_tissue = about(picture, left, top, low, high, ends, radii, capsule_owners, views, frame, look)
+        if marked and frame.several != 0:
+            low = float(1.0e9)
+            high = float(0.0)
+            for row in range(top, bottom):
+                for pixel in range(start + row * frame.width + left, start + row * frame.width + right):
+                    for sample in range(SAMPLES):
+                        key = samples[SAMPLES * pixel + sample]
+                        if key != EMPTY:
+                            z = depth_of(key)
+                            low, high = wp.min(low, z), wp.max(high, z)
+            on_links = about(picture, left, top, low, high, ends, radii, capsule_owners, views, frame, look)
+    if not marked and on_tissue == wp.uint64(0):
+        return
+    marks[picture * each + number] = wp.uint8(0)
+    for row in range(top, bottom):
+        for column in range(left, right):
+            blend(
+                start + row * frame.width + column, column, row, picture, on_tissue, on_links, samples, screen, normals, links, owners,
+                materials, surfaces, ends, radii, capsule_owners, views, around, frame, look, colors, depths, alphas, labels,
+            )  # fmt: skip
+
+
+@wp.kernel
+def resolve_pixels(
+    first: int,
+    samples: wp.array[wp.int64],
+    screen: wp.array[wp.vec3],
+    normals: wp.array[wp.vec3],
+    links: wp.array[int],
+    owners: wp.array[int],
+    materials: wp.array[int],
+    surfaces: wp.array2d[float],
+    ends: wp.array2d[wp.vec3],
+    radii: wp.array[float],
+    capsule_owners: wp.array[int],
+    views: wp.array2d[float],
+    around: wp.array[wp.vec3],
+    frame: Frame,
+    look: Look,
+    colors: wp.array[wp.vec3],
+    depths: wp.array[float],
+    alphas: wp.array[float],
+    labels: wp.array[wp.uint8],
+):
+    """On a GPU: a pixel."""
+    i = first + wp.tid()
+    picture = i // (frame.width * frame.height)
+    row, column = i // frame.width % frame.height, i % frame.width
+    on_tissue = wp.uint64(0)
+    on_links = wp.uint64(0)
+    if frame.capsules > 0:
+        on_tissue = ALL
+        if frame.several != 0:
+            on_links = ALL
+    blend(
+        i, column, row, picture, on_tissue, on_links, samples, screen, normals, links, owners,
+        materials, surfaces, ends, radii, capsule_owners, views, around, frame, look, colors, depths, alphas, labels,
+    )  # fmt: skip

@@ -1,0 +1,91 @@
+"""The arms of physics_node from its options, and where they stand."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.instruments import load_arm, place_arm
+from endo_sim_ros.nodes.arm import Arm
+from endo_sim_ros.nodes.configs import PhysicsNodeConfig, arm_names
+from endo_sim_ros.nodes.jointed_arm import CameraArm, JointedArm
+
+CAMERA_ARM = "ECM"
+_NO_INSTRUMENT = "none"
+_WITHDRAWN = 0.02  # m: at the start the jaws, 1 to 2 cm long, are in front of the tissue, and two instruments do not meet
+
+
+def make_arms(options: PhysicsNodeConfig) -> dict[str, Arm]:
+    """The arms by name.
+
+    Raises:
+        ConfigError: If there are neither one nor as many instruments and models as arms, one cannot be loaded or is no instrument,
+            or the ECM shall be that of a robot.
+    """
+    names = arm_names(options.arms)
+    arms: dict[str, Arm] = {}
+    commanded = options.arm_source == "commanded"
+    tools, models = _for_each("instruments", options.instruments, names), _for_each("arm_models", options.arm_models, names)
+    for name, tool, model in zip(names, tools, models):
+        if name == CAMERA_ARM:
+            if not commanded:
+                raise ConfigError(f"arms: {name} needs arm_source commanded; the pose of a robot's is heard on {name}/measured_cp anyway")
+            tool = tool if len(options.instruments) > 1 else ""  # the one for all is an instrument
+            arms[name] = CameraArm(name, kinematics=load_arm(model.replace("PSM", "ECM") if len(options.arm_models) == 1 else model, tool))
+        elif tool == _NO_INSTRUMENT:
+            arms[name] = Arm(name)
+        else:
+            kinematics = load_arm(model, tool)
+            kind, _, number = kinematics.tool.rpartition("_")
+            tool_type = str(Path(tool).resolve()) if tool.endswith(".json") else f"{kind}:{number}"
+            arms[name] = JointedArm(name, kinematics=kinematics, tool_type=tool_type, commanded=commanded)
+        arm = arms[name]
+        if isinstance(arm, JointedArm) and (len(arm.kinematics.joints) == 4) != (name == CAMERA_ARM):
+            wrong = f"{arm.kinematics.name} with {arm.kinematics.tool or 'no tool'}"
+            raise ConfigError(f"arms: {name} cannot be {wrong}; {CAMERA_ARM} takes an endoscope, every other arm an instrument")
+    return arms
+
+
+def _for_each(option: str, values: Sequence[str], names: Sequence[str]) -> Sequence[str]:
+    values = [value.strip() for value in values]
+    if len(values) not in (1, len(names)):
+        raise ConfigError(
+            f"{option}: there are {len(values)} for {len(names)} arms; give one for all, or one for each in the order of arms"
+        )
+    return values * len(names) if len(values) == 1 else values
+
+
+def place_arms(arms: Mapping[str, Arm], frames: Mapping[str, np.ndarray], view: tuple[Camera, float] | None) -> str:
+    """Give each arm with joints a place: its base in `frames`, or else a sensible one in front of a camera.
+
+    Args:
+        arms: The arms by name.
+        frames: Poses [4, 4] of known frames in the world, by name; ``PSM1_base`` is the base of PSM1.
+        view: A camera and the depth of the tissue that it sees, m, or None where neither is known.
+
+    Returns:
+        Why arms have no place, in a sentence; empty if all have one. Such an arm is a tip without joints.
+    """
+    missing = []
+    for name, arm in arms.items():
+        if not isinstance(arm, JointedArm):
+            continue
+        kinematics, short = arm.kinematics, name.rpartition("/")[2]
+        lower, upper = kinematics.lower, kinematics.upper
+        try:
+            if f"{name}_base" in frames:
+                base, joints = frames[f"{name}_base"], np.clip(np.zeros(len(lower)), lower, upper)
+                joints[2] = 0.5 * (lower[2] + upper[2])
+            elif view is None:
+                raise ConfigError(f"{name}: no camera shows where the tissue is; give {name}_base in frames")
+            else:
+                placement = place_arm(short, kinematics, *view)
+                base, joints = placement.base, placement.joints.copy()
+            if not isinstance(arm, CameraArm):
+                joints[2] = np.clip(joints[2] - _WITHDRAWN, lower[2], upper[2])
+            arm.stand(base, joints)
+        except ConfigError as error:
+            missing.append(str(error))
+    return "; ".join(missing)

@@ -1,0 +1,266 @@
+"""An arm with joints: where its links are when its tip is at a pose, and how its joints get to where they are told."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from endo_sim_ros.core.cameras import invert_pose
+from endo_sim_ros.instruments import ArmKinematics, ReachConfig, link_poses, solve_inverse
+from endo_sim_ros.nodes.arm import Arm
+
+_ROUNDED = 1 + 1e-9  # a way that takes a whole number of steps must not take one more
+_WITHIN = 1e-6  # rad, m: how far a command may leave the limits, as what is sent back was rounded
+_LEAP = 10.0  # times the speed of a joint: the straight way passes a singularity or goes on with another bend of the wrist
+_TRIES = 4  # to find how far the tip gets in a step; one or two are enough where joints follow in proportion
+_CAMERA_REACH = ReachConfig(radian_length=1e-4)  # the direction of an endoscope follows from its place
+_CAMERA_THERE = 1e-4  # m: nearer is at the pose
+
+
+@dataclass(kw_only=True)
+class JointedArm(Arm):
+    """An arm with a base, joints and a tool.
+
+    Until it has a base it is as an arm without joints: nobody knows what it reaches.
+
+    Args:
+        kinematics: The arm with its tool.
+        tool_type: What loads the tool: its name and number, or the path of its file.
+        commanded: Whether it has no robot, so that it is where its joints get to.
+        joint_speed, slide_speed: Largest speeds of joints that turn and that slide during moves, rad/s and m/s.
+    """
+
+    kinematics: ArmKinematics = field()
+    tool_type: str = ""
+    commanded: bool = True
+    joint_speed: float = np.inf
+    slide_speed: float = np.inf
+    base: np.ndarray | None = None  # [4, 4], world
+    joints: np.ndarray | None = None  # [n] rad and m
+    joint_goal: np.ndarray | None = None  # [n]; None while no move of joints is under way
+    velocities: np.ndarray | None = None  # [n] rad/s and m/s, in the last step
+    start: np.ndarray | None = None  # [n] joints while nobody has commanded anything
+    _posed: np.ndarray | None = None  # the pose that belongs to the joints
+    _stepped: np.ndarray | None = None  # joints at the end of the last step
+
+    def stand(self, base: np.ndarray, joints: np.ndarray) -> None:
+        """Stand at a base [4, 4], world; a commanded arm with its joints at positions [n], waiting for a command."""
+        self.base, self.start, self._posed = base, joints, None
+        if self.commanded:
+            self.return_to_start()
+        else:
+            self.joints = joints
+
+    def return_to_start(self) -> None:
+        """Be at the start, which touches nothing until the arm is commanded."""
+        if self.start is not None:
+            self.stop()
+            self._take(self.start)
+            self._stepped, self.velocities, self.acts = self.start, np.zeros(len(self.start)), False
+
+    @property
+    def moving(self) -> bool:
+        """Whether the tip or the joints are on their way to a goal."""
+        return self.pose_goal is not None or self.joint_goal is not None
+
+    def stop(self) -> None:
+        """End all moves where they are."""
+        super().stop()
+        self.joint_goal = None
+
+    def halt(self) -> None:
+        """End the move of tip or joints where it is; the jaw goes on."""
+        self.pose_goal = self.joint_goal = None
+
+    # ---------------------------------------------------------------- commands
+
+    def servo(self, pose: np.ndarray) -> None:
+        """Put the tip at a pose [4, 4], world, or as near as the joints get, which `move` finds out."""
+        super().servo(pose)
+        self.joint_goal = None
+
+    def move_to(self, pose: np.ndarray) -> str:
+        """Let the tip move to a pose [4, 4], world, or as near as the joints get; returns what it will miss, in a sentence."""
+        self.joint_goal, missing = None, ""
+        if self.base is not None and self.joints is not None:
+            reach = solve_inverse(self.kinematics, invert_pose(self.base) @ pose, self.joints)
+            missing = reach.shortfall()
+            if missing:
+                pose = self.base @ self.kinematics.tip_pose(reach.joints)
+        super().move_to(pose)
+        return missing and f"{self.name}: {missing}"
+
+    def servo_joints(self, joints: ArrayLike) -> None:
+        """Put the joints at positions [n], rad and m, now.
+
+        Raises:
+            ValueError: If they are not n finite numbers within the limits; the arm then stays where it is.
+        """
+        self._take(self.check_joints(joints))
+        self.halt()
+        self.acts = True
+
+    def move_joints(self, joints: ArrayLike) -> None:
+        """Let the joints move to positions [n], rad and m; raises as `servo_joints` does."""
+        self.joint_goal = self.check_joints(joints)
+        self.pose_goal, self.acts = None, True
+
+    def check_joints(self, joints: ArrayLike) -> np.ndarray:
+        """Joint positions [n] that the arm may take; raises as `servo_joints` does."""
+        arm = self.kinematics
+        positions = arm.check_joints(joints)
+        if self.base is None:
+            raise ValueError(f"{self.name} has no place yet; publish a model, or give {self.name}_base in frames")
+        for joint, value in zip(arm.joints, positions):
+            if not joint.lower - _WITHIN <= value <= joint.upper + _WITHIN:
+                scale, unit = (1e3, "mm") if joint.kind == "prismatic" else (np.degrees(1.0), "degrees")
+                lower, upper, value = (f"{scale * number:.4g}" for number in (joint.lower, joint.upper, value))
+                raise ValueError(f"{self.name}: {joint.name} cannot be at {value} {unit}; its limits are {lower} and {upper} {unit}")
+        return np.clip(positions, arm.lower, arm.upper)
+
+    # ------------------------------------------------------------------ motion
+
+    def move(self, seconds: float, speed: float, turn_speed: float) -> str:
+        """Go on for some seconds towards the goals, or take the pose last commanded, with joints within their limits.
+
+        The tip moves straight, and as slowly as the fastest joint needs. Where the straight way leaves what the joints reach, or asks
+        one to leap, the rest of it is a move of the joints.
+
+        Returns:
+            What the arm misses of the pose that it is told, in a sentence; empty if nothing.
+        """
+        if not self.commanded or self.base is None or self.joints is None:
+            return super().move(seconds, speed, turn_speed)
+        self._move_jaw(seconds, turn_speed)
+        missing = self.settle()
+        if self.pose_goal is not None:
+            self._move_straight(seconds, speed, turn_speed)
+        elif self.joint_goal is not None:
+            self._move_joints(seconds)
+        before, self._stepped = self._stepped, self.joints
+        self.velocities = (self.joints - before) / seconds if before is not None else np.zeros(len(self.joints))
+        return missing
+
+    def settle(self) -> str:
+        """Find the joints of the pose last commanded or measured; a commanded arm then is where they get. Returns what is missing."""
+        if self.pose is None or self.pose is self._posed or self.base is None or self.joints is None:
+            return ""
+        reach = solve_inverse(self.kinematics, invert_pose(self.base) @ self.pose, self.joints)
+        self.joints = reach.joints
+        if self.commanded and not reach.reached:
+            self.pose = self.base @ self.kinematics.tip_pose(self.joints)
+        self._posed = self.pose  # as it was told where it is reached, without the rounding of the joints
+        return f"{self.name}: {reach.shortfall()}" if self.commanded and not reach.reached else ""
+
+    def _take(self, joints: np.ndarray) -> None:
+        assert self.base is not None
+        self.joints = joints
+        self.pose = self._posed = self.base @ self.kinematics.tip_pose(joints)
+
+    def _haste(self, joints: np.ndarray, seconds: float) -> float:
+        """How many times too fast it is to come from some joint positions to the present ones in some seconds."""
+        assert self.joints is not None
+        most = np.where(self.kinematics.prismatic, self.slide_speed, self.joint_speed)
+        return float(np.max(np.abs(self.joints - joints) / (most * seconds)))
+
+    def _move_joints(self, seconds: float) -> None:
+        before, goal = self.joints, self.joint_goal
+        assert before is not None and goal is not None
+        self.joints = goal
+        haste = self._haste(before, seconds)
+        if haste <= _ROUNDED:
+            self.joint_goal = None
+        self._take(goal if haste <= _ROUNDED else before + (goal - before) / haste)
+
+    def _move_straight(self, seconds: float, speed: float, turn_speed: float) -> None:
+        pose, goal, joints, share = self.pose, self.pose_goal, self.joints, 1.0
+        assert joints is not None and goal is not None and self.base is not None
+        for _ in range(_TRIES):
+            self._move_tip(share * seconds, speed, turn_speed)
+            left = bool(self.settle())  # what lies between two poses in reach may be out of it
+            haste = self._haste(joints, seconds)
+            if haste <= _ROUNDED and not left:
+                return
+            self.pose, self._posed, self.pose_goal, self.joints = pose, pose, goal, joints
+            if haste > _LEAP or left:
+                break
+            share /= 1.01 * haste  # a little less, so that it is enough where joints do not follow in proportion
+        self.joint_goal, self.pose_goal = solve_inverse(self.kinematics, invert_pose(self.base) @ goal, joints).joints, None
+        self._move_joints(seconds)
+
+    # ------------------------------------------------------------------ states
+
+    def links(self) -> list[np.ndarray]:
+        """Poses [4, 4] of the links in the world, in the order of `link_poses`; none while they are not known."""
+        self.settle()
+        if self.base is None or self.joints is None or self.pose is None:
+            return []
+        widest = self.kinematics.jaw[1] if self.kinematics.jaw else 0.0
+        poses = link_poses(self.kinematics, self.joints, np.clip(self.angle, 0.0, widest))  # closed jaws press, they do not overlap
+        return [self.base @ pose for pose in poses.values()]
+
+    def dynamics(self, force: np.ndarray, torque: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What the joints and the tip do under a wrench on the tip.
+
+        Args:
+            force: Force [3], N, world.
+            torque: Torque [3] about the tip, N·m, world.
+
+        Returns:
+            Efforts of the joints [n], N·m and N: Jᵀ times the wrench. Velocity [3], m/s, and angular velocity [3], rad/s, of the
+            tip in the last step, world.
+        """
+        assert self.base is not None and self.joints is not None
+        R = self.base[:3, :3]
+        J = self.kinematics.jacobian(self.joints)
+        twist = J @ (np.zeros(len(self.joints)) if self.velocities is None else self.velocities)
+        return J.T @ np.concatenate([R.T @ force, R.T @ torque]), R @ twist[:3], R @ twist[3:]
+
+    def reset(self) -> None:
+        """Let go of everything; a commanded arm is back at its start."""
+        super().reset()
+        if self.commanded:
+            self.return_to_start()
+
+
+@dataclass(kw_only=True)
+class CameraArm(JointedArm):
+    """The arm of the endoscope, whose tip is the optical frame of its camera. It touches no tissue."""
+
+    def servo(self, pose: np.ndarray) -> None:
+        """Put the camera where a pose [4, 4], world, says; its direction follows from that.
+
+        Raises:
+            ValueError: If it does not get there, or would be upside down; the camera then stays where it is.
+        """
+        self.servo_joints(self._aim(pose))
+
+    def move_to(self, pose: np.ndarray) -> str:
+        """Let the camera move, joint by joint, to where a pose [4, 4], world, says; raises as `servo` does."""
+        self.move_joints(self._aim(pose))
+        return ""
+
+    def check_joints(self, joints: ArrayLike) -> np.ndarray:
+        """Joint positions [n] that the arm may take; raises as `servo` does."""
+        positions = super().check_joints(joints)
+        assert self.start is not None
+        down, was = (self.kinematics.tip_pose(at)[:3, 1] for at in (positions, self.start))
+        self._require_upright(down, was)
+        return positions
+
+    def _aim(self, pose: np.ndarray) -> np.ndarray:
+        """Joints [n] that put the camera at a pose."""
+        if self.base is None or self.joints is None or self.start is None:
+            raise ValueError(f"{self.name} has no place yet; publish a model, or give {self.name}_base in frames")
+        wanted = invert_pose(self.base) @ pose
+        self._require_upright(wanted[:3, 1], self.kinematics.tip_pose(self.start)[:3, 1])
+        reach = solve_inverse(self.kinematics, wanted, self.joints, _CAMERA_REACH)
+        if reach.position_error > _CAMERA_THERE:
+            raise ValueError(f"{self.name} stays where it is: {reach.shortfall()}")
+        return reach.joints
+
+    def _require_upright(self, down: np.ndarray, was: np.ndarray) -> None:
+        if down @ was <= 0:
+            raise ValueError(
+                f"{self.name} stays where it is: the camera would be upside down; y of its frame must point down as at the start"
+            )

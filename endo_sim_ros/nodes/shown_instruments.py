@@ -1,0 +1,135 @@
+"""The instruments of arms as they are published: their tools, where their links are at the time of each state, and what draws them."""
+
+from collections import deque
+from collections.abc import Collection, Sequence
+from typing import Any, Literal
+
+import numpy as np
+
+from endo_sim_ros import messages
+from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.instruments import LINKS, Capsule, Part, build_instrument, load_arm
+from endo_sim_ros.instruments.config import DrawingConfig
+from endo_sim_ros.instruments.drawing import FIRST_LINK, InstrumentDrawing, PosedInstruments
+from endo_sim_ros.messages import MessageError
+from endo_sim_ros.nodes.background import Background
+from endo_sim_ros.nodes.pacing import MOST_WAITING
+
+
+class ShownInstruments:
+    """Keeps what arms say about their instruments.
+
+    Args:
+        arms: Names of the arms, in the order of the labels.
+        lockstep: Whether links are wanted for each state, not only the newest.
+    """
+
+    def __init__(self, arms: Sequence[str], lockstep: bool) -> None:
+        self.arms = tuple(arms)
+        self._lockstep = lockstep
+        self._types: dict[str, str] = {}
+        self._tools: dict[str, tuple[list[Part], list[Capsule]]] = {}
+        self._links: dict[str, deque[tuple[int, np.ndarray]]] = {arm: deque(maxlen=MOST_WAITING if lockstep else 1) for arm in arms}
+        self._background = Background()
+        self._key: Any = None  # of what is drawn with
+        self._drawing: InstrumentDrawing | None = None
+
+    def receive_type(self, arm: str, message: Any) -> None:
+        """Take the tool of an arm.
+
+        Raises:
+            MessageError: If it cannot be loaded, or nobody knows its shape; the arm is not drawn then.
+        """
+        name = messages.decode_text(message)
+        self._types[arm] = name
+        self._tools.pop(arm, None)
+        try:
+            self._tools[arm] = build_instrument(load_arm("PSM", name))
+        except (ConfigError, OSError) as error:
+            raise MessageError(f"{messages.tool_type(arm).name}: {error}; {arm} is not drawn") from error
+
+    def receive_links(self, arm: str, message: Any, world_frame: str) -> bool:
+        """Take where the links of an arm are; returns whether they have moved.
+
+        Raises:
+            MessageError: If they cannot be used.
+        """
+        topic = messages.tool_links(arm).name
+        messages.check_frame(message, (world_frame,), topic)
+        poses, links = messages.decode_poses(message, topic), self._links[arm]
+        if len(poses) not in (0, len(LINKS)):
+            raise MessageError(f"{topic}: {len(poses)} poses; publish those of {', '.join(LINKS)}, or none while they are not known")
+        moved = not links or not np.array_equal(links[-1][1], poses)
+        links.append((messages.stamp_to_ns(message.header.stamp), poses))
+        return moved
+
+    def newest(self) -> dict[str, np.ndarray]:
+        """Where the links [5, 4, 4] of each arm are that has said so."""
+        return {arm: links[-1][1] for arm, links in self._links.items() if links and len(links[-1][1])}
+
+    def at(self, stamp: int, later: Collection[int], published: Collection[str]) -> dict[str, np.ndarray] | str:
+        """Lockstep: where the links of each arm are at the time of a state, or the name of an arm whose links are awaited.
+
+        Args:
+            stamp: That of the state, ns.
+            later: Stamps of the states after it; where links of these are there, those of this state will not come.
+            published: Arms whose links somebody publishes; those whose tool is known are awaited, too.
+        """
+        found = {}
+        for arm, links in self._links.items():
+            poses = next((poses for when, poses in links if when == stamp), None)
+            if poses is None:
+                if (arm in published or arm in self._types) and not any(when in later for when, _ in links):
+                    return arm
+            elif len(poses):
+                if arm not in self._types:
+                    return arm
+                found[arm] = poses
+        return found
+
+    def forget(self, stamp: int) -> None:
+        """Lockstep: a state was shown; what arms said before and at it is not needed any more."""
+        for links in self._links.values():
+            if any(when == stamp for when, _ in links):
+                while links.popleft()[0] != stamp:
+                    pass
+
+    def posed(self, links: dict[str, np.ndarray], config: DrawingConfig, device: str) -> PosedInstruments | None | Literal[False]:
+        """What draws the instruments where their links are; None if there are none, False while that is prepared.
+
+        Raises what the preparation raised, once; after that there are none.
+        """
+        names = tuple(arm for arm in self.arms if arm in links and arm in self._tools)
+        if not names:
+            return None
+        tools = [self._tools[arm] for arm in names]
+        key = tuple((arm, self._types[arm]) for arm in names), config, device
+        if key != self._key:
+            self._background.want(
+                key, lambda: InstrumentDrawing([parts for parts, _ in tools], config, device, [capsules for _, capsules in tools])
+            )
+            try:
+                built = self._background.take()
+            except Exception:
+                self._key, self._drawing = key, None
+                raise
+            if built is None or built[0] != key:
+                return False
+            self._key, self._drawing = built
+        if self._drawing is None:
+            return None
+        return self._drawing.at([dict(zip(LINKS, links[arm])) for arm in names])
+
+    def labels(self, instruments: PosedInstruments | None, found: np.ndarray) -> np.ndarray:
+        """Labels [H, W] of a picture as they are published: those of an arm and link are the same whoever else is drawn."""
+        if instruments is None:
+            return found
+        table = np.arange(256, dtype=np.uint8)
+        names = [arm for arm, _ in self._key[0]]
+        for label, (number, link) in enumerate(instruments.drawing.links, FIRST_LINK):
+            table[label] = FIRST_LINK + len(LINKS) * self.arms.index(names[number]) + LINKS.index(link)
+        return table[found]
+
+    def stop(self) -> None:
+        """Prepare nothing more."""
+        self._background.stop()

@@ -1,0 +1,104 @@
+"""How the joints of an arm get to where the tip is told to be."""
+
+import numpy as np
+import pytest
+
+from endo_sim_ros.core.cameras import make_pose
+from endo_sim_ros.instruments import load_arm
+from endo_sim_ros.nodes.jointed_arm import JointedArm
+
+PSM = load_arm("PSM", "LARGE_NEEDLE_DRIVER")
+BASE = make_pose([0.1, -0.2, 0.3], [0.5, 0.1, -0.7, 0.3])
+SPEEDS = np.where(PSM.prismatic, 0.2, 2.0)
+STEP = 0.04  # s
+
+
+def arm_at(joints):
+    arm = JointedArm("PSM1", kinematics=PSM, joint_speed=2.0, slide_speed=0.2)
+    arm.stand(BASE, np.asarray(joints))
+    return arm
+
+
+def travel(arm):
+    """Joints and poses of all steps of a move."""
+    joints, poses = [arm.joints], [arm.pose]
+    while arm.busy:
+        assert len(joints) < 1000, "it never arrives"
+        assert arm.move(STEP, 0.05, 1.5) == ""
+        joints.append(arm.joints)
+        poses.append(arm.pose)
+    return np.array(joints), np.array(poses)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_moves_between_any_two_poses_arrive_within_all_limits(seed):
+    random = np.random.default_rng(seed)
+    first, last = (random.uniform(0.95 * PSM.lower, 0.95 * PSM.upper) for _ in range(2))
+    first[2], last[2] = random.uniform(0.06, 0.22, 2)
+    arm, goal = arm_at(first), BASE @ PSM.tip_pose(last)
+    assert arm.move_to(goal) == ""
+    joints, _ = travel(arm)
+    assert (np.abs(np.diff(joints, axis=0)) <= SPEEDS * STEP * (1 + 1e-6)).all()
+    assert (joints >= PSM.lower - 1e-9).all() and (joints <= PSM.upper + 1e-9).all()
+    np.testing.assert_allclose(arm.pose, goal, atol=1e-7)
+
+
+def test_a_move_in_reach_is_straight():
+    arm = arm_at([0.0, 0, 0.12, 0, 0.2, 0.1])
+    goal = arm.pose.copy()
+    goal[:3, 3] += BASE[:3, :3] @ [0.02, 0.01, 0.01]
+    arm.move_to(goal)
+    _, poses = travel(arm)
+    way = poses[:, :3, 3] - poses[0, :3, 3]
+    length = np.linalg.norm(way, axis=1)
+    np.testing.assert_allclose(way, length[:, None] * way[-1] / length[-1], atol=1e-7)
+    np.testing.assert_allclose(np.diff(length)[:-1], 0.05 * STEP, atol=1e-7)
+
+
+def test_through_a_singularity_the_joints_move_instead_of_leaping():
+    """From one side of the remote centre to the other the shaft would have to turn round on the spot."""
+    arm = arm_at([0.3, 0.2, 0.02, 0, 0.0, 0.0])
+    goal = BASE @ PSM.tip_pose([-0.9, -0.6, 0.02, 2.5, 0.5, -0.5])
+    assert arm.move_to(goal) == ""
+    joints, _ = travel(arm)
+    assert (np.abs(np.diff(joints, axis=0)) <= SPEEDS * STEP * (1 + 1e-6)).all()
+    np.testing.assert_allclose(arm.pose, goal, atol=1e-7)
+
+
+def test_a_servoed_pose_is_taken_exactly_and_one_out_of_reach_as_near_as_possible():
+    arm = arm_at([0.0, 0, 0.12, 0, 0, 0])
+    pose = arm.pose.copy()
+    pose[:3, 3] += BASE[:3, :3] @ [0.01, 0, 0]
+    arm.servo(pose)
+    assert arm.move(STEP, 0.05, 1.5) == "" and arm.pose is pose
+    assert np.abs(arm.velocities).max() > 0.1
+    pose = pose.copy()
+    pose[:3, 3] += BASE[:3, :3] @ [0, 0, -0.5]
+    arm.servo(pose)
+    assert "insertion at its limit of 240 mm" in arm.move(STEP, 0.05, 1.5)
+    np.testing.assert_allclose(arm.pose, BASE @ PSM.tip_pose(arm.joints), atol=1e-12)
+    arm.move(STEP, 0.05, 1.5)
+    assert not arm.velocities.any()
+
+
+def test_efforts_are_the_torques_of_a_force_at_the_tip():
+    arm = arm_at([0.1, 0.2, 0.12, 0.3, 0.4, 0.5])
+    force, torque, small = np.array([0.3, -0.2, 0.5]), np.array([0.01, 0.02, -0.03]), 1e-6
+    efforts, _, _ = arm.dynamics(force, torque)
+    for i in range(6):
+        moved = arm.joints.copy()
+        moved[i] += small
+        change = (BASE @ PSM.tip_pose(moved)) - arm.pose
+        turn = change[:3, :3] @ arm.pose[:3, :3].T
+        twist = np.concatenate([change[:3, 3], [turn[2, 1], turn[0, 2], turn[1, 0]]]) / small
+        assert efforts[i] == pytest.approx(twist @ np.concatenate([force, torque]), abs=1e-5)
+
+
+def test_an_arm_without_a_base_is_a_tip():
+    arm = JointedArm("PSM3", kinematics=PSM)
+    arm.move_to(np.eye(4))
+    arm.move(STEP, 0.05, 1.5)
+    np.testing.assert_array_equal(arm.pose, np.eye(4))
+    assert arm.links() == []
+    with pytest.raises(ValueError, match="PSM3 has no place yet; publish a model, or give PSM3_base in frames"):
+        arm.servo_joints(np.zeros(6))

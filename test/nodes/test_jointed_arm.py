@@ -1,0 +1,353 @@
+"""Arms with joints, through their topics: what they publish, where they get to, and what they refuse."""
+
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import rclpy
+from ros_bench import HEIGHT, SMALL, WIDTH, Bench, K, S, await_nodes, moved, send_model
+from std_srvs.srv import Trigger
+
+from endo_sim_ros import messages
+from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.instruments import link_poses, load_arm, solve_inverse
+from endo_sim_ros.nodes.arm_setup import make_arms
+from endo_sim_ros.nodes.configs import PhysicsNodeConfig
+from endo_sim_ros.nodes.physics_node import PhysicsNode
+from endo_sim_ros.nodes.rendering_node import RenderingNode
+
+pytestmark = pytest.mark.dds
+
+LINKS = ("roll", "wrist_pitch", "wrist_yaw", "jaw_left", "jaw_right")
+HEARD = (
+    messages.tool_pose, messages.tool_links, messages.tool_type, messages.tool_joints, messages.tool_velocity, messages.tool_local_pose,
+    messages.tool_state, messages.tool_warning, messages.tool_error, messages.tool_jaw_state,
+)  # fmt: skip
+ARMS = ("PSM1", "PSM2", "ECM")
+PSM = load_arm("PSM", "LARGE_NEEDLE_DRIVER")
+
+
+def start(arms, **parameters):
+    values = {**SMALL["physics_node"], "arms": f"[{', '.join(arms)}]", **parameters}
+    rclpy.init(args=["--ros-args", *(word for name, value in values.items() for word in ("-p", f"physics_node:{name}:={value}"))])
+    bench = Bench()
+    bench.hear(messages.CONTROL_NODES)
+    for topic in (messages.JOINT_STATES, messages.ROBOT_DESCRIPTION):
+        bench.hear(topic)
+    for arm in arms:
+        for topic in HEARD:
+            bench.hear(topic(arm))
+    bench.add(PhysicsNode)
+    send_model(bench)
+    await_nodes(bench, 5 * S)
+    return bench
+
+
+@pytest.fixture(scope="module")
+def running():
+    """Two commanded arms and that of the camera beside a piece of tissue."""
+    tools = "[LARGE_NEEDLE_DRIVER, PROGRASP_FORCEPS, ENDOSCOPE_STRAIGHT]"
+    bench = start(ARMS, arm_source="commanded", instruments=tools, arm_models="[PSM, PSM, ECM]")
+    yield bench
+    bench.close()
+    rclpy.try_shutdown()
+
+
+@pytest.fixture
+def graph(running):
+    """The same at its start."""
+    assert running.call(Trigger, "/physics_node/reset").success
+    latched = {messages.ROBOT_DESCRIPTION.name} | {topic(arm).name for arm in ARMS for topic in (messages.tool_state, messages.tool_type)}
+    arms = running.nodes[1].arms.items()
+    told = lambda arm: running.heard[f"{arm}/measured_js"][-1:]  # noqa: E731
+    running.until(
+        lambda: all(told(name) and list(told(name)[0].position) == list(arm.start) for name, arm in arms), "the start of all arms"
+    )
+    running.statuses.clear()
+    for name, heard in running.heard.items():
+        if name not in latched:
+            heard.clear()
+    return running
+
+
+def newest(bench, topic):
+    bench.until(lambda: bench.heard[topic.name], f"a message on {topic.name}")
+    return bench.heard[topic.name][-1]
+
+
+def pose_of(bench, topic):
+    return messages.decode_pose(newest(bench, topic), "world", topic.name)
+
+
+def tip_at(x, y, z):
+    pose = np.eye(4)
+    pose[:3, 3] = x, y, z
+    return pose
+
+
+def servo(bench, pose, arm="PSM1"):
+    bench.publish(messages.tool_pose_command(arm), messages.encode_pose(pose, S, "world"))
+
+
+def test_arms_stand_beside_each_other_with_their_instruments_and_touch_nothing(graph):
+    names = [newest(graph, messages.tool_type(arm)).data for arm in ("PSM1", "PSM2")]
+    assert names == ["LARGE_NEEDLE_DRIVER:400006", "PROGRASP_FORCEPS:400093"]
+    graph.until(lambda: len(graph.heard["PSM2/link_poses"]) > 2, "poses of links")
+    tips = [pose_of(graph, messages.tool_pose(arm)) for arm in ("PSM1", "PSM2")]
+    assert tips[0][0, 3] > 0.005 > -0.005 > tips[1][0, 3], "PSM1 on the right of the picture, PSM2 on the left"
+    assert all(0.08 < tip[2, 3] < 0.095 for tip in tips) and moved(graph) == 0
+    for arm, tip in zip(("PSM1", "PSM2"), tips):
+        message = newest(graph, messages.tool_links(arm))
+        links = dict(zip(LINKS, messages.decode_poses(message, "")))
+        assert message.header.frame_id == "world" and len(message.poses) == len(LINKS)
+        np.testing.assert_allclose(links["wrist_yaw"][:3, 3], tip[:3, 3], atol=1e-6)  # the tip is the hinge of the jaws
+        left, right = links["jaw_left"][:3, 1], links["jaw_right"][:3, 1]  # distal is y
+        np.testing.assert_allclose(np.arccos(left @ right), 1.0, atol=1e-6)  # the angle of a jaw at the start
+
+
+def test_links_follow_a_servoed_tip_with_its_stamp(graph):
+    pose = tip_at(0.01, -0.01, 0.08)
+    servo(graph, pose)
+    graph.until(lambda: np.allclose(pose_of(graph, messages.tool_pose("PSM1")), pose, atol=1e-12), "the pose exactly")
+    stamp = graph.heard["PSM1/measured_cp"][-1].header.stamp
+    (links,) = graph.until(lambda: [m for m in graph.heard["PSM1/link_poses"] if m.header.stamp == stamp], "links with its stamp")
+    base = graph.nodes[1].arms["PSM1"].base
+    psm = load_arm("PSM", "LARGE_NEEDLE_DRIVER")
+    reach = solve_inverse(psm, np.linalg.inv(base) @ pose, graph.nodes[1].arms["PSM1"].joints)
+    expected = np.stack(list(link_poses(psm, reach.joints, 1.0).values()))
+    np.testing.assert_allclose(messages.decode_poses(links, ""), base @ expected, atol=1e-6)
+
+
+def joints_of(bench, arm="PSM1"):
+    return np.array(newest(bench, messages.tool_joints(arm)).position)
+
+
+def send_joints(bench, topic, positions, arm="PSM1"):
+    none = np.zeros(0)
+    bench.publish(topic(arm), messages.encode_joints([], np.array(positions), none, none, S))
+
+
+def texts(bench, topic, arm="PSM1"):
+    """What came on a topic of the types of CRTK, which are strings where those are not installed."""
+
+    def text(message):
+        if hasattr(message, "state"):
+            return f"{message.state} BUSY" if message.is_busy else message.state
+        return messages.decode_state_command(message)
+
+    return [text(message) for message in bench.heard[topic(arm).name]]
+
+
+def test_joints_move_together_within_their_speeds_and_their_poses_agree(graph):
+    first = joints_of(graph)
+    goal = first + [0.2, -0.1, 0.01, 0.3, 0.0, -0.2]
+    send_joints(graph, messages.tool_joint_move, goal)
+    graph.until(lambda: texts(graph, messages.tool_state)[-1] == "ENABLED BUSY", "a busy arm")
+    graph.until(lambda: texts(graph, messages.tool_state)[-1] == "ENABLED", "the end of the move")
+    graph.until(lambda: np.allclose(joints_of(graph), goal, atol=1e-12))
+    way = np.array([m.position for m in graph.heard["PSM1/measured_js"]])
+    speeds = np.abs([m.velocity for m in graph.heard["PSM1/measured_js"]]).max(0)
+    assert (speeds <= np.array([2, 2, 0.2, 2, 2, 2]) * 1.001).all() and speeds[3] > 1.99
+    part = (way - first)[:, 3] / 0.3
+    np.testing.assert_allclose(way, first + part[:, None] * (goal - first), atol=1e-9)
+    assert list(newest(graph, messages.tool_joints("PSM1")).name) == [joint.name for joint in PSM.joints]
+    local = lambda: messages.decode_pose(newest(graph, messages.tool_local_pose("PSM1")), "PSM1_base", "")  # noqa: E731
+    graph.until(lambda: np.allclose(local(), PSM.tip_pose(goal), atol=1e-9), "the pose in the base")
+    world = graph.nodes[1].arms["PSM1"].base @ PSM.tip_pose(goal)
+    graph.until(lambda: np.allclose(pose_of(graph, messages.tool_pose("PSM1")), world, atol=1e-9), "the pose in the world")
+    assert moved(graph) == 0
+
+
+def test_what_is_published_can_be_sent_back(graph):
+    joints, pose = joints_of(graph), pose_of(graph, messages.tool_pose("PSM1"))
+    send_joints(graph, messages.tool_joint_command, joints + [0, 0, 0.005, 0, 0, 0])
+    graph.until(lambda: joints_of(graph)[2] > joints[2] + 0.004)
+    servo(graph, pose)
+    graph.until(lambda: np.allclose(joints_of(graph), joints, atol=1e-9), "the joints of before")
+    fastest = lambda: max((abs(m.twist.linear.z) for m in graph.heard["PSM1/measured_cv"]), default=0.0)  # noqa: E731
+    graph.until(lambda: fastest() > 0.05, "5 mm in a step")
+
+
+BAD_JOINTS = {
+    "too_few": ([0.0] * 5, "a joint position must have 6 numbers"),
+    "too_many": ([0.0] * 7, "a joint position must have 6 numbers"),
+    "none": ([], "expected finite joint positions"),
+    "nan": ([0, 0, float("nan"), 0, 0, 0], "expected finite joint positions"),
+    "infinite": ([0, 0, float("inf"), 0, 0, 0], "expected finite joint positions"),
+    "beyond_limits": ([0, 0, 0.3, 0, 0, 0], "insertion cannot be at 300 mm; its limits are 0 and 240 mm"),
+    "degrees": ([0, 0, 0.1, 0, 45, 0], "wrist_pitch cannot be at 2578 degrees"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_JOINTS)
+def test_bad_joints_are_one_sentence_and_the_arm_stays(graph, name):
+    positions, sentence = BAD_JOINTS[name]
+    before, pose = joints_of(graph), pose_of(graph, messages.tool_pose("PSM1"))
+    for topic in (messages.tool_joint_command, messages.tool_joint_move):
+        graph.heard["PSM1/error"].clear()
+        graph.statuses.clear()
+        send_joints(graph, topic, positions)
+        graph.until(lambda: texts(graph, messages.tool_error), "an error of the arm")
+        (said,) = texts(graph, messages.tool_error)
+        assert sentence in said and said.startswith(topic("PSM1").name)
+        graph.refused("physics_node", said)
+    graph.spin(0.1)
+    np.testing.assert_array_equal(joints_of(graph), before)
+    np.testing.assert_array_equal(pose_of(graph, messages.tool_pose("PSM1")), pose)
+
+
+@pytest.mark.parametrize("topic", [messages.tool_pose_command, messages.tool_move])
+def test_a_pose_out_of_reach_takes_the_arm_as_near_as_it_gets(graph, topic):
+    assert graph.set("physics_node", move_speed=1.0)[0]
+    goal = tip_at(0.0, 0.0, 0.4)
+    graph.publish(topic("PSM1"), messages.encode_pose(goal, S, "world"))
+    said = graph.until(lambda: texts(graph, messages.tool_warning), "a warning")
+    assert said[-1].startswith("PSM1: PSM stops") and "insertion at its limit of 240 mm" in said[-1]
+    graph.refused("physics_node", "from the pose, with insertion at its limit")
+    graph.until(lambda: joints_of(graph)[2] > 0.2399, "the arm to be there")
+    reach = solve_inverse(PSM, np.linalg.inv(graph.nodes[1].arms["PSM1"].base) @ goal, joints_of(graph))
+    assert np.abs(joints_of(graph) - reach.joints).max() < 0.02 and not reach.reached
+    graph.spin(0.2)
+    assert len(texts(graph, messages.tool_warning)) == 1, "told once"
+    servo(graph, tip_at(0, 0, 0.08))
+    graph.until(lambda: np.allclose(pose_of(graph, messages.tool_pose("PSM1"))[:3, 3], [0, 0, 0.08]), "a pose in reach")
+
+
+def test_a_straight_move_is_as_slow_as_its_fastest_joint(graph):
+    servo(graph, tip_at(0, 0, 0.08))
+    graph.until(lambda: np.allclose(pose_of(graph, messages.tool_pose("PSM1"))[:3, 3], [0, 0, 0.08]))
+    assert graph.set("physics_node", move_speed=10.0, turn_speed=100.0)[0]
+    goal = tip_at(0.02, 0.0, 0.07)
+    goal[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    graph.heard["PSM1/measured_js"].clear()
+    graph.publish(messages.tool_move("PSM1"), messages.encode_pose(goal, S, "world"))
+    graph.until(lambda: np.allclose(pose_of(graph, messages.tool_pose("PSM1")), goal, atol=1e-9), "the goal")
+    speeds = np.abs([m.velocity for m in graph.heard["PSM1/measured_js"]])
+    assert (speeds.max(0) <= np.array([2, 2, 0.2, 2, 2, 2]) * 1.001).all() and speeds.max() > 1.5
+    assert graph.set("physics_node", move_speed=0.05, turn_speed=1.5)[0]
+
+
+def test_reset_takes_arms_to_their_start_and_the_same_episode_gives_the_same_bits(graph):
+    def episode():
+        assert graph.call(Trigger, "/physics_node/reset").success
+        graph.heard["PSM1/measured_js"].clear()
+        send_joints(graph, messages.tool_joint_move, at + [0.1, 0, 0.03, 0.2, 0, 0])
+        graph.until(lambda: len(graph.heard["PSM1/measured_js"]) > 15, "some steps")
+        way = [tuple(m.position) for m in graph.heard["PSM1/measured_js"]]
+        return list(dict.fromkeys(way))[:8]  # the start may be told twice
+
+    at = joints_of(graph)
+    assert episode() == episode()
+    assert graph.call(Trigger, "/physics_node/reset").success
+    graph.until(lambda: (joints_of(graph) == at).all(), "the start")
+    assert moved(graph) == 0
+
+
+def test_a_move_through_tissue_ends_at_its_force_limit_and_the_way_back_does_not(graph):
+    assert graph.set("physics_node", contact_radius=0.015, force_limit=0.05)[0]
+    graph.until(lambda: graph.nodes[1].simulation.contact_radius >= 0.015, "contact")
+    servo(graph, tip_at(0, 0, 0.07))
+    graph.spin(0.1)
+    goal = messages.encode_pose(tip_at(0, 0, 0.11), S, "world")
+    graph.publish(messages.tool_move("PSM1"), goal)
+    (said,) = graph.until(lambda: texts(graph, messages.tool_error), lambda: f"the force limit; felt {graph.nodes[1].arms['PSM1'].felt} N")
+    assert said.startswith("PSM1: the move ended at 0.") and "above force_limit = 0.05 N" in said
+    graph.refused("physics_node", "the move ended at")
+    graph.until(lambda: texts(graph, messages.tool_state)[-1] == "ENABLED", "an arm that is not busy")
+    assert moved(graph) > 1e-4
+    depth = pose_of(graph, messages.tool_pose("PSM1"))[2, 3]
+    assert 0.07 < depth < 0.109
+    graph.publish(messages.tool_move("PSM1"), messages.encode_pose(tip_at(0, 0, 0.07), S, "world"))
+    graph.until(lambda: abs(pose_of(graph, messages.tool_pose("PSM1"))[2, 3] - 0.07) < 1e-9, "the way back")
+    assert graph.set("physics_node", contact_radius=0.0, force_limit=10.0)[0]
+    graph.until(lambda: graph.nodes[1].simulation.contact_radius == 0, "no contact")
+
+
+def test_the_arm_of_the_camera_moves_it_and_does_not_turn_it_over(graph):
+    np.testing.assert_allclose(pose_of(graph, messages.tool_pose("ECM")), np.eye(4), atol=1e-9)  # the training camera
+    graph.publish(messages.tool_move("ECM"), messages.encode_pose(tip_at(0.01, 0.005, 0.02), S, "world"))
+    there = lambda: np.allclose(pose_of(graph, messages.tool_pose("ECM"))[:3, 3], [0.01, 0.005, 0.02], atol=2e-4)  # noqa: E731
+    graph.until(there, "the camera to be there")
+    pose = pose_of(graph, messages.tool_pose("ECM"))
+    over = tip_at(0.01, 0.005, 0.02) @ np.diag([-1.0, -1, 1, 1])
+    graph.publish(messages.tool_pose_command("ECM"), messages.encode_pose(over, S, "world"))
+    graph.refused("physics_node", "ECM/servo_cp: ECM stays where it is: the camera would be upside down")
+    graph.publish(messages.tool_pose_command("ECM"), messages.encode_pose(tip_at(0, 0, 0.5), S, "world"))
+    graph.refused("physics_node", "ECM/servo_cp: ECM stays where it is: ECM stops", "insertion at its limit")
+    send_joints(graph, messages.tool_joint_command, [0, 0, 0.1, 1.6], "ECM")
+    graph.refused("physics_node", "ECM: roll cannot be at 91.67 degrees")
+    graph.spin(0.1)
+    np.testing.assert_allclose(pose_of(graph, messages.tool_pose("ECM")), pose, atol=1e-12)
+    send_joints(graph, messages.tool_joint_command, [0, 0, 0.1, 0.5], "ECM")
+    graph.until(lambda: np.allclose(joints_of(graph, "ECM"), [0, 0, 0.1, 0.5]), "the joints")
+
+
+def test_poses_may_be_in_the_frame_of_the_moving_camera_and_of_a_base(graph):
+    in_view = tip_at(0.01, 0.02, 0.08)
+    graph.publish(messages.tool_pose_command("PSM1"), messages.encode_pose(in_view, S, "ECM_view"))
+    graph.until(lambda: np.allclose(pose_of(graph, messages.tool_pose("PSM1"))[:3, 3], [-0.01, -0.02, 0.08]), "x left, y up")
+    send_joints(graph, messages.tool_joint_command, joints_of(graph, "ECM") + [0.05, 0, 0.01, 0], "ECM")
+    graph.spin(0.1)
+    assert graph.set("physics_node", cartesian_frame="ECM_view")[0]
+    graph.publish(messages.tool_pose_command("PSM1"), messages.encode_pose(in_view, S, ""))
+    told = lambda: graph.heard["PSM1/measured_cp"][-1]  # noqa: E731
+    graph.until(lambda: told().header.frame_id == "ECM_view" and np.allclose(messages.decode_pose(told(), "ECM_view", ""), in_view))
+    assert graph.set("physics_node", cartesian_frame="world")[0]
+    graph.until(lambda: told().header.frame_id == "world")
+    world = pose_of(graph, messages.tool_pose("ECM")) @ np.diag([-1.0, -1, 1, 1]) @ in_view
+    np.testing.assert_allclose(pose_of(graph, messages.tool_pose("PSM1")), world, atol=1e-9)
+    local = messages.decode_pose(newest(graph, messages.tool_local_pose("PSM1")), "PSM1_base", "")
+    local[2, 3] += 0.01
+    graph.publish(messages.tool_pose_command("PSM1"), messages.encode_pose(local, S, "PSM1_base"))
+    shown = lambda: messages.decode_pose(newest(graph, messages.tool_local_pose("PSM1")), "PSM1_base", "")  # noqa: E731
+    graph.until(lambda: np.allclose(shown(), local), "the pose in the base")
+
+
+def test_all_joints_are_told_together_with_a_description_that_has_them(graph):
+    states = newest(graph, messages.JOINT_STATES)
+    robot = ElementTree.fromstring(newest(graph, messages.ROBOT_DESCRIPTION).data)
+    joints = {joint.get("name") for joint in robot.findall("joint") if joint.get("type") != "fixed" and joint.find("mimic") is None}
+    assert joints == set(states.name) and len(states.name) == len(states.position) == 7 + 7 + 4
+    assert {"PSM1_yaw", "PSM2_jaw", "ECM_roll"} <= joints
+
+
+def test_a_disabled_arm_takes_no_command(graph):
+    for command, state in (("disable", "DISABLED"), ("enable", "ENABLED")):
+        graph.publish(messages.tool_state_command("PSM2"), messages.encode_report(command, S))
+        graph.until(lambda: texts(graph, messages.tool_state, "PSM2")[-1] == state)
+        if state == "DISABLED":
+            send_joints(graph, messages.tool_joint_move, joints_of(graph, "PSM2"), "PSM2")
+            graph.refused("physics_node", "PSM2/move_jp: PSM2 is DISABLED; send enable")
+
+
+BAD_OPTIONS = {
+    "two_for_three": (dict(arms=("A", "B", "C"), instruments=("none", "none")), "instruments: there are 2 for 3 arms"),
+    "unknown": (dict(instruments=("SPOON",)), "tool must be the path of a .json file or one of"),
+    "no_file": (dict(arm_models=("/nowhere/psm.json",)), "there is no such file"),
+    "endoscope": (dict(instruments=("ENDOSCOPE_STRAIGHT",), arm_models=("ECM",)), "PSM1 cannot be ECM with ENDOSCOPE_STRAIGHT"),
+    "two_of_a_name": (dict(arms=("PSM1", "PSM1")), "PSM1 is there 2 times"),
+    "measured_camera": (dict(arms=("PSM1", "ECM")), "ECM needs arm_source commanded"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_OPTIONS)
+def test_bad_options_are_one_sentence(name):
+    values, sentence = BAD_OPTIONS[name]
+    with pytest.raises(ConfigError, match=sentence):
+        make_arms(PhysicsNodeConfig(**values))
+
+
+def test_pictures_follow_the_arm_of_the_camera(graph):
+    rendering = graph.add(RenderingNode)
+    shown = graph.hear(messages.RENDERED_POSE)
+    send_model(graph, stamp=6 * S)  # which takes the arms to their start
+    await_nodes(graph, 6 * S)
+    graph.publish(messages.LEFT_INFO, messages.encode_camera_info(K, WIDTH, HEIGHT, S, "endoscope_left"))
+    graph.until(lambda: shown, "a picture")
+    arm = graph.nodes[1].arms["ECM"]
+    goal = arm.start + [0.1, 0.05, 0.02, 0.3]
+    send_joints(graph, messages.tool_joint_move, goal, "ECM")
+    graph.until(lambda: np.allclose(arm.joints, goal), "the end of the move")
+    assert np.linalg.norm(arm.pose[:3, 3]) > 0.02
+    graph.until(lambda: np.allclose(messages.decode_pose(shown[-1], "world", ""), arm.pose, atol=1e-6), "its view")
+    assert rendering.error_count == 0

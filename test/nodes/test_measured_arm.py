@@ -1,0 +1,57 @@
+"""The instrument of a robot's arm: its links follow the pose that the robot measures."""
+
+import numpy as np
+import pytest
+import rclpy
+from ros_bench import SMALL, Bench, S, await_nodes, send_model, send_tip
+
+from endo_sim_ros import messages
+from endo_sim_ros.instruments import link_poses, load_arm, solve_inverse
+from endo_sim_ros.nodes.physics_node import PhysicsNode
+
+pytestmark = pytest.mark.dds
+
+BASE = "0.1 0.05 0.0 0 1 0 0"  # half a turn about y: the shaft of PSM2 points along z of the camera at position zero
+
+
+@pytest.fixture(scope="module")
+def graph():
+    values = {**SMALL["physics_node"], "arms": "[PSM1, PSM2, PSM3]", "frames": f"['PSM2_base {BASE}']"}
+    rclpy.init(args=["--ros-args", *(word for name, value in values.items() for word in ("-p", f"physics_node:{name}:={value}"))])
+    bench = Bench()
+    bench.hear(messages.CONTROL_NODES)
+    for arm in ("PSM1", "PSM2", "PSM3"):
+        bench.hear(messages.tool_links(arm))
+    bench.add(PhysicsNode)
+    send_model(bench)
+    await_nodes(bench, 5 * S)
+    yield bench
+    bench.close()
+    rclpy.try_shutdown()
+
+
+@pytest.mark.parametrize("arm", ["PSM1", "PSM2"])
+def test_links_follow_a_measured_pose_and_jaw(graph, arm):
+    graph.spin(0.1)
+    assert not any(message.poses for message in graph.heard[f"{arm}/link_poses"]), "nobody knows its pose yet"
+    send_tip(graph, (0.01, -0.01, 0.09), arm)
+    links = graph.heard[f"{arm}/link_poses"]
+    graph.until(lambda: links and links[-1].poses, "links")
+    base = graph.nodes[1].arms[arm].base
+    if arm == "PSM2":
+        np.testing.assert_allclose(base[:3, 3], [0.1, 0.05, 0.0])
+    pose, psm = np.eye(4), load_arm("PSM", "LARGE_NEEDLE_DRIVER")
+    pose[:3, 3] = 0.01, -0.01, 0.09
+    graph.publish(messages.tool_jaw(arm), messages.encode_jaw(0.4, S))
+    reach = solve_inverse(psm, np.linalg.inv(base) @ pose, graph.nodes[1].arms[arm].joints)
+    expected = base @ np.stack(list(link_poses(psm, reach.joints, 0.4).values()))
+    graph.until(lambda: np.allclose(messages.decode_poses(links[-1], ""), expected, atol=1e-6), "links of that pose and jaw")
+    assert reach.reached
+
+
+def test_an_arm_without_a_place_says_so_and_is_a_tip(graph):
+    graph.status("physics_node", "there is no default place for PSM3, only for PSM1, PSM2 and ECM; give its base in frames", 1)
+    send_tip(graph, (0, 0, 0.09), "PSM3")
+    graph.until(lambda: graph.nodes[1].arms["PSM3"].pose is not None)
+    graph.spin(0.1)
+    assert not any(message.poses for message in graph.heard["PSM3/link_poses"])

@@ -1,0 +1,180 @@
+"""rendering_node: instruments where their links are said to be, the other eye, labels, and compressed images."""
+
+import numpy as np
+import pytest
+import rclpy
+from ros_bench import HEIGHT, WIDTH, Bench, K, S, await_image, newest_image, send_camera, send_model, sheet
+
+from endo_sim_ros import messages
+from endo_sim_ros.core.cameras import Camera, make_pose
+from endo_sim_ros.instruments import LINKS, build_instrument, link_poses, load_arm, place_arm
+from endo_sim_ros.instruments.drawing import InstrumentDrawing
+from endo_sim_ros.messages import OK
+from endo_sim_ros.nodes.rendering_node import RenderingNode
+from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
+
+pytestmark = pytest.mark.dds
+
+TOOLS = {"PSM1": "LARGE_NEEDLE_DRIVER:400006", "PSM2": "PROGRASP_FORCEPS"}
+CAMERA = Camera(K, WIDTH, HEIGHT)
+BASELINE = 0.005
+
+
+def links(name, aside=0.0):
+    arm = load_arm("PSM", TOOLS[name])
+    place = place_arm(name, arm, CAMERA, 0.08)
+    shift = make_pose([aside, 0, 0], [1, 0, 0, 0])
+    return {link: shift @ place.base @ pose for link, pose in link_poses(arm, place.joints, 0.6).items()}
+
+
+def send_links(bench, name, poses, stamp=S):
+    bench.publish(messages.tool_links(name), messages.encode_poses(list(poses.values()), stamp, "world"))
+
+
+def send_type(bench, name, tool=None):
+    bench.publish(messages.tool_type(name), messages.encode_text(tool or TOOLS[name]))
+
+
+def send_state(bench, stamp, shift=0.0, model_stamp=5 * S):
+    rest = sheet(8).means.numpy()
+    F = np.tile(np.eye(3, dtype=np.float32), (len(rest), 1, 1))
+    cloud = messages.ControlNodeCloud(rest, rest + np.float32([shift, 0, 0]), F, model_stamp)
+    bench.publish(messages.CONTROL_NODES, messages.encode_control_nodes(cloud, stamp, "world"))
+
+
+def expected(names, cameras=(CAMERA,)):
+    """What the library renders at rest."""
+    tools = [build_instrument(load_arm("PSM", TOOLS[name])) for name in names]
+    posed = None
+    if tools:
+        drawing = InstrumentDrawing([parts for parts, _ in tools], device="cpu", capsules=[capsules for _, capsules in tools])
+        posed = drawing.at([links(name) for name in names])
+    renderer = DeformableRenderer(sheet(), None, RenderingConfig(device="cpu"))
+    return renderer.views(list(cameras), labels=True, instruments=posed)
+
+
+def start(mode):
+    rclpy.init(args=["--ros-args", "-p", "arms:=[PSM1, PSM2]", "-p", "device:=cpu", "-p", f"mode:={mode}"])
+    bench = Bench()
+    bench.hear(messages.RENDERED_IMAGE)
+    bench.add(RenderingNode)
+    return bench
+
+
+@pytest.fixture
+def bench():
+    bench = start("realtime")
+    send_model(bench)
+    send_camera(bench)
+    await_image(bench, lambda image: image.max() > 100)
+    yield bench
+    bench.close()
+    rclpy.try_shutdown()
+
+
+@pytest.fixture
+def steps():
+    bench = start("lockstep")
+    send_camera(bench)
+    send_model(bench)
+    yield bench
+    bench.close()
+    rclpy.try_shutdown()
+
+
+def shows(bench, view, what):
+    await_image(bench, lambda image: np.array_equal(image, view.image), what)
+
+
+def newest(bench, topic, condition=lambda message: True):
+    heard = bench.heard[topic.name]
+    bench.until(lambda: heard and condition(heard[-1]), f"{topic.name}")
+    return heard[-1]
+
+
+def test_instruments_come_go_and_are_told_apart(bench):
+    for name in TOOLS:
+        send_type(bench, name)
+    send_links(bench, "PSM2", links("PSM2"))
+    shows(bench, expected(["PSM2"])[0], "PSM2 alone")
+    bench.hear(messages.RENDERED_SEGMENTATION)
+    of_second = {2 + 5 + LINKS.index(link) for link in ("roll", "wrist_pitch", "jaw_left", "jaw_right")}
+    labels = lambda message: np.frombuffer(message.data, np.uint8)
+    found = lambda message: set(labels(message).tolist())
+    newest(bench, messages.RENDERED_SEGMENTATION, lambda message: of_second <= found(message) <= of_second | {0, 1})
+    send_links(bench, "PSM1", links("PSM1"))
+    shows(bench, expected(["PSM1", "PSM2"])[0], "both")
+    both = newest(bench, messages.RENDERED_SEGMENTATION, lambda message: 2 in found(message))
+    assert (both.encoding, both.height, both.width) == ("mono8", HEIGHT, WIDTH)
+    library = expected(["PSM1", "PSM2"])[0].labels
+    assert np.array_equal(labels(both).reshape(HEIGHT, WIDTH) > 1, library > 1)
+    send_links(bench, "PSM1", links("PSM1", 0.004))
+    await_image(bench, lambda image: np.abs(image - expected(["PSM1", "PSM2"])[0].image).max() > 60, "PSM1 to move")
+    assert bench.set("rendering_node", instruments=False)[0]
+    shows(bench, expected([])[0], "the tissue alone")
+
+
+def test_what_cannot_be_drawn_is_one_sentence(bench):
+    send_links(bench, "PSM1", dict(list(links("PSM1").items())[:3]))
+    bench.refused("rendering_node", "3 poses; publish those of roll, wrist_pitch", "PSM1/link_poses")
+    send_type(bench, "PSM1", "SPOON")
+    bench.refused("rendering_node", "SPOON", "PSM1/tool_type")
+    send_links(bench, "PSM1", links("PSM1"))
+    shows(bench, expected([])[0], "the tissue alone")
+    send_type(bench, "PSM1")
+    shows(bench, expected(["PSM1"])[0], "the instrument after all")
+
+
+def test_the_right_eye_and_compressed_images_for_those_who_ask(bench):
+    send_type(bench, "PSM1")
+    send_links(bench, "PSM1", links("PSM1"))
+    topics = messages.RENDERED_RIGHT_IMAGE, messages.RENDERED_RIGHT_INFO, messages.RENDERED_RIGHT_COMPRESSED, messages.RENDERED_COMPRESSED
+    for topic in topics:
+        bench.hear(topic)
+    newest(bench, messages.RENDERED_COMPRESSED)
+    assert not bench.heard[messages.RENDERED_RIGHT_IMAGE.name]  # nobody knows the baseline
+    right = messages.encode_camera_info(K, WIDTH, HEIGHT, S, "endoscope_right", BASELINE)
+    bench.publish(messages.RIGHT_INFO, right)
+    eyes = expected(["PSM1"], [CAMERA, CAMERA.at(make_pose([BASELINE, 0, 0], [1, 0, 0, 0]))])
+    stamps = lambda topic: {messages.stamp_to_ns(m.header.stamp): m for m in bench.heard[topic.name]}
+    complete = lambda: stamps(messages.RENDERED_RIGHT_IMAGE).keys() & stamps(messages.RENDERED_RIGHT_INFO).keys()
+    shown = lambda: [s for s in complete() if np.array_equal(messages.decode_image(stamps(topics[0])[s]), eyes[1].image)]
+    stamp = bench.until(shown, "the right eye")[0]
+    image, info = (stamps(topic)[stamp] for topic in topics[:2])
+    assert image.header.frame_id == info.header.frame_id == "endoscope_right"
+    assert messages.decode_camera_info(info).baseline == pytest.approx(BASELINE)
+    assert stamp in stamps(messages.RENDERED_IMAGE)
+    for topic, view in ((messages.RENDERED_RIGHT_COMPRESSED, eyes[1]), (messages.RENDERED_COMPRESSED, eyes[0])):
+        heard = bench.heard[topic.name]
+        near = lambda: heard and np.abs(messages.decode_image(heard[-1]).astype(int) - view.image).mean() < 4  # noqa: B023
+        bench.until(near, topic.name)
+        assert len(heard[-1].data) < 0.5 * view.image.nbytes
+
+
+def test_in_lockstep_each_state_waits_for_its_links(steps):
+    images = steps.heard["rendered/image_raw"]
+    stamp_of = lambda message: messages.stamp_to_ns(message.header.stamp)
+    send_type(steps, "PSM1")
+    send_state(steps, 5 * S)
+    steps.status("rendering_node", "for PSM1/link_poses of 5.000000 s", OK)
+    assert not images
+    send_state(steps, 6 * S)
+    for stamp, aside in ((5 * S, 0.0), (6 * S, 0.004)):
+        send_links(steps, "PSM1", links("PSM1", aside), stamp)
+    steps.until(lambda: len(images) == 2, "both images", 60)
+    assert [stamp_of(image) for image in images] == [5 * S, 6 * S]
+    moved = [messages.decode_image(image).astype(int) for image in images]
+    assert np.abs(moved[0] - moved[1]).max() > 60
+    send_links(steps, "PSM1", {}, 7 * S)  # nobody knows where it is
+    send_state(steps, 7 * S)
+    steps.until(lambda: len(images) == 3, "the tissue alone")
+    assert np.abs(newest_image(steps) - moved[1]).max() > 60
+    send_links(steps, "PSM1", links("PSM1"), 5 * S)  # a reset
+    send_state(steps, 5 * S)
+    steps.until(lambda: len(images) == 4, "the first observation")
+    assert np.array_equal(newest_image(steps), moved[0])
+    send_state(steps, 6 * S)
+    send_state(steps, 7 * S)
+    send_links(steps, "PSM1", links("PSM1"), 7 * S)  # those of 6 s are lost
+    steps.until(lambda: len(images) == 6, "the states after")
+    assert [stamp_of(image) for image in images[-2:]] == [6 * S, 7 * S]

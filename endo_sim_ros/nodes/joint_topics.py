@@ -53,7 +53,7 @@ class JointTopics:
         """Publish where the links of the instruments are, at the time of a state, ns."""
         for arm, publisher in self._links:
             if links := arm.links():
-                publisher.publish(messages.encode_poses(links, stamp, self.options.world_frame))
+                publisher.publish(messages.encode_poses(list(links.values()), stamp, self.options.world_frame))
 
     def publish_joint_states(self, stamp: int) -> None:
         """Publish the joints of all arms in one message, while somebody subscribes."""

@@ -1,12 +1,13 @@
 """An arm with joints: where its links are when its tip is at a pose, and how its joints get to where they are told."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from endo_sim_ros.core.cameras import invert_pose
-from endo_sim_ros.instruments import ArmKinematics, ReachConfig, link_poses, solve_inverse
+from endo_sim_ros.instruments import ArmKinematics, Capsule, ReachConfig, link_poses, solve_inverse
 from endo_sim_ros.nodes.arm import Arm
 
 _ROUNDED = 1 + 1e-9  # a way that takes a whole number of steps must not take one more
@@ -27,12 +28,14 @@ class JointedArm(Arm):
         kinematics: The arm with its tool.
         tool_type: What loads the tool: its name and number, or the path of its file.
         commanded: Whether it has no robot, so that it is where its joints get to.
+        capsules: What of its instrument touches tissue; none = its tip alone does.
         joint_speed, slide_speed: Largest speeds of joints that turn and that slide during moves, rad/s and m/s.
     """
 
     kinematics: ArmKinematics = field()
     tool_type: str = ""
     commanded: bool = True
+    capsules: Sequence[Capsule] = ()
     joint_speed: float = np.inf
     slide_speed: float = np.inf
     base: np.ndarray | None = None  # [4, 4], world
@@ -190,14 +193,14 @@ class JointedArm(Arm):
 
     # ------------------------------------------------------------------ states
 
-    def links(self) -> list[np.ndarray]:
-        """Poses [4, 4] of the links in the world, in the order of `link_poses`; none while they are not known."""
+    def links(self) -> dict[str, np.ndarray]:
+        """Poses [4, 4] of the links in the world by name, in the order of `link_poses`; none while they are not known."""
         self.settle()
         if self.base is None or self.joints is None or self.pose is None:
-            return []
+            return {}
         widest = self.kinematics.jaw[1] if self.kinematics.jaw else 0.0
         poses = link_poses(self.kinematics, self.joints, np.clip(self.angle, 0.0, widest))  # closed jaws press, they do not overlap
-        return [self.base @ pose for pose in poses.values()]
+        return {name: self.base @ pose for name, pose in poses.items()}
 
     def dynamics(self, force: np.ndarray, torque: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What the joints and the tip do under a wrench on the tip.

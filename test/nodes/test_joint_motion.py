@@ -99,6 +99,6 @@ def test_an_arm_without_a_base_is_a_tip():
     arm.move_to(np.eye(4))
     arm.move(STEP, 0.05, 1.5)
     np.testing.assert_array_equal(arm.pose, np.eye(4))
-    assert arm.links() == []
+    assert arm.links() == {}
     with pytest.raises(ValueError, match="PSM3 has no place yet; publish a model, or give PSM3_base in frames"):
         arm.servo_joints(np.zeros(6))

@@ -42,11 +42,11 @@ def move_links(
     if acts:
         for k in range(constants.capsules):
             i = c * constants.capsules + k
+            if holds.joined[c] == 0:
+                holds.last_start[i] = commands.start[i]
+                holds.last_end[i] = commands.end[i]
+            start, end, start_before, end_before = commands.start[i], commands.end[i], holds.last_start[i], holds.last_end[i]
             if commands.radius[i] > 0.0:
-                if holds.joined[c] == 0:
-                    holds.last_start[i] = commands.start[i]
-                    holds.last_end[i] = commands.end[i]
-                start, end, start_before, end_before = commands.start[i], commands.end[i], holds.last_start[i], holds.last_end[i]
                 place = at + used
                 rigid.tool[place] = t
                 rigid.radius[place] = wp.max(commands.radius[i], constants.thinnest)
@@ -55,8 +55,8 @@ def move_links(
                 rigid.end[place] = single(end_before - constants.origin)
                 rigid.end_v[place] = single((end - end_before) / constants.duration)
                 used += 1
-                holds.last_start[i] = start
-                holds.last_end[i] = end
+            holds.last_start[i] = start
+            holds.last_end[i] = end
         holds.last_opening[c] = wp.length(commands.jaws[3 * c + 1] - commands.jaws[3 * c + 2])
     holds.joined[c] = wp.where(acts, 1, 0)
     return used

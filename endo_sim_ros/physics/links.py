@@ -20,6 +20,12 @@ class PlacedLinks(NamedTuple):
     ends: Tensor  # [..., K, 3]
     jaws: Tensor  # hinge and tips of the left and the right jaw [..., 3, 3]; zero without jaws
 
+    def edge(self, cutting: Tensor) -> np.ndarray:
+        """Corners [C, 3] of the edge that capsules [K], of which these cut, are together one after the other, or else of closed jaws."""
+        if cutting.any():
+            return torch.cat([self.starts[cutting], self.ends[cutting][-1:]]).numpy()
+        return np.stack([self.jaws[0].numpy(), self.jaws[1:].mean(0).numpy()])
+
 
 class ToolLinks:
     """An instrument as tissue meets it.
@@ -48,6 +54,14 @@ class ToolLinks:
         if bool(jaws[0]) != bool(jaws[1]):
             raise ValueError(f"an instrument needs capsules of both links {' and '.join(JAW_LINKS)} or of neither")
         self.has_jaws = bool(jaws[0])
+        cuts = torch.tensor([each.cuts for each in capsules])
+        of_jaws = torch.tensor([each.link in JAW_LINKS for each in capsules])
+        self.scissors = self.has_jaws and bool(cuts[of_jaws].all())
+        """Whether its jaws are blades, which cut what lies between them when they close."""
+        self.wire = cuts & ~of_jaws
+        """Capsules [K] of the edge that cuts when told to, none where that is the line between the jaws."""
+        self.sharp = self.wire if self.wire.any() else of_jaws
+        """Capsules [K] that do not push while they cut: they would keep off what they are to cut."""
         self._of = torch.tensor([self.links.index(each.link) for each in capsules])  # link of each capsule [K]
         self._points = torch.from_numpy(points)  # [K, 2, 3]
         self._on: dict[torch.device, tuple[Tensor, Tensor]] = {}  # these two by device

@@ -1,6 +1,6 @@
 """The tissue that tools push, pull, grasp and cut, each by its name."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,7 @@ from endo_sim_ros.physics.backends.base import capturing
 from endo_sim_ros.physics.batch import TissueBatch
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes, RenderDepth, build_control_nodes
-from endo_sim_ros.physics.cutting.blade import Blade
+from endo_sim_ros.physics.cutting.blade import Blade, Scissors
 from endo_sim_ros.physics.cutting.stencils import CutStencils
 from endo_sim_ros.physics.links import ToolLinks, rigid_pose
 from endo_sim_ros.physics.regions import TissueProperties
@@ -91,6 +91,7 @@ class TissueSimulation:
         self._placed: dict[str, Tensor] = {}  # poses of these [L, 4, 4], while known
         self._stencils: CutStencils | None = None  # from the first cut on
         self._blades: dict[str, Blade] = {}  # of tools that cut
+        self._scissors: dict[str, Scissors] = {}  # of tools whose jaws are blades
         self.disturbed = False  # since the last step: a tool moved, took hold or let go
         self._quiet = 0.0  # s since tools did anything
         self.resting = not any(config.gravity)
@@ -153,17 +154,21 @@ class TissueSimulation:
         Args:
             tool: Name of the tool.
             capsules: Of the links, such as those of `build_instrument`; none = a bare tip. Two links with the names ``jaw_left`` and
-                ``jaw_right`` are jaws, between which tissue is held.
+                ``jaw_right`` are jaws, between which tissue is held, or cut if they are blades.
 
         Raises:
-            ValueError: If they are no instrument, see :class:`ToolLinks`, or too many; the tool then keeps what it had.
+            ValueError: If they are no instrument, see :class:`ToolLinks`, or too many, or they are scissors and kinematics is not rest;
+                the tool then keeps what it had.
         """
         links = ToolLinks(capsules) if capsules else None
+        if links is not None and links.scissors:
+            self._require_cuttable()
         if links is not None and len(links) > MAX_CAPSULES:
             raise ValueError(f"the instrument of tool {tool!r} has {len(links)} capsules; there can be {MAX_CAPSULES}")
         if tool in self._placed:
             self._lose_links(tool)
         self._links.pop(tool, None)
+        self._scissors.pop(tool, None)
         if links is not None:
             self._links[tool] = links
 
@@ -174,7 +179,8 @@ class TissueSimulation:
             tool: Name of the tool.
             pose: Tip-to-world transform [4, 4], metres; held tissue, and the capsule of contact, reach it at the end
                 of the next step.
-            closed: Whether the jaw is closed. A bare tip then holds what is near it, an instrument what lies between its jaws.
+            closed: Whether the jaw is closed. A bare tip then holds what is near it, an instrument what lies between its jaws. Scissors
+                cut that while they close.
             links: Link-to-world transforms [4, 4], metres, of a tool with an instrument by the names of its links (`link_poses`), at
                 the end of the next step; None = nobody knows, and the tool is a bare tip meanwhile.
 
@@ -198,8 +204,15 @@ class TissueSimulation:
         if placed is not None:
             before, self._placed[tool] = self._placed.get(tool, placed), placed
             moved = moved or before is placed or not torch.equal(before, placed)
-            tools.set_links(slot, self._links[tool], placed[None])
+            own = self._links[tool]
+            # Open blades slip past tissue, closed ones are blunt; the edge of a tool that cuts would keep off what it is to cut.
+            sharp = own.scissors and not closed or tool in self._blades
+            tools.set_links(slot, own, placed[None], ~own.sharp if sharp else None)
             touches = moved and (self.disturbed or self._reaches(tool, before, placed))
+            if own.scissors:
+                jaws = own.place(placed).jaws.numpy()
+                self._cut(self._scissors.setdefault(tool, Scissors(self.nodes.spacing)).move, jaws, closed)
+                closed = False  # blades hold nothing
         elif tool in self._placed:
             self._lose_links(tool)
         tools.closed[0, slot] = int(closed)
@@ -231,8 +244,9 @@ class TissueSimulation:
     def set_cut(self, tool: str, pose: np.ndarray, cutting: bool) -> None:
         """Move the cutting edge of a tool; what it sweeps between two calls while cutting is cut.
 
-        The edge is ``blade_length`` long, from the tip backwards against the tool's z axis. Nodes on both sides of the
-        cut then share no momentum; ``cuts`` tells the skinning what not to bridge.
+        The edge is ``blade_length`` long, from the tip backwards against the tool's z axis. That of an instrument is its wire, or the
+        line between its jaws, where `set_grasp` has put its links. Nodes on both sides of the cut then share no momentum; ``cuts``
+        tells the skinning what not to bridge.
 
         Args:
             tool: Name of the tool.
@@ -246,11 +260,19 @@ class TissueSimulation:
         if not cutting:
             self._blades.pop(tool, None)
             return
-        stencils = self._prepared_stencils()
-        self._blades.setdefault(tool, Blade(self.config.blade_length, self.nodes.spacing))
-        state = self.state()
-        triangles = self._blades[tool].move(pose, state.rest, state.positions, state.F, self.cuts)
-        if stencils.cut(triangles):
+        self._require_cuttable()
+        own = self._links[tool] if tool in self._placed else None
+        if own is None or not own.sharp.any():
+            self._cut(self._blades.setdefault(tool, Blade(self.config.blade_length, self.nodes.spacing)).move, pose)
+        else:
+            corners = own.place(self._placed[tool]).edge(own.wire)
+            length = float(np.linalg.norm(np.diff(corners, axis=0), axis=1).sum())
+            self._cut(self._blades.setdefault(tool, Blade(length, self.nodes.spacing)).draw, corners)
+
+    def _cut(self, move: Callable[..., np.ndarray], *to: object) -> None:
+        """Cut what an edge sweeps on its way to where it now is, both as `Blade` and `Scissors` take them."""
+        stencils, state = self._prepared_stencils(), self.state()
+        if stencils.cut(move(*to, state.rest, state.positions, state.F, self.cuts)):
             with capturing:
                 self.solver.set_cut(stencils.table())
             self.disturbed = True
@@ -268,9 +290,12 @@ class TissueSimulation:
         """
         self._prepared_stencils()
 
-    def _prepared_stencils(self) -> CutStencils:
+    def _require_cuttable(self) -> None:
         if self.config.kinematics != "rest":
             raise ValueError(f"tissue with kinematics {self.config.kinematics} cannot be cut; set kinematics to rest")
+
+    def _prepared_stencils(self) -> CutStencils:
+        self._require_cuttable()
         if self._stencils is None:
             self._stencils = CutStencils(self.nodes.rest, self.solver.rest_cells, self.solver.grid_shape)
             with capturing:
@@ -343,6 +368,7 @@ class TissueSimulation:
         self._slots.clear()
         self._placed.clear()
         self._blades.clear()
+        self._scissors.clear()
         if self._stencils is not None:
             self._stencils.reset()
             with capturing:
@@ -364,7 +390,7 @@ class TissueSimulation:
             wp.copy(getattr(self.solver.state, name), getattr(other.solver.state, name))
         self._tools.copy(other._tools)
         self._slots, self._blades, self.time = dict(other._slots), dict(other._blades), other.time
-        self._links, self._placed = dict(other._links), dict(other._placed)
+        self._links, self._placed, self._scissors = dict(other._links), dict(other._placed), dict(other._scissors)
         self.last_fault = other.last_fault
         if len(other.cuts):
             if self.solver.grid_shape == other.solver.grid_shape and self.solver.cell_size == other.solver.cell_size:

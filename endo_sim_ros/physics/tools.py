@@ -110,7 +110,7 @@ class Tools:
         """Take hold of, or let go, now what commands say; otherwise the next step begins with it."""
         self._solver.backend.launch(self._take_hold)
 
-    def set_links(self, tool: int, links: ToolLinks, poses: Tensor) -> None:
+    def set_links(self, tool: int, links: ToolLinks, poses: Tensor, touching: Tensor | None = None) -> None:
         """Let a tool be the links of an instrument from now on, which reach these poses at the end of the next step; nothing waits.
 
         Tip and axes of the tool stay what jaws carry tissue with and what reactions are about: write them, and `present`, too.
@@ -119,6 +119,7 @@ class Tools:
             tool: Number of the tool, the same in all environments.
             links: The instrument.
             poses: Link-to-world transforms [B, L, 4, 4], m, float64, in the order of `ToolLinks.links`.
+            touching: Which of its capsules push [K] or [B, K], bool; None = all.
 
         Raises:
             ValueError: If the instrument has more capsules than the tools have room for, or the poses have another shape.
@@ -132,7 +133,7 @@ class Tools:
         placed = links.place(poses.to(self.starts))
         self.starts[:, tool, : len(links)], self.ends[:, tool, : len(links)] = placed.starts, placed.ends
         self.radii[:, tool] = 0
-        self.radii[:, tool, : len(links)] = links.radii.to(self.radii)
+        self.radii[:, tool, : len(links)] = (links.radii if touching is None else links.radii * touching).to(self.radii)
         self.jaws[:, tool] = placed.jaws
         self.linked[:, tool], self.jawed[:, tool] = 1, int(links.has_jaws)
 

@@ -103,9 +103,11 @@ class PhysicsNode(EndoNode):
                 self._simulated_stamp, self.simulation, self.failure = stamp, simulation, ""
                 self._start_timing()
                 if not continued:
-                    for name, arm in self.arms.items():
+                    for arm in self.arms.values():
                         arm.acting = False
-                        if isinstance(arm, JointedArm) and arm.capsules:
+                for name, arm in self.arms.items():
+                    if isinstance(arm, JointedArm) and arm.capsules and not simulation.has_instrument(name):
+                        with self.guard(f"link_contact of {name}"):
                             simulation.set_instrument(name, arm.capsules)
                 if not same_model:
                     self._view = view
@@ -161,7 +163,7 @@ class PhysicsNode(EndoNode):
             if arm.pose is None or not arm.acts:
                 continue
             where = f"at {np.round(arm.pose[:3, 3], 4).tolist()}"
-            links = arm.links() if isinstance(arm, JointedArm) and arm.capsules else {}
+            links = arm.links() if isinstance(arm, JointedArm) and simulation.has_instrument(name) else {}
             if not simulation.set_grasp(name, arm.pose, arm.closed, links or None):
                 reach = self._out_of_reach(simulation) if not links else "no movable tissue lies between the jaws"
                 self.report_error(f"{name}: the jaw closed on nothing {where}; {reach}")

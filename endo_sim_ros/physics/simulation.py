@@ -172,6 +172,10 @@ class TissueSimulation:
         if links is not None:
             self._links[tool] = links
 
+    def has_instrument(self, tool: str) -> bool:
+        """Whether a tool has links, see `set_instrument`."""
+        return tool in self._links
+
     def set_grasp(self, tool: str, pose: np.ndarray, closed: bool, links: Mapping[str, ArrayLike] | None = None) -> bool:
         """Move a tool, and close or open its jaw.
 
@@ -378,7 +382,8 @@ class TissueSimulation:
         self.time, self.last_fault = 0.0, ""
 
     def continue_from(self, other: "TissueSimulation") -> bool:
-        """Take over shape, motion, cuts and tools of other tissue; returns whether that can be: if it has the same nodes.
+        """Take over shape, motion, cuts and tools of other tissue; returns whether that can be: if it has the same nodes. Scissors are
+        left behind where nothing can be cut.
 
         For tissue whose material changes while it is being touched.
         """
@@ -391,6 +396,8 @@ class TissueSimulation:
         self._tools.copy(other._tools)
         self._slots, self._blades, self.time = dict(other._slots), dict(other._blades), other.time
         self._links, self._placed, self._scissors = dict(other._links), dict(other._placed), dict(other._scissors)
+        for tool in [tool for tool, links in self._links.items() if links.scissors and self.config.kinematics != "rest"]:
+            self.set_instrument(tool, ())
         self.last_fault = other.last_fault
         if len(other.cuts):
             if self.solver.grid_shape == other.solver.grid_shape and self.solver.cell_size == other.solver.cell_size:

@@ -26,7 +26,7 @@ JAWS = 0.0102  # m, of the large needle driver
 def running():
     values = {
         **SMALL["physics_node"],
-        "arms": "[PSM1]",
+        "instruments": "[LARGE_NEEDLE_DRIVER, CURVED_SCISSORS]",
         "node_count": 3000,
         "arm_source": "commanded",
         "link_contact": "true",
@@ -35,7 +35,7 @@ def running():
     values |= {"lockstep_inputs": "[pose, jaw]", "grip_force": 4.0}
     rclpy.init(args=["--ros-args", *(word for name, value in values.items() for word in ("-p", f"physics_node:{name}:={value}"))])
     bench = Bench()
-    for topic in (messages.CONTROL_NODES, REACTION, JOINTS):
+    for topic in (messages.CONTROL_NODES, messages.CUT_SURFACE, REACTION, JOINTS):
         bench.hear(topic)
     bench.add(PhysicsNode)
     send_model(bench)
@@ -45,16 +45,21 @@ def running():
     rclpy.try_shutdown()
 
 
-def play(bench, ways):
-    """Depths of the hinge, m, and angles of the jaw, rad, one each step; returns reactions [n, 6], efforts [n, 6] and the last state."""
+def play(bench, ways, scissors=()):
+    """Depths of the hinge, m, and angles of the jaw, rad, one each step; returns reactions [n, 6], efforts [n, 6] and the last state.
+
+    The scissors of the other arm do the same 2 cm aside, or wait in the air.
+    """
     assert bench.call(Trigger, "/physics_node/reset").success
     for heard in bench.heard.values():
         heard.clear()
-    for step, (depth, angle) in enumerate(ways):
-        pose, stamp = np.eye(4), (100 * S + step * STEP)
-        pose[2, 3] = depth
-        bench.publish(messages.tool_pose_command("PSM1"), messages.encode_pose(pose, stamp, "world"))
-        bench.publish(messages.tool_jaw("PSM1"), messages.encode_jaw(angle, stamp))
+    for step, way in enumerate(ways):
+        other = scissors[min(step, len(scissors) - 1)] if len(scissors) else (0.06, 1.0)
+        for arm, x, (depth, angle) in (("PSM1", 0.0, way), ("PSM2", -0.02, other)):
+            pose, stamp = np.eye(4), (100 * S + step * STEP)
+            pose[0, 3], pose[2, 3] = x, depth
+            bench.publish(messages.tool_pose_command(arm), messages.encode_pose(pose, stamp, "world"))
+            bench.publish(messages.tool_jaw(arm), messages.encode_jaw(angle, stamp))
     bench.until(lambda: len(bench.heard[JOINTS.name]) >= len(ways), "all steps")
     felt = [np.concatenate(messages.decode_wrench(message, "")) for message in bench.heard[REACTION.name][-len(ways) :]]
     efforts = [list(message.effort) for message in bench.heard[JOINTS.name][-len(ways) :]]
@@ -91,6 +96,20 @@ def test_closed_jaws_pull_until_the_tissue_slips_and_the_same_episode_gives_the_
 def test_jaws_that_close_on_nothing_say_so(running):
     play(running, [(0.06, 0.5), (0.06, 0.0)])
     running.refused("physics_node", "PSM1: the jaw closed on nothing", "no movable tissue lies between the jaws")
+
+
+def test_scissors_cut_when_their_jaw_closes_and_not_tissue_that_cannot_be_cut(running):
+    waiting = [(0.06, 0.5)] * 6
+    play(running, waiting, [*[(0.09, 0.9)] * 3, (0.09, 0.5), (0.09, 0.0)])
+    running.until(lambda: running.heard["cut_surface"] and running.heard["cut_surface"][-1].width > 0, "a cut")
+    triangles = messages.decode_cut_surface(running.heard["cut_surface"][-1])
+    assert np.abs(triangles[..., 0] + 0.02).max() < 0.01
+    assert running.call(Trigger, "/physics_node/reset").success
+    assert running.set("physics_node", kinematics="current")[0]
+    running.refused("physics_node", "link_contact of PSM2: tissue with kinematics current cannot be cut")
+    play(running, waiting, [(0.09, 0.9), (0.09, 0.0)])  # the scissors are a bare tip
+    assert running.set("physics_node", kinematics="rest")[0]
+    running.until(lambda: running.nodes[1].simulation.has_instrument("PSM2"), "scissors again")
 
 
 def test_an_instrument_whose_shape_nobody_knows_cannot_touch(tmp_path):

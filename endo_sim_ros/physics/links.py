@@ -64,23 +64,31 @@ class ToolLinks:
         """Capsules [K] that do not push while they cut: they would keep off what they are to cut."""
         self._of = torch.tensor([self.links.index(each.link) for each in capsules])  # link of each capsule [K]
         self._points = torch.from_numpy(points)  # [K, 2, 3]
-        self._on: dict[torch.device, tuple[Tensor, Tensor]] = {}  # these two by device
-        self._bases, self._tips = ([each[i] for each in jaws] for i in (0, -1)) if self.has_jaws else ([], [])
+        self._on: dict[torch.device, tuple[Tensor, Tensor, Tensor]] = {}  # these two and the radii by device
+        self._jaws = [(each[0], each[-1]) for each in jaws if each]  # first and last capsule of each
 
     def __len__(self) -> int:
         """Number of capsules K."""
         return len(self.radii)
 
+    def _at(self, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+        if device not in self._on:
+            self._on[device] = self._of.to(device), self._points.to(device), self.radii.to(device)
+        return self._on[device]
+
+    def radii_on(self, device: torch.device) -> Tensor:
+        """Radii of the capsules [K], m, on a device, copied there once."""
+        return self._at(device)[2]
+
     def place(self, poses: Tensor) -> PlacedLinks:
         """Where capsules and jaws are when the links are at poses [..., L, 4, 4], float64, on any device."""
-        if poses.device not in self._on:
-            self._on[poses.device] = self._of.to(poses.device), self._points.to(poses.device)
-        of, points = self._on[poses.device]
+        of, points, _ = self._at(poses.device)
         own = poses[..., of, :, :]
         ends = (own[..., None, :3, :3] @ points[..., None])[..., 0] + own[..., None, :3, 3]  # [..., K, 2, 3]
         if self.has_jaws:
-            hinge = ends[..., self._bases, 0, :].mean(-2, keepdim=True)
-            jaws = torch.cat([hinge, ends[..., self._tips, 1, :]], -2)
+            (left, left_tip), (right, right_tip) = self._jaws
+            hinge = 0.5 * (ends[..., left, 0, :] + ends[..., right, 0, :])
+            jaws = torch.stack([hinge, ends[..., left_tip, 1, :], ends[..., right_tip, 1, :]], -2)
         else:
             jaws = poses.new_zeros(*poses.shape[:-3], 3, 3)
         return PlacedLinks(ends[..., 0, :], ends[..., 1, :], jaws)

@@ -133,7 +133,8 @@ class Tools:
         placed = links.place(poses.to(self.starts))
         self.starts[:, tool, : len(links)], self.ends[:, tool, : len(links)] = placed.starts, placed.ends
         self.radii[:, tool] = 0
-        self.radii[:, tool, : len(links)] = (links.radii if touching is None else links.radii * touching).to(self.radii)
+        radii = links.radii_on(self.radii.device)
+        self.radii[:, tool, : len(links)] = radii.float() if touching is None else (radii * touching.to(radii.device)).float()
         self.jaws[:, tool] = placed.jaws
         self.linked[:, tool], self.jawed[:, tool] = 1, int(links.has_jaws)
 

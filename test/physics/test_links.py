@@ -56,11 +56,12 @@ def test_what_links_feel_together_is_the_momentum_that_the_tissue_gets(closed):
 
 
 @pytest.mark.slow
-def test_the_plain_kernels_agree_with_the_vectorised_ones_on_instruments():
+@pytest.mark.parametrize("kinematics", ["rest", "current"])
+def test_the_plain_kernels_agree_with_the_vectorised_ones_on_instruments(kinematics):
     ends = []
     for backend in (contextlib.nullcontext, compare_plain):
         with backend():
-            simulation = simulate(node_count=800, grip_force=1.0)
+            simulation = simulate(node_count=800, grip_force=1.0, kinematics=kinematics)
         instrument, felt = Instrument("PROGRASP_FORCEPS"), []
         for tool in ("PSM1", "PSM2"):
             simulation.set_instrument(tool, instrument.capsules)
@@ -140,6 +141,21 @@ def test_links_in_the_air_leave_tissue_at_rest_and_one_that_appears_in_it_pushes
 
 def _with(closed, at):
     return at[0], closed, at[1]
+
+
+def test_an_instrument_whose_links_nobody_knows_is_a_bare_tip_bit_for_bit():
+    ends = []
+    for instrument in (None, Instrument()):
+        simulation = simulate(contact_radius=0.006)
+        if instrument is not None:
+            simulation.set_instrument("PSM1", instrument.capsules)
+        for step in range(6):
+            simulation.set_grasp("PSM1", pose_at(TIP + [0, 0, -0.006 + 0.0005 * step]), False)
+            simulation.set_grasp("PSM2", pose_at(TIP + [0.03, 0, -0.001 * step]), True)
+            simulation.step()
+        ends.append((simulation.state().positions, *simulation.reaction("PSM1"), *simulation.reaction("PSM2")))
+    for one, other in zip(*ends):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_links_that_cannot_be_used_are_one_sentence_and_leave_the_tool_as_it_was():

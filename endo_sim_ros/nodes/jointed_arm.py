@@ -1,6 +1,6 @@
 """An arm with joints: where its links are when its tip is at a pose, and how its joints get to where they are told."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,6 +14,7 @@ _ROUNDED = 1 + 1e-9  # a way that takes a whole number of steps must not take on
 _WITHIN = 1e-6  # rad, m: how far a command may leave the limits, as what is sent back was rounded
 _LEAP = 10.0  # times the speed of a joint: the straight way passes a singularity or goes on with another bend of the wrist
 _TRIES = 4  # to find how far the tip gets in a step; one or two are enough where joints follow in proportion
+_JOINTS_OF_LINK = {"roll": 4, "wrist_pitch": 5}  # joints that move it: the first ones; all others move with all joints
 _CAMERA_REACH = ReachConfig(radian_length=1e-4)  # the direction of an endoscope follows from its place
 _CAMERA_THERE = 1e-4  # m: nearer is at the pose
 
@@ -36,6 +37,7 @@ class JointedArm(Arm):
     tool_type: str = ""
     commanded: bool = True
     capsules: Sequence[Capsule] = ()
+    link_reactions: Mapping[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)  # force N and torque about the tip N·m
     joint_speed: float = np.inf
     slide_speed: float = np.inf
     base: np.ndarray | None = None  # [4, 4], world
@@ -210,14 +212,18 @@ class JointedArm(Arm):
             torque: Torque [3] about the tip, N·m, world.
 
         Returns:
-            Efforts of the joints [n], N·m and N: Jᵀ times the wrench. Velocity [3], m/s, and angular velocity [3], rad/s, of the
-            tip in the last step, world.
+            Efforts of the joints [n], N·m and N: Jᵀ times the wrench, where a joint bears nothing of what the links before it feel
+            (`link_reactions`). Velocity [3], m/s, and angular velocity [3], rad/s, of the tip in the last step, world.
         """
         assert self.base is not None and self.joints is not None
         R = self.base[:3, :3]
         J = self.kinematics.jacobian(self.joints)
         twist = J @ (np.zeros(len(self.joints)) if self.velocities is None else self.velocities)
-        return J.T @ np.concatenate([R.T @ force, R.T @ torque]), R @ twist[:3], R @ twist[3:]
+        efforts = J.T @ np.concatenate([R.T @ force, R.T @ torque])
+        for link, (part, turning) in self.link_reactions.items():
+            beyond = _JOINTS_OF_LINK.get(link, len(self.joints))
+            efforts[beyond:] -= J.T[beyond:] @ np.concatenate([R.T @ part, R.T @ turning])
+        return efforts, R @ twist[:3], R @ twist[3:]
 
     def reset(self) -> None:
         """Let go of everything; a commanded arm is back at its start."""

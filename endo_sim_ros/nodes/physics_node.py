@@ -285,6 +285,8 @@ class PhysicsNode(EndoNode):
             if arm.pose is None:
                 continue
             reaction, torque = simulation.reaction(name)
+            if isinstance(arm, JointedArm):
+                arm.link_reactions = simulation.link_reactions(name)
             self._arm_topics.publish(arm, arm.pose, reaction, torque, stamp)
             force = arm.force if arm.acting and arm.force is not None else np.zeros(3)
             shown.append(messages.ToolDisplay(name, arm.pose[:3, 3], force, reaction, simulation.held(name)))

@@ -63,6 +63,60 @@ def move_links(
 
 
 @wp.func
+def nearest_link(c: int, x: wp.vec3d, commands: Commands, constants: ToolConstants) -> int:
+    """Number of the link of tool c whose surface is nearest to a point, or which the point is deepest in; -1 = none touches."""
+    link = int(-1)
+    nearest = wp.float64(1.0e30)
+    for k in range(constants.capsules):
+        i = c * constants.capsules + k
+        if commands.radius[i] > 0.0:
+            along = commands.end[i] - commands.start[i]
+            arm = x - commands.start[i]
+            share = wp.dot(arm, along) / wp.max(wp.length_sq(along), wp.float64(1.0e-12))
+            share = wp.clamp(share, wp.float64(0.0), wp.float64(1.0))
+            gap = wp.length(arm - share * along) - wp.float64(wp.max(commands.radius[i], constants.thinnest))
+            if gap < nearest:
+                nearest = gap
+                link = commands.link[i]
+    return link
+
+
+@wp.func
+def measure_links(
+    b: int, c: int, thread: int, threads: int, felt: bool, kept: bool, commands: Commands, holds: Holds, constants: ToolConstants,
+    nodes: Nodes, state: State, rigid: RigidTools,
+):  # fmt: skip
+    """What each link of tool c feels: minus the mean of what the tool gave to the nodes that the link is nearest to.
+
+    Args:
+        b: The environment.
+        c: Number of the tool in all environments.
+        thread: This one.
+        threads: How many there are.
+        felt: Whether it gave anything.
+        kept: Whether what was felt before counts.
+        commands, holds, constants, nodes, state, rigid: As the kernels have them.
+    """
+    count = nodes.X.shape[0]
+    for link in range(commands.links[c]):
+        force, moment = wp.vec3d(), wp.vec3d()
+        if felt and commands.linked[c] != 0:
+            for p in range(thread, count, threads):
+                given = rigid.impulse[c * count + p]
+                if wp.length_sq(given) > 0.0:
+                    x = constants.origin + double(nodes.X[p]) + double(state.u[b * count + p])
+                    if nearest_link(c, x, commands, constants) == link:
+                        force += double(given) / constants.duration
+                        moment += double(rigid.moment[c * count + p]) / constants.duration
+            force = wp.vec3d(block_sum(force[0]), block_sum(force[1]), block_sum(force[2]))
+            moment = wp.vec3d(block_sum(moment[0]), block_sum(moment[1]), block_sum(moment[2]))
+        if thread == 0 and not kept:
+            i = c * constants.capsules + link
+            holds.link_force[i] = -force
+            holds.link_torque[i] = wp.cross(commands.tip[c] - constants.origin, force) - moment
+
+
+@wp.func
 def lies_between(c: int, x: wp.vec3d, opening: wp.float64, commands: Commands, constants: ToolConstants) -> int:
     """Whether a point lies between the jaws of tool c where they are to be: 1 or 0.
 

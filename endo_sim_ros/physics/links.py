@@ -76,9 +76,10 @@ class ToolLinks:
             self._on[device] = self._of.to(device), self._points.to(device), self.radii.to(device)
         return self._on[device]
 
-    def radii_on(self, device: torch.device) -> Tensor:
-        """Radii of the capsules [K], m, on a device, copied there once."""
-        return self._at(device)[2]
+    def on(self, device: torch.device) -> tuple[Tensor, Tensor]:
+        """Radius, m, and number of the link of each capsule [K], on a device, copied there once."""
+        of, _, radii = self._at(device)
+        return radii, of
 
     def place(self, poses: Tensor) -> PlacedLinks:
         """Where capsules and jaws are when the links are at poses [..., L, 4, 4], float64, on any device."""

@@ -321,6 +321,18 @@ class TissueSimulation:
         slot, tools = self._slots[tool], self._tools
         return tools.reaction_forces[0, slot].cpu().numpy().copy(), tools.reaction_torques[0, slot].cpu().numpy().copy()
 
+    def link_reactions(self, tool: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """The parts of `reaction` that the links of an instrument feel, by name: force [3] N, torque [3] N·m about the tip, world.
+
+        They add up to what jaw and contact give. A control node counts for the link that it is nearest to at the end of the step.
+        Empty where nobody knows the links.
+        """
+        if tool not in self._placed:
+            return {}
+        slot, tools = self._slots[tool], self._tools
+        forces, torques = tools.link_forces[0, slot].cpu().numpy(), tools.link_torques[0, slot].cpu().numpy()
+        return {link: (forces[i].copy(), torques[i].copy()) for i, link in enumerate(self._links[tool].links)}
+
     def held(self, tool: str) -> np.ndarray:
         """Positions now of the nodes that a tool holds on to [K, 3], m, world; none when it is in the air."""
         nodes = self.held_nodes(tool)

@@ -9,7 +9,7 @@ wp.set_module_options({"enable_backward": False, **OPTIONS})
 
 @wp.struct
 class Commands:
-    """What tools are told to do, all [B · T] but for the last five, world."""
+    """What tools are told to do, all [B · T] but for the last six, world."""
 
     force: wp.array[wp.vec3d]  # N
     torque: wp.array[wp.vec3d]  # about the point held, N·m
@@ -19,10 +19,12 @@ class Commands:
     present: wp.array[int]  # whether tip and R mean anything
     closed: wp.array[int]  # whether the jaw is to be closed
     linked: wp.array[int]  # whether its links are the capsules below, rather than the one of all tools
+    links: wp.array[int]  # how many links these are of
     jawed: wp.array[int]  # whether it holds what lies between two jaws, rather than what is near its tip
     start: wp.array[wp.vec3d]  # [B · T · K] of each capsule, one end at the end of the step, m
     end: wp.array[wp.vec3d]  # the other
     radius: wp.array[float]  # m, 0 = none
+    link: wp.array[int]  # number of the link that it is of
     jaws: wp.array[wp.vec3d]  # [B · T · 3] their hinge, and the tips of the two, m
 
 
@@ -40,6 +42,8 @@ class Holds:
     last_end: wp.array[wp.vec3d]
     last_opening: wp.array[wp.float64]  # between the tips of the jaws, m
     joined: wp.array[int]  # whether these three mean anything
+    link_force: wp.array[wp.vec3d]  # [B · T · K] out, N: the part of the reaction of jaw and contact that each link feels
+    link_torque: wp.array[wp.vec3d]  # [B · T · K] about the tip, N·m
     opening: wp.array[wp.float64]  # of the jaws when they closed, m
     slipping: wp.array[int]  # whether jaws hold by friction, which has a limit
     applied_force: wp.array[wp.vec3d]  # what arrived of the wrench, N and N·m

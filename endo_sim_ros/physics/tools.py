@@ -54,12 +54,13 @@ class Tools:
         commands.R, commands.present, commands.closed = zeros(wp.mat33d), zeros(int), zeros(int)
         commands.linked, commands.jawed, commands.jaws = zeros(int), zeros(int), zeros(wp.vec3d, 3 * tools)
         commands.start, commands.end = zeros(wp.vec3d, slots * tools), zeros(wp.vec3d, slots * tools)
-        commands.radius = zeros(float, slots * tools)
+        commands.radius, commands.link, commands.links = zeros(float, slots * tools), zeros(int, slots * tools), zeros(int)
         holds.contact, holds.applied_force, holds.applied_torque = (zeros(wp.vec3d) for _ in range(3))
         holds.reaction_force, holds.reaction_torque = zeros(wp.vec3d), zeros(wp.vec3d)
         holds.attached, holds.gripping, holds.slips = (zeros(int) for _ in range(3))
         holds.last_tip, holds.last_R, holds.placed = zeros(wp.vec3d), zeros(wp.mat33d), zeros(int)
         holds.last_start, holds.last_end = zeros(wp.vec3d, slots * tools), zeros(wp.vec3d, slots * tools)
+        holds.link_force, holds.link_torque = zeros(wp.vec3d, slots * tools), zeros(wp.vec3d, slots * tools)
         holds.last_opening, holds.opening = zeros(wp.float64), zeros(wp.float64)
         holds.joined, holds.slipping = zeros(int), zeros(int)
         holds.weight, holds.held = zeros(float, entries), zeros(int, entries)
@@ -80,6 +81,10 @@ class Tools:
         self._placed, self._joined = view(holds.placed), view(holds.joined)
         # What the tissue exerts back [B, T, 3], N and N·m (of a wrench about the point held, else about the tip).
         self.reaction_forces, self.reaction_torques = view(holds.reaction_force, 3), view(holds.reaction_torque, 3)
+        # The part of the reaction of jaw and contact that each link feels, in the order of `ToolLinks.links` [B, T, K, 3], torques about
+        # the tip.
+        self.link_forces, self.link_torques = view(holds.link_force, slots, 3), view(holds.link_torque, slots, 3)
+        self._link, self._links = view(commands.link, slots), view(commands.links)
         self.weights, self.held = (view(each, len(self.touchable)) for each in (holds.weight, holds.held))
         constants.touchable = wp.array(self.touchable.astype(np.int32), dtype=int, device=solver.device)
         constants.origin = wp.vec3d(*solver.origin)
@@ -133,7 +138,8 @@ class Tools:
         placed = links.place(poses.to(self.starts))
         self.starts[:, tool, : len(links)], self.ends[:, tool, : len(links)] = placed.starts, placed.ends
         self.radii[:, tool] = 0
-        radii = links.radii_on(self.radii.device)
+        radii, self._link[:, tool, : len(links)] = links.on(self.radii.device)
+        self._links[:, tool] = len(links.links)
         self.radii[:, tool, : len(links)] = radii.float() if touching is None else (radii * touching.to(radii.device)).float()
         self.jaws[:, tool] = placed.jaws
         self.linked[:, tool], self.jawed[:, tool] = 1, int(links.has_jaws)
@@ -146,7 +152,7 @@ class Tools:
 
     def reset(self, environments: torch.Tensor | slice = slice(None)) -> None:
         """No command, nothing held, nothing counted in these environments."""
-        for tensor in (self.forces, self.torques, self.reaction_forces, self.reaction_torques):
+        for tensor in (self.forces, self.torques, self.reaction_forces, self.reaction_torques, self.link_forces, self.link_torques):
             tensor[environments] = 0
         for tensor in (self.present, self.closed, self.attached, self.gripping, self.slips, self._placed, self.faults):
             tensor[environments] = 0

@@ -9,7 +9,7 @@ import warp as wp
 
 from endo_sim_ros.physics.backends.end_kernels import OPTIONS, block_sum
 from endo_sim_ros.physics.backends.structs import Loads, Nodes, RigidTools, State
-from endo_sim_ros.physics.link_kernels import lies_between, links_are_finite, move_links, slide_in_jaws
+from endo_sim_ros.physics.link_kernels import lies_between, links_are_finite, measure_links, move_links, slide_in_jaws
 from endo_sim_ros.physics.tool_state_kernels import Commands, Holds, ToolConstants, block_sum3, double, single
 
 wp.set_module_options({"enable_backward": False, **OPTIONS})
@@ -318,16 +318,18 @@ def measure_reactions(
                     force += double(given) / constants.duration
                     moment += double(rigid.moment[c * count + p]) / constants.duration
             force, moment = block_sum3(force), block_sum3(moment)
+        undone = bad_nodes[b] > 0  # and all that tools did in it
+        # A tool that still holds tissue feels what it felt last: tissue at its limit does not vanish.
+        kept = undone and (holds.attached[c] != 0 or holds.gripping[c] != 0) and is_finite(c, commands, constants)
+        felt = wp.length_sq(force) > wp.float64(0.0) and not undone
+        measure_links(b, c, thread, threads, felt, kept, commands, holds, constants, nodes, state, rigid)
         if thread == 0:
             torque = moment - wp.cross(commands.tip[c] - constants.origin, force)
             force += holds.applied_force[c]
             torque += holds.applied_torque[c]
-            undone = bad_nodes[b] > 0  # and all that tools did in it
             if undone:
                 force, torque = wp.vec3d(), wp.vec3d()
-            # A tool that still holds tissue feels what it felt last: tissue at its limit does not vanish.
-            holding = (holds.attached[c] != 0 or holds.gripping[c] != 0) and is_finite(c, commands, constants)
-            if not (undone and holding):
+            if not kept:
                 holds.reaction_force[c] = -force
                 holds.reaction_torque[c] = -torque
     if thread == 0 and bad_nodes[b] > 0:

@@ -100,6 +100,10 @@ def test_a_shaft_pushes_along_its_length():
     assert np.ptp(along) > 0.03 and moved.max() > 1e-3 and simulation.faults == 0
     lever = torque[1] / force[2]  # about the tip, 7 cm from the middle of the tissue
     assert force[2] < -0.3 and 0.04 < lever < 0.09
+    felt = simulation.link_reactions("PSM1")
+    np.testing.assert_allclose(felt["roll"][0], force, atol=1e-9)
+    np.testing.assert_allclose(felt["roll"][1], torque, atol=1e-9)
+    assert not any(part.any() for link, parts in felt.items() if link != "roll" for part in parts)
 
 
 def test_symmetric_jaws_close_symmetrically_and_do_not_squeeze_out_what_lies_between():
@@ -114,6 +118,10 @@ def test_symmetric_jaws_close_symmetrically_and_do_not_squeeze_out_what_lies_bet
         simulation.set_grasp("PSM1", pose, False, opened(pose, angle))
         simulation.step()
         felt.append(simulation.reaction("PSM1")[0])
+        parts = simulation.link_reactions("PSM1")
+        np.testing.assert_allclose(sum(force for force, _ in parts.values()), felt[-1], atol=1e-9)
+        np.testing.assert_allclose(sum(torque for _, torque in parts.values()), simulation.reaction("PSM1")[1], atol=1e-9)
+        assert np.abs(parts["jaw_left"][0] * [1, -1, 1] - parts["jaw_right"][0]).max() < 0.1 * np.abs(felt).max()
     moved = (simulation.state().positions - nodes.rest).reshape(13, 16, 5, 3)
     largest = np.abs(moved).max()
     np.testing.assert_allclose(moved[:, ::-1] * [1, -1, 1], moved, atol=0.02 * largest)
@@ -136,7 +144,7 @@ def test_links_in_the_air_leave_tissue_at_rest_and_one_that_appears_in_it_pushes
     assert not simulation.resting and simulation.reaction("PSM1")[0][2] < -0.05
     simulation.set_grasp("PSM1", pose_at(TIP), False)  # nobody knows where the links are: a bare tip
     steps(simulation, 2)
-    assert not simulation.reaction("PSM1")[0].any()
+    assert not simulation.reaction("PSM1")[0].any() and not simulation.link_reactions("PSM1")
 
 
 def _with(closed, at):
@@ -209,6 +217,9 @@ def test_a_batch_takes_the_links_of_all_its_copies_at_once():
             single.step()
     for b, single in enumerate(singles):
         np.testing.assert_array_equal(batch.displacements[b].numpy(), single.solver.displacements())
+        for i, (force, torque) in enumerate(single.link_reactions("PSM1").values()):
+            np.testing.assert_array_equal(batch.tools.link_forces[b, 0, i].numpy(), force)
+            np.testing.assert_array_equal(batch.tools.link_torques[b, 0, i].numpy(), torque)
     assert batch.displacements[0].any() and batch.tools.slips[0, 0] and not batch.displacements[2].any()
     assert len({int(each) for each in batch.tools.faults}) == 1
     with pytest.raises(ValueError, match=r"poses of links have shape \[3, 2, 4, 4\], expected \[3, 4, 4, 4\] \(roll, "):

@@ -55,12 +55,16 @@ class Part:
 
 @dataclass(frozen=True)
 class Capsule:
-    """All points nearer than ``radius`` (m) to the line between ``start`` and ``end`` [3] (m, in the frame of the link)."""
+    """All points nearer than ``radius`` (m) to the line between ``start`` and ``end`` [3] (m, in the frame of the link).
+
+    Where ``cuts`` the line is a cutting edge, such as a blade of scissors or the wire of a hook.
+    """
 
     link: str
     start: np.ndarray
     end: np.ndarray
     radius: float
+    cuts: bool = False
 
 
 @dataclass(frozen=True)
@@ -124,9 +128,11 @@ class _Builder:
         vertices, faces = lofted(np.asarray(rings))
         self.parts.append(Part(link, material, (vertices @ axes.T).astype(np.float32), faces))
 
-    def capsule(self, link: str, start: ArrayLike, end: ArrayLike, radius: float, axes: np.ndarray = _DISTAL_Z) -> None:
+    def capsule(
+        self, link: str, start: ArrayLike, end: ArrayLike, radius: float, axes: np.ndarray = _DISTAL_Z, cuts: bool = False
+    ) -> None:  # fmt: skip
         """A capsule between two points in the axes of a shaft, turned into the link's axes."""
-        self.capsules.append(Capsule(link, axes @ np.asarray(start), axes @ np.asarray(end), radius))
+        self.capsules.append(Capsule(link, axes @ np.asarray(start), axes @ np.asarray(end), radius, cuts))
 
 
 def build_instrument(arm: ArmKinematics, shape: ToolShape | None = None) -> tuple[list[Part], list[Capsule]]:
@@ -283,7 +289,7 @@ def _jaw(build: _Builder, link: str, shape: JawShape, side: float, radius: float
     bend = lambda s: np.array([side * 0.25 * (shape.base[1] + shape.tip[1]), _bend(shape, s, side), s * shape.length])
     thick = lambda s: 0.5 * min(_mix(shape.base, shape.tip, s))
     for s in (0.0, 0.5):
-        build.capsule(link, bend(s), bend(s + 0.5), thick(s + 0.25), _DISTAL_Y)
+        build.capsule(link, bend(s), bend(s + 0.5), thick(s + 0.25), _DISTAL_Y, shape.blade)
 
 
 def _prongs(slot: float) -> list[tuple[float, float]]:
@@ -332,8 +338,8 @@ def _hook(build: _Builder, shape: ToolShape) -> None:
     path += [np.array([x, 0, length]) for x in np.linspace(turn, bend, 4)[1:]]
     build.loft("wrist_yaw", Material.STEEL, _swept(np.array(path), lambda s: wire * (1.0 if s < 0.9 else 1.0 - 4 * (s - 0.9))), _DISTAL_Y)
     build.capsule("wrist_yaw", (0, 0, 0), (0, 0, 0.5 * length), 0.35 * r, _DISTAL_Y)
-    build.capsule("wrist_yaw", (0, 0, 0.5 * length), (0, 0, length), wire, _DISTAL_Y)
-    build.capsule("wrist_yaw", (0, 0, length), (bend, 0, length), wire, _DISTAL_Y)
+    build.capsule("wrist_yaw", (0, 0, 0.5 * length), (0, 0, length), wire, _DISTAL_Y, cuts=True)
+    build.capsule("wrist_yaw", (0, 0, length), (bend, 0, length), wire, _DISTAL_Y, cuts=True)
 
 
 def _swept(path: np.ndarray, radius: Callable[[float], float]) -> np.ndarray:

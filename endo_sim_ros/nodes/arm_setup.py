@@ -7,7 +7,7 @@ import numpy as np
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.config import ConfigError
-from endo_sim_ros.instruments import load_arm, place_arm
+from endo_sim_ros.instruments import build_instrument, load_arm, place_arm
 from endo_sim_ros.nodes.arm import Arm
 from endo_sim_ros.nodes.configs import PhysicsNodeConfig, arm_names
 from endo_sim_ros.nodes.jointed_arm import CameraArm, JointedArm
@@ -22,7 +22,7 @@ def make_arms(options: PhysicsNodeConfig) -> dict[str, Arm]:
 
     Raises:
         ConfigError: If there are neither one nor as many instruments and models as arms, one cannot be loaded or is no instrument,
-            or the ECM shall be that of a robot.
+            nobody knows the shape of one whose links shall touch, or the ECM shall be that of a robot.
     """
     names = arm_names(options.arms)
     arms: dict[str, Arm] = {}
@@ -45,6 +45,8 @@ def make_arms(options: PhysicsNodeConfig) -> dict[str, Arm]:
         if isinstance(arm, JointedArm) and (len(arm.kinematics.joints) == 4) != (name == CAMERA_ARM):
             wrong = f"{arm.kinematics.name} with {arm.kinematics.tool or 'no tool'}"
             raise ConfigError(f"arms: {name} cannot be {wrong}; {CAMERA_ARM} takes an endoscope, every other arm an instrument")
+        if isinstance(arm, JointedArm) and name != CAMERA_ARM and options.link_contact:
+            arm.capsules = build_instrument(arm.kinematics)[1]
     return arms
 
 

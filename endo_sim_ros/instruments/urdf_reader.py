@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.instruments.arm_files import load_arm
 from endo_sim_ros.instruments.kinematics import ArmKinematics
 from endo_sim_ros.instruments.shapes import LINKS, SHAPES, Capsule, Material, Part, build_instrument, link_poses
 
@@ -35,6 +36,24 @@ class _Joint(NamedTuple):
     child: str
     origin: np.ndarray  # [4, 4] in the frame of the parent
     axis: np.ndarray  # [3] in that of the child
+
+
+def load_shape(tool_type: str) -> tuple[list[Part], list[Capsule]]:
+    """The parts and capsules of an instrument by what the topic ``tool_type`` says.
+
+    Args:
+        tool_type: What loads the tool, and after an @ the path of the URDF that has its shape, if that is not ours.
+
+    Raises:
+        ConfigError: If there is no such tool, nobody knows its shape, or the URDF cannot be used.
+    """
+    tool, _, description = tool_type.partition("@")
+    if not description:
+        return build_instrument(load_arm("PSM", tool))
+    try:
+        return read_urdf(description, load_arm("PSM", tool))
+    except ConfigError:
+        return read_urdf(description, load_arm("PSM_Si", tool))
 
 
 def read_urdf(path: str | Path, arm: ArmKinematics) -> tuple[list[Part], list[Capsule]]:

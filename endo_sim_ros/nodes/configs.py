@@ -100,8 +100,8 @@ class PhysicsNodeConfig(WorldConfig):
     follow servo_cp at once and move_cp at move_speed, and this node publishes measured_cp and jaw/measured_js as an arm does."""
     instruments: tuple[str, ...] = ("LARGE_NEEDLE_DRIVER",)
     """Tool of each arm in the order of arms, or one for all: a name of the dVRK, such as PROGRASP_FORCEPS or PROGRASP_FORCEPS:420093,
-    or the path of a tool file of the dVRK. none = a tip without joints, which reaches every pose. One for all leaves the ECM its
-    straight endoscope."""
+    or the path of a tool file of the dVRK; after an @ the path of a URDF that has its shape. none = a tip without joints, which
+    reaches every pose. One for all leaves the ECM its straight endoscope."""
     arm_models: tuple[str, ...] = ("PSM",)
     """Kind of each arm in the order of arms, or one for all: PSM, PSM_Si, or the path of a kinematic file of the dVRK. PSM for all
     makes the ECM an ECM."""

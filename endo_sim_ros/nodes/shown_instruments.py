@@ -8,9 +8,10 @@ import numpy as np
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.config import ConfigError
-from endo_sim_ros.instruments import LINKS, Capsule, Part, build_instrument, load_arm
+from endo_sim_ros.instruments import LINKS, Capsule, Part
 from endo_sim_ros.instruments.config import DrawingConfig
 from endo_sim_ros.instruments.drawing import FIRST_LINK, InstrumentDrawing, PosedInstruments
+from endo_sim_ros.instruments.urdf_reader import load_shape
 from endo_sim_ros.messages import MessageError
 from endo_sim_ros.nodes.background import Background
 from endo_sim_ros.nodes.pacing import MOST_WAITING
@@ -44,7 +45,7 @@ class ShownInstruments:
         self._types[arm] = name
         self._tools.pop(arm, None)
         try:
-            self._tools[arm] = build_instrument(load_arm("PSM", name))
+            self._tools[arm] = load_shape(name)
         except (ConfigError, OSError) as error:
             raise MessageError(f"{messages.tool_type(arm).name}: {error}; {arm} is not drawn") from error
 

@@ -5,6 +5,7 @@ Every part moves with one link, in whose frame its vertices are: ``roll``, ``wri
 opening angle.
 """
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -14,6 +15,8 @@ from numpy.typing import ArrayLike
 
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.instruments.kinematics import ArmKinematics
+
+log = logging.getLogger(__name__)
 
 LINKS = ("roll", "wrist_pitch", "wrist_yaw", "jaw_left", "jaw_right")
 """Names of the links, in the order in which `link_poses` gives them."""
@@ -140,14 +143,18 @@ def build_instrument(arm: ArmKinematics, shape: ToolShape | None = None) -> tupl
 
     Args:
         arm: An arm with a wrist, such as a PSM.
-        shape: Its dimensions; None = those in `SHAPES` of its tool.
+        shape: Its dimensions; None = those in `SHAPES` of its tool, or of the most usual tool with a jaw or without one, with a warning.
 
     Raises:
-        ConfigError: If nobody knows the shape of the tool, or the arm has no wrist.
+        ConfigError: If the arm has no wrist.
     """
-    shape = shape or SHAPES.get(arm.tool.rstrip("_0123456789"))
-    if shape is None or len(arm.joints) < 6:
-        raise ConfigError(f"{arm.name}: there is no shape of {arm.tool or 'its tool'}; give one, or a tool among {', '.join(SHAPES)}")
+    if len(arm.joints) < 6:
+        raise ConfigError(f"{arm.name} with {arm.tool or 'no tool'} has no wrist; only an arm with an instrument has a shape")
+    kind = arm.tool.rstrip("_0123456789")
+    if shape is None and kind not in SHAPES:
+        kind = "LARGE_NEEDLE_DRIVER" if arm.jaw else "PERMANENT_CAUTERY_HOOK"
+        log.warning("%s: nobody knows the shape of %s; it looks like a %s", arm.name, arm.tool or "its tool", kind)
+    shape = shape or SHAPES[kind]
     build, r, wrist = _Builder(), shape.radius, arm.joints[5].a
     _shaft(build, shape)
     # Two ears hold the pin of the pitch; between them turns the second clevis, which holds that of the yaw.

@@ -45,7 +45,7 @@ def load_shape(tool_type: str) -> tuple[list[Part], list[Capsule]]:
         tool_type: What loads the tool, and after an @ the path of the URDF that has its shape, if that is not ours.
 
     Raises:
-        ConfigError: If there is no such tool, nobody knows its shape, or the URDF cannot be used.
+        ConfigError: If there is no such tool, or the URDF cannot be used.
     """
     tool, _, description = tool_type.partition("@")
     if not description:

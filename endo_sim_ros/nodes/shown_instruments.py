@@ -29,6 +29,8 @@ class ShownInstruments:
         self.arms = tuple(arms)
         self._lockstep = lockstep
         self._types: dict[str, str] = {}
+        self.undrawn: dict[str, str] = {}
+        """Why arms are not drawn, in a sentence each, by their names."""
         self._tools: dict[str, tuple[list[Part], list[Capsule]]] = {}
         self._links: dict[str, deque[tuple[int, np.ndarray]]] = {arm: deque(maxlen=MOST_WAITING if lockstep else 1) for arm in arms}
         self._background = Background()
@@ -39,15 +41,17 @@ class ShownInstruments:
         """Take the tool of an arm.
 
         Raises:
-            MessageError: If it cannot be loaded, or nobody knows its shape; the arm is not drawn then.
+            MessageError: If it cannot be loaded; the arm is not drawn then, and `undrawn` says so.
         """
         name = messages.decode_text(message)
         self._types[arm] = name
         self._tools.pop(arm, None)
+        self.undrawn.pop(arm, None)
         try:
             self._tools[arm] = load_shape(name)
         except (ConfigError, OSError) as error:
-            raise MessageError(f"{messages.tool_type(arm).name}: {error}; {arm} is not drawn") from error
+            self.undrawn[arm] = f"{messages.tool_type(arm).name}: {error}; {arm} is not drawn"
+            raise MessageError(self.undrawn[arm]) from error
 
     def receive_links(self, arm: str, message: Any, world_frame: str) -> bool:
         """Take where the links of an arm are; returns whether they have moved.

@@ -9,8 +9,7 @@ from ros_bench import SMALL, Bench, S, await_nodes, moved, nodes_of, send_model
 from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
-from endo_sim_ros.core.config import ConfigError
-from endo_sim_ros.instruments import arm_files
+from endo_sim_ros.instruments import arm_files, build_instrument, load_arm
 from endo_sim_ros.nodes.arm_setup import make_arms
 from endo_sim_ros.nodes.configs import PhysicsNodeConfig
 from endo_sim_ros.nodes.physics_node import PhysicsNode
@@ -112,8 +111,9 @@ def test_scissors_cut_when_their_jaw_closes_and_not_tissue_that_cannot_be_cut(ru
     running.until(lambda: running.nodes[1].simulation.has_instrument("PSM2"), "scissors again")
 
 
-def test_an_instrument_whose_shape_nobody_knows_cannot_touch(tmp_path):
+def test_an_instrument_whose_shape_nobody_knows_touches_as_a_usual_one(tmp_path, caplog):
     tool = tmp_path / "MY_SPOON_1.json"
     tool.write_text((Path(arm_files.__file__).parent / "parameters" / "LARGE_NEEDLE_DRIVER_400006.json").read_text())
-    with pytest.raises(ConfigError, match="there is no shape of MY_SPOON_1; give one, or a tool among"):
-        make_arms(PhysicsNodeConfig(instruments=(str(tool),), link_contact=True))
+    arm = make_arms(PhysicsNodeConfig(instruments=(str(tool),), link_contact=True))["PSM1"]
+    assert "nobody knows the shape of MY_SPOON_1; it looks like a LARGE_NEEDLE_DRIVER" in caplog.text
+    assert len(arm.capsules) == len(build_instrument(load_arm("PSM", "LARGE_NEEDLE_DRIVER"))[1])

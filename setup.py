@@ -45,11 +45,12 @@ setup(
         "learning": ["gymnasium>=1.1"],  # endo_sim_ros.learning.environments
         "lerobot": ["pyarrow>=15"],  # `endo-sim export`
         "rl": ["gymnasium>=1.1", "stable-baselines3>=2.4"],  # `endo-sim train --algorithm ppo`
+        "urdf": ["trimesh>=4"],  # instruments of your own, `instruments.urdf_reader`
         "viewer": ["viser>=1.1"],  # `endo-sim view`, viewer_node
         "report": ["matplotlib"],  # `endo-sim report`, `endo-sim plot`, plots of `endo-sim evaluate`
         "test": [
             *("gaussforge", "gymnasium", "hypothesis", "matplotlib", "mcap-ros2-support", "plyfile", "pyarrow", "pytest"),
-            *("pdoc", "pyright", "pytest-xdist", "ruff", "torchmetrics", "viser>=1.1"),
+            *("pdoc", "pyright", "pytest-xdist", "ruff", "torchmetrics", "trimesh>=4", "viser>=1.1"),
         ],
     },
     entry_points={"console_scripts": ["endo-sim = endo_sim_ros.cli:main"]},

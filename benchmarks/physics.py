@@ -21,7 +21,18 @@ from endo_sim_ros.core.device import pick_device, single_threaded_torch
 from endo_sim_ros.core.gaussians import GaussianModel, load_ply
 from endo_sim_ros.core.kernels import compare_plain
 from endo_sim_ros.evaluation.measurement import Row, Stage, machine, median_seconds, milliseconds, peak_megabytes, report, run_stages, short
-from endo_sim_ros.physics import ControlNodes, MpmSolver, PhysicsConfig, Skinning, TissueBatch, TissueSimulation, build_control_nodes
+from endo_sim_ros.instruments import build_instrument, link_poses, load_arm
+from endo_sim_ros.physics import (
+    ControlNodes,
+    MpmSolver,
+    PhysicsConfig,
+    Skinning,
+    TissueBatch,
+    TissueSimulation,
+    ToolLinks,
+    build_control_nodes,
+)
+from endo_sim_ros.physics.links import JAW_LINKS
 from endo_sim_ros.physics.tools import Tools
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_camera
@@ -234,6 +245,24 @@ def _pulled(scene: Scene, config: PhysicsConfig, pressed: bool = False) -> MpmSo
     return solver
 
 
+def _pressed_by_instrument(scene: Scene, config: PhysicsConfig) -> MpmSolver:
+    """A solver into whose tissue a needle driver reaches with open jaws by 5 mm."""
+    psm, joints = load_arm("PSM", "LARGE_NEEDLE_DRIVER"), np.array([0.0, 0.0, 0.12, 0.0, 0.0, 0.0])
+    capsules = build_instrument(psm)[1]
+    links, jaws = ToolLinks(capsules), [float(np.linalg.norm(each.end)) for each in capsules if each.link in JAW_LINKS]
+    nodes = build_control_nodes(scene.model, scene.camera.position, config)
+    solver = MpmSolver(nodes, config, capsules=len(links))
+    tools, tip = Tools(solver, nodes, config), psm.tip_pose(joints)
+    hinge = scene.camera.pose.copy()  # z goes into the tissue
+    hinge[:3, 3] = scene.tip + (0.005 - max(jaws)) * hinge[:3, 2]
+    poses = link_poses(psm, joints, 0.5)
+    base = hinge @ np.linalg.inv(tip)
+    tools.set_links(0, links, torch.from_numpy(np.stack([base @ poses[link] for link in links.links]))[None])
+    tools.tips[:], tools.rotations[:] = torch.from_numpy(hinge[:3, 3]), torch.from_numpy(hinge[:3, :3].copy())
+    tools.present[:] = 1
+    return solver
+
+
 def _pull(tools: Tools, scene: Scene, pressed: bool = False) -> None:
     """Command all tools to close and pull, or to press."""
     into = scene.camera.pose[:3, :3] @ np.array([0.0, 0.0, 1.0])
@@ -279,12 +308,17 @@ def _over_substeps(scene: Scene, substeps: int, nodes: int, device: str, seconds
 
 
 def _contact(scene: Scene, nodes: int, device: str, seconds: float) -> list[Row]:
-    """A step of the default method with a tool that presses, and the same without contact."""
+    """A step of the default method with a tool that presses, one capsule or an instrument, and the same without contact."""
     config = PhysicsConfig(node_count=nodes, device=device)
     touching = dataclasses.replace(config, contact_radius=0.005, contact_length=0.03)
     name = f"{short(nodes)} nodes, pressed by a capsule"
     rows = _step_rows(name, scene, touching, device, seconds, pressed=True)
     with_it, without = milliseconds([_pulled(scene, each, pressed=True).step for each in (touching, config)], device, seconds)
+    rows.append(Row(name, with_it, "ms", with_it / without, "no contact"))
+    name = f"{short(nodes)} nodes, pressed by an instrument"
+    pressed = lambda: _pressed_by_instrument(scene, config).step  # noqa: E731
+    rows += _against_plain(name, pressed, device, seconds)
+    with_it, without = milliseconds([pressed(), _pulled(scene, config, pressed=True).step], device, seconds)
     return [*rows, Row(name, with_it, "ms", with_it / without, "no contact")]
 
 

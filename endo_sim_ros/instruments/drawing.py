@@ -204,7 +204,7 @@ class InstrumentDrawing:
             self._launch(drawing_kernels.cover_rows, count * frame.down, drawn, least=4)
             self._launch(resolving_kernels.resolve_tiles, count * frame.across * frame.down, [room["marks"], *scene], least=4)
         else:
-            self._launch(drawing_kernels.cover_faces, count * frame.faces, drawn)
+            self._launch(drawing_kernels.cover_faces, count * frame.faces * -(-height // int(drawing_kernels.ROWS)), drawn)
             self._launch(resolving_kernels.resolve_pixels, count * width * height, scene)
         return labels
 

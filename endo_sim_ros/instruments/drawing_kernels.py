@@ -8,6 +8,7 @@ SAMPLES = wp.constant(4)  # of a pixel, on a rotated grid: as many levels of gre
 EMPTY = wp.constant(wp.int64(0x7FFFFFFFFFFFFFFF))
 BEYOND = wp.constant(1.0e6)  # pixels: float32 cannot tell on which side of an edge a sample lies from so far
 TILE = wp.constant(16)  # pixels a side: what one item takes on a CPU
+ROWS = wp.constant(4)  # of a triangle: what one thread takes on a GPU
 
 
 @wp.struct
@@ -193,7 +194,10 @@ def cover_faces(
     samples: wp.array[wp.int64],
     marks: wp.array[wp.uint8],
 ):
-    """On a GPU: one triangle."""
+    """On a GPU: some rows of one triangle; those of a shaft reach across the picture, and all would wait for the thread that has one."""
     i = first + wp.tid()
-    if rows[i][0] <= rows[i][1]:
-        cover(i, 0, frame.height - 1, 0, screen, rows, frame, samples, marks)
+    slices = (frame.height + ROWS - 1) // ROWS
+    face, low = i // slices, ROWS * (i % slices)
+    reached = rows[face]
+    if reached[0] < low + ROWS and reached[1] >= low and reached[0] <= reached[1]:
+        cover(face, low, low + ROWS - 1, 0, screen, rows, frame, samples, marks)

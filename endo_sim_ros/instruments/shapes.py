@@ -5,6 +5,7 @@ Every part moves with one link, in whose frame its vertices are: ``roll``, ``wri
 opening angle.
 """
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -14,6 +15,8 @@ from numpy.typing import ArrayLike
 
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.instruments.kinematics import ArmKinematics
+
+log = logging.getLogger(__name__)
 
 LINKS = ("roll", "wrist_pitch", "wrist_yaw", "jaw_left", "jaw_right")
 """Names of the links, in the order in which `link_poses` gives them."""
@@ -55,12 +58,16 @@ class Part:
 
 @dataclass(frozen=True)
 class Capsule:
-    """All points nearer than ``radius`` (m) to the line between ``start`` and ``end`` [3] (m, in the frame of the link)."""
+    """All points nearer than ``radius`` (m) to the line between ``start`` and ``end`` [3] (m, in the frame of the link).
+
+    Where ``cuts`` the line is a cutting edge, such as a blade of scissors or the wire of a hook.
+    """
 
     link: str
     start: np.ndarray
     end: np.ndarray
     radius: float
+    cuts: bool = False
 
 
 @dataclass(frozen=True)
@@ -124,9 +131,11 @@ class _Builder:
         vertices, faces = lofted(np.asarray(rings))
         self.parts.append(Part(link, material, (vertices @ axes.T).astype(np.float32), faces))
 
-    def capsule(self, link: str, start: ArrayLike, end: ArrayLike, radius: float, axes: np.ndarray = _DISTAL_Z) -> None:
+    def capsule(
+        self, link: str, start: ArrayLike, end: ArrayLike, radius: float, axes: np.ndarray = _DISTAL_Z, cuts: bool = False
+    ) -> None:  # fmt: skip
         """A capsule between two points in the axes of a shaft, turned into the link's axes."""
-        self.capsules.append(Capsule(link, axes @ np.asarray(start), axes @ np.asarray(end), radius))
+        self.capsules.append(Capsule(link, axes @ np.asarray(start), axes @ np.asarray(end), radius, cuts))
 
 
 def build_instrument(arm: ArmKinematics, shape: ToolShape | None = None) -> tuple[list[Part], list[Capsule]]:
@@ -134,14 +143,18 @@ def build_instrument(arm: ArmKinematics, shape: ToolShape | None = None) -> tupl
 
     Args:
         arm: An arm with a wrist, such as a PSM.
-        shape: Its dimensions; None = those in `SHAPES` of its tool.
+        shape: Its dimensions; None = those in `SHAPES` of its tool, or of the most usual tool with a jaw or without one, with a warning.
 
     Raises:
-        ConfigError: If nobody knows the shape of the tool, or the arm has no wrist.
+        ConfigError: If the arm has no wrist.
     """
-    shape = shape or SHAPES.get(arm.tool.rstrip("_0123456789"))
-    if shape is None or len(arm.joints) < 6:
-        raise ConfigError(f"{arm.name}: there is no shape of {arm.tool or 'its tool'}; give one, or a tool among {', '.join(SHAPES)}")
+    if len(arm.joints) < 6:
+        raise ConfigError(f"{arm.name} with {arm.tool or 'no tool'} has no wrist; only an arm with an instrument has a shape")
+    kind = arm.tool.rstrip("_0123456789")
+    if shape is None and kind not in SHAPES:
+        kind = "LARGE_NEEDLE_DRIVER" if arm.jaw else "PERMANENT_CAUTERY_HOOK"
+        log.warning("%s: nobody knows the shape of %s; it looks like a %s", arm.name, arm.tool or "its tool", kind)
+    shape = shape or SHAPES[kind]
     build, r, wrist = _Builder(), shape.radius, arm.joints[5].a
     _shaft(build, shape)
     # Two ears hold the pin of the pitch; between them turns the second clevis, which holds that of the yaw.
@@ -283,7 +296,7 @@ def _jaw(build: _Builder, link: str, shape: JawShape, side: float, radius: float
     bend = lambda s: np.array([side * 0.25 * (shape.base[1] + shape.tip[1]), _bend(shape, s, side), s * shape.length])
     thick = lambda s: 0.5 * min(_mix(shape.base, shape.tip, s))
     for s in (0.0, 0.5):
-        build.capsule(link, bend(s), bend(s + 0.5), thick(s + 0.25), _DISTAL_Y)
+        build.capsule(link, bend(s), bend(s + 0.5), thick(s + 0.25), _DISTAL_Y, shape.blade)
 
 
 def _prongs(slot: float) -> list[tuple[float, float]]:
@@ -332,8 +345,8 @@ def _hook(build: _Builder, shape: ToolShape) -> None:
     path += [np.array([x, 0, length]) for x in np.linspace(turn, bend, 4)[1:]]
     build.loft("wrist_yaw", Material.STEEL, _swept(np.array(path), lambda s: wire * (1.0 if s < 0.9 else 1.0 - 4 * (s - 0.9))), _DISTAL_Y)
     build.capsule("wrist_yaw", (0, 0, 0), (0, 0, 0.5 * length), 0.35 * r, _DISTAL_Y)
-    build.capsule("wrist_yaw", (0, 0, 0.5 * length), (0, 0, length), wire, _DISTAL_Y)
-    build.capsule("wrist_yaw", (0, 0, length), (bend, 0, length), wire, _DISTAL_Y)
+    build.capsule("wrist_yaw", (0, 0, 0.5 * length), (0, 0, length), wire, _DISTAL_Y, cuts=True)
+    build.capsule("wrist_yaw", (0, 0, length), (bend, 0, length), wire, _DISTAL_Y, cuts=True)
 
 
 def _swept(path: np.ndarray, radius: Callable[[float], float]) -> np.ndarray:

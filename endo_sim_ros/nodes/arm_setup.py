@@ -7,7 +7,8 @@ import numpy as np
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.config import ConfigError
-from endo_sim_ros.instruments import load_arm, place_arm
+from endo_sim_ros.instruments import Capsule, build_instrument, load_arm, place_arm
+from endo_sim_ros.instruments.urdf_reader import read_urdf
 from endo_sim_ros.nodes.arm import Arm
 from endo_sim_ros.nodes.configs import PhysicsNodeConfig, arm_names
 from endo_sim_ros.nodes.jointed_arm import CameraArm, JointedArm
@@ -22,10 +23,11 @@ def make_arms(options: PhysicsNodeConfig) -> dict[str, Arm]:
 
     Raises:
         ConfigError: If there are neither one nor as many instruments and models as arms, one cannot be loaded or is no instrument,
-            or the ECM shall be that of a robot.
+            nobody knows the shape of one whose links shall touch, or the ECM shall be that of a robot.
     """
     names = arm_names(options.arms)
     arms: dict[str, Arm] = {}
+    capsules: dict[str, list[Capsule]] = {}  # of shapes that are not ours
     commanded = options.arm_source == "commanded"
     tools, models = _for_each("instruments", options.instruments, names), _for_each("arm_models", options.arm_models, names)
     for name, tool, model in zip(names, tools, models):
@@ -37,14 +39,20 @@ def make_arms(options: PhysicsNodeConfig) -> dict[str, Arm]:
         elif tool == _NO_INSTRUMENT:
             arms[name] = Arm(name)
         else:
+            tool, _, description = tool.partition("@")
             kinematics = load_arm(model, tool)
             kind, _, number = kinematics.tool.rpartition("_")
             tool_type = str(Path(tool).resolve()) if tool.endswith(".json") else f"{kind}:{number}"
+            if description:
+                capsules[name] = read_urdf(description, kinematics)[1]
+                tool_type += f"@{Path(description).resolve()}"
             arms[name] = JointedArm(name, kinematics=kinematics, tool_type=tool_type, commanded=commanded)
         arm = arms[name]
         if isinstance(arm, JointedArm) and (len(arm.kinematics.joints) == 4) != (name == CAMERA_ARM):
             wrong = f"{arm.kinematics.name} with {arm.kinematics.tool or 'no tool'}"
             raise ConfigError(f"arms: {name} cannot be {wrong}; {CAMERA_ARM} takes an endoscope, every other arm an instrument")
+        if isinstance(arm, JointedArm) and name != CAMERA_ARM and options.link_contact:
+            arm.capsules = capsules[name] if name in capsules else build_instrument(arm.kinematics)[1]
     return arms
 
 

@@ -100,11 +100,15 @@ class PhysicsNodeConfig(WorldConfig):
     follow servo_cp at once and move_cp at move_speed, and this node publishes measured_cp and jaw/measured_js as an arm does."""
     instruments: tuple[str, ...] = ("LARGE_NEEDLE_DRIVER",)
     """Tool of each arm in the order of arms, or one for all: a name of the dVRK, such as PROGRASP_FORCEPS or PROGRASP_FORCEPS:420093,
-    or the path of a tool file of the dVRK. none = a tip without joints, which reaches every pose. One for all leaves the ECM its
-    straight endoscope."""
+    or the path of a tool file of the dVRK; after an @ the path of a URDF that has its shape. none = a tip without joints, which
+    reaches every pose. One for all leaves the ECM its straight endoscope."""
     arm_models: tuple[str, ...] = ("PSM",)
     """Kind of each arm in the order of arms, or one for all: PSM, PSM_Si, or the path of a kinematic file of the dVRK. PSM for all
     makes the ECM an ECM."""
+    link_contact: bool = False
+    """Let the links of instruments touch the tissue: shaft, wrist and jaws push, and closed jaws hold what lies between them, by friction.
+    The tip of an instrument is then where its jaws begin. Off: tips act alone, as viewer_node, scripted_tool and policies expect, which
+    put the tip on the tissue: its jaws would be 1 to 2 cm deep in it."""
     move_speed: Annotated[float, Range(1e-4, 10, "m/s")] = 0.05
     """Speed of a tool tip that moves to the goal of move_cp."""
     turn_speed: Annotated[float, Range(1e-2, 100, "rad/s")] = 1.5

@@ -53,7 +53,7 @@ class JointTopics:
     def publish_links(self, stamp: int) -> None:
         """Publish where the links of the instruments are, at the time of a state, ns; nowhere while nobody knows."""
         for arm, publisher in self._links:
-            publisher.publish(messages.encode_poses(arm.links(), stamp, self.options.world_frame))
+            publisher.publish(messages.encode_poses(list(arm.links().values()), stamp, self.options.world_frame))
 
     def publish_joint_states(self, stamp: int) -> None:
         """Publish the joints of all arms in one message, while somebody subscribes."""

@@ -1,18 +1,20 @@
 """An arm with joints: where its links are when its tip is at a pose, and how its joints get to where they are told."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from endo_sim_ros.core.cameras import invert_pose
-from endo_sim_ros.instruments import ArmKinematics, ReachConfig, link_poses, solve_inverse
+from endo_sim_ros.instruments import ArmKinematics, Capsule, ReachConfig, link_poses, solve_inverse
 from endo_sim_ros.nodes.arm import Arm
 
 _ROUNDED = 1 + 1e-9  # a way that takes a whole number of steps must not take one more
 _WITHIN = 1e-6  # rad, m: how far a command may leave the limits, as what is sent back was rounded
 _LEAP = 10.0  # times the speed of a joint: the straight way passes a singularity or goes on with another bend of the wrist
 _TRIES = 4  # to find how far the tip gets in a step; one or two are enough where joints follow in proportion
+_JOINTS_OF_LINK = {"roll": 4, "wrist_pitch": 5}  # joints that move it: the first ones; all others move with all joints
 _CAMERA_REACH = ReachConfig(radian_length=1e-4)  # the direction of an endoscope follows from its place
 _CAMERA_THERE = 1e-4  # m: nearer is at the pose
 
@@ -27,12 +29,15 @@ class JointedArm(Arm):
         kinematics: The arm with its tool.
         tool_type: What loads the tool: its name and number, or the path of its file.
         commanded: Whether it has no robot, so that it is where its joints get to.
+        capsules: What of its instrument touches tissue; none = its tip alone does.
         joint_speed, slide_speed: Largest speeds of joints that turn and that slide during moves, rad/s and m/s.
     """
 
     kinematics: ArmKinematics = field()
     tool_type: str = ""
     commanded: bool = True
+    capsules: Sequence[Capsule] = ()
+    link_reactions: Mapping[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)  # force N and torque about the tip N·m
     joint_speed: float = np.inf
     slide_speed: float = np.inf
     base: np.ndarray | None = None  # [4, 4], world
@@ -190,14 +195,14 @@ class JointedArm(Arm):
 
     # ------------------------------------------------------------------ states
 
-    def links(self) -> list[np.ndarray]:
-        """Poses [4, 4] of the links in the world, in the order of `link_poses`; none while they are not known."""
+    def links(self) -> dict[str, np.ndarray]:
+        """Poses [4, 4] of the links in the world by name, in the order of `link_poses`; none while they are not known."""
         self.settle()
         if self.base is None or self.joints is None or self.pose is None:
-            return []
+            return {}
         widest = self.kinematics.jaw[1] if self.kinematics.jaw else 0.0
         poses = link_poses(self.kinematics, self.joints, np.clip(self.angle, 0.0, widest))  # closed jaws press, they do not overlap
-        return [self.base @ pose for pose in poses.values()]
+        return {name: self.base @ pose for name, pose in poses.items()}
 
     def dynamics(self, force: np.ndarray, torque: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What the joints and the tip do under a wrench on the tip.
@@ -207,14 +212,18 @@ class JointedArm(Arm):
             torque: Torque [3] about the tip, N·m, world.
 
         Returns:
-            Efforts of the joints [n], N·m and N: Jᵀ times the wrench. Velocity [3], m/s, and angular velocity [3], rad/s, of the
-            tip in the last step, world.
+            Efforts of the joints [n], N·m and N: Jᵀ times the wrench, where a joint bears nothing of what the links before it feel
+            (`link_reactions`). Velocity [3], m/s, and angular velocity [3], rad/s, of the tip in the last step, world.
         """
         assert self.base is not None and self.joints is not None
         R = self.base[:3, :3]
         J = self.kinematics.jacobian(self.joints)
         twist = J @ (np.zeros(len(self.joints)) if self.velocities is None else self.velocities)
-        return J.T @ np.concatenate([R.T @ force, R.T @ torque]), R @ twist[:3], R @ twist[3:]
+        efforts = J.T @ np.concatenate([R.T @ force, R.T @ torque])
+        for link, (part, turning) in self.link_reactions.items():
+            beyond = _JOINTS_OF_LINK.get(link, len(self.joints))
+            efforts[beyond:] -= J.T[beyond:] @ np.concatenate([R.T @ part, R.T @ turning])
+        return efforts, R @ twist[:3], R @ twist[3:]
 
     def reset(self) -> None:
         """Let go of everything; a commanded arm is back at its start."""

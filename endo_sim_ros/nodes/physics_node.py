@@ -14,6 +14,7 @@ from endo_sim_ros.nodes.arm_setup import CAMERA_ARM, make_arms, place_arms
 from endo_sim_ros.nodes.arm_topics import ArmTopics
 from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode, run, sentence
 from endo_sim_ros.nodes.configs import COMMAND_PARTS, PhysicsNodeConfig
+from endo_sim_ros.nodes.jointed_arm import JointedArm
 from endo_sim_ros.nodes.pacing import MOST_WAITING, CommandQueue, Pacer
 from endo_sim_ros.nodes.tissue_builder import TissueBuilder
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
@@ -29,7 +30,7 @@ _WINDOW = 1.0  # seconds over which the real-time factor is measured
 class PhysicsNode(EndoNode):
     """Samples control nodes from the latest model and steps them at the rate of the simulation."""
 
-    read_at_start = frozenset({"arms", "arm_source", "instruments", "arm_models", "mode", "lockstep_inputs"})
+    read_at_start = frozenset({"arms", "arm_source", "instruments", "arm_models", "link_contact", "mode", "lockstep_inputs"})
 
     def __init__(self) -> None:
         super().__init__("physics_node")
@@ -106,6 +107,10 @@ class PhysicsNode(EndoNode):
                 if not continued:
                     for arm in self.arms.values():
                         arm.acting = False
+                for name, arm in self.arms.items():
+                    if isinstance(arm, JointedArm) and arm.capsules and not simulation.has_instrument(name):
+                        with self.guard(f"link_contact of {name}"):
+                            simulation.set_instrument(name, arm.capsules)
                 if not same_model:
                     self._view = view
                     self._place_arms()
@@ -163,8 +168,10 @@ class PhysicsNode(EndoNode):
             if arm.pose is None or not arm.acts:
                 continue
             where = f"at {np.round(arm.pose[:3, 3], 4).tolist()}"
-            if not simulation.set_grasp(name, arm.pose, arm.closed):
-                self.report_error(f"{name}: the jaw closed on nothing {where}; {self._out_of_reach(simulation)}")
+            links = arm.links() if isinstance(arm, JointedArm) and simulation.has_instrument(name) else {}
+            if not simulation.set_grasp(name, arm.pose, arm.closed, links or None):
+                reach = self._out_of_reach(simulation) if not links else "no movable tissue lies between the jaws"
+                self.report_error(f"{name}: the jaw closed on nothing {where}; {reach}")
                 arm.closed = False
             try:
                 simulation.set_cut(name, arm.pose, arm.cutting)
@@ -254,8 +261,11 @@ class PhysicsNode(EndoNode):
         for name, arm in self._tools.items():
             self._arm_topics.limit_force(arm, lambda name=name: simulation.reaction(name)[0])
         if simulation.slips > slips:
-            travel = f"{simulation.config.travel:g} m"
-            self.report_error(f"tissue slipped out of a jaw that pulled it almost {travel}; open it, come nearer, or raise travel")
+            pulled, raised = f"almost {simulation.config.travel:g} m", "travel"
+            if self._options.link_contact and simulation.config.grip_force:
+                pulled += f", or with {2 * simulation.config.friction * simulation.config.grip_force:.3g} N between two jaws"
+                raised += " or grip_force"
+            self.report_error(f"tissue slipped out of a jaw that pulled it {pulled}; open it, come nearer, or raise {raised}")
             for name, arm in self._tools.items():
                 arm.closed = arm.closed and simulation.in_reach(name)
         self.steps += 1
@@ -280,6 +290,8 @@ class PhysicsNode(EndoNode):
             if arm.pose is None:
                 continue
             reaction, torque = simulation.reaction(name)
+            if isinstance(arm, JointedArm):
+                arm.link_reactions = simulation.link_reactions(name)
             self._arm_topics.publish(arm, arm.pose, reaction, torque, stamp)
             force = arm.force if arm.acting and arm.force is not None else np.zeros(3)
             shown.append(messages.ToolDisplay(name, arm.pose[:3, 3], force, reaction, simulation.held(name)))

@@ -208,7 +208,7 @@ class RenderingNode(EndoNode):
             self._output = self._render(self.tissue.bound, self._nodes, camera, instruments or None)
             if instruments is False:  # the tissue alone meanwhile
                 self._change()
-        elif now - self._last_image < 1 / self.options.idle_rate - 0.5 / self.options.rate:
+        elif now - self._last_image < idle_period(self.options):
             return
         self._last_image = now
         self._last_stamp = self._stamp(self.tissue.bound)
@@ -361,6 +361,8 @@ class RenderingNode(EndoNode):
             camera, tissue = (np.round(each, 4).tolist() for each in (self._blind, self.tissue.model.means.mean(0).numpy()))
             what = f"the camera at {camera} sees no tissue, the middle of which is at {tissue}, metres"
             return WARN, f"{what}; check the poses on {messages.CAMERA_POSE.name}, their unit is metres", values
+        if self.options.instruments and self.instruments.undrawn:
+            return WARN, "; ".join(self.instruments.undrawn.values()), values
         if self._lockstep:
             waiting = f", {len(self._states)} states wait" if self._states else ""
             if self._states and self._lacks_pose(*self._states[0]):
@@ -375,6 +377,11 @@ class RenderingNode(EndoNode):
         self.tissue.stop()
         self.instruments.stop()
         super().destroy_node()
+
+
+def idle_period(options: RenderingNodeConfig) -> float:
+    """Seconds from one image to the next while nothing changes, no shorter than at `rate`; half a poll less, so as not to miss a poll."""
+    return 1 / min(options.idle_rate, options.rate) - 0.5 / options.rate / _POLLS
 
 
 def _decode_info(message: Any, topic: str) -> CameraInfo:

@@ -8,9 +8,10 @@ import numpy as np
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.config import ConfigError
-from endo_sim_ros.instruments import LINKS, Capsule, Part, build_instrument, load_arm
+from endo_sim_ros.instruments import LINKS, Capsule, Part
 from endo_sim_ros.instruments.config import DrawingConfig
 from endo_sim_ros.instruments.drawing import FIRST_LINK, InstrumentDrawing, PosedInstruments
+from endo_sim_ros.instruments.urdf_reader import load_shape
 from endo_sim_ros.messages import MessageError
 from endo_sim_ros.nodes.background import Background
 from endo_sim_ros.nodes.pacing import MOST_WAITING
@@ -28,6 +29,8 @@ class ShownInstruments:
         self.arms = tuple(arms)
         self._lockstep = lockstep
         self._types: dict[str, str] = {}
+        self.undrawn: dict[str, str] = {}
+        """Why arms are not drawn, in a sentence each, by their names."""
         self._tools: dict[str, tuple[list[Part], list[Capsule]]] = {}
         self._links: dict[str, deque[tuple[int, np.ndarray]]] = {arm: deque(maxlen=MOST_WAITING if lockstep else 1) for arm in arms}
         self._background = Background()
@@ -38,15 +41,17 @@ class ShownInstruments:
         """Take the tool of an arm.
 
         Raises:
-            MessageError: If it cannot be loaded, or nobody knows its shape; the arm is not drawn then.
+            MessageError: If it cannot be loaded; the arm is not drawn then, and `undrawn` says so.
         """
         name = messages.decode_text(message)
         self._types[arm] = name
         self._tools.pop(arm, None)
+        self.undrawn.pop(arm, None)
         try:
-            self._tools[arm] = build_instrument(load_arm("PSM", name))
+            self._tools[arm] = load_shape(name)
         except (ConfigError, OSError) as error:
-            raise MessageError(f"{messages.tool_type(arm).name}: {error}; {arm} is not drawn") from error
+            self.undrawn[arm] = f"{messages.tool_type(arm).name}: {error}; {arm} is not drawn"
+            raise MessageError(self.undrawn[arm]) from error
 
     def receive_links(self, arm: str, message: Any, world_frame: str) -> bool:
         """Take where the links of an arm are; returns whether they have moved.

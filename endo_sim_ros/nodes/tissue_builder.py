@@ -96,7 +96,8 @@ class TissueBuilder:
         origin, poses = self._viewpoint()
         if self.model is not None and poses is not None:
             model, stamp, cameras = self.model, self._model_stamp, self._own_cameras()
-            viewpoint, camera = poses[:, :3, 3], cameras[0] if cameras else Camera(*_USUAL_VIEW, poses[0])
+            middle = len(poses) // 2  # where rendering_node stands as long as nobody moves the camera
+            viewpoint, camera = poses[:, :3, 3], cameras[middle] if cameras else Camera(*_USUAL_VIEW, poses[middle])
             key = self._model_number, origin, bool(cameras), config
             self._background.want(key, lambda: (stamp, _tissue(model, viewpoint, config, cameras), _view(model, camera)))
 

@@ -75,16 +75,19 @@ def new_loads(count: int, device: str) -> Loads:
     """Return loads on count control nodes: none."""
     loads = Loads()
     loads.force, loads.target, loads.target_v = (wp.zeros(count, wp.vec3, device=device) for _ in range(3))
-    loads.spring = wp.zeros(count, float, device=device)
+    loads.spring, loads.limit = (wp.zeros(count, float, device=device) for _ in range(2))
     loads.holder = wp.full(count, -1, dtype=int, device=device)
     return loads
 
 
-def new_tools(count: int, environments: int, nodes: int, friction: float, push_out: float, device: str) -> tuple[wp.array, RigidTools]:
+def new_tools(
+    count: int, room: int, environments: int, nodes: int, friction: float, push_out: float, device: str
+) -> tuple[wp.array, RigidTools]:
     """Return what rigid tools gave to control nodes, as one array to clear, and the tools, which touch nothing.
 
     Args:
         count: Number of tools T in each environment.
+        room: Capsules C that all tools of an environment may have together.
         environments: B.
         nodes: Number of control nodes M in each.
         friction: Coulomb's coefficient.
@@ -92,8 +95,9 @@ def new_tools(count: int, environments: int, nodes: int, friction: float, push_o
         device: Where to.
     """
     tools = RigidTools()
-    tools.count, tools.friction, tools.push_out = count, friction, push_out
-    tools.tip, tools.tip_v, tools.end, tools.end_v = (wp.zeros(environments * count, wp.vec3, device=device) for _ in range(4))
-    tools.radius = wp.zeros(environments * count, float, device=device)
+    tools.count, tools.room, tools.friction, tools.push_out = count, room, friction, push_out
+    tools.used, tools.tool = wp.zeros(environments, int, device=device), wp.zeros(environments * room, int, device=device)
+    tools.tip, tools.tip_v, tools.end, tools.end_v = (wp.zeros(environments * room, wp.vec3, device=device) for _ in range(4))
+    tools.radius = wp.zeros(environments * room, float, device=device)
     given, (tools.impulse, tools.moment) = adjoining(environments * count * nodes, device, wp.vec3, wp.vec3)
     return given, tools

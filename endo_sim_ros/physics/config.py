@@ -81,11 +81,14 @@ class PhysicsConfig(StageConfig):
     contact_radius: Annotated[float, Range(0.0, 0.1, "m")] = 0.0
     """Radius of the rigid capsule that each tool pushes the tissue away with, 0 = tools act by wrench and jaw only. Control nodes, not
     the skin between them, are what it touches, so a capsule thinner than 1.5 times their distance, or 0.3 of a grid cell, acts as
-    one as thick as that."""
+    one as thick as that. Tools whose links are known are their links instead."""
     contact_length: Annotated[float, Range(0.0, 1.0, "m")] = 0.0
     """Length of that capsule from the tip backwards, against the tool's z axis; 0 = a sphere."""
     friction: Annotated[float, Range(0.0, 10.0)] = 0.2
     """Coulomb friction between tool and tissue; wet instruments have 0.05 to 0.3."""
+    grip_force: Annotated[float, Range(0.0, 1000.0, "N")] = 10.0
+    """Force that presses the jaws of an instrument together: what pulls tissue with more than 2 friction grip_force lets it slip out.
+    Instruments of the da Vinci have 2.3 to 39.9 N (Mucksavage et al. 2011). 0 = without limit, as for tools without links."""
     blade_length: Annotated[float, Range(1e-4, 0.1, "m")] = 0.01
     """Length of the edge that a cutting tool sweeps through the tissue, from its tip backwards, against its z axis. A cut opens
     once it is about one cell of the grid deep; more layers make that finer."""

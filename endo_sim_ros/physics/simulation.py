@@ -1,6 +1,6 @@
-"""The tissue that tools push, pull, grasp and cut: one scene by name and message, or many copies of it in tensors."""
+"""The tissue that tools push, pull, grasp and cut, each by its name."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,96 +11,20 @@ from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.instruments.shapes import Capsule
 from endo_sim_ros.physics.backends.base import capturing
+from endo_sim_ros.physics.batch import TissueBatch
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes, RenderDepth, build_control_nodes
-from endo_sim_ros.physics.cutting.blade import Blade
+from endo_sim_ros.physics.cutting.blade import Blade, Scissors
 from endo_sim_ros.physics.cutting.stencils import CutStencils
-from endo_sim_ros.physics.regions import TissueProperties, paint_regions
-from endo_sim_ros.physics.skinning import Skinning
-from endo_sim_ros.physics.solver import MpmSolver
-from endo_sim_ros.physics.tools import Tools
+from endo_sim_ros.physics.links import ToolLinks, rigid_pose
+from endo_sim_ros.physics.regions import TissueProperties
 
 MAX_TOOLS = 8  # of a TissueSimulation
+MAX_CAPSULES = 12  # of each; the instruments of the da Vinci have five or six
 _RESTING_SPEED = 1e-5  # m/s; tissue slower than this, with no tool acting, is left as it is
 _RELAXED = 8.0  # relaxation times after the last touch, too
-
-
-def tissue_properties(nodes: ControlNodes, config: PhysicsConfig) -> TissueProperties:
-    """Stiffness and density of each node [M]: those of the config with its regions painted over."""
-    uniform = TissueProperties.uniform(len(nodes), config.young_modulus, config.poisson_ratio, config.density)
-    return paint_regions(uniform, nodes.rest, config.regions)
-
-
-class TissueBatch:
-    """B independent copies of the same tissue, stepped together, with T tools each; for learning.
-
-    Everything is a tensor on the simulation's device, and nothing waits for it: write commands into ``tools`` (see
-    :class:`Tools`), call :meth:`step`, read ``displacements``, ``F`` and the reactions. Copies differ by their tools
-    and, if asked for, by their stiffness. A step that ends badly is undone in its copy and counted in ``tools.faults``.
-
-    Args:
-        nodes: The nodes at rest.
-        config: Parameters.
-        environments: B.
-        tools: T.
-        properties: Stiffness and density of each node; default: those of the config, with its regions.
-        stiffness: Factor on the moduli of each copy [B], or of each of its nodes [B, M]; default 1. See `MpmSolver.set_stiffness`.
-
-    Raises:
-        ValueError: If the config or the nodes make no tissue, see :class:`MpmSolver`.
-    """
-
-    def __init__(
-        self,
-        nodes: ControlNodes,
-        config: PhysicsConfig,
-        environments: int,
-        tools: int = 1,
-        properties: TissueProperties | None = None,
-        stiffness: ArrayLike | None = None,
-    ):
-        self.nodes, self.config = nodes, config
-        properties = tissue_properties(nodes, config) if properties is None else properties
-        with capturing:
-            self.solver = MpmSolver(nodes, config, properties, environments=environments, tools=tools, stiffness=stiffness)
-            self.tools = Tools(self.solver, nodes, config)
-        self.step_duration = config.step_duration
-        self.displacements: Tensor = wp.to_torch(self.solver.state.u).view(environments, -1, 3)  # [B, M, 3] m
-        self.F: Tensor = wp.to_torch(self.solver.state.F).view(environments, -1, 3, 3)  # [B, M, 3, 3]
-        self._rest = torch.from_numpy(nodes.rest).to(self.solver.device)
-        self._free = torch.from_numpy(~nodes.pinned).to(self.solver.device)
-
-    def step(self) -> None:
-        """Advance all copies by ``step_duration``."""
-        self.solver.step()
-
-    def positions(self) -> Tensor:
-        """Positions of the nodes [B, M, 3], m, world; pinned ones where they rest."""
-        return self._rest + self.displacements * self._free[:, None]
-
-    def append_skinning(self, skinning: Skinning) -> tuple[Tensor, Tensor]:
-        """Make skinning part of every step from now on, in place of another that was; on a GPU of the one graph that a step is.
-
-        Args:
-            skinning: With compact weights, bound to these nodes at rest, on this device; cuts that come later count.
-
-        Returns:
-            Means [B, N, 3], m, world, and covariances [B, N, 3, 3], m², of the Gaussians at the end of each step, which the
-            next overwrites: the same bits as `Skinning.deform` gives.
-
-        Raises:
-            ValueError: If the skinning is another's.
-        """
-        state = self.solver.state
-        work, means, covars = skinning.work(state.u, state.F, self.nodes.pinned, self.solver.environments)
-        self.solver.append_launches(work)
-        return means, covars
-
-    def reset(self, environments: Tensor | slice = slice(None)) -> None:
-        """Back to rest, in these copies; their tools let go."""
-        self.solver.reset(environments)
-        self.tools.reset(environments)
 
 
 @dataclass(frozen=True)
@@ -122,7 +46,7 @@ class TissueSimulation:
     moves with it: about a tip that stays behind, a mere force would be an ever greater couple on the few nodes. A
     tool that reaches no node applies nothing and tries again every step. A jaw that closes holds the nodes in the
     same reach, which then follow the pose of its tip until it opens. With a ``contact_radius`` tools are rigid capsules
-    that push tissue away.
+    that push tissue away. A tool with an instrument is its links instead: they push, and its jaws hold what lies between them.
     Tissue that nothing acts on and that has come to rest costs no time.
 
     Args:
@@ -156,15 +80,18 @@ class TissueSimulation:
     def _start(self, nodes: ControlNodes, config: PhysicsConfig, properties: TissueProperties | None = None) -> None:
         self.nodes = nodes
         self.config = config
-        self._batch = TissueBatch(nodes, config, 1, MAX_TOOLS, properties)
+        self._batch = TissueBatch(nodes, config, 1, MAX_TOOLS, properties, capsules=MAX_CAPSULES)
         self.solver, self._tools = self._batch.solver, self._batch.tools
         self.substepping = self.solver.substepping
         self.step_duration = config.step_duration
         self.time = 0.0
         self.last_fault = ""
         self._slots: dict[str, int] = {}  # of tools, by name
+        self._links: dict[str, ToolLinks] = {}  # of tools with an instrument
+        self._placed: dict[str, Tensor] = {}  # poses of these [L, 4, 4], while known
         self._stencils: CutStencils | None = None  # from the first cut on
         self._blades: dict[str, Blade] = {}  # of tools that cut
+        self._scissors: dict[str, Scissors] = {}  # of tools whose jaws are blades
         self.disturbed = False  # since the last step: a tool moved, took hold or let go
         self._quiet = 0.0  # s since tools did anything
         self.resting = not any(config.gravity)
@@ -221,42 +148,109 @@ class TissueSimulation:
             tools.reaction_forces[0, slot], tools.reaction_torques[0, slot] = 0.0, 0.0
         return not wanted or bool(tools.attached[0, slot])
 
-    def set_grasp(self, tool: str, pose: np.ndarray, closed: bool) -> bool:
+    def set_instrument(self, tool: str, capsules: Sequence[Capsule]) -> None:
+        """Let a tool have the links of an instrument, which touch tissue wherever `set_grasp` says that they are.
+
+        Args:
+            tool: Name of the tool.
+            capsules: Of the links, such as those of `build_instrument`; none = a bare tip. Two links with the names ``jaw_left`` and
+                ``jaw_right`` are jaws, between which tissue is held, or cut if they are blades.
+
+        Raises:
+            ValueError: If they are no instrument, see :class:`ToolLinks`, or too many, or they are scissors and kinematics is not rest;
+                the tool then keeps what it had.
+        """
+        links = ToolLinks(capsules) if capsules else None
+        if links is not None and links.scissors:
+            self._require_cuttable()
+        if links is not None and len(links) > MAX_CAPSULES:
+            raise ValueError(f"the instrument of tool {tool!r} has {len(links)} capsules; there can be {MAX_CAPSULES}")
+        if tool in self._placed:
+            self._lose_links(tool)
+        self._links.pop(tool, None)
+        self._scissors.pop(tool, None)
+        if links is not None:
+            self._links[tool] = links
+
+    def has_instrument(self, tool: str) -> bool:
+        """Whether a tool has links, see `set_instrument`."""
+        return tool in self._links
+
+    def set_grasp(self, tool: str, pose: np.ndarray, closed: bool, links: Mapping[str, ArrayLike] | None = None) -> bool:
         """Move a tool, and close or open its jaw.
 
         Args:
             tool: Name of the tool.
             pose: Tip-to-world transform [4, 4], metres; held tissue, and the capsule of contact, reach it at the end
                 of the next step.
-            closed: Whether the jaw is closed.
+            closed: Whether the jaw is closed. A bare tip then holds what is near it, an instrument what lies between its jaws. Scissors
+                cut that while they close.
+            links: Link-to-world transforms [4, 4], metres, of a tool with an instrument by the names of its links (`link_poses`), at
+                the end of the next step; None = nobody knows, and the tool is a bare tip meanwhile.
 
         Returns:
             Whether the jaw holds what it should: False when it is closed on nothing.
 
         Raises:
-            ValueError: If the pose has a wrong shape or is not finite; the tool then stays as it was.
+            ValueError: If the pose or that of a link has a wrong shape or is not finite, a link is missing, or the tool has no
+                instrument; the tool then stays as it was.
         """
-        pose = _pose(tool, pose)
+        pose = rigid_pose(f"tool {tool!r}", pose)
+        if links is not None and tool not in self._links:
+            raise ValueError(f"tool {tool!r} has no instrument, so it has no links; give it one with set_instrument")
+        placed = None if links is None else self._links[tool].order(tool, links)
         slot, tools = self._slot(tool), self._tools
         R, tip = torch.from_numpy(pose[:3, :3].copy()), torch.from_numpy(pose[:3, 3].copy())
         moved = not (torch.equal(tools.tips[0, slot].cpu(), tip) and torch.equal(tools.rotations[0, slot].cpu(), R))
         moved = moved or not tools.present[0, slot]
         tools.tips[0, slot], tools.rotations[0, slot], tools.present[0, slot] = tip, R, 1
+        touches = self.contact_radius > 0
+        if placed is not None:
+            before, self._placed[tool] = self._placed.get(tool, placed), placed
+            moved = moved or before is placed or not torch.equal(before, placed)
+            own = self._links[tool]
+            # Open blades slip past tissue, closed ones are blunt; the edge of a tool that cuts would keep off what it is to cut.
+            sharp = own.scissors and not closed or tool in self._blades
+            tools.set_links(slot, own, placed[None], ~own.sharp if sharp else None)
+            touches = moved and (self.disturbed or self._reaches(tool, before, placed))
+            if own.scissors:
+                jaws = own.place(placed).jaws.numpy()
+                self._cut(self._scissors.setdefault(tool, Scissors(self.nodes.spacing)).move, jaws, closed)
+                closed = False  # blades hold nothing
+        elif tool in self._placed:
+            self._lose_links(tool)
         tools.closed[0, slot] = int(closed)
         was = bool(tools.gripping[0, slot])
         if closed != was:
             tools.take_hold()
         holding = bool(tools.gripping[0, slot])
-        self.disturbed |= holding != was or moved and (holding or self.contact_radius > 0)
+        self.disturbed |= holding != was or moved and (holding or touches)
         if closed and not holding:
             tools.closed[0, slot] = 0
         return holding or not closed
 
+    def _lose_links(self, tool: str) -> None:
+        """Let a tool be a bare tip."""
+        slot = self._slots[tool]
+        self._tools.linked[0, slot] = self._tools.jawed[0, slot] = 0
+        del self._placed[tool]
+
+    def _reaches(self, tool: str, before: Tensor, after: Tensor) -> bool:
+        """Whether the links of a tool may touch tissue on their way from poses to others [L, 4, 4]: instruments move a lot in the air."""
+        links = self._links[tool]
+        placed = links.place(torch.stack([before, after]))
+        ends = torch.stack([placed.starts, placed.ends]).numpy()  # [2, 2, K, 3]
+        reach = np.maximum(links.radii.numpy(), self._tools.thinnest)[:, None] + self.nodes.spacing
+        low, high = ends.min((0, 1)) - reach, ends.max((0, 1)) + reach
+        positions = self.nodes.rest + self.solver.displacements()
+        return bool(((low <= positions.max(0)) & (high >= positions.min(0))).all(1).any())
+
     def set_cut(self, tool: str, pose: np.ndarray, cutting: bool) -> None:
         """Move the cutting edge of a tool; what it sweeps between two calls while cutting is cut.
 
-        The edge is ``blade_length`` long, from the tip backwards against the tool's z axis. Nodes on both sides of the
-        cut then share no momentum; ``cuts`` tells the skinning what not to bridge.
+        The edge is ``blade_length`` long, from the tip backwards against the tool's z axis. That of an instrument is its wire, or the
+        line between its jaws, where `set_grasp` has put its links. Nodes on both sides of the cut then share no momentum; ``cuts``
+        tells the skinning what not to bridge.
 
         Args:
             tool: Name of the tool.
@@ -266,15 +260,23 @@ class TissueSimulation:
         Raises:
             ValueError: If the pose has a wrong shape or is not finite, or kinematics is not rest.
         """
-        pose = _pose(tool, pose)
+        pose = rigid_pose(f"tool {tool!r}", pose)
         if not cutting:
             self._blades.pop(tool, None)
             return
-        stencils = self._prepared_stencils()
-        self._blades.setdefault(tool, Blade(self.config.blade_length, self.nodes.spacing))
-        state = self.state()
-        triangles = self._blades[tool].move(pose, state.rest, state.positions, state.F, self.cuts)
-        if stencils.cut(triangles):
+        self._require_cuttable()
+        own = self._links[tool] if tool in self._placed else None
+        if own is None or not own.sharp.any():
+            self._cut(self._blades.setdefault(tool, Blade(self.config.blade_length, self.nodes.spacing)).move, pose)
+        else:
+            corners = own.place(self._placed[tool]).edge(own.wire)
+            length = float(np.linalg.norm(np.diff(corners, axis=0), axis=1).sum())
+            self._cut(self._blades.setdefault(tool, Blade(length, self.nodes.spacing)).draw, corners)
+
+    def _cut(self, move: Callable[..., np.ndarray], *to: object) -> None:
+        """Cut what an edge sweeps on its way to where it now is, both as `Blade` and `Scissors` take them."""
+        stencils, state = self._prepared_stencils(), self.state()
+        if stencils.cut(move(*to, state.rest, state.positions, state.F, self.cuts)):
             with capturing:
                 self.solver.set_cut(stencils.table())
             self.disturbed = True
@@ -292,9 +294,12 @@ class TissueSimulation:
         """
         self._prepared_stencils()
 
-    def _prepared_stencils(self) -> CutStencils:
+    def _require_cuttable(self) -> None:
         if self.config.kinematics != "rest":
             raise ValueError(f"tissue with kinematics {self.config.kinematics} cannot be cut; set kinematics to rest")
+
+    def _prepared_stencils(self) -> CutStencils:
+        self._require_cuttable()
         if self._stencils is None:
             self._stencils = CutStencils(self.nodes.rest, self.solver.rest_cells, self.solver.grid_shape)
             with capturing:
@@ -315,6 +320,18 @@ class TissueSimulation:
             return np.zeros(3), np.zeros(3)
         slot, tools = self._slots[tool], self._tools
         return tools.reaction_forces[0, slot].cpu().numpy().copy(), tools.reaction_torques[0, slot].cpu().numpy().copy()
+
+    def link_reactions(self, tool: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """The parts of `reaction` that the links of an instrument feel, by name: force [3] N, torque [3] N·m about the tip, world.
+
+        They add up to what jaw and contact give. A control node counts for the link that it is nearest to at the end of the step.
+        Empty where nobody knows the links.
+        """
+        if tool not in self._placed:
+            return {}
+        slot, tools = self._slots[tool], self._tools
+        forces, torques = tools.link_forces[0, slot].cpu().numpy(), tools.link_torques[0, slot].cpu().numpy()
+        return {link: (forces[i].copy(), torques[i].copy()) for i, link in enumerate(self._links[tool].links)}
 
     def held(self, tool: str) -> np.ndarray:
         """Positions now of the nodes that a tool holds on to [K, 3], m, world; none when it is in the air."""
@@ -365,7 +382,9 @@ class TissueSimulation:
         """Back to the rest state at time zero; tools let go, cuts heal."""
         self._batch.reset()
         self._slots.clear()
+        self._placed.clear()
         self._blades.clear()
+        self._scissors.clear()
         if self._stencils is not None:
             self._stencils.reset()
             with capturing:
@@ -375,7 +394,8 @@ class TissueSimulation:
         self.time, self.last_fault = 0.0, ""
 
     def continue_from(self, other: "TissueSimulation") -> bool:
-        """Take over shape, motion, cuts and tools of other tissue; returns whether that can be: if it has the same nodes.
+        """Take over shape, motion, cuts and tools of other tissue; returns whether that can be: if it has the same nodes. Scissors are
+        left behind where nothing can be cut.
 
         For tissue whose material changes while it is being touched.
         """
@@ -387,6 +407,9 @@ class TissueSimulation:
             wp.copy(getattr(self.solver.state, name), getattr(other.solver.state, name))
         self._tools.copy(other._tools)
         self._slots, self._blades, self.time = dict(other._slots), dict(other._blades), other.time
+        self._links, self._placed, self._scissors = dict(other._links), dict(other._placed), dict(other._scissors)
+        for tool in [tool for tool, links in self._links.items() if links.scissors and self.config.kinematics != "rest"]:
+            self.set_instrument(tool, ())
         self.last_fault = other.last_fault
         if len(other.cuts):
             if self.solver.grid_shape == other.solver.grid_shape and self.solver.cell_size == other.solver.cell_size:
@@ -415,19 +438,9 @@ class TissueSimulation:
                 parts.append(f"{name} {' and '.join(acting)}")
             if tools.gripping[0, slot]:
                 parts.append(f"{name} grasping")
-            elif self.contact_radius and tools.present[0, slot]:
+            elif (self.contact_radius or name in self._placed) and tools.present[0, slot]:
                 parts.append(f"{name} pushing")
         return ", ".join(parts) or "no tool"
-
-
-def _pose(tool: str, value: np.ndarray) -> np.ndarray:
-    pose = np.asarray(value, np.float64)
-    if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        raise ValueError(f"pose of tool {tool!r} must be a finite 4×4 matrix, got {pose.tolist()}")
-    R = pose[:3, :3]
-    if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0:
-        raise ValueError(f"pose of tool {tool!r} must turn and shift, not scale or mirror, got {pose.round(4).tolist()}")
-    return pose
 
 
 def _vector(name: str, value: ArrayLike, tool: str) -> np.ndarray:

@@ -37,6 +37,7 @@ class MpmSolver:
         properties: Stiffness and density of each control node; default: those of the config everywhere.
         environments: Number of independent copies B.
         tools: Number of rigid tools T in each.
+        capsules: Most capsules of a tool.
         stiffness: Factor on the moduli of each environment [B], or of each of its control nodes [B, M]; default 1. The
             largest one is also the largest that `set_stiffness` takes later.
 
@@ -53,10 +54,13 @@ class MpmSolver:
         *,
         environments: int = 1,
         tools: int = 1,
+        capsules: int = 1,
         stiffness: ArrayLike | None = None,
     ):
         if environments < 1 or tools < 0:
             raise ValueError(f"there must be at least one environment and no fewer than zero tools, not {environments} and {tools}")
+        if capsules < 1:
+            raise ValueError(f"a tool must have room for at least one capsule, not {capsules}")
         if properties is None:
             properties = TissueProperties.uniform(len(nodes), config.young_modulus, config.poisson_ratio, config.density)
         if len(properties) != len(nodes):
@@ -68,6 +72,7 @@ class MpmSolver:
         self.config, self.device = config, pick_device(config.device)
         self.backend = backend_for(self.device)
         self.environments, self.tool_count, self.node_count = environments, tools, len(nodes)
+        self.capsule_count = capsules
         self.largest_stiffness = float(scale.max())
         plan = plan_grid(nodes, config, environments)
         bad = np.flatnonzero(~((nodes.volumes > 0) & np.isfinite(nodes.volumes)))
@@ -87,7 +92,8 @@ class MpmSolver:
         self.loads = new_loads(count, device)
         self.pin_springs, self.scale = (wp.zeros(count, float, device=device) for _ in range(2))  # [B · M]; N/m, 1
         self.set_stiffness(slice(None), np.broadcast_to(scale.reshape(environments, -1), (environments, len(nodes))))
-        self._given, self.rigid = new_tools(tools, environments, len(nodes), config.friction, config.push_out_speed, device)
+        given = new_tools(tools, tools * capsules, environments, len(nodes), config.friction, config.push_out_speed, device)
+        self._given, self.rigid = given
         (self._saved, self.state), (self._backed_up, self._backup) = new_state(count, device), new_state(count, device)
         self.bad_nodes = wp.zeros(environments, int, device=device)  # in the last step; where there were any it was undone
         self._speed_sq = wp.zeros(environments, float, device=device)

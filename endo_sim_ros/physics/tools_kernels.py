@@ -9,72 +9,12 @@ import warp as wp
 
 from endo_sim_ros.physics.backends.end_kernels import OPTIONS, block_sum
 from endo_sim_ros.physics.backends.structs import Loads, Nodes, RigidTools, State
+from endo_sim_ros.physics.link_kernels import lies_between, links_are_finite, measure_links, move_links, slide_in_jaws
+from endo_sim_ros.physics.tool_state_kernels import Commands, Holds, ToolConstants, block_sum3, double, single
 
 wp.set_module_options({"enable_backward": False, **OPTIONS})
 
 SLIP = 0.9  # of the travel; tissue pulled farther slips out of the jaw
-
-
-@wp.struct
-class Commands:
-    """What tools are told to do, all [B · T], world."""
-
-    force: wp.array[wp.vec3d]  # N
-    torque: wp.array[wp.vec3d]  # about the point held, N·m
-    grasp_point: wp.array[wp.vec3d]  # where the wrench takes hold, m
-    tip: wp.array[wp.vec3d]  # of the tool at the end of the step, m
-    R: wp.array[wp.mat33d]  # its axes
-    present: wp.array[int]  # whether tip and R mean anything
-    closed: wp.array[int]  # whether the jaw is to be closed
-
-
-@wp.struct
-class Holds:
-    """What tools hold, all [B · T] but for the last four, [B · T · S] over the nodes that tools may touch."""
-
-    attached: wp.array[int]  # whether the wrench acts on nodes
-    contact: wp.array[wp.vec3d]  # the point held relative to their weighted centroid, kept, m
-    gripping: wp.array[int]  # whether the jaw holds nodes
-    last_tip: wp.array[wp.vec3d]  # at the end of the last step
-    last_R: wp.array[wp.mat33d]
-    placed: wp.array[int]  # whether these two mean anything
-    applied_force: wp.array[wp.vec3d]  # what arrived of the wrench, N and N·m
-    applied_torque: wp.array[wp.vec3d]
-    reaction_force: wp.array[wp.vec3d]  # out, N
-    reaction_torque: wp.array[wp.vec3d]  # out, N·m: of the wrench about the point held, of jaw and contact about the tip
-    slips: wp.array[int]  # times that tissue slipped out of the jaw
-    weight: wp.array[float]  # of each node in the wrench, zero = none
-    held: wp.array[int]  # whether the jaw holds the node
-    local: wp.array[wp.vec3d]  # where it was in the axes of the tip when the jaw closed, m
-    pulled: wp.array[wp.vec3d]  # displacement that it was last pulled to, m
-
-
-@wp.struct
-class ToolConstants:
-    """What all tools share."""
-
-    touchable: wp.array[int]  # [S] nodes that tools may take hold of
-    origin: wp.vec3d  # of the local frame, world, m
-    radius: wp.float64  # of the wrench and the jaw, m
-    travel: wp.float64  # m
-    duration: wp.float64  # of the step, s
-    contact_radius: float  # of the capsule, m
-    contact_length: wp.float64  # m
-
-
-@wp.func
-def block_sum3(v: wp.vec3d) -> wp.vec3d:
-    return wp.vec3d(block_sum(v[0]), block_sum(v[1]), block_sum(v[2]))
-
-
-@wp.func
-def double(v: wp.vec3) -> wp.vec3d:
-    return wp.vec3d(wp.float64(v[0]), wp.float64(v[1]), wp.float64(v[2]))
-
-
-@wp.func
-def single(v: wp.vec3d) -> wp.vec3:
-    return wp.vec3(wp.float32(v[0]), wp.float32(v[1]), wp.float32(v[2]))
 
 
 @wp.func
@@ -115,6 +55,11 @@ def take_hold(
         if attach or grip:
             centre = wp.vec3d()
             total, gripped = wp.float64(0.0), wp.float64(0.0)
+            opening = zero  # as wide as the jaws were before they closed
+            if commands.jawed[c] != 0:
+                opening = wp.length(commands.jaws[3 * c + 1] - commands.jaws[3 * c + 2])
+                if holds.joined[c] != 0:
+                    opening = wp.max(opening, holds.last_opening[c])
             for s in range(thread, touchable, threads):
                 p = constants.touchable[s]
                 u = double(state.u[b * count + p])
@@ -132,8 +77,11 @@ def take_hold(
                 if grip:
                     arm = x - commands.tip[c]
                     inside = int(0)
-                    if wp.length(arm) <= constants.radius:
+                    if commands.jawed[c] != 0:
+                        inside = lies_between(c, x, opening, commands, constants)
+                    elif wp.length(arm) <= constants.radius:
                         inside = 1
+                    if inside != 0:
                         gripped += one
                         holds.local[c * touchable + s] = wp.transpose(commands.R[c]) * arm
                         holds.pulled[c * touchable + s] = u
@@ -145,6 +93,8 @@ def take_hold(
                     holds.contact[c] = commands.grasp_point[c] - centre / total
                 if grip and gripped > zero:
                     holds.gripping[c] = 1
+                    holds.opening[c] = opening
+                    holds.slipping[c] = commands.jawed[c]
         if thread == 0:
             if not wanted:
                 holds.attached[c] = 0
@@ -212,12 +162,16 @@ def pull_by_jaw(
 ):  # fmt: skip
     """Let springs pull the nodes that the jaw of tool t holds to where it will be; it loses tissue that it pulls too far.
 
-    A node that several jaws hold follows the last of them; when that opens, the one before has it.
+    A node that several jaws hold follows the last of them; when that opens, the one before has it. Jaws of links share what
+    friction can bear among the nodes that they hold.
     """
     count = nodes.X.shape[0]
     touchable = constants.touchable.shape[0]
     zero, one = wp.float64(0.0), wp.float64(1.0)
-    beyond = wp.float64(0.0)
+    beyond, kept, share = wp.float64(0.0), one, zero
+    if holds.slipping[c] != 0 and constants.most_pull > zero:
+        kept = slide_in_jaws(b, t, c, thread, threads, commands, holds, constants, nodes, state, loads, bad_nodes)
+        share = constants.most_pull / wp.max(kept, one)
     for s in range(thread, touchable, threads):
         if holds.held[c * touchable + s] != 0:
             p = constants.touchable[s]
@@ -235,36 +189,46 @@ def pull_by_jaw(
                 start = double(state.u[e])
             goal = commands.tip[c] + commands.R[c] * holds.local[c * touchable + s] - constants.origin - double(nodes.X[p])
             loads.spring[e] = nodes.stiffness[e]
+            loads.limit[e] = wp.float32(share)
             loads.target[e] = single(start)
             loads.target_v[e] = single((goal - start) / constants.duration)
             loads.holder[e] = t
             holds.pulled[c * touchable + s] = goal
-    if thread == 0 and beyond > zero:
+    if thread == 0 and (beyond > zero or kept == zero):
         holds.gripping[c] = 0
         holds.slips[c] = holds.slips[c] + 1
         commands.closed[c] = 0
 
 
 @wp.func
-def is_finite(c: int, commands: Commands) -> bool:
+def is_finite(c: int, commands: Commands, constants: ToolConstants) -> bool:
     """Whether the command of a tool can be used."""
     finite = wp.isfinite(wp.length_sq(commands.force[c]) + wp.length_sq(commands.torque[c]))
     if commands.present[c] != 0:
         finite = finite and wp.isfinite(wp.length_sq(commands.tip[c]) + wp.ddot(commands.R[c], commands.R[c]))
+        finite = finite and (commands.linked[c] == 0 or links_are_finite(c, commands, constants))
     return finite
 
 
 @wp.func
 def fail_if_unusable(b: int, c: int, commands: Commands, constants: ToolConstants, nodes: Nodes, loads: Loads):
     """Make a command that is not finite fail the step, which is then counted and undone."""
-    if not is_finite(c, commands) and constants.touchable.shape[0] > 0:
+    if not is_finite(c, commands, constants) and constants.touchable.shape[0] > 0:
         loads.force[b * nodes.X.shape[0] + constants.touchable[0]] = wp.vec3(wp.nan, wp.nan, wp.nan)
 
 
 @wp.func
-def move_capsule(c: int, commands: Commands, holds: Holds, constants: ToolConstants, rigid: RigidTools):
-    """Let the capsule of a tool move from where it was to where it is to be at the end of the step."""
-    rigid.radius[c] = 0.0
+def move_capsule(
+    t: int, c: int, at: int, used: int, commands: Commands, holds: Holds, constants: ToolConstants, rigid: RigidTools
+) -> int:  # fmt: skip
+    """Let the capsule of tool t move from where it was to where it is to be at the end of the step; returns how many there are now.
+
+    Args:
+        t: The tool.
+        c: Its number in all environments.
+        at: First capsule of the environment.
+        used: Capsules of the tools before it.
+    """
     if commands.present[c] != 0:
         if holds.placed[c] == 0:
             holds.last_tip[c] = commands.tip[c]
@@ -272,14 +236,19 @@ def move_capsule(c: int, commands: Commands, holds: Holds, constants: ToolConsta
         tip, R, before, R_before = commands.tip[c], commands.R[c], holds.last_tip[c], holds.last_R[c]
         end = tip - constants.contact_length * wp.vec3d(R[0, 2], R[1, 2], R[2, 2])
         end_before = before - constants.contact_length * wp.vec3d(R_before[0, 2], R_before[1, 2], R_before[2, 2])
-        rigid.radius[c] = constants.contact_radius
-        rigid.tip[c] = single(before - constants.origin)
-        rigid.tip_v[c] = single((tip - before) / constants.duration)
-        rigid.end[c] = single(end_before - constants.origin)
-        rigid.end_v[c] = single((end - end_before) / constants.duration)
+        if commands.linked[c] == 0 and constants.contact_radius > 0.0:
+            k = at + used
+            rigid.tool[k] = t
+            rigid.radius[k] = constants.contact_radius
+            rigid.tip[k] = single(before - constants.origin)
+            rigid.tip_v[k] = single((tip - before) / constants.duration)
+            rigid.end[k] = single(end_before - constants.origin)
+            rigid.end_v[k] = single((end - end_before) / constants.duration)
+            used += 1
         holds.last_tip[c] = tip
         holds.last_R[c] = R
     holds.placed[c] = commands.present[c]
+    return used
 
 
 @wp.kernel(launch_bounds=512)
@@ -303,6 +272,8 @@ def load_nodes(
         e = b * count + constants.touchable[s]
         loads.force[e] = wp.vec3()
         loads.spring[e] = 0.0  # its last holder stays known
+        loads.limit[e] = 0.0
+    used = int(0)
     for t in range(tools):
         c = b * tools + t
         F, torque = wp.vec3d(), wp.vec3d()
@@ -314,7 +285,10 @@ def load_nodes(
             fail_if_unusable(b, c, commands, constants, nodes, loads)
             holds.applied_force[c] = F
             holds.applied_torque[c] = torque
-            move_capsule(c, commands, holds, constants, rigid)
+            used = move_capsule(t, c, b * rigid.room, used, commands, holds, constants, rigid)
+            used = move_links(t, c, b * rigid.room, used, commands, holds, constants, rigid)
+    if thread == 0:
+        rigid.used[b] = used
 
 
 @wp.kernel
@@ -344,16 +318,18 @@ def measure_reactions(
                     force += double(given) / constants.duration
                     moment += double(rigid.moment[c * count + p]) / constants.duration
             force, moment = block_sum3(force), block_sum3(moment)
+        undone = bad_nodes[b] > 0  # and all that tools did in it
+        # A tool that still holds tissue feels what it felt last: tissue at its limit does not vanish.
+        kept = undone and (holds.attached[c] != 0 or holds.gripping[c] != 0) and is_finite(c, commands, constants)
+        felt = wp.length_sq(force) > wp.float64(0.0) and not undone
+        measure_links(b, c, thread, threads, felt, kept, commands, holds, constants, nodes, state, rigid)
         if thread == 0:
             torque = moment - wp.cross(commands.tip[c] - constants.origin, force)
             force += holds.applied_force[c]
             torque += holds.applied_torque[c]
-            undone = bad_nodes[b] > 0  # and all that tools did in it
             if undone:
                 force, torque = wp.vec3d(), wp.vec3d()
-            # A tool that still holds tissue feels what it felt last: tissue at its limit does not vanish.
-            holding = (holds.attached[c] != 0 or holds.gripping[c] != 0) and is_finite(c, commands)
-            if not (undone and holding):
+            if not kept:
                 holds.reaction_force[c] = -force
                 holds.reaction_torque[c] = -torque
     if thread == 0 and bad_nodes[b] > 0:

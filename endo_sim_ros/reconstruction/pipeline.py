@@ -289,6 +289,7 @@ def extrapolate_tissue(scene: PreparedScene, config: ReconstructionConfig, progr
         max_gaussians=scene.max_gaussians,
         options=config.extrapolated,
         interpolation=config.interpolation,
+        device=pick_device(config.device),
         progress=progress,
     )
     return replace(scene, model=model)

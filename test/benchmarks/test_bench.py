@@ -129,6 +129,7 @@ def test_the_physics_bench_reports_every_row(tmp_path, capsys, monkeypatch):
     expected |= {(f"{name}: PSNR, {what}", "dense's images"): "dB" for name in shown for what in ("mean", "lowest")}
     expected |= {("over nodes: 80, printed, 80 substeps", plain): "ms", ("over nodes: 80, default", plain): "ms"}
     expected |= {("over substeps: 3, 100 nodes", plain): "ms", ("100 nodes, pressed by a capsule", "no contact"): "ms"}
+    expected |= {("100 nodes, pressed by an instrument", peer): "ms" for peer in (plain, "no contact")}
     expected |= {(name, plain): "ms" for name in ("100 nodes, pressed by a capsule", "skin 500", "step and skin 500")}
     expected |= {("step and skin 500", "step, then skin"): "ms", ("1 x 80 nodes: steps of all", None): "1/s"}
     expected |= {("2 x 80 nodes: steps of all", "1 x 80 nodes"): "1/s", ("2 x 80 nodes: steps of each", None): "1/s"}

@@ -94,11 +94,29 @@ def test_efforts_are_the_torques_of_a_force_at_the_tip():
         assert efforts[i] == pytest.approx(twist @ np.concatenate([force, torque]), abs=1e-5)
 
 
+@pytest.mark.parametrize("link, index", [("roll", 3), ("wrist_pitch", 4), ("jaw_left", 5)])
+def test_efforts_of_a_push_on_a_link_are_its_virtual_work_and_joints_beyond_bear_none_of_it(link, index):
+    arm = arm_at([0.1, 0.2, 0.12, 0.3, 0.4, 0.5])
+    push, at_tip, small = np.array([0.3, -0.2, 0.5]), np.array([-0.1, 0.4, 0.2]), 1e-6
+    frame = BASE @ PSM.link_frames(arm.joints)[index]
+    local = np.array([0.004, -0.003, -0.05])  # of the point that is pushed, in the frame of the link
+    point = frame[:3, :3] @ local + frame[:3, 3]
+    turning = np.cross(point - arm.pose[:3, 3], push)
+    arm.link_reactions = {link: (push, turning)}
+    efforts, _, _ = arm.dynamics(push + at_tip, turning)
+    for i in range(6):
+        moved = arm.joints.copy()
+        moved[i] += small
+        then = BASE @ PSM.link_frames(moved)[index]
+        work = push @ (then[:3, :3] @ local + then[:3, 3] - point) + at_tip @ (BASE @ PSM.tip_pose(moved) - arm.pose)[:3, 3]
+        assert efforts[i] == pytest.approx(work / small, abs=1e-5)
+
+
 def test_an_arm_without_a_base_is_a_tip():
     arm = JointedArm("PSM3", kinematics=PSM)
     arm.move_to(np.eye(4))
     arm.move(STEP, 0.05, 1.5)
     np.testing.assert_array_equal(arm.pose, np.eye(4))
-    assert arm.links() == []
+    assert arm.links() == {}
     with pytest.raises(ValueError, match="PSM3 has no place yet; publish a model, or give PSM3_base in frames"):
         arm.servo_joints(np.zeros(6))

@@ -7,6 +7,8 @@ from ros_bench import HEIGHT, WIDTH, K, S, await_image, await_nodes, newest_imag
 
 from endo_sim_ros import messages
 from endo_sim_ros.messages import OK, WARN
+from endo_sim_ros.nodes.configs import RenderingNodeConfig
+from endo_sim_ros.nodes.rendering_node import idle_period
 
 pytestmark = pytest.mark.dds
 
@@ -199,3 +201,12 @@ def test_rendered_tissue_follows_a_wrench_and_comes_back(bench, physics, renderi
     at_rest = await_image(bench, lambda image: image.max() > 100)
     pull(bench, lambda: np.abs(newest_image(bench) - at_rest).max() > 30, (0.8, 0, -1.5), what="pixels to change")
     await_image(bench, lambda image: np.abs(image - at_rest).max() < 12, "the tissue to come back")
+
+
+@pytest.mark.parametrize(("rate", "idle"), [(25.0, 5.0), (6.0, 5.0), (2.0, 5.0), (100.0, 0.5)])
+def test_images_of_what_rests_are_no_more_than_asked_for(rate, idle):
+    """The timer asks four times per image; at the first moment that is late enough an image comes."""
+    options = RenderingNodeConfig(rate=rate, idle_rate=idle)
+    poll = 1 / rate / 4
+    period = np.ceil(idle_period(options) / poll - 1e-9) * poll
+    assert period == pytest.approx(1 / min(rate, idle), abs=poll / 2)

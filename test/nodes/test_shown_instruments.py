@@ -119,6 +119,7 @@ def test_what_cannot_be_drawn_is_one_sentence(bench):
     bench.refused("rendering_node", "3 poses; publish those of roll, wrist_pitch", "PSM1/link_poses")
     send_type(bench, "PSM1", "SPOON")
     bench.refused("rendering_node", "SPOON", "PSM1/tool_type")
+    bench.until(lambda: "SPOON" in bench.nodes[1].status()[1], "a status that goes on saying so")
     send_links(bench, "PSM1", links("PSM1"))
     shows(bench, expected([])[0], "the tissue alone")
     send_type(bench, "PSM1")

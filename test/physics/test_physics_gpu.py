@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 from dense_sheet import sheet
+from instrument_scene import Instrument
 
-from endo_sim_ros.physics import PhysicsConfig, Skinning, TissueBatch, TissueSimulation, build_control_nodes
+from endo_sim_ros.physics import PhysicsConfig, Skinning, TissueBatch, TissueSimulation, ToolLinks, build_control_nodes
 from endo_sim_ros.physics.backends import cuda
 from endo_sim_ros.physics.materials import MATERIALS
 
@@ -63,6 +64,61 @@ def test_blocks_that_share_the_tissue_agree_with_launches_for_each_substep(count
     many = touch("cuda", node_count=count, relaxation=0.5)[1]
     np.testing.assert_allclose(few["positions"], many["positions"], atol=2e-3 * np.abs(many["positions"] - one.nodes.rest).max())
     np.testing.assert_allclose(few["felt"], many["felt"], atol=2e-2 * np.abs(many["felt"]).max())
+
+
+def press_and_pull(device: str, **overrides) -> tuple[TissueSimulation, dict[str, np.ndarray]]:
+    """Press with an instrument, close its jaws, pull until tissue slips, while the shaft of another lies on the tissue."""
+    config = PhysicsConfig(**{"device": device, "node_count": 2000, "grip_force": 1.0, **overrides})
+    simulation, instrument, felt = TissueSimulation(sheet(), np.zeros(3), config), Instrument("PROGRASP_FORCEPS"), []
+    for tool in ("grip", "lie"):
+        simulation.set_instrument(tool, instrument.capsules)
+    for step in range(16):
+        deep = min(step, 5) - 2.0 * max(step - 6, 0)
+        pose, links = instrument.at(TIP + [0, 0, -0.02 + 0.001 * deep], 0.0, 0.6 if step < 6 else 0.0)
+        simulation.set_grasp("grip", pose, step == 6 or step > 6 and simulation.in_reach("grip"), links)
+        pose, links = instrument.at(TIP + [0.0, 0.03, -0.004 + 0.0004 * step], np.pi / 2)
+        simulation.set_grasp("lie", pose, False, links)
+        simulation.step()
+        felt.append(np.concatenate([*simulation.reaction("grip"), *simulation.reaction("lie"), [len(simulation.held_nodes("grip"))]]))
+    assert simulation.faults == 0
+    state = simulation.state()
+    return simulation, {"positions": state.positions, "F": state.F, "felt": np.array(felt)}
+
+
+@pytest.mark.parametrize("kinematics", ["rest", "current"])
+def test_instruments_agree_step_for_step(kinematics):
+    (simulation, cpu), (_, cuda) = press_and_pull("cpu", kinematics=kinematics), press_and_pull("cuda", kinematics=kinematics)
+    moved = np.abs(cpu["positions"] - simulation.nodes.rest).max()
+    assert moved > 2e-3 and simulation.slips + cpu["felt"][6, -1] > 0
+    np.testing.assert_allclose(cuda["positions"], cpu["positions"], atol=5e-3 * moved)
+    np.testing.assert_allclose(cuda["felt"][:, :12], cpu["felt"][:, :12], atol=0.02 * np.abs(cpu["felt"][:, :12]).max())
+    np.testing.assert_allclose(cuda["felt"][:, -1], cpu["felt"][:, -1], atol=1)
+
+
+def test_instruments_give_the_same_bits_twice_and_in_blocks_what_they_give_in_launches(monkeypatch):
+    (one, first), (_, second) = press_and_pull("cuda"), press_and_pull("cuda")
+    for name, values in first.items():
+        np.testing.assert_array_equal(second[name], values, err_msg=name)
+    monkeypatch.setattr(cuda.cluster, "divide", lambda *arguments: None)
+    many = press_and_pull("cuda")[1]
+    np.testing.assert_allclose(first["positions"], many["positions"], atol=5e-3 * np.abs(many["positions"] - one.nodes.rest).max())
+    np.testing.assert_allclose(first["felt"][:, :12], many["felt"][:, :12], atol=2e-2 * np.abs(many["felt"][:, :12]).max())
+
+
+def test_a_batch_takes_the_links_of_all_its_copies_without_waiting():
+    config, instrument, count = PhysicsConfig(device="cuda", node_count=1000), Instrument(), 16
+    nodes, links = build_control_nodes(sheet(), np.zeros(3), config), ToolLinks(instrument.capsules)
+    batch = TissueBatch(nodes, config, environments=count, capsules=len(links))
+    for step in range(6):
+        at = [instrument.at(TIP + [0, 0, -0.016 + 0.001 * step + 0.0002 * b]) for b in range(count)]
+        poses = torch.from_numpy(np.stack([[each[name] for name in links.links] for _, each in at])).cuda()
+        tips = torch.from_numpy(np.stack([pose for pose, _ in at])).cuda()
+        batch.tools.set_links(0, links, poses)
+        batch.tools.tips[:, 0], batch.tools.rotations[:, 0] = tips[:, :3, 3], tips[:, :3, :3]
+        batch.tools.present[:] = 1
+        batch.step()
+    pushes = -batch.tools.reaction_forces[:, 0, 2]
+    assert not batch.tools.faults.any() and bool((pushes[1:] > pushes[:-1]).all()) and float(pushes[-1]) > 0.05
 
 
 def test_the_same_touches_give_the_same_bits_twice():

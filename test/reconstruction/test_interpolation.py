@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.interpolate import RBFInterpolator
 
 from endo_sim_ros.reconstruction.priors.interpolation import clip_to_range, fit_plane, inverse_distance_weighted, krige
 from endo_sim_ros.reconstruction.stage_configs import InterpolationConfig
@@ -28,6 +29,15 @@ def test_depth_beyond_is_that_of_kriging():
     weights = np.linalg.solve(system, np.column_stack([between(targets, sources), np.ones(len(targets))]).T)[:35]
     expected = weights.T @ np.concatenate([values[known], there])
     np.testing.assert_allclose(told[~known], expected, atol=1e-4)
+
+
+def test_kriging_from_the_nearest_of_many_points_is_that_of_scipy():
+    random, width = np.random.default_rng(0), 80  # one pixel a cell
+    uv, there = random.uniform(0, [width, 30], (500, 2)), random.normal(0, 1, 500)
+    told = krige(np.zeros((30, width)), np.zeros((30, width), bool), uv, there, width, OPTIONS)
+    targets = np.argwhere(np.ones((30, width)))[:, ::-1] + 0.5
+    scipys = RBFInterpolator(uv, there, neighbors=OPTIONS.neighbours, smoothing=width * OPTIONS.point_error, kernel="linear", degree=0)
+    np.testing.assert_allclose(told.ravel(), scipys(targets), atol=1e-5)
 
 
 def test_colour_beyond_is_the_mean_of_what_is_seen_by_distance():

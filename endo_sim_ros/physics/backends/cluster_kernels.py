@@ -162,14 +162,12 @@ def make_step_kernel(material: str, lanes: int):
         lam = scale[e] * nodes.lam[p]
         stiffness = nodes.stiffness[e]
         spring = loads.spring[e]
+        limit = loads.limit[e]
         holder = loads.holder[e]
         target = loads.target[e]
         target_v = loads.target_v[e]
         force = loads.force[e]
-        touching = int(0)  # tools that may push
-        for t in range(tools.count):
-            if tools.radius[b * tools.count + t] > 0.0:
-                touching = tools.count
+        touching = tools.used[b]  # capsules that may push
         source_tool = int(-1)  # that gave impulse and moment
         impulse, moment = wp.vec3(), wp.vec3()
         base = nodes.first[p]
@@ -199,8 +197,8 @@ def make_step_kernel(material: str, lanes: int):
             # ---- Nodes give: the update of the node, and into its slots what it gives to each of its grid nodes.
             momentum, growth, pull = wp.vec3(), wp.mat33(), wp.vec4()
             source = update(
-                tools, b * tools.count, touching, grid, step, time, X, u, v, C, F, Q, force, target, target_v,
-                mass, volume, mu, lam, stiffness, spring, holder, momentum, growth, pull,
+                tools, b * tools.room, touching, grid, step, time, X, u, v, C, F, Q, force, target, target_v,
+                mass, volume, mu, lam, stiffness, spring, limit, holder, momentum, growth, pull,
             )  # fmt: skip
             ax = wp.vec3(growth[0, 0], growth[1, 0], growth[2, 0])
             ay = wp.vec3(growth[0, 1], growth[1, 1], growth[2, 1])

@@ -13,7 +13,7 @@ from endo_sim_ros.physics.backends.structs import Grid, Loads, Nodes, RigidTools
 from endo_sim_ros.physics.materials import LEAST_VOLUME
 
 LANES = 16
-SCRATCH = 56  # vectors of scratch for 16 control nodes: 40 components and 16 rows of weights
+SCRATCH = 57  # vectors of scratch for 16 control nodes: 41 components and 16 rows of weights
 HEADER = native("physics/native/cpu_step.h", CPU_SCRATCH=SCRATCH, LEAST_VOLUME=LEAST_VOLUME)
 OPTIONS = {"default_grid_stride": False, "extra_build_options": HEADER}
 SKINNING = {"default_grid_stride": False, "extra_build_options": native("physics/native/skinning.h")}

@@ -78,13 +78,13 @@ def node_update(material: str, kinematics: str) -> wp.Function:
 
     @wp.func_native(f"""
         return endo_sim::update_one<endo_sim::{material}, {native_bool(kinematics == "current")}>(
-            tools, first_tool, tool_count, grid, substep, time, X, u, v, C, F, Q, force, target, target_v,
-            mass, volume, mu, lam, stiffness, spring, holder, momentum, growth, pull);
+            tools, first_capsule, capsules, grid, substep, time, X, u, v, C, F, Q, force, target, target_v,
+            mass, volume, mu, lam, stiffness, spring, limit, holder, momentum, growth, pull);
     """)
     def update(
         tools: RigidTools,
-        first_tool: int,
-        tool_count: int,
+        first_capsule: int,
+        capsules: int,
         grid: Grid,
         substep: Substep,
         time: float,
@@ -103,6 +103,7 @@ def node_update(material: str, kinematics: str) -> wp.Function:
         lam: float,
         stiffness: float,
         spring: float,
+        limit: float,
         holder: int,
         momentum: wp.ref[wp.vec3],
         growth: wp.ref[wp.mat33],
@@ -209,9 +210,9 @@ def make_advance_kernel(material: str, kinematics: str):
                 Q = state.Q[e]
             momentum, growth, pull = wp.vec3(), wp.mat33(), wp.vec4()
             transfer.source_tool[e] = update(
-                tools, b * tools.count, tools.count, grid, step, time, X, u, v, C, F, Q, loads.force[e], loads.target[e],
+                tools, b * tools.room, tools.used[b], grid, step, time, X, u, v, C, F, Q, loads.force[e], loads.target[e],
                 loads.target_v[e], nodes.mass[p], nodes.volume[p], scale[e] * nodes.mu[p], scale[e] * nodes.lam[p],
-                nodes.stiffness[e], loads.spring[e], loads.holder[e], momentum, growth, pull,
+                nodes.stiffness[e], loads.spring[e], loads.limit[e], loads.holder[e], momentum, growth, pull,
             )  # fmt: skip
             if step.ratio > 0.0:
                 state.Q[e] = Q

@@ -66,20 +66,24 @@ class Loads:
     target: wp.array[wp.vec3]  # displacement u* at the start of the step that the spring pulls to, m
     target_v: wp.array[wp.vec3]  # its velocity during the step, m/s
     holder: wp.array[int]  # tool whose jaw the spring belongs to, or did when the control node was held last; -1 = none
+    limit: wp.array[float]  # most that the spring pulls with, N; zero: without limit
 
 
 @struct
 class RigidTools:
-    """Capsules in the local frame, all [B · T]; their ends move evenly through the step."""
+    """Capsules of tools in the local frame, [B · C] with room for C in each environment; their ends move evenly through the step."""
 
-    count: int  # T
+    count: int  # tools T
+    room: int  # C
+    used: wp.array[int]  # [B] capsules that touch: the first ones, those of a tool together
+    tool: wp.array[int]  # that a capsule is part of
     friction: float  # Coulomb's coefficient
     tip: wp.array[wp.vec3]  # one end at the start of the step, m
     tip_v: wp.array[wp.vec3]  # m/s
     end: wp.array[wp.vec3]  # the other
     end_v: wp.array[wp.vec3]
     push_out: float  # m/s; a tool that suddenly is deep within tissue pushes it out no faster than this
-    radius: wp.array[float]  # m; zero or less: touches nothing
+    radius: wp.array[float]  # m
     impulse: wp.array[wp.vec3]  # out [B · T · M]: what each gave to each node during the step, N·s
     moment: wp.array[wp.vec3]  # out [B · T · M]: its moment about the local origin, N·m·s
 

@@ -9,6 +9,7 @@ MIN_DETERMINANT = 0.05  # of F; below it a node has collapsed and says nothing o
 BLADE_NEIGHBOURS = 4  # nodes that carry a point of the blade
 BLADE_POINTS, BLADE_PIECES = 16, 16  # most along an edge, and on its way in one step
 SHORTEST_MOVE = 0.1  # spacings that a blade moves before it cuts again
+_CLOSING = 1e-3  # spacings by which tips come nearer in a step when scissors close: rounding is far below
 
 
 class Blade:
@@ -42,7 +43,17 @@ class Blade:
             F: Their deformation gradients [M, 3, 3].
             cuts: Triangles of all cuts [T, 3, 3], m, at rest.
         """
-        edge = pose[:3, 3] - self._along * pose[:3, 2]
+        return self._draw(pose[:3, 3] - self._along * pose[:3, 2], rest, positions, F, cuts)
+
+    def draw(self, corners: np.ndarray, rest: np.ndarray, positions: np.ndarray, F: np.ndarray, cuts: np.ndarray) -> np.ndarray:
+        """The same for an edge through corners [C, 3], m, world, about as long as it was at first."""
+        lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
+        at = np.concatenate([[0.0], np.cumsum(lengths)])
+        along = np.linspace(0, at[-1], len(self._along))
+        edge = np.stack([np.interp(along, at, corners[:, axis]) for axis in range(3)], 1)
+        return self._draw(edge, rest, positions, F, cuts)
+
+    def _draw(self, edge: np.ndarray, rest: np.ndarray, positions: np.ndarray, F: np.ndarray, cuts: np.ndarray) -> np.ndarray:
         if self._edge is None:
             self._edge = edge
             self._rest, self._inside = to_rest(edge, rest, positions, F, self._spacing, cuts)
@@ -60,6 +71,48 @@ class Blade:
         triangles = [sweep(carried[k], carried[k + 1], inside[k] & inside[k + 1]) for k in range(pieces)]
         self._edge, self._rest, self._inside = edge, carried[-1], inside[-1]
         return np.concatenate(triangles)
+
+
+class Scissors:
+    """Two blades that cut what lies between them while they close.
+
+    Each sweeps from where it was; closed, the two meet half way. While they open or stand still they cut nothing.
+
+    Args:
+        spacing: Typical distance between nodes, m.
+    """
+
+    def __init__(self, spacing: float):
+        self._spacing = spacing
+        self._jaws: np.ndarray | None = None  # at the last call [3, 3]
+        self._closed = False
+        self._blades: list[Blade] | None = None  # while they close
+
+    def move(
+        self, jaws: np.ndarray, closed: bool, rest: np.ndarray, positions: np.ndarray, F: np.ndarray, cuts: np.ndarray
+    ) -> np.ndarray:  # fmt: skip
+        """Triangles [T, 3, 3], m, at rest, that the blades cut on their way.
+
+        Args:
+            jaws: Hinge and tips of the two [3, 3], m, world.
+            closed: Whether they are to meet.
+            rest, positions, F, cuts: As for `Blade.move`.
+        """
+        before, was_closed, self._jaws, self._closed = self._jaws, self._closed, jaws, closed
+        if before is None or was_closed or not (closed or _opening(jaws) < _opening(before) - _CLOSING * self._spacing):
+            self._blades = None
+            return np.zeros((0, 3, 3))
+        state = rest, positions, F, cuts
+        if self._blades is None:
+            self._blades = [Blade(float(np.linalg.norm(tip - before[0])), self._spacing) for tip in before[1:]]
+            for blade, tip in zip(self._blades, before[1:]):
+                blade.draw(np.stack([before[0], tip]), *state)
+        tips = [jaws[1:].mean(0)] * 2 if closed else jaws[1:]
+        return np.concatenate([blade.draw(np.stack([jaws[0], tip]), *state) for blade, tip in zip(self._blades, tips)])
+
+
+def _opening(jaws: np.ndarray) -> float:
+    return float(np.linalg.norm(jaws[1] - jaws[2]))
 
 
 def to_rest(

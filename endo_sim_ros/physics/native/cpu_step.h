@@ -51,6 +51,7 @@ enum Component {
     LAM,
     STIFFNESS,
     SPRING,
+    LIMIT,
     HOLDER,
     X,
     U = X + 3,
@@ -118,6 +119,7 @@ template <bool CURRENT, class Nodes, class State, class Loads, class Tools, clas
                 at(block, LAM)[lane] *= factor;
                 fill(block, lane, STIFFNESS, nodes.stiffness.data, e, 1);
                 fill(block, lane, SPRING, loads.spring.data, e, 1);
+                fill(block, lane, LIMIT, loads.limit.data, e, 1);
                 fill(block, lane, HOLDER, loads.holder.data, e, 1);  // an integer, bit by bit
                 fill(block, lane, X, nodes.X.data, p, 3);
                 fill(block, lane, U, state.u.data, e, 3);
@@ -416,8 +418,8 @@ template <bool CURRENT, class Nodes, class State, class Loads, class Tools, clas
             const Node<vfloat> node
                 = {&at(block, X), u, v, C, F, &at(block, Q0), &at(block, FORCE), &at(block, TARGET), &at(block, TARGET_V),
                    at(block, MASS), at(block, VOLUME), at(block, MU), at(block, LAM), at(block, STIFFNESS), at(block, SPRING),
-                   (vint)at(block, HOLDER)};
-            const auto given = update<Law, CURRENT>(node, tools, b * tools.count, tools.count, grid, substep, time);
+                   at(block, LIMIT), (vint)at(block, HOLDER)};
+            const auto given = update<Law, CURRENT>(node, tools, b * tools.room, tools.used.data[b], grid, substep, time);
             if (tools.count > 0) {
                 source_tools[block] = given.source_tool;
                 for (int i = 0; i < 3; ++i)

@@ -6,6 +6,10 @@
 
 namespace endo_sim {
 
+// Cosine of the angle between the ways out of two capsules from which on these face each other: 120°. Links of a wrist meet at
+// 100° at most, jaws on either side of tissue at 180°.
+constexpr float FACING = -0.5f;
+
 // A node, with pointers to what is only read if need be.
 template <class T> struct Node {
     const T* X;  // where it is at rest
@@ -20,6 +24,7 @@ template <class T> struct Node {
     T mass, volume, mu, lam;
     T stiffness;  // of what pushes the node
     T spring;  // zero where free
+    T limit;  // of the spring's force, zero without one
     integers_of<T> holder;  // tool that the spring belongs to
 };
 
@@ -95,23 +100,35 @@ template <class T> ENDO_SIM_INLINE void kirchhoff(const T* F, T* P)
 }
 
 // The spring that pins or grasps a node, until `time` of the step: mass Δt² k and momentum −Δt k (u − u*).
+//
+// Where its force has a limit, as tissue between jaws that hold it by friction, k is as much smaller as keeps the impulse
+// Δt² k |v* − v| below the limit; v* = −(u − u*)/Δt is where the spring draws the node to.
 template <class T> ENDO_SIM_INLINE void pull_by_spring(const Node<T>& node, float dt, float time, Given<T>& given)
 {
     ENDO_SIM_FUSE(on)
     const auto held = node.spring > 0.0f;
     if (!any(held))
         return;
-    given.added = dt * dt * node.spring;
+    T spring = node.spring;
+    if (any(node.limit > 0.0f)) {
+        T wanted[3];  // Δt (v* − v)
+        for (int i = 0; i < 3; ++i)
+            wanted[i] = -(node.u[i] - node.target[i] - time * node.target_v[i]) - dt * node.v[i];
+        const T most = node.limit / larger(root(dot(wanted, wanted)), everywhere<T>(1e-12f));
+        spring = node.limit > 0.0f ? smaller(spring, most) : spring;
+    }
+    given.added = dt * dt * spring;
     for (int i = 0; i < 3; ++i)
-        given.pull[i] = -dt * node.spring * (node.u[i] - node.target[i] - time * node.target_v[i]);
+        given.pull[i] = -dt * spring * (node.u[i] - node.target[i] - time * node.target_v[i]);
     given.source_tool = held ? node.holder : given.source_tool;
 }
 
-// Momentum and mass by which the tool that a free node is about to enter deepest pushes it out.
+// Momentum and mass by which the capsule that a free node is about to enter deepest pushes it out.
 //
-// The tool is where it will be at the end of the substep, `time`. The node is drawn to the tool's surface along the normal n
+// The capsule is where it will be at the end of the substep, `time`. The node is drawn to its surface along the normal n
 // by an implicit spring k, mass Δt² k, with normal velocity −φ/Δt; along the surface that mass moves with the node, less
-// what Coulomb's friction takes from the velocity relative to the tool.
+// what Coulomb's friction takes from the velocity relative to the tool. A node between two capsules of a tool that face each
+// other, such as its jaws, is pushed by neither: one would push it into the other.
 template <class T, class Tools>
 ENDO_SIM_INLINE void push_by_tools(
     const Node<T>& node, const Tools& tools, int first, int count, float dt, float time, Given<T>& given)
@@ -122,17 +139,15 @@ ENDO_SIM_INLINE void push_by_tools(
     if (!any(negated(held)))
         return;
     T deepest = zero, outward = zero, normal[3] = {}, along[3] = {};
-    integers_of<T> pushing = integers_of<T>{} - 1;
-    for (int t = 0; t < count; ++t) {
-        const int tool = first + t;
-        const float radius = tools.radius.data[tool];
-        if (!(radius > 0.0f))
-            continue;
+    integers_of<T> pushing = integers_of<T>{} - 1, pinched = {};
+    for (int capsule = first; capsule < first + count; ++capsule) {
+        const int tool = tools.tool.data[capsule];
+        const float radius = tools.radius.data[capsule];
         float tip[3], axis[3], square = 0.0f;
-        const float *tip_v = tools.tip_v.data[tool].c, *end_v = tools.end_v.data[tool].c;
+        const float *tip_v = tools.tip_v.data[capsule].c, *end_v = tools.end_v.data[capsule].c;
         for (int i = 0; i < 3; ++i) {
-            tip[i] = tools.tip.data[tool].c[i] + time * tip_v[i];
-            axis[i] = tools.end.data[tool].c[i] + time * end_v[i] - tip[i];
+            tip[i] = tools.tip.data[capsule].c[i] + time * tip_v[i];
+            axis[i] = tools.end.data[capsule].c[i] + time * end_v[i] - tip[i];
             square += axis[i] * axis[i];
         }
         T arm[3], share = zero;
@@ -143,27 +158,34 @@ ENDO_SIM_INLINE void push_by_tools(
         share = clamp(share / (square > 1e-12f ? square : 1e-12f), 0.0f, 1.0f);
         for (int i = 0; i < 3; ++i)
             arm[i] -= share * axis[i];
-        const T distance = root(dot(arm, arm));
-        if (!any(distance < radius + dt * 10.0f))  // nothing comes nearer at 10 m/s
+        const T apart = dot(arm, arm);
+        const float reach = radius + dt * 10.0f;
+        if (!any(apart < reach * reach))  // nothing comes nearer at 10 m/s
             continue;
+        const T distance = root(apart);
         const T gap = distance - radius;
         for (int i = 0; i < 3; ++i)
             arm[i] /= larger(distance, everywhere<T>(1e-9f));
         const T predicted = gap + dt * dot(node.v, arm);
-        const auto deeper = (distance > 1e-9f) & (predicted < deepest) & negated(held) & (node.mass > 0.0f);
+        const auto entering = (distance > 1e-9f) & (predicted < 0.0f) & negated(held) & (node.mass > 0.0f);
+        if (!any(entering))
+            continue;
+        const auto facing = entering & (pushing == tool) & (dot(arm, normal) < FACING);
+        pinched = facing ? integers_of<T>{} + 1 : pinched;
+        const auto deeper = entering & (predicted < deepest);
         T moving[3];
         for (int i = 0; i < 3; ++i)
             moving[i] = tip_v[i] + share * (end_v[i] - tip_v[i]);
         const T out = smaller(-gap / dt, larger(dot(moving, arm), zero) + tools.push_out);
         deepest = deeper ? predicted : deepest;
-        pushing = deeper ? integers_of<T>{} + t : pushing;
+        pushing = deeper ? integers_of<T>{} + tool : pushing;
         outward = deeper ? out : outward;
         for (int i = 0; i < 3; ++i) {
             normal[i] = deeper ? arm[i] : normal[i];
             along[i] = deeper ? moving[i] : along[i];
         }
     }
-    const auto pushed = pushing >= 0;
+    const auto pushed = (pushing >= 0) & (pinched == 0);
     if (!any(pushed))
         return;
     const T weight = dt * dt * node.stiffness, towards = dot<1>(along, normal);
@@ -183,10 +205,11 @@ ENDO_SIM_INLINE void push_by_tools(
     given.source_tool = pushed ? pushing : given.source_tool;
 }
 
-// What a node gives to the grid in a substep that ends at `time` of the step, while so many tools push, from the first on.
+// What a node gives to the grid in a substep that ends at `time` of the step, while so many capsules push, from the first on.
 template <class Law, bool CURRENT, class T, class Tools, class Grid, class Substep>
 ENDO_SIM_INLINE Given<T> update(
-    const Node<T>& node, const Tools& tools, int first_tool, int tool_count, const Grid& grid, const Substep& substep, float time)
+    const Node<T>& node, const Tools& tools, int first_capsule, int capsules, const Grid& grid, const Substep& substep,
+    float time)
 {
     ENDO_SIM_FUSE(on)
     const float dt = substep.dt;
@@ -199,7 +222,7 @@ ENDO_SIM_INLINE Given<T> update(
     Given<T> given = {};
     given.source_tool = integers_of<T>{} - 1;
     pull_by_spring(node, dt, time, given);
-    push_by_tools(node, tools, first_tool, tool_count, dt, time, given);
+    push_by_tools(node, tools, first_capsule, capsules, dt, time, given);
     const T share = dt * 4.0f * grid.inverse_h * node.volume;
     for (int r = 0; r < 3; ++r) {
         given.momentum[r] = node.mass * (node.v[r] + dt * substep.gravity[r]) + dt * node.force[r] + given.pull[r];
@@ -212,14 +235,14 @@ ENDO_SIM_INLINE Given<T> update(
 
 // `update` of one control node in the vectors and matrices of Warp; returns the tool that gave the pull (x, y, z, mass).
 template <class Law, bool CURRENT, class Tools, class Grid, class Substep, class Three, class Nine, class Four>
-ENDO_SIM_INLINE int update_one(const Tools& tools, int first_tool, int tool_count, const Grid& grid, const Substep& substep,
+ENDO_SIM_INLINE int update_one(const Tools& tools, int first_capsule, int capsules, const Grid& grid, const Substep& substep,
     float time, const Three& X, const Three& u, const Three& v, const Nine& C, const Nine& F, Nine& Q, const Three& force,
     const Three& target, const Three& target_v, float mass, float volume, float mu, float lam, float stiffness, float spring,
-    int holder, Three& momentum, Nine& growth, Four& pull)
+    float limit, int holder, Three& momentum, Nine& growth, Four& pull)
 {
     const Node<float> node = {X.c, u.c, v.c, &C.data[0][0], &F.data[0][0], &Q.data[0][0], force.c, target.c, target_v.c,
-        mass, volume, mu, lam, stiffness, spring, holder};
-    const auto given = update<Law, CURRENT>(node, tools, first_tool, tool_count, grid, substep, time);
+        mass, volume, mu, lam, stiffness, spring, limit, holder};
+    const auto given = update<Law, CURRENT>(node, tools, first_capsule, capsules, grid, substep, time);
     for (int r = 0; r < 3; ++r) {
         momentum.c[r] = given.momentum[r];
         for (int c = 0; c < 3; ++c)

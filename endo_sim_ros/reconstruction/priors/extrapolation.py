@@ -18,9 +18,11 @@ from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import features_at
 from endo_sim_ros.reconstruction.priors.interpolation import clip_to_range, fit_plane, inverse_distance_weighted, krige
 from endo_sim_ros.reconstruction.progress import StageProgress
-from endo_sim_ros.reconstruction.scene import TrainingView, pixels_of
+from endo_sim_ros.reconstruction.scene import TrainingView, pixels_of, shrink
 from endo_sim_ros.reconstruction.stage_configs import ExtrapolationConfig, InterpolationConfig
 from endo_sim_ros.reconstruction.triangulation import points_in_view
+
+_FINENESS = 4  # pixels of a cell: what goes on beyond a picture is no finer than cells
 
 
 class ContinuedView(NamedTuple):
@@ -52,6 +54,7 @@ def extrapolate(
     max_gaussians: int,
     options: ExtrapolationConfig = ExtrapolationConfig(),
     interpolation: InterpolationConfig = InterpolationConfig(),
+    device: str = "cpu",
     progress: StageProgress = StageProgress(),
 ) -> GaussianModel:
     """The model, and Gaussians where no view knows the depth: inverse depth by kriging, colour as the mean of the picture by distance.
@@ -66,6 +69,7 @@ def extrapolate(
         max_gaussians: Largest number of Gaussians in all.
         options: Size and opacity of the Gaussians.
         interpolation: How depth and colour are continued, and on how fine a lattice.
+        device: Where depth is continued.
         progress: Reported to by views.
     """
     parts = [model.means.numpy().astype(np.float64)]
@@ -75,9 +79,9 @@ def extrapolate(
     usable = [index for index, view in enumerate(views) if known[index] and view.tissue.any()]
 
     def around(index: int) -> tuple[_Guess, _Guess]:
-        view = views[index]
+        view = shrink(views[index], round(_FINENESS / interpolation.cell))
         pad = int(reach * view.camera.width)
-        continued = continue_view(view, points, light, exposures[index], reference, pad, interpolation)
+        continued = continue_view(view, points, light, exposures[index], reference, pad, interpolation, device)
         positions = continued.camera.backproject(continued.depth)
         on_lattice = lambda times: _on_lattice(view, continued, positions, times * interpolation.cell)
         return on_lattice(1.0), on_lattice(1.5)
@@ -88,17 +92,20 @@ def extrapolate(
     # Holes, then outwards around all views at a time, since what is close to one picture and far from another is told by the former.
     for ring in (-1, *rings):
         least, most = ring * width, np.inf if ring == rings[-1] else (ring + 1) * width
+        before, of_ring = cKDTree(np.concatenate(parts)), []
         for fine, coarse in guesses:
             progress.check()
             guess = fine if least < options.fine_reach else coarse
             chosen = (guess.away > least) & (guess.away <= most)
             positions, spacing = guess.positions[chosen], guess.spacing[chosen]
             new = _unknown(positions, views, ring in rings)
-            if new.any():
-                new[new] = cKDTree(np.concatenate(parts)).query(positions[new])[0] > 0.7 * spacing[new]
-            parts.append(positions[new])
+            trees = [before, cKDTree(np.concatenate(of_ring))] if of_ring else [before]
+            for tree in trees if new.any() else []:
+                new[new] = tree.query(positions[new])[0] > 0.7 * spacing[new]
+            of_ring.append(positions[new])
             colors.append(guess.colors[chosen][new])
             spacings.append(spacing[new])
+        parts += of_ring
     count, room = sum(map(len, spacings)), max_gaussians - len(model)
     if not count or room <= 0:
         return model
@@ -119,6 +126,7 @@ def continue_view(
     reference: float,
     pad: int,
     interpolation: InterpolationConfig = InterpolationConfig(),
+    device: str = "cpu",
 ) -> ContinuedView:
     """The view with a margin of so many pixels, and depth and colour wherever it has none.
 
@@ -129,6 +137,7 @@ def continue_view(
         reference: Distance (m) at which colours are the tissue's own.
         pad: Width of the margin, pixels.
         interpolation: How depth and colour are continued.
+        device: Where depth is.
     """
     K = view.camera.K.copy()
     K[:2, 2] += pad
@@ -148,7 +157,7 @@ def continue_view(
     point_residual = point_inverse - plane[rows, columns]
     if len(point_residual) > 8:  # the median of a point and those around: one wrong point would stand like a pillar before the tissue
         point_residual = np.median(point_residual[cKDTree(uv).query(uv, k=9)[1]], 1)
-    residual = krige(residual, known, uv, point_residual, view.camera.width, interpolation)
+    residual = krige(residual, known, uv, point_residual, view.camera.width, interpolation, device)
     depth = 1 / clip_to_range(plane + residual, np.concatenate([inverse, point_inverse]), interpolation)
     shading = features_at(camera.backproject(depth).reshape(-1, 3), camera, reference) * light
     near, lit = np.exp(shading[:, 0]).reshape(depth.shape), np.exp(shading[:, 1:].sum(1)[:, None] + exposure).reshape(image.shape)

@@ -1,12 +1,17 @@
 """Values of some pixels and points of a picture continued to all its pixels."""
 
+import threading
 from typing import Any
 
 import cv2
 import numpy as np
-from scipy.interpolate import RBFInterpolator
+import torch
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (it is public)
 
 from endo_sim_ros.reconstruction.stage_configs import InterpolationConfig
+
+_SYSTEMS = 512  # of equations that are solved at a time: a dozen megabytes
+_loading = threading.Lock()
 
 
 def krige(
@@ -16,6 +21,7 @@ def krige(
     point_values: np.ndarray,
     width: int,
     options: InterpolationConfig = InterpolationConfig(),
+    device: str = "cpu",
 ) -> np.ndarray:
     """Values [H, W] where known [H, W]; elsewhere the likeliest, by kriging with a linear variogram.
 
@@ -26,6 +32,7 @@ def krige(
         uv, point_values: Pixels [N, 2] of points and their values [N]. There must be one known pixel or point.
         width: Of the picture, pixels; the options' lengths are in units of it.
         options: Size of the cells, errors, and number of neighbours that tell a value.
+        device: Where the systems of equations are solved.
     """
     side = max(round(options.cell * width), 1)
     count, means = _in_cells(values[..., None], known, side)
@@ -35,9 +42,30 @@ def krige(
     sources = np.concatenate([centres[occupied], uv / side])
     errors: Any = np.repeat([options.pixel_error, options.point_error], [occupied.sum(), len(uv)]) * width / side
     source_values = np.concatenate([means[occupied], point_values])
-    kriging = RBFInterpolator(sources, source_values, neighbors=options.neighbours, smoothing=errors, kernel="linear", degree=0)
-    means[~occupied] = kriging(centres[~occupied])
+    means[~occupied] = _kriged(sources, source_values, errors, centres[~occupied], options.neighbours, device)
     return np.where(known, values, _in_pixels(means, side, known.shape))
+
+
+def _kriged(sources: np.ndarray, values: np.ndarray, errors: np.ndarray, targets: np.ndarray, count: int, device: str) -> np.ndarray:
+    """Values at targets [M, 2] from the nearest of sources [N, 2], whose values [N] and errors [N] are given."""
+    nearest = cKDTree(sources).query(targets, k=range(1, min(count, len(sources)) + 1))[1]
+    sets, which = np.unique(np.sort(nearest, 1), axis=0, return_inverse=True)  # targets side by side mostly have the same
+    at, given, variances, wanted = (torch.from_numpy(array).to(device, torch.float64) for array in (sources, values, errors, targets))
+    if device != "cpu":
+        with _loading:  # torch loads its solver in the first call, and fails if two threads are the first
+            torch.linalg.solve(at.new_ones(1, 1), at.new_ones(1, 1))
+    chosen, count = torch.from_numpy(sets).to(device), sets.shape[1]
+    solved = []
+    for chunk in chosen.split(_SYSTEMS):
+        system, right = at.new_ones(len(chunk), count + 1, count + 1), at.new_zeros(len(chunk), count + 1)
+        between = torch.linalg.vector_norm(at[chunk][:, :, None] - at[chunk][:, None], dim=-1)
+        system[:, :count, :count] = torch.diag_embed(variances[chunk]) - between
+        system[:, count, count] = 0
+        right[:, :count] = given[chunk]
+        solved.append(torch.linalg.solve(system, right))
+    group = torch.from_numpy(which.reshape(-1)).to(device)
+    weights, away = torch.cat(solved)[group], torch.linalg.vector_norm(wanted[:, None] - at[chosen[group]], dim=-1)
+    return (weights[:, count] - (weights[:, :count] * away).sum(1)).cpu().numpy()
 
 
 def fit_plane(u: np.ndarray, v: np.ndarray, values: np.ndarray) -> tuple[float, float, float]:

@@ -187,7 +187,19 @@ def _cost(own: _Picture, others: list[_Picture], plane: np.ndarray, options: Pla
         correlation = (_mean(own.grey * grey, options) - own.mean * mean) / np.sqrt(own.variance * variance)
         comparable = own.inside & _whole(seen(other.tissue), options)
         found.append(np.where(comparable, np.minimum(1 - correlation, 1), 1))
-    return np.sort(np.stack(found), 0)[: (len(found) + 1) // 2].mean(0)
+    return _smaller_half(found)
+
+
+def _smaller_half(values: list[np.ndarray]) -> np.ndarray:
+    """Mean of the smaller half (rounded up) of several values, for each pixel."""
+    # Whole pictures are compared at a time, which takes a fraction of what sorting pixel by pixel does.
+    values, total, count = list(values), np.zeros_like(values[0]), (len(values) + 1) // 2
+    for _ in range(count):
+        least = values.pop(0)
+        for index, value in enumerate(values):
+            least, values[index] = np.minimum(least, value), np.maximum(least, value)
+        total += least
+    return total / count
 
 
 def _aggregated(costs: np.ndarray, options: PlaneSweepConfig, device: str) -> np.ndarray:

@@ -65,7 +65,7 @@ def estimate_depth(
             )
         return found
     if source == "points":
-        options = config.interpolation, config.matching
+        options = config.interpolation, config.matching, pick_device(config.device)
         found = progress.map(lambda view: _with_prior(view, interpolate_points(view, points.positions, *options)), views)
         without = sum(view.depth_prior is None for view in found)
         if without:
@@ -83,7 +83,7 @@ def borrow_depth(views: Sequence[TrainingView], config: ReconstructionConfig) ->
         taken[::stride, ::stride] = view.surface[::stride, ::stride] > 0
         parts.append(view.camera.backproject(view.surface)[taken])
     points = np.concatenate(parts)
-    depth = lambda view: interpolate_points(view, points, config.interpolation, config.matching)
+    depth = lambda view: interpolate_points(view, points, config.interpolation, config.matching, pick_device(config.device))
     return [view if view.depth_prior is not None else _with_prior(view, depth(view)) for view in views]
 
 
@@ -106,6 +106,7 @@ def interpolate_points(
     points: np.ndarray,
     options: InterpolationConfig = InterpolationConfig(),
     matching: MatchingConfig = MatchingConfig(),
+    device: str = "cpu",
 ) -> np.ndarray | None:
     """Depth [H, W] (m, 0 outside their hull) between the scene points [N, 3] (m, world) seen in a view; None if few.
 
@@ -116,7 +117,8 @@ def interpolate_points(
         return None
     height, width = shape = frame.camera.height, frame.camera.width
     a, b, c = fit_plane(uv[:, 0], uv[:, 1], 1 / z)
-    residual = krige(np.zeros(shape), np.zeros(shape, bool), uv, 1 / z - (a * uv[:, 0] + b * uv[:, 1] + c), width, options)
+    apart = 1 / z - (a * uv[:, 0] + b * uv[:, 1] + c)
+    residual = krige(np.zeros(shape), np.zeros(shape, bool), uv, apart, width, options, device)
     plane = a * (np.arange(width) + 0.5) + b * (np.arange(height)[:, None] + 0.5) + c
     inverse = clip_to_range(plane + residual, 1 / z, options)
     hull = cv2.fillConvexPoly(np.zeros(shape, np.uint8), cv2.convexHull(np.floor(uv).astype(np.int32)), 1)

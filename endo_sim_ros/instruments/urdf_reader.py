@@ -1,0 +1,306 @@
+"""The shape of an instrument from a robot description (URDF) with its meshes, in place of the shape that `shapes` builds.
+
+Joints are not taken from it: those of the arm's parameter file count. Both must describe the same arm, so that each link of the file
+stays where it is in the frame of the same link of ours.
+"""
+
+import itertools
+import logging
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+from xml.etree import ElementTree
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.instruments.arm_files import load_arm
+from endo_sim_ros.instruments.kinematics import ArmKinematics
+from endo_sim_ros.instruments.shapes import LINKS, SHAPES, Capsule, Material, Part, build_instrument, link_poses
+
+log = logging.getLogger(__name__)
+
+_KINDS = ["revolute", "revolute", "prismatic", "revolute", "revolute", "revolute"]
+_MOST_FACES = 200_000  # of all meshes; drawing takes time for each, and a picture has as many pixels
+_LARGEST = 1.5  # m: no link is as long; one of a hundred is in millimetres
+_OFF = 1e-3  # m, and its thousandfold in mrad, by which axes may differ from those of the arm
+_DARK = 0.2  # mean of red, green and blue below which a surface is that of a shaft
+_SHAFT_BEHIND = 0.03  # m behind the wrist; where nothing of the file is, the shaft is ours
+
+
+class _Joint(NamedTuple):
+    kind: str
+    parent: str
+    child: str
+    origin: np.ndarray  # [4, 4] in the frame of the parent
+    axis: np.ndarray  # [3] in that of the child
+
+
+def load_shape(tool_type: str) -> tuple[list[Part], list[Capsule]]:
+    """The parts and capsules of an instrument by what the topic ``tool_type`` says.
+
+    Args:
+        tool_type: What loads the tool, and after an @ the path of the URDF that has its shape, if that is not ours.
+
+    Raises:
+        ConfigError: If there is no such tool, or the URDF cannot be used.
+    """
+    tool, _, description = tool_type.partition("@")
+    if not description:
+        return build_instrument(load_arm("PSM", tool))
+    try:
+        return read_urdf(description, load_arm("PSM", tool))
+    except ConfigError:
+        return read_urdf(description, load_arm("PSM_Si", tool))
+
+
+def read_urdf(path: str | Path, arm: ArmKinematics) -> tuple[list[Part], list[Capsule]]:
+    """The parts and capsules of an instrument, as `build_instrument` gives them, from the visual meshes of a URDF.
+
+    What moves with the insertion moves with the roll here. Links whose mesh is missing are not drawn, and a warning names them; a
+    missing shaft is replaced by ours. Dark colours are those of a shaft, others steel.
+
+    Args:
+        path: The file. Meshes are looked for beside it; ``package://`` names the folder above, or one further up.
+        arm: The arm with its tool that carries the instrument.
+
+    Raises:
+        ConfigError: If the file cannot be read, describes another arm, or has no usable mesh.
+    """
+    path = Path(path)
+    try:
+        robot = ElementTree.parse(path).getroot()
+        joints = [_joint(element) for element in robot.iter("joint") if element.find("parent") is not None]
+    except (OSError, ElementTree.ParseError, ValueError, AttributeError, KeyError) as error:
+        raise ConfigError(f"{path}: this is no readable URDF: {error}") from None
+    chain = next((way for way in _ways(joints) if [j.kind for j in way if j.kind != "fixed"][:6] == _KINDS), None)
+    if chain is None or len(arm.joints) < 6:
+        raise ConfigError(f"{path}: no chain of joints goes from a base by {', '.join(_KINDS)}, as that of {arm.name or 'an arm'} does")
+    poses = _poses(joints, chain[0].parent)
+    moving = [joint for joint in chain if joint.kind != "fixed"][:6]
+    base = _base(path, arm, [(poses[j.child][:3, 3], poses[j.child][:3, :3] @ j.axis) for j in moving])
+    zero = {link: base @ pose for link, pose in link_poses(arm, np.zeros(len(arm.joints))).items()}
+    parts = _Meshes(path, robot).parts(_links(joints, moving, poses, zero), poses, zero)
+    shape = SHAPES.get(arm.tool.rstrip("_0123456789"), SHAPES["LARGE_NEEDLE_DRIVER"])
+    capsules = [_capsule(link, np.concatenate([p.vertices for p in parts if p.link == link])) for link in LINKS if _has(parts, link)]
+    if not any(part.link == "roll" and part.vertices[:, 2].min() < -_SHAFT_BEHIND for part in parts):
+        ours, around = build_instrument(arm, shape)
+        parts += [part for part in ours if part.material == Material.SHAFT]
+        capsules.append(next(capsule for capsule in around if capsule.link == "roll"))
+    return parts, capsules
+
+
+def _has(parts: list[Part], link: str) -> bool:
+    return any(part.link == link for part in parts)
+
+
+def _joint(element: ElementTree.Element) -> _Joint:
+    kind = element.get("type", "fixed").replace("continuous", "revolute")
+    ends = [element.find(name) for name in ("parent", "child")]
+    parent, child = (end.attrib["link"] for end in ends if end is not None)
+    axis = element.find("axis")
+    direction = np.array([1.0, 0, 0]) if axis is None else _numbers(axis.get("xyz", "1 0 0"), 3)
+    length = np.linalg.norm(direction)
+    if kind != "fixed" and not length > 0:
+        raise ValueError(f"the axis of {element.get('name')} has no direction")
+    return _Joint(kind, parent, child, _origin(element), direction / max(length, 1e-12))
+
+
+def _numbers(text: str, count: int) -> np.ndarray:
+    values = np.array(text.split(), np.float64)
+    if values.shape != (count,) or not np.isfinite(values).all():
+        raise ValueError(f"expected {count} finite numbers, got {text!r:.60}")
+    return values
+
+
+def _origin(element: ElementTree.Element) -> np.ndarray:
+    pose, origin = np.eye(4), element.find("origin")
+    if origin is not None:
+        pose[:3, 3] = _numbers(origin.get("xyz", "0 0 0"), 3)
+        pose[:3, :3] = Rotation.from_euler("xyz", _numbers(origin.get("rpy", "0 0 0"), 3)).as_matrix()
+    return pose
+
+
+def _ways(joints: list[_Joint]) -> Iterator[list[_Joint]]:
+    """All ways from a root to a leaf; a file that goes round in circles has none."""
+    children = {joint.child for joint in joints}
+
+    def onwards(way: list[_Joint]) -> Iterator[list[_Joint]]:
+        after = [joint for joint in joints if joint.parent == way[-1].child and joint not in way]
+        for joint in after:
+            yield from onwards([*way, joint])
+        if not after:
+            yield way
+
+    for joint in joints:
+        if joint.parent not in children:
+            yield from onwards([joint])
+
+
+def _poses(joints: list[_Joint], root: str) -> dict[str, np.ndarray]:
+    """Poses [4, 4] of links in the root, all joints at zero."""
+    poses, waiting = {root: np.eye(4)}, [root]
+    while waiting:
+        parent = waiting.pop()
+        for joint in joints:
+            if joint.parent == parent and joint.child not in poses:
+                poses[joint.child] = poses[parent] @ joint.origin
+                waiting.append(joint.child)
+    return poses
+
+
+def _base(path: Path, arm: ArmKinematics, axes: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """Pose [4, 4] of the arm's base in the root of the file, in which the axes of all joints are the same lines.
+
+    Two chains whose axes are the same lines while joints are at zero move alike (product of exponentials).
+    """
+    ours = [(frame[:3, 3], frame[:3, 2]) for frame in arm.link_frames(np.zeros(len(arm.joints)))[:6]]
+    # The base is where the axes of yaw and pitch meet: the point nearest to both.
+    across = [np.eye(3) - np.outer(way, way) for _, way in axes[:2]]
+    meeting = np.linalg.lstsq(sum(across, np.zeros((3, 3))), sum((A @ at for A, (at, _) in zip(across, axes)), np.zeros(3)), rcond=None)[0]
+    best, least = np.eye(4), np.inf
+    for signs in itertools.product((1, -1), repeat=3):  # an axis may point either way: only the sign of its joint's position differs
+        theirs = [sign * way for sign, (_, way) in zip(signs, axes)]
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = Rotation.align_vectors(theirs, [way for _, way in ours[:3]])[0].as_matrix(), meeting
+        off = max(_apart(pose, mine, other, slides=i == 2) for i, (mine, other) in enumerate(zip(ours, axes)))
+        if off < least:
+            best, least = pose, off
+    if least > _OFF:
+        raise ConfigError(
+            f"{path}: the axes of its joints are up to {1e3 * least:.3g} mm or mrad from those of {arm.name} with {arm.tool}; name the arm "
+            "and the tool that the file describes"
+        )
+    return best
+
+
+def _apart(base: np.ndarray, ours: tuple[np.ndarray, np.ndarray], theirs: tuple[np.ndarray, np.ndarray], slides: bool) -> float:
+    """How far apart two axes are: m, or rad; of one that slides the direction alone counts."""
+    at, way = base[:3, :3] @ ours[0] + base[:3, 3], base[:3, :3] @ ours[1]
+    turned = float(np.linalg.norm(np.cross(way, theirs[1])))
+    return turned if slides else max(turned, float(np.linalg.norm(np.cross(theirs[0] - at, way))))
+
+
+def _links(joints: list[_Joint], moving: list[_Joint], poses: dict[str, np.ndarray], zero: dict[str, np.ndarray]) -> dict[str, list[str]]:
+    """Links of the file that move with each of ours."""
+
+    def rigid(link: str) -> list[str]:
+        """A link and what is fixed to it."""
+        return [link, *(found for joint in joints if joint.parent == link and joint.kind == "fixed" for found in rigid(joint.child))]
+
+    insertion, roll, pitch, yaw = (rigid(joint.child) for joint in moving[2:])
+    jaws = [joint for joint in joints if joint.parent in yaw and joint.kind == "revolute"]
+    named = {"roll": insertion + roll, "wrist_pitch": pitch, "wrist_yaw": yaw}
+    return named | {f"jaw {i}": rigid(joint.child) for i, joint in enumerate(jaws)}
+
+
+class _Meshes:
+    """The visual meshes of a file."""
+
+    def __init__(self, path: Path, robot: ElementTree.Element) -> None:
+        try:
+            import trimesh  # pyright: ignore[reportMissingImports]  (optional)
+        except ImportError:
+            raise ConfigError(f"{path}: its meshes are read by trimesh, which is not installed: pip install 'endo_sim_ros[urdf]'") from None
+        self._trimesh, self._path = trimesh, path
+        self._links = {link.get("name"): link for link in robot.iter("link")}
+        self._materials = {m.get("name"): m for m in robot.iter("material") if m.find("color") is not None}
+
+    def parts(self, links: dict[str, list[str]], poses: dict[str, np.ndarray], zero: dict[str, np.ndarray]) -> list[Part]:
+        """The parts of the instrument; which jaw is which tells the side on which it lies."""
+        found: dict[str, list[Part]] = {}
+        missing, faces = [], 0
+        for ours, theirs in links.items():
+            frame = np.linalg.inv(zero["wrist_yaw" if ours.startswith("jaw") else ours])
+            for name in theirs:
+                for visual in self._links[name].iter("visual") if name in self._links else ():
+                    try:
+                        mesh = self._mesh(visual)
+                    except FileNotFoundError as error:
+                        missing.append(str(error))
+                        continue
+                    if mesh is None:
+                        continue
+                    faces += len(mesh.faces)
+                    pose = frame @ poses[name] @ _origin(visual)
+                    vertices = (mesh.vertices @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32)
+                    found.setdefault(ours, []).append(Part(ours, self._material(visual), vertices, np.asarray(mesh.faces, np.int32)))
+        if faces > _MOST_FACES:
+            raise ConfigError(f"{self._path}: its meshes have {faces} triangles; simplify them to less than {_MOST_FACES}")
+        if missing:
+            rest = "" if found else "; none is there, so there is nothing to draw"
+            text = f"{self._path}: {len(missing)} meshes are missing, first {missing[0]}{rest}"
+            if not found:
+                raise ConfigError(text)
+            log.warning("%s; their links are not drawn", text)
+        if not found:
+            raise ConfigError(f"{self._path}: no link of the instrument has a visual mesh")
+        sides = [name for name in found if name.startswith("jaw")]
+        # The left jaw opens towards x of the frame of the yaw.
+        sides.sort(key=lambda name: -float(np.mean([part.vertices[:, 0].mean() for part in found[name]])))
+        names = dict.fromkeys(sides, "wrist_yaw") | dict(zip(sides, LINKS[3:]))  # a third one stays closed
+        return [replace(part, link=names.get(link, link)) for link, own in found.items() for part in own]
+
+    def _mesh(self, visual: ElementTree.Element) -> Any:
+        """The mesh of a visual, or None where it has no shape; raises FileNotFoundError with the name of a file that is missing."""
+        geometry = visual.find("geometry")
+        shape = None if geometry is None else next(iter(geometry), None)
+        create = self._trimesh.creation
+        if shape is None:
+            return None
+        if shape.tag == "box":
+            return create.box(_numbers(shape.get("size", ""), 3))
+        if shape.tag == "cylinder":
+            return create.cylinder(float(shape.get("radius", "nan")), float(shape.get("length", "nan")), sections=32)
+        if shape.tag == "sphere":
+            return create.icosphere(3, float(shape.get("radius", "nan")))
+        if shape.tag != "mesh":
+            return None
+        file = self._file(shape.get("filename", ""))
+        try:
+            mesh = self._trimesh.load(file, force="mesh")
+        except Exception as error:  # of whatever reads this format
+            raise ConfigError(f"{file}: this mesh cannot be read: {error!s:.200}") from None
+        mesh.apply_scale(_numbers(shape.get("scale", "1 1 1"), 3))
+        if len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
+            raise ConfigError(f"{file}: this mesh has no triangles, or corners that are not finite")
+        if (size := np.ptp(mesh.vertices, axis=0).max()) > _LARGEST:
+            raise ConfigError(f"{file}: this mesh is {size:.3g} m long; if its unit is not the metre, give the URDF its scale")
+        if not mesh.is_winding_consistent:
+            mesh.fix_normals()
+        return mesh
+
+    def _file(self, name: str) -> Path:
+        folders = [self._path.parent]
+        if name.startswith("package://"):
+            name, folders = name.removeprefix("package://"), [*self._path.resolve().parents]
+            name, within = name.split("/", 1)[-1], name
+            candidates = [folder / each for folder in folders for each in (within, name)]
+        else:
+            candidates = [folders[0] / name.removeprefix("file://")]
+        for candidate in candidates:
+            if candidate.is_file():
+                return candidate
+        raise FileNotFoundError(name)
+
+    def _material(self, visual: ElementTree.Element) -> Material:
+        material = visual.find("material")
+        if material is not None and material.find("color") is None:
+            material = self._materials.get(material.get("name"))
+        color = None if material is None else material.find("color")
+        if color is None:
+            return Material.STEEL
+        return Material.SHAFT if _numbers(color.get("rgba", "1 1 1 1"), 4)[:3].mean() < _DARK else Material.STEEL
+
+
+def _capsule(link: str, vertices: np.ndarray) -> Capsule:
+    """A capsule around most of the vertices [V, 3] of a link, along their longest axis."""
+    middle = vertices.mean(0).astype(np.float64)
+    way = np.linalg.svd(vertices - middle, full_matrices=False)[2][0]
+    along = (vertices - middle) @ way
+    radius = float(np.percentile(np.linalg.norm(vertices - middle - along[:, None] * way, axis=1), 90))
+    low, high = along.min() + radius, along.max() - radius
+    low, high = (low, high) if low < high else (0.5 * (low + high),) * 2
+    return Capsule(link, middle + low * way, middle + high * way, radius)

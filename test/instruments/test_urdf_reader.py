@@ -1,0 +1,144 @@
+"""A robot description with meshes takes the place of the shape that is built."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from endo_sim_ros.core.cameras import make_pose
+from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.instruments import build_instrument, link_poses, load_arm
+from endo_sim_ros.instruments.urdf import robot_description
+from endo_sim_ros.instruments.urdf_reader import read_urdf
+
+ARM = load_arm("PSM", "LARGE_NEEDLE_DRIVER")
+SURROL = Path(__file__).parents[3] / "shared" / "data" / "instruments" / "psm" / "psm.urdf"
+JOINTS, JAW = np.array([0.3, -0.2, 0.12, 0.7, -0.5, 0.4]), 0.6
+
+
+def written(folder, text=None, **changes):
+    """The file that describes our own arm, with some texts replaced."""
+    text = (
+        robot_description({"PSM1": (ARM, make_pose([0.1, -0.2, 0.3], [0.5, 0.1, -0.7, 0.3]), build_instrument(ARM)[1])})
+        if text is None
+        else text
+    )
+    for old, new in changes.get("replace", ()):
+        assert old in text
+        text = text.replace(old, new)
+    file = folder / "psm.urdf"
+    file.write_text(text)
+    return file
+
+
+def in_base(parts, joints, jaw):
+    """Vertices of each link in the base frame."""
+    poses = link_poses(ARM, joints, jaw)
+    found = {}
+    for part in parts:
+        found.setdefault(part.link, []).append(part.vertices @ poses[part.link][:3, :3].T + poses[part.link][:3, 3])
+    return {link: np.concatenate(own) for link, own in found.items()}
+
+
+def test_what_was_written_is_read_back(tmp_path):
+    """Cylinders of the description lie around the capsules that they were made of, wherever the base stands and however joints move."""
+    parts, capsules = read_urdf(written(tmp_path), ARM)
+    ours = build_instrument(ARM)[1]
+    vertices, poses = in_base(parts, JOINTS, JAW), link_poses(ARM, JOINTS, JAW)
+    assert set(vertices) == {capsule.link for capsule in ours}
+    for link, found in vertices.items():
+        own = [capsule for capsule in ours if capsule.link == link]
+        away = []
+        for capsule in own:
+            start, end = (poses[link] @ [*point, 1] for point in (capsule.start, capsule.end))
+            way, arm = (end - start)[:3], found - start[:3]
+            share = np.clip(arm @ way / (way @ way), 0, 1)
+            away.append(np.linalg.norm(arm - share[:, None] * way, axis=1) - capsule.radius)
+        away = np.min(away, 0)  # the middles of their ends lie on the axis, all other corners on the capsule
+        assert away.max() < 1e-6 and (np.abs(away) < 1e-6).mean() > 0.7
+    assert {capsule.link for capsule in capsules} == set(vertices)
+
+
+@pytest.mark.skipif(not SURROL.exists(), reason=f"{SURROL} is not there")
+def test_a_description_of_somebody_else_fits_our_arm(caplog):
+    parts, capsules = read_urdf(SURROL, ARM)
+    assert "3 meshes are missing, first meshes/visual/main_insertion_link_1.obj" in caplog.text
+    theirs, ours = in_base(parts, JOINTS, JAW), in_base(build_instrument(ARM)[0], JOINTS, JAW)
+    for link in ("wrist_pitch", "jaw_left", "jaw_right"):
+        assert np.linalg.norm(theirs[link].mean(0) - ours[link].mean(0)) < 4e-3, link
+    assert np.ptp(theirs["roll"], axis=0).max() > 0.2  # with our shaft, as theirs is missing
+    # Jaws open to their own sides.
+    closed = in_base(parts, JOINTS, 0.0)
+    apart = lambda found: np.linalg.norm(found["jaw_left"].mean(0) - found["jaw_right"].mean(0))
+    assert apart(theirs) > apart(closed)
+
+
+def test_meshes_are_found_scaled_and_coloured(tmp_path):
+    (tmp_path / "meshes").mkdir()
+    trimesh.creation.box((8, 8, 12)).export(tmp_path / "meshes" / "box.stl")  # mm
+    cylinder = '<cylinder radius="0.0032" length="0.0091" /></geometry></visual></link><joint name="PSM1_wrist_pitch"'
+    mesh = '<mesh filename="package://{}" scale="0.001 0.001 0.001"/></geometry>'
+    black = '<material name="b"><color rgba="0 0 0 1"/></material></visual></link><joint name="PSM1_wrist_pitch"'
+    for name in ("my_robot/meshes/box.stl", f"{tmp_path.name}/meshes/box.stl"):
+        parts, _ = read_urdf(written(tmp_path, replace=[(cylinder, mesh.format(name) + black)]), ARM)
+        (part,) = [part for part in parts if part.link == "wrist_pitch"]
+        assert part.material.name == "SHAFT" and np.allclose(np.sort(np.ptp(part.vertices, axis=0)), [0.008, 0.008, 0.012], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("replace", "sentence"),
+    [
+        ([("<robot", "<robot <")], "this is no readable URDF"),
+        ([('xyz="0 0 1"', 'xyz="0 nan 1"')], "expected 3 finite numbers"),
+        ([('xyz="0 0 1"', 'xyz="0 0 0"')], "has no direction"),
+        ([('type="prismatic"', 'type="fixed"')], "no chain of joints"),
+        ([("<cylinder", '<mesh filename="gone.stl"'), ("length=", "len=")], r"\d+ meshes are missing, first gone.stl; none is there"),
+        ([("<visual>", "<collision>"), ("</visual>", "</collision>")], "no link of the instrument has a visual mesh"),
+    ],
+)
+def test_a_bad_file_is_one_sentence(tmp_path, replace, sentence):
+    with pytest.raises(ConfigError, match=sentence):
+        read_urdf(written(tmp_path, replace=replace), ARM)
+
+
+def test_the_file_of_another_tool_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match=r"up to 0\.\d+ mm or mrad|up to \d+(\.\d+)? mm or mrad from those of PSM with PROGRASP"):
+        read_urdf(written(tmp_path), load_arm("PSM", "PROGRASP_FORCEPS:420093"))
+
+
+@pytest.mark.parametrize(
+    ("mesh", "sentence"),
+    [
+        (trimesh.creation.box((8, 8, 9100)), "is 9.1e.03 m long; if its unit is not the metre"),
+        (trimesh.creation.icosphere(7, 0.004), "triangles; simplify them to less than 200000"),
+        (b"solid nothing", "has no triangles|cannot be read"),
+    ],
+)
+def test_a_bad_mesh_is_one_sentence(tmp_path, mesh, sentence):
+    file = tmp_path / "bad.stl"
+    file.write_bytes(mesh) if isinstance(mesh, bytes) else mesh.export(file)
+    with pytest.raises(ConfigError, match=sentence):
+        read_urdf(written(tmp_path, replace=[("<cylinder", '<mesh filename="bad.stl"'), ("length=", "len=")]), ARM)
+
+
+def test_an_open_mesh_that_turns_its_back_is_drawn_all_the_same(tmp_path):
+    """Corners in no order: triangles seen from behind are not drawn, so they are made to agree."""
+    box = trimesh.creation.box((0.008, 0.008, 0.012))
+    faces = box.faces.copy()
+    faces[::2] = faces[::2, ::-1]
+    trimesh.Trimesh(box.vertices, faces, process=False).export(tmp_path / "box.ply")
+    file = written(tmp_path, replace=[("<cylinder", '<mesh filename="box.ply"'), ("length=", "len=")])
+    for part in read_urdf(file, ARM)[0]:
+        corners = part.vertices[part.faces].astype(np.float64)
+        assert np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) > 0
+
+
+def test_axes_may_point_the_other_way(tmp_path):
+    turned = Rotation.from_euler("x", 180, degrees=True).as_matrix()
+    assert turned[2, 2] < 0  # an axis of 0 0 -1 is that line, too
+    expected = in_base(read_urdf(written(tmp_path), ARM)[0], JOINTS, JAW)
+    found = in_base(read_urdf(written(tmp_path, replace=[('xyz="0 0 1"', 'xyz="0 0 -1"')]), ARM)[0], JOINTS, JAW)
+    for link in expected:
+        np.testing.assert_allclose(found[link], expected[link], atol=1e-5)

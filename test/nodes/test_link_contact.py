@@ -1,0 +1,119 @@
+"""Arms whose instruments touch the tissue with their links, through their topics."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rclpy
+from ros_bench import SMALL, Bench, S, await_nodes, moved, nodes_of, send_model
+from std_srvs.srv import Trigger
+
+from endo_sim_ros import messages
+from endo_sim_ros.instruments import arm_files, build_instrument, load_arm
+from endo_sim_ros.nodes.arm_setup import make_arms
+from endo_sim_ros.nodes.configs import PhysicsNodeConfig
+from endo_sim_ros.nodes.physics_node import PhysicsNode
+
+pytestmark = pytest.mark.dds
+
+STEP = 40_000_000  # ns
+REACTION, JOINTS = messages.tool_reaction("PSM1"), messages.tool_joints("PSM1")
+JAWS = 0.0102  # m, of the large needle driver
+
+
+@pytest.fixture(scope="module")
+def running():
+    values = {
+        **SMALL["physics_node"],
+        "instruments": "[LARGE_NEEDLE_DRIVER, CURVED_SCISSORS]",
+        "node_count": 3000,
+        "arm_source": "commanded",
+        "link_contact": "true",
+        "mode": "lockstep",
+    }
+    values |= {"lockstep_inputs": "[pose, jaw]", "grip_force": 4.0}
+    rclpy.init(args=["--ros-args", *(word for name, value in values.items() for word in ("-p", f"physics_node:{name}:={value}"))])
+    bench = Bench()
+    for topic in (messages.CONTROL_NODES, messages.CUT_SURFACE, REACTION, JOINTS):
+        bench.hear(topic)
+    bench.add(PhysicsNode)
+    send_model(bench)
+    await_nodes(bench, 5 * S)
+    yield bench
+    bench.close()
+    rclpy.try_shutdown()
+
+
+def play(bench, ways, scissors=()):
+    """Depths of the hinge, m, and angles of the jaw, rad, one each step; returns reactions [n, 6], efforts [n, 6] and the last state.
+
+    The scissors of the other arm do the same 2 cm aside, or wait in the air.
+    """
+    assert bench.call(Trigger, "/physics_node/reset").success
+    for heard in bench.heard.values():
+        heard.clear()
+    for step, way in enumerate(ways):
+        other = scissors[min(step, len(scissors) - 1)] if len(scissors) else (0.06, 1.0)
+        for arm, x, (depth, angle) in (("PSM1", 0.0, way), ("PSM2", -0.02, other)):
+            pose, stamp = np.eye(4), (100 * S + step * STEP)
+            pose[0, 3], pose[2, 3] = x, depth
+            bench.publish(messages.tool_pose_command(arm), messages.encode_pose(pose, stamp, "world"))
+            bench.publish(messages.tool_jaw(arm), messages.encode_jaw(angle, stamp))
+    bench.until(lambda: len(bench.heard[JOINTS.name]) >= len(ways), "all steps")
+    felt = [np.concatenate(messages.decode_wrench(message, "")) for message in bench.heard[REACTION.name][-len(ways) :]]
+    efforts = [list(message.effort) for message in bench.heard[JOINTS.name][-len(ways) :]]
+    return np.array(felt), np.array(efforts), nodes_of(bench).positions.copy()
+
+
+PRESS = [(0.1 - JAWS - 0.008 + 0.001 * step, 0.5) for step in range(12)]
+GRASP = [*PRESS, *[(PRESS[-1][0], 0.0)] * 3, *[(PRESS[-1][0] - 0.001 * step, 0.0) for step in range(1, 8)]]
+
+
+def test_jaws_press_before_the_tip_does_and_joints_feel_it(running):
+    felt, efforts, _ = play(running, PRESS)
+    assert felt[-1, 2] < -0.05 and moved(running) > 1e-3  # although the tip is still 7 mm in front of the tissue
+    arm = running.nodes[1].arms["PSM1"]
+    R = arm.base[:3, :3]
+    wrench = np.concatenate([R.T @ felt[-1, :3], R.T @ felt[-1, 3:]])  # the axes of the tip are those of the world
+    np.testing.assert_allclose(efforts[-1], arm.kinematics.jacobian(arm.joints).T @ wrench, atol=1e-6)
+    assert efforts[-1, 2] < -0.5 * np.linalg.norm(felt[-1, :3])  # it pushes the instrument out
+
+
+def test_closed_jaws_pull_until_the_tissue_slips_and_the_same_episode_gives_the_same_bytes(running):
+    felt, _, first = play(running, GRASP)
+    bound = 2 * 0.2 * 4.0
+    assert 0.05 < felt[-1, 2] < bound  # the tissue pulls the tool back
+    again, _, second = play(running, GRASP)
+    np.testing.assert_array_equal(first, second)
+    np.testing.assert_array_equal(felt, again)
+    far = [(GRASP[-1][0] - 0.002 * step, 0.0) for step in range(1, 12)]
+    felt, _, _ = play(running, [*GRASP, *far])
+    assert felt[:, 2].max() < 1.02 * bound and not felt[-1].any()
+    running.refused("physics_node", "or with 1.6 N between two jaws; open it, come nearer, or raise travel or grip_force")
+
+
+def test_jaws_that_close_on_nothing_say_so(running):
+    play(running, [(0.06, 0.5), (0.06, 0.0)])
+    running.refused("physics_node", "PSM1: the jaw closed on nothing", "no movable tissue lies between the jaws")
+
+
+def test_scissors_cut_when_their_jaw_closes_and_not_tissue_that_cannot_be_cut(running):
+    waiting = [(0.06, 0.5)] * 6
+    play(running, waiting, [*[(0.09, 0.9)] * 3, (0.09, 0.5), (0.09, 0.0)])
+    running.until(lambda: running.heard["cut_surface"] and running.heard["cut_surface"][-1].width > 0, "a cut")
+    triangles = messages.decode_cut_surface(running.heard["cut_surface"][-1])
+    assert np.abs(triangles[..., 0] + 0.02).max() < 0.01
+    assert running.call(Trigger, "/physics_node/reset").success
+    assert running.set("physics_node", kinematics="current")[0]
+    running.refused("physics_node", "link_contact of PSM2: tissue with kinematics current cannot be cut")
+    play(running, waiting, [(0.09, 0.9), (0.09, 0.0)])  # the scissors are a bare tip
+    assert running.set("physics_node", kinematics="rest")[0]
+    running.until(lambda: running.nodes[1].simulation.has_instrument("PSM2"), "scissors again")
+
+
+def test_an_instrument_whose_shape_nobody_knows_touches_as_a_usual_one(tmp_path, caplog):
+    tool = tmp_path / "MY_SPOON_1.json"
+    tool.write_text((Path(arm_files.__file__).parent / "parameters" / "LARGE_NEEDLE_DRIVER_400006.json").read_text())
+    arm = make_arms(PhysicsNodeConfig(instruments=(str(tool),), link_contact=True))["PSM1"]
+    assert "nobody knows the shape of MY_SPOON_1; it looks like a LARGE_NEEDLE_DRIVER" in caplog.text
+    assert len(arm.capsules) == len(build_instrument(load_arm("PSM", "LARGE_NEEDLE_DRIVER"))[1])

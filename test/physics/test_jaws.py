@@ -1,0 +1,101 @@
+"""Jaws of instruments: what they hold, with what force, and how it slips out."""
+
+import numpy as np
+import pytest
+from instrument_scene import Instrument, opened, plain_jaws
+from tissue_scene import TIP, pose_at, simulate, specimen, steps
+
+from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
+
+# A strip along x that is held at x = 0; jaws that point to -x and close across it come from its other end.
+TOWARDS_STRIP = np.array([[-1.0, 0, 0], [0, 0, 1], [0, 1, 0]]).T
+
+
+def strip(**overrides) -> tuple[TissueSimulation, np.ndarray]:
+    """The strip, and the pose of jaws that reach 8 mm over its end."""
+    nodes = specimen((25, 5, 3), 0.0025, lambda x: x[:, 0] < 1e-6, lambda x: np.ones(len(x), bool))
+    config = PhysicsConfig(device="cpu", **{"young_modulus": 50e3, "travel": 0.2, **overrides})
+    simulation, end, pose = TissueSimulation.from_nodes(nodes, config), nodes.rest.max(0), np.eye(4)
+    simulation.set_instrument("PSM1", plain_jaws())
+    pose[:3, :3], pose[:3, 3] = TOWARDS_STRIP, [end[0] + 0.002, end[1] / 2, end[2] / 2]
+    return simulation, pose
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("friction, grip", [(0.2, 0.5), (0.2, 1.5), (0.4, 0.5)])
+def test_a_strip_slips_out_of_the_jaws_at_twice_friction_times_the_force_of_the_grip(friction, grip):
+    simulation, start = strip(friction=friction, grip_force=grip)
+    bound, pulls, pose = 2 * friction * grip, [], start.copy()
+    assert simulation.set_grasp("PSM1", pose, True, opened(pose, 0.0))
+    while simulation.in_reach("PSM1"):
+        pose[0, 3] += 0.0005
+        simulation.set_grasp("PSM1", pose, True, opened(pose, 0.0))
+        assert simulation.slips == 0
+        simulation.step()
+        pulls.append(-simulation.reaction("PSM1")[0][0])
+    pulls = np.array(pulls)
+    assert pulls.max() < 1.005 * bound
+    sliding = pulls[pulls > 0.9 * bound]
+    assert len(sliding) > 10 and sliding.mean() == pytest.approx(bound, rel=0.02)
+    assert simulation.slips == 1 and simulation.faults == 0
+    slid = pose[0, 3] - start[0, 3] - pulls.max() / pulls[0] * 0.0005  # beside what the strip stretches
+    assert 0.005 < slid < 0.03
+    steps(simulation, 200)
+    np.testing.assert_allclose(simulation.state().positions, simulation.nodes.rest, atol=3e-4)  # it is the same tissue as before
+
+
+def test_a_weak_pull_and_a_grip_without_limit_do_not_slip():
+    for grip, pulled in ((1.5, 0.003), (0.0, 0.02)):
+        simulation, pose = strip(grip_force=grip)
+        simulation.set_grasp("PSM1", pose, True, opened(pose, 0.0))
+        held = simulation.held_nodes("PSM1")
+        for _ in range(10):
+            pose[0, 3] += pulled / 10
+            assert simulation.set_grasp("PSM1", pose, True, opened(pose, 0.0))
+            simulation.step()
+        moved = (simulation.state().positions - simulation.nodes.rest)[held, 0]
+        assert simulation.slips == 0 and moved.mean() == pytest.approx(pulled, rel=0.05)
+        np.testing.assert_array_equal(simulation.held_nodes("PSM1"), held)
+
+
+@pytest.mark.parametrize("before", [0.0, 0.8])
+def test_jaws_hold_what_lies_between_them_and_a_bare_tip_what_is_near_it(before):
+    simulation, instrument = simulate(node_count=3000), Instrument("PROGRASP_FORCEPS")
+    simulation.set_instrument("PSM1", instrument.capsules)
+    length, tilt = 0.0175, 1.2
+    hinge = TIP - 0.6 * length * np.array([np.sin(tilt), 0, np.cos(tilt)])
+    pose, links = instrument.at(hinge, tilt, before)
+    simulation.set_grasp("PSM1", pose, False, links)
+    simulation.step()
+    x = simulation.nodes.rest + simulation.solver.displacements()
+    pose, links = instrument.at(hinge, tilt, 0.0)
+    assert simulation.set_grasp("PSM1", pose, True, links)
+    held = simulation.held_nodes("PSM1")
+    along = (x - hinge) @ pose[:3, 2]
+    off = np.linalg.norm(x - hinge - np.clip(along, 0, length)[:, None] * pose[:3, 2], axis=1)
+    reach = 1.34 * simulation._tools.thinnest  # half a distance between nodes past a capsule 1.5 of them thick
+    near = np.clip(along / length, 0, 1) * length * np.sin(before / 2) + reach
+    skin = simulation.nodes.is_skin & ~simulation.nodes.pinned & (along >= 0)
+    assert set(np.flatnonzero(skin & (off < 0.9 * near))) <= set(held) <= set(np.flatnonzero(skin & (off < 1.1 * near + 5e-4)))
+    assert len(held) > 4
+    bare = simulate(node_count=3000)
+    assert bare.set_grasp("PSM1", pose, True)
+    ball = np.linalg.norm(bare.nodes.rest - hinge, axis=1) <= bare.config.force_radius
+    np.testing.assert_array_equal(bare.held_nodes("PSM1"), np.flatnonzero(ball & bare.nodes.is_skin & ~bare.nodes.pinned))
+
+
+def test_jaws_close_on_nothing_in_the_air_and_let_go_when_they_open():
+    simulation, pose = strip()
+    away = pose.copy()
+    away[0, 3] += 0.03
+    assert not simulation.set_grasp("PSM1", away, True, opened(away, 0.0))
+    assert simulation.set_grasp("PSM1", pose, True, opened(pose, 0.0))
+    pose[0, 3] += 0.004
+    for _ in range(5):
+        assert simulation.set_grasp("PSM1", pose, True, opened(pose, 0.0))
+        simulation.step()
+    assert simulation.reaction("PSM1")[0][0] < -0.1
+    simulation.set_grasp("PSM1", pose_at([0, 0, 1.0]), False)
+    steps(simulation, 150)
+    assert not simulation.held_nodes("PSM1").size and not simulation.reaction("PSM1")[0].any() and simulation.slips == 0
+    np.testing.assert_allclose(simulation.state().positions, simulation.nodes.rest, atol=3e-4)

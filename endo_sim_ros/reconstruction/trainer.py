@@ -125,6 +125,7 @@ class Trainer:
             "model": self._detached().tensors(),
             "optimizer": self.optimizer.state,
             "strategy": self._strategy_state,
+            "seen": self._seen,  # by where Gaussians were when their number last changed
             "light": {name: value.detach() for name, value in self.appearance.tensors.items()},
             "light_optimizer": self.appearance.optimizer.state,
             "generator": self._generator.get_state(),
@@ -156,7 +157,7 @@ class Trainer:
             if noise is not generator:
                 noise.set_state(state["noise"].cpu())
             self._set_model(GaussianModel(**state["model"]))  # what is refused was so before: a training goes on as it was
-            self.optimizer.state, self._strategy_state = state["optimizer"], state["strategy"]
+            self.optimizer.state, self._strategy_state, self._seen = state["optimizer"], state["strategy"], state["seen"]
             self.appearance.set(**state["light"])
             self.appearance.optimizer.state = state["light_optimizer"]
             self._generator, self._noise = generator, noise
@@ -333,7 +334,8 @@ class Trainer:
         self._strategy_state = self._strategy.initialize_state(len(model), self.device)
         # Of each Gaussian, 0 where an iteration leaves it out, else what makes up for those; a captured step reads what it is by then.
         self._kept = torch.ones(len(model), device=self.device) if self.config.dropout else None
-        self._seen = self._seen_by_views(model.means) if self.config.lambda_opacity or self.config.lambda_scale else 1.0
+        counts = self.config.lambda_opacity or self.config.lambda_scale
+        self._seen = self._seen_by_views(model.means) if counts else torch.ones(len(model), device=self.device)
 
     @torch.no_grad()
     def _seen_by_views(self, means: Tensor) -> Tensor:

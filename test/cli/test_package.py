@@ -246,5 +246,5 @@ def test_the_api_reference_is_built_and_has_public_names(tmp_path):
     done = subprocess.run(command, shell=True, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
     pages = tmp_path / "api" / "endo_sim_ros"
-    for page, name in {"physics/simulation": "TissueBatch", "splatting/api": "rasterize", "messages/images": "encode_image"}.items():
+    for page, name in {"physics/batch": "TissueBatch", "splatting/api": "rasterize", "messages/images": "encode_image"}.items():
         assert f'id="{name}"' in (pages / f"{page}.html").read_text(), f"{page} does not show {name}"

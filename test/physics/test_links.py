@@ -224,7 +224,7 @@ def test_a_batch_takes_the_links_of_all_its_copies_at_once():
     assert len({int(each) for each in batch.tools.faults}) == 1
     with pytest.raises(ValueError, match=r"poses of links have shape \[3, 2, 4, 4\], expected \[3, 4, 4, 4\] \(roll, "):
         batch.tools.set_links(0, links, torch.zeros(3, 2, 4, 4))
-    with pytest.raises(ValueError, match="the instrument has 6 capsules, but tools have room for 1"):
+    with pytest.raises(ValueError, match="the instrument has 7 capsules, but tools have room for 1"):
         TissueBatch(nodes, config, 3).tools.set_links(0, links, torch.from_numpy(poses))
     batch.tools.starts[1, 0, 2] = float("nan")
     batch.step()

@@ -32,7 +32,7 @@ class Arm:
     cutting: bool = False
     state: str = ENABLED
     homed: bool = True
-    felt: float = 0.0  # reaction in the last step of a move, N
+    felt: float = 0.0  # reaction in the last step, N
     acts: bool = True  # False at a start where nobody has commanded it yet: it touches nothing there
     pose_goal: np.ndarray | None = None  # [4, 4], world; None while no move is under way
     angle_goal: float | None = None  # rad

@@ -273,12 +273,11 @@ class ArmTopics:
             arm: The arm.
             reaction: Gives the force [3] of the tissue on its tip, N.
         """
-        limit = self.options.force_limit
-        if not limit or not arm.moving or not isinstance(arm, JointedArm):
-            arm.felt = 0.0
+        if not isinstance(arm, JointedArm):
             return
-        before, arm.felt = arm.felt, float(np.linalg.norm(reaction()))
-        if arm.felt > max(limit, before):
+        before, arm.felt = arm.felt, float(np.linalg.norm(reaction()))  # also while it waits: a retreat begins with what it feels
+        limit = self.options.force_limit
+        if limit and arm.moving and arm.felt > max(limit, before):
             arm.halt()
             text = f"{arm.name}: the move ended at {arm.felt:.1f} N, above force_limit = {limit:g} N; move back, or raise the limit"
             self._tell(arm, messages.tool_error, text)

@@ -1,10 +1,14 @@
 """How the joints of an arm get to where the tip is told to be."""
 
+import types
+
 import numpy as np
 import pytest
 
 from endo_sim_ros.core.cameras import make_pose
 from endo_sim_ros.instruments import load_arm
+from endo_sim_ros.nodes.arm_topics import ArmTopics
+from endo_sim_ros.nodes.configs import PhysicsNodeConfig
 from endo_sim_ros.nodes.jointed_arm import JointedArm
 
 PSM = load_arm("PSM", "LARGE_NEEDLE_DRIVER")
@@ -120,3 +124,18 @@ def test_an_arm_without_a_base_is_a_tip():
     assert arm.links() == {}
     with pytest.raises(ValueError, match="PSM3 has no place yet; publish a model, or give PSM3_base in frames"):
         arm.servo_joints(np.zeros(6))
+
+
+@pytest.mark.parametrize("forces, ended", [((15, 15, 14, 9, 3), False), ((15, 15.5), True), ((4, 9, 11), True), ((4, 9, 9.9), False)])
+def test_a_move_ends_where_a_reaction_above_the_limit_grows_and_a_retreat_does_not(forces, ended):
+    """The first force is felt while the arm waits."""
+    told = []
+    topics = types.SimpleNamespace(
+        options=PhysicsNodeConfig(), _node=types.SimpleNamespace(report_error=told.append), _tell=lambda arm, topic, text: None
+    )
+    arm = arm_at([0.0, 0, 0.12, 0, 0, 0])
+    for number, force in enumerate(forces):
+        if number == 1:
+            arm.move_joints([0.0, 0, 0.06, 0, 0, 0])
+        ArmTopics.limit_force(topics, arm, lambda force=force: np.array([0.0, 0, force]))
+    assert bool(told) == ended and arm.moving != ended

@@ -257,8 +257,13 @@ def test_a_move_through_tissue_ends_at_its_force_limit_and_the_way_back_does_not
     assert moved(graph) > 1e-4
     depth = pose_of(graph, messages.tool_pose("PSM1"))[2, 3]
     assert 0.07 < depth < 0.109
+    pressed = graph.heard["PSM1/measured_cp"]
+    pressed.clear()
+    graph.until(lambda: len(pressed) > 5, "some steps of waiting")
+    assert graph.nodes[1].arms["PSM1"].felt > 0, "it feels the tissue while it waits"
     graph.publish(messages.tool_move("PSM1"), messages.encode_pose(tip_at(0, 0, 0.07), S, "world"))
     graph.until(lambda: abs(pose_of(graph, messages.tool_pose("PSM1"))[2, 3] - 0.07) < 1e-9, "the way back")
+    assert len(texts(graph, messages.tool_error)) == 1, "the way back is not ended"
     assert graph.set("physics_node", contact_radius=0.0, force_limit=10.0)[0]
     graph.until(lambda: graph.nodes[1].simulation.contact_radius == 0, "no contact")
 

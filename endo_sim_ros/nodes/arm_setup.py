@@ -65,13 +65,16 @@ def _for_each(option: str, values: Sequence[str], names: Sequence[str]) -> Seque
     return values * len(names) if len(values) == 1 else values
 
 
-def place_arms(arms: Mapping[str, Arm], frames: Mapping[str, np.ndarray], view: tuple[Camera, float] | None) -> str:
+def place_arms(arms: Mapping[str, Arm], frames: Mapping[str, np.ndarray], view: tuple[Camera, float] | None, anew: bool) -> str:
     """Give each arm with joints a place: its base in `frames`, or else a sensible one in front of a camera.
+
+    An arm whose place changes is at its start then.
 
     Args:
         arms: The arms by name.
         frames: Poses [4, 4] of known frames in the world, by name; ``PSM1_base`` is the base of PSM1.
         view: A camera and the depth of the tissue that it sees, m, or None where neither is known.
+        anew: Whether an arm that is in its place already goes to its start, too.
 
     Returns:
         Why arms have no place, in a sentence; empty if all have one. Such an arm is a tip without joints.
@@ -93,7 +96,8 @@ def place_arms(arms: Mapping[str, Arm], frames: Mapping[str, np.ndarray], view: 
                 base, joints = placement.base, placement.joints.copy()
             if not isinstance(arm, CameraArm):
                 joints[2] = np.clip(joints[2] - _WITHDRAWN, lower[2], upper[2])
-            arm.stand(base, joints)
+            if anew or arm.base is None or not np.array_equal(arm.base, base):
+                arm.stand(base, joints)
         except ConfigError as error:
             missing.append(str(error))
     return "; ".join(missing)

@@ -57,9 +57,9 @@ class JointedArm(Arm):
             self.joints = joints
 
     def return_to_start(self) -> None:
-        """Be at the start, which touches nothing until the arm is commanded."""
+        """Let go of everything and be at the start, which touches nothing until the arm is commanded."""
+        super().reset()
         if self.start is not None:
-            self.stop()
             self._take(self.start)
             self._stepped, self.velocities, self.acts = self.start, np.zeros(len(self.start)), False
 
@@ -227,9 +227,10 @@ class JointedArm(Arm):
 
     def reset(self) -> None:
         """Let go of everything; a commanded arm is back at its start."""
-        super().reset()
         if self.commanded:
             self.return_to_start()
+        else:
+            super().reset()
 
 
 @dataclass(kw_only=True)

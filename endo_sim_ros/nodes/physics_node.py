@@ -111,7 +111,7 @@ class PhysicsNode(EndoNode):
                             simulation.set_instrument(name, arm.capsules)
                 if not same_model:
                     self._view = view
-                    self._place_arms()
+                    self._place_arms(anew=True)
                 if self._lockstep and not continued:  # the first observation, before any command
                     self._publish(self.simulation, self._simulated_stamp, at_rest=True)
         except Exception as error:
@@ -121,9 +121,13 @@ class PhysicsNode(EndoNode):
 
     # ------------------------------------------------------------------ tools
 
-    def _place_arms(self) -> None:
-        """Put the arms where `frames` or the camera of the newest model says, those without a robot at their start."""
-        before, self._unplaced = self._unplaced, place_arms(self.arms, self._options.frame_poses, self._view)
+    def _place_arms(self, anew: bool = False) -> None:
+        """Put the arms where `frames` or the camera of the newest model says, those without a robot at their start.
+
+        Args:
+            anew: Also those that stand there already.
+        """
+        before, self._unplaced = self._unplaced, place_arms(self.arms, self._options.frame_poses, self._view, anew)
         self._arm_topics.describe()
         if self._unplaced and self._unplaced != before and self.simulation is not None:
             self.get_logger().warning(self._unplaced)
@@ -161,6 +165,7 @@ class PhysicsNode(EndoNode):
     def _apply_tools(self, simulation: TissueSimulation) -> None:
         for name, arm in self._tools.items():
             if arm.pose is None or not arm.acts:
+                simulation.withdraw(name)
                 continue
             where = f"at {np.round(arm.pose[:3, 3], 4).tolist()}"
             links = arm.links() if isinstance(arm, JointedArm) and simulation.has_instrument(name) else {}

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.dds
 LINKS = ("roll", "wrist_pitch", "wrist_yaw", "jaw_left", "jaw_right")
 HEARD = (
     messages.tool_pose, messages.tool_links, messages.tool_type, messages.tool_joints, messages.tool_velocity, messages.tool_local_pose,
-    messages.tool_state, messages.tool_warning, messages.tool_error, messages.tool_jaw_state,
+    messages.tool_state, messages.tool_warning, messages.tool_error, messages.tool_jaw_state, messages.tool_reaction,
 )  # fmt: skip
 ARMS = ("PSM1", "PSM2", "ECM")
 PSM = load_arm("PSM", "LARGE_NEEDLE_DRIVER")
@@ -266,6 +266,40 @@ def test_a_move_through_tissue_ends_at_its_force_limit_and_the_way_back_does_not
     assert len(texts(graph, messages.tool_error)) == 1, "the way back is not ended"
     assert graph.set("physics_node", contact_radius=0.0, force_limit=10.0)[0]
     graph.until(lambda: graph.nodes[1].simulation.contact_radius == 0, "no contact")
+
+
+def jaw(bench, angle, arm="PSM1"):
+    bench.publish(messages.tool_jaw(arm), messages.encode_jaw(angle, S))
+
+
+def felt(bench, arm="PSM1"):
+    return np.linalg.norm(messages.decode_wrench(newest(bench, messages.tool_reaction(arm)), "")[0])
+
+
+def hold_tissue(bench, arm="PSM1"):
+    """Close a jaw on the tissue and pull at it."""
+    servo(bench, tip_at(0, 0, 0.1), arm)
+    bench.spin(0.1)
+    jaw(bench, 0.0, arm)
+    bench.until(lambda: bench.nodes[1].arms[arm].closed and bench.nodes[1].simulation.in_reach(arm), "a grasp")
+    servo(bench, tip_at(0, 0, 0.085), arm)
+    bench.until(lambda: felt(bench, arm) > 0.1 and moved(bench) > 0.01, "a pull")
+
+
+def test_an_arm_whose_base_is_moved_lets_go_and_the_others_stay(graph):
+    hold_tissue(graph)
+    send_joints(graph, messages.tool_joint_command, joints_of(graph, "PSM2") + [0.1, 0, 0, 0, 0, 0], "PSM2")
+    graph.spin(0.1)
+    other = joints_of(graph, "PSM2")
+    assert graph.set("physics_node", frames=["PSM1_base 0.12 0.1 0.0 0 1 0 0"])[0]
+    graph.until(lambda: felt(graph) == 0 and moved(graph) < 1e-3, "tissue that is let go")
+    arms = graph.nodes[1].arms
+    np.testing.assert_allclose(arms["PSM1"].base[:3, 3], [0.12, 0.1, 0.0])
+    graph.until(lambda: newest(graph, messages.tool_jaw_state("PSM1")).position[0] == 1.0, "an open jaw")
+    np.testing.assert_array_equal(joints_of(graph, "PSM2"), other)
+    assert graph.set("physics_node", frames=[""])[0]
+    graph.until(lambda: arms["PSM1"].base[0, 3] != 0.12, "the place of before")
+    np.testing.assert_array_equal(joints_of(graph, "PSM2"), other)
 
 
 def test_the_arm_of_the_camera_moves_it_and_does_not_turn_it_over(graph):

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from endo_sim_ros.core.cameras import invert_pose
 from endo_sim_ros.instruments import ArmKinematics, Capsule, ReachConfig, link_poses, solve_inverse
-from endo_sim_ros.nodes.arm import Arm
+from endo_sim_ros.nodes.arm import DISABLED, Arm
 
 _ROUNDED = 1 + 1e-9  # a way that takes a whole number of steps must not take one more
 _WITHIN = 1e-6  # rad, m: how far a command may leave the limits, as what is sent back was rounded
@@ -226,8 +226,8 @@ class JointedArm(Arm):
         return efforts, R @ twist[:3], R @ twist[3:]
 
     def reset(self) -> None:
-        """Let go of everything; a commanded arm is back at its start."""
-        if self.commanded:
+        """Let go of everything; a commanded arm is back at its start, unless it is disabled, as it does not move then."""
+        if self.commanded and self.state != DISABLED:
             self.return_to_start()
         else:
             super().reset()

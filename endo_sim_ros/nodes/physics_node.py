@@ -1,7 +1,7 @@
 """Gaussian model and tool wrenches in, control nodes and reactions out."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ from std_srvs.srv import SetBool, Trigger
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ControlNodeCloud, PhysicsState
+from endo_sim_ros.nodes.arm import Arm
 from endo_sim_ros.nodes.arm_setup import CAMERA_ARM, make_arms, place_arms
 from endo_sim_ros.nodes.arm_topics import ArmTopics
 from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode, run, sentence
@@ -109,9 +110,13 @@ class PhysicsNode(EndoNode):
                     if isinstance(arm, JointedArm) and arm.capsules and not simulation.has_instrument(name):
                         with self.guard(f"link_contact of {name}"):
                             simulation.set_instrument(name, arm.capsules)
-                if not same_model:
+                if not same_model and not _same_camera(self._view, view):
                     self._view = view
                     self._place_arms(anew=True)
+                elif not same_model:
+                    self._place_arms(
+                        {name: arm for name, arm in self.arms.items() if isinstance(arm, JointedArm) and arm.base is None}, view
+                    )
                 if self._lockstep and not continued:  # the first observation, before any command
                     self._publish(self.simulation, self._simulated_stamp, at_rest=True)
         except Exception as error:
@@ -121,13 +126,22 @@ class PhysicsNode(EndoNode):
 
     # ------------------------------------------------------------------ tools
 
-    def _place_arms(self, anew: bool = False) -> None:
-        """Put the arms where `frames` or the camera of the newest model says, those without a robot at their start.
+    def _place_arms(self, arms: Mapping[str, Arm] | None = None, view: tuple[Camera, float] | None = None, anew: bool = False) -> None:
+        """Put arms where `frames` or a camera says, those without a robot at their start.
 
         Args:
-            anew: Also those that stand there already.
+            arms: These arms; None = all.
+            view: As `place_arms` has it; None = what was seen of the first model of the recording.
+            anew: Also arms that stand there already.
         """
-        before, self._unplaced = self._unplaced, place_arms(self.arms, self._options.frame_poses, self._view, anew)
+        arms = self.arms if arms is None else arms
+        stood = {name: arm.pose for name, arm in arms.items() if isinstance(arm, JointedArm) and arm.commanded and arm.base is not None}
+        before, self._unplaced = self._unplaced, place_arms(arms, self._options.frame_poses, view or self._view, anew)
+        why = "a model of another recording came" if anew else "its base has changed"
+        for name, pose in stood.items():
+            arm = arms[name]
+            if pose is not None and arm.pose is not None and not np.array_equal(pose, arm.pose):
+                self._arm_topics.warn(arm, f"{name} is at its start, as {why}; it holds nothing, and its move ended", again=True)
         self._arm_topics.describe()
         if self._unplaced and self._unplaced != before and self.simulation is not None:
             self.get_logger().warning(self._unplaced)
@@ -388,6 +402,13 @@ class PhysicsNode(EndoNode):
         """Build no more tissue, and destroy the node."""
         self._builder.stop()
         super().destroy_node()
+
+
+def _same_camera(view: tuple[Camera, float] | None, other: tuple[Camera, float] | None) -> bool:
+    """Whether the cameras of two models are the same: then a recording goes on, as while its model is being trained."""
+    if view is None or other is None:
+        return False
+    return np.array_equal(view[0].pose, other[0].pose) and np.array_equal(view[0].K, other[0].K)
 
 
 def _poll(config: PhysicsConfig) -> float:

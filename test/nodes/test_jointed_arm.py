@@ -5,7 +5,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import rclpy
-from ros_bench import HEIGHT, SMALL, WIDTH, Bench, K, S, await_nodes, moved, send_model
+from ros_bench import HEIGHT, SMALL, WIDTH, Bench, K, S, await_nodes, moved, send_model, sheet
 from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
@@ -376,11 +376,44 @@ def test_bad_options_are_one_sentence(name):
         make_arms(PhysicsNodeConfig(**values))
 
 
+def test_a_model_of_the_same_recording_leaves_the_arms_and_another_takes_them_to_their_start(graph):
+    send_joints(graph, messages.tool_joint_command, joints_of(graph, "PSM2") + [0.1, 0, 0, 0, 0, 0], "PSM2")
+    graph.publish(messages.tool_state_command("PSM2"), messages.encode_report("disable", S))
+    graph.until(lambda: texts(graph, messages.tool_state, "PSM2")[-1] == "DISABLED")
+    arms, goal = graph.nodes[1].arms, joints_of(graph) + [0.0, 0, -0.04, 0, 0, 0]
+    left, base = arms["PSM2"].joints, arms["PSM1"].base
+    assert graph.set("physics_node", slide_speed=0.02)[0]
+    send_joints(graph, messages.tool_joint_move, goal)
+    send_model(graph, sheet(z=0.101), stamp=7 * S)
+    await_nodes(graph, 7 * S)
+    assert arms["PSM1"].base is base and arms["PSM1"].busy, "the move goes on"
+    graph.until(lambda: np.allclose(joints_of(graph), goal), "its goal")
+    assert graph.set("physics_node", slide_speed=0.2)[0]
+    assert not texts(graph, messages.tool_warning)
+    assert graph.call(Trigger, "/physics_node/reset").success
+    graph.until(lambda: (joints_of(graph) == arms["PSM1"].start).all(), "the start")
+    np.testing.assert_array_equal(arms["PSM2"].joints, left)  # disabled
+
+    other = tip_at(0.001, 0, 0)
+    send_joints(graph, messages.tool_joint_move, goal)
+    send_model(graph, stamp=8 * S, cameras=(other,))
+    await_nodes(graph, 8 * S)
+    for arm in ARMS:
+        (said,) = graph.until(lambda arm=arm: texts(graph, messages.tool_warning, arm), f"a warning of {arm}")
+        assert said.startswith(f"{arm} is at its start, as a model of another recording came")
+        np.testing.assert_array_equal(arms[arm].joints, arms[arm].start)
+    graph.refused("physics_node", "is at its start, as a model of another recording came")
+    graph.publish(messages.tool_state_command("PSM2"), messages.encode_report("enable", S))
+    graph.until(lambda: texts(graph, messages.tool_state, "PSM2")[-1] == "ENABLED")
+    send_model(graph, stamp=9 * S)
+    await_nodes(graph, 9 * S)
+
+
 def test_pictures_follow_the_arm_of_the_camera(graph):
     rendering = graph.add(RenderingNode)
     shown = graph.hear(messages.RENDERED_POSE)
-    send_model(graph, stamp=6 * S)  # which takes the arms to their start
-    await_nodes(graph, 6 * S)
+    send_model(graph, stamp=10 * S)
+    await_nodes(graph, 10 * S)
     graph.publish(messages.LEFT_INFO, messages.encode_camera_info(K, WIDTH, HEIGHT, S, "endoscope_left"))
     graph.until(lambda: shown, "a picture")
     arm = graph.nodes[1].arms["ECM"]

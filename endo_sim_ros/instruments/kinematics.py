@@ -64,6 +64,13 @@ class ArmKinematics:
         return np.array([joint.upper for joint in self.joints])
 
     @cached_property
+    def length(self) -> float:
+        """Length of all links in a row, drawn out, m: no pose of the tip is farther from the base."""
+        links = sum(np.hypot(joint.a, joint.shift) for joint in self.joints)
+        slides = sum(max(abs(joint.lower), abs(joint.upper)) for joint in self.joints if joint.kind == "prismatic")
+        return float(links + slides + np.linalg.norm(self.tooltip_offset[:3, 3]))
+
+    @cached_property
     def prismatic(self) -> np.ndarray:
         """Which joints slide [n], bool; the others turn."""
         return np.array([joint.kind == "prismatic" for joint in self.joints])

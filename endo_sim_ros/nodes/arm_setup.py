@@ -1,5 +1,6 @@
 """The arms of physics_node from its options, and where they stand."""
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -77,7 +78,7 @@ def place_arms(arms: Mapping[str, Arm], frames: Mapping[str, np.ndarray], view: 
         anew: Whether an arm that is in its place already goes to its start, too.
 
     Returns:
-        Why arms have no place, in a sentence; empty if all have one. Such an arm is a tip without joints.
+        Why arms have no place, or hardly the right one, in a sentence; empty if all have one. An arm without is a tip without joints.
     """
     missing = []
     for name, arm in arms.items():
@@ -89,6 +90,10 @@ def place_arms(arms: Mapping[str, Arm], frames: Mapping[str, np.ndarray], view: 
             if f"{name}_base" in frames:
                 base, joints = frames[f"{name}_base"], np.clip(np.zeros(len(lower)), lower, upper)
                 joints[2] = 0.5 * (lower[2] + upper[2])
+                away = 0.0 if view is None else math.dist(base[:3, 3], view[0].pose[:3, 3])
+                if view is not None and away > 2 * kinematics.length + view[1]:
+                    size = f"the whole arm is {kinematics.length:.2g} m long"
+                    missing.append(f"{name}_base in frames is {away:.3g} m from the camera, and {size}; is it in metres?")
             elif view is None:
                 raise ConfigError(f"{name}: no camera shows where the tissue is; give {name}_base in frames")
             else:

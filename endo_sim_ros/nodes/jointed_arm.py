@@ -1,5 +1,6 @@
 """An arm with joints: where its links are when its tip is at a pose, and how its joints get to where they are told."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -79,13 +80,37 @@ class JointedArm(Arm):
 
     # ---------------------------------------------------------------- commands
 
+    def _astray(self, pose: np.ndarray) -> str:
+        """Why a pose is beyond any reach, by more than the whole length of the arm, in a sentence; empty if it is not."""
+        if self.base is None:
+            return ""
+        distance = math.dist(pose[:3, 3], self.base[:3, 3])
+        if distance <= 2 * self.kinematics.length:
+            return ""
+        return f"the pose is {distance:.3g} m from the base, and the whole arm is {self.kinematics.length:.2g} m long; is it in metres?"
+
+    def _require_sense(self, pose: np.ndarray) -> None:
+        astray = self._astray(pose)
+        if self.commanded and astray:
+            raise ValueError(f"{self.name} stays where it is: {astray}")
+
     def servo(self, pose: np.ndarray) -> None:
-        """Put the tip at a pose [4, 4], world, or as near as the joints get, which `move` finds out."""
+        """Put the tip at a pose [4, 4], world, or as near as the joints get, which `move` finds out.
+
+        Raises:
+            ValueError: If a commanded arm is not long enough by far; it then stays where it is.
+        """
+        self._require_sense(pose)
         super().servo(pose)
         self.joint_goal = None
 
     def move_to(self, pose: np.ndarray) -> str:
-        """Let the tip move to a pose [4, 4], world, or as near as the joints get; returns what it will miss, in a sentence."""
+        """Let the tip move to a pose [4, 4], world, or as near as the joints get; returns what it will miss, in a sentence.
+
+        Raises:
+            ValueError: As `servo` does.
+        """
+        self._require_sense(pose)
         self.joint_goal, missing = None, ""
         if self.base is not None and self.joints is not None:
             reach = solve_inverse(self.kinematics, invert_pose(self.base) @ pose, self.joints)
@@ -262,6 +287,7 @@ class CameraArm(JointedArm):
         """Joints [n] that put the camera at a pose."""
         if self.base is None or self.joints is None or self.start is None:
             raise ValueError(f"{self.name} has no place yet; publish a model, or give {self.name}_base in frames")
+        self._require_sense(pose)
         wanted = invert_pose(self.base) @ pose
         self._require_upright(wanted[:3, 1], self.kinematics.tip_pose(self.start)[:3, 1])
         reach = solve_inverse(self.kinematics, wanted, self.joints, _CAMERA_REACH)

@@ -1,6 +1,7 @@
 """How the joints of an arm get to where the tip is told to be."""
 
 import types
+import warnings
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from endo_sim_ros.core.cameras import make_pose
 from endo_sim_ros.instruments import load_arm
 from endo_sim_ros.nodes.arm_topics import ArmTopics
 from endo_sim_ros.nodes.configs import PhysicsNodeConfig
-from endo_sim_ros.nodes.jointed_arm import JointedArm
+from endo_sim_ros.nodes.jointed_arm import CameraArm, JointedArm
 
 PSM = load_arm("PSM", "LARGE_NEEDLE_DRIVER")
 BASE = make_pose([0.1, -0.2, 0.3], [0.5, 0.1, -0.7, 0.3])
@@ -83,6 +84,34 @@ def test_a_servoed_pose_is_taken_exactly_and_one_out_of_reach_as_near_as_possibl
     np.testing.assert_allclose(arm.pose, BASE @ PSM.tip_pose(arm.joints), atol=1e-12)
     arm.move(STEP, 0.05, 1.5)
     assert not arm.velocities.any()
+
+
+@pytest.mark.parametrize("far", [80.0, -90.0, 3.0, 1e5, 1e200, -1e308])
+def test_a_pose_beyond_any_reach_is_refused_in_a_sentence_and_the_arm_stays(far):
+    for arm in (arm_at([0.0, 0, 0.12, 0, 0, 0]), camera_arm()):
+        before = arm.pose, arm.joints
+        pose = arm.pose.copy()
+        pose[0, 3] = far
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            for command in (arm.servo, arm.move_to):
+                with pytest.raises(ValueError, match=r"stays where it is: the pose is \S+ m from the base, .* is it in metres\?$"):
+                    command(pose)
+        assert arm.move(STEP, 0.05, 1.5) == "" and not arm.busy
+        assert arm.pose is before[0] and arm.joints is before[1]
+
+
+def camera_arm():
+    arm = CameraArm("ECM", kinematics=load_arm("ECM", "ENDOSCOPE_STRAIGHT"), joint_speed=2.0, slide_speed=0.2)
+    arm.stand(BASE, np.array([0.0, 0, 0.1, 0]))
+    return arm
+
+
+def test_no_joint_positions_put_the_tip_farther_away_than_the_arm_is_long():
+    random = np.random.default_rng(0)
+    for arm in (PSM, load_arm("PSM_Si", "LARGE_NEEDLE_DRIVER"), load_arm("ECM", "ENDOSCOPE_UP")):
+        reached = np.linalg.norm(arm.tip_pose(random.uniform(arm.lower, arm.upper, (1000, len(arm.joints))))[:, :3, 3], axis=-1)
+        assert reached.max() < arm.length < 2
 
 
 def test_efforts_are_the_torques_of_a_force_at_the_tip():

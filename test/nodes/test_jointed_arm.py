@@ -9,9 +9,10 @@ from ros_bench import HEIGHT, SMALL, WIDTH, Bench, K, S, await_nodes, moved, sen
 from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
+from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.instruments import link_poses, load_arm, solve_inverse
-from endo_sim_ros.nodes.arm_setup import make_arms
+from endo_sim_ros.nodes.arm_setup import make_arms, place_arms
 from endo_sim_ros.nodes.configs import PhysicsNodeConfig
 from endo_sim_ros.nodes.physics_node import PhysicsNode
 from endo_sim_ros.nodes.rendering_node import RenderingNode
@@ -407,6 +408,13 @@ def test_a_model_of_the_same_recording_leaves_the_arms_and_another_takes_them_to
     graph.until(lambda: texts(graph, messages.tool_state, "PSM2")[-1] == "ENABLED")
     send_model(graph, stamp=9 * S)
     await_nodes(graph, 9 * S)
+
+
+def test_a_base_far_from_the_camera_is_told():
+    arms, view = make_arms(PhysicsNodeConfig(arm_source="commanded")), (Camera(K, WIDTH, HEIGHT, np.eye(4)), 0.1)
+    assert place_arms(arms, {"PSM1_base": tip_at(0.1, -0.2, 0.3)}, view, True) == ""
+    said = place_arms(arms, {"PSM1_base": tip_at(100, -200, 300)}, view, True)
+    assert said == "PSM1_base in frames is 374 m from the camera, and the whole arm is 1.1 m long; is it in metres?"
 
 
 def test_pictures_follow_the_arm_of_the_camera(graph):

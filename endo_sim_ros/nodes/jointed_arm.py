@@ -18,6 +18,7 @@ _TRIES = 4  # to find how far the tip gets in a step; one or two are enough wher
 _JOINTS_OF_LINK = {"roll": 4, "wrist_pitch": 5}  # joints that move it: the first ones; all others move with all joints
 _CAMERA_REACH = ReachConfig(radian_length=1e-4)  # the direction of an endoscope follows from its place
 _CAMERA_THERE = 1e-4  # m: nearer is at the pose
+_MEASURED_WRONG, _MEASURED_TURNED = 1e-3, np.radians(1.0)  # m, rad: less is what calibrations are off
 
 
 @dataclass(kw_only=True)
@@ -45,6 +46,7 @@ class JointedArm(Arm):
     joints: np.ndarray | None = None  # [n] rad and m
     joint_goal: np.ndarray | None = None  # [n]; None while no move of joints is under way
     velocities: np.ndarray | None = None  # [n] rad/s and m/s, in the last step
+    missing: str = ""  # what the joints miss of the pose that a robot measured, in a sentence
     start: np.ndarray | None = None  # [n] joints while nobody has commanded anything
     _posed: np.ndarray | None = None  # the pose that belongs to the joints
     _stepped: np.ndarray | None = None  # joints at the end of the last step
@@ -172,15 +174,28 @@ class JointedArm(Arm):
         return missing
 
     def settle(self) -> str:
-        """Find the joints of the pose last commanded or measured; a commanded arm then is where they get. Returns what is missing."""
+        """Find the joints of the pose last commanded or measured; a commanded arm then is where they get.
+
+        Returns:
+            What a commanded arm misses, in a sentence; `missing` has that of a measured one.
+        """
         if self.pose is None or self.pose is self._posed or self.base is None or self.joints is None:
+            return ""
+        if not self.commanded and (astray := self._astray(self.pose)):
+            self.missing, self._posed = f"{self.name}: {astray}", self.pose
             return ""
         reach = solve_inverse(self.kinematics, invert_pose(self.base) @ self.pose, self.joints)
         self.joints = reach.joints
-        if self.commanded and not reach.reached:
+        short = "" if reach.reached else f"{self.name}: {reach.shortfall()}"
+        if self.commanded and short:
             self.pose = self.base @ self.kinematics.tip_pose(self.joints)
         self._posed = self.pose  # as it was told where it is reached, without the rounding of the joints
-        return f"{self.name}: {reach.shortfall()}" if self.commanded and not reach.reached else ""
+        if self.commanded:
+            return short
+        wrong = reach.position_error > _MEASURED_WRONG or reach.rotation_error > _MEASURED_TURNED
+        check = f"the robot measures that pose: check {self.name}_base in frames, arm_models and instruments"
+        self.missing = f"{short}; {check}" if wrong else ""
+        return ""
 
     def _take(self, joints: np.ndarray) -> None:
         assert self.base is not None

@@ -25,6 +25,7 @@ _SLOW = 0.5  # real-time factor below which the node warns
 _FAST = 1.5  # times real speed from which a clock is to blame for that
 _POLLS = 4  # times per step that the timer asks whether a step is due
 _LONGEST_POLL = 0.1  # seconds; models and parameters must not wait for steps that take minutes
+_SAID_AGAIN = 10.0  # seconds after which the log has again that an arm misses what is measured
 _WINDOW = 1.0  # seconds over which the real-time factor is measured
 
 
@@ -271,6 +272,8 @@ class PhysicsNode(EndoNode):
             if turning:  # else a jaw that tissue slipped out of would close again
                 arm.hold(self._options.jaw_closed, self._options.jaw_open)
         self._apply_tools(simulation)
+        for missing in self._misses():
+            self.get_logger().warning(missing, throttle_duration_sec=_SAID_AGAIN)
         simulation.step()
         for name, arm in self._tools.items():
             self._arm_topics.limit_force(arm, lambda name=name: simulation.reaction(name)[0])
@@ -385,18 +388,29 @@ class PhysicsNode(EndoNode):
             return ERROR, f"{self.failure}; the model before goes on", values
         if state is PhysicsState.PAUSED:
             return OK, "paused", values
+        level, text = self._progress()
+        if level == OK and (wrong := "; ".join(filter(None, [self._unplaced, *self._misses()]))):
+            level, text = WARN, f"{text}; {wrong}"
+        return level, text, values
+
+    def _misses(self) -> list[str]:
+        """What joints miss of the poses that robots measure, in sentences."""
+        return [arm.missing for arm in self.arms.values() if isinstance(arm, JointedArm) and arm.missing]
+
+    def _progress(self) -> tuple[int, str]:
+        """Level and message: how the steps go."""
         if self._lockstep:
             waiting = self._commands.missing()
             if waiting is None:
-                return OK, f"in lockstep, {self.steps} steps taken, waiting for a command", values
+                return OK, f"in lockstep, {self.steps} steps taken, waiting for a command"
             parts = ", ".join(sorted(f"{name}'s {kind}" for name, kind in waiting[1]))
-            return OK, f"in lockstep, waiting for {parts} of the command of {waiting[0] * 1e-9:.6f} s", values
+            return OK, f"in lockstep, waiting for {parts} of the command of {waiting[0] * 1e-9:.6f} s"
         if self._real_time_factor < _SLOW and self._clock_speed > _FAST:
             text = f"slower than /clock, which runs at {self._clock_speed:.1f} times real speed; let it run slower, or lower node_count"
-            return WARN, text, values
+            return WARN, text
         if self._real_time_factor < _SLOW:
-            return WARN, "slower than real time; lower node_count or young_modulus, or use a GPU", values
-        return (WARN, f"running; {self._unplaced}", values) if self._unplaced else (OK, "running", values)
+            return WARN, "slower than real time; lower node_count or young_modulus, or use a GPU"
+        return OK, "running"
 
     def destroy_node(self) -> None:
         """Build no more tissue, and destroy the node."""

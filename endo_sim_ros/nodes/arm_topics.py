@@ -104,7 +104,8 @@ class ArmTopics:
         if view is not None:
             found.setdefault(ECM_VIEW, view)
         if self.options.cartesian_frame != ECM_VIEW or arm is self._camera:
-            found[""] = given.get(f"{arm.name}_base", np.eye(4))
+            # A commanded arm is told its pose in the frame in which it publishes it, and that is the world; a robot's is in its base.
+            found[""] = np.eye(4) if arm.name in self._publishers else given.get(f"{arm.name}_base", np.eye(4))
         elif view is not None:
             found[""] = view
         return found

@@ -298,6 +298,10 @@ def test_an_arm_whose_base_is_moved_lets_go_and_the_others_stay(graph):
     np.testing.assert_allclose(arms["PSM1"].base[:3, 3], [0.12, 0.1, 0.0])
     graph.until(lambda: newest(graph, messages.tool_jaw_state("PSM1")).position[0] == 1.0, "an open jaw")
     np.testing.assert_array_equal(joints_of(graph, "PSM2"), other)
+    pose = pose_of(graph, messages.tool_pose("PSM1"))  # in the world, and so is a pose without a frame
+    pose[:3, 3] += [0.001, 0, 0]
+    graph.publish(messages.tool_pose_command("PSM1"), messages.encode_pose(pose, S, ""))
+    graph.until(lambda: np.allclose(pose_of(graph, messages.tool_pose("PSM1")), pose, atol=1e-9), "a pose 1 mm further")
     assert graph.set("physics_node", frames=[""])[0]
     graph.until(lambda: arms["PSM1"].base[0, 3] != 0.12, "the place of before")
     np.testing.assert_array_equal(joints_of(graph, "PSM2"), other)

@@ -106,9 +106,7 @@ class Arm:
             return
         if self.pose is None:  # nobody knows where it comes from
             self.pose = self.pose_goal
-        turn = self.pose[:3, :3].T @ self.pose_goal[:3, :3]
-        angle = np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))
-        needed = float(max(np.linalg.norm(self.pose_goal[:3, 3] - self.pose[:3, 3]) / speed, angle / turn_speed))
+        needed = seconds_between(self.pose, self.pose_goal, speed, turn_speed)
         if needed <= seconds * _ROUNDED:
             self.pose, self.pose_goal = self.pose_goal, None
         else:
@@ -134,3 +132,10 @@ class Arm:
         """Let go of everything; pose and state stay."""
         self.force, self.acting, self.closed, self.angle, self.cutting = None, False, False, JAW_AT_START, False
         self.stop()
+
+
+def seconds_between(pose: np.ndarray, goal: np.ndarray, speed: float, turn_speed: float) -> float:
+    """Time from one pose [4, 4] to another, s, with at most these speeds, m/s and rad/s."""
+    turn = pose[:3, :3].T @ goal[:3, :3]
+    angle = np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))
+    return float(max(np.linalg.norm(goal[:3, 3] - pose[:3, 3]) / speed, angle / turn_speed))

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from endo_sim_ros.core.cameras import invert_pose
 from endo_sim_ros.instruments import ArmKinematics, Capsule, ReachConfig, link_poses, solve_inverse
-from endo_sim_ros.nodes.arm import DISABLED, Arm
+from endo_sim_ros.nodes.arm import DISABLED, Arm, seconds_between
 
 _ROUNDED = 1 + 1e-9  # a way that takes a whole number of steps must not take one more
 _WITHIN = 1e-6  # rad, m: how far a command may leave the limits, as what is sent back was rounded
@@ -45,6 +45,7 @@ class JointedArm(Arm):
     base: np.ndarray | None = None  # [4, 4], world
     joints: np.ndarray | None = None  # [n] rad and m
     joint_goal: np.ndarray | None = None  # [n]; None while no move of joints is under way
+    _to_pose: bool = False  # whether that move is the rest of one to a pose
     velocities: np.ndarray | None = None  # [n] rad/s and m/s, in the last step
     missing: str = ""  # what the joints miss of the pose that a robot measured, in a sentence
     start: np.ndarray | None = None  # [n] joints while nobody has commanded anything
@@ -135,7 +136,7 @@ class JointedArm(Arm):
     def move_joints(self, joints: ArrayLike) -> None:
         """Let the joints move to positions [n], rad and m; raises as `servo_joints` does."""
         self.joint_goal = self.check_joints(joints)
-        self.pose_goal, self.acts = None, True
+        self.pose_goal, self.acts, self._to_pose = None, True, False
 
     def check_joints(self, joints: ArrayLike) -> np.ndarray:
         """Joint positions [n] that the arm may take; raises as `servo_joints` does."""
@@ -168,7 +169,7 @@ class JointedArm(Arm):
         if self.pose_goal is not None:
             self._move_straight(seconds, speed, turn_speed)
         elif self.joint_goal is not None:
-            self._move_joints(seconds)
+            self._move_joints(seconds, speed, turn_speed)
         before, self._stepped = self._stepped, self.joints
         self.velocities = (self.joints - before) / seconds if before is not None else np.zeros(len(self.joints))
         return missing
@@ -197,10 +198,12 @@ class JointedArm(Arm):
         self.missing = f"{short}; {check}" if wrong else ""
         return ""
 
-    def _take(self, joints: np.ndarray) -> None:
+    def _take(self, joints: np.ndarray) -> np.ndarray:
+        """Be at joint positions [n]; returns the pose of the tip there."""
         assert self.base is not None
         self.joints = joints
-        self.pose = self._posed = self.base @ self.kinematics.tip_pose(joints)
+        self.pose = self._posed = pose = self.base @ self.kinematics.tip_pose(joints)
+        return pose
 
     def _haste(self, joints: np.ndarray, seconds: float) -> float:
         """How many times too fast it is to come from some joint positions to the present ones in some seconds."""
@@ -208,14 +211,21 @@ class JointedArm(Arm):
         most = np.where(self.kinematics.prismatic, self.slide_speed, self.joint_speed)
         return float(np.max(np.abs(self.joints - joints) / (most * seconds)))
 
-    def _move_joints(self, seconds: float) -> None:
-        before, goal = self.joints, self.joint_goal
-        assert before is not None and goal is not None
+    def _move_joints(self, seconds: float, speed: float, turn_speed: float) -> None:
+        """Go on towards the goal of the joints; on the way to a pose with at most these speeds of the tip, m/s and rad/s, too."""
+        before, goal, pose = self.joints, self.joint_goal, self.pose
+        assert before is not None and goal is not None and pose is not None
         self.joints = goal
-        haste = self._haste(before, seconds)
-        if haste <= _ROUNDED:
+        haste, there = self._haste(before, seconds), False
+        for _ in range(_TRIES * _TRIES):
+            there = haste <= _ROUNDED
+            reached = self._take(goal if there else before + (goal - before) / haste)
+            too_fast = seconds_between(pose, reached, speed, turn_speed) / seconds if self._to_pose else 0.0
+            if too_fast <= _ROUNDED:
+                break
+            haste = max(haste, 1.0) * 1.01 * too_fast  # a little less, as the tip does not follow in proportion
+        if there:
             self.joint_goal = None
-        self._take(goal if haste <= _ROUNDED else before + (goal - before) / haste)
 
     def _move_straight(self, seconds: float, speed: float, turn_speed: float) -> None:
         pose, goal, joints, share = self.pose, self.pose_goal, self.joints, 1.0
@@ -231,7 +241,8 @@ class JointedArm(Arm):
                 break
             share /= 1.01 * haste  # a little less, so that it is enough where joints do not follow in proportion
         self.joint_goal, self.pose_goal = solve_inverse(self.kinematics, invert_pose(self.base) @ goal, joints).joints, None
-        self._move_joints(seconds)
+        self._to_pose = True
+        self._move_joints(seconds, speed, turn_speed)
 
     # ------------------------------------------------------------------ states
 

@@ -8,6 +8,7 @@ import pytest
 
 from endo_sim_ros.core.cameras import make_pose
 from endo_sim_ros.instruments import load_arm
+from endo_sim_ros.nodes.arm import seconds_between
 from endo_sim_ros.nodes.arm_topics import ArmTopics
 from endo_sim_ros.nodes.configs import PhysicsNodeConfig
 from endo_sim_ros.nodes.jointed_arm import CameraArm, JointedArm
@@ -35,15 +36,16 @@ def travel(arm):
     return np.array(joints), np.array(poses)
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(24))
 def test_moves_between_any_two_poses_arrive_within_all_limits(seed):
     random = np.random.default_rng(seed)
     first, last = (random.uniform(0.95 * PSM.lower, 0.95 * PSM.upper) for _ in range(2))
     first[2], last[2] = random.uniform(0.06, 0.22, 2)
     arm, goal = arm_at(first), BASE @ PSM.tip_pose(last)
     assert arm.move_to(goal) == ""
-    joints, _ = travel(arm)
+    joints, poses = travel(arm)
     assert (np.abs(np.diff(joints, axis=0)) <= SPEEDS * STEP * (1 + 1e-6)).all()
+    assert max(seconds_between(*pair, 0.05, 1.5) for pair in zip(poses, poses[1:])) <= STEP * (1 + 1e-6)
     assert (joints >= PSM.lower - 1e-9).all() and (joints <= PSM.upper + 1e-9).all()
     np.testing.assert_allclose(arm.pose, goal, atol=1e-7)
 

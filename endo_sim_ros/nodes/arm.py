@@ -69,6 +69,10 @@ class Arm:
             what = "resume" if self.state == PAUSED else "enable"
             raise ValueError(f"{self.name} is {self.state}; send {what} on {self.name}/state_command")
 
+    def check_jaw(self, angle: float) -> float:
+        """An angle of the jaw, rad, that the arm may take; every one, as nobody knows its tool."""
+        return angle
+
     @property
     def moving(self) -> bool:
         """Whether the tip is on its way to a goal."""

@@ -226,7 +226,7 @@ class ArmTopics:
         self._deliver_part(arm, "wrench", message, topic, act)
 
     def _on_jaw(self, arm: Arm, topic: str, message: Any) -> None:
-        angle = messages.decode_jaw(message, topic)
+        angle = arm.check_jaw(messages.decode_jaw(message, topic))
 
         def act() -> None:
             self._require_pose(arm, "jaw command")
@@ -237,7 +237,7 @@ class ArmTopics:
         self._deliver_part(arm, "jaw", message, topic, act)
 
     def _on_jaw_move(self, arm: Arm, topic: str, message: Any) -> None:
-        goal = messages.decode_jaw(message, topic)
+        goal = arm.check_jaw(messages.decode_jaw(message, topic))
         self._require_pose(arm, "jaw command")
         arm.angle_goal = goal
         self.publish_operating_states(arm.name)

@@ -13,6 +13,7 @@ from endo_sim_ros.nodes.arm import DISABLED, Arm, seconds_between
 
 _ROUNDED = 1 + 1e-9  # a way that takes a whole number of steps must not take one more
 _WITHIN = 1e-6  # rad, m: how far a command may leave the limits, as what is sent back was rounded
+_JAW_WITHIN = 0.01  # rad: the same of the jaw, whose limits clients have in whole degrees
 _LEAP = 10.0  # times the speed of a joint: the straight way passes a singularity or goes on with another bend of the wrist
 _TRIES = 4  # to find how far the tip gets in a step; one or two are enough where joints follow in proportion
 _JOINTS_OF_LINK = {"roll": 4, "wrist_pitch": 5}  # joints that move it: the first ones; all others move with all joints
@@ -150,6 +151,15 @@ class JointedArm(Arm):
                 lower, upper, value = (f"{scale * number:.4g}" for number in (joint.lower, joint.upper, value))
                 raise ValueError(f"{self.name}: {joint.name} cannot be at {value} {unit}; its limits are {lower} and {upper} {unit}")
         return np.clip(positions, arm.lower, arm.upper)
+
+    def check_jaw(self, angle: float) -> float:
+        """An angle of the jaw, rad, that a commanded arm may take; ValueError if it is beyond the limits of the tool."""
+        if self.commanded and self.kinematics.jaw is not None:
+            lower, upper = self.kinematics.jaw
+            if not lower - _JAW_WITHIN <= angle <= upper + _JAW_WITHIN:
+                shown, *limits = (f"{np.degrees(number):.4g}" for number in (angle, lower, upper))
+                raise ValueError(f"{self.name}: the jaw cannot be at {shown} degrees; its limits are {' and '.join(limits)} degrees")
+        return angle
 
     # ------------------------------------------------------------------ motion
 

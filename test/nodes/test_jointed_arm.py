@@ -287,6 +287,22 @@ def hold_tissue(bench, arm="PSM1"):
     bench.until(lambda: felt(bench, arm) > 0.1 and moved(bench) > 0.01, "a pull")
 
 
+@pytest.mark.parametrize("topic", [messages.tool_jaw, messages.tool_jaw_move])
+def test_an_angle_beyond_the_jaw_is_refused_and_a_tight_closing_is_not(graph, topic):
+    assert graph.set("physics_node", turn_speed=100.0)[0]
+    angle = lambda: newest(graph, messages.tool_jaw_state("PSM1")).position[0]  # noqa: E731
+    for goal, shown in ((99.0, "5672"), (1.45, "83.08"), (-0.5, "-28.65"), (20.0, "1146")):
+        graph.publish(topic("PSM1"), messages.encode_jaw(goal, S))
+        said = f"{topic('PSM1').name}: PSM1: the jaw cannot be at {shown} degrees; its limits are -20 and 80 degrees"
+        graph.refused("physics_node", said)
+        graph.until(lambda said=said: said in texts(graph, messages.tool_error), "the same on the topic of the arm")
+    assert angle() == 1.0
+    for goal in (np.radians(-20), np.radians(80), -0.355, 0.0):
+        graph.publish(topic("PSM1"), messages.encode_jaw(goal, S))
+        graph.until(lambda goal=goal: angle() == goal, "the angle")
+    assert graph.set("physics_node", turn_speed=1.5)[0]
+
+
 def test_an_arm_whose_base_is_moved_lets_go_and_the_others_stay(graph):
     hold_tissue(graph)
     send_joints(graph, messages.tool_joint_command, joints_of(graph, "PSM2") + [0.1, 0, 0, 0, 0, 0], "PSM2")

@@ -26,7 +26,7 @@ class Arm:
     force: np.ndarray | None = None  # [3] N, world
     torque: np.ndarray | None = None  # [3] N·m about the point held, world
     heard: float = 0.0  # time of the last wrench, seconds of the clock
-    acting: bool = False
+    acting: bool = False  # whether the tissue was last given a wrench of it
     angle: float = JAW_AT_START  # of the jaw, rad
     closed: bool = False  # the jaw
     cutting: bool = False
@@ -60,8 +60,8 @@ class Arm:
         if after != ENABLED:
             self.stop()
         if after == DISABLED:
-            self.force, self.cutting = None if self.force is None else np.zeros(3), False
-            self.torque = None if self.torque is None else np.zeros(3)
+            self.force = self.torque = None
+            self.closed = self.cutting = False  # enabled again it holds nothing before it is told to
 
     def require_enabled(self) -> None:
         """Raise ValueError if the arm does not move now."""
@@ -134,7 +134,7 @@ class Arm:
 
     def reset(self) -> None:
         """Let go of everything; pose and state stay."""
-        self.force, self.acting, self.closed, self.angle, self.cutting = None, False, False, JAW_AT_START, False
+        self.force, self.closed, self.angle, self.cutting = None, False, JAW_AT_START, False
         self.stop()
 
 

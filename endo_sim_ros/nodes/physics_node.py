@@ -10,7 +10,7 @@ from std_srvs.srv import SetBool, Trigger
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ControlNodeCloud, PhysicsState
-from endo_sim_ros.nodes.arm import Arm
+from endo_sim_ros.nodes.arm import DISABLED, Arm
 from endo_sim_ros.nodes.arm_setup import CAMERA_ARM, make_arms, place_arms
 from endo_sim_ros.nodes.arm_topics import ArmTopics
 from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode, run, sentence
@@ -179,7 +179,7 @@ class PhysicsNode(EndoNode):
 
     def _apply_tools(self, simulation: TissueSimulation) -> None:
         for name, arm in self._tools.items():
-            if arm.pose is None or not arm.acts:
+            if arm.pose is None or not arm.acts or arm.state == DISABLED:
                 simulation.withdraw(name)
                 continue
             where = f"at {np.round(arm.pose[:3, 3], 4).tolist()}"
@@ -193,11 +193,10 @@ class PhysicsNode(EndoNode):
             except ValueError as error:
                 arm.cutting = False
                 self.report_error(sentence(f"{name}: cut", error))
-            if arm.force is None or arm.torque is None:
-                continue
-            timeout = self._options.command_timeout
+            timeout, force, torque = self._options.command_timeout, arm.force, arm.torque
             stale = not self._lockstep and 0 < timeout < self._seconds() - arm.heard
-            force, torque = (np.zeros(3), np.zeros(3)) if stale else (arm.force, arm.torque)
+            if force is None or torque is None or stale:
+                force, torque = np.zeros(3), np.zeros(3)
             wanted = bool(force.any() or torque.any())
             if wanted or arm.acting:
                 reached = simulation.set_wrench(name, arm.pose[:3, 3], force, torque)

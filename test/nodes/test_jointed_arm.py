@@ -380,6 +380,50 @@ def test_a_disabled_arm_takes_no_command(graph):
             graph.refused("physics_node", "PSM2/move_jp: PSM2 is DISABLED; send enable")
 
 
+def switch(bench, command, state, arm="PSM1"):
+    bench.publish(messages.tool_state_command(arm), messages.encode_report(command, S))
+    bench.until(lambda: texts(bench, messages.tool_state, arm)[-1] == state, state)
+
+
+def test_a_disabled_arm_lets_go_and_holds_nothing_when_it_is_enabled_before_it_is_told_to(graph):
+    hold_tissue(graph)
+    switch(graph, "disable", "DISABLED")
+    graph.until(lambda: felt(graph) == 0 and moved(graph) < 1e-3, "tissue that is let go")
+    switch(graph, "enable", "ENABLED")
+    graph.spin(0.2)
+    assert moved(graph) < 1e-3
+    servo(graph, tip_at(0, 0, 0.1))
+    jaw(graph, 0.0)
+    graph.until(lambda: graph.nodes[1].simulation.in_reach("PSM1"), "a grasp")
+
+
+def test_a_wrench_ends_when_its_arm_is_disabled_however_soon_it_is_enabled(graph):
+    arm, physics = graph.nodes[1].arms["PSM1"], graph.nodes[1]
+    assert graph.set("physics_node", command_timeout=0.0)[0]
+    servo(graph, tip_at(0, 0, 0.1))
+    graph.publish(messages.tool_wrench("PSM1"), messages.encode_wrench(np.array([0, 0, -0.5]), np.zeros(3), S, "world"))
+    graph.until(lambda: physics.simulation.in_reach("PSM1"), "a pull")
+    for command in ("disable", "enable"):  # between two steps
+        arm.command_state(command)
+    graph.until(lambda: not physics.simulation.in_reach("PSM1") and felt(graph) == 0, "the end of the pull")
+    assert graph.set("physics_node", command_timeout=0.5)[0]
+
+
+def test_a_disabled_arm_has_no_capsule(graph):
+    assert graph.set("physics_node", contact_radius=0.015)[0]
+    graph.until(lambda: graph.nodes[1].simulation.contact_radius >= 0.015, "contact")
+    for step in range(6):
+        servo(graph, tip_at(0, 0, 0.08 + 0.004 * step))
+        graph.spin(0.05)
+    graph.until(lambda: felt(graph) > 0.01 and moved(graph) > 1e-3, "contact")
+    switch(graph, "disable", "DISABLED")
+    graph.until(lambda: felt(graph) == 0 and moved(graph) < 1e-3, "tissue that is free")
+    switch(graph, "enable", "ENABLED")
+    graph.until(lambda: felt(graph) > 0.01 and moved(graph) > 1e-3, "contact again")
+    assert graph.set("physics_node", contact_radius=0.0)[0]
+    graph.until(lambda: graph.nodes[1].simulation.contact_radius == 0, "no contact")
+
+
 BAD_OPTIONS = {
     "two_for_three": (dict(arms=("A", "B", "C"), instruments=("none", "none")), "instruments: there are 2 for 3 arms"),
     "unknown": (dict(instruments=("SPOON",)), "tool must be the path of a .json file or one of"),

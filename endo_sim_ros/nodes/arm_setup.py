@@ -1,7 +1,7 @@
 """The arms of physics_node from its options, and where they stand."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -66,7 +66,13 @@ def _for_each(option: str, values: Sequence[str], names: Sequence[str]) -> Seque
     return values * len(names) if len(values) == 1 else values
 
 
-def place_arms(arms: Mapping[str, Arm], frames: Mapping[str, np.ndarray], view: tuple[Camera, float] | None, anew: bool) -> str:
+def place_arms(
+    arms: Mapping[str, Arm],
+    frames: Mapping[str, np.ndarray],
+    view: tuple[Camera, float] | None,
+    anew: bool = False,
+    kept: Collection[str] = (),
+) -> str:
     """Give each arm with joints a place: its base in `frames`, or else a sensible one in front of a camera.
 
     An arm whose place changes is at its start then.
@@ -76,13 +82,16 @@ def place_arms(arms: Mapping[str, Arm], frames: Mapping[str, np.ndarray], view: 
         frames: Poses [4, 4] of known frames in the world, by name; ``PSM1_base`` is the base of PSM1.
         view: A camera and the depth of the tissue that it sees, m, or None where neither is known.
         anew: Whether an arm that is in its place already goes to its start, too.
+        kept: Names of arms that stay as they are if they are not in `frames`.
 
     Returns:
         Why arms have no place, or hardly the right one, in a sentence; empty if all have one. An arm without is a tip without joints.
     """
     missing = []
+    asking = [name for name, arm in reversed([*arms.items()]) if isinstance(arm, JointedArm) and f"{name}_base" not in frames]
+    places = {name.rpartition("/")[2]: name for name in sorted(asking, key=lambda name: -name.count("/"))}  # PSM1 before left/PSM1
     for name, arm in arms.items():
-        if not isinstance(arm, JointedArm):
+        if not isinstance(arm, JointedArm) or name in kept and name in asking:
             continue
         kinematics, short = arm.kinematics, name.rpartition("/")[2]
         lower, upper = kinematics.lower, kinematics.upper
@@ -96,6 +105,9 @@ def place_arms(arms: Mapping[str, Arm], frames: Mapping[str, np.ndarray], view: 
                     missing.append(f"{name}_base in frames is {away:.3g} m from the camera, and {size}; is it in metres?")
             elif view is None:
                 raise ConfigError(f"{name}: no camera shows where the tissue is; give {name}_base in frames")
+            elif places[short] != name or (short == CAMERA_ARM) != isinstance(arm, CameraArm):
+                other = places[short] if places[short] != name else "a camera"
+                raise ConfigError(f"{name}: the place of {short} in front of a camera is that of {other}; give {name}_base in frames")
             else:
                 placement = place_arm(short, kinematics, *view)
                 base, joints = placement.base, placement.joints.copy()

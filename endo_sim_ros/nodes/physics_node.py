@@ -1,7 +1,7 @@
 """Gaussian model and tool wrenches in, control nodes and reactions out."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ from std_srvs.srv import SetBool, Trigger
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ControlNodeCloud, PhysicsState
-from endo_sim_ros.nodes.arm import DISABLED, Arm
+from endo_sim_ros.nodes.arm import DISABLED
 from endo_sim_ros.nodes.arm_setup import CAMERA_ARM, make_arms, place_arms
 from endo_sim_ros.nodes.arm_topics import ArmTopics
 from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode, run, sentence
@@ -114,10 +114,9 @@ class PhysicsNode(EndoNode):
                 if not same_model and not _same_camera(self._view, view):
                     self._view = view
                     self._place_arms(anew=True)
-                elif not same_model:
-                    self._place_arms(
-                        {name: arm for name, arm in self.arms.items() if isinstance(arm, JointedArm) and arm.base is None}, view
-                    )
+                elif not same_model:  # a later model may show where the others stand
+                    kept = [name for name, arm in self.arms.items() if isinstance(arm, JointedArm) and arm.base is not None]
+                    self._place_arms(view=view, kept=kept)
                 if self._lockstep and not continued:  # the first observation, before any command
                     self._publish(self.simulation, self._simulated_stamp, at_rest=True)
         except Exception as error:
@@ -127,17 +126,17 @@ class PhysicsNode(EndoNode):
 
     # ------------------------------------------------------------------ tools
 
-    def _place_arms(self, arms: Mapping[str, Arm] | None = None, view: tuple[Camera, float] | None = None, anew: bool = False) -> None:
+    def _place_arms(self, anew: bool = False, view: tuple[Camera, float] | None = None, kept: Collection[str] = ()) -> None:
         """Put arms where `frames` or a camera says, those without a robot at their start.
 
         Args:
-            arms: These arms; None = all.
-            view: As `place_arms` has it; None = what was seen of the first model of the recording.
             anew: Also arms that stand there already.
+            view: As `place_arms` has it; None = what was seen of the first model of the recording.
+            kept: As `place_arms` has it.
         """
-        arms = self.arms if arms is None else arms
+        arms = self.arms
         stood = {name: arm.pose for name, arm in arms.items() if isinstance(arm, JointedArm) and arm.commanded and arm.base is not None}
-        before, self._unplaced = self._unplaced, place_arms(arms, self._options.frame_poses, view or self._view, anew)
+        before, self._unplaced = self._unplaced, place_arms(arms, self._options.frame_poses, view or self._view, anew, kept)
         why = "a model of another recording came" if anew else "its base has changed"
         for name, pose in stood.items():
             arm = arms[name]

@@ -430,6 +430,7 @@ BAD_OPTIONS = {
     "no_file": (dict(arm_models=("/nowhere/psm.json",)), "there is no such file"),
     "endoscope": (dict(instruments=("ENDOSCOPE_STRAIGHT",), arm_models=("ECM",)), "PSM1 cannot be ECM with ENDOSCOPE_STRAIGHT"),
     "two_of_a_name": (dict(arms=("PSM1", "PSM1")), "PSM1 is there 2 times"),
+    "capitals": (dict(arms=("PSM1", "psm1")), "PSM1 and psm1 differ in capitals alone; give each arm a name of its own"),
     "measured_camera": (dict(arms=("PSM1", "ECM")), "ECM needs arm_source commanded"),
 }
 
@@ -472,6 +473,17 @@ def test_a_model_of_the_same_recording_leaves_the_arms_and_another_takes_them_to
     graph.until(lambda: texts(graph, messages.tool_state, "PSM2")[-1] == "ENABLED")
     send_model(graph, stamp=9 * S)
     await_nodes(graph, 9 * S)
+
+
+def test_two_arms_never_have_the_same_place():
+    view = Camera(K, WIDTH, HEIGHT, np.eye(4)), 0.1
+    arms = make_arms(PhysicsNodeConfig(arms=("right/PSM2", "left/PSM1", "PSM1", "left/ECM")))
+    places = "left/PSM1: the place of PSM1 in front of a camera is that of PSM1; give left/PSM1_base in frames; "
+    places += "left/ECM: the place of ECM in front of a camera is that of a camera; give left/ECM_base in frames"
+    for kept in ((), ("PSM1", "right/PSM2")):
+        assert place_arms(arms, {}, view, True, kept) == places
+    assert arms["left/PSM1"].base is None and arms["PSM1"].base is not None is not arms["right/PSM2"].base
+    assert place_arms(arms, {"PSM1_base": np.eye(4), "left/ECM_base": np.eye(4)}, view, True) == ""
 
 
 def test_a_base_far_from_the_camera_is_told():

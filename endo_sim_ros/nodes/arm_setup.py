@@ -15,6 +15,7 @@ from endo_sim_ros.nodes.configs import PhysicsNodeConfig, arm_names
 from endo_sim_ros.nodes.jointed_arm import CameraArm, JointedArm
 
 CAMERA_ARM = "ECM"
+_OF_CAMERA = {"PSM": "ECM", "PSM_Si": "ECM_Si"}  # which one goes with the instruments' arms where there is one model for all
 _NO_INSTRUMENT = "none"
 _WITHDRAWN = 0.02  # m: at the start the jaws, 1 to 2 cm long, are in front of the tissue, and two instruments do not meet
 
@@ -36,7 +37,8 @@ def make_arms(options: PhysicsNodeConfig) -> dict[str, Arm]:
             if not commanded:
                 raise ConfigError(f"arms: {name} needs arm_source commanded; the pose of a robot's is heard on {name}/measured_cp anyway")
             tool = tool if len(options.instruments) > 1 else ""  # the one for all is an instrument
-            arms[name] = CameraArm(name, kinematics=load_arm(model.replace("PSM", "ECM") if len(options.arm_models) == 1 else model, tool))
+            model = _OF_CAMERA.get(model, model) if len(options.arm_models) == 1 else model
+            arms[name] = CameraArm(name, kinematics=load_arm(model, tool))
         elif tool == _NO_INSTRUMENT:
             arms[name] = Arm(name)
         else:

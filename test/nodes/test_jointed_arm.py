@@ -1,5 +1,6 @@
 """Arms with joints, through their topics: what they publish, where they get to, and what they refuse."""
 
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -11,7 +12,7 @@ from std_srvs.srv import Trigger
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.config import ConfigError
-from endo_sim_ros.instruments import link_poses, load_arm, solve_inverse
+from endo_sim_ros.instruments import arm_files, link_poses, load_arm, solve_inverse
 from endo_sim_ros.nodes.arm_setup import make_arms, place_arms
 from endo_sim_ros.nodes.configs import PhysicsNodeConfig
 from endo_sim_ros.nodes.physics_node import PhysicsNode
@@ -473,6 +474,18 @@ def test_a_model_of_the_same_recording_leaves_the_arms_and_another_takes_them_to
     graph.until(lambda: texts(graph, messages.tool_state, "PSM2")[-1] == "ENABLED")
     send_model(graph, stamp=9 * S)
     await_nodes(graph, 9 * S)
+
+
+def test_one_model_for_all_arms_makes_that_of_the_camera_an_ecm_if_it_is_a_name(tmp_path):
+    for model in ("PSM", "PSM_Si"):
+        arms = make_arms(PhysicsNodeConfig(arms=("PSM1", "ECM"), arm_source="commanded", arm_models=(model,)))
+        assert arms["ECM"].kinematics.name == model.replace("PSM", "ECM")
+    file = tmp_path / "PSM" / "PSM.json"
+    file.parent.mkdir()
+    file.write_text((Path(arm_files.__file__).parent / "parameters" / "PSM.json").read_text())
+    assert make_arms(PhysicsNodeConfig(arm_models=(str(file),)))["PSM1"].kinematics.name == "PSM"
+    with pytest.raises(ConfigError, match="ECM cannot be PSM with .*; ECM takes an endoscope, every other arm an instrument"):
+        make_arms(PhysicsNodeConfig(arms=("PSM1", "ECM"), arm_source="commanded", arm_models=(str(file),)))
 
 
 def test_two_arms_never_have_the_same_place():

@@ -197,7 +197,7 @@ class ArmTopics:
 
     def _on_joints(self, arm: Arm, topic: str, message: Any) -> None:
         assert isinstance(arm, JointedArm)
-        joints = arm.check_joints(messages.decode_joints(message, topic))
+        joints = arm.check_joints(messages.decode_joints(message, topic), message.name)
 
         def act() -> None:
             arm.require_enabled()
@@ -208,7 +208,7 @@ class ArmTopics:
 
     def _on_joint_move(self, arm: Arm, topic: str, message: Any) -> None:
         assert isinstance(arm, JointedArm)
-        goal = messages.decode_joints(message, topic)
+        goal = arm.check_joints(messages.decode_joints(message, topic), message.name)
         arm.require_enabled()
         arm.move_joints(goal)
         self.publish_operating_states(arm.name)

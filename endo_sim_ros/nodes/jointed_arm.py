@@ -139,9 +139,15 @@ class JointedArm(Arm):
         self.joint_goal = self.check_joints(joints)
         self.pose_goal, self.acts, self._to_pose = None, True, False
 
-    def check_joints(self, joints: ArrayLike) -> np.ndarray:
-        """Joint positions [n] that the arm may take; raises as `servo_joints` does."""
-        arm = self.kinematics
+    def check_joints(self, joints: ArrayLike, names: Sequence[str] = ()) -> np.ndarray:
+        """Joint positions [n] that the arm may take, in the order of its joints, by whose names they may be called.
+
+        Raises:
+            ValueError: As from `servo_joints`, and if they have other names.
+        """
+        arm, known = self.kinematics, ", ".join(joint.name for joint in self.kinematics.joints)
+        if names and ", ".join(names) != known:
+            raise ValueError(f"{self.name}: the joints are {known}, in this order, not {', '.join(names):.200}; send these names or none")
         positions = arm.check_joints(joints)
         if self.base is None:
             raise ValueError(f"{self.name} has no place yet; publish a model, or give {self.name}_base in frames")
@@ -311,9 +317,9 @@ class CameraArm(JointedArm):
         self.move_joints(self._aim(pose))
         return ""
 
-    def check_joints(self, joints: ArrayLike) -> np.ndarray:
+    def check_joints(self, joints: ArrayLike, names: Sequence[str] = ()) -> np.ndarray:
         """Joint positions [n] that the arm may take; raises as `servo` does."""
-        positions = super().check_joints(joints)
+        positions = super().check_joints(joints, names)
         assert self.start is not None
         down, was = (self.kinematics.tip_pose(at)[:3, 1] for at in (positions, self.start))
         self._require_upright(down, was)

@@ -198,6 +198,19 @@ def test_bad_joints_are_one_sentence_and_the_arm_stays(graph, name):
     np.testing.assert_array_equal(pose_of(graph, messages.tool_pose("PSM1")), pose)
 
 
+@pytest.mark.parametrize("topic", [messages.tool_joint_command, messages.tool_joint_move])
+def test_joints_may_have_their_names_and_no_others(graph, topic):
+    joints, none = joints_of(graph), np.zeros(0)
+    names = list(newest(graph, messages.tool_joints("PSM1")).name)
+    for wrong in (names[::-1], names[:5], [f"PSM1_{name}" for name in names]):
+        graph.publish(topic("PSM1"), messages.encode_joints(wrong, joints + 0.01, none, none, S))
+        said = f"PSM1: the joints are {', '.join(names)}, in this order, not {', '.join(wrong)}; send these names or none"
+        graph.refused("physics_node", f"{topic('PSM1').name}: {said}")
+    np.testing.assert_array_equal(joints_of(graph), joints)
+    graph.publish(topic("PSM1"), messages.encode_joints(names, joints + 0.01, none, none, S))
+    graph.until(lambda: np.allclose(joints_of(graph), joints + 0.01), "the joints")
+
+
 @pytest.mark.parametrize("topic", [messages.tool_pose_command, messages.tool_move])
 def test_a_pose_out_of_reach_takes_the_arm_as_near_as_it_gets(graph, topic):
     assert graph.set("physics_node", move_speed=1.0)[0]

@@ -87,7 +87,8 @@ class ArmKinematics:
             raise ValueError(f"{self.name}: a joint position must be {len(self.joints)} numbers, got {joints!r:.80}") from None
         names = ", ".join(joint.name for joint in self.joints)
         if positions.ndim == 0 or positions.shape[-1] != len(self.joints):
-            raise ValueError(f"{self.name}: a joint position must have {len(self.joints)} numbers ({names}), got shape {positions.shape}")
+            given = f"{positions.shape[-1]} numbers" if positions.ndim else "one number"
+            raise ValueError(f"{self.name}: {given}, not {len(self.joints)}; the joints are {names}")
         if not np.isfinite(positions).all():
             wrong = self.joints[np.argwhere(~np.isfinite(positions))[0][-1]].name
             raise ValueError(f"{self.name}: {wrong} is not finite; send rad and m ({names})")

@@ -148,14 +148,20 @@ class JointedArm(Arm):
         arm, known = self.kinematics, ", ".join(joint.name for joint in self.kinematics.joints)
         if names and ", ".join(names) != known:
             raise ValueError(f"{self.name}: the joints are {known}, in this order, not {', '.join(names):.200}; send these names or none")
-        positions = arm.check_joints(joints)
+        try:
+            positions = arm.check_joints(joints)
+        except ValueError as error:
+            raise ValueError(f"{self.name}: {str(error).removeprefix(f'{arm.name}: ')}") from None
         if self.base is None:
             raise ValueError(f"{self.name} has no place yet; publish a model, or give {self.name}_base in frames")
         for joint, value in zip(arm.joints, positions):
             if not joint.lower - _WITHIN <= value <= joint.upper + _WITHIN:
-                scale, unit = (1e3, "mm") if joint.kind == "prismatic" else (np.degrees(1.0), "degrees")
+                slides = joint.kind == "prismatic"
+                scale, unit, asked = (1e3, "mm", "metres") if slides else (np.degrees(1.0), "degrees", "radians")
+                doubt = f"; is it in {asked}?" if abs(value) > (arm.length if slides else 2 * np.pi) else ""
                 lower, upper, value = (f"{scale * number:.4g}" for number in (joint.lower, joint.upper, value))
-                raise ValueError(f"{self.name}: {joint.name} cannot be at {value} {unit}; its limits are {lower} and {upper} {unit}")
+                limits = f"its limits are {lower} and {upper} {unit}"
+                raise ValueError(f"{self.name}: {joint.name} cannot be at {value} {unit}; {limits}{doubt}")
         return np.clip(positions, arm.lower, arm.upper)
 
     def check_jaw(self, angle: float) -> float:

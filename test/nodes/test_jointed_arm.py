@@ -171,13 +171,14 @@ def test_what_is_published_can_be_sent_back(graph):
 
 
 BAD_JOINTS = {
-    "too_few": ([0.0] * 5, "a joint position must have 6 numbers"),
-    "too_many": ([0.0] * 7, "a joint position must have 6 numbers"),
+    "too_few": ([0.0] * 5, "PSM1: 5 numbers, not 6; the joints are yaw, pitch,"),
+    "too_many": ([0.0] * 7, "PSM1: 7 numbers, not 6; the joints are yaw, pitch,"),
     "none": ([], "expected finite joint positions"),
     "nan": ([0, 0, float("nan"), 0, 0, 0], "expected finite joint positions"),
     "infinite": ([0, 0, float("inf"), 0, 0, 0], "expected finite joint positions"),
     "beyond_limits": ([0, 0, 0.3, 0, 0, 0], "insertion cannot be at 300 mm; its limits are 0 and 240 mm"),
-    "degrees": ([0, 0, 0.1, 0, 45, 0], "wrist_pitch cannot be at 2578 degrees"),
+    "degrees": ([0, 0, 0.1, 0, 45, 0], "wrist_pitch cannot be at 2578 degrees; its limits are -80 and 80 degrees; is it in radians?"),
+    "millimetres": ([0, 0, 100, 0, 0, 0], "insertion cannot be at 1e+05 mm; its limits are 0 and 240 mm; is it in metres?"),
 }
 
 

@@ -67,6 +67,13 @@ class ArmKinematics:
         return np.array([joint.upper for joint in self.joints])
 
     @cached_property
+    def length(self) -> float:
+        """Length of all links in a row, drawn out, m: no pose of the tip is farther from the base."""
+        links = sum(np.hypot(joint.a, joint.shift) for joint in self.joints)
+        slides = sum(max(abs(joint.lower), abs(joint.upper)) for joint in self.joints if joint.kind == "prismatic")
+        return float(links + slides + np.linalg.norm(self.tooltip_offset[:3, 3]))
+
+    @cached_property
     def prismatic(self) -> np.ndarray:
         """Which joints slide [n], bool; the others turn."""
         return np.array([joint.kind == "prismatic" for joint in self.joints])
@@ -83,7 +90,8 @@ class ArmKinematics:
             raise ValueError(f"{self.name}: a joint position must be {len(self.joints)} numbers, got {joints!r:.80}") from None
         names = ", ".join(joint.name for joint in self.joints)
         if positions.ndim == 0 or positions.shape[-1] != len(self.joints):
-            raise ValueError(f"{self.name}: a joint position must have {len(self.joints)} numbers ({names}), got shape {positions.shape}")
+            given = f"{positions.shape[-1]} numbers" if positions.ndim else "one number"
+            raise ValueError(f"{self.name}: {given}, not {len(self.joints)}; the joints are {names}")
         if not np.isfinite(positions).all():
             wrong = self.joints[np.argwhere(~np.isfinite(positions))[0][-1]].name
             raise ValueError(f"{self.name}: {wrong} is not finite; send rad and m ({names})")

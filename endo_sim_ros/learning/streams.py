@@ -42,8 +42,9 @@ def read_streams(
     """
     decoders = {}
     for arm in arms:
-        for make in (messages.tool_pose, messages.tool_pose_command):
-            decoders[make(arm)] = lambda m, topic, arm=arm: _pose_row(messages.decode_tip(m, frames, arm, topic))
+        decoders[messages.tool_pose(arm)] = lambda m, topic, arm=arm: _pose_row(messages.decode_tip(m, frames, arm, topic))
+        in_world = {**frames, "": np.eye(4)}  # as a commanded arm publishes its pose
+        decoders[messages.tool_pose_command(arm)] = lambda m, topic, known=in_world: _pose_row(messages.decode_pose(m, known, topic))
         for make in (messages.tool_jaw, messages.tool_jaw_state):
             decoders[make(arm)] = lambda m, topic: [messages.decode_jaw(m, topic)]
         for make in (messages.tool_wrench, messages.tool_reaction):

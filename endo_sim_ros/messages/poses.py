@@ -39,7 +39,7 @@ def decode_pose(message: Message, frames: str | Mapping[str, np.ndarray], topic:
 
 
 def decode_tip(message: Message, frames: Mapping[str, np.ndarray], arm: str, topic: str) -> np.ndarray:
-    """Pose [4, 4] of an arm's tip from a PoseStamped, metres, in the world.
+    """Pose [4, 4] of an arm's tip from a PoseStamped that is measured, metres, in the world.
 
     Clients of CRTK leave the frame empty. It is the arm's base then, ``PSM1_base`` for PSM1, or the world if that is unknown.
 

@@ -26,13 +26,13 @@ class Arm:
     force: np.ndarray | None = None  # [3] N, world
     torque: np.ndarray | None = None  # [3] N·m about the point held, world
     heard: float = 0.0  # time of the last wrench, seconds of the clock
-    acting: bool = False
+    acting: bool = False  # whether the tissue was last given a wrench of it
     angle: float = JAW_AT_START  # of the jaw, rad
     closed: bool = False  # the jaw
     cutting: bool = False
     state: str = ENABLED
     homed: bool = True
-    felt: float = 0.0  # reaction in the last step of a move, N
+    felt: float = 0.0  # reaction in the last step, N
     acts: bool = True  # False at a start where nobody has commanded it yet: it touches nothing there
     pose_goal: np.ndarray | None = None  # [4, 4], world; None while no move is under way
     angle_goal: float | None = None  # rad
@@ -60,14 +60,18 @@ class Arm:
         if after != ENABLED:
             self.stop()
         if after == DISABLED:
-            self.force, self.cutting = None if self.force is None else np.zeros(3), False
-            self.torque = None if self.torque is None else np.zeros(3)
+            self.force = self.torque = None
+            self.closed = self.cutting = False  # enabled again it holds nothing before it is told to
 
     def require_enabled(self) -> None:
         """Raise ValueError if the arm does not move now."""
         if self.state != ENABLED:
             what = "resume" if self.state == PAUSED else "enable"
             raise ValueError(f"{self.name} is {self.state}; send {what} on {self.name}/state_command")
+
+    def check_jaw(self, angle: float) -> float:
+        """An angle of the jaw, rad, that the arm may take; every one, as nobody knows its tool."""
+        return angle
 
     @property
     def moving(self) -> bool:
@@ -106,9 +110,7 @@ class Arm:
             return
         if self.pose is None:  # nobody knows where it comes from
             self.pose = self.pose_goal
-        turn = self.pose[:3, :3].T @ self.pose_goal[:3, :3]
-        angle = np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))
-        needed = float(max(np.linalg.norm(self.pose_goal[:3, 3] - self.pose[:3, 3]) / speed, angle / turn_speed))
+        needed = seconds_between(self.pose, self.pose_goal, speed, turn_speed)
         if needed <= seconds * _ROUNDED:
             self.pose, self.pose_goal = self.pose_goal, None
         else:
@@ -132,5 +134,12 @@ class Arm:
 
     def reset(self) -> None:
         """Let go of everything; pose and state stay."""
-        self.force, self.acting, self.closed, self.angle, self.cutting = None, False, False, JAW_AT_START, False
+        self.force, self.closed, self.angle, self.cutting = None, False, JAW_AT_START, False
         self.stop()
+
+
+def seconds_between(pose: np.ndarray, goal: np.ndarray, speed: float, turn_speed: float) -> float:
+    """Time from one pose [4, 4] to another, s, with at most these speeds, m/s and rad/s."""
+    turn = pose[:3, :3].T @ goal[:3, :3]
+    angle = np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))
+    return float(max(np.linalg.norm(goal[:3, 3] - pose[:3, 3]) / speed, angle / turn_speed))

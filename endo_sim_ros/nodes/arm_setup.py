@@ -1,6 +1,7 @@
 """The arms of physics_node from its options, and where they stand."""
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from endo_sim_ros.nodes.configs import PhysicsNodeConfig, arm_names
 from endo_sim_ros.nodes.jointed_arm import CameraArm, JointedArm
 
 CAMERA_ARM = "ECM"
+_OF_CAMERA = {"PSM": "ECM", "PSM_Si": "ECM_Si"}  # which one goes with the instruments' arms where there is one model for all
 _NO_INSTRUMENT = "none"
 _WITHDRAWN = 0.02  # m: at the start the jaws, 1 to 2 cm long, are in front of the tissue, and two instruments do not meet
 
@@ -35,7 +37,8 @@ def make_arms(options: PhysicsNodeConfig) -> dict[str, Arm]:
             if not commanded:
                 raise ConfigError(f"arms: {name} needs arm_source commanded; the pose of a robot's is heard on {name}/measured_cp anyway")
             tool = tool if len(options.instruments) > 1 else ""  # the one for all is an instrument
-            arms[name] = CameraArm(name, kinematics=load_arm(model.replace("PSM", "ECM") if len(options.arm_models) == 1 else model, tool))
+            model = _OF_CAMERA.get(model, model) if len(options.arm_models) == 1 else model
+            arms[name] = CameraArm(name, kinematics=load_arm(model, tool))
         elif tool == _NO_INSTRUMENT:
             arms[name] = Arm(name)
         else:
@@ -65,20 +68,32 @@ def _for_each(option: str, values: Sequence[str], names: Sequence[str]) -> Seque
     return values * len(names) if len(values) == 1 else values
 
 
-def place_arms(arms: Mapping[str, Arm], frames: Mapping[str, np.ndarray], view: tuple[Camera, float] | None) -> str:
+def place_arms(
+    arms: Mapping[str, Arm],
+    frames: Mapping[str, np.ndarray],
+    view: tuple[Camera, float] | None,
+    anew: bool = False,
+    kept: Collection[str] = (),
+) -> str:
     """Give each arm with joints a place: its base in `frames`, or else a sensible one in front of a camera.
+
+    An arm whose place changes is at its start then.
 
     Args:
         arms: The arms by name.
         frames: Poses [4, 4] of known frames in the world, by name; ``PSM1_base`` is the base of PSM1.
         view: A camera and the depth of the tissue that it sees, m, or None where neither is known.
+        anew: Whether an arm that is in its place already goes to its start, too.
+        kept: Names of arms that stay as they are if they are not in `frames`.
 
     Returns:
-        Why arms have no place, in a sentence; empty if all have one. Such an arm is a tip without joints.
+        Why arms have no place, or hardly the right one, in a sentence; empty if all have one. An arm without is a tip without joints.
     """
     missing = []
+    asking = [name for name, arm in reversed([*arms.items()]) if isinstance(arm, JointedArm) and f"{name}_base" not in frames]
+    places = {name.rpartition("/")[2]: name for name in sorted(asking, key=lambda name: -name.count("/"))}  # PSM1 before left/PSM1
     for name, arm in arms.items():
-        if not isinstance(arm, JointedArm):
+        if not isinstance(arm, JointedArm) or name in kept and name in asking:
             continue
         kinematics, short = arm.kinematics, name.rpartition("/")[2]
         lower, upper = kinematics.lower, kinematics.upper
@@ -86,14 +101,22 @@ def place_arms(arms: Mapping[str, Arm], frames: Mapping[str, np.ndarray], view: 
             if f"{name}_base" in frames:
                 base, joints = frames[f"{name}_base"], np.clip(np.zeros(len(lower)), lower, upper)
                 joints[2] = 0.5 * (lower[2] + upper[2])
+                away = 0.0 if view is None else math.dist(base[:3, 3], view[0].pose[:3, 3])
+                if view is not None and away > 2 * kinematics.length + view[1]:
+                    size = f"the whole arm is {kinematics.length:.2g} m long"
+                    missing.append(f"{name}_base in frames is {away:.3g} m from the camera, and {size}; is it in metres?")
             elif view is None:
                 raise ConfigError(f"{name}: no camera shows where the tissue is; give {name}_base in frames")
+            elif places[short] != name or (short == CAMERA_ARM) != isinstance(arm, CameraArm):
+                other = places[short] if places[short] != name else "a camera"
+                raise ConfigError(f"{name}: the place of {short} in front of a camera is that of {other}; give {name}_base in frames")
             else:
                 placement = place_arm(short, kinematics, *view)
                 base, joints = placement.base, placement.joints.copy()
             if not isinstance(arm, CameraArm):
                 joints[2] = np.clip(joints[2] - _WITHDRAWN, lower[2], upper[2])
-            arm.stand(base, joints)
+            if anew or arm.base is None or not np.array_equal(arm.base, base):
+                arm.stand(base, joints)
         except ConfigError as error:
             missing.append(str(error))
     return "; ".join(missing)

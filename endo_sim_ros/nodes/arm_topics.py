@@ -104,7 +104,8 @@ class ArmTopics:
         if view is not None:
             found.setdefault(ECM_VIEW, view)
         if self.options.cartesian_frame != ECM_VIEW or arm is self._camera:
-            found[""] = given.get(f"{arm.name}_base", np.eye(4))
+            # A commanded arm is told its pose in the frame in which it publishes it, and that is the world; a robot's is in its base.
+            found[""] = np.eye(4) if arm.name in self._publishers else given.get(f"{arm.name}_base", np.eye(4))
         elif view is not None:
             found[""] = view
         return found
@@ -196,7 +197,7 @@ class ArmTopics:
 
     def _on_joints(self, arm: Arm, topic: str, message: Any) -> None:
         assert isinstance(arm, JointedArm)
-        joints = arm.check_joints(messages.decode_joints(message, topic))
+        joints = arm.check_joints(messages.decode_joints(message, topic), message.name)
 
         def act() -> None:
             arm.require_enabled()
@@ -207,7 +208,7 @@ class ArmTopics:
 
     def _on_joint_move(self, arm: Arm, topic: str, message: Any) -> None:
         assert isinstance(arm, JointedArm)
-        goal = messages.decode_joints(message, topic)
+        goal = arm.check_joints(messages.decode_joints(message, topic), message.name)
         arm.require_enabled()
         arm.move_joints(goal)
         self.publish_operating_states(arm.name)
@@ -225,7 +226,7 @@ class ArmTopics:
         self._deliver_part(arm, "wrench", message, topic, act)
 
     def _on_jaw(self, arm: Arm, topic: str, message: Any) -> None:
-        angle = messages.decode_jaw(message, topic)
+        angle = arm.check_jaw(messages.decode_jaw(message, topic))
 
         def act() -> None:
             self._require_pose(arm, "jaw command")
@@ -236,7 +237,7 @@ class ArmTopics:
         self._deliver_part(arm, "jaw", message, topic, act)
 
     def _on_jaw_move(self, arm: Arm, topic: str, message: Any) -> None:
-        goal = messages.decode_jaw(message, topic)
+        goal = arm.check_jaw(messages.decode_jaw(message, topic))
         self._require_pose(arm, "jaw command")
         arm.angle_goal = goal
         self.publish_operating_states(arm.name)
@@ -273,12 +274,11 @@ class ArmTopics:
             arm: The arm.
             reaction: Gives the force [3] of the tissue on its tip, N.
         """
-        limit = self.options.force_limit
-        if not limit or not arm.moving or not isinstance(arm, JointedArm):
-            arm.felt = 0.0
+        if not isinstance(arm, JointedArm):
             return
-        before, arm.felt = arm.felt, float(np.linalg.norm(reaction()))
-        if arm.felt > max(limit, before):
+        before, arm.felt = arm.felt, float(np.linalg.norm(reaction()))  # also while it waits: a retreat begins with what it feels
+        limit = self.options.force_limit
+        if limit and arm.moving and arm.felt > max(limit, before):
             arm.halt()
             text = f"{arm.name}: the move ended at {arm.felt:.1f} N, above force_limit = {limit:g} N; move back, or raise the limit"
             self._tell(arm, messages.tool_error, text)

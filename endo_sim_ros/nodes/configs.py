@@ -281,7 +281,7 @@ def arm_names(names: Iterable[str]) -> tuple[str, ...]:
     """The names in the parameter `arms` without spaces.
 
     Raises:
-        ConfigError: If there is none, one is there twice, or one cannot be part of the name of a topic.
+        ConfigError: If there is none, one is there twice or in other capitals, or one cannot be part of the name of a topic.
     """
     names = tuple(name.strip() for name in names)
     if not names:
@@ -291,4 +291,6 @@ def arm_names(names: Iterable[str]) -> tuple[str, ...]:
             raise ConfigError(f"arms: {name!r} cannot name topics; use letters, digits and _")
         if names.count(name) > 1:
             raise ConfigError(f"arms: {name} is there {names.count(name)} times; give each arm a name of its own")
+        if alike := [other for other in names if other != name and other.lower() == name.lower()]:
+            raise ConfigError(f"arms: {name} and {alike[0]} differ in capitals alone; give each arm a name of its own")
     return names

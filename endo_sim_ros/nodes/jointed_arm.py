@@ -1,5 +1,6 @@
 """An arm with joints: where its links are when its tip is at a pose, and how its joints get to where they are told."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -8,15 +9,17 @@ from numpy.typing import ArrayLike
 
 from endo_sim_ros.core.cameras import invert_pose
 from endo_sim_ros.instruments import ArmKinematics, Capsule, ReachConfig, link_poses, solve_inverse
-from endo_sim_ros.nodes.arm import Arm
+from endo_sim_ros.nodes.arm import DISABLED, Arm, seconds_between
 
 _ROUNDED = 1 + 1e-9  # a way that takes a whole number of steps must not take one more
 _WITHIN = 1e-6  # rad, m: how far a command may leave the limits, as what is sent back was rounded
+_JAW_WITHIN = 0.01  # rad: the same of the jaw, whose limits clients have in whole degrees
 _LEAP = 10.0  # times the speed of a joint: the straight way passes a singularity or goes on with another bend of the wrist
 _TRIES = 4  # to find how far the tip gets in a step; one or two are enough where joints follow in proportion
 _JOINTS_OF_LINK = {"roll": 4, "wrist_pitch": 5}  # joints that move it: the first ones; all others move with all joints
 _CAMERA_REACH = ReachConfig(radian_length=1e-4)  # the direction of an endoscope follows from its place
 _CAMERA_THERE = 1e-4  # m: nearer is at the pose
+_MEASURED_WRONG, _MEASURED_TURNED = 1e-3, np.radians(1.0)  # m, rad: less is what calibrations are off
 
 
 @dataclass(kw_only=True)
@@ -43,7 +46,9 @@ class JointedArm(Arm):
     base: np.ndarray | None = None  # [4, 4], world
     joints: np.ndarray | None = None  # [n] rad and m
     joint_goal: np.ndarray | None = None  # [n]; None while no move of joints is under way
+    _to_pose: bool = False  # whether that move is the rest of one to a pose
     velocities: np.ndarray | None = None  # [n] rad/s and m/s, in the last step
+    missing: str = ""  # what the joints miss of the pose that a robot measured, in a sentence
     start: np.ndarray | None = None  # [n] joints while nobody has commanded anything
     _posed: np.ndarray | None = None  # the pose that belongs to the joints
     _stepped: np.ndarray | None = None  # joints at the end of the last step
@@ -57,9 +62,9 @@ class JointedArm(Arm):
             self.joints = joints
 
     def return_to_start(self) -> None:
-        """Be at the start, which touches nothing until the arm is commanded."""
+        """Let go of everything and be at the start, which touches nothing until the arm is commanded."""
+        super().reset()
         if self.start is not None:
-            self.stop()
             self._take(self.start)
             self._stepped, self.velocities, self.acts = self.start, np.zeros(len(self.start)), False
 
@@ -79,13 +84,37 @@ class JointedArm(Arm):
 
     # ---------------------------------------------------------------- commands
 
+    def _astray(self, pose: np.ndarray) -> str:
+        """Why a pose is beyond any reach, by more than the whole length of the arm, in a sentence; empty if it is not."""
+        if self.base is None:
+            return ""
+        distance = math.dist(pose[:3, 3], self.base[:3, 3])
+        if distance <= 2 * self.kinematics.length:
+            return ""
+        return f"the pose is {distance:.3g} m from the base, and the whole arm is {self.kinematics.length:.2g} m long; is it in metres?"
+
+    def _require_sense(self, pose: np.ndarray) -> None:
+        astray = self._astray(pose)
+        if self.commanded and astray:
+            raise ValueError(f"{self.name} stays where it is: {astray}")
+
     def servo(self, pose: np.ndarray) -> None:
-        """Put the tip at a pose [4, 4], world, or as near as the joints get, which `move` finds out."""
+        """Put the tip at a pose [4, 4], world, or as near as the joints get, which `move` finds out.
+
+        Raises:
+            ValueError: If a commanded arm is not long enough by far; it then stays where it is.
+        """
+        self._require_sense(pose)
         super().servo(pose)
         self.joint_goal = None
 
     def move_to(self, pose: np.ndarray) -> str:
-        """Let the tip move to a pose [4, 4], world, or as near as the joints get; returns what it will miss, in a sentence."""
+        """Let the tip move to a pose [4, 4], world, or as near as the joints get; returns what it will miss, in a sentence.
+
+        Raises:
+            ValueError: As `servo` does.
+        """
+        self._require_sense(pose)
         self.joint_goal, missing = None, ""
         if self.base is not None and self.joints is not None:
             reach = solve_inverse(self.kinematics, invert_pose(self.base) @ pose, self.joints)
@@ -108,20 +137,41 @@ class JointedArm(Arm):
     def move_joints(self, joints: ArrayLike) -> None:
         """Let the joints move to positions [n], rad and m; raises as `servo_joints` does."""
         self.joint_goal = self.check_joints(joints)
-        self.pose_goal, self.acts = None, True
+        self.pose_goal, self.acts, self._to_pose = None, True, False
 
-    def check_joints(self, joints: ArrayLike) -> np.ndarray:
-        """Joint positions [n] that the arm may take; raises as `servo_joints` does."""
-        arm = self.kinematics
-        positions = arm.check_joints(joints)
+    def check_joints(self, joints: ArrayLike, names: Sequence[str] = ()) -> np.ndarray:
+        """Joint positions [n] that the arm may take, in the order of its joints, by whose names they may be called.
+
+        Raises:
+            ValueError: As from `servo_joints`, and if they have other names.
+        """
+        arm, known = self.kinematics, ", ".join(joint.name for joint in self.kinematics.joints)
+        if names and ", ".join(names) != known:
+            raise ValueError(f"{self.name}: the joints are {known}, in this order, not {', '.join(names):.200}; send these names or none")
+        try:
+            positions = arm.check_joints(joints)
+        except ValueError as error:
+            raise ValueError(f"{self.name}: {str(error).removeprefix(f'{arm.name}: ')}") from None
         if self.base is None:
             raise ValueError(f"{self.name} has no place yet; publish a model, or give {self.name}_base in frames")
         for joint, value in zip(arm.joints, positions):
             if not joint.lower - _WITHIN <= value <= joint.upper + _WITHIN:
-                scale, unit = (1e3, "mm") if joint.kind == "prismatic" else (np.degrees(1.0), "degrees")
+                slides = joint.kind == "prismatic"
+                scale, unit, asked = (1e3, "mm", "metres") if slides else (np.degrees(1.0), "degrees", "radians")
+                doubt = f"; is it in {asked}?" if abs(value) > (arm.length if slides else 2 * np.pi) else ""
                 lower, upper, value = (f"{scale * number:.4g}" for number in (joint.lower, joint.upper, value))
-                raise ValueError(f"{self.name}: {joint.name} cannot be at {value} {unit}; its limits are {lower} and {upper} {unit}")
+                limits = f"its limits are {lower} and {upper} {unit}"
+                raise ValueError(f"{self.name}: {joint.name} cannot be at {value} {unit}; {limits}{doubt}")
         return np.clip(positions, arm.lower, arm.upper)
+
+    def check_jaw(self, angle: float) -> float:
+        """An angle of the jaw, rad, that a commanded arm may take; ValueError if it is beyond the limits of the tool."""
+        if self.commanded and self.kinematics.jaw is not None:
+            lower, upper = self.kinematics.jaw
+            if not lower - _JAW_WITHIN <= angle <= upper + _JAW_WITHIN:
+                shown, *limits = (f"{np.degrees(number):.4g}" for number in (angle, lower, upper))
+                raise ValueError(f"{self.name}: the jaw cannot be at {shown} degrees; its limits are {' and '.join(limits)} degrees")
+        return angle
 
     # ------------------------------------------------------------------ motion
 
@@ -141,26 +191,41 @@ class JointedArm(Arm):
         if self.pose_goal is not None:
             self._move_straight(seconds, speed, turn_speed)
         elif self.joint_goal is not None:
-            self._move_joints(seconds)
+            self._move_joints(seconds, speed, turn_speed)
         before, self._stepped = self._stepped, self.joints
         self.velocities = (self.joints - before) / seconds if before is not None else np.zeros(len(self.joints))
         return missing
 
     def settle(self) -> str:
-        """Find the joints of the pose last commanded or measured; a commanded arm then is where they get. Returns what is missing."""
+        """Find the joints of the pose last commanded or measured; a commanded arm then is where they get.
+
+        Returns:
+            What a commanded arm misses, in a sentence; `missing` has that of a measured one.
+        """
         if self.pose is None or self.pose is self._posed or self.base is None or self.joints is None:
+            return ""
+        if not self.commanded and (astray := self._astray(self.pose)):
+            self.missing, self._posed = f"{self.name}: {astray}", self.pose
             return ""
         reach = solve_inverse(self.kinematics, invert_pose(self.base) @ self.pose, self.joints)
         self.joints = reach.joints
-        if self.commanded and not reach.reached:
+        short = "" if reach.reached else f"{self.name}: {reach.shortfall()}"
+        if self.commanded and short:
             self.pose = self.base @ self.kinematics.tip_pose(self.joints)
         self._posed = self.pose  # as it was told where it is reached, without the rounding of the joints
-        return f"{self.name}: {reach.shortfall()}" if self.commanded and not reach.reached else ""
+        if self.commanded:
+            return short
+        wrong = reach.position_error > _MEASURED_WRONG or reach.rotation_error > _MEASURED_TURNED
+        check = f"the robot measures that pose: check {self.name}_base in frames, arm_models and instruments"
+        self.missing = f"{short}; {check}" if wrong else ""
+        return ""
 
-    def _take(self, joints: np.ndarray) -> None:
+    def _take(self, joints: np.ndarray) -> np.ndarray:
+        """Be at joint positions [n]; returns the pose of the tip there."""
         assert self.base is not None
         self.joints = joints
-        self.pose = self._posed = self.base @ self.kinematics.tip_pose(joints)
+        self.pose = self._posed = pose = self.base @ self.kinematics.tip_pose(joints)
+        return pose
 
     def _haste(self, joints: np.ndarray, seconds: float) -> float:
         """How many times too fast it is to come from some joint positions to the present ones in some seconds."""
@@ -168,14 +233,21 @@ class JointedArm(Arm):
         most = np.where(self.kinematics.prismatic, self.slide_speed, self.joint_speed)
         return float(np.max(np.abs(self.joints - joints) / (most * seconds)))
 
-    def _move_joints(self, seconds: float) -> None:
-        before, goal = self.joints, self.joint_goal
-        assert before is not None and goal is not None
+    def _move_joints(self, seconds: float, speed: float, turn_speed: float) -> None:
+        """Go on towards the goal of the joints; on the way to a pose with at most these speeds of the tip, m/s and rad/s, too."""
+        before, goal, pose = self.joints, self.joint_goal, self.pose
+        assert before is not None and goal is not None and pose is not None
         self.joints = goal
-        haste = self._haste(before, seconds)
-        if haste <= _ROUNDED:
+        haste, there = self._haste(before, seconds), False
+        for _ in range(_TRIES * _TRIES):
+            there = haste <= _ROUNDED
+            reached = self._take(goal if there else before + (goal - before) / haste)
+            too_fast = seconds_between(pose, reached, speed, turn_speed) / seconds if self._to_pose else 0.0
+            if too_fast <= _ROUNDED:
+                break
+            haste = max(haste, 1.0) * 1.01 * too_fast  # a little less, as the tip does not follow in proportion
+        if there:
             self.joint_goal = None
-        self._take(goal if haste <= _ROUNDED else before + (goal - before) / haste)
 
     def _move_straight(self, seconds: float, speed: float, turn_speed: float) -> None:
         pose, goal, joints, share = self.pose, self.pose_goal, self.joints, 1.0
@@ -191,7 +263,8 @@ class JointedArm(Arm):
                 break
             share /= 1.01 * haste  # a little less, so that it is enough where joints do not follow in proportion
         self.joint_goal, self.pose_goal = solve_inverse(self.kinematics, invert_pose(self.base) @ goal, joints).joints, None
-        self._move_joints(seconds)
+        self._to_pose = True
+        self._move_joints(seconds, speed, turn_speed)
 
     # ------------------------------------------------------------------ states
 
@@ -226,10 +299,11 @@ class JointedArm(Arm):
         return efforts, R @ twist[:3], R @ twist[3:]
 
     def reset(self) -> None:
-        """Let go of everything; a commanded arm is back at its start."""
-        super().reset()
-        if self.commanded:
+        """Let go of everything; a commanded arm is back at its start, unless it is disabled, as it does not move then."""
+        if self.commanded and self.state != DISABLED:
             self.return_to_start()
+        else:
+            super().reset()
 
 
 @dataclass(kw_only=True)
@@ -249,9 +323,9 @@ class CameraArm(JointedArm):
         self.move_joints(self._aim(pose))
         return ""
 
-    def check_joints(self, joints: ArrayLike) -> np.ndarray:
+    def check_joints(self, joints: ArrayLike, names: Sequence[str] = ()) -> np.ndarray:
         """Joint positions [n] that the arm may take; raises as `servo` does."""
-        positions = super().check_joints(joints)
+        positions = super().check_joints(joints, names)
         assert self.start is not None
         down, was = (self.kinematics.tip_pose(at)[:3, 1] for at in (positions, self.start))
         self._require_upright(down, was)
@@ -261,6 +335,7 @@ class CameraArm(JointedArm):
         """Joints [n] that put the camera at a pose."""
         if self.base is None or self.joints is None or self.start is None:
             raise ValueError(f"{self.name} has no place yet; publish a model, or give {self.name}_base in frames")
+        self._require_sense(pose)
         wanted = invert_pose(self.base) @ pose
         self._require_upright(wanted[:3, 1], self.kinematics.tip_pose(self.start)[:3, 1])
         reach = solve_inverse(self.kinematics, wanted, self.joints, _CAMERA_REACH)

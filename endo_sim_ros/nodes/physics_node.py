@@ -1,7 +1,7 @@
 """Gaussian model and tool wrenches in, control nodes and reactions out."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ from std_srvs.srv import SetBool, Trigger
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ControlNodeCloud, PhysicsState
+from endo_sim_ros.nodes.arm import DISABLED
 from endo_sim_ros.nodes.arm_setup import CAMERA_ARM, make_arms, place_arms
 from endo_sim_ros.nodes.arm_topics import ArmTopics
 from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode, run, sentence
@@ -24,6 +25,7 @@ _SLOW = 0.5  # real-time factor below which the node warns
 _FAST = 1.5  # times real speed from which a clock is to blame for that
 _POLLS = 4  # times per step that the timer asks whether a step is due
 _LONGEST_POLL = 0.1  # seconds; models and parameters must not wait for steps that take minutes
+_SAID_AGAIN = 10.0  # seconds after which the log has again that an arm misses what is measured
 _WINDOW = 1.0  # seconds over which the real-time factor is measured
 
 
@@ -111,9 +113,12 @@ class PhysicsNode(EndoNode):
                     if isinstance(arm, JointedArm) and arm.capsules and not simulation.has_instrument(name):
                         with self.guard(f"link_contact of {name}"):
                             simulation.set_instrument(name, arm.capsules)
-                if not same_model:
+                if not same_model and not _same_camera(self._view, view):
                     self._view = view
-                    self._place_arms()
+                    self._place_arms(anew=True)
+                elif not same_model:  # a later model may show where the others stand
+                    kept = [name for name, arm in self.arms.items() if isinstance(arm, JointedArm) and arm.base is not None]
+                    self._place_arms(view=view, kept=kept)
                 if self._lockstep and not continued:  # the first observation, before any command
                     self._publish(self.simulation, self._simulated_stamp, at_rest=True)
         except Exception as error:
@@ -123,9 +128,22 @@ class PhysicsNode(EndoNode):
 
     # ------------------------------------------------------------------ tools
 
-    def _place_arms(self) -> None:
-        """Put the arms where `frames` or the camera of the newest model says, those without a robot at their start."""
-        before, self._unplaced = self._unplaced, place_arms(self.arms, self._options.frame_poses, self._view)
+    def _place_arms(self, anew: bool = False, view: tuple[Camera, float] | None = None, kept: Collection[str] = ()) -> None:
+        """Put arms where `frames` or a camera says, those without a robot at their start.
+
+        Args:
+            anew: Also arms that stand there already.
+            view: As `place_arms` has it; None = what was seen of the first model of the recording.
+            kept: As `place_arms` has it.
+        """
+        arms = self.arms
+        stood = {name: arm.pose for name, arm in arms.items() if isinstance(arm, JointedArm) and arm.commanded and arm.base is not None}
+        before, self._unplaced = self._unplaced, place_arms(arms, self._options.frame_poses, view or self._view, anew, kept)
+        why = "a model of another recording came" if anew else "its base has changed"
+        for name, pose in stood.items():
+            arm = arms[name]
+            if pose is not None and arm.pose is not None and not np.array_equal(pose, arm.pose):
+                self._arm_topics.warn(arm, f"{name} is at its start, as {why}; it holds nothing, and its move ended", again=True)
         self._arm_topics.describe()
         if self._unplaced and self._unplaced != before and self.simulation is not None:
             self.get_logger().warning(self._unplaced)
@@ -165,7 +183,8 @@ class PhysicsNode(EndoNode):
 
     def _apply_tools(self, simulation: TissueSimulation) -> None:
         for name, arm in self._tools.items():
-            if arm.pose is None or not arm.acts:
+            if arm.pose is None or not arm.acts or arm.state == DISABLED:
+                simulation.withdraw(name)
                 continue
             where = f"at {np.round(arm.pose[:3, 3], 4).tolist()}"
             links = arm.links() if isinstance(arm, JointedArm) and simulation.has_instrument(name) else {}
@@ -178,11 +197,10 @@ class PhysicsNode(EndoNode):
             except ValueError as error:
                 arm.cutting = False
                 self.report_error(sentence(f"{name}: cut", error))
-            if arm.force is None or arm.torque is None:
-                continue
-            timeout = self._options.command_timeout
+            timeout, force, torque = self._options.command_timeout, arm.force, arm.torque
             stale = not self._lockstep and 0 < timeout < self._seconds() - arm.heard
-            force, torque = (np.zeros(3), np.zeros(3)) if stale else (arm.force, arm.torque)
+            if force is None or torque is None or stale:
+                force, torque = np.zeros(3), np.zeros(3)
             wanted = bool(force.any() or torque.any())
             if wanted or arm.acting:
                 reached = simulation.set_wrench(name, arm.pose[:3, 3], force, torque)
@@ -257,6 +275,8 @@ class PhysicsNode(EndoNode):
             if turning:  # else a jaw that tissue slipped out of would close again
                 arm.hold(self._options.jaw_closed, self._options.jaw_open)
         self._apply_tools(simulation)
+        for missing in self._misses():
+            self.get_logger().warning(missing, throttle_duration_sec=_SAID_AGAIN)
         simulation.step()
         for name, arm in self._tools.items():
             self._arm_topics.limit_force(arm, lambda name=name: simulation.reaction(name)[0])
@@ -372,23 +392,41 @@ class PhysicsNode(EndoNode):
             return ERROR, f"{self.failure}; the model before goes on", values
         if state is PhysicsState.PAUSED:
             return OK, "paused", values
+        level, text = self._progress()
+        if level == OK and (wrong := "; ".join(filter(None, [self._unplaced, *self._misses()]))):
+            level, text = WARN, f"{text}; {wrong}"
+        return level, text, values
+
+    def _misses(self) -> list[str]:
+        """What joints miss of the poses that robots measure, in sentences."""
+        return [arm.missing for arm in self.arms.values() if isinstance(arm, JointedArm) and arm.missing]
+
+    def _progress(self) -> tuple[int, str]:
+        """Level and message: how the steps go."""
         if self._lockstep:
             waiting = self._commands.missing()
             if waiting is None:
-                return OK, f"in lockstep, {self.steps} steps taken, waiting for a command", values
+                return OK, f"in lockstep, {self.steps} steps taken, waiting for a command"
             parts = ", ".join(sorted(f"{name}'s {kind}" for name, kind in waiting[1]))
-            return OK, f"in lockstep, waiting for {parts} of the command of {waiting[0] * 1e-9:.6f} s", values
+            return OK, f"in lockstep, waiting for {parts} of the command of {waiting[0] * 1e-9:.6f} s"
         if self._real_time_factor < _SLOW and self._clock_speed > _FAST:
             text = f"slower than /clock, which runs at {self._clock_speed:.1f} times real speed; let it run slower, or lower node_count"
-            return WARN, text, values
+            return WARN, text
         if self._real_time_factor < _SLOW:
-            return WARN, "slower than real time; lower node_count or young_modulus, or use a GPU", values
-        return (WARN, f"running; {self._unplaced}", values) if self._unplaced else (OK, "running", values)
+            return WARN, "slower than real time; lower node_count or young_modulus, or use a GPU"
+        return OK, "running"
 
     def destroy_node(self) -> None:
         """Build no more tissue, and destroy the node."""
         self._builder.stop()
         super().destroy_node()
+
+
+def _same_camera(view: tuple[Camera, float] | None, other: tuple[Camera, float] | None) -> bool:
+    """Whether the cameras of two models are the same: then a recording goes on, as while its model is being trained."""
+    if view is None or other is None:
+        return False
+    return np.array_equal(view[0].pose, other[0].pose) and np.array_equal(view[0].K, other[0].K)
 
 
 def _poll(config: PhysicsConfig) -> float:

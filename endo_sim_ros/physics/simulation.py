@@ -229,6 +229,26 @@ class TissueSimulation:
             tools.closed[0, slot] = 0
         return holding or not closed
 
+    def withdraw(self, tool: str) -> None:
+        """Let a tool go and touch nothing any more, with its jaw, wrench, edge, capsule and links, until `set_grasp` moves it again.
+
+        Args:
+            tool: Name of the tool.
+        """
+        if tool not in self._slots:
+            return
+        slot, tools = self._slots[tool], self._tools
+        if not (tools.present[0, slot] or self.in_reach(tool)):
+            return
+        self._blades.pop(tool, None)
+        self._scissors.pop(tool, None)
+        if tool in self._placed:
+            self._lose_links(tool)
+        for tensor in (tools.forces, tools.torques, tools.reaction_forces, tools.reaction_torques, tools.closed, tools.present):
+            tensor[0, slot] = 0
+        tools.take_hold()
+        self.disturbed = True
+
     def _lose_links(self, tool: str) -> None:
         """Let a tool be a bare tip."""
         slot = self._slots[tool]

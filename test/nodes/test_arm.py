@@ -71,14 +71,14 @@ def test_a_jaw_closes_on_its_way_and_opens_again():
 
 
 def test_a_paused_arm_stays_where_it_is_and_a_disabled_one_lets_go():
-    arm = Arm("PSM1", np.eye(4), force=np.ones(3), torque=np.ones(3), cutting=True)
+    arm = Arm("PSM1", np.eye(4), force=np.ones(3), torque=np.ones(3), cutting=True, closed=True)
     arm.pose_goal, arm.angle_goal = make_pose(np.ones(3), TURNED), 0.0
     arm.command_state("pause")
-    assert not arm.busy and arm.force.any()
+    assert not arm.busy and arm.force.any() and arm.closed
     with pytest.raises(ValueError, match="PSM1 is PAUSED; send resume on PSM1/state_command"):
         arm.require_enabled()
     arm.command_state("disable")
-    assert not arm.force.any() and not arm.torque.any() and not arm.cutting
+    assert arm.force is None and arm.torque is None and not arm.cutting and not arm.closed
     with pytest.raises(ValueError, match="PSM1 is DISABLED; send enable"):
         arm.require_enabled()
 

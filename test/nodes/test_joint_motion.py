@@ -1,11 +1,17 @@
 """How the joints of an arm get to where the tip is told to be."""
 
+import types
+import warnings
+
 import numpy as np
 import pytest
 
 from endo_sim_ros.core.cameras import make_pose
 from endo_sim_ros.instruments import load_arm
-from endo_sim_ros.nodes.jointed_arm import JointedArm
+from endo_sim_ros.nodes.arm import seconds_between
+from endo_sim_ros.nodes.arm_topics import ArmTopics
+from endo_sim_ros.nodes.configs import PhysicsNodeConfig
+from endo_sim_ros.nodes.jointed_arm import CameraArm, JointedArm
 
 PSM = load_arm("PSM", "LARGE_NEEDLE_DRIVER")
 BASE = make_pose([0.1, -0.2, 0.3], [0.5, 0.1, -0.7, 0.3])
@@ -30,15 +36,16 @@ def travel(arm):
     return np.array(joints), np.array(poses)
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(24))
 def test_moves_between_any_two_poses_arrive_within_all_limits(seed):
     random = np.random.default_rng(seed)
     first, last = (random.uniform(0.95 * PSM.lower, 0.95 * PSM.upper) for _ in range(2))
     first[2], last[2] = random.uniform(0.06, 0.22, 2)
     arm, goal = arm_at(first), BASE @ PSM.tip_pose(last)
     assert arm.move_to(goal) == ""
-    joints, _ = travel(arm)
+    joints, poses = travel(arm)
     assert (np.abs(np.diff(joints, axis=0)) <= SPEEDS * STEP * (1 + 1e-6)).all()
+    assert max(seconds_between(*pair, 0.05, 1.5) for pair in zip(poses, poses[1:])) <= STEP * (1 + 1e-6)
     assert (joints >= PSM.lower - 1e-9).all() and (joints <= PSM.upper + 1e-9).all()
     np.testing.assert_allclose(arm.pose, goal, atol=1e-7)
 
@@ -81,6 +88,34 @@ def test_a_servoed_pose_is_taken_exactly_and_one_out_of_reach_as_near_as_possibl
     assert not arm.velocities.any()
 
 
+@pytest.mark.parametrize("far", [80.0, -90.0, 3.0, 1e5, 1e200, -1e308])
+def test_a_pose_beyond_any_reach_is_refused_in_a_sentence_and_the_arm_stays(far):
+    for arm in (arm_at([0.0, 0, 0.12, 0, 0, 0]), camera_arm()):
+        before = arm.pose, arm.joints
+        pose = arm.pose.copy()
+        pose[0, 3] = far
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            for command in (arm.servo, arm.move_to):
+                with pytest.raises(ValueError, match=r"stays where it is: the pose is \S+ m from the base, .* is it in metres\?$"):
+                    command(pose)
+        assert arm.move(STEP, 0.05, 1.5) == "" and not arm.busy
+        assert arm.pose is before[0] and arm.joints is before[1]
+
+
+def camera_arm():
+    arm = CameraArm("ECM", kinematics=load_arm("ECM", "ENDOSCOPE_STRAIGHT"), joint_speed=2.0, slide_speed=0.2)
+    arm.stand(BASE, np.array([0.0, 0, 0.1, 0]))
+    return arm
+
+
+def test_no_joint_positions_put_the_tip_farther_away_than_the_arm_is_long():
+    random = np.random.default_rng(0)
+    for arm in (PSM, load_arm("PSM_Si", "LARGE_NEEDLE_DRIVER"), load_arm("ECM", "ENDOSCOPE_UP")):
+        reached = np.linalg.norm(arm.tip_pose(random.uniform(arm.lower, arm.upper, (1000, len(arm.joints))))[:, :3, 3], axis=-1)
+        assert reached.max() < arm.length < 2
+
+
 def test_efforts_are_the_torques_of_a_force_at_the_tip():
     arm = arm_at([0.1, 0.2, 0.12, 0.3, 0.4, 0.5])
     force, torque, small = np.array([0.3, -0.2, 0.5]), np.array([0.01, 0.02, -0.03]), 1e-6
@@ -120,3 +155,18 @@ def test_an_arm_without_a_base_is_a_tip():
     assert arm.links() == {}
     with pytest.raises(ValueError, match="PSM3 has no place yet; publish a model, or give PSM3_base in frames"):
         arm.servo_joints(np.zeros(6))
+
+
+@pytest.mark.parametrize("forces, ended", [((15, 15, 14, 9, 3), False), ((15, 15.5), True), ((4, 9, 11), True), ((4, 9, 9.9), False)])
+def test_a_move_ends_where_a_reaction_above_the_limit_grows_and_a_retreat_does_not(forces, ended):
+    """The first force is felt while the arm waits."""
+    told = []
+    topics = types.SimpleNamespace(
+        options=PhysicsNodeConfig(), _node=types.SimpleNamespace(report_error=told.append), _tell=lambda arm, topic, text: None
+    )
+    arm = arm_at([0.0, 0, 0.12, 0, 0, 0])
+    for number, force in enumerate(forces):
+        if number == 1:
+            arm.move_joints([0.0, 0, 0.06, 0, 0, 0])
+        ArmTopics.limit_force(topics, arm, lambda force=force: np.array([0.0, 0, force]))
+    assert bool(told) == ended and arm.moving != ended

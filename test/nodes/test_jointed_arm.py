@@ -1,17 +1,19 @@
 """Arms with joints, through their topics: what they publish, where they get to, and what they refuse."""
 
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 import rclpy
-from ros_bench import HEIGHT, SMALL, WIDTH, Bench, K, S, await_nodes, moved, send_model
+from ros_bench import HEIGHT, SMALL, WIDTH, Bench, K, S, await_nodes, moved, send_model, sheet
 from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
+from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.config import ConfigError
-from endo_sim_ros.instruments import link_poses, load_arm, solve_inverse
-from endo_sim_ros.nodes.arm_setup import make_arms
+from endo_sim_ros.instruments import arm_files, link_poses, load_arm, solve_inverse
+from endo_sim_ros.nodes.arm_setup import make_arms, place_arms
 from endo_sim_ros.nodes.configs import PhysicsNodeConfig
 from endo_sim_ros.nodes.physics_node import PhysicsNode
 from endo_sim_ros.nodes.rendering_node import RenderingNode
@@ -21,7 +23,7 @@ pytestmark = pytest.mark.dds
 LINKS = ("roll", "wrist_pitch", "wrist_yaw", "jaw_left", "jaw_right")
 HEARD = (
     messages.tool_pose, messages.tool_links, messages.tool_type, messages.tool_joints, messages.tool_velocity, messages.tool_local_pose,
-    messages.tool_state, messages.tool_warning, messages.tool_error, messages.tool_jaw_state,
+    messages.tool_state, messages.tool_warning, messages.tool_error, messages.tool_jaw_state, messages.tool_reaction,
 )  # fmt: skip
 ARMS = ("PSM1", "PSM2", "ECM")
 PSM = load_arm("PSM", "LARGE_NEEDLE_DRIVER")
@@ -169,13 +171,14 @@ def test_what_is_published_can_be_sent_back(graph):
 
 
 BAD_JOINTS = {
-    "too_few": ([0.0] * 5, "a joint position must have 6 numbers"),
-    "too_many": ([0.0] * 7, "a joint position must have 6 numbers"),
+    "too_few": ([0.0] * 5, "PSM1: 5 numbers, not 6; the joints are yaw, pitch,"),
+    "too_many": ([0.0] * 7, "PSM1: 7 numbers, not 6; the joints are yaw, pitch,"),
     "none": ([], "expected finite joint positions"),
     "nan": ([0, 0, float("nan"), 0, 0, 0], "expected finite joint positions"),
     "infinite": ([0, 0, float("inf"), 0, 0, 0], "expected finite joint positions"),
     "beyond_limits": ([0, 0, 0.3, 0, 0, 0], "insertion cannot be at 300 mm; its limits are 0 and 240 mm"),
-    "degrees": ([0, 0, 0.1, 0, 45, 0], "wrist_pitch cannot be at 2578 degrees"),
+    "degrees": ([0, 0, 0.1, 0, 45, 0], "wrist_pitch cannot be at 2578 degrees; its limits are -80 and 80 degrees; is it in radians?"),
+    "millimetres": ([0, 0, 100, 0, 0, 0], "insertion cannot be at 1e+05 mm; its limits are 0 and 240 mm; is it in metres?"),
 }
 
 
@@ -194,6 +197,19 @@ def test_bad_joints_are_one_sentence_and_the_arm_stays(graph, name):
     graph.spin(0.1)
     np.testing.assert_array_equal(joints_of(graph), before)
     np.testing.assert_array_equal(pose_of(graph, messages.tool_pose("PSM1")), pose)
+
+
+@pytest.mark.parametrize("topic", [messages.tool_joint_command, messages.tool_joint_move])
+def test_joints_may_have_their_names_and_no_others(graph, topic):
+    joints, none = joints_of(graph), np.zeros(0)
+    names = list(newest(graph, messages.tool_joints("PSM1")).name)
+    for wrong in (names[::-1], names[:5], [f"PSM1_{name}" for name in names]):
+        graph.publish(topic("PSM1"), messages.encode_joints(wrong, joints + 0.01, none, none, S))
+        said = f"PSM1: the joints are {', '.join(names)}, in this order, not {', '.join(wrong)}; send these names or none"
+        graph.refused("physics_node", f"{topic('PSM1').name}: {said}")
+    np.testing.assert_array_equal(joints_of(graph), joints)
+    graph.publish(topic("PSM1"), messages.encode_joints(names, joints + 0.01, none, none, S))
+    graph.until(lambda: np.allclose(joints_of(graph), joints + 0.01), "the joints")
 
 
 @pytest.mark.parametrize("topic", [messages.tool_pose_command, messages.tool_move])
@@ -257,10 +273,69 @@ def test_a_move_through_tissue_ends_at_its_force_limit_and_the_way_back_does_not
     assert moved(graph) > 1e-4
     depth = pose_of(graph, messages.tool_pose("PSM1"))[2, 3]
     assert 0.07 < depth < 0.109
+    pressed = graph.heard["PSM1/measured_cp"]
+    pressed.clear()
+    graph.until(lambda: len(pressed) > 5, "some steps of waiting")
+    assert graph.nodes[1].arms["PSM1"].felt > 0, "it feels the tissue while it waits"
     graph.publish(messages.tool_move("PSM1"), messages.encode_pose(tip_at(0, 0, 0.07), S, "world"))
     graph.until(lambda: abs(pose_of(graph, messages.tool_pose("PSM1"))[2, 3] - 0.07) < 1e-9, "the way back")
+    assert len(texts(graph, messages.tool_error)) == 1, "the way back is not ended"
     assert graph.set("physics_node", contact_radius=0.0, force_limit=10.0)[0]
     graph.until(lambda: graph.nodes[1].simulation.contact_radius == 0, "no contact")
+
+
+def jaw(bench, angle, arm="PSM1"):
+    bench.publish(messages.tool_jaw(arm), messages.encode_jaw(angle, S))
+
+
+def felt(bench, arm="PSM1"):
+    return np.linalg.norm(messages.decode_wrench(newest(bench, messages.tool_reaction(arm)), "")[0])
+
+
+def hold_tissue(bench, arm="PSM1"):
+    """Close a jaw on the tissue and pull at it."""
+    servo(bench, tip_at(0, 0, 0.1), arm)
+    bench.spin(0.1)
+    jaw(bench, 0.0, arm)
+    bench.until(lambda: bench.nodes[1].arms[arm].closed and bench.nodes[1].simulation.in_reach(arm), "a grasp")
+    servo(bench, tip_at(0, 0, 0.085), arm)
+    bench.until(lambda: felt(bench, arm) > 0.1 and moved(bench) > 0.01, "a pull")
+
+
+@pytest.mark.parametrize("topic", [messages.tool_jaw, messages.tool_jaw_move])
+def test_an_angle_beyond_the_jaw_is_refused_and_a_tight_closing_is_not(graph, topic):
+    assert graph.set("physics_node", turn_speed=100.0)[0]
+    angle = lambda: newest(graph, messages.tool_jaw_state("PSM1")).position[0]  # noqa: E731
+    for goal, shown in ((99.0, "5672"), (1.45, "83.08"), (-0.5, "-28.65"), (20.0, "1146")):
+        graph.publish(topic("PSM1"), messages.encode_jaw(goal, S))
+        said = f"{topic('PSM1').name}: PSM1: the jaw cannot be at {shown} degrees; its limits are -20 and 80 degrees"
+        graph.refused("physics_node", said)
+        graph.until(lambda said=said: said in texts(graph, messages.tool_error), "the same on the topic of the arm")
+    assert angle() == 1.0
+    for goal in (np.radians(-20), np.radians(80), -0.355, 0.0):
+        graph.publish(topic("PSM1"), messages.encode_jaw(goal, S))
+        graph.until(lambda goal=goal: angle() == goal, "the angle")
+    assert graph.set("physics_node", turn_speed=1.5)[0]
+
+
+def test_an_arm_whose_base_is_moved_lets_go_and_the_others_stay(graph):
+    hold_tissue(graph)
+    send_joints(graph, messages.tool_joint_command, joints_of(graph, "PSM2") + [0.1, 0, 0, 0, 0, 0], "PSM2")
+    graph.spin(0.1)
+    other = joints_of(graph, "PSM2")
+    assert graph.set("physics_node", frames=["PSM1_base 0.12 0.1 0.0 0 1 0 0"])[0]
+    graph.until(lambda: felt(graph) == 0 and moved(graph) < 1e-3, "tissue that is let go")
+    arms = graph.nodes[1].arms
+    np.testing.assert_allclose(arms["PSM1"].base[:3, 3], [0.12, 0.1, 0.0])
+    graph.until(lambda: newest(graph, messages.tool_jaw_state("PSM1")).position[0] == 1.0, "an open jaw")
+    np.testing.assert_array_equal(joints_of(graph, "PSM2"), other)
+    pose = pose_of(graph, messages.tool_pose("PSM1"))  # in the world, and so is a pose without a frame
+    pose[:3, 3] += [0.001, 0, 0]
+    graph.publish(messages.tool_pose_command("PSM1"), messages.encode_pose(pose, S, ""))
+    graph.until(lambda: np.allclose(pose_of(graph, messages.tool_pose("PSM1")), pose, atol=1e-9), "a pose 1 mm further")
+    assert graph.set("physics_node", frames=[""])[0]
+    graph.until(lambda: arms["PSM1"].base[0, 3] != 0.12, "the place of before")
+    np.testing.assert_array_equal(joints_of(graph, "PSM2"), other)
 
 
 def test_the_arm_of_the_camera_moves_it_and_does_not_turn_it_over(graph):
@@ -320,12 +395,57 @@ def test_a_disabled_arm_takes_no_command(graph):
             graph.refused("physics_node", "PSM2/move_jp: PSM2 is DISABLED; send enable")
 
 
+def switch(bench, command, state, arm="PSM1"):
+    bench.publish(messages.tool_state_command(arm), messages.encode_report(command, S))
+    bench.until(lambda: texts(bench, messages.tool_state, arm)[-1] == state, state)
+
+
+def test_a_disabled_arm_lets_go_and_holds_nothing_when_it_is_enabled_before_it_is_told_to(graph):
+    hold_tissue(graph)
+    switch(graph, "disable", "DISABLED")
+    graph.until(lambda: felt(graph) == 0 and moved(graph) < 1e-3, "tissue that is let go")
+    switch(graph, "enable", "ENABLED")
+    graph.spin(0.2)
+    assert moved(graph) < 1e-3
+    servo(graph, tip_at(0, 0, 0.1))
+    jaw(graph, 0.0)
+    graph.until(lambda: graph.nodes[1].simulation.in_reach("PSM1"), "a grasp")
+
+
+def test_a_wrench_ends_when_its_arm_is_disabled_however_soon_it_is_enabled(graph):
+    arm, physics = graph.nodes[1].arms["PSM1"], graph.nodes[1]
+    assert graph.set("physics_node", command_timeout=0.0)[0]
+    servo(graph, tip_at(0, 0, 0.1))
+    graph.publish(messages.tool_wrench("PSM1"), messages.encode_wrench(np.array([0, 0, -0.5]), np.zeros(3), S, "world"))
+    graph.until(lambda: physics.simulation.in_reach("PSM1"), "a pull")
+    for command in ("disable", "enable"):  # between two steps
+        arm.command_state(command)
+    graph.until(lambda: not physics.simulation.in_reach("PSM1") and felt(graph) == 0, "the end of the pull")
+    assert graph.set("physics_node", command_timeout=0.5)[0]
+
+
+def test_a_disabled_arm_has_no_capsule(graph):
+    assert graph.set("physics_node", contact_radius=0.015)[0]
+    graph.until(lambda: graph.nodes[1].simulation.contact_radius >= 0.015, "contact")
+    for step in range(6):
+        servo(graph, tip_at(0, 0, 0.08 + 0.004 * step))
+        graph.spin(0.05)
+    graph.until(lambda: felt(graph) > 0.01 and moved(graph) > 1e-3, "contact")
+    switch(graph, "disable", "DISABLED")
+    graph.until(lambda: felt(graph) == 0 and moved(graph) < 1e-3, "tissue that is free")
+    switch(graph, "enable", "ENABLED")
+    graph.until(lambda: felt(graph) > 0.01 and moved(graph) > 1e-3, "contact again")
+    assert graph.set("physics_node", contact_radius=0.0)[0]
+    graph.until(lambda: graph.nodes[1].simulation.contact_radius == 0, "no contact")
+
+
 BAD_OPTIONS = {
     "two_for_three": (dict(arms=("A", "B", "C"), instruments=("none", "none")), "instruments: there are 2 for 3 arms"),
     "unknown": (dict(instruments=("SPOON",)), "tool must be the path of a .json file or one of"),
     "no_file": (dict(arm_models=("/nowhere/psm.json",)), "there is no such file"),
     "endoscope": (dict(instruments=("ENDOSCOPE_STRAIGHT",), arm_models=("ECM",)), "PSM1 cannot be ECM with ENDOSCOPE_STRAIGHT"),
     "two_of_a_name": (dict(arms=("PSM1", "PSM1")), "PSM1 is there 2 times"),
+    "capitals": (dict(arms=("PSM1", "psm1")), "PSM1 and psm1 differ in capitals alone; give each arm a name of its own"),
     "measured_camera": (dict(arms=("PSM1", "ECM")), "ECM needs arm_source commanded"),
 }
 
@@ -337,11 +457,74 @@ def test_bad_options_are_one_sentence(name):
         make_arms(PhysicsNodeConfig(**values))
 
 
+def test_a_model_of_the_same_recording_leaves_the_arms_and_another_takes_them_to_their_start(graph):
+    send_joints(graph, messages.tool_joint_command, joints_of(graph, "PSM2") + [0.1, 0, 0, 0, 0, 0], "PSM2")
+    graph.publish(messages.tool_state_command("PSM2"), messages.encode_report("disable", S))
+    graph.until(lambda: texts(graph, messages.tool_state, "PSM2")[-1] == "DISABLED")
+    arms, goal = graph.nodes[1].arms, joints_of(graph) + [0.0, 0, -0.04, 0, 0, 0]
+    left, base = arms["PSM2"].joints, arms["PSM1"].base
+    assert graph.set("physics_node", slide_speed=0.02)[0]
+    send_joints(graph, messages.tool_joint_move, goal)
+    send_model(graph, sheet(z=0.101), stamp=7 * S)
+    await_nodes(graph, 7 * S)
+    assert arms["PSM1"].base is base and arms["PSM1"].busy, "the move goes on"
+    graph.until(lambda: np.allclose(joints_of(graph), goal), "its goal")
+    assert graph.set("physics_node", slide_speed=0.2)[0]
+    assert not texts(graph, messages.tool_warning)
+    assert graph.call(Trigger, "/physics_node/reset").success
+    graph.until(lambda: (joints_of(graph) == arms["PSM1"].start).all(), "the start")
+    np.testing.assert_array_equal(arms["PSM2"].joints, left)  # disabled
+
+    other = tip_at(0.001, 0, 0)
+    send_joints(graph, messages.tool_joint_move, goal)
+    send_model(graph, stamp=8 * S, cameras=(other,))
+    await_nodes(graph, 8 * S)
+    for arm in ARMS:
+        (said,) = graph.until(lambda arm=arm: texts(graph, messages.tool_warning, arm), f"a warning of {arm}")
+        assert said.startswith(f"{arm} is at its start, as a model of another recording came")
+        np.testing.assert_array_equal(arms[arm].joints, arms[arm].start)
+    graph.refused("physics_node", "is at its start, as a model of another recording came")
+    graph.publish(messages.tool_state_command("PSM2"), messages.encode_report("enable", S))
+    graph.until(lambda: texts(graph, messages.tool_state, "PSM2")[-1] == "ENABLED")
+    send_model(graph, stamp=9 * S)
+    await_nodes(graph, 9 * S)
+
+
+def test_one_model_for_all_arms_makes_that_of_the_camera_an_ecm_if_it_is_a_name(tmp_path):
+    for model in ("PSM", "PSM_Si"):
+        arms = make_arms(PhysicsNodeConfig(arms=("PSM1", "ECM"), arm_source="commanded", arm_models=(model,)))
+        assert arms["ECM"].kinematics.name == model.replace("PSM", "ECM")
+    file = tmp_path / "PSM" / "PSM.json"
+    file.parent.mkdir()
+    file.write_text((Path(arm_files.__file__).parent / "parameters" / "PSM.json").read_text())
+    assert make_arms(PhysicsNodeConfig(arm_models=(str(file),)))["PSM1"].kinematics.name == "PSM"
+    with pytest.raises(ConfigError, match="ECM cannot be PSM with .*; ECM takes an endoscope, every other arm an instrument"):
+        make_arms(PhysicsNodeConfig(arms=("PSM1", "ECM"), arm_source="commanded", arm_models=(str(file),)))
+
+
+def test_two_arms_never_have_the_same_place():
+    view = Camera(K, WIDTH, HEIGHT, np.eye(4)), 0.1
+    arms = make_arms(PhysicsNodeConfig(arms=("right/PSM2", "left/PSM1", "PSM1", "left/ECM")))
+    places = "left/PSM1: the place of PSM1 in front of a camera is that of PSM1; give left/PSM1_base in frames; "
+    places += "left/ECM: the place of ECM in front of a camera is that of a camera; give left/ECM_base in frames"
+    for kept in ((), ("PSM1", "right/PSM2")):
+        assert place_arms(arms, {}, view, True, kept) == places
+    assert arms["left/PSM1"].base is None and arms["PSM1"].base is not None is not arms["right/PSM2"].base
+    assert place_arms(arms, {"PSM1_base": np.eye(4), "left/ECM_base": np.eye(4)}, view, True) == ""
+
+
+def test_a_base_far_from_the_camera_is_told():
+    arms, view = make_arms(PhysicsNodeConfig(arm_source="commanded")), (Camera(K, WIDTH, HEIGHT, np.eye(4)), 0.1)
+    assert place_arms(arms, {"PSM1_base": tip_at(0.1, -0.2, 0.3)}, view, True) == ""
+    said = place_arms(arms, {"PSM1_base": tip_at(100, -200, 300)}, view, True)
+    assert said == "PSM1_base in frames is 374 m from the camera, and the whole arm is 1.1 m long; is it in metres?"
+
+
 def test_pictures_follow_the_arm_of_the_camera(graph):
     rendering = graph.add(RenderingNode)
     shown = graph.hear(messages.RENDERED_POSE)
-    send_model(graph, stamp=6 * S)  # which takes the arms to their start
-    await_nodes(graph, 6 * S)
+    send_model(graph, stamp=10 * S)
+    await_nodes(graph, 10 * S)
     graph.publish(messages.LEFT_INFO, messages.encode_camera_info(K, WIDTH, HEIGHT, S, "endoscope_left"))
     graph.until(lambda: shown, "a picture")
     arm = graph.nodes[1].arms["ECM"]

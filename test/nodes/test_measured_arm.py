@@ -49,6 +49,21 @@ def test_links_follow_a_measured_pose_and_jaw(graph, arm):
     assert reach.reached
 
 
+@pytest.mark.parametrize("depth, sentence", [
+    (0.6, "PSM2: PSM stops 3"), (80.0, "PSM2: the pose is 80 m from the base, and the whole arm is 1.1 m long; is it in metres?"),
+    (1e200, "PSM2: the pose is 1e+200 m from the base"),
+])  # fmt: skip
+def test_a_measured_pose_that_the_arm_cannot_have_is_a_warning_as_long_as_it_is_there(graph, depth, sentence):
+    errors = graph.nodes[1].error_count
+    send_tip(graph, (0.01, -0.01, depth), "PSM2")
+    since = len(graph.statuses["physics_node"])
+    _, text, _ = graph.status("physics_node", sentence, 1, since)
+    assert text.startswith("running; ") and ("PSM2_base in frames" in text or depth > 1)
+    send_tip(graph, (0.01, -0.01, 0.09), "PSM2")
+    graph.until(lambda: not graph.nodes[1].arms["PSM2"].missing, "a pose in reach")
+    assert graph.nodes[1].error_count == errors
+
+
 def test_an_arm_without_a_place_says_so_and_is_a_tip(graph):
     graph.status("physics_node", "there is no default place for PSM3, only for PSM1, PSM2 and ECM; give its base in frames", 1)
     send_tip(graph, (0, 0, 0.09), "PSM3")

@@ -125,3 +125,26 @@ def test_jaw_closed_in_the_air_holds_nothing_and_tissue_pulled_too_far_slips():
         simulation.set_grasp("PSM1", np.diag([2.0, 2.0, 2.0, 1.0]), True)
     with pytest.raises(ValueError, match="pose of tool 'PSM1' must be a finite"):
         simulation.set_grasp("PSM1", np.full((4, 4), np.nan), True)
+
+
+@pytest.mark.parametrize("hold", ["jaw", "wrench", "capsule"])
+def test_a_tool_that_is_withdrawn_lets_go_and_touches_nothing_until_it_comes_back(hold):
+    simulation = simulate(contact_radius=0.015 if hold == "capsule" else 0.0)
+    simulation.withdraw("PSM1")  # which it knows nothing of yet
+
+    def act(depth):
+        simulation.set_grasp("PSM1", pose_at(TIP + [0, 0, depth]), hold == "jaw")
+        if hold == "wrench":
+            simulation.set_wrench("PSM1", TIP, np.array([0, 0, -1.0]))
+        simulation.step()
+
+    for step in range(8):
+        act(0.001 * step - (0.01 if hold == "capsule" else 0))
+    assert np.linalg.norm(simulation.reaction("PSM1")[0]) > 0.01 and depth_of_dent(simulation) > 1e-3
+    simulation.withdraw("PSM1")
+    assert not simulation.reaction("PSM1")[0].any() and not simulation.in_reach("PSM1")
+    steps(simulation, 60)
+    assert depth_of_dent(simulation) < 3e-4 and not simulation.reaction("PSM1")[0].any()
+    act(0.0)
+    steps(simulation, 3)
+    assert simulation.reaction("PSM1")[0].any()

@@ -105,13 +105,13 @@ class InstrumentDrawing:
         self._normals = move(np.concatenate(normals).reshape(-1, 3), torch.float32)
         self._links, self._materials = move(links, torch.int32), move(materials, torch.int32)
         self._owners = move([self.links[link][0] for link in links], torch.int32)
-        self._surfaces = move([SURFACES[material] for material in Material], torch.float32)
+        self._surfaces = np.array([SURFACES[material] for material in Material])
         thrown = [(i, capsule) for i, own in enumerate(capsules) for capsule in own] if config.shadows else []
         if len(thrown) > int(MOST):
             raise ValueError(f"{len(thrown)} capsules throw shadows, and at most {int(MOST)} can; draw fewer instruments")
-        ends = np.array([(capsule.start, capsule.end) for _, capsule in thrown]).reshape(-1, 2, 3)
-        self._starts = move(ends, torch.float32)
-        self._capsule_links = move([self.links.index((i, capsule.link)) for i, capsule in thrown], torch.int32)
+        ends = np.array([((*capsule.start, 1.0), (*capsule.end, 1.0)) for _, capsule in thrown]).reshape(-1, 2, 4)
+        self._ends = ends.swapaxes(1, 2)  # [C, 4, 2] m, in the frame of the link
+        self._capsule_links = np.array([self.links.index((i, capsule.link)) for i, capsule in thrown], int)
         self._capsule_owners = move([i for i, _ in thrown], torch.int32)
         self._radii = move([capsule.radius for _, capsule in thrown], torch.float32)
         self._room: tuple[tuple[int, int, int], dict[str, Tensor]] = (0, 0, 0), {}
@@ -184,19 +184,20 @@ class InstrumentDrawing:
         frame.surfaces = 0 if surfaces is None else len(Material)
         look.ambient, look.softness = config.ambient, config.softness
         look.lamp_size, look.mirror, look.white = config.lamp_size, config.mirror, config.white
+        frame.lanes = -(-height // int(drawing_kernels.APART))
         lamps = np.tile((config.lamp_x, config.lamp_y, 0.0), (count, 1)) if lamps is None else lamps
-        views, placed = self._upload(np.concatenate([lenses, lamps], 1)), self._upload(local)
-        materials = self._surfaces if surfaces is None else self._upload(surfaces.reshape(-1, surfaces.shape[-1]))
+        ends = local[:, self._capsule_links] @ self._ends  # [B, C, 4, 2]
+        placed, ends, views, materials = self._upload(
+            local, ends[:, :, :3].swapaxes(2, 3), np.concatenate([lenses, lamps], 1), self._surfaces if surfaces is None else surfaces
+        )
         room = self._buffers(count, frame)
-        labels = (alphas > SURFACE).to(torch.uint8)
-        coarse, seen = colors[:, ::_STRIDE, ::_STRIDE], (alphas[:, ::_STRIDE, ::_STRIDE] > SURFACE)[..., None]
-        # The hue of the tissue in linear light; in float64, so that the order of the sum, which depends on B, does not show.
-        around = (coarse * coarse * seen).sum((1, 2), dtype=torch.float64) + 1e-6
-        around = (around / around.amax(1, keepdim=True)).float().contiguous()
-        corners = [self._corners, self._normals, self._links, placed, views, frame]
-        ends, drawn = room["ends"], [room["screen"], room["rows"], frame, room["samples"], room["marks"]]
-        self._launch(drawing_kernels.project, count * frame.faces, [*corners, room["screen"], room["turned"], room["rows"]])
-        self._launch(drawing_kernels.place, count * frame.capsules, [self._starts, self._capsule_links, placed, frame, ends])
+        labels = (alphas > SURFACE).view(torch.uint8)
+        coarse, seen = colors[:, ::_STRIDE, ::_STRIDE], labels[:, ::_STRIDE, ::_STRIDE, None]
+        # The tissue's light, linear; in float64, so that the order of the sum, which depends on B, does not show.
+        around = (coarse * coarse * seen).sum((1, 2), dtype=torch.float64)
+        drawn = [room["screen"], room["rows"], frame, room["samples"], room["marks"]]
+        corners = [self._corners, self._normals, self._links, placed, views, frame, room["screen"], room["turned"], room["rows"]]
+        self._launch(drawing_kernels.project, count * frame.faces, corners)
         flat = [colors.view(-1, 3), depths.view(-1), alphas.view(-1), labels.view(-1)]
         scene = [room["samples"], room["screen"], room["turned"], self._links, self._owners, self._materials, materials]
         scene += [ends, self._radii, self._capsule_owners, views, around, frame, look, *flat]
@@ -204,14 +205,16 @@ class InstrumentDrawing:
             self._launch(drawing_kernels.cover_rows, count * frame.down, drawn, least=4)
             self._launch(resolving_kernels.resolve_tiles, count * frame.across * frame.down, [room["marks"], *scene], least=4)
         else:
-            self._launch(drawing_kernels.cover_faces, count * frame.faces * -(-height // int(drawing_kernels.ROWS)), drawn)
+            self._launch(drawing_kernels.cover_faces, count * frame.faces * frame.lanes, drawn)
             self._launch(resolving_kernels.resolve_pixels, count * width * height, scene)
         return labels
 
-    def _upload(self, values: np.ndarray) -> Tensor:
-        """Numbers as float32 on the device, without waiting for what that does at the moment."""
-        tensor = torch.from_numpy(np.asarray(values, np.float32))
-        return tensor if torch.device(self.device).type == "cpu" else tensor.pin_memory().to(self.device, non_blocking=True)
+    def _upload(self, *arrays: np.ndarray) -> list[Tensor]:
+        """Numbers as float32 on the device, all at once and without waiting for what that does at the moment."""
+        flat = torch.from_numpy(np.concatenate([array.ravel() for array in arrays], dtype=np.float32))
+        if torch.device(self.device).type != "cpu":
+            flat = flat.pin_memory().to(self.device, non_blocking=True)
+        return [part.view(array.shape) for part, array in zip(flat.split([array.size for array in arrays]), arrays)]
 
     def _buffers(self, count: int, frame: Any) -> dict[str, Tensor]:
         """What kernels write for each other; samples are left empty by each picture for the next."""
@@ -227,7 +230,6 @@ class InstrumentDrawing:
                     "rows": new((triangles, 2), torch.int32),
                     "samples": new((pixels * int(drawing_kernels.SAMPLES),), torch.int64, int(drawing_kernels.EMPTY)),
                     "marks": new((count * frame.across * frame.down,), torch.uint8),
-                    "ends": new((count * frame.capsules, 2, 3), torch.float32),
                 },
             )
         return self._room[1]

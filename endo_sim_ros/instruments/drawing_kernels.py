@@ -8,7 +8,7 @@ SAMPLES = wp.constant(4)  # of a pixel, on a rotated grid: as many levels of gre
 EMPTY = wp.constant(wp.int64(0x7FFFFFFFFFFFFFFF))
 BEYOND = wp.constant(1.0e6)  # pixels: float32 cannot tell on which side of an edge a sample lies from so far
 TILE = wp.constant(16)  # pixels a side: what one item takes on a CPU
-ROWS = wp.constant(4)  # of a triangle: what one thread takes on a GPU
+APART = wp.constant(8)  # columns from one that a thread takes on a GPU to its next
 
 
 @wp.struct
@@ -27,6 +27,7 @@ class Frame:
     spread: float  # pixels: side of the square from which a pixel takes light
     nearest: float  # m: what is nearer to the plane of the lens is not drawn
     surfaces: int  # rows of surfaces from those of one picture to the next; 0 = all have the same
+    lanes: int  # threads that share a triangle on a GPU
 
 
 @wp.func
@@ -77,21 +78,6 @@ def project(
         turned[3 * i + k] = wp.transform_vector(pose, normals[3 * face + k])
 
 
-@wp.kernel
-def place(
-    first: int,
-    starts: wp.array2d[wp.vec3],  # [C, 2] ends of capsules, m, in the frame of the link
-    links: wp.array[int],  # [C]
-    poses: wp.array[wp.mat44],
-    frame: Frame,
-    ends: wp.array2d[wp.vec3],  # out [B C, 2], camera
-):
-    i = first + wp.tid()
-    pose = poses[i // frame.capsules * frame.links + links[i % frame.capsules]]
-    for k in range(2):
-        ends[i, k] = wp.transform_point(pose, starts[i % frame.capsules, k])
-
-
 @wp.func
 def weights(a: wp.vec3, b: wp.vec3, c: wp.vec3, u: float, v: float) -> wp.vec3:
     """Shares of the corners in a point of the picture, times the area of the triangle twice; their signs tell on which sides it lies."""
@@ -123,8 +109,10 @@ def span(a: wp.vec3, b: wp.vec3, row: int, spread: float, columns: wp.vec2) -> w
 @wp.func
 def cover(
     i: int,  # of B F triangles
-    low: int,
+    low: int,  # row
     high: int,
+    first: int,  # of the columns that the triangle may reach
+    step: int,
     alone: int,  # whether no other thread writes to these rows
     screen: wp.array[wp.vec3],
     rows: wp.array[wp.vec2i],
@@ -132,7 +120,7 @@ def cover(
     samples: wp.array[wp.int64],
     marks: wp.array[wp.uint8],
 ):
-    """Enter a triangle into the samples of rows from ``low`` to ``high``, and mark their tiles."""
+    """Enter a triangle into the samples of every ``step``-th column of rows from ``low`` to ``high``, and mark their tiles."""
     a, b, c = corner(screen, 3 * i), corner(screen, 3 * i + 1), corner(screen, 3 * i + 2)
     picture, face = i // frame.faces, i % frame.faces
     per_area = 1.0 / ((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
@@ -149,7 +137,7 @@ def cover(
         columns = span(b, c, row, frame.spread, columns)
         columns = span(c, a, row, frame.spread, columns)
         tile = (picture * frame.down + row // TILE) * frame.across
-        for column in range(int(wp.ceil(columns[0] - 0.5)), int(wp.floor(columns[1] - 0.5)) + 1):
+        for column in range(int(wp.ceil(columns[0] - 0.5)) + first, int(wp.floor(columns[1] - 0.5)) + 1, step):
             here = weights(a, b, c, float(column), float(row))
             pixel = (picture * frame.height + row) * frame.width + column
             for sample in range(SAMPLES):
@@ -182,7 +170,7 @@ def cover_rows(
     for face in range(picture * frame.faces, (picture + 1) * frame.faces):
         reached = rows[face]
         if reached[0] < low + TILE and reached[1] >= low and reached[0] <= reached[1]:
-            cover(face, low, low + TILE - 1, 1, screen, rows, frame, samples, marks)
+            cover(face, low, low + TILE - 1, 0, 1, 1, screen, rows, frame, samples, marks)
 
 
 @wp.kernel
@@ -194,10 +182,10 @@ def cover_faces(
     samples: wp.array[wp.int64],
     marks: wp.array[wp.uint8],
 ):
-    """On a GPU: some rows of one triangle; those of a shaft reach across the picture, and all would wait for the thread that has one."""
+    """On a GPU: a share of one triangle; those of a shaft reach across the picture, and all would wait for the thread that has one."""
     i = first + wp.tid()
-    slices = (frame.height + ROWS - 1) // ROWS
-    face, low = i // slices, ROWS * (i % slices)
+    face = i // frame.lanes
     reached = rows[face]
-    if reached[0] < low + ROWS and reached[1] >= low and reached[0] <= reached[1]:
-        cover(face, low, low + ROWS - 1, 0, screen, rows, frame, samples, marks)
+    for part in range(i % frame.lanes, APART * (reached[1] - reached[0] + 1), frame.lanes):
+        row = reached[0] + part // APART
+        cover(face, row, row, part % APART, APART, 0, screen, rows, frame, samples, marks)

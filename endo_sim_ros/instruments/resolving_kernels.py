@@ -39,6 +39,13 @@ def encoded(light: float) -> float:
 
 
 @wp.func
+def hue(light: wp.vec3d) -> wp.vec3:
+    """Light as bright as it gets without being more than 1 in any colour; white where there is none."""
+    lifted = light + wp.vec3d(wp.float64(1.0e-6))
+    return wp.vec3(lifted / wp.max(lifted))
+
+
+@wp.func
 def reflected(
     normal: wp.vec3, at: wp.vec3, lamp: wp.vec3, surfaces: wp.array2d[float], row: int, around: wp.vec3, left: wp.vec2, look: Look
 ) -> wp.vec3:
@@ -82,7 +89,7 @@ def blend(
     radii: wp.array[float],
     capsule_owners: wp.array[int],
     views: wp.array2d[float],
-    around: wp.array[wp.vec3],  # [B] light that comes from the tissue
+    around: wp.array[wp.vec3d],  # [B] in the hue of the light that comes from the tissue
     frame: Frame,
     look: Look,
     colors: wp.array[wp.vec3],
@@ -134,7 +141,7 @@ def blend(
                                 on_links, at, normal, 0.5 * z / view[0], lamp, look.lamp_size,
                                 picture * frame.capsules, frame.capsules, ends, radii, capsule_owners, owners[face],
                             )  # fmt: skip
-                        lit = reflected(normal, at, lamp, surfaces, picture * frame.surfaces + material, around[picture], left, look)
+                        lit = reflected(normal, at, lamp, surfaces, picture * frame.surfaces + material, hue(around[picture]), left, look)
                 color += seen * lit
                 depth += seen * z
                 total += seen
@@ -202,7 +209,7 @@ def resolve_tiles(
     radii: wp.array[float],
     capsule_owners: wp.array[int],
     views: wp.array2d[float],
-    around: wp.array[wp.vec3],
+    around: wp.array[wp.vec3d],
     frame: Frame,
     look: Look,
     colors: wp.array[wp.vec3],
@@ -265,7 +272,7 @@ def resolve_pixels(
     radii: wp.array[float],
     capsule_owners: wp.array[int],
     views: wp.array2d[float],
-    around: wp.array[wp.vec3],
+    around: wp.array[wp.vec3d],
     frame: Frame,
     look: Look,
     colors: wp.array[wp.vec3],

@@ -151,6 +151,16 @@ def test_too_many_capsules_are_refused():
         InstrumentDrawing([[cylinder(1e-3, 0, 0.01)]], device="cpu", capsules=[[CAPSULES["rod"]] * 65])
 
 
+def test_the_kernels_of_gpus_draw_the_picture_of_those_of_cpus(monkeypatch):
+    drawing, poses = both()
+    expected = drawing.draw(poses, CAMERA, *tissue(0.09))
+    monkeypatch.setenv("ENDO_SIM_THREADS", "1")  # on a CPU these kernels have no atomic operations
+    with compare_plain():
+        found = drawing.draw(poses, CAMERA, *tissue(0.09))
+    assert torch.equal(expected.labels, found.labels)
+    assert (expected.colors - found.colors).abs().max() < 1e-4 and (expected.depths - found.depths).abs().max() < 1e-6
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_a_gpu_draws_the_picture_of_the_cpu():

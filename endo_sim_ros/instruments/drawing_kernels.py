@@ -8,7 +8,7 @@ SAMPLES = wp.constant(4)  # of a pixel, on a rotated grid: as many levels of gre
 EMPTY = wp.constant(wp.int64(0x7FFFFFFFFFFFFFFF))
 BEYOND = wp.constant(1.0e6)  # pixels: float32 cannot tell on which side of an edge a sample lies from so far
 TILE = wp.constant(16)  # pixels a side: what one item takes on a CPU
-APART = wp.constant(8)  # columns from one that a thread takes on a GPU to its next
+APART = wp.constant(4)  # columns from one that a thread takes on a GPU to its next
 
 
 @wp.struct

@@ -7,7 +7,7 @@ matters and a scene metres from the world's origin as accurate as one at it.
 
 import warp as wp
 
-from endo_sim_ros.physics.backends.end_kernels import OPTIONS, block_sum
+from endo_sim_ros.physics.backends.end_kernels import OPTIONS, THREADS, block_sum
 from endo_sim_ros.physics.backends.structs import Loads, Nodes, RigidTools, State
 from endo_sim_ros.physics.link_kernels import lies_between, links_are_finite, measure_links, move_links, slide_in_jaws
 from endo_sim_ros.physics.tool_state_kernels import Commands, Holds, ToolConstants, block_sum3, double, single
@@ -30,7 +30,7 @@ def solve_on_range(J: wp.mat33d, needed: wp.vec3d, floor: wp.float64) -> wp.vec3
     return beta
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=THREADS)
 def take_hold(
     tools: int,
     threads: int,
@@ -251,7 +251,7 @@ def move_capsule(
     return used
 
 
-@wp.kernel(launch_bounds=512)
+@wp.kernel(launch_bounds=THREADS)
 def load_nodes(
     tools: int,
     threads: int,
@@ -291,7 +291,7 @@ def load_nodes(
         rigid.used[b] = used
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=THREADS)
 def measure_reactions(
     tools: int,
     threads: int,

@@ -17,6 +17,7 @@ from endo_sim_ros.physics.backends import cluster_division as cluster, plain_ski
 from endo_sim_ros.physics.backends.base import Action, Launch, SkinData, StepData, Work, capturing, viewed
 from endo_sim_ros.physics.backends.cluster_kernels import make_step_kernel
 from endo_sim_ros.physics.backends.cpu import cpu_action
+from endo_sim_ros.physics.backends.end_kernels import THREADS
 from endo_sim_ros.physics.backends.plain_kernels import collect, make_advance_kernel, scatter, update_grid
 from endo_sim_ros.physics.backends.plain_skinning_kernels import skin_environments, skin_gaussians
 from endo_sim_ros.physics.backends.structs import Transfer
@@ -30,7 +31,7 @@ class CudaBackend:
     def __init__(self, device: str):
         self.device = device
         self._comparing = device == "cpu"  # within `compare_plain`
-        self.threads = 1 if self._comparing else 512
+        self.threads = 1 if self._comparing else THREADS
         self.prepares_early = self._comparing
 
     def substeps(self, step: StepData) -> list[Action]:

@@ -7,6 +7,8 @@ from endo_sim_ros.physics.backends.structs import State
 
 OPTIONS = {"extra_build_options": native("physics/native/threads.h")}
 wp.set_module_options({"enable_backward": False, **OPTIONS})
+THREADS = 512
+"""Of a GPU's block, which is one environment; kernels are bound to as few registers as leave room for these."""
 
 
 @wp.func_native("return endo_sim::block_sum(value);")
@@ -21,7 +23,7 @@ def block_max(value: float) -> float:
     ...
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=THREADS)
 def end_step(
     threads: int,
     count: int,

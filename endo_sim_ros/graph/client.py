@@ -24,15 +24,25 @@ CHANGED = 60  # grey levels by which an image must differ to show that the tissu
 
 
 class Client(Watcher):
-    """A teleoperation stack: sends poses and wrenches of a tool, receives images and states."""
+    """A teleoperation stack: sends poses and wrenches of a tool, receives images and states.
 
-    def __init__(self) -> None:
+    Args:
+        shown: The topic of the images that count; those of the left eye are received in any case.
+
+    Attributes:
+        axes: Rotation [3, 3] of the tool in the world.
+    """
+
+    def __init__(self, shown: Topic = messages.RENDERED_IMAGE) -> None:
         super().__init__("bench")
+        self.axes = np.eye(3)
         self.images: list[tuple[float, int, np.ndarray]] = []  # time of arrival s, stamp ns, pixels [H, W, 3]
         self.states: list[tuple[float, int]] = []  # time of arrival s and stamp ns of control_nodes
         self._newest: Any = None  # control_nodes
         self._senders: dict[Topic, Publisher] = {}
-        self.subscribe(messages.RENDERED_IMAGE, self._on_image)
+        self.subscribe(shown, self._on_image)
+        if shown != messages.RENDERED_IMAGE:
+            self.subscribe(messages.RENDERED_IMAGE, lambda _: None)
         self.subscribe(messages.CONTROL_NODES, self._on_control_nodes)
         self._spinner = SingleThreadedExecutor()
         self._spinner.add_node(self)
@@ -68,7 +78,7 @@ class Client(Watcher):
             RuntimeError: If nobody subscribes.
         """
         pose = np.eye(4)
-        pose[:3, 3] = tip
+        pose[:3, :3], pose[:3, 3] = self.axes, tip
         self.send(messages.tool_pose(ARM), messages.encode_pose(pose, stamp, WORLD))
         self.send(messages.tool_wrench(ARM), messages.encode_wrench(force, np.zeros(3), stamp, WORLD))
 

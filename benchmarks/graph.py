@@ -27,6 +27,7 @@ from endo_sim_ros.messages import PhysicsState
 
 _FORCE = 2.0  # N, towards the camera
 _HOLD = 0.6  # seconds between one change of the force and the next
+_SOME = np.s_[::4, ::4]  # pixels that are compared: all of them would take as much time as rendering does
 _APART = 0.005  # m between the eyes
 _SHOWN: dict[str, dict[str, Any]] = {  # what the pictures have: options of rendering_node
     "tissue alone": {"instruments": False},
@@ -92,12 +93,12 @@ def _realtime(client: Client, scene: Tissue, rate: float, changes: int, shown: s
         end = due + _HOLD + rng.uniform(0, 1 / rate)
         pulling = not pulling
         client.spin_until(due)
-        before, sent = client.images[-1][2].astype(np.int16), time.perf_counter()
+        before, sent = client.images[-1][2][_SOME].astype(np.int16), time.perf_counter()
         while due < end:
             client.spin_until(due)
             client.command(scene.tip, _FORCE * pulling * scene.towards_camera, client.now_ns())
             due += 1 / rate
-        seen = (t for t, _, image in client.images if t > sent and np.abs(image - before).max() > CHANGED)
+        seen = (t for t, _, image in client.images if t > sent and np.abs(image[_SOME] - before).max() > CHANGED)
         latencies.append(1e3 * (next(seen, np.inf) - sent))
         times.append(_node_times(client))
         del client.images[:-1]

@@ -22,7 +22,6 @@ from endo_sim_ros.core.gaussians import save_ply
 from endo_sim_ros.evaluation.measurement import Row, machine, report
 from endo_sim_ros.graph.client import ARM, CHANGED, PATIENCE, WORLD, Client, Tissue, tissue
 from endo_sim_ros.graph.processes import NodeGroup
-from endo_sim_ros.instruments import load_arm, place_arm
 from endo_sim_ros.messages import PhysicsState
 
 _FORCE = 2.0  # N, towards the camera
@@ -53,7 +52,7 @@ def _graph(
         os.environ.update(group.environment)  # this process joins the same graph
         rclpy.init()
         client = Client(messages.RENDERED_RIGHT_IMAGE if "baseline" in _SHOWN[shown] else messages.RENDERED_IMAGE)
-        client.axes = _tool_axes(scene)
+        client.axes = scene.tool_axes
         try:
             nodes = _parameters(mode, rate, device, shown)
             for node, parameters in nodes.items():
@@ -71,13 +70,6 @@ def _graph(
         finally:
             client.destroy_node()
             try_shutdown()
-
-
-def _tool_axes(scene: Tissue) -> np.ndarray:
-    """Rotation [3, 3] in the world of a tool whose shaft comes into the picture from the side, as arms do."""
-    psm = load_arm("PSM", "LARGE_NEEDLE_DRIVER")
-    place = place_arm(ARM, psm, scene.camera, float(np.linalg.norm(scene.tip - scene.camera.position)))
-    return (place.base @ psm.tip_pose(place.joints))[:3, :3]
 
 
 def _realtime(client: Client, scene: Tissue, rate: float, changes: int, shown: str) -> list[Row]:

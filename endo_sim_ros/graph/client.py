@@ -13,6 +13,7 @@ from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.instruments import load_arm, place_arm
 from endo_sim_ros.messages import Topic
 from endo_sim_ros.nodes.watcher import Watcher
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
@@ -24,15 +25,26 @@ CHANGED = 60  # grey levels by which an image must differ to show that the tissu
 
 
 class Client(Watcher):
-    """A teleoperation stack: sends poses and wrenches of a tool, receives images and states."""
+    """A teleoperation stack: sends poses and wrenches of a tool, receives images and states.
 
-    def __init__(self) -> None:
+    Args:
+        shown: The topic of the images that count; those of the left eye are received in any case.
+
+    Attributes:
+        axes: Rotation [3, 3] of the tool in the world.
+        pose_topic: Where its pose is sent.
+    """
+
+    def __init__(self, shown: Topic = messages.RENDERED_IMAGE) -> None:
         super().__init__("bench")
+        self.axes, self.pose_topic = np.eye(3), messages.tool_pose(ARM)
         self.images: list[tuple[float, int, np.ndarray]] = []  # time of arrival s, stamp ns, pixels [H, W, 3]
         self.states: list[tuple[float, int]] = []  # time of arrival s and stamp ns of control_nodes
         self._newest: Any = None  # control_nodes
         self._senders: dict[Topic, Publisher] = {}
-        self.subscribe(messages.RENDERED_IMAGE, self._on_image)
+        self.subscribe(shown, self._on_image)
+        if shown != messages.RENDERED_IMAGE:
+            self.subscribe(messages.RENDERED_IMAGE, lambda _: None)
         self.subscribe(messages.CONTROL_NODES, self._on_control_nodes)
         self._spinner = SingleThreadedExecutor()
         self._spinner.add_node(self)
@@ -68,8 +80,8 @@ class Client(Watcher):
             RuntimeError: If nobody subscribes.
         """
         pose = np.eye(4)
-        pose[:3, 3] = tip
-        self.send(messages.tool_pose(ARM), messages.encode_pose(pose, stamp, WORLD))
+        pose[:3, :3], pose[:3, 3] = self.axes, tip
+        self.send(self.pose_topic, messages.encode_pose(pose, stamp, WORLD))
         self.send(messages.tool_wrench(ARM), messages.encode_wrench(force, np.zeros(3), stamp, WORLD))
 
     def until(self, done: Callable[[], Any], what: str, seconds: float = PATIENCE) -> None:
@@ -106,6 +118,13 @@ class Tissue(NamedTuple):
         """Unit vector [3] from the tip to the camera, world."""
         offset = self.camera.position - self.tip
         return offset / np.linalg.norm(offset)
+
+    @property
+    def tool_axes(self) -> np.ndarray:
+        """Rotation [3, 3] in the world of a tool whose shaft comes into the picture from the side, as arms do."""
+        psm = load_arm("PSM", "LARGE_NEEDLE_DRIVER")
+        place = place_arm(ARM, psm, self.camera, float(np.linalg.norm(self.tip - self.camera.position)))
+        return (place.base @ psm.tip_pose(place.joints))[:3, :3]
 
 
 def depth_of(frame: Frame) -> np.ndarray:

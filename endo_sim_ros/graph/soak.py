@@ -19,6 +19,7 @@ from endo_sim_ros.core.frames import LEFT_FRAME
 from endo_sim_ros.evaluation.measurement import Row, report
 from endo_sim_ros.graph.client import ARM, CHANGED, Client, depth_of, tissue
 from endo_sim_ros.graph.processes import NodeGroup
+from endo_sim_ros.instruments.kinematics import JOINTS
 from endo_sim_ros.messages import ERROR, ReconstructionState, Topic
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
@@ -78,6 +79,7 @@ class _Traffic:
         self.recording = list(phantom_sequence(PhantomConfig(frames=8, width=_WIDTH, height=_HEIGHT)))
         self._frame = self.recording[0]
         self.scene = tissue(2000, _WIDTH, _HEIGHT)
+        self.axes = self.scene.tool_axes
         self._rest = self.scene.model.means.numpy()[:300]
 
     def message(self, topic: Topic, stamp: int) -> Any:
@@ -104,10 +106,15 @@ class _Traffic:
             F = np.tile(np.eye(3, dtype=np.float32), (len(self._rest), 1, 1))
             state = messages.ControlNodeCloud(self._rest, self._rest + np.float32(1e-3), F, stamp)
             return messages.encode_control_nodes(state, stamp, "world")
-        if topic == messages.tool_pose(ARM):
+        if topic in (messages.tool_pose_command(ARM), messages.tool_move(ARM)):
             pose = np.eye(4)
+            pose[:3, :3] = self.axes
             pose[:3, 3] = self.scene.tip + [rng.gauss(0, 0.01) for _ in range(3)]
             return messages.encode_pose(pose, stamp, "world")
+        if topic in (messages.tool_joint_command(ARM), messages.tool_joint_move(ARM)):
+            joints = np.array([rng.gauss(0, 0.1) for _ in JOINTS])
+            joints[2] = rng.uniform(0.1, 0.2)  # the insertion, m
+            return messages.encode_joints(list(JOINTS), joints, np.zeros(0), np.zeros(0), stamp)
         if topic == messages.tool_wrench(ARM):
             return messages.encode_wrench(np.array([rng.gauss(0, 1) for _ in range(3)]), np.zeros(3), stamp, "world")
         if topic == messages.tool_cut(ARM):
@@ -121,10 +128,16 @@ class _Traffic:
 
 _TOPICS = (
     *messages.RECORDING_TOPICS, *messages.MODEL_TOPICS, messages.CONTROL_NODES,
-    messages.CUT_SURFACE, messages.tool_pose(ARM), messages.tool_wrench(ARM), messages.tool_jaw(ARM),
-    messages.tool_jaw_move(ARM), messages.tool_cut(ARM),
+    messages.CUT_SURFACE, messages.tool_pose_command(ARM), messages.tool_move(ARM), messages.tool_joint_command(ARM),
+    messages.tool_joint_move(ARM), messages.tool_wrench(ARM), messages.tool_jaw(ARM), messages.tool_jaw_move(ARM), messages.tool_cut(ARM),
 )  # fmt: skip
 _WEIGHTS = [0.02 if topic in messages.MODEL_TOPICS else 0.1 if topic == messages.CONTROL_NODES else 1.0 for topic in _TOPICS]
+
+
+_HEARD = (  # what is made for those alone who hear it
+    messages.RENDERED_COMPRESSED, messages.RENDERED_DEPTH, messages.RENDERED_SEGMENTATION, messages.RENDERED_RIGHT_IMAGE,
+    messages.RENDERED_RIGHT_COMPRESSED, messages.tool_reaction(ARM),
+)  # fmt: skip
 
 
 def _memory(pid: int) -> float:
@@ -149,14 +162,17 @@ def soak(json_file: Path | None, minutes: float, rate: float = 500.0, seed: int 
     traffic = _Traffic(rng)
     parameters = {
         "reconstruction_node": {"iterations": 20, "max_gaussians": 1500, "start_after": 0.5},
-        "physics_node": {"node_count": 400, "arms": [ARM], "contact_radius": 0.005},
-        "rendering_node": {},
+        "physics_node": {"node_count": 400, "arms": [ARM], "arm_source": "commanded", "contact_radius": 0.005, "reaction_rate": 500.0},
+        "rendering_node": {"baseline": 0.005},
     }
     with tempfile.TemporaryDirectory() as folder, NodeGroup(Path(folder) / "logs") as group:
         parameters["reconstruction_node"]["output_dir"] = str(Path(folder) / "models")
         os.environ.update(group.environment)
         rclpy.init()
         client = Client()
+        client.axes, client.pose_topic = traffic.axes, messages.tool_pose_command(ARM)
+        for topic in _HEARD:
+            client.subscribe(topic, lambda _: None)
         try:
             for name in _NODES:
                 group.start(name, **parameters[name])

@@ -48,7 +48,6 @@ class ArmTopics:
         self._pose_topic = messages.tool_pose_command if commanded else messages.tool_pose
         self._camera = next((arm for arm in arms.values() if isinstance(arm, CameraArm)), None)
         tools = [arm for arm in arms.values() if arm is not self._camera]
-        self._reactions = {arm.name: node.publisher(messages.tool_reaction(arm.name), alone=True) for arm in tools}
         self._publishers = {arm.name: self._make_publishers(arm, options) for arm in arms.values() if commanded}
         self._told: dict[str, tuple[str, bool, bool]] = {}  # what was last said on operating_state
         self._short: set[str] = set()  # arms that have said that they do not reach their pose
@@ -317,7 +316,7 @@ class ArmTopics:
         self._joints.publish_joint_states(stamp)
 
     def publish(self, arm: Arm, pose: np.ndarray, reaction: np.ndarray, torque: np.ndarray, stamp: int) -> None:
-        """Publish what a tool arm feels and, if it is commanded, where it is.
+        """Publish where a tool arm is, if it is commanded, and what its joints feel.
 
         Args:
             arm: The arm.
@@ -326,8 +325,6 @@ class ArmTopics:
             torque: Torque [3], N·m, world, as `TissueSimulation.reaction` has it.
             stamp: Time of the state, ns.
         """
-        axes = pose[:3, :3].T  # the reaction is given in the axes of the tool
-        self._reactions[arm.name].publish(messages.encode_wrench(axes @ reaction, axes @ torque, stamp, arm.name))
         if arm.name in self._publishers:
             self._publish_motion(arm, pose, reaction, torque, stamp)
             for topic in (messages.tool_jaw_state, messages.tool_jaw_setpoint):

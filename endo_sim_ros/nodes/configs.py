@@ -123,6 +123,10 @@ class PhysicsNodeConfig(WorldConfig):
     cartesian_frame: Literal["world", "ECM_view"] = "world"
     """Frame of measured_cp, setpoint_cp and measured_cv of commanded tool arms. ECM_view: that of the camera now, x to the left and
     y up in the picture as on a dVRK; poses without a frame are in it, too."""
+    reaction_rate: Annotated[float, Range(0, 1000, "Hz")] = 0.0
+    """Reactions per second on body/measured_cf, interpolated between steps, for haptic devices (500). In real time each is published one
+    and a quarter steps after its stamp, the time for which it holds. In lockstep those since the step before come together. 0 = one
+    with each step, at once."""
     command_timeout: Annotated[float, Range(0, 3600, "s")] = 0.5
     """A wrench that is not repeated for this long is dropped; 0 = held until changed."""
     jaw_closed: Annotated[float, Range(-3.2, 3.2, "rad")] = 0.1

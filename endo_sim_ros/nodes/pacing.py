@@ -1,8 +1,10 @@
 """When periodic work is due: at the pace of a clock, or at the pace of commands."""
 
+import time
 from collections.abc import Callable, Hashable
 from typing import Any, Generic, TypeVar
 
+WINDOW = 1.0  # seconds over which speed is measured
 MOST_WAITING = 1000  # commands; beyond it the oldest is given up, so that nothing grows without bound
 
 # In periods:
@@ -64,6 +66,35 @@ class Pacer:
     def restart(self) -> None:
         """Forget the rhythm: the time since the last piece of work was not meant to be filled."""
         self._due = None
+
+
+class SpeedMeter:
+    """How fast simulated time goes, over the last whole window.
+
+    Attributes:
+        real_time_factor: Simulated time over that of the clock.
+        clock_speed: Time of the clock over that of the wall.
+    """
+
+    real_time_factor = clock_speed = 1.0
+
+    def __init__(self) -> None:
+        self._window: tuple[float, float, float] | None = None  # clock, simulated and wall time at its beginning
+
+    def note(self, now: float, simulated: float) -> None:
+        """Note the time of the clock and the simulated time, s."""
+        wall = time.monotonic()
+        if self._window is None or now < self._window[0] or simulated < self._window[1]:
+            self._window = now, simulated, wall
+        elapsed = now - self._window[0]
+        if elapsed > WINDOW:
+            self.real_time_factor = (simulated - self._window[1]) / elapsed
+            self.clock_speed = elapsed / max(wall - self._window[2], 1e-3)
+            self._window = now, simulated, wall
+
+    def restart(self) -> None:
+        """Forget the window: the time since it began was not meant to be simulated."""
+        self._window, self.real_time_factor = None, 1.0
 
 
 Part = TypeVar("Part", bound=Hashable)

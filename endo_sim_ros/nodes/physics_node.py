@@ -16,7 +16,8 @@ from endo_sim_ros.nodes.arm_topics import ArmTopics
 from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode, run, sentence
 from endo_sim_ros.nodes.configs import COMMAND_PARTS, PhysicsNodeConfig
 from endo_sim_ros.nodes.jointed_arm import JointedArm
-from endo_sim_ros.nodes.pacing import MOST_WAITING, CommandQueue, Pacer
+from endo_sim_ros.nodes.pacing import MOST_WAITING, WINDOW, CommandQueue, Pacer, SpeedMeter
+from endo_sim_ros.nodes.reactions import ReactionTopics
 from endo_sim_ros.nodes.tissue_builder import TissueBuilder
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
 from endo_sim_ros.physics.regions import read_regions
@@ -26,13 +27,14 @@ _FAST = 1.5  # times real speed from which a clock is to blame for that
 _POLLS = 4  # times per step that the timer asks whether a step is due
 _LONGEST_POLL = 0.1  # seconds; models and parameters must not wait for steps that take minutes
 _SAID_AGAIN = 10.0  # seconds after which the log has again that an arm misses what is measured
-_WINDOW = 1.0  # seconds over which the real-time factor is measured
 
 
 class PhysicsNode(EndoNode):
     """Samples control nodes from the latest model and steps them at the rate of the simulation."""
 
-    read_at_start = frozenset({"arms", "arm_source", "instruments", "arm_models", "link_contact", "mode", "lockstep_inputs"})
+    read_at_start = frozenset(
+        {"arms", "arm_source", "instruments", "arm_models", "link_contact", "mode", "lockstep_inputs", "reaction_rate"}
+    )
 
     def __init__(self) -> None:
         super().__init__("physics_node")
@@ -43,8 +45,7 @@ class PhysicsNode(EndoNode):
         self._simulated_stamp = 0  # stamp of the simulated model, ns
         self.failure = ""  # why the newest model is not simulated
         self._paused, self.steps, self._seconds_per_step = False, 0, 0.0
-        self._window: tuple[float, float, float] | None = None  # clock, simulated and wall time where the real-time factor begins
-        self._real_time_factor = self._clock_speed = 1.0  # the clock's is that against the wall's
+        self.speed = SpeedMeter()
         self._asked = 0.0  # time of the clock when it was last asked for a step
         self._pacer = Pacer()
         self.arms = make_arms(self._options)
@@ -68,6 +69,7 @@ class PhysicsNode(EndoNode):
         )
         self.subscribe(messages.TRAINING_CAMERA_INFO, self._builder.receive_training_info)
         self.subscribe(messages.CAMERA_POSE, self._on_camera_pose)
+        self._reactions = ReactionTopics(self, self._tools, self._options.reaction_rate, self._lockstep)
         self._arm_topics = ArmTopics(self, self.arms, self._options, depth, self._on_command)
         self._place_arms()
         self.service(Trigger, "~/reset", self._on_reset)
@@ -233,7 +235,7 @@ class PhysicsNode(EndoNode):
             return
         step, before, began = simulation.step_duration, self._asked, time.monotonic()
         self._asked = now
-        leaping = self.get_parameter("use_sim_time").value and 0 < now - before < _WINDOW
+        leaping = self.get_parameter("use_sim_time").value and 0 < now - before < WINDOW
         moments = [*np.arange(before + step, now, step), now] if leaping else [now]
         due = False
         for moment in moments:
@@ -247,24 +249,13 @@ class PhysicsNode(EndoNode):
                 break
         if due:
             if not self._paused:
-                self._measure(now, simulation)
+                self.speed.note(now, simulation.time)
             self._publish(simulation, self.now_ns())
 
     def _start_timing(self) -> None:
         """Begin to measure and to pace anew: the time before this was not meant to be simulated."""
         self._pacer.restart()
-        self._window, self._real_time_factor = None, 1.0
-
-    def _measure(self, now: float, simulation: TissueSimulation) -> None:
-        """Real-time factor: simulated over elapsed time."""
-        wall = time.monotonic()
-        if self._window is None or now < self._window[0] or simulation.time < self._window[1]:
-            self._window = now, simulation.time, wall
-        elapsed = now - self._window[0]
-        if elapsed > _WINDOW:
-            self._real_time_factor = (simulation.time - self._window[1]) / elapsed
-            self._clock_speed = elapsed / max(wall - self._window[2], 1e-3)
-            self._window = now, simulation.time, wall
+        self.speed.restart()
 
     def step(self, simulation: TissueSimulation) -> None:
         """Take one step with what the arms command, and publish it."""
@@ -305,16 +296,19 @@ class PhysicsNode(EndoNode):
         self._arm_topics.publish_views(stamp)  # before the state with the same stamp, as who draws them waits for that
         cloud = ControlNodeCloud(state.rest, state.positions, state.F, self._simulated_stamp, cut)
         self._nodes_pub.publish(messages.encode_control_nodes(cloud, stamp, world))
-        shown = []
+        shown, reactions = [], {}
         for name, arm in self._tools.items():
             if arm.pose is None:
                 continue
             reaction, torque = simulation.reaction(name)
             if isinstance(arm, JointedArm):
                 arm.link_reactions = simulation.link_reactions(name)
+            axes = arm.pose[:3, :3].T  # those of the tool
+            reactions[name] = np.concatenate([axes @ reaction, axes @ torque])
             self._arm_topics.publish(arm, arm.pose, reaction, torque, stamp)
             force = arm.force if arm.acting and arm.force is not None else np.zeros(3)
             shown.append(messages.ToolDisplay(name, arm.pose[:3, 3], force, reaction, simulation.held(name)))
+        self._reactions.publish(reactions, stamp, simulation.step_duration)
         self._arm_topics.publish_joint_states(stamp)
         if shown and self._markers_pub.get_subscription_count():
             self._markers_pub.publish(messages.encode_tool_markers(shown, stamp, world))
@@ -381,7 +375,7 @@ class PhysicsNode(EndoNode):
             "steps": self.steps,
             "substeps": simulation.solver.substepping.count,
             "milliseconds per step": f"{1e3 * self._seconds_per_step:.1f}",
-            "real-time factor": f"{self._real_time_factor:.2f}",
+            "real-time factor": f"{self.speed.real_time_factor:.2f}",
             "skipped steps": self._pacer.skipped,
             "simulated time": f"{simulation.time:.2f}",
             "faults": simulation.faults,
@@ -409,16 +403,19 @@ class PhysicsNode(EndoNode):
                 return OK, f"in lockstep, {self.steps} steps taken, waiting for a command"
             parts = ", ".join(sorted(f"{name}'s {kind}" for name, kind in waiting[1]))
             return OK, f"in lockstep, waiting for {parts} of the command of {waiting[0] * 1e-9:.6f} s"
-        if self._real_time_factor < _SLOW and self._clock_speed > _FAST:
-            text = f"slower than /clock, which runs at {self._clock_speed:.1f} times real speed; let it run slower, or lower node_count"
+        if self.speed.real_time_factor < _SLOW and self.speed.clock_speed > _FAST:
+            text = (
+                f"slower than /clock, which runs at {self.speed.clock_speed:.1f} times real speed; let it run slower, or lower node_count"
+            )
             return WARN, text
-        if self._real_time_factor < _SLOW:
+        if self.speed.real_time_factor < _SLOW:
             return WARN, "slower than real time; lower node_count or young_modulus, or use a GPU"
         return OK, "running"
 
     def destroy_node(self) -> None:
-        """Build no more tissue, and destroy the node."""
+        """Build no more tissue, publish no more reactions, and destroy the node."""
         self._builder.stop()
+        self._reactions.stop()
         super().destroy_node()
 
 

@@ -121,6 +121,9 @@ class TissueSimulation:
     def set_wrench(self, tool: str, tip: np.ndarray, force: np.ndarray, torque: ArrayLike = (0.0, 0.0, 0.0)) -> bool:
         """The wrench that a tool exerts on the tissue at its tip, until changed; zero lets go.
 
+        Of a wrench that takes tissue beyond its travel as much arrives as the tissue bears, which the steps after the first, which is
+        undone, find within a few percent.
+
         Args:
             tool: Name of the tool.
             tip: Tip position [3], metres, world; what counts is where it is when the tool takes hold.
@@ -335,7 +338,7 @@ class TissueSimulation:
         """Force [3] N and torque [3] N·m that the tissue exerts back on a tool, world: minus what its wrench applies
         (torque about the point held) and the mean over the last step of what its jaw and its capsule gave (about the tip);
         zero for a tool that is out of reach, has let go or is unknown. In a step that is undone it stays for a tool that holds
-        tissue, so that it does not vanish where the tissue can follow no farther."""
+        or pushes tissue, so that it does not vanish where the tissue can follow no farther."""
         if tool not in self._slots:
             return np.zeros(3), np.zeros(3)
         slot, tools = self._slots[tool], self._tools

@@ -48,6 +48,8 @@ class Holds:
     slipping: wp.array[int]  # whether jaws hold by friction, which has a limit
     applied_force: wp.array[wp.vec3d]  # what arrived of the wrench, N and N·m
     applied_torque: wp.array[wp.vec3d]
+    borne: wp.array[wp.float64]  # size of the wrench that the tissue bore last, N
+    unborne: wp.array[wp.float64]  # of one that was too much for it, 0 = none known
     reaction_force: wp.array[wp.vec3d]  # out, N
     reaction_torque: wp.array[wp.vec3d]  # out, N·m: of the wrench about the point held, of jaw and contact about the tip
     slips: wp.array[int]  # times that tissue slipped out of the jaw

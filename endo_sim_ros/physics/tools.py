@@ -56,6 +56,7 @@ class Tools:
         commands.start, commands.end = zeros(wp.vec3d, slots * tools), zeros(wp.vec3d, slots * tools)
         commands.radius, commands.link, commands.links = zeros(float, slots * tools), zeros(int, slots * tools), zeros(int)
         holds.contact, holds.applied_force, holds.applied_torque = (zeros(wp.vec3d) for _ in range(3))
+        holds.borne, holds.unborne = zeros(wp.float64), zeros(wp.float64)
         holds.reaction_force, holds.reaction_torque = zeros(wp.vec3d), zeros(wp.vec3d)
         holds.attached, holds.gripping, holds.slips = (zeros(int) for _ in range(3))
         holds.last_tip, holds.last_R, holds.placed = zeros(wp.vec3d), zeros(wp.mat33d), zeros(int)

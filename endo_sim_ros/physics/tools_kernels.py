@@ -15,6 +15,10 @@ from endo_sim_ros.physics.tool_state_kernels import Commands, Holds, ToolConstan
 wp.set_module_options({"enable_backward": False, **OPTIONS})
 
 SLIP = 0.9  # of the travel; tissue pulled farther slips out of the jaw
+# What tissue bears of a wrench that is too much for it is found by trial:
+FAR = 4.0  # times less is tried next where nothing is known to be borne; then the geometric mean of the least unborne and the most borne
+RETREAT = 0.95  # of what was borne is still taken for that after a step that was undone
+PROBE = 1.01  # times more is taken for unborne after each step that went well
 
 
 @wp.func
@@ -90,6 +94,8 @@ def take_hold(
             if thread == 0:
                 if attach and total > zero:
                     holds.attached[c] = 1
+                    holds.borne[c] = zero
+                    holds.unborne[c] = zero
                     holds.contact[c] = commands.grasp_point[c] - centre / total
                 if grip and gripped > zero:
                     holds.gripping[c] = 1
@@ -100,6 +106,35 @@ def take_hold(
                 holds.attached[c] = 0
             if not close:
                 holds.gripping[c] = 0
+
+
+@wp.func
+def size_of(force: wp.vec3d, torque: wp.vec3d, constants: ToolConstants) -> wp.float64:
+    """Size of a wrench, N: its force, and its torque as forces at the reach of the tool."""
+    return wp.length(force) + wp.length(torque) / constants.radius
+
+
+@wp.func
+def bearable_share(c: int, commands: Commands, holds: Holds, constants: ToolConstants) -> wp.float64:
+    """The share of the wrench of tool c that the tissue can bear within its travel, as far as is known; 1 until it was too much."""
+    bad = holds.unborne[c]
+    share = wp.float64(1.0)
+    if bad > wp.float64(0.0):
+        good = wp.max(holds.borne[c], bad / wp.float64(FAR * FAR))
+        share = wp.min(share, wp.sqrt(good * bad) / size_of(commands.force[c], commands.torque[c], constants))
+    return share
+
+
+@wp.func
+def learn_what_is_borne(c: int, undone: bool, holds: Holds, constants: ToolConstants):
+    """Note whether the tissue bore what arrived of the wrench of tool c."""
+    size = size_of(holds.applied_force[c], holds.applied_torque[c], constants)
+    if undone:
+        holds.unborne[c] = size
+        holds.borne[c] = wp.float64(RETREAT) * holds.borne[c]  # it bore that for one step, and maybe not for two
+    else:
+        holds.unborne[c] = wp.float64(PROBE) * holds.unborne[c]  # moved elsewhere it may bear more
+        holds.borne[c] = size
 
 
 @wp.func
@@ -141,10 +176,11 @@ def apply_wrench(
     xx, yy, zz = block_sum(xx), block_sum(yy), block_sum(zz)
     xy, xz, yz = block_sum(xy), block_sum(xz), block_sum(yz)
     J = wp.mat33d(yy + zz, -xy, -xz, -xy, xx + zz, -yz, -xz, -yz, xx + yy)
-    F = commands.force[c]
+    share = bearable_share(c, commands, holds, constants)
+    F = share * commands.force[c]
     lever = -holds.contact[c]  # of the centroid about the point held
     floor = wp.max(xx + yy + zz + wp.length_sq(lever), wp.float64(1.0e-30))
-    beta = solve_on_range(J, commands.torque[c] - wp.cross(lever, F), floor)
+    beta = solve_on_range(J, share * commands.torque[c] - wp.cross(lever, F), floor)
     torque = wp.cross(lever, F) + J * beta
     for s in range(thread, touchable, threads):
         w = wp.float64(holds.weight[c * touchable + s]) / total
@@ -305,7 +341,7 @@ def measure_reactions(
     faults: wp.array[int],
 ):
     """What the tissue exerts back on each tool: minus its wrench, and minus the mean of what jaw and contact gave; of a tool that holds
-    tissue in a step that was undone, what it was before."""
+    or pushes tissue in a step that was undone, what it was before."""
     b, thread = wp.tid()
     count = nodes.X.shape[0]
     for t in range(tools):
@@ -319,11 +355,14 @@ def measure_reactions(
                     moment += double(rigid.moment[c * count + p]) / constants.duration
             force, moment = block_sum3(force), block_sum3(moment)
         undone = bad_nodes[b] > 0  # and all that tools did in it
-        # A tool that still holds tissue feels what it felt last: tissue at its limit does not vanish.
-        kept = undone and (holds.attached[c] != 0 or holds.gripping[c] != 0) and is_finite(c, commands, constants)
+        # A tool that still holds or pushes tissue feels what it felt last: tissue at its limit does not vanish.
+        touches = holds.attached[c] != 0 or holds.gripping[c] != 0 or wp.length_sq(force) > wp.float64(0.0)
+        kept = undone and touches and is_finite(c, commands, constants)
         felt = wp.length_sq(force) > wp.float64(0.0) and not undone
         measure_links(b, c, thread, threads, felt, kept, commands, holds, constants, nodes, state, rigid)
         if thread == 0:
+            if holds.attached[c] != 0 and is_finite(c, commands, constants):
+                learn_what_is_borne(c, undone, holds, constants)
             torque = moment - wp.cross(commands.tip[c] - constants.origin, force)
             force += holds.applied_force[c]
             torque += holds.applied_torque[c]

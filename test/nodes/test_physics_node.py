@@ -315,16 +315,16 @@ def test_physics_takes_the_steps_of_a_clock_that_leaps(bench, physics):
         bench.publish(messages.CLOCK, messages.encode_clock(tenth * S // 10))
         bench.until(lambda: physics.now_ns() == tenth * S // 10, "the time")
         bench.spin(0.02)
-    assert physics._real_time_factor > 0.7
+    assert physics.speed.real_time_factor > 0.7
 
 
 def test_a_clock_that_is_too_fast_is_blamed_for_missed_steps(bench, physics, monkeypatch):
     send_model(bench)
     bench.until(lambda: physics.simulation is not None, "tissue")
-    monkeypatch.setattr(physics, "_measure", lambda *_: None)
-    physics._real_time_factor, physics._clock_speed = 0.3, 10.0
+    monkeypatch.setattr(physics.speed, "note", lambda *_: None)
+    physics.speed.real_time_factor, physics.speed.clock_speed = 0.3, 10.0
     bench.status("physics_node", "slower than /clock, which runs at 10.0 times real speed; let it run slower", WARN)
-    physics._clock_speed = 1.0
+    physics.speed.clock_speed = 1.0
     bench.status("physics_node", "slower than real time; lower node_count", WARN)
 
 

@@ -44,6 +44,56 @@ def test_the_reaction_of_tissue_that_can_follow_no_farther_stays():
     assert not simulation.reaction("probe")[0].any()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("young_modulus", [2e3, 1e4, 5e4])
+def test_the_reaction_to_ever_larger_forces_saturates_whether_they_come_at_once_or_grow(young_modulus):
+    simulation, towards = simulate(young_modulus=young_modulus), np.array([0.0, 0.0, 1.0])
+    bearable = 8e-4 * young_modulus  # N, a little more than this tissue bears
+
+    def push(forces: np.ndarray) -> np.ndarray:
+        simulation.reset()
+        felt = []
+        for force in forces:
+            simulation.set_wrench("probe", TIP, force * towards)
+            simulation.step()
+            felt.append(simulation.reaction("probe")[0])
+        np.testing.assert_array_equal(np.array(felt)[:, :2], 0.0)
+        return -np.array(felt) @ towards
+
+    most = push(np.minimum(np.linspace(0.0, 2.0, 80), 1.5) * bearable)[-20:].mean()
+    assert most > 0.6 * bearable and depth_of_dent(simulation) > 0.9 * simulation.config.travel
+    for times in (1.2, 1.6, 3.0, 10.0, 1e6):
+        felt = push(np.full(60, times * bearable))
+        assert (felt >= 0).all() and (felt[15:] > 0.9 * most).all() and felt.max() < 1.1 * most
+        assert depth_of_dent(simulation) > 0.9 * simulation.config.travel
+        within = 0.5 * most  # less than it bears: at once all of it arrives
+        simulation.set_wrench("probe", TIP, within * towards)
+        simulation.step()
+        assert simulation.reaction("probe")[0][2] == pytest.approx(-within, rel=1e-12)
+
+
+def test_a_wrench_of_force_and_torque_is_borne_in_proportion():
+    simulation = simulate()
+    for _ in range(30):
+        simulation.set_wrench("probe", TIP, [0.0, 0.0, 30.0], [0.0, 0.0, 0.06])
+        simulation.step()
+    force, torque = simulation.reaction("probe")
+    assert -10.0 < force[2] < -4.0
+    np.testing.assert_allclose(torque, 0.002 * force, atol=1e-12)
+
+
+def test_a_capsule_that_pushes_feels_the_tissue_in_steps_that_are_undone():
+    simulation, felt = simulate(contact_radius=0.02), []
+    for k in range(44):
+        simulation.set_grasp("ball", pose_at(TIP + [0, 0, 0.0015 * k - 0.03]), False)
+        before = simulation.faults
+        simulation.step()
+        felt.append(simulation.reaction("ball")[0][2])
+        if simulation.faults > before:
+            assert felt[-1] == felt[-2] < -10.0
+    assert simulation.faults > 0
+
+
 def test_an_absurd_torque_is_said_to_be_one():
     simulation = simulate()
     simulation.set_wrench("probe", TIP, [0.0, 0.0, 0.1], [0.0, 1e6, 0.0])

@@ -45,7 +45,7 @@ test-minimum:
 	.venv-minimum/bin/python -m pytest -n 2 --dist worksteal -q -m "$(FAST)"
 
 api: setup
-	$(VENV)/bin/pdoc --docformat google --output-directory $(OUT)/api endo_sim_ros '!endo_sim_ros.learning.ppo'  # which needs stable-baselines3
+	$(VENV)/bin/pdoc --no-show-source --docformat google --output-directory $(OUT)/api endo_sim_ros '!endo_sim_ros.learning.ppo'  # which needs stable-baselines3
 
 setup: links
 

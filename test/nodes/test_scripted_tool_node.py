@@ -15,10 +15,18 @@ def test_scripted_tool_waits_then_pulls_and_lets_go(bench, physics, rendering):
     bench.status("scripted_tool", "waiting for the rendered depth", WARN)
     assert bench.set("scripted_tool", pull=0.5, swing=0.5, release=0.2, force=1.0)[0]
     assert not bench.set("scripted_tool", arm="PSM2")[0]
+    assert bench.set("physics_node", node_count=2000)[0]
     send_model(bench)
     send_camera(bench)
     await_nodes(bench, 5 * S)
-    bench.until(lambda: moved(bench) > 1e-3, "the tool to move tissue")
+    bench.until(lambda: moved(bench) > 1e-3, "the tool to touch tissue")
+    simulation, arm = physics.simulation, physics.arms["PSM1"]
+    bench.until(lambda: tool.status()[2]["state"] == "swinging", "the tool to pull")
+    hold = simulation.held("PSM1").mean(0)
+    jaws = np.mean([pose[:3, 3] for link, pose in arm.links().items() if link.startswith("jaw")], 0)
+    ahead = arm.pose[:3, 2]  # from the hinge to the points of the jaws
+    assert 0.004 < (hold - jaws) @ ahead < 0.016  # what it holds lies between the jaws, not at their hinge
+    assert 0.3 < np.linalg.norm(simulation.reaction("PSM1")[0]) < 2.0
     bench.status("scripted_tool", "finished", OK)
-    assert np.linalg.norm(tool.tip - [0, 0, 0.1]) < 0.01
+    assert np.linalg.norm(tool.grasped - [0, 0, 0.1]) < 0.01
     bench.until(lambda: moved(bench) < 1e-4, "the tissue to be released")

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from ros_bench import S, await_nodes, moved, send_camera, send_model
+import rclpy
+from ros_bench import SMALL, S, await_nodes, moved, send_camera, send_model
 
 from endo_sim_ros.messages import OK, WARN
 from endo_sim_ros.nodes.scripted_tool_node import ScriptedToolNode
@@ -10,12 +11,21 @@ from endo_sim_ros.nodes.scripted_tool_node import ScriptedToolNode
 pytestmark = pytest.mark.dds
 
 
+@pytest.fixture(scope="module")
+def ros():
+    """An instrument whose links touch."""
+    nodes = {**SMALL, "physics_node": SMALL["physics_node"] | {"node_count": 2000, "link_contact": "true"}}
+    given = [(node, *each) for node, values in nodes.items() for each in values.items()]
+    rclpy.init(args=["--ros-args", *(word for node, name, value in given for word in ("-p", f"{node}:{name}:={value}"))])
+    yield
+    rclpy.try_shutdown()
+
+
 def test_scripted_tool_waits_then_pulls_and_lets_go(bench, physics, rendering):
     tool = bench.add(ScriptedToolNode)
     bench.status("scripted_tool", "waiting for the rendered depth", WARN)
     assert bench.set("scripted_tool", pull=0.5, swing=0.5, release=0.2, force=1.0)[0]
     assert not bench.set("scripted_tool", arm="PSM2")[0]
-    assert bench.set("physics_node", node_count=2000)[0]
     send_model(bench)
     send_camera(bench)
     await_nodes(bench, 5 * S)

@@ -13,8 +13,16 @@ import numpy as np
 from endo_sim_ros.core.cameras import invert_pose, matrix_to_quat, parse_frames
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.instruments import (
-    ArmKinematics, Capsule, Part, build_instrument, link_poses, load_arm, place_arm, solve_inverse, working_point,
-)  # fmt: skip
+    ArmKinematics,
+    Capsule,
+    Part,
+    build_instrument,
+    link_poses,
+    load_arm,
+    place_arm,
+    solve_inverse,
+    working_point,
+)
 from endo_sim_ros.instruments.shapes import SHAPES
 from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.learning.tasks import Task

@@ -33,7 +33,7 @@ def _parameters(mode: str, rate: float, device: str) -> dict[str, dict[str, Any]
     """What the nodes under test are started with."""
     common = {"mode": mode, "device": device}
     step = {"step_duration": 1 / rate}  # as many steps per second as images
-    return {"physics_node": {**common, **step, "arms": [ARM]}, "rendering_node": {**common, "rate": rate}}
+    return {"physics_node": {**common, **step, "arms": [ARM], "link_contact": False}, "rendering_node": {**common, "rate": rate}}
 
 
 @contextmanager

@@ -39,7 +39,8 @@ def _parameters(mode: str, rate: float, device: str, shown: str = "tissue alone"
     """What the nodes under test are started with; what is shown is a key of `_SHOWN`."""
     common = {"mode": mode, "device": device}
     step = {"step_duration": 1 / rate}  # as many steps per second as images
-    return {"physics_node": {**common, **step, "arms": [ARM]}, "rendering_node": {**common, "rate": rate, **_SHOWN[shown]}}
+    physics = {**common, **step, "arms": [ARM], "link_contact": False}
+    return {"physics_node": physics, "rendering_node": {**common, "rate": rate, **_SHOWN[shown]}}
 
 
 @contextmanager

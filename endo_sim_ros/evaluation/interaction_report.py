@@ -12,6 +12,8 @@ from endo_sim_ros.core import drawing
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.evaluation import metrics
+from endo_sim_ros.instruments import load_arm, working_point
+from endo_sim_ros.instruments.urdf_reader import load_shape
 from endo_sim_ros.sequences.bag import BagReader
 
 _ARROW_PIXELS = 0.3  # length of the largest force's arrow, in image widths
@@ -20,7 +22,7 @@ _MOMENTS = (0.33, 0.6, 0.9)  # of the time in which the tool acts
 
 
 class TouchReport:
-    """What a recorded run shows: rendered images with the tool's force at that time.
+    """What a recorded run shows: rendered images with the force on the tissue at that time, where the tool works.
 
     Args:
         recording: Bag with the recording, rendered and tool topics.
@@ -31,19 +33,25 @@ class TouchReport:
     """
 
     def __init__(self, recording: Path, arm: str):
-        tip, wrench = messages.tool_pose(arm), messages.tool_wrench(arm)
-        wanted = (messages.LEFT_IMAGE, messages.CAMERA_POSE, messages.MASK, *_RENDERED, tip, wrench)
+        tip, reaction, kind = messages.tool_pose(arm), messages.tool_reaction(arm), messages.tool_type(arm)
+        wanted = (messages.LEFT_IMAGE, messages.CAMERA_POSE, messages.MASK, *_RENDERED, tip, reaction, kind)
         self._inputs: dict[float, dict[str, np.ndarray]] = {}  # image, pose and mask of the recording by time
         self._rendered: dict[float, dict[str, np.ndarray]] = {}  # image, pose, K and depth by time
-        tips, forces = [], []  # (time, vector), world
+        poses: list[tuple[float, np.ndarray]] = []  # (time, [4, 4] of the tip in the world)
+        felt: list[tuple[float, np.ndarray]] = []  # (time, [3] N on the tool, in the axes of the tip)
+        point = np.zeros(3)  # what the tool works with, m, frame of the tip
         with BagReader(recording) as bag:
             for topic, _, message in bag.messages(wanted):
+                if topic == kind:
+                    name = messages.decode_text(message)
+                    point = working_point(load_arm("PSM", name.partition("@")[0]), load_shape(name)[1])
+                    continue
                 # Times are those of the headers: the recorder may have been late.
                 time = messages.stamp_to_ns(message.header.stamp) * 1e-9
                 if topic == tip:
-                    tips.append((time, messages.decode_pose(message, "world", topic.name)[:3, 3]))
-                elif topic == wrench:
-                    forces.append((time, messages.decode_wrench(message, topic.name)[0]))
+                    poses.append((time, messages.decode_pose(message, "world", topic.name)))
+                elif topic == reaction:
+                    felt.append((time, messages.decode_wrench(message, topic.name)[0]))
                 elif topic in _RENDERED:
                     name = messages.RENDERED_IMAGE.name if topic == messages.RENDERED_COMPRESSED else topic.name
                     self._rendered.setdefault(time, {})[name] = _decode(topic, message)
@@ -51,16 +59,18 @@ class TouchReport:
                     self._inputs.setdefault(time, {})[topic.name] = _decode(topic, message)
         names = [topic.name for topic in messages.RENDERED_TOPICS]
         self._times = [time for time in sorted(self._rendered) if all(name in self._rendered[time] for name in names)]
-        began = forces[0][0] if forces else np.inf
+        began = poses[0][0] if poses and felt else np.inf
         before = [time for time in self._times if time < began]
         self._times = [time for time in self._times if time >= began]
-        if not self._times or not before or not tips:
+        if not self._times or not before:
             raise SequenceError(f"{recording}: no images were rendered before and while the tool {arm} acted")
         self._rest = before[-1]
-        self._tips, self._forces = _Track(tips), _Track(forces)
+        track = _Track(poses)
+        self._tips = _Track([(time, pose[:3, :3] @ point + pose[:3, 3]) for time, pose in poses])
+        self._forces = _Track([(time, -track.at(time)[:3, :3] @ force) for time, force in felt])
         camera = self._camera(self._times[0])
         distance = float(camera.project(self._tips.at(self._times[0])[None])[1][0])
-        largest = max(np.linalg.norm(force) for _, force in forces)
+        largest = max(np.linalg.norm(force) for _, force in felt)
         # The largest force is drawn as long as a fixed share of the picture.
         self._scale = _ARROW_PIXELS * camera.width * distance / camera.K[0, 0] / max(largest, 1e-9)
 
@@ -94,7 +104,7 @@ class TouchReport:
         mask = nearest.get(messages.MASK.name)
         mask = None if mask is None else cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)
         quality = metrics.psnr(image, reference, mask)
-        acting = [time for time in self._times if self._forces.at(time).any()]
+        acting = [time for time in self._times if self._forces.at(time).any()] or self._times
         first, last = acting[0], acting[-1]
         moments = [self._newest(first + share * (last - first)) for share in _MOMENTS]
         near, far = np.percentile(depth[depth > 0], [1, 99])

@@ -1,5 +1,6 @@
 """Arms of the da Vinci and their instruments: parameter files, kinematics, shapes, pictures, and where they stand in a scene."""
 
+from endo_sim_ros.instruments.aiming import GRIP as GRIP, aimed_pose as aimed_pose, working_point as working_point
 from endo_sim_ros.instruments.arm_files import (
     arm_names as arm_names,
     load_arm as load_arm,

@@ -22,7 +22,7 @@ BACKGROUND, TISSUE, FIRST_LINK = 0, 1, 2
 """Labels of pixels; links of the instruments follow in their order."""
 
 SURFACES = {
-    Material.STEEL: (0.01, 0.01, 0.011, 0.36, 0.5),
+    Material.STEEL: (0.02, 0.02, 0.021, 0.52, 0.58),
     Material.SHAFT: (0.002, 0.002, 0.0023, 0.55, 0.03),
     Material.INSULATION: (0.04, 0.036, 0.029, 0.6, 0.03),
 }

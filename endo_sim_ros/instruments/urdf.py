@@ -46,6 +46,29 @@ def robot_description(
     return ElementTree.tostring(robot, encoding="unicode")
 
 
+def find_base(description: str, arm: str) -> np.ndarray | None:
+    """Pose [4, 4] of the base of an arm in the world, m, from what `robot_description` gave; None if the arm is not in it.
+
+    Args:
+        description: The URDF.
+        arm: Name of the arm.
+
+    Raises:
+        ConfigError: If it is no URDF.
+    """
+    try:
+        robot = ElementTree.fromstring(description)
+        origin = robot.find(f"joint[@name='{arm.replace('/', '_')}_base']/origin")
+        if origin is None:
+            return None
+        base = np.eye(4)
+        base[:3, 3] = [float(number) for number in origin.get("xyz", "0 0 0").split()]
+        base[:3, :3] = Rotation.from_euler("xyz", [float(number) for number in origin.get("rpy", "0 0 0").split()]).as_matrix()
+    except (ElementTree.ParseError, ValueError) as error:
+        raise ConfigError(f"the robot description cannot be read: {error}") from error
+    return base
+
+
 def _add_arm(
     robot: ElementTree.Element, world: str, arm: str, kinematics: ArmKinematics, base: np.ndarray, capsules: Sequence[Capsule]
 ) -> None:

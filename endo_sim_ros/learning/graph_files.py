@@ -46,7 +46,14 @@ def save_scene(scene: Scene, folder: Path, task: str, seed: int = 0, sight: Sigh
         arm = {"instruments": [str(tool)], "frames": [held.frame]}
     parameters = {
         "reconstruction_node": {"mode": "lockstep", "model_file": str(folder.resolve() / "model.ply")},
-        "physics_node": {"mode": "lockstep", "arm_source": "commanded", "lockstep_inputs": ["pose", "jaw"], **arm, **changed},
+        "physics_node": {
+            "mode": "lockstep",
+            "arm_source": "commanded",
+            "lockstep_inputs": ["pose", "jaw"],
+            "link_contact": False,
+            **arm,
+            **changed,
+        },
         "rendering_node": {"mode": "lockstep", "image_width": sight.image_width, "baseline": sight.baseline},
         "policy": {"task": task, "scene": str(folder.resolve()), "seed": seed},
     }

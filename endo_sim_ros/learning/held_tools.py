@@ -12,7 +12,17 @@ import numpy as np
 
 from endo_sim_ros.core.cameras import invert_pose, matrix_to_quat, parse_frames
 from endo_sim_ros.core.config import ConfigError
-from endo_sim_ros.instruments import ArmKinematics, Capsule, Part, build_instrument, link_poses, load_arm, place_arm, solve_inverse
+from endo_sim_ros.instruments import (
+    ArmKinematics,
+    Capsule,
+    Part,
+    build_instrument,
+    link_poses,
+    load_arm,
+    place_arm,
+    solve_inverse,
+    working_point,
+)
 from endo_sim_ros.instruments.shapes import SHAPES
 from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.learning.tasks import Task
@@ -82,7 +92,7 @@ def hold_tool(task: type[Task], scene: Scene, tool: str = "") -> HeldTool:
         raise ConfigError(f"{error}; or leave out the tool (instrument off)") from error
     base = parse_frames(_WORLD, [_frame(placed.base)])[f"{ARM}_base"]  # with the bits that physics_node has
     # The tip moves from the hinge to where the jaws work: in the axes of the hinge, and then in those of the world.
-    point = (invert_pose(arm.tooltip_offset) @ np.append(task.tool_share * capsules[-1].end, 1.0))[:3]
+    point = working_point(arm, capsules, task.tool_share)
     hinge = (base @ arm.tip_pose(placed.joints))[:3, :3]
     # A ball that pushes has no picture: the tool touches where the ball meets what lies ahead of it.
     ahead = task.physics().contact_radius * camera.pose[:3, 2]

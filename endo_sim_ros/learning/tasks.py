@@ -19,6 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from endo_sim_ros.instruments import GRIP
 from endo_sim_ros.physics import ControlNodes, PhysicsConfig
 from endo_sim_ros.physics.regions import inside_sphere
 
@@ -240,7 +241,7 @@ class Retraction(Task):
     )  # fmt: skip
     horizon, force_limit = 60, 3.0
     working_fourth = 1.0
-    tool, tool_share = "PROGRASP_FORCEPS", 0.85  # what it grasps lies between its jaws, not at their points
+    tool, tool_share = "PROGRASP_FORCEPS", GRIP  # what it grasps lies between its jaws, not at their points
     low, high = (-0.02, -0.02, -0.004), (0.02, 0.02, 0.025)
     lift, hold = 0.006, 3  # m, steps
     grasp_radius = 0.008  # m; the jaw holds control nodes within it

@@ -87,7 +87,7 @@ class PolicyState(NodeState):
 class ScriptedToolState(NodeState):
     """States of the scripted tool."""
 
-    WAITING = "waiting"  # for rendered depth, control nodes, tissue in the image, or subscribers of the wrench
+    WAITING = "waiting"  # for rendered depth, control nodes, tissue in the image, or subscribers of the jaw
     PULLING = "pulling"
     SWINGING = "swinging"
     RELEASED = "released"

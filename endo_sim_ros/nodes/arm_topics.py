@@ -161,13 +161,13 @@ class ArmTopics:
         self._node.report_error(text)
 
     def _deliver_part(self, arm: Arm, kind: str, message: Any, topic: str, act: Callable[[], None]) -> None:
-        """Let a part of a command act on an arm when it is time; on the camera's, which has no part in the tissue, now."""
+        """Let a part of a command act on an arm when it is time; in lockstep on the camera's, which is no part of a command, now."""
 
         def telling() -> None:
             with self._telling(arm, topic):
                 act()
 
-        if arm is self._camera:
+        if arm is self._camera and self.options.mode == "lockstep":
             telling()
         else:
             self._deliver(arm.name, kind, message, topic, telling)

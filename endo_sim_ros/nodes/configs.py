@@ -105,10 +105,10 @@ class PhysicsNodeConfig(WorldConfig):
     arm_models: tuple[str, ...] = ("PSM",)
     """Kind of each arm in the order of arms, or one for all: PSM, PSM_Si, or the path of a kinematic file of the dVRK. PSM for all
     makes the ECM an ECM."""
-    link_contact: bool = False
+    link_contact: bool = True
     """Let the links of instruments touch the tissue: shaft, wrist and jaws push, and closed jaws hold what lies between them, by friction.
-    The tip of an instrument is then where its jaws begin. Off: tips act alone, as viewer_node, scripted_tool and policies expect, which
-    put the tip on the tissue: its jaws would be 1 to 2 cm deep in it."""
+    Off, and for arms without an instrument or a place: the tip alone acts, with contact_radius as a rod; the tip of an instrument is
+    the hinge of its jaws, so that a closed jaw holds what is within force_radius of that."""
     move_speed: Annotated[float, Range(1e-4, 10, "m/s")] = 0.05
     """Speed of a tool tip that moves to the goal of move_cp."""
     turn_speed: Annotated[float, Range(1e-2, 100, "rad/s")] = 1.5
@@ -130,7 +130,7 @@ class PhysicsNodeConfig(WorldConfig):
     command_timeout: Annotated[float, Range(0, 3600, "s")] = 0.5
     """A wrench that is not repeated for this long is dropped; 0 = held until changed."""
     jaw_closed: Annotated[float, Range(-3.2, 3.2, "rad")] = 0.1
-    """A jaw at or below this angle grasps the tissue at its tip."""
+    """A jaw at or below this angle grasps the tissue between its jaws, that of an arm without links the tissue at its tip."""
     jaw_open: Annotated[float, Range(-3.2, 3.2, "rad")] = 0.2
     """A jaw at or above this angle releases; between the two angles nothing changes."""
 
@@ -212,19 +212,19 @@ class ScriptedToolConfig(StageConfig):
     world_frame: str = "world"
     """Frame of the tool's pose."""
     force: Annotated[float, Range(0, 100, "N")] = 2.0
-    """Largest force."""
+    """Force to which it pulls, if that takes less than 2 cm."""
     u: Annotated[float, Range(0, 1)] = 0.5
     """Column of the pixel at which the tool grasps, as a fraction of the image width."""
     v: Annotated[float, Range(0, 1)] = 0.5
     """Row of the pixel at which the tool grasps, as a fraction of the image height."""
     listeners: Annotated[int, Range(0, 100)] = 1
-    """Subscribers of the wrench to wait for before the first command."""
+    """Subscribers of the jaw to wait for before the first command."""
     rate: Annotated[float, Range(1, 1000, "Hz")] = 50.0
     """Commands per second."""
     pull: Annotated[float, Range(0, 600, "s")] = 2.0
-    """Time in which the force grows, obliquely towards the camera."""
+    """Time in which it pulls farther and farther, obliquely towards the camera."""
     swing: Annotated[float, Range(0, 600, "s")] = 4.0
-    """Time in which the force circles around the direction to the camera."""
+    """Time in which the pull circles around the direction to the camera."""
     release: Annotated[float, Range(0, 600, "s")] = 2.5
     """Time after the release until the tool is finished."""
 

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from endo_sim_ros.core.cameras import invert_pose
 from endo_sim_ros.instruments import ArmKinematics, Capsule, ReachConfig, link_poses, solve_inverse
 from endo_sim_ros.nodes.arm import DISABLED, Arm, seconds_between
+from endo_sim_ros.physics import ControlNodes
 
 _ROUNDED = 1 + 1e-9  # a way that takes a whole number of steps must not take one more
 _WITHIN = 1e-6  # rad, m: how far a command may leave the limits, as what is sent back was rounded
@@ -19,6 +20,7 @@ _TRIES = 4  # to find how far the tip gets in a step; one or two are enough wher
 _JOINTS_OF_LINK = {"roll": 4, "wrist_pitch": 5}  # joints that move it: the first ones; all others move with all joints
 _CAMERA_REACH = ReachConfig(radian_length=1e-4)  # the direction of an endoscope follows from its place
 _CAMERA_THERE = 1e-4  # m: nearer is at the pose
+_ENDOSCOPE = 6e-3  # m: radius of a 12 mm endoscope
 _MEASURED_WRONG, _MEASURED_TURNED = 1e-3, np.radians(1.0)  # m, rad: less is what calibrations are off
 
 
@@ -83,6 +85,11 @@ class JointedArm(Arm):
         self.pose_goal = self.joint_goal = None
 
     # ---------------------------------------------------------------- commands
+
+    @property
+    def astray(self) -> bool:
+        """Whether a robot measures a pose beyond any reach: its unit or the base is wrong, and nobody knows where it is."""
+        return self.pose is not None and bool(self._astray(self.pose))
 
     def _astray(self, pose: np.ndarray) -> str:
         """Why a pose is beyond any reach, by more than the whole length of the arm, in a sentence; empty if it is not."""
@@ -330,6 +337,13 @@ class CameraArm(JointedArm):
         down, was = (self.kinematics.tip_pose(at)[:3, 1] for at in (positions, self.start))
         self._require_upright(down, was)
         return positions
+
+    def in_tissue(self, nodes: ControlNodes) -> str:
+        """That the camera is in the tissue at rest or touches it, in a sentence, as nothing stops it; empty if it is not."""
+        near = max(_ENDOSCOPE, nodes.spacing)  # inside the tissue no place is farther from a control node
+        if self.pose is None or np.linalg.norm(nodes.rest - self.pose[:3, 3], axis=1).min() >= near:
+            return ""
+        return f"{self.name} is in the tissue or within {1e3 * near:.0f} mm of it; nothing stops it there, so draw the endoscope back"
 
     def _aim(self, pose: np.ndarray) -> np.ndarray:
         """Joints [n] that put the camera at a pose."""

@@ -1,7 +1,7 @@
 """Gaussian model and tool wrenches in, control nodes and reactions out."""
 
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from endo_sim_ros.nodes.arm_setup import CAMERA_ARM, make_arms, place_arms
 from endo_sim_ros.nodes.arm_topics import ArmTopics
 from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode, run, sentence
 from endo_sim_ros.nodes.configs import COMMAND_PARTS, PhysicsNodeConfig
-from endo_sim_ros.nodes.jointed_arm import JointedArm
+from endo_sim_ros.nodes.jointed_arm import CameraArm, JointedArm
 from endo_sim_ros.nodes.pacing import MOST_WAITING, WINDOW, CommandQueue, Pacer, SpeedMeter
 from endo_sim_ros.nodes.reactions import ReactionTopics
 from endo_sim_ros.nodes.tissue_builder import TissueBuilder
@@ -55,6 +55,7 @@ class PhysicsNode(EndoNode):
         self._lockstep = self._options.mode == "lockstep"
         self._commands = CommandQueue(frozenset((n, kind) for n in self._tools for kind in self._options.lockstep_inputs))
         self._placing = CommandQueue(self._commands.needed)  # lockstep: what puts the arms where an episode begins
+        self._held: dict[tuple[str, str], tuple[str, Callable[[], None]]] = {}  # newest parts of commands that came during a pause
         self._at_rest = False  # whether no step was taken of the simulation
         # In real time only the newest command counts, and none may queue; in lockstep none may be lost.
         depth = MOST_WAITING if self._lockstep else 1
@@ -160,6 +161,9 @@ class PhysicsNode(EndoNode):
             (self._placing if placing else self._commands).put(stamp, (name, kind), (topic, act))
             self._run_commands()
             return
+        if self._paused:
+            self._held[name, kind] = topic, act
+            return
         act()
         if kind == "wrench" and not self._lockstep:
             self._pacer.note_input(self._seconds(), name)
@@ -174,18 +178,23 @@ class PhysicsNode(EndoNode):
 
         while self.simulation is not None and (command := self._placing.take(give_up) or self._commands.take(give_up)):
             stamp, parts = command
-            for part in sorted(parts, key=lambda part: (COMMAND_PARTS.index(part[1]), part[0])):  # poses before what needs them
-                topic, act = parts[part]
-                with self.guard(topic):
-                    act()
+            self._run_parts(parts)
             placing = self._at_rest and stamp == self._simulated_stamp
             if not placing:
                 self.step(self.simulation)
             self._publish(self.simulation, stamp, at_rest=placing)
 
+    def _run_parts(self, parts: Mapping[tuple[str, str], tuple[str, Callable[[], None]]]) -> None:
+        """Let parts of commands act."""
+        for part in sorted(parts, key=lambda part: (COMMAND_PARTS.index(part[1]), part[0])):  # poses before what needs them
+            topic, act = parts[part]
+            with self.guard(topic):
+                act()
+
     def _apply_tools(self, simulation: TissueSimulation) -> None:
         for name, arm in self._tools.items():
-            if arm.pose is None or not arm.acts or arm.state == DISABLED:
+            astray = isinstance(arm, JointedArm) and bool(arm.capsules) and arm.astray
+            if arm.pose is None or not arm.acts or arm.state == DISABLED or astray:
                 simulation.withdraw(name)
                 continue
             where = f"at {np.round(arm.pose[:3, 3], 4).tolist()}"
@@ -260,9 +269,14 @@ class PhysicsNode(EndoNode):
     def step(self, simulation: TissueSimulation) -> None:
         """Take one step with what the arms command, and publish it."""
         start, faults, slips = time.monotonic(), simulation.faults, simulation.slips
+        held, self._held = self._held, {}
+        self._run_parts(held)
         for arm in self.arms.values():
             turning = arm.angle_goal is not None
-            self._arm_topics.warn(arm, arm.move(simulation.step_duration, self._options.move_speed, self._options.turn_speed))
+            missing = arm.move(simulation.step_duration, self._options.move_speed, self._options.turn_speed)
+            if isinstance(arm, CameraArm):
+                missing = missing or arm.in_tissue(simulation.nodes)
+            self._arm_topics.warn(arm, missing)
             if turning:  # else a jaw that tissue slipped out of would close again
                 arm.hold(self._options.jaw_closed, self._options.jaw_open)
         self._apply_tools(simulation)
@@ -322,6 +336,7 @@ class PhysicsNode(EndoNode):
         self.simulation.reset()
         self._commands.clear()
         self._placing.clear()
+        self._held.clear()
         self._start_timing()
         for arm in self.arms.values():
             arm.reset()

@@ -41,17 +41,20 @@ class ShownInstruments:
         """Take the tool of an arm.
 
         Raises:
-            MessageError: If it cannot be loaded; the arm is not drawn then, and `undrawn` says so.
+            MessageError: If it cannot be loaded. The arm is drawn with the tool that it had; without one it is not drawn, and `undrawn`
+                says so.
         """
         name = messages.decode_text(message)
-        self._types[arm] = name
-        self._tools.pop(arm, None)
-        self.undrawn.pop(arm, None)
         try:
-            self._tools[arm] = load_shape(name)
+            tool = load_shape(name)
         except (ConfigError, OSError) as error:
-            self.undrawn[arm] = f"{messages.tool_type(arm).name}: {error}; {arm} is not drawn"
+            text = f"{messages.tool_type(arm).name}: {error}; {arm} is "
+            if arm in self._tools:
+                raise MessageError(f"{text}drawn as before") from error
+            self._types[arm], self.undrawn[arm] = name, f"{text}not drawn"
             raise MessageError(self.undrawn[arm]) from error
+        self._types[arm], self._tools[arm] = name, tool
+        self.undrawn.pop(arm, None)
 
     def receive_links(self, arm: str, message: Any, world_frame: str) -> bool:
         """Take where the links of an arm are; returns whether they have moved.

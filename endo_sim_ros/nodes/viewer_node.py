@@ -1,6 +1,7 @@
 """The tissue in a browser: what the graph publishes is shown, and the mouse is one more tool."""
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -14,6 +15,7 @@ from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.instruments.config import DrawingConfig
 from endo_sim_ros.messages import OK, STATE, WARN, ControlNodeCloud, PhysicsState, ViewerState
+from endo_sim_ros.nodes.aimed_tool import AHEAD, CLOSED, OPEN, AimedTool
 from endo_sim_ros.nodes.base import run
 from endo_sim_ros.nodes.configs import ViewerNodeConfig, arm_names
 from endo_sim_ros.nodes.model_tracker import ModelTracker
@@ -28,7 +30,6 @@ _GONE = 1.0  # s after which a tool that says nothing is not shown any more
 _SILENT = 5.0  # s after which a node that says nothing is reported
 _STALE = 1.5  # s in which diagnostics may be older than the answer of a service
 _ASK_EVERY = 2.0  # s between two looks at the parameters of the physics
-_JAW_OPEN, _JAW_CLOSED = 1.0, 0.0  # rad
 _SHOWN = ("physics_node", "rendering_node", "reconstruction_node")  # whose diagnostics are on the page
 
 
@@ -36,6 +37,7 @@ _SHOWN = ("physics_node", "rendering_node", "reconstruction_node")  # whose diag
 class _Arm:
     """What was last heard from one arm."""
 
+    tool: AimedTool
     pose: np.ndarray | None = None  # [4, 4], world
     reaction: np.ndarray | None = None  # [3] N on the tool, in its axes
     heard: float = 0.0  # when the reaction came
@@ -51,7 +53,7 @@ class ViewerNode(Watcher):
         self._options = self.declare(ViewerNodeConfig)
         config, self._rendering = self.declare(ViewerConfig), self.declare(RenderingConfig)
         (arm,) = arm_names([self._options.arm])
-        self._arms = {name: _Arm() for name in dict.fromkeys((*arm_names(self._options.arms), arm))}
+        self._arms = {name: _Arm(AimedTool(name)) for name in dict.fromkeys((*arm_names(self._options.arms), arm))}
         self._hand = arm
         self._tissue = ModelTracker()
         self._instruments, self._moved = ShownInstruments(tuple(self._arms), lockstep=False), False
@@ -79,6 +81,7 @@ class ViewerNode(Watcher):
             self.subscribe(topic, partial(self._on_info, topic.name), depth=1)
         self.subscribe(messages.RENDERED_POSE, self._on_rendered_pose, depth=1)
         self.subscribe(messages.RENDERED_IMAGE, self._on_rendered_image, depth=1)
+        self.subscribe(messages.ROBOT_DESCRIPTION, self._on_description)
         for name in self._arms:
             self.subscribe(messages.tool_pose(name), partial(self._on_tool_pose, name), depth=1)
             self.subscribe(messages.tool_reaction(name), partial(self._on_reaction, name), depth=1)
@@ -153,6 +156,11 @@ class ViewerNode(Watcher):
     def _on_tool_type(self, name: str, message: Any) -> None:
         self._moved = True
         self._instruments.receive_type(name, message)
+        self._arms[name].tool.receive_type(message)
+
+    def _on_description(self, message: Any) -> None:
+        for arm in self._arms.values():
+            arm.tool.receive_description(message)
 
     def _on_links(self, name: str, message: Any) -> None:
         self._moved |= self._instruments.receive_links(name, message, self._options.world_frame)
@@ -185,12 +193,11 @@ class ViewerNode(Watcher):
                     self._show_instruments(bound.renderer.device)
             now = time.monotonic()
             tools = {
-                name: Tool(arm.pose[:3, 3], -arm.pose[:3, :3] @ arm.reaction)
+                name: Tool(arm.tool.works_at(arm.pose), -arm.pose[:3, :3] @ arm.reaction)
                 for name, arm in self._arms.items()
                 if arm.pose is not None and arm.reaction is not None and now - arm.heard < _GONE
             }
-            mine = tools.get(self._hand)
-            self.viewer.show_tools(tools, 0.0 if mine is None else float(np.linalg.norm(mine.force)))
+            self.viewer.show_tools(tools, self._hand)
             if now - self._asked > _ASK_EVERY:
                 self._asked = now
                 self._ask_parameters()
@@ -226,19 +233,29 @@ class ViewerNode(Watcher):
         if not self._get.service_is_ready():
             return
 
-        def ask(*names: str) -> None:
+        def show_touch(values: dict[str, Any]) -> None:
+            for arm in self._arms.values():
+                arm.tool.links_touch = values["link_contact"]
+
+        def ask(*names: str, show: Callable[[dict[str, Any]], None] = self.viewer.show_parameters) -> None:
             def answered(future: Any) -> None:
                 with self.guard("parameters"):
                     values = [parameter_value_to_python(value) for value in future.result().values]
                     if len(values) == len(names):  # else another node bears that name
-                        self.viewer.show_parameters(dict(zip(names, values)))
+                        show(dict(zip(names, values)))
 
             self._get.call_async(GetParameters.Request(names=names)).add_done_callback(answered)
 
         ask(*(name for name in PARAMETERS if name != "regions"))
+        ask("link_contact", show=show_touch)
         ask("regions")  # a list that nobody has filled has no value, and a request that names it gets none at all
 
     # ----------------------------------------------------------------- actions
+
+    def aim(self, point: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, float]:
+        """As `Actions` has it: an instrument whose links touch comes straight from its remote centre."""
+        tool = self._arms[self._hand].tool
+        return tool.pose(point, axes), AHEAD if tool.known else 0.0
 
     def hold(self, pose: np.ndarray, closed: bool) -> None:
         """Publish the pose [4, 4] (m, world) of the tool that the mouse moves, and close its jaw."""
@@ -248,13 +265,13 @@ class ViewerNode(Watcher):
             return
         self.pose_publisher.publish(messages.encode_pose(pose, self.now_ns(), self._options.world_frame))
         if closed:
-            self.jaw_publisher.publish(messages.encode_jaw(_JAW_CLOSED, self.now_ns()))
+            self.jaw_publisher.publish(messages.encode_jaw(CLOSED, self.now_ns()))
             self._closed = True
 
     def let_go(self) -> None:
         """Open the jaw, if it was closed here."""
         if self._closed:  # else it may be somebody else's
-            self.jaw_publisher.publish(messages.encode_jaw(_JAW_OPEN, self.now_ns()))
+            self.jaw_publisher.publish(messages.encode_jaw(OPEN, self.now_ns()))
             self._closed = False
 
     def set_parameters(self, values: dict[str, float]) -> None:

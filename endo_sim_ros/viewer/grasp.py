@@ -9,25 +9,27 @@ _FELT = 0.02  # share of the largest force below which a reaction tells nothing 
 
 
 class Grasp:
-    """The pose of a jaw between its closing on a point of the tissue and its opening.
+    """The pose of a jaw from its way to a point of the tissue to its way back.
 
-    The tip moves from the point towards the target, not faster than ``max_speed``. Where the reaction says that the way
-    would take more than ``max_force``, taking the tissue for a linear spring, it stops short. As the jaw moves tissue by
-    its position, this is stable for any stiffness; a spring between mouse and tissue would swing as soon as it is
+    The tip comes along its z axis, and the jaw closes. Then it moves towards the target, not faster than ``max_speed``. Where the
+    reaction says that the way would take more than ``max_force``, taking the tissue for a linear spring, it stops short. As the jaw
+    moves tissue by its position, this is stable for any stiffness; a spring between mouse and tissue would swing as soon as it is
     stiffer than what it pulls at, since the tissue comes to rest within a step.
 
     Args:
-        pose: Pose of the tip [4, 4] on the tissue, m, world.
+        pose: Pose of the tip [4, 4] at the tissue, m, world.
         max_force: N.
         max_speed: m/s.
         longest_pull: Longest pull, m.
+        ahead: How far in front of the tissue the tip comes from, and goes back to, m.
     """
 
-    def __init__(self, pose: np.ndarray, max_force: float, max_speed: float, longest_pull: float):
+    def __init__(self, pose: np.ndarray, max_force: float, max_speed: float, longest_pull: float, ahead: float = 0.0):
         self.start = np.array(pose, np.float64)
         self._max_force, self._max_speed, self._longest_pull = max_force, max_speed, longest_pull
         self.target = self._pull = np.zeros(3)
-        self._age = 0.0
+        self._ahead = self._way = ahead  # m: where it comes from; what is left of the way
+        self._age = 0.0  # s at the tissue
 
     @property
     def closed(self) -> bool:
@@ -38,15 +40,28 @@ class Grasp:
     def pose(self) -> np.ndarray:
         """Pose of the tip [4, 4], m, world."""
         pose = self.start.copy()
-        pose[:3, 3] += self._pull
+        pose[:3, 3] += self._pull - self._way * pose[:3, 2]
         return pose
 
-    def aim(self, target: np.ndarray) -> None:
-        """Where the tip [3] shall go, m, world."""
-        self.target = _shortened(np.asarray(target, np.float64) - self.start[:3, 3], self._longest_pull)
+    def aim(self, pull: np.ndarray) -> None:
+        """How far what is held shall be pulled [3], m, world."""
+        self.target = _shortened(np.asarray(pull, np.float64), self._longest_pull)
+
+    def resistance(self, force: np.ndarray) -> float:
+        """How hard the tissue resists the pull, N, by the force [3] on it, N, world; what jaws press with from the side does not count."""
+        length = float(np.linalg.norm(self._pull))
+        return max(float(force @ self._pull) / length, 0.0) if length else 0.0
+
+    def withdraw(self, seconds: float) -> bool:
+        """Go back for some time; returns whether it is on its way still."""
+        before, self._way = self._way, min(self._way + self._max_speed * seconds, self._ahead)
+        return self._way > before
 
     def advance(self, seconds: float, reaction: float) -> np.ndarray:
         """Pose of the tip after some time in which the tissue resisted with a force, N."""
+        if self._way > 0:
+            self._way = max(self._way - self._max_speed * seconds, 0.0)
+            return self.pose
         was_closed, self._age = self.closed, self._age + seconds
         if not was_closed:
             return self.pose

@@ -58,6 +58,12 @@ class Standalone:
 
     # ---------------------------------------------------------------- actions
 
+    def aim(self, point: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, float]:
+        """As `Actions` has it: a bare tip."""
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = axes, point
+        return pose, 0.0
+
     def hold(self, pose: np.ndarray, closed: bool) -> None:
         """Grasp tissue at a pose [4, 4], m, world, or move what is held; say so where nothing can be held."""
         if not closed:
@@ -149,7 +155,7 @@ class Standalone:
         force, _ = self.simulation.reaction(_HAND)
         tools = {} if self._pose is None else {_HAND: Tool(self._pose[:3, 3], -force)}
         viewer, moved = self.viewer, self.viewer.show_state(state.positions, state.F, age)
-        viewer.show_tools(tools, float(np.linalg.norm(force)))
+        viewer.show_tools(tools, _HAND)
         viewer.show_text(*self._text())
         self._endoscope_dirty |= moved
         if viewer.wants_endoscope and self._endoscope_dirty:

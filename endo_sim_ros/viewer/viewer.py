@@ -60,8 +60,13 @@ PARAMETERS = (*(slider.parameter for slider in SLIDERS), "poisson_ratio", "mater
 class Actions(Protocol):
     """What a user can do to the tissue."""
 
+    def aim(self, point: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, float]:
+        """Pose of the tip [4, 4], m, world, with which the tool works at a point of the tissue [3], and how far ahead of it the tool comes
+        from, m. A bare tip has the axes [3, 3] of the view."""
+        ...
+
     def hold(self, pose: np.ndarray, closed: bool) -> None:
-        """A jaw is at this pose [4, 4], m, world; again and again until `let_go`."""
+        """A tip is at this pose [4, 4], m, world, and its jaw closed or not; again and again, after `let_go` on its way back."""
 
     def let_go(self) -> None:
         """The jaw opens."""
@@ -117,7 +122,8 @@ class Viewer:
         self._begun = 0.0  # when the step to that state began
         self._dirty, self._drawn = False, 0.0
         self.grasp: Grasp | None = None
-        self._holder, self._resistance = 0, 0.0  # who holds, and the force in N
+        self._leaving: Grasp | None = None  # the one before, whose jaw is on its way back
+        self._holder, self._force = 0, np.zeros(3)  # who holds, and the force on the tissue, N, world
         self._plane: tuple[np.ndarray, np.ndarray, float] = np.zeros(3), np.zeros(3), 0.0
         self._asked: float | None = None  # when the mouse moved; its pull has not been seen yet
         self.latency, self.pictures_per_second = 0.0, 0.0  # s; Hz
@@ -189,9 +195,9 @@ class Viewer:
         """Whether anybody looks through the endoscope."""
         return any(browser.view == ENDOSCOPE for browser in self.browsers.values())
 
-    def show_tools(self, tools: dict[str, Tool], resistance: float) -> None:
-        """All tools by name, and the force in N with which the tissue resists the mouse."""
-        self.tools, self._resistance = tools, resistance
+    def show_tools(self, tools: dict[str, Tool], mine: str) -> None:
+        """All tools by name, and the name of that which the mouse moves."""
+        self.tools, self._force = tools, tools[mine].force if mine in tools else np.zeros(3)
 
     def show_parameters(self, values: dict[str, Any]) -> None:
         """The physics' parameters as they are."""
@@ -232,9 +238,9 @@ class Viewer:
         origin, ray, _ = browser.ray(*pointer.at)
         point, normal, height = self._plane
         if pointer.lifts:  # up on the screen is towards the user
-            self.grasp.aim(point - normal * height * (pointer.began_at[1] - pointer.at[1]))
+            self.grasp.aim(-normal * height * (pointer.began_at[1] - pointer.at[1]))
         elif ray @ normal > 1e-6:
-            self.grasp.aim(origin + ray * ((point - origin) @ normal / (ray @ normal)))
+            self.grasp.aim(origin + ray * ((point - origin) @ normal / (ray @ normal)) - point)
         if self._asked is None:
             self._asked = time.monotonic()
 
@@ -243,11 +249,10 @@ class Viewer:
         if point is None:
             return
         origin, _, camera = browser.ray(*pointer.began_at)
-        pose = camera.pose.copy()
-        pose[:3, 3] = point
+        pose, ahead = self.actions.aim(point, camera.pose[:3, :3])
         longest_pull = _TRAVEL * self._parameters["travel"]
-        self.grasp = Grasp(pose, self.config.max_force, self.config.max_speed, longest_pull)
-        self._holder, self._resistance = pointer.client, 0.0
+        self.grasp, self._leaving = Grasp(pose, self.config.max_force, self.config.max_speed, longest_pull, ahead), None
+        self._holder, self._force = pointer.client, np.zeros(3)
         depth = (point - origin) @ camera.pose[:3, 2]
         self._plane = point, camera.pose[:3, 2], depth * camera.height / camera.K[1, 1]  # the last: height of the view there
 
@@ -267,12 +272,13 @@ class Viewer:
     def release(self) -> None:
         """Let go of the tissue."""
         if self.grasp is not None:
-            self.grasp, self._asked = None, None
+            self.grasp, self._leaving, self._asked = None, self.grasp, None
             self.actions.let_go()
 
     def reset(self) -> None:
         """Let go, and bring the tissue back to rest."""
         self.release()
+        self._leaving = None  # an arm that is back at its start stays there
         self.actions.reset()
 
     def slide(self, slider: Slider, value: float) -> None:
@@ -288,8 +294,12 @@ class Viewer:
             self._events.get()()
         now = time.monotonic()
         if self.grasp is not None:
-            pose = self.grasp.advance(now - self._updated, self._resistance)
+            pose = self.grasp.advance(now - self._updated, self.grasp.resistance(self._force))
             self.actions.hold(pose, self.grasp.closed)
+        elif self._leaving is not None:
+            self._leaving = self._leaving if self._leaving.withdraw(now - self._updated) else None
+            if self._leaving is not None:
+                self.actions.hold(self._leaving.pose, False)
         self._updated = now
         if self._wanted and now - self._wanted_at > _QUIET:
             wanted, self._wanted = self._wanted, {}

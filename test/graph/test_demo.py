@@ -28,7 +28,7 @@ def test_demo_runs_the_whole_graph_and_leaves_its_results(tmp_path):
     for topic in (
         "gaussians",
         "control_nodes",
-        "PSM1/body/servo_cf",
+        "PSM1/jaw/servo_jp",
         "PSM1/body/measured_cf",
         "rendered/image_raw/compressed",
         "diagnostics",

@@ -28,7 +28,14 @@ pytestmark = pytest.mark.dds
 
 MODEL_STAMP, STEP = 5_000_000_000, 20_000_000  # ns
 PARAMETERS = {
-    "physics_node": {"node_count": 300, "step_duration": 0.02, "force_radius": 0.02, "mode": "lockstep", "device": "cpu"},
+    "physics_node": {
+        "node_count": 300,
+        "step_duration": 0.02,
+        "force_radius": 0.02,
+        "mode": "lockstep",
+        "device": "cpu",
+        "link_contact": "false",
+    },
     "rendering_node": {"mode": "lockstep", "device": "cpu"},
 }
 IMAGES = messages.RENDERED_IMAGE

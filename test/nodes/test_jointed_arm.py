@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import rclpy
 from ros_bench import HEIGHT, SMALL, WIDTH, Bench, K, S, await_nodes, moved, send_model, sheet
-from std_srvs.srv import Trigger
+from std_srvs.srv import SetBool, Trigger
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
@@ -355,6 +355,29 @@ def test_the_arm_of_the_camera_moves_it_and_does_not_turn_it_over(graph):
     np.testing.assert_allclose(pose_of(graph, messages.tool_pose("ECM")), pose, atol=1e-12)
     send_joints(graph, messages.tool_joint_command, [0, 0, 0.1, 0.5], "ECM")
     graph.until(lambda: np.allclose(joints_of(graph, "ECM"), [0, 0, 0.1, 0.5]), "the joints")
+
+
+def test_no_arm_moves_during_a_pause_and_the_newest_commands_act_after_it(graph):
+    before = {arm: joints_of(graph, arm) for arm in ("PSM1", "ECM")}
+    assert graph.call(SetBool, "/physics_node/pause", data=True).success
+    try:
+        for yaw in (0.1, 0.02):
+            for arm, joints in before.items():
+                send_joints(graph, messages.tool_joint_command, joints + [yaw, 0, 0, *[0] * (len(joints) - 3)], arm)
+        graph.spin(0.5)
+        for arm, joints in before.items():
+            np.testing.assert_array_equal(joints_of(graph, arm), joints)
+    finally:
+        assert graph.call(SetBool, "/physics_node/pause", data=False).success
+    for arm, joints in before.items():
+        graph.until(lambda arm=arm, joints=joints: np.isclose(joints_of(graph, arm)[0], joints[0] + 0.02), f"the newest command of {arm}")
+
+
+def test_a_camera_in_the_tissue_is_a_warning(graph):
+    graph.publish(messages.tool_pose_command("ECM"), messages.encode_pose(tip_at(0, 0, 0.1), S, "world"))
+    said = graph.until(lambda: texts(graph, messages.tool_warning, "ECM"), "a warning of the camera's arm")
+    assert said == ["ECM is in the tissue or within 12 mm of it; nothing stops it there, so draw the endoscope back"]
+    graph.refused("physics_node", "ECM is in the tissue or within", "draw the endoscope back")
 
 
 def test_poses_may_be_in_the_frame_of_the_moving_camera_and_of_a_base(graph):

@@ -53,6 +53,13 @@ def expected(names, cameras=(CAMERA,)):
     return renderer.views(list(cameras), labels=True, instruments=posed)
 
 
+def expected_at(shift):
+    """What the library renders of PSM1, shifted."""
+    parts, capsules = build_instrument(load_arm("PSM", TOOLS["PSM1"]))
+    posed = InstrumentDrawing([parts], device="cpu", capsules=[capsules]).at([links("PSM1", shift)])
+    return DeformableRenderer(sheet(), None, RenderingConfig(device="cpu")).views([CAMERA], instruments=posed)[0]
+
+
 def start(mode):
     rclpy.init(args=["--ros-args", "-p", "arms:=[PSM1, PSM2]", "-p", "device:=cpu", "-p", f"mode:={mode}"])
     bench = Bench()
@@ -124,6 +131,10 @@ def test_what_cannot_be_drawn_is_one_sentence(bench):
     shows(bench, expected([])[0], "the tissue alone")
     send_type(bench, "PSM1")
     shows(bench, expected(["PSM1"])[0], "the instrument after all")
+    send_type(bench, "PSM1", "LADLE")
+    bench.refused("rendering_node", "LADLE", "PSM1/tool_type", "PSM1 is drawn as before")
+    send_links(bench, "PSM1", links("PSM1", 0.004))
+    await_image(bench, lambda image: np.array_equal(image, expected_at(0.004).image), "the instrument where it moves")
 
 
 def test_the_right_eye_and_compressed_images_for_those_who_ask(bench):

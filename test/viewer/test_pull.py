@@ -36,6 +36,22 @@ def test_pull_is_no_longer_than_the_reach_and_no_faster_than_allowed():
     assert np.linalg.norm(end) < 0.005
 
 
+def test_jaw_comes_along_its_axis_and_goes_back():
+    grasp = Grasp(np.eye(4), 1.0, 0.1, 0.1, ahead=0.02)
+    grasp.aim(np.array([0.1, 0, 0]))
+    ways = [grasp.advance(0.05, 0.0)[:3, 3].tolist() for _ in range(4)]
+    np.testing.assert_allclose(ways, [[0, 0, z] for z in (-0.015, -0.01, -0.005, 0)], atol=1e-12)
+    assert not grasp.closed
+    while not grasp.closed:
+        grasp.advance(0.05, 0.0)
+    pull = grasp.advance(0.05, 0.0)[0, 3]
+    assert pull > 0 and grasp.resistance(np.array([2.0, 0, 5.0])) == pytest.approx(2)  # what presses from the side resists no pull
+    assert grasp.withdraw(0.1)
+    np.testing.assert_allclose(grasp.pose[:3, 3], [pull, 0, -0.01], atol=1e-12)
+    assert grasp.withdraw(0.2) and not grasp.withdraw(0.1)
+    np.testing.assert_allclose(grasp.pose[:3, 3], [pull, 0, -0.02], atol=1e-12)
+
+
 def test_jaw_closes_before_it_moves():
     grasp = Grasp(np.eye(4), 1.0, 1.0, 0.1)
     grasp.aim(np.array([0.1, 0, 0]))

@@ -156,11 +156,11 @@ def test_sliders_show_the_parameters_within_their_ends(page):
 
 
 def test_tools_of_others_are_shown_and_vanish(page):
-    page.viewer.show_tools({"PSM2": Tool(np.array([0, 0, 0.1]), np.array([0, 0, -2.0]))}, 0.0)
+    page.viewer.show_tools({"PSM2": Tool(np.array([0, 0, 0.1]), np.array([0, 0, -2.0]))}, "mouse")
     page.viewer.draw_tools()
     np.testing.assert_allclose(page.viewer.arrows.points, [[[0, 0, 10], [0, 0, 8]]], atol=1e-5)
     assert page.viewer.labels["PSM2"].text == "2.0 N"
-    page.viewer.show_tools({}, 0.0)
+    page.viewer.show_tools({}, "mouse")
     page.viewer.draw_tools()
     assert not page.viewer.arrows.visible and not page.viewer.tips.visible and not page.viewer.labels
 

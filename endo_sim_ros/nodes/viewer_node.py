@@ -23,7 +23,8 @@ from endo_sim_ros.nodes.shown_instruments import ShownInstruments
 from endo_sim_ros.nodes.watcher import Watcher
 from endo_sim_ros.rendering import RenderingConfig
 from endo_sim_ros.viewer.config import ViewerConfig
-from endo_sim_ros.viewer.viewer import PARAMETERS, Tool, Viewer, plain_camera
+from endo_sim_ros.viewer.tool_marks import Tool
+from endo_sim_ros.viewer.viewer import PARAMETERS, Viewer, plain_camera
 
 _PERIOD = 0.02  # s between two looks at what users did
 _GONE = 1.0  # s after which a tool that says nothing is not shown any more

@@ -12,7 +12,8 @@ from endo_sim_ros.core.gaussians import GaussianModel, load_ply
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig, render_depth
 from endo_sim_ros.viewer.config import ViewerConfig
-from endo_sim_ros.viewer.viewer import PARAMETERS, Tool, Viewer, plain_camera
+from endo_sim_ros.viewer.tool_marks import Tool
+from endo_sim_ros.viewer.viewer import PARAMETERS, Viewer, plain_camera
 
 _logger = logging.getLogger(__name__)
 _HAND = "mouse"  # name of the tool

@@ -5,11 +5,9 @@ import queue
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
-import cv2
 import numpy as np
 import torch
 
@@ -18,42 +16,21 @@ from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.drawing import draw_force
 from endo_sim_ros.instruments.drawing import PosedInstruments
 from endo_sim_ros.physics import PhysicsConfig
-from endo_sim_ros.physics.regions import TissueProperties, paint_regions
-from endo_sim_ros.physics.stress import von_mises
 from endo_sim_ros.rendering import DeformableRenderer
 from endo_sim_ros.viewer.browser import CENTIMETRES, ENDOSCOPE, Browser, Pointer
 from endo_sim_ros.viewer.config import ViewerConfig
 from endo_sim_ros.viewer.grasp import Grasp
+from endo_sim_ros.viewer.sliders import SLIDERS, Sliders
+from endo_sim_ros.viewer.stress import StressColors
+from endo_sim_ros.viewer.tool_marks import ARROW, Tool, ToolMarks
 
-_QUIET = 0.4  # s without a change after which the sliders act; each change builds new tissue
 _TEXT_EVERY = 0.5  # s
 _PANEL_WIDTH = 270  # pixels
-_SLIDER_HINT = "Acts a moment after the slider stands still; a new thickness brings the tissue back to rest."
 _NOTICE_FOR = 8.0  # s that a notice stays
-_ARROW = 1.0  # cm of arrow per newton, as in tool_markers
 _TRAVEL = 0.8  # share of the physics' travel that the mouse may pull; tissue slips out of a jaw at 0.9
 _FOCAL = 0.85  # focal length of a camera that nothing is known of, in image widths
-_RED = 99.7  # percentile of the stress that is shown red: single nodes at the edge of a jaw are torn at
-_LEAST_SCALE = 0.05  # of Young's modulus: the smallest stress that is shown red
 
 
-class Slider(NamedTuple):
-    """One of the physics' parameters on the page."""
-
-    parameter: str
-    label: str
-    unit: float  # SI units in one of the label
-    low: float
-    high: float
-    step: float
-
-
-SLIDERS = (
-    Slider("young_modulus", "stiffness, kPa", 1e3, 0.5, 100, 0.5),
-    Slider("damping", "damping, 1/s", 1, 0, 300, 5),
-    Slider("thickness", "thickness, mm", 1e-3, 2, 80, 1),
-    Slider("force_radius", "hold radius, mm", 1e-3, 2, 40, 1),
-)
 PARAMETERS = (*(slider.parameter for slider in SLIDERS), "poisson_ratio", "material", "regions", "travel")  # that the page needs to know
 
 
@@ -84,14 +61,6 @@ class Actions(Protocol):
         """One step while time stands still."""
 
 
-@dataclass(frozen=True)
-class Tool:
-    """A tool, and what it does to the tissue."""
-
-    position: np.ndarray  # [3] m, world
-    force: np.ndarray  # [3] N on the tissue, world
-
-
 class Viewer:
     """Serves the page to any number of browsers.
 
@@ -118,7 +87,6 @@ class Viewer:
         self.tools: dict[str, Tool] = {}
         self.instruments: PosedInstruments | None = None
         self._node_size = 0.0  # cm
-        self._stress_scale = 0.0  # Pa
         self._begun = 0.0  # when the step to that state began
         self._dirty, self._drawn = False, 0.0
         self.grasp: Grasp | None = None
@@ -129,10 +97,7 @@ class Viewer:
         self.latency, self.pictures_per_second = 0.0, 0.0  # s; Hz
         self._pictures, self._texted, self._updated = 0, 0.0, time.monotonic()
         self._parameters: dict[str, Any] = {name: getattr(PhysicsConfig(), name) for name in PARAMETERS}
-        self._rest: np.ndarray | None = None  # nodes [M, 3], m, world
-        self._tissue: TissueProperties | None = None  # what each node is made of; None = not known yet
-        self._wanted: dict[str, float] = {}
-        self._wanted_at = 0.0
+        self.stress_colors = StressColors(self._parameters, self.notify)
         self.paused = False
         self._lines: tuple[str, ...] = ()
         self.notice, self._notice_until = "", 0.0
@@ -157,7 +122,7 @@ class Viewer:
         old = self.renderer
         same = old is not None and torch.equal(old.model.means, renderer.model.means)
         self.renderer, self.state, self.camera = renderer, None, camera
-        self._rest, self._tissue = node_rest, None
+        self.stress_colors.set_nodes(node_rest)
         self.release()
         means = renderer.model.means.cpu().numpy()
         if node_rest is not None and len(node_rest) > 1:
@@ -202,10 +167,9 @@ class Viewer:
     def show_parameters(self, values: dict[str, Any]) -> None:
         """The physics' parameters as they are."""
         if (known := self._parameters | values) != self._parameters:
-            self._parameters, self._tissue = known, None
-        for slider in SLIDERS:
-            if slider.parameter in values and slider.parameter not in self._wanted:
-                self.sliders[slider.parameter].value = _on_slider(slider, values[slider.parameter])
+            self._parameters = known
+            self.stress_colors.set_parameters(known)
+        self.sliders.show(values)
 
     def show_text(self, *lines: str, paused: bool | None = None) -> None:
         """What there is to say about the simulation."""
@@ -281,11 +245,6 @@ class Viewer:
         self._leaving = None  # an arm that is back at its start stays there
         self.actions.reset()
 
-    def slide(self, slider: Slider, value: float) -> None:
-        """Take the value of a slider, in its unit; it is set when the slider stands still."""
-        self._wanted[slider.parameter] = value * slider.unit
-        self._wanted_at = time.monotonic()
-
     # ----------------------------------------------------------------- drawing
 
     def update(self) -> None:
@@ -301,8 +260,7 @@ class Viewer:
             if self._leaving is not None:
                 self.actions.hold(self._leaving.pose, False)
         self._updated = now
-        if self._wanted and now - self._wanted_at > _QUIET:
-            wanted, self._wanted = self._wanted, {}
+        if wanted := self.sliders.take(now):
             self.actions.set_parameters(wanted)
         if now - self._drawn >= 1 / self.config.rate and self.renderer is not None:
             self._draw(now)
@@ -311,7 +269,7 @@ class Viewer:
 
     def _draw(self, now: float) -> None:
         self._drawn, dirty, self._dirty = now, self._dirty, False
-        self.draw_tools()
+        self.marks.draw(self.tools)
         splats = colors = None
         for browser in self.browsers.values():
             if dirty and browser.wants_splats:
@@ -339,54 +297,11 @@ class Viewer:
         rgb, opacity = ((values * 255).byte().cpu().numpy() for values in (model.base_colors, model.opacities[:, None]))
         return (CENTIMETRES * means).cpu().numpy(), (CENTIMETRES**2 * covars).cpu().numpy(), rgb, opacity
 
-    def stress_colors(self, F: np.ndarray) -> np.ndarray:
-        """Colours [M, 3] uint8 of nodes with these deformation gradients [M, 3, 3].
-
-        Blue is no stress; red is almost the largest von Mises stress of late.
-        """
-        if self._tissue is None:
-            self._tissue = self._properties(len(F))
-        stress = von_mises(F, self._tissue.young_modulus, self._tissue.poisson_ratio, self._parameters["material"])
-        largest = max(float(np.percentile(stress, _RED)), _LEAST_SCALE * self._parameters["young_modulus"])
-        self._stress_scale = max(largest, 0.98 * self._stress_scale)
-        levels = (255 * np.minimum(stress / self._stress_scale, 1)).astype(np.uint8)
-        return cv2.applyColorMap(levels[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1]
-
-    def _properties(self, count: int) -> TissueProperties:
-        """What each node is made of, as the physics' parameters tell."""
-        known = self._parameters  # stress does not depend on density
-        uniform = TissueProperties.uniform(count, known["young_modulus"], known["poisson_ratio"], density=1.0)
-        if self._rest is None:
-            return uniform
-        try:
-            return paint_regions(uniform, self._rest, self._parameters["regions"])
-        except ConfigError as error:  # a mask may lie on the physics' machine only
-            self.notify(f"stress is coloured without regions: {error}")
-            return uniform
-
     def _tools_on(self, image: np.ndarray, camera: Camera) -> np.ndarray:
         """A picture with the tools' forces."""
         for tool in self.tools.values():
-            image = draw_force(image, camera, tool.position, tool.force, _ARROW / CENTIMETRES)
+            image = draw_force(image, camera, tool.position, tool.force, ARROW / CENTIMETRES)
         return image
-
-    def draw_tools(self) -> None:
-        """Draw tips, forces and their numbers."""
-        tips = np.array([tool.position for tool in self.tools.values()]).reshape(-1, 3) * CENTIMETRES
-        ends = tips + _ARROW * np.array([tool.force for tool in self.tools.values()]).reshape(-1, 3)
-        pulling = np.linalg.norm(ends - tips, axis=1) > 0.02
-        self.tips.visible, self.arrows.visible = bool(len(tips)), bool(pulling.any())
-        if len(tips):
-            self.tips.points = tips.astype(np.float32)
-        if pulling.any():
-            self.arrows.points = np.stack([tips, ends], 1)[pulling].astype(np.float32)
-        for name in self.labels.keys() - self.tools.keys():
-            self.labels.pop(name).remove()
-        for name, tip in zip(self.tools, tips):
-            if name not in self.labels:
-                self.labels[name] = self._server.scene.add_label(f"/force_of/{name}", "", font_screen_scale=1.2, anchor="bottom-left")
-            self.labels[name].position = tip
-            self.labels[name].text = f"{np.linalg.norm(self.tools[name].force):.1f} N"
 
     def _write_text(self, now: float) -> None:
         elapsed, self._texted = now - self._texted, now
@@ -399,7 +314,7 @@ class Viewer:
         lines.append(f"{numbers}, {len(self.browsers)} browser{'s' * (len(self.browsers) != 1)}")
         lines += [f"{name}: {np.linalg.norm(tool.force):.2f} N" for name, tool in self.tools.items()]
         if any(browser.wants_stress for browser in self.browsers.values()):
-            lines.append(f"red: von Mises stress of {self._stress_scale / 1e3:.2g} kPa")
+            lines.append(f"red: von Mises stress of {self.stress_colors.scale / 1e3:.2g} kPa")
         if now < self._notice_until:
             lines.append(f"**{self.notice}**")
         self._text.content = "  \n".join(lines)
@@ -426,26 +341,9 @@ class Viewer:
         self._play = button("pause", lambda: self.actions.pause(not self.paused), "Let time stand still, or go on.")
         button("step", self.actions.step, "One step while time stands still.")
         button("reset", self.reset, "Tissue back to rest.")
-        self.sliders = {}
         with gui.add_folder("tissue"):
-            for slider in SLIDERS:
-                made = gui.add_slider(slider.label, slider.low, slider.high, slider.step, slider.low, hint=_SLIDER_HINT)
-                self.sliders[slider.parameter] = made
-
-                def slide(event: Any, slider: Slider = slider) -> None:
-                    if event.client is not None:  # not set by this program
-                        value = event.target.value
-                        self.post(lambda: self.slide(slider, value))
-
-                made.on_update(slide)
-        nowhere = np.zeros((1, 3), np.float32)
-        self.tips = scene.add_point_cloud(
-            "/tips", nowhere, (235, 235, 235), point_size=0.25, point_shape="circle", precision="float32", visible=False
-        )
-        self.arrows = scene.add_arrows(
-            "/forces", np.eye(3)[None, :2], (255, 140, 25), shaft_radius=0.06, head_radius=0.15, head_length=0.3, visible=False
-        )
-        self.labels: dict[str, Any] = {}
+            self.sliders = Sliders(gui, lambda slider, value: self.post(lambda: self.sliders.slide(slider, value)))
+        self.marks = ToolMarks(scene)
         self._server.on_client_connect(lambda client: self.post(lambda: self._join(client)))
         self._server.on_client_disconnect(lambda client: self.post(lambda: self.leave(client.client_id)))
 
@@ -493,10 +391,6 @@ def serve(config: ViewerConfig) -> Any:
         return viser.ViserServer(host=config.host, port=config.port, verbose=False)
     except (OSError, RuntimeError) as error:
         raise ConfigError(f"the page cannot be served at {config.host}:{config.port}: {error}") from error
-
-
-def _on_slider(slider: Slider, value: float) -> float:
-    return float(np.clip(round(value / slider.unit / slider.step) * slider.step, slider.low, slider.high))
 
 
 def plain_camera(pose: np.ndarray) -> Camera:

@@ -13,7 +13,7 @@ from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.nodes.physics_node import PhysicsNode
 from endo_sim_ros.nodes.rendering_node import RenderingNode
 from endo_sim_ros.viewer.browser import VIEWS
-from endo_sim_ros.viewer.viewer import SLIDERS
+from endo_sim_ros.viewer.sliders import SLIDERS
 
 pytestmark = pytest.mark.dds
 
@@ -77,13 +77,13 @@ def test_mouse_is_a_tool_of_the_graph(graph):
 
 
 def test_page_sets_and_follows_the_parameters_of_physics(graph):
-    graph.until(lambda: graph.viewer.sliders["young_modulus"].value == 10, "the slider to know")
+    graph.until(lambda: graph.viewer.sliders.handles["young_modulus"].value == 10, "the slider to know")
     slider = next(slider for slider in SLIDERS if slider.parameter == "young_modulus")
-    graph.viewer.slide(slider, 20.0)
+    graph.viewer.sliders.slide(slider, 20.0)
     graph.until(lambda: graph.physics.get_parameter("young_modulus").value == 20e3, "the parameter")
     assert graph.set("physics_node", damping=100.0)[0]
-    graph.until(lambda: graph.viewer.sliders["damping"].value == 100, "what somebody else has set")
-    assert graph.viewer.sliders["young_modulus"].value == 20
+    graph.until(lambda: graph.viewer.sliders.handles["damping"].value == 100, "what somebody else has set")
+    assert graph.viewer.sliders.handles["young_modulus"].value == 20
 
 
 def test_page_stops_time_and_steps(graph):

@@ -14,7 +14,9 @@ from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.drawing import draw_points
 from endo_sim_ros.viewer.browser import Pointer, fitted, padded
 from endo_sim_ros.viewer.config import ViewerConfig
-from endo_sim_ros.viewer.viewer import PARAMETERS, SLIDERS, Tool
+from endo_sim_ros.viewer.sliders import SLIDERS
+from endo_sim_ros.viewer.tool_marks import Tool
+from endo_sim_ros.viewer.viewer import PARAMETERS
 
 
 @pytest.fixture
@@ -138,12 +140,12 @@ def test_slider_changes_the_material_under_the_hand_when_it_stands_still(page):
     point(page.viewer, "update", (0.52, 0.5))
     turn_until(page, lambda: moved(page) > 5e-4, "tissue to follow")
     for value in (20.0, 25.0, 30.0):
-        page.viewer.slide(slider, value)
+        page.viewer.sliders.slide(slider, value)
         page.turn()
         assert page.simulation.config.young_modulus == SOFT.young_modulus, "not at each move of the slider"
     turn_until(page, lambda: page.simulation.config.young_modulus == 30e3, "the new stiffness")
     assert page.viewer.holding and moved(page) > 5e-4
-    page.viewer.slide(next(slider for slider in SLIDERS if slider.parameter == "thickness"), 30)
+    page.viewer.sliders.slide(next(slider for slider in SLIDERS if slider.parameter == "thickness"), 30)
     turn_until(page, lambda: page.simulation.config.thickness == pytest.approx(0.03), "the new thickness")
     assert page.simulation.config.young_modulus == 30e3 and not page.viewer.holding and moved(page) == 0
     assert page.viewer.browsers[1].models == 0, "the model is the same, so that views stay as they are"
@@ -151,18 +153,18 @@ def test_slider_changes_the_material_under_the_hand_when_it_stands_still(page):
 
 def test_sliders_show_the_parameters_within_their_ends(page):
     page.viewer.show_parameters({"young_modulus": 5e6, "damping": 20.0})
-    assert page.viewer.sliders["young_modulus"].value == 100 and page.viewer.sliders["damping"].value == 20
+    assert page.viewer.sliders.handles["young_modulus"].value == 100 and page.viewer.sliders.handles["damping"].value == 20
     assert set(PARAMETERS) <= set(vars(SOFT))
 
 
 def test_tools_of_others_are_shown_and_vanish(page):
     page.viewer.show_tools({"PSM2": Tool(np.array([0, 0, 0.1]), np.array([0, 0, -2.0]))}, "mouse")
-    page.viewer.draw_tools()
-    np.testing.assert_allclose(page.viewer.arrows.points, [[[0, 0, 10], [0, 0, 8]]], atol=1e-5)
-    assert page.viewer.labels["PSM2"].text == "2.0 N"
+    page.viewer.marks.draw(page.viewer.tools)
+    np.testing.assert_allclose(page.viewer.marks.arrows.points, [[[0, 0, 10], [0, 0, 8]]], atol=1e-5)
+    assert page.viewer.marks.labels["PSM2"].text == "2.0 N"
     page.viewer.show_tools({}, "mouse")
-    page.viewer.draw_tools()
-    assert not page.viewer.arrows.visible and not page.viewer.tips.visible and not page.viewer.labels
+    page.viewer.marks.draw(page.viewer.tools)
+    assert not page.viewer.marks.arrows.visible and not page.viewer.marks.tips.visible and not page.viewer.marks.labels
 
 
 def test_endoscope_picture_is_centred_at_its_optical_axis():

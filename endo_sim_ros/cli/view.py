@@ -18,6 +18,8 @@ class Command:
     model: Positional[Path]
     """PLY model, in metres; seen by the cameras in the cameras.json beside it, else from the world's origin."""
     config: Annotated[ViewerConfig, tyro.conf.arg(name="")] = field(default_factory=ViewerConfig)
+    instrument: str = "LARGE_NEEDLE_DRIVER"
+    """Tool that the mouse moves: its name, or the path of its file; empty, or where its arm does not reach = a bare tip."""
     node_count: int | None = None
     """Number of control nodes; default: that of the physics."""
     device: str = "auto"
@@ -30,4 +32,4 @@ class Command:
         physics = PhysicsConfig(device=self.device)
         if self.node_count is not None:
             physics = replace(physics, node_count=self.node_count)
-        view(self.model, physics, self.config)
+        view(self.model, physics, self.config, self.instrument)

@@ -13,6 +13,9 @@ from endo_sim_ros.instruments.shapes import LINKS, Capsule
 GRIP = 0.85
 """Where on the jaws tissue is gripped, from their hinge, 0, to their points, 1: with what lies before the points, not at them."""
 
+AHEAD = 0.02
+"""How far in front of the tissue tools come from, straight ahead, and go back to, m."""
+
 
 def working_point(arm: ArmKinematics, capsules: Sequence[Capsule], share: float = GRIP) -> np.ndarray:
     """Where a tool works [3], m, in the frame of the tip: between its jaws, or at the point of a tool that has none, such as a hook.

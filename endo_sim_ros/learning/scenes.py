@@ -11,7 +11,7 @@ import numpy as np
 from endo_sim_ros.core.cameras import Camera, load_cameras
 from endo_sim_ros.core.gaussians import GaussianModel, ModelError, load_ply, save_ply
 from endo_sim_ros.physics import ControlNodes, PhysicsConfig, build_control_nodes
-from endo_sim_ros.rendering import render_depth
+from endo_sim_ros.rendering import middle_depth, render_depth
 
 _CACHED = "phantom-1.ply"  # raise the number when the default scene changes
 _PIECE = 0.5  # of the synthetic patient's picture, about its middle
@@ -36,12 +36,10 @@ class Scene:
         Raises:
             ValueError: If there is none.
         """
-        depth = render_depth(self.model, self.camera)
-        rows, columns = (slice(side // 4, side - side // 4) for side in depth.shape)
-        seen = depth[rows, columns][depth[rows, columns] > 0]
-        if not len(seen):
+        depth = middle_depth(render_depth(self.model, self.camera))
+        if depth is None:
             raise ValueError("the endoscope sees no tissue in the middle of its picture; check the poses in cameras.json")
-        return float(np.median(seen))
+        return depth
 
     def nodes(self, config: PhysicsConfig) -> ControlNodes:
         """The tissue's control nodes at rest, m, world: those that physics_node makes of the same files.

@@ -12,7 +12,6 @@ from endo_sim_ros.instruments.urdf_reader import load_shape
 from endo_sim_ros.messages import MessageError
 
 OPEN, CLOSED = 1.0, 0.0  # rad: angles of the jaw of who grasps
-AHEAD = 0.02  # m in front of the tissue from where jaws come, straight ahead, and to where they go back
 
 
 class AimedTool:

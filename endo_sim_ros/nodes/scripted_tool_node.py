@@ -6,8 +6,9 @@ import numpy as np
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera, invert_pose
+from endo_sim_ros.instruments.aiming import AHEAD
 from endo_sim_ros.messages import OK, STATE, WARN, ScriptedToolState
-from endo_sim_ros.nodes.aimed_tool import AHEAD, CLOSED, OPEN, AimedTool
+from endo_sim_ros.nodes.aimed_tool import CLOSED, OPEN, AimedTool
 from endo_sim_ros.nodes.base import EndoNode, run
 from endo_sim_ros.nodes.configs import ScriptedToolConfig, arm_names
 

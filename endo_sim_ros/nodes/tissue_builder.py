@@ -11,7 +11,7 @@ from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.nodes.background import Background
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
-from endo_sim_ros.rendering import render_depth
+from endo_sim_ros.rendering import middle_depth, render_depth
 
 # A view as wide as an endoscope's, for a camera whose intrinsics nobody has told:
 _USUAL_VIEW = intrinsic_matrix(560.0, 560.0, 320.0, 256.0), 640, 512
@@ -140,7 +140,5 @@ def _tissue(model: GaussianModel, viewpoint: np.ndarray, config: PhysicsConfig, 
 def _view(model: GaussianModel, camera: Camera) -> tuple[Camera, float] | None:
     """The camera, and how deep the tissue lies in the middle of its picture, m; None where it shows none."""
     small = camera.resized(_PIXELS_OF_DEPTH, max(round(_PIXELS_OF_DEPTH * camera.height / camera.width), 4))
-    depth = render_depth(model, small)
-    rows, columns = (slice(side // 4, side - side // 4) for side in depth.shape)
-    seen = depth[rows, columns][depth[rows, columns] > 0]
-    return (camera, float(np.median(seen))) if seen.size else None
+    depth = middle_depth(render_depth(model, small))
+    return None if depth is None else (camera, depth)

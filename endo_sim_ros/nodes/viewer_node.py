@@ -13,9 +13,10 @@ from std_srvs.srv import SetBool, Trigger
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.instruments.aiming import AHEAD
 from endo_sim_ros.instruments.config import DrawingConfig
 from endo_sim_ros.messages import OK, STATE, WARN, ControlNodeCloud, PhysicsState, ViewerState
-from endo_sim_ros.nodes.aimed_tool import AHEAD, CLOSED, OPEN, AimedTool
+from endo_sim_ros.nodes.aimed_tool import CLOSED, OPEN, AimedTool
 from endo_sim_ros.nodes.base import run
 from endo_sim_ros.nodes.configs import ViewerNodeConfig, arm_names
 from endo_sim_ros.nodes.model_tracker import ModelTracker

@@ -202,6 +202,13 @@ def render_depth(model: GaussianModel, camera: Camera) -> np.ndarray:
     return torch.where(output.alphas[0] > SURFACE, output.medians[0], 0.0).cpu().numpy()
 
 
+def middle_depth(depth: np.ndarray) -> float | None:
+    """Return the median depth in the middle of a depth image [H, W], m, or None where no surface is there."""
+    rows, columns = (slice(side // 4, side - side // 4) for side in depth.shape)
+    seen = depth[rows, columns][depth[rows, columns] > 0]
+    return float(np.median(seen)) if seen.size else None
+
+
 def turned_colors(sh: Tensor, skinning: Skinning, means: Tensor, F: Tensor | np.ndarray, camera: Camera) -> Tensor:
     """Return coefficients of degree 0 [N, 1, 3] of the colours that a camera sees, as view directions turn back with the tissue.
 

@@ -8,10 +8,15 @@ from pathlib import Path
 import numpy as np
 
 from endo_sim_ros.core.cameras import Camera, load_cameras, look_at
+from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.gaussians import GaussianModel, load_ply
+from endo_sim_ros.instruments import load_arm, place_arm
+from endo_sim_ros.instruments.aiming import AHEAD
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
-from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig, render_depth
+from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig, middle_depth, render_depth
 from endo_sim_ros.viewer.config import ViewerConfig
+from endo_sim_ros.viewer.mouse_tool import MouseTool
 from endo_sim_ros.viewer.tool_marks import Tool
 from endo_sim_ros.viewer.viewer import PARAMETERS, Viewer, plain_camera
 
@@ -28,12 +33,17 @@ class Standalone:
         cameras: From where they were seen; the one in the middle is the endoscope of the page.
         physics: Parameters of the tissue.
         config: Parameters of the page.
+        instrument: Name of the tool that the mouse moves, or path of its file; empty = a bare tip.
+
+    Raises:
+        ConfigError: If there is no such tool, or the page cannot be served.
     """
 
-    def __init__(self, model: GaussianModel, cameras: list[Camera], physics: PhysicsConfig, config: ViewerConfig):
+    def __init__(self, model: GaussianModel, cameras: list[Camera], physics: PhysicsConfig, config: ViewerConfig, instrument: str = ""):
         self.model, self._physics = model, physics
         self._camera = cameras[len(cameras) // 2]
         self._cameras = cameras
+        self._tool = self._make_tool(instrument) if instrument else None
         self.simulation = self._simulate(physics)
         self._pose: np.ndarray | None = None
         self._faults = self._slips = 0
@@ -42,14 +52,29 @@ class Standalone:
         self.viewer = Viewer(config, self)
         self._show_model()
 
+    def _make_tool(self, name: str) -> MouseTool | None:
+        """The tool on an arm that stands where a graph's PSM1 does; None where such an arm does not reach the tissue."""
+        arm, depth = load_arm("PSM", name), middle_depth(render_depth(self.model, self._camera))
+        try:
+            place = place_arm("PSM1", arm, self._camera, depth or 0.0)
+        except ConfigError as error:
+            _logger.warning("the mouse moves a bare tip: %s", error)
+            return None
+        return MouseTool(arm, place, pick_device(self._physics.device))
+
     def _simulate(self, physics: PhysicsConfig) -> TissueSimulation:
         viewpoint = np.stack([camera.position for camera in self._cameras])
-        return TissueSimulation(self.model, viewpoint, physics, self._cameras, render_depth)
+        simulation = TissueSimulation(self.model, viewpoint, physics, self._cameras, render_depth)
+        if self._tool is not None:
+            simulation.set_instrument(_HAND, self._tool.capsules)
+        return simulation
 
     def _show_model(self) -> None:
         rest = self.simulation.nodes.rest
         self._renderer = DeformableRenderer(self.model, rest, RenderingConfig(device=self._physics.device))
         self.viewer.show_model(self._renderer, rest, self._camera)
+        if self._tool is not None:
+            self.viewer.show_instruments(self._tool.drawn())
         self._show_parameters()
         self._restart_clock()
         self._show()
@@ -60,26 +85,40 @@ class Standalone:
     # ---------------------------------------------------------------- actions
 
     def aim(self, point: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, float]:
-        """As `Actions` has it: a bare tip."""
+        """As `Actions` has it: an instrument comes straight from its remote centre."""
+        if self._tool is not None:
+            return self._tool.aim(point), AHEAD
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = axes, point
         return pose, 0.0
 
     def hold(self, pose: np.ndarray, closed: bool) -> None:
-        """Grasp tissue at a pose [4, 4], m, world, or move what is held; say so where nothing can be held."""
-        if not closed:
+        """Move the tool to a pose [4, 4], m, world, and close its jaw; say so where nothing can be held."""
+        if self._tool is None and not closed:
             return
-        if self.simulation.set_grasp(_HAND, pose, True):
-            self._pose = pose
-        else:
-            self.viewer.notify("nothing here can be held: it is fixed, or further away than the hold radius")
-            self.viewer.release()
+        if self._move(pose, closed):
+            return
+        missed = "it is fixed, or further away than the hold radius" if self._tool is None else "nothing is between the jaws, or it slips"
+        self.viewer.notify(f"nothing here can be held: {missed}")
+        self.viewer.release()
 
     def let_go(self) -> None:
         """Open the jaw."""
         if self._pose is not None:
-            self.simulation.set_grasp(_HAND, self._pose, False)
+            self._move(self._pose, False)
         self._pose = None
+
+    def _move(self, pose: np.ndarray, closed: bool) -> bool:
+        """Move the tool, and close or open its jaw; returns whether that holds what it should."""
+        links = None
+        if self._tool is not None:
+            links, pose = self._tool.move(pose, closed), self._tool.pose
+            self.viewer.show_instruments(self._tool.drawn())
+            self._endoscope_dirty = True
+        held = self.simulation.set_grasp(_HAND, pose, closed, links)
+        if held and closed:
+            self._pose = pose
+        return held
 
     def set_parameters(self, values: dict[str, float]) -> None:
         """Rebuild the simulation with new values, SI units, and go on from its state; keep the old one if they are refused."""
@@ -102,6 +141,10 @@ class Standalone:
     def reset(self) -> None:
         """Return the tissue to rest."""
         self.simulation.reset()
+        if self._tool is not None:
+            self.simulation.withdraw(_HAND)
+            self._tool.return_to_start()
+            self.viewer.show_instruments(self._tool.drawn())
         self._restart_clock()
         self._show()
 
@@ -154,14 +197,17 @@ class Standalone:
     def _show(self, age: float = 0.0) -> None:
         state = self.simulation.state()
         force, _ = self.simulation.reaction(_HAND)
-        tools = {} if self._pose is None else {_HAND: Tool(self._pose[:3, 3], -force)}
+        works_at = None if self._pose is None else self._pose[:3, 3] if self._tool is None else self._tool.works_at
+        tools = {} if works_at is None else {_HAND: Tool(works_at, -force)}
         viewer, moved = self.viewer, self.viewer.show_state(state.positions, state.F, age)
         viewer.show_tools(tools, _HAND)
         viewer.show_text(*self._text())
         self._endoscope_dirty |= moved
         if viewer.wants_endoscope and self._endoscope_dirty:
             self._endoscope_dirty = False
-            viewer.show_endoscope(self._renderer.render(self._camera, state.positions, state.F)[0], self._camera)
+            drawn = None if self._tool is None else self._tool.drawn()
+            seen = self._renderer.views([self._camera], state.positions, state.F, depth=False, instruments=drawn)[0]
+            viewer.show_endoscope(seen.image, self._camera)
 
     def _restart_clock(self) -> None:
         self._due = time.monotonic()
@@ -177,8 +223,12 @@ class Standalone:
         return [f"{len(self.model)} Gaussians, {len(self.simulation.nodes.rest)} nodes", f"{self.simulation.time:.1f} s, {pace}"]
 
 
-def view(path: Path, physics: PhysicsConfig, config: ViewerConfig) -> None:
+def view(path: Path, physics: PhysicsConfig, config: ViewerConfig, instrument: str) -> None:
     """Serve the page on a PLY model, seen by the cameras in the cameras.json beside it, else from the world's origin.
+
+    Args:
+        path: The model.
+        physics, config, instrument: As for `Standalone`.
 
     Raises:
         ModelError: If the model cannot be read.
@@ -186,7 +236,7 @@ def view(path: Path, physics: PhysicsConfig, config: ViewerConfig) -> None:
     """
     model = load_ply(path)
     beside = path.parent / "cameras.json"
-    page = Standalone(model, load_cameras(beside) if beside.is_file() else [camera_at_origin(model)], physics, config)
+    page = Standalone(model, load_cameras(beside) if beside.is_file() else [camera_at_origin(model)], physics, config, instrument)
     print(f"open {page.viewer.url} in a browser; Ctrl-C ends", flush=True)
     page.run()
 

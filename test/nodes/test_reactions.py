@@ -21,7 +21,15 @@ REACTION = messages.tool_reaction("PSM1")
 
 @pytest.fixture
 def bench():
-    given = {"mode": "lockstep", "reaction_rate": RATE, "step_duration": 0.02, "node_count": 300, "force_radius": 0.02, "device": "cpu"}
+    given = {
+        "mode": "lockstep",
+        "reaction_rate": RATE,
+        "step_duration": 0.02,
+        "node_count": 300,
+        "force_radius": 0.02,
+        "device": "cpu",
+        "link_contact": "false",
+    }
     rclpy.init(args=["--ros-args", *(word for name, value in given.items() for word in ("-p", f"physics_node:{name}:={value}"))])
     bench = Bench()
     yield bench

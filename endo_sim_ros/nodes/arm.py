@@ -52,7 +52,7 @@ class Arm:
             self.homed = command == "home"
             return
         if command not in _TRANSITIONS:
-            raise ValueError(f"{command!r} is no state command; there are {', '.join(_TRANSITIONS)}, home, unhome")
+            raise ValueError(f"{command[:40]!r} is no state command; there are {', '.join(_TRANSITIONS)}, home, unhome")
         states, after = _TRANSITIONS[command]
         if self.state not in states:
             raise ValueError(f"{command} is not possible while {self.name} is {self.state}")
@@ -72,6 +72,12 @@ class Arm:
     def check_jaw(self, angle: float) -> float:
         """An angle of the jaw, rad, that the arm may take; every one, as nobody knows its tool."""
         return angle
+
+    @property
+    def works_at(self) -> np.ndarray:
+        """Where a wrench acts [3], m, world: at the tip, as nobody knows its tool. The arm has a pose."""
+        assert self.pose is not None
+        return self.pose[:3, 3]
 
     @property
     def moving(self) -> bool:

@@ -43,7 +43,12 @@ def make_arms(options: PhysicsNodeConfig) -> dict[str, Arm]:
             arms[name] = Arm(name)
         else:
             tool, _, description = tool.partition("@")
-            kinematics = load_arm(model, tool)
+            if not tool:
+                raise ConfigError(f"instruments: that of {name} has no name; give one, or {_NO_INSTRUMENT}")
+            try:
+                kinematics = load_arm(model, tool)
+            except ConfigError as error:
+                raise ConfigError(f"instruments or arm_models of {name}: {error}") from error
             kind, _, number = kinematics.tool.rpartition("_")
             tool_type = str(Path(tool).resolve()) if tool.endswith(".json") else f"{kind}:{number}"
             if description:

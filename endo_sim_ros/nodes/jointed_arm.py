@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from endo_sim_ros.core.cameras import invert_pose
-from endo_sim_ros.instruments import ArmKinematics, Capsule, ReachConfig, link_poses, solve_inverse
+from endo_sim_ros.instruments import ArmKinematics, Capsule, ReachConfig, link_poses, solve_inverse, working_point
 from endo_sim_ros.nodes.arm import DISABLED, Arm, seconds_between
 from endo_sim_ros.physics import ControlNodes
 
@@ -153,7 +153,7 @@ class JointedArm(Arm):
             ValueError: As from `servo_joints`, and if they have other names.
         """
         arm, known = self.kinematics, ", ".join(joint.name for joint in self.kinematics.joints)
-        if names and ", ".join(names) != known:
+        if any(names) and ", ".join(names) != known:
             raise ValueError(f"{self.name}: the joints are {known}, in this order, not {', '.join(names):.200}; send these names or none")
         try:
             positions = arm.check_joints(joints)
@@ -173,12 +173,26 @@ class JointedArm(Arm):
 
     def check_jaw(self, angle: float) -> float:
         """An angle of the jaw, rad, that a commanded arm may take; ValueError if it is beyond the limits of the tool."""
+        if self.commanded and self.kinematics.jaw is None:
+            raise ValueError(f"{self.name}: {self.kinematics.tool} has no jaw, so it neither opens nor closes")
         if self.commanded and self.kinematics.jaw is not None:
             lower, upper = self.kinematics.jaw
             if not lower - _JAW_WITHIN <= angle <= upper + _JAW_WITHIN:
                 shown, *limits = (f"{np.degrees(number):.4g}" for number in (angle, lower, upper))
                 raise ValueError(f"{self.name}: the jaw cannot be at {shown} degrees; its limits are {' and '.join(limits)} degrees")
         return angle
+
+    def hold(self, closed_at: float, open_at: float) -> None:
+        """Close or open the jaw by its angle; a tool without one holds nothing, whatever its robot measures."""
+        if self.kinematics.jaw is not None:
+            super().hold(closed_at, open_at)
+
+    @property
+    def works_at(self) -> np.ndarray:
+        """Where a wrench acts [3], m, world: between the jaws or at the point of an instrument that touches, else at the tip."""
+        if not self.capsules or self.base is None or self.pose is None:
+            return super().works_at
+        return self.pose[:3, :3] @ working_point(self.kinematics, self.capsules) + self.pose[:3, 3]
 
     # ------------------------------------------------------------------ motion
 

@@ -214,14 +214,14 @@ class PhysicsNode(EndoNode):
                 force, torque = np.zeros(3), np.zeros(3)
             wanted = bool(force.any() or torque.any())
             if wanted or arm.acting:
-                reached = simulation.set_wrench(name, arm.pose[:3, 3], force, torque)
+                reached = simulation.set_wrench(name, arm.works_at, force, torque)
                 if wanted and not reached:
                     self.report_error(f"{name}: the wrench {where} has no effect; {self._out_of_reach(simulation)}")
             arm.acting = wanted
 
     @staticmethod
     def _out_of_reach(simulation: TissueSimulation) -> str:
-        return f"no movable tissue lies within force_radius = {simulation.config.force_radius:g} m of the tip"
+        return f"no movable tissue lies within force_radius = {simulation.config.force_radius:g} m of where the tool works"
 
     # ------------------------------------------------------------------ steps
 

@@ -24,6 +24,7 @@ from endo_sim_ros.physics.regions import TissueProperties
 MAX_TOOLS = 8  # of a TissueSimulation
 MAX_CAPSULES = 12  # of each; the instruments of the da Vinci have five or six
 _RESTING_SPEED = 1e-5  # m/s; tissue slower than this, with no tool acting, is left as it is
+_MOST_WRENCH = 1e9  # N, N·m; more is beyond what float32 can square
 _RELAXED = 8.0  # relaxation times after the last touch, too
 
 
@@ -134,9 +135,11 @@ class TissueSimulation:
             Whether the wrench arrives: False when it is not zero but no moving skin node is in reach.
 
         Raises:
-            ValueError: If an input has a wrong shape or is not finite; the tool then keeps its previous wrench.
+            ValueError: If an input has a wrong shape, is not finite, or is beyond any unit; the tool then keeps its previous wrench.
         """
         tip, force, torque = (_vector(name, value, tool) for name, value in (("tip", tip), ("force", force), ("torque", torque)))
+        if max(np.abs(force).max(), np.abs(torque).max()) > _MOST_WRENCH:
+            raise ValueError(f"the wrench of tool {tool!r} is more than {_MOST_WRENCH:g} N or N·m; is it in newtons?")
         wanted = bool(force.any() or torque.any())
         if not wanted and tool not in self._slots:
             return True
@@ -393,9 +396,10 @@ class TissueSimulation:
         if undone:
             turned = float(self._tools.torques.norm()) > float(self._tools.forces.norm())  # with levers below a metre
             less = "torque" if turned else "force"
+            limited = "; until then as much of the wrench acts as the tissue bears" if self._wrenches_act() else ""
             self.last_fault = (
                 f"a step was undone: {self.solver.bad_nodes.numpy()[0]} of {len(self.nodes)} nodes ended non-finite, torn or"
-                f" over {self.config.travel:g} m from rest ({self._describe_tools()}); use less {less} or more travel"
+                f" over {self.config.travel:g} m from rest ({self._describe_tools()}); use less {less} or more travel{limited}"
             )
 
     def _wrenches_act(self) -> bool:

@@ -117,3 +117,28 @@ def test_an_instrument_whose_shape_nobody_knows_touches_as_a_usual_one(tmp_path,
     arm = make_arms(PhysicsNodeConfig(instruments=(str(tool),), link_contact=True))["PSM1"]
     assert "nobody knows the shape of MY_SPOON_1; it looks like a LARGE_NEEDLE_DRIVER" in caplog.text
     assert len(arm.capsules) == len(build_instrument(load_arm("PSM", "LARGE_NEEDLE_DRIVER"))[1])
+
+
+def test_a_tool_without_a_jaw_refuses_one_and_holds_nothing():
+    arm = make_arms(PhysicsNodeConfig(instruments=("PERMANENT_CAUTERY_HOOK",), arm_source="commanded"))["PSM1"]
+    with pytest.raises(ValueError, match="PSM1: PERMANENT_CAUTERY_HOOK_400183 has no jaw, so it neither opens nor closes"):
+        arm.check_jaw(0.0)
+    arm.angle = 0.0
+    arm.hold(0.1, 0.2)
+    assert not arm.closed, "whatever a robot measures"
+
+
+def test_a_wrench_acts_between_the_jaws_and_at_a_bare_tip_where_the_links_do_not_touch():
+    for touch in (True, False):
+        arm = make_arms(PhysicsNodeConfig(link_contact=touch, arm_source="commanded"))["PSM1"]
+        arm.stand(np.eye(4), np.clip(np.zeros(6), arm.kinematics.lower, arm.kinematics.upper))
+        offset = np.linalg.norm(arm.works_at - arm.pose[:3, 3])
+        assert (0.005 < offset < 0.02) if touch else offset == 0
+
+
+@pytest.mark.parametrize(
+    "tool, said", [("FOO_DRIVER", "instruments or arm_models of PSM1: "), (" ", "instruments: that of PSM1 has no name")]
+)
+def test_an_instrument_that_is_none_is_refused_by_the_name_of_its_arm(tool, said):
+    with pytest.raises(ValueError, match=said):
+        make_arms(PhysicsNodeConfig(instruments=(tool,)))

@@ -192,3 +192,13 @@ def test_substeps_follow_from_the_material_and_add_up_to_the_step():
     for duration in (0.04, 0.02):  # a number is taken as it is, whatever the duration of the step; the paper has 80
         printed = plan_substeps(PhysicsConfig(substeps=80, step_duration=duration), 0.00875)
         assert (printed.count, printed.dt) == (80, pytest.approx(duration / 80))
+
+
+def test_a_wrench_beyond_any_unit_is_refused_and_the_one_before_stays():
+    simulation = simulate()
+    assert simulation.set_wrench("probe", TIP, [0.0, 0.0, -0.1])
+    for force in (1e40, 1e300):
+        with pytest.raises(ValueError, match=r"the wrench of tool 'probe' is more than 1e\+09 N or N·m; is it in newtons\?"):
+            simulation.set_wrench("probe", TIP, [0.0, 0.0, -force])
+    simulation.step()
+    assert simulation.reaction("probe")[0][2] == pytest.approx(0.1, rel=1e-6)

@@ -321,9 +321,9 @@ def test_an_angle_beyond_the_jaw_is_refused_and_a_tight_closing_is_not(graph, to
 
 def test_an_arm_whose_base_is_moved_lets_go_and_the_others_stay(graph):
     hold_tissue(graph)
-    send_joints(graph, messages.tool_joint_command, joints_of(graph, "PSM2") + [0.1, 0, 0, 0, 0, 0], "PSM2")
-    graph.spin(0.1)
-    other = joints_of(graph, "PSM2")
+    other = joints_of(graph, "PSM2") + [0.1, 0, 0, 0, 0, 0]
+    send_joints(graph, messages.tool_joint_command, other, "PSM2")
+    graph.until(lambda: (joints_of(graph, "PSM2") == other).all(), "another arm that has moved")
     assert graph.set("physics_node", frames=["PSM1_base 0.12 0.1 0.0 0 1 0 0"])[0]
     graph.until(lambda: felt(graph) == 0 and moved(graph) < 1e-3, "tissue that is let go")
     arms = graph.nodes[1].arms

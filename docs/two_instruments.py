@@ -11,17 +11,18 @@ import numpy as np
 
 from endo_sim_ros.core.cameras import load_cameras
 from endo_sim_ros.core.gaussians import load_ply
-from endo_sim_ros.instruments import build_instrument, link_poses, load_arm, place_arm, solve_inverse
+from endo_sim_ros.instruments import build_instrument, load_arm, place_arm
+from endo_sim_ros.instruments.aiming import AHEAD
 from endo_sim_ros.instruments.drawing import InstrumentDrawing
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig, render_depth
+from endo_sim_ros.viewer.posed_tool import PosedTool
 
 TOOLS = {"PSM1": "PROGRASP_FORCEPS", "PSM2": "LARGE_NEEDLE_DRIVER"}
 PLACES = {"PSM1": (0.55, 0.48), "PSM2": (0.43, 0.50)}  # where they take hold, shares of the picture
-ASIDE = {"PSM1": np.array([0.010, 0.002, -0.014]), "PSM2": np.array([-0.010, -0.003, -0.012])}  # m, camera: how far they pull
-NEAR = 0.006  # m from the hinge of the jaws to the tissue between them
-SECONDS, EVERY = 4.8, 2  # of tissue, and steps from one picture to the next
-JAW = 0.7  # rad, open
+ASIDE = {"PSM1": np.array([0.007, 0.001, -0.009]), "PSM2": np.array([-0.007, -0.002, -0.008])}  # m, camera: how far they pull
+SECONDS, EVERY = 4.8, 3  # of tissue, and steps from one picture to the next
+WIDTH, HEIGHT = 300, 240  # pixels
 
 
 def smooth(share: float) -> float:
@@ -38,39 +39,33 @@ def main() -> None:
     tissue = TissueSimulation(model, np.array([c.position for c in cameras]), PhysicsConfig(), cameras, render_depth)
     renderer = DeformableRenderer(model, tissue.nodes.rest, RenderingConfig())
     depth = render_depth(model, camera)
-    arms, places, parts, capsules, held = {}, {}, [], [], {}
+    tools, tips, shapes = {}, {}, []
     for name, tool in TOOLS.items():
-        arms[name] = load_arm("PSM", tool)
+        arm = load_arm("PSM", tool)
         column, row = (int(share * size) for share, size in zip(PLACES[name], (camera.width, camera.height)))
-        places[name] = place_arm(name, arms[name], camera, float(depth[row, column]))
-        held[name] = camera.backproject(depth)[row, column]
-        shape, capsule = build_instrument(arms[name])
-        parts.append(shape)
-        capsules.append(capsule)
-    drawing = InstrumentDrawing(parts, device=renderer.device, capsules=capsules)
-    pictures, toward = [], -camera.pose[:3, 2]
-    steps = round(SECONDS / tissue.step_duration)
+        tools[name] = PosedTool(arm, place_arm(name, arm, camera, float(depth[row, column])), renderer.device)
+        tips[name] = tools[name].aim(camera.backproject(depth)[row, column])
+        tissue.set_instrument(name, tools[name].capsules)
+        shapes.append(build_instrument(arm))
+    drawing = InstrumentDrawing([parts for parts, _ in shapes], device=renderer.device, capsules=[own for _, own in shapes])
+    pictures, steps = [], round(SECONDS / tissue.step_duration)
     for step in range(steps):
-        time, posed = step / steps, []
-        for name, arm in arms.items():
-            place = places[name]
+        time = step / steps
+        for name, tool in tools.items():
             # Down to the tissue, close, spread and lift, back, open, up.
-            above = 0.02 * (1 - smooth(time / 0.2) + smooth((time - 0.85) / 0.15))
+            back = AHEAD * (1 - smooth(time / 0.2) + smooth((time - 0.85) / 0.15))
             pulled = camera.pose[:3, :3] @ ASIDE[name] * (smooth((time - 0.3) / 0.25) - smooth((time - 0.65) / 0.15))
-            tip = place.base @ arm.tip_pose(place.joints)
-            tip[:3, 3] = held[name] + pulled + (NEAR + above) * toward
-            closed = 0.25 < time < 0.82
-            tissue.set_grasp(name, tip, closed)
-            joints = solve_inverse(arm, np.linalg.inv(place.base) @ tip, place.joints).joints
-            jaw = JAW * (1 - smooth((time - 0.2) / 0.05) + smooth((time - 0.82) / 0.04))
-            posed.append({link: place.base @ pose for link, pose in link_poses(arm, joints, jaw).items()})
+            tip, closed = tips[name].copy(), 0.25 < time < 0.82
+            tip[:3, 3] += pulled - back * tip[:3, 2]
+            links = tool.move(tip, closed)
+            tissue.set_grasp(name, tool.pose, closed, links)
         tissue.step()
         if step % EVERY == 0:
-            state = tissue.state()
-            (view,) = renderer.views([camera], state.positions, state.F, depth=False, instruments=drawing.at(posed))
+            state, posed = tissue.state(), drawing.at([tool.links() for tool in tools.values()])
+            (view,) = renderer.views([camera], state.positions, state.F, depth=False, instruments=posed)
             pictures.append(cv2.cvtColor(view.image, cv2.COLOR_RGB2BGR))
     animation = cv2.Animation()
-    animation.frames = [cv2.resize(picture, (360, 288), interpolation=cv2.INTER_AREA) for picture in pictures]
+    animation.frames = [cv2.resize(picture, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA) for picture in pictures]
     animation.durations = [round(1000 * EVERY * tissue.step_duration)] * len(pictures)
     if not cv2.imwriteanimation(target, animation):
         raise SystemExit(f"{target} could not be written; name a .gif in a folder that is there")

@@ -14,7 +14,7 @@ GRIP = 0.85
 """Where on the jaws tissue is gripped, from their hinge, 0, to their points, 1: with what lies before the points, not at them."""
 
 AHEAD = 0.02
-"""How far in front of the tissue tools come from, straight ahead, and go back to, m."""
+"""How far in front of the tissue tools wait at the start, come from, straight ahead, and go back to, m."""
 
 
 def working_point(arm: ArmKinematics, capsules: Sequence[Capsule], share: float = GRIP) -> np.ndarray:

@@ -23,13 +23,13 @@ from endo_sim_ros.instruments import (
     solve_inverse,
     working_point,
 )
+from endo_sim_ros.instruments.aiming import AHEAD
 from endo_sim_ros.instruments.shapes import SHAPES
 from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.learning.tasks import Task
 from endo_sim_ros.learning.variation import Variation
 
 ARM = "PSM1"
-WITHDRAWN = 0.02  # m: how far from the middle of the tissue physics_node's arm waits for its first command
 _WORLD = "world"
 _LEVER = 0.1  # m: about how far the tip is from the remote centre, about which yaw and pitch turn it
 _WRIST_STEP = 0.05  # rad a step of 0.04 s: about half the speed that the dVRK allows
@@ -55,7 +55,7 @@ class HeldTool:
     def start(self) -> np.ndarray:
         """Joint positions [6] before the first command, rad and m; as physics_node has them for an arm with a known base."""
         joints = np.clip(np.zeros(len(self.arm.joints)), self.arm.lower, self.arm.upper)
-        joints[2] = np.clip(0.5 * (self.arm.lower[2] + self.arm.upper[2]) - WITHDRAWN, self.arm.lower[2], self.arm.upper[2])
+        joints[2] = np.clip(0.5 * (self.arm.lower[2] + self.arm.upper[2]) - AHEAD, self.arm.lower[2], self.arm.upper[2])
         return joints
 
     @cached_property

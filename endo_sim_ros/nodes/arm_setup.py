@@ -9,6 +9,7 @@ import numpy as np
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.instruments import Capsule, build_instrument, load_arm, place_arm
+from endo_sim_ros.instruments.aiming import AHEAD
 from endo_sim_ros.instruments.urdf_reader import read_urdf
 from endo_sim_ros.nodes.arm import Arm
 from endo_sim_ros.nodes.configs import PhysicsNodeConfig, arm_names
@@ -17,7 +18,6 @@ from endo_sim_ros.nodes.jointed_arm import CameraArm, JointedArm
 CAMERA_ARM = "ECM"
 _OF_CAMERA = {"PSM": "ECM", "PSM_Si": "ECM_Si"}  # which one goes with the instruments' arms where there is one model for all
 _NO_INSTRUMENT = "none"
-_WITHDRAWN = 0.02  # m: at the start the jaws, 1 to 2 cm long, are in front of the tissue, and two instruments do not meet
 
 
 def make_arms(options: PhysicsNodeConfig) -> dict[str, Arm]:
@@ -118,8 +118,8 @@ def place_arms(
             else:
                 placement = place_arm(short, kinematics, *view)
                 base, joints = placement.base, placement.joints.copy()
-            if not isinstance(arm, CameraArm):
-                joints[2] = np.clip(joints[2] - _WITHDRAWN, lower[2], upper[2])
+            if not isinstance(arm, CameraArm):  # its jaws are in front of the tissue then, and two instruments do not meet
+                joints[2] = np.clip(joints[2] - AHEAD, lower[2], upper[2])
             if anew or arm.base is None or not np.array_equal(arm.base, base):
                 arm.stand(base, joints)
         except ConfigError as error:

@@ -16,7 +16,7 @@ from endo_sim_ros.instruments.aiming import AHEAD
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig, middle_depth, render_depth
 from endo_sim_ros.viewer.config import ViewerConfig
-from endo_sim_ros.viewer.mouse_tool import MouseTool
+from endo_sim_ros.viewer.posed_tool import PosedTool
 from endo_sim_ros.viewer.tool_marks import Tool
 from endo_sim_ros.viewer.viewer import PARAMETERS, Viewer, plain_camera
 
@@ -52,7 +52,7 @@ class Standalone:
         self.viewer = Viewer(config, self)
         self._show_model()
 
-    def _make_tool(self, name: str) -> MouseTool | None:
+    def _make_tool(self, name: str) -> PosedTool | None:
         """The tool on an arm that stands where a graph's PSM1 does; None where such an arm does not reach the tissue."""
         arm, depth = load_arm("PSM", name), middle_depth(render_depth(self.model, self._camera))
         try:
@@ -60,7 +60,7 @@ class Standalone:
         except ConfigError as error:
             _logger.warning("the mouse moves a bare tip: %s", error)
             return None
-        return MouseTool(arm, place, pick_device(self._physics.device))
+        return PosedTool(arm, place, pick_device(self._physics.device))
 
     def _simulate(self, physics: PhysicsConfig) -> TissueSimulation:
         viewpoint = np.stack([camera.position for camera in self._cameras])
@@ -142,7 +142,6 @@ class Standalone:
         """Return the tissue to rest."""
         self.simulation.reset()
         if self._tool is not None:
-            self.simulation.withdraw(_HAND)
             self._tool.return_to_start()
             self.viewer.show_instruments(self._tool.drawn())
         self._restart_clock()

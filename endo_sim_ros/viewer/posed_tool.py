@@ -1,4 +1,4 @@
-"""The instrument that the mouse moves where no graph has one."""
+"""An instrument that is moved by the pose of its tip, where no graph has an arm for it."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from endo_sim_ros.instruments.aiming import AHEAD
 from endo_sim_ros.instruments.drawing import InstrumentDrawing, PosedInstruments
 
 
-class MouseTool:
+class PosedTool:
     """An instrument, open and in front of the tissue until it is moved.
 
     Args:

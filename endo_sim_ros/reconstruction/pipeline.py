@@ -197,6 +197,7 @@ def refine_across_views(scene: PreparedScene, config: ReconstructionConfig, prog
         stereo=config.stereo,
         interpolation=config.interpolation,
         width=config.image_width,
+        device=pick_device(config.device),
         progress=progress,
     )
     return replace(scene, views=tuple(refined))

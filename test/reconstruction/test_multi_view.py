@@ -5,12 +5,15 @@ import dataclasses
 import cv2
 import numpy as np
 import pytest
+import torch
 from short_training import NO_POINTS, bare, options
 from training_views import unknown, with_prior
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame
+from endo_sim_ros.core.kernels import launch
 from endo_sim_ros.reconstruction import prepare
+from endo_sim_ros.reconstruction.priors import smoothing_kernels
 from endo_sim_ros.reconstruction.priors.inverse_depth import correct, smooth
 from endo_sim_ros.reconstruction.priors.multi_view import refine_depth
 from endo_sim_ros.reconstruction.priors.sources import estimate_depth
@@ -157,6 +160,23 @@ def test_ripples_of_wide_images_are_smoothed_and_edges_are_not():
     error = smooth((step + noise).astype(np.float32), 10, 0.05) - step
     assert error.std() < 0.1 * noise.std()
     assert np.abs(error[:, 950:970]).max() < 0.5 * noise.std()
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=pytest.mark.gpu)])
+@pytest.mark.parametrize("height, width, size", [(60, 90, 30), (64, 80, 80), (40, 1300, 13), (2, 50, 60)])
+def test_the_filter_of_gpus_is_that_of_opencv(height, width, size, device):
+    if device != "cpu" and not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    rng = np.random.default_rng(0)
+    inverse = (np.where(np.arange(width) < width / 3, 8.0, 12.0) + rng.normal(0, 0.3, (height, width))).astype(np.float32)
+    median, spread = np.float32(np.median(inverse)), size * width / 640
+    stride = max(round(spread / 8), 1)
+    relative, found = torch.from_numpy(inverse / median).to(device), torch.empty(inverse.shape, device=device)
+    arguments = [relative, 0.1, spread / stride, max(round(1.5 * spread / stride), 1), stride, found]
+    launch(smoothing_kernels.bilateral, inverse.size, arguments, device)
+    np.testing.assert_allclose(median * found.cpu().numpy(), smooth(inverse, size, 0.1), rtol=2e-4)
+    if device != "cpu":
+        np.testing.assert_allclose(smooth(inverse, size, 0.1, device), smooth(inverse, size, 0.1), rtol=2e-4)
 
 
 def test_larger_relative_steps_than_an_edge_are_kept():

@@ -13,7 +13,7 @@ import numpy as np
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.reconstruction.priors.flow import EyeImage, eye_image, flow_correction
 from endo_sim_ros.reconstruction.priors.interpolation import inverse_distance_weighted
-from endo_sim_ros.reconstruction.priors.inverse_depth import blur, correct, scaled, smooth
+from endo_sim_ros.reconstruction.priors.inverse_depth import blur, correct, prepare_smoothing, scaled, smooth
 from endo_sim_ros.reconstruction.priors.stereo import right_view
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import ScenePoints, TrainingView, pixels_of, shrink
@@ -29,6 +29,7 @@ def refine_depth(
     stereo: StereoConfig = StereoConfig(),
     interpolation: InterpolationConfig = InterpolationConfig(),
     width: int = 0,
+    device: str = "cpu",
     progress: StageProgress = StageProgress(),
 ) -> list[TrainingView]:
     """The views with their depth prior corrected by scene points and by what neighbouring views show.
@@ -47,9 +48,11 @@ def refine_depth(
         stereo: How right images were matched.
         interpolation: How holes are filled, for what lies beside them.
         width: Views come back shrunk to it, pixels; 0 leaves them as they are.
+        device: Where depth is smoothed.
         progress: Reported to by views.
     """
     views = list(views)
+    prepare_smoothing(device)
     images = progress.map(lambda view: eye_image(view, options), views)
     near = nearest_views(views, options.neighbours)
 
@@ -62,14 +65,14 @@ def refine_depth(
         inverse = inverse_distance_weighted(inverse, known, camera.width, interpolation)[..., 0]
         error = (options.points_error if source == "points" else options.prior_error) * inverse
         if source == "stereo" and view.right is not None:
-            inverse, error = _refine_by_eyes(inverse, view, images[i], options, stereo)
+            inverse, error = _refine_by_eyes(inverse, view, images[i], options, stereo, device)
         total, weight = _point_corrections(camera, inverse, error, points, options)
         for j in near[i]:
             progress.check()
             if (found := flow_correction(inverse, images[i], images[j], options)) is not None:
                 total, weight = total + found.precision * found.correction, weight + found.precision
         inverse = correct(inverse, total, weight, error, options.continuation, options.max_correction)
-        inverse = smooth(inverse, options.smoothing, options.edge)
+        inverse = smooth(inverse, options.smoothing, options.edge, device)
         good = known & np.isfinite(inverse) & (inverse > 0)
         return np.where(good, 1 / np.where(good, inverse, 1), 0).astype(np.float32)
 
@@ -82,7 +85,7 @@ def refine_depth(
 
 
 def _refine_by_eyes(
-    inverse: np.ndarray, view: TrainingView, left: EyeImage, options: MultiViewConfig, stereo: StereoConfig
+    inverse: np.ndarray, view: TrainingView, left: EyeImage, options: MultiViewConfig, stereo: StereoConfig, device: str
 ) -> tuple[np.ndarray, np.ndarray]:
     """Inverse depth [H, W] (1/m) of matching, corrected by the flow that it leaves between the eyes, and its error [H, W].
 
@@ -92,7 +95,7 @@ def _refine_by_eyes(
     assert view.baseline is not None
     pixel, other = left.camera.K[0, 0] * view.baseline, right_view(view, stereo)  # a disparity of one pixel is 1 / pixel
     width, matched = left.camera.width, np.full(inverse.shape, stereo.disparity_error / pixel, np.float32)
-    inverse = smooth(inverse, options.matched_window, options.matched_edge)
+    inverse = smooth(inverse, options.matched_window, options.matched_edge, device)
     # Between the eyes reflections hardly move.
     left = left._replace(matte=view.tissue.astype(np.uint8))
     right = eye_image(other, options)._replace(matte=other.tissue.astype(np.uint8))
@@ -106,7 +109,7 @@ def _refine_by_eyes(
     # Where flow tells nothing, far and wide, the error stays that of matching.
     share = np.minimum(2 * blur(precision > 0, options.continuation, width), 1)
     error = (stereo.disparity_error + (options.refined_disparity_error - stereo.disparity_error) * share) / pixel
-    return smooth(corrected, options.smoothing, options.eyes_edge), error
+    return smooth(corrected, options.smoothing, options.eyes_edge, device), error
 
 
 def _point_corrections(

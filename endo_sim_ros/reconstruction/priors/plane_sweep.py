@@ -16,7 +16,7 @@ from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.kernels import launch, load_kernels
 from endo_sim_ros.reconstruction.priors import sweep_kernels
 from endo_sim_ros.reconstruction.priors.interpolation import fit_plane
-from endo_sim_ros.reconstruction.priors.inverse_depth import smooth
+from endo_sim_ros.reconstruction.priors.inverse_depth import prepare_smoothing, smooth
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import TrainingView, pixels_of, shrink
 from endo_sim_ros.reconstruction.stage_configs import MatchingConfig, PlaneSweepConfig
@@ -69,6 +69,7 @@ def sweep_depth(
         progress: Reported to by views.
     """
     load_kernels((sweep_kernels,), device)
+    prepare_smoothing(device)
     pictures = progress.map(lambda view: _picture(shrink(view, options.width), options), views)
     near = nearest_views(views, options.neighbours)
 
@@ -88,7 +89,7 @@ def sweep_depth(
         if (own := matched[index]) is not None:
             others = [(pictures[j].camera, matched[j]) for j in near[index] if matched[j] is not None]
             believed = own.alike & (_confirmed(pictures[index].camera, own, others, options) >= options.min_views)
-            inverse = np.where(believed, smooth(own.inverse, options.smoothing, options.edge), 0)
+            inverse = np.where(believed, smooth(own.inverse, options.smoothing, options.edge, device), 0)
             inverse = cv2.resize(inverse, (view.camera.width, view.camera.height), interpolation=cv2.INTER_NEAREST_EXACT)
             other = (inverse > 0) & (view.tissue > 0) & (np.abs(depth * inverse - 1) > tolerance)  # 0 is another depth, too
             depth[other] = 1 / inverse[other]

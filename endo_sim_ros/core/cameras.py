@@ -82,6 +82,11 @@ class Camera:
         points = self.rays() * depth[..., None]
         return points @ self.pose[:3, :3].T + self.pose[:3, 3]
 
+    def unproject(self, uv: np.ndarray, z: np.ndarray) -> np.ndarray:
+        """World points [N, 3] at pixels [N, 2] and depths [N] (z along the optical axis, metres)."""
+        slopes = (uv - self.K[:2, 2]) / np.diag(self.K)[:2]
+        return np.append(slopes, np.ones((len(slopes), 1)), 1) * z[:, None] @ self.pose[:3, :3].T + self.pose[:3, 3]
+
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pixel coordinates [N, 2] and depths [N] of world points [N, 3]; points behind have depth <= 0."""
         local = (points - self.pose[:3, 3]) @ self.pose[:3, :3]
@@ -92,8 +97,12 @@ class Camera:
 
     def sees(self, points: np.ndarray) -> np.ndarray:
         """Which points [N, 3] (m, world) lie in the picture [N], hidden or not."""
-        uv, z = self.project(points)
-        return (z > 0) & (uv >= 0).all(1) & (uv < [self.width, self.height]).all(1)
+        return self.contains(*self.project(points))
+
+    def contains(self, uv: np.ndarray, z: np.ndarray) -> np.ndarray:
+        """Which points at pixels [N, 2] and depths [N] (m), as `project` gives them, lie in the picture [N]."""
+        u, v = uv.T
+        return (z > 0) & (u >= 0) & (v >= 0) & (u < self.width) & (v < self.height)
 
 
 def intrinsic_matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:

@@ -64,9 +64,9 @@ def initial_model(
         stride = _stride(chosen, max_gaussians)
         taken = [pixels & _lattice(pixels.shape, stride) for pixels in chosen]
         for view, pixels, seen in zip(surfaces, taken, compared.mean_colors(taken, tolerance, progress)):
-            spacing = stride * view.surface[pixels].astype(np.float64) / view.camera.K[0, 0]
-            parts.append(_Points(view.camera.backproject(view.surface)[pixels], seen, spacing))
-    useful = ~_afloat(surfaces, points, tolerance, options)
+            depth, centres = view.surface[pixels].astype(np.float64), np.argwhere(pixels)[:, ::-1] + 0.5
+            parts.append(_Points(view.camera.unproject(centres, depth), seen, stride * depth / view.camera.K[0, 0]))
+    useful = ~_afloat(surfaces, points, tolerance, options, progress)
     if any(pixels.any() for pixels in chosen):  # lone points beyond the views would reach into them; see `extrapolate`
         useful &= np.any([view.camera.sees(points) for view in views], 0)
     parts.append(_in_holes(parts, points[useful], colors[useful]))
@@ -113,18 +113,24 @@ def _lattice(shape: tuple[int, int], stride: float) -> np.ndarray:
     return rows[:, None] & columns
 
 
-def _afloat(views: list[TrainingView], points: np.ndarray, tolerance: float, options: InitialModelConfig) -> np.ndarray:
+def _afloat(
+    views: list[TrainingView], points: np.ndarray, tolerance: float, options: InitialModelConfig, progress: StageProgress
+) -> np.ndarray:
     """Which triangulated points [N] float in front of the surface that some view sees there or, in a hole of it, beside it.
 
     Highlights are where depth has holes, and where points are matched that are no tissue: they move with the light.
     """
-    floats = np.zeros(len(points), bool)
-    for view in views:
+
+    def before(view: TrainingView) -> np.ndarray:
         depth, distance = fill_holes(view.surface)
         beside = (depth * (1 - tolerance - options.max_slope * distance / view.camera.K[0, 0])).astype(np.float32)
         found = pixels_of(view.camera, points)
         surface = np.maximum(beside, 0)[found.rows, found.columns]
-        floats[found.index] |= (surface > 0) & (found.depth < surface)
+        return found.index[(surface > 0) & (found.depth < surface)]
+
+    floats = np.zeros(len(points), bool)
+    for index in progress.map(before, views):
+        floats[index] = True
     return floats
 
 

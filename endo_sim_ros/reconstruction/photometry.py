@@ -67,10 +67,7 @@ def fit_light(
         progress: Reported to by views.
     """
     points = points[:: max(-(-len(points) // options.max_points), 1)]
-    observed = []
-    for done, view in enumerate(views):
-        progress(done, len(views))
-        observed.append(_well_seen(view, points, reference, tolerance, options))
+    observed = progress.map(lambda view: _well_seen(view, points, reference, tolerance, options), views)
     view = np.concatenate([np.full(len(index), v) for v, (index, _, _) in enumerate(observed)])
     index, colors, quantities = (np.concatenate(arrays) for arrays in zip(*observed))
     seen = np.bincount(index, minlength=len(points))[index] > 1
@@ -102,6 +99,7 @@ def remove_light(
     exposures: np.ndarray,
     reference: float,
     tolerance: float,
+    progress: StageProgress = StageProgress(),
 ) -> GaussianModel:
     """The model with the colours that, in the light [4] and exposures [V, 3], look like those of the views that see it.
 
@@ -109,12 +107,17 @@ def remove_light(
     """
     points = model.means.numpy().astype(np.float64)
     total, count = np.zeros((len(points), 3)), np.zeros((len(points), 1))
-    for view, exposure in zip(views, exposures):
+
+    def seen_colors(own: tuple[TrainingView, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        view, exposure = own
         seen = _visible(view, points, tolerance)
         colors = view.image[seen.rows, seen.columns].astype(np.float64).clip(1) / 255
         quantities = features_at(points[seen.index], view.camera, reference)
-        total[seen.index] += colors / np.exp((quantities @ light)[:, None] + exposure)
-        count[seen.index] += 1
+        return seen.index, colors / np.exp((quantities @ light)[:, None] + exposure)
+
+    for index, colors in progress.map(seen_colors, zip(views, exposures)):
+        total[index] += colors
+        count[index] += 1
     # What is dark in the corner of a picture may be this many times as bright as white in full light.
     colors = torch.from_numpy((total / count.clip(1)).clip(0, 4).astype(np.float32))
     sh = model.sh.clone()

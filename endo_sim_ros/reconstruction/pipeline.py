@@ -86,18 +86,18 @@ def reconstruct(
 def select_usable(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Leave out views that show no tissue: those masked whole, mostly white, or black."""
     options = config.views
-    kept, out = [], {}
-    for frame in scene.frames:
+
+    def fault(frame: Frame) -> str:
         pixels = frame.image.reshape(-1, 3) if frame.mask is None else frame.image[frame.mask > 0]
         if not len(pixels):
-            out.setdefault("masked", []).append(frame)
-        elif (pixels.min(-1) >= options.white).mean() > options.overexposed_share:
-            out.setdefault("overexposed", []).append(frame)
-        elif (pixels.max(-1) <= options.black).mean() > options.black_share:
-            out.setdefault("black", []).append(frame)
-        else:
-            kept.append(frame)
-        progress.check()
+            return "masked"
+        if (pixels.min(-1) >= options.white).mean() > options.overexposed_share:
+            return "overexposed"
+        return "black" if (pixels.max(-1) <= options.black).mean() > options.black_share else ""
+
+    kept, out = [], {}
+    for frame, reason in zip(scene.frames, progress.map(fault, scene.frames)):
+        (out.setdefault(reason, []) if reason else kept).append(frame)
     if not kept:
         advice = {
             "masked": "every pixel of every view is masked; a mask has 255 where there is tissue",
@@ -253,7 +253,7 @@ def place_gaussians(scene: PreparedScene, config: ReconstructionConfig, progress
         device=pick_device(config.device),
     )
     positions = model.means.numpy().astype(np.float64)
-    depths = np.concatenate([view.camera.project(positions)[1] for view in views])
+    depths = np.concatenate(progress.map(lambda view: view.camera.project(positions)[1], views))
     return replace(scene, model=model, depth=float(np.median(depths[depths > 0])), exposures=np.zeros((len(views), 3)))
 
 
@@ -271,7 +271,7 @@ def fit_light(scene: PreparedScene, config: ReconstructionConfig, progress: Stag
         exposure=config.exposure,
         progress=progress,
     )
-    model = photometry.remove_light(scene.model, scene.views, light, exposures, scene.depth, config.depth_tolerance)
+    model = photometry.remove_light(scene.model, scene.views, light, exposures, scene.depth, config.depth_tolerance, progress)
     return replace(scene, model=model, light=light, exposures=exposures)
 
 

@@ -42,19 +42,13 @@ def misposed(
         matching: How far a match may lie beside where a motion of the camera has it, and how many matches tell anything.
         progress: Reported to by pairs of views.
     """
-    check, moving = _PoseCheck([frame.camera for frame in frames], depths or [None] * len(frames), options, matching), []
-    for done, match in enumerate(matches):
-        progress(done, len(matches))
-        fits = check.fits_one_motion(match)
-        if fits.any():
-            moving.append(match._replace(first=match.first[fits], second=match.second[fits]))
-    wrong = check.outvoted([(match.views, check.error_in_two(match)) for match in moving])
+    check = _PoseCheck([frame.camera for frame in frames], depths or [None] * len(frames), options, matching)
+    moving = [match for match in progress.map(check.of_one_motion, matches) if len(match.first)]
+    wrong = check.outvoted([(match.views, error) for match, error in zip(moving, progress.map(check.error_in_two, moving))])
     moving = [match for match in moving if not set(match.views) & set(wrong)]
-    errors = []
-    for views, pixels in _tracks(moving, matching.min_points):
-        progress.check()
-        errors.append((views, check.error_in_three(views, pixels)))
-    return sorted(wrong + check.outvoted(errors))
+    tracks = _tracks(moving, matching.min_points)
+    errors = progress.map(lambda track: check.error_in_three(*track), tracks)
+    return sorted(wrong + check.outvoted([(views, error) for (views, _), error in zip(tracks, errors)]))
 
 
 class _PoseCheck:
@@ -65,11 +59,11 @@ class _PoseCheck:
     ) -> None:
         self._cameras, self._depths, self._options, self._matching = cameras, depths, options, matching
 
-    def fits_one_motion(self, matches: Matches) -> np.ndarray:
-        """Which matches [M] fit the motion of the camera that most fit; none where it may be an accident."""
+    def of_one_motion(self, matches: Matches) -> Matches:
+        """The matches that fit the motion of the camera that most fit; none where it may be an accident."""
         first, second = (self._cameras[view] for view in matches.views)
-        none = np.zeros(len(matches.first), bool)
-        if len(none) < self._matching.min_points:
+        none, count = matches._replace(first=matches.first[:0], second=matches.second[:0]), len(matches.first)
+        if count < self._matching.min_points:
             return none
         here, there = slopes(first, matches.first), slopes(second, matches.second)
         found: Any = cv2.findEssentialMat(here, there, np.eye(3), cv2.RANSAC, 0.999, self._matching.reprojection_error / second.K[0, 0])
@@ -77,7 +71,9 @@ class _PoseCheck:
             return none
         inliers = found[1][:, 0] > 0
         # Fewer than half of the matches fit many a motion.
-        return inliers if inliers.sum() >= max(self._matching.min_points, 0.5 * len(none)) else none
+        if inliers.sum() < max(self._matching.min_points, 0.5 * count):
+            return none
+        return matches._replace(first=matches.first[inliers], second=matches.second[inliers])
 
     def error_in_two(self, matches: Matches) -> float:
         """How far matches are from where the poses, and depth if there is any, expect them: the median."""
@@ -90,7 +86,7 @@ class _PoseCheck:
             u, v = np.floor(here).astype(int).T
             known = depth[v, u] > 0
             if known.sum() >= self._matching.min_points:
-                points = self._cameras[one].backproject(depth)[v, u][known]
+                points = self._cameras[one].unproject((np.floor(here) + 0.5)[known], depth[v, u][known])
                 errors.append(np.median(np.linalg.norm(self._cameras[other].project(points)[0] - there[known], axis=1)))
         return float(max(errors)) / self._cameras[j].width
 

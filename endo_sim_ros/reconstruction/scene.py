@@ -55,10 +55,10 @@ class PointPixels(NamedTuple):
 
 def pixels_of(camera: Camera, points: np.ndarray) -> PointPixels:
     """The pixels of points [N, 3] (m, world)."""
-    index = np.nonzero(camera.sees(points))[0]
-    uv, z = camera.project(points[index])
-    columns, rows = np.floor(uv).astype(int).T
-    return PointPixels(index, rows, columns, z)
+    uv, z = camera.project(points)
+    index = np.nonzero(camera.contains(uv, z))[0]
+    columns, rows = np.floor(uv[index]).astype(int).T
+    return PointPixels(index, rows, columns, z[index])
 
 
 def fill_holes(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -72,22 +72,33 @@ def scene_points(
     return triangulate(shown, None, options, progress) if len(shown) > 1 else ScenePoints.none()
 
 
-def points_in_view(camera: Camera, points: np.ndarray, options: MatchingConfig = MatchingConfig()) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels [M, 2] and depths [M] (m) of those of the points [N, 3] (m, world) that lie in a view.
+def points_in_view(
+    camera: Camera, points: np.ndarray, options: MatchingConfig = MatchingConfig(), where: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels [M, 2] and depths [M] (m) of those of the points [N, 3] (m, world) that lie in a view, or in some of its pixels [H, W].
 
     A point whose depth disagrees with that of its neighbours in the image is a wrong match or hidden, and left out.
     """
-    uv, z = camera.project(points[camera.sees(points)])
-    uv, first = np.unique(uv, axis=0, return_index=True)
-    agrees = _like_those_around(uv, z[first], options)
-    return uv[agrees], z[first][agrees]
+    uv, z = camera.project(points)
+    seen = camera.contains(uv, z)
+    first = np.unique(uv[seen] @ [1, 1j], return_index=True)[1]  # as complex numbers they are sorted several times as fast
+    uv, z = uv[seen][first], z[seen][first]
+    if where is None:
+        agrees = _like_those_around(uv, z, options)
+    else:
+        columns, rows = np.floor(uv).astype(int).T
+        agrees = _like_those_around(uv, z, options, where[rows, columns])
+    return uv[agrees], z[agrees]
 
 
-def _like_those_around(uv: np.ndarray, z: np.ndarray, options: MatchingConfig) -> np.ndarray:
-    """Which of the points at pixels [N, 2] have a depth [N] like that of the eight around them; none of too few."""
-    if len(uv) <= 8:
-        return np.zeros(len(uv), bool)
-    return np.abs(np.median(z[cKDTree(uv).query(uv, k=9)[1][:, 1:]], axis=1) / z - 1) < options.outlier_depth
+def _like_those_around(uv: np.ndarray, z: np.ndarray, options: MatchingConfig, which: np.ndarray | None = None) -> np.ndarray:
+    """Which of the points at pixels [N, 2], or of some [N], have a depth [N] like that of the eight around them; none of too few."""
+    alike = np.zeros(len(uv), bool)
+    chosen = np.arange(len(uv)) if which is None else np.flatnonzero(which)
+    if len(uv) > 8 and len(chosen):
+        around = z[cKDTree(uv).query(uv[chosen], k=9)[1][:, 1:]]
+        alike[chosen] = np.abs(np.median(around, axis=1) / z[chosen] - 1) < options.outlier_depth
+    return alike
 
 
 def _intersect(

@@ -84,7 +84,7 @@ def extrapolate(
         continued = continue_view(view, points, light, exposures[index], reference, pad, interpolation, device)
         positions = continued.camera.backproject(continued.depth)
         on_lattice = lambda times: _on_lattice(view, continued, positions, times * interpolation.cell)
-        return on_lattice(1.0), on_lattice(1.5)
+        return _unknown(on_lattice(1.0), views), _unknown(on_lattice(1.5), views)
 
     guesses = progress.map(around, usable)
     width = 4 * interpolation.cell
@@ -98,9 +98,9 @@ def extrapolate(
             guess = fine if least < options.fine_reach else coarse
             chosen = (guess.away > least) & (guess.away <= most)
             positions, spacing = guess.positions[chosen], guess.spacing[chosen]
-            new = _unknown(positions, views, ring in rings)
+            new = np.ones(len(positions), bool)
             trees = [before, cKDTree(np.concatenate(of_ring))] if of_ring else [before]
-            for tree in trees if new.any() else []:
+            for tree in trees:
                 new[new] = tree.query(positions[new])[0] > 0.7 * spacing[new]
             of_ring.append(positions[new])
             colors.append(guess.colors[chosen][new])
@@ -150,10 +150,9 @@ def continue_view(
     plane = a * np.arange(camera.width) + b * np.arange(camera.height)[:, None] + c  # what departs from it fades
     residual = np.zeros(depth.shape, np.float32)
     residual[known] = inverse - plane[known]
-    uv, z = points_in_view(camera, points)
+    uv, z = points_in_view(camera, points, where=~known)
     columns, rows = np.floor(uv).astype(int).T
-    beyond = ~known[rows, columns]
-    uv, columns, rows, point_inverse = uv[beyond], columns[beyond], rows[beyond], 1 / z[beyond]
+    point_inverse = 1 / z
     point_residual = point_inverse - plane[rows, columns]
     if len(point_residual) > 8:  # the median of a point and those around: one wrong point would stand like a pillar before the tissue
         point_residual = np.median(point_residual[cKDTree(uv).query(uv, k=9)[1]], 1)
@@ -180,15 +179,12 @@ def _on_lattice(view: TrainingView, continued: ContinuedView, positions: np.ndar
     return _Guess(positions[lattice], colors[lattice], stride * depth[lattice] / camera.K[0, 0], away[lattice] / width)
 
 
-def _unknown(points: np.ndarray, views: Sequence[TrainingView], beyond: bool) -> np.ndarray:
-    """Which points [N] lie where no view knows the depth, or beyond what any view sees."""
-    unknown = np.ones(len(points), bool)
+def _unknown(guess: _Guess, views: Sequence[TrainingView]) -> _Guess:
+    """The part of a guess that lies where no view knows the depth, and, if beyond its own picture, beyond the tissue that any view sees."""
+    unknown = np.ones(len(guess.away), bool)
     for view in views:
-        if view.depth_prior is None:
-            continue
-        index, v, u, _ = pixels_of(view.camera, points)
-        known = view.depth_prior[v, u] > 0
-        if beyond:
-            known |= view.tissue[v, u] > 0
-        unknown[index[known]] = False
-    return unknown
+        if view.depth_prior is not None:
+            index, v, u, _ = pixels_of(view.camera, guess.positions)
+            known = (view.depth_prior[v, u] > 0) | (view.tissue[v, u] > 0) & (guess.away[index] > 0)
+            unknown[index[known]] = False
+    return _Guess(*(values[unknown] for values in guess))

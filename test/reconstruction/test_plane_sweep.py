@@ -12,10 +12,10 @@ from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.kernels import launch, load_kernels
 from endo_sim_ros.reconstruction.pipeline import sweep_planes
 from endo_sim_ros.reconstruction.priors import sweep_kernels
-from endo_sim_ros.reconstruction.priors.plane_sweep import sweep_depth
+from endo_sim_ros.reconstruction.priors.plane_sweep import costs_by_kernels, costs_by_opencv, picture_of, sweep_depth
 from endo_sim_ros.reconstruction.priors.sources import estimate_depth
 from endo_sim_ros.reconstruction.progress import StageProgress
-from endo_sim_ros.reconstruction.scene import PreparedScene, ScenePoints, TrainingView
+from endo_sim_ros.reconstruction.scene import PreparedScene, ScenePoints, TrainingView, shrink
 from endo_sim_ros.reconstruction.stage_configs import PlaneSweepConfig
 
 NEAR, FAR = 0.06, 0.1  # m
@@ -116,6 +116,27 @@ def test_the_stage_sweeps_interpolated_depth_and_tells_so(given, swept):
     assert sweep_planes(unknown, options(**given), StageProgress()) is unknown
     measured = dataclasses.replace(scene, depth_source="stereo")
     assert sweep_planes(measured, options(**given), StageProgress()) is measured
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=pytest.mark.gpu)])
+@pytest.mark.parametrize("window, count", [(9, 5), (6, 2), (5, 4)])
+def test_costs_of_kernels_are_those_of_opencv(window, count, device):
+    if device != "cpu" and not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    settings = PlaneSweepConfig(window=window)
+    views = [wall_behind_a_band(x)[0] for x in np.linspace(-0.006, 0.006, count)]
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[:, :30] = 0
+    views[0] = dataclasses.replace(views[0], mask=mask)
+    views[1] = shrink(views[1], WIDTH // 2)  # another size
+    own, *others = (picture_of(view, settings) for view in views)
+    planes = np.array([[0, 0, 1 / FAR], [0, 0, 1 / NEAR], [0.02, -0.01, 12.0], [0, 0, -3.0]])
+    expected = costs_by_opencv(own, others, planes, settings, "cpu", StageProgress()).numpy()
+    found = costs_by_kernels(own, others, planes, settings, device, StageProgress()).cpu().numpy()
+    assert (expected < 0.3).mean() > 0.1 and (expected == 1).mean() > 0.1
+    # OpenCV takes pictures at 32nds of a pixel, which decides where next to nothing is in a window, or its edge.
+    assert np.abs(found - expected).mean() < 0.005
+    assert np.quantile(np.abs(found - expected), 0.99) < 0.05
 
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=pytest.mark.gpu)])

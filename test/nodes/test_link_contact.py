@@ -34,7 +34,7 @@ def running():
     values |= {"lockstep_inputs": "[pose, jaw]", "grip_force": 4.0}
     rclpy.init(args=["--ros-args", *(word for name, value in values.items() for word in ("-p", f"physics_node:{name}:={value}"))])
     bench = Bench()
-    for topic in (messages.CONTROL_NODES, messages.CUT_SURFACE, REACTION, JOINTS):
+    for topic in (messages.CONTROL_NODES, messages.CUT_SURFACE, REACTION, JOINTS, *map(messages.tool_warning, ("PSM1", "PSM2"))):
         bench.hear(topic)
     bench.add(PhysicsNode)
     send_model(bench)
@@ -89,7 +89,10 @@ def test_closed_jaws_pull_until_the_tissue_slips_and_the_same_episode_gives_the_
     far = [(GRASP[-1][0] - 0.002 * step, 0.0) for step in range(1, 12)]
     felt, _, _ = play(running, [*GRASP, *far])
     assert felt[:, 2].max() < 1.02 * bound and not felt[-1].any()
-    running.refused("physics_node", "or with 1.6 N between two jaws; open it, come nearer, or raise travel or grip_force")
+    where = "PSM1: tissue slipped out of the jaw, which pulled it almost 0.05 m, or with 1.6 N between two jaws"
+    said = running.refused("physics_node", f"{where}; open it, come nearer, or raise travel or grip_force")
+    assert said in [messages.decode_state_command(message) for message in running.heard["PSM1/warning"]]
+    assert not running.heard["PSM2/warning"]
 
 
 def test_jaws_that_close_on_nothing_say_so(running):

@@ -85,6 +85,30 @@ def encode_joints(
     )
 
 
+def decode_number(message: Message, topic: str) -> float:
+    """Number of a Float64.
+
+    Raises:
+        MessageError: If it is not finite.
+    """
+    if not np.isfinite(message.data):
+        raise MessageError(f"{topic}: expected a finite number, got {message.data}")
+    return float(message.data)
+
+
+def encode_number(value: float, types: MessageTypes = ros_types()) -> Message:
+    """Float64 of a number."""
+    return types.Float64(data=float(value))
+
+
+def encode_matrix(matrix: np.ndarray, types: MessageTypes = ros_types()) -> Message:
+    """Float64MultiArray of a matrix [r, c], row by row."""
+    (rows, columns), dimension = matrix.shape, types.MultiArrayDimension
+    dim = [dimension(label="rows", size=rows, stride=matrix.size), dimension(label="columns", size=columns, stride=columns)]
+    layout = types.MultiArrayLayout(dim=dim, data_offset=0)
+    return types.Float64MultiArray(layout=layout, data=types.sequence(np.asarray(matrix, np.float64)))
+
+
 def decode_cut(message: Message, topic: str) -> bool:
     """Whether the first button of a Joy is pressed: the edge of the tool cuts.
 

@@ -57,9 +57,15 @@ class ArmTopics:
             if commanded:
                 self._hear(arm, messages.tool_move, self._on_move, several)
                 self._hear(arm, messages.tool_state_command, self._on_state_command, STREAM_DEPTH)
+                self._hear(arm, messages.tool_hold, self._on_hold, several)
+                self._hear(arm, messages.tool_free, self._on_hold, several)  # joints that nothing moves stay where they are
                 if isinstance(arm, JointedArm):
                     self._hear(arm, messages.tool_joint_command, self._on_joints, depth)
+                    self._hear(arm, messages.tool_joint_change, self._on_joint_change, several)  # none replaces another
                     self._hear(arm, messages.tool_joint_move, self._on_joint_move, several)
+                    self._hear(arm, messages.tool_joint_move_change, self._on_joint_move_change, several)
+                    self._hear(arm, messages.tool_ratio_command, self._on_ratio, several)
+                    self._publishers[arm.name][messages.tool_ratio].publish(messages.encode_number(arm.speed_ratio))
         for arm in tools:
             self._hear(arm, messages.tool_wrench, self._on_wrench, depth)
             self._hear(arm, messages.tool_jaw, self._on_jaw, several)
@@ -81,6 +87,8 @@ class ArmTopics:
         shown += [messages.tool_info, messages.tool_warning, messages.tool_error]
         if arm is not self._camera:
             shown += [messages.tool_jaw_state, messages.tool_jaw_setpoint]
+        if isinstance(arm, JointedArm):
+            shown += [messages.tool_ratio]
         # A renderer in lockstep waits for each pose of the camera.
         depth = MOST_WAITING if arm is self._camera and options.mode == "lockstep" else STREAM_DEPTH
         publishers = {topic: self._node.publisher(topic(arm.name), alone=True) for topic in shown}
@@ -211,6 +219,40 @@ class ArmTopics:
         arm.require_enabled()
         arm.move_joints(goal)
         self.publish_operating_states(arm.name)
+
+    def _on_joint_change(self, arm: Arm, topic: str, message: Any) -> None:
+        assert isinstance(arm, JointedArm)
+        change = arm.check_numbers(messages.decode_joints(message, topic), message.name)
+
+        def act() -> None:
+            arm.require_enabled()
+            arm.servo_joints(arm.joints_after(change))
+            self.publish_operating_states()
+
+        self._deliver_part(arm, "pose", message, topic, act)
+
+    def _on_joint_move_change(self, arm: Arm, topic: str, message: Any) -> None:
+        assert isinstance(arm, JointedArm)
+        change = arm.check_numbers(messages.decode_joints(message, topic), message.name)
+        arm.require_enabled()
+        arm.move_joints(arm.joints_after(change, of_goal=True))
+        self.publish_operating_states(arm.name)
+
+    def _on_hold(self, arm: Arm, topic: str, message: Any) -> None:
+        def act() -> None:
+            arm.require_enabled()
+            arm.stop()
+            self.publish_operating_states(arm.name)
+
+        if self.options.mode == "lockstep":  # it is no part of a command, and has no stamp
+            act()
+        else:
+            self._deliver_part(arm, "pose", message, topic, act)
+
+    def _on_ratio(self, arm: Arm, topic: str, message: Any) -> None:
+        assert isinstance(arm, JointedArm)
+        arm.set_speed_ratio(messages.decode_number(message, topic))
+        self._publishers[arm.name][messages.tool_ratio].publish(messages.encode_number(arm.speed_ratio))
 
     def _on_wrench(self, arm: Arm, topic: str, message: Any) -> None:
         force, torque = messages.decode_wrench(message, topic)

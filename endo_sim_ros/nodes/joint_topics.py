@@ -6,6 +6,7 @@ import numpy as np
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import invert_pose
+from endo_sim_ros.instruments import ArmKinematics
 from endo_sim_ros.instruments.urdf import arm_capsules, robot_description
 from endo_sim_ros.messages import Topic
 from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode
@@ -14,6 +15,7 @@ from endo_sim_ros.nodes.jointed_arm import CameraArm, JointedArm
 from endo_sim_ros.nodes.pacing import MOST_WAITING
 
 _SHOWN = messages.tool_joints, messages.tool_joint_setpoint, messages.tool_velocity, messages.tool_local_pose, messages.tool_local_setpoint
+_JACOBIANS = {messages.tool_body_jacobian: ArmKinematics.body_jacobian, messages.tool_spatial_jacobian: ArmKinematics.spatial_jacobian}
 
 
 class JointTopics:
@@ -36,7 +38,9 @@ class JointTopics:
         for publisher, arm in zip(self._tool_types, instruments.values()):
             publisher.publish(messages.encode_text(arm.tool_type))
         self._shown: dict[str, dict[Callable[[str], Topic], messages.Message]] = {
-            name: {topic: node.publisher(topic(name), alone=True) for topic in _SHOWN} for name, arm in arms.items() if arm.commanded
+            name: {topic: node.publisher(topic(name), alone=True) for topic in (*_SHOWN, *_JACOBIANS)}
+            for name, arm in arms.items()
+            if arm.commanded
         }
         if arms:
             self._joint_states = node.publisher(messages.JOINT_STATES)
@@ -94,3 +98,6 @@ class JointTopics:
         local = invert_pose(arm.base) @ arm.pose
         for topic in (messages.tool_local_pose, messages.tool_local_setpoint):
             publishers[topic].publish(messages.encode_pose(local, stamp, f"{arm.name}_base"))
+        for topic, jacobian in _JACOBIANS.items():
+            if publishers[topic].get_subscription_count():
+                publishers[topic].publish(messages.encode_matrix(jacobian(arm.kinematics, arm.joints)))

@@ -21,7 +21,8 @@ pytestmark = pytest.mark.dds
 LINKS = ("roll", "wrist_pitch", "wrist_yaw", "jaw_left", "jaw_right")
 HEARD = (
     messages.tool_pose, messages.tool_links, messages.tool_type, messages.tool_joints, messages.tool_velocity, messages.tool_local_pose,
-    messages.tool_state, messages.tool_warning, messages.tool_error, messages.tool_jaw_state, messages.tool_reaction,
+    messages.tool_state, messages.tool_warning, messages.tool_error, messages.tool_jaw_state, messages.tool_reaction, messages.tool_ratio,
+    messages.tool_body_jacobian, messages.tool_spatial_jacobian,
 )  # fmt: skip
 ARMS = ("PSM1", "PSM2", "ECM")
 PSM = load_arm("PSM", "LARGE_NEEDLE_DRIVER")
@@ -40,7 +41,8 @@ def running():
 def graph(running):
     """The same at its start."""
     assert running.call(Trigger, "/physics_node/reset").success
-    latched = {messages.ROBOT_DESCRIPTION.name} | {topic(arm).name for arm in ARMS for topic in (messages.tool_state, messages.tool_type)}
+    kept = messages.tool_state, messages.tool_type, messages.tool_ratio
+    latched = {messages.ROBOT_DESCRIPTION.name} | {topic(arm).name for arm in ARMS for topic in kept}
     arms = running.nodes[1].arms.items()
     told = lambda arm: running.heard[f"{arm}/measured_js"][-1:]  # noqa: E731
     running.until(
@@ -139,6 +141,100 @@ def test_joints_move_together_within_their_speeds_and_their_poses_agree(graph):
     world = graph.nodes[1].arms["PSM1"].base @ PSM.tip_pose(goal)
     graph.until(lambda: np.allclose(pose_of(graph, messages.tool_pose("PSM1")), world, atol=1e-9), "the pose in the world")
     assert moved(graph) == 0
+
+
+def test_changes_of_joints_add_up_and_may_not_lead_beyond_limits(graph):
+    first = joints_of(graph)
+    change = np.array([0.01, 0, 0.002, 0.1, 0, 0])
+    for _ in range(3):
+        send_joints(graph, messages.tool_joint_change, change)
+    graph.until(lambda: np.allclose(joints_of(graph), first + 3 * change, atol=1e-12), "three changes at once")
+    for _ in range(2):
+        send_joints(graph, messages.tool_joint_move_change, 10 * change)
+    graph.until(lambda: np.allclose(joints_of(graph), first + 23 * change, atol=1e-12), "a goal that moved on")
+    there = joints_of(graph)
+    for topic in (messages.tool_joint_change, messages.tool_joint_move_change):
+        for positions, sentence in (([0.0] * 5, "PSM1: 5 numbers, not 6"), ([0, 0, 0.3, 0, 0, 0], "insertion cannot be at")):
+            graph.heard["PSM1/error"].clear()
+            send_joints(graph, topic, positions)
+            (said,) = graph.until(lambda: texts(graph, messages.tool_error), "an error of the arm")
+            assert said.startswith(topic("PSM1").name) and sentence in said
+    graph.spin(0.1)
+    np.testing.assert_array_equal(joints_of(graph), there)
+
+
+def test_the_newest_change_during_a_pause_acts_after_it(graph):
+    first = joints_of(graph)
+    assert graph.call(SetBool, "/physics_node/pause", data=True).success
+    for yaw in (0.1, 0.02):
+        send_joints(graph, messages.tool_joint_change, [yaw, 0, 0, 0, 0, 0])
+    graph.spin(0.3)
+    assert graph.call(SetBool, "/physics_node/pause", data=False).success
+    graph.until(lambda: np.isclose(joints_of(graph)[0], first[0] + 0.02), "the newest change")
+
+
+@pytest.mark.parametrize("topic", [messages.tool_hold, messages.tool_free])
+def test_hold_and_free_end_all_moves_where_they_are(graph, topic):
+    empty = messages.ros_class(topic("PSM1").type)
+    first, goal = joints_of(graph), joints_of(graph) + [0.5, 0, 0, 0, 0, 0]
+    send_joints(graph, messages.tool_joint_move, goal)
+    graph.publish(messages.tool_jaw_move("PSM1"), messages.encode_jaw(-0.3, S))
+    graph.until(lambda: joints_of(graph)[0] > first[0] + 0.05, "a move")
+    graph.publish(topic("PSM1"), empty())
+    arm = graph.nodes[1].arms["PSM1"]
+    graph.until(lambda: not arm.busy, "the end of the move")
+    joints, angle = arm.joints, arm.angle
+    graph.spin(0.2)
+    np.testing.assert_array_equal(joints_of(graph), joints)
+    assert joints[0] < goal[0] - 0.05 and newest(graph, messages.tool_jaw_state("PSM1")).position[0] == angle > -0.2
+    assert texts(graph, messages.tool_state)[-1] == "ENABLED"
+    switch(graph, "disable", "DISABLED")
+    graph.publish(topic("PSM1"), empty())
+    said = f"{topic('PSM1').name}: PSM1 is DISABLED; send enable on PSM1/state_command"
+    graph.until(lambda: said in texts(graph, messages.tool_error), "an error of the arm")
+    switch(graph, "enable", "ENABLED")
+
+
+def test_a_ratio_makes_moves_slower(graph):
+    ratio = lambda: newest(graph, messages.tool_ratio("PSM1")).data  # noqa: E731
+    send = lambda value: graph.publish(messages.tool_ratio_command("PSM1"), messages.encode_number(value))  # noqa: E731
+    assert ratio() == 1.0
+    send(0.25)
+    graph.until(lambda: ratio() == 0.25, "the ratio")
+    goal = joints_of(graph) + [0.1, 0, 0, 0, 0, 0]
+    send_joints(graph, messages.tool_joint_move, goal)
+    graph.until(lambda: np.allclose(joints_of(graph), goal, atol=1e-12), "the goal")
+    fastest = lambda: np.abs([m.velocity for m in graph.heard["PSM1/measured_js"]]).max()  # noqa: E731
+    assert 0.499 < fastest() < 0.501  # of 2 rad/s
+    pose = pose_of(graph, messages.tool_pose("PSM1"))
+    pose[2, 3] -= 0.002
+    graph.spin(0.1)  # it stands
+    graph.heard["PSM1/measured_cv"].clear()
+    graph.publish(messages.tool_move("PSM1"), messages.encode_pose(pose, S, "world"))
+    graph.until(lambda: np.allclose(pose_of(graph, messages.tool_pose("PSM1")), pose, atol=1e-9), "the pose")
+    speed = max(np.hypot(np.hypot(v.x, v.y), v.z) for v in (m.twist.linear for m in graph.heard["PSM1/measured_cv"]))
+    assert 0.01 < speed < 0.0126  # of 5 cm/s
+    for value in (0.0, 1.5, -0.1):
+        send(value)
+        said = f"PSM1/trajectory_j/set_ratio: PSM1: the ratio of speeds is {value:g}; send one above 0 and at most 1"
+        graph.until(lambda said=said: said in texts(graph, messages.tool_error), "an error of the arm")
+    send(float("nan"))
+    graph.refused("physics_node", "PSM1/trajectory_j/set_ratio: expected a finite number, got nan")
+    assert graph.nodes[1].arms["PSM1"].speed_ratio == 0.25
+    send(1.0)
+    graph.until(lambda: ratio() == 1.0, "the ratio of before")
+
+
+def test_jacobians_are_those_of_the_joints(graph):
+    for arm in ("PSM1", "ECM"):
+        kinematics, joints = graph.nodes[1].arms[arm].kinematics, joints_of(graph, arm)
+        for topic, expected in (
+            (messages.tool_body_jacobian, kinematics.body_jacobian(joints)),
+            (messages.tool_spatial_jacobian, kinematics.spatial_jacobian(joints)),
+        ):
+            message = newest(graph, topic(arm))
+            shape = [each.size for each in message.layout.dim]
+            np.testing.assert_allclose(np.array(message.data).reshape(shape), expected, atol=1e-12)
 
 
 def test_what_is_published_can_be_sent_back(graph):

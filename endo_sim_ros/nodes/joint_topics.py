@@ -71,7 +71,7 @@ class JointTopics:
                 positions += list(arm.joints)
                 if arm.kinematics.jaw is not None:
                     names.append(f"{prefix}_jaw")
-                    positions.append(arm.angle)
+                    positions.append(arm.gape)
         none = np.zeros(0)
         self._joint_states.publish(messages.encode_joints(names, np.array(positions), none, none, stamp))
 

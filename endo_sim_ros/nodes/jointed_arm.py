@@ -312,9 +312,13 @@ class JointedArm(Arm):
         self.settle()
         if self.base is None or self.joints is None or self.pose is None:
             return {}
-        widest = self.kinematics.jaw[1] if self.kinematics.jaw else 0.0
-        poses = link_poses(self.kinematics, self.joints, np.clip(self.angle, 0.0, widest))  # closed jaws press, they do not overlap
+        poses = link_poses(self.kinematics, self.joints, self.gape)
         return {name: self.base @ pose for name, pose in poses.items()}
+
+    @property
+    def gape(self) -> float:
+        """Angle at which the jaws stand to each other, rad: closed jaws press, they do not overlap."""
+        return float(np.clip(self.angle, 0.0, self.kinematics.jaw[1])) if self.kinematics.jaw else 0.0
 
     def dynamics(self, force: np.ndarray, torque: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What the joints and the tip do under a wrench on the tip.

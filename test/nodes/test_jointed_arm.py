@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from ros_bench import HEIGHT, WIDTH, K, S, await_nodes, moved, send_model, sheet, tissue_bench
 from std_srvs.srv import SetBool, Trigger
+from urdf_links import poses_of_links
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
@@ -485,6 +486,23 @@ def test_all_joints_are_told_together_with_a_description_that_has_them(graph):
     joints = {joint.get("name") for joint in robot.findall("joint") if joint.get("type") != "fixed" and joint.find("mimic") is None}
     assert joints == set(states.name) and len(states.name) == len(states.position) == 7 + 7 + 4
     assert {"PSM1_yaw", "PSM2_jaw", "ECM_roll"} <= joints
+
+
+@pytest.mark.parametrize("angle", [0.5, -0.3])
+def test_description_and_joints_put_links_where_they_are(graph, angle):
+    jaw(graph, angle)
+    send_joints(graph, messages.tool_joint_command, joints_of(graph) + [0.1, -0.1, 0.01, 0.3, 0.2, -0.2])
+    graph.until(lambda: newest(graph, messages.tool_jaw_state("PSM1")).position[0] == angle, "the angle")
+    same = lambda: newest(graph, messages.JOINT_STATES).header.stamp == newest(graph, messages.tool_links("PSM1")).header.stamp  # noqa: E731
+    graph.spin(0.1)
+    graph.until(same, "joints and links of one step")
+    states = newest(graph, messages.JOINT_STATES)
+    description = newest(graph, messages.ROBOT_DESCRIPTION).data
+    _, found = poses_of_links(description, dict(zip(states.name, states.position)), "world")
+    for link, pose in zip(LINKS, messages.decode_poses(newest(graph, messages.tool_links("PSM1")), "")):
+        np.testing.assert_allclose(found[f"PSM1_{link}"], pose, atol=1e-6, err_msg=link)
+    camera = pose_of(graph, messages.tool_pose("ECM"))
+    np.testing.assert_allclose(found["ECM_tip"], camera, atol=1e-6)
 
 
 def test_a_disabled_arm_takes_no_command(graph):

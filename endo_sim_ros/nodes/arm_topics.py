@@ -353,6 +353,13 @@ class ArmTopics:
             self._publish_motion(self._camera, self._camera.pose, np.zeros(3), np.zeros(3), stamp)
         self._joints.publish_links(stamp)
 
+    def display(self, arm: Arm, reaction: np.ndarray, held: np.ndarray) -> messages.ToolDisplay:
+        """What `tool_markers` shows of an arm with a pose, the reaction [3] on it, N, and control nodes [K, 3] that it holds, world."""
+        assert arm.pose is not None
+        force = arm.force if arm.acting and arm.force is not None else np.zeros(3)
+        rods = self._joints.rods(arm) if isinstance(arm, JointedArm) else ()
+        return messages.ToolDisplay(arm.name, arm.pose[:3, 3], force, reaction, held, rods)
+
     def publish_joint_states(self, stamp: int) -> None:
         """Publish the joints of all arms in one message, while somebody subscribes."""
         self._joints.publish_joint_states(stamp)

@@ -59,6 +59,13 @@ class JointTopics:
         for arm, publisher in self._links:
             publisher.publish(messages.encode_poses(list(arm.links().values()), stamp, self.options.world_frame))
 
+    def rods(self, arm: JointedArm) -> list[tuple[np.ndarray, np.ndarray, float]]:
+        """Both ends [3], world, and the radius of each capsule of an arm's instrument, m; none while nobody knows where it is."""
+        links = arm.links()
+        place = lambda capsule, end: links[capsule.link][:3, :3] @ end + links[capsule.link][:3, 3]  # noqa: E731
+        capsules = self._capsules[arm.name] if links else ()
+        return [(place(capsule, capsule.start), place(capsule, capsule.end), capsule.radius) for capsule in capsules]
+
     def publish_joint_states(self, stamp: int) -> None:
         """Publish the joints of all arms in one message, while somebody subscribes."""
         if not self._arms or not self._joint_states.get_subscription_count():

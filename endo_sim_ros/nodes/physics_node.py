@@ -315,7 +315,7 @@ class PhysicsNode(EndoNode):
         self._arm_topics.publish_views(stamp)  # before the state with the same stamp, as who draws them waits for that
         cloud = ControlNodeCloud(state.rest, state.positions, state.F, self._simulated_stamp, cut)
         self._nodes_pub.publish(messages.encode_control_nodes(cloud, stamp, world))
-        shown, reactions = [], {}
+        shown, reactions, marked = [], {}, self._markers_pub.get_subscription_count() > 0
         for name, arm in self._tools.items():
             if arm.pose is None:
                 continue
@@ -325,11 +325,11 @@ class PhysicsNode(EndoNode):
             axes = arm.pose[:3, :3].T  # those of the tool
             reactions[name] = np.concatenate([axes @ reaction, axes @ torque])
             self._arm_topics.publish(arm, arm.pose, reaction, torque, stamp)
-            force = arm.force if arm.acting and arm.force is not None else np.zeros(3)
-            shown.append(messages.ToolDisplay(name, arm.pose[:3, 3], force, reaction, simulation.held(name)))
+            if marked:
+                shown.append(self._arm_topics.display(arm, reaction, simulation.held(name)))
         self._reactions.publish(reactions, stamp, simulation.step_duration)
         self._arm_topics.publish_joint_states(stamp)
-        if shown and self._markers_pub.get_subscription_count():
+        if shown:
             self._markers_pub.publish(messages.encode_tool_markers(shown, stamp, world))
         self._arm_topics.publish_operating_states()  # at last: who waits for the end of a move then asks where the arm is
 

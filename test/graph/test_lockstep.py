@@ -288,7 +288,7 @@ def test_a_commanded_arm_answers_like_a_robot_and_shows_its_markers(graph):
     np.testing.assert_allclose(pose[:3, 3], [0, 0, 0.1])
     assert messages.decode_jaw(graph.heard["PSM1/jaw/measured_js"][-1], "") == 0.7
     assert stamps(graph, messages.tool_pose("PSM1")) == [MODEL_STAMP, 100, 200]  # first at its start
-    tip, force, reaction, held = graph.heard["tool_markers"][-1].markers
+    tip, force, reaction, held, *_ = graph.heard["tool_markers"][-1].markers
     assert (tip.ns, tip.header.frame_id, tip.action) == ("PSM1", "world", tip.ADD)
     arrow = np.array([[p.x, p.y, p.z] for p in force.points])
     np.testing.assert_allclose(arrow[1] - arrow[0], [0, 0, -0.01])

@@ -10,9 +10,9 @@ from std_srvs.srv import SetBool, Trigger
 from urdf_links import poses_of_links
 
 from endo_sim_ros import messages
-from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.cameras import Camera, make_pose
 from endo_sim_ros.core.config import ConfigError
-from endo_sim_ros.instruments import arm_files, link_poses, load_arm, solve_inverse
+from endo_sim_ros.instruments import arm_files, build_instrument, link_poses, load_arm, solve_inverse
 from endo_sim_ros.nodes.arm_setup import make_arms, place_arms
 from endo_sim_ros.nodes.configs import PhysicsNodeConfig
 from endo_sim_ros.nodes.rendering_node import RenderingNode
@@ -503,6 +503,24 @@ def test_description_and_joints_put_links_where_they_are(graph, angle):
         np.testing.assert_allclose(found[f"PSM1_{link}"], pose, atol=1e-6, err_msg=link)
     camera = pose_of(graph, messages.tool_pose("ECM"))
     np.testing.assert_allclose(found["ECM_tip"], camera, atol=1e-6)
+
+
+def test_markers_show_the_capsules_of_the_instrument_where_the_links_are(graph):
+    shown = graph.hear(messages.TOOL_MARKERS)
+    servo(graph, tip_at(0.01, -0.01, 0.08))
+    arm = graph.nodes[1].arms["PSM1"]
+    graph.until(lambda: np.allclose(pose_of(graph, messages.tool_pose("PSM1"))[:3, 3], [0.01, -0.01, 0.08]), "the pose")
+    shown.clear()
+    graph.until(lambda: shown, "markers")
+    rods = [marker for marker in shown[-1].markers if marker.ns == "PSM1" and marker.id >= 4]
+    _, capsules = build_instrument(arm.kinematics)
+    assert len(rods) == len(capsules) and {rod.type for rod in rods} == {rods[0].CYLINDER}
+    for rod, capsule in zip(rods, capsules):
+        half = 0.5 * rod.scale.z * make_pose([0, 0, 0], [getattr(rod.pose.orientation, axis) for axis in "wxyz"])[:3, 2]
+        middle, link = [getattr(rod.pose.position, axis) for axis in "xyz"], arm.links()[capsule.link]
+        for found, end in ((middle - half, capsule.start), (middle + half, capsule.end)):
+            np.testing.assert_allclose(found, link[:3, :3] @ end + link[:3, 3], atol=1e-9)
+        assert rod.scale.x == rod.scale.y == pytest.approx(2 * capsule.radius)
 
 
 def test_a_disabled_arm_takes_no_command(graph):

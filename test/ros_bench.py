@@ -195,6 +195,13 @@ def tissue_bench(*heard, **parameters):
         rclpy.try_shutdown()
 
 
+def report(message):
+    """What a message of the types of CRTK says, which are strings where those are not installed."""
+    if hasattr(message, "state"):
+        return f"{message.state} BUSY" if message.is_busy else message.state
+    return messages.decode_state_command(message)
+
+
 def moved(bench):
     """Largest distance of a control node from rest, metres."""
     return np.linalg.norm(nodes_of(bench).positions - nodes_of(bench).rest, axis=1).max()

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rclpy
-from ros_bench import HEIGHT, WIDTH, Bench, K, send_camera, send_model, sheet
+from ros_bench import HEIGHT, WIDTH, Bench, K, report, send_camera, send_model, sheet
 from std_srvs.srv import SetBool, Trigger
 from waiting import wait_until
 
@@ -299,11 +299,10 @@ def test_a_commanded_arm_moves_in_its_time_and_tells_its_state(graph):
     """The client's way: move, wait until the arm is no longer busy, pause, resume."""
     told, setpoints = graph.hear(messages.tool_state("PSM1")), graph.hear(messages.tool_setpoint("PSM1"))
     jaws = graph.hear(messages.tool_jaw_setpoint("PSM1"))
-    saying = lambda: [message.data for message in told]  # noqa: E731
+    saying = lambda: [report(message) for message in told]  # noqa: E731
 
     def send(text):
-        topic = messages.tool_state_command("PSM1")
-        graph.publish(topic, messages.ros_class(topic.type)(data=text))
+        graph.publish(messages.tool_state_command("PSM1"), messages.encode_report(text, 1))
 
     graph.until(lambda: saying() == ["ENABLED"], "the state that was told before anybody listened")
     send("enable")  # the clients of CRTK wait for an answer, though it says nothing new

@@ -5,7 +5,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from ros_bench import HEIGHT, WIDTH, K, S, await_nodes, moved, send_model, sheet, tissue_bench
+from ros_bench import HEIGHT, WIDTH, K, S, await_nodes, moved, report, send_model, sheet, tissue_bench
 from std_srvs.srv import SetBool, Trigger
 from urdf_links import poses_of_links
 
@@ -114,14 +114,8 @@ def send_joints(bench, topic, positions, arm="PSM1"):
 
 
 def texts(bench, topic, arm="PSM1"):
-    """What came on a topic of the types of CRTK, which are strings where those are not installed."""
-
-    def text(message):
-        if hasattr(message, "state"):
-            return f"{message.state} BUSY" if message.is_busy else message.state
-        return messages.decode_state_command(message)
-
-    return [text(message) for message in bench.heard[topic(arm).name]]
+    """What came on a topic of the types of CRTK."""
+    return [report(message) for message in bench.heard[topic(arm).name]]
 
 
 def test_joints_move_together_within_their_speeds_and_their_poses_agree(graph):

@@ -9,6 +9,7 @@ if "ROS_DOMAIN_ID" not in os.environ or "PYTEST_XDIST_WORKER" in os.environ:  # 
     os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
 os.environ.setdefault("FASTDDS_BUILTIN_TRANSPORTS", "DEFAULT")  # finds late joiners soonest; test messages are small
 
+import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 import torch  # noqa: E402
 
@@ -33,6 +34,17 @@ def small_bag(small_frames, tmp_path_factory):
 
     path = tmp_path_factory.mktemp("bags") / "small"
     write_bag(path, small_frames)
+    return path
+
+
+@pytest.fixture(scope="session")
+def joint_policy(tmp_path_factory):
+    """File of a policy that acts by joints, and leaves them where they are."""
+    from endo_sim_ros.learning.policies import NetworkPolicy
+
+    path = tmp_path_factory.mktemp("policies") / "by_joints.npz"
+    ((inputs, outputs),) = NetworkPolicy.sizes("retraction", [], "joints")
+    NetworkPolicy("retraction", [np.zeros((inputs, outputs))], "joints").save(path)
     return path
 
 

@@ -2,8 +2,10 @@
 
 import time
 from collections import defaultdict
+from contextlib import contextmanager
 
 import numpy as np
+import rclpy
 import torch
 from rcl_interfaces.srv import SetParameters
 from rclpy.executors import SingleThreadedExecutor
@@ -14,6 +16,7 @@ from endo_sim_ros import messages
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.messages import ERROR
 from endo_sim_ros.nodes.base import EndoNode
+from endo_sim_ros.nodes.physics_node import PhysicsNode
 
 S = 1_000_000_000
 K = np.array([[90.0, 0, 48], [0, 90.0, 40], [0, 0, 1]])
@@ -172,6 +175,31 @@ def await_nodes(bench, stamp_ns):
         f"control nodes of the model {stamp_ns}",
     )
     return nodes_of(bench)
+
+
+@contextmanager
+def tissue_bench(*heard, **parameters):
+    """physics_node with these parameters beside the small ones, after it has made tissue of a model; these topics are heard."""
+    values = SMALL["physics_node"] | parameters
+    rclpy.init(args=["--ros-args", *(word for name, value in values.items() for word in ("-p", f"physics_node:{name}:={value}"))])
+    bench = Bench()
+    try:
+        for topic in (messages.CONTROL_NODES, *heard):
+            bench.hear(topic)
+        bench.add(PhysicsNode)
+        send_model(bench)
+        await_nodes(bench, 5 * S)
+        yield bench
+    finally:
+        bench.close()
+        rclpy.try_shutdown()
+
+
+def report(message):
+    """What a message of the types of CRTK says, which are strings where those are not installed."""
+    if hasattr(message, "state"):
+        return f"{message.state} BUSY" if message.is_busy else message.state
+    return messages.decode_state_command(message)
 
 
 def moved(bench):

@@ -23,6 +23,8 @@ class Command:
     algorithm: Literal["cem", "ppo"] = "cem"
     """cem: the cross-entropy method, by the options below; ppo: proximal policy optimisation, by those that begin with ppo; it
     needs stable-baselines3."""
+    actions: Literal["cartesian", "joints", "joint_positions"] = "cartesian"
+    """What the policy moves: the tip of the tool, or the joints of its arm, by how far or to where; docs/learning.md says more."""
     model: Path | None = None
     """PLY model with its cameras.json; default: a piece of the synthetic patient."""
     device: str = "auto"
@@ -46,7 +48,7 @@ class Command:
             raise ConfigError(f"options that begin with --ppo. are for ppo, the others for cem; --algorithm is {self.algorithm}")
         with leaving_none_empty(self.out):
             self.out.mkdir(parents=True, exist_ok=True)  # before the long work
-            policy, curve = learn(self.task, load_scene(self.model), randomisation=self.vary, device=self.device)
+            policy, curve = learn(self.task, load_scene(self.model), randomisation=self.vary, device=self.device, actions=self.actions)
             save_training(self.out, policy, curve, config)
         last = curve[-1]
         print(f"{self.out}: {last['test_success']:.0%} of test episodes solved after {last['episodes']} episodes")

@@ -128,6 +128,18 @@ class ArmKinematics:
         frames = self.link_frames(joints)
         return self._jacobian(frames, (frames[..., -1, :, :] @ self.tooltip_offset)[..., :3, 3])
 
+    def body_jacobian(self, joints: ArrayLike) -> np.ndarray:
+        """The Jacobian [..., 6, n] for velocities in the axes of the tip; else as `jacobian`."""
+        R = np.swapaxes(self.tip_pose(joints)[..., :3, :3], -1, -2)
+        J = self.jacobian(joints)
+        return np.concatenate([R @ J[..., :3, :], R @ J[..., 3:, :]], -2)
+
+    def spatial_jacobian(self, joints: ArrayLike) -> np.ndarray:
+        """The Jacobian [..., 6, n] for the velocity of what moves with the tip and is at the origin of the base; else as `jacobian`."""
+        J, tip = self.jacobian(joints), self.tip_pose(joints)[..., :3, 3]
+        at_origin = J[..., :3, :] + np.cross(tip[..., :, None], J[..., 3:, :], axis=-2)
+        return np.concatenate([at_origin, J[..., 3:, :]], -2)
+
     def _jacobian(self, frames: np.ndarray, tip: np.ndarray) -> np.ndarray:
         axes, origins = frames[..., :3, 2], frames[..., :3, 3]  # [..., n, 3]
         turning = np.concatenate([np.cross(axes, tip[..., None, :] - origins), axes], -1)

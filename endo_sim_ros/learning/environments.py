@@ -11,10 +11,11 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from endo_sim_ros.learning.actions import Actions
 from endo_sim_ros.learning.config import Randomisation, SightConfig
 from endo_sim_ros.learning.pictures import IMAGE, IMAGE_RIGHT, SEGMENTATION
 from endo_sim_ros.learning.scenes import Scene, load_scene
-from endo_sim_ros.learning.task_batch import Actions, Observations, TaskBatch
+from endo_sim_ros.learning.task_batch import Observations, TaskBatch
 from endo_sim_ros.learning.tasks import BOUND, TASKS, Outcome
 
 try:

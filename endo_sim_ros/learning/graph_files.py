@@ -44,6 +44,7 @@ def save_scene(scene: Scene, folder: Path, task: str, seed: int = 0, sight: Sigh
         tool = folder.resolve() / f"{held.arm.tool}.json"
         save_tool(tool, held.arm)
         arm = {"instruments": [str(tool)], "frames": [held.frame]}
+    named = str(Path(sight.tool).resolve()) if sight.tool.endswith(".json") else sight.tool
     parameters = {
         "reconstruction_node": {"mode": "lockstep", "model_file": str(folder.resolve() / "model.ply")},
         "physics_node": {
@@ -55,7 +56,7 @@ def save_scene(scene: Scene, folder: Path, task: str, seed: int = 0, sight: Sigh
             **changed,
         },
         "rendering_node": {"mode": "lockstep", "image_width": sight.image_width, "baseline": sight.baseline},
-        "policy": {"task": task, "scene": str(folder.resolve()), "seed": seed},
+        "policy": {"task": task, "scene": str(folder.resolve()), "seed": seed, "tool": named},
     }
     sections = {f"/**/{node}": {"ros__parameters": values} for node, values in parameters.items()}
     (folder / "parameters.yaml").write_text(yaml.safe_dump(sections, sort_keys=False))

@@ -13,6 +13,7 @@ import numpy as np
 from endo_sim_ros.core.cameras import invert_pose, matrix_to_quat, parse_frames
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.instruments import (
+    JOINTS,
     ArmKinematics,
     Capsule,
     Part,
@@ -150,6 +151,35 @@ class HeldTools:
                 reach = solve_inverse(tool.arm, invert_poses(self.bases[own]) @ poses[chosen], self.joints[own])
                 self.joints[own] = reach.joints
         self.angles[episodes] = self._angles(closed)
+
+    def act(self, task: Task, actions: np.ndarray, relative: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Take the step of a task with actions [B, 7] of joints, as `Task.act` does with those of tips, and raises what that does.
+
+        Args:
+            task: The task.
+            actions: Of the joints as in `reach`, and the fourth number of the task.
+            relative: As for `reach`.
+
+        Returns:
+            Poses of the tips [B, 4, 4], world, and whether jaws are closed [B].
+        """
+        actions = task.check_actions(actions, len(JOINTS) + 1)
+        self.joints = self.reach(actions[:, :-1], relative)
+        poses = self.poses()
+        asked = task.find(poses[:, :3, 3])
+        tips, closed = task.go(asked, actions[:, -1])
+        outside = np.flatnonzero((task.tip != asked).any(1))
+        if len(outside):
+            poses[outside, :3, 3] = tips[outside]
+            self.move(outside, poses[outside], closed[outside])
+            poses = self.poses()
+            task.tip[outside] = task.find(poses[:, :3, 3])[outside]
+        self.hold(closed)
+        return poses, closed
+
+    def observe(self, state: np.ndarray) -> np.ndarray:
+        """State observations [B, n + 6], float32: those of the task [B, n], and the joints as `scaled` gives them."""
+        return np.concatenate([state, self.scaled().astype(np.float32)], 1)
 
     def hold(self, closed: np.ndarray) -> None:
         """Close the jaws or not [B]."""

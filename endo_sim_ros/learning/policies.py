@@ -6,6 +6,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from endo_sim_ros.learning.actions import ACTION_SIZES, Actions, observed_names
 from endo_sim_ros.learning.tasks import LENGTH, Palpation, Retraction, find_task
 
 _MOST_WEIGHTS = 10_000_000  # read from a file
@@ -15,19 +16,26 @@ Moves = Generator[np.ndarray, dict[str, float], None]
 
 
 class Policy(Protocol):
-    """Acts in B episodes."""
+    """Acts in B episodes.
+
+    Attributes:
+        actions: What its actions mean, see `TaskBatch`.
+    """
+
+    actions: Actions
 
     def reset(self, episodes: Sequence[int]) -> None:
         """These episodes begin anew."""
 
     def act(self, observations: np.ndarray) -> np.ndarray:
-        """Actions [B, 4] for state observations [B, n]."""
+        """Actions [B, 4 or 7] for state observations [B, n]."""
         ...
 
 
 class RetractionScript:
     """Goes to the spot, grasps, lifts a little farther than needed and holds."""
 
+    actions: Actions = "cartesian"
     grasp, beyond = 0.002, 1.15  # m from the spot at which the jaw closes; how far to lift, in parts of the goal
 
     def reset(self, episodes: Sequence[int]) -> None:
@@ -49,6 +57,7 @@ class RetractionScript:
 class PalpationScript:
     """Presses equally deep at points of a grid, feels the stiffness at each, and reports where it is greatest."""
 
+    actions: Actions = "cartesian"
     spacing, above = 0.01, 0.012  # m: of the grid; of the tip over the skin between presses
     deep, further = 0.003, 0.002  # m: of the tip over the skin at last; by how much that is deeper than before
 
@@ -117,37 +126,39 @@ class NetworkPolicy:
     Args:
         task: Name of the task that it was made for.
         layers: Weights [n_in + 1, n_out] of each layer, the last row being the bias; or [B, n_in + 1, n_out], one for each episode.
+        actions: What its actions mean, see `TaskBatch`; with joints it also sees them.
 
     Raises:
         ValueError: If the layers do not fit together or do not fit the task.
     """
 
-    def __init__(self, task: str, layers: Sequence[np.ndarray]):
+    def __init__(self, task: str, layers: Sequence[np.ndarray], actions: Actions = "cartesian"):
         self.task, self.layers = task, [np.asarray(layer, np.float64) for layer in layers]
-        sizes = self.sizes(task, [layer.shape[-1] for layer in self.layers[:-1]])
+        self.actions: Actions = actions
+        sizes = self.sizes(task, [layer.shape[-1] for layer in self.layers[:-1]], actions)
         shapes = [layer.shape[-2:] for layer in self.layers]
         if shapes != sizes or not all(np.isfinite(layer).all() for layer in self.layers):
             raise ValueError(f"policy for {task}: layers of {shapes} do not fit, expected {sizes} of finite numbers")
 
     @staticmethod
-    def sizes(task: str, hidden: Sequence[int]) -> list[tuple[int, int]]:
-        """Shapes of the layers for a task, with hidden layers of these sizes."""
-        widths = [len(find_task(task).observation_names), *hidden, 4]
+    def sizes(task: str, hidden: Sequence[int], actions: Actions = "cartesian") -> list[tuple[int, int]]:
+        """Shapes of the layers for a task and what actions mean, with hidden layers of these sizes."""
+        widths = [len(observed_names(find_task(task).observation_names, actions)), *hidden, ACTION_SIZES[actions]]
         return [(before + 1, after) for before, after in zip(widths, widths[1:])]
 
     @classmethod
-    def from_vectors(cls, task: str, hidden: Sequence[int], vectors: np.ndarray) -> "NetworkPolicy":
+    def from_vectors(cls, task: str, hidden: Sequence[int], vectors: np.ndarray, actions: Actions = "cartesian") -> "NetworkPolicy":
         """From all weights in a row [P], or one row for each episode [B, P]."""
-        sizes = cls.sizes(task, hidden)
+        sizes = cls.sizes(task, hidden, actions)
         ends = np.cumsum([rows * columns for rows, columns in sizes])
         parts = np.split(vectors, ends[:-1], axis=-1)
-        return cls(task, [part.reshape(*vectors.shape[:-1], *size) for part, size in zip(parts, sizes)])
+        return cls(task, [part.reshape(*vectors.shape[:-1], *size) for part, size in zip(parts, sizes)], actions)
 
     def reset(self, episodes: Sequence[int]) -> None:
         """Nothing to do: the network has no memory."""
 
     def act(self, observations: np.ndarray) -> np.ndarray:
-        """Actions [B, 4], not clipped, for state observations [B, n]."""
+        """Actions [B, 4 or 7], not clipped, for state observations [B, n]."""
         values = observations.astype(np.float64)
         for number, layer in enumerate(self.layers):
             values = np.tanh(values) if number else values
@@ -162,7 +173,7 @@ class NetworkPolicy:
         """Write a .npz file of plain arrays."""
         with Path(path).open("wb") as file:
             layers: dict[str, Any] = {f"layer{i}": layer for i, layer in enumerate(self.layers)}
-            np.savez(file, task=np.array(self.task), **layers)
+            np.savez(file, task=np.array(self.task), actions=np.array(self.actions), **layers)
 
     @classmethod
     def load(cls, path: str | Path) -> "NetworkPolicy":
@@ -173,10 +184,13 @@ class NetworkPolicy:
         """
         try:
             with np.load(path, allow_pickle=False) as file:
-                layers = [file[f"layer{i}"] for i in range(len(file.files) - 1)]
+                layers = [file[f"layer{i}"] for i in range(sum(name.startswith("layer") for name in file.files))]
+                actions: Any = str(file["actions"]) if "actions" in file.files else "cartesian"
+                if actions not in ACTION_SIZES:
+                    raise ValueError(f"nobody knows its actions, {actions[:40]!r}")
                 if sum(layer.size for layer in layers) > _MOST_WEIGHTS or not layers or any(layer.ndim != 2 for layer in layers):
                     raise ValueError("it has no layers, or too large ones")
-                return cls(str(file["task"]), layers)
+                return cls(str(file["task"]), layers, actions)
         except Exception as error:  # zipfile, numpy and the file system have a type each
             raise ValueError(f"{path}: not a readable policy ({error})") from error
 

@@ -10,6 +10,7 @@ import torch
 from rich.progress import Progress
 
 from endo_sim_ros.core.device import single_threaded_torch
+from endo_sim_ros.learning.actions import Actions
 from endo_sim_ros.learning.config import PPOConfig, Randomisation
 from endo_sim_ros.learning.environments import Observed, VectorTaskEnvironment
 from endo_sim_ros.learning.policies import NetworkPolicy
@@ -48,7 +49,7 @@ class StableEnvironments(VecEnv):
         return observations
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Keep actions [B, 4] for `step_wait`."""
+        """Keep actions [B, 4 or 7] for `step_wait`."""
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
@@ -109,11 +110,11 @@ def _of(observations: Observed, i: int) -> Observed:
     return observations[i].copy()
 
 
-def network(task: str, model: PPO) -> NetworkPolicy:
+def network(task: str, model: PPO, actions: Actions = "cartesian") -> NetworkPolicy:
     """The mean action of a PPO model with tanh layers and state observations, as a policy that needs no torch."""
     linear = [layer for layer in model.policy.mlp_extractor.policy_net if isinstance(layer, torch.nn.Linear)]
     layers = [torch.cat([layer.weight.T, layer.bias[None]]) for layer in (*linear, model.policy.action_net)]
-    return NetworkPolicy(task, [layer.detach().cpu().numpy() for layer in layers])
+    return NetworkPolicy(task, [layer.detach().cpu().numpy() for layer in layers], actions)
 
 
 class _Curve(BaseCallback):
@@ -136,7 +137,7 @@ class _Curve(BaseCallback):
             self.test()
 
     def test(self) -> None:
-        tested = measure_policy(self._testing, network(self._task, self.model))
+        tested = measure_policy(self._testing, network(self._task, self.model, self._testing.actions))
         seconds = time.monotonic() - self._began
         self.curve.append({"episodes": self._episodes, "steps": self.num_timesteps, **tested, "seconds": seconds})
         self._bar.update(self._progress, description=f"solved {tested['test_success']:.0%}")
@@ -144,7 +145,12 @@ class _Curve(BaseCallback):
 
 @single_threaded_torch()
 def train_ppo(
-    task: str, scene: Scene, config: PPOConfig, randomisation: Randomisation = Randomisation(), device: str = "auto"
+    task: str,
+    scene: Scene,
+    config: PPOConfig,
+    randomisation: Randomisation = Randomisation(),
+    device: str = "auto",
+    actions: Actions = "cartesian",
 ) -> tuple[NetworkPolicy, list[dict[str, float]]]:
     """Train a policy by PPO on states; repeatable bit by bit on a CPU.
 
@@ -153,9 +159,9 @@ def train_ppo(
         seconds; first of the untrained policy, last of the one returned.
     """
     with Progress() as bar:
-        options = {"scene": scene, "randomisation": randomisation, "device": device}
+        options: dict[str, Any] = {"scene": scene, "randomisation": randomisation, "device": device, "actions": actions}
         environments = StableEnvironments(VectorTaskEnvironment(task, config.environments, **options))
-        testing = TaskBatch(task, scene, config.test_episodes, randomisation=randomisation, device=device)
+        testing = TaskBatch(task, count=config.test_episodes, **options)
         rollout = config.environments * config.rollout
         model = PPO(
             "MlpPolicy",
@@ -172,4 +178,4 @@ def train_ppo(
         callback = _Curve(task, testing, config, bar)
         model.learn(config.steps, callback=callback)
         callback.test()
-        return network(task, model), callback.curve
+        return network(task, model, actions), callback.curve

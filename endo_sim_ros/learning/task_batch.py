@@ -6,7 +6,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from endo_sim_ros.instruments import JOINTS
+from endo_sim_ros.learning.actions import ACTION_SIZES, Actions, observed_names
 from endo_sim_ros.learning.config import Randomisation, SightConfig
 from endo_sim_ros.learning.held_tools import HeldTools, hold_tool, hold_tools
 from endo_sim_ros.learning.pictures import IMAGE, SEGMENTATION, Pictures
@@ -18,7 +18,6 @@ from endo_sim_ros.physics import TissueBatch
 RESTING_SPEED = 1e-5  # m/s; as in TissueSimulation: one tissue slower than this, that no tool moves, is left as it is
 
 Observations = Literal["state", "image", "both"]
-Actions = Literal["cartesian", "joints", "joint_positions"]
 
 
 class TaskBatch:
@@ -70,8 +69,8 @@ class TaskBatch:
         self.sight = sight
         self.tools: HeldTools | None = None
         self.pictures: Pictures | None = None
-        self.actions = actions
-        self.action_size = 4 if actions == "cartesian" else len(JOINTS) + 1
+        self.actions: Actions = actions
+        self.action_size = ACTION_SIZES[actions]
         self.varied: dict[str, np.ndarray] = {}
         """What each episode has of each kind of randomisation that there is [B, …], by the names of the options."""
         self._rotations = np.tile(np.eye(3), (count, 1, 1))  # of the tips, world
@@ -123,7 +122,7 @@ class TaskBatch:
     @property
     def observation_names(self) -> tuple[str, ...]:
         """Names of the numbers of the state."""
-        return self.task.observation_names + (JOINTS if self.actions != "cartesian" else ())
+        return observed_names(self.task.observation_names, self.actions)
 
     def step(
         self, actions: np.ndarray, renew: Sequence[int] = (), generators: Sequence[np.random.Generator] = ()
@@ -165,18 +164,7 @@ class TaskBatch:
     def _act_by_joints(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What `Task.act` returns, for actions [B, 7] of joints."""
         assert self.tools is not None
-        actions, tools = self.task.check_actions(actions, self.action_size), self.tools
-        tools.joints = tools.reach(actions[:, :-1], self.actions == "joints")
-        poses = tools.poses()
-        asked = self.task.find(poses[:, :3, 3])
-        tips, closed = self.task.go(asked, actions[:, -1])
-        outside = np.flatnonzero((self.task.tip != asked).any(1))
-        if len(outside):
-            poses[outside, :3, 3] = tips[outside]
-            tools.move(outside, poses[outside], closed[outside])
-            poses = tools.poses()
-            self.task.tip[outside] = self.task.find(poses[:, :3, 3])[outside]
-        tools.hold(closed)
+        poses, closed = self.tools.act(self.task, actions, self.actions == "joints")
         self._rotations = poses[:, :3, :3].copy()
         return poses[:, :3, 3].copy(), closed
 
@@ -205,9 +193,7 @@ class TaskBatch:
         moved = self.tissue.displacements[rows.to(device), sites.to(device)].cpu()
         positions = (self._rest[sites] + moved).numpy()
         state = self.task.observe(positions, self.tissue.tools.reaction_forces[:, 0].cpu().numpy())
-        if self.actions == "cartesian" or self.tools is None:
-            return state
-        return np.concatenate([state, self.tools.scaled().astype(np.float32)], 1)
+        return state if self.actions == "cartesian" or self.tools is None else self.tools.observe(state)
 
     def images(self) -> np.ndarray:
         """What the left eye of the endoscope sees of all episodes [B, H, W, 3], uint8.

@@ -10,6 +10,7 @@ import numpy as np
 from rich.progress import Progress
 
 from endo_sim_ros.core.device import single_threaded_torch
+from endo_sim_ros.learning.actions import Actions
 from endo_sim_ros.learning.config import PPOConfig, Randomisation, TrainingConfig
 from endo_sim_ros.learning.policies import NetworkPolicy, Policy
 from endo_sim_ros.learning.scenes import Scene
@@ -46,7 +47,12 @@ def measure_policy(batch: TaskBatch, policy: Policy) -> dict[str, float]:
 
 @single_threaded_torch()
 def train(
-    task: str, scene: Scene, config: TrainingConfig, randomisation: Randomisation = Randomisation(), device: str = "auto"
+    task: str,
+    scene: Scene,
+    config: TrainingConfig,
+    randomisation: Randomisation = Randomisation(),
+    device: str = "auto",
+    actions: Actions = "cartesian",
 ) -> tuple[NetworkPolicy, list[dict[str, float]]]:
     """Train a policy.
 
@@ -56,9 +62,9 @@ def train(
     """
     hidden = [config.hidden] if config.hidden else []
     rng = np.random.default_rng([config.seed, 0xCE])
-    batch = TaskBatch(task, scene, config.population, randomisation=randomisation, device=device)
-    testing = TaskBatch(task, scene, config.test_episodes, randomisation=randomisation, device=device)
-    size = sum(rows * columns for rows, columns in NetworkPolicy.sizes(task, hidden))
+    batch = TaskBatch(task, scene, config.population, randomisation=randomisation, device=device, actions=actions)
+    testing = TaskBatch(task, scene, config.test_episodes, randomisation=randomisation, device=device, actions=actions)
+    size = sum(rows * columns for rows, columns in NetworkPolicy.sizes(task, hidden, actions))
     mean, deviation = np.zeros(size), np.full(size, config.spread)
     elite_count = max(round(config.elite * config.population), 2)
     curve, began = [], time.monotonic()
@@ -69,14 +75,14 @@ def train(
             best = np.zeros(1, int)
             if generation:
                 vectors = mean + deviation * rng.standard_normal((config.population, size))
-                policy = NetworkPolicy.from_vectors(task, hidden, vectors)
+                policy = NetworkPolicy.from_vectors(task, hidden, vectors, actions)
                 for _ in range(config.episodes):
                     scores += run_episodes(batch, policy, np.full(config.population, rng.integers(_TESTED_FROM)))[0] / config.episodes
                 best = np.argsort(-scores, kind="stable")[:elite_count]
                 # Noise keeps the Gaussian from collapsing before it has arrived; without it the last 30 % of the generations settle.
                 noise = 0.3 * config.spread * max(1 - generation / (0.7 * config.generations), 0.0)
                 mean, deviation = vectors[best].mean(0), vectors[best].std(0) + noise
-            tested = NetworkPolicy.from_vectors(task, hidden, mean)
+            tested = NetworkPolicy.from_vectors(task, hidden, mean, actions)
             result = measure_policy(testing, tested)
             curve.append(
                 {

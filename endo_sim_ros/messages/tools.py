@@ -85,6 +85,30 @@ def encode_joints(
     )
 
 
+def decode_number(message: Message, topic: str) -> float:
+    """Number of a Float64.
+
+    Raises:
+        MessageError: If it is not finite.
+    """
+    if not np.isfinite(message.data):
+        raise MessageError(f"{topic}: expected a finite number, got {message.data}")
+    return float(message.data)
+
+
+def encode_number(value: float, types: MessageTypes = ros_types()) -> Message:
+    """Float64 of a number."""
+    return types.Float64(data=float(value))
+
+
+def encode_matrix(matrix: np.ndarray, types: MessageTypes = ros_types()) -> Message:
+    """Float64MultiArray of a matrix [r, c], row by row."""
+    (rows, columns), dimension = matrix.shape, types.MultiArrayDimension
+    dim = [dimension(label="rows", size=rows, stride=matrix.size), dimension(label="columns", size=columns, stride=columns)]
+    layout = types.MultiArrayLayout(dim=dim, data_offset=0)
+    return types.Float64MultiArray(layout=layout, data=types.sequence(np.asarray(matrix, np.float64)))
+
+
 def decode_cut(message: Message, topic: str) -> bool:
     """Whether the first button of a Joy is pressed: the edge of the tool cuts.
 
@@ -143,32 +167,34 @@ class ToolDisplay:
     force: np.ndarray  # [3] N, on the tissue
     reaction: np.ndarray  # [3] N, on the tool
     held: np.ndarray  # [K, 3] m, control nodes in the tool's grasp
+    rods: Sequence[tuple[np.ndarray, np.ndarray, float]] = ()  # both ends [3] and the radius of what its instrument is made of, m
 
 
 METRES_PER_NEWTON = 0.01  # length of the arrows
 _MARKER_RADIUS = 0.0015  # m
-_SPHERE, _ARROW, _POINTS = 2, 0, 8  # Marker.type
+_SPHERE, _ARROW, _POINTS, _CYLINDER = 2, 0, 8, 3  # Marker.type
+_METAL = (0.55, 0.56, 0.58, 1.0)
 _ADD, _DELETE = 0, 2  # Marker.action
 
 
 def encode_tool_markers(tools: Iterable[ToolDisplay], stamp_ns: int, frame_id: str) -> Message:
     """MarkerArray for RViz and Foxglove. The namespace of a marker is its arm.
 
-    Ids of each arm: 0 the tip, 1 the force on the tissue, 2 the reaction, 3 the held control nodes. Arrows are 1 cm per newton.
-    A marker with nothing to show is deleted.
+    Ids of each arm: 0 the tip, 1 the force on the tissue, 2 the reaction, 3 the held control nodes, from 4 on the instrument. Arrows are
+    1 cm per newton. A marker with nothing to show is deleted.
     """
     types, r = ros_types(), _MARKER_RADIUS
     point = lambda p: types.Point(x=float(p[0]), y=float(p[1]), z=float(p[2]))  # noqa: E731
     markers = []
 
-    def add(tool: ToolDisplay, kind: int, points: list, size: tuple, color: tuple, visible: bool) -> None:
+    def add(tool: ToolDisplay, kind: int, points: list, size: tuple, color: tuple, visible: bool, pose: Message | None = None) -> None:
         marker = types.Marker(
             header=make_header(types, stamp_ns, frame_id),
             ns=tool.arm,
-            id=len(markers) % 4,
+            id=sum(marker.ns == tool.arm for marker in markers),
             type=kind,
             action=_ADD if visible else _DELETE,
-            pose=types.Pose(position=point(tool.tip if kind == _SPHERE else np.zeros(3))),
+            pose=pose or types.Pose(),
             scale=types.Vector3(**dict(zip("xyz", size))),
             color=types.ColorRGBA(**dict(zip("rgba", color))),
             points=[point(p) for p in points],
@@ -176,9 +202,16 @@ def encode_tool_markers(tools: Iterable[ToolDisplay], stamp_ns: int, frame_id: s
         markers.append(marker)
 
     for tool in tools:
-        add(tool, _SPHERE, [], (2 * r, 2 * r, 2 * r), (0.9, 0.9, 0.9, 1.0), True)
+        add(tool, _SPHERE, [], (2 * r, 2 * r, 2 * r), (0.9, 0.9, 0.9, 1.0), True, types.Pose(position=point(tool.tip)))
         for vector, color in ((tool.force, (1.0, 0.55, 0.1, 1.0)), (tool.reaction, (0.2, 0.6, 1.0, 1.0))):
             end = tool.tip + METRES_PER_NEWTON * vector
             add(tool, _ARROW, [tool.tip, end], (r / 2, r, 2 * r), color, bool(np.any(vector)))
         add(tool, _POINTS, list(tool.held), (r, r, 0.0), (0.3, 1.0, 0.4, 1.0), len(tool.held) > 0)
+        for start, end, radius in tool.rods:
+            way = end - start
+            length = float(np.linalg.norm(way))
+            half = np.array([-way[1], way[0], 0.0, length + way[2]])  # xyzw: half way of the turn from z to the rod, unless it is -z
+            x, y, z, w = half / np.linalg.norm(half) if half.any() else (1.0, 0.0, 0.0, 0.0)
+            pose = types.Pose(position=point(0.5 * (start + end)), orientation=types.Quaternion(x=x, y=y, z=z, w=w))
+            add(tool, _CYLINDER, [], (2 * radius, 2 * radius, length), _METAL, length > 0, pose)
     return types.MarkerArray(markers=markers)

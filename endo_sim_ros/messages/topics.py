@@ -80,6 +80,20 @@ tool_joint_command = _of_arm("servo_jp", "sensor_msgs/msg/JointState")
 """Commanded positions of an arm's joints, reached at once."""
 tool_joint_move = _of_arm("move_jp", "sensor_msgs/msg/JointState")
 """Goal to which an arm's joints move."""
+tool_joint_change = _of_arm("servo_jr", "sensor_msgs/msg/JointState")
+"""Commanded change of the positions of an arm's joints, made at once."""
+tool_joint_move_change = _of_arm("move_jr", "sensor_msgs/msg/JointState")
+"""Change of the goal to which an arm's joints move."""
+tool_hold = _of_arm("hold", "std_msgs/msg/Empty")
+"""Ends all moves of an arm where it is."""
+tool_free = _of_arm("free", "std_msgs/msg/Empty")
+"""Lets go of the position of an arm's joints, which nothing moves then."""
+tool_ratio_command = _of_arm("trajectory_j/set_ratio", "std_msgs/msg/Float64")
+"""Commanded part of their largest speeds with which an arm's moves go."""
+tool_body_jacobian = _of_arm("body/jacobian", "std_msgs/msg/Float64MultiArray")
+"""Jacobian of an arm in the axes of its tip."""
+tool_spatial_jacobian = _of_arm("spatial/jacobian", "std_msgs/msg/Float64MultiArray")
+"""Jacobian of an arm in its base, for what is at the base's origin."""
 tool_velocity = _of_arm("measured_cv", "geometry_msgs/msg/TwistStamped")
 """Measured velocity of an arm's tip."""
 tool_local_pose = _of_arm("local/measured_cp", "geometry_msgs/msg/PoseStamped")
@@ -88,6 +102,11 @@ tool_local_setpoint = _of_arm("local/setpoint_cp", "geometry_msgs/msg/PoseStampe
 """Current setpoint of an arm's tip in its base."""
 tool_links = _of_arm("link_poses", "geometry_msgs/msg/PoseArray")
 """Poses of the links of an arm's instrument."""
+
+
+def tool_ratio(arm: str) -> Topic:
+    """Part of their largest speeds with which an arm's moves go."""
+    return Topic(f"{arm}/trajectory_j/ratio", "std_msgs/msg/Float64", "latched")
 
 
 def tool_type(arm: str) -> Topic:
@@ -135,7 +154,8 @@ MODEL_TOPICS = (GAUSSIANS, TRAINING_CAMERAS, TRAINING_CAMERA_INFO)
 TOOL_TOPICS = (  # of one arm; without those whose type is not installed everywhere
     tool_pose, tool_pose_command, tool_move, tool_setpoint, tool_wrench, tool_jaw, tool_jaw_move, tool_jaw_state, tool_jaw_setpoint,
     tool_cut, tool_reaction, tool_links, tool_type, tool_joints, tool_joint_setpoint, tool_joint_command, tool_joint_move, tool_velocity,
-    tool_local_pose, tool_local_setpoint,
+    tool_local_pose, tool_local_setpoint, tool_joint_change, tool_joint_move_change, tool_hold, tool_free, tool_ratio_command, tool_ratio,
+    tool_body_jacobian, tool_spatial_jacobian,
 )  # fmt: skip
 RENDERED_TOPICS = (RENDERED_INFO, RENDERED_POSE, RENDERED_DEPTH, RENDERED_IMAGE)
 

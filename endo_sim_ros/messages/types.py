@@ -21,7 +21,7 @@ Message = Any  # an instance of a message class, of ROS or of rosbags: both have
 MESSAGE_PACKAGES = {
     "builtin_interfaces": ("Time",),
     "rosgraph_msgs": ("Clock",),
-    "std_msgs": ("Header", "ColorRGBA", "String"),
+    "std_msgs": ("Header", "ColorRGBA", "String", "Empty", "Float64", "Float64MultiArray", "MultiArrayDimension", "MultiArrayLayout"),
     "geometry_msgs": (
         "Point",
         "Quaternion",

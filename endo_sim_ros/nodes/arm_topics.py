@@ -57,9 +57,15 @@ class ArmTopics:
             if commanded:
                 self._hear(arm, messages.tool_move, self._on_move, several)
                 self._hear(arm, messages.tool_state_command, self._on_state_command, STREAM_DEPTH)
+                self._hear(arm, messages.tool_hold, self._on_hold, several)
+                self._hear(arm, messages.tool_free, self._on_hold, several)  # joints that nothing moves stay where they are
                 if isinstance(arm, JointedArm):
                     self._hear(arm, messages.tool_joint_command, self._on_joints, depth)
+                    self._hear(arm, messages.tool_joint_change, self._on_joint_change, several)  # none replaces another
                     self._hear(arm, messages.tool_joint_move, self._on_joint_move, several)
+                    self._hear(arm, messages.tool_joint_move_change, self._on_joint_move_change, several)
+                    self._hear(arm, messages.tool_ratio_command, self._on_ratio, several)
+                    self._publishers[arm.name][messages.tool_ratio].publish(messages.encode_number(arm.speed_ratio))
         for arm in tools:
             self._hear(arm, messages.tool_wrench, self._on_wrench, depth)
             self._hear(arm, messages.tool_jaw, self._on_jaw, several)
@@ -81,6 +87,8 @@ class ArmTopics:
         shown += [messages.tool_info, messages.tool_warning, messages.tool_error]
         if arm is not self._camera:
             shown += [messages.tool_jaw_state, messages.tool_jaw_setpoint]
+        if isinstance(arm, JointedArm):
+            shown += [messages.tool_ratio]
         # A renderer in lockstep waits for each pose of the camera.
         depth = MOST_WAITING if arm is self._camera and options.mode == "lockstep" else STREAM_DEPTH
         publishers = {topic: self._node.publisher(topic(arm.name), alone=True) for topic in shown}
@@ -212,6 +220,40 @@ class ArmTopics:
         arm.move_joints(goal)
         self.publish_operating_states(arm.name)
 
+    def _on_joint_change(self, arm: Arm, topic: str, message: Any) -> None:
+        assert isinstance(arm, JointedArm)
+        change = arm.check_numbers(messages.decode_joints(message, topic), message.name)
+
+        def act() -> None:
+            arm.require_enabled()
+            arm.servo_joints(arm.joints_after(change))
+            self.publish_operating_states()
+
+        self._deliver_part(arm, "pose", message, topic, act)
+
+    def _on_joint_move_change(self, arm: Arm, topic: str, message: Any) -> None:
+        assert isinstance(arm, JointedArm)
+        change = arm.check_numbers(messages.decode_joints(message, topic), message.name)
+        arm.require_enabled()
+        arm.move_joints(arm.joints_after(change, of_goal=True))
+        self.publish_operating_states(arm.name)
+
+    def _on_hold(self, arm: Arm, topic: str, message: Any) -> None:
+        def act() -> None:
+            arm.require_enabled()
+            arm.stop()
+            self.publish_operating_states(arm.name)
+
+        if self.options.mode == "lockstep":  # it is no part of a command, and has no stamp
+            act()
+        else:
+            self._deliver_part(arm, "pose", message, topic, act)
+
+    def _on_ratio(self, arm: Arm, topic: str, message: Any) -> None:
+        assert isinstance(arm, JointedArm)
+        arm.set_speed_ratio(messages.decode_number(message, topic))
+        self._publishers[arm.name][messages.tool_ratio].publish(messages.encode_number(arm.speed_ratio))
+
     def _on_wrench(self, arm: Arm, topic: str, message: Any) -> None:
         force, torque = messages.decode_wrench(message, topic)
         frames = {name: pose for name, pose in self._frames(arm).items() if name}
@@ -310,6 +352,13 @@ class ArmTopics:
         if self._camera is not None and self._camera.pose is not None:
             self._publish_motion(self._camera, self._camera.pose, np.zeros(3), np.zeros(3), stamp)
         self._joints.publish_links(stamp)
+
+    def display(self, arm: Arm, reaction: np.ndarray, held: np.ndarray) -> messages.ToolDisplay:
+        """What `tool_markers` shows of an arm with a pose, the reaction [3] on it, N, and control nodes [K, 3] that it holds, world."""
+        assert arm.pose is not None
+        force = arm.force if arm.acting and arm.force is not None else np.zeros(3)
+        rods = self._joints.rods(arm) if isinstance(arm, JointedArm) else ()
+        return messages.ToolDisplay(arm.name, arm.pose[:3, 3], force, reaction, held, rods)
 
     def publish_joint_states(self, stamp: int) -> None:
         """Publish the joints of all arms in one message, while somebody subscribes."""

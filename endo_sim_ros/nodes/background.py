@@ -17,6 +17,11 @@ class Background:
         self._future: Future | None = None
 
     @property
+    def wish(self) -> Any:
+        """Key of the newest wish that building has begun for, or None."""
+        return self._key
+
+    @property
     def busy(self) -> bool:
         """Whether something is being built, or was built and not taken yet."""
         return self._future is not None

@@ -242,6 +242,8 @@ class PolicyConfig(StageConfig):
     """Folder of the model.ply and cameras.json that the graph runs on; empty = a piece of the synthetic patient."""
     seed: Annotated[int, Range(0, 2**31 - 1)] = 0
     """Seed of the first episode; each following episode has the next seed."""
+    tool: str = ""
+    """Name or file of the tool that the scene was written with, which a policy that acts by joints moves; empty = that of the task."""
     episodes: Annotated[int, Range(1, 1_000_000)] = 1
     """Number of episodes; palpation has one, as the inclusion is part of the parameters of physics_node."""
     record: str = ""

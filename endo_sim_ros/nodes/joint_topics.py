@@ -6,6 +6,7 @@ import numpy as np
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import invert_pose
+from endo_sim_ros.instruments import ArmKinematics
 from endo_sim_ros.instruments.urdf import arm_capsules, robot_description
 from endo_sim_ros.messages import Topic
 from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode
@@ -14,6 +15,7 @@ from endo_sim_ros.nodes.jointed_arm import CameraArm, JointedArm
 from endo_sim_ros.nodes.pacing import MOST_WAITING
 
 _SHOWN = messages.tool_joints, messages.tool_joint_setpoint, messages.tool_velocity, messages.tool_local_pose, messages.tool_local_setpoint
+_JACOBIANS = {messages.tool_body_jacobian: ArmKinematics.body_jacobian, messages.tool_spatial_jacobian: ArmKinematics.spatial_jacobian}
 
 
 class JointTopics:
@@ -36,7 +38,9 @@ class JointTopics:
         for publisher, arm in zip(self._tool_types, instruments.values()):
             publisher.publish(messages.encode_text(arm.tool_type))
         self._shown: dict[str, dict[Callable[[str], Topic], messages.Message]] = {
-            name: {topic: node.publisher(topic(name), alone=True) for topic in _SHOWN} for name, arm in arms.items() if arm.commanded
+            name: {topic: node.publisher(topic(name), alone=True) for topic in (*_SHOWN, *_JACOBIANS)}
+            for name, arm in arms.items()
+            if arm.commanded
         }
         if arms:
             self._joint_states = node.publisher(messages.JOINT_STATES)
@@ -55,6 +59,13 @@ class JointTopics:
         for arm, publisher in self._links:
             publisher.publish(messages.encode_poses(list(arm.links().values()), stamp, self.options.world_frame))
 
+    def rods(self, arm: JointedArm) -> list[tuple[np.ndarray, np.ndarray, float]]:
+        """Both ends [3], world, and the radius of each capsule of an arm's instrument, m; none while nobody knows where it is."""
+        links = arm.links()
+        place = lambda capsule, end: links[capsule.link][:3, :3] @ end + links[capsule.link][:3, 3]  # noqa: E731
+        capsules = self._capsules[arm.name] if links else ()
+        return [(place(capsule, capsule.start), place(capsule, capsule.end), capsule.radius) for capsule in capsules]
+
     def publish_joint_states(self, stamp: int) -> None:
         """Publish the joints of all arms in one message, while somebody subscribes."""
         if not self._arms or not self._joint_states.get_subscription_count():
@@ -67,7 +78,7 @@ class JointTopics:
                 positions += list(arm.joints)
                 if arm.kinematics.jaw is not None:
                     names.append(f"{prefix}_jaw")
-                    positions.append(arm.angle)
+                    positions.append(arm.gape)
         none = np.zeros(0)
         self._joint_states.publish(messages.encode_joints(names, np.array(positions), none, none, stamp))
 
@@ -94,3 +105,6 @@ class JointTopics:
         local = invert_pose(arm.base) @ arm.pose
         for topic in (messages.tool_local_pose, messages.tool_local_setpoint):
             publishers[topic].publish(messages.encode_pose(local, stamp, f"{arm.name}_base"))
+        for topic, jacobian in _JACOBIANS.items():
+            if publishers[topic].get_subscription_count():
+                publishers[topic].publish(messages.encode_matrix(jacobian(arm.kinematics, arm.joints)))

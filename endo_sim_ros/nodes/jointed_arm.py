@@ -46,6 +46,7 @@ class JointedArm(Arm):
     joint_speed: float = np.inf
     slide_speed: float = np.inf
     base: np.ndarray | None = None  # [4, 4], world
+    speed_ratio: float = 1.0  # part of all speeds with which moves go
     joints: np.ndarray | None = None  # [n] rad and m
     joint_goal: np.ndarray | None = None  # [n]; None while no move of joints is under way
     _to_pose: bool = False  # whether that move is the rest of one to a pose
@@ -152,13 +153,7 @@ class JointedArm(Arm):
         Raises:
             ValueError: As from `servo_joints`, and if they have other names.
         """
-        arm, known = self.kinematics, ", ".join(joint.name for joint in self.kinematics.joints)
-        if any(names) and ", ".join(names) != known:
-            raise ValueError(f"{self.name}: the joints are {known}, in this order, not {', '.join(names):.200}; send these names or none")
-        try:
-            positions = arm.check_joints(joints)
-        except ValueError as error:
-            raise ValueError(f"{self.name}: {str(error).removeprefix(f'{arm.name}: ')}") from None
+        arm, positions = self.kinematics, self.check_numbers(joints, names)
         if self.base is None:
             raise ValueError(f"{self.name} has no place yet; publish a model, or give {self.name}_base in frames")
         for joint, value in zip(arm.joints, positions):
@@ -170,6 +165,28 @@ class JointedArm(Arm):
                 limits = f"its limits are {lower} and {upper} {unit}"
                 raise ValueError(f"{self.name}: {joint.name} cannot be at {value} {unit}; {limits}{doubt}")
         return np.clip(positions, arm.lower, arm.upper)
+
+    def check_numbers(self, joints: ArrayLike, names: Sequence[str] = ()) -> np.ndarray:
+        """One number for each joint [n], whatever its limits; raises ValueError if they are not n finite ones, or have other names."""
+        arm, known = self.kinematics, ", ".join(joint.name for joint in self.kinematics.joints)
+        if any(names) and ", ".join(names) != known:
+            raise ValueError(f"{self.name}: the joints are {known}, in this order, not {', '.join(names):.200}; send these names or none")
+        try:
+            return arm.check_joints(joints)
+        except ValueError as error:
+            raise ValueError(f"{self.name}: {str(error).removeprefix(f'{arm.name}: ')}") from None
+
+    def joints_after(self, change: np.ndarray, of_goal: bool = False) -> np.ndarray:
+        """Joint positions [n] that differ by a change [n] from the present ones or, while joints move, from their goal if asked."""
+        self.settle()
+        before = self.joint_goal if of_goal and self.joint_goal is not None else self.joints
+        return change if before is None else before + change  # without any the arm has no place either, and takes none
+
+    def set_speed_ratio(self, ratio: float) -> None:
+        """Let moves go with a part of their largest speeds; raises ValueError if it is not above 0 and at most 1."""
+        if not 0 < ratio <= 1:
+            raise ValueError(f"{self.name}: the ratio of speeds is {ratio:g}; send one above 0 and at most 1")
+        self.speed_ratio = ratio
 
     def check_jaw(self, angle: float) -> float:
         """An angle of the jaw, rad, that a commanded arm may take; ValueError if it is beyond the limits of the tool."""
@@ -207,6 +224,7 @@ class JointedArm(Arm):
         """
         if not self.commanded or self.base is None or self.joints is None:
             return super().move(seconds, speed, turn_speed)
+        speed, turn_speed = self.speed_ratio * speed, self.speed_ratio * turn_speed
         self._move_jaw(seconds, turn_speed)
         missing = self.settle()
         if self.pose_goal is not None:
@@ -251,7 +269,7 @@ class JointedArm(Arm):
     def _haste(self, joints: np.ndarray, seconds: float) -> float:
         """How many times too fast it is to come from some joint positions to the present ones in some seconds."""
         assert self.joints is not None
-        most = np.where(self.kinematics.prismatic, self.slide_speed, self.joint_speed)
+        most = self.speed_ratio * np.where(self.kinematics.prismatic, self.slide_speed, self.joint_speed)
         return float(np.max(np.abs(self.joints - joints) / (most * seconds)))
 
     def _move_joints(self, seconds: float, speed: float, turn_speed: float) -> None:
@@ -294,9 +312,13 @@ class JointedArm(Arm):
         self.settle()
         if self.base is None or self.joints is None or self.pose is None:
             return {}
-        widest = self.kinematics.jaw[1] if self.kinematics.jaw else 0.0
-        poses = link_poses(self.kinematics, self.joints, np.clip(self.angle, 0.0, widest))  # closed jaws press, they do not overlap
+        poses = link_poses(self.kinematics, self.joints, self.gape)
         return {name: self.base @ pose for name, pose in poses.items()}
+
+    @property
+    def gape(self) -> float:
+        """Angle at which the jaws stand to each other, rad: closed jaws press, they do not overlap."""
+        return float(np.clip(self.angle, 0.0, self.kinematics.jaw[1])) if self.kinematics.jaw else 0.0
 
     def dynamics(self, force: np.ndarray, torque: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What the joints and the tip do under a wrench on the tip.

@@ -10,7 +10,7 @@ from std_srvs.srv import SetBool, Trigger
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ControlNodeCloud, PhysicsState
-from endo_sim_ros.nodes.arm import DISABLED
+from endo_sim_ros.nodes.arm import DISABLED, Arm
 from endo_sim_ros.nodes.arm_setup import CAMERA_ARM, make_arms, place_arms
 from endo_sim_ros.nodes.arm_topics import ArmTopics
 from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode, run, sentence
@@ -268,7 +268,7 @@ class PhysicsNode(EndoNode):
 
     def step(self, simulation: TissueSimulation) -> None:
         """Take one step with what the arms command, and publish it."""
-        start, faults, slips = time.monotonic(), simulation.faults, simulation.slips
+        start, faults, slips = time.monotonic(), simulation.faults, simulation.slips_by_tool()
         held, self._held = self._held, {}
         self._run_parts(held)
         for arm in self.arms.values():
@@ -285,18 +285,23 @@ class PhysicsNode(EndoNode):
         simulation.step()
         for name, arm in self._tools.items():
             self._arm_topics.limit_force(arm, lambda name=name: simulation.reaction(name)[0])
-        if simulation.slips > slips:
-            pulled, raised = f"almost {simulation.config.travel:g} m", "travel"
-            if self._options.link_contact and simulation.config.grip_force:
-                pulled += f", or with {2 * simulation.config.friction * simulation.config.grip_force:.3g} N between two jaws"
-                raised += " or grip_force"
-            self.report_error(f"tissue slipped out of a jaw that pulled it {pulled}; open it, come nearer, or raise {raised}")
-            for name, arm in self._tools.items():
-                arm.closed = arm.closed and simulation.in_reach(name)
+        for name, count in simulation.slips_by_tool().items():
+            if count > slips.get(name, 0):
+                self._lose(simulation, self.arms[name])
         self.steps += 1
         if simulation.faults > faults:
             self.report_error(simulation.last_fault)
         self._seconds_per_step += 0.1 * (time.monotonic() - start - self._seconds_per_step)
+
+    def _lose(self, simulation: TissueSimulation, arm: Arm) -> None:
+        """Leave the jaw of an arm that tissue slipped out of open, and say so."""
+        arm.closed = False
+        pulled, raised = f"almost {simulation.config.travel:g} m", "travel"
+        if self._options.link_contact and simulation.config.grip_force:
+            pulled += f", or with {2 * simulation.config.friction * simulation.config.grip_force:.3g} N between two jaws"
+            raised += " or grip_force"
+        text = f"{arm.name}: tissue slipped out of the jaw, which pulled it {pulled}; open it, come nearer, or raise {raised}"
+        self._arm_topics.warn(arm, text, again=True)
 
     def _publish(self, simulation: TissueSimulation, stamp: int, at_rest: bool = False) -> None:
         """The state, the reactions and what belongs to them, all with one stamp; the state at rest is no moment in time."""
@@ -310,7 +315,7 @@ class PhysicsNode(EndoNode):
         self._arm_topics.publish_views(stamp)  # before the state with the same stamp, as who draws them waits for that
         cloud = ControlNodeCloud(state.rest, state.positions, state.F, self._simulated_stamp, cut)
         self._nodes_pub.publish(messages.encode_control_nodes(cloud, stamp, world))
-        shown, reactions = [], {}
+        shown, reactions, marked = [], {}, self._markers_pub.get_subscription_count() > 0
         for name, arm in self._tools.items():
             if arm.pose is None:
                 continue
@@ -320,11 +325,11 @@ class PhysicsNode(EndoNode):
             axes = arm.pose[:3, :3].T  # those of the tool
             reactions[name] = np.concatenate([axes @ reaction, axes @ torque])
             self._arm_topics.publish(arm, arm.pose, reaction, torque, stamp)
-            force = arm.force if arm.acting and arm.force is not None else np.zeros(3)
-            shown.append(messages.ToolDisplay(name, arm.pose[:3, 3], force, reaction, simulation.held(name)))
+            if marked:
+                shown.append(self._arm_topics.display(arm, reaction, simulation.held(name)))
         self._reactions.publish(reactions, stamp, simulation.step_duration)
         self._arm_topics.publish_joint_states(stamp)
-        if shown and self._markers_pub.get_subscription_count():
+        if shown:
             self._markers_pub.publish(messages.encode_tool_markers(shown, stamp, world))
         self._arm_topics.publish_operating_states()  # at last: who waits for the end of a move then asks where the arm is
 

@@ -9,6 +9,7 @@ from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.learning.held_tools import HeldTools, hold_tool
 from endo_sim_ros.learning.policies import make_policy
 from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.learning.tasks import find_task
@@ -33,13 +34,14 @@ class PolicyNode(EndoNode):
             task = find_task(config.task)
             physics = task.physics()
             self._task = task(scene.nodes(physics), scene.camera.position)
-            self._policy = make_policy(config.policy, config.task)
+            self._policy = policy = make_policy(config.policy, config.task)
+            self._tools = None if policy.actions == "cartesian" else HeldTools([hold_tool(task, scene, config.tool)], task, 1)
         except ValueError as error:
             raise ConfigError(str(error)) from error
         if not self._task.same_tissue and config.episodes > 1:
             raise ConfigError(f"episodes: {config.task} has one episode over topics, as its tissue is part of physics_node's parameters")
         self._step_ns = round(physics.step_duration * 1e9)
-        self._pose_pub = self.publisher(messages.tool_pose_command(arm))
+        self._pose_pub = self.publisher((messages.tool_joint_command if self._tools else messages.tool_pose_command)(arm))
         self._jaw_pub = self.publisher(messages.tool_jaw(arm))
         self._resetting = self.create_client(Trigger, f"{config.physics_node}/reset")
         self._state, self._missing = PolicyState.WAITING, ""  # and what for
@@ -61,6 +63,8 @@ class PolicyNode(EndoNode):
         """Set up the next episode and ask for the tissue at rest."""
         self._task.reset(0, np.random.default_rng(self._config.seed + self._done))
         self._policy.reset([0])
+        if self._tools is not None:
+            self._tools.begin(np.zeros(1, int), self._poses(self._task.tips()))
         self._stamp, self._heard, self._state = 0, {}, PolicyState.WAITING
         self._ask()
 
@@ -70,7 +74,7 @@ class PolicyNode(EndoNode):
             return
         listening = all(publisher.get_subscription_count() for publisher in (self._pose_pub, self._jaw_pub))
         if not (listening and self._resetting.service_is_ready()):
-            self._missing = "physics_node with arm_source commanded"
+            self._missing = "physics_node with arm_source commanded" + (", and an instrument with joints" if self._tools else "")
             return
         self._missing = "the tissue of the scene"
         self._heard.pop("reset", None)
@@ -99,7 +103,8 @@ class PolicyNode(EndoNode):
 
     def _on_reaction(self, message: Any) -> None:
         if self._stamp and messages.stamp_to_ns(message.header.stamp) == self._stamp:
-            self._answer("force", messages.decode_wrench(message, "measured_cf")[0])
+            force = messages.decode_wrench(message, "measured_cf")[0]
+            self._answer("force", force if self._tools is None else self._tools.poses()[0, :3, :3] @ force)
 
     def _answer(self, part: str, value: Any) -> None:
         """Take in a part of what answers the last command; when it is complete, act."""
@@ -108,6 +113,7 @@ class PolicyNode(EndoNode):
             return
         positions, force = self._heard["nodes"][self._task.sites], self._heard.get("force", np.zeros(3))
         observation = self._task.observe(positions, force[None])
+        observation = observation if self._tools is None else self._tools.observe(observation)
         ended = False
         if self._stamp:
             outcome = self._task.judge()
@@ -124,17 +130,30 @@ class PolicyNode(EndoNode):
     def _act(self, observation: np.ndarray) -> None:
         actions = self._policy.act(observation)
         self._action = actions[0]
-        tips, closed = self._task.act(actions)
+        if self._tools is None:
+            tips, closed = self._task.act(actions)
+        else:
+            poses, closed = self._tools.act(self._task, actions, self._policy.actions == "joints")
+            tips = poses[:, :3, 3]
         self._stamp, self._heard = self._stamp + self._step_ns, {}
         self._state = PolicyState.WORKING
         self._command(tips, closed, self._stamp)
 
     def _command(self, tips: np.ndarray, closed: np.ndarray, stamp: int) -> None:
-        """Publish where the tip shall be [1, 3], m, world, and whether the jaw is closed [1]."""
-        pose = np.eye(4)
-        pose[:3, 3] = tips[0]
-        self._pose_pub.publish(messages.encode_pose(pose, stamp, self._config.world_frame))
+        """Publish where the tip shall be [1, 3], m, world, or the joints that put it there, and whether the jaw is closed [1]."""
+        if self._tools is None:
+            self._pose_pub.publish(messages.encode_pose(self._poses(tips)[0], stamp, self._config.world_frame))
+        else:
+            none = np.zeros(0)
+            self._pose_pub.publish(messages.encode_joints([], self._tools.joints[0], none, none, stamp))
         self._jaw_pub.publish(messages.encode_jaw(self._task.closed_jaw if closed[0] else self._task.open_jaw, stamp))
+
+    @staticmethod
+    def _poses(tips: np.ndarray) -> np.ndarray:
+        """Poses [1, 4, 4] of a tip at a place [1, 3], m, with the axes of the world."""
+        poses = np.eye(4)[None]
+        poses[:, :3, 3] = tips
+        return poses
 
     def _end(self, success: bool) -> None:
         self._done += 1

@@ -105,20 +105,26 @@ class ShownInstruments:
     def posed(self, links: dict[str, np.ndarray], config: DrawingConfig, device: str) -> PosedInstruments | None | Literal[False]:
         """What draws the instruments where their links are; None if there are none, False while that is prepared.
 
+        Before any links come that is prepared for all tools that are known, so that the first picture with links shows them.
+
         Raises what the preparation raised, once; after that there are none.
         """
         names = tuple(arm for arm in self.arms if arm in links and arm in self._tools)
-        if not names:
-            return None
-        tools = [self._tools[arm] for arm in names]
-        key = tuple((arm, self._types[arm]) for arm in names), config, device
-        if key != self._key:
+        drawn = names or tuple(arm for arm in self.arms if arm in self._tools)
+        tools = [self._tools[arm] for arm in drawn]
+        key = tuple((arm, self._types[arm]) for arm in drawn), config, device
+        if drawn and key != self._key:
             self._background.want(
                 key, lambda: InstrumentDrawing([parts for parts, _ in tools], config, device, [capsules for _, capsules in tools])
             )
+        if not names:
+            return None
+        if key != self._key:
             try:
                 built = self._background.take()
             except Exception:
+                if self._background.wish != key:  # it was prepared for other arms than have links
+                    return False
                 self._key, self._drawing = key, None
                 raise
             if built is None or built[0] != key:

@@ -107,6 +107,11 @@ class TissueSimulation:
         """Times that tissue slipped out of a jaw because it was pulled farther than the travel allows."""
         return int(self._tools.slips[0].sum())
 
+    def slips_by_tool(self) -> dict[str, int]:
+        """The same of each tool, by its name."""
+        counts = self._tools.slips[0].tolist()
+        return {tool: counts[slot] for tool, slot in self._slots.items()}
+
     @property
     def contact_radius(self) -> float:
         """Radius of the capsule that tools push with, m; 0 = none."""

@@ -66,3 +66,16 @@ def test_pictures_are_seen_from_the_camera_of_their_step_and_episodes_repeat(gra
         np.testing.assert_allclose(np.frombuffer(shown[k]), np.frombuffer(told[k]), atol=1e-12)
     assert len({shown[k] for k in steps}) == 5
     assert len(joints) == 5
+
+
+def test_a_change_of_joints_is_the_pose_of_a_command_and_hold_is_no_part_of_one(graph):
+    assert graph.call(Trigger, "/physics_node/reset").success
+    arm = graph.nodes[1].arms["PSM1"]
+    start, none = arm.joints, np.zeros(0)
+    graph.publish(messages.tool_hold("PSM1"), messages.ros_class(messages.tool_hold("PSM1").type)())
+    for k in (1, 2):
+        change = messages.encode_joints([], np.array([0.01, 0, 0.004, 0, 0, 0]), none, none, k * STEP)
+        graph.publish(messages.tool_joint_change("PSM1"), change)
+        expected = start + k * np.array([0.01, 0, 0.004, 0, 0, 0])
+        graph.until(lambda expected=expected: np.allclose(arm.joints, expected, atol=1e-12), f"step {k}")
+    assert graph.nodes[1].error_count == 0

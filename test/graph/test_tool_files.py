@@ -116,7 +116,7 @@ ENCLAVES = {
     "rendering_node": (RenderingNode, [[]]),
     "scripted_tool_node": (ScriptedToolNode, [[]]),
     "viewer_node": (ViewerNode, [[], ["arm_source:=commanded"]]),
-    "policy_node": (PolicyNode, [[]]),
+    "policy_node": (PolicyNode, [[], ["policy:={joint_policy}"]]),
     "bag_player_node": (BagPlayerNode, [["bag:=/does/not/exist"]]),
 }
 RULES = {
@@ -159,7 +159,7 @@ def used(node_class: type[EndoNode], parameters: list[str]) -> tuple[str, dict[s
 
 @pytest.mark.dds
 @pytest.mark.parametrize("enclave", ENCLAVES)
-def test_policy_allows_what_the_node_uses_and_no_more(enclave):
+def test_policy_allows_what_the_node_uses_and_no_more(enclave, joint_policy):
     policy = ElementTree.parse(CONFIG / "sros2" / "endo_sim.policy.xml").getroot()
     assert policy.tag == "policy" and policy.get("version") == "0.2.0"
     paths = [found.get("path") for found in policy.findall("enclaves/enclave")]
@@ -168,7 +168,7 @@ def test_policy_allows_what_the_node_uses_and_no_more(enclave):
     node_class, variants = ENCLAVES[enclave]
     needed = {rule: set() for rule in RULES}
     for parameters in variants:
-        name, names = used(node_class, parameters)
+        name, names = used(node_class, [parameter.format(joint_policy=joint_policy) for parameter in parameters])
         assert profile.get("node") == name
         for rule in RULES:
             needed[rule] |= names[rule]

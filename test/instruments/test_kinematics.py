@@ -119,11 +119,16 @@ def test_jacobian_is_that_of_finite_differences(arms):
     step = 1e-6
     for arm in arms:
         for joints in within_limits(arm, 5):
+            here, body, spatial = arm.tip_pose(joints), arm.body_jacobian(joints), arm.spatial_jacobian(joints)
             for i, column in enumerate(arm.jacobian(joints).T):
                 change = step * np.eye(len(joints))[i]
                 before, after = arm.tip_pose(joints - change), arm.tip_pose(joints + change)
                 turn = Rotation.from_matrix(after[:3, :3] @ before[:3, :3].T).as_rotvec()
                 np.testing.assert_allclose(column, np.concatenate([after[:3, 3] - before[:3, 3], turn]) / (2 * step), atol=1e-8)
+                slope, back = (after - before) / (2 * step), np.linalg.inv(here)
+                for twist, found in ((back @ slope, body), (slope @ back, spatial)):  # of matrices, as textbooks define them
+                    skew = [twist[2, 1], twist[0, 2], twist[1, 0]]
+                    np.testing.assert_allclose(found[:, i], np.concatenate([twist[:3, 3], skew]), atol=1e-8)
 
 
 @pytest.mark.parametrize(
@@ -137,7 +142,7 @@ def test_jacobian_is_that_of_finite_differences(arms):
         (None, "PSM: "),
     ],
 )
-@pytest.mark.parametrize("method", ["link_frames", "tip_pose", "jacobian"])
+@pytest.mark.parametrize("method", ["link_frames", "tip_pose", "jacobian", "body_jacobian", "spatial_jacobian"])
 def test_wrong_joint_positions_are_one_sentence(method, joints, sentence):
     with pytest.raises(ValueError, match=sentence):
         getattr(load_arm("PSM"), method)(joints)

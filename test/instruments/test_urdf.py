@@ -4,38 +4,13 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from urdf_links import matrix, poses_of_links
 
 from endo_sim_ros.core.cameras import make_pose
 from endo_sim_ros.instruments import build_instrument, link_poses, load_arm
 from endo_sim_ros.instruments.urdf import arm_capsules, robot_description
 
 BASE = make_pose([0.1, -0.2, 0.3], [0.5, 0.1, -0.7, 0.3])
-
-
-def matrix(origin):
-    pose = np.eye(4)
-    pose[:3, 3] = list(map(float, origin.get("xyz").split()))
-    pose[:3, :3] = Rotation.from_euler("xyz", list(map(float, origin.get("rpy").split()))).as_matrix()
-    return pose
-
-
-def poses_of_links(text, positions):
-    """Poses of all links in the world as any reader of a URDF finds them."""
-    robot = ElementTree.fromstring(text)
-    found = {"map": np.eye(4)}
-    for joint in robot.findall("joint"):
-        name, mimic = joint.get("name"), joint.find("mimic")
-        position = positions.get(name, 0.0)
-        if mimic is not None:
-            position = float(mimic.get("multiplier")) * positions[mimic.get("joint")]
-        move = np.eye(4)
-        if joint.get("type") == "prismatic":
-            move[2, 3] = position
-        elif joint.get("type") == "revolute":
-            move[:3, :3] = Rotation.from_rotvec([0, 0, position]).as_matrix()
-        found[joint.find("child").get("link")] = found[joint.find("parent").get("link")] @ matrix(joint.find("origin")) @ move
-    return robot, found
 
 
 @pytest.mark.parametrize("model, tool", [
@@ -47,7 +22,7 @@ def test_links_are_where_the_kinematics_has_them(model, tool):
     for _ in range(5):
         joints, jaw = random.uniform(arm.lower, arm.upper), 0.6
         positions = {f"left_A_{joint.name}": value for joint, value in zip(arm.joints, joints)} | {"left_A_jaw": jaw}
-        robot, found = poses_of_links(text, positions)
+        robot, found = poses_of_links(text, positions, "map")
         np.testing.assert_allclose(found["left_A_tip"], BASE @ arm.tip_pose(joints), atol=1e-9)
         for joint, frame in zip(arm.joints, arm.link_frames(joints)):
             np.testing.assert_allclose(found[f"left_A_{joint.name}"], BASE @ frame, atol=1e-9)

@@ -4,6 +4,7 @@ import gymnasium
 import numpy as np
 
 import endo_sim_ros.learning.environments  # noqa: F401  (registers them)
+from endo_sim_ros.instruments import JOINTS
 from endo_sim_ros.learning.policies import NetworkPolicy
 from endo_sim_ros.learning.tasks import TASKS
 
@@ -43,3 +44,13 @@ def linear_policy():
     weights[names.index("spot_moved_z"), 2] = -2.3
     weights[names.index("distance"), 3], weights[-1, 3] = -10, 2
     return NetworkPolicy("retraction", [weights])
+
+
+def joint_policy():
+    """Weights by hand that act by joints: down to the skin, closed there, a little up, all the while turning."""
+    names = TASKS["retraction"].observation_names + JOINTS
+    weights = np.zeros((len(names) + 1, 7))
+    weights[names.index("tip_z"), [2, 6]], weights[names.index("jaw"), [2, 6]] = (5, -8), (-1.5, 1)
+    weights[-1] = 0.1, -0.05, 0, 0.5, 0.2, -0.3, 2
+    weights[names.index("wrist_yaw"), 0] = 0.3
+    return NetworkPolicy("retraction", [weights], "joints")

@@ -5,12 +5,13 @@ import json
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from played_tasks import linear_policy
+from played_tasks import joint_policy, linear_policy
 
 from endo_sim_ros.learning.config import Randomisation, TrainingConfig
 from endo_sim_ros.learning.policies import NetworkPolicy, make_policy, scripted_policy
@@ -42,12 +43,22 @@ def test_a_network_is_saved_and_loaded_and_nothing_else_is(tmp_path):
     loaded = make_policy(str(tmp_path / "p.npz"), "retraction")
     np.testing.assert_array_equal(loaded.act(observations), policy.act(observations))
     np.testing.assert_array_equal(loaded.act(observations[:1]), policy.act(observations)[:1])
+    assert loaded.actions == "cartesian"
+    with np.load(tmp_path / "p.npz") as file:  # as files were before there were other actions
+        np.savez(tmp_path / "old.npz", **{name: file[name] for name in file.files if name != "actions"})
+        np.savez(tmp_path / "feet.npz", **(dict(file) | {"actions": np.array("feet")}))
+    np.testing.assert_array_equal(NetworkPolicy.load(tmp_path / "old.npz").layers[0], policy.layers[0])
+    by_joints = joint_policy()
+    by_joints.save(tmp_path / "joints.npz")
+    assert make_policy(str(tmp_path / "joints.npz"), "retraction").actions == "joints"
+    with pytest.raises(ValueError, match=r"layers of \[\(23, 7\)\] do not fit, expected \[\(17, 4\)\]"):
+        NetworkPolicy("retraction", by_joints.layers)
     with pytest.raises(ValueError, match="trained for retraction, not for palpation"):
         make_policy(str(tmp_path / "p.npz"), "palpation")
     (tmp_path / "no.npz").write_text("no")
     np.savez(tmp_path / "evil.npz", task=np.array("retraction"), layer0=np.array([print], dtype=object))
     np.savez(tmp_path / "small.npz", task=np.array("retraction"), layer0=np.zeros((3, 4)))
-    for name in ("no", "evil", "small", "missing"):
+    for name in ("no", "evil", "small", "missing", "feet"):
         with pytest.raises(ValueError, match=f"{name}.npz: not a readable policy"):
             NetworkPolicy.load(tmp_path / f"{name}.npz")
 
@@ -62,6 +73,8 @@ def test_training_learns_and_leaves_its_curve(tmp_path):
     assert curve[-1]["test_return"] > curve[0]["test_return"]
     save_training(tmp_path, policy, curve, config)
     assert json.loads((tmp_path / "curve.json").read_text())["curve"] == curve
+    by_joints, _ = train("retraction", load_scene(), replace(config, generations=1), device="cpu", actions="joints")
+    assert by_joints.actions == "joints" and by_joints.layers[0].shape == (23, 7)
     assert (tmp_path / "curve.png").stat().st_size > 1000 and NetworkPolicy.load(tmp_path / "policy.npz").task == "retraction"
 
 

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import rclpy
-from played_tasks import linear_policy, make
+from played_tasks import joint_policy, linear_policy, make
 from ros_bench import Bench
 from waiting import wait_until
 
@@ -16,19 +16,23 @@ from endo_sim_ros.learning.config import SightConfig
 from endo_sim_ros.learning.graph_files import save_scene
 from endo_sim_ros.learning.policies import scripted_policy
 from endo_sim_ros.learning.scenes import load_scene
+from endo_sim_ros.learning.tasks import TASKS
 
 pytestmark = pytest.mark.dds
+
+SEED = 4
 
 
 PICTURES = {"image": messages.RENDERED_IMAGE, "image_right": messages.RENDERED_RIGHT_IMAGE, "segmentation": messages.RENDERED_SEGMENTATION}
 
 
-def assert_same_as_environment(record, task, policy, seed, episodes, sight):
-    """The steps in a file are, bit for bit, those of the environment; returns its pictures of the last episode, the first at rest."""
-    heard, environment, k = np.load(record), make(task, observations="both", eyes=2, segmentation=True, instrument=sight.instrument), 0
+def assert_same_as_environment(record, policy, episodes, environment):
+    """The steps in a file are, bit for bit, those of an environment; returns what it shows in the last episode, the first at rest."""
+    heard, k = np.load(record), 0
+    state = lambda seen: seen["state"] if isinstance(seen, dict) else seen
     for episode in range(episodes):
-        seen, _ = environment.reset(seed=seed + episode)
-        observation, images = seen["state"], [seen]
+        seen, _ = environment.reset(seed=SEED + episode)
+        observation, images = state(seen), [seen]
         policy.reset([0])
         ended = False
         while not ended:
@@ -36,12 +40,12 @@ def assert_same_as_environment(record, task, policy, seed, episodes, sight):
             assert heard["observations"][k].tobytes() == observation.tobytes(), k
             assert heard["actions"][k].tobytes() == action.tobytes(), k
             seen, reward, terminated, truncated, info = environment.step(action)
-            observation = seen["state"]
+            observation = state(seen)
             ended = terminated or truncated
             assert heard["rewards"][k] == reward and heard["success"][k] == info["success"], k
             images.append(seen)
             k += 1
-    assert k == len(heard["rewards"]) and heard["success"][-1]
+    assert k == len(heard["rewards"])
     return images
 
 
@@ -80,7 +84,7 @@ def user():
 @pytest.mark.parametrize("task, episodes, instrument", [("retraction", 2, True), ("retraction", 1, False), ("palpation", 1, True)])
 def test_over_topics_observations_images_and_actions_are_bit_for_bit_those_of_the_environment(task, episodes, instrument, user, tmp_path):
     sight = SightConfig(instrument=instrument)
-    save_scene(load_scene(), tmp_path, task, seed=4, sight=sight)
+    save_scene(load_scene(), tmp_path, task, seed=SEED, sight=sight)
     heard = {name: [] for name in PICTURES}
     for name, topic in PICTURES.items():
         user.user.subscribe(topic, heard[name].append, depth=1000)  # all that come while this process does not spin
@@ -102,16 +106,24 @@ def test_over_topics_observations_images_and_actions_are_bit_for_bit_those_of_th
         group.start("rendering_node", *parameters, device="cpu")
         user.until(lambda: user.user.count_publishers("rendered/image_raw"), "the rendering node", 60)
         run(tmp_path / "scripted.npz")
-        images = assert_same_as_environment(tmp_path / "scripted.npz", task, scripted_policy(task), 4, episodes, sight)
+        pictured = make(task, observations="both", eyes=2, segmentation=True, instrument=instrument)
+        images = assert_same_as_environment(tmp_path / "scripted.npz", scripted_policy(task), episodes, pictured)
         # They may come late; an earlier episode, or some pictures of one, may be missed.
         shown = lambda name: any(shows(part, name, images) for part in episodes_of(heard[name]))
         user.until(lambda: all(map(shown, heard)), lambda: {name: list(map(step_number, got)) for name, got in heard.items()}, 40)
         if episodes > 1:
             linear_policy().save(tmp_path / "policy.npz")
             run(tmp_path / "learned.npz", policy=tmp_path / "policy.npz")
+            joint_policy().save(tmp_path / "by_joints.npz")
+            run(tmp_path / "joints.npz", policy=tmp_path / "by_joints.npz")
             other = group.start("policy_node", scene=tmp_path, task="palpation")  # for which other tissue is needed
             wait_until(lambda: "is not that of the scene and the task" in other.log.read_text(), 60, logs)
             assert other.exit_status is None
+    assert np.load(tmp_path / "scripted.npz")["success"][-1]
     assert (images[-1]["segmentation"] > 1).any() == instrument
     if episodes > 1:
-        assert_same_as_environment(tmp_path / "learned.npz", task, linear_policy(), 4, episodes, sight)
+        assert_same_as_environment(tmp_path / "learned.npz", linear_policy(), episodes, make(task))
+        assert np.load(tmp_path / "learned.npz")["success"][-1]
+        assert_same_as_environment(tmp_path / "joints.npz", joint_policy(), episodes, make(task, actions="joints"))
+        felt = np.load(tmp_path / "joints.npz")["observations"][:, TASKS[task].observation_names.index("force")]
+        assert (felt > 0.1).any(), "it holds tissue"

@@ -55,7 +55,7 @@ def queues(cell: str) -> dict[str, tuple[int, int]]:
 
 
 @pytest.fixture(scope="module")
-def ends(tmp_path_factory, small_bag):
+def ends(tmp_path_factory, small_bag, joint_policy):
     """Every publisher and subscriber of every node, as (kind, node, lockstep, topic, type, profile)."""
     viewer_node = pytest.importorskip("endo_sim_ros.nodes.viewer_node", reason="needs viser")
     found = []
@@ -86,6 +86,7 @@ def ends(tmp_path_factory, small_bag):
         look(viewer_node.ViewerNode, arm_source=source)
     look(ScriptedToolNode)
     look(PolicyNode)
+    look(PolicyNode, policy=str(joint_policy))
     look(RecorderNode, bag=str(made / "bag"))
     return found
 

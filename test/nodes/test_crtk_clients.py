@@ -12,12 +12,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rclpy
-from ros_bench import SMALL, Bench, S, await_nodes, send_model
+from ros_bench import tissue_bench
 
-from endo_sim_ros import messages
 from endo_sim_ros.instruments import load_arm
-from endo_sim_ros.nodes.physics_node import PhysicsNode
 
 pytestmark = [pytest.mark.dds, pytest.mark.slow]
 
@@ -57,8 +54,26 @@ told["moved"] &= after(psm.jaw.open())
 camera = ecm.measured_jp()[0] + numpy.array([0.05, 0.02, 0.01, 0.1])
 told["moved"] &= after(ecm.move_jp(camera))
 told["camera"] = [list(camera), list(ecm.measured_jp()[0])]
-told["local"] = list(psm.local.measured_cp()[0].p)
+start = psm.measured_jp()[0]
+psm.servo_jr(numpy.array([0.02, 0, 0, 0, 0, 0]))
+told["moved"] &= after(psm.move_jr(numpy.array([-0.01, 0, 0, 0, 0, 0])))
+told["changed"] = float(psm.measured_jp()[0][0] - start[0])
+psm.trajectory_j_set_ratio(0.2)
+for _ in range(100):
+    time.sleep(0.02)
+    if psm.trajectory_j_get_ratio() == 0.2:
+        break
+told["ratio"] = psm.trajectory_j_get_ratio()
+start = psm.measured_jp()[0]
+for stop in (psm.hold, psm.free):
+    moving = psm.move_jr(numpy.array([0.3, 0, 0, 0, 0, 0]))
+    moving.wait(is_busy=True, timeout=10)
+    stop()
+    told["moved"] &= after(moving)
+told["held"] = float(psm.measured_jp()[0][0] - start[0])
+told["jacobians"] = [arm.jacobian(wait_timeout=5)[0].tolist() for arm in (psm.body, psm.spatial)]
 told["joints at the end"] = list(psm.measured_jp()[0])
+told["local"] = list(psm.local.measured_cp()[0].p)
 told["disabled"] = psm.disable(10)
 print(json.dumps(told, default=float))
 ral.shutdown()
@@ -71,16 +86,8 @@ def graph(monkeypatch):
         monkeypatch.syspath_prepend(path)
     for package in ("PyKDL", "crtk_msgs.msg", "crtk", "dvrk"):
         pytest.importorskip(package, reason=f"needs {package}: source a workspace of the dVRK, or set CRTK_SOURCES")
-    values = {**SMALL["physics_node"], "arms": "[PSM1, ECM]", "arm_source": "commanded", "cartesian_frame": "ECM_view"}
-    rclpy.init(args=["--ros-args", *(word for name, value in values.items() for word in ("-p", f"physics_node:{name}:={value}"))])
-    bench = Bench()
-    bench.hear(messages.CONTROL_NODES)
-    bench.add(PhysicsNode)
-    send_model(bench)
-    await_nodes(bench, 5 * S)
-    yield bench
-    bench.close()
-    rclpy.try_shutdown()
+    with tissue_bench(arms="[PSM1, ECM]", arm_source="commanded", cartesian_frame="ECM_view") as bench:
+        yield bench
 
 
 def test_unmodified_clients_command_the_arms(graph):
@@ -98,5 +105,8 @@ def test_unmodified_clients_command_the_arms(graph):
     for goal, there in (told["joints"], told["camera"]):
         np.testing.assert_allclose(there, goal, atol=1e-9)
     assert told["offset"] < 1e-9 and told["closed"] == pytest.approx(np.radians(-20))
-    psm = load_arm("PSM", "LARGE_NEEDLE_DRIVER")
+    assert told["changed"] == pytest.approx(0.01) and told["ratio"] == 0.2
+    assert 0 < told["held"] < 0.5, "two moves of 0.3 rad that were ended"
+    psm, joints = load_arm("PSM", "LARGE_NEEDLE_DRIVER"), told["joints at the end"]
+    np.testing.assert_allclose(told["jacobians"], [psm.body_jacobian(joints), psm.spatial_jacobian(joints)], atol=1e-9)
     np.testing.assert_allclose(told["local"], psm.tip_pose(told["joints at the end"])[:3, 3], atol=1e-6)

@@ -5,17 +5,16 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-import rclpy
-from ros_bench import HEIGHT, SMALL, WIDTH, Bench, K, S, await_nodes, moved, send_model, sheet
+from ros_bench import HEIGHT, WIDTH, K, S, await_nodes, moved, report, send_model, sheet, tissue_bench
 from std_srvs.srv import SetBool, Trigger
+from urdf_links import poses_of_links
 
 from endo_sim_ros import messages
-from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.cameras import Camera, make_pose
 from endo_sim_ros.core.config import ConfigError
-from endo_sim_ros.instruments import arm_files, link_poses, load_arm, solve_inverse
+from endo_sim_ros.instruments import arm_files, build_instrument, link_poses, load_arm, solve_inverse
 from endo_sim_ros.nodes.arm_setup import make_arms, place_arms
 from endo_sim_ros.nodes.configs import PhysicsNodeConfig
-from endo_sim_ros.nodes.physics_node import PhysicsNode
 from endo_sim_ros.nodes.rendering_node import RenderingNode
 
 pytestmark = pytest.mark.dds
@@ -23,43 +22,28 @@ pytestmark = pytest.mark.dds
 LINKS = ("roll", "wrist_pitch", "wrist_yaw", "jaw_left", "jaw_right")
 HEARD = (
     messages.tool_pose, messages.tool_links, messages.tool_type, messages.tool_joints, messages.tool_velocity, messages.tool_local_pose,
-    messages.tool_state, messages.tool_warning, messages.tool_error, messages.tool_jaw_state, messages.tool_reaction,
+    messages.tool_state, messages.tool_warning, messages.tool_error, messages.tool_jaw_state, messages.tool_reaction, messages.tool_ratio,
+    messages.tool_body_jacobian, messages.tool_spatial_jacobian,
 )  # fmt: skip
 ARMS = ("PSM1", "PSM2", "ECM")
 PSM = load_arm("PSM", "LARGE_NEEDLE_DRIVER")
 
 
-def start(arms, **parameters):
-    values = {**SMALL["physics_node"], "arms": f"[{', '.join(arms)}]", **parameters}
-    rclpy.init(args=["--ros-args", *(word for name, value in values.items() for word in ("-p", f"physics_node:{name}:={value}"))])
-    bench = Bench()
-    bench.hear(messages.CONTROL_NODES)
-    for topic in (messages.JOINT_STATES, messages.ROBOT_DESCRIPTION):
-        bench.hear(topic)
-    for arm in arms:
-        for topic in HEARD:
-            bench.hear(topic(arm))
-    bench.add(PhysicsNode)
-    send_model(bench)
-    await_nodes(bench, 5 * S)
-    return bench
-
-
 @pytest.fixture(scope="module")
 def running():
     """Two commanded arms and that of the camera beside a piece of tissue."""
-    tools = "[LARGE_NEEDLE_DRIVER, PROGRASP_FORCEPS, ENDOSCOPE_STRAIGHT]"
-    bench = start(ARMS, arm_source="commanded", instruments=tools, arm_models="[PSM, PSM, ECM]")
-    yield bench
-    bench.close()
-    rclpy.try_shutdown()
+    heard = messages.JOINT_STATES, messages.ROBOT_DESCRIPTION, *(topic(arm) for arm in ARMS for topic in HEARD)
+    arms = {"arms": f"[{', '.join(ARMS)}]", "arm_models": "[PSM, PSM, ECM]", "arm_source": "commanded"}
+    with tissue_bench(*heard, **arms, instruments="[LARGE_NEEDLE_DRIVER, PROGRASP_FORCEPS, ENDOSCOPE_STRAIGHT]") as bench:
+        yield bench
 
 
 @pytest.fixture
 def graph(running):
     """The same at its start."""
     assert running.call(Trigger, "/physics_node/reset").success
-    latched = {messages.ROBOT_DESCRIPTION.name} | {topic(arm).name for arm in ARMS for topic in (messages.tool_state, messages.tool_type)}
+    kept = messages.tool_state, messages.tool_type, messages.tool_ratio
+    latched = {messages.ROBOT_DESCRIPTION.name} | {topic(arm).name for arm in ARMS for topic in kept}
     arms = running.nodes[1].arms.items()
     told = lambda arm: running.heard[f"{arm}/measured_js"][-1:]  # noqa: E731
     running.until(
@@ -130,14 +114,8 @@ def send_joints(bench, topic, positions, arm="PSM1"):
 
 
 def texts(bench, topic, arm="PSM1"):
-    """What came on a topic of the types of CRTK, which are strings where those are not installed."""
-
-    def text(message):
-        if hasattr(message, "state"):
-            return f"{message.state} BUSY" if message.is_busy else message.state
-        return messages.decode_state_command(message)
-
-    return [text(message) for message in bench.heard[topic(arm).name]]
+    """What came on a topic of the types of CRTK."""
+    return [report(message) for message in bench.heard[topic(arm).name]]
 
 
 def test_joints_move_together_within_their_speeds_and_their_poses_agree(graph):
@@ -158,6 +136,100 @@ def test_joints_move_together_within_their_speeds_and_their_poses_agree(graph):
     world = graph.nodes[1].arms["PSM1"].base @ PSM.tip_pose(goal)
     graph.until(lambda: np.allclose(pose_of(graph, messages.tool_pose("PSM1")), world, atol=1e-9), "the pose in the world")
     assert moved(graph) == 0
+
+
+def test_changes_of_joints_add_up_and_may_not_lead_beyond_limits(graph):
+    first = joints_of(graph)
+    change = np.array([0.01, 0, 0.002, 0.1, 0, 0])
+    for _ in range(3):
+        send_joints(graph, messages.tool_joint_change, change)
+    graph.until(lambda: np.allclose(joints_of(graph), first + 3 * change, atol=1e-12), "three changes at once")
+    for _ in range(2):
+        send_joints(graph, messages.tool_joint_move_change, 10 * change)
+    graph.until(lambda: np.allclose(joints_of(graph), first + 23 * change, atol=1e-12), "a goal that moved on")
+    there = joints_of(graph)
+    for topic in (messages.tool_joint_change, messages.tool_joint_move_change):
+        for positions, sentence in (([0.0] * 5, "PSM1: 5 numbers, not 6"), ([0, 0, 0.3, 0, 0, 0], "insertion cannot be at")):
+            graph.heard["PSM1/error"].clear()
+            send_joints(graph, topic, positions)
+            (said,) = graph.until(lambda: texts(graph, messages.tool_error), "an error of the arm")
+            assert said.startswith(topic("PSM1").name) and sentence in said
+    graph.spin(0.1)
+    np.testing.assert_array_equal(joints_of(graph), there)
+
+
+def test_the_newest_change_during_a_pause_acts_after_it(graph):
+    first = joints_of(graph)
+    assert graph.call(SetBool, "/physics_node/pause", data=True).success
+    for yaw in (0.1, 0.02):
+        send_joints(graph, messages.tool_joint_change, [yaw, 0, 0, 0, 0, 0])
+    graph.spin(0.3)
+    assert graph.call(SetBool, "/physics_node/pause", data=False).success
+    graph.until(lambda: np.isclose(joints_of(graph)[0], first[0] + 0.02), "the newest change")
+
+
+@pytest.mark.parametrize("topic", [messages.tool_hold, messages.tool_free])
+def test_hold_and_free_end_all_moves_where_they_are(graph, topic):
+    empty = messages.ros_class(topic("PSM1").type)
+    first, goal = joints_of(graph), joints_of(graph) + [0.5, 0, 0, 0, 0, 0]
+    send_joints(graph, messages.tool_joint_move, goal)
+    graph.publish(messages.tool_jaw_move("PSM1"), messages.encode_jaw(-0.3, S))
+    graph.until(lambda: joints_of(graph)[0] > first[0] + 0.05, "a move")
+    graph.publish(topic("PSM1"), empty())
+    arm = graph.nodes[1].arms["PSM1"]
+    graph.until(lambda: not arm.busy, "the end of the move")
+    joints, angle = arm.joints, arm.angle
+    graph.spin(0.2)
+    np.testing.assert_array_equal(joints_of(graph), joints)
+    assert joints[0] < goal[0] - 0.05 and newest(graph, messages.tool_jaw_state("PSM1")).position[0] == angle > -0.2
+    assert texts(graph, messages.tool_state)[-1] == "ENABLED"
+    switch(graph, "disable", "DISABLED")
+    graph.publish(topic("PSM1"), empty())
+    said = f"{topic('PSM1').name}: PSM1 is DISABLED; send enable on PSM1/state_command"
+    graph.until(lambda: said in texts(graph, messages.tool_error), "an error of the arm")
+    switch(graph, "enable", "ENABLED")
+
+
+def test_a_ratio_makes_moves_slower(graph):
+    ratio = lambda: newest(graph, messages.tool_ratio("PSM1")).data  # noqa: E731
+    send = lambda value: graph.publish(messages.tool_ratio_command("PSM1"), messages.encode_number(value))  # noqa: E731
+    assert ratio() == 1.0
+    send(0.25)
+    graph.until(lambda: ratio() == 0.25, "the ratio")
+    goal = joints_of(graph) + [0.1, 0, 0, 0, 0, 0]
+    send_joints(graph, messages.tool_joint_move, goal)
+    graph.until(lambda: np.allclose(joints_of(graph), goal, atol=1e-12), "the goal")
+    fastest = lambda: np.abs([m.velocity for m in graph.heard["PSM1/measured_js"]]).max()  # noqa: E731
+    assert 0.499 < fastest() < 0.501  # of 2 rad/s
+    pose = pose_of(graph, messages.tool_pose("PSM1"))
+    pose[2, 3] -= 0.002
+    graph.spin(0.1)  # it stands
+    graph.heard["PSM1/measured_cv"].clear()
+    graph.publish(messages.tool_move("PSM1"), messages.encode_pose(pose, S, "world"))
+    graph.until(lambda: np.allclose(pose_of(graph, messages.tool_pose("PSM1")), pose, atol=1e-9), "the pose")
+    speed = max(np.hypot(np.hypot(v.x, v.y), v.z) for v in (m.twist.linear for m in graph.heard["PSM1/measured_cv"]))
+    assert 0.01 < speed < 0.0126  # of 5 cm/s
+    for value in (0.0, 1.5, -0.1):
+        send(value)
+        said = f"PSM1/trajectory_j/set_ratio: PSM1: the ratio of speeds is {value:g}; send one above 0 and at most 1"
+        graph.until(lambda said=said: said in texts(graph, messages.tool_error), "an error of the arm")
+    send(float("nan"))
+    graph.refused("physics_node", "PSM1/trajectory_j/set_ratio: expected a finite number, got nan")
+    assert graph.nodes[1].arms["PSM1"].speed_ratio == 0.25
+    send(1.0)
+    graph.until(lambda: ratio() == 1.0, "the ratio of before")
+
+
+def test_jacobians_are_those_of_the_joints(graph):
+    for arm in ("PSM1", "ECM"):
+        kinematics, joints = graph.nodes[1].arms[arm].kinematics, joints_of(graph, arm)
+        for topic, expected in (
+            (messages.tool_body_jacobian, kinematics.body_jacobian(joints)),
+            (messages.tool_spatial_jacobian, kinematics.spatial_jacobian(joints)),
+        ):
+            message = newest(graph, topic(arm))
+            shape = [each.size for each in message.layout.dim]
+            np.testing.assert_allclose(np.array(message.data).reshape(shape), expected, atol=1e-12)
 
 
 def test_what_is_published_can_be_sent_back(graph):
@@ -408,6 +480,41 @@ def test_all_joints_are_told_together_with_a_description_that_has_them(graph):
     joints = {joint.get("name") for joint in robot.findall("joint") if joint.get("type") != "fixed" and joint.find("mimic") is None}
     assert joints == set(states.name) and len(states.name) == len(states.position) == 7 + 7 + 4
     assert {"PSM1_yaw", "PSM2_jaw", "ECM_roll"} <= joints
+
+
+@pytest.mark.parametrize("angle", [0.5, -0.3])
+def test_description_and_joints_put_links_where_they_are(graph, angle):
+    jaw(graph, angle)
+    send_joints(graph, messages.tool_joint_command, joints_of(graph) + [0.1, -0.1, 0.01, 0.3, 0.2, -0.2])
+    graph.until(lambda: newest(graph, messages.tool_jaw_state("PSM1")).position[0] == angle, "the angle")
+    same = lambda: newest(graph, messages.JOINT_STATES).header.stamp == newest(graph, messages.tool_links("PSM1")).header.stamp  # noqa: E731
+    graph.spin(0.1)
+    graph.until(same, "joints and links of one step")
+    states = newest(graph, messages.JOINT_STATES)
+    description = newest(graph, messages.ROBOT_DESCRIPTION).data
+    _, found = poses_of_links(description, dict(zip(states.name, states.position)), "world")
+    for link, pose in zip(LINKS, messages.decode_poses(newest(graph, messages.tool_links("PSM1")), "")):
+        np.testing.assert_allclose(found[f"PSM1_{link}"], pose, atol=1e-6, err_msg=link)
+    camera = pose_of(graph, messages.tool_pose("ECM"))
+    np.testing.assert_allclose(found["ECM_tip"], camera, atol=1e-6)
+
+
+def test_markers_show_the_capsules_of_the_instrument_where_the_links_are(graph):
+    shown = graph.hear(messages.TOOL_MARKERS)
+    servo(graph, tip_at(0.01, -0.01, 0.08))
+    arm = graph.nodes[1].arms["PSM1"]
+    graph.until(lambda: np.allclose(pose_of(graph, messages.tool_pose("PSM1"))[:3, 3], [0.01, -0.01, 0.08]), "the pose")
+    shown.clear()
+    graph.until(lambda: shown, "markers")
+    rods = [marker for marker in shown[-1].markers if marker.ns == "PSM1" and marker.id >= 4]
+    _, capsules = build_instrument(arm.kinematics)
+    assert len(rods) == len(capsules) and {rod.type for rod in rods} == {rods[0].CYLINDER}
+    for rod, capsule in zip(rods, capsules):
+        half = 0.5 * rod.scale.z * make_pose([0, 0, 0], [getattr(rod.pose.orientation, axis) for axis in "wxyz"])[:3, 2]
+        middle, link = [getattr(rod.pose.position, axis) for axis in "xyz"], arm.links()[capsule.link]
+        for found, end in ((middle - half, capsule.start), (middle + half, capsule.end)):
+            np.testing.assert_allclose(found, link[:3, :3] @ end + link[:3, 3], atol=1e-9)
+        assert rod.scale.x == rod.scale.y == pytest.approx(2 * capsule.radius)
 
 
 def test_a_disabled_arm_takes_no_command(graph):

@@ -4,15 +4,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rclpy
-from ros_bench import SMALL, Bench, S, await_nodes, moved, nodes_of, send_model
+from ros_bench import S, moved, nodes_of, tissue_bench
 from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
 from endo_sim_ros.instruments import arm_files, build_instrument, load_arm
 from endo_sim_ros.nodes.arm_setup import make_arms
 from endo_sim_ros.nodes.configs import PhysicsNodeConfig
-from endo_sim_ros.nodes.physics_node import PhysicsNode
 
 pytestmark = pytest.mark.dds
 
@@ -23,25 +21,11 @@ JAWS = 0.0102  # m, of the large needle driver
 
 @pytest.fixture(scope="module")
 def running():
-    values = {
-        **SMALL["physics_node"],
-        "instruments": "[LARGE_NEEDLE_DRIVER, CURVED_SCISSORS]",
-        "node_count": 3000,
-        "arm_source": "commanded",
-        "link_contact": "true",
-        "mode": "lockstep",
-    }
-    values |= {"lockstep_inputs": "[pose, jaw]", "grip_force": 4.0}
-    rclpy.init(args=["--ros-args", *(word for name, value in values.items() for word in ("-p", f"physics_node:{name}:={value}"))])
-    bench = Bench()
-    for topic in (messages.CONTROL_NODES, messages.CUT_SURFACE, REACTION, JOINTS):
-        bench.hear(topic)
-    bench.add(PhysicsNode)
-    send_model(bench)
-    await_nodes(bench, 5 * S)
-    yield bench
-    bench.close()
-    rclpy.try_shutdown()
+    heard = messages.CUT_SURFACE, REACTION, JOINTS, messages.tool_warning("PSM1"), messages.tool_warning("PSM2")
+    tools = {"instruments": "[LARGE_NEEDLE_DRIVER, CURVED_SCISSORS]", "link_contact": "true", "grip_force": 4.0}
+    lockstep = {"mode": "lockstep", "lockstep_inputs": "[pose, jaw]"}
+    with tissue_bench(*heard, node_count=3000, arm_source="commanded", **tools, **lockstep) as bench:
+        yield bench
 
 
 def play(bench, ways, scissors=()):
@@ -89,7 +73,10 @@ def test_closed_jaws_pull_until_the_tissue_slips_and_the_same_episode_gives_the_
     far = [(GRASP[-1][0] - 0.002 * step, 0.0) for step in range(1, 12)]
     felt, _, _ = play(running, [*GRASP, *far])
     assert felt[:, 2].max() < 1.02 * bound and not felt[-1].any()
-    running.refused("physics_node", "or with 1.6 N between two jaws; open it, come nearer, or raise travel or grip_force")
+    where = "PSM1: tissue slipped out of the jaw, which pulled it almost 0.05 m, or with 1.6 N between two jaws"
+    said = running.refused("physics_node", f"{where}; open it, come nearer, or raise travel or grip_force")
+    assert said in [messages.decode_state_command(message) for message in running.heard["PSM1/warning"]]
+    assert not running.heard["PSM2/warning"]
 
 
 def test_jaws_that_close_on_nothing_say_so(running):

@@ -121,6 +121,19 @@ def test_instruments_come_go_and_are_told_apart(bench):
     shows(bench, expected([])[0], "the tissue alone")
 
 
+def test_the_first_picture_after_its_links_shows_an_instrument(bench):
+    assert bench.set("rendering_node", idle_rate=0.1)[0]
+    send_type(bench, "PSM1")
+    prepared = bench.nodes[1].instruments._background
+    bench.until(lambda: prepared._future is not None and prepared._future.done(), "what draws it")
+    bench.spin(0.2)  # no more pictures come
+    bench.heard[messages.RENDERED_IMAGE.name].clear()
+    send_links(bench, "PSM1", links("PSM1"))
+    bench.until(lambda: bench.heard[messages.RENDERED_IMAGE.name], "a picture")
+    first = messages.decode_image(bench.heard[messages.RENDERED_IMAGE.name][0], "rendered")
+    np.testing.assert_array_equal(first, expected(["PSM1"])[0].image)
+
+
 def test_what_cannot_be_drawn_is_one_sentence(bench):
     send_links(bench, "PSM1", dict(list(links("PSM1").items())[:3]))
     bench.refused("rendering_node", "3 poses; publish those of roll, wrist_pitch", "PSM1/link_poses")

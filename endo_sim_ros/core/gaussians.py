@@ -15,6 +15,7 @@ from torch import Tensor
 
 from endo_sim_ros.core import compressed_ply
 from endo_sim_ros.core.compressed_ply import SH_C0
+from endo_sim_ros.core.errors import ModelError as ModelError
 from endo_sim_ros.core.light import Light
 
 _COMPRESSED = ".compressed.ply"  # ending of the names of compressed models, as SuperSplat has it
@@ -25,10 +26,6 @@ _TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8",
     "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
 }  # fmt: skip
-
-
-class ModelError(ValueError):
-    """A Gaussian model or model file that cannot be used; the message says which field and why."""
 
 
 @dataclass(frozen=True)

@@ -133,6 +133,14 @@ def test_options_of_all_nodes_need_neither_ros_nor_torch(module):
     assert done.stdout.strip() == "[]", done.stdout + done.stderr
 
 
+@pytest.mark.dds
+def test_what_computes_nothing_starts_without_torch():
+    modules = [f"endo_sim_ros.{name}" for name in ("graph.up", "nodes.bag_player_node", "nodes.recorder_node", "nodes.scripted_tool_node")]
+    code = f"import sys, {', '.join(modules)}; print(sorted({{'torch', 'warp'}} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert done.stdout.strip() == "[]", done.stdout + done.stderr
+
+
 @pytest.mark.parametrize("package", ["physics", "reconstruction", "rendering"])
 def test_names_of_a_package_are_those_that_type_checkers_see(package):
     """What type checkers see imported leads to the same thing when it is imported on first use."""

@@ -19,7 +19,16 @@ S = 1_000_000_000
 K = np.array([[90.0, 0, 48], [0, 90.0, 40], [0, 0, 1]])
 WIDTH, HEIGHT = 96, 80
 SMALL = {
-    "reconstruction_node": {"iterations": 30, "max_gaussians": 1500, "image_width": WIDTH, "start_after": 0.0},
+    # Few views, and no stage that takes long: that is for the tests of reconstruction.
+    "reconstruction_node": {
+        "iterations": 30,
+        "max_gaussians": 1500,
+        "image_width": WIDTH,
+        "start_after": 0.0,
+        "keyframes": 3,
+        "plane_sweep": "false",
+        "extrapolation": 0.0,
+    },
     # Tests of tips put tips on the tissue, and so few nodes would make thick rods of links.
     "physics_node": {"node_count": 300, "arms": "[PSM1, PSM2]", "step_duration": 0.02, "force_radius": 0.02, "link_contact": "false"},
     "rendering_node": {"rate": 20.0, "instruments": "false"},  # tests of tissue look at tissue

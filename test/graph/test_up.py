@@ -22,7 +22,8 @@ from endo_sim_ros.graph.up import Supervisor, UpError, run_up
 
 SMALL = """
 /**/reconstruction_node:
-  ros__parameters: {iterations: 30, max_gaussians: 1000, image_width: 96, output_dir: OUT}
+  ros__parameters:
+    {iterations: 30, max_gaussians: 1000, image_width: 96, keyframes: 3, plane_sweep: false, extrapolation: 0.0, output_dir: OUT}
 /**/physics_node:
   ros__parameters: {node_count: 300, arms: [PSM1]}
 """

@@ -160,7 +160,7 @@ def test_every_node_reports_a_state_of_its_own_and_only_values_that_are_document
 
 
 def test_a_reconstruction_goes_through_its_states_in_order(start, small_frames, tmp_path):
-    small = {"iterations": 10, "max_gaussians": 500, "start_after": 0.5, "output_dir": tmp_path}
+    small = {"iterations": 10, "max_gaussians": 500, "image_width": 48, "start_after": 0.5, "output_dir": tmp_path}
     graph = start(reconstruction_node=small)
     graph.add(ReconstructionNode)
     graph.until("reconstruction_node", ReconstructionState.WAITING)

@@ -161,7 +161,7 @@ def soak(json_file: Path | None, minutes: float, rate: float = 500.0, seed: int 
     rng, rows = random.Random(seed), []
     traffic = _Traffic(rng)
     parameters = {
-        "reconstruction_node": {"iterations": 20, "max_gaussians": 1500, "start_after": 0.5},
+        "reconstruction_node": {"iterations": 20, "max_gaussians": 1500, "keyframes": 3, "start_after": 0.5},
         "physics_node": {"node_count": 400, "arms": [ARM], "arm_source": "commanded", "contact_radius": 0.005, "reaction_rate": 500.0},
         "rendering_node": {"baseline": 0.005},
     }

@@ -1,9 +1,11 @@
 """Nodes in the process of a test, and what a user says to them and hears."""
 
+import contextlib
 import time
 from collections import defaultdict
 
 import numpy as np
+import rclpy
 import torch
 from rcl_interfaces.srv import SetParameters
 from rclpy.executors import SingleThreadedExecutor
@@ -119,6 +121,29 @@ class Bench:
         self.executor.shutdown()
         for node in self.nodes:
             node.destroy_node()
+
+
+def start_ros(**parameters):
+    """Start ROS with parameters of nodes in this process, by the name of the node."""
+    given = [f"{node}:{name}:={value}" for node, values in parameters.items() for name, value in values.items()]
+    rclpy.init(args=["--ros-args", *(word for each in given for word in ("-p", each))])
+
+
+@contextlib.contextmanager
+def tissue_bench(*heard, **parameters):
+    """A user who hears topics, and a physics node with tissue whose parameters differ from those in SMALL."""
+    from endo_sim_ros.nodes.physics_node import PhysicsNode
+
+    start_ros(physics_node=SMALL["physics_node"] | parameters)
+    bench = Bench()
+    for topic in (messages.CONTROL_NODES, *heard):
+        bench.hear(topic)
+    bench.add(PhysicsNode)
+    send_model(bench)
+    await_nodes(bench, 5 * S)
+    yield bench
+    bench.close()
+    rclpy.try_shutdown()
 
 
 def sheet(side=30, z=0.1, half=0.05, tilt=0.0):

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rclpy
-from ros_bench import HEIGHT, WIDTH, Bench, K, send_camera, send_model, sheet
+from ros_bench import HEIGHT, WIDTH, Bench, K, send_camera, send_model, sheet, start_ros
 from std_srvs.srv import SetBool, Trigger
 from waiting import wait_until
 
@@ -46,11 +46,7 @@ STATES = (messages.CONTROL_NODES, messages.tool_reaction("PSM1"), messages.CLOCK
 
 @pytest.fixture(scope="module", autouse=True)
 def ros():
-    arguments = ["--ros-args", "-p", "physics_node:arm_source:=commanded"]
-    for node, values in PARAMETERS.items():
-        for name, value in values.items():
-            arguments += ["-p", f"{node}:{name}:={value}"]
-    rclpy.init(args=arguments)
+    start_ros(**PARAMETERS | {"physics_node": PARAMETERS["physics_node"] | {"arm_source": "commanded"}})
     yield
     rclpy.try_shutdown()
 

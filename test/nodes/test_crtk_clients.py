@@ -12,12 +12,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rclpy
-from ros_bench import SMALL, Bench, S, await_nodes, send_model
+from ros_bench import tissue_bench
 
-from endo_sim_ros import messages
 from endo_sim_ros.instruments import load_arm
-from endo_sim_ros.nodes.physics_node import PhysicsNode
 
 pytestmark = [pytest.mark.dds, pytest.mark.slow]
 
@@ -71,16 +68,8 @@ def graph(monkeypatch):
         monkeypatch.syspath_prepend(path)
     for package in ("PyKDL", "crtk_msgs.msg", "crtk", "dvrk"):
         pytest.importorskip(package, reason=f"needs {package}: source a workspace of the dVRK, or set CRTK_SOURCES")
-    values = {**SMALL["physics_node"], "arms": "[PSM1, ECM]", "arm_source": "commanded", "cartesian_frame": "ECM_view"}
-    rclpy.init(args=["--ros-args", *(word for name, value in values.items() for word in ("-p", f"physics_node:{name}:={value}"))])
-    bench = Bench()
-    bench.hear(messages.CONTROL_NODES)
-    bench.add(PhysicsNode)
-    send_model(bench)
-    await_nodes(bench, 5 * S)
-    yield bench
-    bench.close()
-    rclpy.try_shutdown()
+    with tissue_bench(arms="[PSM1, ECM]", arm_source="commanded", cartesian_frame="ECM_view") as bench:
+        yield bench
 
 
 def test_unmodified_clients_command_the_arms(graph):

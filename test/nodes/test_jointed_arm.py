@@ -5,8 +5,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-import rclpy
-from ros_bench import HEIGHT, SMALL, WIDTH, Bench, K, S, await_nodes, moved, send_model, sheet
+from ros_bench import HEIGHT, WIDTH, K, S, await_nodes, moved, send_model, sheet, tissue_bench
 from std_srvs.srv import SetBool, Trigger
 
 from endo_sim_ros import messages
@@ -15,7 +14,6 @@ from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.instruments import arm_files, link_poses, load_arm, solve_inverse
 from endo_sim_ros.nodes.arm_setup import make_arms, place_arms
 from endo_sim_ros.nodes.configs import PhysicsNodeConfig
-from endo_sim_ros.nodes.physics_node import PhysicsNode
 from endo_sim_ros.nodes.rendering_node import RenderingNode
 
 pytestmark = pytest.mark.dds
@@ -29,30 +27,14 @@ ARMS = ("PSM1", "PSM2", "ECM")
 PSM = load_arm("PSM", "LARGE_NEEDLE_DRIVER")
 
 
-def start(arms, **parameters):
-    values = {**SMALL["physics_node"], "arms": f"[{', '.join(arms)}]", **parameters}
-    rclpy.init(args=["--ros-args", *(word for name, value in values.items() for word in ("-p", f"physics_node:{name}:={value}"))])
-    bench = Bench()
-    bench.hear(messages.CONTROL_NODES)
-    for topic in (messages.JOINT_STATES, messages.ROBOT_DESCRIPTION):
-        bench.hear(topic)
-    for arm in arms:
-        for topic in HEARD:
-            bench.hear(topic(arm))
-    bench.add(PhysicsNode)
-    send_model(bench)
-    await_nodes(bench, 5 * S)
-    return bench
-
-
 @pytest.fixture(scope="module")
 def running():
     """Two commanded arms and that of the camera beside a piece of tissue."""
     tools = "[LARGE_NEEDLE_DRIVER, PROGRASP_FORCEPS, ENDOSCOPE_STRAIGHT]"
-    bench = start(ARMS, arm_source="commanded", instruments=tools, arm_models="[PSM, PSM, ECM]")
-    yield bench
-    bench.close()
-    rclpy.try_shutdown()
+    heard = (messages.JOINT_STATES, messages.ROBOT_DESCRIPTION, *(topic(arm) for arm in ARMS for topic in HEARD))
+    values = {"arms": f"[{', '.join(ARMS)}]", "arm_source": "commanded", "instruments": tools, "arm_models": "[PSM, PSM, ECM]"}
+    with tissue_bench(*heard, **values) as bench:
+        yield bench
 
 
 @pytest.fixture

@@ -4,15 +4,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rclpy
-from ros_bench import SMALL, Bench, S, await_nodes, moved, nodes_of, send_model
+from ros_bench import S, moved, nodes_of, tissue_bench
 from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
 from endo_sim_ros.instruments import arm_files, build_instrument, load_arm
 from endo_sim_ros.nodes.arm_setup import make_arms
 from endo_sim_ros.nodes.configs import PhysicsNodeConfig
-from endo_sim_ros.nodes.physics_node import PhysicsNode
 
 pytestmark = pytest.mark.dds
 
@@ -24,24 +22,16 @@ JAWS = 0.0102  # m, of the large needle driver
 @pytest.fixture(scope="module")
 def running():
     values = {
-        **SMALL["physics_node"],
         "instruments": "[LARGE_NEEDLE_DRIVER, CURVED_SCISSORS]",
         "node_count": 3000,
         "arm_source": "commanded",
         "link_contact": "true",
         "mode": "lockstep",
+        "lockstep_inputs": "[pose, jaw]",
+        "grip_force": 4.0,
     }
-    values |= {"lockstep_inputs": "[pose, jaw]", "grip_force": 4.0}
-    rclpy.init(args=["--ros-args", *(word for name, value in values.items() for word in ("-p", f"physics_node:{name}:={value}"))])
-    bench = Bench()
-    for topic in (messages.CONTROL_NODES, messages.CUT_SURFACE, REACTION, JOINTS):
-        bench.hear(topic)
-    bench.add(PhysicsNode)
-    send_model(bench)
-    await_nodes(bench, 5 * S)
-    yield bench
-    bench.close()
-    rclpy.try_shutdown()
+    with tissue_bench(messages.CUT_SURFACE, REACTION, JOINTS, **values) as bench:
+        yield bench
 
 
 def play(bench, ways, scissors=()):

@@ -2,12 +2,10 @@
 
 import numpy as np
 import pytest
-import rclpy
-from ros_bench import SMALL, Bench, S, await_nodes, send_model, send_tip
+from ros_bench import S, send_tip, tissue_bench
 
 from endo_sim_ros import messages
 from endo_sim_ros.instruments import link_poses, load_arm, solve_inverse
-from endo_sim_ros.nodes.physics_node import PhysicsNode
 
 pytestmark = pytest.mark.dds
 
@@ -16,18 +14,9 @@ BASE = "0.1 0.05 0.0 0 1 0 0"  # half a turn about y: the shaft of PSM2 points a
 
 @pytest.fixture(scope="module")
 def graph():
-    values = {**SMALL["physics_node"], "arms": "[PSM1, PSM2, PSM3]", "frames": f"['PSM2_base {BASE}']"}
-    rclpy.init(args=["--ros-args", *(word for name, value in values.items() for word in ("-p", f"physics_node:{name}:={value}"))])
-    bench = Bench()
-    bench.hear(messages.CONTROL_NODES)
-    for arm in ("PSM1", "PSM2", "PSM3"):
-        bench.hear(messages.tool_links(arm))
-    bench.add(PhysicsNode)
-    send_model(bench)
-    await_nodes(bench, 5 * S)
-    yield bench
-    bench.close()
-    rclpy.try_shutdown()
+    links = map(messages.tool_links, ("PSM1", "PSM2", "PSM3"))
+    with tissue_bench(*links, arms="[PSM1, PSM2, PSM3]", frames=f"['PSM2_base {BASE}']") as bench:
+        yield bench
 
 
 @pytest.mark.parametrize("arm", ["PSM1", "PSM2"])

@@ -16,6 +16,7 @@ from torch import Tensor
 from endo_sim_ros.core import compressed_ply
 from endo_sim_ros.core.compressed_ply import SH_C0
 from endo_sim_ros.core.errors import ModelError as ModelError
+from endo_sim_ros.core.folders import written_whole
 from endo_sim_ros.core.light import Light
 
 _COMPRESSED = ".compressed.ply"  # ending of the names of compressed models, as SuperSplat has it
@@ -212,16 +213,10 @@ def save_ply(model: GaussianModel, path: str | Path) -> None:
     for name, kind, fields, array in elements:
         lines += [f"element {name} {len(array)}", *(f"property {kind} {field}" for field in fields)]
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".part")
-    try:
-        with partial.open("wb") as file:
-            file.write("\n".join([*lines, "end_header", ""]).encode())
-            for *_, array in elements:
-                file.write(np.ascontiguousarray(array).data)
-        partial.replace(path)
-    except OSError:
-        partial.unlink(missing_ok=True)
-        raise
+    with written_whole(path) as partial, partial.open("wb") as file:
+        file.write("\n".join([*lines, "end_header", ""]).encode())
+        for *_, array in elements:
+            file.write(np.ascontiguousarray(array).data)
 
 
 def load_ply(path: str | Path) -> GaussianModel:

@@ -84,15 +84,7 @@ class GaussianModel:
     @property
     def rotations(self) -> Tensor:
         """Rotation matrices [N, 3, 3]."""
-        w, x, y, z = torch.nn.functional.normalize(self.quats, dim=1).unbind(1)
-        return torch.stack(
-            [
-                1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-                2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-                2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-            ],
-            1,
-        ).view(-1, 3, 3)  # fmt: skip
+        return rotation_matrices(self.quats)
 
     @property
     def covariances(self) -> Tensor:
@@ -132,6 +124,19 @@ class GaussianModel:
             torch.full_like(scales, opacity).logit(),
             sh,
         )
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """Rotation matrices [N, 3, 3] of quaternions wxyz [N, 4], which need not be normalised; zero means no rotation."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
+    return torch.stack(
+        [
+            1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+        ],
+        1,
+    ).view(-1, 3, 3)  # fmt: skip
 
 
 def ply_fields(sh_degree: int) -> list[str]:

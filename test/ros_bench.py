@@ -1,8 +1,8 @@
 """Nodes in the process of a test, and what a user says to them and hears."""
 
+import contextlib
 import time
 from collections import defaultdict
-from contextlib import contextmanager
 
 import numpy as np
 import rclpy
@@ -22,7 +22,16 @@ S = 1_000_000_000
 K = np.array([[90.0, 0, 48], [0, 90.0, 40], [0, 0, 1]])
 WIDTH, HEIGHT = 96, 80
 SMALL = {
-    "reconstruction_node": {"iterations": 30, "max_gaussians": 1500, "image_width": WIDTH, "start_after": 0.0},
+    # Few views, and no stage that takes long: that is for the tests of reconstruction.
+    "reconstruction_node": {
+        "iterations": 30,
+        "max_gaussians": 1500,
+        "image_width": WIDTH,
+        "start_after": 0.0,
+        "keyframes": 3,
+        "plane_sweep": "false",
+        "extrapolation": 0.0,
+    },
     # Tests of tips put tips on the tissue, and so few nodes would make thick rods of links.
     "physics_node": {"node_count": 300, "arms": "[PSM1, PSM2]", "step_duration": 0.02, "force_radius": 0.02, "link_contact": "false"},
     "rendering_node": {"rate": 20.0, "instruments": "false"},  # tests of tissue look at tissue
@@ -115,6 +124,30 @@ class Bench:
             node.destroy_node()
 
 
+def start_ros(**parameters):
+    """Start ROS with parameters of nodes in this process, by the name of the node."""
+    given = [f"{node}:{name}:={value}" for node, values in parameters.items() for name, value in values.items()]
+    rclpy.init(args=["--ros-args", *(word for each in given for word in ("-p", each))])
+
+
+@contextlib.contextmanager
+def tissue_bench(*heard, **parameters):
+    """A user who hears topics, and a physics node with tissue whose parameters differ from those in SMALL."""
+
+    start_ros(physics_node=SMALL["physics_node"] | parameters)
+    bench = Bench()
+    try:
+        for topic in (messages.CONTROL_NODES, *heard):
+            bench.hear(topic)
+        bench.add(PhysicsNode)
+        send_model(bench)
+        await_nodes(bench, 5 * S)
+        yield bench
+    finally:
+        bench.close()
+        rclpy.try_shutdown()
+
+
 def sheet(side=30, z=0.1, half=0.05, tilt=0.0):
     """A flat piece of tissue in front of the camera, with a pattern that shows how it moves.
 
@@ -175,24 +208,6 @@ def await_nodes(bench, stamp_ns):
         f"control nodes of the model {stamp_ns}",
     )
     return nodes_of(bench)
-
-
-@contextmanager
-def tissue_bench(*heard, **parameters):
-    """physics_node with these parameters beside the small ones, after it has made tissue of a model; these topics are heard."""
-    values = SMALL["physics_node"] | parameters
-    rclpy.init(args=["--ros-args", *(word for name, value in values.items() for word in ("-p", f"physics_node:{name}:={value}"))])
-    bench = Bench()
-    try:
-        for topic in (messages.CONTROL_NODES, *heard):
-            bench.hear(topic)
-        bench.add(PhysicsNode)
-        send_model(bench)
-        await_nodes(bench, 5 * S)
-        yield bench
-    finally:
-        bench.close()
-        rclpy.try_shutdown()
 
 
 def report(message):

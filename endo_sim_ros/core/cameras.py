@@ -110,12 +110,16 @@ def intrinsic_matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)
 
 
+def rigid_pose(rotation: ArrayLike, position: ArrayLike) -> np.ndarray:
+    """Rigid transform [4, 4] of a rotation [3, 3] and a position [3], metres."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, position
+    return pose
+
+
 def invert_pose(pose: np.ndarray) -> np.ndarray:
     """Inverse of a rigid transform [4, 4]."""
-    inverse = np.eye(4)
-    inverse[:3, :3] = pose[:3, :3].T
-    inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
-    return inverse
+    return rigid_pose(pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3])
 
 
 def quat_to_matrix(quat: ArrayLike) -> np.ndarray:
@@ -150,10 +154,7 @@ def matrix_to_quat(matrix: ArrayLike) -> np.ndarray:
 
 def make_pose(position: ArrayLike, quat: ArrayLike) -> np.ndarray:
     """Rigid transform [4, 4] of a position [3], metres, and a quaternion wxyz [4], which need not be normalised."""
-    pose = np.eye(4)
-    pose[:3, :3] = quat_to_matrix(quat)
-    pose[:3, 3] = position
-    return pose
+    return rigid_pose(quat_to_matrix(quat), position)
 
 
 def look_at(position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, -1.0, 0.0)) -> np.ndarray:
@@ -162,10 +163,7 @@ def look_at(position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, -1.0, 
     z /= np.linalg.norm(z)
     x = np.cross(-np.asarray(up, np.float64), z)
     x /= np.linalg.norm(x)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([x, np.cross(z, x), z], 1)
-    pose[:3, 3] = position
-    return pose
+    return rigid_pose(np.stack([x, np.cross(z, x), z], 1), position)
 
 
 def slerp(q1: np.ndarray, q2: np.ndarray, alpha: float) -> np.ndarray:

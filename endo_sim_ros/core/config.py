@@ -10,6 +10,7 @@ import dataclasses
 import inspect
 import math
 import operator
+import sys
 import textwrap
 import typing
 from collections.abc import Sequence
@@ -83,7 +84,9 @@ def options(config_class: type) -> tuple[Option, ...]:
 
 def _field_docstrings(config_class: type) -> dict[str, str]:
     """The strings under the fields of a class, which Python itself forgets."""
-    (definition,) = ast.parse(textwrap.dedent(inspect.getsource(config_class))).body
+    definition = _class_definitions(config_class.__module__).get(config_class.__qualname__)
+    if definition is None:  # it is local to a function
+        (definition,) = ast.parse(textwrap.dedent(inspect.getsource(config_class))).body
     body = definition.body if isinstance(definition, ast.ClassDef) else []
     found = {}
     for field, doc in zip(body, body[1:]):
@@ -91,6 +94,13 @@ def _field_docstrings(config_class: type) -> dict[str, str]:
             if isinstance(doc.value, ast.Constant) and isinstance(doc.value.value, str):
                 found[field.target.id] = " ".join(doc.value.value.split())
     return found
+
+
+@cache
+def _class_definitions(module: str) -> dict[str, ast.ClassDef]:
+    """The classes of a module by name; `inspect` would parse its file again for each of them, at every start of a program."""
+    body = ast.parse(inspect.getsource(sys.modules[module])).body
+    return {node.name: node for node in body if isinstance(node, ast.ClassDef)}
 
 
 def _is_stage(hint: Any) -> bool:

@@ -1,8 +1,20 @@
-"""Folders for results, of which nothing is left where there are no results."""
+"""Folders and files for results, of which nothing is left where there are no results."""
 
 import contextlib
 from collections.abc import Iterator
 from pathlib import Path
+
+
+@contextlib.contextmanager
+def written_whole(path: Path) -> Iterator[Path]:
+    """Where to write a file instead, so that it is there whole or not at all: it gets its name when the block ends well."""
+    partial = path.with_name(path.name + ".part")
+    try:
+        yield partial
+        partial.replace(path)
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise
 
 
 @contextlib.contextmanager

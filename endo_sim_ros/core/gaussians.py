@@ -15,6 +15,8 @@ from torch import Tensor
 
 from endo_sim_ros.core import compressed_ply
 from endo_sim_ros.core.compressed_ply import SH_C0
+from endo_sim_ros.core.errors import ModelError as ModelError
+from endo_sim_ros.core.folders import written_whole
 from endo_sim_ros.core.light import Light
 
 _COMPRESSED = ".compressed.ply"  # ending of the names of compressed models, as SuperSplat has it
@@ -25,10 +27,6 @@ _TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8",
     "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
 }  # fmt: skip
-
-
-class ModelError(ValueError):
-    """A Gaussian model or model file that cannot be used; the message says which field and why."""
 
 
 @dataclass(frozen=True)
@@ -86,15 +84,7 @@ class GaussianModel:
     @property
     def rotations(self) -> Tensor:
         """Rotation matrices [N, 3, 3]."""
-        w, x, y, z = torch.nn.functional.normalize(self.quats, dim=1).unbind(1)
-        return torch.stack(
-            [
-                1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-                2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-                2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-            ],
-            1,
-        ).view(-1, 3, 3)  # fmt: skip
+        return rotation_matrices(self.quats)
 
     @property
     def covariances(self) -> Tensor:
@@ -134,6 +124,19 @@ class GaussianModel:
             torch.full_like(scales, opacity).logit(),
             sh,
         )
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """Rotation matrices [N, 3, 3] of quaternions wxyz [N, 4], which need not be normalised; zero means no rotation."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
+    return torch.stack(
+        [
+            1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+        ],
+        1,
+    ).view(-1, 3, 3)  # fmt: skip
 
 
 def ply_fields(sh_degree: int) -> list[str]:
@@ -215,16 +218,10 @@ def save_ply(model: GaussianModel, path: str | Path) -> None:
     for name, kind, fields, array in elements:
         lines += [f"element {name} {len(array)}", *(f"property {kind} {field}" for field in fields)]
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".part")
-    try:
-        with partial.open("wb") as file:
-            file.write("\n".join([*lines, "end_header", ""]).encode())
-            for *_, array in elements:
-                file.write(np.ascontiguousarray(array).data)
-        partial.replace(path)
-    except OSError:
-        partial.unlink(missing_ok=True)
-        raise
+    with written_whole(path) as partial, partial.open("wb") as file:
+        file.write("\n".join([*lines, "end_header", ""]).encode())
+        for *_, array in elements:
+            file.write(np.ascontiguousarray(array).data)
 
 
 def load_ply(path: str | Path) -> GaussianModel:

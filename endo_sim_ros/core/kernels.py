@@ -75,12 +75,12 @@ def _array(kind: Any, tensor: Tensor) -> Any:
     return wp.from_torch(tensor, dtype=kind.dtype, requires_grad=False, return_ctype=True)
 
 
-def launch(kernel: Any, count: int, arguments: Sequence, device: torch.device | str) -> None:
+def launch(kernel: Any, count: int | tuple[int, ...], arguments: Sequence, device: torch.device | str) -> None:
     """Launch a kernel over count items on a device, in order with torch's own work there.
 
     Args:
         kernel: A Warp kernel.
-        count: Number of its threads.
+        count: Number of its threads, or numbers along each axis.
         arguments: As for `kernel_arguments`.
         device: That of all tensors.
     """

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from endo_sim_ros.core import drawing
 from endo_sim_ros.core.config import ConfigError, unused_options
+from endo_sim_ros.core.folders import written_whole
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.evaluation import gsplat_trainers
 from endo_sim_ros.evaluation.config import EvaluationConfig
@@ -94,9 +95,8 @@ def save_record(out: Path, cell: Cell, outcome: Finished) -> dict[str, Any]:
         (out / pictures[name]).write_bytes(data)
     record = {"cell": cell._asdict(), "error": outcome.error, "pictures": pictures, **result}
     file = out / "cells" / f"{cell.stem}.json"
-    partial = file.with_suffix(".part")
-    partial.write_text(json.dumps(record, indent=1) + "\n")
-    partial.replace(file)
+    with written_whole(file) as partial:
+        partial.write_text(json.dumps(record, indent=1) + "\n")
     return json.loads(file.read_text())
 
 

@@ -17,7 +17,7 @@ from endo_sim_ros.evaluation.splits import right_views, split_views
 from endo_sim_ros.reconstruction import ReconstructionConfig, ScenePoints, scene_points, shrink
 from endo_sim_ros.reconstruction.priors.sources import estimate_depth
 from endo_sim_ros.reconstruction.scene import TrainingView
-from endo_sim_ros.sequences.folder import read_points
+from endo_sim_ros.sequences.point_files import read_points
 from endo_sim_ros.sequences.recording import Recording, StoredFrame, spread, store
 
 _POINT_VIEWS = 48  # views that structure from motion is done with

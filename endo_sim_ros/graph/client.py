@@ -10,7 +10,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.publisher import Publisher
 
 from endo_sim_ros import messages
-from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.cameras import Camera, rigid_pose
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.instruments import load_arm, place_arm
@@ -79,9 +79,7 @@ class Client(Watcher):
         Raises:
             RuntimeError: If nobody subscribes.
         """
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = self.axes, tip
-        self.send(self.pose_topic, messages.encode_pose(pose, stamp, WORLD))
+        self.send(self.pose_topic, messages.encode_pose(rigid_pose(self.axes, tip), stamp, WORLD))
         self.send(messages.tool_wrench(ARM), messages.encode_wrench(force, np.zeros(3), stamp, WORLD))
 
     def until(self, done: Callable[[], Any], what: str, seconds: float = PATIENCE) -> None:

@@ -15,6 +15,7 @@ from rclpy.utilities import try_shutdown
 from rich.progress import Progress
 
 from endo_sim_ros import messages
+from endo_sim_ros.core.cameras import rigid_pose
 from endo_sim_ros.core.frames import LEFT_FRAME
 from endo_sim_ros.evaluation.measurement import Row, report
 from endo_sim_ros.graph.client import ARM, CHANGED, Client, depth_of, tissue
@@ -107,10 +108,8 @@ class _Traffic:
             state = messages.ControlNodeCloud(self._rest, self._rest + np.float32(1e-3), F, stamp)
             return messages.encode_control_nodes(state, stamp, "world")
         if topic in (messages.tool_pose_command(ARM), messages.tool_move(ARM)):
-            pose = np.eye(4)
-            pose[:3, :3] = self.axes
-            pose[:3, 3] = self.scene.tip + [rng.gauss(0, 0.01) for _ in range(3)]
-            return messages.encode_pose(pose, stamp, "world")
+            tip = self.scene.tip + [rng.gauss(0, 0.01) for _ in range(3)]
+            return messages.encode_pose(rigid_pose(self.axes, tip), stamp, "world")
         if topic in (messages.tool_joint_command(ARM), messages.tool_joint_move(ARM)):
             joints = np.array([rng.gauss(0, 0.1) for _ in JOINTS])
             joints[2] = rng.uniform(0.1, 0.2)  # the insertion, m
@@ -161,7 +160,7 @@ def soak(json_file: Path | None, minutes: float, rate: float = 500.0, seed: int 
     rng, rows = random.Random(seed), []
     traffic = _Traffic(rng)
     parameters = {
-        "reconstruction_node": {"iterations": 20, "max_gaussians": 1500, "start_after": 0.5},
+        "reconstruction_node": {"iterations": 20, "max_gaussians": 1500, "keyframes": 3, "start_after": 0.5},
         "physics_node": {"node_count": 400, "arms": [ARM], "arm_source": "commanded", "contact_radius": 0.005, "reaction_rate": 500.0},
         "rendering_node": {"baseline": 0.005},
     }

@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from endo_sim_ros.core.cameras import invert_pose, matrix_to_quat, parse_frames
+from endo_sim_ros.core.cameras import invert_pose, matrix_to_quat, parse_frames, rigid_pose
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.instruments import (
     JOINTS,
@@ -97,8 +97,7 @@ def hold_tool(task: type[Task], scene: Scene, tool: str = "") -> HeldTool:
     hinge = (base @ arm.tip_pose(placed.joints))[:3, :3]
     # A ball that pushes has no picture: the tool touches where the ball meets what lies ahead of it.
     ahead = task.physics().contact_radius * camera.pose[:3, 2]
-    mount = np.eye(4)
-    mount[:3, :3], mount[:3, 3] = hinge, ahead - hinge @ point
+    mount = rigid_pose(hinge, ahead - hinge @ point)
     centre = camera.position + scene.depth * camera.pose[:3, 2]
     return HeldTool(replace(arm, tooltip_offset=arm.tooltip_offset @ invert_pose(mount)), base, centre, tool or task.tool)
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from endo_sim_ros.core.cameras import rigid_pose
 from endo_sim_ros.learning.config import Randomisation
 
 _FIRST, _MORE = 10, 12  # numbers that are drawn
@@ -40,10 +41,8 @@ class Variation:
     @property
     def camera(self) -> np.ndarray:
         """Pose [4, 4] of the endoscope in the frame of the scene's, but its position is along the axes of the world, m."""
-        pose = np.eye(4)
-        pose[:3, 3] = self.by.camera_position * self.chance[1:4]
-        pose[:3, :3] = Rotation.from_rotvec(np.radians(self.by.camera_angle) * self.chance[4:7]).as_matrix()
-        return pose
+        turn = Rotation.from_rotvec(np.radians(self.by.camera_angle) * self.chance[4:7])
+        return rigid_pose(turn.as_matrix(), self.by.camera_position * self.chance[1:4])
 
     @property
     def light(self) -> np.ndarray:

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from endo_sim_ros import messages
+from endo_sim_ros.core.cameras import rigid_pose
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.instruments import ArmKinematics, aimed_pose, load_arm, working_point
 from endo_sim_ros.instruments.urdf import find_base
@@ -55,9 +56,7 @@ class AimedTool:
         """Pose of the tip [4, 4] with which the tool works at a target [3], m, world; a bare tip has these axes [3, 3]."""
         if self.known and self._tool is not None and self._base is not None:
             return aimed_pose(self._tool[0], self._base, target, self._tool[1])
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = axes, target
-        return pose
+        return rigid_pose(axes, target)
 
     def works_at(self, pose: np.ndarray) -> np.ndarray:
         """Where the tool works [3], m, world, when its tip is at a pose [4, 4]."""

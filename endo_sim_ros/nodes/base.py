@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
-import torch
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.context import Context
@@ -50,7 +49,8 @@ class EndoNode(ConfiguredNode):
 
     def __init__(self, name: str, context: Context | None = None) -> None:
         super().__init__(name, context)
-        torch.set_num_threads(1)  # the kernels bring their own threads
+        if torch := sys.modules.get("torch"):  # not imported by the nodes that start sooner without it
+            torch.set_num_threads(1)  # the kernels bring their own threads
         self._diagnostics = self.publisher(messages.DIAGNOSTICS)
         self._error_text, self._error_until, self.error_count = "", 0.0, 0
         self.logged: dict[str, float] = {}

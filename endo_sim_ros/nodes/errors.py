@@ -1,8 +1,8 @@
 """Errors as sentences for people."""
 
 from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.core.errors import ModelError
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.core.gaussians import ModelError
 from endo_sim_ros.messages import MessageError
 
 

@@ -15,7 +15,6 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from endo_sim_ros.core.config import ConfigError, Option, StageConfig, option_values, options, renamed_options, unused_options
-from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.nodes.configs import NODE_CONFIGS
 from endo_sim_ros.nodes.errors import sentence
 from endo_sim_ros.nodes.rclpy_private import given_parameters
@@ -169,6 +168,8 @@ def _require_device(config: StageConfig) -> None:
     """Raise ConfigError if the device of a configuration does not exist."""
     device = getattr(config, "device", None)
     if device is not None:
+        from endo_sim_ros.core.device import pick_device  # needs torch
+
         try:
             pick_device(device)
         except ValueError as error:

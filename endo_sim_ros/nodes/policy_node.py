@@ -9,6 +9,7 @@ from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.core.folders import written_whole
 from endo_sim_ros.learning.held_tools import HeldTools, hold_tool
 from endo_sim_ros.learning.policies import make_policy
 from endo_sim_ros.learning.scenes import load_scene
@@ -166,11 +167,9 @@ class PolicyNode(EndoNode):
         self._state = PolicyState.DONE
         if self._config.record:
             names, path = ("observations", "actions", "rewards", "success", "episode"), Path(self._config.record)
-            partial = path.with_name(path.name + ".part")
             columns: dict[str, Any] = {name: np.array(column) for name, column in zip(names, zip(*self._rows))}
-            with partial.open("wb") as file:
+            with written_whole(path) as partial, partial.open("wb") as file:
                 np.savez(file, **columns)
-            partial.replace(path)  # there whole or not at all
         self.publish_diagnostics()
 
     def status(self) -> tuple[int, str, dict[str, Any]]:

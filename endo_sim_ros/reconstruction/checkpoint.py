@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from endo_sim_ros.core.config import option_values
+from endo_sim_ros.core.folders import written_whole
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
@@ -41,12 +42,10 @@ def write_checkpoint(state: dict[str, Any], path: str | Path) -> None:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".part")
     try:
-        torch.save(state, partial)
-        partial.replace(path)
+        with written_whole(path) as partial:
+            torch.save(state, partial)
     except (OSError, RuntimeError) as error:  # torch turns a full disk into a RuntimeError
-        partial.unlink(missing_ok=True)
         reason = getattr(error, "strerror", None) or next(iter(str(error).splitlines()), "")
         raise OSError(f"{path}: the checkpoint cannot be written ({reason}); is the disk full?") from error
 

@@ -21,7 +21,7 @@ from endo_sim_ros.reconstruction.scene import ScenePoints
 from endo_sim_ros.reconstruction.trainer import Progress, Trainer
 from endo_sim_ros.reconstruction.triangulation import POINT_VIEWS
 from endo_sim_ros.sequences.bag import read_bag
-from endo_sim_ros.sequences.folder import read_points
+from endo_sim_ros.sequences.point_files import read_points
 from endo_sim_ros.sequences.recording import Recording, spread, survey
 
 log = logging.getLogger(__name__)

@@ -14,7 +14,7 @@ from endo_sim_ros.core.frames import LEFT_FRAME, RIGHT_FRAME, WORLD_FRAME, Frame
 from endo_sim_ros.messages import Topic, bag_types
 from endo_sim_ros.sequences.bag_reader import BagReader, RawMessage
 from endo_sim_ros.sequences.bag_writer import BagWriter, canonical_cdr
-from endo_sim_ros.sequences.folder import write_points
+from endo_sim_ros.sequences.point_files import write_points
 from endo_sim_ros.sequences.synchronizer import Synchronizer
 
 __all__ = [

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
+from endo_sim_ros.core.cameras import Camera, intrinsic_matrix, rigid_pose
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.images import check_size, image_size, numbered_files, read_depth, read_image
 from endo_sim_ros.sequences.masks import MaskFiles
@@ -115,9 +115,7 @@ def _camera(row: np.ndarray, size: tuple[int, int], pose_scale: float, source: s
     height, width, focal = block[:, 4]
     if min(height, width, focal) <= 0:
         raise SequenceError(f"{source}: height, width and focal must be positive, got {block[:, 4].tolist()}")
-    matrix = np.eye(4)
-    down, right, back = block[:, 0], block[:, 1], block[:, 2]
-    matrix[:3, :3] = np.stack([right, down, -back], 1)  # optical frame: x right, y down, z forward
-    matrix[:3, 3] = block[:, 3] * pose_scale
+    down, right, back, position, _ = block.T
+    matrix = rigid_pose(np.stack([right, down, -back], 1), position * pose_scale)  # optical frame: x right, y down, z forward
     K = intrinsic_matrix(focal * size[0] / width, focal * size[1] / height, size[0] / 2, size[1] / 2)
     return Camera(K, *size, rigid(matrix, source))

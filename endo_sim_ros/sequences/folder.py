@@ -23,6 +23,7 @@ from endo_sim_ros.sequences.calibration_files import check_calibrated_size, read
 from endo_sim_ros.sequences.estimated_poses import with_estimated_poses
 from endo_sim_ros.sequences.images import check_size, image_size, numbered_files, read_depth, read_image
 from endo_sim_ros.sequences.masks import MaskFiles, lit_area, lit_now
+from endo_sim_ros.sequences.point_files import read_points
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.recording import (
     DEFAULT_FPS,
@@ -41,7 +42,6 @@ logger = logging.getLogger(__name__)
 
 CALIBRATION_FILE = "calibration.yaml"
 POSE_FILES = ("poses_left.txt", "poses.txt")
-POINTS_FILE = "points.txt"
 
 
 def read_folder(
@@ -141,28 +141,3 @@ def read_folder(
     if poses is None:
         logger.warning("%s: no %s, so poses come from structure from motion", root, " or ".join(POSE_FILES))
     return with_estimated_poses(recording, root, poses)
-
-
-def read_points(path: Path | str) -> tuple[np.ndarray, np.ndarray] | None:
-    """Scene points [N, 3] (m, world) and their RGB [N, 3] in [0, 1] of a folder of images or a bag; None if it has none.
-
-    Raises:
-        SequenceError: If they cannot be read.
-    """
-    root = Path(path)
-    file = root / POINTS_FILE
-    if not file.is_file():
-        return None
-    try:
-        values = np.loadtxt(file, usecols=range(6), ndmin=2)
-    except (ValueError, IndexError, OSError) as error:
-        reason = next(iter(str(error).splitlines()), "")
-        raise SequenceError(f"{file}: not lines of x y z r g b ({reason}); correct or remove it") from None
-    if not len(values) or not np.isfinite(values).all() or values[:, 3:].min() < 0 or values[:, 3:].max() > 255:
-        raise SequenceError(f"{file}: expected finite x y z and colours r g b from 0 to 255; correct or remove it")
-    return values[:, :3], values[:, 3:] / 255
-
-
-def write_points(path: Path | str, points: np.ndarray, colors: np.ndarray) -> None:
-    """Write scene points [N, 3] (m, world) and their RGB [N, 3] in [0, 1] into a folder of images or a bag."""
-    np.savetxt(Path(path) / POINTS_FILE, np.column_stack([points, np.round(255 * colors)]), "%.7g", header="x y z r g b")

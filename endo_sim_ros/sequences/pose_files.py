@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from endo_sim_ros.core.cameras import quat_to_matrix
+from endo_sim_ros.core.cameras import quat_to_matrix, rigid_pose
 from endo_sim_ros.core.frames import SequenceError
 
 
@@ -83,6 +83,4 @@ def rigid(matrix: ArrayLike, source: str) -> np.ndarray:
     u, singular, vt = np.linalg.svd(values[:3, :3])
     if np.abs(singular - 1).max() > 0.02 or np.linalg.det(u @ vt) < 0:
         raise SequenceError(f"{source}: its 3×3 block is not a rotation (singular values {singular.round(3).tolist()})")
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = u @ vt, values[:3, 3]
-    return pose
+    return rigid_pose(u @ vt, values[:3, 3])

@@ -5,6 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from endo_sim_ros.core.gaussians import rotation_matrices
 from endo_sim_ros.splatting.api import RenderOutput, check_inputs, median_depths
 from endo_sim_ros.splatting.constants import ALPHA_MAX, ALPHA_MIN, LOG_ALPHA_SLACK, MEDIAN, TRANSMITTANCE_MIN
 from endo_sim_ros.splatting.scene import Scene, Settings
@@ -40,7 +41,7 @@ def rasterize_in_torch(
     check_inputs("rasterize_in_torch", scene, settings, masks, absgrad)
     if covars is None:
         assert quats is not None and scales is not None  # else the check has refused
-        rotations = quat_to_matrix(quats)
+        rotations = rotation_matrices(quats)
         covars = rotations @ torch.diag_embed(scales**2) @ rotations.mT
     covars = (covars + covars.mT) / 2
     count = means.shape[-2]
@@ -51,20 +52,6 @@ def rasterize_in_torch(
     first = count * torch.arange(len(viewmats), device=means.device)[:, None, None]
     owners = torch.where(owners >= 0, owners + first, -1)
     return RenderOutput(*images, medians=median_depths(owners, means, viewmats) if median else None)
-
-
-def quat_to_matrix(quats: Tensor) -> Tensor:
-    """Return rotation matrices [N, 3, 3] of quaternions wxyz [N, 4]; zero means no rotation."""
-    norms = quats.norm(dim=1, keepdim=True)
-    identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0]).expand_as(quats)
-    zero = norms < 1e-12
-    w, x, y, z = torch.where(zero, identity, quats / norms.where(~zero, 1)).unbind(1)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
 def sh_basis(directions: Tensor, count: int) -> Tensor:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from endo_sim_ros.core.cameras import Camera, load_cameras, look_at
+from endo_sim_ros.core.cameras import Camera, load_cameras, look_at, rigid_pose
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.gaussians import GaussianModel, load_ply
@@ -88,9 +88,7 @@ class Standalone:
         """As `Actions` has it: an instrument comes straight from its remote centre."""
         if self._tool is not None:
             return self._tool.aim(point), AHEAD
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = axes, point
-        return pose, 0.0
+        return rigid_pose(axes, point), 0.0
 
     def hold(self, pose: np.ndarray, closed: bool) -> None:
         """Move the tool to a pose [4, 4], m, world, and close its jaw; say so where nothing can be held."""

@@ -206,7 +206,7 @@ def test_the_status_tells_what_was_given_wrong_from_what_failed_later(error, sta
 @pytest.mark.dds
 def test_reconstruct_writes_a_model_and_measures_held_out_views(bag, tmp_path):
     out = tmp_path / "result"
-    done = endo_sim("reconstruct", bag, out, "--iterations", 80, "--max-gaussians", 4000, "--keyframes", 4, "--device", "cpu")
+    done = endo_sim("reconstruct", bag, out, "--iterations", 40, "--max-gaussians", 4000, "--keyframes", 3, "--device", "cpu")
     assert done.returncode == 0, done.stderr
     psnr = float(next(line for line in done.stderr.splitlines() if line.startswith("PSNR [dB]")).split()[-1])
     assert 18 < psnr < 45

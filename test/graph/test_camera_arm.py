@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import rclpy
-from ros_bench import HEIGHT, WIDTH, Bench, K, send_model, sheet
+from ros_bench import HEIGHT, WIDTH, Bench, K, send_model, sheet, start_ros
 from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
@@ -18,9 +18,8 @@ STEP = 20_000_000  # ns
 @pytest.fixture
 def graph():
     physics = {"node_count": 300, "step_duration": 0.02, "arm_source": "commanded", "arms": "[PSM1, ECM]", "lockstep_inputs": "[pose]"}
-    parameters = {"physics_node": physics, "rendering_node": {"lockstep_camera": True}}
-    given = [(node, *each) for node, values in parameters.items() for each in (values | {"mode": "lockstep", "device": "cpu"}).items()]
-    rclpy.init(args=["--ros-args", *(word for node, name, value in given for word in ("-p", f"{node}:{name}:={value}"))])
+    both = {"mode": "lockstep", "device": "cpu"}
+    start_ros(physics_node=physics | both, rendering_node=both | {"lockstep_camera": True})
     bench = Bench()
     for topic in (messages.RENDERED_POSE, messages.CAMERA_POSE, messages.tool_joints("PSM1"), messages.CONTROL_NODES):
         bench.hear(topic)

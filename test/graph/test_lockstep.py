@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rclpy
-from ros_bench import HEIGHT, WIDTH, Bench, K, report, send_camera, send_model, sheet
+from ros_bench import HEIGHT, WIDTH, Bench, K, report, send_camera, send_model, sheet, start_ros
 from std_srvs.srv import SetBool, Trigger
 from waiting import wait_until
 
@@ -46,11 +46,7 @@ STATES = (messages.CONTROL_NODES, messages.tool_reaction("PSM1"), messages.CLOCK
 
 @pytest.fixture(scope="module", autouse=True)
 def ros():
-    arguments = ["--ros-args", "-p", "physics_node:arm_source:=commanded"]
-    for node, values in PARAMETERS.items():
-        for name, value in values.items():
-            arguments += ["-p", f"{node}:{name}:={value}"]
-    rclpy.init(args=arguments)
+    start_ros(**PARAMETERS | {"physics_node": PARAMETERS["physics_node"] | {"arm_source": "commanded"}})
     yield
     rclpy.try_shutdown()
 
@@ -393,7 +389,7 @@ def test_the_same_bag_gives_the_same_model_in_every_run(tmp_path, small_bag):
         heard = bench.hear(messages.GAUSSIANS)
         try:
             with NodeGroup(tmp_path / run) as group:
-                options = {"iterations": 30, "max_gaussians": 1500, "image_width": 96, "start_after": 0.5, "device": "cpu"}
+                options = {"iterations": 30, "max_gaussians": 1500, "image_width": 96, "keyframes": 3, "start_after": 0.5, "device": "cpu"}
                 group.start("reconstruction_node", mode="lockstep", output_dir=tmp_path / run, **options)
                 bench.status("reconstruction_node", "collecting views", OK)
                 group.start("bag_player_node", bag=small_bag)

@@ -108,7 +108,7 @@ def test_a_graph_works_across_two_machines(two_hosts, small_bag, tmp_path):
 
     try:
         said = start(first, "-c", LISTENER)
-        small = {"iterations": 10, "max_gaussians": 500, "image_width": 48, "start_after": 0.5, "output_dir": tmp_path}
+        small = {"iterations": 10, "max_gaussians": 500, "image_width": 48, "keyframes": 2, "start_after": 0.5, "output_dir": tmp_path}
         node(first, "reconstruction_node", **small)
         node(second, "physics_node", node_count=300)
         node(second, "rendering_node", rate=10.0)

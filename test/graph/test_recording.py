@@ -57,6 +57,11 @@ class Graph:
         self.sent.append(stamp)
         self.step()
 
+    def say_for(self, seconds):
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.say()
+
     def step(self):
         self.executor.spin_once(timeout_sec=0.01)
 
@@ -94,13 +99,9 @@ def test_what_was_recorded_outlives_the_recorder(graph, tmp_path, number):
     recorder = start("endo_sim_ros.cli", "record", path, "--images", "raw", "--arms", "PSM1", "PSM2")
     try:
         wait_until(graph.heard, 30, "the recorder", graph.step)
-        begin = time.monotonic() + 1.5  # each side of a topic finds the other in its own time
-        while time.monotonic() < begin:
-            graph.say()
+        graph.say_for(1.5)  # each side of a topic finds the other in its own time
         began = len(graph.sent)
-        end = time.monotonic() + 3.0
-        while time.monotonic() < end:
-            graph.say()
+        graph.say_for(3.0)
         if number != signal.SIGKILL:  # these end a recorder that hears all; a kill may lose the last second
             settled = time.monotonic() + 0.5
             wait_until(lambda: time.monotonic() > settled, 5, "the last message to arrive", graph.step)
@@ -125,9 +126,7 @@ def test_chosen_topics_alone_are_recorded_with_canonical_bytes(graph, tmp_path):
     try:
         image = graph.publishers[messages.RENDERED_IMAGE]
         wait_until(image.get_subscription_count, 30, "the recorder", graph.step)
-        until = time.monotonic() + 1.5
-        while time.monotonic() < until:
-            graph.say()
+        graph.say_for(1.5)
     finally:
         recorder.send_signal(signal.SIGINT)
         recorder.communicate(timeout=30)
@@ -146,9 +145,7 @@ def test_a_graph_in_a_namespace_is_recorded_under_the_names_without_it(graph, tm
     recorder = start("endo_sim_ros.cli", "record", tmp_path / "bag", *arguments)
     try:
         wait_until(graph.heard, 30, "the recorder", graph.step)
-        begin = time.monotonic() + 1.5  # each side of a topic finds the other in its own time
-        while time.monotonic() < begin:
-            graph.say()
+        graph.say_for(1.5)  # each side of a topic finds the other in its own time
         began = len(graph.sent)
         for _ in range(20):
             graph.say()

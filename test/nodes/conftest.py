@@ -2,7 +2,7 @@
 
 import pytest
 import rclpy
-from ros_bench import SMALL, Bench
+from ros_bench import SMALL, Bench, start_ros
 
 from endo_sim_ros import messages
 from endo_sim_ros.nodes.physics_node import PhysicsNode
@@ -12,14 +12,9 @@ from endo_sim_ros.nodes.rendering_node import RenderingNode
 @pytest.fixture(scope="module")
 def ros(tmp_path_factory):
     """ROS with small parameters for the nodes that are made in this process."""
-    outputs = {"reconstruction_node": {"output_dir": tmp_path_factory.mktemp("models")}}
-    recording = tmp_path_factory.mktemp("recordings") / "bag"
-    outputs |= {"recorder": {"bag": recording}}
-    arguments = ["--ros-args"]
-    for node, values in [*SMALL.items(), *outputs.items()]:
-        for name, value in values.items():
-            arguments += ["-p", f"{node}:{name}:={value}"]
-    rclpy.init(args=arguments)
+    models, recording = tmp_path_factory.mktemp("models"), tmp_path_factory.mktemp("recordings") / "bag"
+    reconstruction = SMALL["reconstruction_node"] | {"output_dir": models}
+    start_ros(**SMALL | {"reconstruction_node": reconstruction, "recorder": {"bag": recording}})
     yield recording
     rclpy.try_shutdown()
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import rclpy
-from ros_bench import Bench, S
+from ros_bench import Bench, S, start_ros
 
 from endo_sim_ros import messages
 from endo_sim_ros.messages import OK
@@ -17,8 +17,7 @@ def bench(tmp_path):
     """A reconstruction in this process that is quick to take a pause for the end, and a user."""
     values = {"iterations": 5, "max_gaussians": 300, "image_width": 48, "keyframes": 3, "start_after": 0.4, "image_timeout": 1.0}
     values["output_dir"] = tmp_path
-    arguments = [word for name, value in values.items() for word in ("-p", f"reconstruction_node:{name}:={value}")]
-    rclpy.init(args=["--ros-args", *arguments])
+    start_ros(reconstruction_node=values)
     bench = Bench()
     yield bench
     bench.close()

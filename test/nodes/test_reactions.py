@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 import rclpy
-from ros_bench import Bench, S, send_model, send_tip, send_wrench
+from ros_bench import Bench, S, send_model, send_tip, send_wrench, start_ros
 from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
@@ -30,7 +30,7 @@ def bench():
         "device": "cpu",
         "link_contact": "false",
     }
-    rclpy.init(args=["--ros-args", *(word for name, value in given.items() for word in ("-p", f"physics_node:{name}:={value}"))])
+    start_ros(physics_node=given)
     bench = Bench()
     yield bench
     bench.close()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import rclpy
-from ros_bench import SMALL, S, await_nodes, moved, send_camera, send_model
+from ros_bench import SMALL, S, await_nodes, moved, send_camera, send_model, start_ros
 
 from endo_sim_ros.messages import OK, WARN
 from endo_sim_ros.nodes.scripted_tool_node import ScriptedToolNode
@@ -14,9 +14,7 @@ pytestmark = pytest.mark.dds
 @pytest.fixture(scope="module")
 def ros():
     """An instrument whose links touch."""
-    nodes = {**SMALL, "physics_node": SMALL["physics_node"] | {"node_count": 2000, "link_contact": "true"}}
-    given = [(node, *each) for node, values in nodes.items() for each in values.items()]
-    rclpy.init(args=["--ros-args", *(word for node, name, value in given for word in ("-p", f"{node}:{name}:={value}"))])
+    start_ros(**SMALL | {"physics_node": SMALL["physics_node"] | {"node_count": 2000, "link_contact": "true"}})
     yield
     rclpy.try_shutdown()
 

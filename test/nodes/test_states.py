@@ -10,10 +10,10 @@ import rclpy
 import torch
 from node_states import NODE_STATES
 from rclpy.executors import SingleThreadedExecutor
+from ros_bench import HEIGHT, WIDTH, K, S, sheet, start_ros
 from std_srvs.srv import SetBool
 
 from endo_sim_ros import messages
-from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.graph.client import Client
 from endo_sim_ros.graph.processes import NodeGroup
 from endo_sim_ros.messages import (
@@ -39,9 +39,7 @@ from endo_sim_ros.nodes.scripted_tool_node import ScriptedToolNode
 
 pytestmark = pytest.mark.dds
 
-S = 1_000_000_000
 CONVENTIONS = (Path(__file__).parents[2] / "msg_conventions.md").read_text()
-K = np.array([[90.0, 0, 48], [0, 90.0, 40], [0, 0, 1]])
 
 
 def documented_keys(node: str) -> set[str]:
@@ -102,8 +100,7 @@ def start(tmp_path):
     graphs = []
 
     def begin(**parameters):
-        words = [f"{node}:{name}:={value}" for node, values in parameters.items() for name, value in values.items()]
-        rclpy.init(args=["--ros-args", *(part for word in words for part in ("-p", word))])
+        start_ros(**parameters)
         graphs.append(Graph())
         return graphs[-1]
 
@@ -112,13 +109,6 @@ def start(tmp_path):
         graph.close()
     rclpy.try_shutdown()
     assert not [graph.undocumented for graph in graphs if graph.undocumented]
-
-
-def sheet(side=30):
-    """A flat piece of tissue 10 cm in front of a camera at the origin."""
-    x, y = torch.meshgrid(*[torch.linspace(-0.05, 0.05, side)] * 2, indexing="ij")
-    points = torch.stack([x, y, torch.full_like(x, 0.1)], -1).reshape(-1, 3)
-    return GaussianModel.from_points(points, torch.full_like(points, 0.5), torch.full((len(points),), 0.05 / side), opacity=0.95)
 
 
 def send_model(client, model, stamp):
@@ -160,7 +150,7 @@ def test_every_node_reports_a_state_of_its_own_and_only_values_that_are_document
 
 
 def test_a_reconstruction_goes_through_its_states_in_order(start, small_frames, tmp_path):
-    small = {"iterations": 10, "max_gaussians": 500, "start_after": 0.5, "output_dir": tmp_path}
+    small = {"iterations": 10, "max_gaussians": 500, "image_width": 48, "start_after": 0.5, "output_dir": tmp_path}
     graph = start(reconstruction_node=small)
     graph.add(ReconstructionNode)
     graph.until("reconstruction_node", ReconstructionState.WAITING)
@@ -205,7 +195,7 @@ def test_the_renderer_waits_for_model_and_camera_then_renders(start):
     graph.add(RenderingNode)
     graph.until("rendering_node", RenderingState.WAITING)
     send_model(graph.client, sheet(), 5 * S)
-    graph.client.send(messages.LEFT_INFO, messages.encode_camera_info(K, 96, 80, S, "endoscope_left"))
+    graph.client.send(messages.LEFT_INFO, messages.encode_camera_info(K, WIDTH, HEIGHT, S, "endoscope_left"))
     graph.until("rendering_node", RenderingState.RENDERING)
     assert [state for state in graph.heard["rendering_node"] if state != RenderingState.BUILDING] == ["waiting", "rendering"]
     assert graph.newest["rendering_node"].values["following control nodes"] == "False"  # there are none

@@ -13,6 +13,8 @@ from endo_sim_ros.reconstruction.stage_configs import MatchingConfig, PosesConfi
 from endo_sim_ros.reconstruction.triangulation import match_features
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
+QUICK = {"plane_sweep": False, "multi_view_refinement": False, "dynamic_mask": False, "extrapolation": 0.0}  # what comes after the check
+
 
 @pytest.fixture(scope="module")
 def large():
@@ -44,7 +46,7 @@ def test_a_wrong_pose_among_good_ones_is_found(large, fault, caplog):
     frames[2] = misplaced(frames[2], fault)
     assert misposed(frames, match_features(frames)) == [2]
     if fault == "moved":
-        scene = prepare(frames, options(image_width=160, depth="points"))
+        scene = prepare(frames, options(image_width=160, depth="points", **QUICK))
         assert len(scene.views) == 4 and "left out" in caplog.text
 
 
@@ -52,7 +54,7 @@ def test_a_wrong_pose_among_good_ones_is_found(large, fault, caplog):
 def test_with_stereo_a_wrong_pose_among_three_is_left_out(caplog):
     views = list(phantom_sequence(PhantomConfig(width=320, height=256, frames=3, travel=0.02)))
     views = [dataclasses.replace(view, depth=None) for view in views]
-    short = options(image_width=80, iterations=1)
+    short = options(image_width=80, **QUICK)
     assert len(prepare(views, short).views) == 3 and "left out" not in caplog.text
     scene = prepare([views[0], misplaced(views[1], "farther"), views[2]], short)
     assert len(scene.views) == 2 and f"{views[1].stamp_ns * 1e-9:.3f} s left out" in caplog.text

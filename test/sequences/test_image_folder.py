@@ -24,8 +24,9 @@ from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.physics import regions
 from endo_sim_ros.sequences import calibration_files
 from endo_sim_ros.sequences.bag import read_bag, write_bag
-from endo_sim_ros.sequences.folder import read_folder, read_points, write_points
+from endo_sim_ros.sequences.folder import read_folder
 from endo_sim_ros.sequences.images import read_image
+from endo_sim_ros.sequences.point_files import read_points, write_points
 from endo_sim_ros.sequences.readers import open_sequence
 
 CALIBRATION = f"width: {WIDTH}\nheight: {HEIGHT}\nfx: 150\nfy: 150\ncx: {WIDTH / 2}\ncy: {HEIGHT / 2}\n"

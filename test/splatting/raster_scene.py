@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from endo_sim_ros.core.cameras import look_at
-from endo_sim_ros.splatting import RenderOutput, rasterize, rasterize_in_torch, reference
+from endo_sim_ros.core.gaussians import rotation_matrices
+from endo_sim_ros.splatting import RenderOutput, rasterize, rasterize_in_torch
 
 DEVICES = ["cpu", *([pytest.param("cuda", marks=pytest.mark.gpu)] if torch.cuda.is_available() else [])]
 WIDTH, HEIGHT = 70, 45  # no multiple of the tile
@@ -41,7 +42,7 @@ def random_like(images, seed=1):
 
 def covariances(quats, scales):
     """World covariances [N, 3, 3]."""
-    rotations = reference.quat_to_matrix(quats)
+    rotations = rotation_matrices(quats)
     return rotations @ torch.diag_embed(scales**2) @ rotations.mT
 
 

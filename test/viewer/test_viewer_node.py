@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import rclpy
 from fake_browser import MOST, PORT, FakeBrowser, point
-from ros_bench import HEIGHT, WIDTH, Bench, K, S, send_camera, send_model, send_tip, sheet
+from ros_bench import HEIGHT, WIDTH, Bench, K, S, send_camera, send_model, send_tip, sheet, start_ros
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
@@ -20,10 +20,8 @@ pytestmark = pytest.mark.dds
 
 @pytest.fixture(scope="module")
 def ros():
-    arguments = ["--ros-args", "-p", f"viewer_node:port:={PORT}", "-p", "viewer_node:rate:=30.0", "-p", f"viewer_node:max_force:={MOST}"]
-    for name, value in {"node_count": 300, "step_duration": 0.02, "force_radius": 0.02, "device": "cpu"}.items():
-        arguments += ["-p", f"physics_node:{name}:={value}"]
-    rclpy.init(args=arguments)
+    viewer = {"port": PORT, "rate": 30.0, "max_force": MOST}
+    start_ros(viewer_node=viewer, physics_node={"node_count": 300, "step_duration": 0.02, "force_radius": 0.02, "device": "cpu"})
     yield
     rclpy.try_shutdown()
 

@@ -19,7 +19,7 @@ from endo_sim_ros.physics.backends.cluster_kernels import make_step_kernel
 from endo_sim_ros.physics.backends.cpu import cpu_action
 from endo_sim_ros.physics.backends.end_kernels import THREADS
 from endo_sim_ros.physics.backends.plain_kernels import collect, make_advance_kernel, scatter, update_grid
-from endo_sim_ros.physics.backends.plain_skinning_kernels import skin_environments, skin_gaussians
+from endo_sim_ros.physics.backends.plain_skinning_kernels import skin_environments
 from endo_sim_ros.physics.backends.structs import Transfer
 
 
@@ -73,7 +73,8 @@ class CudaBackend:
             launch(kernel, count, [0, *arguments], self.device)
 
     def skin(self, skin: SkinData, maps: Tensor, means: Tensor, covars: Tensor) -> None:
-        self.over_items(skin_gaussians, len(skin.means), [*skin[:4], maps, *skin[4:], means, covars])
+        if len(skin.means):
+            launch(skin_environments, (1, len(skin.means)), [0, *skin[:4], maps, *skin[4:], means, covars], self.device)
 
     def skin_work(self, skin: SkinData, maps: Tensor, means: Tensor, covars: Tensor) -> list[Work]:
         at_rest = [viewed(skin.means, wp.vec3), viewed(skin.covars, wp.mat33), viewed(skin.neighbours), viewed(skin.weights)]

@@ -30,25 +30,6 @@ def skin_gaussian(
 
 
 @wp.kernel
-def skin_gaussians(
-    first: int,
-    means: wp.array[wp.vec3],
-    covars: wp.array[wp.mat33],
-    neighbours: wp.array2d[int],
-    weights: wp.array2d[float],
-    maps: wp.array[wp.mat44],
-    origin: wp.vec3,
-    low: float,
-    high: float,
-    out_means: wp.array[wp.vec3],
-    out_covars: wp.array[wp.mat33],
-):
-    """The Gaussians from the first one on."""
-    n = first + wp.tid()
-    skin_gaussian(n, n, 0, means, covars, neighbours, weights, maps, origin, low, high, out_means, out_covars)
-
-
-@wp.kernel
 def skin_environments(
     nodes: int,  # M
     means: wp.array[wp.vec3],

@@ -106,8 +106,6 @@ class RenderingNode(EndoNode):
         last, self._nodes, self._nodes_stamp = self._nodes_stamp, nodes, messages.stamp_to_ns(message.header.stamp)
         if self._lockstep:
             if self._nodes_stamp == nodes.model_stamp_ns and old is not None and old.model_stamp_ns == nodes.model_stamp_ns:
-                if self._states and last == nodes.model_stamp_ns:
-                    self.instruments.forget(self._states.pop()[0])  # a reset after a reset that was not shown yet
                 self._end_episode(last)
             self._states.append((self._nodes_stamp, nodes, None))
             if len(self._states) > MOST_WAITING:
@@ -242,6 +240,8 @@ class RenderingNode(EndoNode):
                 return
             self._states.popleft()
             self.instruments.forget(stamp)
+            if at_rest and self._states and self._states[0][0] == stamp:  # a reset after a reset
+                continue
             if pose is None and not at_rest:
                 self._poses = {other: later for other, later in self._poses.items() if other > stamp}
             self._publish(self._render(self.tissue.bound, nodes, camera, instruments), stamp)

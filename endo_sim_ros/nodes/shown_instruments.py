@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Collection, Sequence
+from itertools import islice, pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -75,17 +76,18 @@ class ShownInstruments:
         """Where the links [5, 4, 4] of each arm are that has said so."""
         return {arm: links[-1][1] for arm, links in self._links.items() if links and len(links[-1][1])}
 
-    def at(self, stamp: int, later: Collection[int], published: Collection[str]) -> dict[str, np.ndarray] | str:
+    def at(self, stamp: int, later: Sequence[int], published: Collection[str]) -> dict[str, np.ndarray] | str:
         """Lockstep: where the links of each arm are at the time of a state, or the name of an arm whose links are awaited.
 
         Args:
-            stamp: That of the state, ns.
+            stamp: That of the state, ns; states are asked for in order, and stamps of an episode come again in the next one.
             later: Stamps of the states after it; where links of these are there, those of this state will not come.
             published: Arms whose links somebody publishes; those whose tool is known are awaited, too.
         """
         found = {}
         for arm, links in self._links.items():
-            poses = next((poses for when, poses in links if when == stamp), None)
+            self._skip_episodes(links, stamp, later)
+            poses = next((poses for when, poses in _first_episode(links) if when == stamp), None)
             if poses is None:
                 if (arm in published or arm in self._types) and not any(when in later for when, _ in links):
                     return arm
@@ -95,10 +97,20 @@ class ShownInstruments:
                 found[arm] = poses
         return found
 
+    @staticmethod
+    def _skip_episodes(links: deque[tuple[int, np.ndarray]], stamp: int, later: Sequence[int]) -> None:
+        """Drop what is left of episodes before that of a state, whose own states never came."""
+        while any(when == stamp for when, _ in links):
+            first = _first_episode(links)
+            if any(when == stamp or later and when == later[0] for when, _ in first):
+                return
+            for _ in first:
+                links.popleft()
+
     def forget(self, stamp: int) -> None:
-        """Lockstep: a state was shown; what arms said before and at it is not needed any more."""
+        """Lockstep: a state was shown, or is not to be; what arms said before and at it is not needed any more."""
         for links in self._links.values():
-            if any(when == stamp for when, _ in links):
+            if any(when == stamp for when, _ in _first_episode(links)):
                 while links.popleft()[0] != stamp:
                     pass
 
@@ -147,3 +159,9 @@ class ShownInstruments:
     def stop(self) -> None:
         """Prepare nothing more."""
         self._background.stop()
+
+
+def _first_episode(links: Sequence[tuple[int, np.ndarray]]) -> list[tuple[int, np.ndarray]]:
+    """The first stamped links of an arm, until stamps go back."""
+    end = next((i for i, (before, after) in enumerate(pairwise(links), 1) if after[0] < before[0]), len(links))
+    return list(islice(links, end))

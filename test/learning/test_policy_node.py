@@ -110,7 +110,10 @@ def test_over_topics_observations_images_and_actions_are_bit_for_bit_those_of_th
         images = assert_same_as_environment(tmp_path / "scripted.npz", scripted_policy(task), episodes, pictured)
         # They may come late; an earlier episode, or some pictures of one, may be missed.
         shown = lambda name: any(shows(part, name, images) for part in episodes_of(heard[name]))
-        user.until(lambda: all(map(shown, heard)), lambda: {name: list(map(step_number, got)) for name, got in heard.items()}, 40)
+        came = lambda: (
+            {name: list(map(step_number, got)) for name, got in heard.items()} | {"renderer": user.statuses["rendering_node"][-1]}
+        )
+        user.until(lambda: all(map(shown, heard)), came, 40)
         if episodes > 1:
             linear_policy().save(tmp_path / "policy.npz")
             run(tmp_path / "learned.npz", policy=tmp_path / "policy.npz")

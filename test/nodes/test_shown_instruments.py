@@ -176,6 +176,30 @@ def test_the_right_eye_and_compressed_images_for_those_who_ask(bench):
         assert len(heard[-1].data) < 0.5 * view.image.nbytes
 
 
+def test_in_lockstep_a_renderer_that_lags_episodes_behind_shows_each_state_with_its_own_links():
+    bench = start("lockstep")
+    send_model(bench)
+    send_type(bench, "PSM1")
+    # Stamps and where the instrument is: in both episodes two resets after the first one, of which the last is shown.
+    episodes = [
+        [(5 * S, 0.0), (5 * S, 0.001), (5 * S, 0.002), (6 * S, 0.003), (7 * S, 0.004)],
+        [(5 * S, 0.006), (5 * S, 0.007), (5 * S, 0.008), (6 * S, 0.009), (7 * S, 0.010)],
+    ]
+    for stamp, shift in (state for episode in episodes for state in episode):
+        send_links(bench, "PSM1", links("PSM1", shift), stamp)
+        send_state(bench, stamp)
+    shown = [state for episode in episodes for state in episode[2:]]
+    images = bench.heard["rendered/image_raw"]
+    bench.status("rendering_node", "waiting for a camera")
+    send_camera(bench)
+    bench.until(lambda: len(images) == len(shown), "all pictures", 60)
+    assert [messages.stamp_to_ns(image.header.stamp) for image in images] == [stamp for stamp, _ in shown]
+    for image, (stamp, shift) in zip(images, shown):
+        assert np.array_equal(messages.decode_image(image), expected_at(shift).image), stamp
+    bench.close()
+    rclpy.try_shutdown()
+
+
 def test_in_lockstep_each_state_waits_for_its_links(steps):
     images = steps.heard["rendered/image_raw"]
     stamp_of = lambda message: messages.stamp_to_ns(message.header.stamp)

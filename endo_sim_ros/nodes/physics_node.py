@@ -10,7 +10,6 @@ from std_srvs.srv import SetBool, Trigger
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ControlNodeCloud, PhysicsState
-from endo_sim_ros.nodes.arm import DISABLED, Arm
 from endo_sim_ros.nodes.arm_setup import CAMERA_ARM, make_arms, place_arms
 from endo_sim_ros.nodes.arm_topics import ArmTopics
 from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode, run, sentence
@@ -19,6 +18,7 @@ from endo_sim_ros.nodes.jointed_arm import CameraArm, JointedArm
 from endo_sim_ros.nodes.pacing import MOST_WAITING, WINDOW, CommandQueue, Pacer, SpeedMeter
 from endo_sim_ros.nodes.reactions import ReactionTopics
 from endo_sim_ros.nodes.tissue_builder import TissueBuilder
+from endo_sim_ros.nodes.tool_actions import apply_tools, slip_sentence
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
 from endo_sim_ros.physics.regions import read_regions
 
@@ -191,38 +191,6 @@ class PhysicsNode(EndoNode):
             with self.guard(topic):
                 act()
 
-    def _apply_tools(self, simulation: TissueSimulation) -> None:
-        for name, arm in self._tools.items():
-            astray = isinstance(arm, JointedArm) and bool(arm.capsules) and arm.astray
-            if arm.pose is None or not arm.acts or arm.state == DISABLED or astray:
-                simulation.withdraw(name)
-                continue
-            where = f"at {np.round(arm.pose[:3, 3], 4).tolist()}"
-            links = arm.links() if isinstance(arm, JointedArm) and simulation.has_instrument(name) else {}
-            if not simulation.set_grasp(name, arm.pose, arm.closed, links or None):
-                reach = self._out_of_reach(simulation) if not links else "no movable tissue lies between the jaws"
-                self.report_error(f"{name}: the jaw closed on nothing {where}; {reach}")
-                arm.closed = False
-            try:
-                simulation.set_cut(name, arm.pose, arm.cutting)
-            except ValueError as error:
-                arm.cutting = False
-                self.report_error(sentence(f"{name}: cut", error))
-            timeout, force, torque = self._options.command_timeout, arm.force, arm.torque
-            stale = not self._lockstep and 0 < timeout < self._seconds() - arm.heard
-            if force is None or torque is None or stale:
-                force, torque = np.zeros(3), np.zeros(3)
-            wanted = bool(force.any() or torque.any())
-            if wanted or arm.acting:
-                reached = simulation.set_wrench(name, arm.works_at, force, torque)
-                if wanted and not reached:
-                    self.report_error(f"{name}: the wrench {where} has no effect; {self._out_of_reach(simulation)}")
-            arm.acting = wanted
-
-    @staticmethod
-    def _out_of_reach(simulation: TissueSimulation) -> str:
-        return f"no movable tissue lies within force_radius = {simulation.config.force_radius:g} m of where the tool works"
-
     # ------------------------------------------------------------------ steps
 
     def _seconds(self) -> float:
@@ -279,7 +247,7 @@ class PhysicsNode(EndoNode):
             self._arm_topics.warn(arm, missing)
             if turning:  # else a jaw that tissue slipped out of would close again
                 arm.hold(self._options.jaw_closed, self._options.jaw_open)
-        self._apply_tools(simulation)
+        apply_tools(simulation, self._tools, self._options, None if self._lockstep else self._seconds(), self.report_error)
         for missing in self._misses():
             self.get_logger().warning(missing, throttle_duration_sec=_SAID_AGAIN)
         simulation.step()
@@ -287,21 +255,12 @@ class PhysicsNode(EndoNode):
             self._arm_topics.limit_force(arm, lambda name=name: simulation.reaction(name)[0])
         for name, count in simulation.slips_by_tool().items():
             if count > slips.get(name, 0):
-                self._lose(simulation, self.arms[name])
+                self.arms[name].closed = False
+                self._arm_topics.warn(self.arms[name], slip_sentence(name, simulation.config, self._options.link_contact), again=True)
         self.steps += 1
         if simulation.faults > faults:
             self.report_error(simulation.last_fault)
         self._seconds_per_step += 0.1 * (time.monotonic() - start - self._seconds_per_step)
-
-    def _lose(self, simulation: TissueSimulation, arm: Arm) -> None:
-        """Leave the jaw of an arm that tissue slipped out of open, and say so."""
-        arm.closed = False
-        pulled, raised = f"almost {simulation.config.travel:g} m", "travel"
-        if self._options.link_contact and simulation.config.grip_force:
-            pulled += f", or with {2 * simulation.config.friction * simulation.config.grip_force:.3g} N between two jaws"
-            raised += " or grip_force"
-        text = f"{arm.name}: tissue slipped out of the jaw, which pulled it {pulled}; open it, come nearer, or raise {raised}"
-        self._arm_topics.warn(arm, text, again=True)
 
     def _publish(self, simulation: TissueSimulation, stamp: int, at_rest: bool = False) -> None:
         """The state, the reactions and what belongs to them, all with one stamp; the state at rest is no moment in time."""

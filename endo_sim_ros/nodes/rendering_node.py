@@ -4,6 +4,7 @@ import time
 from collections import deque
 from dataclasses import replace
 from functools import partial
+from itertools import islice
 from typing import Any, Literal
 
 import numpy as np
@@ -14,6 +15,7 @@ from endo_sim_ros.instruments.drawing import PosedInstruments
 from endo_sim_ros.messages import ERROR, OK, STATE, WARN, CameraInfo, ControlNodeCloud, MessageError, RenderingState
 from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode, run, sentence
 from endo_sim_ros.nodes.configs import RenderingNodeConfig, arm_names
+from endo_sim_ros.nodes.episode_queue import EpisodeQueue
 from endo_sim_ros.nodes.model_tracker import BoundModel, ModelTracker
 from endo_sim_ros.nodes.pacing import MOST_WAITING, Pacer
 from endo_sim_ros.nodes.rendered_topics import RenderedTopics, Shown, beside, right_camera
@@ -22,6 +24,7 @@ from endo_sim_ros.rendering import RenderingConfig
 
 _MAX_SIDE = 8192  # pixels; a damaged camera_info must not make the node ask for all memory
 _POLLS = 4  # times per image that the timer asks whether one is due
+_IN_TRANSIT = 0.5  # seconds after a reset in which poses of the episode before may still come
 
 
 class RenderingNode(EndoNode):
@@ -44,9 +47,9 @@ class RenderingNode(EndoNode):
         self._info: CameraInfo | None = None
         self._right_info: CameraInfo | None = None
         self._training_info: CameraInfo | None = None
-        # Lockstep: stamps and states still to be shown, with their poses if a reset came since.
-        self._states: deque[tuple[int, ControlNodeCloud, np.ndarray | None]] = deque()
-        self._poses: dict[int, np.ndarray] = {}  # lockstep_camera: poses that wait for their state, by stamp
+        self._states: deque[tuple[int, ControlNodeCloud]] = deque()  # lockstep: stamps and states still to be shown
+        self._poses = EpisodeQueue[np.ndarray]()  # lockstep_camera: poses that wait for their state
+        self._reset_heard = 0.0  # lockstep: when the newest state at rest came
         self._pacer = Pacer()
         self._dirty, self.images, self._last_image = True, 0, 0.0
         self._output: Shown | None = None
@@ -54,7 +57,7 @@ class RenderingNode(EndoNode):
         self._blind: np.ndarray | None = None  # position [3], m, world, of the newest camera, if it sees no tissue
         self._topics = RenderedTopics(self)
         self.instruments = ShownInstruments(arm_names(self.options.arms), self._lockstep)
-        self._awaited = ""  # lockstep: the arm whose links are awaited
+        self._awaited = ""  # lockstep: what the first state waits for
         self.subscribe(messages.GAUSSIANS, self._on_model)
         self.subscribe(messages.TRAINING_CAMERAS, self._on_training_cameras)
         self.subscribe(messages.TRAINING_CAMERA_INFO, self._on_training_info)
@@ -103,11 +106,11 @@ class RenderingNode(EndoNode):
             and np.array_equal(old.F, nodes.F)
             and old.cut == nodes.cut
         )
-        last, self._nodes, self._nodes_stamp = self._nodes_stamp, nodes, messages.stamp_to_ns(message.header.stamp)
+        self._nodes, self._nodes_stamp = nodes, messages.stamp_to_ns(message.header.stamp)
         if self._lockstep:
-            if self._nodes_stamp == nodes.model_stamp_ns and old is not None and old.model_stamp_ns == nodes.model_stamp_ns:
-                self._end_episode(last)
-            self._states.append((self._nodes_stamp, nodes, None))
+            if self._nodes_stamp == nodes.model_stamp_ns:
+                self._reset_heard = time.monotonic()
+            self._states.append((self._nodes_stamp, nodes))
             if len(self._states) > MOST_WAITING:
                 self.instruments.forget(self._states.popleft()[0])
                 raise MessageError(f"{messages.CONTROL_NODES.name}: over {MOST_WAITING} states wait to be shown; one is left out")
@@ -136,9 +139,7 @@ class RenderingNode(EndoNode):
         if self._lockstep and self.options.lockstep_camera:
             stamp = messages.stamp_to_ns(message.header.stamp)
             if stamp != self.tissue.model_stamp:  # that of the state at rest, which comes before or after those of all steps
-                self._poses[stamp] = pose
-            while len(self._poses) > MOST_WAITING:
-                del self._poses[next(iter(self._poses))]
+                self._poses.put(stamp, pose, replace=True)
             self.show_states()
         elif not same:
             self._change()
@@ -220,19 +221,22 @@ class RenderingNode(EndoNode):
     def show_states(self) -> None:
         """Lockstep: one image for each state, in order, as soon as its model and its camera are there."""
         while self._states and self.tissue.bound is not None:
-            stamp, nodes, pose = self._states[0]
+            self._awaited = ""
+            (stamp, nodes), later = self._states[0], [later for later, _ in islice(self._states, 1, None)]
             if nodes.model_stamp_ns not in (self.tissue.bound.model_stamp, self.tissue.model_stamp):
                 self._leave_out("belongs to a model that is gone")
                 continue
-            camera = self._camera()
-            if self._lacks_pose(*self._states[0]):
-                if not any(other > stamp for other in self._poses):
-                    return
-                self._leave_out(f"has no pose with its stamp on {messages.CAMERA_POSE.name}")
-                continue
-            at_rest = stamp == nodes.model_stamp_ns  # the first observation
-            if self.options.lockstep_camera and not at_rest:
-                camera = camera and replace(camera, pose=self._poses[stamp] if pose is None else pose)
+            camera, at_rest = self._camera(), stamp == nodes.model_stamp_ns  # the first observation
+            if self._posed_camera(stamp, nodes):
+                pose = self._poses.find(stamp, later)
+                if pose is None:
+                    ended = nodes.model_stamp_ns in later and time.monotonic() - self._reset_heard > _IN_TRANSIT
+                    if not self._poses.passed(later) and not ended:
+                        self._awaited = f"a pose on {messages.CAMERA_POSE.name}"
+                        return
+                    self._leave_out(f"has no pose with its stamp on {messages.CAMERA_POSE.name}")
+                    continue
+                camera = camera and replace(camera, pose=pose)
             if not self.tissue.bound.follows(nodes) or not camera or not self.tissue.has_cut(nodes):
                 return
             instruments = self._await_instruments(stamp, self.tissue.bound)
@@ -240,21 +244,19 @@ class RenderingNode(EndoNode):
                 return
             self._states.popleft()
             self.instruments.forget(stamp)
+            self._poses.forget(stamp)
             if at_rest and self._states and self._states[0][0] == stamp:  # a reset after a reset
                 continue
-            if pose is None and not at_rest:
-                self._poses = {other: later for other, later in self._poses.items() if other > stamp}
             self._publish(self._render(self.tissue.bound, nodes, camera, instruments), stamp)
 
     def _await_instruments(self, stamp: int, bound: BoundModel) -> PosedInstruments | None | Literal[False]:
         """Lockstep: the instruments at the time of the first state that waits; False while links or their drawing are awaited."""
-        self._awaited = ""
         if not self.options.instruments:
             return None
         awaited = [arm for arm in self.instruments.arms if self.count_publishers(messages.tool_links(arm).name)]
-        links = self.instruments.at(stamp, [later for later, *_ in self._states if later != stamp], awaited)
+        links = self.instruments.at(stamp, [later for later, _ in self._states if later != stamp], awaited)
         if isinstance(links, str):
-            self._awaited = links
+            self._awaited = messages.tool_links(links).name
             return False
         return self._posed(bound, links)
 
@@ -268,27 +270,14 @@ class RenderingNode(EndoNode):
             self.report_error(sentence("instruments", error))
             return None
 
-    def _lacks_pose(self, stamp: int, nodes: ControlNodeCloud, pose: np.ndarray | None) -> bool:
-        """Lockstep: whether a state still waits for its camera; the one at rest does not, as nobody sends one for it."""
-        wanted = self.options.lockstep_camera and stamp != nodes.model_stamp_ns
-        return wanted and pose is None and stamp not in self._poses
-
-    def _end_episode(self, last: int) -> None:
-        """A reset: states that still wait to be shown keep their poses, as the same stamps come again; those without are left out.
-
-        No state will want poses later than the last stamp.
-        """
-        waiting = [state[0] for state in self._states if self._lacks_pose(*state)]
-        states = [state for state in self._states if not self._lacks_pose(*state)]
-        self._states = deque((stamp, nodes, self._poses.pop(stamp, None) if pose is None else pose) for stamp, nodes, pose in states)
-        self._poses = {stamp: pose for stamp, pose in self._poses.items() if stamp <= last}
-        if waiting:
-            which = ", ".join(f"{stamp * 1e-9:.6f} s" for stamp in waiting)
-            self.report_error(f"reset: what waited for its pose on {messages.CAMERA_POSE.name} is not shown, the state of {which}")
+    def _posed_camera(self, stamp: int, nodes: ControlNodeCloud) -> bool:
+        """Lockstep: whether a state has a camera of its own; the one at rest has not, as nobody sends one for it."""
+        return self.options.lockstep_camera and stamp != nodes.model_stamp_ns
 
     def _leave_out(self, why: str) -> None:
         stamp = self._states.popleft()[0]
         self.instruments.forget(stamp)
+        self._poses.forget(stamp)
         self.report_error(f"the state of {stamp * 1e-9:.6f} s is not shown: it {why}")
 
     def _build(self) -> None:
@@ -365,10 +354,8 @@ class RenderingNode(EndoNode):
             return WARN, "; ".join(self.instruments.undrawn.values()), values
         if self._lockstep:
             waiting = f", {len(self._states)} states wait" if self._states else ""
-            if self._states and self._lacks_pose(*self._states[0]):
-                waiting += f" for a pose on {messages.CAMERA_POSE.name} of {self._states[0][0] * 1e-9:.6f} s"
-            elif self._states and self._awaited:
-                waiting += f" for {messages.tool_links(self._awaited).name} of {self._states[0][0] * 1e-9:.6f} s"
+            if self._states and self._awaited:
+                waiting += f" for {self._awaited} of {self._states[0][0] * 1e-9:.6f} s"
             return OK, f"in lockstep, {self.images} images rendered{waiting}", values
         return OK, "rendering", values
 

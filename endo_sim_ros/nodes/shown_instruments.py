@@ -1,8 +1,6 @@
 """The instruments of arms as they are published: their tools, where their links are at the time of each state, and what draws them."""
 
-from collections import deque
 from collections.abc import Collection, Sequence
-from itertools import islice, pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -15,6 +13,7 @@ from endo_sim_ros.instruments.drawing import FIRST_LINK, InstrumentDrawing, Pose
 from endo_sim_ros.instruments.urdf_reader import load_shape
 from endo_sim_ros.messages import MessageError
 from endo_sim_ros.nodes.background import Background
+from endo_sim_ros.nodes.episode_queue import EpisodeQueue
 from endo_sim_ros.nodes.pacing import MOST_WAITING
 
 
@@ -33,7 +32,7 @@ class ShownInstruments:
         self.undrawn: dict[str, str] = {}
         """Why arms are not drawn, in a sentence each, by their names."""
         self._tools: dict[str, tuple[list[Part], list[Capsule]]] = {}
-        self._links: dict[str, deque[tuple[int, np.ndarray]]] = {arm: deque(maxlen=MOST_WAITING if lockstep else 1) for arm in arms}
+        self._links = {arm: EpisodeQueue[np.ndarray](MOST_WAITING if lockstep else 1) for arm in arms}
         self._background = Background()
         self._key: Any = None  # of what is drawn with
         self._drawing: InstrumentDrawing | None = None
@@ -68,13 +67,13 @@ class ShownInstruments:
         poses, links = messages.decode_poses(message, topic), self._links[arm]
         if len(poses) not in (0, len(LINKS)):
             raise MessageError(f"{topic}: {len(poses)} poses; publish those of {', '.join(LINKS)}, or none while they are not known")
-        moved = not links or not np.array_equal(links[-1][1], poses)
-        links.append((messages.stamp_to_ns(message.header.stamp), poses))
+        moved = links.newest is None or not np.array_equal(links.newest, poses)
+        links.put(messages.stamp_to_ns(message.header.stamp), poses)
         return moved
 
     def newest(self) -> dict[str, np.ndarray]:
         """Where the links [5, 4, 4] of each arm are that has said so."""
-        return {arm: links[-1][1] for arm, links in self._links.items() if links and len(links[-1][1])}
+        return {arm: links.newest for arm, links in self._links.items() if links.newest is not None and len(links.newest)}
 
     def at(self, stamp: int, later: Sequence[int], published: Collection[str]) -> dict[str, np.ndarray] | str:
         """Lockstep: where the links of each arm are at the time of a state, or the name of an arm whose links are awaited.
@@ -86,10 +85,9 @@ class ShownInstruments:
         """
         found = {}
         for arm, links in self._links.items():
-            self._skip_episodes(links, stamp, later)
-            poses = next((poses for when, poses in _first_episode(links) if when == stamp), None)
+            poses = links.find(stamp, later)
             if poses is None:
-                if (arm in published or arm in self._types) and not any(when in later for when, _ in links):
+                if (arm in published or arm in self._types) and not links.passed(later):
                     return arm
             elif len(poses):
                 if arm not in self._types:
@@ -97,22 +95,10 @@ class ShownInstruments:
                 found[arm] = poses
         return found
 
-    @staticmethod
-    def _skip_episodes(links: deque[tuple[int, np.ndarray]], stamp: int, later: Sequence[int]) -> None:
-        """Drop what is left of episodes before that of a state, whose own states never came."""
-        while any(when == stamp for when, _ in links):
-            first = _first_episode(links)
-            if any(when == stamp or later and when == later[0] for when, _ in first):
-                return
-            for _ in first:
-                links.popleft()
-
     def forget(self, stamp: int) -> None:
         """Lockstep: a state was shown, or is not to be; what arms said before and at it is not needed any more."""
         for links in self._links.values():
-            if any(when == stamp for when, _ in _first_episode(links)):
-                while links.popleft()[0] != stamp:
-                    pass
+            links.forget(stamp)
 
     def posed(self, links: dict[str, np.ndarray], config: DrawingConfig, device: str) -> PosedInstruments | None | Literal[False]:
         """What draws the instruments where their links are; None if there are none, False while that is prepared.
@@ -159,9 +145,3 @@ class ShownInstruments:
     def stop(self) -> None:
         """Prepare nothing more."""
         self._background.stop()
-
-
-def _first_episode(links: Sequence[tuple[int, np.ndarray]]) -> list[tuple[int, np.ndarray]]:
-    """The first stamped links of an arm, until stamps go back."""
-    end = next((i for i, (before, after) in enumerate(pairwise(links), 1) if after[0] < before[0]), len(links))
-    return list(islice(links, end))

@@ -235,7 +235,7 @@ def test_an_image_may_wait_for_the_camera_of_its_stamp(graph):
     assert graph.call(Trigger, "/physics_node/reset").success
     await_images(graph, 7)
     assert stamps(graph, IMAGES)[-1] == MODEL_STAMP
-    graph.refused("rendering_node", "what waited for its pose", "0.040000 s")
+    graph.refused("rendering_node", "is not shown: it has no pose", "0.040000 s")
 
     def commanded(k: int, x: float) -> None:
         pose = np.eye(4)

@@ -60,8 +60,9 @@ def expected_at(shift):
     return DeformableRenderer(sheet(), None, RenderingConfig(device="cpu")).views([CAMERA], instruments=posed)[0]
 
 
-def start(mode):
-    rclpy.init(args=["--ros-args", "-p", "arms:=[PSM1, PSM2]", "-p", "device:=cpu", "-p", f"mode:={mode}"])
+def start(mode, *parameters):
+    given = ("arms:=[PSM1, PSM2]", "device:=cpu", f"mode:={mode}", *parameters)
+    rclpy.init(args=["--ros-args", *(word for each in given for word in ("-p", each))])
     bench = Bench()
     bench.hear(messages.RENDERED_IMAGE)
     bench.add(RenderingNode)
@@ -196,6 +197,27 @@ def test_in_lockstep_a_renderer_that_lags_episodes_behind_shows_each_state_with_
     assert [messages.stamp_to_ns(image.header.stamp) for image in images] == [stamp for stamp, _ in shown]
     for image, (stamp, shift) in zip(images, shown):
         assert np.array_equal(messages.decode_image(image), expected_at(shift).image), stamp
+    bench.close()
+    rclpy.try_shutdown()
+
+
+def test_in_lockstep_poses_of_the_camera_that_come_after_the_states_of_two_episodes_are_those_of_their_own():
+    bench = start("lockstep", "lockstep_camera:=true")
+    poses = bench.hear(messages.RENDERED_POSE)
+    send_model(bench)
+    send_camera(bench)
+    bench.status("rendering_node", "in lockstep", OK)
+    states = [5 * S, 6 * S, 7 * S] * 2
+    for stamp in states:
+        send_state(bench, stamp)
+    for k, stamp in enumerate(states):
+        if stamp > 5 * S:
+            pose = make_pose([0.001 * k, 0, 0], [1, 0, 0, 0])
+            bench.publish(messages.CAMERA_POSE, messages.encode_pose(pose, stamp, "world"))
+    bench.until(lambda: len(poses) == len(states), "all pictures", 60)
+    assert [messages.stamp_to_ns(pose.header.stamp) for pose in poses] == states
+    shown = [messages.decode_pose(pose, "world", "")[0, 3] for pose in poses]
+    assert [shown[k] for k in (1, 2, 4, 5)] == pytest.approx([0.001, 0.002, 0.004, 0.005])
     bench.close()
     rclpy.try_shutdown()
 

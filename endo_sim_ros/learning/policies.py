@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, Protocol, cast, get_args
 
 import numpy as np
 
@@ -146,7 +146,7 @@ class NetworkPolicy:
     def _which_fit(self, shapes: list[tuple[int, ...]]) -> str:
         """For which other actions layers of these shapes are, as the end of a sentence; empty for none."""
         hidden = [shape[-1] for shape in shapes[:-1]]
-        fitting = [name for name in ACTION_SIZES if name != self.actions and shapes == self.sizes(self.task, hidden, name)]
+        fitting = [name for name in get_args(Actions) if name != self.actions and shapes == self.sizes(self.task, hidden, name)]
         return (
             f"; they fit actions = {' or '.join(map(repr, fitting))}; make a NetworkPolicy of the one it was trained for, and save it"
             if fitting

@@ -129,13 +129,21 @@ class ArmKinematics:
         return self._jacobian(frames, (frames[..., -1, :, :] @ self.tooltip_offset)[..., :3, 3])
 
     def body_jacobian(self, joints: ArrayLike) -> np.ndarray:
-        """The Jacobian [..., 6, n] for velocities in the axes of the tip; else as `jacobian`."""
+        """Geometric Jacobian [..., 6, n] at joint positions [..., n], rad and m, in the frame of the tip; raises as `check_joints` does.
+
+        Times joint speeds, rad/s and m/s, it gives the velocity of the tip, m/s, and the angular velocity, rad/s, both relative to the
+        base and in the axes of the tip.
+        """
         R = np.swapaxes(self.tip_pose(joints)[..., :3, :3], -1, -2)
         J = self.jacobian(joints)
         return np.concatenate([R @ J[..., :3, :], R @ J[..., 3:, :]], -2)
 
     def spatial_jacobian(self, joints: ArrayLike) -> np.ndarray:
-        """The Jacobian [..., 6, n] for the velocity of what moves with the tip and is at the origin of the base; else as `jacobian`."""
+        """Spatial Jacobian [..., 6, n] at joint positions [..., n], rad and m, in the frame of the base; raises as `check_joints` does.
+
+        Times joint speeds, rad/s and m/s, it gives the velocity, m/s, of the point that moves with the tip and is at the origin of the
+        base, and the angular velocity, rad/s, both in the axes of the base.
+        """
         J, tip = self.jacobian(joints), self.tip_pose(joints)[..., :3, 3]
         at_origin = J[..., :3, :] + np.cross(tip[..., :, None], J[..., 3:, :], axis=-2)
         return np.concatenate([at_origin, J[..., 3:, :]], -2)

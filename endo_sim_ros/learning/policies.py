@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, cast, get_args
 
 import numpy as np
 
@@ -138,7 +138,20 @@ class NetworkPolicy:
         sizes = self.sizes(task, [layer.shape[-1] for layer in self.layers[:-1]], actions)
         shapes = [layer.shape[-2:] for layer in self.layers]
         if shapes != sizes or not all(np.isfinite(layer).all() for layer in self.layers):
-            raise ValueError(f"policy for {task}: layers of {shapes} do not fit, expected {sizes} of finite numbers")
+            raise ValueError(
+                f"policy for {task}: layers of {shapes} do not fit, expected {sizes} of finite numbers for actions = {actions!r}"
+                + self._which_fit(shapes)
+            )
+
+    def _which_fit(self, shapes: list[tuple[int, ...]]) -> str:
+        """For which other actions layers of these shapes are, as the end of a sentence; empty for none."""
+        hidden = [shape[-1] for shape in shapes[:-1]]
+        fitting = [name for name in get_args(Actions) if name != self.actions and shapes == self.sizes(self.task, hidden, name)]
+        return (
+            f"; they fit actions = {' or '.join(map(repr, fitting))}; make a NetworkPolicy of the one it was trained for, and save it"
+            if fitting
+            else ""
+        )
 
     @staticmethod
     def sizes(task: str, hidden: Sequence[int], actions: Actions = "cartesian") -> list[tuple[int, int]]:
@@ -158,7 +171,17 @@ class NetworkPolicy:
         """Nothing to do: the network has no memory."""
 
     def act(self, observations: np.ndarray) -> np.ndarray:
-        """Actions [B, 4 or 7], not clipped, for state observations [B, n]."""
+        """Actions [B, 4 or 7], not clipped, for state observations [B, n].
+
+        Raises:
+            ValueError: If they are not as many as the policy was made for.
+        """
+        expected = self.layers[0].shape[-2] - 1
+        if observations.shape[1:] != (expected,):
+            raise ValueError(
+                f"the policy for {self.task} with actions = {self.actions!r} takes observations [B, {expected}], got "
+                f"{list(observations.shape)}; make the task with these actions"
+            )
         values = observations.astype(np.float64)
         for number, layer in enumerate(self.layers):
             values = np.tanh(values) if number else values
@@ -183,15 +206,23 @@ class NetworkPolicy:
             ValueError: If it is something else; the message names the file.
         """
         try:
-            with np.load(path, allow_pickle=False) as file:
+            with Path(path).open("rb") as opened, np.load(opened, allow_pickle=False) as file:
                 layers = [file[f"layer{i}"] for i in range(sum(name.startswith("layer") for name in file.files))]
-                actions: Any = str(file["actions"]) if "actions" in file.files else "cartesian"
-                if actions not in ACTION_SIZES:
-                    raise ValueError(f"nobody knows its actions, {actions[:40]!r}")
-                if sum(layer.size for layer in layers) > _MOST_WEIGHTS or not layers or any(layer.ndim != 2 for layer in layers):
-                    raise ValueError("it has no layers, or too large ones")
-                return cls(str(file["task"]), layers, actions)
-        except Exception as error:  # zipfile, numpy and the file system have a type each
+                task, actions = str(file["task"]), str(file["actions"]) if "actions" in file.files else "cartesian"
+        except OSError as error:
+            raise ValueError(f"{path}: not a readable policy ({error})") from error
+        except Exception as error:  # zipfile and numpy have a type each, and advise on what only programmers can do
+            raise ValueError(f"{path} is no policy file; give the policy.npz that `endo-sim train` wrote") from error
+        if actions not in ACTION_SIZES:
+            known = ", ".join(ACTION_SIZES)
+            raise ValueError(
+                f"{path}: not a readable policy (its actions are {actions[:40]!r}, known are {known}; train one with one of these)"
+            )
+        if sum(layer.size for layer in layers) > _MOST_WEIGHTS or not layers or any(layer.ndim != 2 for layer in layers):
+            raise ValueError(f"{path}: not a readable policy (it has no layers, or too large ones)")
+        try:
+            return cls(task, layers, cast(Actions, actions))
+        except (ValueError, TypeError) as error:
             raise ValueError(f"{path}: not a readable policy ({error})") from error
 
 

@@ -20,6 +20,8 @@ from endo_sim_ros.reconstruction.surfaces import Surfaces
 
 _TOO_NEAR = 0.002  # metres; a guess below it says that the camera has hardly moved
 
+_FEWEST = 10  # points that give a scene a shape
+
 
 class _Points(NamedTuple):
     """Surface points with what a Gaussian needs."""
@@ -39,6 +41,7 @@ def initial_model(
     options: InitialModelConfig = InitialModelConfig(),
     progress: StageProgress = StageProgress(),
     device: str = "cpu",
+    share: float = 1.0,
 ) -> GaussianModel:
     """Isotropic Gaussians at the back-projected depth of the views, and at triangulated points where no depth reaches.
 
@@ -46,22 +49,24 @@ def initial_model(
         views: Training views; those without a depth prior have no part in the surface.
         points, colors: Triangulated points [N, 3] (m, world) and their RGB in [0, 1].
         tolerance: Relative difference of depth at which two views contradict each other.
-        max_gaussians: Largest number of Gaussians.
+        max_gaussians: Largest number of Gaussians of a scene.
         sh_degree: Degree of the spherical harmonics.
         options: Opacity, and which points float before the surface.
         progress: Reported to by views.
         device: Where views are compared.
+        share: Part of ``max_gaussians`` that may be used here, above 0 and up to 1; at least one is used.
 
     Raises:
-        SequenceError: If neither depth nor points give the scene a shape.
+        SequenceError: If neither depth nor points give the scene a shape, or the number of Gaussians leaves next to none of it.
     """
+    most = max(int(share * max_gaussians), 1)
     surfaces = [view for view in views if (view.surface > 0).any()]
     parts = [_Points(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))]
     chosen: list[np.ndarray] = []
     if surfaces:
         compared = Surfaces(surfaces, device)
         chosen = compared.chosen(tolerance, progress)
-        stride = _stride(chosen, max_gaussians)
+        stride = _stride(chosen, most)
         taken = [pixels & _lattice(pixels.shape, stride) for pixels in chosen]
         for view, pixels, seen in zip(surfaces, taken, compared.mean_colors(taken, tolerance, progress)):
             depth, centres = view.surface[pixels].astype(np.float64), np.argwhere(pixels)[:, ::-1] + 0.5
@@ -71,12 +76,18 @@ def initial_model(
         useful &= np.any([view.camera.sees(points) for view in views], 0)
     parts.append(_in_holes(parts, points[useful], colors[useful]))
     positions, *others = (np.concatenate(arrays) for arrays in zip(*parts))
-    if len(positions) < 10:  # stray matches
+    shown = sum(int(pixels.sum()) for pixels in chosen)
+    if len(positions) < _FEWEST <= shown:
+        raise SequenceError(
+            f"max_gaussians = {max_gaussians} is too small: of {shown} pixels with depth in {len(views)} views it leaves {len(positions)} "
+            "to start from; give some thousands, or 0 for as many as the views can tell of"
+        )
+    if len(positions) < _FEWEST:  # stray matches
         raise SequenceError(
             f"only {len(positions)} scene points could be found in {len(views)} views; give depth or a right image, "
             "views that overlap from different positions, or check the poses"
         )
-    tensors = [torch.from_numpy(array[:max_gaussians].astype(np.float32)) for array in (positions, *others)]
+    tensors = [torch.from_numpy(array[:most].astype(np.float32)) for array in (positions, *others)]
     return GaussianModel.from_points(*tensors, opacity=options.opacity, sh_degree=sh_degree)
 
 

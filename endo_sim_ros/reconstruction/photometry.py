@@ -63,8 +63,8 @@ def fit_light(
         reference: Distance at which brightness is the point's own, metres.
         tolerance: Relative difference from a view's depth from which on a point is taken to be hidden there.
         options: The prior, and which observations count.
-        light, exposure: Whether to fit each; what is not fitted stays at zero.
-        progress: Reported to by views.
+        light, exposure: Whether to fit each; what is not fitted stays at next to zero, below 1e-6.
+        progress: Reported to by views, and asked whether to go on while the light is fitted.
     """
     points = points[:: max(-(-len(points) // options.max_points), 1)]
     observed = progress.map(lambda view: _well_seen(view, points, reference, tolerance, options), views)
@@ -82,11 +82,12 @@ def fit_light(
     spread = np.concatenate([[0.3, 6.0, 0.3, 0.3] if light else np.full(4, off), np.full(count, 0.7 if exposure else off)])
     prior = np.concatenate([prior, np.zeros(count)])
     y = np.log(colors).mean(1)
-    solution, weights = _solve(A, y, index, len(points), prior, spread, options.noise)
+    solution, weights = _solve(A, y, index, len(points), prior, spread, options.noise, progress)
     # The exposure of each channel by itself, with the light of all.
     shaded = quantities @ solution[:4]
     channels = [np.log(channel) - shaded for channel in colors.T]
-    exposures = np.stack([_solve(gains, c, index, len(points), solution[4:], spread[4:], options.noise)[0] for c in channels], 1)
+    by_channel = [_solve(gains, c, index, len(points), solution[4:], spread[4:], options.noise, progress)[0] for c in channels]
+    exposures = np.stack(by_channel, 1)
     if exposure:
         exposures = exposures - np.average(shaded[:, None] + exposures[view], axis=0, weights=weights)
     return solution[:4], exposures
@@ -128,11 +129,15 @@ def remove_light(
 def fit_exposure(
     exposures: np.ndarray, brightness: np.ndarray, options: PhotometryConfig = PhotometryConfig()
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """Response and levels [3] of the automatic exposure from each view's log exposure [V, 3] and log brightness [V] without it,
-    and what they leave of the exposures [V, 3].
+    """Response and levels [3] of the automatic exposure, see `Light`, and what they leave of the exposures [V, 3].
 
-    See `Light`. A camera that evens out most of the brightness is the prior, as brightness may be much the same in all views; exposures
-    that hardly vary speak for a fixed one.
+    A camera that evens out most of the brightness is the prior, as brightness may be much the same in all views; exposures
+    that hardly vary speak for a fixed one. Levels and what is left are natural logarithms, as exposures are.
+
+    Args:
+        exposures: Natural logarithm of each view's exposure [V, 3], red, green and blue; `fit_light` finds them.
+        brightness: Natural logarithm of each picture's brightness [V] in the light, without the exposure.
+        options: The response that is the prior, from 0 of a fixed exposure to 1 of one that evens out all.
     """
     centred, mean = brightness - brightness.mean(), exposures.mean(1)
     noise = np.clip(mean.std(), 0.01, 0.04)  # what the logarithm of an exposure varies by itself, the less the less it varies at all
@@ -163,7 +168,14 @@ def _well_seen(
 
 
 def _solve(
-    A: Any, y: np.ndarray, index: np.ndarray, count: int, prior: np.ndarray, spread: np.ndarray, noise: float
+    A: Any,
+    y: np.ndarray,
+    index: np.ndarray,
+    count: int,
+    prior: np.ndarray,
+    spread: np.ndarray,
+    noise: float,
+    progress: StageProgress,
 ) -> tuple[np.ndarray, np.ndarray]:
     """x [P] that minimises Σ w (y − A x − own_index)² / noise² + Σ (x − prior)² / spread², and the weights w [M]; A [M, P] is sparse.
 
@@ -173,6 +185,7 @@ def _solve(
     trust = min(300 / points, 1) / noise**2  # neighbouring points err alike: no more than this many are worth counting
     weights, x = np.ones(len(y)), prior
     for _ in range(10):
+        progress.check()
         total = np.bincount(index, weights, count).clip(1e-9)
         about = lambda values: (np.bincount(index, weights * values, count) / total)[index]  # noqa: B023
         by_point: Any = sparse.csr_matrix((weights, (index, np.arange(len(y)))), (count, len(y))) @ A

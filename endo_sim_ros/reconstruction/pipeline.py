@@ -160,8 +160,8 @@ def sweep_planes(scene: PreparedScene, config: ReconstructionConfig, progress: S
     swept = sweep_depth(scene.views, scene.points.positions, config.depth_tolerance, config.sweep, config.matching, device, progress)
     pixels, before, after, other = np.sum([_depth_shares(*pair) for pair in zip(scene.views, swept)], 0)
     sentence = (
-        f"of {before / pixels:.0%} of the tissue with interpolated depth {(after - other) / pixels:.0%} stay, being near scene points; "
-        f"the views matched plane by plane tell {other / pixels:.0%}"
+        f"{before / pixels:.0%} of the tissue had interpolated depth; now {(after - other) / pixels:.0%} have it, near scene points, "
+        f"{other / pixels:.0%} have depth from views matched plane by plane, and {1 - after / pixels:.0%} have none"
     )
     return replace(scene, views=tuple(swept)).decided(sentence, logging.INFO)
 
@@ -231,7 +231,6 @@ def size_training(scene: PreparedScene, config: ReconstructionConfig, progress: 
 
 def place_gaussians(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Set `model` to the Gaussians that training starts from, `depth` to their median depth in the views, and `exposures` to zeros."""
-    most = max(int(config.initial.seen_share * scene.max_gaussians) if config.extrapolation else scene.max_gaussians, 1)
     views, points = list(scene.views), scene.points
     fewest = config.matching.min_points
     if len(points.positions) >= fewest and (config.initialization == "points" or scene.depth_source == "none"):
@@ -246,11 +245,12 @@ def place_gaussians(scene: PreparedScene, config: ReconstructionConfig, progress
         points.positions,
         points.colors,
         tolerance=config.depth_tolerance,
-        max_gaussians=most,
+        max_gaussians=scene.max_gaussians,
         sh_degree=config.sh_degree,
         options=config.initial,
         progress=progress,
         device=pick_device(config.device),
+        share=config.initial.seen_share if config.extrapolation else 1.0,
     )
     positions = model.means.numpy().astype(np.float64)
     depths = np.concatenate(progress.map(lambda view: view.camera.project(positions)[1], views))

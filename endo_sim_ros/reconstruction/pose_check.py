@@ -8,7 +8,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.features import epipolar_distance, slopes
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.reconstruction.progress import StageProgress
@@ -41,12 +40,15 @@ def misposed(
         options: When a pose is wrong.
         matching: How far a match may lie beside where a motion of the camera has it, and how many matches tell anything.
         progress: Reported to by pairs of views.
+
+    Raises:
+        Cancelled: If progress does.
     """
-    check = _PoseCheck([frame.camera for frame in frames], depths or [None] * len(frames), options, matching)
+    check = _PoseCheck(frames, depths or [None] * len(frames), options, matching, progress)
     moving = [match for match in progress.map(check.of_one_motion, matches) if len(match.first)]
     wrong = check.outvoted([(match.views, error) for match, error in zip(moving, progress.map(check.error_in_two, moving))])
     moving = [match for match in moving if not set(match.views) & set(wrong)]
-    tracks = _tracks(moving, matching.min_points)
+    tracks = _tracks(moving, matching.min_points, progress)
     errors = progress.map(lambda track: check.error_in_three(*track), tracks)
     return sorted(wrong + check.outvoted([(views, error) for (views, _), error in zip(tracks, errors)]))
 
@@ -55,9 +57,16 @@ class _PoseCheck:
     """How far off features of several views are, and which views are to blame; errors are in widths of the image."""
 
     def __init__(
-        self, cameras: Sequence[Camera], depths: Sequence[np.ndarray | None], options: PosesConfig, matching: MatchingConfig
+        self,
+        frames: Sequence[Frame],
+        depths: Sequence[np.ndarray | None],
+        options: PosesConfig,
+        matching: MatchingConfig,
+        progress: StageProgress,
     ) -> None:
-        self._cameras, self._depths, self._options, self._matching = cameras, depths, options, matching
+        self._cameras = [frame.camera for frame in frames]
+        self._stamps = [f"{frame.stamp_ns * 1e-9:.3f} s" for frame in frames]
+        self._depths, self._options, self._matching, self._progress = depths, options, matching, progress
 
     def of_one_motion(self, matches: Matches) -> Matches:
         """The matches that fit the motion of the camera that most fit; none where it may be an accident."""
@@ -120,6 +129,7 @@ class _PoseCheck:
         limit = min(max(options.min_error, options.outlier_factor * usual), options.max_error)
         wrong: list[int] = []
         while True:  # the worst first: what contradicts it may be right without it
+            self._progress.check()
             left = [(views, error) for views, error in errors if not set(views) & set(wrong)]
             bad, all_of, total = np.zeros((3, len(self._cameras)))
             for views, error in left:
@@ -135,12 +145,12 @@ class _PoseCheck:
         wrong = wrong if len(agreeing) > len(wrong) else []
         unsettled = {tuple(sorted(views)) for views, error in errors if error > limit and not set(views) & set(wrong)}
         if unsettled:
-            groups = ", ".join(" and ".join(map(str, views)) for views in sorted(unsettled)[:5])
-            log.warning("the poses of views %s contradict what they see; check them", groups)
+            groups = ", ".join(" and ".join(self._stamps[view] for view in views) for views in sorted(unsettled)[:5])
+            log.warning("the poses of the views at %s contradict what these see; check these poses and their stamps", groups)
         return wrong
 
 
-def _tracks(matches: Sequence[Matches], least: int) -> list[tuple[_Views, list[np.ndarray]]]:
+def _tracks(matches: Sequence[Matches], least: int, progress: StageProgress) -> list[tuple[_Views, list[np.ndarray]]]:
     """Three views each, with their pixels [M, 2] of the features that the first shares with both others, if they are enough."""
     ends: dict[int, list[tuple[int, np.ndarray, np.ndarray]]] = {}
     for (i, j), first, second in matches:
@@ -148,6 +158,7 @@ def _tracks(matches: Sequence[Matches], least: int) -> list[tuple[_Views, list[n
         ends.setdefault(j, []).append((i, second, first))
     found = []
     for view, others in ends.items():
+        progress.check()
         for (j, here_j, there_j), (k, here_k, there_k) in combinations(others, 2):
             _, of_j, of_k = np.intersect1d(here_j @ [1, 1j], here_k @ [1, 1j], return_indices=True)
             if len(of_j) >= least:

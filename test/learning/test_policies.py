@@ -58,9 +58,29 @@ def test_a_network_is_saved_and_loaded_and_nothing_else_is(tmp_path):
     (tmp_path / "no.npz").write_text("no")
     np.savez(tmp_path / "evil.npz", task=np.array("retraction"), layer0=np.array([print], dtype=object))
     np.savez(tmp_path / "small.npz", task=np.array("retraction"), layer0=np.zeros((3, 4)))
-    for name in ("no", "evil", "small", "missing", "feet"):
-        with pytest.raises(ValueError, match=f"{name}.npz: not a readable policy"):
+    with np.load(tmp_path / "joints.npz") as file:
+        np.savez(tmp_path / "unnamed.npz", **{name: file[name] for name in file.files if name != "actions"})
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    (tmp_path / "array.npy").rename(tmp_path / "array.npz")
+    messages = {
+        "small": "not a readable policy .*do not fit, expected [^;]*$",
+        "missing": "not a readable policy .*No such file",
+        "feet": "its actions are 'feet', known are cartesian, joints, joint_positions; train one",
+        "unnamed": "expected .* for actions = 'cartesian'; they fit actions = 'joints' or 'joint_positions'; make",
+    }
+    for name, message in messages.items():
+        with pytest.raises(ValueError, match=f"{name}.npz: .*{message}"):
             NetworkPolicy.load(tmp_path / f"{name}.npz")
+    for name in ("no", "evil", "array"):
+        with pytest.raises(ValueError, match=rf"{name}.npz is no policy file; give the policy.npz that `endo-sim train` wrote$"):
+            NetworkPolicy.load(tmp_path / f"{name}.npz")
+
+
+def test_a_policy_refuses_observations_that_it_was_not_made_for():
+    for policy, wrong in ((joint_policy(), 16), (linear_policy(), 22)):
+        expected = rf"retraction with actions = '{policy.actions}' takes observations \[B, {38 - wrong}\], got \[3, {wrong}\]"
+        with pytest.raises(ValueError, match=expected):
+            policy.act(np.zeros((3, wrong), np.float32))
 
 
 @pytest.mark.slow

@@ -130,6 +130,11 @@ def test_no_more_gaussians_than_asked_for_and_larger_ones_instead(views):
     assert len(around(1)) == 1
 
 
+def test_without_reach_nothing_is_added(views):
+    nothing = GaussianModel.from_points(torch.zeros(1, 3), torch.zeros(1, 3), torch.full((1,), 1e-6), 0.5)
+    assert extrapolate(nothing, with_prior(views[4:5]), np.empty((0, 3)), np.zeros(4), np.zeros((1, 3)), 0.1, 0.0, 60_000) is nothing
+
+
 def test_a_view_that_knows_next_to_no_depth_tells_nothing_of_its_surroundings(views):
     depth = np.zeros_like(views[4].depth)
     depth[60:62, 80:90] = views[4].depth[60:62, 80:90]

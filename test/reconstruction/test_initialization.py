@@ -84,6 +84,13 @@ def test_too_few_points_are_one_clear_error(small):
     assert len(placed([empty], points=np.random.default_rng(0).random((10, 3)))) == 10
 
 
+def test_a_limit_that_leaves_next_to_nothing_is_named(small):
+    points = np.empty((0, 3))
+    for share, most in ((1.0, 3), (0.5, 7)):
+        with pytest.raises(SequenceError, match=rf"max_gaussians = {most} is too small: of \d+ pixels with depth in 1 views it leaves \d "):
+            initial_model(with_prior(small[:1]), points, points, TOLERANCE, most, share=share)
+
+
 @pytest.mark.slow
 def test_surfaces_are_compared_as_by_plain_numpy(small):
     random = np.random.default_rng(0)

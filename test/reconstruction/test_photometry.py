@@ -11,6 +11,7 @@ from lit_wall import CAMERA, LAMP, wall
 from endo_sim_ros.core.cameras import look_at
 from endo_sim_ros.core.light import Light
 from endo_sim_ros.reconstruction.photometry import Drift, fit_exposure, fit_light, remove_light
+from endo_sim_ros.reconstruction.progress import Cancelled, StageProgress
 from endo_sim_ros.reconstruction.scene import TrainingView
 from endo_sim_ros.reconstruction.stage_configs import PhotometryConfig
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
@@ -57,6 +58,19 @@ def test_what_is_switched_off_stays_off():
     theta, exposures = fit_light(frames, points, 0.1, 0.1, exposure=False)
     np.testing.assert_allclose(exposures, 0, atol=1e-6)
     assert theta[1] > 4
+
+
+def test_the_fit_of_the_light_can_be_cancelled():
+    frames = lit_views(LAMP, [0.0, 0.3], [np.eye(4), look_at(np.array([0.02, 0, 0]), np.array([0, 0, 0.1]))])
+    finished = []
+
+    def cancel(stage, done, total):
+        finished.extend([done] * (done == total))
+        if len(finished) > 1:  # the first says that all views were looked at
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        fit_light(frames, wall().means.numpy().astype(np.float64), 0.1, 0.1, progress=StageProgress("photometry", cancel))
 
 
 def test_without_two_views_of_a_point_the_prior_counts():

@@ -1,14 +1,19 @@
 """Views whose poses contradict the others."""
 
 import dataclasses
+from itertools import combinations
 
 import cv2
 import numpy as np
 import pytest
 from short_training import bare, options
 
+from endo_sim_ros.core.cameras import Camera, intrinsic_matrix, rigid_pose
+from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.reconstruction import prepare
 from endo_sim_ros.reconstruction.pose_check import misposed
+from endo_sim_ros.reconstruction.progress import StageProgress
+from endo_sim_ros.reconstruction.scene import Matches
 from endo_sim_ros.reconstruction.stage_configs import MatchingConfig, PosesConfig
 from endo_sim_ros.reconstruction.triangulation import match_features
 from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
@@ -38,6 +43,34 @@ def misplaced(frame, fault):
     return dataclasses.replace(frame, camera=frame.camera.at(pose))
 
 
+def shared(poses):
+    """Posed frames, black, and points of a bent sheet that all pairs of them share."""
+    K, sheet = intrinsic_matrix(200, 200, 80, 64), np.random.default_rng(0).uniform([-0.02, -0.02, 0.09], [0.02, 0.02, 0.11], (80, 3))
+    seen = Camera(K, 160, 128, np.eye(4))
+    frames = [Frame((i + 1) * 40_000_000, np.zeros((128, 160, 3), np.uint8), seen.at(pose)) for i, pose in enumerate(poses)]
+    pixels = [frame.camera.project(sheet)[0] for frame in frames]
+    return frames, [Matches((i, j), pixels[i], pixels[j]) for i, j in combinations(range(len(frames)), 2)]
+
+
+ASIDE = [rigid_pose(np.eye(3), [0.005 * i, 0.002 * i * i, 0.0]) for i in range(3)]
+
+
+def test_views_that_contradict_each_other_are_named_by_their_stamps(caplog):
+    frames, matches = shared(ASIDE[:2])
+    frames[1] = misplaced(frames[1], "turned")
+    assert misposed(frames, matches) == []
+    sentence = "the poses of the views at 0.040 s and 0.080 s contradict what these see; check these poses and their stamps"
+    assert [record.getMessage() for record in caplog.records] == [sentence]
+
+
+def test_all_of_the_check_can_be_cancelled():
+    frames, matches = shared(ASIDE)
+    reports = []
+    assert misposed(frames, matches, progress=StageProgress("poses", lambda *report: reports.append(report))) == []
+    # Three passes over matches or tracks are finished; tracks are looked for in three views, and votes are counted twice.
+    assert sum(done == total for _, done, total in reports) == 3 + 3 + 2
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_wrong_pose_among_good_ones_is_found(large, fault, caplog):
@@ -59,7 +92,8 @@ def test_with_stereo_a_wrong_pose_among_three_is_left_out(caplog):
     scene = prepare([views[0], misplaced(views[1], "farther"), views[2]], short)
     assert len(scene.views) == 2 and f"{views[1].stamp_ns * 1e-9:.3f} s left out" in caplog.text
     prepare([views[0], misplaced(views[1], "farther")], short)
-    assert "the poses of views 0 and 1 contradict" in caplog.text
+    first, second = (f"{views[i].stamp_ns * 1e-9:.3f} s" for i in (0, 1))
+    assert f"the poses of the views at {first} and {second} contradict" in caplog.text
 
 
 @pytest.mark.slow
@@ -75,7 +109,8 @@ def test_of_two_views_neither_is_left_out(large, caplog):
         frames = [first, misplaced(second, fault)]
         caplog.clear()
         assert misposed(frames, match_features(frames), [frame.depth for frame in frames]) == []
-        assert "the poses of views 0 and 1 contradict" in caplog.text
+        stamps = " and ".join(f"{frame.stamp_ns * 1e-9:.3f} s" for frame in frames)
+        assert f"the poses of the views at {stamps} contradict" in caplog.text
 
 
 @pytest.mark.slow

@@ -65,13 +65,15 @@ def extrapolate(
         points: Scene points [N, 3] (m, world) that other views may have given; they tell how the surface goes on.
         light, exposures: The light [4] and the logarithm of each view's exposure [V, 3].
         reference: Distance (m) at which colours are the tissue's own.
-        reach: How far to go beyond the pictures, in their widths.
+        reach: How far to go beyond the pictures, in their widths; 0 adds nothing, in holes neither.
         max_gaussians: Largest number of Gaussians in all.
         options: Size and opacity of the Gaussians.
         interpolation: How depth and colour are continued, and on how fine a lattice.
         device: Where depth is continued.
         progress: Reported to by views.
     """
+    if reach <= 0:
+        return model
     parts = [model.means.numpy().astype(np.float64)]
     points = np.concatenate([parts[0], points])
     colors, spacings = [], []

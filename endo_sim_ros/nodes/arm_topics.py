@@ -1,7 +1,7 @@
 """The topics of the arms of physics_node: commands in, states out."""
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from typing import Any
 
 import numpy as np
@@ -9,9 +9,9 @@ import numpy as np
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import invert_pose
 from endo_sim_ros.messages import Topic
-from endo_sim_ros.nodes.arm import Arm
+from endo_sim_ros.nodes.arm import DISABLED, ENABLED, Arm
 from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode, sentence
-from endo_sim_ros.nodes.configs import PhysicsNodeConfig
+from endo_sim_ros.nodes.configs import COMMAND_PARTS, PhysicsNodeConfig
 from endo_sim_ros.nodes.joint_topics import JointTopics
 from endo_sim_ros.nodes.jointed_arm import CameraArm, JointedArm
 from endo_sim_ros.nodes.pacing import MOST_WAITING
@@ -20,6 +20,7 @@ ECM_VIEW = "ECM_view"
 _TURNED = np.diag([-1.0, -1.0, 1.0, 1.0])  # the dVRK's frame of a camera in the optical one: x to the left and y up in the picture
 
 Deliver = Callable[[str, str, Any, str, Callable[[], None]], None]
+Discard = Callable[[str, Collection[str]], None]
 
 
 class _Told(messages.MessageError):
@@ -36,13 +37,16 @@ class ArmTopics:
         depth: Length of the queues of commands.
         deliver: Called with the name of an arm, the part of a command ("pose", "wrench", "jaw", "cut"), its message, its
             topic, and a function that lets the part act on the arm; decides when that is called.
+        discard: Called with the name of an arm and the parts of commands that a newer command replaces; those that wait never act.
 
     Attributes:
         camera_pose: Newest pose [4, 4] of a camera that is no arm of this node, world, or None.
     """
 
-    def __init__(self, node: EndoNode, arms: dict[str, Arm], options: PhysicsNodeConfig, depth: int, deliver: Deliver) -> None:
-        self._node, self._arms, self._deliver = node, arms, deliver
+    def __init__(
+        self, node: EndoNode, arms: dict[str, Arm], options: PhysicsNodeConfig, depth: int, deliver: Deliver, discard: Discard
+    ) -> None:
+        self._node, self._arms, self._deliver, self._discard = node, arms, deliver, discard
         self.camera_pose: np.ndarray | None = None
         commanded = options.arm_source == "commanded"
         self._pose_topic = messages.tool_pose_command if commanded else messages.tool_pose
@@ -200,6 +204,7 @@ class ArmTopics:
         goal = self._decode_pose(arm, topic, message)
         arm.require_enabled()
         self.warn(arm, arm.move_to(goal), again=True)
+        self._discard(arm.name, ("pose",))
         self.publish_operating_states(arm.name)
 
     def _on_joints(self, arm: Arm, topic: str, message: Any) -> None:
@@ -218,6 +223,7 @@ class ArmTopics:
         goal = arm.check_joints(messages.decode_joints(message, topic), message.name)
         arm.require_enabled()
         arm.move_joints(goal)
+        self._discard(arm.name, ("pose",))
         self.publish_operating_states(arm.name)
 
     def _on_joint_change(self, arm: Arm, topic: str, message: Any) -> None:
@@ -236,18 +242,14 @@ class ArmTopics:
         change = arm.check_numbers(messages.decode_joints(message, topic), message.name)
         arm.require_enabled()
         arm.move_joints(arm.joints_after(change, of_goal=True))
+        self._discard(arm.name, ("pose",))
         self.publish_operating_states(arm.name)
 
     def _on_hold(self, arm: Arm, topic: str, message: Any) -> None:
-        def act() -> None:
-            arm.require_enabled()
-            arm.stop()
-            self.publish_operating_states(arm.name)
-
-        if self.options.mode == "lockstep":  # it is no part of a command, and has no stamp
-            act()
-        else:
-            self._deliver_part(arm, "pose", message, topic, act)
+        arm.require_enabled()
+        arm.stop()
+        self._discard(arm.name, ("pose", "jaw"))
+        self.publish_operating_states(arm.name)
 
     def _on_ratio(self, arm: Arm, topic: str, message: Any) -> None:
         assert isinstance(arm, JointedArm)
@@ -281,6 +283,7 @@ class ArmTopics:
         goal = arm.check_jaw(messages.decode_jaw(message, topic))
         self._require_pose(arm, "jaw command")
         arm.angle_goal = goal
+        self._discard(arm.name, ("jaw",))
         self.publish_operating_states(arm.name)
 
     def _on_cut(self, arm: Arm, topic: str, message: Any) -> None:
@@ -296,6 +299,8 @@ class ArmTopics:
         try:
             command = messages.decode_state_command(message)
             arm.command_state(command)
+            if arm.state != ENABLED:  # a pause leaves what tissue the arm pulls and cuts
+                self._discard(arm.name, COMMAND_PARTS if arm.state == DISABLED else ("pose", "jaw"))
             self._tell(arm, messages.tool_info, f"{arm.name} is {arm.state} after {command}")
         finally:
             self.publish_operating_states(arm.name)

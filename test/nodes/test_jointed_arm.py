@@ -168,6 +168,50 @@ def test_the_newest_change_during_a_pause_acts_after_it(graph):
     graph.until(lambda: np.isclose(joints_of(graph)[0], first[0] + 0.02), "the newest change")
 
 
+def pause(bench, paused):
+    assert bench.call(SetBool, "/physics_node/pause", data=paused).success
+
+
+@pytest.mark.parametrize("newest_is", ["move_jp", "move_jr", "move_cp", "hold", "free", "pause", "disable"])
+def test_the_newest_command_of_a_pause_ends_those_that_wait(graph, newest_is):
+    physics, arm, first = graph.nodes[1], graph.nodes[1].arms["PSM1"], joints_of(graph)
+    change, goal = np.array([0.1, 0, 0, 0, 0, 0]), first + [0.1, 0, 0, 0, 0, 0]
+    pause(graph, True)
+    send_joints(graph, messages.tool_joint_command, first + [0.02, 0, 0, 0, 0, 0])
+    jaw(graph, 0.5)
+    graph.until(lambda: len(physics._held) == 2, "two commands that wait")
+    if newest_is in ("hold", "free"):
+        topic = getattr(messages, f"tool_{newest_is}")("PSM1")
+        graph.publish(topic, messages.ros_class(topic.type)())
+    elif newest_is in ("disable", "pause"):
+        switch(graph, newest_is, f"{newest_is.upper()}D")
+        switch(graph, "enable" if newest_is == "disable" else "resume", "ENABLED")
+    elif newest_is == "move_cp":
+        graph.publish(messages.tool_move("PSM1"), messages.encode_pose(arm.base @ PSM.tip_pose(goal), S, "world"))
+    else:
+        relative = newest_is == "move_jr"
+        send_joints(graph, messages.tool_joint_move_change if relative else messages.tool_joint_move, change if relative else goal)
+    moves = newest_is.startswith("move")
+    graph.until(lambda: ("PSM1", "pose") not in physics._held, "the older command to be forgotten")
+    pause(graph, False)
+    graph.until(lambda: not physics._held and not arm.busy, "the end of the newest command")
+    graph.spin(0.1)
+    np.testing.assert_allclose(joints_of(graph), goal if moves else first, atol=1e-6)
+    assert newest(graph, messages.tool_jaw_state("PSM1")).position[0] == (0.5 if moves else 1.0)
+
+
+def test_the_newest_command_of_a_jaw_during_a_pause_acts_after_it(graph):
+    physics, arm = graph.nodes[1], graph.nodes[1].arms["PSM1"]
+    pause(graph, True)
+    jaw(graph, 0.5)
+    graph.until(lambda: physics._held, "a command that waits")
+    graph.publish(messages.tool_jaw_move("PSM1"), messages.encode_jaw(0.8, S))
+    graph.until(lambda: arm.angle_goal == 0.8, "a goal")
+    pause(graph, False)
+    graph.until(lambda: not arm.busy, "the end of the move")
+    assert arm.angle == 0.8
+
+
 @pytest.mark.parametrize("topic", [messages.tool_hold, messages.tool_free])
 def test_hold_and_free_end_all_moves_where_they_are(graph, topic):
     empty = messages.ros_class(topic("PSM1").type)

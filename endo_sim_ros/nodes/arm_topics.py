@@ -65,7 +65,7 @@ class ArmTopics:
                 self._hear(arm, messages.tool_free, self._on_hold, several)  # joints that nothing moves stay where they are
                 if isinstance(arm, JointedArm):
                     self._hear(arm, messages.tool_joint_command, self._on_joints, depth)
-                    self._hear(arm, messages.tool_joint_change, self._on_joint_change, several)  # none replaces another
+                    self._hear(arm, messages.tool_joint_change, self._on_joint_change, MOST_WAITING)  # none replaces another
                     self._hear(arm, messages.tool_joint_move, self._on_joint_move, several)
                     self._hear(arm, messages.tool_joint_move_change, self._on_joint_move_change, several)
                     self._hear(arm, messages.tool_ratio_command, self._on_ratio, several)

@@ -158,6 +158,13 @@ def test_changes_of_joints_add_up_and_may_not_lead_beyond_limits(graph):
     np.testing.assert_array_equal(joints_of(graph), there)
 
 
+def test_each_of_many_changes_at_once_counts(graph):
+    first = joints_of(graph)
+    for _ in range(150):
+        send_joints(graph, messages.tool_joint_change, [0.0005, 0, 0, 0, 0, 0])
+    graph.until(lambda: np.isclose(joints_of(graph)[0], first[0] + 0.075, atol=1e-9), "all changes", 5)
+
+
 def test_the_newest_change_during_a_pause_acts_after_it(graph):
     first = joints_of(graph)
     assert graph.call(SetBool, "/physics_node/pause", data=True).success

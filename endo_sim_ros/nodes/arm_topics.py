@@ -11,9 +11,10 @@ from endo_sim_ros.core.cameras import invert_pose
 from endo_sim_ros.messages import Topic
 from endo_sim_ros.nodes.arm import DISABLED, ENABLED, Arm
 from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode, sentence
+from endo_sim_ros.nodes.camera_arm import CameraArm
 from endo_sim_ros.nodes.configs import COMMAND_PARTS, PhysicsNodeConfig
 from endo_sim_ros.nodes.joint_topics import JointTopics
-from endo_sim_ros.nodes.jointed_arm import CameraArm, JointedArm
+from endo_sim_ros.nodes.jointed_arm import JointedArm
 from endo_sim_ros.nodes.pacing import MOST_WAITING
 
 ECM_VIEW = "ECM_view"

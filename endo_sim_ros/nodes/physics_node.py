@@ -13,8 +13,9 @@ from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ControlNodeCloud, Phys
 from endo_sim_ros.nodes.arm_setup import CAMERA_ARM, make_arms, place_arms
 from endo_sim_ros.nodes.arm_topics import ArmTopics
 from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode, run, sentence
+from endo_sim_ros.nodes.camera_arm import CameraArm
 from endo_sim_ros.nodes.configs import COMMAND_PARTS, PhysicsNodeConfig
-from endo_sim_ros.nodes.jointed_arm import CameraArm, JointedArm
+from endo_sim_ros.nodes.jointed_arm import JointedArm
 from endo_sim_ros.nodes.pacing import MOST_WAITING, WINDOW, CommandQueue, Pacer, SpeedMeter
 from endo_sim_ros.nodes.reactions import ReactionTopics
 from endo_sim_ros.nodes.tissue_builder import TissueBuilder

@@ -10,8 +10,9 @@ from endo_sim_ros.core.cameras import make_pose
 from endo_sim_ros.instruments import load_arm
 from endo_sim_ros.nodes.arm import seconds_between
 from endo_sim_ros.nodes.arm_topics import ArmTopics
+from endo_sim_ros.nodes.camera_arm import CameraArm
 from endo_sim_ros.nodes.configs import PhysicsNodeConfig
-from endo_sim_ros.nodes.jointed_arm import CameraArm, JointedArm
+from endo_sim_ros.nodes.jointed_arm import JointedArm
 
 PSM = load_arm("PSM", "LARGE_NEEDLE_DRIVER")
 BASE = make_pose([0.1, -0.2, 0.3], [0.5, 0.1, -0.7, 0.3])

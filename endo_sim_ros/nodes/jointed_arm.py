@@ -51,6 +51,7 @@ class JointedArm(Arm):
     start: np.ndarray | None = None  # [n] joints while nobody has commanded anything
     _posed: np.ndarray | None = None  # the pose that belongs to the joints
     _stepped: np.ndarray | None = None  # joints at the end of the last step
+    _untold: str = ""  # what it missed of a pose that it was told between two steps, in a sentence
 
     def stand(self, base: np.ndarray, joints: np.ndarray) -> None:
         """Stand at a base [4, 4], world; a commanded arm with its joints at positions [n], waiting for a command."""
@@ -63,6 +64,7 @@ class JointedArm(Arm):
     def return_to_start(self) -> None:
         """Let go of everything and be at the start, which touches nothing until the arm is commanded."""
         super().reset()
+        self._untold = ""
         if self.start is not None:
             self._take(self.start)
             self._stepped, self.velocities, self.acts = self.start, np.zeros(len(self.start)), False
@@ -174,7 +176,7 @@ class JointedArm(Arm):
 
     def joints_after(self, change: np.ndarray, of_goal: bool = False) -> np.ndarray:
         """Joint positions [n] that differ by a change [n] from the present ones or, while joints move, from their goal if asked."""
-        self.settle()
+        self._untold = self.settle() or self._untold  # `move` tells it
         before = self.joint_goal if of_goal and self.joint_goal is not None else self.joints
         return change if before is None else before + change  # without any the arm has no place either, and takes none
 
@@ -222,7 +224,7 @@ class JointedArm(Arm):
             return super().move(seconds, speed, turn_speed)
         speed, turn_speed = self.speed_ratio * speed, self.speed_ratio * turn_speed
         self._move_jaw(seconds, turn_speed)
-        missing = self.settle()
+        missing, self._untold = self.settle() or self._untold, ""
         if self.pose_goal is not None:
             self._move_straight(seconds, speed, turn_speed)
         elif self.joint_goal is not None:
@@ -305,7 +307,7 @@ class JointedArm(Arm):
 
     def links(self) -> dict[str, np.ndarray]:
         """Poses [4, 4] of the links in the world by name, in the order of `link_poses`; none while they are not known."""
-        self.settle()
+        self._untold = self.settle() or self._untold
         if self.base is None or self.joints is None or self.pose is None:
             return {}
         poses = link_poses(self.kinematics, self.joints, self.gape)

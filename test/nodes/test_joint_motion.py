@@ -148,6 +148,15 @@ def test_efforts_of_a_push_on_a_link_are_its_virtual_work_and_joints_beyond_bear
         assert efforts[i] == pytest.approx(work / small, abs=1e-5)
 
 
+@pytest.mark.parametrize("before_the_step", [lambda arm: arm.servo_joints(arm.joints_after(np.zeros(6))), JointedArm.links])
+def test_what_an_arm_misses_is_told_in_the_next_step_whoever_asks_where_it_is_before(before_the_step):
+    arm = arm_at([0.0, 0, 0.12, 0, 0, 0])
+    arm.servo(BASE @ PSM.tip_pose([0.0, 0, 0.12, 0, 0, 0]) @ make_pose([0, 0, 0.3], [1, 0, 0, 0]))
+    before_the_step(arm)
+    assert arm.move(STEP, 0.05, 1.5).startswith("PSM1: PSM stops")
+    assert arm.move(STEP, 0.05, 1.5) == ""
+
+
 def test_an_arm_without_a_base_is_a_tip():
     arm = JointedArm("PSM3", kinematics=PSM)
     arm.move_to(np.eye(4))

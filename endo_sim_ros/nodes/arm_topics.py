@@ -20,12 +20,22 @@ from endo_sim_ros.nodes.pacing import MOST_WAITING
 ECM_VIEW = "ECM_view"
 _TURNED = np.diag([-1.0, -1.0, 1.0, 1.0])  # the dVRK's frame of a camera in the optical one: x to the left and y up in the picture
 
-Deliver = Callable[[str, str, Any, str, Callable[[], None]], None]
+Act = Callable[[], None]
+Deliver = Callable[[str, str, Any, str, Act], None]
 Discard = Callable[[str, Collection[str]], None]
 
 
 class _Told(messages.MessageError):
     """A sentence that has been published on the topic of its arm."""
+
+
+def _refuse(error: ValueError) -> Act:
+    """What a refused part of a command does: it raises why."""
+
+    def act() -> None:
+        raise error
+
+    return act
 
 
 class ArmTopics:
@@ -58,24 +68,24 @@ class ArmTopics:
         self._short: set[str] = set()  # arms that have said that they do not reach their pose
         several = max(depth, STREAM_DEPTH)  # for what comes once
         for arm in arms.values():
-            self._hear(arm, self._pose_topic, self._on_pose, depth)
+            self._hear_part(arm, "pose", self._pose_topic, self._on_pose, depth)
             if commanded:
                 self._hear(arm, messages.tool_move, self._on_move, several)
                 self._hear(arm, messages.tool_state_command, self._on_state_command, STREAM_DEPTH)
                 self._hear(arm, messages.tool_hold, self._on_hold, several)
                 self._hear(arm, messages.tool_free, self._on_hold, several)  # joints that nothing moves stay where they are
                 if isinstance(arm, JointedArm):
-                    self._hear(arm, messages.tool_joint_command, self._on_joints, depth)
-                    self._hear(arm, messages.tool_joint_change, self._on_joint_change, MOST_WAITING)  # none replaces another
+                    self._hear_part(arm, "pose", messages.tool_joint_command, self._on_joints, depth)
+                    self._hear_part(arm, "pose", messages.tool_joint_change, self._on_joint_change, MOST_WAITING)  # none replaces another
                     self._hear(arm, messages.tool_joint_move, self._on_joint_move, several)
                     self._hear(arm, messages.tool_joint_move_change, self._on_joint_move_change, several)
                     self._hear(arm, messages.tool_ratio_command, self._on_ratio, several)
                     self._publishers[arm.name][messages.tool_ratio].publish(messages.encode_number(arm.speed_ratio))
         for arm in tools:
-            self._hear(arm, messages.tool_wrench, self._on_wrench, depth)
-            self._hear(arm, messages.tool_jaw, self._on_jaw, several)
+            self._hear_part(arm, "wrench", messages.tool_wrench, self._on_wrench, depth)
+            self._hear_part(arm, "jaw", messages.tool_jaw, self._on_jaw, several)
             self._hear(arm, messages.tool_jaw_move, self._on_jaw_move, several)
-            self._hear(arm, messages.tool_cut, self._on_cut, several)
+            self._hear_part(arm, "cut", messages.tool_cut, self._on_cut, several)
         self._joints = JointTopics(node, {name: arm for name, arm in arms.items() if isinstance(arm, JointedArm)}, options)
         self.change_options(options)
         self.publish_operating_states()
@@ -141,6 +151,22 @@ class ArmTopics:
 
         self._node.subscribe(topic, heard, depth)
 
+    def _hear_part(
+        self, arm: Arm, kind: str, topic_of: Callable[[str], Topic], prepare: Callable[[Arm, str, Any], Act], depth: int
+    ) -> None:
+        """Deliver what each message makes the arm do; in lockstep also that a message is refused, as its command waits for its parts."""
+
+        def heard(arm: Arm, topic: str, message: Any) -> None:
+            try:
+                act = prepare(arm, topic, message)
+            except ValueError as error:
+                if self.options.mode != "lockstep":
+                    raise
+                act = _refuse(error)
+            self._deliver_part(arm, kind, message, topic, act)
+
+        self._hear(arm, topic_of, heard, depth)
+
     @contextlib.contextmanager
     def _telling(self, arm: Arm, topic: str) -> Iterator[None]:
         """Context that also tells the errors of its block on the topic of the arm."""
@@ -173,7 +199,7 @@ class ArmTopics:
         self._short.add(arm.name)
         self._node.report_error(text)
 
-    def _deliver_part(self, arm: Arm, kind: str, message: Any, topic: str, act: Callable[[], None]) -> None:
+    def _deliver_part(self, arm: Arm, kind: str, message: Any, topic: str, act: Act) -> None:
         """Let a part of a command act on an arm when it is time; in lockstep on the camera's, which is no part of a command, now."""
 
         def telling() -> None:
@@ -191,7 +217,7 @@ class ArmTopics:
             raise ValueError(f"a pose in {ECM_VIEW}, but no pose of a camera came on {messages.CAMERA_POSE.name}; add ECM to arms")
         return messages.decode_pose(message, frames, topic)
 
-    def _on_pose(self, arm: Arm, topic: str, message: Any) -> None:
+    def _on_pose(self, arm: Arm, topic: str, message: Any) -> Act:
         pose = self._decode_pose(arm, topic, message)
 
         def act() -> None:
@@ -199,7 +225,7 @@ class ArmTopics:
             arm.servo(pose)
             self.publish_operating_states()
 
-        self._deliver_part(arm, "pose", message, topic, act)
+        return act
 
     def _on_move(self, arm: Arm, topic: str, message: Any) -> None:
         goal = self._decode_pose(arm, topic, message)
@@ -208,7 +234,7 @@ class ArmTopics:
         self._discard(arm.name, ("pose",))
         self.publish_operating_states(arm.name)
 
-    def _on_joints(self, arm: Arm, topic: str, message: Any) -> None:
+    def _on_joints(self, arm: Arm, topic: str, message: Any) -> Act:
         assert isinstance(arm, JointedArm)
         joints = arm.check_joints(messages.decode_joints(message, topic), message.name)
 
@@ -217,7 +243,7 @@ class ArmTopics:
             arm.servo_joints(joints)
             self.publish_operating_states()
 
-        self._deliver_part(arm, "pose", message, topic, act)
+        return act
 
     def _on_joint_move(self, arm: Arm, topic: str, message: Any) -> None:
         assert isinstance(arm, JointedArm)
@@ -227,7 +253,7 @@ class ArmTopics:
         self._discard(arm.name, ("pose",))
         self.publish_operating_states(arm.name)
 
-    def _on_joint_change(self, arm: Arm, topic: str, message: Any) -> None:
+    def _on_joint_change(self, arm: Arm, topic: str, message: Any) -> Act:
         assert isinstance(arm, JointedArm)
         change = arm.check_numbers(messages.decode_joints(message, topic), message.name)
 
@@ -236,7 +262,7 @@ class ArmTopics:
             arm.servo_joints(arm.joints_after(change))
             self.publish_operating_states()
 
-        self._deliver_part(arm, "pose", message, topic, act)
+        return act
 
     def _on_joint_move_change(self, arm: Arm, topic: str, message: Any) -> None:
         assert isinstance(arm, JointedArm)
@@ -257,7 +283,7 @@ class ArmTopics:
         arm.set_speed_ratio(messages.decode_number(message, topic))
         self._publishers[arm.name][messages.tool_ratio].publish(messages.encode_number(arm.speed_ratio))
 
-    def _on_wrench(self, arm: Arm, topic: str, message: Any) -> None:
+    def _on_wrench(self, arm: Arm, topic: str, message: Any) -> Act:
         force, torque = messages.decode_wrench(message, topic)
         frames = {name: pose for name, pose in self._frames(arm).items() if name}
         frame = messages.check_frame(message, ("", arm.name, *frames), topic)
@@ -267,9 +293,9 @@ class ArmTopics:
             R = frames.get(frame, pose)[:3, :3]  # any other is the tool's own
             arm.force, arm.torque, arm.heard = R @ force, R @ torque, self._node.now_ns() * 1e-9
 
-        self._deliver_part(arm, "wrench", message, topic, act)
+        return act
 
-    def _on_jaw(self, arm: Arm, topic: str, message: Any) -> None:
+    def _on_jaw(self, arm: Arm, topic: str, message: Any) -> Act:
         angle = arm.check_jaw(messages.decode_jaw(message, topic))
 
         def act() -> None:
@@ -278,7 +304,7 @@ class ArmTopics:
             arm.hold(self.options.jaw_closed, self.options.jaw_open)
             self.publish_operating_states()
 
-        self._deliver_part(arm, "jaw", message, topic, act)
+        return act
 
     def _on_jaw_move(self, arm: Arm, topic: str, message: Any) -> None:
         goal = arm.check_jaw(messages.decode_jaw(message, topic))
@@ -287,14 +313,14 @@ class ArmTopics:
         self._discard(arm.name, ("jaw",))
         self.publish_operating_states(arm.name)
 
-    def _on_cut(self, arm: Arm, topic: str, message: Any) -> None:
+    def _on_cut(self, arm: Arm, topic: str, message: Any) -> Act:
         cutting = messages.decode_cut(message, topic)
 
         def act() -> None:
             self._require_pose(arm, "cut")
             arm.cutting = cutting
 
-        self._deliver_part(arm, "cut", message, topic, act)
+        return act
 
     def _on_state_command(self, arm: Arm, topic: str, message: Any) -> None:
         try:

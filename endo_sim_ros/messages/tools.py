@@ -85,14 +85,8 @@ def encode_joints(
     )
 
 
-def decode_number(message: Message, topic: str) -> float:
-    """Number of a Float64.
-
-    Raises:
-        MessageError: If it is not finite.
-    """
-    if not np.isfinite(message.data):
-        raise MessageError(f"{topic}: expected a finite number, got {message.data}")
+def decode_number(message: Message) -> float:
+    """Number of a Float64; whether it is finite is not checked."""
     return float(message.data)
 
 

@@ -280,7 +280,7 @@ class ArmTopics:
 
     def _on_ratio(self, arm: Arm, topic: str, message: Any) -> None:
         assert isinstance(arm, JointedArm)
-        arm.set_speed_ratio(messages.decode_number(message, topic))
+        arm.set_speed_ratio(messages.decode_number(message))
         self._publishers[arm.name][messages.tool_ratio].publish(messages.encode_number(arm.speed_ratio))
 
     def _on_wrench(self, arm: Arm, topic: str, message: Any) -> Act:

@@ -17,6 +17,7 @@ _JAW_WITHIN = 0.01  # rad: the same of the jaw, whose limits clients have in who
 _LEAP = 10.0  # times the speed of a joint: the straight way passes a singularity or goes on with another bend of the wrist
 _TRIES = 4  # to find how far the tip gets in a step; one or two are enough where joints follow in proportion
 _JOINTS_OF_LINK = {"roll": 4, "wrist_pitch": 5}  # joints that move it: the first ones; all others move with all joints
+_SLOWEST = 1e-3  # part of all speeds: less makes a quarter of an hour of a move of a second
 _MEASURED_WRONG, _MEASURED_TURNED = 1e-3, np.radians(1.0)  # m, rad: less is what calibrations are off
 
 
@@ -181,9 +182,9 @@ class JointedArm(Arm):
         return change if before is None else before + change  # without any the arm has no place either, and takes none
 
     def set_speed_ratio(self, ratio: float) -> None:
-        """Let moves go with a part of their largest speeds; raises ValueError if it is not above 0 and at most 1."""
-        if not 0 < ratio <= 1:
-            raise ValueError(f"{self.name}: the ratio of speeds is {ratio:g}; send one above 0 and at most 1")
+        """Let moves go with a part of their largest speeds; raises ValueError if it is not from 0.001 to 1."""
+        if not _SLOWEST <= ratio <= 1:
+            raise ValueError(f"{self.name}: the ratio of speeds is {ratio!r}; send one from {_SLOWEST:g} to 1")
         self.speed_ratio = ratio
 
     def check_jaw(self, angle: float) -> float:

@@ -260,12 +260,10 @@ def test_a_ratio_makes_moves_slower(graph):
     graph.until(lambda: np.allclose(pose_of(graph, messages.tool_pose("PSM1")), pose, atol=1e-9), "the pose")
     speed = max(np.hypot(np.hypot(v.x, v.y), v.z) for v in (m.twist.linear for m in graph.heard["PSM1/measured_cv"]))
     assert 0.01 < speed < 0.0126  # of 5 cm/s
-    for value in (0.0, 1.5, -0.1):
+    for value in (0.0, 1.5, -0.1, 1.0000001, 0.0009, 5e-324, float("inf"), float("nan")):
         send(value)
-        said = f"PSM1/trajectory_j/set_ratio: PSM1: the ratio of speeds is {value:g}; send one above 0 and at most 1"
+        said = f"PSM1/trajectory_j/set_ratio: PSM1: the ratio of speeds is {value}; send one from 0.001 to 1"
         graph.until(lambda said=said: said in texts(graph, messages.tool_error), "an error of the arm")
-    send(float("nan"))
-    graph.refused("physics_node", "PSM1/trajectory_j/set_ratio: expected a finite number, got nan")
     assert graph.nodes[1].arms["PSM1"].speed_ratio == 0.25
     send(1.0)
     graph.until(lambda: ratio() == 1.0, "the ratio of before")

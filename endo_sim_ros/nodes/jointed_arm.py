@@ -167,9 +167,10 @@ class JointedArm(Arm):
 
     def check_numbers(self, joints: ArrayLike, names: Sequence[str] = ()) -> np.ndarray:
         """One number for each joint [n], whatever its limits; raises ValueError if they are not n finite ones, or have other names."""
-        arm, known = self.kinematics, ", ".join(joint.name for joint in self.kinematics.joints)
-        if any(names) and ", ".join(names) != known:
-            raise ValueError(f"{self.name}: the joints are {known}, in this order, not {', '.join(names):.200}; send these names or none")
+        arm, known = self.kinematics, [joint.name for joint in self.kinematics.joints]
+        if any(names) and list(names) != known:
+            given = ", ".join(map(repr, names))  # as they may have line feeds
+            raise ValueError(f"{self.name}: the joints are {', '.join(known)}, in this order, not {given:.200}; send these names or none")
         try:
             return arm.check_joints(joints)
         except ValueError as error:

@@ -324,9 +324,9 @@ def test_bad_joints_are_one_sentence_and_the_arm_stays(graph, name):
 def test_joints_may_have_their_names_and_no_others(graph, topic):
     joints, none = joints_of(graph), np.zeros(0)
     names = list(newest(graph, messages.tool_joints("PSM1")).name)
-    for wrong in (names[::-1], names[:5], [f"PSM1_{name}" for name in names]):
+    for wrong in (names[::-1], names[:5], [", ".join(names)], ["yaw\n[ERROR] forged"]):
         graph.publish(topic("PSM1"), messages.encode_joints(wrong, joints + 0.01, none, none, S))
-        said = f"PSM1: the joints are {', '.join(names)}, in this order, not {', '.join(wrong)}; send these names or none"
+        said = f"PSM1: the joints are {', '.join(names)}, in this order, not {', '.join(map(repr, wrong))}; send these names or none"
         graph.refused("physics_node", f"{topic('PSM1').name}: {said}")
     np.testing.assert_array_equal(joints_of(graph), joints)
     graph.publish(topic("PSM1"), messages.encode_joints(names, joints + 0.01, none, none, S))

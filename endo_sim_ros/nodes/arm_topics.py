@@ -19,6 +19,7 @@ from endo_sim_ros.nodes.pacing import MOST_WAITING
 
 ECM_VIEW = "ECM_view"
 _TURNED = np.diag([-1.0, -1.0, 1.0, 1.0])  # the dVRK's frame of a camera in the optical one: x to the left and y up in the picture
+_CHANGES = "changes of joint positions"
 
 Act = Callable[[], None]
 Deliver = Callable[[str, str, Any, str, Act], None]
@@ -255,7 +256,7 @@ class ArmTopics:
 
     def _on_joint_change(self, arm: Arm, topic: str, message: Any) -> Act:
         assert isinstance(arm, JointedArm)
-        change = arm.check_numbers(messages.decode_joints(message, topic), message.name)
+        change = arm.check_numbers(messages.decode_joints(message, topic, _CHANGES), message.name)
 
         def act() -> None:
             arm.require_enabled()
@@ -266,7 +267,7 @@ class ArmTopics:
 
     def _on_joint_move_change(self, arm: Arm, topic: str, message: Any) -> None:
         assert isinstance(arm, JointedArm)
-        change = arm.check_numbers(messages.decode_joints(message, topic), message.name)
+        change = arm.check_numbers(messages.decode_joints(message, topic, _CHANGES), message.name)
         arm.require_enabled()
         arm.move_joints(arm.joints_after(change, of_goal=True))
         self._discard(arm.name, ("pose",))

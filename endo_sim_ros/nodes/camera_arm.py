@@ -24,7 +24,7 @@ class CameraArm(JointedArm):
         """Put the camera where a pose [4, 4], world, says; its direction follows from that.
 
         Raises:
-            ValueError: If it does not get there, or would be upside down; the camera then stays where it is.
+            ValueError: If it does not get there, or would be upside down; nothing changes then.
         """
         self.servo_joints(self._aim(pose))
 

@@ -109,7 +109,7 @@ class JointedArm(Arm):
         """Put the tip at a pose [4, 4], world, or as near as the joints get, which `move` finds out.
 
         Raises:
-            ValueError: If a commanded arm is not long enough by far; it then stays where it is.
+            ValueError: If a commanded arm is not long enough by far; nothing changes then.
         """
         self._require_sense(pose)
         super().servo(pose)
@@ -135,7 +135,7 @@ class JointedArm(Arm):
         """Put the joints at positions [n], rad and m, now.
 
         Raises:
-            ValueError: If they are not n finite numbers within the limits; the arm then stays where it is.
+            ValueError: If they are not n finite numbers within the limits; nothing changes then.
         """
         self._take(self.check_joints(joints))
         self.halt()

@@ -149,7 +149,9 @@ def test_changes_of_joints_add_up_and_may_not_lead_beyond_limits(graph):
     graph.until(lambda: np.allclose(joints_of(graph), first + 23 * change, atol=1e-12), "a goal that moved on")
     there = joints_of(graph)
     for topic in (messages.tool_joint_change, messages.tool_joint_move_change):
-        for positions, sentence in (([0.0] * 5, "PSM1: 5 numbers, not 6"), ([0, 0, 0.3, 0, 0, 0], "insertion cannot be at")):
+        lengths = [([0.0] * length, f"PSM1: {length} numbers, not 6; the joints are yaw, pitch,") for length in (0, 5)]
+        no_number = [float("nan")] * 6, "expected finite changes of joint positions, rad and m, got [nan,"
+        for positions, sentence in (*lengths, no_number, ([0, 0, 0.3, 0, 0, 0], "insertion cannot be at")):
             graph.heard["PSM1/error"].clear()
             send_joints(graph, topic, positions)
             (said,) = graph.until(lambda: texts(graph, messages.tool_error), "an error of the arm")
@@ -294,7 +296,7 @@ def test_what_is_published_can_be_sent_back(graph):
 BAD_JOINTS = {
     "too_few": ([0.0] * 5, "PSM1: 5 numbers, not 6; the joints are yaw, pitch,"),
     "too_many": ([0.0] * 7, "PSM1: 7 numbers, not 6; the joints are yaw, pitch,"),
-    "none": ([], "expected finite joint positions"),
+    "none": ([], "PSM1: 0 numbers, not 6; the joints are yaw, pitch,"),
     "nan": ([0, 0, float("nan"), 0, 0, 0], "expected finite joint positions"),
     "infinite": ([0, 0, float("inf"), 0, 0, 0], "expected finite joint positions"),
     "beyond_limits": ([0, 0, 0.3, 0, 0, 0], "insertion cannot be at 300 mm; its limits are 0 and 240 mm"),
@@ -318,6 +320,15 @@ def test_bad_joints_are_one_sentence_and_the_arm_stays(graph, name):
     graph.spin(0.1)
     np.testing.assert_array_equal(joints_of(graph), before)
     np.testing.assert_array_equal(pose_of(graph, messages.tool_pose("PSM1")), pose)
+
+
+def test_a_refused_command_lets_a_move_go_on(graph):
+    goal = joints_of(graph) + [0.3, 0, 0, 0, 0, 0]
+    send_joints(graph, messages.tool_joint_move, goal)
+    send_joints(graph, messages.tool_joint_move_change, [9, 0, 0, 0, 0, 0])
+    send_joints(graph, messages.tool_joint_command, [9, 0, 0, 0, 0, 0])
+    graph.until(lambda: len(texts(graph, messages.tool_error)) == 2, "two errors")
+    graph.until(lambda: np.allclose(joints_of(graph), goal), "the goal")
 
 
 @pytest.mark.parametrize("topic", [messages.tool_joint_command, messages.tool_joint_move])

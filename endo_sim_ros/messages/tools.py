@@ -55,15 +55,20 @@ def encode_jaw(angle: float, stamp_ns: int, types: MessageTypes = ros_types()) -
     return encode_joints(["jaw"], np.array([angle]), np.zeros(0), np.zeros(0), stamp_ns, types)
 
 
-def decode_joints(message: Message, topic: str) -> np.ndarray:
+def decode_joints(message: Message, topic: str, what: str = "joint positions") -> np.ndarray:
     """Positions [n] of a JointState, rad and m, in the order of the arm's joints; whether the arm has as many is not checked.
 
+    Args:
+        message: The JointState.
+        topic: Its topic, for errors.
+        what: What the positions stand for, for errors.
+
     Raises:
-        MessageError: If there is none, or one is not finite.
+        MessageError: If one is not finite.
     """
     positions = np.asarray(message.position, np.float64)
-    if not positions.size or not np.isfinite(positions).all():
-        raise MessageError(f"{topic}: expected finite joint positions, rad and m, got {positions.tolist()!s:.200}")
+    if not np.isfinite(positions).all():
+        raise MessageError(f"{topic}: expected finite {what}, rad and m, got {positions.tolist()!s:.200}")
     return positions
 
 
@@ -85,14 +90,8 @@ def encode_joints(
     )
 
 
-def decode_number(message: Message, topic: str) -> float:
-    """Number of a Float64.
-
-    Raises:
-        MessageError: If it is not finite.
-    """
-    if not np.isfinite(message.data):
-        raise MessageError(f"{topic}: expected a finite number, got {message.data}")
+def decode_number(message: Message) -> float:
+    """Number of a Float64; whether it is finite is not checked."""
     return float(message.data)
 
 

@@ -12,8 +12,9 @@ from endo_sim_ros.instruments import Capsule, build_instrument, load_arm, place_
 from endo_sim_ros.instruments.aiming import AHEAD
 from endo_sim_ros.instruments.urdf_reader import read_urdf
 from endo_sim_ros.nodes.arm import Arm
+from endo_sim_ros.nodes.camera_arm import CameraArm
 from endo_sim_ros.nodes.configs import PhysicsNodeConfig, arm_names
-from endo_sim_ros.nodes.jointed_arm import CameraArm, JointedArm
+from endo_sim_ros.nodes.jointed_arm import JointedArm
 
 CAMERA_ARM = "ECM"
 _OF_CAMERA = {"PSM": "ECM", "PSM_Si": "ECM_Si"}  # which one goes with the instruments' arms where there is one model for all

@@ -1,7 +1,7 @@
 """The topics of the arms of physics_node: commands in, states out."""
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from typing import Any
 
 import numpy as np
@@ -9,21 +9,34 @@ import numpy as np
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import invert_pose
 from endo_sim_ros.messages import Topic
-from endo_sim_ros.nodes.arm import Arm
+from endo_sim_ros.nodes.arm import DISABLED, ENABLED, Arm
 from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode, sentence
-from endo_sim_ros.nodes.configs import PhysicsNodeConfig
+from endo_sim_ros.nodes.camera_arm import CameraArm
+from endo_sim_ros.nodes.configs import COMMAND_PARTS, PhysicsNodeConfig
 from endo_sim_ros.nodes.joint_topics import JointTopics
-from endo_sim_ros.nodes.jointed_arm import CameraArm, JointedArm
+from endo_sim_ros.nodes.jointed_arm import JointedArm
 from endo_sim_ros.nodes.pacing import MOST_WAITING
 
 ECM_VIEW = "ECM_view"
 _TURNED = np.diag([-1.0, -1.0, 1.0, 1.0])  # the dVRK's frame of a camera in the optical one: x to the left and y up in the picture
+_CHANGES = "changes of joint positions"
 
-Deliver = Callable[[str, str, Any, str, Callable[[], None]], None]
+Act = Callable[[], None]
+Deliver = Callable[[str, str, Any, str, Act], None]
+Discard = Callable[[str, Collection[str]], None]
 
 
 class _Told(messages.MessageError):
     """A sentence that has been published on the topic of its arm."""
+
+
+def _refuse(error: ValueError) -> Act:
+    """What a refused part of a command does: it raises why."""
+
+    def act() -> None:
+        raise error
+
+    return act
 
 
 class ArmTopics:
@@ -36,13 +49,16 @@ class ArmTopics:
         depth: Length of the queues of commands.
         deliver: Called with the name of an arm, the part of a command ("pose", "wrench", "jaw", "cut"), its message, its
             topic, and a function that lets the part act on the arm; decides when that is called.
+        discard: Called with the name of an arm and the parts of commands that a newer command replaces; those that wait never act.
 
     Attributes:
         camera_pose: Newest pose [4, 4] of a camera that is no arm of this node, world, or None.
     """
 
-    def __init__(self, node: EndoNode, arms: dict[str, Arm], options: PhysicsNodeConfig, depth: int, deliver: Deliver) -> None:
-        self._node, self._arms, self._deliver = node, arms, deliver
+    def __init__(
+        self, node: EndoNode, arms: dict[str, Arm], options: PhysicsNodeConfig, depth: int, deliver: Deliver, discard: Discard
+    ) -> None:
+        self._node, self._arms, self._deliver, self._discard = node, arms, deliver, discard
         self.camera_pose: np.ndarray | None = None
         commanded = options.arm_source == "commanded"
         self._pose_topic = messages.tool_pose_command if commanded else messages.tool_pose
@@ -53,24 +69,24 @@ class ArmTopics:
         self._short: set[str] = set()  # arms that have said that they do not reach their pose
         several = max(depth, STREAM_DEPTH)  # for what comes once
         for arm in arms.values():
-            self._hear(arm, self._pose_topic, self._on_pose, depth)
+            self._hear_part(arm, "pose", self._pose_topic, self._on_pose, depth)
             if commanded:
                 self._hear(arm, messages.tool_move, self._on_move, several)
                 self._hear(arm, messages.tool_state_command, self._on_state_command, STREAM_DEPTH)
                 self._hear(arm, messages.tool_hold, self._on_hold, several)
                 self._hear(arm, messages.tool_free, self._on_hold, several)  # joints that nothing moves stay where they are
                 if isinstance(arm, JointedArm):
-                    self._hear(arm, messages.tool_joint_command, self._on_joints, depth)
-                    self._hear(arm, messages.tool_joint_change, self._on_joint_change, several)  # none replaces another
+                    self._hear_part(arm, "pose", messages.tool_joint_command, self._on_joints, depth)
+                    self._hear_part(arm, "pose", messages.tool_joint_change, self._on_joint_change, MOST_WAITING)  # none replaces another
                     self._hear(arm, messages.tool_joint_move, self._on_joint_move, several)
                     self._hear(arm, messages.tool_joint_move_change, self._on_joint_move_change, several)
                     self._hear(arm, messages.tool_ratio_command, self._on_ratio, several)
                     self._publishers[arm.name][messages.tool_ratio].publish(messages.encode_number(arm.speed_ratio))
         for arm in tools:
-            self._hear(arm, messages.tool_wrench, self._on_wrench, depth)
-            self._hear(arm, messages.tool_jaw, self._on_jaw, several)
+            self._hear_part(arm, "wrench", messages.tool_wrench, self._on_wrench, depth)
+            self._hear_part(arm, "jaw", messages.tool_jaw, self._on_jaw, several)
             self._hear(arm, messages.tool_jaw_move, self._on_jaw_move, several)
-            self._hear(arm, messages.tool_cut, self._on_cut, several)
+            self._hear_part(arm, "cut", messages.tool_cut, self._on_cut, several)
         self._joints = JointTopics(node, {name: arm for name, arm in arms.items() if isinstance(arm, JointedArm)}, options)
         self.change_options(options)
         self.publish_operating_states()
@@ -136,6 +152,22 @@ class ArmTopics:
 
         self._node.subscribe(topic, heard, depth)
 
+    def _hear_part(
+        self, arm: Arm, kind: str, topic_of: Callable[[str], Topic], prepare: Callable[[Arm, str, Any], Act], depth: int
+    ) -> None:
+        """Deliver what each message makes the arm do; in lockstep also that a message is refused, as its command waits for its parts."""
+
+        def heard(arm: Arm, topic: str, message: Any) -> None:
+            try:
+                act = prepare(arm, topic, message)
+            except ValueError as error:
+                if self.options.mode != "lockstep":
+                    raise
+                act = _refuse(error)
+            self._deliver_part(arm, kind, message, topic, act)
+
+        self._hear(arm, topic_of, heard, depth)
+
     @contextlib.contextmanager
     def _telling(self, arm: Arm, topic: str) -> Iterator[None]:
         """Context that also tells the errors of its block on the topic of the arm."""
@@ -168,7 +200,7 @@ class ArmTopics:
         self._short.add(arm.name)
         self._node.report_error(text)
 
-    def _deliver_part(self, arm: Arm, kind: str, message: Any, topic: str, act: Callable[[], None]) -> None:
+    def _deliver_part(self, arm: Arm, kind: str, message: Any, topic: str, act: Act) -> None:
         """Let a part of a command act on an arm when it is time; in lockstep on the camera's, which is no part of a command, now."""
 
         def telling() -> None:
@@ -186,7 +218,7 @@ class ArmTopics:
             raise ValueError(f"a pose in {ECM_VIEW}, but no pose of a camera came on {messages.CAMERA_POSE.name}; add ECM to arms")
         return messages.decode_pose(message, frames, topic)
 
-    def _on_pose(self, arm: Arm, topic: str, message: Any) -> None:
+    def _on_pose(self, arm: Arm, topic: str, message: Any) -> Act:
         pose = self._decode_pose(arm, topic, message)
 
         def act() -> None:
@@ -194,15 +226,16 @@ class ArmTopics:
             arm.servo(pose)
             self.publish_operating_states()
 
-        self._deliver_part(arm, "pose", message, topic, act)
+        return act
 
     def _on_move(self, arm: Arm, topic: str, message: Any) -> None:
         goal = self._decode_pose(arm, topic, message)
         arm.require_enabled()
         self.warn(arm, arm.move_to(goal), again=True)
+        self._discard(arm.name, ("pose",))
         self.publish_operating_states(arm.name)
 
-    def _on_joints(self, arm: Arm, topic: str, message: Any) -> None:
+    def _on_joints(self, arm: Arm, topic: str, message: Any) -> Act:
         assert isinstance(arm, JointedArm)
         joints = arm.check_joints(messages.decode_joints(message, topic), message.name)
 
@@ -211,50 +244,47 @@ class ArmTopics:
             arm.servo_joints(joints)
             self.publish_operating_states()
 
-        self._deliver_part(arm, "pose", message, topic, act)
+        return act
 
     def _on_joint_move(self, arm: Arm, topic: str, message: Any) -> None:
         assert isinstance(arm, JointedArm)
         goal = arm.check_joints(messages.decode_joints(message, topic), message.name)
         arm.require_enabled()
         arm.move_joints(goal)
+        self._discard(arm.name, ("pose",))
         self.publish_operating_states(arm.name)
 
-    def _on_joint_change(self, arm: Arm, topic: str, message: Any) -> None:
+    def _on_joint_change(self, arm: Arm, topic: str, message: Any) -> Act:
         assert isinstance(arm, JointedArm)
-        change = arm.check_numbers(messages.decode_joints(message, topic), message.name)
+        change = arm.check_numbers(messages.decode_joints(message, topic, _CHANGES), message.name)
 
         def act() -> None:
             arm.require_enabled()
             arm.servo_joints(arm.joints_after(change))
             self.publish_operating_states()
 
-        self._deliver_part(arm, "pose", message, topic, act)
+        return act
 
     def _on_joint_move_change(self, arm: Arm, topic: str, message: Any) -> None:
         assert isinstance(arm, JointedArm)
-        change = arm.check_numbers(messages.decode_joints(message, topic), message.name)
+        change = arm.check_numbers(messages.decode_joints(message, topic, _CHANGES), message.name)
         arm.require_enabled()
         arm.move_joints(arm.joints_after(change, of_goal=True))
+        self._discard(arm.name, ("pose",))
         self.publish_operating_states(arm.name)
 
     def _on_hold(self, arm: Arm, topic: str, message: Any) -> None:
-        def act() -> None:
-            arm.require_enabled()
-            arm.stop()
-            self.publish_operating_states(arm.name)
-
-        if self.options.mode == "lockstep":  # it is no part of a command, and has no stamp
-            act()
-        else:
-            self._deliver_part(arm, "pose", message, topic, act)
+        arm.require_enabled()
+        arm.stop()
+        self._discard(arm.name, ("pose", "jaw"))
+        self.publish_operating_states(arm.name)
 
     def _on_ratio(self, arm: Arm, topic: str, message: Any) -> None:
         assert isinstance(arm, JointedArm)
-        arm.set_speed_ratio(messages.decode_number(message, topic))
+        arm.set_speed_ratio(messages.decode_number(message))
         self._publishers[arm.name][messages.tool_ratio].publish(messages.encode_number(arm.speed_ratio))
 
-    def _on_wrench(self, arm: Arm, topic: str, message: Any) -> None:
+    def _on_wrench(self, arm: Arm, topic: str, message: Any) -> Act:
         force, torque = messages.decode_wrench(message, topic)
         frames = {name: pose for name, pose in self._frames(arm).items() if name}
         frame = messages.check_frame(message, ("", arm.name, *frames), topic)
@@ -264,9 +294,9 @@ class ArmTopics:
             R = frames.get(frame, pose)[:3, :3]  # any other is the tool's own
             arm.force, arm.torque, arm.heard = R @ force, R @ torque, self._node.now_ns() * 1e-9
 
-        self._deliver_part(arm, "wrench", message, topic, act)
+        return act
 
-    def _on_jaw(self, arm: Arm, topic: str, message: Any) -> None:
+    def _on_jaw(self, arm: Arm, topic: str, message: Any) -> Act:
         angle = arm.check_jaw(messages.decode_jaw(message, topic))
 
         def act() -> None:
@@ -275,27 +305,30 @@ class ArmTopics:
             arm.hold(self.options.jaw_closed, self.options.jaw_open)
             self.publish_operating_states()
 
-        self._deliver_part(arm, "jaw", message, topic, act)
+        return act
 
     def _on_jaw_move(self, arm: Arm, topic: str, message: Any) -> None:
         goal = arm.check_jaw(messages.decode_jaw(message, topic))
         self._require_pose(arm, "jaw command")
         arm.angle_goal = goal
+        self._discard(arm.name, ("jaw",))
         self.publish_operating_states(arm.name)
 
-    def _on_cut(self, arm: Arm, topic: str, message: Any) -> None:
+    def _on_cut(self, arm: Arm, topic: str, message: Any) -> Act:
         cutting = messages.decode_cut(message, topic)
 
         def act() -> None:
             self._require_pose(arm, "cut")
             arm.cutting = cutting
 
-        self._deliver_part(arm, "cut", message, topic, act)
+        return act
 
     def _on_state_command(self, arm: Arm, topic: str, message: Any) -> None:
         try:
             command = messages.decode_state_command(message)
             arm.command_state(command)
+            if arm.state != ENABLED:  # a pause leaves what tissue the arm pulls and cuts
+                self._discard(arm.name, COMMAND_PARTS if arm.state == DISABLED else ("pose", "jaw"))
             self._tell(arm, messages.tool_info, f"{arm.name} is {arm.state} after {command}")
         finally:
             self.publish_operating_states(arm.name)

@@ -10,8 +10,9 @@ from endo_sim_ros.instruments import ArmKinematics
 from endo_sim_ros.instruments.urdf import arm_capsules, robot_description
 from endo_sim_ros.messages import Topic
 from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode
+from endo_sim_ros.nodes.camera_arm import CameraArm
 from endo_sim_ros.nodes.configs import PhysicsNodeConfig
-from endo_sim_ros.nodes.jointed_arm import CameraArm, JointedArm
+from endo_sim_ros.nodes.jointed_arm import JointedArm
 from endo_sim_ros.nodes.pacing import MOST_WAITING
 
 _SHOWN = messages.tool_joints, messages.tool_joint_setpoint, messages.tool_velocity, messages.tool_local_pose, messages.tool_local_setpoint

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from endo_sim_ros.core.cameras import invert_pose
-from endo_sim_ros.instruments import ArmKinematics, Capsule, ReachConfig, link_poses, solve_inverse, working_point
+from endo_sim_ros.instruments import ArmKinematics, Capsule, link_poses, solve_inverse, working_point
 from endo_sim_ros.nodes.arm import DISABLED, Arm, seconds_between
-from endo_sim_ros.physics import ControlNodes
 
 _ROUNDED = 1 + 1e-9  # a way that takes a whole number of steps must not take one more
 _WITHIN = 1e-6  # rad, m: how far a command may leave the limits, as what is sent back was rounded
@@ -18,9 +17,7 @@ _JAW_WITHIN = 0.01  # rad: the same of the jaw, whose limits clients have in who
 _LEAP = 10.0  # times the speed of a joint: the straight way passes a singularity or goes on with another bend of the wrist
 _TRIES = 4  # to find how far the tip gets in a step; one or two are enough where joints follow in proportion
 _JOINTS_OF_LINK = {"roll": 4, "wrist_pitch": 5}  # joints that move it: the first ones; all others move with all joints
-_CAMERA_REACH = ReachConfig(radian_length=1e-4)  # the direction of an endoscope follows from its place
-_CAMERA_THERE = 1e-4  # m: nearer is at the pose
-_ENDOSCOPE = 6e-3  # m: radius of a 12 mm endoscope
+_SLOWEST = 1e-3  # part of all speeds: less makes a quarter of an hour of a move of a second
 _MEASURED_WRONG, _MEASURED_TURNED = 1e-3, np.radians(1.0)  # m, rad: less is what calibrations are off
 
 
@@ -55,6 +52,7 @@ class JointedArm(Arm):
     start: np.ndarray | None = None  # [n] joints while nobody has commanded anything
     _posed: np.ndarray | None = None  # the pose that belongs to the joints
     _stepped: np.ndarray | None = None  # joints at the end of the last step
+    _untold: str = ""  # what it missed of a pose that it was told between two steps, in a sentence
 
     def stand(self, base: np.ndarray, joints: np.ndarray) -> None:
         """Stand at a base [4, 4], world; a commanded arm with its joints at positions [n], waiting for a command."""
@@ -67,6 +65,7 @@ class JointedArm(Arm):
     def return_to_start(self) -> None:
         """Let go of everything and be at the start, which touches nothing until the arm is commanded."""
         super().reset()
+        self._untold = ""
         if self.start is not None:
             self._take(self.start)
             self._stepped, self.velocities, self.acts = self.start, np.zeros(len(self.start)), False
@@ -110,7 +109,7 @@ class JointedArm(Arm):
         """Put the tip at a pose [4, 4], world, or as near as the joints get, which `move` finds out.
 
         Raises:
-            ValueError: If a commanded arm is not long enough by far; it then stays where it is.
+            ValueError: If a commanded arm is not long enough by far; nothing changes then.
         """
         self._require_sense(pose)
         super().servo(pose)
@@ -136,7 +135,7 @@ class JointedArm(Arm):
         """Put the joints at positions [n], rad and m, now.
 
         Raises:
-            ValueError: If they are not n finite numbers within the limits; the arm then stays where it is.
+            ValueError: If they are not n finite numbers within the limits; nothing changes then.
         """
         self._take(self.check_joints(joints))
         self.halt()
@@ -168,9 +167,10 @@ class JointedArm(Arm):
 
     def check_numbers(self, joints: ArrayLike, names: Sequence[str] = ()) -> np.ndarray:
         """One number for each joint [n], whatever its limits; raises ValueError if they are not n finite ones, or have other names."""
-        arm, known = self.kinematics, ", ".join(joint.name for joint in self.kinematics.joints)
-        if any(names) and ", ".join(names) != known:
-            raise ValueError(f"{self.name}: the joints are {known}, in this order, not {', '.join(names):.200}; send these names or none")
+        arm, known = self.kinematics, [joint.name for joint in self.kinematics.joints]
+        if any(names) and list(names) != known:
+            given = ", ".join(map(repr, names))  # as they may have line feeds
+            raise ValueError(f"{self.name}: the joints are {', '.join(known)}, in this order, not {given:.200}; send these names or none")
         try:
             return arm.check_joints(joints)
         except ValueError as error:
@@ -178,14 +178,14 @@ class JointedArm(Arm):
 
     def joints_after(self, change: np.ndarray, of_goal: bool = False) -> np.ndarray:
         """Joint positions [n] that differ by a change [n] from the present ones or, while joints move, from their goal if asked."""
-        self.settle()
+        self._untold = self.settle() or self._untold  # `move` tells it
         before = self.joint_goal if of_goal and self.joint_goal is not None else self.joints
         return change if before is None else before + change  # without any the arm has no place either, and takes none
 
     def set_speed_ratio(self, ratio: float) -> None:
-        """Let moves go with a part of their largest speeds; raises ValueError if it is not above 0 and at most 1."""
-        if not 0 < ratio <= 1:
-            raise ValueError(f"{self.name}: the ratio of speeds is {ratio:g}; send one above 0 and at most 1")
+        """Let moves go with a part of their largest speeds; raises ValueError if it is not from 0.001 to 1."""
+        if not _SLOWEST <= ratio <= 1:
+            raise ValueError(f"{self.name}: the ratio of speeds is {ratio!r}; send one from {_SLOWEST:g} to 1")
         self.speed_ratio = ratio
 
     def check_jaw(self, angle: float) -> float:
@@ -226,7 +226,7 @@ class JointedArm(Arm):
             return super().move(seconds, speed, turn_speed)
         speed, turn_speed = self.speed_ratio * speed, self.speed_ratio * turn_speed
         self._move_jaw(seconds, turn_speed)
-        missing = self.settle()
+        missing, self._untold = self.settle() or self._untold, ""
         if self.pose_goal is not None:
             self._move_straight(seconds, speed, turn_speed)
         elif self.joint_goal is not None:
@@ -309,7 +309,7 @@ class JointedArm(Arm):
 
     def links(self) -> dict[str, np.ndarray]:
         """Poses [4, 4] of the links in the world by name, in the order of `link_poses`; none while they are not known."""
-        self.settle()
+        self._untold = self.settle() or self._untold
         if self.base is None or self.joints is None or self.pose is None:
             return {}
         poses = link_poses(self.kinematics, self.joints, self.gape)
@@ -347,54 +347,3 @@ class JointedArm(Arm):
             self.return_to_start()
         else:
             super().reset()
-
-
-@dataclass(kw_only=True)
-class CameraArm(JointedArm):
-    """The arm of the endoscope, whose tip is the optical frame of its camera. It touches no tissue."""
-
-    def servo(self, pose: np.ndarray) -> None:
-        """Put the camera where a pose [4, 4], world, says; its direction follows from that.
-
-        Raises:
-            ValueError: If it does not get there, or would be upside down; the camera then stays where it is.
-        """
-        self.servo_joints(self._aim(pose))
-
-    def move_to(self, pose: np.ndarray) -> str:
-        """Let the camera move, joint by joint, to where a pose [4, 4], world, says; raises as `servo` does."""
-        self.move_joints(self._aim(pose))
-        return ""
-
-    def check_joints(self, joints: ArrayLike, names: Sequence[str] = ()) -> np.ndarray:
-        """Joint positions [n] that the arm may take; raises as `servo` does."""
-        positions = super().check_joints(joints, names)
-        assert self.start is not None
-        down, was = (self.kinematics.tip_pose(at)[:3, 1] for at in (positions, self.start))
-        self._require_upright(down, was)
-        return positions
-
-    def in_tissue(self, nodes: ControlNodes) -> str:
-        """That the camera is in the tissue at rest or touches it, in a sentence, as nothing stops it; empty if it is not."""
-        near = max(_ENDOSCOPE, nodes.spacing)  # inside the tissue no place is farther from a control node
-        if self.pose is None or np.linalg.norm(nodes.rest - self.pose[:3, 3], axis=1).min() >= near:
-            return ""
-        return f"{self.name} is in the tissue or within {1e3 * near:.0f} mm of it; nothing stops it there, so draw the endoscope back"
-
-    def _aim(self, pose: np.ndarray) -> np.ndarray:
-        """Joints [n] that put the camera at a pose."""
-        if self.base is None or self.joints is None or self.start is None:
-            raise ValueError(f"{self.name} has no place yet; publish a model, or give {self.name}_base in frames")
-        self._require_sense(pose)
-        wanted = invert_pose(self.base) @ pose
-        self._require_upright(wanted[:3, 1], self.kinematics.tip_pose(self.start)[:3, 1])
-        reach = solve_inverse(self.kinematics, wanted, self.joints, _CAMERA_REACH)
-        if reach.position_error > _CAMERA_THERE:
-            raise ValueError(f"{self.name} stays where it is: {reach.shortfall()}")
-        return reach.joints
-
-    def _require_upright(self, down: np.ndarray, was: np.ndarray) -> None:
-        if down @ was <= 0:
-            raise ValueError(
-                f"{self.name} stays where it is: the camera would be upside down; y of its frame must point down as at the start"
-            )

@@ -13,8 +13,9 @@ from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ControlNodeCloud, Phys
 from endo_sim_ros.nodes.arm_setup import CAMERA_ARM, make_arms, place_arms
 from endo_sim_ros.nodes.arm_topics import ArmTopics
 from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode, run, sentence
+from endo_sim_ros.nodes.camera_arm import CameraArm
 from endo_sim_ros.nodes.configs import COMMAND_PARTS, PhysicsNodeConfig
-from endo_sim_ros.nodes.jointed_arm import CameraArm, JointedArm
+from endo_sim_ros.nodes.jointed_arm import JointedArm
 from endo_sim_ros.nodes.pacing import MOST_WAITING, WINDOW, CommandQueue, Pacer, SpeedMeter
 from endo_sim_ros.nodes.reactions import ReactionTopics
 from endo_sim_ros.nodes.tissue_builder import TissueBuilder
@@ -71,7 +72,7 @@ class PhysicsNode(EndoNode):
         self.subscribe(messages.TRAINING_CAMERA_INFO, self._builder.receive_training_info)
         self.subscribe(messages.CAMERA_POSE, self._on_camera_pose)
         self._reactions = ReactionTopics(self, self._tools, self._options.reaction_rate, self._lockstep)
-        self._arm_topics = ArmTopics(self, self.arms, self._options, depth, self._on_command)
+        self._arm_topics = ArmTopics(self, self.arms, self._options, depth, self._on_command, self._discard)
         self._place_arms()
         self.service(Trigger, "~/reset", self._on_reset)
         self.service(Trigger, "~/step", self._on_step)
@@ -168,6 +169,11 @@ class PhysicsNode(EndoNode):
         if kind == "wrench" and not self._lockstep:
             self._pacer.note_input(self._seconds(), name)
             self._step_if_due()
+
+    def _discard(self, name: str, kinds: Collection[str]) -> None:
+        """Forget parts of commands that wait for the end of a pause."""
+        for kind in kinds:
+            self._held.pop((name, kind), None)
 
     def _run_commands(self) -> None:
         """Lockstep: one step for each complete command, but none for one with the stamp of the state at rest."""

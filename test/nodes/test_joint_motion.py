@@ -10,8 +10,9 @@ from endo_sim_ros.core.cameras import make_pose
 from endo_sim_ros.instruments import load_arm
 from endo_sim_ros.nodes.arm import seconds_between
 from endo_sim_ros.nodes.arm_topics import ArmTopics
+from endo_sim_ros.nodes.camera_arm import CameraArm
 from endo_sim_ros.nodes.configs import PhysicsNodeConfig
-from endo_sim_ros.nodes.jointed_arm import CameraArm, JointedArm
+from endo_sim_ros.nodes.jointed_arm import JointedArm
 
 PSM = load_arm("PSM", "LARGE_NEEDLE_DRIVER")
 BASE = make_pose([0.1, -0.2, 0.3], [0.5, 0.1, -0.7, 0.3])
@@ -145,6 +146,15 @@ def test_efforts_of_a_push_on_a_link_are_its_virtual_work_and_joints_beyond_bear
         then = BASE @ PSM.link_frames(moved)[index]
         work = push @ (then[:3, :3] @ local + then[:3, 3] - point) + at_tip @ (BASE @ PSM.tip_pose(moved) - arm.pose)[:3, 3]
         assert efforts[i] == pytest.approx(work / small, abs=1e-5)
+
+
+@pytest.mark.parametrize("before_the_step", [lambda arm: arm.servo_joints(arm.joints_after(np.zeros(6))), JointedArm.links])
+def test_what_an_arm_misses_is_told_in_the_next_step_whoever_asks_where_it_is_before(before_the_step):
+    arm = arm_at([0.0, 0, 0.12, 0, 0, 0])
+    arm.servo(BASE @ PSM.tip_pose([0.0, 0, 0.12, 0, 0, 0]) @ make_pose([0, 0, 0.3], [1, 0, 0, 0]))
+    before_the_step(arm)
+    assert arm.move(STEP, 0.05, 1.5).startswith("PSM1: PSM stops")
+    assert arm.move(STEP, 0.05, 1.5) == ""
 
 
 def test_an_arm_without_a_base_is_a_tip():

@@ -149,13 +149,22 @@ def test_changes_of_joints_add_up_and_may_not_lead_beyond_limits(graph):
     graph.until(lambda: np.allclose(joints_of(graph), first + 23 * change, atol=1e-12), "a goal that moved on")
     there = joints_of(graph)
     for topic in (messages.tool_joint_change, messages.tool_joint_move_change):
-        for positions, sentence in (([0.0] * 5, "PSM1: 5 numbers, not 6"), ([0, 0, 0.3, 0, 0, 0], "insertion cannot be at")):
+        lengths = [([0.0] * length, f"PSM1: {length} numbers, not 6; the joints are yaw, pitch,") for length in (0, 5)]
+        no_number = [float("nan")] * 6, "expected finite changes of joint positions, rad and m, got [nan,"
+        for positions, sentence in (*lengths, no_number, ([0, 0, 0.3, 0, 0, 0], "insertion cannot be at")):
             graph.heard["PSM1/error"].clear()
             send_joints(graph, topic, positions)
             (said,) = graph.until(lambda: texts(graph, messages.tool_error), "an error of the arm")
             assert said.startswith(topic("PSM1").name) and sentence in said
     graph.spin(0.1)
     np.testing.assert_array_equal(joints_of(graph), there)
+
+
+def test_each_of_many_changes_at_once_counts(graph):
+    first = joints_of(graph)
+    for _ in range(150):
+        send_joints(graph, messages.tool_joint_change, [0.0005, 0, 0, 0, 0, 0])
+    graph.until(lambda: np.isclose(joints_of(graph)[0], first[0] + 0.075, atol=1e-9), "all changes", 5)
 
 
 def test_the_newest_change_during_a_pause_acts_after_it(graph):
@@ -166,6 +175,50 @@ def test_the_newest_change_during_a_pause_acts_after_it(graph):
     graph.spin(0.3)
     assert graph.call(SetBool, "/physics_node/pause", data=False).success
     graph.until(lambda: np.isclose(joints_of(graph)[0], first[0] + 0.02), "the newest change")
+
+
+def pause(bench, paused):
+    assert bench.call(SetBool, "/physics_node/pause", data=paused).success
+
+
+@pytest.mark.parametrize("newest_is", ["move_jp", "move_jr", "move_cp", "hold", "free", "pause", "disable"])
+def test_the_newest_command_of_a_pause_ends_those_that_wait(graph, newest_is):
+    physics, arm, first = graph.nodes[1], graph.nodes[1].arms["PSM1"], joints_of(graph)
+    change, goal = np.array([0.1, 0, 0, 0, 0, 0]), first + [0.1, 0, 0, 0, 0, 0]
+    pause(graph, True)
+    send_joints(graph, messages.tool_joint_command, first + [0.02, 0, 0, 0, 0, 0])
+    jaw(graph, 0.5)
+    graph.until(lambda: len(physics._held) == 2, "two commands that wait")
+    if newest_is in ("hold", "free"):
+        topic = getattr(messages, f"tool_{newest_is}")("PSM1")
+        graph.publish(topic, messages.ros_class(topic.type)())
+    elif newest_is in ("disable", "pause"):
+        switch(graph, newest_is, f"{newest_is.upper()}D")
+        switch(graph, "enable" if newest_is == "disable" else "resume", "ENABLED")
+    elif newest_is == "move_cp":
+        graph.publish(messages.tool_move("PSM1"), messages.encode_pose(arm.base @ PSM.tip_pose(goal), S, "world"))
+    else:
+        relative = newest_is == "move_jr"
+        send_joints(graph, messages.tool_joint_move_change if relative else messages.tool_joint_move, change if relative else goal)
+    moves = newest_is.startswith("move")
+    graph.until(lambda: ("PSM1", "pose") not in physics._held, "the older command to be forgotten")
+    pause(graph, False)
+    graph.until(lambda: not physics._held and not arm.busy, "the end of the newest command")
+    graph.spin(0.1)
+    np.testing.assert_allclose(joints_of(graph), goal if moves else first, atol=1e-6)
+    assert newest(graph, messages.tool_jaw_state("PSM1")).position[0] == (0.5 if moves else 1.0)
+
+
+def test_the_newest_command_of_a_jaw_during_a_pause_acts_after_it(graph):
+    physics, arm = graph.nodes[1], graph.nodes[1].arms["PSM1"]
+    pause(graph, True)
+    jaw(graph, 0.5)
+    graph.until(lambda: physics._held, "a command that waits")
+    graph.publish(messages.tool_jaw_move("PSM1"), messages.encode_jaw(0.8, S))
+    graph.until(lambda: arm.angle_goal == 0.8, "a goal")
+    pause(graph, False)
+    graph.until(lambda: not arm.busy, "the end of the move")
+    assert arm.angle == 0.8
 
 
 @pytest.mark.parametrize("topic", [messages.tool_hold, messages.tool_free])
@@ -209,12 +262,10 @@ def test_a_ratio_makes_moves_slower(graph):
     graph.until(lambda: np.allclose(pose_of(graph, messages.tool_pose("PSM1")), pose, atol=1e-9), "the pose")
     speed = max(np.hypot(np.hypot(v.x, v.y), v.z) for v in (m.twist.linear for m in graph.heard["PSM1/measured_cv"]))
     assert 0.01 < speed < 0.0126  # of 5 cm/s
-    for value in (0.0, 1.5, -0.1):
+    for value in (0.0, 1.5, -0.1, 1.0000001, 0.0009, 5e-324, float("inf"), float("nan")):
         send(value)
-        said = f"PSM1/trajectory_j/set_ratio: PSM1: the ratio of speeds is {value:g}; send one above 0 and at most 1"
+        said = f"PSM1/trajectory_j/set_ratio: PSM1: the ratio of speeds is {value}; send one from 0.001 to 1"
         graph.until(lambda said=said: said in texts(graph, messages.tool_error), "an error of the arm")
-    send(float("nan"))
-    graph.refused("physics_node", "PSM1/trajectory_j/set_ratio: expected a finite number, got nan")
     assert graph.nodes[1].arms["PSM1"].speed_ratio == 0.25
     send(1.0)
     graph.until(lambda: ratio() == 1.0, "the ratio of before")
@@ -245,7 +296,7 @@ def test_what_is_published_can_be_sent_back(graph):
 BAD_JOINTS = {
     "too_few": ([0.0] * 5, "PSM1: 5 numbers, not 6; the joints are yaw, pitch,"),
     "too_many": ([0.0] * 7, "PSM1: 7 numbers, not 6; the joints are yaw, pitch,"),
-    "none": ([], "expected finite joint positions"),
+    "none": ([], "PSM1: 0 numbers, not 6; the joints are yaw, pitch,"),
     "nan": ([0, 0, float("nan"), 0, 0, 0], "expected finite joint positions"),
     "infinite": ([0, 0, float("inf"), 0, 0, 0], "expected finite joint positions"),
     "beyond_limits": ([0, 0, 0.3, 0, 0, 0], "insertion cannot be at 300 mm; its limits are 0 and 240 mm"),
@@ -271,13 +322,22 @@ def test_bad_joints_are_one_sentence_and_the_arm_stays(graph, name):
     np.testing.assert_array_equal(pose_of(graph, messages.tool_pose("PSM1")), pose)
 
 
+def test_a_refused_command_lets_a_move_go_on(graph):
+    goal = joints_of(graph) + [0.3, 0, 0, 0, 0, 0]
+    send_joints(graph, messages.tool_joint_move, goal)
+    send_joints(graph, messages.tool_joint_move_change, [9, 0, 0, 0, 0, 0])
+    send_joints(graph, messages.tool_joint_command, [9, 0, 0, 0, 0, 0])
+    graph.until(lambda: len(texts(graph, messages.tool_error)) == 2, "two errors")
+    graph.until(lambda: np.allclose(joints_of(graph), goal), "the goal")
+
+
 @pytest.mark.parametrize("topic", [messages.tool_joint_command, messages.tool_joint_move])
 def test_joints_may_have_their_names_and_no_others(graph, topic):
     joints, none = joints_of(graph), np.zeros(0)
     names = list(newest(graph, messages.tool_joints("PSM1")).name)
-    for wrong in (names[::-1], names[:5], [f"PSM1_{name}" for name in names]):
+    for wrong in (names[::-1], names[:5], [", ".join(names)], ["yaw\n[ERROR] forged"]):
         graph.publish(topic("PSM1"), messages.encode_joints(wrong, joints + 0.01, none, none, S))
-        said = f"PSM1: the joints are {', '.join(names)}, in this order, not {', '.join(wrong)}; send these names or none"
+        said = f"PSM1: the joints are {', '.join(names)}, in this order, not {', '.join(map(repr, wrong))}; send these names or none"
         graph.refused("physics_node", f"{topic('PSM1').name}: {said}")
     np.testing.assert_array_equal(joints_of(graph), joints)
     graph.publish(topic("PSM1"), messages.encode_joints(names, joints + 0.01, none, none, S))

@@ -112,7 +112,9 @@ class RenderingNode(EndoNode):
                 self._reset_heard = time.monotonic()
             self._states.append((self._nodes_stamp, nodes))
             if len(self._states) > MOST_WAITING:
-                self.instruments.forget(self._states.popleft()[0])
+                dropped = self._states.popleft()[0]
+                self.instruments.forget(dropped)
+                self._poses.forget(dropped)
                 raise MessageError(f"{messages.CONTROL_NODES.name}: over {MOST_WAITING} states wait to be shown; one is left out")
             self.show_states()
         elif not same:

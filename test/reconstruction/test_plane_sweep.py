@@ -147,9 +147,10 @@ def test_costs_are_aggregated_as_published(device):
     """Hirschmüller 2008, eq. 13, pixel by pixel."""
     if device != "cpu" and not torch.cuda.is_available():
         pytest.skip("no CUDA device")
-    costs = np.random.default_rng(0).random((7, 9, 5)).astype(np.float32)
+    costs = np.random.default_rng(0).random((7, 9, 70)).astype(np.float32)
     height, width, levels = costs.shape
     small, large = 0.1, 0.3
+    lanes = 1 if device == "cpu" else sweep_kernels.WARP
     load_kernels((sweep_kernels,), device)
     for down, across in [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1)]:
         expected = costs.astype(np.float64)
@@ -164,5 +165,5 @@ def test_costs_are_aggregated_as_published(device):
                 expected[row, column] += best - before.min()
         given, totals = torch.from_numpy(costs).to(device), torch.zeros(costs.shape, device=device)
         scratch = torch.empty(height + width, 2, levels, device=device)
-        launch(sweep_kernels.aggregate, height + width, [given, down, across, small, large, scratch, totals], device)
+        launch(sweep_kernels.aggregate, lanes * (height + width), [given, down, across, small, large, lanes, scratch, totals], device)
         np.testing.assert_allclose(totals.cpu().numpy(), expected, atol=1e-5)

@@ -249,9 +249,10 @@ def _aggregated(costs: Tensor, options: PlaneSweepConfig, device: str) -> Tensor
     """Σ of the costs [H, W, L] along paths from eight directions."""
     height, width, levels = costs.shape
     totals, scratch = torch.zeros_like(costs), torch.empty(height + width, 2, levels, device=device)
+    lanes = 1 if device == "cpu" else sweep_kernels.WARP
     for down, across in _DIRECTIONS:
-        arguments = [costs, down, across, options.small_penalty, options.large_penalty, scratch, totals]
-        launch(sweep_kernels.aggregate, height + width, arguments, device)
+        arguments = [costs, down, across, options.small_penalty, options.large_penalty, lanes, scratch, totals]
+        launch(sweep_kernels.aggregate, lanes * (height + width), arguments, device)
     return totals
 
 

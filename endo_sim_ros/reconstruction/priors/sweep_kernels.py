@@ -1,10 +1,24 @@
-"""Matching costs of planes, a thread for a pixel, and their semi-global aggregation (Hirschmüller 2008), a thread for a path."""
+"""Matching costs of planes, a thread for a pixel, and their semi-global aggregation (Hirschmüller 2008), a warp of threads for a path."""
 
 import warp as wp
 
 from endo_sim_ros.reconstruction.priors.smoothing_kernels import mirrored
 
 wp.set_module_options({"enable_backward": False})
+
+WARP = 32  # threads of a GPU that go together
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    for (int apart = 16; apart > 0; apart /= 2) value = fminf(value, __shfl_xor_sync(0xffffffffu, value, apart));
+    __syncwarp();  // what the threads have written, all of them may read
+#endif
+    return value;
+""")
+def least_of_warp(value: float) -> float:
+    """The least value of the threads of a warp; on a CPU, where a path has one thread, that of the thread."""
+    ...
 
 
 @wp.func
@@ -95,11 +109,13 @@ def aggregate(
     across: int,  # and in columns
     small: float,  # penalty of a change by one level
     large: float,  # penalty of a larger one
+    lanes: int,  # threads of a path: a warp, or one on a CPU
     scratch: wp.array3d[float],  # [H + W, 2, L]
     totals: wp.array3d[float],  # in, out [H, W, L]
 ):
     """Add to the totals, of each pixel, the least costs of a path that comes to it in one direction, from where it enters the picture."""
-    path = wp.tid()
+    thread = wp.tid()
+    path = thread // lanes
     rows, columns, levels = costs.shape[0], costs.shape[1], costs.shape[2]
     row = int(0)
     column = int(0)
@@ -120,7 +136,7 @@ def aggregate(
     first = bool(True)
     while row >= 0 and row < rows and column >= 0 and column < columns:
         smallest = float(1.0e30)
-        for level in range(levels):
+        for level in range(thread % lanes, levels, lanes):
             cost = costs[row, column, level]
             if not first:
                 best = wp.min(scratch[path, before, level], least + large)
@@ -132,7 +148,7 @@ def aggregate(
             scratch[path, 1 - before, level] = cost
             totals[row, column, level] += cost
             smallest = wp.min(smallest, cost)
-        least = smallest
+        least = least_of_warp(smallest)
         before = 1 - before
         first = False
         row += down

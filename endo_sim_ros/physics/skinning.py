@@ -84,7 +84,8 @@ class Skinning:
         self.means = model.means.float().contiguous()  # [N, 3] m, at rest
         self.covars = model.covariances.float().contiguous()  # [N, 3, 3] m², at rest
         self.node_rest = torch.from_numpy(rest).float().to(self.device).contiguous()  # [M, 3] m
-        self._origin = wp.vec3(*rest.mean(0))  # of the maps
+        x, y, z = rest.mean(0).tolist()
+        self._origin = x, y, z  # of the maps, m
         index, weights = bind_weights(means, rest, neighbours, weighting)
         self.rebind(index, weights)
         self._cuts = CutNeighbours(means, rest, index, weights)

@@ -7,7 +7,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from endo_sim_ros.core.device import pick_device
+from endo_sim_ros.core.device import pick_device, upload
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.kernels import load_kernels
 from endo_sim_ros.physics import node_map_kernels as kernels
@@ -162,6 +162,8 @@ class Skinning:
         return out
 
     def _nodes(self, name: str, values: Tensor | np.ndarray, shape: tuple[int, ...]) -> Tensor:
+        if isinstance(values, np.ndarray) and self.device != "cpu":
+            (values,) = upload(self.device, values)
         values = torch.as_tensor(values).detach().to(self.device, torch.float32).contiguous()
         expected = (len(self.node_rest), *shape)
         if tuple(values.shape) != expected:

@@ -95,6 +95,18 @@ def upload(device: torch.device | str, *arrays: np.ndarray) -> list[Tensor]:
     return [part.view(array.shape) for part, array in zip(flat.split(sizes), arrays)]
 
 
+def download(*tensors: Tensor) -> list[np.ndarray]:
+    """Return tensors of one device as arrays. The host waits once for a GPU, not once for each.
+
+    The copies pass through pinned memory, which is soon there for others again, as pictures may be kept for long.
+    """
+    if tensors[0].device.type == "cpu":
+        return [tensor.numpy() for tensor in tensors]
+    pinned = [torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True).copy_(tensor, non_blocking=True) for tensor in tensors]
+    torch.cuda.current_stream(tensors[0].device).synchronize()
+    return [tensor.numpy().copy() for tensor in pinned]
+
+
 def cpu_threads() -> int:
     """Return the number of threads for CPU kernels: the cores that this process may use, or ENDO_SIM_THREADS.
 

@@ -64,10 +64,11 @@ class PosedInstruments:
 
     def draw_into(self, cameras: Sequence[Camera], colors: Tensor, depths: Tensor, alphas: Tensor) -> Tensor:
         """Draw them into the pictures of the eyes of one endoscope, whose lamp is beside the first; see `InstrumentDrawing.draw_into`."""
-        config = self.drawing.config
-        lamp = cameras[0].pose @ np.array([config.lamp_x, config.lamp_y, 0.0, 1.0])
-        lamps = np.stack([(camera.viewmat @ lamp)[:3] for camera in cameras])
-        return self.drawing.draw_into([self.poses] * len(cameras), cameras, colors, depths, alphas, lamps)
+        drawing, config = self.drawing, self.drawing.config
+        viewmats = np.array([camera.viewmat for camera in cameras])
+        lamps = viewmats @ (cameras[0].pose @ np.array([config.lamp_x, config.lamp_y, 0.0, 1.0]))
+        local = viewmats[:, None] @ np.array([self.poses[i][link] for i, link in drawing.links])
+        return drawing.draw_links(local, lenses(cameras), colors, depths, alphas, lamps[:, :3])
 
 
 class InstrumentDrawing:
@@ -190,9 +191,8 @@ class InstrumentDrawing:
         drawn = [room["screen"], room["rows"], frame, room["samples"], room["marks"]]
         corners = [self._corners, self._normals, self._links, placed, views, frame, room["screen"], room["turned"], room["rows"]]
         self._launch(drawing_kernels.project, count * frame.faces, corners)
-        flat = [colors.view(-1, 3), depths.view(-1), alphas.view(-1), labels.view(-1)]
         scene = [room["samples"], room["screen"], room["turned"], self._links, self._owners, self._materials, materials]
-        scene += [ends, self._radii, self._capsule_owners, views, around, frame, self._look, *flat]
+        scene += [ends, self._radii, self._capsule_owners, views, around, frame, self._look, colors, depths, alphas, labels]
         if vectorised(self.device):
             self._launch(drawing_kernels.cover_rows, count * frame.down, drawn, least=4)
             self._launch(resolving_kernels.resolve_tiles, count * frame.across * frame.down, [room["marks"], *scene], least=4)
@@ -212,7 +212,7 @@ class InstrumentDrawing:
             return (coarse * coarse * seen).sum((1, 2), dtype=torch.float64), labels
         around = torch.empty((len(colors), 3), dtype=torch.float64, device=self.device)
         lanes = 1 if torch.device(self.device).type == "cpu" else light_kernels.LANES
-        self._launch(light_kernels.sum_light, len(colors) * lanes, [lanes, frame, _STRIDE, colors.view(-1, 3), alphas.view(-1), around])
+        self._launch(light_kernels.sum_light, len(colors) * lanes, [lanes, frame, _STRIDE, colors, alphas, around])
         return around, torch.empty_like(alphas, dtype=torch.uint8)
 
     def _frame(self, width: int, height: int, own_surfaces: bool) -> Any:

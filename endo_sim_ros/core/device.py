@@ -8,7 +8,9 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
+from torch import Tensor
 
 if TYPE_CHECKING:
     import warp as wp
@@ -78,6 +80,31 @@ def _warp_stream(device: torch.device, handle: int) -> "wp.Stream":
     import warp as wp
 
     return wp.Stream(wp.device_from_torch(device), cuda_stream=handle)
+
+
+def upload(device: torch.device | str, *arrays: np.ndarray) -> list[Tensor]:
+    """Return numbers as float32 tensors on a device, copied all at once. The host does not wait for what a GPU does at the moment.
+
+    The copy starts from pinned memory, which torch does not use again before the copy is done.
+    """
+    sizes, on_host = [array.size for array in arrays], torch.device(device).type == "cpu"
+    flat = torch.empty(sum(sizes), dtype=torch.float32, pin_memory=not on_host)
+    np.concatenate([array.reshape(-1) for array in arrays], out=flat.numpy(), casting="same_kind")
+    if not on_host:
+        flat = flat.to(device, non_blocking=True)
+    return [part.view(array.shape) for part, array in zip(flat.split(sizes), arrays)]
+
+
+def download(*tensors: Tensor) -> list[np.ndarray]:
+    """Return tensors of one device as arrays. The host waits once for a GPU, not once for each.
+
+    The copies pass through pinned memory, which is soon there for others again, as pictures may be kept for long.
+    """
+    if tensors[0].device.type == "cpu":
+        return [tensor.numpy() for tensor in tensors]
+    pinned = [torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True).copy_(tensor, non_blocking=True) for tensor in tensors]
+    torch.cuda.current_stream(tensors[0].device).synchronize()
+    return [tensor.numpy().copy() for tensor in pinned]
 
 
 def cpu_threads() -> int:

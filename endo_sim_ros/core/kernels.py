@@ -7,6 +7,7 @@ backend of a device. What Warp does not promise to keep (`kernel.adj`, `dtype._s
 import contextlib
 import contextvars
 import functools
+import threading
 import types
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -78,15 +79,50 @@ def _array(kind: Any, tensor: Tensor) -> Any:
 def launch(kernel: Any, count: int | tuple[int, ...], arguments: Sequence, device: torch.device | str) -> None:
     """Launch a kernel over count items on a device, in order with torch's own work there.
 
+    Packing the arguments takes longer than many kernels run. So launches are recorded, and a launch of the same kind as an
+    earlier one of this thread only gets the addresses of its tensors.
+
     Args:
         kernel: A Warp kernel.
         count: Number of its threads, or numbers along each axis.
-        arguments: As for `kernel_arguments`.
+        arguments: As for `kernel_arguments`; what is no tensor must be hashable. A struct is known by its identity: one that
+            is kept spares its packing.
         device: That of all tensors.
     """
+    if not (count if isinstance(count, int) else all(count)):
+        return
     device = torch.device(device)
-    stream = warp_stream(torch.cuda.current_stream(device)) if device.type == "cuda" else None
-    wp.launch(kernel, count, kernel_arguments(kernel, arguments), device=str(device), stream=stream)
+    tensors = [x for x in arguments if isinstance(x, Tensor)]
+    kind = (kernel, count, device, *[(x.shape, x.dtype, x.stride()) if isinstance(x, Tensor) else x for x in arguments])
+    found = _recorded.launches.get(kind)
+    if found is None:
+        while len(_recorded.launches) >= _COMMANDS:
+            del _recorded.launches[next(iter(_recorded.launches))]
+        found = _recorded.launches[kind] = _record(kernel, count, arguments, str(device))
+    command, places = found
+    for place, tensor in zip(places, tensors, strict=True):
+        place.data = tensor.data_ptr()
+    command.launch(warp_stream(torch.cuda.current_stream(device)) if device.type == "cuda" else None)
+
+
+class _Recorded(threading.local):
+    """Launches of one thread, with their array arguments: two threads never fill in the addresses of one launch."""
+
+    def __init__(self) -> None:
+        self.launches: dict[tuple, tuple[Any, list]] = {}
+
+
+_recorded = _Recorded()
+_COMMANDS = 512  # recorded launches that a thread keeps
+
+
+def _record(kernel: Any, count: int | tuple[int, ...], arguments: Sequence, device: str) -> tuple[Any, list]:
+    """Return a launch, not made yet, and its array arguments, whose addresses are to be filled in."""
+    command: Any = wp.launch(kernel, count, kernel_arguments(kernel, arguments), device=device, record_cmd=True)
+    places = [command.params[1 + i] for i, x in enumerate(arguments) if isinstance(x, Tensor)]
+    for place in places:
+        place._ref = None  # Warp's hold on the tensor, whose memory would never be free again
+    return command, places
 
 
 def launch_in_shares(kernel: Any, count: int, arguments: Sequence, least: int = 1024) -> None:

@@ -24,7 +24,7 @@ def shade(light: Light, colors: Tensor, depths: Tensor, alphas: Tensor, camera: 
         camera: The camera that the picture was rendered for.
     """
     lit = backend_for(colors.device).light(light, colors, depths, alphas, directions(camera, colors.device))
-    level = lit.new_tensor([light.level_r, light.level_g, light.level_b])
+    _, level = _constants(light, colors.device)
     return lit.mul_((level - light.response * log_brightness(lit, alphas > SURFACE)).exp())
 
 
@@ -77,22 +77,26 @@ class _Torch:
     modules = ()
 
     def light(self, light: Light, colors: Tensor, depths: Tensor, alphas: Tensor, rays: Tensor) -> Tensor:
-        return colors * falloff(features(depths, alphas, rays, light.reference), _exponents(light, rays))[..., None]
+        return colors * falloff(features(depths, alphas, rays, light.reference), _constants(light, rays.device)[0])[..., None]
 
     def to_bytes(self, colors: Tensor) -> Tensor:
         return (colors.clamp(0, 1) * 255 + 0.5).to(torch.uint8)
 
 
-def _exponents(light: Light, like: Tensor) -> Tensor:
-    """Return what `falloff` multiplies the four features with [4], on the device of another tensor."""
-    return like.new_tensor([light.distance, light.angle, light.tilt_x, light.tilt_y])
+@functools.lru_cache(maxsize=8)
+@torch.inference_mode(False)
+def _constants(light: Light, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return what `falloff` multiplies the four features with [4], and the levels of the exposure [3]; kept, as a copy takes the host to
+    wait for a GPU."""
+    exponents = torch.tensor([light.distance, light.angle, light.tilt_x, light.tilt_y], dtype=torch.float32, device=device)
+    return exponents, torch.tensor([light.level_r, light.level_g, light.level_b], dtype=torch.float32, device=device)
 
 
 @functools.lru_cache(maxsize=8)
 def _fixed_falloff(light: Light, rays: Tensor) -> Tensor:
     """Return the factor of brightness [H, W] that does not depend on depth along the axis, for `directions` [3, H, W]."""
     here = rays.new_full(rays.shape[1:], light.reference)
-    return falloff(features(here, torch.ones_like(here), rays, light.reference), _exponents(light, rays))
+    return falloff(features(here, torch.ones_like(here), rays, light.reference), _constants(light, rays.device)[0])
 
 
 def _launch(kernel: Any, count: int, arguments: list) -> None:

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.core.device import pick_device
+from endo_sim_ros.core.device import pick_device, upload
 from endo_sim_ros.core.kernels import launch, launch_in_shares, load_kernels, vectorised
 from endo_sim_ros.core.light import SURFACE
-from endo_sim_ros.instruments import drawing_kernels, resolving_kernels
+from endo_sim_ros.instruments import drawing_kernels, light_kernels, resolving_kernels
 from endo_sim_ros.instruments.config import DrawingConfig as DrawingConfig
 from endo_sim_ros.instruments.shadow_kernels import MOST
 from endo_sim_ros.instruments.shapes import Capsule, Material, Part
@@ -64,10 +64,11 @@ class PosedInstruments:
 
     def draw_into(self, cameras: Sequence[Camera], colors: Tensor, depths: Tensor, alphas: Tensor) -> Tensor:
         """Draw them into the pictures of the eyes of one endoscope, whose lamp is beside the first; see `InstrumentDrawing.draw_into`."""
-        config = self.drawing.config
-        lamp = cameras[0].pose @ np.array([config.lamp_x, config.lamp_y, 0.0, 1.0])
-        lamps = np.stack([(camera.viewmat @ lamp)[:3] for camera in cameras])
-        return self.drawing.draw_into([self.poses] * len(cameras), cameras, colors, depths, alphas, lamps)
+        drawing, config = self.drawing, self.drawing.config
+        viewmats = np.array([camera.viewmat for camera in cameras])
+        lamps = viewmats @ (cameras[0].pose @ np.array([config.lamp_x, config.lamp_y, 0.0, 1.0]))
+        local = viewmats[:, None] @ np.array([self.poses[i][link] for i, link in drawing.links])
+        return drawing.draw_links(local, lenses(cameras), colors, depths, alphas, lamps[:, :3])
 
 
 class InstrumentDrawing:
@@ -114,8 +115,12 @@ class InstrumentDrawing:
         self._capsule_links = np.array([self.links.index((i, capsule.link)) for i, capsule in thrown], int)
         self._capsule_owners = move([i for i, _ in thrown], torch.int32)
         self._radii = move([capsule.radius for _, capsule in thrown], torch.float32)
+        self._look = look = resolving_kernels.Look()
+        look.ambient, look.softness = config.ambient, config.softness
+        look.lamp_size, look.mirror, look.white = config.lamp_size, config.mirror, config.white
+        self._frames: dict[tuple[int, int, bool], Any] = {}
         self._room: tuple[tuple[int, int, int], dict[str, Tensor]] = (0, 0, 0), {}
-        load_kernels((drawing_kernels, resolving_kernels), self.device)
+        load_kernels((drawing_kernels, light_kernels, resolving_kernels), self.device)
 
     def at(self, poses: Sequence[Mapping[str, np.ndarray]]) -> PosedInstruments:
         """The instruments where the poses [4, 4] of their links, world, put them."""
@@ -153,8 +158,9 @@ class InstrumentDrawing:
         Returns:
             Labels [B, H, W], uint8, as in `Picture`.
         """
-        local = [camera.viewmat @ np.stack([own[i][link] for i, link in self.links]) for own, camera in zip(poses, cameras, strict=True)]
-        return self.draw_links(np.stack(local), lenses(cameras), colors, depths, alphas, lamps)
+        world = np.array([[own[i][link] for i, link in self.links] for own, _ in zip(poses, cameras, strict=True)])
+        viewmats = np.array([camera.viewmat for camera in cameras])
+        return self.draw_links(viewmats[:, None] @ world, lenses(cameras), colors, depths, alphas, lamps)
 
     def draw_links(
         self,
@@ -175,32 +181,18 @@ class InstrumentDrawing:
             surfaces: What the materials of each are like [B, M, 5], as `SURFACES`; those by default.
         """
         config, count, (height, width) = self.config, len(local), colors.shape[1:3]
-        frame, look = drawing_kernels.Frame(), resolving_kernels.Look()
-        tile = int(drawing_kernels.TILE)
-        frame.width, frame.height, frame.across, frame.down = width, height, -(-width // tile), -(-height // tile)
-        frame.faces, frame.links, frame.capsules = len(self._links), len(self.links), len(self._radii)
-        frame.several, frame.spread, frame.nearest = int(len({i for i, _ in self.links}) > 1), config.blur, _NEAREST
-        frame.stride = _stride(frame.across * frame.down * frame.down)
-        frame.surfaces = 0 if surfaces is None else len(Material)
-        look.ambient, look.softness = config.ambient, config.softness
-        look.lamp_size, look.mirror, look.white = config.lamp_size, config.mirror, config.white
-        frame.lanes = -(-height // int(drawing_kernels.APART))
+        frame = self._frame(width, height, surfaces is not None)
         lamps = np.tile((config.lamp_x, config.lamp_y, 0.0), (count, 1)) if lamps is None else lamps
-        ends = local[:, self._capsule_links] @ self._ends  # [B, C, 4, 2]
-        placed, ends, views, materials = self._upload(
-            local, ends[:, :, :3].swapaxes(2, 3), np.concatenate([lenses, lamps], 1), self._surfaces if surfaces is None else surfaces
-        )
+        surfaces = self._surfaces if surfaces is None else surfaces
+        ends = (local[:, self._capsule_links] @ self._ends)[:, :, :3].swapaxes(2, 3)  # [B, C, 2, 3]
+        placed, ends, views, materials = upload(self.device, local, ends, np.concatenate([lenses, lamps], 1), surfaces)
         room = self._buffers(count, frame)
-        labels = (alphas > SURFACE).view(torch.uint8)
-        coarse, seen = colors[:, ::_STRIDE, ::_STRIDE], labels[:, ::_STRIDE, ::_STRIDE, None]
-        # The tissue's light, linear; in float64, so that the order of the sum, which depends on B, does not show.
-        around = (coarse * coarse * seen).sum((1, 2), dtype=torch.float64)
+        around, labels = self._tissue(frame, colors, alphas)
         drawn = [room["screen"], room["rows"], frame, room["samples"], room["marks"]]
         corners = [self._corners, self._normals, self._links, placed, views, frame, room["screen"], room["turned"], room["rows"]]
         self._launch(drawing_kernels.project, count * frame.faces, corners)
-        flat = [colors.view(-1, 3), depths.view(-1), alphas.view(-1), labels.view(-1)]
         scene = [room["samples"], room["screen"], room["turned"], self._links, self._owners, self._materials, materials]
-        scene += [ends, self._radii, self._capsule_owners, views, around, frame, look, *flat]
+        scene += [ends, self._radii, self._capsule_owners, views, around, frame, self._look, colors, depths, alphas, labels]
         if vectorised(self.device):
             self._launch(drawing_kernels.cover_rows, count * frame.down, drawn, least=4)
             self._launch(resolving_kernels.resolve_tiles, count * frame.across * frame.down, [room["marks"], *scene], least=4)
@@ -209,12 +201,33 @@ class InstrumentDrawing:
             self._launch(resolving_kernels.resolve_pixels, count * width * height, scene)
         return labels
 
-    def _upload(self, *arrays: np.ndarray) -> list[Tensor]:
-        """Numbers as float32 on the device, all at once and without waiting for what that does at the moment."""
-        flat = torch.from_numpy(np.concatenate([array.ravel() for array in arrays], dtype=np.float32))
-        if torch.device(self.device).type != "cpu":
-            flat = flat.pin_memory().to(self.device, non_blocking=True)
-        return [part.view(array.shape) for part, array in zip(flat.split([array.size for array in arrays]), arrays)]
+    def _tissue(self, frame: Any, colors: Tensor, alphas: Tensor) -> tuple[Tensor, Tensor]:
+        """The tissue's light in each picture [B, 3], linear, and labels [B, H, W]: on a GPU `resolve_pixels` writes what is tissue.
+
+        The light is added up in float64, so that the order of the sum, which depends on B on a CPU, does not show.
+        """
+        if vectorised(self.device):
+            labels = (alphas > SURFACE).view(torch.uint8)
+            coarse, seen = (each[:, ::_STRIDE, ::_STRIDE] for each in (colors, labels[..., None]))
+            return (coarse * coarse * seen).sum((1, 2), dtype=torch.float64), labels
+        around = torch.empty((len(colors), 3), dtype=torch.float64, device=self.device)
+        lanes = 1 if torch.device(self.device).type == "cpu" else light_kernels.LANES
+        self._launch(light_kernels.sum_light, len(colors) * lanes, [lanes, frame, _STRIDE, colors, alphas, around])
+        return around, torch.empty_like(alphas, dtype=torch.uint8)
+
+    def _frame(self, width: int, height: int, own_surfaces: bool) -> Any:
+        """The sizes of pictures; the same object for the same sizes, so that launches are known again."""
+        key = width, height, own_surfaces
+        if key not in self._frames:
+            frame, tile = drawing_kernels.Frame(), int(drawing_kernels.TILE)
+            frame.width, frame.height, frame.across, frame.down = width, height, -(-width // tile), -(-height // tile)
+            frame.faces, frame.links, frame.capsules = len(self._links), len(self.links), len(self._radii)
+            frame.several, frame.spread, frame.nearest = int(len({i for i, _ in self.links}) > 1), self.config.blur, _NEAREST
+            frame.stride = _stride(frame.across * frame.down * frame.down)
+            frame.surfaces = len(Material) if own_surfaces else 0
+            frame.lanes = -(-height // int(drawing_kernels.APART))
+            self._frames[key] = frame
+        return self._frames[key]
 
     def _buffers(self, count: int, frame: Any) -> dict[str, Tensor]:
         """What kernels write for each other; samples are left empty by each picture for the next."""

@@ -284,6 +284,7 @@ def resolve_pixels(
     i = first + wp.tid()
     picture = i // (frame.width * frame.height)
     row, column = i // frame.width % frame.height, i % frame.width
+    labels[i] = wp.where(alphas[i] > 0.5, wp.uint8(1), wp.uint8(0))
     on_tissue = wp.uint64(0)
     on_links = wp.uint64(0)
     if frame.capsules > 0:

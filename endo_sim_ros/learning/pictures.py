@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.device import download, upload
 from endo_sim_ros.core.light import SURFACE
 from endo_sim_ros.core.shading import shade, to_bytes
 from endo_sim_ros.instruments import LINKS, Material
@@ -116,24 +117,21 @@ class Pictures:
         if self._by.light:
             one = np.ones((1, 1, 1), np.float32)
             factors = [np.broadcast_to(one if view.light is None else view.light, (*colors.shape[1:3], 1)) for view in views]
-            colors = colors * self._move(factors * len(eyes))
-        images = to_bytes(colors).cpu().numpy()
+            colors = colors * upload(self._device, np.array(factors * len(eyes)))[0]
+        images, *rest = download(to_bytes(colors), *([marks[: len(own), ..., None]] if labels else []))
         found: dict[str, np.ndarray] = dict(zip((IMAGE, IMAGE_RIGHT), np.split(images, len(eyes))))
         if labels:
-            found[SEGMENTATION] = marks[: len(own), ..., None].cpu().numpy()
+            (found[SEGMENTATION],) = rest
         return found
 
     def _rasterize(self, own: np.ndarray, eye: int) -> tuple[Tensor, Tensor, Tensor]:
         rows = slice(own[0], own[-1] + 1)
+        viewmats, Ks = upload(self._device, self._viewmats[eye, rows], np.array([self.camera.K] * len(own)))
         seen = rasterize(
-            self._means[rows], None, None, self._model.opacities, self._colors(rows, eye),
-            self._move(self._viewmats[eye, rows]), self._move([self.camera.K] * len(own)),
+            self._means[rows], None, None, self._model.opacities, self._colors(rows, eye), viewmats, Ks,
             self.camera.width, self.camera.height, covars=self._covars[rows],
         )  # fmt: skip
         return seen.colors, seen.depths, seen.alphas
-
-    def _move(self, arrays: Sequence[np.ndarray] | np.ndarray) -> Tensor:
-        return torch.from_numpy(np.asarray(arrays).astype(np.float32)).to(self._device)
 
     def _colors(self, rows: slice, eye: int) -> Tensor:
         """Colours of all these episodes [N, K, 3], or of each [b, N, K, 3], as `rasterize` takes them."""

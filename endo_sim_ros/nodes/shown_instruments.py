@@ -3,6 +3,7 @@
 from collections.abc import Collection, Sequence
 from typing import Any, Literal
 
+import cv2
 import numpy as np
 
 from endo_sim_ros import messages
@@ -140,7 +141,7 @@ class ShownInstruments:
         names = [arm for arm, _ in self._key[0]]
         for label, (number, link) in enumerate(instruments.drawing.links, FIRST_LINK):
             table[label] = FIRST_LINK + len(LINKS) * self.arms.index(names[number]) + LINKS.index(link)
-        return table[found]
+        return cv2.LUT(found, table)  # in a third of numpy's time
 
     def stop(self) -> None:
         """Prepare nothing more."""

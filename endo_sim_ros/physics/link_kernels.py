@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from endo_sim_ros.physics.backends.end_kernels import OPTIONS, block_sum
+from endo_sim_ros.core.block_sums import OPTIONS, block_sum
 from endo_sim_ros.physics.backends.structs import Loads, Nodes, RigidTools, State
 from endo_sim_ros.physics.tool_state_kernels import Commands, Holds, ToolConstants, double, single
 

@@ -7,7 +7,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from endo_sim_ros.core.device import pick_device
+from endo_sim_ros.core.device import pick_device, upload
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.kernels import load_kernels
 from endo_sim_ros.physics import node_map_kernels as kernels
@@ -84,7 +84,8 @@ class Skinning:
         self.means = model.means.float().contiguous()  # [N, 3] m, at rest
         self.covars = model.covariances.float().contiguous()  # [N, 3, 3] m², at rest
         self.node_rest = torch.from_numpy(rest).float().to(self.device).contiguous()  # [M, 3] m
-        self._origin = wp.vec3(*rest.mean(0))  # of the maps
+        x, y, z = rest.mean(0).tolist()
+        self._origin = x, y, z  # of the maps, m
         index, weights = bind_weights(means, rest, neighbours, weighting)
         self.rebind(index, weights)
         self._cuts = CutNeighbours(means, rest, index, weights)
@@ -161,6 +162,8 @@ class Skinning:
         return out
 
     def _nodes(self, name: str, values: Tensor | np.ndarray, shape: tuple[int, ...]) -> Tensor:
+        if isinstance(values, np.ndarray) and self.device != "cpu":
+            (values,) = upload(self.device, values)
         values = torch.as_tensor(values).detach().to(self.device, torch.float32).contiguous()
         expected = (len(self.node_rest), *shape)
         if tuple(values.shape) != expected:

@@ -7,7 +7,8 @@ matters and a scene metres from the world's origin as accurate as one at it.
 
 import warp as wp
 
-from endo_sim_ros.physics.backends.end_kernels import OPTIONS, THREADS, block_sum
+from endo_sim_ros.core.block_sums import OPTIONS, block_sum
+from endo_sim_ros.physics.backends.end_kernels import THREADS
 from endo_sim_ros.physics.backends.structs import Loads, Nodes, RigidTools, State
 from endo_sim_ros.physics.link_kernels import lies_between, links_are_finite, measure_links, move_links, slide_in_jaws
 from endo_sim_ros.physics.tool_state_kernels import Commands, Holds, ToolConstants, block_sum3, double, single

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal, overload
 
 import numpy as np
@@ -9,14 +10,14 @@ import torch
 from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.core.device import pick_device
+from endo_sim_ros.core.device import download, pick_device, upload
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
 from endo_sim_ros.core.light import SURFACE, Light
 from endo_sim_ros.core.shading import shade, to_bytes
 from endo_sim_ros.instruments.drawing import PosedInstruments
 from endo_sim_ros.physics.skinning import Skinning
 from endo_sim_ros.rendering.config import RenderingConfig
-from endo_sim_ros.splatting import RenderOutput, render, sh_basis
+from endo_sim_ros.splatting import render, sh_basis
 
 
 @dataclass(frozen=True)
@@ -166,32 +167,45 @@ class DeformableRenderer:
             if F is None:
                 raise ValueError("render: positions of control nodes go with their deformation gradients F; F is None")
             means, covars = self.deform(positions, F)
-        seen = [self._render_tissue(camera, means, covars, F) for camera in cameras]
-        sees_tissue = (seen[0].alphas[0] > SURFACE).any()
-        pictures = [(each.colors, each.depths, each.alphas) for each in seen]
-        colors, depths, alphas = pictures[0] if len(seen) == 1 else map(torch.cat, zip(*pictures))
+        colors, depths, alphas = self._render_tissue(cameras, means, covars, F)
+        sees_tissue = (alphas[0] > SURFACE).any()
         marks = None
         if instruments is not None:
             marks = instruments.draw_into(cameras, colors, depths, alphas)
         elif labels:
             marks = (alphas > SURFACE).to(torch.uint8)
-        light, found = light or self.model.light, []
+        found, light = [sees_tissue], light or self.model.light
         for i, camera in enumerate(cameras):
-            lit = colors[i] if light is None else shade(light, colors[i], depths[i], alphas[i], camera)
-            image, distance = to_bytes(lit).cpu().numpy(), None
-            if depth:
-                distance = torch.where(alphas[i] > SURFACE, depths[i] / alphas[i].clamp_min(1e-6), 0.0).cpu().numpy()
-            found.append(View(image, distance, marks[i].cpu().numpy() if labels and marks is not None else None))
-        self.sees_tissue = bool(sees_tissue)
-        return found
+            found.append(to_bytes(colors[i] if light is None else shade(light, colors[i], depths[i], alphas[i], camera)))
+        if depth:
+            found += torch.where(alphas > SURFACE, depths / alphas.clamp_min(1e-6), 0.0)
+        if labels and marks is not None:
+            found += marks
+        sees, *arrays = download(*found)
+        self.sees_tissue = bool(sees)
+        count = len(cameras)
+        images, rest, nothing = arrays[:count], arrays[count:], [None] * count
+        distances = rest[:count] if depth else nothing
+        return [View(*each) for each in zip(images, distances, rest[-count:] if labels else nothing, strict=True)]
 
-    def _render_tissue(self, camera: Camera, means: Tensor, covars: Tensor | None, F: np.ndarray | None) -> RenderOutput:
+    def _render_tissue(
+        self, cameras: Sequence[Camera], means: Tensor, covars: Tensor | None, F: np.ndarray | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Colours [E, H, W, 3], depths and alphas [E, H, W] of the tissue in each camera."""
         model = self.model
-        if covars is not None:
-            assert self.skinning is not None and F is not None  # else there are no covariances
-            sh = turned_colors(model.sh, self.skinning, means, F, camera) if model.sh_degree else model.sh
-            model = GaussianModel(means, model.quats, model.log_scales, model.logit_opacities, sh)
-        return render(model, camera, background=self._background, covars=covars)
+        draw = partial(render, background=self._background, covars=covars)
+        if covars is None:
+            return draw(model, *cameras)[:3]
+        assert self.skinning is not None and F is not None  # else there are no covariances
+        moved = lambda sh: GaussianModel(means, model.quats, model.log_scales, model.logit_opacities, sh)
+        if not model.sh_degree:
+            return draw(moved(model.sh), *cameras)[:3]
+        # Each eye sees colours of its own.
+        seen = [draw(moved(turned_colors(model.sh, self.skinning, means, F, camera)), camera)[:3] for camera in cameras]
+        if len(seen) == 1:
+            return seen[0]
+        colors, depths, alphas = map(torch.cat, zip(*seen))
+        return colors, depths, alphas
 
 
 @torch.no_grad()
@@ -219,7 +233,7 @@ def turned_colors(sh: Tensor, skinning: Skinning, means: Tensor, F: Tensor | np.
         F: Deformation gradients of the control nodes [M, 3, 3].
         camera: Where the Gaussians are seen from.
     """
-    position = torch.as_tensor(camera.position, dtype=torch.float32, device=means.device)
+    (position,) = upload(means.device, camera.position)
     directions = torch.nn.functional.normalize(means - position, dim=1)
     at_rest = torch.einsum("nij,ni->nj", skinning.rotations(F), directions)
     return (sh_basis(at_rest, sh.shape[1])[..., None] * sh).sum(1, keepdim=True) / SH_C0

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.device import upload
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.splatting.backend import backend_for
 from endo_sim_ros.splatting.constants import TILE
@@ -102,16 +103,17 @@ def rasterize(
 def render(
     model: GaussianModel,
     camera: Camera,
-    *,
+    *others: Camera,
     covars: Tensor | None = None,
     background: Tensor | None = None,
     median: bool = False,
 ) -> RenderOutput:
-    """Return images of a Gaussian model in one camera: `rasterize` with C = 1.
+    """Return images of a Gaussian model in one camera, or in C of one size at once: `rasterize` with their matrices.
 
     Args:
         model: Gaussians, world; the images are computed on their device.
         camera: Intrinsics, pose and image size.
+        others: More cameras.
         covars: World covariances [N, 3, 3], m², instead of the model's own.
         background: Colour behind everything [3]; black by default.
         median: Whether to compute median depths.
@@ -119,10 +121,11 @@ def render(
     Raises:
         ValueError: As `rasterize` does.
     """
-    viewmat, K = (torch.tensor(matrix, dtype=torch.float32, device=model.means.device) for matrix in (camera.viewmat, camera.K))
+    cameras = camera, *others
+    viewmats, Ks = upload(model.means.device, np.array([each.viewmat for each in cameras]), np.array([each.K for each in cameras]))
     shapes = (None, None) if covars is not None else (model.quats, model.scales)
-    cameras = viewmat[None], K[None], camera.width, camera.height
-    return rasterize(model.means, *shapes, model.opacities, model.sh, *cameras, covars=covars, background=background, median=median)
+    arguments = viewmats, Ks, camera.width, camera.height
+    return rasterize(model.means, *shapes, model.opacities, model.sh, *arguments, covars=covars, background=background, median=median)
 
 
 def check_inputs(name: str, scene: Scene, settings: Settings, masks: Tensor | None, absgrad: Tensor | None) -> None:

@@ -7,14 +7,14 @@ import functools
 import math
 import threading
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 import warp as wp
 from torch import Tensor
 
 from endo_sim_ros.core.device import on_torch_stream
-from endo_sim_ros.core.kernels import kernel_arguments
+from endo_sim_ros.core.kernels import launch
 from endo_sim_ros.splatting import common_kernels as kernels, cuda_kernels
 from endo_sim_ros.splatting.constants import RECORD_SIZE, SPLAT_SIZE
 from endo_sim_ros.splatting.scene import Gradients, Scene, Settings, empty_images
@@ -25,7 +25,7 @@ _MOST = 64.0  # intersections of a splat, on average, that lists have room for
 _ALWAYS = 2**24  # intersections that lists have room for, however few splats there are; with more a picture is drawn without lists
 _SPARE = 1.25  # capacity of lists, relative to the expected number of intersections
 _FORGETTING = 0.98  # factor on the largest number of intersections so far, at every picture
-_COMMANDS = 512  # recorded launches that are kept
+_lock = threading.Lock()  # the scratch memory of a stream serves one picture after the other
 
 
 class State(NamedTuple):
@@ -44,7 +44,7 @@ def forward(scene: Scene, tile_mask: Tensor, settings: Settings) -> tuple[list[T
     images, owners = empty_images(scene, settings)
     radii = integers((len(scene.viewmats), scene.gaussian_count))
     splats, counts, ranges = scene.means.new_empty(splat_count, SPLAT_SIZE), integers(splat_count), integers((tile_count, 2))
-    with _lock, on_torch_stream(device):  # the scratch memory serves one picture after the other, and Warp has one stream
+    with _lock, on_torch_stream(device):  # Warp has one stream
         if splat_count:
             scratch = scratch_for(device, stream_of(device))
             if device.type == "cuda" and torch.cuda.is_current_stream_capturing():
@@ -52,24 +52,24 @@ def forward(scene: Scene, tile_mask: Tensor, settings: Settings) -> tuple[list[T
             scratch.reserve_splats(splat_count)
             arguments = [*scene.gaussian_arguments(), *_cameras(scene, settings), settings.near, settings.eps2d, scene.per_camera]
             outputs = [splats, radii, scratch.depth_keys, scratch.order, counts]
-            _launch(kernels.project, splat_count, [0, *arguments, tile_mask, *outputs])
+            launch(kernels.project, splat_count, [0, *arguments, tile_mask, *outputs], device)
             wp.utils.radix_sort_pairs(*scratch.by_depth, splat_count, 0, 31)
-            _launch(cuda_kernels.gather_counts, splat_count, [scratch.order, counts, scratch.sorted_counts])
+            launch(cuda_kernels.gather_counts, splat_count, [scratch.order, counts, scratch.sorted_counts], device)
             wp.utils.array_scan(*scratch.sums)
             capacity = scratch.reserve_lists(tile_count)
             splat_list = integers(capacity)
-            _launch(cuda_kernels.clear_lists, capacity, [tile_count, ranges, scratch.tiles])
+            launch(cuda_kernels.clear_lists, capacity, [tile_count, ranges, scratch.tiles], device)
             arguments = [scratch.order, scratch.ends, counts, scene.gaussian_count, splats, tile_mask, settings.tiles_x, settings.tiles_y]
-            _launch(kernels.emit_intersections, splat_count, [0, *arguments, capacity, 1, scratch.tiles, scratch.values, None, None])
+            launch(kernels.emit_intersections, splat_count, [0, *arguments, capacity, 1, scratch.tiles, scratch.values, None, None], device)
             wp.utils.radix_sort_pairs(*scratch.by_tile, capacity, 0, tile_count.bit_length())
             arguments = [scratch.tiles, scratch.values, scratch.order, scratch.ends, tile_mask]
-            _launch(cuda_kernels.find_ranges, capacity, [*arguments, splat_list, ranges, scratch.seen])
+            launch(cuda_kernels.find_ranges, capacity, [*arguments, splat_list, ranges, scratch.seen], device)
         else:
             splat_list = integers(0)
             ranges.zero_()
         state = State(splats, counts, splat_list, ranges)
         arguments = [*_image_arguments(state, scene, settings, images), int(settings.median), owners]
-        _launch(cuda_kernels.render_pixels, tile_count * cuda_kernels.BLOCK, arguments)
+        launch(cuda_kernels.render_pixels, tile_count * cuda_kernels.BLOCK, arguments, device)
     return images, radii, owners, state
 
 
@@ -77,12 +77,12 @@ def backward(
     scene: Scene, state: State, settings: Settings, images: Sequence[Tensor], v_images: Sequence[Tensor], gradients: Gradients
 ) -> None:
     """Fill the gradients of a scene, as `RasterBackend` says."""
-    records = scene.means.new_zeros(scene.splat_count, RECORD_SIZE)
-    with _lock, on_torch_stream(scene.means.device):
+    device, records = scene.means.device, scene.means.new_zeros(scene.splat_count, RECORD_SIZE)
+    with _lock, on_torch_stream(device):
         arguments = [*_image_arguments(state, scene, settings, images), *v_images, gradients.wants_absolute(settings), records]
-        _launch(cuda_kernels.render_pixels_backward, len(state.ranges) * cuda_kernels.BLOCK, arguments)
+        launch(cuda_kernels.render_pixels_backward, len(state.ranges) * cuda_kernels.BLOCK, arguments, device)
         arguments = [0, *scene.gaussian_arguments(), *_cameras(scene, settings)[1:], settings.eps2d, state.counts, 1, None, records]
-        _launch(kernels.project_backward, len(scene.means), [*arguments, *gradients.arguments(settings)])
+        launch(kernels.project_backward, len(scene.means), [*arguments, *gradients.arguments(settings)], device)
 
 
 def _cameras(scene: Scene, settings: Settings) -> list:
@@ -205,40 +205,3 @@ def scratch_for(device: torch.device, stream: int) -> _Scratch:
 def stream_of(device: torch.device) -> int:
     """torch's current stream, 0 on a CPU."""
     return torch.cuda.current_stream(device).cuda_stream if device.type == "cuda" else 0
-
-
-# ---------------------------------------------------------------- launches
-
-_lock = threading.Lock()
-
-
-def _launch(kernel: Any, count: int, arguments: list) -> None:
-    """Launch a kernel over count items.
-
-    Packing the arguments takes longer than many kernels run. So launches are recorded, and a launch of the same kind as an
-    earlier one only gets the addresses of its tensors.
-    """
-    if not count:
-        return
-    tensors = [x for x in arguments if isinstance(x, Tensor)]
-    kind = (kernel, count, tensors[0].device, *[x.shape if isinstance(x, Tensor) else x for x in arguments])
-    if kind not in _recorded:
-        while len(_recorded) >= _COMMANDS:
-            del _recorded[next(iter(_recorded))]
-        _recorded[kind] = _record(kernel, count, arguments, str(tensors[0].device))
-    command, places = _recorded[kind]
-    for place, tensor in zip(places, tensors):
-        place.data = tensor.data_ptr()
-    command.launch()
-
-
-def _record(kernel: Any, count: int, arguments: list, device: str) -> tuple[Any, list]:
-    """Return a launch, not made yet, and its array arguments, whose addresses are to be filled in."""
-    command: Any = wp.launch(kernel, dim=count, inputs=kernel_arguments(kernel, arguments), device=device, record_cmd=True)
-    places = [command.params[1 + i] for i, x in enumerate(arguments) if isinstance(x, Tensor)]
-    for place in places:
-        place._ref = None  # Warp's hold on the tensor, whose memory would never be free again
-    return command, places
-
-
-_recorded: dict[tuple, tuple[Any, list]] = {}

@@ -117,6 +117,30 @@ def test_light_and_exposure_see_the_instrument():
     assert abs(corner(1.0, 0.02) / corner(1.0, None) - 1) > 0.05  # what is bright in the middle darkens the rest, or the other way round
 
 
+def check_eyes_drawn_together(degree, device):
+    renderer = DeformableRenderer(sheet(degree), NODES, RenderingConfig(device=device))
+    state = (NODES + 1e-3 * np.sin(300 * NODES[:, ::-1])).astype(np.float32), 1.05 * IDENTITY
+    eyes, light = (CAMERA, CAMERA.at(make_pose([0.004, 0, 0], [1, 0, 0, 0]))), Light(distance=0.9, level_r=0.1, response=0.5)
+    together = renderer.views(eyes, *state, labels=True, light=light)
+    for eye, view in zip(eyes, together, strict=True):
+        (alone,) = renderer.views([eye], *state, labels=True, light=light)
+        for name, picture in vars(view).items():
+            assert np.array_equal(picture, getattr(alone, name)), name
+    assert (together[0].image != together[1].image).any()
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+def test_eyes_drawn_together_see_what_each_sees_alone(degree):
+    check_eyes_drawn_together(degree, "cpu")
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@pytest.mark.parametrize("degree", [0, 2])
+def test_on_a_gpu_eyes_drawn_together_see_what_each_sees_alone(degree):
+    check_eyes_drawn_together(degree, "cuda")
+
+
 def test_two_eyes_see_a_point_as_far_apart_as_its_depth_says():
     baseline, z = 0.005, 0.05
     renderer = DeformableRenderer(sheet(), None, CPU)

@@ -175,3 +175,18 @@ def test_a_gpu_draws_the_picture_of_the_cpu():
         far = (mine.float() - other.float()).abs() > 1e-3
         assert far.float().mean() < 2e-3, name
         assert torch.equal(getattr(found, name), getattr(again, name)), name
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_a_gpu_draws_into_the_tensors_that_it_is_given():
+    parts, capsules = build_instrument(load_arm("PSM", "LARGE_NEEDLE_DRIVER"))
+    make = lambda: InstrumentDrawing([parts, parts], device="cuda", capsules=[capsules, capsules])
+    drawing, poses = make(), both()[1]
+    first = drawing.draw(poses, CAMERA, *(x.cuda() for x in tissue(0.09)))
+    kept = [x.clone() for x in vars(first).values()]
+    second = drawing.draw(poses, CAMERA, *(x.cuda() for x in tissue(0.08)))  # the launches are recorded by now
+    for mine, before in zip(vars(first).values(), kept):
+        assert torch.equal(mine, before)
+    for mine, other in zip(vars(second).values(), vars(make().draw(poses, CAMERA, *(x.cuda() for x in tissue(0.08)))).values()):
+        assert torch.equal(mine, other)

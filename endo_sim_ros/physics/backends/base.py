@@ -69,7 +69,7 @@ class SkinData(NamedTuple):
     covars: Tensor  # [N, 3, 3] m²
     neighbours: Tensor  # [N, K]
     weights: Tensor  # [N, K]
-    origin: wp.vec3  # of the maps
+    origin: tuple[float, float, float]  # of the maps, m
     low: float  # bounds of the singular values of each Gaussian's F
     high: float
 

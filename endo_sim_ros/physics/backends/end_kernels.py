@@ -1,26 +1,13 @@
-"""The end of a step: what went wrong is undone. And sums over the threads of a block, as of one environment."""
+"""The end of a step: what went wrong is undone."""
 
 import warp as wp
 
-from endo_sim_ros.core.native import native
+from endo_sim_ros.core.block_sums import OPTIONS, block_max, block_sum
 from endo_sim_ros.physics.backends.structs import State
 
-OPTIONS = {"extra_build_options": native("physics/native/threads.h")}
 wp.set_module_options({"enable_backward": False, **OPTIONS})
 THREADS = 512
 """Of a GPU's block, which is one environment; kernels are bound to as few registers as leave room for these."""
-
-
-@wp.func_native("return endo_sim::block_sum(value);")
-def block_sum(value: wp.float64) -> wp.float64:
-    """Sum over the threads of a block on a GPU, in the same order every time; all must be here. On a CPU there is one."""
-    ...
-
-
-@wp.func_native("return endo_sim::block_max(value);")
-def block_max(value: float) -> float:
-    """Largest value of the threads of a block on a GPU; all must be here."""
-    ...
 
 
 @wp.kernel(launch_bounds=THREADS)

@@ -25,7 +25,7 @@ import warp as wp
 from endo_sim_ros.core.native import native
 from endo_sim_ros.physics.backends.structs import Grid, Loads, Nodes, RigidTools, State, Substep, Transfer
 
-OPTIONS = {"extra_build_options": native("physics/native/node.h", "physics/native/threads.h")}
+OPTIONS = {"extra_build_options": native("physics/native/node.h", "core/native/threads.h")}
 wp.set_module_options({"enable_backward": False, **OPTIONS})
 
 

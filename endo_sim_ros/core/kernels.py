@@ -64,6 +64,7 @@ def kernel_arguments(kernel: Any, arguments: Sequence, offset: int = 0) -> list:
     Raises:
         ValueError: If there are more or fewer arguments than the kernel takes.
     """
+    init_warp()  # as arrays need it, whether or not kernels have been loaded
     kinds = [argument.type for argument in kernel.adj.args[offset:]]
     return [_array(kind, x) if isinstance(x, Tensor) else x for kind, x in zip(kinds, arguments, strict=True)]
 

@@ -6,12 +6,14 @@ lies beside where another view's depth and pose expect it tells that depth sever
 
 import dataclasses
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
 
 from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.reconstruction.priors.flow import EyeImage, eye_image, flow_correction
+from endo_sim_ros.core.device import cpu_threads
+from endo_sim_ros.reconstruction.priors.flow import EyeImage, FlowCorrection, eye_image, flow_correction
 from endo_sim_ros.reconstruction.priors.interpolation import inverse_distance_weighted
 from endo_sim_ros.reconstruction.priors.inverse_depth import blur, correct, prepare_smoothing, scaled, smooth
 from endo_sim_ros.reconstruction.priors.stereo import right_view
@@ -67,9 +69,13 @@ def refine_depth(
         if source == "stereo" and view.right is not None:
             inverse, error = _refine_by_eyes(inverse, view, images[i], options, stereo, device)
         total, weight = _point_corrections(camera, inverse, error, points, options)
-        for j in near[i]:
+
+        def told_by(j: int) -> FlowCorrection | None:
             progress.check()
-            if (found := flow_correction(inverse, images[i], images[j], options)) is not None:
+            return flow_correction(inverse, images[i], images[j], options)
+
+        for found in neighbours.map(told_by, near[i]):
+            if found is not None:
                 total, weight = total + found.precision * found.correction, weight + found.precision
         inverse = correct(inverse, total, weight, error, options.continuation, options.max_correction)
         inverse = smooth(inverse, options.smoothing, options.edge, device)
@@ -80,7 +86,8 @@ def refine_depth(
         view = dataclasses.replace(views[i], depth_prior=corrected(i))
         views[i] = shrink(view, width) if width else view  # the others need its image only, which `images` has
 
-    progress.map(refine, range(len(views)))
+    with ThreadPoolExecutor(cpu_threads(), "endo_sim") as neighbours:  # views may be fewer than cores
+        progress.map(refine, range(len(views)))
     return views
 
 

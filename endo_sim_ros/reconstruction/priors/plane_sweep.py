@@ -189,10 +189,10 @@ def costs_by_opencv(
         progress: Asked whether to go on.
     """
     size, costs = own.grey.shape[::-1], np.empty((*own.grey.shape, len(planes)), np.float32)
-    for index, plane in enumerate(planes):
+    for index, homographies in enumerate(_homographies(own, others, planes)):
         progress.check()
         found = []
-        for other, homography in zip(others, _homographies(own, others, plane)):
+        for other, homography in zip(others, homographies):
             seen = lambda picture: cv2.warpPerspective(picture, homography, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)  # noqa: B023
             grey = seen(other.grey)
             mean, variance = _moments(grey, options)
@@ -212,25 +212,26 @@ def costs_by_kernels(
     padded = lambda array: np.pad(array, [(0, most - size) for most, size in zip(largest, array.shape)])
     on_device = lambda array: torch.from_numpy(np.ascontiguousarray(array)).to(device)
     pictures = on_device(np.stack([np.stack([padded(other.grey), padded(other.tissue)], -1) for other in others]))
-    homographies = on_device(np.array([_homographies(own, others, plane) for plane in planes], np.float32))
+    homographies = on_device(_homographies(own, others, planes).astype(np.float32))
     view = [on_device(array) for array in (own.grey, own.inside.astype(np.uint8), own.mean, own.variance)]
     warped, scratch = (torch.empty(len(others), height, width, *more, device=device) for more in ((2,), ()))
-    costs = torch.empty(height, width, len(planes), device=device)
-    for index in range(len(planes)):
+    costs, levels = torch.empty(height, width, len(planes), device=device), torch.arange(len(planes), dtype=torch.int32, device=device)
+    for homography, level in zip(homographies, levels.split(1)):
         progress.check()
-        launch(sweep_kernels.warp_pictures, scratch.numel(), [pictures, homographies[index], height, width, warped], device)
-        arguments = [*view, warped, options.window, options.noise**2, index, scratch, costs]
+        launch(sweep_kernels.warp_pictures, scratch.numel(), [pictures, homography, height, width, warped], device)
+        arguments = [*view, warped, options.window, options.noise**2, level, scratch, costs]
         launch(sweep_kernels.match_costs, height * width, arguments, device)
     return costs
 
 
-def _homographies(own: Picture, others: list[Picture], plane: np.ndarray) -> list[np.ndarray]:
-    """From a view's pixels to those of others [3, 3], as OpenCV counts them, if all tissue lies on a plane."""
+def _homographies(own: Picture, others: list[Picture], planes: np.ndarray) -> np.ndarray:
+    """From a view's pixels to those of others [L, J, 3, 3], as OpenCV counts them, if all tissue lies on one of the planes [L, 3]."""
     rays, found = np.linalg.inv(own.camera.K), []
     for other in others:
         motion = (other.camera.viewmat @ own.camera.pose)[:3]
-        found.append(np.linalg.inv(_CENTRED) @ other.camera.K @ (motion[:, :3] @ rays + np.outer(motion[:, 3], plane)) @ _CENTRED)
-    return found
+        moved = motion[:, :3] @ rays + motion[:, 3, None] * planes[:, None]
+        found.append(np.linalg.inv(_CENTRED) @ other.camera.K @ moved @ _CENTRED)
+    return np.stack(found, 1)
 
 
 def _smaller_half(values: list[np.ndarray]) -> np.ndarray:

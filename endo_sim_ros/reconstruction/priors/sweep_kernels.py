@@ -66,7 +66,7 @@ def match_costs(
     warped: wp.array3d[wp.vec2],  # [J, H, W] the others as they would look on a plane
     window: int,  # side of it, pixels
     noise: float,  # variance of it
-    level: int,  # of the plane
+    level: wp.array[int],  # [1] of the plane
     scratch: wp.array3d[float],  # [J, H, W]
     costs: wp.array3d[float],  # out [H, W, L]
 ):
@@ -99,7 +99,7 @@ def match_costs(
                 best = index
         total += scratch[best, row, column]
         scratch[best, row, column] = 3.0  # above any
-    costs[row, column, level] = total / float(count)
+    costs[row, column, level[0]] = total / float(count)
 
 
 @wp.kernel

@@ -5,6 +5,7 @@ from typing import Annotated, ClassVar, Literal
 
 from endo_sim_ros.core.config import Range, StageConfig
 from endo_sim_ros.reconstruction.stage_configs import (
+    CapacityConfig,
     CoverageConfig,
     DynamicMaskConfig,
     ExtrapolationConfig,
@@ -214,6 +215,7 @@ class ReconstructionConfig(StageConfig):
     motion: DynamicMaskConfig = DynamicMaskConfig()
     initial: InitialModelConfig = InitialModelConfig()
     training: TrainingSizeConfig = TrainingSizeConfig()
+    capacity: CapacityConfig = CapacityConfig()
     photometry: PhotometryConfig = PhotometryConfig()
     extrapolated: ExtrapolationConfig = ExtrapolationConfig()
     # Of the training.
@@ -238,6 +240,7 @@ class ReconstructionConfig(StageConfig):
         "extrapolated": ("extrapolation", "more than 0"),
         **{f"training.{name}": ("iterations", "0") for name in ("iterations_per_view", "min_iterations", "max_iterations")},
         **{f"training.{name}": ("max_gaussians", "0") for name in ("pixels_per_gaussian", "min_gaussians", "max_gaussians")},
+        "capacity": ("max_gaussians", "0"),
         "mcmc": ("densification", "mcmc"),
         "gradient": ("densification", "gradient"),
         "proximity": ("densification", "proximity"),

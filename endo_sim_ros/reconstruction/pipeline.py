@@ -16,6 +16,7 @@ from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.reconstruction import photometry
+from endo_sim_ros.reconstruction.capacity_trial import choose_capacity
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.dynamic_mask import mask_motion
 from endo_sim_ros.reconstruction.initialization import guessed_depth, initial_model, rough_depth
@@ -229,6 +230,16 @@ def size_training(scene: PreparedScene, config: ReconstructionConfig, progress: 
     return scene.decided(sentence, logging.INFO)
 
 
+def try_capacity(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
+    """Let a trial tell whether fewer Gaussians do better, where the views are so few that their pixels do not."""
+    size, pixels = config.training, sum(int((view.tissue > 0).sum()) for view in scene.views)
+    known = sum(int((view.surface > 0).sum()) for view in scene.views) >= config.matching.min_points
+    if config.max_gaussians or not config.capacity.iterations or not known or pixels > size.min_gaussians * size.pixels_per_gaussian:
+        return scene
+    start = lambda trial: fit_light(place_gaussians(trial, config, progress), config, progress)
+    return choose_capacity(scene, config, start, progress)
+
+
 def place_gaussians(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Set `model` to the Gaussians that training starts from, `depth` to their median depth in the views, and `exposures` to zeros."""
     views, points = list(scene.views), scene.points
@@ -308,6 +319,7 @@ STAGES: dict[str, Callable[[PreparedScene, ReconstructionConfig, StageProgress],
     "shrinking views": shrink_views,
     "dynamic mask": mask_dynamic,
     "training size": size_training,
+    "capacity trial": try_capacity,
     "initial model": place_gaussians,
     "photometry": fit_light,
     "extrapolation": extrapolate_tissue,

@@ -103,6 +103,7 @@ class PreparedScene:
         model: Gaussians to start from; none before they are placed.
         iterations: Number of optimisation steps.
         max_gaussians: Largest number of Gaussians.
+        fading: Factor on the weights of their opacity and size in the loss.
         depth: Median depth of the scene, metres.
         light: Of the light at the camera (distance, angle, tilt_x, tilt_y) [4].
         exposures: Logarithm of each view's exposure [V, 3].
@@ -118,6 +119,7 @@ class PreparedScene:
     model: GaussianModel = field(default_factory=lambda: GaussianModel.from_points(torch.empty(0, 3), torch.empty(0, 3), torch.empty(0)))
     iterations: int = 0
     max_gaussians: int = 0
+    fading: float = 1.0
     depth: float = 0.0
     light: np.ndarray = field(default_factory=lambda: np.zeros(4))
     exposures: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))

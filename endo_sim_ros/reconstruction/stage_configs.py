@@ -257,6 +257,24 @@ class TrainingSizeConfig(StageConfig):
 
 
 @dataclass(frozen=True)
+class CapacityConfig(StageConfig):
+    """The trial of fewer Gaussians, where few views leave their number to ``training.min_gaussians``."""
+
+    iterations: Annotated[int, Range(0, 100_000)] = 1000
+    """Optimisation steps of each trial; 0 = no trial."""
+    fewer: Annotated[float, Range(0.01, 1)] = 0.4
+    """Share of the Gaussians that is tried beside all of them."""
+    fading: Annotated[float, Range(0.1, 100)] = 3.0
+    """Factor on ``lambda_opacity`` and ``lambda_scale`` that is tried with it."""
+    share: Annotated[float, Range(0.1, 1)] = 0.5
+    """Share of the width and height of the views, their middle, and of the Gaussians for each of both."""
+    left_out: Annotated[float, Range(0.005, 0.5)] = 0.05
+    """Share of the pixels that the trial does not see."""
+    block: Annotated[int, Range(1, 100, "pixels")] = 6
+    """Side of the squares that they are left out in: single pixels are foretold by their neighbours, noise and all."""
+
+
+@dataclass(frozen=True)
 class PhotometryConfig(StageConfig):
     """The light at the camera and each view's exposure, before training."""
 

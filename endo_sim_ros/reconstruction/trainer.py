@@ -24,6 +24,7 @@ from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.device_views import DeviceView, matrices, reprojected_prior, shown
 from endo_sim_ros.reconstruction.optimizer import PARAMETERS, Adam, model_of, parameters_of
 from endo_sim_ros.reconstruction.scene import PreparedScene, TrainingView, shrink
+from endo_sim_ros.reconstruction.ssim import ssim
 from endo_sim_ros.reconstruction.strategies import STRATEGIES
 from endo_sim_ros.reconstruction.triangulation import nearest_views
 from endo_sim_ros.splatting import RenderOutput, rasterize
@@ -64,6 +65,8 @@ class Trainer:
 
     def __init__(self, scene: PreparedScene, config: ReconstructionConfig) -> None:
         self.config = config
+        fading = {name: scene.fading * getattr(config, name) for name in ("lambda_opacity", "lambda_scale")}
+        self._weights = dataclasses.replace(config, **fading)
         self.scene_depth = scene.depth
         self.device = pick_device(config.device)
         self.stamps = [view.stamp_ns for view in scene.views]
@@ -114,6 +117,21 @@ class Trainer:
     def progress(self) -> Progress:
         """How far the training is; on a GPU this waits for it."""
         return Progress(self.iteration, self.iterations, float(self._last_loss), len(self.parameters["means"]))
+
+    @torch.no_grad()
+    def photometric_error(self, pixels: Sequence[np.ndarray]) -> float:
+        """Mean photometric loss of the training views at pixels [H, W] (bool) of each, such as their masks leave out."""
+        total, count = 0.0, 0
+        for view, chosen in zip(self._device_views, pixels, strict=True):
+            output = self.render(*matrices([view.camera], self.device), (view.camera.width, view.camera.height))[1]
+            rays = directions(view.camera, self.device) if self.config.light else None
+            gain = self.appearance.gain(output.depths[0], output.alphas[0], rays, view.index_tensor)
+            color = output.colors[0] if gain is None else output.colors[0] * gain
+            where = torch.tensor(chosen, device=self.device)
+            l1, unlike = (color - view.image).abs()[where], 1 - ssim(color, view.image)[where]
+            total += float(torch.lerp(l1, unlike, self.config.lambda_ssim).mean(1, dtype=torch.float64).sum())
+            count += len(l1)
+        return total / count
 
     def save_checkpoint(self, path: str | Path) -> None:
         """Write model, optimiser and random state; a training that loads them goes on as if never interrupted."""
@@ -317,10 +335,10 @@ class Trainer:
         gain = self.appearance.gain(seen.depth, seen.alpha, view.rays, view.exposure)
         color = output.colors[0] if gain is None else output.colors[0] * gain
         loss = losses.photometric(color, view.image, view.mask, config.lambda_ssim)
-        loss = losses.regularized(loss, terms, seen, config)
+        loss = losses.regularized(loss, terms, seen, self._weights)
         if len(view.viewmats) > 1:
             seen = losses.Rendering(*images(1), mask=None, prior=view.virtual_prior, **of_scene)
-            loss = losses.regularized(loss, terms, seen, config, virtual=True)
+            loss = losses.regularized(loss, terms, seen, self._weights, virtual=True)
         return loss + config.light_anchor * self.appearance.changes() if config.light else loss
 
     # --------------------------------------------------------------- Gaussians

@@ -24,8 +24,9 @@ QUICK = ("shrinking views", "training size")  # stages that need not report
 def given(small):
     """Options, and the scenes that each stage is given: with right images, and without."""
     cases = []
+    tried = {"training.min_gaussians": 2000, "capacity.iterations": 20, "capacity.share": 1.0}
     for source in ("stereo", "points"):
-        config, scene, scenes = options(depth=source), PreparedScene(tuple(small[::4])), {}
+        config, scene, scenes = options(depth=source, max_gaussians=0).replaced(tried), PreparedScene(tuple(small[::4])), {}
         for name, stage in STAGES.items():
             scenes[name] = scene
             scene = stage(scene, config, StageProgress())

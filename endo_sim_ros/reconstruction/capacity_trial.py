@@ -1,0 +1,80 @@
+"""Cross-validation of how many Gaussians few views can tell of: which number foretells pixels best that a short training did not see."""
+
+import logging
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from endo_sim_ros.reconstruction.config import ReconstructionConfig
+from endo_sim_ros.reconstruction.progress import StageProgress
+from endo_sim_ros.reconstruction.scene import PreparedScene, TrainingView
+from endo_sim_ros.reconstruction.trainer import Trainer
+
+_FEWEST = 500  # left-out pixels that tell numbers apart
+_EVERY = 10  # iterations between two reports
+
+
+def choose_capacity(
+    scene: PreparedScene,
+    config: ReconstructionConfig,
+    start: Callable[[PreparedScene], PreparedScene],
+    progress: StageProgress,
+) -> PreparedScene:
+    """Try fewer Gaussians and stronger fading beside what the scene has, and keep what foretells left-out pixels better.
+
+    Few views are memorised with their noise by many Gaussians; fewer are too smooth for clean pictures. Which of both the pictures are,
+    the views tell by themselves: blocks of pixels, left out of a short training with the middle of the views, are foretold worse by
+    Gaussians that memorise what is around them.
+
+    Args:
+        scene: Views and depth prior; `max_gaussians` and `fading` are what is tried first.
+        config: Options.
+        start: Places the Gaussians that a training of a scene starts from.
+        progress: Reported to by iterations.
+
+    Raises:
+        Cancelled: If the work is not wanted any more.
+    """
+    options = config.capacity
+    generator = np.random.default_rng(config.seed)
+    views = [_middle(view, options.share) for view in scene.views]
+    views = [view for view in views if (view.tissue > 0).any()]
+    left_out = [_blocks(view, options.left_out, options.block, generator) for view in views]
+    if sum(int(pixels.sum()) for pixels in left_out) < _FEWEST:
+        return scene
+    seen = [replace(view, mask=np.uint8(255) * ((view.tissue > 0) & ~pixels)) for view, pixels in zip(views, left_out)]
+    trial = replace(scene, frames=(), views=tuple(seen), iterations=options.iterations)
+    tried = [scene, replace(scene, max_gaussians=max(int(options.fewer * scene.max_gaussians), 1), fading=options.fading * scene.fading)]
+    losses = []
+    for index, candidate in enumerate(tried):
+        most = max(int(candidate.max_gaussians * options.share**2), 1)
+        trainer = Trainer(start(replace(trial, max_gaussians=most, fading=candidate.fading)), replace(config, schedule=0))
+        while trainer.iteration < trainer.iterations:
+            if trainer.iteration % _EVERY == 0:
+                progress(index * trainer.iterations + trainer.iteration, len(tried) * trainer.iterations)
+            trainer.step()
+        losses.append(trainer.photometric_error(left_out))
+    best = int(np.argmin(losses))
+    numbers = " and ".join(f"{loss:.4f} with {candidate.max_gaussians} Gaussians" for loss, candidate in zip(losses, tried))
+    return tried[best].decided(f"of pixels left out of a trial the loss is {numbers}: {tried[best].max_gaussians} at most", logging.INFO)
+
+
+def _middle(view: TrainingView, share: float) -> TrainingView:
+    """The middle of a view, that share of its width and height."""
+    height, width = view.image.shape[:2]
+    rows, columns = (slice((n - max(round(share * n), 1)) // 2, (n + max(round(share * n), 1)) // 2) for n in (height, width))
+    K = view.camera.K.copy()
+    K[:2, 2] -= columns.start, rows.start
+    cut = lambda image: None if image is None else np.ascontiguousarray(image[rows, columns])
+    camera = replace(view.camera, K=K, width=columns.stop - columns.start, height=rows.stop - rows.start)
+    images = {name: cut(getattr(view, name)) for name in ("image", "mask", "depth", "depth_prior")}
+    return replace(view, camera=camera, right=None, right_K=None, baseline=None, **images)
+
+
+def _blocks(view: TrainingView, share: float, size: int, generator: np.random.Generator) -> np.ndarray:
+    """Pixels [H, W] of tissue in a share of the blocks of size × size pixels."""
+    tissue = view.tissue > 0
+    height, width = tissue.shape
+    chosen = generator.random((-(-height // size), -(-width // size))) < share
+    return np.kron(chosen, np.ones((size, size), bool))[:height, :width] & tissue

@@ -1,0 +1,87 @@
+"""The trial that tells how many Gaussians few views can tell of."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from short_training import bare, options
+from training_views import with_prior
+
+from endo_sim_ros.reconstruction import Trainer, prepare
+from endo_sim_ros.reconstruction.capacity_trial import choose_capacity
+from endo_sim_ros.reconstruction.losses import photometric
+from endo_sim_ros.reconstruction.progress import StageProgress
+from endo_sim_ros.reconstruction.scene import PreparedScene
+
+QUICK = {"training.min_gaussians": 8000, "capacity.iterations": 250, "capacity.share": 1.0, "capacity.left_out": 0.1}
+
+
+def undecided(**changes):
+    """Options that leave the number of Gaussians to the views."""
+    return options(max_gaussians=0, iterations=0, depth="topic", extrapolation=0.0).replaced(QUICK | changes)
+
+
+@pytest.mark.slow
+def test_noise_asks_for_fewer_gaussians_and_clean_pictures_do_not(small):
+    """Noise of independent pixels cannot be foretold: whatever memorises it foretells worse."""
+    clean, generator = [bare(frame, depth=frame.depth) for frame in small[2:7:4]], np.random.default_rng(0)
+    noisy = [
+        dataclasses.replace(frame, image=np.clip(frame.image + generator.normal(0, 12, frame.image.shape), 0, 255).astype(np.uint8))
+        for frame in clean
+    ]
+    scene = prepare(clean, undecided())
+    assert (scene.max_gaussians, scene.fading) == (8000, 1.0)
+    scene = prepare(noisy, undecided())
+    assert (scene.max_gaussians, scene.fading) == (3200, 3.0)
+    assert "left out" in scene.decisions[-1] and "3200 at most" in scene.decisions[-1]
+
+
+@pytest.mark.slow
+def test_what_is_given_or_told_by_many_pixels_is_not_tried(small):
+    frames = [bare(frame, depth=frame.depth) for frame in small[:2]]
+    for changes in ({"max_gaussians": 900}, {"capacity.iterations": 0}, {"training.min_gaussians": 100}):
+        stages = {}
+        scene = prepare(frames, undecided(**changes), on_progress=lambda stage, done, total: stages.update({stage: total}))
+        assert scene.fading == 1.0 and not stages["capacity trial"]
+
+
+def test_trials_see_the_middle_of_the_views_without_the_left_out_blocks(small):
+    views, given = with_prior(small[:2]), []
+    scene = PreparedScene((), tuple(views), max_gaussians=4000, iterations=77)
+
+    class Seen(Exception):
+        pass
+
+    def start(trial):
+        given.append(trial)
+        raise Seen
+
+    config = undecided(**{"capacity.share": 0.5, "capacity.left_out": 0.3, "capacity.block": 4})
+    with pytest.raises(Seen):
+        choose_capacity(scene, config, start, StageProgress())
+    (trial,) = given
+    assert (trial.max_gaussians, trial.iterations) == (1000, 250)
+    for view, whole in zip(trial.views, views):
+        assert (view.image == whole.image[32:96, 40:120]).all() and (view.depth_prior == whole.depth_prior[32:96, 40:120]).all()
+        points = whole.camera.backproject(whole.depth_prior).reshape(-1, 3)
+        assert np.allclose(view.camera.project(points)[0] + (40, 32), whole.camera.project(points)[0])
+        blocks = (view.mask == 0).reshape(16, 4, 20, 4).swapaxes(1, 2)
+        assert (blocks.all((2, 3)) == blocks.any((2, 3))).all()  # whole blocks, as all is tissue
+        assert 0.2 < blocks.mean() < 0.4
+
+
+def test_the_error_of_pixels_is_the_loss_of_training(small):
+    config = options(iterations=3, extrapolation=0.0, depth="topic", lambda_depth=0.0, light=False, exposure=False)
+    trainer = Trainer(prepare([bare(frame, depth=frame.depth) for frame in small[:3]], config), config)
+    trainer.run()
+    losses = []
+    for camera, frame in zip(trainer.cameras, small):
+        viewmats, Ks = (torch.tensor(matrix, dtype=torch.float32)[None] for matrix in (camera.viewmat, camera.K))
+        image = trainer.render(viewmats, Ks, (camera.width, camera.height))[1].colors[0].detach()
+        losses.append(float(photometric(image, torch.tensor(frame.image) / 255, None, config.lambda_ssim)))
+    everything = np.ones((128, 160), bool)
+    assert trainer.photometric_error([everything] * 3) == pytest.approx(np.mean(losses), rel=1e-5)
+    one = np.zeros_like(everything)
+    one[60:70, 60:70] = True
+    assert trainer.photometric_error([one] * 3) != pytest.approx(np.mean(losses), rel=1e-3)

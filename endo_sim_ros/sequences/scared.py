@@ -32,16 +32,7 @@ from endo_sim_ros.core.cameras import Camera, invert_pose
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.estimated_poses import with_estimated_poses
 from endo_sim_ros.sequences.images import clean_depth, image_size, numbered_files, read_image
-from endo_sim_ros.sequences.recording import (
-    DEFAULT_FPS,
-    Recording,
-    check_folder,
-    check_positive,
-    keep_posed,
-    select,
-    stamp_ns,
-    tell_lacking,
-)
+from endo_sim_ros.sequences.recording import DEFAULT_FPS, Recording, check_folder, keep_posed, select, stamp_ns, tell_lacking
 from endo_sim_ros.sequences.rectification import Rectification, StereoCalibration
 from endo_sim_ros.sequences.scared_archives import (
     PointFiles,
@@ -95,8 +86,7 @@ def read_scared(
     Raises:
         SequenceError: If a file is missing or wrong.
     """
-    root = check_folder(path)
-    check_positive(root, fps=fps)
+    root = check_folder(path, fps=fps)
     for name, value, allowed in (("depth", depth, DEPTHS), ("pose_direction", pose_direction, DIRECTIONS)):
         if value not in allowed:
             raise SequenceError(f"{root}: {name} must be one of {', '.join(allowed)}, got {value!r}")
@@ -162,11 +152,7 @@ def read_scared(
                 yield _frame(rectification, number, fps or images.fps, left, right, depth_of(number, points), pose_of[number])
 
     recording = Recording(frames, len(numbers))
-    if posed:
-        return recording
-    if poses is None:
-        logger.warning("%s: file is missing, so poses come from structure from motion", frame_data)
-    return with_estimated_poses(recording, root, poses)
+    return recording if posed else with_estimated_poses(recording, root, poses, str(frame_data.relative_to(root)))
 
 
 def _tell_defects(root: Path) -> None:

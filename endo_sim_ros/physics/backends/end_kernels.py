@@ -14,13 +14,11 @@ THREADS = 512
 @wp.func_native("return endo_sim::block_sum(value);")
 def block_sum(value: wp.float64) -> wp.float64:
     """Sum over the threads of a block on a GPU, in the same order every time; all must be here. On a CPU there is one."""
-    ...
 
 
 @wp.func_native("return endo_sim::block_max(value);")
 def block_max(value: float) -> float:
     """Largest value of the threads of a block on a GPU; all must be here."""
-    ...
 
 
 @wp.kernel(launch_bounds=THREADS)

@@ -190,17 +190,10 @@ class Pictures:
             camera = replace(camera, pose=pose) if by.camera_position or by.camera_angle else camera
             view.contrast, lamp = variation.texture, lamp + np.append(variation.lamp, 0.0)
             view.metal = variation.metal
-        view.cameras = (camera,) if self._sight.eyes == 1 else (camera, right_of(camera, self._sight.baseline))
+        view.cameras = (camera,) if self._sight.eyes == 1 else (camera, camera.beside(self._sight.baseline))
         lamp = camera.pose @ lamp
         view.lamps = np.stack([(each.viewmat @ lamp)[:3] for each in view.cameras])
         return view
-
-
-def right_of(left: Camera, baseline: float) -> Camera:
-    """The right eye beside a left one, at a distance in metres."""
-    pose = left.pose.copy()
-    pose[:3, 3] += baseline * pose[:3, 0]
-    return left.at(pose)
 
 
 def _labels(drawing: InstrumentDrawing) -> np.ndarray:

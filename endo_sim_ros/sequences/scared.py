@@ -35,7 +35,6 @@ from endo_sim_ros.sequences.images import clean_depth, image_size, numbered_file
 from endo_sim_ros.sequences.recording import DEFAULT_FPS, Recording, check_folder, keep_posed, select, stamp_ns, tell_lacking
 from endo_sim_ros.sequences.rectification import Rectification, StereoCalibration
 from endo_sim_ros.sequences.scared_archives import (
-    PointFiles,
     ScenePoints,
     keyframe_points,
     numbered,
@@ -121,7 +120,7 @@ def read_scared(
             pose_of[n] = published[n] if pose_direction == "camera_to_world" else invert_pose(published[n])
 
     points_source = _archive_or_folder(root, "scene_points")
-    disparities: dict[int, Path] = {}
+    disparities, point_files = dict[int, Path](), dict[int, Path]()
     if depth == "scene_points" and not points_source.exists():
         disparities = numbered(root / "data/disparity", ".tiff") if is_rectified else {}
         logger.warning(
@@ -131,25 +130,28 @@ def read_scared(
         )  # fmt: skip
         depth = "disparity" if disparities else "keyframe"
     elif depth == "scene_points" and points_source.is_dir():
-        tell_lacking(numbers, numbered(points_source, ".tiff"), points_source)
+        point_files = numbered(points_source, ".tiff")
+        tell_lacking(numbers, point_files, points_source)
 
-    def depth_of(number: int, points: PointFiles | ScenePoints | None) -> np.ndarray | None:
+    def depth_of(number: int, archive: ScenePoints | None) -> np.ndarray | None:
         if number in disparities:
             with np.errstate(divide="ignore"):
                 return clean_depth(rectification.K[0, 0] * (rectification.baseline or 0) / read_disparity(disparities[number], images.size))
         if depth == "keyframe" and number == 0:
             found = keyframe_points(root, images.size)
+        elif number in point_files:
+            found = read_point_map(point_files[number], str(point_files[number]), images.size)
         else:
-            found = points.of(number, images.size) if points else None
+            found = archive.of(number, images.size) if archive else None
         return None if found is None else rectification.depth(found)
 
     def frames() -> Iterator[Frame]:
-        opened = (PointFiles if points_source.is_dir() else ScenePoints)(points_source) if depth == "scene_points" else None
-        with contextlib.closing(opened) if opened else contextlib.nullcontext() as points:
+        opened = ScenePoints(points_source) if depth == "scene_points" and not points_source.is_dir() else None
+        with contextlib.closing(opened) if opened else contextlib.nullcontext() as archive:
             for number, left, right in images.read(numbers):
                 if not is_rectified:
                     left, right = rectification.left(left), rectification.right(right)
-                yield _frame(rectification, number, fps or images.fps, left, right, depth_of(number, points), pose_of[number])
+                yield _frame(rectification, number, fps or images.fps, left, right, depth_of(number, archive), pose_of[number])
 
     recording = Recording(frames, len(numbers))
     return recording if posed else with_estimated_poses(recording, root, poses, str(frame_data.relative_to(root)))

@@ -100,11 +100,9 @@ class Backend(Protocol):
 
     def launch(self, launch: Launch) -> None:
         """Launch now, in order with torch's own work."""
-        ...
 
     def load_for_cuts(self, material: str, kinematics: str) -> None:
         """Load what a step needs once cuts have made more grid nodes than it was made ready for."""
-        ...
 
     def over_items(self, kernel: Any, count: int, arguments: Sequence) -> None:
         """Launch a kernel now over count items, whose first argument, not among these, is the number of the first one.
@@ -114,7 +112,6 @@ class Backend(Protocol):
             count: Number of items.
             arguments: The others, tensors among them.
         """
-        ...
 
     def skin(self, skin: SkinData, maps: Tensor, means: Tensor, covars: Tensor) -> None:
         """Move Gaussians now by the maps of their control nodes, see `node_map_kernels`.
@@ -125,7 +122,6 @@ class Backend(Protocol):
             means: Out [N, 3], m, world.
             covars: Out [N, 3, 3], m².
         """
-        ...
 
     def skin_work(self, skin: SkinData, maps: Tensor, means: Tensor, covars: Tensor) -> list[Work]:
         """Return the work that moves Gaussians in B environments by maps [B, M, 4, 4]; means and covars are [B, N, …]."""

@@ -10,19 +10,19 @@ import threading
 import types
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import warp as wp
 from torch import Tensor
 
-from endo_sim_ros.physics.backends.structs import Grid, Loads, Nodes, RigidTools, State, Substep
+from endo_sim_ros.physics.backends.structs import Grid, Loads, Nodes, RigidTools, Skin, State, Substep
 from endo_sim_ros.physics.stencils import Stencils
 
 BLOCK = 64  # threads of a GPU's block: a few thousand control nodes then reach many multiprocessors
 
 Action = Callable[[], object]
 
-viewed = functools.partial(wp.from_torch, requires_grad=False)
+viewed: Callable[..., Any] = functools.partial(wp.from_torch, requires_grad=False)
 """A tensor as an array of Warp in the same memory, which keeps the tensor."""
 
 capturing = threading.Lock()
@@ -60,18 +60,6 @@ class StepData:
     substep: Substep
     scale: wp.array  # of the moduli of each control node [B · M]
     stencils: Stencils
-
-
-class SkinData(NamedTuple):
-    """N Gaussians at rest and the K control nodes that move each: float32 and int32 tensors on the backend's device."""
-
-    means: Tensor  # [N, 3] m, world
-    covars: Tensor  # [N, 3, 3] m²
-    neighbours: Tensor  # [N, K]
-    weights: Tensor  # [N, K]
-    origin: wp.vec3  # of the maps
-    low: float  # bounds of the singular values of each Gaussian's F
-    high: float
 
 
 class Backend(Protocol):
@@ -113,16 +101,16 @@ class Backend(Protocol):
             arguments: The others, tensors among them.
         """
 
-    def skin(self, skin: SkinData, maps: Tensor, means: Tensor, covars: Tensor) -> None:
+    def skin(self, rest: Skin, maps: Tensor, means: Tensor, covars: Tensor) -> None:
         """Move Gaussians now by the maps of their control nodes, see `node_map_kernels`.
 
         Args:
-            skin: Gaussians at rest.
+            rest: Gaussians at rest.
             maps: [M, 4, 4].
             means: Out [N, 3], m, world.
             covars: Out [N, 3, 3], m².
         """
 
-    def skin_work(self, skin: SkinData, maps: Tensor, means: Tensor, covars: Tensor) -> list[Work]:
+    def skin_work(self, rest: Skin, maps: Tensor, means: Tensor, covars: Tensor) -> list[Work]:
         """Return the work that moves Gaussians in B environments by maps [B, M, 4, 4]; means and covars are [B, N, …]."""
         ...

@@ -14,6 +14,8 @@ from endo_sim_ros.core.config import ConfigError, Range, StageConfig
 from endo_sim_ros.instruments.inverse import aim_shaft
 from endo_sim_ros.instruments.kinematics import ArmKinematics
 
+__all__ = ["Placement", "PlacementConfig", "place_arm"]
+
 _SIDES = {"PSM1": 1.0, "PSM2": -1.0}  # along x of the picture
 _LEAST_ANGLE, _ANGLE_STEP = 5.0, 5.0  # degrees between shaft and view
 

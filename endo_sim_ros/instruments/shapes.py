@@ -16,6 +16,8 @@ from numpy.typing import ArrayLike
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.instruments.kinematics import ArmKinematics
 
+__all__ = ["LINKS", "Capsule", "JawShape", "Material", "Part", "ToolShape", "build_instrument", "link_poses"]
+
 log = logging.getLogger(__name__)
 
 LINKS = ("roll", "wrist_pitch", "wrist_yaw", "jaw_left", "jaw_right")

@@ -28,7 +28,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from endo_sim_ros.core.cameras import Camera, invert_pose
+from endo_sim_ros.core.cameras import invert_pose
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.estimated_poses import with_estimated_poses
 from endo_sim_ros.sequences.images import clean_depth, image_size, numbered_files, read_image
@@ -151,7 +151,8 @@ def read_scared(
             for number, left, right in images.read(numbers):
                 if not is_rectified:
                     left, right = rectification.left(left), rectification.right(right)
-                yield _frame(rectification, number, fps or images.fps, left, right, depth_of(number, archive), pose_of[number])
+                found, stamp = depth_of(number, archive), stamp_ns(number, fps or images.fps)
+                yield rectification.frame(stamp, left, right, pose_of[number], rectification.valid, found)
 
     recording = Recording(frames, len(numbers))
     return recording if posed else with_estimated_poses(recording, root, poses, str(frame_data.relative_to(root)))
@@ -189,7 +190,7 @@ def _read_keyframe(root: Path, start: int | None, stop: int | None, step: int, d
         points = None if depth == "none" else keyframe_points(root, size)
         eyes = rectification.left(read_image(left)), rectification.right(read_image(right))
         measured = None if points is None else rectification.depth(points)
-        yield _frame(rectification, 0, fps or DEFAULT_FPS, *eyes, measured, np.eye(4))
+        yield rectification.frame(stamp_ns(0, fps or DEFAULT_FPS), *eyes, np.eye(4), rectification.valid, measured)
 
     return Recording(frames, 1)
 
@@ -214,26 +215,6 @@ def _pose_direction(root: Path, images: StereoImages, published: dict[int, np.nd
         return USUAL_DIRECTION
     points = read_point_map(depth_map, str(depth_map), images.size)
     return find_pose_direction(points, read_image(keyframe), images, published, project, root)
-
-
-def _frame(
-    rectification: Rectification,
-    number: int,
-    fps: float,
-    left: np.ndarray,
-    right: np.ndarray,
-    depth: np.ndarray | None,
-    pose: np.ndarray,
-) -> Frame:
-    return Frame(
-        stamp_ns=stamp_ns(number, fps),
-        image=left,
-        camera=Camera(rectification.K, *rectification.size, rectification.pose(pose)),
-        right=right,
-        baseline=rectification.baseline,
-        depth=depth,
-        mask=rectification.mask(None),
-    )
 
 
 # ------------------------------------------------------------------------------------------------------ calibration

@@ -152,15 +152,10 @@ def read_stereomis(
 
     def frames() -> Iterator[Frame]:
         for number, left, right in images.read(numbers):
-            pose = np.eye(4) if rows is None else rectification.pose(posed[number])
-            yield Frame(
-                stamp_ns=stamp_ns(number, fps),
-                image=left if is_rectified else rectification.left(left),
-                camera=Camera(rectification.K, *images.size, pose),
-                right=right if is_rectified else rectification.right(right),
-                baseline=rectification.baseline,
-                mask=tissue(number),
-            )
+            if not is_rectified:
+                left, right = rectification.left(left), rectification.right(right)
+            pose = np.eye(4) if rows is None else posed[number]
+            yield rectification.frame(stamp_ns(number, fps), left, right, pose, tissue(number))
 
     recording = Recording(frames, len(numbers))
     return recording if rows is not None else with_estimated_poses(recording, root, poses, POSES_FILE)

@@ -82,7 +82,7 @@ def read_urdf(path: str | Path, arm: ArmKinematics) -> tuple[list[Part], list[Ca
     poses = _poses(joints, chain[0].parent)
     moving = [joint for joint in chain if joint.kind != "fixed"][:6]
     base = _base(path, arm, [(poses[j.child][:3, 3], poses[j.child][:3, :3] @ j.axis) for j in moving])
-    zero = {link: base @ pose for link, pose in link_poses(arm, np.zeros(len(arm.joints))).items()}
+    zero = link_poses(arm, np.zeros(len(arm.joints)), base=base)
     parts = _Meshes(path, robot).parts(_links(joints, moving, poses, zero), poses, zero)
     shape = SHAPES.get(arm.tool.rstrip("_0123456789"), SHAPES["LARGE_NEEDLE_DRIVER"])
     capsules = [_capsule(link, np.concatenate([p.vertices for p in parts if p.link == link])) for link in LINKS if _has(parts, link)]

@@ -12,7 +12,7 @@ from endo_sim_ros.core.light import SURFACE
 from endo_sim_ros.core.shading import shade, to_bytes
 from endo_sim_ros.instruments import LINKS, Material
 from endo_sim_ros.instruments.config import DrawingConfig
-from endo_sim_ros.instruments.drawing import BACKGROUND, FIRST_LINK, SURFACES, TISSUE, InstrumentDrawing, lenses
+from endo_sim_ros.instruments.drawing import FIRST_LINK, SURFACES, InstrumentDrawing, lenses
 from endo_sim_ros.learning.config import Randomisation, SightConfig
 from endo_sim_ros.learning.held_tools import HeldTools
 from endo_sim_ros.learning.scenes import Scene
@@ -199,7 +199,6 @@ class Pictures:
 def _labels(drawing: InstrumentDrawing) -> np.ndarray:
     """The labels [256] that are shown for those of a drawing: as on rendered/segmentation/image, whatever parts the tool has."""
     table = np.arange(256, dtype=np.uint8)
-    table[[BACKGROUND, TISSUE]] = BACKGROUND, TISSUE
     for label, (_, link) in enumerate(drawing.links, FIRST_LINK):
         table[label] = FIRST_LINK + LINKS.index(link)
     return table

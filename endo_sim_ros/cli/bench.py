@@ -1,5 +1,6 @@
 """`endo-sim bench`: finds and runs the benchmarks, which are no part of the installed package."""
 
+import importlib
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,24 +27,24 @@ def find_benchmarks() -> None:
 
 @dataclass(frozen=True)
 class Measured:
-    """What benchmarks have in common."""
+    """What benchmarks have in common. Each is a function ``bench_NAME`` of the module NAME, which takes the options."""
 
     json: Path | None = None
     """File for the results as a list of rows."""
     device: str = "auto"
     """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""
 
+    def run(self) -> None:
+        """Measure."""
+        find_benchmarks()
+        name = type(self).__name__.removeprefix("Bench").lower()
+        options = {"json_file" if option == "json" else option: value for option, value in vars(self).items()}
+        getattr(importlib.import_module(f"benchmarks.{name}"), f"bench_{name}")(**options)
+
 
 @dataclass(frozen=True)
 class BenchRaster(Measured):
     """The rasteriser: forward, forward and backward, memory, and how time grows."""
-
-    def run(self) -> None:
-        """Measure the rasteriser."""
-        find_benchmarks()
-        from benchmarks.raster import bench_raster
-
-        bench_raster(self.device, self.json)
 
 
 @dataclass(frozen=True)
@@ -55,13 +56,6 @@ class BenchPhysics(Measured):
     origin; default: a piece of the synthetic patient."""
     environments: tuple[int, ...] = ()
     """Numbers of copies stepped together; default: 1 4 16 64, on a GPU also 256 1024."""
-
-    def run(self) -> None:
-        """Measure the simulation."""
-        find_benchmarks()
-        from benchmarks.physics import bench_physics
-
-        bench_physics(self.device, self.json, self.model, self.environments)
 
 
 @dataclass(frozen=True)
@@ -83,14 +77,6 @@ class BenchGraph(Measured):
     kills: int = 3
     """Deaths of each node whose recovery is timed; 0 = none."""
 
-    def run(self) -> None:
-        """Measure the node graph."""
-        find_benchmarks()
-        from benchmarks.graph import bench_graph
-
-        options = {name: value for name, value in vars(self).items() if name != "json"}
-        bench_graph(self.json, **options)
-
 
 @dataclass(frozen=True)
 class BenchEnvironments(Measured):
@@ -100,13 +86,6 @@ class BenchEnvironments(Measured):
     """Name of the task, such as retraction or palpation; an unknown one is answered with the list."""
     environments: tuple[int, ...] = (1, 64)
     """Numbers of environments stepped together."""
-
-    def run(self) -> None:
-        """Measure the environments."""
-        find_benchmarks()
-        from benchmarks.environments import bench_environments
-
-        bench_environments(self.json, self.task, self.environments, self.device)
 
 
 @dataclass(frozen=True)

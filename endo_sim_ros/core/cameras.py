@@ -11,6 +11,7 @@ import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -64,6 +65,12 @@ class Camera:
     def at(self, pose: np.ndarray) -> Camera:
         """The same camera at another camera-to-world pose [4, 4], metres."""
         return dataclasses.replace(self, pose=pose)
+
+    def beside(self, distance: float) -> Camera:
+        """The same camera to the right of this one, metres: the right eye beside a left one."""
+        pose = self.pose.copy()
+        pose[:3, 3] += distance * pose[:3, 0]
+        return self.at(pose)
 
     def resized(self, width: int, height: int) -> Camera:
         """The camera that sees the same field of view in an image of width × height pixels."""
@@ -122,18 +129,20 @@ def invert_pose(pose: np.ndarray) -> np.ndarray:
     return rigid_pose(pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3])
 
 
+def rotation_numbers(w: Any, x: Any, y: Any, z: Any) -> list:
+    """The nine numbers of a rotation matrix, row by row, of those of a unit quaternion; arrays, or tensors, of each."""
+    return [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+
+
 def quat_to_matrix(quat: ArrayLike) -> np.ndarray:
     """Rotation matrices [..., 3, 3] of quaternions wxyz [..., 4], which need not be normalised."""
     quat = np.asarray(quat, np.float64)
     w, x, y, z = np.moveaxis(quat / np.linalg.norm(quat, axis=-1, keepdims=True), -1, 0)
-    return np.stack(
-        [
-            1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-        ],
-        -1,
-    ).reshape(quat.shape[:-1] + (3, 3))  # fmt: skip
+    return np.stack(rotation_numbers(w, x, y, z), -1).reshape(quat.shape[:-1] + (3, 3))
 
 
 def matrix_to_quat(matrix: ArrayLike) -> np.ndarray:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from endo_sim_ros.core import compressed_ply
+from endo_sim_ros.core.cameras import rotation_numbers
 from endo_sim_ros.core.compressed_ply import SH_C0
 from endo_sim_ros.core.errors import ModelError as ModelError
 from endo_sim_ros.core.folders import written_whole
@@ -129,14 +130,7 @@ class GaussianModel:
 def rotation_matrices(quats: Tensor) -> Tensor:
     """Rotation matrices [N, 3, 3] of quaternions wxyz [N, 4], which need not be normalised; zero means no rotation."""
     w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
-    return torch.stack(
-        [
-            1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-        ],
-        1,
-    ).view(-1, 3, 3)  # fmt: skip
+    return torch.stack(rotation_numbers(w, x, y, z), 1).view(-1, 3, 3)
 
 
 def ply_fields(sh_degree: int) -> list[str]:

@@ -55,7 +55,7 @@ def _deformed_view_psnr(model: GaussianModel, cameras: Sequence[Camera], device:
     config = PhysicsConfig(device=device, force_radius=size / 2, travel=2 * size)
     simulation = TissueSimulation(model, np.stack([each.position for each in cameras]), config, cameras, render_depth)
     ours, reference = (DeformableRenderer(each, simulation.nodes.rest, options) for each in (model, surface))
-    at_rest = reference.render(camera, depth=False)[0].astype(int)
+    at_rest = reference.views([camera], depth=False)[0].image.astype(int)
     right, down, ahead = camera.pose[:3, :3].T
     found = []
     for direction in (-ahead, -right - 0.3 * ahead, -down - 0.3 * ahead):
@@ -68,7 +68,7 @@ def _deformed_view_psnr(model: GaussianModel, cameras: Sequence[Camera], device:
         if not held:
             continue
         state = simulation.state()
-        picture, expected = (each.render(camera, state.positions, state.F, depth=False)[0] for each in (ours, reference))
+        picture, expected = (each.views([camera], state.positions, state.F, depth=False)[0].image for each in (ours, reference))
         changed = (np.abs(expected - at_rest).max(-1) > _CHANGED).astype(np.uint8)
         if changed.any():
             found.append(metrics.psnr(picture, expected, cv2.dilate(changed, np.ones((2 * _MARGIN + 1,) * 2))))

@@ -130,13 +130,14 @@ def peak_megabytes(action: Callable[[], object], device: str) -> float | None:
     try:
         ctypes.CDLL(None).malloc_trim(0)  # else the allocator would serve the action from what it keeps
         Path("/proc/self/clear_refs").write_text("5")  # sets the peak to what is resident now
-        before = _status_kilobytes("VmRSS")
+        before = status_kilobytes("VmRSS")
         action()
-        return (_status_kilobytes("VmHWM") - before) * 1024 / 1e6
+        return (status_kilobytes("VmHWM") - before) * 1024 / 1e6
     except (OSError, AttributeError):
         return None
 
 
-def _status_kilobytes(field: str) -> int:
-    lines = Path("/proc/self/status").read_text().splitlines()
+def status_kilobytes(field: str, process: int | str = "self") -> int:
+    """A number of kilobytes that Linux tells of a process."""
+    lines = Path(f"/proc/{process}/status").read_text().splitlines()
     return int(next(line for line in lines if line.startswith(field + ":")).split()[1])

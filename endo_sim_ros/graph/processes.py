@@ -1,5 +1,6 @@
 """Starts the nodes of the graph as processes of their own."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -43,16 +44,13 @@ def _yaml(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
-class NodeGroup:
+class NodeGroup(contextlib.AbstractContextManager):
     """Nodes that live and end together. Use as a context manager."""
 
     def __init__(self, log_folder: Path) -> None:
         self.environment = graph_environment()
         self._log_folder = log_folder
         self.nodes: dict[str, NodeProcess] = {}
-
-    def __enter__(self) -> "NodeGroup":
-        return self
 
     def __exit__(self, *_: Any) -> None:
         self.stop()

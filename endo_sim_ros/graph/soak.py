@@ -17,7 +17,7 @@ from rich.progress import Progress
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import rigid_pose
 from endo_sim_ros.core.frames import LEFT_FRAME
-from endo_sim_ros.evaluation.measurement import Row, report
+from endo_sim_ros.evaluation.measurement import Row, report, status_kilobytes
 from endo_sim_ros.graph.client import ARM, CHANGED, Client, depth_of, tissue
 from endo_sim_ros.graph.processes import NodeGroup
 from endo_sim_ros.instruments.kinematics import JOINTS
@@ -139,12 +139,6 @@ _HEARD = (  # what is made for those alone who hear it
 )  # fmt: skip
 
 
-def _memory(pid: int) -> float:
-    """Resident memory of a process, MB."""
-    status = Path(f"/proc/{pid}/status").read_text()
-    return next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmRSS")) / 1024
-
-
 def soak(json_file: Path | None, minutes: float, rate: float = 500.0, seed: int = 0) -> list[Row]:
     """Send random traffic to a graph, then let it do its work; print and return what was measured.
 
@@ -205,7 +199,7 @@ def _send(client: Client, group: NodeGroup, traffic: _Traffic, rng: random.Rando
                 for name in _NODES:
                     if group.nodes[name].exit_status is not None:
                         raise RuntimeError(f"{name} ended after {now:.0f} s:\n{group.nodes[name].log.read_text()[-3000:]}")
-                    used[name].append(_memory(group.nodes[name].process.pid))
+                    used[name].append(status_kilobytes("VmRSS", group.nodes[name].process.pid) / 1024)
     rows = [Row("messages sent", sent, ""), Row("of them spoilt", spoilt, ""), Row("messages per second", sent / seconds, "1/s")]
     for name in _NODES:
         settled, last = max(used[name][: int(_SETTLED * len(used[name])) + 1]), np.median(used[name][-3:])

@@ -10,6 +10,8 @@ from endo_sim_ros.instruments.inverse import aim_shaft
 from endo_sim_ros.instruments.kinematics import ArmKinematics
 from endo_sim_ros.instruments.shapes import LINKS, Capsule
 
+__all__ = ["GRIP", "aimed_pose", "working_point"]
+
 GRIP = 0.85
 """Where on the jaws tissue is gripped, from their hinge, 0, to their points, 1: with what lies before the points, not at them."""
 

@@ -11,6 +11,8 @@ import numpy as np
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.instruments.kinematics import ArmKinematics, Joint, nearest_rotations
 
+__all__ = ["arm_names", "load_arm", "save_tool", "tool_names"]
+
 _SHIPPED = Path(__file__).parent / "parameters"
 _MOST_BYTES = 1_000_000  # of a parameter file; one takes 3000
 _STRING = r'("(?:\\.|[^"\\])*")'

@@ -17,6 +17,8 @@ from endo_sim_ros.core.cameras import invert_pose
 from endo_sim_ros.core.config import Range, StageConfig
 from endo_sim_ros.instruments.kinematics import ArmKinematics, nearest_rotations
 
+__all__ = ["Reach", "ReachConfig", "solve_inverse"]
+
 _REACHED = 1e-8  # m, rad: errors below come from rounding
 _UNDECIDED = 1e-9  # m: shorter vectors have no direction
 _WITHIN = 1e-9  # rad, m: how far rounding may leave the limits

@@ -11,6 +11,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+__all__ = ["JOINTS", "ArmKinematics", "Joint"]
+
 JOINTS = ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw")
 """Names of the joints of an arm with an instrument."""
 

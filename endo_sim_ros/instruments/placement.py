@@ -9,10 +9,12 @@ from typing import Annotated
 
 import numpy as np
 
-from endo_sim_ros.core.cameras import Camera, invert_pose
+from endo_sim_ros.core.cameras import Camera, invert_pose, rigid_pose
 from endo_sim_ros.core.config import ConfigError, Range, StageConfig
 from endo_sim_ros.instruments.inverse import aim_shaft
 from endo_sim_ros.instruments.kinematics import ArmKinematics
+
+__all__ = ["Placement", "PlacementConfig", "place_arm"]
 
 _SIDES = {"PSM1": 1.0, "PSM2": -1.0}  # along x of the picture
 _LEAST_ANGLE, _ANGLE_STEP = 5.0, 5.0  # degrees between shaft and view
@@ -80,9 +82,8 @@ def place_arm(name: str, arm: ArmKinematics, camera: Camera, depth: float, confi
         z = np.sin(angle) * outward - np.array([0, 0, np.cos(angle)])  # from the tip to the remote centre
         y = np.cross(z, (-1.0, 0.0, 0.0))
         y /= np.linalg.norm(y)
-        base = np.eye(4)
-        base[:3, :3] = np.stack([np.cross(y, z), y, z], 1)
-        base[:3, 3] = (0, 0, depth) - base[:3, :3] @ tip[:3, 3]
+        R = np.stack([np.cross(y, z), y, z], 1)
+        base = rigid_pose(R, (0, 0, depth) - R @ tip[:3, 3])
         if _reaches(arm, joints[2] + tip[2, 3], (depth * rays - base[:3, 3]) @ base[:3, :3]):
             return Placement(camera.pose @ base, joints)
     width = depth * camera.width / camera.K[0, 0]

@@ -16,6 +16,8 @@ from numpy.typing import ArrayLike
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.instruments.kinematics import ArmKinematics
 
+__all__ = ["LINKS", "Capsule", "JawShape", "Material", "Part", "ToolShape", "build_instrument", "link_poses"]
+
 log = logging.getLogger(__name__)
 
 LINKS = ("roll", "wrist_pitch", "wrist_yaw", "jaw_left", "jaw_right")
@@ -173,13 +175,14 @@ def build_instrument(arm: ArmKinematics, shape: ToolShape | None = None) -> tupl
     return build.parts, build.capsules
 
 
-def link_poses(arm: ArmKinematics, joints: ArrayLike, jaw: ArrayLike = 0.0) -> dict[str, np.ndarray]:
-    """Poses [..., 4, 4] in the base frame of the links that parts and capsules move with, by name.
+def link_poses(arm: ArmKinematics, joints: ArrayLike, jaw: ArrayLike = 0.0, base: np.ndarray | None = None) -> dict[str, np.ndarray]:
+    """Poses [..., 4, 4] of the links that parts and capsules move with, by name.
 
     Args:
         arm: An arm with a wrist.
         joints: Joint positions [..., n], rad and m.
         jaw: Angle between the jaws [...], rad.
+        base: Pose [..., 4, 4] of the base in the frame of the result; None = that is the base frame.
 
     Raises:
         ValueError: As `ArmKinematics.check_joints` does.
@@ -192,7 +195,7 @@ def link_poses(arm: ArmKinematics, joints: ArrayLike, jaw: ArrayLike = 0.0) -> d
         turn[..., 0, 0], turn[..., 0, 1], turn[..., 1, 0], turn[..., 1, 1] = np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)
         turn[..., 2, 2] = turn[..., 3, 3] = 1
         poses[name] = poses["wrist_yaw"] @ turn
-    return poses
+    return poses if base is None else {name: base @ pose for name, pose in poses.items()}
 
 
 def lofted(rings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

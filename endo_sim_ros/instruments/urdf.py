@@ -6,6 +6,7 @@ from xml.etree import ElementTree
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from endo_sim_ros.core.cameras import rigid_pose
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.instruments.kinematics import ArmKinematics
 from endo_sim_ros.instruments.shapes import Capsule, build_instrument
@@ -58,15 +59,27 @@ def find_base(description: str, arm: str) -> np.ndarray | None:
     """
     try:
         robot = ElementTree.fromstring(description)
-        origin = robot.find(f"joint[@name='{arm.replace('/', '_')}_base']/origin")
-        if origin is None:
-            return None
-        base = np.eye(4)
-        base[:3, 3] = [float(number) for number in origin.get("xyz", "0 0 0").split()]
-        base[:3, :3] = Rotation.from_euler("xyz", [float(number) for number in origin.get("rpy", "0 0 0").split()]).as_matrix()
+        joint = robot.find(f"joint[@name='{arm.replace('/', '_')}_base']")
+        return None if joint is None or joint.find("origin") is None else read_origin(joint)
     except (ElementTree.ParseError, ValueError) as error:
         raise ConfigError(f"the robot description cannot be read: {error}") from error
-    return base
+
+
+def read_origin(element: ElementTree.Element) -> np.ndarray:
+    """Pose [4, 4] that the origin of an element says, m; raises ValueError if that is not made of finite numbers."""
+    origin = element.find("origin")
+    if origin is None:
+        return np.eye(4)
+    turn = Rotation.from_euler("xyz", read_numbers(origin.get("rpy", "0 0 0"), 3))
+    return rigid_pose(turn.as_matrix(), read_numbers(origin.get("xyz", "0 0 0"), 3))
+
+
+def read_numbers(text: str, count: int) -> np.ndarray:
+    """So many finite numbers of a text; raises ValueError if it has others."""
+    values = np.array(text.split(), np.float64)
+    if values.shape != (count,) or not np.isfinite(values).all():
+        raise ValueError(f"expected {count} finite numbers, got {text!r:.60}")
+    return values
 
 
 def _add_arm(
@@ -116,10 +129,8 @@ def _add_arm(
 def _add_cylinder(element: ElementTree.Element, capsule: Capsule) -> None:
     way = capsule.end - capsule.start
     length = float(np.linalg.norm(way))
-    pose = np.eye(4)
-    pose[:3, 3] = 0.5 * (capsule.start + capsule.end)
-    if length > 0:
-        pose[:3, :3] = Rotation.align_vectors([way / length], [[0.0, 0, 1]])[0].as_matrix()
+    turn = Rotation.align_vectors([way / length], [[0.0, 0, 1]])[0] if length > 0 else Rotation.identity()
+    pose = rigid_pose(turn.as_matrix(), 0.5 * (capsule.start + capsule.end))
     visual = ElementTree.SubElement(element, "visual")
     ElementTree.SubElement(visual, "origin", _origin(pose))
     geometry = ElementTree.SubElement(visual, "geometry")

@@ -19,6 +19,7 @@ from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.instruments.arm_files import load_arm
 from endo_sim_ros.instruments.kinematics import ArmKinematics
 from endo_sim_ros.instruments.shapes import LINKS, SHAPES, Capsule, Material, Part, build_instrument, link_poses
+from endo_sim_ros.instruments.urdf import read_numbers, read_origin
 
 log = logging.getLogger(__name__)
 
@@ -81,7 +82,7 @@ def read_urdf(path: str | Path, arm: ArmKinematics) -> tuple[list[Part], list[Ca
     poses = _poses(joints, chain[0].parent)
     moving = [joint for joint in chain if joint.kind != "fixed"][:6]
     base = _base(path, arm, [(poses[j.child][:3, 3], poses[j.child][:3, :3] @ j.axis) for j in moving])
-    zero = {link: base @ pose for link, pose in link_poses(arm, np.zeros(len(arm.joints))).items()}
+    zero = link_poses(arm, np.zeros(len(arm.joints)), base=base)
     parts = _Meshes(path, robot).parts(_links(joints, moving, poses, zero), poses, zero)
     shape = SHAPES.get(arm.tool.rstrip("_0123456789"), SHAPES["LARGE_NEEDLE_DRIVER"])
     capsules = [_capsule(link, np.concatenate([p.vertices for p in parts if p.link == link])) for link in LINKS if _has(parts, link)]
@@ -101,26 +102,11 @@ def _joint(element: ElementTree.Element) -> _Joint:
     ends = [element.find(name) for name in ("parent", "child")]
     parent, child = (end.attrib["link"] for end in ends if end is not None)
     axis = element.find("axis")
-    direction = np.array([1.0, 0, 0]) if axis is None else _numbers(axis.get("xyz", "1 0 0"), 3)
+    direction = np.array([1.0, 0, 0]) if axis is None else read_numbers(axis.get("xyz", "1 0 0"), 3)
     length = np.linalg.norm(direction)
     if kind != "fixed" and not length > 0:
         raise ValueError(f"the axis of {element.get('name')} has no direction")
-    return _Joint(kind, parent, child, _origin(element), direction / max(length, 1e-12))
-
-
-def _numbers(text: str, count: int) -> np.ndarray:
-    values = np.array(text.split(), np.float64)
-    if values.shape != (count,) or not np.isfinite(values).all():
-        raise ValueError(f"expected {count} finite numbers, got {text!r:.60}")
-    return values
-
-
-def _origin(element: ElementTree.Element) -> np.ndarray:
-    pose, origin = np.eye(4), element.find("origin")
-    if origin is not None:
-        pose[:3, 3] = _numbers(origin.get("xyz", "0 0 0"), 3)
-        pose[:3, :3] = Rotation.from_euler("xyz", _numbers(origin.get("rpy", "0 0 0"), 3)).as_matrix()
-    return pose
+    return _Joint(kind, parent, child, read_origin(element), direction / max(length, 1e-12))
 
 
 def _ways(joints: list[_Joint]) -> Iterator[list[_Joint]]:
@@ -224,7 +210,7 @@ class _Meshes:
                     if mesh is None:
                         continue
                     faces += len(mesh.faces)
-                    pose = frame @ poses[name] @ _origin(visual)
+                    pose = frame @ poses[name] @ read_origin(visual)
                     vertices = (mesh.vertices @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32)
                     found.setdefault(ours, []).append(Part(ours, self._material(visual), vertices, np.asarray(mesh.faces, np.int32)))
         if faces > _MOST_FACES:
@@ -251,7 +237,7 @@ class _Meshes:
         if shape is None:
             return None
         if shape.tag == "box":
-            return create.box(_numbers(shape.get("size", ""), 3))
+            return create.box(read_numbers(shape.get("size", ""), 3))
         if shape.tag == "cylinder":
             return create.cylinder(float(shape.get("radius", "nan")), float(shape.get("length", "nan")), sections=32)
         if shape.tag == "sphere":
@@ -263,7 +249,7 @@ class _Meshes:
             mesh = self._trimesh.load(file, force="mesh")
         except Exception as error:  # of whatever reads this format
             raise ConfigError(f"{file}: this mesh cannot be read: {error!s:.200}") from None
-        mesh.apply_scale(_numbers(shape.get("scale", "1 1 1"), 3))
+        mesh.apply_scale(read_numbers(shape.get("scale", "1 1 1"), 3))
         if len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
             raise ConfigError(f"{file}: this mesh has no triangles, or corners that are not finite")
         if (size := np.ptp(mesh.vertices, axis=0).max()) > _LARGEST:
@@ -292,7 +278,7 @@ class _Meshes:
         color = None if material is None else material.find("color")
         if color is None:
             return Material.STEEL
-        return Material.SHAFT if _numbers(color.get("rgba", "1 1 1 1"), 4)[:3].mean() < _DARK else Material.STEEL
+        return Material.SHAFT if read_numbers(color.get("rgba", "1 1 1 1"), 4)[:3].mean() < _DARK else Material.STEEL
 
 
 def _capsule(link: str, vertices: np.ndarray) -> Capsule:

@@ -33,29 +33,28 @@ Observed = np.ndarray | dict[str, np.ndarray]
 def _make(
     task: str,
     count: int,
-    scene: Scene | Path | str | None,
-    observations: Observations,
-    randomisation: Randomisation | dict[str, float] | None,
-    image_width: int,
-    device: str,
-    render_mode: str | None,
-    actions: Actions,
+    scene: Scene | Path | str | None = None,
+    observations: Observations = "state",
+    randomisation: Randomisation | dict[str, float] | None = None,
+    device: str = "auto",
+    render_mode: str | None = None,
+    actions: Actions = "cartesian",
     **sight: Any,
 ) -> tuple[TaskBatch, gymnasium.Space]:
-    """The simulation, and the space of the observations of one environment."""
+    """The simulation, and the space of the observations of one environment; the arguments are those of `TaskEnvironment`."""
     if observations not in ("state", "image", "both"):
         raise ValueError(f"observations must be state, image or both, got {observations!r}")
     if render_mode not in (None, "rgb_array"):
         raise ValueError(f"render_mode must be rgb_array or None, got {render_mode!r}")
     if actions not in get_args(Actions):
         raise ValueError(f"actions must be {', '.join(get_args(Actions)[:-1])} or {get_args(Actions)[-1]}, got {actions!r}")
-    if image_width < 1:
-        raise ValueError(f"image_width must be at least 1, got {image_width}")
-    if sight["eyes"] == 2 and observations == "state":
+    if sight.get("image_width", 1) < 1:
+        raise ValueError(f"image_width must be at least 1, got {sight['image_width']}")
+    shown = SightConfig(**sight)
+    if shown.eyes == 2 and observations == "state":
         raise ValueError("eyes is 2, but observations is state, which has no images; ask for image or both")
     randomisation = Randomisation.from_mapping(randomisation) if isinstance(randomisation, dict) else randomisation or Randomisation()
     scene = scene if isinstance(scene, Scene) else load_scene(scene)
-    shown = SightConfig(image_width=image_width, **sight)
     batch = TaskBatch(task, scene, count, observations, randomisation, shown, device, render_mode is not None, actions)
     spaces: dict[str, gymnasium.Space] = {}
     if observations != "image":
@@ -122,7 +121,7 @@ class TaskEnvironment(gymnasium.Env):
         actions: Actions = "cartesian",
     ):
         self.batch, self.observation_space = _make(
-            task, 1, scene, observations, randomisation, image_width, device, render_mode, actions,
+            task, 1, scene, observations, randomisation, device, render_mode, actions, image_width=image_width,
             instrument=instrument, tool=tool, eyes=eyes, baseline=baseline, segmentation=segmentation,
         )  # fmt: skip
         self.action_space, self.render_mode = _action_space(self.batch), render_mode
@@ -150,33 +149,15 @@ class VectorTaskEnvironment(gymnasium.vector.VectorEnv):
     Args:
         task: As for :class:`TaskEnvironment`, like all others.
         num_envs: How many.
+        render_mode, options: Its other arguments, by their names.
     """
 
     metadata = {
         "render_modes": ["rgb_array"], "render_fps": FPS, "autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP,
     }  # fmt: skip
 
-    def __init__(
-        self,
-        task: str,
-        num_envs: int = 1,
-        scene: Scene | Path | str | None = None,
-        observations: Observations = "state",
-        randomisation: Randomisation | dict[str, float] | None = None,
-        image_width: int = 64,
-        device: str = "auto",
-        render_mode: str | None = None,
-        instrument: bool = True,
-        tool: str = "",
-        eyes: Literal[1, 2] = 1,
-        baseline: float = SightConfig.baseline,
-        segmentation: bool = False,
-        actions: Actions = "cartesian",
-    ):
-        self.batch, self.single_observation_space = _make(
-            task, num_envs, scene, observations, randomisation, image_width, device, render_mode, actions,
-            instrument=instrument, tool=tool, eyes=eyes, baseline=baseline, segmentation=segmentation,
-        )  # fmt: skip
+    def __init__(self, task: str, num_envs: int = 1, render_mode: str | None = None, **options: Any):
+        self.batch, self.single_observation_space = _make(task, num_envs, render_mode=render_mode, **options)
         self.num_envs, self.single_action_space, self.render_mode = num_envs, _action_space(self.batch), render_mode
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)

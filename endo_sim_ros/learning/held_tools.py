@@ -222,8 +222,7 @@ class HeldTools:
     def links(self, number: int, episodes: np.ndarray) -> dict[str, np.ndarray]:
         """Poses [n, 4, 4] of the links, world, by name, of episodes that have the tool of a number."""
         tool = self.tools[number]
-        poses = link_poses(tool.arm, self.joints[episodes], tool.jaw(self.angles[episodes]))
-        return {name: self.bases[episodes] @ pose for name, pose in poses.items()}
+        return link_poses(tool.arm, self.joints[episodes], tool.jaw(self.angles[episodes]), self.bases[episodes])
 
 
 def invert_poses(poses: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from endo_sim_ros.core.light import SURFACE
 from endo_sim_ros.core.shading import shade, to_bytes
 from endo_sim_ros.instruments import LINKS, Material
 from endo_sim_ros.instruments.config import DrawingConfig
-from endo_sim_ros.instruments.drawing import BACKGROUND, FIRST_LINK, SURFACES, TISSUE, InstrumentDrawing, lenses
+from endo_sim_ros.instruments.drawing import FIRST_LINK, SURFACES, InstrumentDrawing, lenses
 from endo_sim_ros.learning.config import Randomisation, SightConfig
 from endo_sim_ros.learning.held_tools import HeldTools
 from endo_sim_ros.learning.scenes import Scene
@@ -188,23 +188,15 @@ class Pictures:
             camera = replace(camera, pose=pose) if by.camera_position or by.camera_angle else camera
             view.contrast, lamp = variation.texture, lamp + np.append(variation.lamp, 0.0)
             view.metal = variation.metal
-        view.cameras = (camera,) if self._sight.eyes == 1 else (camera, right_of(camera, self._sight.baseline))
+        view.cameras = (camera,) if self._sight.eyes == 1 else (camera, camera.beside(self._sight.baseline))
         lamp = camera.pose @ lamp
         view.lamps = np.stack([(each.viewmat @ lamp)[:3] for each in view.cameras])
         return view
 
 
-def right_of(left: Camera, baseline: float) -> Camera:
-    """The right eye beside a left one, at a distance in metres."""
-    pose = left.pose.copy()
-    pose[:3, 3] += baseline * pose[:3, 0]
-    return left.at(pose)
-
-
 def _labels(drawing: InstrumentDrawing) -> np.ndarray:
     """The labels [256] that are shown for those of a drawing: as on rendered/segmentation/image, whatever parts the tool has."""
     table = np.arange(256, dtype=np.uint8)
-    table[[BACKGROUND, TISSUE]] = BACKGROUND, TISSUE
     for label, (_, link) in enumerate(drawing.links, FIRST_LINK):
         table[label] = FIRST_LINK + LINKS.index(link)
     return table

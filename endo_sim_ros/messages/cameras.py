@@ -10,6 +10,8 @@ from endo_sim_ros.messages.headers import make_header
 from endo_sim_ros.messages.topics import LEFT_INFO
 from endo_sim_ros.messages.types import Message, MessageError, MessageTypes, ros_types
 
+__all__ = ["CameraInfo", "decode_camera_info", "encode_camera_info"]
+
 _DISTORTION_MODELS = ("", "plumb_bob", "rational_polynomial")
 
 

@@ -14,6 +14,11 @@ from endo_sim_ros.messages.types import Message, MessageError, MessageTypes, ros
 if TYPE_CHECKING:  # it takes torch, which most users of this package do not need
     from endo_sim_ros.core.gaussians import GaussianModel
 
+__all__ = [
+    "ControlNodeCloud", "cut_number", "decode_cloud", "decode_control_nodes", "decode_cut_surface", "decode_gaussians",
+    "encode_control_nodes", "encode_cut_surface", "encode_gaussians",
+]  # fmt: skip
+
 _POINT_FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # PointField.datatype
 _POINT_DATATYPES = {name: number for number, name in _POINT_FORMATS.items()}
 

@@ -4,6 +4,8 @@ from collections.abc import Iterable
 
 from endo_sim_ros.messages.types import Message, MessageError, MessageTypes, ros_types
 
+__all__ = ["check_frame", "encode_clock", "stamp_to_ns"]
+
 NANOSECONDS = 1_000_000_000  # in a second
 
 

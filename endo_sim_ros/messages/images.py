@@ -8,6 +8,8 @@ from endo_sim_ros.messages.headers import make_header
 from endo_sim_ros.messages.topics import DEPTH, LEFT_IMAGE, MASK, RENDERED_SEGMENTATION
 from endo_sim_ros.messages.types import Message, MessageError, MessageTypes, ros_types
 
+__all__ = ["decode_depth", "decode_image", "decode_labels", "decode_mask", "encode_compressed", "encode_image"]
+
 _COLOR_CHANNELS = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "8UC1": 1, "8UC3": 3}
 _ENCODINGS = {("uint8", 3): "rgb8", ("uint8", 1): "mono8", ("float32", 1): "32FC1"}  # by dtype and channels
 

@@ -9,6 +9,8 @@ from endo_sim_ros.messages.headers import check_frame, make_header
 from endo_sim_ros.messages.topics import TRAINING_CAMERAS
 from endo_sim_ros.messages.types import Message, MessageError, MessageTypes, ros_types
 
+__all__ = ["decode_pose", "decode_poses", "decode_tip", "encode_pose", "encode_poses"]
+
 
 def _decode_pose(pose: Message, topic: str) -> np.ndarray:
     """Pose [4, 4] of a geometry_msgs/Pose."""

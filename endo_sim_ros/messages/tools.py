@@ -8,6 +8,12 @@ import numpy as np
 from endo_sim_ros.messages.headers import make_header
 from endo_sim_ros.messages.types import Message, MessageError, MessageTypes, crtk_type, ros_class, ros_types
 
+__all__ = [
+    "ToolDisplay", "decode_cut", "decode_jaw", "decode_joints", "decode_number", "decode_state_command", "decode_text", "decode_wrench",
+    "encode_cut", "encode_jaw", "encode_joints", "encode_matrix", "encode_number", "encode_operating_state", "encode_report", "encode_text",
+    "encode_tool_markers", "encode_twist", "encode_wrench",
+]  # fmt: skip
+
 
 def decode_wrench(message: Message, topic: str) -> tuple[np.ndarray, np.ndarray]:
     """Force [3] (N) and torque [3] (N·m) of a WrenchStamped, in the axes of its frame.

@@ -43,9 +43,9 @@ DIAGNOSTICS = Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
 CLOCK = Topic("/clock", "rosgraph_msgs/msg/Clock")
 
 
-def _of_arm(name: str, kind: str) -> Callable[[str], Topic]:
-    """Function from the name of an arm to its topic."""
-    return lambda arm: Topic(f"{arm}/{name}", kind)
+def _of_arm(name: str, kind: str, qos: str = "stream") -> Callable[[str], Topic]:
+    """Function from the name of an arm to its topic; a type without a package is one of crtk_msgs."""
+    return lambda arm: Topic(f"{arm}/{name}", kind if "/" in kind else crtk_type(kind), qos)
 
 
 tool_pose = _of_arm("measured_cp", "geometry_msgs/msg/PoseStamped")
@@ -102,47 +102,22 @@ tool_local_setpoint = _of_arm("local/setpoint_cp", "geometry_msgs/msg/PoseStampe
 """Current setpoint of an arm's tip in its base."""
 tool_links = _of_arm("link_poses", "geometry_msgs/msg/PoseArray")
 """Poses of the links of an arm's instrument."""
-
-
-def tool_ratio(arm: str) -> Topic:
-    """Part of their largest speeds with which an arm's moves go."""
-    return Topic(f"{arm}/trajectory_j/ratio", "std_msgs/msg/Float64", "latched")
-
-
-def tool_type(arm: str) -> Topic:
-    """Name and number, or path of the file, of the tool on an arm."""
-    return Topic(f"{arm}/tool_type", "std_msgs/msg/String", "latched")
-
-
-def tool_state(arm: str) -> Topic:
-    """CRTK operating state of an arm."""
-    return Topic(f"{arm}/operating_state", crtk_type("OperatingState"), "latched")
-
-
-def tool_state_command(arm: str) -> Topic:
-    """CRTK state command to an arm."""
-    return Topic(f"{arm}/state_command", crtk_type("StringStamped"))
-
-
-def tool_state_name(arm: str) -> Topic:
-    """CRTK state of an arm by its name alone."""
-    return Topic(f"{arm}/state", crtk_type("StringStamped"), "latched")
-
-
-def tool_info(arm: str) -> Topic:
-    """What an arm tells people."""
-    return Topic(f"{arm}/info", crtk_type("StringStamped"))
-
-
-def tool_warning(arm: str) -> Topic:
-    """What an arm warns people of."""
-    return Topic(f"{arm}/warning", crtk_type("StringStamped"))
-
-
-def tool_error(arm: str) -> Topic:
-    """What an arm refused, or what ended its move."""
-    return Topic(f"{arm}/error", crtk_type("StringStamped"))
-
+tool_ratio = _of_arm("trajectory_j/ratio", "std_msgs/msg/Float64", "latched")
+"""Part of their largest speeds with which an arm's moves go."""
+tool_type = _of_arm("tool_type", "std_msgs/msg/String", "latched")
+"""Name and number, or path of the file, of the tool on an arm."""
+tool_state = _of_arm("operating_state", "OperatingState", "latched")
+"""CRTK operating state of an arm."""
+tool_state_command = _of_arm("state_command", "StringStamped")
+"""CRTK state command to an arm."""
+tool_state_name = _of_arm("state", "StringStamped", "latched")
+"""CRTK state of an arm by its name alone."""
+tool_info = _of_arm("info", "StringStamped")
+"""What an arm tells people."""
+tool_warning = _of_arm("warning", "StringStamped")
+"""What an arm warns people of."""
+tool_error = _of_arm("error", "StringStamped")
+"""What an arm refused, or what ended its move."""
 
 JOINT_STATES = Topic("joint_states", "sensor_msgs/msg/JointState")
 ROBOT_DESCRIPTION = Topic("robot_description", "std_msgs/msg/String", "latched")

@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+__all__ = ["Message", "MessageError", "MessageTypes", "bag_types", "crtk_type", "ros_class", "ros_types"]
+
 
 class MessageError(ValueError):
     """A message that cannot be used. The sentence names the topic, the field and what to do."""

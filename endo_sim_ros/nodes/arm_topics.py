@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Collection, Iterator
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -21,6 +21,7 @@ ECM_VIEW = "ECM_view"
 _TURNED = np.diag([-1.0, -1.0, 1.0, 1.0])  # the dVRK's frame of a camera in the optical one: x to the left and y up in the picture
 _CHANGES = "changes of joint positions"
 
+AnArm = TypeVar("AnArm", bound=Arm)
 Act = Callable[[], None]
 Deliver = Callable[[str, str, Any, str, Act], None]
 Discard = Callable[[str, Collection[str]], None]
@@ -52,6 +53,7 @@ class ArmTopics:
         discard: Called with the name of an arm and the parts of commands that a newer command replaces; those that wait never act.
 
     Attributes:
+        joints: Topics of the arms with joints.
         camera_pose: Newest pose [4, 4] of a camera that is no arm of this node, world, or None.
     """
 
@@ -87,13 +89,13 @@ class ArmTopics:
             self._hear_part(arm, "jaw", messages.tool_jaw, self._on_jaw, several)
             self._hear(arm, messages.tool_jaw_move, self._on_jaw_move, several)
             self._hear_part(arm, "cut", messages.tool_cut, self._on_cut, several)
-        self._joints = JointTopics(node, {name: arm for name, arm in arms.items() if isinstance(arm, JointedArm)}, options)
+        self.joints = JointTopics(node, {name: arm for name, arm in arms.items() if isinstance(arm, JointedArm)}, options)
         self.change_options(options)
         self.publish_operating_states()
 
     def change_options(self, options: PhysicsNodeConfig) -> None:
         """Use new options of the node."""
-        self.options = self._joints.options = options
+        self.options = self.joints.options = options
         for arm in self._arms.values():
             if isinstance(arm, JointedArm):
                 arm.joint_speed, arm.slide_speed = options.joint_speed, options.slide_speed
@@ -142,7 +144,7 @@ class ArmTopics:
 
     # ---------------------------------------------------------------- commands
 
-    def _hear(self, arm: Arm, topic_of: Callable[[str], Topic], callback: Callable[[Arm, str, Any], None], depth: int) -> None:
+    def _hear(self, arm: AnArm, topic_of: Callable[[str], Topic], callback: Callable[[AnArm, str, Any], None], depth: int) -> None:
         """Call back with the arm, the topic's name and each message; a ValueError is reported under that name."""
         topic = topic_of(arm.name)
 
@@ -153,11 +155,11 @@ class ArmTopics:
         self._node.subscribe(topic, heard, depth)
 
     def _hear_part(
-        self, arm: Arm, kind: str, topic_of: Callable[[str], Topic], prepare: Callable[[Arm, str, Any], Act], depth: int
+        self, arm: AnArm, kind: str, topic_of: Callable[[str], Topic], prepare: Callable[[AnArm, str, Any], Act], depth: int
     ) -> None:
         """Deliver what each message makes the arm do; in lockstep also that a message is refused, as its command waits for its parts."""
 
-        def heard(arm: Arm, topic: str, message: Any) -> None:
+        def heard(arm: AnArm, topic: str, message: Any) -> None:
             try:
                 act = prepare(arm, topic, message)
             except ValueError as error:
@@ -218,69 +220,57 @@ class ArmTopics:
             raise ValueError(f"a pose in {ECM_VIEW}, but no pose of a camera came on {messages.CAMERA_POSE.name}; add ECM to arms")
         return messages.decode_pose(message, frames, topic)
 
-    def _on_pose(self, arm: Arm, topic: str, message: Any) -> Act:
-        pose = self._decode_pose(arm, topic, message)
+    def _servo(self, arm: Arm, take: Act) -> Act:
+        """What a command does that an arm takes at once, if it is enabled."""
 
         def act() -> None:
             arm.require_enabled()
-            arm.servo(pose)
+            take()
             self.publish_operating_states()
 
         return act
+
+    def _begin(self, arm: Arm, *replaced: str) -> None:
+        """A command acts from now on: parts of others that wait are forgotten, and the state of the arm is told."""
+        self._discard(arm.name, replaced)
+        self.publish_operating_states(arm.name)
+
+    def _on_pose(self, arm: Arm, topic: str, message: Any) -> Act:
+        pose = self._decode_pose(arm, topic, message)
+        return self._servo(arm, lambda: arm.servo(pose))
 
     def _on_move(self, arm: Arm, topic: str, message: Any) -> None:
         goal = self._decode_pose(arm, topic, message)
         arm.require_enabled()
         self.warn(arm, arm.move_to(goal), again=True)
-        self._discard(arm.name, ("pose",))
-        self.publish_operating_states(arm.name)
+        self._begin(arm, "pose")
 
-    def _on_joints(self, arm: Arm, topic: str, message: Any) -> Act:
-        assert isinstance(arm, JointedArm)
+    def _on_joints(self, arm: JointedArm, topic: str, message: Any) -> Act:
         joints = arm.check_joints(messages.decode_joints(message, topic), message.name)
+        return self._servo(arm, lambda: arm.servo_joints(joints))
 
-        def act() -> None:
-            arm.require_enabled()
-            arm.servo_joints(joints)
-            self.publish_operating_states()
-
-        return act
-
-    def _on_joint_move(self, arm: Arm, topic: str, message: Any) -> None:
-        assert isinstance(arm, JointedArm)
+    def _on_joint_move(self, arm: JointedArm, topic: str, message: Any) -> None:
         goal = arm.check_joints(messages.decode_joints(message, topic), message.name)
         arm.require_enabled()
         arm.move_joints(goal)
-        self._discard(arm.name, ("pose",))
-        self.publish_operating_states(arm.name)
+        self._begin(arm, "pose")
 
-    def _on_joint_change(self, arm: Arm, topic: str, message: Any) -> Act:
-        assert isinstance(arm, JointedArm)
+    def _on_joint_change(self, arm: JointedArm, topic: str, message: Any) -> Act:
         change = arm.check_numbers(messages.decode_joints(message, topic, _CHANGES), message.name)
+        return self._servo(arm, lambda: arm.servo_joints(arm.joints_after(change)))
 
-        def act() -> None:
-            arm.require_enabled()
-            arm.servo_joints(arm.joints_after(change))
-            self.publish_operating_states()
-
-        return act
-
-    def _on_joint_move_change(self, arm: Arm, topic: str, message: Any) -> None:
-        assert isinstance(arm, JointedArm)
+    def _on_joint_move_change(self, arm: JointedArm, topic: str, message: Any) -> None:
         change = arm.check_numbers(messages.decode_joints(message, topic, _CHANGES), message.name)
         arm.require_enabled()
         arm.move_joints(arm.joints_after(change, of_goal=True))
-        self._discard(arm.name, ("pose",))
-        self.publish_operating_states(arm.name)
+        self._begin(arm, "pose")
 
     def _on_hold(self, arm: Arm, topic: str, message: Any) -> None:
         arm.require_enabled()
         arm.stop()
-        self._discard(arm.name, ("pose", "jaw"))
-        self.publish_operating_states(arm.name)
+        self._begin(arm, "pose", "jaw")
 
-    def _on_ratio(self, arm: Arm, topic: str, message: Any) -> None:
-        assert isinstance(arm, JointedArm)
+    def _on_ratio(self, arm: JointedArm, topic: str, message: Any) -> None:
         arm.set_speed_ratio(messages.decode_number(message))
         self._publishers[arm.name][messages.tool_ratio].publish(messages.encode_number(arm.speed_ratio))
 
@@ -311,8 +301,7 @@ class ArmTopics:
         goal = arm.check_jaw(messages.decode_jaw(message, topic))
         self._require_pose(arm, "jaw command")
         arm.angle_goal = goal
-        self._discard(arm.name, ("jaw",))
-        self.publish_operating_states(arm.name)
+        self._begin(arm, "jaw")
 
     def _on_cut(self, arm: Arm, topic: str, message: Any) -> Act:
         cutting = messages.decode_cut(message, topic)
@@ -376,26 +365,18 @@ class ArmTopics:
             if before is None or before[0] != arm.state:
                 publishers[messages.tool_state_name].publish(messages.encode_report(arm.state, self._node.now_ns()))
 
-    def describe(self) -> None:
-        """Publish what the arms look like and where they stand, if that has changed."""
-        self._joints.describe()
-
     def publish_views(self, stamp: int) -> None:
         """Publish what pictures of a state need, at its time, ns: the camera's pose if it has an arm here, and the links."""
         if self._camera is not None and self._camera.pose is not None:
             self._publish_motion(self._camera, self._camera.pose, np.zeros(3), np.zeros(3), stamp)
-        self._joints.publish_links(stamp)
+        self.joints.publish_links(stamp)
 
     def display(self, arm: Arm, reaction: np.ndarray, held: np.ndarray) -> messages.ToolDisplay:
         """What `tool_markers` shows of an arm with a pose, the reaction [3] on it, N, and control nodes [K, 3] that it holds, world."""
         assert arm.pose is not None
         force = arm.force if arm.acting and arm.force is not None else np.zeros(3)
-        rods = self._joints.rods(arm) if isinstance(arm, JointedArm) else ()
+        rods = self.joints.rods(arm) if isinstance(arm, JointedArm) else ()
         return messages.ToolDisplay(arm.name, arm.pose[:3, 3], force, reaction, held, rods)
-
-    def publish_joint_states(self, stamp: int) -> None:
-        """Publish the joints of all arms in one message, while somebody subscribes."""
-        self._joints.publish_joint_states(stamp)
 
     def publish(self, arm: Arm, pose: np.ndarray, reaction: np.ndarray, torque: np.ndarray, stamp: int) -> None:
         """Publish where a tool arm is, if it is commanded, and what its joints feel.
@@ -418,4 +399,4 @@ class ArmTopics:
         for topic in (messages.tool_pose, messages.tool_setpoint):  # an arm without a robot is where it is told to be
             self._publishers[arm.name][topic].publish(messages.encode_pose(shown, stamp, frame))
         if isinstance(arm, JointedArm):
-            self._joints.publish(arm, force, torque, stamp, frame, origin[:3, :3])
+            self.joints.publish(arm, force, torque, stamp, frame, origin[:3, :3])

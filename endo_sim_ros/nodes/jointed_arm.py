@@ -312,8 +312,7 @@ class JointedArm(Arm):
         self._untold = self.settle() or self._untold
         if self.base is None or self.joints is None or self.pose is None:
             return {}
-        poses = link_poses(self.kinematics, self.joints, self.gape)
-        return {name: self.base @ pose for name, pose in poses.items()}
+        return link_poses(self.kinematics, self.joints, self.gape, self.base)
 
     @property
     def gape(self) -> float:

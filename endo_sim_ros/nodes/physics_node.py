@@ -148,7 +148,7 @@ class PhysicsNode(EndoNode):
             arm = arms[name]
             if pose is not None and arm.pose is not None and not np.array_equal(pose, arm.pose):
                 self._arm_topics.warn(arm, f"{name} is at its start, as {why}; it holds nothing, and its move ended", again=True)
-        self._arm_topics.describe()
+        self._arm_topics.joints.describe()
         if self._unplaced and self._unplaced != before and self.simulation is not None:
             self.get_logger().warning(self._unplaced)
 
@@ -293,7 +293,7 @@ class PhysicsNode(EndoNode):
             if marked:
                 shown.append(self._arm_topics.display(arm, reaction, simulation.held(name)))
         self._reactions.publish(reactions, stamp, simulation.step_duration)
-        self._arm_topics.publish_joint_states(stamp)
+        self._arm_topics.joints.publish_joint_states(stamp)
         if shown:
             self._markers_pub.publish(messages.encode_tool_markers(shown, stamp, world))
         self._arm_topics.publish_operating_states()  # at last: who waits for the end of a move then asks where the arm is

@@ -8,6 +8,7 @@ import numpy as np
 from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
+from endo_sim_ros.core.cameras import rigid_pose
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.folders import written_whole
 from endo_sim_ros.learning.held_tools import HeldTools, hold_tool
@@ -152,9 +153,7 @@ class PolicyNode(EndoNode):
     @staticmethod
     def _poses(tips: np.ndarray) -> np.ndarray:
         """Poses [1, 4, 4] of a tip at a place [1, 3], m, with the axes of the world."""
-        poses = np.eye(4)[None]
-        poses[:, :3, 3] = tips
-        return poses
+        return rigid_pose(np.eye(3), tips[0])[None]
 
     def _end(self, success: bool) -> None:
         self._done += 1

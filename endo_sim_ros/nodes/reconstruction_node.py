@@ -21,16 +21,7 @@ from endo_sim_ros.core.gaussians import GaussianModel, load_ply, save_ply
 from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ReconstructionState, Topic
 from endo_sim_ros.nodes.base import EndoNode, run, sentence
 from endo_sim_ros.nodes.configs import ReconstructionNodeConfig
-from endo_sim_ros.reconstruction import (
-    PRESETS,
-    Cancelled,
-    Progress,
-    ReconstructionConfig,
-    Trainer,
-    choose_views,
-    prepare,
-    preset,
-)
+from endo_sim_ros.reconstruction import PRESETS, Cancelled, Progress, ReconstructionConfig, Trainer, choose_views, prepare, preset
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.triangulation import POINT_VIEWS
 from endo_sim_ros.sequences.bag import feed

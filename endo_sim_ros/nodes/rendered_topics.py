@@ -37,8 +37,7 @@ class Shown:
 
 def right_camera(left: Camera, info: CameraInfo) -> Camera:
     """The right eye beside a left one, with its own intrinsics at the size of the left image."""
-    pose = left.pose.copy()
-    pose[:3, 3] += info.baseline * pose[:3, 0]
+    pose = left.beside(info.baseline).pose
     return Camera(info.P[:, :3], info.width, info.height, pose).resized(left.width, left.height)
 
 

@@ -75,9 +75,10 @@ class ViewerNode(Watcher):
         self._get = self.create_client(GetParameters, f"{name}/get_parameters")
         kinds = {"reset": Trigger, "step": Trigger, "pause": SetBool}
         self._calls = {what: self.create_client(kind, f"{name}/{what}") for what, kind in kinds.items()}
-        self.subscribe(messages.GAUSSIANS, self._on_model)
+        self.subscribe(messages.GAUSSIANS, lambda message: self._tissue.receive_model(message, self._options.world_frame))
         self.subscribe(messages.TRAINING_CAMERAS, self._on_training_cameras)
-        self.subscribe(messages.CUT_SURFACE, self._on_cut_surface, depth=1)
+        on_cut = lambda message: self._tissue.receive_cut_surface(message, self._options.world_frame)
+        self.subscribe(messages.CUT_SURFACE, on_cut, depth=1)
         self.subscribe(messages.CONTROL_NODES, self._on_nodes, depth=1)
         for topic in (messages.TRAINING_CAMERA_INFO, messages.RENDERED_INFO):
             self.subscribe(topic, partial(self._on_info, topic.name), depth=1)
@@ -103,9 +104,6 @@ class ViewerNode(Watcher):
 
     # ------------------------------------------------------------------ input
 
-    def _on_model(self, message: Any) -> None:
-        self._tissue.receive_model(message, self._options.world_frame)
-
     def _on_training_cameras(self, message: Any) -> None:
         messages.check_frame(message, (self._options.world_frame,), messages.TRAINING_CAMERAS.name)
         poses = messages.decode_poses(message)
@@ -125,9 +123,6 @@ class ViewerNode(Watcher):
         milliseconds = float(self.value(self._physics, "milliseconds per step", "0"))
         age = 1e-9 * (self.now_ns() - messages.stamp_to_ns(message.header.stamp)) + 1e-3 * milliseconds
         self.viewer.show_state(self._nodes.positions, self._nodes.F, age)
-
-    def _on_cut_surface(self, message: Any) -> None:
-        self._tissue.receive_cut_surface(message, self._options.world_frame)
 
     def _on_rendered_pose(self, message: Any) -> None:
         pose = messages.decode_pose(message, self._options.world_frame, messages.RENDERED_POSE.name)

@@ -1,5 +1,7 @@
 """Builds what kernels take, in the memory of a device."""
 
+from typing import Any
+
 import numpy as np
 import torch
 import warp as wp
@@ -14,6 +16,15 @@ from endo_sim_ros.physics.stencils import Stencils
 def copied(values: np.ndarray, dtype: type, device: str) -> wp.array:
     """Return a copy of values as an array of a Warp type on a device."""
     return wp.array(np.ascontiguousarray(values, np.int32 if dtype in (int, wp.vec3i) else np.float32), dtype=dtype, device=device)
+
+
+def zeroed(kind: Any, count: int, device: str, **counts: int) -> Any:
+    """Return a struct of Warp whose arrays are zeros, each of count elements, or of as many as counts says of its name."""
+    made = kind()
+    for name, field in kind.vars.items():
+        if wp.types.is_array(field.type):
+            setattr(made, name, wp.zeros(counts.get(name, count), field.type.dtype, device=device))
+    return made
 
 
 def adjoining(count: int, device: str, *dtypes: type) -> tuple[wp.array, list[wp.array]]:
@@ -73,10 +84,8 @@ def new_state(count: int, device: str) -> tuple[wp.array, State]:
 
 def new_loads(count: int, device: str) -> Loads:
     """Return loads on count control nodes: none."""
-    loads = Loads()
-    loads.force, loads.target, loads.target_v = (wp.zeros(count, wp.vec3, device=device) for _ in range(3))
-    loads.spring, loads.limit = (wp.zeros(count, float, device=device) for _ in range(2))
-    loads.holder = wp.full(count, -1, dtype=int, device=device)
+    loads = zeroed(Loads, count, device)
+    loads.holder.fill_(-1)
     return loads
 
 
@@ -94,10 +103,7 @@ def new_tools(
         push_out: Speed at which tools push out tissue that they are suddenly deep in, m/s.
         device: Where to.
     """
-    tools = RigidTools()
+    tools = zeroed(RigidTools, environments * room, device, used=environments)
     tools.count, tools.room, tools.friction, tools.push_out = count, room, friction, push_out
-    tools.used, tools.tool = wp.zeros(environments, int, device=device), wp.zeros(environments * room, int, device=device)
-    tools.tip, tools.tip_v, tools.end, tools.end_v = (wp.zeros(environments * room, wp.vec3, device=device) for _ in range(4))
-    tools.radius = wp.zeros(environments * room, float, device=device)
     given, (tools.impulse, tools.moment) = adjoining(environments * count * nodes, device, wp.vec3, wp.vec3)
     return given, tools

@@ -60,10 +60,10 @@ def sample_farthest(points: np.ndarray, count: int, start: int = 0) -> np.ndarra
         raise ValueError(f"sample_farthest: cannot pick {count} of {len(points)} points")
     init_warp()
     centred = (points - points.mean(0)).astype(np.float32)
-    axes = [wp.array(np.ascontiguousarray(centred[:, axis]), dtype=float, device="cpu") for axis in range(3)]
+    axes = wp.array(np.ascontiguousarray(centred.T), dtype=float, device="cpu")
     distances = wp.full(len(points), float("inf"), dtype=float, device="cpu")
     samples = wp.zeros(count, dtype=int, device="cpu")
-    wp.launch(sample_farthest_points, 1, [*axes, len(points), count, start, distances, samples], device="cpu")
+    wp.launch(sample_farthest_points, 1, [axes, count, start, distances, samples], device="cpu")
     return samples.numpy().copy()
 
 

@@ -22,7 +22,6 @@ wp.set_module_options({"enable_backward": False, "extra_build_options": native("
 @wp.func_native("wp::mat33 R; endo_sim::rotation_of(&F.data[0][0], &R.data[0][0]); return R;")
 def rotation_of(F: wp.mat33) -> wp.mat33:
     """Rotation R of the polar decomposition F = R S."""
-    ...
 
 
 @wp.kernel

@@ -72,14 +72,8 @@ class TissueProperties:
         """The same everywhere; Pa, 1, kg/m³."""
         return cls(*(np.full(count, value, np.float64) for value in (young_modulus, poisson_ratio, density)))
 
-    def painted(
-        self,
-        where: np.ndarray,
-        young_modulus: float | None = None,
-        poisson_ratio: float | None = None,
-        density: float | None = None,
-    ) -> "TissueProperties":
-        """The same with other properties where `where` [M] is true; None leaves a property as it is.
+    def painted(self, where: np.ndarray, **properties: float) -> "TissueProperties":
+        """The same with other properties, by their names, where `where` [M] is true.
 
         Raises:
             ConfigError: If `where` is not bool [M], or a value is out of its range.
@@ -87,8 +81,7 @@ class TissueProperties:
         where = np.asarray(where)
         if where.dtype != bool or where.shape != (len(self),):
             raise ConfigError(f"tissue properties: where is {where.dtype} {where.shape}, expected bool ({len(self)},)")
-        given = {"young_modulus": young_modulus, "poisson_ratio": poisson_ratio, "density": density}
-        return replace(self, **{k: np.where(where, v, getattr(self, k)) for k, v in given.items() if v is not None})
+        return replace(self, **{name: np.where(where, value, getattr(self, name)) for name, value in properties.items()})
 
 
 _PROPERTIES = tuple(each.name for each in fields(TissueProperties))
@@ -151,15 +144,11 @@ class Region:
 
     Args:
         text: As it was written, for messages.
-        young_modulus: Pa; None leaves it, as for the next two.
-        poisson_ratio: 0 to 0.49.
-        density: kg/m³.
+        properties: Those of `TissueProperties` that differ there, by their names.
     """
 
     text: str
-    young_modulus: float | None = None
-    poisson_ratio: float | None = None
-    density: float | None = None
+    properties: dict[str, float]
     _contains: Callable[[np.ndarray], np.ndarray] = field(kw_only=True, repr=False, compare=False)
 
     def contains(self, points: np.ndarray) -> np.ndarray:
@@ -210,7 +199,7 @@ def parse_region(text: str) -> Region:
             seen_in_mask(np.zeros((0, 3)), camera, mask)  # sizes must fit
         except ValueError as error:
             raise wrong(str(error)) from error
-        return Region(text, **properties, _contains=lambda points: seen_in_mask(points, camera, mask))
+        return Region(text, properties, _contains=lambda points: seen_in_mask(points, camera, mask))
     values = [_number(word) for word in place]
     if not np.isfinite(values).all():
         raise wrong(f"{place[int(np.argmin(np.isfinite(values)))]!r} is not a number of metres")
@@ -218,9 +207,9 @@ def parse_region(text: str) -> Region:
         *centre, radius = values
         if radius <= 0:
             raise wrong(f"its radius is {radius:g} m, but must be above 0")
-        return Region(text, **properties, _contains=lambda points: inside_sphere(points, centre, radius))
+        return Region(text, properties, _contains=lambda points: inside_sphere(points, centre, radius))
     low, high = np.minimum(values[:3], values[3:]), np.maximum(values[:3], values[3:])
-    return Region(text, **properties, _contains=lambda points: inside_box(points, low, high))
+    return Region(text, properties, _contains=lambda points: inside_box(points, low, high))
 
 
 def read_regions(texts: Iterable[str]) -> list[Region]:
@@ -247,7 +236,7 @@ def paint_regions(properties: TissueProperties, points: np.ndarray, regions: Seq
         if not where.any():
             low, high = (" ".join(f"{x:.4g}" for x in corner) for corner in (points.min(0), points.max(0)))
             raise ConfigError(f"region {region.text!r} contains none of the nodes, which lie between {low} and {high} (metres, world)")
-        properties = properties.painted(where, region.young_modulus, region.poisson_ratio, region.density)
+        properties = properties.painted(where, **region.properties)
     return properties
 
 

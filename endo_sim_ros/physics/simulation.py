@@ -334,7 +334,7 @@ class TissueSimulation:
         if self._stencils is None:
             self._stencils = CutStencils(self.nodes.rest, self.solver.rest_cells, self.solver.grid_shape)
             with capturing:
-                self.solver.load_for_cuts()
+                self.solver.backend.load_for_cuts(self.config.material, self.config.kinematics)
         return self._stencils
 
     @property

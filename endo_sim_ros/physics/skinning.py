@@ -12,7 +12,8 @@ from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.kernels import load_kernels
 from endo_sim_ros.physics import node_map_kernels as kernels
 from endo_sim_ros.physics.backends import backend_for
-from endo_sim_ros.physics.backends.base import Launch, SkinData, Work, viewed
+from endo_sim_ros.physics.backends.base import Launch, Work, viewed
+from endo_sim_ros.physics.backends.structs import Skin
 from endo_sim_ros.physics.cutting.gaussians import CutNeighbours, clip_to_sides
 from endo_sim_ros.physics.weights import compact_weights, nearest_nodes
 
@@ -136,6 +137,10 @@ class Skinning:
             raise ValueError("skinning: the weights of a Gaussian must not be negative and must add up to one")
         self.neighbours = torch.tensor(index, dtype=torch.int32, device=self.device)  # [N, K]
         self.weights = torch.tensor(weights, dtype=torch.float32, device=self.device)  # [N, K]
+        self._rest = rest = Skin()  # views of these tensors
+        rest.means, rest.covars = viewed(self.means, wp.vec3), viewed(self.covars, wp.mat33)
+        rest.neighbours, rest.weights = viewed(self.neighbours), viewed(self.weights)
+        rest.origin, (rest.low, rest.high) = self._origin, self.stretch
 
     def deform(self, positions: Tensor | np.ndarray, F: Tensor | np.ndarray) -> tuple[Tensor, Tensor]:
         """Return means [N, 3] (m) and covariances [N, 3, 3] (m²) of the Gaussians.
@@ -170,15 +175,12 @@ class Skinning:
             raise ValueError(f"skinning: {name} has shape {tuple(values.shape)}, expected {expected}")
         return values
 
-    def _at_rest(self) -> SkinData:
-        return SkinData(self.means, self.covars, self.neighbours, self.weights, self._origin, *self.stretch)
-
     def _skin(self, positions: Tensor, A: Tensor) -> tuple[Tensor, Tensor]:
         """Means [N, 3] and covariances [N, 3, 3] for transforms A of the control nodes [M, 3, 3]."""
         maps = torch.empty((len(A), 4, 4), device=self.device)
         self.backend.over_items(kernels.node_maps, len(A), [self.node_rest, positions, A, self._origin, maps])
         means, covars = torch.empty_like(self.means), torch.empty_like(self.covars)
-        self.backend.skin(self._at_rest(), maps, means, covars)
+        self.backend.skin(self._rest, maps, means, covars)
         return means, covars
 
     def work(self, u: wp.array, F: wp.array, pinned: np.ndarray, environments: int) -> tuple[list[Work], Tensor, Tensor]:
@@ -204,4 +206,4 @@ class Skinning:
         held = viewed(torch.from_numpy(pinned).to(device, torch.int32))
         inputs = [viewed(self.node_rest, wp.vec3), held, u, F, self._origin, viewed(maps.view(-1, 4, 4), wp.mat44)]
         mapping = Launch(kernels.moved_node_maps, (environments, count), inputs)
-        return [mapping, *self.backend.skin_work(self._at_rest(), maps, means, covars)], means, covars
+        return [mapping, *self.backend.skin_work(self._rest, maps, means, covars)], means, covars

@@ -155,10 +155,6 @@ class MpmSolver:
         set_stencils(self.nodes, self.grid, self._stencils, self.device)
         self._change_step()
 
-    def load_for_cuts(self) -> None:
-        """Load now what a step of cut tissue may need on a GPU: its grid nodes can become too many for one launch."""
-        self.backend.load_for_cuts(self.config.material, self.config.kinematics)
-
     def wrap_step(self, before: list[Launch], after: list[Launch]) -> None:
         """Make these launches of `Tools` part of every step, on a GPU of the one graph that it is; see `_build_step`."""
         self._before, self._after = before, after
@@ -173,17 +169,17 @@ class MpmSolver:
         """Make the step ready anew: now, where nobody waits, or where it takes seconds, when the tissue is first touched."""
         self._advance = self._build_step() if self.backend.prepares_early else None
 
-    def prepare(self) -> None:
-        """Make ready now what the next step would otherwise begin with: on a GPU its capture, and at first its kernels."""
+    def prepare(self) -> Callable[[], object]:
+        """Make ready now, and return, what the next step would otherwise begin with: on a GPU its capture, and at first its kernels."""
         if self._advance is None:
             self._advance = self._build_step()
+        return self._advance
 
     def step(self) -> None:
         """Take one step in every environment."""
-        if self._advance is None:
-            self._advance = self._build_step()
+        advance = self.prepare()
         with on_torch_stream(self.device):
-            self._advance()
+            advance()
 
     @property
     def speed(self) -> float:

@@ -6,6 +6,7 @@ import warp as wp
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from endo_sim_ros.physics.arrays import zeroed
 from endo_sim_ros.physics.backends.base import Launch
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes
@@ -39,33 +40,16 @@ class Tools:
         shape, slots = (solver.environments, solver.tool_count), solver.capsule_count
         tools, entries = solver.environments * solver.tool_count, solver.environments * solver.tool_count * len(self.touchable)
 
-        self._everything: list[torch.Tensor] = []  # that commands and holds are
-
-        def zeros(dtype: type, count: int = tools) -> wp.array:
-            array = wp.zeros(count, dtype, device=solver.device)
-            self._everything.append(wp.to_torch(array))
-            return array
-
         def view(array: wp.array, *rest: int) -> torch.Tensor:
             return wp.to_torch(array).view(*shape, *rest)
 
-        commands, holds, constants = Commands(), Holds(), ToolConstants()
-        commands.force, commands.torque, commands.grasp_point, commands.tip = (zeros(wp.vec3d) for _ in range(4))
-        commands.R, commands.present, commands.closed = zeros(wp.mat33d), zeros(int), zeros(int)
-        commands.linked, commands.jawed, commands.jaws = zeros(int), zeros(int), zeros(wp.vec3d, 3 * tools)
-        commands.start, commands.end = zeros(wp.vec3d, slots * tools), zeros(wp.vec3d, slots * tools)
-        commands.radius, commands.link, commands.links = zeros(float, slots * tools), zeros(int, slots * tools), zeros(int)
-        holds.contact, holds.applied_force, holds.applied_torque = (zeros(wp.vec3d) for _ in range(3))
-        holds.borne, holds.unborne = zeros(wp.float64), zeros(wp.float64)
-        holds.reaction_force, holds.reaction_torque = zeros(wp.vec3d), zeros(wp.vec3d)
-        holds.attached, holds.gripping, holds.slips = (zeros(int) for _ in range(3))
-        holds.last_tip, holds.last_R, holds.placed = zeros(wp.vec3d), zeros(wp.mat33d), zeros(int)
-        holds.last_start, holds.last_end = zeros(wp.vec3d, slots * tools), zeros(wp.vec3d, slots * tools)
-        holds.link_force, holds.link_torque = zeros(wp.vec3d, slots * tools), zeros(wp.vec3d, slots * tools)
-        holds.last_opening, holds.opening = zeros(wp.float64), zeros(wp.float64)
-        holds.joined, holds.slipping = zeros(int), zeros(int)
-        holds.weight, holds.held = zeros(float, entries), zeros(int, entries)
-        holds.local, holds.pulled = zeros(wp.vec3d, entries), zeros(wp.vec3d, entries)
+        links = dict.fromkeys(("start", "end", "radius", "link"), slots * tools)
+        commands = zeroed(Commands, tools, solver.device, jaws=3 * tools, **links)
+        links = dict.fromkeys(("last_start", "last_end", "link_force", "link_torque"), slots * tools)
+        holds = zeroed(Holds, tools, solver.device, **links, **dict.fromkeys(("weight", "held", "local", "pulled"), entries))
+        told = [getattr(commands, name) for name in Commands.vars] + [getattr(holds, name) for name in Holds.vars]
+        self._everything = [wp.to_torch(array) for array in told]
+        constants = ToolConstants()
 
         self.forces, self.torques = view(commands.force, 3), view(commands.torque, 3)  # [B, T, 3], N and N·m about the point held
         self.grasp_points = view(commands.grasp_point, 3)  # where the wrench takes hold [B, T, 3], m

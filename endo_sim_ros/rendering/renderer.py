@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, overload
+from typing import Any
 
 import numpy as np
 import torch
@@ -89,51 +89,22 @@ class DeformableRenderer:
             raise ValueError("this renderer has no control nodes and shows the model at rest only; give it node_rest")
         return self.skinning.deform(positions, F)
 
-    @overload
     def render(
-        self,
-        camera: Camera,
-        positions: np.ndarray | None = None,
-        F: np.ndarray | None = None,
-        *,
-        depth: Literal[True] = True,
-        light: Light | None = None,
-    ) -> tuple[np.ndarray, np.ndarray]: ...
-
-    @overload
-    def render(
-        self,
-        camera: Camera,
-        positions: np.ndarray | None = None,
-        F: np.ndarray | None = None,
-        *,
-        depth: bool,
-        light: Light | None = None,
-    ) -> tuple[np.ndarray, np.ndarray | None]: ...
-
-    @torch.no_grad()
-    def render(
-        self,
-        camera: Camera,
-        positions: np.ndarray | None = None,
-        F: np.ndarray | None = None,
-        *,
-        depth: bool = True,
-        light: Light | None = None,
-    ) -> tuple[np.ndarray, np.ndarray | None]:
+        self, camera: Camera, positions: np.ndarray | None = None, F: np.ndarray | None = None, *, light: Light | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return an RGB image [H, W, 3], uint8, and the depth [H, W] that goes with it, float32, metres, 0 = no surface.
 
         Args:
             camera: Intrinsics, pose and image size.
             positions: Control nodes now [M, 3], metres, world; None renders the model at rest.
             F: Their deformation gradients [M, 3, 3]; given with positions.
-            depth: Whether to return depth; None otherwise.
             light: Light in place of the model's.
 
         Raises:
             ValueError: If the renderer has no control nodes, F is missing, or shapes disagree.
         """
-        (view,) = self.views([camera], positions, F, depth=depth, light=light)
+        (view,) = self.views([camera], positions, F, light=light)
+        assert view.depth is not None  # asked for
         return view.image, view.depth
 
     @torch.no_grad()

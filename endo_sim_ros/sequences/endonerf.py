@@ -17,16 +17,7 @@ from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.images import check_size, image_size, numbered_files, read_depth, read_image
 from endo_sim_ros.sequences.masks import MaskFiles
 from endo_sim_ros.sequences.pose_files import rigid
-from endo_sim_ros.sequences.recording import (
-    DEFAULT_FPS,
-    Recording,
-    check_folder,
-    check_positive,
-    keep_posed,
-    select,
-    stamp_ns,
-    tell_lacking,
-)
+from endo_sim_ros.sequences.recording import DEFAULT_FPS, Recording, check_folder, keep_posed, select, stamp_ns, tell_lacking
 
 POSES_FILE = "poses_bounds.npy"
 
@@ -59,8 +50,7 @@ def read_endonerf(
     Raises:
         SequenceError: If a file is missing or wrong.
     """
-    root = check_folder(path)
-    check_positive(root, fps=fps, depth_scale=depth_scale, pose_scale=pose_scale)
+    root = check_folder(path, fps=fps, depth_scale=depth_scale, pose_scale=pose_scale)
     images = numbered_files(root / "images")
     if not images:
         raise SequenceError(f"{root / 'images'}: holds no images named like 000000.png")

@@ -5,12 +5,15 @@ import functools
 import logging
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TypeVar
 
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.recording import OnProgress, Recording
 from endo_sim_ros.sequences.structure_from_motion import STRUCTURE_FROM_MOTION, StructureFromMotion, estimate_poses
 
 logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 VGGT = "vggt"  # what the readers' option `poses` says to ask for it
 
@@ -40,29 +43,36 @@ def known_estimator(poses: str | None, source: Path) -> Callable[..., StructureF
     return estimate
 
 
-def with_estimated_poses(recording: Recording, source: Path, poses: str | None = None) -> Recording:
+def found_once(find: Callable[[OnProgress | None], T]) -> Callable[..., T]:
+    """What takes long to find, and is found by the first call, with or without somebody to tell its progress to."""
+    results: list[T] = []
+
+    def found(on_progress: OnProgress | None = None) -> T:
+        if not results:
+            results.append(find(on_progress))
+        return results[0]
+
+    return found
+
+
+def with_estimated_poses(recording: Recording, source: Path, poses: str | None, lacking: str) -> Recording:
     """Frames of a calibrated camera with unknown poses, which are estimated on first iteration.
 
     Args:
         recording: Its frames have any pose; stereo frames make the result metric.
         source: Its file or folder, for messages.
-        poses: How, see `pose_estimator`; None: by structure from motion.
+        poses: How, see `pose_estimator`; None: by structure from motion, with a warning.
+        lacking: What would have had the poses, for that.
 
     Raises:
         SequenceError: If there is no such way.
     """
     estimate = known_estimator(poses, source)
-    results: list[StructureFromMotion] = []
+    if poses is None:
+        logger.warning("%s: no %s, so poses come from structure from motion", source, lacking)
 
-    def prepare(on_progress: OnProgress | None = None) -> None:
-        if not results:
-            results.append(find(on_progress))
-
-    def estimated() -> StructureFromMotion:
-        prepare()
-        return results[0]
-
-    def find(on_progress: OnProgress | None) -> StructureFromMotion:
+    @found_once
+    def estimated(on_progress: OnProgress | None) -> StructureFromMotion:
         logger.info("%s: estimating the poses of %d frames", source, len(recording))
         first = next(iter(recording))
         stereo = first.right is not None
@@ -85,4 +95,4 @@ def with_estimated_poses(recording: Recording, source: Path, poses: str | None =
             if position in placed:
                 yield dataclasses.replace(frame, camera=frame.camera.at(placed[position]))
 
-    return Recording(posed, len(recording), lambda: estimated().points, prepare=prepare)
+    return Recording(posed, len(recording), lambda: estimated().points, prepare=estimated)

@@ -10,7 +10,6 @@ my_recording/
   points.txt              optional, with poses; x y z [m, world] r g b [0-255], of structure from motion, for methods that start from it
 """
 
-import logging
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -25,20 +24,8 @@ from endo_sim_ros.sequences.images import check_size, image_size, numbered_files
 from endo_sim_ros.sequences.masks import MaskFiles, lit_area, lit_now
 from endo_sim_ros.sequences.point_files import read_points
 from endo_sim_ros.sequences.pose_files import read_poses
-from endo_sim_ros.sequences.recording import (
-    DEFAULT_FPS,
-    Recording,
-    check_folder,
-    check_positive,
-    keep_posed,
-    select,
-    spread,
-    stamp_ns,
-    tell_lacking,
-)
+from endo_sim_ros.sequences.recording import DEFAULT_FPS, Recording, check_folder, keep_posed, select, spread, stamp_ns, tell_lacking
 from endo_sim_ros.sequences.rectification import Rectification
-
-logger = logging.getLogger(__name__)
 
 CALIBRATION_FILE = "calibration.yaml"
 POSE_FILES = ("poses_left.txt", "poses.txt")
@@ -75,8 +62,7 @@ def read_folder(
     Raises:
         SequenceError: If a file is missing or wrong.
     """
-    root = check_folder(path)
-    check_positive(root, fps=fps, depth_scale=depth_scale)
+    root = check_folder(path, fps=fps, depth_scale=depth_scale)
     left, right = numbered_files(root / "left"), numbered_files(root / "right")
     if not left:
         raise SequenceError(f"{root / 'left'}: holds no images named like 000001.png")
@@ -136,8 +122,4 @@ def read_folder(
             )
 
     recording = Recording(frames, len(numbers), lambda: read_points(root))  # of the poses recorded
-    if recorded is not None:
-        return recording
-    if poses is None:
-        logger.warning("%s: no %s, so poses come from structure from motion", root, " or ".join(POSE_FILES))
-    return with_estimated_poses(recording, root, poses)
+    return recording if recorded is not None else with_estimated_poses(recording, root, poses, " or ".join(POSE_FILES))

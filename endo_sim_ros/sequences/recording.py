@@ -42,7 +42,7 @@ class Recording:
     frames: Callable[[], Iterator[Frame]]
     count: int
     points: Callable[[], tuple[np.ndarray, np.ndarray] | None] = lambda: None
-    prepare: Callable[[OnProgress], None] | None = None
+    prepare: Callable[[OnProgress], object] | None = None
 
     def __iter__(self) -> Iterator[Frame]:
         return self.frames()
@@ -132,15 +132,16 @@ def check_positive(source: Path | str, **values: float | None) -> None:
             raise SequenceError(f"{source}: {name} must be positive, got {value:g}")
 
 
-def check_folder(path: Path | str) -> Path:
+def check_folder(path: Path | str, **positive: float | None) -> Path:
     """The path of a folder.
 
     Raises:
-        SequenceError: If there is none.
+        SequenceError: If there is none, or one of the options that are given is not a positive number.
     """
     path = Path(path)
     if not path.is_dir():
         raise SequenceError(f"{path}: no such folder; pass the folder of the recording")
+    check_positive(path, **positive)
     return path
 
 

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.images import clean_depth
 
 logger = logging.getLogger(__name__)
@@ -200,6 +201,13 @@ class Rectification:
         turned = pose.copy()
         turned[:3, :3] = pose[:3, :3] @ self.rotation.T
         return turned
+
+    def frame(
+        self, stamp_ns: int, left: np.ndarray, right: np.ndarray, pose: np.ndarray, mask: np.ndarray, depth: np.ndarray | None = None
+    ) -> Frame:
+        """A frame of what is rectified, images [H, W, 3], mask and depth [H, W], at the pose [4, 4] of the raw left camera."""
+        camera = Camera(self.K, *self.size, self.pose(pose))
+        return Frame(stamp_ns, left, camera, right=right, baseline=self.baseline, depth=depth, mask=mask)
 
     def _remap(self, image: np.ndarray, maps: Maps | None, interpolation: int) -> np.ndarray:
         if image.shape[1::-1] != tuple(self.size):

@@ -28,23 +28,13 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from endo_sim_ros.core.cameras import Camera, invert_pose
+from endo_sim_ros.core.cameras import invert_pose
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.estimated_poses import with_estimated_poses
 from endo_sim_ros.sequences.images import clean_depth, image_size, numbered_files, read_image
-from endo_sim_ros.sequences.recording import (
-    DEFAULT_FPS,
-    Recording,
-    check_folder,
-    check_positive,
-    keep_posed,
-    select,
-    stamp_ns,
-    tell_lacking,
-)
+from endo_sim_ros.sequences.recording import DEFAULT_FPS, Recording, check_folder, keep_posed, select, stamp_ns, tell_lacking
 from endo_sim_ros.sequences.rectification import Rectification, StereoCalibration
 from endo_sim_ros.sequences.scared_archives import (
-    PointFiles,
     ScenePoints,
     keyframe_points,
     numbered,
@@ -95,8 +85,7 @@ def read_scared(
     Raises:
         SequenceError: If a file is missing or wrong.
     """
-    root = check_folder(path)
-    check_positive(root, fps=fps)
+    root = check_folder(path, fps=fps)
     for name, value, allowed in (("depth", depth, DEPTHS), ("pose_direction", pose_direction, DIRECTIONS)):
         if value not in allowed:
             raise SequenceError(f"{root}: {name} must be one of {', '.join(allowed)}, got {value!r}")
@@ -131,7 +120,7 @@ def read_scared(
             pose_of[n] = published[n] if pose_direction == "camera_to_world" else invert_pose(published[n])
 
     points_source = _archive_or_folder(root, "scene_points")
-    disparities: dict[int, Path] = {}
+    disparities, point_files = dict[int, Path](), dict[int, Path]()
     if depth == "scene_points" and not points_source.exists():
         disparities = numbered(root / "data/disparity", ".tiff") if is_rectified else {}
         logger.warning(
@@ -141,32 +130,32 @@ def read_scared(
         )  # fmt: skip
         depth = "disparity" if disparities else "keyframe"
     elif depth == "scene_points" and points_source.is_dir():
-        tell_lacking(numbers, numbered(points_source, ".tiff"), points_source)
+        point_files = numbered(points_source, ".tiff")
+        tell_lacking(numbers, point_files, points_source)
 
-    def depth_of(number: int, points: PointFiles | ScenePoints | None) -> np.ndarray | None:
+    def depth_of(number: int, archive: ScenePoints | None) -> np.ndarray | None:
         if number in disparities:
             with np.errstate(divide="ignore"):
                 return clean_depth(rectification.K[0, 0] * (rectification.baseline or 0) / read_disparity(disparities[number], images.size))
         if depth == "keyframe" and number == 0:
             found = keyframe_points(root, images.size)
+        elif number in point_files:
+            found = read_point_map(point_files[number], str(point_files[number]), images.size)
         else:
-            found = points.of(number, images.size) if points else None
+            found = archive.of(number, images.size) if archive else None
         return None if found is None else rectification.depth(found)
 
     def frames() -> Iterator[Frame]:
-        opened = (PointFiles if points_source.is_dir() else ScenePoints)(points_source) if depth == "scene_points" else None
-        with contextlib.closing(opened) if opened else contextlib.nullcontext() as points:
+        opened = ScenePoints(points_source) if depth == "scene_points" and not points_source.is_dir() else None
+        with contextlib.closing(opened) if opened else contextlib.nullcontext() as archive:
             for number, left, right in images.read(numbers):
                 if not is_rectified:
                     left, right = rectification.left(left), rectification.right(right)
-                yield _frame(rectification, number, fps or images.fps, left, right, depth_of(number, points), pose_of[number])
+                found, stamp = depth_of(number, archive), stamp_ns(number, fps or images.fps)
+                yield rectification.frame(stamp, left, right, pose_of[number], rectification.valid, found)
 
     recording = Recording(frames, len(numbers))
-    if posed:
-        return recording
-    if poses is None:
-        logger.warning("%s: file is missing, so poses come from structure from motion", frame_data)
-    return with_estimated_poses(recording, root, poses)
+    return recording if posed else with_estimated_poses(recording, root, poses, str(frame_data.relative_to(root)))
 
 
 def _tell_defects(root: Path) -> None:
@@ -201,7 +190,7 @@ def _read_keyframe(root: Path, start: int | None, stop: int | None, step: int, d
         points = None if depth == "none" else keyframe_points(root, size)
         eyes = rectification.left(read_image(left)), rectification.right(read_image(right))
         measured = None if points is None else rectification.depth(points)
-        yield _frame(rectification, 0, fps or DEFAULT_FPS, *eyes, measured, np.eye(4))
+        yield rectification.frame(stamp_ns(0, fps or DEFAULT_FPS), *eyes, np.eye(4), rectification.valid, measured)
 
     return Recording(frames, 1)
 
@@ -226,26 +215,6 @@ def _pose_direction(root: Path, images: StereoImages, published: dict[int, np.nd
         return USUAL_DIRECTION
     points = read_point_map(depth_map, str(depth_map), images.size)
     return find_pose_direction(points, read_image(keyframe), images, published, project, root)
-
-
-def _frame(
-    rectification: Rectification,
-    number: int,
-    fps: float,
-    left: np.ndarray,
-    right: np.ndarray,
-    depth: np.ndarray | None,
-    pose: np.ndarray,
-) -> Frame:
-    return Frame(
-        stamp_ns=stamp_ns(number, fps),
-        image=left,
-        camera=Camera(rectification.K, *rectification.size, rectification.pose(pose)),
-        right=right,
-        baseline=rectification.baseline,
-        depth=depth,
-        mask=rectification.mask(None),
-    )
 
 
 # ------------------------------------------------------------------------------------------------------ calibration

@@ -104,21 +104,6 @@ def published_pose(document: Any, archive: Path, number: int) -> np.ndarray:
     return pose
 
 
-class PointFiles:
-    """Reads the maps of points in an extracted folder scene_points."""
-
-    def __init__(self, folder: Path):
-        self._files = numbered(folder, ".tiff")
-
-    def of(self, number: int, size: tuple[int, int]) -> np.ndarray | None:
-        """As `ScenePoints.of`."""
-        file = self._files.get(number)
-        return None if file is None else read_point_map(file, str(file), size)
-
-    def close(self) -> None:
-        """Nothing is held open."""
-
-
 class ScenePoints:
     """Reads scene_points.tar.gz forwards, in step with the video; tens of gigabytes unpacked, so one map at a time.
 

@@ -11,7 +11,7 @@ from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.sequences.images import check_size, image_size, read_image
 from endo_sim_ros.sequences.recording import DEFAULT_FPS, spread
 from endo_sim_ros.sequences.rectification import StereoCalibration
-from endo_sim_ros.sequences.video_files import Video, split_stacked
+from endo_sim_ros.sequences.video_files import Video
 
 
 class StereoImages(ABC):
@@ -48,7 +48,7 @@ class StackedVideo(StereoImages):
 
     def read(self, numbers: Sequence[int]) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:  # noqa: D102
         for number, image in self._video.frames(numbers):
-            yield number, *split_stacked(image, self.source)
+            yield number, image[: self.size[1]], image[self.size[1] :]
 
 
 class StereoFiles(StereoImages):

@@ -33,7 +33,7 @@ from endo_sim_ros.sequences.mask_alignment import MaskAlignment, Reading
 from endo_sim_ros.sequences.masks import MaskFiles, read_mask
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.pose_lag import LagFinder
-from endo_sim_ros.sequences.recording import Recording, check_folder, check_positive, keep_posed, select, spread, stamp_ns
+from endo_sim_ros.sequences.recording import Recording, check_folder, keep_posed, select, spread, stamp_ns
 from endo_sim_ros.sequences.rectification import Rectification, StereoCalibration
 from endo_sim_ros.sequences.stereo_images import StackedVideo, StereoFiles, StereoImages, row_offsets
 from endo_sim_ros.sequences.video_files import find_video
@@ -90,8 +90,7 @@ def read_stereomis(
     Raises:
         SequenceError: If a file is missing or wrong.
     """
-    root = check_folder(path)
-    check_positive(root, fps=fps)
+    root = check_folder(path, fps=fps)
     if max_mask_gap < 0:
         raise SequenceError(f"{root}: max_mask_gap must be 0 or more, got {max_mask_gap}")
     if first_mask is not None and first_mask < 0:
@@ -153,22 +152,13 @@ def read_stereomis(
 
     def frames() -> Iterator[Frame]:
         for number, left, right in images.read(numbers):
-            pose = np.eye(4) if rows is None else rectification.pose(posed[number])
-            yield Frame(
-                stamp_ns=stamp_ns(number, fps),
-                image=left if is_rectified else rectification.left(left),
-                camera=Camera(rectification.K, *images.size, pose),
-                right=right if is_rectified else rectification.right(right),
-                baseline=rectification.baseline,
-                mask=tissue(number),
-            )
+            if not is_rectified:
+                left, right = rectification.left(left), rectification.right(right)
+            pose = np.eye(4) if rows is None else posed[number]
+            yield rectification.frame(stamp_ns(number, fps), left, right, pose, tissue(number))
 
     recording = Recording(frames, len(numbers))
-    if rows is not None:
-        return recording
-    if poses is None:
-        logger.warning("%s: no %s, so poses come from structure from motion", root, POSES_FILE)
-    return with_estimated_poses(recording, root, poses)
+    return recording if rows is not None else with_estimated_poses(recording, root, poses, POSES_FILE)
 
 
 def read_stereo_ini(path: Path) -> StereoCalibration:

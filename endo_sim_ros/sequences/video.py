@@ -18,7 +18,7 @@ import numpy as np
 from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.sequences.calibration_files import check_calibrated_size, read_calibration
-from endo_sim_ros.sequences.estimated_poses import pose_estimator
+from endo_sim_ros.sequences.estimated_poses import found_once, pose_estimator
 from endo_sim_ros.sequences.images import numbered_files, read_gray
 from endo_sim_ros.sequences.masks import MaskFiles, lit_area, lit_now, tissue_mask, tool_is_white
 from endo_sim_ros.sequences.pose_files import read_poses
@@ -119,17 +119,9 @@ def read_video(
         logger.info("%s: poses of every %d-th frame are estimated", path, step * sfm_step)
 
     mask_of = _mask_reader(mask, mask_polarity, size, numbers)
-    results: list[tuple[np.ndarray, Rectification, Mapping[int, np.ndarray], Points]] = []
 
-    def prepare(on_progress: OnProgress | None = None) -> None:
-        if not results:
-            results.append(find(on_progress))
-
-    def prepared() -> tuple[np.ndarray, Rectification, Mapping[int, np.ndarray], Points]:
-        prepare()
-        return results[0]
-
-    def find(on_progress: OnProgress | None) -> tuple[np.ndarray, Rectification, Mapping[int, np.ndarray], Points]:
+    @found_once
+    def prepared(on_progress: OnProgress | None) -> tuple[np.ndarray, Rectification, Mapping[int, np.ndarray], Points]:
         """Lit area, rectification, poses and scene points: what takes a pass over the video is found once, on first iteration."""
         lit = np.full(size[::-1], 255, np.uint8)
         if mask_border:
@@ -160,7 +152,7 @@ def read_video(
                 mask=rectification.mask(cv2.bitwise_and(lit_now(lit, image), mask_of(number))),
             )
 
-    return Recording(frames, len(numbers), lambda: prepared()[3], prepare=prepare if known is None else None)
+    return Recording(frames, len(numbers), lambda: prepared()[3], prepare=prepared if known is None else None)
 
 
 def _estimate(

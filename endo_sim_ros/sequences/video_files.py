@@ -70,11 +70,3 @@ class Video:
                 yield number, cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
         finally:
             capture.release()
-
-
-def split_stacked(image: np.ndarray, source: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Left and right image of a frame with the left eye stacked on top of the right."""
-    height = image.shape[0]
-    if height % 2:
-        raise SequenceError(f"{source}: a stacked stereo video must have an even height, got {height}")
-    return image[: height // 2], image[height // 2 :]

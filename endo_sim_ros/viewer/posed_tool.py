@@ -55,8 +55,7 @@ class PosedTool:
 
     def links(self) -> dict[str, np.ndarray]:
         """Poses [4, 4] of the links by name, m, world."""
-        poses = link_poses(self._arm, self._joints, 0.0 if self._closed else self._widest)
-        return {name: self._base @ pose for name, pose in poses.items()}
+        return link_poses(self._arm, self._joints, 0.0 if self._closed else self._widest, self._base)
 
     def drawn(self) -> PosedInstruments:
         """What draws it where it is."""

@@ -106,7 +106,7 @@ def test_a_mask_of_another_size_is_scaled_if_its_shape_fits():
 
 def test_text_becomes_a_region():
     box = parse_region("box -0.01 -0.01 0.05 0.01 0.01 0.14 young_modulus=30000 poisson_ratio=0.4")
-    assert (box.young_modulus, box.poisson_ratio, box.density) == (3e4, 0.4, None)
+    assert box.properties == {"young_modulus": 3e4, "poisson_ratio": 0.4}
     assert box.contains(POINTS).tolist() == [True, False, False, False]
     flipped = parse_region("box 0.01 0.01 0.14 -0.01 -0.01 0.05 density=1")  # any two opposite corners
     assert flipped.contains(POINTS).tolist() == box.contains(POINTS).tolist()

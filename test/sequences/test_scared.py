@@ -220,7 +220,7 @@ def test_poses_can_be_estimated_instead_of_the_published(scared, monkeypatch):
     asked = []
     monkeypatch.setattr(scared_reader, "with_estimated_poses", lambda recording, *how: asked.append(how) or recording)
     frames = list(read_scared(scared, poses="sfm"))
-    assert asked == [(scared, "sfm")] and len(frames) == 6
+    assert [how[:2] for how in asked] == [(scared, "sfm")] and len(frames) == 6
     assert all(np.array_equal(frame.camera.pose, frames[0].camera.pose) for frame in frames)
 
 

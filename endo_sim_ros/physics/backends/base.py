@@ -10,19 +10,19 @@ import threading
 import types
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import warp as wp
 from torch import Tensor
 
-from endo_sim_ros.physics.backends.structs import Grid, Loads, Nodes, RigidTools, State, Substep
+from endo_sim_ros.physics.backends.structs import Grid, Loads, Nodes, RigidTools, Skin, State, Substep
 from endo_sim_ros.physics.stencils import Stencils
 
 BLOCK = 64  # threads of a GPU's block: a few thousand control nodes then reach many multiprocessors
 
 Action = Callable[[], object]
 
-viewed = functools.partial(wp.from_torch, requires_grad=False)
+viewed: Callable[..., Any] = functools.partial(wp.from_torch, requires_grad=False)
 """A tensor as an array of Warp in the same memory, which keeps the tensor."""
 
 capturing = threading.Lock()
@@ -62,18 +62,6 @@ class StepData:
     stencils: Stencils
 
 
-class SkinData(NamedTuple):
-    """N Gaussians at rest and the K control nodes that move each: float32 and int32 tensors on the backend's device."""
-
-    means: Tensor  # [N, 3] m, world
-    covars: Tensor  # [N, 3, 3] m²
-    neighbours: Tensor  # [N, K]
-    weights: Tensor  # [N, K]
-    origin: tuple[float, float, float]  # of the maps, m
-    low: float  # bounds of the singular values of each Gaussian's F
-    high: float
-
-
 class Backend(Protocol):
     """How physics runs on a kind of device."""
 
@@ -100,11 +88,9 @@ class Backend(Protocol):
 
     def launch(self, launch: Launch) -> None:
         """Launch now, in order with torch's own work."""
-        ...
 
     def load_for_cuts(self, material: str, kinematics: str) -> None:
         """Load what a step needs once cuts have made more grid nodes than it was made ready for."""
-        ...
 
     def over_items(self, kernel: Any, count: int, arguments: Sequence) -> None:
         """Launch a kernel now over count items, whose first argument, not among these, is the number of the first one.
@@ -114,19 +100,17 @@ class Backend(Protocol):
             count: Number of items.
             arguments: The others, tensors among them.
         """
-        ...
 
-    def skin(self, skin: SkinData, maps: Tensor, means: Tensor, covars: Tensor) -> None:
+    def skin(self, rest: Skin, maps: Tensor, means: Tensor, covars: Tensor) -> None:
         """Move Gaussians now by the maps of their control nodes, see `node_map_kernels`.
 
         Args:
-            skin: Gaussians at rest.
+            rest: Gaussians at rest.
             maps: [M, 4, 4].
             means: Out [N, 3], m, world.
             covars: Out [N, 3, 3], m².
         """
-        ...
 
-    def skin_work(self, skin: SkinData, maps: Tensor, means: Tensor, covars: Tensor) -> list[Work]:
+    def skin_work(self, rest: Skin, maps: Tensor, means: Tensor, covars: Tensor) -> list[Work]:
         """Return the work that moves Gaussians in B environments by maps [B, M, 4, 4]; means and covars are [B, N, …]."""
         ...

@@ -28,19 +28,16 @@ BUILD = native("physics/native/node.h", "physics/native/cluster.h")
 @wp.func_native("endo_sim::wait_for_cluster();")
 def wait_for_cluster():
     """Until all threads of the cluster are here, and see what the others wrote."""
-    ...
 
 
 @wp.func_native("endo_sim::wait_for_block();")
 def wait_for_block():
     """Until all threads of the block are here; those of a warp go on together."""
-    ...
 
 
 @wp.func_native("return endo_sim::shared_memory();")
 def shared_memory() -> int:
     """Where the shared memory begins that tiles take; the same in all blocks."""
-    ...
 
 
 @wp.func_native("return endo_sim::load_shared<wp::vec4>(memory, i);")
@@ -54,25 +51,21 @@ def store_shared(memory: int, i: int, value: wp.vec4): ...
 @wp.func_native("endo_sim::make_barriers(barrier);")
 def make_barriers(barrier: int):
     """Two of them, at this address; others may use them after `wait_for_cluster`."""
-    ...
 
 
 @wp.func_native("endo_sim::send(block, memory, i, value, barrier);")
 def send(block: int, memory: int, i: int, value: wp.vec4, barrier: int):
     """Store in the shared memory of another block, and count it at that block's barrier."""
-    ...
 
 
 @wp.func_native("endo_sim::receive(barrier, count, turn);")
 def receive(barrier: int, count: int, turn: int):
     """Wait until that many fours have been sent to the barrier, which is used for the turn-th time; all threads of the block."""
-    ...
 
 
 @wp.func_native("return endo_sim::sum_of_lanes<3>(value, apart, lanes);")
 def sum3_of_lanes(value: wp.vec3, apart: int, lanes: int) -> wp.vec3:
     """Sum over a power of two of lanes so far apart; all lanes of the warp must be here."""
-    ...
 
 
 @wp.func_native("return endo_sim::sum_of_lanes<4>(value, apart, lanes);")

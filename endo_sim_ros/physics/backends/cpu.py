@@ -11,8 +11,9 @@ from torch import Tensor
 from endo_sim_ros.core.device import cpu_threads, run_in_threads, shares
 from endo_sim_ros.core.kernels import launch_in_shares
 from endo_sim_ros.physics.backends import cpu_kernels
-from endo_sim_ros.physics.backends.base import Action, Launch, SkinData, StepData, Work, viewed
+from endo_sim_ros.physics.backends.base import Action, Launch, StepData, Work, viewed
 from endo_sim_ros.physics.backends.cpu_kernels import LANES, SCRATCH, make_step_kernel, skin_gaussians
+from endo_sim_ros.physics.backends.structs import Skin
 
 SHARED_FROM = 4096  # Gaussians; fewer are done before a second thread has begun
 
@@ -63,19 +64,18 @@ class CpuBackend:
     def over_items(self, kernel: Any, count: int, arguments: Sequence) -> None:
         launch_in_shares(kernel, count, arguments, SHARED_FROM)
 
-    def skin(self, skin: SkinData, maps: Tensor, means: Tensor, covars: Tensor) -> None:
+    def skin(self, rest: Skin, maps: Tensor, means: Tensor, covars: Tensor) -> None:
         if maps.any():
-            self.over_items(skin_gaussians, len(skin.means), [*skin[:4], maps, *skin[4:], means, covars])
+            self.over_items(skin_gaussians, len(means), [rest, maps, means, covars])
         else:  # nothing has moved yet
-            means.copy_(skin.means)
-            covars.copy_(skin.covars)
+            means.copy_(wp.to_torch(rest.means))
+            covars.copy_(wp.to_torch(rest.covars))
 
-    def skin_work(self, skin: SkinData, maps: Tensor, means: Tensor, covars: Tensor) -> list[Work]:
-        at_rest = [viewed(skin.means, wp.vec3), viewed(skin.covars, wp.mat33), viewed(skin.neighbours), viewed(skin.weights)]
+    def skin_work(self, rest: Skin, maps: Tensor, means: Tensor, covars: Tensor) -> list[Work]:
         done: list[Work] = []
         for b in range(len(means)):
-            inputs = [*at_rest, viewed(maps[b], wp.mat44), *skin[4:], viewed(means[b], wp.vec3), viewed(covars[b], wp.mat33)]
-            done.append([Launch(skin_gaussians, size, [first, *inputs]) for first, size in shares(len(skin.means), SHARED_FROM)])
+            inputs = [rest, viewed(maps[b], wp.mat44), viewed(means[b], wp.vec3), viewed(covars[b], wp.mat33)]
+            done.append([Launch(skin_gaussians, size, [first, *inputs]) for first, size in shares(means.shape[1], SHARED_FROM)])
         return done
 
 

@@ -9,7 +9,7 @@ import functools
 import warp as wp
 
 from endo_sim_ros.core.native import native
-from endo_sim_ros.physics.backends.structs import Grid, Loads, Nodes, RigidTools, State, Substep
+from endo_sim_ros.physics.backends.structs import Grid, Loads, Nodes, RigidTools, Skin, State, Substep
 from endo_sim_ros.physics.materials import LEAST_VOLUME
 
 LANES = 16
@@ -79,38 +79,15 @@ def make_step_kernel(material: str, kinematics: str):
 
 
 @wp.func_native("""
-    endo_sim::skin<endo_sim::VectorColumn>((const float*)(means.data + n), (const float*)(covars.data + n),
-        neighbours.data + (size_t)n * neighbours.shape[1], weights.data + (size_t)n * neighbours.shape[1], neighbours.shape[1],
-        (const float*)maps.data, origin.c, low, high, (float*)(out_means.data + n), (float*)(out_covars.data + n));
+    const size_t first = (size_t)n * rest.neighbours.shape[1];
+    endo_sim::skin<endo_sim::VectorColumn>((const float*)(rest.means.data + n), (const float*)(rest.covars.data + n),
+        rest.neighbours.data + first, rest.weights.data + first, rest.neighbours.shape[1], (const float*)maps.data,
+        rest.origin.c, rest.low, rest.high, (float*)(out_means.data + n), (float*)(out_covars.data + n));
 """)
-def skin_gaussian(
-    n: int,
-    means: wp.array[wp.vec3],
-    covars: wp.array[wp.mat33],
-    neighbours: wp.array2d[int],
-    weights: wp.array2d[float],
-    maps: wp.array[wp.mat44],
-    origin: wp.vec3,
-    low: float,
-    high: float,
-    out_means: wp.array[wp.vec3],
-    out_covars: wp.array[wp.mat33],
-): ...
+def skin_gaussian(n: int, rest: Skin, maps: wp.array[wp.mat44], out_means: wp.array[wp.vec3], out_covars: wp.array[wp.mat33]): ...
 
 
 @wp.kernel
-def skin_gaussians(
-    first: int,
-    means: wp.array[wp.vec3],
-    covars: wp.array[wp.mat33],
-    neighbours: wp.array2d[int],
-    weights: wp.array2d[float],
-    maps: wp.array[wp.mat44],
-    origin: wp.vec3,
-    low: float,
-    high: float,
-    out_means: wp.array[wp.vec3],
-    out_covars: wp.array[wp.mat33],
-):
+def skin_gaussians(first: int, rest: Skin, maps: wp.array[wp.mat44], out_means: wp.array[wp.vec3], out_covars: wp.array[wp.mat33]):
     """The Gaussians from the first one on, see `node_map_kernels`; the numbers of a map are one vector."""
-    skin_gaussian(first + wp.tid(), means, covars, neighbours, weights, maps, origin, low, high, out_means, out_covars)
+    skin_gaussian(first + wp.tid(), rest, maps, out_means, out_covars)

@@ -14,13 +14,13 @@ from torch import Tensor
 from endo_sim_ros.core.device import on_torch_stream
 from endo_sim_ros.core.kernels import launch
 from endo_sim_ros.physics.backends import cluster_division as cluster, plain_skinning_kernels
-from endo_sim_ros.physics.backends.base import Action, Launch, SkinData, StepData, Work, capturing, viewed
+from endo_sim_ros.physics.backends.base import Action, Launch, StepData, Work, capturing, viewed
 from endo_sim_ros.physics.backends.cluster_kernels import make_step_kernel
 from endo_sim_ros.physics.backends.cpu import cpu_action
 from endo_sim_ros.physics.backends.end_kernels import THREADS
 from endo_sim_ros.physics.backends.plain_kernels import collect, make_advance_kernel, scatter, update_grid
 from endo_sim_ros.physics.backends.plain_skinning_kernels import skin_environments
-from endo_sim_ros.physics.backends.structs import Transfer
+from endo_sim_ros.physics.backends.structs import Skin, Transfer
 
 
 class CudaBackend:
@@ -72,15 +72,14 @@ class CudaBackend:
         if count:
             launch(kernel, count, [0, *arguments], self.device)
 
-    def skin(self, skin: SkinData, maps: Tensor, means: Tensor, covars: Tensor) -> None:
-        if len(skin.means):
-            launch(skin_environments, (1, len(skin.means)), [0, *skin[:4], maps, *skin[4:], means, covars], self.device)
+    def skin(self, rest: Skin, maps: Tensor, means: Tensor, covars: Tensor) -> None:
+        if len(means):
+            launch(skin_environments, (1, len(means)), [0, rest, maps, means, covars], self.device)
 
-    def skin_work(self, skin: SkinData, maps: Tensor, means: Tensor, covars: Tensor) -> list[Work]:
-        at_rest = [viewed(skin.means, wp.vec3), viewed(skin.covars, wp.mat33), viewed(skin.neighbours), viewed(skin.weights)]
+    def skin_work(self, rest: Skin, maps: Tensor, means: Tensor, covars: Tensor) -> list[Work]:
         outputs = [viewed(means.view(-1, 3), wp.vec3), viewed(covars.view(-1, 3, 3), wp.mat33)]
-        inputs = [maps.shape[1], *at_rest, viewed(maps.view(-1, 4, 4), wp.mat44), *skin[4:], *outputs]
-        return [Launch(skin_environments, (len(means), len(skin.means)), inputs)]
+        inputs = [maps.shape[1], rest, viewed(maps.view(-1, 4, 4), wp.mat44), *outputs]
+        return [Launch(skin_environments, means.shape[:2], inputs)]
 
     def _clustered(self, step: StepData) -> list[Action]:
         """One launch for all substeps, on a GPU with clusters of multiprocessors; none for more control nodes than they hold."""

@@ -32,13 +32,11 @@ wp.set_module_options({"enable_backward": False, **OPTIONS})
 @wp.func_native("return endo_sim::load_four(array.data + index);")
 def load(array: wp.array[wp.vec4], index: int) -> wp.vec4:
     """array[index], on a GPU in one piece."""
-    ...
 
 
 @wp.func_native("endo_sim::store_four(array.data + index, value);")
 def store(array: wp.array[wp.vec4], index: int, value: wp.vec4):
     """array[index] = value, on a GPU in one piece."""
-    ...
 
 
 @wp.func
@@ -49,7 +47,6 @@ def three(v: wp.vec4) -> wp.vec3:
 @wp.func_native("wp::vec3 weights; endo_sim::spline(x, weights.c); return weights;")
 def spline(x: float) -> wp.vec3:
     """Quadratic B-spline weights of the three grid nodes around a point x cells (0.5 to 1.5) past the first."""
-    ...
 
 
 @wp.func
@@ -227,7 +224,6 @@ def make_advance_kernel(material: str, kinematics: str):
 @wp.func_native("return endo_sim::lane_sum(value);")
 def lane_sum(value: float) -> float:
     """Sum over the 32 lanes of a warp on a GPU, in the same order every time; on a CPU there is one lane."""
-    ...
 
 
 @wp.kernel

@@ -98,6 +98,19 @@ class Transfer:
 
 
 @struct
+class Skin:
+    """N Gaussians at rest and the K control nodes that move each."""
+
+    means: wp.array[wp.vec3]  # [N] m, world
+    covars: wp.array[wp.mat33]  # [N] m²
+    neighbours: wp.array2d[int]  # [N, K]
+    weights: wp.array2d[float]  # [N, K]
+    origin: wp.vec3  # of the maps
+    low: float  # bounds of the singular values of each Gaussian's F
+    high: float
+
+
+@struct
 class Substep:
     """What is the same in every substep."""
 

@@ -55,9 +55,7 @@ def phantom_sequence(config: PhantomConfig) -> Iterator[Frame]:
         image, depth = expose(camera, camera, index, 0)
         right = None
         if config.stereo:
-            shifted = pose.copy()
-            shifted[:3, 3] += config.baseline * pose[:3, 0]
-            right = expose(camera.at(shifted), camera, index, 1)[0]
+            right = expose(camera.beside(config.baseline), camera, index, 1)[0]
         return Frame(
             stamp_ns=FIRST_STAMP_NS + round(index * 1e9 / config.fps),
             image=image,

@@ -114,7 +114,7 @@ class _Recorded(threading.local):
 
 
 _recorded = _Recorded()
-_COMMANDS = 512  # recorded launches that a thread keeps
+_COMMANDS = 128  # recorded launches that a thread keeps, with the structs they name
 
 
 def _record(kernel: Any, count: int | tuple[int, ...], arguments: Sequence, device: str) -> tuple[Any, list]:

@@ -5,6 +5,7 @@ recording do not ask for it. Inside, a stage gives the algorithm views, its own 
 """
 
 import logging
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -31,6 +32,7 @@ from endo_sim_ros.reconstruction.trainer import Trainer
 from endo_sim_ros.reconstruction.triangulation import match_features, triangulate
 
 log = logging.getLogger(__name__)
+_DEPTHS = 10_000_000  # of Gaussians in views, whose median is that of the scene
 
 
 def prepare(
@@ -263,7 +265,8 @@ def place_gaussians(scene: PreparedScene, config: ReconstructionConfig, progress
         device=pick_device(config.device),
         share=config.initial.seen_share if config.extrapolation else 1.0,
     )
-    positions = model.means.numpy().astype(np.float64)
+    # Of many views some Gaussians tell the depth, as all of them in all views would take gigabytes.
+    positions = model.means[:: math.ceil(len(model) * len(views) / _DEPTHS)].numpy().astype(np.float64)
     depths = np.concatenate(progress.map(lambda view: view.camera.project(positions)[1], views))
     return replace(scene, model=model, depth=float(np.median(depths[depths > 0])), exposures=np.zeros((len(views), 3)))
 

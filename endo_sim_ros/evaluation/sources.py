@@ -56,6 +56,22 @@ def open_named(source: str) -> Iterable[Frame]:
     return find_named(source)()
 
 
+def find_patient(source: str) -> PhantomConfig | None:
+    """The synthetic patient that a source names, as `phantom:0,frames=50`; None if it names something else.
+
+    Raises:
+        SequenceError, ConfigError: If it has no number, or no such option.
+    """
+    place, texts = split_source(source)
+    if not place.startswith(PHANTOM):
+        return None
+    seed = place.removeprefix(PHANTOM)
+    if not seed.isdecimal():
+        raise SequenceError(f"{place}: the synthetic patients have numbers, as {PHANTOM}0")
+    # Half a round: after a whole one the last view would be the first again, and two views one.
+    return PhantomConfig.from_mapping({"seed": int(seed), "rounds": 0.5} | parse_values(texts, place, PhantomConfig))
+
+
 def find_named(source: str) -> Callable[[], Iterable[Frame]]:
     """What opens a sequence; nothing of it is read yet.
 
@@ -63,12 +79,7 @@ def find_named(source: str) -> Callable[[], Iterable[Frame]]:
         SequenceError, ConfigError: If there is no such sequence or option.
     """
     place, texts = split_source(source)
-    if place.startswith(PHANTOM):
-        seed = place.removeprefix(PHANTOM)
-        if not seed.isdecimal():
-            raise SequenceError(f"{place}: the synthetic patients have numbers, as {PHANTOM}0")
-        # Half a round: after a whole one the last view would be the first again, and two views one.
-        config = PhantomConfig.from_mapping({"seed": int(seed), "rounds": 0.5} | parse_values(texts, place, PhantomConfig))
+    if config := find_patient(source):
         return lambda: Recording(lambda: phantom_sequence(config), config.frames)
     given = {name: _value(value) for name, _, value in (text.partition("=") for text in texts)}
     if "distortion" in given:

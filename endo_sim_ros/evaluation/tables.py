@@ -21,6 +21,7 @@ from endo_sim_ros.evaluation.splits import explain_split
 
 COLUMNS = FIGURES | {
     "psnr_deformed": Figure("PSNR, deformed", "dB", 2),
+    "psnr_deformed_truth": Figure("PSNR, deformed, against truth", "dB", 2),
     "seconds": Figure("training", "s", 1),
     "gaussians": Figure("Gaussians", "", 0),
     "megabytes": Figure("peak memory", "MB", 0),

@@ -20,12 +20,14 @@ from endo_sim_ros.core.device import cpu_threads
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.evaluation.cells import Cell
+from endo_sim_ros.evaluation.deformed_truth import deformed_truth_psnr
 from endo_sim_ros.evaluation.deformed_views import deformed_view_psnr
 from endo_sim_ros.evaluation.gsplat_trainers import STRATEGIES, GsplatTrainer
 from endo_sim_ros.evaluation.held_out import difference, mean_figures, measure, model_renderer, seen_pixels
 from endo_sim_ros.evaluation.lpips import Lpips
 from endo_sim_ros.evaluation.measurement import machine, peak_megabytes
 from endo_sim_ros.evaluation.preparation import Prepared
+from endo_sim_ros.evaluation.sources import find_patient
 from endo_sim_ros.evaluation.splits import split_views
 from endo_sim_ros.reconstruction import Progress, ReconstructionConfig, ScenePoints, Trainer, prepare, reconstruct, shrink
 from endo_sim_ros.reconstruction.triangulation import points_in_view
@@ -113,7 +115,11 @@ def train_and_measure(argument: tuple[Cell, Path | None, Prepared | Path], devic
         pictures = _pictures(number, image, depth, frame) if number in shown else {}
         return row, pictures, _reference_at_points(frame, prepared.judging)
 
-    deformed = {"psnr_deformed": deformed_view_psnr(model, [view.camera for view in seen_by], device)}
+    cameras = [view.camera for view in seen_by]
+    deformed = {"psnr_deformed": deformed_view_psnr(model, cameras, device)}
+    if patient := find_patient(cell.source):
+        shown_from = [load(number).camera for number in sorted(shown)]
+        deformed["psnr_deformed_truth"] = deformed_truth_psnr(model, patient, cameras, shown_from, device)
     deformed = {name: value for name, value in deformed.items() if np.isfinite(value)}
     rows, pictures, off, masked, size = [], {}, [], False, [0, 0]
     with ThreadPoolExecutor(cpu_threads()) as pool:  # measuring takes longer than drawing

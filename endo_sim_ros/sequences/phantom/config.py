@@ -45,6 +45,17 @@ class PhantomConfig(StageConfig):
     border: Annotated[float, Range(0.0, 0.3)] = 0.0
     """Black frame with round corners, as a fraction of the image height; masked out, without depth."""
 
+    deformed: Annotated[float, Range(0.0, 0.03, "m")] = 0.0
+    """How far tissue in the middle is pulled towards the endoscope and aside, within 2 cm around, in all frames."""
+    breathing: Annotated[float, Range(0.0, 0.03, "m")] = 0.0
+    """How far breath moves the organs there and back."""
+    breathing_period: Annotated[float, Range(0.1, 60.0, "s")] = 4.0
+    """Time from breath to breath."""
+    heartbeat: Annotated[float, Range(0.0, 0.01, "m")] = 0.0
+    """How far the heart moves what lies on it."""
+    heartbeat_period: Annotated[float, Range(0.1, 10.0, "s")] = 0.9
+    """Time from beat to beat."""
+
     @property
     def sections(self) -> int:
         """Organs side by side, so that the surface reaches 10 cm beyond the flight on both sides, where the views end."""

@@ -11,6 +11,7 @@ from endo_sim_ros.core.device import init_warp
 from endo_sim_ros.sequences.phantom import surface_kernels as kernels
 from endo_sim_ros.sequences.phantom.anatomy import Anatomy
 from endo_sim_ros.sequences.phantom.config import PhantomConfig
+from endo_sim_ros.sequences.phantom.displacement import Displacement, displacement_at
 from endo_sim_ros.sequences.phantom.height_field import CELL, CELLS, SEAM, joined, noise, smoothstep
 from endo_sim_ros.sequences.phantom.paint import Paint
 
@@ -92,8 +93,16 @@ _WORKING_DISTANCE = 0.115  # metres, at which the exposure is right
 _LIGHT_OFFSET = np.array([0.0027, -0.004, 0.0])  # of the fibre's end from the left lens, camera frame, metres
 
 
-def radiance_and_depth(phantom: Phantom, camera: Camera, rig: Camera) -> tuple[np.ndarray, np.ndarray]:
+def radiance_and_depth(
+    phantom: Phantom, camera: Camera, rig: Camera, displacement: Displacement | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Linear image [H, W, 3] and depth [H, W] of a camera, in the light of the endoscope whose left camera is `rig`."""
+    motion = kernels.Motion()
+    if displacement is not None:
+        array = lambda values, kind: wp.array(values.astype(np.float32), dtype=kind, device="cpu")
+        motion.centres, motion.amplitudes = (array(each, wp.vec3) for each in (displacement.centres, displacement.amplitudes))
+        motion.radii = array(displacement.radii, float)
+        motion.largest = float(np.linalg.norm(displacement.amplitudes, axis=1).sum())
     light = kernels.Light()
     light.position = wp.vec3(*(rig.pose[:3, :3] @ _LIGHT_OFFSET + rig.position))
     light.power = 1.12 * _WORKING_DISTANCE**2
@@ -106,6 +115,7 @@ def radiance_and_depth(phantom: Phantom, camera: Camera, rig: Camera) -> tuple[n
         dim=depth.shape,
         inputs=[
             phantom.surface,
+            motion,
             light,
             wp.mat44(camera.pose.astype(np.float32)),
             wp.vec2(camera.K[0, 0], camera.K[1, 1]),
@@ -133,12 +143,13 @@ def develop(radiance: np.ndarray, camera: Camera, exposure: float, auto: bool) -
     return 255.0 * np.minimum(1.04 * tone, 1.0) ** np.float32(1 / 2.2)
 
 
-def render_phantom(phantom: PhantomConfig | Phantom, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+def render_phantom(phantom: PhantomConfig | Phantom, camera: Camera, seconds: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """What an endoscope at any pose sees of the patient, without noise or border.
 
     Args:
-        phantom: The configuration (its seed, flight, exposure and auto_exposure count), or a built phantom.
+        phantom: The configuration (its seed, flight, displacement, exposure and auto_exposure count), or a built phantom.
         camera: Where to look from; its light moves with it.
+        seconds: Time since the first frame, for tissue that moves.
 
     Returns:
         The RGB image [H, W, 3], uint8, and the depth along the optical axis [H, W], float32, metres, 0 where the
@@ -146,7 +157,7 @@ def render_phantom(phantom: PhantomConfig | Phantom, camera: Camera) -> tuple[np
     """
     config = phantom if isinstance(phantom, PhantomConfig) else PhantomConfig()
     built = build_phantom(config.seed, config.sections) if isinstance(phantom, PhantomConfig) else phantom
-    radiance, depth = radiance_and_depth(built, camera, camera)
+    radiance, depth = radiance_and_depth(built, camera, camera, displacement_at(config, seconds))
     return quantise(develop(radiance, camera, config.exposure, config.auto_exposure)), depth
 
 

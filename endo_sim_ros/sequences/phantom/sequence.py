@@ -9,6 +9,7 @@ from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import cpu_threads
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.sequences.phantom.config import PhantomConfig
+from endo_sim_ros.sequences.phantom.displacement import displacement_at
 from endo_sim_ros.sequences.phantom.path import phantom_camera, phantom_poses
 from endo_sim_ros.sequences.phantom.rendering import build_phantom, develop, quantise, radiance_and_depth
 from endo_sim_ros.sequences.recording import FIRST_STAMP_NS
@@ -41,7 +42,7 @@ def phantom_sequence(config: PhantomConfig) -> Iterator[Frame]:
         mask[window[..., 0] < 1.0] = 0
 
     def expose(camera: Camera, rig: Camera, index: int, eye: int) -> tuple[np.ndarray, np.ndarray]:
-        radiance, depth = radiance_and_depth(phantom, camera, rig)
+        radiance, depth = radiance_and_depth(phantom, camera, rig, displacement_at(config, index / config.fps))
         image = develop(radiance, camera, config.exposure, config.auto_exposure)
         if window is not None:
             image *= window

@@ -16,6 +16,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 TOP_LEVEL = wp.constant(6)  # the coarsest cells a ray skips at once are 2^6 cells wide
 FAR = wp.constant(1.0e9)
+STEP = wp.constant(2.0e-3)  # metres, length of a chord of a ray through displaced tissue
 
 
 @wp.struct
@@ -43,6 +44,45 @@ class Light:
     sheen: float  # strength of the broad, satin reflection
     glint: float  # strength of the mirror reflection of the wet film
     sharpness: float  # its Blinn-Phong exponent
+
+
+@wp.struct
+class Motion:
+    """A displacement of the surface, u(q) = Σ a exp(−|q − c|² / 2 r²)."""
+
+    centres: wp.array[wp.vec3]  # [T] m, world
+    amplitudes: wp.array[wp.vec3]  # [T] m; none where the surface is at rest
+    radii: wp.array[float]  # [T] m
+    largest: float  # bound of |u|, m
+
+
+@wp.func
+def displaced(motion: Motion, point: wp.vec3):
+    """u at a point at rest."""
+    total = wp.vec3()
+    for k in range(motion.amplitudes.shape[0]):
+        apart = (point - motion.centres[k]) / motion.radii[k]
+        total += wp.exp(-0.5 * wp.dot(apart, apart)) * motion.amplitudes[k]
+    return total
+
+
+@wp.func
+def deformation(motion: Motion, point: wp.vec3):
+    """I + ∂u/∂q at a point at rest."""
+    total = wp.identity(n=3, dtype=float)
+    for k in range(motion.amplitudes.shape[0]):
+        apart = (point - motion.centres[k]) / motion.radii[k]
+        total -= wp.exp(-0.5 * wp.dot(apart, apart)) / motion.radii[k] * wp.outer(motion.amplitudes[k], apart)
+    return total
+
+
+@wp.func
+def at_rest(motion: Motion, point: wp.vec3, guess: wp.vec3, steps: int):
+    """Where a point is at rest: q + u(q) = p, by Newton's method."""
+    found = guess
+    for _ in range(steps):
+        found += wp.inverse(deformation(motion, found)) * (point - found - displaced(motion, found))
+    return found
 
 
 @wp.func
@@ -126,16 +166,16 @@ def hit_in_cell(surface: Surface, u: float, v: float, z: float, du: float, dv: f
 
 
 @wp.func
-def cast(surface: Surface, origin: wp.vec3, ray: wp.vec3):
-    """Depth at which a ray first meets the surface, 0 if it never does."""
+def cast(surface: Surface, origin: wp.vec3, ray: wp.vec3, limit: float):
+    """Depth, up to a limit, at which a ray first meets the surface at rest, negative if it never does."""
     u = origin[0] / surface.cell + 0.5 * float(surface.columns)
     v = origin[1] / surface.cell + 0.5 * float(surface.rows)
     du = ray[0] / surface.cell
     dv = ray[1] / surface.cell
     if ray[2] <= 1.0e-3:
-        return 0.0
+        return -1.0
     t = wp.max((surface.lowest - origin[2]) / ray[2], 0.0)
-    last = (surface.highest - origin[2]) / ray[2] + 1.0e-6
+    last = wp.min((surface.highest - origin[2]) / ray[2] + 1.0e-6, limit)
     nudge = 1.0e-3 / wp.max(wp.max(wp.abs(du), wp.abs(dv)), 1.0)  # past a cell's border, in depth
     level = int(TOP_LEVEL)
     for _ in range(4000):
@@ -174,16 +214,38 @@ def cast(surface: Surface, origin: wp.vec3, ray: wp.vec3):
                 return hit
             t = leave + nudge
             level = 1
-    return 0.0
+    return -1.0
 
 
 @wp.func
-def shade(surface: Surface, light: Light, point: wp.vec3, eye: wp.vec3, footprint: float):
-    """Linear radiance towards the eye of a surface point, filtered over a footprint in metres."""
+def cast_displaced(surface: Surface, motion: Motion, origin: wp.vec3, ray: wp.vec3):
+    """Depth at which a ray first meets the displaced surface, 0 if it never does, and the point there at rest.
+
+    At rest the ray is a curve. It is followed in chords, which are so short that they leave it by some hundredth of a millimetre.
+    """
+    step = STEP / wp.length(ray)
+    t = wp.max((surface.lowest - motion.largest - origin[2]) / ray[2], 0.0)
+    last = (surface.highest + motion.largest - origin[2]) / ray[2]
+    point = origin + t * ray
+    start = at_rest(motion, point, point, 6)
+    while t < last:
+        point = origin + (t + step) * ray
+        end = at_rest(motion, point, start + step * ray, 2)
+        hit = cast(surface, start, (end - start) / step, step)
+        if hit >= 0.0:
+            return t + hit, start + hit / step * (end - start)
+        t += step
+        start = end
+    return 0.0, start
+
+
+@wp.func
+def shade(surface: Surface, motion: Motion, light: Light, rest: wp.vec3, point: wp.vec3, eye: wp.vec3, footprint: float):
+    """Linear radiance towards the eye of a surface point, filtered over a footprint in metres; it is another one at rest."""
     rows = surface.rows
     columns = surface.columns
-    u, sign_u = mirrored(point[0] / surface.cell + 0.5 * float(columns), float(columns))
-    v, sign_v = mirrored(point[1] / surface.cell + 0.5 * float(rows), float(rows))
+    u, sign_u = mirrored(rest[0] / surface.cell + 0.5 * float(columns), float(columns))
+    v, sign_v = mirrored(rest[1] / surface.cell + 0.5 * float(rows), float(rows))
     detail = wp.clamp(wp.log2(footprint / surface.cell), 0.0, 4.999)
     level = int(detail)
     blend = detail - float(level)
@@ -194,6 +256,10 @@ def shade(surface: Surface, light: Light, point: wp.vec3, eye: wp.vec3, footprin
         slope += blend * (sample(surface.slopes, rows, columns, level + 1, u, v) - slope)
     normal = wp.normalize(wp.vec3(sign_u * slope[0], sign_v * slope[1], -1.0))
     film = wp.normalize(wp.vec3(sign_u * (slope[0] + slope[2]), sign_v * (slope[1] + slope[3]), -1.0))
+    if motion.amplitudes.shape[0] > 0:
+        turn = wp.transpose(wp.inverse(deformation(motion, rest)))  # of normals
+        normal = wp.normalize(turn * normal)
+        film = wp.normalize(turn * film)
     to_eye = wp.normalize(eye - point)
     to_light = light.position - point
     irradiance = light.power / wp.dot(to_light, to_light)
@@ -214,6 +280,7 @@ def shade(surface: Surface, light: Light, point: wp.vec3, eye: wp.vec3, footprin
 @wp.kernel
 def render(
     surface: Surface,
+    motion: Motion,
     light: Light,
     pose: wp.mat44,  # camera-to-world
     focal: wp.vec2,  # pixels
@@ -225,8 +292,14 @@ def render(
     local = wp.vec3((float(x) + 0.5 - centre[0]) / focal[0], (float(y) + 0.5 - centre[1]) / focal[1], 1.0)
     ray = wp.transform_vector(pose, local)
     origin = wp.transform_point(pose, wp.vec3(0.0, 0.0, 0.0))
-    t = cast(surface, origin, ray)
+    t = float(0.0)
+    rest = wp.vec3()
+    if motion.amplitudes.shape[0] > 0:
+        t, rest = cast_displaced(surface, motion, origin, ray)
+    else:
+        t = wp.max(cast(surface, origin, ray, FAR), 0.0)
+        rest = origin + t * ray
     depth[y, x] = t
     radiance[y, x] = wp.vec3()
     if t > 0.0:
-        radiance[y, x] = shade(surface, light, origin + t * ray, origin, t / focal[0])
+        radiance[y, x] = shade(surface, motion, light, rest, origin + t * ray, origin, t / focal[0])

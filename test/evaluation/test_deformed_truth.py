@@ -1,0 +1,37 @@
+"""Models that are displaced as a synthetic patient is, against the patient filmed anew."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.evaluation.deformed_truth import deformed_truth_psnr
+from endo_sim_ros.evaluation.sources import find_patient
+from endo_sim_ros.sequences.phantom import PhantomConfig, displacement_at, phantom_camera, phantom_poses, render_phantom
+
+PATIENT = PhantomConfig(seed=0, width=160, height=128, stereo=False, frames=2)
+
+
+@pytest.mark.slow
+def test_a_painted_surface_follows_and_one_that_is_elsewhere_does_not():
+    camera = phantom_camera(PATIENT, phantom_poses(PATIENT)[0])
+    image, depth = render_phantom(PATIENT, camera)
+    points = torch.from_numpy(camera.backproject(depth).reshape(-1, 3)).float()
+    colors, radii = torch.from_numpy(image.reshape(-1, 3) / 255.0).float(), torch.from_numpy(depth.reshape(-1) / camera.K[0, 0] / 2)
+    model = GaussianModel.from_points(points, colors, radii, opacity=0.95)
+    found = deformed_truth_psnr(model, PATIENT, [camera], [camera], "cpu")
+    pulled = dataclasses.replace(PATIENT, deformed=0.012)
+    # The same painting of the patient who is pulled already comes apart when it is pulled again.
+    displacement = displacement_at(pulled, 0.0)
+    assert displacement is not None
+    moved = points.double().numpy() + displacement.at(points.double().numpy())
+    twice = dataclasses.replace(model, means=torch.from_numpy(moved).float())
+    assert 24 < found < 32 and deformed_truth_psnr(twice, PATIENT, [camera], [camera], "cpu") < found - 2
+    assert np.isnan(deformed_truth_psnr(model, pulled, [camera], [camera], "cpu"))  # a patient who was not at rest tells nothing
+
+
+def test_sources_name_patients():
+    assert find_patient("phantom:3,deformed=0.01") == PhantomConfig(seed=3, rounds=0.5, deformed=0.01)
+    assert find_patient("my_bag,step=2") is None

@@ -1,14 +1,17 @@
 """What all rooms with kernels share: where kernels run, and how they are loaded and launched.
 
 Beside its kernels a room has a `typing.Protocol` of what a backend does, and a function ``backend_for(device)`` that returns the
-backend of a device. What Warp does not promise to keep (`kernel.adj`, `dtype._shape_`) was seen with version 1.19.
+backend of a device. What Warp does not promise to keep (`kernel.adj`, `dtype._shape_`, `Launch.fwd_args`, `array_t._ref`) was seen with
+version 1.19.
 """
 
 import contextlib
 import contextvars
 import functools
+import numbers
 import threading
 import types
+import weakref
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -94,7 +97,7 @@ def launch(kernel: Any, count: int | tuple[int, ...], arguments: Sequence, devic
         return
     device = torch.device(device)
     tensors = [x for x in arguments if isinstance(x, Tensor)]
-    kind = (kernel, count, device, *[(x.shape, x.dtype, x.stride()) if isinstance(x, Tensor) else x for x in arguments])
+    kind = (kernel, count, device, *[_kind(x) for x in arguments])
     found = _recorded.launches.get(kind)
     if found is None:
         while len(_recorded.launches) >= _COMMANDS:
@@ -106,6 +109,13 @@ def launch(kernel: Any, count: int | tuple[int, ...], arguments: Sequence, devic
     command.launch(warp_stream(torch.cuda.current_stream(device)) if device.type == "cuda" else None)
 
 
+def _kind(argument: Any) -> Any:
+    """What of an argument a recorded launch depends on. A struct is not kept alive by it, nor are its arrays."""
+    if isinstance(argument, Tensor):
+        return argument.shape, argument.dtype, argument.stride()
+    return argument if argument is None or isinstance(argument, (numbers.Number, tuple)) else weakref.ref(argument)
+
+
 class _Recorded(threading.local):
     """Launches of one thread, with their array arguments: two threads never fill in the addresses of one launch."""
 
@@ -114,15 +124,16 @@ class _Recorded(threading.local):
 
 
 _recorded = _Recorded()
-_COMMANDS = 128  # recorded launches that a thread keeps, with the structs they name
+_COMMANDS = 512  # recorded launches that a thread keeps
 
 
 def _record(kernel: Any, count: int | tuple[int, ...], arguments: Sequence, device: str) -> tuple[Any, list]:
     """Return a launch, not made yet, and its array arguments, whose addresses are to be filled in."""
     command: Any = wp.launch(kernel, count, kernel_arguments(kernel, arguments), device=device, record_cmd=True)
     places = [command.params[1 + i] for i, x in enumerate(arguments) if isinstance(x, Tensor)]
+    command.fwd_args = None  # Warp's hold on structs and tensors, whose memory would never be free again
     for place in places:
-        place._ref = None  # Warp's hold on the tensor, whose memory would never be free again
+        place._ref = None
     return command, places
 
 

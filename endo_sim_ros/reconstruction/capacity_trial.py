@@ -5,13 +5,15 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+import torch
 
+from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import PreparedScene, TrainingView
 from endo_sim_ros.reconstruction.trainer import Trainer
 
-_FEWEST = 500  # left-out pixels that tell numbers apart
+_FEWEST = 500  # pixels, those that are left out and those whose depth is known, from which on a trial tells something
 _EVERY = 10  # iterations between two reports
 
 
@@ -22,6 +24,8 @@ def choose_capacity(
     progress: StageProgress,
 ) -> PreparedScene:
     """Try fewer Gaussians and stronger fading beside what the scene has, and keep what foretells left-out pixels better.
+
+    A trial that cannot be made, as too little is seen or memory is short, leaves the scene as it is; a decision says so.
 
     Few views are memorised with their noise by many Gaussians; fewer are too smooth for clean pictures. Which of both the pictures are,
     the views tell by themselves: blocks of pixels, left out of a short training with the middle of the views, are foretold worse by
@@ -39,25 +43,33 @@ def choose_capacity(
     options = config.capacity
     generator = np.random.default_rng(config.seed)
     views = [_middle(view, options.share) for view in scene.views]
-    views = [view for view in views if (view.tissue > 0).any()]
     left_out = [_blocks(view, options.left_out, options.block, generator) for view in views]
-    if sum(int(pixels.sum()) for pixels in left_out) < _FEWEST:
-        return scene
     seen = [replace(view, mask=np.uint8(255) * ((view.tissue > 0) & ~pixels)) for view, pixels in zip(views, left_out)]
+    known = sum(int(((view.surface > 0) & (view.mask > 0)).sum()) for view in seen)
+    if min(known, sum(int(pixels.sum()) for pixels in left_out)) < _FEWEST:
+        return scene.decided("no trial of fewer Gaussians: the middle of the views shows too little tissue of known depth", logging.INFO)
     trial = replace(scene, frames=(), views=tuple(seen), iterations=options.iterations)
-    tried = [scene, replace(scene, max_gaussians=max(int(options.fewer * scene.max_gaussians), 1), fading=options.fading * scene.fading)]
+    fewer = replace(scene, max_gaussians=max(int(options.fewer * scene.max_gaussians), 1), fading=options.fading * scene.fading)
     losses = []
-    for index, candidate in enumerate(tried):
+    for candidate in (scene, fewer):
         most = max(int(candidate.max_gaussians * options.share**2), 1)
-        trainer = Trainer(start(replace(trial, max_gaussians=most, fading=candidate.fading)), replace(config, schedule=0))
-        while trainer.iteration < trainer.iterations:
-            if trainer.iteration % _EVERY == 0:
-                progress(index * trainer.iterations + trainer.iteration, len(tried) * trainer.iterations)
-            trainer.step()
+        try:
+            trainer = Trainer(start(replace(trial, max_gaussians=most, fading=candidate.fading)), replace(config, schedule=0))
+            while trainer.iteration < trainer.iterations:
+                if trainer.iteration % _EVERY == 0:
+                    progress(len(losses) * trainer.iterations + trainer.iteration, 2 * trainer.iterations)
+                trainer.step()
+        except (SequenceError, torch.OutOfMemoryError) as error:
+            reason = "out of memory" if isinstance(error, torch.OutOfMemoryError) else str(error)
+            return scene.decided(f"no trial of fewer Gaussians: {reason}", logging.INFO)
         losses.append(trainer.photometric_error(left_out))
-    best = int(np.argmin(losses))
-    numbers = " and ".join(f"{loss:.4f} with {candidate.max_gaussians} Gaussians" for loss, candidate in zip(losses, tried))
-    return tried[best].decided(f"of pixels left out of a trial the loss is {numbers}: {tried[best].max_gaussians} at most", logging.INFO)
+    progress(2 * options.iterations, 2 * options.iterations)
+    chosen = fewer if losses[1] < losses[0] else scene
+    sentence = (
+        f"of pixels left out of a trial the loss is {losses[0]:.4f}, and {losses[1]:.4f} with {options.fewer:.0%} of the Gaussians "
+        f"that fade {options.fading:g} times as fast: {chosen.max_gaussians} at most{', which do' if chosen is fewer else ''}"
+    )
+    return chosen.decided(sentence, logging.INFO)
 
 
 def _middle(view: TrainingView, share: float) -> TrainingView:

@@ -235,10 +235,10 @@ def size_training(scene: PreparedScene, config: ReconstructionConfig, progress: 
 def try_capacity(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Let a trial tell whether fewer Gaussians do better, where the views are so few that their pixels do not."""
     size, pixels = config.training, sum(int((view.tissue > 0).sum()) for view in scene.views)
-    known = sum(int((view.surface > 0).sum()) for view in scene.views) >= config.matching.min_points
-    if config.max_gaussians or not config.capacity.iterations or not known or pixels > size.min_gaussians * size.pixels_per_gaussian:
+    if config.max_gaussians or not config.capacity.iterations or pixels > size.min_gaussians * size.pixels_per_gaussian:
         return scene
-    start = lambda trial: fit_light(place_gaussians(trial, config, progress), config, progress)
+    silent = StageProgress("", lambda *_: progress.check())
+    start = lambda trial: fit_light(place_gaussians(trial, config, silent), config, silent)
     return choose_capacity(scene, config, start, progress)
 
 

@@ -65,8 +65,7 @@ class Trainer:
 
     def __init__(self, scene: PreparedScene, config: ReconstructionConfig) -> None:
         self.config = config
-        fading = {name: scene.fading * getattr(config, name) for name in ("lambda_opacity", "lambda_scale")}
-        self._weights = dataclasses.replace(config, **fading)
+        self._fade(scene.fading)
         self.scene_depth = scene.depth
         self.device = pick_device(config.device)
         self.stamps = [view.stamp_ns for view in scene.views]
@@ -138,6 +137,8 @@ class Trainer:
         state = {
             "config": identity(self.config),
             "stamps": self.stamps,
+            "max_gaussians": self._strategy.limit,
+            "fading": self._fading,
             "iteration": self.iteration,
             "order": self._order,
             "model": self._detached().tensors(),
@@ -161,6 +162,9 @@ class Trainer:
             state = read_checkpoint(path, self.config, self.device)
             if state["stamps"] != self.stamps:
                 raise SequenceError(f"{path}: the checkpoint was made with other views; use the same or start anew")
+            limit, fading = int(state["max_gaussians"]), float(state["fading"])
+            if limit < 1 or not 0 < fading < math.inf:
+                raise ValueError("it names a number of Gaussians or a fading that there cannot be")
             iteration, order = int(state["iteration"]), [int(view) for view in state["order"]]
             if iteration < 0 or not set(order) <= set(range(len(self._device_views))):
                 raise ValueError("it names views or an iteration that there cannot be")
@@ -179,7 +183,14 @@ class Trainer:
             self.appearance.set(**state["light"])
             self.appearance.optimizer.state = state["light_optimizer"]
             self._generator, self._noise = generator, noise
+            self._strategy.limit = limit  # as was decided then, should a trial decide otherwise now
+            self._fade(fading)
             self.iteration, self._order, self._fitted = iteration, order, None
+
+    def _fade(self, factor: float) -> None:
+        """Weigh opacity and size of the Gaussians by so many times what the options say."""
+        weights = {name: factor * getattr(self.config, name) for name in ("lambda_opacity", "lambda_scale")}
+        self._fading, self._weights = factor, dataclasses.replace(self.config, **weights)
 
     def _detached(self) -> GaussianModel:
         return model_of({name: tensor.detach().clone() for name, tensor in self.parameters.items()})

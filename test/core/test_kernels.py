@@ -1,6 +1,8 @@
 """Launches that are recorded, and filled in again."""
 
+import gc
 import threading
+import weakref
 
 import torch
 import warp as wp
@@ -42,6 +44,29 @@ def test_tensors_of_other_strides_are_another_launch():
         out = torch.zeros(5, 3)
         launch(shifted, 5, [values, 1.0, shift_of(0.0), out], "cpu")
         assert torch.equal(out, values)
+
+
+@wp.struct
+class Held:
+    values: wp.array[wp.vec3]
+
+
+@wp.kernel
+def copied(held: Held, out: wp.array[wp.vec3]):
+    i = wp.tid()
+    out[i] = held.values[i]
+
+
+def test_a_recorded_launch_keeps_no_memory_of_its_struct():
+    values, out = torch.rand(5, 3), torch.zeros(5, 3)
+    held = Held()
+    held.values = wp.from_torch(values, dtype=wp.vec3)
+    launch(copied, 5, [held, out], "cpu")
+    assert torch.equal(out, values)
+    memory = weakref.ref(held.values)
+    del held
+    gc.collect()
+    assert memory() is None
 
 
 def test_no_items_are_no_launch():

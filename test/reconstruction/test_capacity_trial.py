@@ -46,6 +46,48 @@ def test_what_is_given_or_told_by_many_pixels_is_not_tried(small):
         assert scene.fading == 1.0 and not stages["capacity trial"]
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "changes, reason",
+    [
+        ({"capacity.block": 100, "capacity.share": 0.5, "capacity.left_out": 0.5}, "middle"),  # all of it is left out, or nothing
+        ({"training.min_gaussians": 600, "capacity.fewer": 0.01}, "leaves"),
+    ],
+)
+def test_a_trial_that_cannot_be_made_leaves_the_scene_as_it_is(small, changes, reason):
+    frames = [bare(frame, depth=frame.depth) for frame in small[:1]]
+    for seed in range(3):
+        scene = prepare(frames, undecided(seed=seed, **{"capacity.iterations": 1} | changes))
+        assert (scene.max_gaussians, scene.fading) == (changes.get("training.min_gaussians", 8000), 1.0)
+        assert "no trial" in scene.decisions[-1] and reason in scene.decisions[-1]
+
+
+@pytest.mark.slow
+def test_a_trial_that_runs_out_of_memory_is_left_out(small, monkeypatch):
+    def step(_):
+        raise torch.OutOfMemoryError("out of memory")
+
+    monkeypatch.setattr(Trainer, "step", step)
+    scene = prepare([bare(frame, depth=frame.depth) for frame in small[:2]], undecided())
+    assert scene.max_gaussians == 8000 and scene.decisions[-1] == "no trial of fewer Gaussians: out of memory"
+
+
+@pytest.mark.slow
+def test_training_goes_on_with_what_was_decided_when_it_began(small, tmp_path):
+    config = undecided(**{"capacity.iterations": 0})
+    scene = prepare([bare(frame, depth=frame.depth) for frame in small[:2]], config)
+    first = Trainer(dataclasses.replace(scene, max_gaussians=3000, fading=3.0), config)
+    for _ in range(3):
+        first.step()
+    first.save_checkpoint(tmp_path / "begun.ckpt")
+    second = Trainer(dataclasses.replace(scene, model=first.model), config)
+    second.load_checkpoint(tmp_path / "begun.ckpt")
+    for trainer in (first, second):
+        for _ in range(3):
+            trainer.step()
+    assert all(torch.equal(a, b) for a, b in zip(first.model.tensors().values(), second.model.tensors().values()))
+
+
 def test_trials_see_the_middle_of_the_views_without_the_left_out_blocks(small):
     views, given = with_prior(small[:2]), []
     scene = PreparedScene((), tuple(views), max_gaussians=4000, iterations=77)

@@ -110,12 +110,10 @@ def _names(sequences: Sequence[str]) -> dict[str, str]:
         if not place.startswith(PHANTOM) and not Path(place).exists():
             raise SequenceError(f"{place}: no such file or folder; give a bag, a recording, or {PHANTOM}0")
         find_named(source)
-        parts = [place] if place.startswith(PHANTOM) else list(Path(place).resolve().parts)
-        for length in range(1, len(parts) + 1):
-            name = "/".join(parts[-length:])
-            if name not in names:
-                break
-        else:
+        parts = Path(place).resolve().parts
+        longer = [place, source] if place.startswith(PHANTOM) else ["/".join(parts[-count:]) for count in range(1, len(parts) + 1)]
+        name = next((name for name in longer if name not in names), None)
+        if name is None or source in names.values():
             raise SequenceError(f"{source}: the same sequence twice")
         names[name] = source
     return names

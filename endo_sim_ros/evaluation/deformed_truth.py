@@ -2,6 +2,7 @@
 
 import dataclasses
 import logging
+import math
 from collections.abc import Sequence
 
 import cv2
@@ -22,7 +23,7 @@ _MARGIN = 4  # pixels around those that changed, which count too
 
 def deformed_truth_psnr(
     model: GaussianModel, patient: PhantomConfig, trained: Sequence[Camera], seen_from: Sequence[Camera], device: str, pull: float = 0.012
-) -> float:
+) -> tuple[float, float]:
     """PSNR, dB, of pictures of a model whose tissue is displaced as the patient's, over the pixels that the true pictures change.
 
     The patient is displaced by a known field (`displacement_at`) and filmed anew; the model's control nodes are moved by the same
@@ -37,25 +38,28 @@ def deformed_truth_psnr(
         pull: How far the tissue is pulled, metres.
 
     Returns:
-        The mean over the cameras; NaN if the patient was moving, no picture changes, or the model holds no control nodes.
+        The mean over the cameras that see a change, and that of the same pixels while both are at rest; displacement costs the difference.
+        NaN if the patient was moving or flown over, no picture changes, or the model holds no control nodes.
     """
-    if displacement_at(patient, 0.0) is not None:
-        return float("nan")
+    if displacement_at(patient, 0.0) is not None or patient.flight:
+        return math.nan, math.nan
     pulled = dataclasses.replace(patient, deformed=pull)
     try:
         rest = build_control_nodes(model, np.stack([each.position for each in trained]), PhysicsConfig(), trained, render_depth).rest
     except ValueError as error:  # next to nothing was reconstructed: the other figures stand
         log.warning("PSNR, deformed against truth, is left out: %s", error)
-        return float("nan")
+        return math.nan, math.nan
     displacement = displacement_at(pulled, 0.0)
     assert displacement is not None
     renderer = DeformableRenderer(model, rest, RenderingConfig(device=device))
-    positions, F = (np.float32(each) for each in (rest + displacement.at(rest), displacement.gradients(rest)))
+    moved = tuple(each.astype(np.float32) for each in (rest + displacement.at(rest), displacement.gradients(rest)))
     found = []
     for camera in seen_from:
         still, truth = (render_phantom(each, camera)[0] for each in (patient, pulled))
         changed = (np.abs(truth.astype(int) - still).max(-1) > _CHANGED).astype(np.uint8)
         if changed.any():
-            picture = renderer.views([camera], positions, F, depth=False)[0].image
-            found.append(metrics.psnr(picture, truth, cv2.dilate(changed, np.ones((2 * _MARGIN + 1,) * 2))))
-    return float(np.mean(found)) if found else float("nan")
+            where = cv2.dilate(changed, np.ones((2 * _MARGIN + 1,) * 2))
+            pairs = ((moved, truth), ((), still))
+            found.append([metrics.psnr(renderer.views([camera], *state, depth=False)[0].image, image, where) for state, image in pairs])
+    deformed, at_rest = np.mean(found, 0) if found else (math.nan, math.nan)
+    return float(deformed), float(at_rest)

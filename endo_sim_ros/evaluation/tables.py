@@ -22,6 +22,7 @@ from endo_sim_ros.evaluation.splits import explain_split
 COLUMNS = FIGURES | {
     "psnr_deformed": Figure("PSNR, deformed", "dB", 2),
     "psnr_deformed_truth": Figure("PSNR, deformed, against truth", "dB", 2),
+    "psnr_undeformed": Figure("the same pixels at rest", "dB", 2),
     "seconds": Figure("training", "s", 1),
     "gaussians": Figure("Gaussians", "", 0),
     "megabytes": Figure("peak memory", "MB", 0),
@@ -117,6 +118,7 @@ def notes(results: dict[str, Any]) -> list[str]:
         "Methods with an exposure take that of a held-out view from its brightness as rendered and from when it was taken.",
         "PSNR, deformed: over the pixels that change while a jaw moves the tissue; the reference is the model's own picture at rest, "
         "deformed with its surface.",
+        "Against truth: over the pixels that change when a synthetic patient is pulled by 12 mm and filmed anew; of a patient at rest.",
         "Seen: pixels with a depth whose surface a training view shows, too, visibility checked with the reference depth"
         + ("; without one, with the model's own." if models else "."),
         "Median scaled: depth times the factor that makes its median right. Depth stays in floating point throughout.",

@@ -119,7 +119,8 @@ def train_and_measure(argument: tuple[Cell, Path | None, Prepared | Path], devic
     deformed = {"psnr_deformed": deformed_view_psnr(model, cameras, device)}
     if patient := find_patient(cell.source):
         shown_from = [load(number).camera for number in sorted(shown)]
-        deformed["psnr_deformed_truth"] = deformed_truth_psnr(model, patient, cameras, shown_from, device)
+        names = "psnr_deformed_truth", "psnr_undeformed"
+        deformed |= dict(zip(names, deformed_truth_psnr(model, patient, cameras, shown_from, device)))
     deformed = {name: value for name, value in deformed.items() if np.isfinite(value)}
     rows, pictures, off, masked, size = [], {}, [], False, [0, 0]
     with ThreadPoolExecutor(cpu_threads()) as pool:  # measuring takes longer than drawing

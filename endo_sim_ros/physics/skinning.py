@@ -140,7 +140,7 @@ class Skinning:
         self._rest = rest = Skin()  # views of these tensors
         rest.means, rest.covars = viewed(self.means, wp.vec3), viewed(self.covars, wp.mat33)
         rest.neighbours, rest.weights = viewed(self.neighbours), viewed(self.weights)
-        rest.origin, (rest.low, rest.high) = self._origin, self.stretch
+        rest.origin, (rest.low, rest.high) = wp.vec3(*self._origin), self.stretch
 
     def deform(self, positions: Tensor | np.ndarray, F: Tensor | np.ndarray) -> tuple[Tensor, Tensor]:
         """Return means [N, 3] (m) and covariances [N, 3, 3] (m²) of the Gaussians.

@@ -45,10 +45,10 @@ def choose_capacity(
     views = [_middle(view, options.share) for view in scene.views]
     left_out = [_blocks(view, options.left_out, options.block, generator) for view in views]
     seen = [replace(view, mask=np.uint8(255) * ((view.tissue > 0) & ~pixels)) for view, pixels in zip(views, left_out)]
-    known = sum(int(((view.surface > 0) & (view.mask > 0)).sum()) for view in seen)
+    known = sum(int(((view.surface > 0) & (view.tissue > 0)).sum()) for view in seen)
     if min(known, sum(int(pixels.sum()) for pixels in left_out)) < _FEWEST:
         return scene.decided("no trial of fewer Gaussians: the middle of the views shows too little tissue of known depth", logging.INFO)
-    trial = replace(scene, frames=(), views=tuple(seen), iterations=options.iterations)
+    trial = replace(scene, frames=(), views=tuple(seen), iterations=min(options.iterations, scene.iterations))
     fewer = replace(scene, max_gaussians=max(int(options.fewer * scene.max_gaussians), 1), fading=options.fading * scene.fading)
     losses = []
     for candidate in (scene, fewer):
@@ -63,7 +63,7 @@ def choose_capacity(
             reason = "out of memory" if isinstance(error, torch.OutOfMemoryError) else str(error)
             return scene.decided(f"no trial of fewer Gaussians: {reason}", logging.INFO)
         losses.append(trainer.photometric_error(left_out))
-    progress(2 * options.iterations, 2 * options.iterations)
+    progress(2 * trial.iterations, 2 * trial.iterations)
     chosen = fewer if losses[1] < losses[0] else scene
     sentence = (
         f"of pixels left out of a trial the loss is {losses[0]:.4f}, and {losses[1]:.4f} with {options.fewer:.0%} of the Gaussians "

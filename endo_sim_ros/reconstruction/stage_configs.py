@@ -261,7 +261,7 @@ class CapacityConfig(StageConfig):
     """The trial of fewer Gaussians, where few views leave their number to ``training.min_gaussians``."""
 
     iterations: Annotated[int, Range(0, 100_000)] = 1000
-    """Optimisation steps of each trial; 0 = no trial."""
+    """Optimisation steps of each trial, if the training has as many; 0 = no trial."""
     fewer: Annotated[float, Range(0.01, 1)] = 0.4
     """Share of the Gaussians that is tried beside all of them."""
     fading: Annotated[float, Range(0.1, 100)] = 3.0

@@ -11,6 +11,7 @@ import pytest
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.evaluation import paper, tables
+from endo_sim_ros.evaluation.cells import list_cells
 from endo_sim_ros.evaluation.config import EvaluationConfig
 from endo_sim_ros.evaluation.evaluate import evaluate
 from endo_sim_ros.evaluation.page import write_page
@@ -232,3 +233,11 @@ def test_the_page_needs_nothing_else_and_sorts_and_slides(run, chromium):
 def test_a_folder_without_results_is_an_error(tmp_path):
     with pytest.raises(ValueError, match="no results of an evaluation .* give the --out of"):
         write_page(tmp_path)
+
+
+def test_patients_are_told_apart_by_their_options():
+    sources = ["phantom:0,frames=5", "phantom:0,frames=5,deformed=0.01"]
+    cells, _ = list_cells(sources, EvaluationConfig(splits=("two-views",), presets=("3dgs",), lpips=()))
+    assert [cell.sequence for cell in cells] == ["phantom:0", "phantom:0,frames=5,deformed=0.01"]
+    with pytest.raises(SequenceError, match="the same sequence twice"):
+        list_cells([sources[0]] * 2, EvaluationConfig(splits=("two-views",)))

@@ -90,7 +90,7 @@ def test_training_goes_on_with_what_was_decided_when_it_began(small, tmp_path):
 
 def test_trials_see_the_middle_of_the_views_without_the_left_out_blocks(small):
     views, given = with_prior(small[:2]), []
-    scene = PreparedScene((), tuple(views), max_gaussians=4000, iterations=77)
+    scene = PreparedScene((), tuple(views), max_gaussians=4000, iterations=900)
 
     class Seen(Exception):
         pass

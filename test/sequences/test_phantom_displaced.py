@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.sequences.phantom import (
     Displacement,
     PhantomConfig,
@@ -68,6 +69,17 @@ def test_every_point_that_is_seen_was_on_the_surface(camera):
     assert moved.max() > 0.01 and np.median(moved) < 0.003
     off = np.abs(rest[:, 2] - build_phantom(0).height(rest[:, 0], rest[:, 1]))
     assert np.quantile(off, 0.99) < 5e-5 and off.max() < 1e-3  # along a steep edge a hair aside is far in z
+
+
+def test_what_would_fold_tissue_is_refused():
+    PhantomConfig(deformed=0.03)
+    with pytest.raises(ConfigError, match="together fold the tissue"):
+        PhantomConfig(deformed=0.03, breathing=0.03, heartbeat=0.01)
+    grid = np.stack(np.meshgrid(*[np.linspace(low, high, 41) for low, high in ((-0.1, 0.1), (-0.1, 0.1), (0, 0.2))]), -1).reshape(-1, 3)
+    for seed in range(20):
+        config = PhantomConfig(seed=seed, deformed=0.015, breathing=0.03, heartbeat=0.007)
+        displacement = displacement_at(config, 2.0 + 0.025)  # breath at its height, and the heart nearly so
+        assert displacement is not None and np.linalg.det(displacement.gradients(grid)).min() > 0.05
 
 
 def test_breath_and_heart_go_there_and_back_in_their_time():

@@ -4,7 +4,12 @@ import math
 from dataclasses import dataclass
 from typing import Annotated
 
-from endo_sim_ros.core.config import Range, StageConfig
+from endo_sim_ros.core.config import ConfigError, Range, StageConfig
+
+PULL_RADIUS = 0.02  # metres, standard deviation of what moves: about what a grasper takes along
+BREATH_RADIUS = 0.06  # the diaphragm moves whole organs
+HEART_RADIUS = 0.03  # the heart moves what lies on it
+_STEEPEST = 0.92  # gradient of a displacement; with 1 tissue could fold
 
 
 @dataclass(frozen=True)
@@ -46,7 +51,8 @@ class PhantomConfig(StageConfig):
     """Black frame with round corners, as a fraction of the image height; masked out, without depth."""
 
     deformed: Annotated[float, Range(0.0, 0.03, "m")] = 0.0
-    """How far tissue in the middle is pulled towards the endoscope and aside, within 2 cm around, in all frames."""
+    """How far tissue in the middle of the flight is pulled towards the endoscope and aside, in all frames; 2 cm off it follows by 0.6
+    of it, 4 cm off by 0.14."""
     breathing: Annotated[float, Range(0.0, 0.03, "m")] = 0.0
     """How far breath moves the organs there and back."""
     breathing_period: Annotated[float, Range(0.1, 60.0, "s")] = 4.0
@@ -55,6 +61,16 @@ class PhantomConfig(StageConfig):
     """How far the heart moves what lies on it."""
     heartbeat_period: Annotated[float, Range(0.1, 10.0, "s")] = 0.9
     """Time from beat to beat."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        # The largest gradient of a Gaussian bump is its height over its radius, times exp(−1/2).
+        steepest = math.exp(-0.5) * (self.deformed / PULL_RADIUS + self.breathing / BREATH_RADIUS + self.heartbeat / HEART_RADIUS)
+        if steepest > _STEEPEST:
+            raise ConfigError(
+                f"deformed {self.deformed:g} m, breathing {self.breathing:g} m and heartbeat {self.heartbeat:g} m together fold the "
+                "tissue; give less of them"
+            )
 
     @property
     def sections(self) -> int:

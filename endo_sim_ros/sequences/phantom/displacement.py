@@ -5,10 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from endo_sim_ros.sequences.phantom.config import PhantomConfig
+from endo_sim_ros.sequences.phantom.config import BREATH_RADIUS, HEART_RADIUS, PULL_RADIUS, PhantomConfig
 
-_PULL_RADIUS = 0.02  # metres, standard deviation: about what a grasper takes along
-_BREATH_RADIUS, _HEART_RADIUS = 0.06, 0.03  # the diaphragm moves whole organs, the heart what lies on it
 _MIDDLE = 0.13  # metres, world z about which tissue lies
 
 
@@ -56,5 +54,5 @@ def displacement_at(config: PhantomConfig, seconds: float) -> Displacement | Non
     breath = 0.5 - 0.5 * math.cos(2 * math.pi * seconds / config.breathing_period)
     heart = math.exp(-0.5 * ((seconds / config.heartbeat_period % 1.0 - 0.25) / 0.08) ** 2)
     amplitudes = (largest * [1.0, breath, heart])[:, None] * directions
-    moving, radii = largest > 0, np.array([_PULL_RADIUS, _BREATH_RADIUS, _HEART_RADIUS])
+    moving, radii = largest > 0, np.array([PULL_RADIUS, BREATH_RADIUS, HEART_RADIUS])
     return Displacement(centres[moving], amplitudes[moving], radii[moving])

@@ -168,6 +168,7 @@ def test_what_is_not_there_is_told_before_any_work(tmp_path):
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_reader_takes_its_options_from_the_name(small_bag, small_frames, tmp_path):
     assert [f.stamp_ns for f in open_named(f"{small_bag},start=2,step=4")] == [f.stamp_ns for f in small_frames[2::4]]
     with pytest.raises(SequenceError, match="a bag has no option fps"):

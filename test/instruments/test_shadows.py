@@ -50,6 +50,7 @@ def disc(count):
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(count)], 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CAPSULES)
 def test_a_shadow_lies_where_the_lamp_is_hidden(name):
     config = DrawingConfig(ambient=0.0, lamp_x=0.012, lamp_y=-0.006, lamp_size=3e-3)

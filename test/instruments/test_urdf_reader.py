@@ -112,7 +112,7 @@ def test_the_file_of_another_tool_is_refused(tmp_path):
     ("mesh", "sentence"),
     [
         (trimesh.creation.box((8, 8, 9100)), "is 9.1e.03 m long; if its unit is not the metre"),
-        (trimesh.creation.icosphere(7, 0.004), "triangles; simplify them to less than 200000"),
+        pytest.param(trimesh.creation.icosphere(7, 0.004), "triangles; simplify them to less than 200000", marks=pytest.mark.slow),
         (b"solid nothing", "has no triangles|cannot be read"),
     ],
 )

@@ -19,6 +19,7 @@ from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import PreparedScene, ScenePoints, TrainingView, shrink
 from endo_sim_ros.reconstruction.stage_configs import PlaneSweepConfig
 
+pytestmark = pytest.mark.slow
 NEAR, FAR = 0.06, 0.1  # m
 WIDTH, HEIGHT = 160, 128
 

@@ -71,6 +71,7 @@ def test_every_point_that_is_seen_was_on_the_surface(camera):
     assert np.quantile(off, 0.99) < 5e-5 and off.max() < 1e-3  # along a steep edge a hair aside is far in z
 
 
+@pytest.mark.slow
 def test_what_would_fold_tissue_is_refused():
     PhantomConfig(deformed=0.03)
     with pytest.raises(ConfigError, match="together fold the tissue"):

@@ -345,6 +345,7 @@ def test_scared_dataset_folder_lists_its_keyframes(scared):
         open_sequence(scared.parent)
 
 
+@pytest.mark.slow
 def test_a_pose_that_is_none_matters_only_where_its_frame_is_asked_for(scared):
     write_scared(scared, count=3)
     extract(scared, "frame_data")

@@ -5,20 +5,17 @@ import logging
 import math
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.evaluation import metrics
+from endo_sim_ros.evaluation.deformed_views import changed_pixels
 from endo_sim_ros.physics import PhysicsConfig, build_control_nodes
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig, render_depth
 from endo_sim_ros.sequences.phantom import PhantomConfig, displacement_at, render_phantom
 
 log = logging.getLogger(__name__)
-
-_CHANGED = 6  # difference from rest, grey levels of 255, above which a pixel has changed
-_MARGIN = 4  # pixels around those that changed, which count too
 
 
 def deformed_truth_psnr(
@@ -56,10 +53,9 @@ def deformed_truth_psnr(
     found = []
     for camera in seen_from:
         still, truth = (render_phantom(each, camera)[0] for each in (patient, pulled))
-        changed = (np.abs(truth.astype(int) - still).max(-1) > _CHANGED).astype(np.uint8)
+        changed = changed_pixels(truth, still)
         if changed.any():
-            where = cv2.dilate(changed, np.ones((2 * _MARGIN + 1,) * 2))
             pairs = ((moved, truth), ((), still))
-            found.append([metrics.psnr(renderer.views([camera], *state, depth=False)[0].image, image, where) for state, image in pairs])
+            found.append([metrics.psnr(renderer.views([camera], *state, depth=False)[0].image, image, changed) for state, image in pairs])
     deformed, at_rest = np.mean(found, 0) if found else (math.nan, math.nan)
     return float(deformed), float(at_rest)

@@ -43,6 +43,12 @@ def deformed_view_psnr(model: GaussianModel, cameras: Sequence[Camera], device: 
         return float("nan")
 
 
+def changed_pixels(image: np.ndarray, at_rest: np.ndarray) -> np.ndarray:
+    """Mask [H, W] (uint8, 1 or 0) of where an image [H, W, 3] (uint8) differs from the one at rest, and a margin around."""
+    changed = np.abs(image.astype(int) - at_rest).max(-1) > _CHANGED
+    return cv2.dilate(changed.astype(np.uint8), np.ones((2 * _MARGIN + 1,) * 2))
+
+
 def _deformed_view_psnr(model: GaussianModel, cameras: Sequence[Camera], device: str) -> float:
     camera, options = cameras[len(cameras) // 2], RenderingConfig(device=device)
     model = dataclasses.replace(model, light=None)
@@ -69,9 +75,9 @@ def _deformed_view_psnr(model: GaussianModel, cameras: Sequence[Camera], device:
             continue
         state = simulation.state()
         picture, expected = (each.views([camera], state.positions, state.F, depth=False)[0].image for each in (ours, reference))
-        changed = (np.abs(expected - at_rest).max(-1) > _CHANGED).astype(np.uint8)
+        changed = changed_pixels(expected, at_rest)
         if changed.any():
-            found.append(metrics.psnr(picture, expected, cv2.dilate(changed, np.ones((2 * _MARGIN + 1,) * 2))))
+            found.append(metrics.psnr(picture, expected, changed))
     return float(np.mean(found)) if found else float("nan")
 
 

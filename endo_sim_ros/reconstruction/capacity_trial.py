@@ -1,4 +1,4 @@
-"""Cross-validation of how many Gaussians few views can tell of: which number foretells pixels best that a short training did not see."""
+"""Cross-validation of the number of Gaussians for few views: which number predicts left-out pixels best after a short training."""
 
 import logging
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import PreparedScene, TrainingView
 from endo_sim_ros.reconstruction.trainer import Trainer
 
-_FEWEST = 500  # pixels, those that are left out and those whose depth is known, from which on a trial tells something
+_FEWEST = 500  # left-out pixels, and pixels of known depth, that a trial needs
 _EVERY = 10  # iterations between two reports
 
 
@@ -23,16 +23,14 @@ def choose_capacity(
     start: Callable[[PreparedScene], PreparedScene],
     progress: StageProgress,
 ) -> PreparedScene:
-    """Try fewer Gaussians and stronger fading beside what the scene has, and keep what foretells left-out pixels better.
+    """The scene with its own number of Gaussians, or with fewer that fade faster: whichever predicts left-out pixels better.
 
-    A trial that cannot be made, as too little is seen or memory is short, leaves the scene as it is; a decision says so.
-
-    Few views are memorised with their noise by many Gaussians; fewer are too smooth for clean pictures. Which of both the pictures are,
-    the views tell by themselves: blocks of pixels, left out of a short training with the middle of the views, are foretold worse by
-    Gaussians that memorise what is around them.
+    With few views many Gaussians memorise noise, and few smooth away detail. Both are trained briefly on the middle of the views without
+    some blocks of pixels; Gaussians that memorise predict those blocks worse. Where no trial can be made, because too little is seen or
+    memory is short, the scene stays as it is, and a decision says so.
 
     Args:
-        scene: Views and depth prior; `max_gaussians` and `fading` are what is tried first.
+        scene: Views with depth prior, `max_gaussians` and `fading`.
         config: Options.
         start: Places the Gaussians that a training of a scene starts from.
         progress: Reported to by iterations.
@@ -65,10 +63,9 @@ def choose_capacity(
         losses.append(trainer.photometric_error(left_out))
     progress(2 * trial.iterations, 2 * trial.iterations)
     chosen = fewer if losses[1] < losses[0] else scene
-    sentence = (
-        f"of pixels left out of a trial the loss is {losses[0]:.4f}, and {losses[1]:.4f} with {options.fewer:.0%} of the Gaussians "
-        f"that fade {options.fading:g} times as fast: {chosen.max_gaussians} at most{', which do' if chosen is fewer else ''}"
-    )
+    decided = f"{chosen.max_gaussians} Gaussians at most" + (f", weight of fading × {options.fading:g}" if chosen is fewer else "")
+    tried = f"with {options.fewer:.0%} of the Gaussians and {options.fading:g} times the weight of fading"
+    sentence = f"loss of left-out pixels {losses[0]:.4f}, and {losses[1]:.4f} {tried}: {decided}"
     return chosen.decided(sentence, logging.INFO)
 
 

@@ -261,17 +261,21 @@ class CapacityConfig(StageConfig):
     """The trial of fewer Gaussians, where few views leave their number to ``training.min_gaussians``."""
 
     iterations: Annotated[int, Range(0, 100_000)] = 1000
-    """Optimisation steps of each trial, if the training has as many; 0 = no trial."""
+    """Optimisation steps of each of the two trainings, if the training has as many: after half as many noise is not memorised yet, twice
+    as many decide alike. 0 = no trial."""
     fewer: Annotated[float, Range(0.01, 1)] = 0.4
-    """Share of the Gaussians that is tried beside all of them."""
+    """Share of the Gaussians that is tried beside all of them; with half of 0.4 LPIPS is worse
+    on all recordings of the development set."""
     fading: Annotated[float, Range(0.1, 100)] = 3.0
-    """Factor on ``lambda_opacity`` and ``lambda_scale`` that is tried with it."""
+    """Factor on ``lambda_opacity`` and ``lambda_scale`` that is tried with it: fewer Gaussians alone bring about
+    two thirds of the SSIM."""
     share: Annotated[float, Range(0.1, 1)] = 0.5
-    """Share of the width and height of the views, their middle, and of the Gaussians for each of both."""
+    """Share of the width and height of the views, their middle, and of the Gaussians along both: a quarter of the
+    pixels."""
     left_out: Annotated[float, Range(0.005, 0.5)] = 0.05
-    """Share of the pixels that the trial does not see."""
+    """Share of the pixels that the trial does not see: enough to tell losses apart, too few to make the training another one."""
     block: Annotated[int, Range(1, 100, "pixels")] = 6
-    """Side of the squares that they are left out in: single pixels are foretold by their neighbours, noise and all."""
+    """Side of the squares that they are left out in: single pixels are predicted by their neighbours, noise and all."""
 
 
 @dataclass(frozen=True)

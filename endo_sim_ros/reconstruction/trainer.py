@@ -124,8 +124,7 @@ class Trainer:
         for view, chosen in zip(self._device_views, pixels, strict=True):
             output = self.render(*matrices([view.camera], self.device), (view.camera.width, view.camera.height))[1]
             rays = directions(view.camera, self.device) if self.config.light else None
-            gain = self.appearance.gain(output.depths[0], output.alphas[0], rays, view.index_tensor)
-            color = output.colors[0] if gain is None else output.colors[0] * gain
+            color = self._exposed(output, rays, view.index_tensor)
             where = torch.tensor(chosen, device=self.device)
             l1, unlike = (color - view.image).abs()[where], 1 - ssim(color, view.image)[where]
             total += float(torch.lerp(l1, unlike, self.config.lambda_ssim).mean(1, dtype=torch.float64).sum())
@@ -343,14 +342,18 @@ class Trainer:
         images = lambda camera: (model, *(images[camera] for images in (output.depths, output.alphas, output.distortions)))
         of_scene = {"eye": self._eye, "scene_depth": self.scene_depth, "seen": self._seen}
         seen = losses.Rendering(*images(0), mask=view.mask, prior=view.prior, **of_scene)
-        gain = self.appearance.gain(seen.depth, seen.alpha, view.rays, view.exposure)
-        color = output.colors[0] if gain is None else output.colors[0] * gain
+        color = self._exposed(output, view.rays, view.exposure)
         loss = losses.photometric(color, view.image, view.mask, config.lambda_ssim)
         loss = losses.regularized(loss, terms, seen, self._weights)
         if len(view.viewmats) > 1:
             seen = losses.Rendering(*images(1), mask=None, prior=view.virtual_prior, **of_scene)
             loss = losses.regularized(loss, terms, seen, self._weights, virtual=True)
         return loss + config.light_anchor * self.appearance.changes() if config.light else loss
+
+    def _exposed(self, output: RenderOutput, rays: Tensor | None, exposure: Tensor) -> Tensor:
+        """The first camera's colours [H, W, 3] in the light and with the exposure of a training view."""
+        gain = self.appearance.gain(output.depths[0], output.alphas[0], rays, exposure)
+        return output.colors[0] if gain is None else output.colors[0] * gain
 
     # --------------------------------------------------------------- Gaussians
 

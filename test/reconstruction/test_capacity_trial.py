@@ -24,7 +24,7 @@ def undecided(**changes):
 
 @pytest.mark.slow
 def test_noise_asks_for_fewer_gaussians_and_clean_pictures_do_not(small):
-    """Noise of independent pixels cannot be foretold: whatever memorises it foretells worse."""
+    """Noise of independent pixels cannot be predicted: whatever memorises it predicts worse."""
     clean, generator = [bare(frame, depth=frame.depth) for frame in small[2:7:4]], np.random.default_rng(0)
     noisy = [
         dataclasses.replace(frame, image=np.clip(frame.image + generator.normal(0, 12, frame.image.shape), 0, 255).astype(np.uint8))
@@ -34,7 +34,7 @@ def test_noise_asks_for_fewer_gaussians_and_clean_pictures_do_not(small):
     assert (scene.max_gaussians, scene.fading) == (8000, 1.0)
     scene = prepare(noisy, undecided())
     assert (scene.max_gaussians, scene.fading) == (3200, 3.0)
-    assert "left out" in scene.decisions[-1] and "3200 at most" in scene.decisions[-1]
+    assert "left-out pixels" in scene.decisions[-1] and "3200 Gaussians at most, weight of fading × 3" in scene.decisions[-1]
 
 
 @pytest.mark.slow

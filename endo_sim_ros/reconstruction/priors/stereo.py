@@ -46,9 +46,8 @@ def stereo_depth(
 
 def right_camera(frame: Frame) -> Camera:
     """The camera of a stereo frame's right eye."""
-    pose = frame.camera.pose.copy()
-    pose[:3, 3] += frame.baseline * pose[:3, 0]
-    return dataclasses.replace(frame.camera, K=_right_K(frame), pose=pose)
+    assert frame.baseline is not None
+    return dataclasses.replace(frame.camera.beside(frame.baseline), K=_right_K(frame))
 
 
 def right_view(frame: Frame, options: StereoConfig = StereoConfig()) -> Frame:

@@ -18,6 +18,7 @@ from endo_sim_ros.sequences.bag import BagReader
 
 _ARROW_PIXELS = 0.3  # length of the largest force's arrow, in image widths
 _RENDERED = (*messages.RENDERED_TOPICS, messages.RENDERED_COMPRESSED)  # of the two forms of images either will do
+_AHEAD = 0.5  # seconds, ample, by which an instrument may be seen before the first stamp of its pose
 _MOMENTS = (0.33, 0.6, 0.9)  # of the time in which the tool acts
 
 
@@ -64,7 +65,9 @@ class TouchReport:
         self._times = [time for time in self._times if time >= began]
         if not self._times or not before:
             raise SequenceError(f"{recording}: no images were rendered before and while the tool {arm} acted")
-        self._rest = before[-1]
+        # In real time an image shows the newest links, which may be newer than the state that it is stamped by.
+        alone = [time for time in before if time < began - _AHEAD]
+        self._rest = alone[-1] if alone else before[0]
         track = _Track(poses)
         self._tips = _Track([(time, pose[:3, :3] @ point + pose[:3, 3]) for time, pose in poses])
         self._forces = _Track([(time, -track.at(time)[:3, :3] @ force) for time, force in felt])

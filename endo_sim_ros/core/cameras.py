@@ -7,6 +7,7 @@ quaternions are wxyz. Pixel (0, 0) has its centre at (0.5, 0.5), so that scaling
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -52,9 +53,9 @@ class Camera:
         object.__setattr__(self, "K", K)
         object.__setattr__(self, "pose", pose)
 
-    @property
+    @functools.cached_property
     def viewmat(self) -> np.ndarray:
-        """World-to-camera transform [4, 4]."""
+        """World-to-camera transform [4, 4], which is kept."""
         return invert_pose(self.pose)
 
     @property
@@ -79,10 +80,10 @@ class Camera:
 
     def rays(self) -> np.ndarray:
         """Directions through every pixel centre with unit z, camera frame [H, W, 3]."""
-        u, v = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
-        x = (u - self.K[0, 2]) / self.K[0, 0]
-        y = (v - self.K[1, 2]) / self.K[1, 1]
-        return np.stack([x, y, np.ones_like(x)], -1)
+        rays = np.ones((self.height, self.width, 3))
+        rays[..., 0] = (np.arange(self.width) + 0.5 - self.K[0, 2]) / self.K[0, 0]
+        rays[..., 1] = ((np.arange(self.height) + 0.5 - self.K[1, 2]) / self.K[1, 1])[:, None]
+        return rays
 
     def backproject(self, depth: np.ndarray) -> np.ndarray:
         """World points [H, W, 3] of a depth image (z along the optical axis, metres) [H, W]."""

@@ -1,6 +1,7 @@
 """Devices and threads: one name of a device for torch and Warp, Warp on torch's streams, and shares of work."""
 
 import contextlib
+import ctypes
 import functools
 import os
 import sys
@@ -63,23 +64,40 @@ def _silent_stderr():
 
 def on_torch_stream(device: torch.device | str) -> contextlib.AbstractContextManager:
     """Return a context within which Warp works on torch's current stream of a CUDA device, in order with torch's own work."""
-    if torch.device(device).type == "cpu":
+    index = gpu_index(device)
+    if index is None:
         return contextlib.nullcontext()
     import warp as wp
 
-    return wp.ScopedStream(warp_stream(torch.cuda.current_stream(device)), sync_enter=False)
+    return wp.ScopedStream(current_warp_stream(index), sync_enter=False)
+
+
+def gpu_index(device: torch.device | str) -> int | None:
+    """Return the number of a GPU, None for a CPU."""
+    device = torch.device(device)
+    if device.type == "cpu":
+        return None
+    return torch.cuda.current_device() if device.index is None else device.index
+
+
+def current_warp_stream(index: int) -> "wp.Stream":
+    """Return Warp's object for torch's current stream of a GPU, by its number.
+
+    Torch gives the bare handle, as every launch asks for it, and making a `torch.cuda.Stream` takes longer than all else here.
+    """
+    return _warp_stream(index, torch._C._cuda_getCurrentRawStream(index))
 
 
 def warp_stream(stream: torch.cuda.Stream) -> "wp.Stream":
     """Return Warp's object for a stream of torch: one that is kept, because Warp forgets what it knows of a stream with the object."""
-    return _warp_stream(stream.device, stream.cuda_stream)
+    return _warp_stream(stream.device.index, stream.cuda_stream)
 
 
 @functools.cache
-def _warp_stream(device: torch.device, handle: int) -> "wp.Stream":
+def _warp_stream(index: int, handle: int) -> "wp.Stream":
     import warp as wp
 
-    return wp.Stream(wp.device_from_torch(device), cuda_stream=handle)
+    return wp.Stream(wp.get_device(f"cuda:{index}"), cuda_stream=handle)
 
 
 def upload(device: torch.device | str, *arrays: np.ndarray) -> list[Tensor]:
@@ -89,10 +107,10 @@ def upload(device: torch.device | str, *arrays: np.ndarray) -> list[Tensor]:
     """
     sizes, on_host = [array.size for array in arrays], torch.device(device).type == "cpu"
     flat = torch.empty(sum(sizes), dtype=torch.float32, pin_memory=not on_host)
-    np.concatenate([array.reshape(-1) for array in arrays], out=flat.numpy(), casting="same_kind")
+    np.concatenate(arrays, None, flat.numpy(), casting="same_kind")
     if not on_host:
         flat = flat.to(device, non_blocking=True)
-    return [part.view(array.shape) for part, array in zip(flat.split(sizes), arrays)]
+    return [part.view(array.shape) for part, array in zip(flat.split_with_sizes(sizes), arrays)]
 
 
 def download(*tensors: Tensor) -> list[np.ndarray]:
@@ -118,6 +136,12 @@ def cpu_threads() -> int:
     if not wanted.isdecimal():
         raise ValueError(f"ENDO_SIM_THREADS is {wanted!r}; it must be a number of threads, or 0 for as many as there are cores")
     return int(wanted) or available
+
+
+def return_freed_memory() -> None:
+    """Give back to the system the memory of arrays that are gone, which glibc keeps for new ones of the thread that made them."""
+    with contextlib.suppress(AttributeError, OSError, TypeError):  # no such function, or no way to ask for one
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 @contextlib.contextmanager

@@ -1,6 +1,5 @@
 """What all benchmarks share: medians, rows of results, the table that people read and the file that machines read."""
 
-import ctypes
 import json
 import platform
 import statistics
@@ -15,7 +14,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from endo_sim_ros.core.device import cpu_threads
+from endo_sim_ros.core.device import cpu_threads, return_freed_memory
 
 
 @dataclass(frozen=True)
@@ -128,7 +127,7 @@ def peak_megabytes(action: Callable[[], object], device: str) -> float | None:
         warp = max(wp.get_mempool_used_mem_high(device) - warp_before, 0)
         return (torch.cuda.max_memory_allocated(device) - before + warp) / 1e6
     try:
-        ctypes.CDLL(None).malloc_trim(0)  # else the allocator would serve the action from what it keeps
+        return_freed_memory()  # else the allocator would serve the action from what it keeps
         Path("/proc/self/clear_refs").write_text("5")  # sets the peak to what is resident now
         before = status_kilobytes("VmRSS")
         action()

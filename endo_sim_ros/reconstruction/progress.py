@@ -4,7 +4,7 @@ import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 
-from endo_sim_ros.core.device import cpu_threads
+from endo_sim_ros.core.device import cpu_threads, return_freed_memory
 
 OnProgress = Callable[[str, int, int], None]
 """``on_progress(stage, done, total)``; total is 0 where it is unknown. It may be called from several threads, and cancels the work by
@@ -71,4 +71,5 @@ class StageProgress:
             wait([future for future in futures if not future.cancelled()], timeout=0.5)
             raise
         pool.shutdown()
+        return_freed_memory()  # of threads that have ended
         return [future.result() for future in futures]

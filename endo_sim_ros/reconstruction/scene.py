@@ -144,8 +144,6 @@ def shrink(frame: AnyFrame, width: int) -> AnyFrame:
         return frame
     size = (width, max(round(camera.height * width / camera.width), 1))
     average = lambda image: cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    # Plain INTER_NEAREST takes the corner instead of the centre.
-    nearest = lambda depth: cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT)
     all_tissue = 0.999  # share of a pixel: an average of ones may be rounded
     depths = {name: getattr(frame, name, None) for name in ("depth", "depth_prior")}
     scale = np.diag([size[0] / camera.width, size[1] / camera.height, 1])
@@ -156,5 +154,11 @@ def shrink(frame: AnyFrame, width: int) -> AnyFrame:
         right=None if frame.right is None else average(frame.right),
         right_K=None if frame.right_K is None else scale @ frame.right_K,
         mask=None if frame.mask is None else np.uint8(255) * (average(np.float32(frame.mask > 0)) > all_tissue),
-        **{name: nearest(depth) for name, depth in depths.items() if depth is not None},
+        **{name: resized_depth(depth, *size) for name, depth in depths.items() if depth is not None},
     )
+
+
+def resized_depth(depth: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Depth [H, W] in another size, pixels: that at the centre of each pixel."""
+    # Plain INTER_NEAREST takes the corner instead of the centre.
+    return cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)

@@ -1,10 +1,10 @@
 """Sequences as cells use them: what is read, what is kept, and how much memory it takes."""
 
-import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import pytest
+from peak_memory import peak_of
 from rich.progress import Progress
 
 from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
@@ -31,16 +31,6 @@ def long_bag(path: Path, count: int) -> Path:
 
     write_bag(path, map(frame, range(count)))
     return path
-
-
-def peak_of(action) -> float:
-    """Megabytes that an action held at its worst."""
-    tracemalloc.start()
-    try:
-        action()
-        return tracemalloc.get_traced_memory()[1] / 1e6
-    finally:
-        tracemalloc.stop()
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from peak_memory import peak_of
 from short_training import NO_POINTS, bare, options
 from training_views import unknown
 
@@ -29,8 +30,10 @@ def test_a_wrong_principal_point_of_the_right_eye_is_found(large):
     points = triangulate(list(large))
     right = [np.ascontiguousarray(np.roll(frame.right, -3, axis=1)) for frame in large]  # as if cx were 3 pixels less
     wrong = [dataclasses.replace(frame, right=image) for frame, image in zip(large, right)]
-    offset = disparity_offsets(wrong, [stereo_disparity(frame) for frame in wrong], points)
-    np.testing.assert_allclose(offset, -3, atol=0.25)
+    disparities = [stereo_disparity(frame) for frame in wrong]
+    np.testing.assert_allclose(disparity_offsets(wrong, disparities, points), -3, atol=0.25)
+    many = lambda: disparity_offsets(8 * wrong, 8 * disparities, points)
+    assert peak_of(many) < 0.3 * 8 * sum(disparity.nbytes for disparity in disparities) / 1e6, "copies of them all take gigabytes"
     K = large[0].camera.K - np.array([[0, 0, 3.0], [0, 0, 0], [0, 0, 0]])
     known = [dataclasses.replace(frame, right_K=K) for frame in wrong]
     assert disparity_offsets(known, [stereo_disparity(frame) for frame in known], points).max() == pytest.approx(0, abs=0.25)

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from peak_memory import peak_of
 from short_training import NO_POINTS, bare, options
 from training_views import unknown, with_prior
 
@@ -17,7 +18,7 @@ from endo_sim_ros.reconstruction.priors import smoothing_kernels
 from endo_sim_ros.reconstruction.priors.inverse_depth import correct, smooth
 from endo_sim_ros.reconstruction.priors.multi_view import refine_depth
 from endo_sim_ros.reconstruction.priors.sources import estimate_depth
-from endo_sim_ros.reconstruction.scene import ScenePoints, shrink
+from endo_sim_ros.reconstruction.scene import ScenePoints, TrainingView, shrink
 
 
 def matched(frames):
@@ -72,6 +73,22 @@ def test_views_come_back_as_narrow_as_asked_for(large):
     for view, full in zip(shrunk, alone):
         assert view.image.shape == (128, 160, 3) and full.image.shape == (512, 640, 3)
         np.testing.assert_array_equal(view.depth_prior, shrink(full, 160).depth_prior)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("source", ["stereo", "network"])
+def test_a_view_more_takes_no_more_memory_than_the_view_itself(small, monkeypatch, source):
+    monkeypatch.setenv("ENDO_SIM_THREADS", "1")  # each thread has arrays of its own
+
+    def copies(count):
+        for frame in small[:count]:
+            image, right = frame.image.copy(), frame.right.copy() if source == "stereo" else None
+            yield dataclasses.replace(TrainingView.of(frame), image=image, right=right, depth=None, depth_prior=frame.depth.copy())
+
+    peak = lambda count: peak_of(lambda: refine_depth(copies(count), NO_POINTS, source, width=40))
+    peak(5)  # what is made once
+    held = sum(array.nbytes for array in vars(next(copies(1))).values() if isinstance(array, np.ndarray)) / 1e6
+    assert peak(9) - peak(5) < 1.05 * 4 * held
 
 
 @pytest.mark.slow

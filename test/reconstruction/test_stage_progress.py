@@ -1,6 +1,7 @@
 """Every stage of the preparation reports its progress, and stops when it is cancelled."""
 
 import dataclasses
+import platform
 import threading
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from short_training import options
 from training_views import with_prior
 
+from endo_sim_ros.evaluation.measurement import status_kilobytes
 from endo_sim_ros.reconstruction.dynamic_mask import mask_motion
 from endo_sim_ros.reconstruction.pipeline import STAGES
 from endo_sim_ros.reconstruction.priors.multi_view import refine_depth
@@ -87,3 +89,13 @@ def test_a_stage_leaves_the_views_it_is_given_as_they_are(small):
     estimate_depth([dataclasses.replace(view, depth=view.depth_prior) for view in views], SCENE_POINTS, options(depth="topic"))
     for view, arrays in zip(views, before):
         assert all((getattr(view, name) == value).all() for name, value in arrays.items())
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="needs glibc on Linux")
+def test_threads_leave_no_freed_memory_behind():
+    def last(_) -> np.ndarray:  # after 20 MB, which it keeps from being given back by themselves
+        return [np.ones(100_000, np.uint8) for _ in range(200)][-1]
+
+    before = status_kilobytes("VmRSS")
+    kept = StageProgress().map(last, range(4))
+    assert len(kept) == 4 and status_kilobytes("VmRSS") - before < 10_000

@@ -16,7 +16,16 @@ class EyeImage(NamedTuple):
 
     camera: Camera
     grey: np.ndarray  # [H, W] uint8, freed of light and contrast
-    matte: np.ndarray  # [H, W] bool as uint8: tissue without reflections of the light
+    bits: np.ndarray  # [H, ⌈W / 8⌉] uint8, the matte in an eighth of its memory, as images of all views are kept
+
+    @property
+    def matte(self) -> np.ndarray:
+        """Tissue without reflections of the light [H, W], uint8, 1 or 0."""
+        return np.unpackbits(self.bits, 1, count=self.camera.width)
+
+    def with_matte(self, matte: np.ndarray) -> "EyeImage":
+        """The same with another matte [H, W], 0 where it does not count."""
+        return self._replace(bits=np.packbits(matte > 0, 1))
 
 
 class FlowCorrection(NamedTuple):
@@ -35,7 +44,7 @@ def eye_image(frame: Frame, options: MultiViewConfig) -> EyeImage:
     mean = around(grey * tissue) / share
     variance = np.maximum(around(grey * grey * tissue) / share - mean * mean, 0)
     grey = np.clip(128 + 40 * (grey - mean) / np.sqrt(variance + 4), 0, 255).astype(np.uint8)  # 2 grey levels are noise
-    return EyeImage(frame.camera, grey, tissue.astype(np.uint8) * ~_reflections(frame.image, tissue, options))
+    return EyeImage(frame.camera, grey, np.packbits((tissue > 0) & ~_reflections(frame.image, tissue, options), 1))
 
 
 def _reflections(image: np.ndarray, tissue: np.ndarray, options: MultiViewConfig) -> np.ndarray:
@@ -59,31 +68,40 @@ def flow_correction(inverse: np.ndarray, own: EyeImage, other: EyeImage, options
     inside = (z > 0) & (_sample(other.matte, u, v, cv2.INTER_NEAREST) > 0)
     if not inside.any() or min(inside.shape) < 16:  # pixels, which optical flow needs
         return None
-    predicted = np.where(inside, _sample(other.grey, u, v), own.grey)
-    # The way back, a mere check, is told in images of half the size: a fifth of all the time, and a hundredth of the precision.
-    flow, back = _flow(own.grey, predicted), _flow(predicted, own.grey, finest=1)
-    # A pixel is seen where the prediction took the pixel from that flow leads to.
-    rows, columns = np.mgrid[: inverse.shape[0], : inverse.shape[1]].astype(np.float32) + np.float32(0.5)
-    columns, rows = columns + flow[..., 0], rows + flow[..., 1]
-    seen_u, seen_v = _sample(u, columns, rows), _sample(v, columns, rows)
     step = 0.01 * inverse
-    ahead_u, ahead_v, _ = _project(camera, inverse + step, other.camera)
-    along_u, along_v = (ahead_u - u) / step, (ahead_v - v) / step
-    speed = np.maximum(along_u**2 + along_v**2, 1e-9)  # squared pixels per 1/m
-    off_u, off_v = seen_u - u, seen_v - v
-    beside = np.abs(along_u * off_v - along_v * off_u) / np.sqrt(speed)
+    ahead = _project(camera, inverse + step, other.camera)
+    along_u, along_v = ((there - here) / step for there, here in zip(ahead, (u, v)))
+    del z, ahead  # each image of numbers takes as much memory as two of colours
+    columns, rows, good = _led_to(own.grey, np.where(inside, _sample(other.grey, u, v), own.grey), unit, options)
+    good &= inside & (own.matte > 0) & (_sample(inside.astype(np.float32), columns, rows, cv2.INTER_NEAREST) > 0)
+    seen_u, seen_v = _sample(u, columns, rows), _sample(v, columns, rows)
     alike = _correlation(own.grey, _sample(other.grey, seen_u, seen_v))
-    good = inside & (_sample(inside.astype(np.float32), columns, rows, cv2.INTER_NEAREST) > 0)
-    good &= (own.matte > 0) & (beside < options.max_beside * unit) & (np.abs(flow).max(2) < options.max_flow * unit)
-    good &= np.hypot(off_u, off_v) < options.max_flow * unit
-    good &= np.hypot(*cv2.split(flow + _sample(back, columns, rows))) < options.max_round_trip
-    precision = np.where(good, speed * (alike / options.flow_error) ** 2, 0)
+    off_u, off_v = seen_u - u, seen_v - v
+    speed = np.maximum(along_u**2 + along_v**2, 1e-9)  # squared pixels per 1/m
+    beside = np.abs(along_u * off_v - along_v * off_u) / np.sqrt(speed)
+    good &= (beside < options.max_beside * unit) & (np.hypot(off_u, off_v) < options.max_flow * unit)
+    if not good.any():
+        return None
+    # Across the line no depth tells anything: what is off there is what poses, calibration and flow are off along it, too.
+    error = options.flow_error * max(1.4826 * float(np.median(beside[good])), 0.01)
+    precision = np.where(good, speed * (alike / error) ** 2, 0)
     return FlowCorrection((along_u * off_u + along_v * off_v) / speed, precision)
+
+
+def _led_to(image: np.ndarray, predicted: np.ndarray, unit: float, options: MultiViewConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Columns and rows [H, W] that optical flow leads to from an image to its prediction, and whether it can be believed [H, W]."""
+    # The way back, a mere check, is told in images of half the size: a fifth of all the time, and a hundredth of the precision.
+    flow, back = _flow(image, predicted), _flow(predicted, image, finest=1)
+    height, width = image.shape
+    columns = np.arange(width, dtype=np.float32) + np.float32(0.5) + flow[..., 0]
+    rows = np.arange(height, dtype=np.float32)[:, None] + np.float32(0.5) + flow[..., 1]
+    returns = np.hypot(*cv2.split(flow + _sample(back, columns, rows))) < options.max_round_trip
+    return columns, rows, returns & (np.abs(flow).max(2) < options.max_flow * unit)
 
 
 def _flow(image: np.ndarray, other: np.ndarray, finest: int = 0) -> np.ndarray:
     """By how many pixels [H, W, 2] what an image shows lies elsewhere in another; ``finest`` halvings of the images are left out."""
-    flow: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    flow: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     flow.setFinestScale(finest)
     return flow.calc(image, other, None)
 
@@ -92,8 +110,8 @@ def _project(camera: Camera, inverse: np.ndarray, other: Camera) -> tuple[np.nda
     """Where another camera sees a view's pixels of the given inverse depth: u, v and z [H, W] float32."""
     motion = (other.viewmat @ camera.pose)[:3]
     # Scaled by inverse depth, which leaves u and v alone, z keeps its sign.
-    rays = camera.rays().astype(np.float32)
-    x, y, z = cv2.split(cv2.transform(rays, motion[:, :3]) + (inverse[..., None] * motion[:, 3]).astype(np.float32))
+    turned = cv2.split(cv2.transform(camera.rays().astype(np.float32), motion[:, :3]))
+    x, y, z = (part + (inverse * shift).astype(np.float32) for part, shift in zip(turned, motion[:, 3:]))
     ahead = np.where(z > 1e-3, z, np.inf)
     K = other.K
     far = np.float32(-1e4)  # out of any picture

@@ -12,15 +12,17 @@ import cv2
 import numpy as np
 
 from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.core.device import cpu_threads
+from endo_sim_ros.core.device import cpu_threads, return_freed_memory
 from endo_sim_ros.reconstruction.priors.flow import EyeImage, FlowCorrection, eye_image, flow_correction
 from endo_sim_ros.reconstruction.priors.interpolation import inverse_distance_weighted
 from endo_sim_ros.reconstruction.priors.inverse_depth import blur, correct, prepare_smoothing, scaled, smooth
 from endo_sim_ros.reconstruction.priors.stereo import right_view
 from endo_sim_ros.reconstruction.progress import StageProgress
-from endo_sim_ros.reconstruction.scene import ScenePoints, TrainingView, pixels_of, shrink
+from endo_sim_ros.reconstruction.scene import ScenePoints, TrainingView, pixels_of, resized_depth, shrink
 from endo_sim_ros.reconstruction.stage_configs import InterpolationConfig, MultiViewConfig, StereoConfig
 from endo_sim_ros.reconstruction.triangulation import nearest_views
+
+_MANY = 4  # views for each core, from which on views alone keep all cores busy
 
 
 def refine_depth(
@@ -43,7 +45,7 @@ def refine_depth(
     right image is corrected likewise by that image. Reflections of the light count between the eyes alone. Holes stay holes.
 
     Args:
-        views: Views with a depth prior; if only an iterator holds them, each is let go of when its depth is corrected.
+        views: Views with a depth prior; if only an iterator holds them, full-size colours are let go of first, depth once corrected.
         points: Scene points.
         source: Where the prior is from, as `depth_source` tells, on which its error depends.
         options: Errors, and what flow to believe.
@@ -55,26 +57,41 @@ def refine_depth(
     """
     views = list(views)
     prepare_smoothing(device)
-    images = progress.map(lambda view: eye_image(view, options), views)
-    near = nearest_views(views, options.neighbours)
+    near, priors = nearest_views(views, options.neighbours), [view.depth_prior for view in views]
+    pairs: list[tuple[EyeImage, EyeImage, float] | None] = [None] * len(views)
+
+    def look(i: int) -> EyeImage:
+        return_freed_memory()  # of the view before
+        view, image = views[i], eye_image(views[i], options)
+        if source == "stereo" and view.right is not None:
+            assert view.baseline is not None
+            right = right_view(view, stereo)
+            # Between the eyes reflections hardly move.
+            pairs[i] = image.with_matte(view.tissue), eye_image(right, options).with_matte(right.tissue), view.baseline
+        view = dataclasses.replace(view, depth_prior=None)
+        views[i] = shrink(view, width) if width else view  # grey images are all that is needed of the full size
+        return image
+
+    images = progress.map(look, range(len(views)))
 
     def corrected(i: int) -> np.ndarray | None:
-        view, camera = views[i], views[i].camera
-        known = view.surface > 0
-        if not known.any():
-            return view.depth_prior
-        inverse = (known / np.where(known, view.surface, 1)).astype(np.float32)[..., None]
+        prior, pair, camera = priors[i], pairs[i], images[i].camera
+        priors[i] = pairs[i] = None
+        if prior is None or not (prior > 0).any():
+            return prior
+        known = prior > 0
+        inverse = (known / np.where(known, prior, 1)).astype(np.float32)[..., None]
         inverse = inverse_distance_weighted(inverse, known, camera.width, interpolation)[..., 0]
         error = (options.points_error if source == "points" else options.prior_error) * inverse
-        if source == "stereo" and view.right is not None:
-            inverse, error = _refine_by_eyes(inverse, view, images[i], options, stereo, device)
+        if pair is not None:
+            inverse, error = _refine_by_eyes(inverse, *pair, options, stereo, device)
         total, weight = _point_corrections(camera, inverse, error, points, options)
 
         def told_by(j: int) -> FlowCorrection | None:
             progress.check()
             return flow_correction(inverse, images[i], images[j], options)
 
-        for found in neighbours.map(told_by, near[i]):
+        for found in several(told_by, near[i]):
             if found is not None:
                 total, weight = total + found.precision * found.correction, weight + found.precision
         inverse = correct(inverse, total, weight, error, options.continuation, options.max_correction)
@@ -83,29 +100,35 @@ def refine_depth(
         return np.where(good, 1 / np.where(good, inverse, 1), 0).astype(np.float32)
 
     def refine(i: int) -> None:
-        view = dataclasses.replace(views[i], depth_prior=corrected(i))
-        views[i] = shrink(view, width) if width else view  # the others need its image only, which `images` has
+        return_freed_memory()
+        depth, camera = corrected(i), views[i].camera
+        depth = None if depth is None else resized_depth(depth, camera.width, camera.height)
+        views[i] = dataclasses.replace(views[i], depth_prior=depth)
 
-    with ThreadPoolExecutor(cpu_threads(), "endo_sim") as neighbours:  # views may be fewer than cores
+    with ThreadPoolExecutor(cpu_threads(), "endo_sim") as neighbours:
+        # Few views leave cores idle; of many, several neighbours at a time would only take memory.
+        several = neighbours.map if len(views) < _MANY * cpu_threads() else map
         progress.map(refine, range(len(views)))
     return views
 
 
 def _refine_by_eyes(
-    inverse: np.ndarray, view: TrainingView, left: EyeImage, options: MultiViewConfig, stereo: StereoConfig, device: str
+    inverse: np.ndarray,
+    left: EyeImage,
+    right: EyeImage,
+    baseline: float,
+    options: MultiViewConfig,
+    stereo: StereoConfig,
+    device: str,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Inverse depth [H, W] (1/m) of matching, corrected by the flow that it leaves between the eyes, and its error [H, W].
 
     Semi-global matching prefers whole pixels and goes in steps; optical flow does neither, but errs wildly where there is little to
     see.
     """
-    assert view.baseline is not None
-    pixel, other = left.camera.K[0, 0] * view.baseline, right_view(view, stereo)  # a disparity of one pixel is 1 / pixel
+    pixel = left.camera.K[0, 0] * baseline  # a disparity of one pixel is 1 / pixel
     width, matched = left.camera.width, np.full(inverse.shape, stereo.disparity_error / pixel, np.float32)
     inverse = smooth(inverse, options.matched_window, options.matched_edge, device)
-    # Between the eyes reflections hardly move.
-    left = left._replace(matte=view.tissue.astype(np.uint8))
-    right = eye_image(other, options)._replace(matte=other.tissue.astype(np.uint8))
     found = flow_correction(inverse, left, right, options)
     if found is None:
         return inverse, matched

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.device import return_freed_memory
 from endo_sim_ros.core.features import detect, match_pair
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.reconstruction.progress import StageProgress
@@ -40,6 +41,7 @@ def stereo_depth(
     disparities = progress.map(lambda view: None if view.right is None else stereo_disparity(view, options), aligned)
     offsets = disparity_offsets(aligned, disparities, points, options, matching)
     for view, offset in zip(aligned, offsets):
+        return_freed_memory()  # of the view before
         found = disparities.pop(0)  # which takes as much memory as the depth
         yield (view, None) if found is None else (_with_right_K(view, column=offset), disparity_to_depth(view, found, offset, options))
 
@@ -139,7 +141,8 @@ def disparity_offsets(
     # A quarter of a pixel is as good as none.
     if abs(offset) < max(0.25, 3 * spread * np.sqrt((weight**2).sum()) / weight.sum()):
         return none
-    typical = float(np.median(np.concatenate([d[d > 0] for d in disparities if d is not None])))
+    some = np.concatenate([d[::8, ::8].ravel() for d in disparities if d is not None])  # all of many views would take gigabytes
+    typical = float(np.median(some[some > 0]))
     if abs(offset) > options.max_offset * typical:
         text = "stereo disparity, %.1f pixels, and the poses are %.1f pixels apart: left so; check poses, their scale and the baseline"
         log.warning(text, typical, abs(offset))

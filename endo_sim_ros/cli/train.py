@@ -25,6 +25,8 @@ class Command:
     needs stable-baselines3."""
     actions: Literal["cartesian", "joints", "joint_positions"] = "cartesian"
     """What the policy moves: the tip of the tool, or the joints of its arm, by how far or to where; docs/learning.md says more."""
+    contact: Literal["point", "links"] = "point"
+    """What touches the tissue: the tip that the task describes, or the links of the instrument."""
     model: Path | None = None
     """PLY model with its cameras.json; default: a piece of the synthetic patient."""
     device: str = "auto"
@@ -48,7 +50,8 @@ class Command:
             raise ConfigError(f"options that begin with --ppo. are for ppo, the others for cem; --algorithm is {self.algorithm}")
         with leaving_none_empty(self.out):
             self.out.mkdir(parents=True, exist_ok=True)  # before the long work
-            policy, curve = learn(self.task, load_scene(self.model), randomisation=self.vary, device=self.device, actions=self.actions)
+            options = {"randomisation": self.vary, "device": self.device, "actions": self.actions, "contact": self.contact}
+            policy, curve = learn(self.task, load_scene(self.model), **options)
             save_training(self.out, policy, curve, config)
         last = curve[-1]
         print(f"{self.out}: {last['test_success']:.0%} of test episodes solved after {last['episodes']} episodes")

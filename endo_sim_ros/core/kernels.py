@@ -8,18 +8,18 @@ version 1.19.
 import contextlib
 import contextvars
 import functools
-import numbers
 import threading
 import types
 import weakref
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
 
-from endo_sim_ros.core.device import init_warp, run_in_threads, shares, warp_stream
+from endo_sim_ros.core.device import current_warp_stream, gpu_index, init_warp, run_in_threads, shares
 
 _plain = contextvars.ContextVar("plain", default=False)
 
@@ -95,46 +95,46 @@ def launch(kernel: Any, count: int | tuple[int, ...], arguments: Sequence, devic
     """
     if not (count if isinstance(count, int) else all(count)):
         return
-    device = torch.device(device)
-    tensors = [x for x in arguments if isinstance(x, Tensor)]
-    kind = (kernel, count, device, *[_kind(x) for x in arguments])
-    found = _recorded.launches.get(kind)
+    kind, tensors = [kernel, count, device], []
+    for argument in arguments:  # in line, as it runs some hundred times for a picture
+        if isinstance(argument, Tensor):
+            tensors.append(argument)
+            kind += argument.shape, argument.dtype, argument.stride()
+        elif argument is None or isinstance(argument, _VALUES):
+            kind.append(argument)
+        else:  # a struct, which is not kept alive by it, nor are its arrays
+            kind.append(weakref.ref(argument))
+    found = _recorded.launches.get(key := tuple(kind))
     if found is None:
         while len(_recorded.launches) >= _COMMANDS:
             del _recorded.launches[next(iter(_recorded.launches))]
-        found = _recorded.launches[kind] = _record(kernel, count, arguments, str(device))
-    command, places = found
+        found = _recorded.launches[key] = _record(kernel, count, arguments, device)
+    command, places, index = found
     for place, tensor in zip(places, tensors, strict=True):
         place.data = tensor.data_ptr()
-    command.launch(warp_stream(torch.cuda.current_stream(device)) if device.type == "cuda" else None)
-
-
-def _kind(argument: Any) -> Any:
-    """What of an argument a recorded launch depends on. A struct is not kept alive by it, nor are its arrays."""
-    if isinstance(argument, Tensor):
-        return argument.shape, argument.dtype, argument.stride()
-    return argument if argument is None or isinstance(argument, (numbers.Number, tuple)) else weakref.ref(argument)
+    command.launch(None if index is None else current_warp_stream(index))
 
 
 class _Recorded(threading.local):
     """Launches of one thread, with their array arguments: two threads never fill in the addresses of one launch."""
 
     def __init__(self) -> None:
-        self.launches: dict[tuple, tuple[Any, list]] = {}
+        self.launches: dict[tuple, tuple[Any, list, int | None]] = {}
 
 
 _recorded = _Recorded()
+_VALUES = (int, float, tuple, np.generic)  # arguments that are known by what they are, not by which they are
 _COMMANDS = 512  # recorded launches that a thread keeps
 
 
-def _record(kernel: Any, count: int | tuple[int, ...], arguments: Sequence, device: str) -> tuple[Any, list]:
-    """Return a launch, not made yet, and its array arguments, whose addresses are to be filled in."""
-    command: Any = wp.launch(kernel, count, kernel_arguments(kernel, arguments), device=device, record_cmd=True)
+def _record(kernel: Any, count: int | tuple[int, ...], arguments: Sequence, device: torch.device | str) -> tuple[Any, list, int | None]:
+    """Return a launch, not made yet, its array arguments, whose addresses are to be filled in, and the number of its GPU."""
+    command: Any = wp.launch(kernel, count, kernel_arguments(kernel, arguments), device=str(device), record_cmd=True)
     places = [command.params[1 + i] for i, x in enumerate(arguments) if isinstance(x, Tensor)]
     command.fwd_args = None  # Warp's hold on structs and tensors, whose memory would never be free again
     for place in places:
         place._ref = None
-    return command, places
+    return command, places, gpu_index(device)
 
 
 def launch_in_shares(kernel: Any, count: int, arguments: Sequence, least: int = 1024) -> None:

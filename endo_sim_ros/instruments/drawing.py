@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import warp as wp
 from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
@@ -102,10 +103,13 @@ class InstrumentDrawing:
                 links += [self.links.index((i, part.link))] * len(part.faces)
                 materials += [int(part.material)] * len(part.faces)
         move = lambda arrays, kind: torch.as_tensor(np.asarray(arrays), dtype=kind, device=self.device).contiguous()
-        self._corners = move(np.concatenate(corners).reshape(-1, 3), torch.float32)
-        self._normals = move(np.concatenate(normals).reshape(-1, 3), torch.float32)
-        self._links, self._materials = move(links, torch.int32), move(materials, torch.int32)
-        self._owners = move([self.links[link][0] for link in links], torch.int32)
+        self._fixed = {
+            "corners": move(np.concatenate(corners).reshape(-1, 3), torch.float32),
+            "normals": move(np.concatenate(normals).reshape(-1, 3), torch.float32),
+            "face_links": move(links, torch.int32),
+            "materials": move(materials, torch.int32),
+            "owners": move([self.links[link][0] for link in links], torch.int32),
+        }
         self._surfaces = np.array([SURFACES[material] for material in Material])
         thrown = [(i, capsule) for i, own in enumerate(capsules) for capsule in own] if config.shadows else []
         if len(thrown) > int(MOST):
@@ -113,13 +117,12 @@ class InstrumentDrawing:
         ends = np.array([((*capsule.start, 1.0), (*capsule.end, 1.0)) for _, capsule in thrown]).reshape(-1, 2, 4)
         self._ends = ends.swapaxes(1, 2)  # [C, 4, 2] m, in the frame of the link
         self._capsule_links = np.array([self.links.index((i, capsule.link)) for i, capsule in thrown], int)
-        self._capsule_owners = move([i for i, _ in thrown], torch.int32)
-        self._radii = move([capsule.radius for _, capsule in thrown], torch.float32)
+        self._fixed["capsule_owners"] = move([i for i, _ in thrown], torch.int32)
+        self._fixed["radii"] = move([capsule.radius for _, capsule in thrown], torch.float32)
         self._look = look = resolving_kernels.Look()
         look.ambient, look.softness = config.ambient, config.softness
         look.lamp_size, look.mirror, look.white = config.lamp_size, config.mirror, config.white
-        self._frames: dict[tuple[int, int, bool], Any] = {}
-        self._room: tuple[tuple[int, int, int], dict[str, Tensor]] = (0, 0, 0), {}
+        self._newest: tuple[int, tuple[int, int, bool], Any] = 0, (0, 0, False), None
         load_kernels((drawing_kernels, light_kernels, resolving_kernels), self.device)
 
     def at(self, poses: Sequence[Mapping[str, np.ndarray]]) -> PosedInstruments:
@@ -181,71 +184,51 @@ class InstrumentDrawing:
             surfaces: What the materials of each are like [B, M, 5], as `SURFACES`; those by default.
         """
         config, count, (height, width) = self.config, len(local), colors.shape[1:3]
-        frame = self._frame(width, height, surfaces is not None)
+        frame = self._frame(count, width, height, surfaces is not None)
         lamps = np.tile((config.lamp_x, config.lamp_y, 0.0), (count, 1)) if lamps is None else lamps
         surfaces = self._surfaces if surfaces is None else surfaces
         ends = (local[:, self._capsule_links] @ self._ends)[:, :, :3].swapaxes(2, 3)  # [B, C, 2, 3]
         placed, ends, views, materials = upload(self.device, local, ends, np.concatenate([lenses, lamps], 1), surfaces)
-        room = self._buffers(count, frame)
-        around, labels = self._tissue(frame, colors, alphas)
-        drawn = [room["screen"], room["rows"], frame, room["samples"], room["marks"]]
-        corners = [self._corners, self._normals, self._links, placed, views, frame, room["screen"], room["turned"], room["rows"]]
-        self._launch(drawing_kernels.project, count * frame.faces, corners)
-        scene = [room["samples"], room["screen"], room["turned"], self._links, self._owners, self._materials, materials]
-        scene += [ends, self._radii, self._capsule_owners, views, around, frame, self._look, colors, depths, alphas, labels]
+        lanes = 1 if torch.device(self.device).type == "cpu" else light_kernels.LANES
+        self._launch(light_kernels.sum_light, count * lanes, [lanes, frame, _STRIDE, colors, alphas])
+        self._launch(drawing_kernels.project, count * frame.faces, [placed, views, frame])
+        labels = (alphas > SURFACE).view(torch.uint8) if vectorised(self.device) else torch.empty_like(alphas, dtype=torch.uint8)
+        scene = [materials, ends, views, frame, self._look, colors, depths, alphas, labels]
         if vectorised(self.device):
-            self._launch(drawing_kernels.cover_rows, count * frame.down, drawn, least=4)
-            self._launch(resolving_kernels.resolve_tiles, count * frame.across * frame.down, [room["marks"], *scene], least=4)
+            self._launch(drawing_kernels.cover_rows, count * frame.down, [frame], least=4)
+            self._launch(resolving_kernels.resolve_tiles, count * frame.across * frame.down, scene, least=4)
         else:
-            self._launch(drawing_kernels.cover_faces, count * frame.faces * frame.lanes, drawn)
+            self._launch(drawing_kernels.cover_faces, count * frame.faces * frame.lanes, [frame])
             self._launch(resolving_kernels.resolve_pixels, count * width * height, scene)
         return labels
 
-    def _tissue(self, frame: Any, colors: Tensor, alphas: Tensor) -> tuple[Tensor, Tensor]:
-        """The tissue's light in each picture [B, 3], linear, and labels [B, H, W]: on a GPU `resolve_pixels` writes what is tissue.
-
-        The light is added up in float64, so that the order of the sum, which depends on B on a CPU, does not show.
-        """
-        if vectorised(self.device):
-            labels = (alphas > SURFACE).view(torch.uint8)
-            coarse, seen = (each[:, ::_STRIDE, ::_STRIDE] for each in (colors, labels[..., None]))
-            return (coarse * coarse * seen).sum((1, 2), dtype=torch.float64), labels
-        around = torch.empty((len(colors), 3), dtype=torch.float64, device=self.device)
-        lanes = 1 if torch.device(self.device).type == "cpu" else light_kernels.LANES
-        self._launch(light_kernels.sum_light, len(colors) * lanes, [lanes, frame, _STRIDE, colors, alphas, around])
-        return around, torch.empty_like(alphas, dtype=torch.uint8)
-
-    def _frame(self, width: int, height: int, own_surfaces: bool) -> Any:
-        """The sizes of pictures; the same object for the same sizes, so that launches are known again."""
+    def _frame(self, count: int, width: int, height: int, own_surfaces: bool) -> Any:
+        """What kernels draw into B pictures of a size with; the same object as before if it will do, so that launches are known again."""
         key = width, height, own_surfaces
-        if key not in self._frames:
-            frame, tile = drawing_kernels.Frame(), int(drawing_kernels.TILE)
-            frame.width, frame.height, frame.across, frame.down = width, height, -(-width // tile), -(-height // tile)
-            frame.faces, frame.links, frame.capsules = len(self._links), len(self.links), len(self._radii)
-            frame.several, frame.spread, frame.nearest = int(len({i for i, _ in self.links}) > 1), self.config.blur, _NEAREST
-            frame.stride = _stride(frame.across * frame.down * frame.down)
-            frame.surfaces = len(Material) if own_surfaces else 0
-            frame.lanes = -(-height // int(drawing_kernels.APART))
-            self._frames[key] = frame
-        return self._frames[key]
-
-    def _buffers(self, count: int, frame: Any) -> dict[str, Tensor]:
-        """What kernels write for each other; samples are left empty by each picture for the next."""
-        key = (count, frame.width, frame.height)
-        if self._room[0][1:] != key[1:] or self._room[0][0] < count:
-            new = lambda shape, kind, value=0: torch.full(shape, value, dtype=kind, device=self.device)
-            triangles, pixels = count * frame.faces, count * frame.width * frame.height
-            self._room = (
-                key,
-                {
-                    "screen": new((3 * triangles, 3), torch.float32),
-                    "turned": new((3 * triangles, 3), torch.float32),
-                    "rows": new((triangles, 2), torch.int32),
-                    "samples": new((pixels * int(drawing_kernels.SAMPLES),), torch.int64, int(drawing_kernels.EMPTY)),
-                    "marks": new((count * frame.across * frame.down,), torch.uint8),
-                },
-            )
-        return self._room[1]
+        most, known, frame = self._newest
+        if known == key and count <= most:
+            return frame
+        frame, tile = drawing_kernels.Frame(), int(drawing_kernels.TILE)
+        frame.width, frame.height, frame.across, frame.down = width, height, -(-width // tile), -(-height // tile)
+        frame.faces, frame.links, frame.capsules = (len(x) for x in (self._fixed["face_links"], self.links, self._fixed["radii"]))
+        frame.several, frame.spread, frame.nearest = int(len({i for i, _ in self.links}) > 1), self.config.blur, _NEAREST
+        frame.stride = _stride(frame.across * frame.down * frame.down)
+        frame.surfaces = len(Material) if own_surfaces else 0
+        frame.lanes = -(-height // int(drawing_kernels.APART))
+        new = lambda shape, kind, value=0: torch.full(shape, value, dtype=kind, device=self.device)
+        triangles, pixels = count * frame.faces, count * width * height
+        arrays = self._fixed | {
+            "around": new((count, 3), torch.float64),
+            "screen": new((3 * triangles, 3), torch.float32),
+            "turned": new((3 * triangles, 3), torch.float32),
+            "rows": new((triangles, 2), torch.int32),
+            "samples": new((pixels * int(drawing_kernels.SAMPLES),), torch.int64, int(drawing_kernels.EMPTY)),
+            "marks": new((count * frame.across * frame.down,), torch.uint8),
+        }
+        for name, array in arrays.items():
+            setattr(frame, name, wp.from_torch(array, dtype=drawing_kernels.Frame.vars[name].type.dtype))
+        self._newest = count, key, frame
+        return frame
 
     def _launch(self, kernel: object, count: int, arguments: list, least: int = 1024) -> None:
         if torch.device(self.device).type == "cpu":

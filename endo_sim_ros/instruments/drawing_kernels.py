@@ -13,7 +13,10 @@ APART = wp.constant(4)  # columns from one that a thread takes on a GPU to its n
 
 @wp.struct
 class Frame:
-    """Sizes of the pictures and of what is drawn into each."""
+    """B pictures of one size, what is drawn into each, and what kernels write for each other.
+
+    One struct, as each array that is an argument of its own costs time at every launch.
+    """
 
     width: int
     height: int
@@ -28,6 +31,19 @@ class Frame:
     nearest: float  # m: what is nearer to the plane of the lens is not drawn
     surfaces: int  # rows of surfaces from those of one picture to the next; 0 = all have the same
     lanes: int  # threads that share a triangle on a GPU
+    corners: wp.array[wp.vec3]  # [3 F] m, in the frame of the link
+    normals: wp.array[wp.vec3]  # [3 F]
+    face_links: wp.array[int]  # [F]
+    materials: wp.array[int]  # [F]
+    owners: wp.array[int]  # [F] numbers of the instruments
+    radii: wp.array[float]  # [C] m
+    capsule_owners: wp.array[int]  # [C]
+    around: wp.array[wp.vec3d]  # [B] in the hue of the light that comes from the tissue
+    screen: wp.array[wp.vec3]  # [3 B F] column and row in pixels, and one over the depth
+    turned: wp.array[wp.vec3]  # [3 B F] normals, camera
+    rows: wp.array[wp.vec2i]  # [B F] the first and the last row that a triangle may reach; none if it is not seen
+    samples: wp.array[wp.int64]  # [P · 4] left empty for the next picture
+    marks: wp.array[wp.uint8]  # of tiles that something is drawn in, on a CPU; left at zero
 
 
 @wp.func
@@ -47,35 +63,29 @@ def lens(views: wp.array2d[float], picture: int) -> wp.vec4:
 @wp.kernel
 def project(
     first: int,
-    corners: wp.array[wp.vec3],  # [3 F] m, in the frame of the link
-    normals: wp.array[wp.vec3],  # [3 F]
-    links: wp.array[int],  # [F]
     poses: wp.array[wp.mat44],  # [B L], in the camera
     views: wp.array2d[float],  # [B, 7] fx fy cx cy, and the lamp, m, camera
     frame: Frame,
-    screen: wp.array[wp.vec3],  # out [3 B F]: column and row in pixels, and one over the depth
-    turned: wp.array[wp.vec3],  # out [3 B F]: normals, camera
-    rows: wp.array[wp.vec2i],  # out [B F]: the first and the last row that a triangle may reach; none if it is not seen
 ):
     i = first + wp.tid()
     picture, face = i // frame.faces, i % frame.faces
-    pose, view = poses[picture * frame.links + links[face]], lens(views, picture)
-    rows[i] = wp.vec2i(1, 0)
+    pose, view = poses[picture * frame.links + frame.face_links[face]], lens(views, picture)
+    frame.rows[i] = wp.vec2i(1, 0)
     for k in range(3):
-        at = wp.transform_point(pose, corners[3 * face + k])
+        at = wp.transform_point(pose, frame.corners[3 * face + k])
         u, v = view[0] * at[0] / at[2] + view[2], view[1] * at[1] / at[2] + view[3]
         if not (at[2] > frame.nearest and wp.abs(u) < BEYOND and wp.abs(v) < BEYOND):  # nor if it is not a number
             return
-        screen[3 * i + k] = wp.vec3(u, v, 1.0 / at[2])
-    a, b, c = corner(screen, 3 * i), corner(screen, 3 * i + 1), corner(screen, 3 * i + 2)
+        frame.screen[3 * i + k] = wp.vec3(u, v, 1.0 / at[2])
+    a, b, c = corner(frame, 3 * i), corner(frame, 3 * i + 1), corner(frame, 3 * i + 2)
     if (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]) >= 0.0:  # rows count downwards: it turns its back
         return
     margin = 0.5 * (frame.spread - 1.0)
     top = wp.floor(wp.clamp(wp.min(wp.min(a[1], b[1]), c[1]) - margin, 0.0, float(frame.height)))
     bottom = wp.floor(wp.clamp(wp.max(wp.max(a[1], b[1]), c[1]) + margin, -1.0, float(frame.height) - 0.5))
-    rows[i] = wp.vec2i(int(top), int(bottom))
+    frame.rows[i] = wp.vec2i(int(top), int(bottom))
     for k in range(3):
-        turned[3 * i + k] = wp.transform_vector(pose, normals[3 * face + k])
+        frame.turned[3 * i + k] = wp.transform_vector(pose, frame.normals[3 * face + k])
 
 
 @wp.func
@@ -89,8 +99,8 @@ def weights(a: wp.vec3, b: wp.vec3, c: wp.vec3, u: float, v: float) -> wp.vec3:
 
 
 @wp.func
-def corner(screen: wp.array[wp.vec3], i: int) -> wp.vec3:
-    return screen[i]
+def corner(frame: Frame, i: int) -> wp.vec3:
+    return frame.screen[i]
 
 
 @wp.func
@@ -114,14 +124,10 @@ def cover(
     first: int,  # of the columns that the triangle may reach
     step: int,
     alone: int,  # whether no other thread writes to these rows
-    screen: wp.array[wp.vec3],
-    rows: wp.array[wp.vec2i],
     frame: Frame,
-    samples: wp.array[wp.int64],
-    marks: wp.array[wp.uint8],
 ):
     """Enter a triangle into the samples of every ``step``-th column of rows from ``low`` to ``high``, and mark their tiles."""
-    a, b, c = corner(screen, 3 * i), corner(screen, 3 * i + 1), corner(screen, 3 * i + 2)
+    a, b, c = corner(frame, 3 * i), corner(frame, 3 * i + 1), corner(frame, 3 * i + 2)
     picture, face = i // frame.faces, i % frame.faces
     per_area = 1.0 / ((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
     by_u = wp.vec3(b[1] - c[1], c[1] - a[1], a[1] - b[1])  # of the weights
@@ -131,7 +137,7 @@ def cover(
     rightmost = wp.min(wp.max(wp.max(a[0], b[0]), c[0]) + margin, float(frame.width) - 0.5)
     if leftmost > rightmost:
         return
-    for row in range(wp.max(rows[i][0], low), wp.min(rows[i][1], high) + 1):
+    for row in range(wp.max(frame.rows[i][0], low), wp.min(frame.rows[i][1], high) + 1):
         columns = wp.vec2(leftmost, rightmost)
         columns = span(a, b, row, frame.spread, columns)
         columns = span(b, c, row, frame.spread, columns)
@@ -147,45 +153,37 @@ def cover(
                     inverse = (w[0] * a[2] + w[1] * b[2] + w[2] * c[2]) * per_area
                     # Of positive floats the bits order as they do: what is nearest has the least key.
                     key = (wp.int64(0x7FFFFFFF - wp.cast(inverse, wp.int32)) << wp.int64(32)) | wp.int64(face)
-                    if key < samples[pixel * SAMPLES + sample]:
+                    if key < frame.samples[pixel * SAMPLES + sample]:
                         if alone != 0:
-                            samples[pixel * SAMPLES + sample] = key
+                            frame.samples[pixel * SAMPLES + sample] = key
                         else:
-                            wp.atomic_min(samples, pixel * SAMPLES + sample, key)
-                        marks[tile + column // TILE] = wp.uint8(1)
+                            wp.atomic_min(frame.samples, pixel * SAMPLES + sample, key)
+                        frame.marks[tile + column // TILE] = wp.uint8(1)
 
 
 @wp.kernel
 def cover_rows(
     first: int,
-    screen: wp.array[wp.vec3],
-    rows: wp.array[wp.vec2i],
     frame: Frame,
-    samples: wp.array[wp.int64],
-    marks: wp.array[wp.uint8],
 ):
     """On a CPU: the rows of some tiles, to which no other thread writes."""
     i = first + wp.tid()
     picture, low = i // frame.down, TILE * ((i % frame.down * frame.stride) % frame.down)
     for face in range(picture * frame.faces, (picture + 1) * frame.faces):
-        reached = rows[face]
+        reached = frame.rows[face]
         if reached[0] < low + TILE and reached[1] >= low and reached[0] <= reached[1]:
-            cover(face, low, low + TILE - 1, 0, 1, 1, screen, rows, frame, samples, marks)
+            cover(face, low, low + TILE - 1, 0, 1, 1, frame)
 
 
 @wp.kernel
 def cover_faces(
     first: int,
-    screen: wp.array[wp.vec3],
-    rows: wp.array[wp.vec2i],
     frame: Frame,
-    samples: wp.array[wp.int64],
-    marks: wp.array[wp.uint8],
 ):
     """On a GPU: a share of one triangle; those of a shaft reach across the picture, and all would wait for the thread that has one."""
     i = first + wp.tid()
     face = i // frame.lanes
-    reached = rows[face]
+    reached = frame.rows[face]
     for part in range(i % frame.lanes, APART * (reached[1] - reached[0] + 1), frame.lanes):
         row = reached[0] + part // APART
-        cover(face, row, row, part % APART, APART, 0, screen, rows, frame, samples, marks)
+        cover(face, row, row, part % APART, APART, 0, frame)

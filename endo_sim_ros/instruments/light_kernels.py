@@ -1,4 +1,4 @@
-"""Kernel of `drawing` on a GPU, for B pictures at once: the light of the tissue."""
+"""Kernel of `drawing`, for B pictures at once: the light of the tissue."""
 
 import warp as wp
 
@@ -18,8 +18,8 @@ def sum_light(
     stride: int,  # pixels from one that is read to the next
     colors: wp.array[wp.vec3],  # [P]
     alphas: wp.array[float],  # [P]
-    around: wp.array[wp.vec3d],  # out [B] sum of squares, as the pictures are gamma-compressed
 ):
+    """Squares, as the pictures are gamma-compressed; added up in float64, so that the order of the sum does not show."""
     i = first + wp.tid()
     picture, lane = i // lanes, i % lanes
     across, down = (frame.width + stride - 1) // stride, (frame.height + stride - 1) // stride
@@ -33,4 +33,4 @@ def sum_light(
             blue += wp.float64(color[2] * color[2])
     red, green, blue = block_sum(red), block_sum(green), block_sum(blue)
     if lane == 0:
-        around[picture] = wp.vec3d(red, green, blue)
+        frame.around[picture] = wp.vec3d(red, green, blue)

@@ -78,18 +78,9 @@ def blend(
     picture: int,
     on_tissue: wp.uint64,  # capsules that may keep light from the tissue here
     on_links: wp.uint64,  # and from instruments
-    samples: wp.array[wp.int64],  # [P · 4], left empty for the next picture
-    screen: wp.array[wp.vec3],
-    normals: wp.array[wp.vec3],
-    links: wp.array[int],  # [F]
-    owners: wp.array[int],  # [F] numbers of the instruments
-    materials: wp.array[int],  # [F]
     surfaces: wp.array2d[float],  # [M or B M, 5] red, green, blue, roughness, strength of the shine
     ends: wp.array2d[wp.vec3],
-    radii: wp.array[float],
-    capsule_owners: wp.array[int],
     views: wp.array2d[float],
-    around: wp.array[wp.vec3d],  # [B] in the hue of the light that comes from the tissue
     frame: Frame,
     look: Look,
     colors: wp.array[wp.vec3],
@@ -116,9 +107,9 @@ def blend(
     second = float(0.0)  # what is seen in the second sample
     before = int(-1)
     for sample in range(SAMPLES):
-        key = samples[SAMPLES * pixel + sample]
+        key = frame.samples[SAMPLES * pixel + sample]
         if key != EMPTY:
-            samples[SAMPLES * pixel + sample] = EMPTY
+            frame.samples[SAMPLES * pixel + sample] = EMPTY
             face = int(key & wp.int64(0xFFFFFFFF))
             z = depth_of(key)
             seen = wp.clamp(0.5 + (tissue - z) / look.softness, 0.0, 1.0)
@@ -126,22 +117,23 @@ def blend(
                 if face != before:
                     before = face
                     i = 3 * (picture * frame.faces + face)
-                    a, b, c = corner(screen, i), corner(screen, i + 1), corner(screen, i + 2)
+                    a, b, c = corner(frame, i), corner(frame, i + 1), corner(frame, i + 2)
                     beside = offset(sample, row, column, frame.spread)
                     w = wp.cw_mul(weights(a, b, c, u - 0.5 + beside[0], v - 0.5 + beside[1]), wp.vec3(a[2], b[2], c[2]))
-                    bent = wp.normalize(-w[0] * normals[i] - w[1] * normals[i + 1] - w[2] * normals[i + 2])
+                    bent = wp.normalize(-w[0] * frame.turned[i] - w[1] * frame.turned[i + 1] - w[2] * frame.turned[i + 2])
                     # Light costs more than all else: what lies as the sample before has its colour.
-                    if wp.dot(bent, normal) < ALIKE or materials[face] != material:
+                    if wp.dot(bent, normal) < ALIKE or frame.materials[face] != material:
                         normal = bent
-                        material = materials[face]
+                        material = frame.materials[face]
                         at = point(view, u, v, z)
                         left = wp.vec2(1.0, 1.0)
                         if on_links != wp.uint64(0):
                             left = light_left(
                                 on_links, at, normal, 0.5 * z / view[0], lamp, look.lamp_size,
-                                picture * frame.capsules, frame.capsules, ends, radii, capsule_owners, owners[face],
+                                picture * frame.capsules, frame.capsules, ends, frame.radii, frame.capsule_owners, frame.owners[face],
                             )  # fmt: skip
-                        lit = reflected(normal, at, lamp, surfaces, picture * frame.surfaces + material, hue(around[picture]), left, look)
+                        surface, around = picture * frame.surfaces + material, hue(frame.around[picture])
+                        lit = reflected(normal, at, lamp, surfaces, surface, around, left, look)
                 color += seen * lit
                 depth += seen * z
                 total += seen
@@ -156,7 +148,7 @@ def blend(
         at = point(view, u, v, tissue)
         left = light_left(
             on_tissue, at, wp.normalize(-at), 0.5 * tissue / view[0], lamp, look.lamp_size,
-            picture * frame.capsules, frame.capsules, ends, radii, capsule_owners, -1,
+            picture * frame.capsules, frame.capsules, ends, frame.radii, frame.capsule_owners, -1,
         )  # fmt: skip
         behind *= encoded((1.0 - look.ambient) * left[0] + look.ambient * left[1])
     if total > 0.0:
@@ -164,8 +156,36 @@ def blend(
         depths[pixel] = kept * depths[pixel] + depth / float(SAMPLES)
         alphas[pixel] = kept * alpha + total / float(SAMPLES)
         if kept < 0.5 or kept == 0.5 and second > 0.5:  # of halves every other one, so that outlines neither grow nor shrink
-            labels[pixel] = wp.uint8(2 + links[nearest_face])
+            labels[pixel] = wp.uint8(2 + frame.face_links[nearest_face])
     colors[pixel] = behind
+
+
+@wp.func
+def blend_square(
+    left: int,
+    top: int,
+    right: int,
+    bottom: int,
+    picture: int,
+    on_tissue: wp.uint64,
+    on_links: wp.uint64,
+    surfaces: wp.array2d[float],
+    ends: wp.array2d[wp.vec3],
+    views: wp.array2d[float],
+    frame: Frame,
+    look: Look,
+    colors: wp.array[wp.vec3],
+    depths: wp.array[float],
+    alphas: wp.array[float],
+    labels: wp.array[wp.uint8],
+):
+    """Pixels of one picture. On a CPU a call copies all structs and arrays, which for each pixel takes a quarter of the time."""
+    for row in range(top, bottom):
+        for column in range(left, right):
+            blend(
+                (picture * frame.height + row) * frame.width + column, column, row, picture, on_tissue, on_links,
+                surfaces, ends, views, frame, look, colors, depths, alphas, labels,
+            )  # fmt: skip
 
 
 @wp.func
@@ -176,8 +196,6 @@ def about(
     low: float,
     high: float,
     ends: wp.array2d[wp.vec3],
-    radii: wp.array[float],
-    owners: wp.array[int],
     views: wp.array2d[float],
     frame: Frame,
     look: Look,
@@ -191,25 +209,15 @@ def about(
     at = point(view, float(left) + half, float(top) + half, 0.5 * (low + high))
     across = wp.length(wp.vec2(half / view[0], half / view[1])) * high
     slack = across + 0.5 * (high - low) * wp.length(at) / at[2] + high / view[0]
-    return near(at, slack, lamp, look.lamp_size, picture * frame.capsules, frame.capsules, ends, radii, owners, -1)
+    return near(at, slack, lamp, look.lamp_size, picture * frame.capsules, frame.capsules, ends, frame.radii, frame.capsule_owners, -1)
 
 
 @wp.kernel
 def resolve_tiles(
     first: int,
-    marks: wp.array[wp.uint8],  # left at zero
-    samples: wp.array[wp.int64],
-    screen: wp.array[wp.vec3],
-    normals: wp.array[wp.vec3],
-    links: wp.array[int],
-    owners: wp.array[int],
-    materials: wp.array[int],
     surfaces: wp.array2d[float],
     ends: wp.array2d[wp.vec3],
-    radii: wp.array[float],
-    capsule_owners: wp.array[int],
     views: wp.array2d[float],
-    around: wp.array[wp.vec3d],
     frame: Frame,
     look: Look,
     colors: wp.array[wp.vec3],
@@ -224,7 +232,7 @@ def resolve_tiles(
     left, top = TILE * (number % frame.across), TILE * (number // frame.across)
     right, bottom = wp.min(left + TILE, frame.width), wp.min(top + TILE, frame.height)
     start = picture * frame.height * frame.width
-    marked = marks[picture * each + number] != wp.uint8(0)
+    marked = frame.marks[picture * each + number] != wp.uint8(0)
     on_tissue = wp.uint64(0)
     on_links = wp.uint64(0)
     if frame.capsules > 0:
@@ -235,44 +243,30 @@ def resolve_tiles(
                 if alphas[pixel] > 0.5:
                     z = depths[pixel] / alphas[pixel]
                     low, high = wp.min(low, z), wp.max(high, z)
-        on_tissue = about(picture, left, top, low, high, ends, radii, capsule_owners, views, frame, look)
+        on_tissue = about(picture, left, top, low, high, ends, views, frame, look)
         if marked and frame.several != 0:
             low = float(1.0e9)
             high = float(0.0)
             for row in range(top, bottom):
                 for pixel in range(start + row * frame.width + left, start + row * frame.width + right):
                     for sample in range(SAMPLES):
-                        key = samples[SAMPLES * pixel + sample]
+                        key = frame.samples[SAMPLES * pixel + sample]
                         if key != EMPTY:
                             z = depth_of(key)
                             low, high = wp.min(low, z), wp.max(high, z)
-            on_links = about(picture, left, top, low, high, ends, radii, capsule_owners, views, frame, look)
+            on_links = about(picture, left, top, low, high, ends, views, frame, look)
     if not marked and on_tissue == wp.uint64(0):
         return
-    marks[picture * each + number] = wp.uint8(0)
-    for row in range(top, bottom):
-        for column in range(left, right):
-            blend(
-                start + row * frame.width + column, column, row, picture, on_tissue, on_links, samples, screen, normals, links, owners,
-                materials, surfaces, ends, radii, capsule_owners, views, around, frame, look, colors, depths, alphas, labels,
-            )  # fmt: skip
+    frame.marks[picture * each + number] = wp.uint8(0)
+    blend_square(left, top, right, bottom, picture, on_tissue, on_links, surfaces, ends, views, frame, look, colors, depths, alphas, labels)
 
 
 @wp.kernel
 def resolve_pixels(
     first: int,
-    samples: wp.array[wp.int64],
-    screen: wp.array[wp.vec3],
-    normals: wp.array[wp.vec3],
-    links: wp.array[int],
-    owners: wp.array[int],
-    materials: wp.array[int],
     surfaces: wp.array2d[float],
     ends: wp.array2d[wp.vec3],
-    radii: wp.array[float],
-    capsule_owners: wp.array[int],
     views: wp.array2d[float],
-    around: wp.array[wp.vec3d],
     frame: Frame,
     look: Look,
     colors: wp.array[wp.vec3],
@@ -291,7 +285,7 @@ def resolve_pixels(
         on_tissue = ALL
         if frame.several != 0:
             on_links = ALL
-    blend(
-        i, column, row, picture, on_tissue, on_links, samples, screen, normals, links, owners,
-        materials, surfaces, ends, radii, capsule_owners, views, around, frame, look, colors, depths, alphas, labels,
+    blend_square(
+        column, row, column + 1, row + 1, picture, on_tissue, on_links,
+        surfaces, ends, views, frame, look, colors, depths, alphas, labels,
     )  # fmt: skip

@@ -11,7 +11,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from endo_sim_ros.learning.actions import Actions
+from endo_sim_ros.learning.actions import Actions, Contact
 from endo_sim_ros.learning.config import Randomisation, SightConfig
 from endo_sim_ros.learning.pictures import IMAGE, IMAGE_RIGHT, SEGMENTATION
 from endo_sim_ros.learning.scenes import Scene, load_scene
@@ -39,6 +39,7 @@ def _make(
     device: str = "auto",
     render_mode: str | None = None,
     actions: Actions = "cartesian",
+    contact: Contact = "point",
     **sight: Any,
 ) -> tuple[TaskBatch, gymnasium.Space]:
     """The simulation, and the space of the observations of one environment; the arguments are those of `TaskEnvironment`."""
@@ -48,6 +49,8 @@ def _make(
         raise ValueError(f"render_mode must be rgb_array or None, got {render_mode!r}")
     if actions not in get_args(Actions):
         raise ValueError(f"actions must be {', '.join(get_args(Actions)[:-1])} or {get_args(Actions)[-1]}, got {actions!r}")
+    if contact not in get_args(Contact):
+        raise ValueError(f"contact must be {' or '.join(get_args(Contact))}, got {contact!r}")
     if sight.get("image_width", 1) < 1:
         raise ValueError(f"image_width must be at least 1, got {sight['image_width']}")
     shown = SightConfig(**sight)
@@ -55,7 +58,7 @@ def _make(
         raise ValueError("eyes is 2, but observations is state, which has no images; ask for image or both")
     randomisation = Randomisation.from_mapping(randomisation) if isinstance(randomisation, dict) else randomisation or Randomisation()
     scene = scene if isinstance(scene, Scene) else load_scene(scene)
-    batch = TaskBatch(task, scene, count, observations, randomisation, shown, device, render_mode is not None, actions)
+    batch = TaskBatch(task, scene, count, observations, randomisation, shown, device, render_mode is not None, actions, contact)
     spaces: dict[str, gymnasium.Space] = {}
     if observations != "image":
         spaces["state"] = gymnasium.spaces.Box(-BOUND, BOUND, (len(batch.observation_names),), np.float32)
@@ -97,6 +100,7 @@ class TaskEnvironment(gymnasium.Env):
         segmentation: Add ``segmentation``, what is in each pixel: 0 nothing, 1 tissue, and from 2 on the links of the instrument,
             `endo_sim_ros.instruments.LINKS`.
         actions: ``cartesian``, ``joints`` or ``joint_positions``, see :class:`TaskBatch`.
+        contact: What touches the tissue: ``point`` or ``links``, see :class:`TaskBatch`.
 
     Raises:
         ValueError: If an argument cannot be used, or the model is too small.
@@ -119,9 +123,10 @@ class TaskEnvironment(gymnasium.Env):
         baseline: float = SightConfig.baseline,
         segmentation: bool = False,
         actions: Actions = "cartesian",
+        contact: Contact = "point",
     ):
         self.batch, self.observation_space = _make(
-            task, 1, scene, observations, randomisation, device, render_mode, actions, image_width=image_width,
+            task, 1, scene, observations, randomisation, device, render_mode, actions, contact, image_width=image_width,
             instrument=instrument, tool=tool, eyes=eyes, baseline=baseline, segmentation=segmentation,
         )  # fmt: skip
         self.action_space, self.render_mode = _action_space(self.batch), render_mode

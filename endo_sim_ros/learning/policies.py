@@ -36,7 +36,7 @@ class RetractionScript:
     """Goes to the spot, grasps, lifts a little farther than needed and holds."""
 
     actions: Actions = "cartesian"
-    grasp, beyond = 0.002, 1.15  # m from the spot at which the jaw closes; how far to lift, in parts of the goal
+    grasp, beyond = 0.005, 1.15  # m from the spot at which the jaw closes; how far to lift, in parts of the goal
 
     def reset(self, episodes: Sequence[int]) -> None:
         """Nothing to do: the script has no memory."""

@@ -10,7 +10,7 @@ import torch
 from rich.progress import Progress
 
 from endo_sim_ros.core.device import single_threaded_torch
-from endo_sim_ros.learning.actions import Actions
+from endo_sim_ros.learning.actions import Actions, Contact
 from endo_sim_ros.learning.config import PPOConfig, Randomisation
 from endo_sim_ros.learning.environments import Observed, VectorTaskEnvironment
 from endo_sim_ros.learning.policies import NetworkPolicy
@@ -151,6 +151,7 @@ def train_ppo(
     randomisation: Randomisation = Randomisation(),
     device: str = "auto",
     actions: Actions = "cartesian",
+    contact: Contact = "point",
 ) -> tuple[NetworkPolicy, list[dict[str, float]]]:
     """Train a policy by PPO on states; repeatable bit by bit on a CPU.
 
@@ -159,7 +160,7 @@ def train_ppo(
         seconds; first of the untrained policy, last of the one returned.
     """
     with Progress() as bar:
-        options: dict[str, Any] = {"scene": scene, "randomisation": randomisation, "device": device, "actions": actions}
+        options: dict[str, Any] = {"scene": scene, "randomisation": randomisation, "device": device, "actions": actions, "contact": contact}
         environments = StableEnvironments(VectorTaskEnvironment(task, config.environments, **options))
         testing = TaskBatch(task, count=config.test_episodes, **options)
         rollout = config.environments * config.rollout

@@ -6,14 +6,14 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from endo_sim_ros.learning.actions import ACTION_SIZES, Actions, observed_names
+from endo_sim_ros.learning.actions import ACTION_SIZES, Actions, Contact, observed_names
 from endo_sim_ros.learning.config import Randomisation, SightConfig
-from endo_sim_ros.learning.held_tools import HeldTools, hold_tool, hold_tools
+from endo_sim_ros.learning.held_tools import HeldTool, HeldTools, hold_tool, hold_tools
 from endo_sim_ros.learning.pictures import IMAGE, SEGMENTATION, Pictures
 from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.learning.tasks import Outcome, find_task
 from endo_sim_ros.learning.variation import Variation
-from endo_sim_ros.physics import TissueBatch
+from endo_sim_ros.physics import TissueBatch, ToolLinks
 
 RESTING_SPEED = 1e-5  # m/s; as in TissueSimulation: one tissue slower than this, that no tool moves, is left as it is
 
@@ -39,9 +39,12 @@ class TaskBatch:
             `HeldTools.steps`, and the fourth number of the task. ``joint_positions``: where they are, -1 and 1 being their limits,
             and the same. With joints the state ends with their positions as parts of their ranges. A tip that would leave where
             the task allows it comes as near as its joints get.
+        contact: What touches the tissue: ``point``, the tip that the task describes, or ``links``, the links of the instrument, whose
+            jaws hold what lies between them, as in physics_node.
 
     Raises:
-        ValueError: If there is no such task or tool, the scene is too small for it, or an arm does not reach it.
+        ValueError: If there is no such task or tool, the scene is too small for it, an arm does not reach it, or links shall touch
+            where each episode has another tool.
     """
 
     def __init__(
@@ -55,6 +58,7 @@ class TaskBatch:
         device: str = "auto",
         images: bool = False,
         actions: Actions = "cartesian",
+        contact: Contact = "point",
     ):
         kind = find_task(task)
         config = kind.physics(device)
@@ -62,22 +66,27 @@ class TaskBatch:
         self.task, self.count = kind(nodes, scene.camera.position, count), count
         self.observations, self.randomisation = observations, randomisation
         largest = kind.largest_stiffness * float(np.exp(randomisation.stiffness))
-        self.tissue = TissueBatch(nodes, config, count, 1, stiffness=np.full(count, largest) if largest != 1 else None)
+        stiffness = np.full(count, largest) if largest != 1 else None
+        held: list[HeldTool] = []
+        shown = images or observations != "state" or sight.segmentation
+        if shown and sight.instrument or actions != "cartesian" or contact == "links":
+            held = hold_tools(kind, scene, sight.tool) if randomisation.tool else [hold_tool(kind, scene, sight.tool)]
+        if contact == "links" and randomisation.tool:
+            raise ValueError("contact is links, which all episodes share, but randomisation gives each its tool; set its tool to 0")
+        self._links = ToolLinks(held[0].shape[1]) if contact == "links" else None
+        self._linked = torch.zeros(0)  # poses of the links, of a single tissue
+        self.tissue = TissueBatch(nodes, config, count, 1, stiffness=stiffness, capsules=len(self._links or [0]))
         self._varies = largest != 1
         self._rest = torch.from_numpy(nodes.rest)
         self._resting, self._placed = True, False  # of a single tissue
         self.sight = sight
-        self.tools: HeldTools | None = None
+        self.tools = HeldTools(held, kind, count) if held else None
         self.pictures: Pictures | None = None
         self.actions: Actions = actions
         self.action_size = ACTION_SIZES[actions]
         self.varied: dict[str, np.ndarray] = {}
         """What each episode has of each kind of randomisation that there is [B, …], by the names of the options."""
         self._rotations = np.tile(np.eye(3), (count, 1, 1))  # of the tips, world
-        shown = images or observations != "state" or sight.segmentation
-        if shown and sight.instrument or actions != "cartesian":
-            held = hold_tools(kind, scene, sight.tool) if randomisation.tool else [hold_tool(kind, scene, sight.tool)]
-            self.tools = HeldTools(held, kind, count)
         if shown:
             self.pictures = Pictures(scene, self.tissue, count, sight, randomisation, self.tools if sight.instrument else None)
 
@@ -152,11 +161,19 @@ class TaskBatch:
         tools.present.copy_(present)
         tools.closed.copy_(torch.from_numpy(closed.astype(np.int32))[:, None] * present)
         self._placed = True
+        going = np.setdiff1d(np.arange(self.count), renew)
+        if self.tools is not None and self._links is not None:
+            if self.actions == "cartesian":
+                self.tools.move(going, self._poses()[going], closed[going])
+            posed = self.tools.links(0, np.arange(self.count))
+            linked = torch.from_numpy(np.stack([posed[link] for link in self._links.links], 1))
+            moved = moved or not torch.equal(linked, self._linked)
+            self._linked = linked
+            tools.set_links(0, self._links, linked)
         step = self.count > 1 or not self._rests(moved)
         if step:
             self.tissue.step()
-        if self.tools is not None and self.actions == "cartesian":  # while a GPU takes the step
-            going = np.setdiff1d(np.arange(self.count), renew)
+        if self.tools is not None and self._links is None and self.actions == "cartesian":  # while a GPU takes the step
             self.tools.move(going, self._poses()[going], closed[going])
         if step:
             self._resting = self.count == 1 and self.tissue.solver.speed < RESTING_SPEED
@@ -173,8 +190,8 @@ class TaskBatch:
         tools = self.tissue.tools
         before = bool(tools.gripping[0, 0])
         tools.take_hold()
-        holding = bool(tools.gripping[0, 0])
-        return self._resting and holding == before and not (moved and (holding or tools.contact_radius > 0))
+        holding, touching = bool(tools.gripping[0, 0]), tools.contact_radius > 0 or self._links is not None
+        return self._resting and holding == before and not (moved and (holding or touching))
 
     def observe(self) -> np.ndarray | dict[str, np.ndarray]:
         """Observations of all episodes now."""

@@ -241,6 +241,7 @@ class Retraction(Task):
     )  # fmt: skip
     horizon, force_limit = 60, 3.0
     working_fourth = 1.0
+    open_jaw = 0.6  # rad: as links, wider jaws grasp more tissue than they lift within the limit of the force
     tool, tool_share = "PROGRASP_FORCEPS", GRIP  # what it grasps lies between its jaws, not at their points
     low, high = (-0.02, -0.02, -0.004), (0.02, 0.02, 0.025)
     lift, hold = 0.006, 3  # m, steps

@@ -4,13 +4,14 @@ import json
 import logging
 import time
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from rich.progress import Progress
 
 from endo_sim_ros.core.device import single_threaded_torch
-from endo_sim_ros.learning.actions import Actions
+from endo_sim_ros.learning.actions import Actions, Contact
 from endo_sim_ros.learning.config import PPOConfig, Randomisation, TrainingConfig
 from endo_sim_ros.learning.policies import NetworkPolicy, Policy
 from endo_sim_ros.learning.scenes import Scene
@@ -53,6 +54,7 @@ def train(
     randomisation: Randomisation = Randomisation(),
     device: str = "auto",
     actions: Actions = "cartesian",
+    contact: Contact = "point",
 ) -> tuple[NetworkPolicy, list[dict[str, float]]]:
     """Train a policy.
 
@@ -62,8 +64,8 @@ def train(
     """
     hidden = [config.hidden] if config.hidden else []
     rng = np.random.default_rng([config.seed, 0xCE])
-    batch = TaskBatch(task, scene, config.population, randomisation=randomisation, device=device, actions=actions)
-    testing = TaskBatch(task, scene, config.test_episodes, randomisation=randomisation, device=device, actions=actions)
+    make = partial(TaskBatch, task, scene, randomisation=randomisation, device=device, actions=actions, contact=contact)
+    batch, testing = make(config.population), make(config.test_episodes)
     size = sum(rows * columns for rows, columns in NetworkPolicy.sizes(task, hidden, actions))
     mean, deviation = np.zeros(size), np.full(size, config.spread)
     elite_count = max(round(config.elite * config.population), 2)

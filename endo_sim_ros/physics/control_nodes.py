@@ -34,6 +34,7 @@ class ControlNodes:
         volumes: Tissue volume that each stands for [M], m³, float32.
         is_skin: Nodes on the reconstructed surface, where tools act [M], bool. Skin nodes come first.
         spacing: Typical distance between neighbours, metres; the grid's cells are sized by it.
+        seen_from: From where the skin was seen [3], metres, world; None where nobody has seen it.
     """
 
     rest: np.ndarray
@@ -41,6 +42,7 @@ class ControlNodes:
     volumes: np.ndarray
     is_skin: np.ndarray
     spacing: float
+    seen_from: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.rest)
@@ -250,6 +252,7 @@ def build_control_nodes(
         np.concatenate(volumes)[kept].astype(np.float32),
         (layer_of == 0)[kept],
         max(sheet.spacing, gap),
+        eye,
     )
 
 
@@ -266,4 +269,4 @@ def _dense_nodes(points: np.ndarray, eye: np.ndarray, skin: np.ndarray, sheet: S
         pinned = KDTree(skin[sheet.rim]).query(points)[0] <= max(sheet.spacing, spacing)
     volumes = spacing**3 / occupancy[cell_of.ravel()]
     rest = (points + eye).astype(np.float32)
-    return ControlNodes(rest, pinned, volumes.astype(np.float32), np.ones(len(points), bool), spacing)
+    return ControlNodes(rest, pinned, volumes.astype(np.float32), np.ones(len(points), bool), spacing, eye)

@@ -24,6 +24,15 @@ def links_are_finite(c: int, commands: Commands, constants: ToolConstants) -> bo
 
 
 @wp.func
+def set_back(point: wp.vec3d, radius: float, constants: ToolConstants) -> wp.vec3d:
+    """An end of a capsule as it acts: towards the eye by as much as the capsule acts thicker than it is, so that it meets the skin where
+    it is seen to."""
+    if constants.seen == 0 or radius >= constants.thinnest:
+        return point
+    return point + wp.float64(constants.thinnest - radius) * wp.normalize(constants.eye - point)
+
+
+@wp.func
 def move_links(
     t: int, c: int, at: int, used: int, commands: Commands, holds: Holds, constants: ToolConstants, rigid: RigidTools
 ) -> int:  # fmt: skip
@@ -49,11 +58,13 @@ def move_links(
             if commands.radius[i] > 0.0:
                 place = at + used
                 rigid.tool[place] = t
-                rigid.radius[place] = wp.max(commands.radius[i], constants.thinnest)
-                rigid.tip[place] = single(start_before - constants.origin)
-                rigid.tip_v[place] = single((start - start_before) / constants.duration)
-                rigid.end[place] = single(end_before - constants.origin)
-                rigid.end_v[place] = single((end - end_before) / constants.duration)
+                thin = commands.radius[i]
+                rigid.radius[place] = wp.max(thin, constants.thinnest)
+                start_acts, end_acts = set_back(start_before, thin, constants), set_back(end_before, thin, constants)
+                rigid.tip[place] = single(start_acts - constants.origin)
+                rigid.tip_v[place] = single((set_back(start, thin, constants) - start_acts) / constants.duration)
+                rigid.end[place] = single(end_acts - constants.origin)
+                rigid.end_v[place] = single((set_back(end, thin, constants) - end_acts) / constants.duration)
                 used += 1
             holds.last_start[i] = start
             holds.last_end[i] = end
@@ -70,8 +81,9 @@ def nearest_link(c: int, x: wp.vec3d, commands: Commands, constants: ToolConstan
     for k in range(constants.capsules):
         i = c * constants.capsules + k
         if commands.radius[i] > 0.0:
-            along = commands.end[i] - commands.start[i]
-            arm = x - commands.start[i]
+            start = set_back(commands.start[i], commands.radius[i], constants)
+            along = set_back(commands.end[i], commands.radius[i], constants) - start
+            arm = x - start
             share = wp.dot(arm, along) / wp.max(wp.length_sq(along), wp.float64(1.0e-12))
             share = wp.clamp(share, wp.float64(0.0), wp.float64(1.0))
             gap = wp.length(arm - share * along) - wp.float64(wp.max(commands.radius[i], constants.thinnest))

@@ -82,6 +82,8 @@ class Tools:
         self.contact_radius = radius  # of the capsule that acts, m; 0 = none
         constants.capsules, constants.thinnest = slots, thinnest
         self.thinnest = thinnest  # radius as which thinner capsules act, m
+        constants.seen = int(nodes.seen_from is not None)
+        constants.eye = wp.vec3d(*(np.zeros(3) if nodes.seen_from is None else nodes.seen_from))
         constants.margin = thinnest + _MARGIN * apart
         self.most_pull = 2 * config.friction * config.grip_force  # of jaws, N: friction at two faces; 0 = without limit
         constants.most_pull = self.most_pull

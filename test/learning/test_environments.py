@@ -94,6 +94,45 @@ def test_each_of_many_environments_is_the_single_one_with_its_seed(task):
         assert recorded[k][1][1] == reward
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("task", "count"), [("retraction", 8), ("palpation", 4)])
+def test_the_scripts_solve_the_tasks_with_links_that_touch_and_each_episode_has_the_bits_of_its_seed(task, count):
+    ends = []
+    for first, b in ((50, count), (51, 1)):
+        batch = TaskBatch(task, load_scene(), b, device="cpu", contact="links")
+        batch.reset(range(b), [np.random.default_rng(first + i) for i in range(b)])
+        policy, states, rewards, solved = scripted_policy(task, b), [batch.observe()], [], np.zeros(b, bool)
+        for _ in range(batch.task.horizon):
+            state, outcome = batch.step(policy.act(states[-1]))
+            states.append(state)
+            rewards.append(outcome.reward)
+            solved |= outcome.success
+        ends.append((np.array(states), np.array(rewards), solved, batch))
+    (many, rewards, solved, batch), (single, reward, *_) = ends
+    assert solved.mean() >= 0.75 and not batch.tissue.tools.faults.any()
+    np.testing.assert_array_equal(many[:, 1], single[:, 0])
+    np.testing.assert_array_equal(rewards[:, 1], reward[:, 0])
+
+
+@pytest.mark.slow
+def test_links_push_tissue_that_a_point_leaves_alone():
+    moved = []
+    for contact in ("point", "links"):
+        environment = make("retraction", contact=contact)
+        environment.reset(seed=0)
+        for _ in range(16):
+            environment.step(np.array([0, 0, -1.0, -1.0]))  # open jaws, straight down
+        moved.append(float(environment.unwrapped.batch.tissue.displacements.abs().max()))
+    assert moved[0] == 0 and moved[1] > 2e-3
+
+
+def test_contact_that_there_is_not_is_refused():
+    with pytest.raises(ValueError, match="contact must be point or links, got 'capsule'"):
+        make("retraction", contact="capsule")
+    with pytest.raises(ValueError, match="contact is links, which all episodes share, but randomisation gives each its tool"):
+        make("retraction", contact="links", randomisation={"tool": 0.5})
+
+
 def test_many_environments_begin_anew_one_by_one_and_count_their_seeds():
     many = gymnasium.make_vec(IDS["retraction"], num_envs=2, vectorization_mode="vector_entry_point", device="cpu")
     first, _ = many.reset(seed=np.array([5, 8]))

@@ -18,12 +18,12 @@ def test_a_link_pushes_as_the_one_capsule_of_all_tools_bit_for_bit(backend):
     ends = []
     for linked in (False, True):
         with backend():
-            simulation = simulate(contact_radius=0.006, contact_length=0.03, node_count=600)
-        felt, rod = [], Capsule("rod", np.zeros(3), np.array([0.0, 0.0, -0.03]), 0.006)
+            simulation = simulate(contact_radius=0.016, contact_length=0.03, node_count=600)  # thicker than the least
+        felt, rod = [], Capsule("rod", np.zeros(3), np.array([0.0, 0.0, -0.03]), 0.016)
         if linked:
             simulation.set_instrument("probe", [rod])
         for step in range(8):
-            pose = pose_at(TIP + [0.0003 * step, 0, -0.006 + 0.0005 * step])
+            pose = pose_at(TIP + [0.0003 * step, 0, -0.016 + 0.0005 * step])
             simulation.set_grasp("probe", pose, False, {"rod": pose} if linked else None)
             simulation.step()
             felt.append(np.concatenate(simulation.reaction("probe")))
@@ -31,6 +31,22 @@ def test_a_link_pushes_as_the_one_capsule_of_all_tools_bit_for_bit(backend):
     for one, other in zip(*ends):
         np.testing.assert_array_equal(one, other)
     assert ends[0][1][-1, 2] < -0.1
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0), (0.013, -0.009)])
+def test_a_thin_link_touches_the_skin_where_it_is_seen_to(place):
+    simulation = simulate()
+    rod = Capsule("rod", np.zeros(3), np.array([0.0, 0.0, -0.03]), 0.001)
+    simulation.set_instrument("probe", [rod])
+    model = curved_sheet().means.numpy()
+    skin = model[((model[:, :2] - place) ** 2).sum(1).argmin(), 2]
+    gap = 0.008
+    while not simulation.reaction("probe")[0].any() and gap > -0.01:
+        gap -= 0.0005
+        pose = pose_at([*place, skin - rod.radius - gap])
+        simulation.set_grasp("probe", pose, False, {"rod": pose})
+        simulation.step()
+    assert abs(gap) < 0.0015, f"touches at {1e3 * gap:.1f} mm"
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ import signal
 import sys
 import textwrap
 import time
+from collections.abc import Container
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -59,6 +60,15 @@ def parse(name: str, words: list[str]) -> Runnable:
     document_ranges(command)
     default: Any = module.defaults(words) if hasattr(module, "defaults") else None
     return tyro.cli(command, prog=f"endo-sim {name}", description=summary(name), args=words, default=default)
+
+
+def chosen(words: list[str], flag: str, names: Container[str]) -> str:
+    """Return which of these names the words give a flag last, default if none: what tyro then refuses."""
+    name = "default"
+    for word, following in zip(words, [*words[1:], ""]):
+        if word == flag or word.startswith(f"{flag}="):
+            name = following if word == flag else word.removeprefix(f"{flag}=")
+    return name if name in names else "default"
 
 
 def main() -> int:

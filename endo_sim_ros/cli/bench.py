@@ -89,6 +89,21 @@ class BenchEnvironments(Measured):
 
 
 @dataclass(frozen=True)
+class BenchPresses:
+    """The laws of materials on presses of real tissue by a testing machine: how well each fits, and predicts other trials."""
+
+    folder: tyro.conf.Positional[Path]
+    """Folder of CSV files with the columns trial, time_s, force_N and position_mm; the trials of a file are of one organ."""
+    json: Path | None = None
+    """File for the results as a list of rows."""
+
+    def run(self) -> None:
+        """Fit and predict."""
+        find_benchmarks()
+        importlib.import_module("benchmarks.presses").bench_presses(self.folder, self.json)
+
+
+@dataclass(frozen=True)
 class BenchSoak:
     """The node graph under random traffic, half of it spoilt: who dies, whose memory grows, does it still work."""
 
@@ -110,13 +125,14 @@ class BenchSoak:
 
 @dataclass(frozen=True)
 class Command:
-    """Measure speed on this machine, beside peers where they are installed; medians and ratios."""
+    """Measure speed on this machine, beside peers where they are installed, or laws of materials on real tissue; medians and ratios."""
 
     what: tyro.conf.OmitArgPrefixes[
         Annotated[BenchRaster, tyro.conf.subcommand("raster", prefix_name=False)]
         | Annotated[BenchPhysics, tyro.conf.subcommand("physics", prefix_name=False)]
         | Annotated[BenchGraph, tyro.conf.subcommand("graph", prefix_name=False)]
         | Annotated[BenchEnvironments, tyro.conf.subcommand("environments", prefix_name=False)]
+        | Annotated[BenchPresses, tyro.conf.subcommand("presses", prefix_name=False)]
         | Annotated[BenchSoak, tyro.conf.subcommand("soak", prefix_name=False)]
     ]
 

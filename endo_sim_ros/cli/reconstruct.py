@@ -1,6 +1,5 @@
 """`endo-sim reconstruct`."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -8,6 +7,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
+from endo_sim_ros.cli import chosen
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.presets import PRESETS, Preset, preset
 
@@ -38,10 +38,6 @@ class Command:
             measure_held_out(trainer, held_out, self.out)
 
 
-def defaults(words: Sequence[str]) -> Command:
+def defaults(words: list[str]) -> Command:
     """Return the command with the options of the preset that the words name: the values of options that they do not give."""
-    name = "default"
-    for word, following in zip(words, [*words[1:], ""]):
-        if word == "--preset" or word.startswith("--preset="):
-            name = following if word == "--preset" else word.removeprefix("--preset=")
-    return Command(tyro.MISSING, tyro.MISSING, config=preset(name if name in PRESETS else "default"))  # tyro refuses other names
+    return Command(tyro.MISSING, tyro.MISSING, config=preset(chosen(words, "--preset", PRESETS)))

@@ -7,7 +7,9 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
+from endo_sim_ros.cli import chosen
 from endo_sim_ros.physics.config import PhysicsConfig
+from endo_sim_ros.physics.tissues import TISSUES, Tissue, tissue
 
 
 @dataclass(frozen=True)
@@ -18,6 +20,8 @@ class Command:
     """PLY model, with the cameras.json that is saved beside it."""
     out: Path = Path("touch.png")
     """Picture to write."""
+    tissue: Tissue = "default"
+    """What the tissue is made of, with published numbers (docs/physics.md). Options that are not given have the values of the tissue."""
     config: Annotated[PhysicsConfig, tyro.conf.arg(name="")] = field(default_factory=PhysicsConfig)
 
     def run(self) -> None:
@@ -25,3 +29,8 @@ class Command:
         from endo_sim_ros.evaluation.interaction_sheet import draw_touches
 
         draw_touches(self.model, self.out, self.config)
+
+
+def defaults(words: list[str]) -> Command:
+    """Return the command with the options of the tissue that the words name: the values of options that they do not give."""
+    return Command(tyro.MISSING, config=tissue(chosen(words, "--tissue", TISSUES)))

@@ -1,13 +1,13 @@
 """`endo-sim view`."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 from tyro.conf import Positional
 
-from endo_sim_ros.physics.config import PhysicsConfig
+from endo_sim_ros.physics.tissues import Tissue, tissue
 from endo_sim_ros.viewer.config import ViewerConfig
 
 
@@ -20,6 +20,8 @@ class Command:
     config: Annotated[ViewerConfig, tyro.conf.arg(name="")] = field(default_factory=ViewerConfig)
     instrument: str = "LARGE_NEEDLE_DRIVER"
     """Tool that the mouse moves: its name, or the path of its file; empty, or where its arm does not reach = a bare tip."""
+    tissue: Tissue = "default"
+    """What the tissue is made of, with published numbers (docs/physics.md)."""
     node_count: int | None = None
     """Number of control nodes; default: that of the physics."""
     device: str = "auto"
@@ -29,7 +31,5 @@ class Command:
         """Serve the page until interrupted; raises ValueError if model, cameras or options cannot be used."""
         from endo_sim_ros.viewer.standalone import view
 
-        physics = PhysicsConfig(device=self.device)
-        if self.node_count is not None:
-            physics = replace(physics, node_count=self.node_count)
-        view(self.model, physics, self.config, self.instrument)
+        nodes = {} if self.node_count is None else {"node_count": self.node_count}
+        view(self.model, tissue(self.tissue, device=self.device, **nodes), self.config, self.instrument)

@@ -14,6 +14,7 @@ from endo_sim_ros.core.frames import LEFT_FRAME, RIGHT_FRAME
 from endo_sim_ros.instruments.config import DrawingConfig
 from endo_sim_ros.nodes.pacing import MOST_WAITING
 from endo_sim_ros.physics.config import PhysicsConfig
+from endo_sim_ros.physics.tissues import Tissue
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.presets import Preset
 from endo_sim_ros.rendering.config import RenderingConfig
@@ -85,6 +86,8 @@ class ReconstructionNodeConfig(WorldConfig):
 class PhysicsNodeConfig(WorldConfig):
     """Options of physics_node beside those of the physics."""
 
+    tissue: Tissue = "default"
+    """What the tissue is made of, with published numbers (docs/physics.md). Options that are not given have the values of the tissue."""
     mode: Literal["realtime", "lockstep"] = "realtime"
     """realtime: steps follow the clock (the wall clock, or /clock with use_sim_time) and use the newest commands; steps that
     would be late are skipped. lockstep: each command takes one step; state, reaction and /clock have its stamp."""

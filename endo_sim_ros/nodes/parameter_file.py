@@ -1,24 +1,31 @@
 """The ROS parameter files in config/, generated from the configurations."""
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import Any
 
-from endo_sim_ros.core.config import Option, options
+from endo_sim_ros.core.config import Option, StageConfig, options
 from endo_sim_ros.nodes.configs import NODE_CONFIGS
+from endo_sim_ros.physics.config import PhysicsConfig
+from endo_sim_ros.physics.tissues import TISSUES
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.presets import PRESETS
 
-_OF_PRESETS = frozenset(name for values in PRESETS.values() for name in values)
+# Options that name a set of others, by the configuration that these are of.
+_PRESETS: dict[type[StageConfig], tuple[str, Iterable[dict[str, Any]]]] = {
+    ReconstructionConfig: ("preset", PRESETS.values()),
+    PhysicsConfig: ("tissue", TISSUES.values()),
+}
 _WIDTH = 110  # characters of a line of text
 _ABOUT_PRESETS = """\
-A parameter with a value in this file has that value, whatever the preset. Parameters that some preset changes are
-therefore commented out below, with the value of the preset default: remove the # to give one a value of your own."""
+A parameter with a value in this file has that value, whatever the {0}. Parameters that some {0} changes are
+therefore commented out below, with the value of the {0} default: remove the # to give one a value of your own."""
 
 
 def parameter_file(nodes: Sequence[str] = tuple(NODE_CONFIGS)) -> str:
     """A YAML file with every parameter of some nodes at its default, each under its description and range.
 
-    Parameters whose values come from the preset are commented out: given in a file they would outweigh it.
+    Parameters whose values come from a preset or tissue are commented out: given in a file they would outweigh it.
 
     Args:
         nodes: Names of ROS nodes, keys of `NODE_CONFIGS`.
@@ -27,9 +34,10 @@ def parameter_file(nodes: Sequence[str] = tuple(NODE_CONFIGS)) -> str:
     for node in nodes:
         lines += [f"/**/{node}:", "  ros__parameters:"]
         for config_class in NODE_CONFIGS[node]:
-            of_presets = _OF_PRESETS if config_class is ReconstructionConfig else ()
+            chooser, sets = _PRESETS.get(config_class, ("", ()))
+            of_presets = {name for values in sets for name in values}
             if of_presets:
-                lines += ["", *(f"    # {line}" for line in textwrap.wrap(_ABOUT_PRESETS, _WIDTH)), ""]
+                lines += ["", *(f"    # {line}" for line in textwrap.wrap(_ABOUT_PRESETS.format(chooser), _WIDTH)), ""]
             for option in options(config_class):
                 lines += [f"    # {line}" for line in textwrap.wrap(_description(option), _WIDTH)]
                 lines.append(f"    {'#' * (option.name in of_presets)}{option.name}: {_yaml(option.default)}")

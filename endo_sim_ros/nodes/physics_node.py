@@ -9,6 +9,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.config import option_values
 from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ControlNodeCloud, PhysicsState
 from endo_sim_ros.nodes.arm_setup import CAMERA_ARM, make_arms, place_arms
 from endo_sim_ros.nodes.arm_topics import ArmTopics
@@ -20,7 +21,7 @@ from endo_sim_ros.nodes.pacing import MOST_WAITING, WINDOW, CommandQueue, Pacer,
 from endo_sim_ros.nodes.reactions import ReactionTopics
 from endo_sim_ros.nodes.tissue_builder import TissueBuilder
 from endo_sim_ros.nodes.tool_actions import apply_tools, slip_sentence
-from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
+from endo_sim_ros.physics import TISSUES, PhysicsConfig, TissueSimulation, tissue
 from endo_sim_ros.physics.regions import read_regions
 
 _SLOW = 0.5  # real-time factor below which the node warns
@@ -40,7 +41,7 @@ class PhysicsNode(EndoNode):
     def __init__(self) -> None:
         super().__init__("physics_node")
         self._options = self.declare(PhysicsNodeConfig)
-        self.config = self.declare(PhysicsConfig)
+        self.config = self.declare(PhysicsConfig, option_values(tissue(self._options.tissue)))
         self._builder = TissueBuilder()
         self.simulation: TissueSimulation | None = None
         self._simulated_stamp = 0  # stamp of the simulated model, ns
@@ -92,6 +93,11 @@ class PhysicsNode(EndoNode):
             self._arm_topics.change_options(config)
             if moved:
                 self._place_arms()
+
+    def implied_values(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """A tissue implies its options."""
+        name = values.get("tissue")
+        return option_values(tissue(name)) if isinstance(name, str) and name in TISSUES else {}
 
     # ------------------------------------------------------------------ model
 

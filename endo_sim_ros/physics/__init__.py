@@ -19,5 +19,6 @@ if TYPE_CHECKING:
     from endo_sim_ros.physics.skinning import Skinning as Skinning
     from endo_sim_ros.physics.solver import MpmSolver as MpmSolver
     from endo_sim_ros.physics.substeps import StabilityError as StabilityError, plan_substeps as plan_substeps
+    from endo_sim_ros.physics.tissues import TISSUES as TISSUES, tissue as tissue
 
 __getattr__ = lazy_names(__name__, __file__)

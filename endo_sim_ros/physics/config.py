@@ -24,13 +24,19 @@ class PhysicsConfig(StageConfig):
     """Hold the control nodes at the border of the skin, as seen from the viewpoint, and the layers behind them."""
     min_opacity: Annotated[float, Range(0.0, 1.0)] = 0.1
     """Gaussians fainter than this do not become control nodes."""
-    material: Literal["fixed_corotated", "neo_hookean"] = "fixed_corotated"
-    """Constitutive law."""
+    material: Literal["fixed_corotated", "neo_hookean", "fung"] = "fixed_corotated"
+    """Constitutive law. fung is neo_hookean whose shear modulus grows exponentially with the strain, as that of organs does."""
     young_modulus: Annotated[float, Range(1.0, 1e9, "Pa")] = 10e3
     """Stiffness of the tissue."""
     poisson_ratio: Annotated[float, Range(0.0, 0.49)] = 0.3
     """Compressibility. Wet tissue is nearer 0.49, but there the sound speed multiplies the substeps by four and
     the coarse grid locks; at 0.3 the paper's 80 substeps are stable."""
+    stiffening: Annotated[float, Range(0.01, 100.0)] = 5.0
+    """How fast fung stiffens: a in exp(a W), which multiplies the shear modulus. W is 0 at rest, about 2 ε:ε at a small strain ε, and 0.14
+    in tissue that is pressed to four fifths and gives way to the sides. Organs have 0.5 to 10."""
+    stiffening_limit: Annotated[float, Range(1.0, 1000.0)] = 5.0
+    """Largest of these factors: from there on fung is a neo_hookean that much stiffer. Waves then meet a shear modulus s (1 + 2 ln s) times
+    that at rest, 21 times for 5, and the substeps are planned for it; 1 = no stiffening."""
     relaxation: Annotated[float, Range(0.0, 20.0)] = 0.0
     """Visco-elasticity: a Maxwell branch this many times as stiff as the material beside it. Fast motion meets all of it, held
     tissue relaxes; liver has about 1, 0 = none."""
@@ -102,6 +108,8 @@ class PhysicsConfig(StageConfig):
         "substep_dt": "step_duration, the duration of all substeps together",
         "adapt_substeps": "substeps, where 0 means as few as are safe",
     }
+
+    needs: ClassVar[dict[str, tuple[str, ...]]] = {"stiffening": ("material", "fung"), "stiffening_limit": ("material", "fung")}
 
     @classmethod
     def baseline(cls, **overrides) -> "PhysicsConfig":

@@ -271,7 +271,8 @@ class TissueSimulation:
         links = self._links[tool]
         placed = links.place(torch.stack([before, after]))
         ends = torch.stack([placed.starts, placed.ends]).numpy()  # [2, 2, K, 3]
-        reach = np.maximum(links.radii.numpy(), self._tools.thinnest)[:, None] + self.nodes.spacing
+        radii = links.radii.numpy()[:, None]
+        reach = 2 * np.maximum(radii, self._tools.thinnest) - radii + self.nodes.spacing  # as far as capsules are set back, too
         low, high = ends.min((0, 1)) - reach, ends.max((0, 1)) + reach
         positions = self.nodes.rest + self.solver.displacements()
         return bool(((low <= positions.max(0)) & (high >= positions.min(0))).all(1).any())

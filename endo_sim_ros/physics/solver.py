@@ -17,7 +17,7 @@ from endo_sim_ros.physics.backends.structs import Substep
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes
 from endo_sim_ros.physics.grid import plan_grid
-from endo_sim_ros.physics.materials import energy_density, lame_parameters
+from endo_sim_ros.physics.materials import Stiffening, energy_density, lame_parameters
 from endo_sim_ros.physics.regions import TissueProperties
 from endo_sim_ros.physics.stencils import CutTable, Stencils
 from endo_sim_ros.physics.substeps import plan_substeps
@@ -103,6 +103,8 @@ class MpmSolver:
         self._substep.gravity = wp.vec3(*config.gravity)
         self._substep.ratio = config.relaxation
         self._substep.forget = -math.expm1(-self.substepping.dt / config.relaxation_time)
+        self._stiffening = Stiffening(config.stiffening, config.stiffening_limit)
+        self._substep.stiffening, self._substep.largest_exponent = config.stiffening, math.log(config.stiffening_limit)
         self._before: list[Launch] = []
         self._after: list[Launch] = []
         self._appended: list[Work] = []
@@ -240,4 +242,5 @@ class MpmSolver:
         kinetic = 0.5 * (mass * ((v**2).sum(1) + self.cell_size**2 / 4 * (C**2).sum((1, 2)))).sum()
         F = torch.from_numpy(self.deformation_gradients(environment)).double()
         mu, lam = (torch.from_numpy(self._of(self.scale, environment) * values) for values in (self.mu, self.lam))
-        return float(kinetic), float((volume * energy_density(self.config.material, F, mu, lam).numpy()).sum())
+        elastic = energy_density(self.config.material, F, mu, lam, self._stiffening).numpy()
+        return float(kinetic), float((volume * elastic).sum())

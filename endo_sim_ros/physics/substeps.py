@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from endo_sim_ros.physics.config import PhysicsConfig
-from endo_sim_ros.physics.materials import sound_speed
+from endo_sim_ros.physics.materials import MATERIALS, Stiffening, sound_speed
 from endo_sim_ros.physics.regions import TissueProperties
 
 CFL_LIMIT = 0.7  # c Δt / h; measured: 0.7 runs, 0.9 blows up
@@ -42,7 +42,8 @@ def plan_substeps(config: PhysicsConfig, cell_size: float, properties: TissuePro
         properties = TissueProperties.uniform(1, config.young_modulus, config.poisson_ratio, config.density)
     # A wave faster than the relaxation meets the elastic law and the Maxwell branch.
     young = factor * (1 + config.relaxation) * properties.young_modulus
-    limits = np.array([sound_speed(*each) for each in zip(young, properties.poisson_ratio, properties.density)])
+    stiffened = MATERIALS[config.material].tangent(Stiffening(config.stiffening, config.stiffening_limit))
+    limits = np.array([sound_speed(*each, stiffened) for each in zip(young, properties.poisson_ratio, properties.density)])
     worst = int(limits.argmax())
     limit = float(limits[worst])
     count = config.substeps or max(math.ceil(config.step_duration * limit / (config.courant_number * cell_size)), 1)
@@ -57,6 +58,7 @@ def plan_substeps(config: PhysicsConfig, cell_size: float, properties: TissuePro
         raise StabilityError(
             f"young_modulus {young[worst] / (1 + config.relaxation):g} Pa, poisson_ratio {properties.poisson_ratio[worst]:g}"
             + f", relaxation {config.relaxation:g}" * (config.relaxation > 0)
+            + f", stiffening_limit {config.stiffening_limit:g}" * (stiffened > 1)
             + f" and density {properties.density[worst]:g} kg/m³ on a grid of {cell_size:.3g} m give a Courant number of"
             f" {cfl:.2f} with {count} substeps of {dt:.3g} s (limits {CFL_LIMIT} and {MAX_SUBSTEPS}); {fit}"
         )

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.physics.materials import Stiffening
 from endo_sim_ros.physics.regions import TissueProperties, paint_regions
 from endo_sim_ros.physics.stress import von_mises
 
@@ -42,8 +43,10 @@ class StressColors:
         """Return colours [M, 3] uint8 of nodes with these deformation gradients [M, 3, 3]."""
         if self._tissue is None:
             self._tissue = self._properties(len(F))
-        stress = von_mises(F, self._tissue.young_modulus, self._tissue.poisson_ratio, self._parameters["material"])
-        largest = max(float(np.percentile(stress, _RED)), _LEAST_SCALE * self._parameters["young_modulus"])
+        known = self._parameters
+        stiffening = Stiffening(known["stiffening"], known["stiffening_limit"])
+        stress = von_mises(F, self._tissue.young_modulus, self._tissue.poisson_ratio, known["material"], stiffening)
+        largest = max(float(np.percentile(stress, _RED)), _LEAST_SCALE * known["young_modulus"])
         self.scale = max(largest, 0.98 * self.scale)
         levels = (255 * np.minimum(stress / self.scale, 1)).astype(np.uint8)
         return cv2.applyColorMap(levels[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1]

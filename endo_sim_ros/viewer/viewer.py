@@ -31,7 +31,10 @@ _TRAVEL = 0.8  # share of the physics' travel that the mouse may pull; tissue sl
 _FOCAL = 0.85  # focal length of a camera that nothing is known of, in image widths
 
 
-PARAMETERS = (*(slider.parameter for slider in SLIDERS), "poisson_ratio", "material", "regions", "travel")  # that the page needs to know
+# Those of physics that the page needs to know.
+PARAMETERS = (
+    *(slider.parameter for slider in SLIDERS), "poisson_ratio", "material", "stiffening", "stiffening_limit", "regions", "travel",
+)  # fmt: skip
 
 
 class Actions(Protocol):

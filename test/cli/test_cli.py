@@ -25,6 +25,7 @@ from endo_sim_ros.core.config import ConfigError, options
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import load_ply
 from endo_sim_ros.evaluation import held_out, plots
+from endo_sim_ros.physics import PhysicsConfig, tissue
 from endo_sim_ros.reconstruction import ReconstructionConfig, from_bag
 from endo_sim_ros.reconstruction.from_bag import reconstruct_bag
 from endo_sim_ros.reconstruction.presets import preset
@@ -142,6 +143,15 @@ def test_options_given_beside_a_preset_count_whatever_their_value(monkeypatch):
         assert cli.main() == 0
     assert taken[0] == taken[1] == preset("paper", lambda_tv=0.0, sh_degree=3)
     assert taken[2] == ReconstructionConfig()
+
+
+def test_a_tissue_has_its_options_unless_the_words_give_them():
+    assert cli.parse("touch", "model.ply --tissue fat --density 900".split()).config == tissue("fat", density=900.0)
+    assert cli.parse("touch", ["model.ply"]).config == PhysicsConfig()
+    with pytest.raises(SystemExit):
+        cli.parse("touch", "model.ply --tissue jelly".split())
+    with pytest.raises(ConfigError, match="tissue must be one of default, liver, gall_bladder, lung, fat, got 'jelly'"):
+        tissue("jelly")
 
 
 def test_a_preset_is_that_of_the_words_and_not_of_the_process(caplog):

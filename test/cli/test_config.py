@@ -23,6 +23,8 @@ from endo_sim_ros.core.config import (
 )
 from endo_sim_ros.nodes.configs import NODE_CONFIGS
 from endo_sim_ros.nodes.parameter_file import parameter_file
+from endo_sim_ros.physics.config import PhysicsConfig
+from endo_sim_ros.physics.tissues import TISSUES, Tissue, tissue
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.presets import PRESETS, Preset, preset
 from endo_sim_ros.reconstruction.strategies import STRATEGIES
@@ -171,16 +173,17 @@ def test_an_option_without_effect_is_told_with_what_gives_it_one(name, given, wh
     assert not unused_options(preset(name, **given), *users), "one of several uses it"
 
 
-@pytest.mark.parametrize("name", PRESETS)
-def test_presets_have_no_option_without_effect(name):
-    assert not unused_options(preset(name))
+@pytest.mark.parametrize("config", [*map(preset, PRESETS), *map(tissue, TISSUES)], ids=[*PRESETS, *TISSUES])
+def test_presets_and_tissues_have_no_option_without_effect(config):
+    assert not unused_options(config)
 
 
 def test_what_options_need_can_be_had():
-    known = {option.name: option for option in options(ReconstructionConfig)}
-    for name, (switch, *wanted) in ReconstructionConfig.needs.items():
-        assert operator.attrgetter(name)(ReconstructionConfig()) is not None and switch in known
-        assert known[switch].choices is None or set(wanted) <= set(known[switch].choices)
+    for config in (ReconstructionConfig, PhysicsConfig):
+        known = {option.name: option for option in options(config)}
+        for name, (switch, *wanted) in config.needs.items():
+            assert operator.attrgetter(name)(config()) is not None and switch in known
+            assert known[switch].choices is None or set(wanted) <= set(known[switch].choices)
     assert all(ReconstructionConfig.needs[name] == ("densification", name) for name in STRATEGIES)
 
 
@@ -215,7 +218,7 @@ def test_parameter_file_gives_every_node_its_defaults(text):
         for config in configs:
             mine = {option.name: values.pop(option.name) for option in options(config) if option.name in values}
             assert config.from_mapping(mine) == config()
-            assert len(mine) == len(options(config)) or (config is ReconstructionConfig and text != UNCOMMENTED)
+            assert len(mine) == len(options(config)) or (config in (ReconstructionConfig, PhysicsConfig) and text != UNCOMMENTED)
         assert not values
 
 
@@ -226,8 +229,15 @@ def test_a_preset_beside_the_parameter_file_has_its_values(name):
     assert preset(name, **given) == preset(name)
 
 
-def test_presets_have_the_names_that_options_allow():
-    assert get_args(Preset) == tuple(PRESETS)
+@pytest.mark.parametrize("name", TISSUES)
+def test_a_tissue_beside_the_parameter_file_has_its_values(name):
+    values = yaml.safe_load(FILE.read_text())["/**/physics_node"]["ros__parameters"]
+    given = {key: value for key, value in values.items() if key in option_values(PhysicsConfig())}
+    assert tissue(name, **given) == tissue(name)
+
+
+def test_presets_and_tissues_have_the_names_that_options_allow():
+    assert get_args(Preset) == tuple(PRESETS) and get_args(Tissue) == tuple(TISSUES)
 
 
 def test_parameters_are_found_by_the_name_of_the_executable_too(capsys):

@@ -14,6 +14,7 @@ from endo_sim_ros.core.config import ConfigError, Range, StageConfig, option_val
 from endo_sim_ros.nodes.parameters import ConfiguredNode
 from endo_sim_ros.nodes.physics_node import PhysicsNode
 from endo_sim_ros.nodes.reconstruction_node import ReconstructionNode
+from endo_sim_ros.physics import PhysicsConfig, tissue
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.presets import preset
 
@@ -58,11 +59,11 @@ class ExampleNode(ConfiguredNode):
 
 @pytest.fixture
 def start():
-    """Makes a node as if its process had been given these ROS arguments; for `ReconstructionNode` there can be one a test."""
+    """Makes a node as if its process had been given these ROS arguments; of those of the package there can be one a test."""
     made = []
 
     def start(node_class, *arguments):
-        context = None if node_class is ReconstructionNode else Context()
+        context = Context() if node_class is ExampleNode else None
         rclpy.init(args=["--ros-args", *arguments], context=context)
         made.append((context, None))
         node = node_class() if context is None else node_class(context)
@@ -181,6 +182,17 @@ def test_a_preset_that_does_not_exist_changes_nothing(start):
     assert not refused.successful and "must be one of default, laptop, paper" in refused.reason
     assert not set_parameter(node, "preset", 3).successful
     assert options_of(node) == preset("paper")
+
+
+def test_a_tissue_has_its_options_unless_somebody_gave_them(start):
+    node = start(PhysicsNode, "--params-file", str(FILE), "-p", "tissue:=liver", "-p", "young_modulus:=4000.0")
+    assert node.config == tissue("liver", young_modulus=4000.0)
+    assert set_parameter(node, "tissue", "lung").successful and set_parameter(node, "density", 300.0).successful
+    assert node.config == tissue("lung", young_modulus=4000.0, density=300.0)
+    refused = set_parameter(node, "tissue", "jelly")
+    assert not refused.successful and "must be one of default, liver, gall_bladder, lung, fat" in refused.reason
+    assert set_parameter(node, "tissue", "default").successful
+    assert node.config == PhysicsConfig(young_modulus=4000.0, density=300.0)
 
 
 def test_what_was_refused_does_not_count_as_given(start):

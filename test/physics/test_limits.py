@@ -5,6 +5,8 @@ import re
 
 import numpy as np
 import pytest
+import torch
+import warp as wp
 from tissue_scene import TIP, depth_of_dent, pose_at, simulate, specimen, steps
 
 from endo_sim_ros.core.config import ConfigError
@@ -118,6 +120,18 @@ def test_tissue_crushed_until_no_step_goes_on_comes_back_when_the_tool_has_gone(
     steps(simulation, 190)
     assert faults > 0 and simulation.faults == faults and "ball pushing" in simulation.last_fault
     assert crushed > 0.03 and depth_of_dent(simulation) < 0.03 * crushed
+
+
+@pytest.mark.parametrize("strain", [1e30, np.inf, np.nan])
+def test_infinite_strain_is_told_and_put_to_rest(strain):
+    """No step leaves it behind, but whoever writes into the state can."""
+    simulation = simulate(node_count=300, material="fung")
+    wp.to_torch(simulation.solver.state.F)[40] = torch.diag(torch.tensor([strain, 1.0, 1.0]))
+    simulation.set_wrench("probe", TIP, [0.0, 0.0, 0.05])
+    simulation.step()
+    assert "nodes ended non-finite, torn or" in simulation.last_fault
+    steps(simulation, 10)
+    assert simulation.faults == 2 and np.isfinite(simulation.state().F).all() and 0 < depth_of_dent(simulation) < 0.01
 
 
 @pytest.mark.parametrize("offset", [1e5, 1e30])

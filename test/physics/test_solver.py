@@ -5,11 +5,15 @@ import threading
 
 import numpy as np
 import pytest
+import warp as wp
 from tissue_scene import EYE, TIP, curved_sheet, depth_of_dent, pose_at, simulate, steps
 
+from endo_sim_ros.core.device import init_warp
 from endo_sim_ros.core.kernels import compare_plain
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation, sample_farthest
 from endo_sim_ros.physics.backends import cluster_division as cluster
+from endo_sim_ros.physics.backends.cluster_kernels import make_step_kernel
+from endo_sim_ros.physics.backends.plain_kernels import make_advance_kernel
 from endo_sim_ros.physics.materials import MATERIALS
 from endo_sim_ros.physics.stencils import Stencils
 
@@ -25,6 +29,15 @@ def test_rest_state_stays_bit_identical_without_force(kinematics, material):
     np.testing.assert_array_equal(state.positions, state.rest)
     np.testing.assert_array_equal(state.F, np.tile(np.eye(3, dtype=np.float32), (len(state.F), 1, 1)))
     assert state.time == pytest.approx(0.12) and state.positions.dtype == np.float32
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("material", MATERIALS)
+def test_kernels_for_gpus_compile_without_one(material, tmp_path):
+    init_warp()
+    for kernel, arch in ((make_advance_kernel(material, "rest"), 75), (make_step_kernel(material, 4), 90)):  # clusters are of sm_90
+        wp.compile_aot_module(kernel.module, arch=arch, module_dir=tmp_path / str(arch), use_ptx=True)
+        assert list((tmp_path / str(arch)).glob("*.ptx"))
 
 
 @pytest.mark.slow

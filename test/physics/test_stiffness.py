@@ -6,20 +6,22 @@ import numpy as np
 import pytest
 from tissue_scene import TIP, depth_of_dent, pose_at, simulate, specimen, steps
 
-from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.core.config import ConfigError, unused_options
 from endo_sim_ros.physics import PhysicsConfig, StabilityError, TissueProperties, TissueSimulation, plan_substeps
+from endo_sim_ros.physics.materials import MATERIALS
 
 
 @pytest.mark.slow
-def test_tissue_that_relaxes_holds_back_less_and_less_as_a_standard_linear_solid():
+@pytest.mark.parametrize("material", ["fixed_corotated", "fung"])
+def test_tissue_that_relaxes_holds_back_less_and_less_as_a_standard_linear_solid(material):
     ratio, time, forces = 1.5, 0.4, []
-    simulation = simulate(relaxation=ratio, relaxation_time=time)
+    simulation = simulate(material=material, relaxation=ratio, relaxation_time=time)
     simulation.set_grasp("PSM1", pose_at(TIP), True)
     simulation.set_grasp("PSM1", pose_at(TIP - [0, 0, 0.002]), True)
     for _ in range(60):
         simulation.step()
         forces.append(simulation.reaction("PSM1")[0][2])
-    lasting = simulate()
+    lasting = simulate(material=material)
     lasting.set_grasp("PSM1", pose_at(TIP), True)
     lasting.set_grasp("PSM1", pose_at(TIP - [0, 0, 0.002]), True)
     steps(lasting, 60)
@@ -43,6 +45,36 @@ def test_slowly_relaxing_tissue_is_not_left_as_it_is_before_it_has_relaxed():
     assert held[1] > 1.25 * lasting[-1] and held[-1] == pytest.approx(lasting[-1], rel=0.02)
     steps(simulation, 1)
     assert simulation.resting
+
+
+def test_stiffening_tissue_has_the_substeps_of_the_stiffest_that_it_becomes():
+    config = PhysicsConfig(material="fung", young_modulus=2600.0, poisson_ratio=0.3, stiffening_limit=4.0)  # μ 1000, λ 1500
+    at_rest = plan_substeps(dataclasses.replace(config, material="neo_hookean"), 0.002).count
+    assert plan_substeps(dataclasses.replace(config, stiffening_limit=1.0), 0.002).count == at_rest
+    ratio = np.sqrt((1500 + 2000 * 4 * (1 + 2 * np.log(4))) / 3500)
+    assert plan_substeps(config, 0.002).count == pytest.approx(ratio * at_rest, rel=0.03)
+    with pytest.raises(StabilityError, match=r"poisson_ratio 0\.3, stiffening_limit 4 and density"):
+        plan_substeps(dataclasses.replace(config, substeps=at_rest), 0.002)
+    said = unused_options(PhysicsConfig(stiffening=3.0))
+    assert said == ["stiffening has no effect while material is fixed_corotated; set material to fung"]
+
+
+@pytest.mark.slow
+def test_tissue_that_has_stiffened_snaps_back_without_a_fault(monkeypatch):
+    """Not so with the substeps for tissue at rest."""
+    faults, lift = [], TIP - [0, 0, 0.02]
+    for tangent in (MATERIALS["fung"].tangent, lambda stiffening: 1.0):
+        monkeypatch.setitem(MATERIALS, "fung", MATERIALS["fung"]._replace(tangent=tangent))
+        simulation = simulate(node_count=800, material="fung", stiffening=9.0, damping=5.0)
+        simulation.set_grasp("grip", pose_at(TIP), True)
+        for share in np.linspace(0.1, 1, 10):
+            simulation.set_grasp("grip", pose_at(TIP + share * (lift - TIP)), True)
+            simulation.step()
+        steps(simulation, 20)
+        simulation.set_grasp("grip", pose_at(lift), False)
+        steps(simulation, 30)
+        faults.append(simulation.faults)
+    assert faults[0] == 0 < faults[1]
 
 
 def test_relaxing_tissue_needs_the_substeps_of_its_fast_stiffness():
@@ -89,6 +121,26 @@ def test_each_node_obeys_its_own_material():
     expected_half = force / area / 5e3 * height / 2
     assert moved[half].mean() == pytest.approx(expected_half, rel=0.12)
     assert moved[middle].mean() == pytest.approx(expected_half * 1.25, rel=0.12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("force", [0.4, 1.2, -0.4])
+def test_a_column_that_stiffens_gives_way_as_the_equation_says(force):
+    """Poisson's ratio 0: it stays as wide as it is, and F/A = μ exp(a W) (s − 1/s) of its stretch s."""
+    height, spacing, young, rate = 0.02, 0.0025, 5e3, 2.0
+    nodes = specimen((9, 9, 9), spacing, lambda x: x[:, 2] > height - 1e-6, lambda x: x[:, 2] < 1e-6)
+    config = PhysicsConfig(
+        device="cpu", material="fung", young_modulus=young, poisson_ratio=0.0, stiffening=rate, stiffening_limit=5.0, force_radius=0.05
+    )
+    simulation = TissueSimulation.from_nodes(nodes, config)
+    simulation.set_wrench("load", [0.01, 0.01, 0.0], [0.0, 0.0, -force])
+    steps(simulation, 60)
+    stretch = np.linspace(0.5, 2.0, 10_000)
+    exponent = np.minimum(rate * (stretch**2 - 1 - 2 * np.log(stretch)), np.log(5.0))
+    expected = np.interp(force / (8 * spacing) ** 2, young / 2 * np.exp(exponent) * (stretch - 1 / stretch), stretch)
+    middle = nodes.is_skin & (np.linalg.norm(nodes.rest[:, :2] - 0.01, axis=1) < 0.008)
+    moved = (nodes.rest - simulation.state().positions)[middle, 2].mean()
+    assert moved == pytest.approx((expected - 1) * height, rel=0.12) and simulation.faults == 0
 
 
 @pytest.mark.slow

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from endo_sim_ros.physics.materials import MATERIALS
+from endo_sim_ros.physics.materials import MATERIALS, Stiffening
 from endo_sim_ros.physics.stress import von_mises
 
 
@@ -22,6 +22,13 @@ def test_stress_of_small_strain_is_that_of_the_textbook(material):
 @pytest.mark.parametrize("material", MATERIALS)
 def test_turned_tissue_has_no_stress_and_collapsed_tissue_a_finite_one(material):
     turn = cv2.Rodrigues(np.array([0.3, -1.0, 0.5]))[0]
-    F = np.stack([turn, np.zeros((3, 3)), -np.eye(3), turn @ np.diag([1.2, 1, 1])])
+    F = np.stack([turn, np.zeros((3, 3)), -np.eye(3), np.diag([np.inf, 1, 1]), turn @ np.diag([1.2, 1, 1])])
     found = von_mises(F, 10e3, 0.3, material)
-    assert np.isfinite(found).all() and found[0] < 1 and not found[1:3].any() and found[3] > 1000
+    assert np.isfinite(found).all() and found[0] < 1 and not found[1:4].any() and found[4] > 1000
+
+
+def test_stiffened_tissue_has_as_much_more_stress():
+    F = np.diag([1.5, 1.0, 1.0])[None]
+    soft, stiff = (von_mises(F, 10e3, 0.0, "fung", Stiffening(2.0, limit))[0] for limit in (1.0, 100.0))
+    assert soft == pytest.approx(5000 * (1.5**2 - 1) / 1.5, rel=1e-4)  # σ = μ (s² − 1)/J along the stretch, none across it
+    assert stiff == pytest.approx(soft * np.exp(2 * (1.5**2 - 1 - 2 * np.log(1.5))), rel=1e-4)

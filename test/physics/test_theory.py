@@ -26,9 +26,10 @@ def test_damping_decays_momentum_exponentially():
     np.testing.assert_allclose(simulation.solver.momentum()[0], before * np.exp(-20 * 0.08), rtol=5e-3, atol=1e-7)
 
 
+@pytest.mark.parametrize("material", ["fixed_corotated", "fung"])
 @pytest.mark.parametrize("kinematics", ["rest", "current"])
-def test_undriven_energy_decays(kinematics):
-    simulation = simulate(kinematics=kinematics, damping=0.0)
+def test_undriven_energy_decays(kinematics, material):
+    simulation = simulate(kinematics=kinematics, material=material, damping=0.0)
     simulation.set_wrench("probe", TIP, [0.0, 0.0, 0.1])
     steps(simulation, 4)
     simulation.set_wrench("probe", TIP, [0.0, 0.0, 0.0])

@@ -25,7 +25,8 @@ def end_step(
 
     Environments where there are any return to the state before the step, at rest there. Where the step before was bad as
     well, they give way towards rest: from tissue that is turned inside out or stretched too far for its substeps every step
-    is bad. u and F − 1 shrink together, and still fit.
+    is bad. u and F − 1 shrink together, and still fit. A control node that somebody has put into a state in which no step ends, such
+    as one of infinite strain, is put to rest: no part of infinity is finite.
     """
     b, thread = wp.tid()
     before = faults[b]
@@ -50,5 +51,9 @@ def end_step(
                 state.u[e] = kept * backup.u[e]
                 state.F[e] = kept * (backup.F[e] - wp.identity(3, float)) + wp.identity(3, float)
                 state.Q[e] = kept * backup.Q[e]
+                if not (wp.length_sq(backup.u[e]) + wp.ddot(backup.F[e], backup.F[e]) < 1.0e6):  # travel is 10 m at most
+                    state.u[e] = wp.vec3()
+                    state.F[e] = wp.identity(3, float)
+                    state.Q[e] = wp.mat33()
             state.v[e] = wp.vec3()
             state.C[e] = wp.mat33()

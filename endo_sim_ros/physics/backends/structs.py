@@ -119,3 +119,5 @@ class Substep:
     gravity: wp.vec3  # m/s²
     ratio: float  # stiffness of the Maxwell branch over that of the elastic law, 0 = none
     forget: float  # 1 - exp(-Δt/τ) of it
+    stiffening: float  # a of the exponential law
+    largest_exponent: float  # of it

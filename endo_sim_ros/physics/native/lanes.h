@@ -20,11 +20,6 @@ ENDO_SIM_INLINE float lane_of(float x, int) { return x; }
 ENDO_SIM_INLINE bool lane_of(bool condition, int) { return condition; }
 ENDO_SIM_INLINE void set_lane(float& x, int, float value) { x = value; }
 
-#if defined(__CUDA_ARCH__)  // on a CPU vector.h has these for one number as well
-ENDO_SIM_INLINE int bits_of(float x) { return __float_as_int(x); }
-ENDO_SIM_INLINE float of_bits(int bits) { return __int_as_float(bits); }
-#endif
-
 // ---------------------------------------------------------------- sixteen lanes
 
 #if !defined(__CUDA_ARCH__)

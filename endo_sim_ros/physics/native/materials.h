@@ -1,8 +1,9 @@
 // Constitutive laws. One definition each, for every kernel: one node a lane.
 //
-// A law is a struct with a function `stress` from the deformation gradient F and Lamé's parameters to the first
-// Piola-Kirchhoff stress P = dψ/dF [Pa], exactly zero at F = 1, so that a rest state stays at rest bit for bit; it returns
-// det F. Matrices are nine numbers, row by row. The energy density ψ of each law is in materials.py.
+// A law is a struct with a function `stress` from the deformation gradient F, Lamé's parameters and what is the same for the
+// whole tissue (`Substep`) to the first Piola-Kirchhoff stress P = dψ/dF [Pa], exactly zero at F = 1, so that a rest state stays
+// at rest bit for bit; it returns det F. Matrices are nine numbers, row by row. The energy density ψ of each law is in
+// materials.py.
 #pragma once
 #include "physics/native/lanes.h"
 #include "physics/native/svd.h"
@@ -76,7 +77,7 @@ template <class T> ENDO_SIM_INLINE void rotation_of(const T* F, T* R)
 
 // P = 2μ (F − R) + λ (J − 1) cof F (Stomakhin et al. 2012).
 struct fixed_corotated {
-    template <class T> ENDO_SIM_INLINE static T stress(const T* F, T mu, T lam, T* P)
+    template <class T, class Substep> ENDO_SIM_INLINE static T stress(const T* F, T mu, T lam, const Substep&, T* P)
     {
         ENDO_SIM_FUSE(on)
         T R[9], cofactor[9];
@@ -90,7 +91,7 @@ struct fixed_corotated {
 
 // P = μ (F − F⁻ᵀ) + λ ln J F⁻ᵀ; below LEAST_VOLUME the resistance is held, as the logarithm has no value there.
 struct neo_hookean {
-    template <class T> ENDO_SIM_INLINE static T stress(const T* F, T mu, T lam, T* P)
+    template <class T, class Substep> ENDO_SIM_INLINE static T stress(const T* F, T mu, T lam, const Substep&, T* P)
     {
         ENDO_SIM_FUSE(on)
         T inverse_transpose[9];
@@ -101,6 +102,20 @@ struct neo_hookean {
             P[i] = mu * (F[i] - inverse_transpose[i]) + lam * log_J * inverse_transpose[i];
         }
         return J;
+    }
+};
+
+// The law above with μ exp(a W) in place of μ, where W = tr FᵀF − 3 − 2 ln J is zero at rest and above it everywhere else (Fung
+// 1967, Demiray 1972). The exponent grows up to a limit, and stays there: without it the stress and the speed of sound would too.
+struct fung {
+    template <class T, class Substep> ENDO_SIM_INLINE static T stress(const T* F, T mu, T lam, const Substep& substep, T* P)
+    {
+        ENDO_SIM_FUSE(on)
+        T cofactor[9];
+        const T J = larger(cofactor_of(F, cofactor), everywhere<T>(LEAST_VOLUME));
+        const T W = dot(F, F) + dot(F + 3, F + 3) + dot(F + 6, F + 6) - 3.0f - 2.0f * logarithm(J);
+        const T exponent = clamp(substep.stiffening * W, 0.0f, substep.largest_exponent);
+        return neo_hookean::stress(F, mu * exp2<true>(1.44269504f * exponent), lam, substep, P);
     }
 };
 

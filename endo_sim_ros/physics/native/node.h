@@ -214,7 +214,7 @@ ENDO_SIM_INLINE Given<T> update(
     ENDO_SIM_FUSE(on)
     const float dt = substep.dt;
     T P[9];
-    const T J = Law::stress(node.F, node.mu, node.lam, P);
+    const T J = Law::stress(node.F, node.mu, node.lam, substep, P);
     if (substep.ratio > 0.0f)
         relax(node.F, J, substep.ratio, substep.forget, node.Q, P);
     if (CURRENT)

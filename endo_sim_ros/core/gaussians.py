@@ -20,6 +20,9 @@ from endo_sim_ros.core.errors import ModelError as ModelError
 from endo_sim_ros.core.folders import written_whole
 from endo_sim_ros.core.light import Light
 
+GLOSS_FIELDS = ("normal_x", "normal_y", "normal_z", "log_sheen", "log_glint")
+"""Field names of what is reflected, in files and messages."""
+_GLOSS = "gloss"  # element of a PLY file that holds them: other programs read the vertices and ignore it
 _COMPRESSED = ".compressed.ply"  # ending of the names of compressed models, as SuperSplat has it
 _LIGHT = "endo_sim_light"  # mark of the comment that holds the light
 _LONGEST_HEADER = 65536  # bytes of a PLY file; that of a model of degree 3 has 1500
@@ -41,6 +44,8 @@ class GaussianModel:
         logit_opacities: Logit of the opacity [N].
         sh: Spherical harmonic colour coefficients [N, (degree + 1)², 3], degree 0 to 3.
         light: What makes an image of the rendered colours; None: they are the image.
+        gloss: How each reflects the light [N, 5]: the normal of its surface, world, not necessarily normalised, and the
+            logarithms of the strengths of sheen and of glints, see `reflections`. None: nothing reflects.
     """
 
     means: Tensor
@@ -49,18 +54,24 @@ class GaussianModel:
     logit_opacities: Tensor
     sh: Tensor
     light: Light | None = None
+    gloss: Tensor | None = None
 
     def __post_init__(self):
         n = len(self.means)
-        shapes = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,)}
+        shapes = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,), "gloss": (n, len(GLOSS_FIELDS))}
         for name, shape in shapes.items():
-            if tuple(getattr(self, name).shape) != shape:
+            if getattr(self, name) is not None and tuple(getattr(self, name).shape) != shape:
                 raise ModelError(f"Gaussian model: {name} has shape {tuple(getattr(self, name).shape)}, expected {shape}")
         if self.sh.ndim != 3 or self.sh.shape[0] != n or self.sh.shape[1] not in (1, 4, 9, 16) or self.sh.shape[2] != 3:
             raise ModelError(f"Gaussian model: sh has shape {tuple(self.sh.shape)}, expected [{n}, 1|4|9|16, 3]")
 
     def __len__(self) -> int:
         return len(self.means)
+
+    @property
+    def reflects(self) -> bool:
+        """Whether its colours depend on where it is seen from by `gloss`, whose lobes its light has."""
+        return self.gloss is not None and self.light is not None
 
     @property
     def sh_degree(self) -> int:
@@ -95,8 +106,9 @@ class GaussianModel:
         return half @ half.transpose(1, 2)
 
     def tensors(self) -> dict[str, Tensor]:
-        """The five arrays by field name."""
-        return {name: getattr(self, name) for name in ("means", "quats", "log_scales", "logit_opacities", "sh")}
+        """The arrays by field name: five, and `gloss` where something reflects."""
+        names = ("means", "quats", "log_scales", "logit_opacities", "sh", "gloss")
+        return {name: value for name in names if (value := getattr(self, name)) is not None}
 
     def to(self, device: str | torch.device) -> GaussianModel:
         """The model on another device."""
@@ -161,7 +173,8 @@ def from_columns(columns: dict[str, np.ndarray], source: str) -> GaussianModel:
     degrees = {3 * ((degree + 1) ** 2 - 1): degree for degree in range(4)}
     if rest_count not in degrees:
         raise ModelError(f"{source}: {rest_count} f_rest_* fields fit no SH degree; expected one of {sorted(degrees)}")
-    missing = [name for name in ply_fields(degrees[rest_count]) if name not in columns]
+    glossy = GLOSS_FIELDS if GLOSS_FIELDS[0] in columns else ()
+    missing = [name for name in (*ply_fields(degrees[rest_count]), *glossy) if name not in columns]
     if missing:
         raise ModelError(f"{source}: missing field {', '.join(missing[:4])}; a Gaussian model has INRIA's field names")
 
@@ -177,6 +190,7 @@ def from_columns(columns: dict[str, np.ndarray], source: str) -> GaussianModel:
         stack([f"scale_{i}" for i in range(3)]),
         stack(["opacity"])[:, 0],
         dc[:, None] if rest is None else torch.cat([dc[:, None], rest], 1),
+        gloss=stack(glossy) if glossy else None,
     )
     for name, value in model.tensors().items():
         # An opacity of exactly 0 or 1 has an infinite logit, which the sigmoid maps back.
@@ -190,13 +204,14 @@ def from_columns(columns: dict[str, np.ndarray], source: str) -> GaussianModel:
 def save_ply(model: GaussianModel, path: str | Path) -> None:
     """Write a binary PLY that SuperSplat, viser and other 3DGS viewers open. Written whole or not at all.
 
-    The light, which they ignore, is a comment in the header. A name that ends in .compressed.ply makes it SuperSplat's
-    compressed layout, which other viewers may not read.
+    What they ignore follows: the light is a comment in the header, what is reflected an element behind the vertices. A name that
+    ends in .compressed.ply makes it SuperSplat's compressed layout, which other viewers may not read.
     """
     path = Path(path)
     columns, names = to_columns(model), ply_fields(model.sh_degree)
+    gloss = None if model.gloss is None else model.gloss.detach().cpu().float().numpy()
     if path.name.endswith(_COMPRESSED) and len(model):
-        chunks, vertices, harmonics = compressed_ply.pack(dict(zip(names, columns.T)))
+        chunks, vertices, harmonics, gloss = compressed_ply.pack(dict(zip(names, columns.T)), gloss)
         elements = [
             ("chunk", "float", compressed_ply.CHUNK_FIELDS, chunks.astype("<f4")),
             ("vertex", "uint", compressed_ply.VERTEX_FIELDS, vertices.astype("<u4")),
@@ -206,6 +221,8 @@ def save_ply(model: GaussianModel, path: str | Path) -> None:
     else:
         columns = np.concatenate([columns[:, :3], np.zeros((len(model), 3), np.float32), columns[:, 3:]], 1)
         elements = [("vertex", "float", names[:3] + ["nx", "ny", "nz"] + names[3:], columns.astype("<f4"))]
+    if gloss is not None:
+        elements.append((_GLOSS, "char" if gloss.dtype == np.int8 else "float", list(GLOSS_FIELDS), gloss))
     lines = ["ply", "format binary_little_endian 1.0"]
     if model.light is not None:
         lines.append(f"comment {_LIGHT} {model.light.to_json()}")
@@ -230,9 +247,11 @@ def load_ply(path: str | Path) -> GaussianModel:
     try:
         with path.open("rb") as file:
             elements, light = _read_elements(file, path.stat().st_size)
-        columns = elements.pop("vertex")
+        columns, gloss = elements.pop("vertex"), elements.pop(_GLOSS, {})
         if elements:
             columns = compressed_ply.unpack(elements.get("chunk", {}), columns, elements.get("sh", {}))
+            gloss = compressed_ply.unpack_gloss(gloss)
+        columns |= gloss
     except (OSError, ValueError) as error:
         raise ModelError(f"{path}: not a readable PLY model ({error})") from error
     return dataclasses.replace(from_columns(columns, str(path)), light=light)
@@ -253,7 +272,7 @@ def _read_elements(file: BinaryIO, size: int) -> tuple[dict[str, dict[str, np.nd
         match line.split():
             case ["format", layout, "1.0"] if layout in _ORDERS:
                 order = _ORDERS[layout]
-            case ["element", name, _] if "vertex" in elements and name != "sh":
+            case ["element", name, _] if "vertex" in elements and name not in ("sh", _GLOSS):
                 break  # what follows the vertices does not matter
             case ["element", name, number] if name not in elements:
                 fields = []

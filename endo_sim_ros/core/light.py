@@ -38,6 +38,8 @@ class Light:
         reference: Distance at which colours are the model's, metres.
         level_r, level_g, level_b: Logarithm of the exposure at B = 1.
         response: How far the camera evens out brightness: 1 holds it constant, 0 is a fixed exposure.
+        sheen_sharpness, glint_sharpness: How narrow the two lobes are in which wet tissue reflects, see `reflections`.
+        facing: Exponent of the cosine between the tissue's normal and the direction towards the lens, there.
     """
 
     distance: float = 0.0
@@ -49,6 +51,9 @@ class Light:
     level_g: float = 0.0
     level_b: float = 0.0
     response: float = 0.0
+    sheen_sharpness: float = 0.0
+    glint_sharpness: float = 0.0
+    facing: float = 0.0
 
     def __post_init__(self):
         for name, value in dataclasses.asdict(self).items():
@@ -62,14 +67,14 @@ class Light:
 
     @staticmethod
     def from_json(text: str) -> "Light":
-        """Return the light that `to_json` wrote.
+        """Return the light that `to_json` wrote, or wrote before there were reflections.
 
         Raises:
             ValueError: If the text is not JSON, values are missing or unknown, or one of them is out of range.
         """
         values = json.loads(text)
         known = {field.name for field in dataclasses.fields(Light)}
-        if not isinstance(values, dict) or set(values) != known:
+        if not isinstance(values, dict) or not known - {"sheen_sharpness", "glint_sharpness", "facing"} <= set(values) <= known:
             raise ValueError(f"light: expected the values {', '.join(sorted(known))}, got {text[:80]}")
         return Light(**values)
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import download, upload
 from endo_sim_ros.core.light import SURFACE
+from endo_sim_ros.core.reflections import seen_colors
 from endo_sim_ros.core.shading import shade, to_bytes
 from endo_sim_ros.instruments import LINKS, Material
 from endo_sim_ros.instruments.config import DrawingConfig
@@ -136,8 +137,12 @@ class Pictures:
     def _colors(self, rows: slice, eye: int) -> Tensor:
         """Colours of all these episodes [N, K, 3], or of each [b, N, K, 3], as `rasterize` takes them."""
         views, sh = self._views[rows], self._model.sh
-        if self._model.sh_degree:
+        if self._model.reflects or self._model.sh_degree:
             F = torch.where(self._pinned, torch.eye(3, device=sh.device), self._tissue.F[rows])  # as on control_nodes
+        if self._model.reflects:
+            positions = [view.cameras[eye].position for view in views]
+            sh = seen_colors(self._model, self._skinning.cosines(F, self._means[rows], positions))
+        elif self._model.sh_degree:
             sh = torch.stack(
                 [turned_colors(sh, self._skinning, *each) for each in zip(self._means[rows], F, (view.cameras[eye] for view in views))]
             )

@@ -1,5 +1,6 @@
 """Skinning: Gaussians follow their nearest control nodes (paper eq. 9, 10)."""
 
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -84,6 +85,7 @@ class Skinning:
         model = model.detach().to(self.device)
         self.means = model.means.float().contiguous()  # [N, 3] m, at rest
         self.covars = model.covariances.float().contiguous()  # [N, 3, 3] m², at rest
+        self._normals = None if model.gloss is None else model.gloss[:, :3].float().contiguous()
         self.node_rest = torch.from_numpy(rest).float().to(self.device).contiguous()  # [M, 3] m
         x, y, z = rest.mean(0).tolist()
         self._origin = x, y, z  # of the maps, m
@@ -164,6 +166,27 @@ class Skinning:
         F = self._nodes("F", F, (3, 3))
         out = torch.empty_like(self.covars)
         self.backend.over_items(kernels.blend_rotations, len(out), [self.neighbours, self.weights, F, out])
+        return out
+
+    def cosines(self, F: Tensor | np.ndarray, means: Tensor, eyes: Sequence[np.ndarray]) -> Tensor:
+        """Return the cosines [B, N] between the normals of the Gaussians, as they turn with the tissue, and the directions towards eyes.
+
+        Args:
+            F: Of the control nodes [M, 3, 3], or of each of B copies of the tissue [B, M, 3, 3].
+            means: Of the Gaussians [N, 3], or [B, N, 3], m, world.
+            eyes: Where each is seen from: B of [3], m, world.
+
+        Raises:
+            ValueError: If the model has no gloss, which the normals are from.
+        """
+        if self._normals is None:
+            raise ValueError("skinning: the model has no gloss, and so no normals")
+        copies = F.ndim == 4
+        F = torch.as_tensor(F, dtype=torch.float32, device=self.device).contiguous() if copies else self._nodes("F", F, (3, 3))
+        (positions,) = upload(self.device, np.asarray(eyes))
+        out = F.new_empty((len(eyes), len(self.means)))
+        arrays = [self.neighbours, self.weights, self._normals, F, copies * len(self.node_rest), means.contiguous(), positions, out]
+        self.backend.over_items(kernels.facing_cosines, out.numel(), arrays)
         return out
 
     def _nodes(self, name: str, values: Tensor | np.ndarray, shape: tuple[int, ...]) -> Tensor:

@@ -1,6 +1,7 @@
 """Light and exposures that are learnt beside the Gaussians."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -10,6 +11,7 @@ from endo_sim_ros.core.light import SURFACE, Light, directions, falloff, feature
 from endo_sim_ros.reconstruction import photometry
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.device_views import DeviceView
+from endo_sim_ros.reconstruction.gloss import lobes
 from endo_sim_ros.reconstruction.optimizer import Adam
 from endo_sim_ros.splatting import RenderOutput
 
@@ -74,10 +76,12 @@ class Appearance:
         """The light with an automatic exposure like that of the views, and what it leaves of their log exposures [V, 3]."""
         light, exposures = self.tensors["light"], self.tensors["exposures"]
         unexplained = np.zeros(exposures.shape)
-        if not (self._config.light or self._config.exposure):
+        if not (self._config.light or self._config.exposure or self._config.reflections):
             return None, unexplained
+        numbers = dict(zip(("distance", "angle", "tilt_x", "tilt_y"), light.tolist())) | {"reference": self._reference}
+        fitted = replace(lobes(self._config.gloss) if self._config.reflections else Light(), **numbers)
         if not self._config.exposure:
-            return Light(*light.tolist(), reference=self._reference), unexplained
+            return fitted, unexplained
         brightness = []
         for view in views:
             output = render(view)
@@ -90,4 +94,4 @@ class Appearance:
         exposures = exposures.cpu().numpy().astype(np.float64)
         response, levels, residuals = photometry.fit_exposure(exposures, np.array(brightness), self._config.photometry)
         levels = {f"level_{channel}": float(level) for channel, level in zip("rgb", levels)}
-        return Light(*light.tolist(), reference=self._reference, response=response, **levels), residuals
+        return replace(fitted, response=response, **levels), residuals

@@ -9,6 +9,7 @@ from endo_sim_ros.reconstruction.stage_configs import (
     CoverageConfig,
     DynamicMaskConfig,
     ExtrapolationConfig,
+    GlossConfig,
     InitialModelConfig,
     InterpolationConfig,
     MatchingConfig,
@@ -41,6 +42,8 @@ class LearningRatesConfig(StageConfig):
     """Of the colours."""
     sh_rest: Annotated[float, Range(0, 1)] = 1.25e-4
     """Of the higher spherical harmonics."""
+    gloss: Annotated[float, Range(0, 1)] = 2e-2
+    """Of the normals and of how strongly tissue reflects."""
     light: Annotated[float, Range(0, 1)] = 2e-3
     """Of the four numbers of the light; `learning_rate` is no factor on it."""
     exposures: Annotated[float, Range(0, 1)] = 1e-3
@@ -173,6 +176,8 @@ class ReconstructionConfig(StageConfig):
     """Each view has an exposure of its own, from which that of unseen views is predicted as a camera's automatic one would be."""
     light: bool = True
     """The light travels with the camera: brightness falls off with distance and angle."""
+    reflections: bool = True
+    """Tissue reflects the light: highlights are a layer of their own, and tissue that turns away is darker. With `sh_degree` 0 alone."""
     light_anchor: Annotated[float, Range(0, 1000)] = 1e-3
     """Weight of squared changes of the light in training: where views hardly differ in distance, colours could explain all of it."""
     densification: Literal["mcmc", "gradient", "proximity"] = "mcmc"
@@ -218,6 +223,7 @@ class ReconstructionConfig(StageConfig):
     capacity: CapacityConfig = CapacityConfig()
     photometry: PhotometryConfig = PhotometryConfig()
     extrapolated: ExtrapolationConfig = ExtrapolationConfig()
+    gloss: GlossConfig = GlossConfig()
     # Of the training.
     rates: LearningRatesConfig = LearningRatesConfig()
     mcmc: McmcConfig = McmcConfig()
@@ -238,6 +244,7 @@ class ReconstructionConfig(StageConfig):
         "multi_view": ("multi_view_refinement", "true"),
         "motion": ("dynamic_mask", "true"),
         "extrapolated": ("extrapolation", "more than 0"),
+        "gloss": ("reflections", "true"),
         **{f"training.{name}": ("iterations", "0") for name in ("iterations_per_view", "min_iterations", "max_iterations")},
         **{f"training.{name}": ("max_gaussians", "0") for name in ("pixels_per_gaussian", "min_gaussians", "max_gaussians")},
         "capacity": ("max_gaussians", "0"),

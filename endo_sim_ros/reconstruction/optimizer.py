@@ -6,21 +6,21 @@ from torch.optim.adam import adam
 
 from endo_sim_ros.core.gaussians import GaussianModel
 
-PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh_base", "sh_rest")
+PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh_base", "sh_rest", "gloss")
 """Names of the tensors that are optimised, as `LearningRatesConfig` has them."""
 
 
 def parameters_of(model: GaussianModel) -> dict[str, Tensor]:
     """The tensors of a model that are optimised, by name; none that are empty."""
     tensors = model.tensors() | {"sh_base": model.sh[:, :1], "sh_rest": model.sh[:, 1:]}
-    return {name: tensors[name] for name in PARAMETERS if tensors[name].numel()}
+    return {name: tensors[name] for name in PARAMETERS if name in tensors and tensors[name].numel()}
 
 
 def model_of(parameters: dict[str, Tensor]) -> GaussianModel:
     """The model made of such tensors; gradients flow through it."""
     p = parameters
     sh = torch.cat([p["sh_base"], p["sh_rest"]], 1) if "sh_rest" in p else p["sh_base"]
-    return GaussianModel(p["means"], p["quats"], p["log_scales"], p["logit_opacities"], sh)
+    return GaussianModel(p["means"], p["quats"], p["log_scales"], p["logit_opacities"], sh, gloss=p.get("gloss"))
 
 
 class Adam:

@@ -20,6 +20,7 @@ from endo_sim_ros.reconstruction import photometry
 from endo_sim_ros.reconstruction.capacity_trial import choose_capacity
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.dynamic_mask import mask_motion
+from endo_sim_ros.reconstruction.gloss import start_gloss
 from endo_sim_ros.reconstruction.initialization import guessed_depth, initial_model, rough_depth
 from endo_sim_ros.reconstruction.pose_check import misposed
 from endo_sim_ros.reconstruction.priors.extrapolation import extrapolate
@@ -310,6 +311,13 @@ def extrapolate_tissue(scene: PreparedScene, config: ReconstructionConfig, progr
     return replace(scene, model=model)
 
 
+def add_reflections(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
+    """Let the Gaussians reflect the light."""
+    if not config.reflections or config.sh_degree:
+        return scene
+    return replace(scene, model=start_gloss(scene.model, [view.camera for view in scene.views], config.gloss, progress))
+
+
 STAGES: dict[str, Callable[[PreparedScene, ReconstructionConfig, StageProgress], PreparedScene]] = {
     "usable views": select_usable,
     "matching features": match_views,
@@ -326,6 +334,7 @@ STAGES: dict[str, Callable[[PreparedScene, ReconstructionConfig, StageProgress],
     "initial model": place_gaussians,
     "photometry": fit_light,
     "extrapolation": extrapolate_tissue,
+    "reflections": add_reflections,
 }
 """What `prepare` does, in this order, by the names that progress reports."""
 

@@ -173,8 +173,9 @@ class MultiViewConfig(StageConfig):
     """Relative error of depth interpolated between scene points."""
     refined_disparity_error: Annotated[float, Range(0.01, 10, "pixels")] = 0.15
     """Error of a disparity that flow between the eyes has corrected; before, it is ``stereo.disparity_error``."""
-    flow_error: Annotated[float, Range(0.01, 10, "pixels")] = 0.35
-    """Error of a displacement by optical flow, that of the poses included."""
+    flow_error: Annotated[float, Range(0.1, 100)] = 3.0
+    """Error of the flow along the line in which depth moves a pixel, in standard deviations of the flow across it, which are measured
+    for each pair of images. More than 1, as pixels side by side err alike."""
     max_round_trip: Annotated[float, Range(0.01, 100, "pixels")] = 0.4
     """By how much flow there and flow back may miss each other. They do where one image shows what the other hides."""
     max_flow: Annotated[float, Range(1, 640, "pixels at width 640")] = 40.0
@@ -312,3 +313,21 @@ class ExtrapolationConfig(StageConfig):
     Gaussians closer to the picture would cover what was seen."""
     min_coverage: Annotated[float, Range(0, 1)] = 0.02
     """Share of the pixels with depth from which on the surroundings of a view can be told."""
+
+
+@dataclass(frozen=True)
+class GlossConfig(StageConfig):
+    """Light that tissue reflects."""
+
+    neighbours: Annotated[int, Range(3, 1000)] = 24
+    """Nearest Gaussians that tell the surface's normal at first: a patch of some pixels."""
+    sheen_sharpness: Annotated[float, Range(0.1, 1e4)] = 12.0
+    """Of the broad lobe: half as bright 20° off."""
+    glint_sharpness: Annotated[float, Range(0.1, 1e4)] = 150.0
+    """Of the narrow lobe: half as bright 5.5° off. 60 and 300 do as well within 0.3 dB."""
+    sheen: Annotated[float, Range(1e-3, 10)] = 0.05
+    """Strength of the broad lobe at first, where white is 1."""
+    glint: Annotated[float, Range(1e-3, 10)] = 0.13
+    """Strength of the narrow lobe at first: enough for training to find which Gaussians glint."""
+    facing: Annotated[float, Range(0, 10)] = 0.45
+    """Exponent of the cosine by which tissue that turns away grows darker: Lambert's law in encoded images, 1 / 2.2."""

@@ -17,11 +17,13 @@ from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import Light, directions
+from endo_sim_ros.core.reflections import cosines, seen_colors
 from endo_sim_ros.reconstruction import losses, photometry
 from endo_sim_ros.reconstruction.appearance import Appearance
 from endo_sim_ros.reconstruction.checkpoint import identity, read_checkpoint, reading, write_checkpoint
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.device_views import DeviceView, matrices, reprojected_prior, shown
+from endo_sim_ros.reconstruction.gloss import lobes
 from endo_sim_ros.reconstruction.optimizer import PARAMETERS, Adam, model_of, parameters_of
 from endo_sim_ros.reconstruction.scene import PreparedScene, TrainingView, shrink
 from endo_sim_ros.reconstruction.ssim import ssim
@@ -86,6 +88,7 @@ class Trainer:
         self._captures: dict[tuple, GraphCapture] = {}
         self._last_loss = torch.zeros(())
         options = getattr(config, config.densification)
+        self._lobes = lobes(config.gloss)
         self._strategy = STRATEGIES[config.densification](options, scene.max_gaussians, self._unit)
         self.appearance = Appearance(scene.light, scene.exposures, scene.depth, config, self.device)
         self._set_model(scene.model.to(self.device))
@@ -333,7 +336,11 @@ class Trainer:
         """The model, and its images of cameras, width × height pixels; ``kept`` are factors on its opacities."""
         model = model_of(self.parameters)
         opacities = model.opacities if kept is None else model.opacities * kept
-        tensors = model.means, model.quats, model.scales, opacities, model.sh[:, : self._sh_count]
+        sh = model.sh[:, : self._sh_count]
+        if model.gloss is not None:  # in the first camera; nobody looks at the colours of a virtual one
+            eye = -viewmats[0, :3, :3].T @ viewmats[0, :3, 3]
+            sh = seen_colors(dataclasses.replace(model, light=self._lobes), cosines(model, eye))
+        tensors = model.means, model.quats, model.scales, opacities, sh
         return model, rasterize(*tensors, viewmats, Ks, *size, masks=masks, absgrad=absgrad, signed=self._strategy.signed)
 
     def _loss(self, terms: tuple[losses.Term, ...], view: _Inputs, model: GaussianModel, output: RenderOutput) -> Tensor:

@@ -1,7 +1,7 @@
 """Images and depth of a Gaussian model, at rest or as it follows its control nodes, in a camera."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -168,11 +168,13 @@ class DeformableRenderer:
         if covars is None:
             return draw(model, *cameras)[:3]
         assert self.skinning is not None and F is not None  # else there are no covariances
-        moved = lambda sh: GaussianModel(means, model.quats, model.log_scales, model.logit_opacities, sh)
+        moved = partial(replace, model, means=means)
+        if model.reflects:
+            return draw(moved(), *cameras, cosines=self.skinning.cosines(F, means, [camera.position for camera in cameras]))[:3]
         if not model.sh_degree:
-            return draw(moved(model.sh), *cameras)[:3]
+            return draw(moved(), *cameras)[:3]
         # Each eye sees colours of its own.
-        seen = [draw(moved(turned_colors(model.sh, self.skinning, means, F, camera)), camera)[:3] for camera in cameras]
+        seen = [draw(moved(sh=turned_colors(model.sh, self.skinning, means, F, camera)), camera)[:3] for camera in cameras]
         if len(seen) == 1:
             return seen[0]
         colors, depths, alphas = map(torch.cat, zip(*seen))

@@ -10,9 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from endo_sim_ros.core import reflections
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import upload
 from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.core.reflections import seen_colors
 from endo_sim_ros.splatting.backend import backend_for
 from endo_sim_ros.splatting.constants import TILE
 from endo_sim_ros.splatting.scene import Gradients, Scene, Settings
@@ -107,8 +109,10 @@ def render(
     covars: Tensor | None = None,
     background: Tensor | None = None,
     median: bool = False,
+    cosines: Tensor | None = None,
 ) -> RenderOutput:
-    """Return images of a Gaussian model in one camera, or in C of one size at once: `rasterize` with their matrices.
+    """Return images of a Gaussian model in one camera, or in C of one size at once: `rasterize` with their matrices, and with the colours
+    that each of them sees where the model reflects.
 
     Args:
         model: Gaussians, world; the images are computed on their device.
@@ -117,15 +121,25 @@ def render(
         covars: World covariances [N, 3, 3], m², instead of the model's own.
         background: Colour behind everything [3]; black by default.
         median: Whether to compute median depths.
+        cosines: What `Skinning.cosines` returned for the cameras [C, N], where the model reflects; those at rest by default.
 
     Raises:
         ValueError: As `rasterize` does.
     """
     cameras = camera, *others
-    viewmats, Ks = upload(model.means.device, np.array([each.viewmat for each in cameras]), np.array([each.K for each in cameras]))
+    arrays = (np.array([getattr(each, name) for each in cameras]) for name in ("viewmat", "K", "position"))
+    viewmats, Ks, positions = upload(model.means.device, *arrays)
+    means, sh = model.means, model.sh
+    if model.reflects:
+        sh = seen_colors(model, reflections.cosines(model, positions[:, None]) if cosines is None else cosines)
+        if others:
+            covars = model.covariances if covars is None else covars
+            means, covars = (each.expand(len(cameras), *each.shape) for each in (means, covars))
+        else:
+            sh = sh[0]
     shapes = (None, None) if covars is not None else (model.quats, model.scales)
     arguments = viewmats, Ks, camera.width, camera.height
-    return rasterize(model.means, *shapes, model.opacities, model.sh, *arguments, covars=covars, background=background, median=median)
+    return rasterize(means, *shapes, model.opacities, sh, *arguments, covars=covars, background=background, median=median)
 
 
 def check_inputs(name: str, scene: Scene, settings: Settings, masks: Tensor | None, absgrad: Tensor | None) -> None:

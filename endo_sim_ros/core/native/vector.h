@@ -59,6 +59,13 @@ ENDO_SIM_INLINE float of_bits(int bits)
     return x;
 }
 
+#else
+
+ENDO_SIM_INLINE int bits_of(float x) { return __float_as_int(x); }
+ENDO_SIM_INLINE float of_bits(int bits) { return __int_as_float(bits); }
+
+#endif
+
 // a b + c, rounded once or twice.
 template <bool fused, class F> ENDO_SIM_INLINE F multiply_add(F a, F b, float c)
 {
@@ -86,7 +93,5 @@ template <bool fused, class F> ENDO_SIM_INLINE F exp2(F x)
     p = multiply_add<fused>(p, f, 1.0f);
     return of_bits(bits_of(p) + (bits_of(n) << 23));
 }
-
-#endif
 
 }  // namespace endo_sim

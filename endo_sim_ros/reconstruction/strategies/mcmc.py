@@ -1,6 +1,7 @@
 """A capped Markov chain Monte Carlo strategy (Kheradmand et al. 2024, 3DGS-MCMC): dead Gaussians move to live ones, and new ones are
 born there, such that the rendered image stays the same; noise explores."""
 
+import dataclasses
 import math
 
 import torch
@@ -34,7 +35,7 @@ class Mcmc(Strategy):
             logit, log_scale = model.logit_opacities.clone(), model.log_scales.clone()
             logit[touched] = opacity.clamp(least, 1 - 1e-6).logit()
             log_scale[touched] = scale.log()
-            model = GaussianModel(model.means, model.quats, log_scale, logit, model.sh)
+            model = dataclasses.replace(model, log_scales=log_scale, logit_opacities=logit)
             fresh = touched[source]
         elif count:
             source, fresh = source[:n], fresh[:n]  # everything is dead: nothing to copy

@@ -1,0 +1,56 @@
+"""What the reflections of a model start from: the normals of its surface, and as much sheen and glint everywhere."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (it is public)
+
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.core.light import Light
+from endo_sim_ros.core.reflections import cosines, unlit
+from endo_sim_ros.reconstruction.progress import StageProgress
+from endo_sim_ros.reconstruction.stage_configs import GlossConfig
+
+_PART = 10_000  # points whose normals are told together
+
+
+def lobes(options: GlossConfig) -> Light:
+    """A light that does nothing but reflect as the options say."""
+    return Light(sheen_sharpness=options.sheen_sharpness, glint_sharpness=options.glint_sharpness, facing=options.facing)
+
+
+def start_gloss(
+    model: GaussianModel, cameras: Sequence[Camera], options: GlossConfig = GlossConfig(), progress: StageProgress = StageProgress()
+) -> GaussianModel:
+    """Return the model with `gloss`. Seen from the camera nearest to it, a Gaussian has the colour that it had.
+
+    Args:
+        model: Gaussians without gloss, of spherical harmonics of degree 0, on the CPU.
+        cameras: Those of the training views; normals point to the nearest.
+        options: Strengths at first, and how many neighbours tell a normal.
+        progress: Reported to by parts of the model.
+    """
+    means = model.means.double().numpy()
+    eyes = np.array([camera.position for camera in cameras])
+    eyes = eyes[cKDTree(eyes).query(means)[1]]
+    normals = surface_normals(means, options.neighbours, progress)
+    normals *= np.where(((eyes - means) * normals).sum(1, keepdims=True) < 0, -1.0, 1.0)
+    strengths = np.tile(np.log([options.sheen, options.glint]), (len(means), 1))
+    gloss = torch.from_numpy(np.concatenate([normals, strengths], 1).astype(np.float32))
+    glossy = dataclasses.replace(model, gloss=gloss, light=lobes(options))
+    return dataclasses.replace(glossy, sh=unlit(glossy, cosines(glossy, torch.from_numpy(eyes).float())), light=model.light)
+
+
+def surface_normals(points: np.ndarray, neighbours: int, progress: StageProgress = StageProgress()) -> np.ndarray:
+    """Return normals [N, 3] of a surface through points [N, 3], of either sign: across the plane of the nearest so many of them."""
+    tree, ranks = cKDTree(points), [*range(1, min(neighbours, len(points)) + 1)]
+
+    def normals(part: np.ndarray) -> np.ndarray:
+        near = points[tree.query(part, k=ranks)[1]]
+        near = near - near.mean(1, keepdims=True)
+        return np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))[1][:, :, 0]
+
+    return np.concatenate(progress.map(normals, [points[i : i + _PART] for i in range(0, len(points), _PART)]))

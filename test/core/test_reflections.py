@@ -1,0 +1,152 @@
+"""Reflections: the formula, its gradients, and highlights that stay with the light and the lens."""
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from lit_wall import CAMERA, wall
+from plyfile import PlyData
+
+from endo_sim_ros.core.gaussians import SH_C0, GaussianModel, load_ply, save_ply
+from endo_sim_ros.core.light import Light
+from endo_sim_ros.core.reflections import cosines, seen_colors, unlit
+from endo_sim_ros.core.shading import shade, to_bytes
+from endo_sim_ros.reconstruction.gloss import start_gloss, surface_normals
+from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
+from endo_sim_ros.splatting import render
+
+WET = Light(sheen_sharpness=12.0, glint_sharpness=150.0, facing=0.45)
+
+
+def glossy(count: int = 500, strengths: tuple[float, float] = (0.1, 0.5)) -> GaussianModel:
+    """A wall at z = 0.1 m, which faces a lens at the origin."""
+    model = wall(count)
+    gloss = torch.tensor([0.0, 0.0, -2.0, *map(math.log, strengths)]).repeat(count, 1)
+    return dataclasses.replace(model, gloss=gloss, light=WET)
+
+
+def test_colours_are_those_of_the_formula():
+    model = glossy()
+    cosine = cosines(model, torch.zeros(1, 3))
+    p = model.means.double().numpy()
+    c = p[:, 2] / np.linalg.norm(p, axis=1)
+    np.testing.assert_allclose(cosine, c, atol=1e-6)
+    expected = (model.sh[:, 0].numpy() * SH_C0 + 0.5) * (c**0.45)[:, None]
+    expected += (0.1 * np.exp(12 * (c - 1)) + 0.5 * np.exp(150 * (c - 1)))[:, None]
+    np.testing.assert_allclose(seen_colors(model, cosine)[:, 0] * SH_C0 + 0.5, expected, rtol=1e-4)
+
+
+def test_gradients_are_those_of_finite_differences():
+    model = glossy(20)
+    doubles = {name: value.double() for name, value in model.tensors().items()}
+    eye = torch.tensor([[0.01, 0.02, 0.0]], dtype=torch.float64)
+
+    def colours(gloss: torch.Tensor, sh: torch.Tensor) -> torch.Tensor:
+        own = GaussianModel(**doubles | {"gloss": gloss, "sh": sh}, light=WET)
+        return seen_colors(own, cosines(own, eye))
+
+    assert torch.autograd.gradcheck(colours, (doubles["gloss"].requires_grad_(), doubles["sh"].requires_grad_()))
+
+
+def test_taking_reflections_out_and_seeing_again_gives_the_colours_back():
+    model = glossy(strengths=(0.05, 0.05))
+    model = dataclasses.replace(model, sh=model.sh.clamp_min(0))  # brighter than what is reflected
+    cosine = cosines(model, torch.tensor([[0.01, 0.0, 0.0]]))
+    again = seen_colors(dataclasses.replace(model, sh=unlit(model, cosine)), cosine)
+    torch.testing.assert_close(again, model.sh[:, :1], atol=1e-5, rtol=0)
+
+
+def test_normals_of_a_sphere_point_along_its_radius():
+    points = np.random.default_rng(0).normal(size=(4000, 3))
+    points *= 0.05 / np.linalg.norm(points, axis=1, keepdims=True)
+    along = np.abs((surface_normals(points, 24) * points).sum(1)) / 0.05
+    assert np.degrees(np.arccos(along.clip(0, 1))).max() < 5
+
+
+def test_a_model_that_starts_to_reflect_looks_as_it_did_from_the_nearest_camera():
+    plain = dataclasses.replace(wall(500), light=None)
+    plain = dataclasses.replace(plain, sh=plain.sh.clamp_min(0))
+    camera = CAMERA
+    model = dataclasses.replace(start_gloss(plain, [camera]), light=WET)
+    assert model.gloss is not None and (model.gloss[:, 2] < 0).all()  # towards the camera
+    torch.testing.assert_close(render(model, camera).colors, render(plain, camera).colors, atol=2e-5, rtol=0)
+
+
+def test_the_highlight_is_where_the_surface_faces_the_lens():
+    model = glossy(8000)
+    dark = dataclasses.replace(model, sh=torch.full_like(model.sh, -0.5 / SH_C0))
+    for x in (-0.02, 0.02):
+        pose = np.eye(4)
+        pose[0, 3] = x
+        seen = render(dark, CAMERA.at(pose))
+        brightness = seen.colors[0, ..., 0] / seen.alphas[0].clamp_min(0.5)
+        row, column = np.unravel_index(int(brightness.argmax()), brightness.shape)
+        assert abs(row - 64) < 12 and abs(column - 80) < 12  # it moved with the lens, not with the sheet
+
+
+def test_a_sheet_that_turns_looks_as_one_that_was_built_turned():
+    model = glossy(2000)
+    camera = CAMERA
+    nodes = model.means[::20].double().numpy()
+    a = np.radians(25)
+    R = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
+    about = np.array([0, 0, 0.1])
+    turn = lambda points: (points - about) @ R.T + about
+    renderer = DeformableRenderer(model, nodes, RenderingConfig(device="cpu"))
+    (turned,) = renderer.views([camera], turn(nodes).astype(np.float32), np.tile(R, (len(nodes), 1, 1)).astype(np.float32))
+    R32 = torch.from_numpy(R).float()
+    gloss = torch.cat([model.gloss[:, :3] @ R32.T, model.gloss[:, 3:]], 1)
+    covars = R32 @ model.covariances @ R32.T
+    built = dataclasses.replace(model, means=torch.from_numpy(turn(model.means.double().numpy())).float(), gloss=gloss)
+    expected = render(built, camera, covars=covars)
+    picture = to_bytes(shade(WET, expected.colors[0], expected.depths[0], expected.alphas[0], camera)).numpy()
+    assert np.abs(turned.image.astype(int) - picture).max() <= 1
+    (still,) = renderer.views([camera])
+    assert np.abs(still.image.astype(int) - turned.image).mean() > 3
+
+
+def test_each_eye_sees_highlights_of_its_own():
+    model = glossy(2000)
+    left = CAMERA
+    right = left.beside(0.02)
+    both = render(model, left, right)
+    for eye, camera in enumerate((left, right)):
+        torch.testing.assert_close(both.colors[eye], render(model, camera).colors[0], atol=2e-4, rtol=0)
+    assert (both.colors[0] - both.colors[1]).abs().max() > 0.02
+
+
+@pytest.mark.parametrize("name, error", [("m.ply", 0.0), ("m.compressed.ply", 0.04)])
+def test_files_keep_what_reflects(tmp_path, name, error):
+    model = glossy(300)
+    g = torch.Generator().manual_seed(0)
+    model.gloss[:, :3] = torch.nn.functional.normalize(torch.randn(300, 3, generator=g), dim=1)
+    model.gloss[:, 3:] = torch.randn(300, 2, generator=g)
+    save_ply(model, tmp_path / name)
+    found = load_ply(tmp_path / name)
+    same = torch.cdist(model.means, found.means).argmin(1)  # a compressed model has another order
+    assert found.light == WET and found.gloss is not None
+    assert (found.gloss[same] - model.gloss).abs().max() <= error
+
+
+def test_other_programs_find_the_same_vertices_and_no_light_means_no_gloss(tmp_path):
+    model = glossy(50)
+    save_ply(model, tmp_path / "glossy.ply")
+    save_ply(dataclasses.replace(model, gloss=None), tmp_path / "plain.ply")
+    vertices = [PlyData.read(tmp_path / f"{name}.ply")["vertex"].data for name in ("glossy", "plain")]
+    assert vertices[0].dtype == vertices[1].dtype and (vertices[0] == vertices[1]).all()
+    text = (tmp_path / "glossy.ply").read_bytes()
+    start = text.index(b"comment")
+    (tmp_path / "unlit.ply").write_bytes(text[:start] + text[text.index(b"\n", start) + 1 :])
+    assert not load_ply(tmp_path / "unlit.ply").reflects and load_ply(tmp_path / "glossy.ply").reflects
+
+
+def test_a_light_of_an_older_file_reflects_nothing():
+    values = {
+        name: value for name, value in json.loads(WET.to_json()).items() if name not in ("sheen_sharpness", "glint_sharpness", "facing")
+    }
+    assert Light.from_json(json.dumps(values)) == Light()
+    with pytest.raises(ValueError, match="expected the values"):
+        Light.from_json(json.dumps(values | {"shine": 1.0}))

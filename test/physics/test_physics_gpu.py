@@ -110,7 +110,7 @@ def test_a_batch_takes_the_links_of_all_its_copies_without_waiting():
     nodes, links = build_control_nodes(sheet(), np.zeros(3), config), ToolLinks(instrument.capsules)
     batch = TissueBatch(nodes, config, environments=count, capsules=len(links))
     for step in range(6):
-        at = [instrument.at(TIP + [0, 0, -0.016 + 0.001 * step + 0.0002 * b]) for b in range(count)]
+        at = [instrument.at(TIP + [0, 0, -0.014 + 0.001 * step + 0.0002 * b]) for b in range(count)]
         poses = torch.from_numpy(np.stack([[each[name] for name in links.links] for _, each in at])).cuda()
         tips = torch.from_numpy(np.stack([pose for pose, _ in at])).cuda()
         batch.tools.set_links(0, links, poses)

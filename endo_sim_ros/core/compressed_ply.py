@@ -14,15 +14,15 @@ CHUNK_FIELDS = [f"{end}_{name}" for names in _QUANTITIES for end in ("min", "max
 VERTEX_FIELDS = [f"packed_{name}" for name in ("position", "rotation", "scale", "color")]
 _VECTOR, _COLOR, _OTHERS = (11, 10, 11), (8, 8, 8, 8), (10, 10, 10)  # bits of a position or scale, colour, three of a quaternion
 _LARGEST_SCALE = 20.0  # logarithm
-_GLOSS_STEPS = np.array([127, 127, 127, 16, 16])  # of a byte for one: of normals, and of logarithms
+_GLOSS_STEPS = 127  # of a byte for one
 
 
 def pack(columns: dict[str, np.ndarray], gloss: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
-    """Chunks [C, 18] float32, vertices [N, 4] uint32, harmonics [N, 0 | 9 | 24 | 45] uint8 and gloss [N, 5] int8 of a model.
+    """Chunks [C, 18] float32, vertices [N, 4] uint32, harmonics [N, 0 | 9 | 24 | 45] uint8 and gloss [N, 8] int8 of a model.
 
     Args:
         columns: `gaussians.ply_fields` by name, [N] each.
-        gloss: That of the model [N, 5], which SuperSplat does not know.
+        gloss: That of the model [N, 8], which SuperSplat does not know.
     """
     stack = lambda *names: np.stack([columns[name] for name in names], 1).astype(np.float64)
     means = stack("x", "y", "z")
@@ -51,15 +51,16 @@ def pack(columns: dict[str, np.ndarray], gloss: np.ndarray | None = None) -> tup
     rest = [f"f_rest_{i}" for i in range(len(columns) - 14)]
     harmonics = (stack(*rest)[order] * 32 + 128).clip(0, 255) if rest else np.empty((len(order), 0))
     if gloss is not None:
-        lengths = np.linalg.norm(gloss[order, :3], axis=1, keepdims=True).clip(1e-30)
-        gloss = np.rint((gloss[order] / np.column_stack([lengths] * 3 + [np.ones_like(lengths)] * 2)) * _GLOSS_STEPS).clip(-128, 127)
-        gloss = gloss.astype(np.int8)
+        gloss = gloss[order]
+        for normals in (gloss[:, :3], gloss[:, 3:6]):
+            normals /= np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-30)
+        gloss = np.rint(gloss * _GLOSS_STEPS).clip(-_GLOSS_STEPS, _GLOSS_STEPS).astype(np.int8)
     return np.concatenate(chunks, 1).astype(np.float32), np.stack(vertices, 1), harmonics.astype(np.uint8), gloss
 
 
 def unpack_gloss(gloss: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The columns of the element gloss as they were before `pack`, normals of length one."""
-    return {name: np.asarray(values, np.float32) / steps for (name, values), steps in zip(gloss.items(), _GLOSS_STEPS)}
+    return {name: np.asarray(values, np.float32) / _GLOSS_STEPS for name, values in gloss.items()}
 
 
 def unpack(chunks: dict[str, np.ndarray], vertices: dict[str, np.ndarray], harmonics: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

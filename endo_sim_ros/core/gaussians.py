@@ -20,7 +20,7 @@ from endo_sim_ros.core.errors import ModelError as ModelError
 from endo_sim_ros.core.folders import written_whole
 from endo_sim_ros.core.light import Light
 
-GLOSS_FIELDS = ("normal_x", "normal_y", "normal_z", "log_sheen", "log_glint")
+GLOSS_FIELDS = ("normal_x", "normal_y", "normal_z", "film_x", "film_y", "film_z", "sheen", "glint")
 """Field names of what is reflected, in files and messages."""
 _GLOSS = "gloss"  # element of a PLY file that holds them: other programs read the vertices and ignore it
 _COMPRESSED = ".compressed.ply"  # ending of the names of compressed models, as SuperSplat has it
@@ -44,8 +44,8 @@ class GaussianModel:
         logit_opacities: Logit of the opacity [N].
         sh: Spherical harmonic colour coefficients [N, (degree + 1)², 3], degree 0 to 3.
         light: What makes an image of the rendered colours; None: they are the image.
-        gloss: How each reflects the light [N, 5]: the normal of its surface, world, not necessarily normalised, and the
-            logarithms of the strengths of sheen and of glints, see `reflections`. None: nothing reflects.
+        gloss: How each reflects the light [N, 8]: the normals of its surface and of the wet film on it, world, not necessarily
+            normalised, and the strengths of sheen and of glints, see `reflections`. None: nothing reflects.
     """
 
     means: Tensor

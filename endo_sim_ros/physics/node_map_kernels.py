@@ -93,14 +93,14 @@ def facing_cosines(
     first: int,
     neighbours: wp.array2d[int],  # [N, K]
     weights: wp.array2d[float],  # [N, K]
-    normals: wp.array[wp.vec3],  # [N] at rest
+    normals: wp.array2d[wp.vec3],  # [N, 2] at rest
     node_F: wp.array[wp.mat33],  # [M], or [B · M] of as many copies of the tissue
     nodes: int,  # from one copy to the next: M, or 0 where there is one
     means: wp.array[wp.vec3],  # [N], or [B · N]
     eyes: wp.array[wp.vec3],  # [B]
-    cosines: wp.array[float],  # out [B · N]
+    cosines: wp.array2d[float],  # out [B · N, 2]
 ):
-    """Cosine between the direction towards an eye and the normal of every Gaussian's surface, cof(F) n, F blended from its nodes."""
+    """Cosine between the direction towards an eye and two normals of every Gaussian, cof(F) n, F blended from its nodes."""
     i = first + wp.tid()
     n = i % normals.shape[0]
     b = i / normals.shape[0]
@@ -110,8 +110,9 @@ def facing_cosines(
     x = wp.vec3(F[0, 0], F[1, 0], F[2, 0])
     y = wp.vec3(F[0, 1], F[1, 1], F[2, 1])
     z = wp.vec3(F[0, 2], F[1, 2], F[2, 2])
-    rest = normals[n]
-    normal = rest[0] * wp.cross(y, z) + rest[1] * wp.cross(z, x) + rest[2] * wp.cross(x, y)
+    cofactor = wp.matrix_from_cols(wp.cross(y, z), wp.cross(z, x), wp.cross(x, y))
     towards = eyes[b] - means[i % means.shape[0]]
-    length = wp.sqrt(wp.dot(normal, normal) * wp.dot(towards, towards))
-    cosines[i] = wp.dot(normal, towards) / wp.max(length, 1.0e-30)
+    for k in range(2):
+        normal = cofactor * normals[n, k]
+        length = wp.sqrt(wp.dot(normal, normal) * wp.dot(towards, towards))
+        cosines[i, k] = wp.dot(normal, towards) / wp.max(length, 1.0e-30)

@@ -85,7 +85,7 @@ class Skinning:
         model = model.detach().to(self.device)
         self.means = model.means.float().contiguous()  # [N, 3] m, at rest
         self.covars = model.covariances.float().contiguous()  # [N, 3, 3] m², at rest
-        self._normals = None if model.gloss is None else model.gloss[:, :3].float().contiguous()
+        self._normals = None if model.gloss is None else model.gloss[:, :6].float().unflatten(1, (2, 3)).contiguous()
         self.node_rest = torch.from_numpy(rest).float().to(self.device).contiguous()  # [M, 3] m
         x, y, z = rest.mean(0).tolist()
         self._origin = x, y, z  # of the maps, m
@@ -169,7 +169,9 @@ class Skinning:
         return out
 
     def cosines(self, F: Tensor | np.ndarray, means: Tensor, eyes: Sequence[np.ndarray]) -> Tensor:
-        """Return the cosines [B, N] between the normals of the Gaussians, as they turn with the tissue, and the directions towards eyes.
+        """Return the cosines [B, N, 2] between the normals of the Gaussians, of surface and film, and the directions towards eyes.
+
+        The normals turn with the tissue.
 
         Args:
             F: Of the control nodes [M, 3, 3], or of each of B copies of the tissue [B, M, 3, 3].
@@ -184,9 +186,9 @@ class Skinning:
         copies = F.ndim == 4
         F = torch.as_tensor(F, dtype=torch.float32, device=self.device).contiguous() if copies else self._nodes("F", F, (3, 3))
         (positions,) = upload(self.device, np.asarray(eyes))
-        out = F.new_empty((len(eyes), len(self.means)))
+        out = F.new_empty((len(eyes), len(self.means), 2))
         arrays = [self.neighbours, self.weights, self._normals, F, copies * len(self.node_rest), means.contiguous(), positions, out]
-        self.backend.over_items(kernels.facing_cosines, out.numel(), arrays)
+        self.backend.over_items(kernels.facing_cosines, out.numel() // 2, arrays)
         return out
 
     def _nodes(self, name: str, values: Tensor | np.ndarray, shape: tuple[int, ...]) -> Tensor:

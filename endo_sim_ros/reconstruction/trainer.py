@@ -321,6 +321,8 @@ class Trainer:
             optimizer.step({name: gradients[name] for name in optimizer.parameters})
         with torch.no_grad():
             self.parameters["log_scales"].clamp_(max=math.log(config.largest * self.scene_depth))
+            if "gloss" in self.parameters:
+                self.parameters["gloss"][:, 6:].clamp_(0, 1)  # nothing reflects more than a mirror
         appearance.hold_level()
         return loss.detach()
 

@@ -23,7 +23,8 @@ def test_training_that_knows_reflections_foresees_another_view():
     x, y = model.means[:, :2].T
     colors = 0.35 + 0.15 * torch.stack([torch.sin(90 * x), torch.sin(70 * y), torch.cos(80 * x)], 1)
     normals = torch.stack([0.25 * torch.sin(60 * x), 0.25 * torch.cos(70 * y), -torch.ones_like(x)], 1)
-    gloss = torch.cat([normals, torch.tensor([0.1, 0.6]).log().repeat(len(model), 1)], 1)
+    flat = torch.tensor([0.0, 0.0, -1.0]).repeat(len(model), 1)
+    gloss = torch.cat([flat, normals, torch.tensor([0.1, 0.6]).repeat(len(model), 1)], 1)
     light = Light(sheen_sharpness=12.0, glint_sharpness=150.0, facing=0.45)
     true = dataclasses.replace(model, sh=((colors - 0.5) / SH_C0)[:, None], gloss=gloss, light=light)
 
@@ -42,4 +43,5 @@ def test_training_that_knows_reflections_foresees_another_view():
         trained = trainer_of(views, options(depth="topic", reflections=reflections, **plain)).run()
         found[reflections] = metrics.psnr(filmed(trained, 0.002, 0.001).image, other.image)
         assert trained.reflects == reflections
+        assert trained.gloss is None or 0 <= trained.gloss[:, 6:].min() and trained.gloss[:, 6:].max() <= 1
     assert found[True] > found[False] + 1

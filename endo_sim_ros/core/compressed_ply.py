@@ -14,7 +14,7 @@ CHUNK_FIELDS = [f"{end}_{name}" for names in _QUANTITIES for end in ("min", "max
 VERTEX_FIELDS = [f"packed_{name}" for name in ("position", "rotation", "scale", "color")]
 _VECTOR, _COLOR, _OTHERS = (11, 10, 11), (8, 8, 8, 8), (10, 10, 10)  # bits of a position or scale, colour, three of a quaternion
 _LARGEST_SCALE = 20.0  # logarithm
-_GLOSS_STEPS = 127  # of a byte for one
+_GLOSS_STEPS = np.array([127] * 6 + [16] * 2)  # of a byte for one: of normals, and of strengths
 
 
 def pack(columns: dict[str, np.ndarray], gloss: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
@@ -54,13 +54,13 @@ def pack(columns: dict[str, np.ndarray], gloss: np.ndarray | None = None) -> tup
         gloss = gloss[order]
         for normals in (gloss[:, :3], gloss[:, 3:6]):
             normals /= np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-30)
-        gloss = np.rint(gloss * _GLOSS_STEPS).clip(-_GLOSS_STEPS, _GLOSS_STEPS).astype(np.int8)
+        gloss = np.rint(gloss * _GLOSS_STEPS).clip(-127, 127).astype(np.int8)
     return np.concatenate(chunks, 1).astype(np.float32), np.stack(vertices, 1), harmonics.astype(np.uint8), gloss
 
 
 def unpack_gloss(gloss: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The columns of the element gloss as they were before `pack`, normals of length one."""
-    return {name: np.asarray(values, np.float32) / _GLOSS_STEPS for name, values in gloss.items()}
+    return {name: np.asarray(values, np.float32) / steps for (name, values), steps in zip(gloss.items(), _GLOSS_STEPS)}
 
 
 def unpack(chunks: dict[str, np.ndarray], vertices: dict[str, np.ndarray], harmonics: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -45,7 +45,7 @@ class GaussianModel:
         sh: Spherical harmonic colour coefficients [N, (degree + 1)², 3], degree 0 to 3.
         light: What makes an image of the rendered colours; None: they are the image.
         gloss: How each reflects the light [N, 8]: the normals of its surface and of the wet film on it, world, not necessarily
-            normalised, and the strengths of sheen and of glints, see `reflections`. None: nothing reflects.
+            normalised, and what the strengths of sheen and of glints are the `softplus` of, see `reflections`. None: nothing reflects.
     """
 
     means: Tensor

@@ -7,15 +7,21 @@ towards the lens and two normals, c that of the surface and f that of the wet fi
 
 The first term is the tissue itself, the others are reflected and white: a broad lobe, and a narrow one that makes glints where the
 film happens to face the lens. Each lobe is a spherical Gaussian (Wang et al. 2009). Every Gaussian of a model has the two normals
-and two strengths, `GaussianModel.gloss`; the sharpnesses p and the exponent are those of its `Light`. Normals turn with the tissue
-(`Skinning.cosines`). Colours are those before the light's falloff and the exposure, like the tissue's own.
+and two strengths, `GaussianModel.gloss`, which holds log(exp(strength) − 1), so that training goes slowly near nothing and never
+below it. The sharpnesses p and the exponent are those of its `Light`. Normals turn with the tissue (`Skinning.cosines`). Colours are
+those before the light's falloff and the exposure, like the tissue's own.
 """
+
+import math
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.nn.functional import normalize, softplus
 
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
+
+WHITE = math.log(math.e - 1)
+"""What `gloss` holds for a strength of 1: a lobe that is white where it is brightest."""
 
 _GRAZING = 0.1  # least cosine: what is seen from behind is as bright as what is seen at a grazing angle
 
@@ -53,7 +59,7 @@ def _shading(model: GaussianModel, cosine: Tensor) -> tuple[Tensor, Tensor]:
     """The factor on a Gaussian's own colour, and what is reflected [..., N, 1, 1]."""
     light, gloss = model.light, model.gloss
     assert light is not None and gloss is not None
-    sheen, glint = gloss[:, 6:, None, None].unbind(1)
+    sheen, glint = softplus(gloss[:, 6:, None, None]).unbind(1)
     surface, film = cosine[..., None, None].unbind(-3)
     reflected = sheen * (light.sheen_sharpness * (surface - 1)).exp() + glint * (light.glint_sharpness * (film - 1)).exp()
     return surface.clamp_min(_GRAZING) ** light.facing, reflected

@@ -38,7 +38,7 @@ def start_gloss(
     eyes = eyes[cKDTree(eyes).query(means)[1]]
     normals = surface_normals(means, options.neighbours, progress)
     normals *= np.where(((eyes - means) * normals).sum(1, keepdims=True) < 0, -1.0, 1.0)
-    strengths = np.tile([options.sheen, options.glint], (len(means), 1))
+    strengths = np.tile(np.log(np.expm1([options.sheen, options.glint])), (len(means), 1))
     gloss = torch.from_numpy(np.concatenate([normals, normals, strengths], 1).astype(np.float32))
     glossy = dataclasses.replace(model, gloss=gloss, light=lobes(options))
     return dataclasses.replace(glossy, sh=unlit(glossy, cosines(glossy, torch.from_numpy(eyes).float())), light=model.light)

@@ -325,9 +325,9 @@ class GlossConfig(StageConfig):
     """Of the broad lobe: half as bright 20° off."""
     glint_sharpness: Annotated[float, Range(0.1, 1e4)] = 150.0
     """Of the narrow lobe: half as bright 5.5° off. 60 and 300 do as well within 0.3 dB."""
-    sheen: Annotated[float, Range(0, 1)] = 0.05
+    sheen: Annotated[float, Range(1e-3, 1)] = 0.05
     """Strength of the broad lobe at first, where white is 1."""
-    glint: Annotated[float, Range(0, 1)] = 0.13
+    glint: Annotated[float, Range(1e-3, 1)] = 0.13
     """Strength of the narrow lobe at first: enough for training to find which Gaussians glint."""
     facing: Annotated[float, Range(0, 10)] = 0.45
     """Exponent of the cosine by which tissue that turns away grows darker: Lambert's law in encoded images, 1 / 2.2."""

@@ -23,7 +23,7 @@ WET = Light(sheen_sharpness=12.0, glint_sharpness=150.0, facing=0.45)
 def glossy(count: int = 500, strengths: tuple[float, float] = (0.1, 0.5), film: float = 0.0) -> GaussianModel:
     """A wall at z = 0.1 m, which faces a lens at the origin, under a film of this slope."""
     model = wall(count)
-    gloss = torch.tensor([0.0, 0.0, -2.0, film, 0.0, -1.0, *strengths]).repeat(count, 1)
+    gloss = torch.tensor([0.0, 0.0, -2.0, film, 0.0, -1.0, *torch.tensor(strengths).expm1().log()]).repeat(count, 1)
     return dataclasses.replace(model, gloss=gloss, light=WET)
 
 
@@ -120,12 +120,12 @@ def test_each_eye_sees_highlights_of_its_own():
     assert (both.colors[0] - both.colors[1]).abs().max() > 0.02
 
 
-@pytest.mark.parametrize("name, error", [("m.ply", 0.0), ("m.compressed.ply", 0.005)])
+@pytest.mark.parametrize("name, error", [("m.ply", 0.0), ("m.compressed.ply", 0.04)])
 def test_files_keep_what_reflects(tmp_path, name, error):
     model = glossy(300)
     g = torch.Generator().manual_seed(0)
     model.gloss[:, :6] = torch.nn.functional.normalize(torch.randn(300, 2, 3, generator=g), dim=2).flatten(1)
-    model.gloss[:, 6:] = torch.rand(300, 2, generator=g)
+    model.gloss[:, 6:] = torch.randn(300, 2, generator=g)
     save_ply(model, tmp_path / name)
     found = load_ply(tmp_path / name)
     same = torch.cdist(model.means, found.means).argmin(1)  # a compressed model has another order

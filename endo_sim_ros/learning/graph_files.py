@@ -1,6 +1,5 @@
 """A task in a scene as the files that start the graph of ROS nodes on it."""
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +7,7 @@ import numpy as np
 import yaml
 
 from endo_sim_ros.core.cameras import save_cameras
+from endo_sim_ros.core.config import option_values
 from endo_sim_ros.core.gaussians import save_ply
 from endo_sim_ros.instruments import save_tool
 from endo_sim_ros.learning.config import SightConfig
@@ -34,7 +34,8 @@ def save_scene(scene: Scene, folder: Path, task: str, seed: int = 0, sight: Sigh
     physics = kind.physics()
     first = kind(scene.nodes(physics), scene.camera.position)
     first.reset(0, np.random.default_rng(seed))
-    changed = {name: value for name, value in asdict(physics).items() if value != getattr(PhysicsConfig(), name) and name != "device"}
+    usual = option_values(PhysicsConfig())
+    changed = {name: value for name, value in option_values(physics).items() if value != usual[name] and name != "device"}
     changed |= {"regions": list(first.regions())} if first.regions() else {}
     save_ply(scene.model, folder / "model.ply")
     save_cameras(list(scene.cameras), folder / "cameras.json")

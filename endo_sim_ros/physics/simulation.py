@@ -434,7 +434,7 @@ class TissueSimulation:
         Raises:
             ValueError: If that is more than the travel leaves room for; nothing changes then.
         """
-        replace(self.config, motion=motion)
+        self.config = replace(self.config, motion=motion)
         self.solver.motion.change(motion)
 
     @property

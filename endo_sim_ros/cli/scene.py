@@ -1,11 +1,12 @@
 """`endo-sim scene`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from tyro.conf import Positional
 
 from endo_sim_ros.learning.config import SightConfig
+from endo_sim_ros.physics.config import MotionConfig
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,7 @@ class Command:
     """Name or file of the tool; default: that of the task."""
     baseline: float = SightConfig.baseline
     """Distance between the eyes, m."""
+    motion: MotionConfig = field(default_factory=MotionConfig)
 
     def run(self) -> None:
         """Write the scene; raises ValueError if there is no such task or tool, or the model is too small or out of reach."""
@@ -35,5 +37,5 @@ class Command:
         from endo_sim_ros.learning.scenes import load_scene
 
         sight = SightConfig(image_width=self.image_width, instrument=self.instrument, tool=self.tool, baseline=self.baseline)
-        save_scene(load_scene(self.model), self.out, self.task, self.seed, sight)
+        save_scene(load_scene(self.model), self.out, self.task, self.seed, sight, self.motion)
         print(f"{self.out}: model.ply, cameras.json, parameters.yaml")

@@ -10,6 +10,7 @@ from tyro.conf import Positional
 
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.learning.config import PPOConfig, Randomisation, TrainingConfig
+from endo_sim_ros.physics.config import MotionConfig
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,7 @@ class Command:
     config: Annotated[TrainingConfig, tyro.conf.arg(name="")] = field(default_factory=TrainingConfig)
     ppo: PPOConfig = field(default_factory=PPOConfig)
     vary: Randomisation = field(default_factory=Randomisation)
+    motion: MotionConfig = field(default_factory=MotionConfig)
 
     def run(self) -> None:
         """Train and save; raises ConfigError if options of the other algorithm are given."""
@@ -50,7 +52,13 @@ class Command:
             raise ConfigError(f"options that begin with --ppo. are for ppo, the others for cem; --algorithm is {self.algorithm}")
         with leaving_none_empty(self.out):
             self.out.mkdir(parents=True, exist_ok=True)  # before the long work
-            options = {"randomisation": self.vary, "device": self.device, "actions": self.actions, "contact": self.contact}
+            options = {
+                "randomisation": self.vary,
+                "device": self.device,
+                "actions": self.actions,
+                "contact": self.contact,
+                "motion": self.motion,
+            }
             policy, curve = learn(self.task, load_scene(self.model), **options)
             save_training(self.out, policy, curve, config)
         last = curve[-1]

@@ -17,6 +17,7 @@ from endo_sim_ros.learning.pictures import IMAGE, IMAGE_RIGHT, SEGMENTATION
 from endo_sim_ros.learning.scenes import Scene, load_scene
 from endo_sim_ros.learning.task_batch import Observations, TaskBatch
 from endo_sim_ros.learning.tasks import BOUND, TASKS, Outcome
+from endo_sim_ros.physics import MotionConfig
 
 try:
     import gymnasium
@@ -40,6 +41,7 @@ def _make(
     render_mode: str | None = None,
     actions: Actions = "cartesian",
     contact: Contact = "point",
+    motion: MotionConfig | dict[str, float] | None = None,
     **sight: Any,
 ) -> tuple[TaskBatch, gymnasium.Space]:
     """The simulation, and the space of the observations of one environment; the arguments are those of `TaskEnvironment`."""
@@ -58,7 +60,8 @@ def _make(
         raise ValueError("eyes is 2, but observations is state, which has no images; ask for image or both")
     randomisation = Randomisation.from_mapping(randomisation) if isinstance(randomisation, dict) else randomisation or Randomisation()
     scene = scene if isinstance(scene, Scene) else load_scene(scene)
-    batch = TaskBatch(task, scene, count, observations, randomisation, shown, device, render_mode is not None, actions, contact)
+    motion = MotionConfig.from_mapping(motion) if isinstance(motion, dict) else motion or MotionConfig()
+    batch = TaskBatch(task, scene, count, observations, randomisation, shown, device, render_mode is not None, actions, contact, motion)
     spaces: dict[str, gymnasium.Space] = {}
     if observations != "image":
         spaces["state"] = gymnasium.spaces.Box(-BOUND, BOUND, (len(batch.observation_names),), np.float32)
@@ -101,6 +104,8 @@ class TaskEnvironment(gymnasium.Env):
             `endo_sim_ros.instruments.LINKS`.
         actions: ``cartesian``, ``joints`` or ``joint_positions``, see :class:`TaskBatch`.
         contact: What touches the tissue: ``point`` or ``links``, see :class:`TaskBatch`.
+        motion: How the tissue breathes, as :class:`MotionConfig` or its values in a dict, such as ``{"breathing": 0.004}``. Each episode
+            begins in phases of its own.
 
     Raises:
         ValueError: If an argument cannot be used, or the model is too small.
@@ -124,10 +129,11 @@ class TaskEnvironment(gymnasium.Env):
         segmentation: bool = False,
         actions: Actions = "cartesian",
         contact: Contact = "point",
+        motion: MotionConfig | dict[str, float] | None = None,
     ):
         self.batch, self.observation_space = _make(
             task, 1, scene, observations, randomisation, device, render_mode, actions, contact, image_width=image_width,
-            instrument=instrument, tool=tool, eyes=eyes, baseline=baseline, segmentation=segmentation,
+            instrument=instrument, tool=tool, eyes=eyes, baseline=baseline, segmentation=segmentation, motion=motion,
         )  # fmt: skip
         self.action_space, self.render_mode = _action_space(self.batch), render_mode
 

@@ -1,6 +1,6 @@
 """A task in a scene as the files that start the graph of ROS nodes on it."""
 
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,16 +8,25 @@ import numpy as np
 import yaml
 
 from endo_sim_ros.core.cameras import save_cameras
+from endo_sim_ros.core.config import option_values
 from endo_sim_ros.core.gaussians import save_ply
 from endo_sim_ros.instruments import save_tool
-from endo_sim_ros.learning.config import SightConfig
+from endo_sim_ros.learning.config import Randomisation, SightConfig
 from endo_sim_ros.learning.held_tools import hold_tool
 from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.learning.tasks import find_task
-from endo_sim_ros.physics import PhysicsConfig
+from endo_sim_ros.learning.variation import Variation
+from endo_sim_ros.physics import MotionConfig, PhysicsConfig
 
 
-def save_scene(scene: Scene, folder: Path, task: str, seed: int = 0, sight: SightConfig = SightConfig()) -> None:
+def save_scene(
+    scene: Scene,
+    folder: Path,
+    task: str,
+    seed: int = 0,
+    sight: SightConfig = SightConfig(),
+    motion: MotionConfig = MotionConfig(),
+) -> None:
     """Write model.ply, cameras.json, the tool's file and parameters.yaml, which start the graph in lockstep on a task in this scene.
 
     Args:
@@ -26,6 +35,7 @@ def save_scene(scene: Scene, folder: Path, task: str, seed: int = 0, sight: Sigh
         task: Name of the task.
         seed: Of the first episode.
         sight: What the endoscope shows. Which of the pictures are rendered is up to who subscribes to them.
+        motion: Breath and heart; each episode on the graph begins in the phases of the first.
 
     Raises:
         ValueError: If there is no such task or tool, the scene is too small for it, or an arm does not reach it.
@@ -33,8 +43,13 @@ def save_scene(scene: Scene, folder: Path, task: str, seed: int = 0, sight: Sigh
     kind = find_task(task)
     physics = kind.physics()
     first = kind(scene.nodes(physics), scene.camera.position)
-    first.reset(0, np.random.default_rng(seed))
-    changed = {name: value for name, value in asdict(physics).items() if value != getattr(PhysicsConfig(), name) and name != "device"}
+    rng = np.random.default_rng(seed)
+    first.reset(0, rng)
+    if motion.breathing or motion.heartbeat:
+        breath, heart = Variation.draw(Randomisation(), rng).phases.tolist()
+        physics = replace(physics, motion=replace(motion, breathing_phase=breath, heartbeat_phase=heart))
+    usual = option_values(PhysicsConfig())
+    changed = {name: value for name, value in option_values(physics).items() if value != usual[name] and name != "device"}
     changed |= {"regions": list(first.regions())} if first.regions() else {}
     save_ply(scene.model, folder / "model.ply")
     save_cameras(list(scene.cameras), folder / "cameras.json")

@@ -86,6 +86,10 @@ class Pictures:
         for b, variation in zip(episodes.tolist(), variations):
             self._show(b, self._view(variation))
         self._means[episodes], self._covars[episodes] = self._skinning.means, self._skinning.covars
+        if self._tissue.solver.motion.moving:
+            positions = self._tissue.positions()
+            for b in episodes.tolist():
+                self._means[b], self._covars[b] = self._skinning.deform(positions[b], self._tissue.F[b])
 
     def _show(self, b: int, view: _View) -> None:
         self._views[b], self._lamps[:, b] = view, view.lamps

@@ -17,6 +17,7 @@ from endo_sim_ros.learning.policies import NetworkPolicy
 from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.learning.task_batch import TaskBatch
 from endo_sim_ros.learning.train import measure_policy
+from endo_sim_ros.physics import MotionConfig
 
 try:
     from stable_baselines3 import PPO  # pyright: ignore[reportMissingImports]  (optional)
@@ -152,6 +153,7 @@ def train_ppo(
     device: str = "auto",
     actions: Actions = "cartesian",
     contact: Contact = "point",
+    motion: MotionConfig = MotionConfig(),
 ) -> tuple[NetworkPolicy, list[dict[str, float]]]:
     """Train a policy by PPO on states; repeatable bit by bit on a CPU.
 
@@ -160,7 +162,14 @@ def train_ppo(
         seconds; first of the untrained policy, last of the one returned.
     """
     with Progress() as bar:
-        options: dict[str, Any] = {"scene": scene, "randomisation": randomisation, "device": device, "actions": actions, "contact": contact}
+        options: dict[str, Any] = {
+            "scene": scene,
+            "randomisation": randomisation,
+            "device": device,
+            "actions": actions,
+            "contact": contact,
+            "motion": motion,
+        }
         environments = StableEnvironments(VectorTaskEnvironment(task, config.environments, **options))
         testing = TaskBatch(task, count=config.test_episodes, **options)
         rollout = config.environments * config.rollout

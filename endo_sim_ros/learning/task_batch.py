@@ -1,6 +1,7 @@
 """B episodes of a task in the simulation: one batched solver, one renderer, no framework; what environments and training share."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -13,7 +14,7 @@ from endo_sim_ros.learning.pictures import IMAGE, SEGMENTATION, Pictures
 from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.learning.tasks import Outcome, find_task
 from endo_sim_ros.learning.variation import Variation
-from endo_sim_ros.physics import TissueBatch, ToolLinks
+from endo_sim_ros.physics import MotionConfig, TissueBatch, ToolLinks
 
 RESTING_SPEED = 1e-5  # m/s; as in TissueSimulation: one tissue slower than this, that no tool moves, is left as it is
 
@@ -41,10 +42,11 @@ class TaskBatch:
             the task allows it comes as near as its joints get.
         contact: What touches the tissue: ``point``, the tip that the task describes, or ``links``, the links of the instrument, whose
             jaws hold what lies between them, as in physics_node.
+        motion: Breath and heart. Each episode begins in phases of its own, not in those of the motion.
 
     Raises:
-        ValueError: If there is no such task or tool, the scene is too small for it, an arm does not reach it, or links shall touch
-            where each episode has another tool.
+        ValueError: If there is no such task or tool, the scene is too small for it, an arm does not reach it, links shall touch
+            where each episode has another tool, or tissue cannot move so far.
     """
 
     def __init__(
@@ -59,9 +61,10 @@ class TaskBatch:
         images: bool = False,
         actions: Actions = "cartesian",
         contact: Contact = "point",
+        motion: MotionConfig = MotionConfig(),
     ):
         kind = find_task(task)
-        config = kind.physics(device)
+        config = replace(kind.physics(device), motion=motion)
         nodes = scene.nodes(config)
         self.task, self.count = kind(nodes, scene.camera.position, count), count
         self.observations, self.randomisation = observations, randomisation
@@ -77,6 +80,7 @@ class TaskBatch:
         self._linked = torch.zeros(0)  # poses of the links, of a single tissue
         self.tissue = TissueBatch(nodes, config, count, 1, stiffness=stiffness, capsules=len(self._links or [0]))
         self._varies = largest != 1
+        self._moves = motion.breathing + motion.heartbeat > 0
         self._rest = torch.from_numpy(nodes.rest)
         self._resting, self._placed = True, False  # of a single tissue
         self.sight = sight
@@ -103,7 +107,7 @@ class TaskBatch:
             self._note(b, variation)
             variations.append(variation)
         chosen = torch.as_tensor(list(episodes), dtype=torch.long, device=self.tissue.solver.device)
-        self.tissue.reset(chosen)
+        self.tissue.reset(chosen, np.array([variation.phases for variation in variations]) if self._moves else None)
         self._resting, self._placed = True, False
         self._rotations[list(episodes)] = np.eye(3)
         if self.tools is not None:
@@ -113,7 +117,7 @@ class TaskBatch:
 
     def _note(self, b: int, variation: Variation) -> None:
         """Keep what an episode has."""
-        values: dict[str, Any] = dict(variation.values())
+        values: dict[str, Any] = dict(variation.values()) | ({"phases": variation.phases} if self._moves else {})
         if self.randomisation.tool and self.tools is not None:
             values["tool"] = self.tools.tools[self.tools.which[b]].name
         for name, value in values.items():
@@ -191,7 +195,7 @@ class TaskBatch:
         before = bool(tools.gripping[0, 0])
         tools.take_hold()
         holding, touching = bool(tools.gripping[0, 0]), tools.contact_radius > 0 or self._links is not None
-        return self._resting and holding == before and not (moved and (holding or touching))
+        return self._resting and not self._moves and holding == before and not (moved and (holding or touching))
 
     def observe(self) -> np.ndarray | dict[str, np.ndarray]:
         """Observations of all episodes now."""

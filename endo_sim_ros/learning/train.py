@@ -16,6 +16,7 @@ from endo_sim_ros.learning.config import PPOConfig, Randomisation, TrainingConfi
 from endo_sim_ros.learning.policies import NetworkPolicy, Policy
 from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.learning.task_batch import TaskBatch
+from endo_sim_ros.physics import MotionConfig
 
 log = logging.getLogger(__name__)
 
@@ -55,6 +56,7 @@ def train(
     device: str = "auto",
     actions: Actions = "cartesian",
     contact: Contact = "point",
+    motion: MotionConfig = MotionConfig(),
 ) -> tuple[NetworkPolicy, list[dict[str, float]]]:
     """Train a policy.
 
@@ -64,7 +66,7 @@ def train(
     """
     hidden = [config.hidden] if config.hidden else []
     rng = np.random.default_rng([config.seed, 0xCE])
-    make = partial(TaskBatch, task, scene, randomisation=randomisation, device=device, actions=actions, contact=contact)
+    make = partial(TaskBatch, task, scene, randomisation=randomisation, device=device, actions=actions, contact=contact, motion=motion)
     batch, testing = make(config.population), make(config.test_episodes)
     size = sum(rows * columns for rows, columns in NetworkPolicy.sizes(task, hidden, actions))
     mean, deviation = np.zeros(size), np.full(size, config.spread)

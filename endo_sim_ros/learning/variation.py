@@ -78,6 +78,11 @@ class Variation:
         """By how much the lamp is moved [3], m, camera."""
         return self.by.lamp * self.more[9:12]
 
+    @property
+    def phases(self) -> np.ndarray:
+        """In which breath and heart begin [2], in periods."""
+        return np.random.default_rng(self.more.view(np.uint32)).uniform(0, 1, 2)  # as above
+
     def values(self) -> dict[str, np.ndarray | float]:
         """What was drawn of each kind that there is, but the tool, by the names of the options; angles in degrees."""
         by = self.by

@@ -9,6 +9,7 @@ from endo_sim_ros.messages.clouds import *
 from endo_sim_ros.messages.diagnostics import *
 from endo_sim_ros.messages.headers import *
 from endo_sim_ros.messages.images import *
+from endo_sim_ros.messages.motion import *
 from endo_sim_ros.messages.poses import *
 from endo_sim_ros.messages.tools import *
 from endo_sim_ros.messages.topics import *

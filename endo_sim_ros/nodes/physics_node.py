@@ -5,6 +5,7 @@ from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import numpy as np
+from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 
 from endo_sim_ros import messages
@@ -64,6 +65,7 @@ class PhysicsNode(EndoNode):
         self._nodes_pub = self.publisher(messages.CONTROL_NODES, MOST_WAITING if self._lockstep else STREAM_DEPTH, alone=True)
         self._cut_pub = self.publisher(messages.CUT_SURFACE, depth, alone=True)
         self._published_cut = 0  # number of the newest surface that was published
+        self._motion_pub = self.publisher(messages.TISSUE_MOTION, alone=True)
         self._markers_pub = self.publisher(messages.TOOL_MARKERS, alone=True)
         self._clock_pub = self.publisher(messages.CLOCK, alone=True) if self._lockstep else None
         self.subscribe(messages.GAUSSIANS, lambda message: self._builder.receive_model(message, self._options.world_frame))
@@ -72,6 +74,7 @@ class PhysicsNode(EndoNode):
         )
         self.subscribe(messages.TRAINING_CAMERA_INFO, self._builder.receive_training_info)
         self.subscribe(messages.CAMERA_POSE, self._on_camera_pose)
+        self.subscribe(messages.TISSUE_MOTION_COMMAND, self._on_motion_command)
         self._reactions = ReactionTopics(self, self._tools, self._options.reaction_rate, self._lockstep)
         self._arm_topics = ArmTopics(self, self.arms, self._options, depth, self._on_command, self._discard)
         self._place_arms()
@@ -86,6 +89,8 @@ class PhysicsNode(EndoNode):
             if config.regions != self.config.regions:
                 read_regions(config.regions)  # what cannot be read is refused
             self.config = config  # the timer builds a simulation for it
+            if self.simulation is not None:
+                self._move_on(self.simulation)
             self._timer.timer_period_ns = int(_poll(config) * 1e9)
         else:
             moved = config.frames != self._options.frames
@@ -115,6 +120,7 @@ class PhysicsNode(EndoNode):
                 same_model = stamp == self._simulated_stamp
                 continued = old is not None and same_model and simulation.continue_from(old)  # only its material has changed
                 self._simulated_stamp, self.simulation, self.failure = stamp, simulation, ""
+                self._move_on(simulation)
                 self._start_timing()
                 if not continued:
                     for arm in self.arms.values():
@@ -135,6 +141,20 @@ class PhysicsNode(EndoNode):
             self.failure = sentence("physics", error)
             self.report_error(self.failure)
         self._builder.want(self.config)
+
+    def _move_on(self, simulation: TissueSimulation) -> None:
+        """Let breath and heart move as the options have it."""
+        room = simulation.config.travel >= self.config.travel  # else a simulation with more is being built
+        if simulation.config.motion != self.config.motion and room:
+            simulation.set_motion(self.config.motion)
+
+    def _on_motion_command(self, message: Any) -> None:
+        values = messages.decode_motion_command(message, messages.TISSUE_MOTION_COMMAND.name)
+        self.config.motion.replaced(values)  # what is wrong, in our words
+        parameters = [Parameter(f"motion.{name}", value=value) for name, value in values.items()]
+        result = self.set_parameters_atomically(parameters)
+        if not result.successful:
+            raise ValueError(result.reason)
 
     # ------------------------------------------------------------------ tools
 
@@ -286,6 +306,8 @@ class PhysicsNode(EndoNode):
         self._arm_topics.publish_views(stamp)  # before the state with the same stamp, as who draws them waits for that
         cloud = ControlNodeCloud(state.rest, state.positions, state.F, self._simulated_stamp, cut)
         self._nodes_pub.publish(messages.encode_control_nodes(cloud, stamp, world))
+        motion = simulation.motion
+        self._motion_pub.publish(messages.encode_motion(motion.displacements, motion.velocities, motion.phases, motion.rates, stamp))
         shown, reactions, marked = [], {}, self._markers_pub.get_subscription_count() > 0
         for name, arm in self._tools.items():
             if arm.pose is None:

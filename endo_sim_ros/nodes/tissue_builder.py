@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.nodes.background import Background
-from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
+from endo_sim_ros.physics import MotionConfig, PhysicsConfig, TissueSimulation
 from endo_sim_ros.rendering import middle_depth, render_depth
 
 # A view as wide as an endoscope's, for a camera whose intrinsics nobody has told:
@@ -92,13 +93,13 @@ class TissueBuilder:
         return None if built is None else built[1]
 
     def want(self, config: PhysicsConfig) -> None:
-        """Build what was received last with these options, unless that was done; call it periodically."""
+        """Build what was received last with these options, unless that was done; call it periodically. Other motion is no reason to."""
         origin, poses = self._viewpoint()
         if self.model is not None and poses is not None:
             model, stamp, cameras = self.model, self._model_stamp, self._own_cameras()
             middle = len(poses) // 2  # where rendering_node stands as long as nobody moves the camera
             viewpoint, camera = poses[:, :3, 3], cameras[middle] if cameras else Camera(*_USUAL_VIEW, poses[middle])
-            key = self._model_number, origin, bool(cameras), config
+            key = self._model_number, origin, bool(cameras), replace(config, motion=MotionConfig())
             self._background.want(key, lambda: (stamp, _tissue(model, viewpoint, config, cameras), _view(model, camera)))
 
     def stop(self) -> None:

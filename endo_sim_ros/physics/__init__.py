@@ -6,7 +6,7 @@ from endo_sim_ros.core.lazy import lazy_names
 
 if TYPE_CHECKING:
     from endo_sim_ros.physics.batch import TissueBatch as TissueBatch
-    from endo_sim_ros.physics.config import PhysicsConfig as PhysicsConfig
+    from endo_sim_ros.physics.config import MotionConfig as MotionConfig, PhysicsConfig as PhysicsConfig
     from endo_sim_ros.physics.control_nodes import (
         ControlNodes as ControlNodes,
         build_control_nodes as build_control_nodes,

@@ -1,5 +1,6 @@
 """Many copies of one tissue, stepped together, in tensors."""
 
+import numpy as np
 import torch
 import warp as wp
 from numpy.typing import ArrayLike
@@ -68,8 +69,8 @@ class TissueBatch:
         self.solver.step()
 
     def positions(self) -> Tensor:
-        """Positions of the nodes [B, M, 3], m, world; pinned ones where they rest."""
-        return self._rest + self.displacements * self._free[:, None]
+        """Positions of the nodes [B, M, 3], m, world; pinned ones where they rest, or where breath and heart have them."""
+        return self._rest + torch.where(self._free[:, None], self.displacements, wp.to_torch(self.solver.held)[:, None])
 
     def append_skinning(self, skinning: Skinning) -> tuple[Tensor, Tensor]:
         """Make skinning part of every step from now on, in place of another that was; on a GPU of the one graph that a step is.
@@ -85,11 +86,11 @@ class TissueBatch:
             ValueError: If the skinning is another's.
         """
         state = self.solver.state
-        work, means, covars = skinning.work(state.u, state.F, self.nodes.pinned, self.solver.environments)
+        work, means, covars = skinning.work(state.u, state.F, self.nodes.pinned, self.solver.held, self.solver.environments)
         self.solver.append_launches(work)
         return means, covars
 
-    def reset(self, environments: Tensor | slice = slice(None)) -> None:
-        """Back to rest, in these copies; their tools let go."""
-        self.solver.reset(environments)
+    def reset(self, environments: Tensor | slice = slice(None), phases: np.ndarray | None = None) -> None:
+        """Back to rest, in these K copies; their tools let go. Breath and heart begin with phases [K, 2], default: those of the config."""
+        self.solver.reset(environments, phases)
         self.tools.reset(environments)

@@ -3,7 +3,65 @@
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
-from endo_sim_ros.core.config import Range, StageConfig
+import numpy as np
+
+from endo_sim_ros.core.config import ConfigError, Range, StageConfig
+
+MOST_MOTION = 0.5  # of the travel; the rest is for tools
+
+
+@dataclass(frozen=True)
+class MotionConfig(StageConfig):
+    """How breath and heart move the control nodes that are held, all of them alike, with the waveforms of the synthetic patient."""
+
+    breathing: Annotated[float, Range(0.0, 0.03, "m")] = 0.0
+    """How far breath moves held tissue there and back."""
+    breathing_period: Annotated[float, Range(0.5, 60.0, "s")] = 4.0
+    """Time from breath to breath."""
+    breathing_phase: Annotated[float, Range(0.0, 1.0)] = 0.0
+    """Part of its period that the breath has gone at the start and after a reset; it is farthest at 0.5."""
+    heartbeat: Annotated[float, Range(0.0, 0.01, "m")] = 0.0
+    """How far the heart moves held tissue."""
+    heartbeat_period: Annotated[float, Range(0.2, 10.0, "s")] = 0.9
+    """Time from beat to beat."""
+    heartbeat_phase: Annotated[float, Range(0.0, 1.0)] = 0.0
+    """Part of its period that the heart has gone at the start and after a reset; it is farthest at 0.25."""
+    direction_x: Annotated[float, Range(-1.0, 1.0)] = 1.0
+    """Direction of the motion in the world, of any length but zero: x. By default tissue slides, and comes half as far nearer to a camera
+    that looks along z."""
+    direction_y: Annotated[float, Range(-1.0, 1.0)] = 0.0
+    """The same: y."""
+    direction_z: Annotated[float, Range(-1.0, 1.0)] = -0.5
+    """The same: z."""
+    fade: Annotated[float, Range(0.0, 60.0, "s")] = 1.0
+    """Time in which a new amplitude or direction takes over from the old one, so that tissue does not jump; a new period acts at once, as
+    the phase goes on from where it is."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not any(self.direction):
+            raise ConfigError("the direction of motion is 0, 0, 0; give one that points somewhere")
+
+    @property
+    def direction(self) -> tuple[float, float, float]:
+        """Direction of the motion, world, of any length."""
+        return self.direction_x, self.direction_y, self.direction_z
+
+    @property
+    def ways(self) -> np.ndarray:
+        """How far breath and heart move held tissue [2, 3], m, world."""
+        direction = np.array(self.direction)
+        return np.array([[self.breathing], [self.heartbeat]]) * (direction / np.linalg.norm(direction))
+
+    @property
+    def periods(self) -> tuple[float, float]:
+        """Of breath and heart, s."""
+        return self.breathing_period, self.heartbeat_period
+
+    @property
+    def phases(self) -> tuple[float, float]:
+        """Of breath and heart at the start, in periods."""
+        return self.breathing_phase, self.heartbeat_phase
 
 
 @dataclass(frozen=True)
@@ -98,6 +156,8 @@ class PhysicsConfig(StageConfig):
     blade_length: Annotated[float, Range(1e-4, 0.1, "m")] = 0.01
     """Length of the edge that a cutting tool sweeps through the tissue, from its tip backwards, against its z axis. A cut opens
     once it is about one cell of the grid deep; more layers make that finer."""
+    motion: MotionConfig = MotionConfig()
+    """Breath and heart."""
     dense: bool = False
     """Simulate every Gaussian as a material point (PhysGaussian's way) instead of sparse control nodes;
     layers are then ignored."""
@@ -110,6 +170,15 @@ class PhysicsConfig(StageConfig):
     }
 
     needs: ClassVar[dict[str, tuple[str, ...]]] = {"stiffening": ("material", "fung"), "stiffening_limit": ("material", "fung")}
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        moved, most = self.motion.breathing + self.motion.heartbeat, MOST_MOTION * self.travel
+        if moved > most:
+            raise ConfigError(
+                f"breathing and heartbeat move tissue by up to {moved:g} m, but with travel {self.travel:g} m it takes {most:g} m, so that"
+                " tools can move it as well; give less of them or more travel"
+            )
 
     @classmethod
     def baseline(cls, **overrides) -> "PhysicsConfig":

@@ -64,14 +64,15 @@ def moved_node_maps(
     pinned: wp.array[int],  # [M]
     u: wp.array[wp.vec3],  # displacements [B · M]
     F: wp.array[wp.mat33],  # [B · M]
+    held: wp.array[wp.vec3],  # how far pinned ones are moved [B]
     origin: wp.vec3,
     maps: wp.array[wp.mat44],  # out [B · M]
 ):
-    """G_k of every control node in every environment, A_k = F_k; pinned ones have not moved."""
+    """G_k of every control node in every environment, A_k = F_k; pinned ones are only shifted, as breath and heart have them."""
     b, k = wp.tid()
     e = b * node_rest.shape[0] + k
     if pinned[k] != 0:
-        maps[e] = wp.mat44()
+        maps[e] = node_map(node_rest[k], node_rest[k] + held[b], wp.identity(3, float), origin)
     else:
         maps[e] = node_map(node_rest[k], node_rest[k] + u[e], F[e], origin)
 

@@ -1,7 +1,7 @@
 """The tissue that tools push, pull, grasp and cut, each by its name."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -14,11 +14,12 @@ from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.instruments.shapes import Capsule
 from endo_sim_ros.physics.backends.base import capturing
 from endo_sim_ros.physics.batch import TissueBatch
-from endo_sim_ros.physics.config import PhysicsConfig
+from endo_sim_ros.physics.config import MotionConfig, PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes, RenderDepth, build_control_nodes
 from endo_sim_ros.physics.cutting.blade import Blade, Scissors
 from endo_sim_ros.physics.cutting.stencils import CutStencils
 from endo_sim_ros.physics.links import ToolLinks, rigid_pose
+from endo_sim_ros.physics.motion import MotionState
 from endo_sim_ros.physics.regions import TissueProperties
 
 MAX_TOOLS = 8  # of a TissueSimulation
@@ -391,9 +392,10 @@ class TissueSimulation:
         ``last_fault``; the tissue is then at rest where it was before, or, after several in a row, nearer to its rest state."""
         before = self.faults
         self.time += self.step_duration
-        if self.resting and not (self.disturbed or self._wrenches_act()):
+        acts = self.disturbed or self._wrenches_act() or self.solver.motion.moving
+        if self.resting and not acts:
             return
-        self._quiet = 0.0 if self.disturbed or self._wrenches_act() else self._quiet + self.step_duration
+        self._quiet = 0.0 if acts else self._quiet + self.step_duration
         self._batch.step()
         self.disturbed = False
         relaxed = not self.config.relaxation or self._quiet > _RELAXED * self.config.relaxation_time
@@ -412,7 +414,7 @@ class TissueSimulation:
         return bool(self._tools.forces.any() or self._tools.torques.any())
 
     def reset(self) -> None:
-        """Back to the rest state at time zero; tools let go, cuts heal."""
+        """Back to the rest state at time zero; tools let go, cuts heal. Breath and heart begin anew, with their whole amplitude."""
         self._batch.reset()
         self._slots.clear()
         self._placed.clear()
@@ -426,6 +428,20 @@ class TissueSimulation:
         self.resting = not any(self.config.gravity)
         self.time, self.last_fault = 0.0, ""
 
+    def set_motion(self, motion: MotionConfig) -> None:
+        """Let breath and heart move held tissue like this from now on, without a jump, see `HeldMotion.change`.
+
+        Raises:
+            ValueError: If that is more than the travel leaves room for; nothing changes then.
+        """
+        self.config = replace(self.config, motion=motion)
+        self.solver.motion.change(motion)
+
+    @property
+    def motion(self) -> MotionState:
+        """Breath and heart now."""
+        return self.solver.motion.state
+
     def continue_from(self, other: "TissueSimulation") -> bool:
         """Take over shape, motion, cuts and tools of other tissue; returns whether that can be: if it has the same nodes. Scissors are
         left behind where nothing can be cut.
@@ -438,6 +454,7 @@ class TissueSimulation:
             return False
         for name in ("u", "v", "C", "F", "Q"):
             wp.copy(getattr(self.solver.state, name), getattr(other.solver.state, name))
+        self.solver.motion.copy(other.solver.motion)
         self._tools.copy(other._tools)
         self._slots, self._blades, self.time = dict(other._slots), dict(other._blades), other.time
         self._links, self._placed, self._scissors = dict(other._links), dict(other._placed), dict(other._scissors)
@@ -458,7 +475,7 @@ class TissueSimulation:
     def state(self) -> TissueState:
         """Positions and deformation gradients of all nodes now."""
         moving = ~self.nodes.pinned[:, None]
-        positions = self.nodes.rest + self.solver.displacements() * moving
+        positions = self.nodes.rest + np.where(moving, self.solver.displacements(), wp.to_torch(self.solver.held)[0].cpu().numpy())
         F = np.where(moving[..., None], self.solver.deformation_gradients(), np.eye(3, dtype=np.float32))
         return TissueState(self.nodes.rest, positions, F, self.time)
 

@@ -208,14 +208,15 @@ class Skinning:
         self.backend.skin(self._rest, maps, means, covars)
         return means, covars
 
-    def work(self, u: wp.array, F: wp.array, pinned: np.ndarray, environments: int) -> tuple[list[Work], Tensor, Tensor]:
+    def work(self, u: wp.array, F: wp.array, pinned: np.ndarray, held: wp.array, environments: int) -> tuple[list[Work], Tensor, Tensor]:
         """Return the work that computes `deform` from the state of a solver, and the means [B, N, 3] and covariances
         [B, N, 3, 3] that it overwrites.
 
         Args:
             u: Displacements of the control nodes in all environments [B · M].
             F: Their deformation gradients [B · M].
-            pinned: Control nodes that never move [M].
+            pinned: Control nodes that are held [M].
+            held: How far these are moved [B], as `MpmSolver.held` is.
             environments: B.
 
         Raises:
@@ -228,7 +229,7 @@ class Skinning:
             raise ValueError(f"skinning: {count} nodes on {device} cannot follow {environments} × {len(pinned)} nodes on {u.device}")
         means, covars = (rest.repeat(environments, *[1] * rest.ndim) for rest in (self.means, self.covars))
         maps = torch.zeros((environments, count, 4, 4), device=device)
-        held = viewed(torch.from_numpy(pinned).to(device, torch.int32))
-        inputs = [viewed(self.node_rest, wp.vec3), held, u, F, self._origin, viewed(maps.view(-1, 4, 4), wp.mat44)]
+        fixed = viewed(torch.from_numpy(pinned).to(device, torch.int32))
+        inputs = [viewed(self.node_rest, wp.vec3), fixed, u, F, held, self._origin, viewed(maps.view(-1, 4, 4), wp.mat44)]
         mapping = Launch(kernels.moved_node_maps, (environments, count), inputs)
         return [mapping, *self.backend.skin_work(self._rest, maps, means, covars)], means, covars

@@ -18,6 +18,7 @@ from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes
 from endo_sim_ros.physics.grid import plan_grid
 from endo_sim_ros.physics.materials import Stiffening, energy_density, lame_parameters
+from endo_sim_ros.physics.motion import HeldMotion
 from endo_sim_ros.physics.regions import TissueProperties
 from endo_sim_ros.physics.stencils import CutTable, Stencils
 from endo_sim_ros.physics.substeps import plan_substeps
@@ -97,6 +98,8 @@ class MpmSolver:
         (self._saved, self.state), (self._backed_up, self._backup) = new_state(count, device), new_state(count, device)
         self.bad_nodes = wp.zeros(environments, int, device=device)  # in the last step; where there were any it was undone
         self._speed_sq = wp.zeros(environments, float, device=device)
+        self.motion = HeldMotion(config.motion, config.step_duration, self._pinned, self.loads, environments)
+        self.held = self.motion.held  # how far pinned control nodes are moved [B], m
         self._substep = Substep()
         self._substep.dt = self.substepping.dt
         self._substep.decay = math.exp(-config.damping * self.substepping.dt)
@@ -112,8 +115,9 @@ class MpmSolver:
         self.set_cut(None)
         self.reset()
 
-    def reset(self, environments: torch.Tensor | slice = slice(None)) -> None:
-        """Back to rest, no force, nothing held but the pinned control nodes, in these environments."""
+    def reset(self, environments: torch.Tensor | slice = slice(None), phases: np.ndarray | None = None) -> None:
+        """Back to rest, no force, nothing held but the pinned control nodes, in these environments. Breath and heart begin with these
+        phases [K, 2], default: those of the config, and the tissue as a whole is where they have it."""
         shape = (self.environments, self.node_count)
 
         def of(array: wp.array) -> torch.Tensor:
@@ -122,6 +126,7 @@ class MpmSolver:
 
         for array in (self.loads.force, self.loads.target, self.loads.target_v, self.state.u, self.state.v, self.state.C, self.state.Q):
             of(array)[environments] = 0
+        of(self.state.u)[environments] += self.motion.reset(environments, phases)[:, None]
         of(self.state.F)[environments] = torch.eye(3, device=self.device)
         of(self.loads.holder)[environments] = -1
         of(self.loads.spring)[environments] = of(self.pin_springs)[environments]
@@ -180,6 +185,7 @@ class MpmSolver:
     def step(self) -> None:
         """Take one step in every environment."""
         advance = self.prepare()
+        self.motion.begin_step()
         with on_torch_stream(self.device):
             advance()
 
@@ -197,7 +203,7 @@ class MpmSolver:
             self.loads, self.rigid, self.grid, self._substep, self.scale, self._stencils,
         )  # fmt: skip
         check = [backend.threads, self.node_count, config.travel, config.rollback_damping]
-        check += [self._backup, self.state, self.bad_nodes, self._speed_sq]
+        check += [self._backup, self.state, self.bad_nodes, self._speed_sq, self.held, self.motion.goal]
         end = Launch(end_step, (self.environments, backend.threads), check, backend.threads)
         return backend.record(
             [
@@ -212,7 +218,8 @@ class MpmSolver:
         )
 
     def displacements(self, environment: int = 0) -> np.ndarray:
-        """Displacements [M, 3], m, world axes. Those of pinned control nodes are how far their springs give way."""
+        """Displacements [M, 3], m, world axes. Those of pinned control nodes are how far their springs give way, beside what breath and
+        heart move them by."""
         return self._of(self.state.u, environment)
 
     def deformation_gradients(self, environment: int = 0) -> np.ndarray:

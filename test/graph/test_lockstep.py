@@ -328,7 +328,7 @@ def test_a_commanded_arm_moves_in_its_time_and_tells_its_state(graph):
     graph.until(lambda: saying()[2:] == ["PAUSED", "ENABLED"])
 
 
-def record(tmp_path, name, model):
+def record(tmp_path, name, model, **physics):
     """A scripted episode with the graph in processes of its own; all output as bytes, by topic."""
     bench, bag = Bench(), tmp_path / name
     bench.hear(IMAGES)
@@ -336,7 +336,7 @@ def record(tmp_path, name, model):
         with NodeGroup(tmp_path / "logs") as group:
             group.environment |= {"ENDO_SIM_THREADS": "2" if name == "second" else "1"}
             group.start("recorder_node", bag=bag, topics=["all", *(topic.name for topic in SHOWN)])
-            group.start("physics_node", **PARAMETERS["physics_node"])
+            group.start("physics_node", **PARAMETERS["physics_node"], **physics)
             group.start("rendering_node", **PARAMETERS["rendering_node"])
             bench.status("recorder", "recording", OK)
             for node in ("physics_node", "rendering_node"):
@@ -370,10 +370,11 @@ def record(tmp_path, name, model):
     return found
 
 
-def test_the_same_commands_give_the_same_bytes_in_every_run(tmp_path):
+@pytest.mark.parametrize("physics", [{}, {"motion.breathing": 0.004, "motion.heartbeat": 0.001}])
+def test_the_same_commands_give_the_same_bytes_in_every_run(tmp_path, physics):
     save_ply(sheet(tilt=0.3), tmp_path / "model.ply")
-    first, second = (record(tmp_path, name, tmp_path / "model.ply") for name in ("first", "second"))
-    for topic in (*STATES, *SHOWN, messages.RENDERED_COMPRESSED, messages.tool_links("PSM1")):
+    first, second = (record(tmp_path, name, tmp_path / "model.ply", **physics) for name in ("first", "second"))
+    for topic in (*STATES, messages.TISSUE_MOTION, *SHOWN, messages.RENDERED_COMPRESSED, messages.tool_links("PSM1")):
         ours, theirs = (episode[f"/{topic.name.lstrip('/')}"] for episode in (first, second))
         assert len(ours) >= 8 and ours[-8:] == theirs[-8:], topic.name
     assert len(set(first["/rendered/image_raw"][-8:])) == 8  # the tissue moves

@@ -94,6 +94,45 @@ def test_each_of_many_environments_is_the_single_one_with_its_seed(task):
         assert recorded[k][1][1] == reward
 
 
+BREATH = {"breathing": 0.004, "breathing_period": 1.5, "heartbeat": 0.001}
+
+
+def test_the_script_retracts_tissue_that_breathes_and_each_episode_has_the_bits_and_the_phase_of_its_seed():
+    options = {"observations": "both", "motion": BREATH, "device": "cpu"}
+    many = gymnasium.make_vec(IDS["retraction"], num_envs=4, vectorization_mode="vector_entry_point", **options)
+    policy = scripted_policy("retraction", 4)
+    observations, info = many.reset(seed=20)
+    phases, recorded, solved = info["phases"], [observations], np.zeros(4, bool)
+    assert phases.shape == (4, 2) and len(np.unique(phases)) == 8
+    while not solved.all() and len(recorded) < 40:
+        observations, _, terminated, _, info = many.step(policy.act(observations["state"]))
+        recorded.append(observations)
+        solved |= info["success"]
+        if terminated.any():
+            break
+    assert len(recorded) > 10 and solved.any()
+    single = make("retraction", observations="both", motion=BREATH)
+    for b in range(2):
+        seen, _, info = play(single, scripted_policy("retraction"), 20 + b)
+        assert info["success"] and info["phases"] == pytest.approx(phases[b], abs=0)
+        for ours, theirs in zip(recorded, seen):
+            np.testing.assert_array_equal(ours["state"][b], theirs["state"])
+            np.testing.assert_array_equal(ours["image"][b], theirs["image"])
+
+
+def test_motion_changes_no_task_and_without_it_the_bits_are_the_same():
+    seen = [make("retraction", motion=motion).reset(seed=3)[0] for motion in (None, {"breathing_period": 2.0}, BREATH)]
+    np.testing.assert_array_equal(seen[0], seen[1])
+    names = list(TASKS["retraction"].observation_names)
+    tip, spot = (names.index(name) for name in ("tip_x", "spot_moved_x"))
+    np.testing.assert_array_equal(seen[0][tip : tip + 3], seen[2][tip : tip + 3])
+    assert not seen[0][spot : spot + 3].any() and seen[2][spot : spot + 3].any()  # the spot is where the breath has it
+    with pytest.raises(ConfigError, match="more travel"):
+        make("retraction", motion={"breathing": 0.03})
+    with pytest.raises(ConfigError, match="no option depth"):
+        make("retraction", motion={"depth": 0.03})
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("task", "count"), [("retraction", 8), ("palpation", 4)])
 def test_the_scripts_solve_the_tasks_with_links_that_touch_and_each_episode_has_the_bits_of_its_seed(task, count):

@@ -17,6 +17,7 @@ from endo_sim_ros.learning.graph_files import save_scene
 from endo_sim_ros.learning.policies import scripted_policy
 from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.learning.tasks import TASKS
+from endo_sim_ros.physics import MotionConfig
 
 pytestmark = pytest.mark.dds
 
@@ -81,10 +82,19 @@ def user():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task, episodes, instrument", [("retraction", 2, True), ("retraction", 1, False), ("palpation", 1, True)])
-def test_over_topics_observations_images_and_actions_are_bit_for_bit_those_of_the_environment(task, episodes, instrument, user, tmp_path):
+@pytest.mark.parametrize(
+    "task, episodes, instrument, motion",
+    [
+        ("retraction", 2, True, MotionConfig()),
+        ("retraction", 1, False, MotionConfig(breathing=0.004, heartbeat=0.001)),
+        ("palpation", 1, True, MotionConfig()),
+    ],
+)
+def test_over_topics_observations_images_and_actions_are_bit_for_bit_those_of_the_environment(
+    task, episodes, instrument, motion, user, tmp_path
+):
     sight = SightConfig(instrument=instrument)
-    save_scene(load_scene(), tmp_path, task, seed=SEED, sight=sight)
+    save_scene(load_scene(), tmp_path, task, seed=SEED, sight=sight, motion=motion)
     heard = {name: [] for name in PICTURES}
     for name, topic in PICTURES.items():
         user.user.subscribe(topic, heard[name].append, depth=1000)  # all that come while this process does not spin
@@ -106,7 +116,7 @@ def test_over_topics_observations_images_and_actions_are_bit_for_bit_those_of_th
         group.start("rendering_node", *parameters, device="cpu")
         user.until(lambda: user.user.count_publishers("rendered/image_raw"), "the rendering node", 60)
         run(tmp_path / "scripted.npz")
-        pictured = make(task, observations="both", eyes=2, segmentation=True, instrument=instrument)
+        pictured = make(task, observations="both", eyes=2, segmentation=True, instrument=instrument, motion=motion)
         images = assert_same_as_environment(tmp_path / "scripted.npz", scripted_policy(task), episodes, pictured)
         # They may come late; an earlier episode, or some pictures of one, may be missed.
         shown = lambda name: any(shows(part, name, images) for part in episodes_of(heard[name]))

@@ -20,13 +20,15 @@ def end_step(
     state: State,
     faults: wp.array[int],
     speed_sq: wp.array[float],
+    held: wp.array[wp.vec3],  # how far breath and heart had moved what is held, and so rest, when the step began [B], m
+    goal: wp.array[wp.vec3],  # the same when it ends
 ):
     """Count control nodes that are not finite or out of bounds (the comparisons are false for NaN) and find the largest v².
 
     Environments where there are any return to the state before the step, at rest there. Where the step before was bad as
     well, they give way towards rest: from tissue that is turned inside out or stretched too far for its substeps every step
     is bad. u and F − 1 shrink together, and still fit. A control node that somebody has put into a state in which no step ends, such
-    as one of infinite strain, is put to rest: no part of infinity is finite.
+    as one of infinite strain, is put to rest: no part of infinity is finite. What is held has reached its goal where the step was good.
     """
     b, thread = wp.tid()
     before = faults[b]
@@ -48,12 +50,14 @@ def end_step(
             state.F[e] = backup.F[e]
             state.Q[e] = backup.Q[e]
             if before > 0:
-                state.u[e] = kept * backup.u[e]
+                state.u[e] = held[b] + kept * (backup.u[e] - held[b])
                 state.F[e] = kept * (backup.F[e] - wp.identity(3, float)) + wp.identity(3, float)
                 state.Q[e] = kept * backup.Q[e]
                 if not (wp.length_sq(backup.u[e]) + wp.ddot(backup.F[e], backup.F[e]) < 1.0e6):  # travel is 10 m at most
-                    state.u[e] = wp.vec3()
+                    state.u[e] = held[b]
                     state.F[e] = wp.identity(3, float)
                     state.Q[e] = wp.mat33()
             state.v[e] = wp.vec3()
             state.C[e] = wp.mat33()
+    elif thread == 0:
+        held[b] = goal[b]

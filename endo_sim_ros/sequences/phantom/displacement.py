@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from endo_sim_ros.core.motion import beat_share, breath_share
 from endo_sim_ros.sequences.phantom.config import BREATH_RADIUS, HEART_RADIUS, PULL_RADIUS, PhantomConfig
 
 _MIDDLE = 0.13  # metres, world z about which tissue lies
@@ -51,8 +52,7 @@ def displacement_at(config: PhantomConfig, seconds: float) -> Displacement | Non
     # Pulled mostly towards the endoscope; breath slides organs, and lifts them half as much; the heart knocks.
     directions = np.array([[*0.5 * aside[0], -1.0], [*aside[1], -0.5], [*0.3 * aside[2], -1.0]])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    breath = 0.5 - 0.5 * math.cos(2 * math.pi * seconds / config.breathing_period)
-    heart = math.exp(-0.5 * ((seconds / config.heartbeat_period % 1.0 - 0.25) / 0.08) ** 2)
+    breath, heart = breath_share(seconds, config.breathing_period), beat_share(seconds, config.heartbeat_period)
     amplitudes = (largest * [1.0, breath, heart])[:, None] * directions
     moving, radii = largest > 0, np.array([PULL_RADIUS, BREATH_RADIUS, HEART_RADIUS])
     return Displacement(centres[moving], amplitudes[moving], radii[moving])

@@ -96,12 +96,19 @@ class Skinning:
         self._clipped = self._covars.copy()  # where the cuts left them
         self._extents = 2 * np.sqrt(np.trace(self._covars, axis1=1, axis2=2))
 
-    def cut(self, triangles: np.ndarray) -> None:
-        """Let no Gaussian follow nodes, or reach, across a cut: all of it [T, 3, 3], m, world, in the tissue at rest."""
+    def cut(self, triangles: np.ndarray) -> bool:
+        """Let no Gaussian follow nodes, or reach, across a cut: all of it [T, 3, 3], m, world, in the tissue at rest.
+
+        Returns whether it goes on from the cuts so far. If not, those have healed, and the Gaussians that `append` added are gone.
+        """
         cuts, known = self._cuts, len(self.cuts)
-        if not cuts.extends(triangles):
+        extends = cuts.extends(triangles)
+        if not extends:
             cuts.heal()
             self._clipped, known = self._covars.copy(), 0
+            count = len(self._covars)
+            self.means, self.covars, self._extents = self.means[:count], self.covars[:count], self._extents[:count]
+            self._normals = None if self._normals is None else self._normals[:count]
             self.rebind(cuts.index, cuts.weights)
             self.covars.copy_(torch.from_numpy(self._clipped))
         rebound = cuts.cut(triangles)
@@ -113,6 +120,23 @@ class Skinning:
         ):
             rows = torch.from_numpy(values[some]).to(tensor.device, tensor.dtype)
             tensor[torch.from_numpy(some).to(tensor.device)] = rows
+        return extends
+
+    def append(self, model: GaussianModel) -> None:
+        """Move more Gaussians, on the device of this one, behind the others; they heed the cuts so far, and last until these heal."""
+        means, covars = model.means.float(), model.covariances.float()
+        at, spread = means.cpu().double().numpy(), covars.cpu().double().numpy()
+        cuts = self._cuts
+        index, weights = bind_weights(at, cuts.node_rest, cuts.index.shape[1], self.weighting)
+        cuts.append(at, index, weights)
+        extents = 2 * np.sqrt(np.trace(spread, axis1=1, axis2=2))
+        clip_to_sides(at, spread, extents, cuts.triangles)
+        self._clipped, self._extents = np.concatenate([self._clipped, spread]), np.concatenate([self._extents, extents])
+        covars = torch.from_numpy(spread).to(covars)
+        self.means, self.covars = torch.cat([self.means, means]), torch.cat([self.covars, covars])
+        if self._normals is not None and model.gloss is not None:
+            self._normals = torch.cat([self._normals, model.gloss[:, :3].float()])
+        self.rebind(cuts.index, cuts.weights)
 
     @property
     def cuts(self) -> np.ndarray:

@@ -25,7 +25,7 @@ _OFFSET, _FLAT, _WIDE = 0.02, 0.008, 0.65  # of a face from the cut, and standar
 _THINNEST = 3  # tissue that is thinner is a bare skin
 _HIDDEN = 0.05  # by which two faces must have moved apart to be there
 # Colours as parts of that of the skin nearby (what is just below it), or of its brightness (fat, flesh, blood).
-_BELOW_SKIN, _FAT = np.array([0.95, 0.8, 0.78]), np.array([0.92, 0.72, 0.47])
+_BELOW_SKIN, _FAT = np.array([0.95, 0.8, 0.78]), np.array([0.96, 0.71, 0.5])
 _FLESH, _BLOOD = np.array([0.62, 0.13, 0.11]), np.array([0.42, 0.03, 0.04])
 
 
@@ -98,7 +98,7 @@ class Inside:
             return self._model.select(np.zeros(0, int))
         depth, thickness = self.measure(rows[:, :3])
         deep = depth > 1.5 * self._config.flesh_from
-        shown = (depth > -0.3 * grain) & (depth < thickness) & ((rows[:, 7] > 0) | ~deep)
+        shown = (depth > 0) & (depth < thickness) & ((rows[:, 7] > 0) | ~deep)
         at, normal, wide, depth = rows[shown, :3], rows[shown, 3:6], rows[shown, 6] * np.where(deep, 2, 1)[shown], depth[shown]
         both = lambda array: torch.from_numpy(np.repeat(array, 2, 0)).float()
         away = _OFFSET * grain * normal

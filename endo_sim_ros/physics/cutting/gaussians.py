@@ -121,8 +121,11 @@ def clip_to_sides(means: np.ndarray, covars: np.ndarray, reach: np.ndarray, tria
     for axis in range(3):
         some &= (means[:, axis] >= low[axis] - reach) & (means[:, axis] <= high[axis] + reach)
     some = np.flatnonzero(some)
+    if not len(some):
+        return some
     x, reach = means[some], reach[some, None]
-    for a, b, c in triangles:
+    near = (triangles.min(1) <= (x + reach).max(0)) & (triangles.max(1) >= (x - reach).min(0))
+    for a, b, c in triangles[near.all(1)]:
         e1, e2 = b - a, c - a
         cross = np.cross(e1, e2)
         square = cross @ cross

@@ -121,9 +121,8 @@ class TissueSimulation:
         """A sentence about the newest tear; empty without any."""
         if self._tearing is None or self._tearing.newest is None:
             return ""
-        count, at, strain = self._tearing.newest
-        places = f"in {count} places, first " if count > 1 else ""
-        where = f"{places}where at rest is {np.round(at, 4).tolist()} m"
+        at, strain = self._tearing.newest
+        where = f"where at rest is {np.round(at, 4).tolist()} m"
         return f"the tissue tore {where}: its true strain was {strain:.2f}, tear_strain is {self.config.tear_strain:g}"
 
     def slips_by_tool(self) -> dict[str, int]:

@@ -52,8 +52,8 @@ def test_a_tear_goes_across_the_stretch_once_and_only_above_the_limit():
     triangles = tearing.tear(F)
     assert triangles.shape == (2, 3, 3) and tearing.count == 1
     np.testing.assert_allclose(triangles[..., 1], rest[63, 1], atol=1e-12)  # across y
-    np.testing.assert_allclose(np.ptp(triangles, axis=(0, 1))[[0, 2]].prod() ** 0.5, 1.5 * 0.015, rtol=0.5)
-    assert tearing.newest is not None and tearing.newest[0] == 1 and tearing.newest[2] == pytest.approx(0.5)
+    np.testing.assert_allclose(np.ptp(triangles, axis=(0, 1))[[0, 2]].max(), 2.5 * 0.015, rtol=0.45)
+    assert tearing.newest is not None and tearing.newest[1] == pytest.approx(0.5)
     assert not len(tearing.tear(F))  # the tear relieves both
     F[0] = np.diag([np.nan, 1, 1])
     assert not len(tearing.tear(F))

@@ -2,14 +2,14 @@
 
 import numpy as np
 
-SIDE = 1.5  # cells of the grid; a smaller patch parts nothing
+SIDE = 2.5  # cells of the grid; smaller tears do not join, and leave crumbs
 
 
 class Tearing:
     """Cuts tissue where its largest principal true strain, the logarithm of the stretch, is above a limit.
 
-    A tear is a square through a node at rest, across the stretch there (O'Brien and Hodgins 1999). The most strained nodes tear first.
-    Nodes within half a side of a tear tear no more: they need time to relax, and one tear relieves them.
+    A tear is a square through a node at rest, across the stretch there (O'Brien and Hodgins 1999). In each step the most strained node
+    tears, so that a tear grows from its ends as the tissue beside it relaxes. Nodes within half a side of a tear tear no more.
 
     Args:
         rest: Nodes at rest [M, 3], m, world.
@@ -24,7 +24,7 @@ class Tearing:
     def reset(self) -> None:
         """Forget all tears."""
         self.count = 0
-        self.newest: tuple[int, np.ndarray, float] | None = None  # at once; the place [3], m, at rest, and the true strain of the first
+        self.newest: tuple[np.ndarray, float] | None = None  # where at rest [3], m, world, and the true strain there
         self._spent = np.zeros(len(self._rest), bool)  # nodes that tear no more
 
     def copy(self, other: "Tearing") -> None:
@@ -32,21 +32,18 @@ class Tearing:
         self.count, self.newest, self._spent = other.count, other.newest, other._spent.copy()
 
     def tear(self, F: np.ndarray) -> np.ndarray:
-        """Triangles [T, 3, 3], m, world, at rest, along which tissue with deformation gradients F [M, 3, 3] tears now."""
+        """Triangles [T, 3, 3], m, world, at rest, along which tissue with deformation gradients F [M, 3, 3] tears now: two or none."""
         C = np.einsum("mji,mjk->mik", F, F, dtype=np.float64)
         mean = np.trace(C, axis1=1, axis2=2) / 3
         spread = np.sqrt(np.maximum((C**2).sum((1, 2)) - 3 * mean**2, 0) * 2 / 3)
         able = np.flatnonzero(~self._spent & (mean + spread > np.exp(2 * self._limit)))  # no eigenvalue of C is above that
         values, axes = np.linalg.eigh(C[able])
         strains = 0.5 * np.log(values[:, 2])
-        torn: list[int] = []
-        for k in np.argsort(-strains, kind="stable"):
-            if strains[k] > self._limit and not self._spent[able[k]]:
-                torn.append(k)
-                self._spent |= np.linalg.norm(self._rest - self._rest[able[k]], axis=1) <= self._side / 2
-        if torn:
-            self.count += len(torn)
-            self.newest = len(torn), self._rest[able[torn[0]]], float(strains[torn[0]])
-        a, b = np.moveaxis(self._side / 2 * axes[torn, :, :2], 2, 0)
-        corners = self._rest[able[torn], None] + np.stack([-a - b, a - b, a + b, b - a], 1)
-        return corners[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3, 3)
+        if not len(able) or strains.max() <= self._limit:
+            return np.zeros((0, 3, 3))
+        k = int(strains.argmax())
+        at, (a, b) = self._rest[able[k]], self._side / 2 * axes[k, :, :2].T
+        self._spent |= np.linalg.norm(self._rest - at, axis=1) <= self._side / 2
+        self.count += 1
+        self.newest = at, float(strains[k])
+        return (at + np.stack([-a - b, a - b, a + b, b - a]))[[[0, 1, 2], [0, 2, 3]]]

@@ -85,7 +85,7 @@ class Skinning:
         model = model.detach().to(self.device)
         self.means = model.means.float().contiguous()  # [N, 3] m, at rest
         self.covars = model.covariances.float().contiguous()  # [N, 3, 3] m², at rest
-        self._normals = None if model.gloss is None else model.gloss[:, :3].float().contiguous()
+        self._normals = _normals(model)
         self.node_rest = torch.from_numpy(rest).float().to(self.device).contiguous()  # [M, 3] m
         x, y, z = rest.mean(0).tolist()
         self._origin = x, y, z  # of the maps, m
@@ -134,8 +134,8 @@ class Skinning:
         self._clipped, self._extents = np.concatenate([self._clipped, spread]), np.concatenate([self._extents, extents])
         covars = torch.from_numpy(spread).to(covars)
         self.means, self.covars = torch.cat([self.means, means]), torch.cat([self.covars, covars])
-        if self._normals is not None and model.gloss is not None:
-            self._normals = torch.cat([self._normals, model.gloss[:, :3].float()])
+        if self._normals is not None and (normals := _normals(model)) is not None:
+            self._normals = torch.cat([self._normals, normals])
         self.rebind(cuts.index, cuts.weights)
 
     @property
@@ -254,3 +254,8 @@ class Skinning:
         inputs = [viewed(self.node_rest, wp.vec3), held, u, F, self._origin, viewed(maps.view(-1, 4, 4), wp.mat44)]
         mapping = Launch(kernels.moved_node_maps, (environments, count), inputs)
         return [mapping, *self.backend.skin_work(self._rest, maps, means, covars)], means, covars
+
+
+def _normals(model: GaussianModel) -> Tensor | None:
+    """Normals of the Gaussians at rest [N, 3], where they have a gloss."""
+    return None if model.gloss is None else model.gloss[:, :3].float().contiguous()

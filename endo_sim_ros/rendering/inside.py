@@ -164,7 +164,7 @@ def open_share(rest: Tensor, means: Tensor, grain: float) -> Tensor:
 def _query(tree: KDTree, points: np.ndarray, count: int) -> np.ndarray:
     """Numbers of the count points of a tree [P, count] that are nearest to points [P, 3], nearest first; all where there are fewer."""
     ranks: Any = list(range(1, min(count, tree.n) + 1))
-    return np.asarray(tree.query(points, k=ranks, workers=-1)[1])
+    return np.asarray(tree.query(points, k=ranks)[1])
 
 
 def _noise(points: np.ndarray, size: float, seed: int) -> np.ndarray:

@@ -268,7 +268,7 @@ class PhysicsNode(EndoNode):
 
     def step(self, simulation: TissueSimulation) -> None:
         """Take one step with what the arms command, and publish it."""
-        start, faults, slips = time.monotonic(), simulation.faults, simulation.slips_by_tool()
+        start, faults, tears, slips = time.monotonic(), simulation.faults, simulation.tears, simulation.slips_by_tool()
         held, self._held = self._held, {}
         self._run_parts(held)
         for arm in self.arms.values():
@@ -292,6 +292,8 @@ class PhysicsNode(EndoNode):
         self.steps += 1
         if simulation.faults > faults:
             self.report_error(simulation.last_fault)
+        if simulation.tears > tears:
+            self.report_error(simulation.last_tear)
         self._seconds_per_step += 0.1 * (time.monotonic() - start - self._seconds_per_step)
 
     def _publish(self, simulation: TissueSimulation, stamp: int, at_rest: bool = False) -> None:
@@ -393,6 +395,7 @@ class PhysicsNode(EndoNode):
             "simulated time": f"{simulation.time:.2f}",
             "faults": simulation.faults,
             "slips": simulation.slips,
+            "tears": simulation.tears,
             "cut triangles": len(simulation.cuts),
         }
         if self.failure:

@@ -18,6 +18,7 @@ from endo_sim_ros.physics.config import MotionConfig, PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes, RenderDepth, build_control_nodes
 from endo_sim_ros.physics.cutting.blade import Blade, Scissors
 from endo_sim_ros.physics.cutting.stencils import CutStencils
+from endo_sim_ros.physics.cutting.tearing import Tearing
 from endo_sim_ros.physics.links import ToolLinks, rigid_pose
 from endo_sim_ros.physics.motion import MotionState
 from endo_sim_ros.physics.regions import TissueProperties
@@ -92,6 +93,9 @@ class TissueSimulation:
         self._links: dict[str, ToolLinks] = {}  # of tools with an instrument
         self._placed: dict[str, Tensor] = {}  # poses of these [L, 4, 4], while known
         self._stencils: CutStencils | None = None  # from the first cut on
+        self._tearing: Tearing | None = None
+        if config.tear_strain and config.kinematics == "rest":
+            self._tearing = Tearing(nodes.rest, config.tear_strain, self.solver.cell_size)
         self._blades: dict[str, Blade] = {}  # of tools that cut
         self._scissors: dict[str, Scissors] = {}  # of tools whose jaws are blades
         self.disturbed = False  # since the last step: a tool moved, took hold or let go
@@ -107,6 +111,20 @@ class TissueSimulation:
     def slips(self) -> int:
         """Times that tissue slipped out of a jaw because it was pulled farther than the travel allows."""
         return int(self._tools.slips[0].sum())
+
+    @property
+    def tears(self) -> int:
+        """Places where the tissue tore."""
+        return 0 if self._tearing is None else self._tearing.count
+
+    @property
+    def last_tear(self) -> str:
+        """A sentence about the newest tear; empty without any."""
+        if self._tearing is None or self._tearing.newest is None:
+            return ""
+        at, strain = self._tearing.newest
+        where = f"where at rest is {np.round(at, 4).tolist()} m"
+        return f"the tissue tore {where}: its true strain was {strain:.2f}, tear_strain is {self.config.tear_strain:g}"
 
     def slips_by_tool(self) -> dict[str, int]:
         """The same of each tool, by its name."""
@@ -308,8 +326,13 @@ class TissueSimulation:
 
     def _cut(self, move: Callable[..., np.ndarray], *to: object) -> None:
         """Cut what an edge sweeps on its way to where it now is, both as `Blade` and `Scissors` take them."""
-        stencils, state = self._prepared_stencils(), self.state()
-        if stencils.cut(move(*to, state.rest, state.positions, state.F, self.cuts)):
+        state = self.state()
+        self._part(move(*to, state.rest, state.positions, state.F, self.cuts))
+
+    def _part(self, triangles: np.ndarray) -> None:
+        """Part the tissue along triangles [T, 3, 3], m, world, at rest."""
+        stencils = self._prepared_stencils()
+        if stencils.cut(triangles):
             with capturing:
                 self.solver.set_cut(stencils.table())
             self.disturbed = True
@@ -400,6 +423,8 @@ class TissueSimulation:
         self.disturbed = False
         relaxed = not self.config.relaxation or self._quiet > _RELAXED * self.config.relaxation_time
         undone = self.faults > before
+        if self._tearing is not None and not undone and len(torn := self._tearing.tear(self.state().F)):
+            self._part(torn)
         self.resting = relaxed and not undone and self.solver.speed < _RESTING_SPEED
         if undone:
             turned = float(self._tools.torques.norm()) > float(self._tools.forces.norm())  # with levers below a metre
@@ -420,6 +445,8 @@ class TissueSimulation:
         self._placed.clear()
         self._blades.clear()
         self._scissors.clear()
+        if self._tearing is not None:
+            self._tearing.reset()
         if self._stencils is not None:
             self._stencils.reset()
             with capturing:
@@ -461,6 +488,8 @@ class TissueSimulation:
         for tool in [tool for tool, links in self._links.items() if links.scissors and self.config.kinematics != "rest"]:
             self.set_instrument(tool, ())
         self.last_fault = other.last_fault
+        if self._tearing is not None and other._tearing is not None:
+            self._tearing.copy(other._tearing)
         if len(other.cuts):
             if self.solver.grid_shape == other.solver.grid_shape and self.solver.cell_size == other.solver.cell_size:
                 self._stencils = other._stencils

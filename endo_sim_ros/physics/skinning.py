@@ -85,7 +85,7 @@ class Skinning:
         model = model.detach().to(self.device)
         self.means = model.means.float().contiguous()  # [N, 3] m, at rest
         self.covars = model.covariances.float().contiguous()  # [N, 3, 3] m², at rest
-        self._normals = None if model.gloss is None else model.gloss[:, :6].float().unflatten(1, (2, 3)).contiguous()
+        self._normals = _normals(model)
         self.node_rest = torch.from_numpy(rest).float().to(self.device).contiguous()  # [M, 3] m
         x, y, z = rest.mean(0).tolist()
         self._origin = x, y, z  # of the maps, m
@@ -96,12 +96,19 @@ class Skinning:
         self._clipped = self._covars.copy()  # where the cuts left them
         self._extents = 2 * np.sqrt(np.trace(self._covars, axis1=1, axis2=2))
 
-    def cut(self, triangles: np.ndarray) -> None:
-        """Let no Gaussian follow nodes, or reach, across a cut: all of it [T, 3, 3], m, world, in the tissue at rest."""
+    def cut(self, triangles: np.ndarray) -> bool:
+        """Let no Gaussian follow nodes, or reach, across a cut: all of it [T, 3, 3], m, world, in the tissue at rest.
+
+        Returns whether it goes on from the cuts so far. If not, those have healed, and the Gaussians that `append` added are gone.
+        """
         cuts, known = self._cuts, len(self.cuts)
-        if not cuts.extends(triangles):
+        extends = cuts.extends(triangles)
+        if not extends:
             cuts.heal()
             self._clipped, known = self._covars.copy(), 0
+            count = len(self._covars)
+            self.means, self.covars, self._extents = self.means[:count], self.covars[:count], self._extents[:count]
+            self._normals = None if self._normals is None else self._normals[:count]
             self.rebind(cuts.index, cuts.weights)
             self.covars.copy_(torch.from_numpy(self._clipped))
         rebound = cuts.cut(triangles)
@@ -113,6 +120,23 @@ class Skinning:
         ):
             rows = torch.from_numpy(values[some]).to(tensor.device, tensor.dtype)
             tensor[torch.from_numpy(some).to(tensor.device)] = rows
+        return extends
+
+    def append(self, model: GaussianModel) -> None:
+        """Move more Gaussians, on the device of this one, behind the others; they heed the cuts so far, and last until these heal."""
+        means, covars = model.means.float(), model.covariances.float()
+        at, spread = means.cpu().double().numpy(), covars.cpu().double().numpy()
+        cuts = self._cuts
+        index, weights = bind_weights(at, cuts.node_rest, cuts.index.shape[1], self.weighting)
+        cuts.append(at, index, weights)
+        extents = 2 * np.sqrt(np.trace(spread, axis1=1, axis2=2))
+        clip_to_sides(at, spread, extents, cuts.triangles)
+        self._clipped, self._extents = np.concatenate([self._clipped, spread]), np.concatenate([self._extents, extents])
+        covars = torch.from_numpy(spread).to(covars)
+        self.means, self.covars = torch.cat([self.means, means]), torch.cat([self.covars, covars])
+        if self._normals is not None and (normals := _normals(model)) is not None:
+            self._normals = torch.cat([self._normals, normals])
+        self.rebind(cuts.index, cuts.weights)
 
     @property
     def cuts(self) -> np.ndarray:
@@ -233,3 +257,8 @@ class Skinning:
         inputs = [viewed(self.node_rest, wp.vec3), fixed, u, F, held, self._origin, viewed(maps.view(-1, 4, 4), wp.mat44)]
         mapping = Launch(kernels.moved_node_maps, (environments, count), inputs)
         return [mapping, *self.backend.skin_work(self._rest, maps, means, covars)], means, covars
+
+
+def _normals(model: GaussianModel) -> Tensor | None:
+    """Normals of the Gaussians at rest, of surface and film [N, 2, 3], where they have a gloss."""
+    return None if model.gloss is None else model.gloss[:, :6].float().unflatten(1, (2, 3)).contiguous()

@@ -17,9 +17,12 @@ _WET = {"material": "fung", "poisson_ratio": 0.45}
 TISSUES: dict[Tissue, dict[str, Any]] = {
     "default": {},
     # G of fast motion 1.8 kPa, 0.27 MPa at a true strain of 0.38. Relaxes from 2.04 to 0.91 kPa.
-    "liver": _WET | {"young_modulus": 2.3e3, "density": 1060.0, "stiffening": 9.2, "relaxation": 1.24, "relaxation_time": 1.1},
+    "liver": _WET | {
+        "young_modulus": 2.3e3, "density": 1060.0, "stiffening": 9.2, "relaxation": 1.24, "relaxation_time": 1.1,
+        "tear_strain": 0.38,
+    },
     # The wall: G 85 kPa, 2.5 MPa at a true strain of 0.43.
-    "gall_bladder": _WET | {"young_modulus": 250e3, "density": 1060.0, "stiffening": 4.3},
+    "gall_bladder": _WET | {"young_modulus": 250e3, "density": 1060.0, "stiffening": 4.3, "tear_strain": 0.43},
     # Inflated. Stiffening fits the published law for stretches of 0.7 to 1.5; relaxation loses as much of the energy as is published.
     "lung": {
         "material": "fung", "young_modulus": 1.9e3, "poisson_ratio": 0.34, "density": 394.0, "stiffening": 0.5,

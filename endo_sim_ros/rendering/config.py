@@ -7,6 +7,24 @@ from endo_sim_ros.core.config import Range, StageConfig
 
 
 @dataclass(frozen=True)
+class InsideConfig(StageConfig):
+    """What an open cut shows below the skin. A reconstruction knows the skin alone; the rest is made up."""
+
+    shown: bool = True
+    """Show flesh in open cuts; false leaves them dark. Without cuts it changes nothing."""
+    seed: Annotated[int, Range(0, 2**31 - 1)] = 0
+    """Of the irregularities of the flesh: the same seed gives the same flesh."""
+    fat_from: Annotated[float, Range(0, 0.1, "m")] = 0.001
+    """Depth below the skin at which its own colour gives way to fat."""
+    flesh_from: Annotated[float, Range(0, 0.1, "m")] = 0.003
+    """Depth at which fat gives way to dark red flesh."""
+    blood: Annotated[float, Range(0, 0.01, "m")] = 0.0004
+    """Width of the dark red line along the edges of a cut; 0 = none."""
+    grain: Annotated[float, Range(1e-4, 0.01, "m")] = 0.0006
+    """Distance between the Gaussians of the faces of a cut. Finer ones cost time with the square of it, coarser ones blur the layers."""
+
+
+@dataclass(frozen=True)
 class RenderingConfig(StageConfig):
     """From a Gaussian model and the state of its control nodes to camera images."""
 
@@ -21,5 +39,7 @@ class RenderingConfig(StageConfig):
     tissue that is torn or turned inside out shows needles and holes."""
     neighbours: Annotated[int, Range(1, 32)] = 4
     """Number of nodes that move one Gaussian."""
+    inside: InsideConfig = InsideConfig()
+    """What open cuts show."""
     device: str = "auto"
     """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""

@@ -17,6 +17,7 @@ from endo_sim_ros.core.shading import shade, to_bytes
 from endo_sim_ros.instruments.drawing import PosedInstruments
 from endo_sim_ros.physics.skinning import Skinning
 from endo_sim_ros.rendering.config import RenderingConfig
+from endo_sim_ros.rendering.inside import Inside, open_share
 from endo_sim_ros.splatting import render, sh_basis
 
 
@@ -63,11 +64,30 @@ class DeformableRenderer:
             if not config.clamp_stretch:
                 options["stretch"] = None
             self.skinning = Skinning(self.model, node_rest, **options)
+        self._skin = self.model
+        self._inside: Inside | None = None  # from the first cut on
 
     def cut(self, triangles: np.ndarray) -> None:
-        """Part the tissue along all cuts so far, triangles [T, 3, 3], metres, world, in the tissue at rest."""
-        if self.skinning is not None and not np.array_equal(triangles, self.skinning.cuts):
-            self.skinning.cut(triangles)
+        """Part the tissue along all cuts so far, triangles [T, 3, 3], metres, world, in the tissue at rest, and show flesh where it opens.
+
+        The Gaussians of the flesh follow those of the skin in `model`.
+        """
+        if self.skinning is None or np.array_equal(triangles, self.skinning.cuts):
+            return
+        known = len(self.skinning.cuts)
+        if not self.skinning.cut(triangles):
+            self.model, known = self._skin, 0
+            if self._inside is not None:
+                self._inside.heal()
+        if not self.config.inside.shown or not len(triangles):
+            return
+        if self._inside is None:
+            self._inside = Inside(self._skin, self.skinning.node_rest.cpu().double().numpy(), self.config.inside)
+        flesh = self._inside.faces(triangles[known:]).to(self.device)
+        if len(flesh):
+            self.skinning.append(flesh)
+            both = {name: torch.cat([value, getattr(flesh, name)]) for name, value in self.model.tensors().items()}
+            self.model = replace(self.model, **both)
 
     def camera(self, camera: Camera) -> Camera:
         """Return the camera at the configured image width, with the height in proportion."""
@@ -163,7 +183,11 @@ class DeformableRenderer:
         self, cameras: Sequence[Camera], means: Tensor, covars: Tensor | None, F: np.ndarray | None
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Colours [E, H, W, 3], depths and alphas [E, H, W] of the tissue in each camera."""
-        model = self.model
+        model, count = self.model, len(self._skin)
+        if len(model) > count:
+            share = open_share(model.means[count:], means[count:], self.config.inside.grain)
+            opacities = torch.cat([model.logit_opacities[:count], (model.opacities[count:] * share).logit()])
+            model = replace(model, logit_opacities=opacities)
         draw = partial(render, background=self._background, covars=covars)
         if covars is None:
             return draw(model, *cameras)[:3]

@@ -46,7 +46,7 @@ class Standalone:
         self._tool = self._make_tool(instrument) if instrument else None
         self.simulation = self._simulate(physics)
         self._pose: np.ndarray | None = None
-        self._faults = self._slips = 0
+        self._faults = self._slips = self._tears = 0
         self._real_time_factor = 1.0
         self._endoscope_dirty = True
         self.viewer = Viewer(config, self)
@@ -130,7 +130,8 @@ class Standalone:
         continued = simulation.continue_from(self.simulation)
         if not continued:
             self.viewer.release()
-        self.simulation, self._physics, self._faults, self._slips = simulation, physics, simulation.faults, simulation.slips
+        self.simulation, self._physics = simulation, physics
+        self._faults, self._slips, self._tears = simulation.faults, simulation.slips, simulation.tears
         if not continued:
             self._show_model()
         self._show_parameters()
@@ -188,11 +189,14 @@ class Standalone:
             self.viewer.notify(simulation.last_fault)
         if simulation.slips > self._slips:
             self.viewer.notify("the tissue slipped out of the jaw")
-        self._faults, self._slips = simulation.faults, simulation.slips
+        if simulation.tears > self._tears:
+            self.viewer.notify(simulation.last_tear)
+        self._faults, self._slips, self._tears = simulation.faults, simulation.slips, simulation.tears
         self._show(time.monotonic() - begun)
 
     def _show(self, age: float = 0.0) -> None:
         state = self.simulation.state()
+        self._renderer.cut(self.simulation.cuts)
         force, _ = self.simulation.reaction(_HAND)
         works_at = None if self._pose is None else self._pose[:3, 3] if self._tool is None else self._tool.works_at
         tools = {} if works_at is None else {_HAND: Tool(works_at, -force)}

@@ -178,7 +178,9 @@ def test_a_cut_is_shown_with_the_states_that_have_it_and_the_same_bytes_come_aga
         numbers = [state.cut for state in states]
         assert numbers[0] == numbers[1] == 0 and len(set(numbers)) > 10 and numbers[-2] == numbers[-1]
         assert messages.cut_number(messages.decode_cut_surface(surfaces[-1])) == numbers[-1]
-        assert graph.nodes[2].tissue.bound.renderer.skinning.cuts.shape == (len(graph.nodes[1].simulation.cuts), 3, 3)
+        renderer = graph.nodes[2].tissue.bound.renderer
+        assert renderer.skinning.cuts.shape == (len(graph.nodes[1].simulation.cuts), 3, 3)
+        assert len(renderer.model) > len(graph.nodes[2].tissue.model)  # flesh
         assert np.abs(states[-1].positions - states[-1].rest).max() > 1e-3
         runs.append([bytes(message.data) for message in graph.heard[IMAGES.name][-22:]])
     assert runs[0] == runs[1]

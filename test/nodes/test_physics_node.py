@@ -189,6 +189,17 @@ def test_what_cannot_be_cut_says_so_and_the_tool_goes_on(bench, physics):
     pull(bench, lambda: moved(bench) > 1e-3)
 
 
+def test_tissue_that_tears_says_where_and_shows_it_as_a_cut(bench, physics):
+    surfaces = bench.hear(messages.CUT_SURFACE)
+    send_model(bench)
+    await_nodes(bench, 5 * S)
+    assert bench.set("physics_node", tear_strain=0.05)[0]
+    bench.until(lambda: physics.simulation.config.tear_strain == 0.05)
+    pull(bench, lambda: physics.simulation.tears > 0, what="a tear")
+    bench.refused("physics_node", "the tissue tore", "tear_strain is 0.05")
+    bench.until(lambda: surfaces and len(messages.decode_cut_surface(surfaces[-1])), "the tear on cut_surface")
+
+
 def test_services_in_every_state(bench, physics):
     call = lambda name: bench.call(Trigger, f"/physics_node/{name}")  # noqa: E731
     for name in ("reset", "step"):

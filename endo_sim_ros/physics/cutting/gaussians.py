@@ -23,8 +23,8 @@ class CutNeighbours:
     """
 
     def __init__(self, means: np.ndarray, node_rest: np.ndarray, index: np.ndarray, weights: np.ndarray):
-        self.means, self._rest = np.asarray(means, np.float64), np.asarray(node_rest, np.float64)
-        self._uncut = index, weights
+        self.means, self.node_rest = np.asarray(means, np.float64), np.asarray(node_rest, np.float64)
+        self._uncut, self._count = (index, weights), len(means)
         self.triangles = np.zeros((0, 3, 3))  # of all cuts [T, 3, 3], m, world, at rest
         self.index, self.weights = index.copy(), weights.copy()  # now
         # Distances, nodes and whether a cut parts them [N, 4 K + 1], nearest first, from the first cut on.
@@ -36,11 +36,26 @@ class CutNeighbours:
         return known <= len(triangles) and np.array_equal(triangles[:known], self.triangles)
 
     def heal(self) -> None:
-        """Forget all cuts."""
+        """Forget all cuts, and the Gaussians that were appended."""
+        count = self._count
+        self.means, self._uncut = self.means[:count], (self._uncut[0][:count], self._uncut[1][:count])
         self.index, self.weights = self._uncut[0].copy(), self._uncut[1].copy()
         self.triangles = np.zeros((0, 3, 3))
         if self._candidates is not None:
-            self._candidates[2][:] = False
+            d, node, parted = (each[:count] for each in self._candidates)
+            self._candidates = d, node, np.zeros_like(parted)
+
+    def append(self, means: np.ndarray, index: np.ndarray, weights: np.ndarray) -> None:
+        """Add Gaussians [n, 3] with what they follow while whole [n, K]; they heed the cuts so far, and are gone when these heal."""
+        added = CutNeighbours(means, self.node_rest, index, weights)
+        added.cut(self.triangles)
+        for name in ("means", "index", "weights"):
+            setattr(self, name, np.concatenate([getattr(self, name), getattr(added, name)]))
+        index, weights = map(np.concatenate, zip(self._uncut, added._uncut))
+        self._uncut = index, weights
+        if self._candidates is not None and added._candidates is not None:
+            d, node, parted = map(np.concatenate, zip(self._candidates, added._candidates))
+            self._candidates = d, node, parted
 
     def cut(self, triangles: np.ndarray) -> np.ndarray:
         """Heed all cuts [T, 3, 3], m, world, at rest, and return the numbers of the Gaussians that follow other nodes now.
@@ -53,14 +68,14 @@ class CutNeighbours:
             return np.zeros(0, int)
         count = self.index.shape[1]
         if self._candidates is None:
-            d, node = nearest_nodes(self._rest, self.means, min(4 * count + 1, len(self._rest)))
+            d, node = nearest_nodes(self.node_rest, self.means, min(4 * count + 1, len(self.node_rest)))
             self._candidates = d, node, np.zeros(d.shape, bool)
         d, node, parted = self._candidates
         reach = d[:, -1].max()
         near = (self.means >= new.min((0, 1)) - reach) & (self.means <= new.max((0, 1)) + reach)
         near = np.flatnonzero(near.all(1))
         ends = node[near]
-        crossed = separated(np.repeat(self.means[near], ends.shape[1], 0), self._rest[ends.ravel()], new)
+        crossed = separated(np.repeat(self.means[near], ends.shape[1], 0), self.node_rest[ends.ravel()], new)
         crossed = crossed.reshape(ends.shape)
         parted[near] |= crossed
         near = near[crossed.any(1)]
@@ -106,8 +121,11 @@ def clip_to_sides(means: np.ndarray, covars: np.ndarray, reach: np.ndarray, tria
     for axis in range(3):
         some &= (means[:, axis] >= low[axis] - reach) & (means[:, axis] <= high[axis] + reach)
     some = np.flatnonzero(some)
+    if not len(some):
+        return some
     x, reach = means[some], reach[some, None]
-    for a, b, c in triangles:
+    near = (triangles.min(1) <= (x + reach).max(0)) & (triangles.max(1) >= (x - reach).min(0))
+    for a, b, c in triangles[near.all(1)]:
         e1, e2 = b - a, c - a
         cross = np.cross(e1, e2)
         square = cross @ cross

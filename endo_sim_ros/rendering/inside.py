@@ -1,0 +1,189 @@
+"""The flesh that an open cut shows: a reconstruction knows the skin alone, so what lies below it is made up here.
+
+The colour of a point is a function of where it is at rest: the skin's own colour below the skin, then fat, then dark flesh, each as bright
+as the skin nearby. Cuts are triangles in the tissue at rest. Both faces of each are covered with flat Gaussians, which then follow the
+control nodes on their own side as the skin beside a cut does. They count as far as the two faces have moved apart.
+"""
+
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
+from endo_sim_ros.physics.control_nodes import select_solid
+from endo_sim_ros.rendering.config import InsideConfig
+
+_NEIGHBOURS = 16  # Gaussians of the skin that tell its place and colour
+_FEET = 32  # control nodes that tell how deep the tissue is, of a few columns
+_SOLID = 0.1  # opacity of what is skin, as for control nodes
+_OPACITY = 0.97
+# Lengths in grains:
+_OFFSET, _FLAT, _WIDE = 0.02, 0.008, 0.65  # of a face from the cut, and standard deviations of its Gaussians across and along it
+_THINNEST = 3  # tissue that is thinner is a bare skin
+_HIDDEN = 0.05  # by which two faces must have moved apart to be there
+# Colours as parts of that of the skin nearby (what is just below it), or of its brightness (fat, flesh, blood).
+_BELOW_SKIN, _FAT = np.array([0.95, 0.8, 0.78]), np.array([0.96, 0.71, 0.5])
+_FLESH, _BLOOD = np.array([0.62, 0.13, 0.11]), np.array([0.42, 0.03, 0.04])
+
+
+class Inside:
+    """What lies below the skin of a model, on the CPU.
+
+    Args:
+        model: Gaussians at rest, world.
+        node_rest: Control nodes at rest [M, 3], m, world.
+        config: Of the flesh.
+    """
+
+    def __init__(self, model: GaussianModel, node_rest: np.ndarray, config: InsideConfig) -> None:
+        self._model, self._config = model.detach().to("cpu"), config
+        node_rest = np.asarray(node_rest, np.float64)
+        self._low, self._high = node_rest.min(0) - config.grain, node_rest.max(0) + config.grain
+        means = self._model.means.double().numpy()
+        self._solid = select_solid(means, self._model.opacities.double().numpy(), _SOLID)
+        self._covered: set[tuple[int, ...]] = set()
+        if len(self._solid):
+            self._skin, self._tree = means[self._solid], KDTree(means[self._solid])
+            self._colors = self._model.base_colors.double().numpy()[self._solid]
+            feet = self._skin[self._nearest(node_rest)[:, 0]]
+            self._columns, self._below = KDTree(feet), node_rest - feet
+
+    def _nearest(self, points: np.ndarray) -> np.ndarray:
+        """Numbers of a few Gaussians of the skin [P, K] that are nearest to points [P, 3], m, nearest first."""
+        return _query(self._tree, points, _NEIGHBOURS)
+
+    def measure(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """How far points [P, 3] lie below the skin, m, negative above it, and how deep the tissue is there [P], m; 0 is beside it, and
+        where there is a bare skin."""
+        feet = self._skin[self._nearest(points)].mean(1)
+        below = self._below[_query(self._columns, feet, _FEET)]
+        inward = below.sum(1)  # those that are deep have most to say
+        inward /= np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-12)
+        depth = ((points - feet) * inward).sum(1)
+        aside = np.linalg.norm(points - feet - depth[:, None] * inward, axis=1)
+        thickness = (below * inward[:, None]).sum(2).max(1)
+        least = _THINNEST * self._config.grain
+        return depth, np.where((aside < np.maximum(depth, least)) & (thickness > least), thickness, 0)
+
+    def colors(self, points: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """RGB [P, 3] of points [P, 3], m, at rest, so far below the skin [P], m."""
+        config = self._config
+        skin = self._colors[self._nearest(points)].mean(1)
+        bright, depth = skin.max(1, keepdims=True), depth[:, None]
+        coarse, fine = (_noise(points, size, config.seed)[:, None] for size in (0.004, 0.0009))
+        color, at = skin * _BELOW_SKIN, depth * (1 + 0.4 * coarse + 0.2 * fine)
+        for start, layer in ((config.fat_from, _FAT), (config.flesh_from, _FLESH)):
+            share = np.clip((at / max(start, 1e-9) - 0.7) / 0.6, 0, 1)
+            color = color + share * (bright * layer - color)
+        color = color * (1 + 0.12 * coarse + 0.2 * fine)
+        share = np.clip(2 - depth / max(config.blood, 1e-9), 0, 1) if config.blood else 0.0
+        return np.clip(color + share * (bright * _BLOOD * (1 + 0.2 * fine) - color), 0, 1)
+
+    def heal(self) -> None:
+        """Forget all cuts."""
+        self._covered.clear()
+
+    def faces(self, triangles: np.ndarray) -> GaussianModel:
+        """Return the Gaussians on both faces of new cuts [T, 3, 3], m, world, at rest: pairs, one on each side of the cut.
+
+        Below the layers near the skin they have twice the distance. What older ones cover gets no more.
+        """
+        grain = self._config.grain
+        rows = [self._cover(triangle) for triangle in np.asarray(triangles, np.float64)] if len(self._solid) else []
+        rows = np.concatenate([np.zeros((0, 8)), *rows])
+        if not len(rows):
+            return self._model.select(np.zeros(0, int))
+        depth, thickness = self.measure(rows[:, :3])
+        deep = depth > 1.5 * self._config.flesh_from
+        shown = (depth > 0) & (depth < thickness) & ((rows[:, 7] > 0) | ~deep)
+        at, normal, wide, depth = rows[shown, :3], rows[shown, 3:6], rows[shown, 6] * np.where(deep, 2, 1)[shown], depth[shown]
+        both = lambda array: torch.from_numpy(np.repeat(array, 2, 0)).float()
+        away = _OFFSET * grain * normal
+        normal = np.where(normal[:, 2:] < 0, -normal, normal)
+        quats = np.stack([1 + normal[:, 2], -normal[:, 1], normal[:, 0], np.zeros(len(at))], 1)  # turn z to the normal
+        sh = torch.zeros((2 * len(at), *self._model.sh.shape[1:]))
+        sh[:, 0] = (both(self.colors(at, depth)) - 0.5) / SH_C0
+        gloss = self._model.gloss
+        return GaussianModel(
+            torch.from_numpy(np.stack([at + away, at - away], 1).reshape(-1, 3)).float(),
+            both(quats),
+            both(np.stack([wide, wide, np.full(len(at), _FLAT * grain)], 1)).log(),
+            torch.full((len(sh),), _OPACITY).logit(),
+            sh,
+            self._model.light,
+            None if gloss is None else gloss[np.repeat(self._solid[self._nearest(at)[:, 0]], 2)],
+        )
+
+    def _cover(self, triangle: np.ndarray) -> np.ndarray:
+        """New places on a triangle [3, 3], as rows [P, 8]: where, the normal, the standard deviation that covers it, m, and 1 for each
+        fourth, which are a square lattice of their own.
+
+        They are where lines through a square lattice along the axis that is nearest to the normal meet the triangle, so that triangles
+        side by side share no place and leave no gap.
+        """
+        grain, nothing = self._config.grain, np.zeros((0, 8))
+        normal = np.cross(triangle[1] - triangle[0], triangle[2] - triangle[0])
+        normal = normal / max(np.linalg.norm(normal), 1e-30)
+        axis = int(np.abs(normal).argmax())
+        plane = [each for each in range(3) if each != axis]
+        low, high = (np.clip(corner, self._low, self._high)[plane] for corner in (triangle.min(0), triangle.max(0)))
+        first, last = np.ceil(low / grain - 0.5), np.floor(high / grain - 0.5)
+        if not normal.any() or (last < first).any():
+            return nothing
+        cells = np.stack(np.meshgrid(*(np.arange(*ends) for ends in zip(first, last + 1)), indexing="ij"), -1).reshape(-1, 2)
+        flat, corners = (cells + 0.5) * grain, triangle[:, plane]
+        ahead = np.roll(corners, -1, 0) - corners
+        side = ahead[:, 0] * (flat[:, None, 1] - corners[:, 1]) - ahead[:, 1] * (flat[:, None, 0] - corners[:, 0])
+        within = (side >= 0).all(1) | (side <= 0).all(1)
+        cells, flat = cells[within], flat[within]
+        height = triangle[0, axis] - (flat - triangle[0, plane]) @ normal[plane] / normal[axis]
+        keys = [(axis, *key) for key in np.column_stack([cells, np.round(height / grain)]).astype(int).tolist()]
+        new = [key not in self._covered for key in keys]
+        self._covered.update(keys)
+        rows = np.empty((len(flat), 8))
+        rows[:, plane], rows[:, axis], rows[:, 3:6] = flat, height, normal
+        rows[:, 6], rows[:, 7] = _WIDE * grain / abs(normal[axis]), (cells % 2 == 0).all(1)
+        return rows[new]
+
+
+def open_share(rest: Tensor, means: Tensor, grain: float) -> Tensor:
+    """Return how much of the pairs of `Inside.faces` counts [2 P], 0 to 1: nothing until the two have moved apart.
+
+    Args:
+        rest: Their centres at rest [2 P, 3], m.
+        means: The same now.
+        grain: Of the configuration, m.
+    """
+    gap, before = ((each[::2] - each[1::2]).norm(dim=1) for each in (means, rest))
+    return ((gap - before) / (_HIDDEN * grain) - 0.2).clamp(0, 1).repeat_interleave(2)
+
+
+def _query(tree: KDTree, points: np.ndarray, count: int) -> np.ndarray:
+    """Numbers of the count points of a tree [P, count] that are nearest to points [P, 3], nearest first; all where there are fewer."""
+    ranks: Any = list(range(1, min(count, tree.n) + 1))
+    return np.asarray(tree.query(points, k=ranks)[1])
+
+
+def _noise(points: np.ndarray, size: float, seed: int) -> np.ndarray:
+    """Value noise [P] from −1 to 1 at points [P, 3], m, that varies over so many metres."""
+    lattice = np.floor(points / size)
+    share = points / size - lattice
+    share = share * share * (3 - 2 * share)
+    corner, noise = lattice.astype(np.int64), np.zeros(len(points))
+    for step in np.ndindex(2, 2, 2):
+        weight = np.where(step, share, 1 - share).prod(1)
+        noise += weight * _random(corner + step, seed)
+    return 2 * noise - 1
+
+
+def _random(cells: np.ndarray, seed: int) -> np.ndarray:
+    """A number from 0 to 1 [P] for each cell [P, 3] of a lattice, the same on all machines."""
+    x, y, z = cells.astype(np.uint64).T
+    with np.errstate(over="ignore"):
+        h = x * np.uint64(0x9E3779B97F4A7C15) ^ y * np.uint64(0xC2B2AE3D27D4EB4F) ^ z * np.uint64(0x165667B19E3779F9) ^ np.uint64(seed)
+        for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+            h = (h ^ h >> np.uint64(shift)) * np.uint64(factor)
+    return (h >> np.uint64(40)).astype(np.float64) / 2**24

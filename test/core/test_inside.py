@@ -1,0 +1,136 @@
+"""What an open cut shows: the flesh below the skin."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.gaussians import GLOSS_FIELDS, GaussianModel
+from endo_sim_ros.core.light import Light
+from endo_sim_ros.physics.cutting.geometry import sweep
+from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
+from endo_sim_ros.rendering.config import InsideConfig
+
+CAMERA = Camera(np.array([[120.0, 0, 48], [0, 120, 40], [0, 0, 1]]), 96, 80)
+SKIN, BACK, MIDDLE = 0.1, 0.115, 0.0003  # m: depth of the skin and of the back, x of the cut
+OPENED = 0.003  # m by which each side of the skin is pulled away
+DARK, FLESH = InsideConfig(shown=False), InsideConfig()
+
+
+def skin(gloss=False):
+    g = torch.Generator().manual_seed(0)
+    points = torch.cat([torch.rand(6000, 2, generator=g) * 0.1 - 0.05, SKIN + 1e-5 * torch.rand(6000, 1, generator=g)], 1)
+    colors = torch.tensor([0.8, 0.5, 0.5]) + 0.1 * torch.rand(6000, 3, generator=g)
+    model = GaussianModel.from_points(points, colors, torch.full((6000,), 1e-3), 0.95)
+    if gloss:
+        rows = torch.randn(6000, len(GLOSS_FIELDS), generator=g)
+        model = dataclasses.replace(model, gloss=rows, light=Light(sheen_sharpness=3.0, glint_sharpness=40.0, facing=0.5))
+    return model
+
+
+def nodes():
+    """Of a block, 5 mm apart."""
+    x, y = np.meshgrid(np.arange(-10, 11) * 0.005, np.arange(-10, 11) * 0.005)
+    return np.concatenate([np.stack([x, y, np.full_like(x, SKIN + 0.005 * k)], -1).reshape(-1, 3) for k in range(4)])
+
+
+def opened(rest):
+    """Positions and F of nodes whose two sides are pulled apart at the skin and hang together at the back."""
+    side = np.where(rest[:, 0] > MIDDLE, OPENED, -OPENED)
+    F = np.tile(np.eye(3), (len(rest), 1, 1))
+    F[:, 0, 2] = -side / (BACK - SKIN)
+    return rest + np.stack([side * (BACK - rest[:, 2]) / (BACK - SKIN), 0 * side, 0 * side], 1), F
+
+
+def cut(to=0.06):
+    """Right through, along y from one border on, in steps of 4 mm."""
+    at = np.arange(-0.06, to + 1e-9, 0.004)
+    edge = lambda y: np.stack([np.full(5, MIDDLE), np.full(5, y), np.linspace(SKIN - 0.005, BACK + 0.005, 5)], 1)
+    return np.concatenate([sweep(edge(a), edge(b)) for a, b in zip(at[:-1], at[1:])])
+
+
+def renderer(inside=FLESH, model=None, rest=None, triangles=None):
+    made = DeformableRenderer(model or skin(), nodes() if rest is None else rest, RenderingConfig(device="cpu", inside=inside))
+    if triangles is not None:
+        made.cut(triangles)
+    return made
+
+
+def test_an_open_cut_shows_flesh_and_no_darkness():
+    state = opened(nodes())
+    dark, flesh = (renderer(inside, triangles=cut()).views([CAMERA], *state, labels=True)[0] for inside in (DARK, FLESH))
+    opening = dark.labels == 0
+    assert opening.sum() > 300
+    assert (flesh.labels[opening] == 0).sum() == 0
+    red, green, blue = flesh.image[opening].astype(float).T
+    assert np.median(red) > 60 and (red > 1.3 * green).mean() > 0.9 and (red > 1.3 * blue).mean() > 0.9
+    whole = np.abs(flesh.image.astype(int) - dark.image).max(2)
+    away = np.abs(np.arange(96) + 0.5 - 48 - 120 * MIDDLE / SKIN) > 120 * (OPENED + 0.004) / SKIN
+    assert not whole[:, away].any()  # nothing of the inside is seen through the skin
+
+
+def test_layers_lie_below_the_skin_in_their_order():
+    made = renderer(InsideConfig(blood=0.0002), triangles=cut())
+    inner = made.model.select(np.arange(6000, len(made.model)))
+    depth, (red, green, blue) = inner.means[:, 2].numpy() - SKIN, inner.base_colors.numpy().T
+    assert depth.min() > 0 and depth.max() < BACK - SKIN + 3e-4
+    mean = lambda values, low, high: values[(depth > low) & (depth < high)].mean()
+    for low, high, least, most in ((0.0004, 0.0008, 0.9, 1.1), (0.0015, 0.0025, 0.4, 0.8), (0.006, 0.015, 0.7, 1.1)):
+        assert least < mean(blue, low, high) / mean(green, low, high) < most  # skin, yellow fat, red flesh
+    assert mean(green, 0.006, 0.015) < 0.3 * mean(red, 0.006, 0.015)
+    assert mean(red, 0.006, 0.015) < 0.8 * mean(red, 0.0015, 0.0025)
+
+
+def test_without_a_cut_and_with_a_closed_one_the_picture_is_the_same_bit_for_bit():
+    state = opened(nodes())
+    plain, made = renderer(DARK), renderer()
+    assert made.model is made._skin and np.array_equal(made.render(CAMERA, *state)[0], plain.render(CAMERA, *state)[0])
+    closed = [renderer(inside, triangles=cut()) for inside in (DARK, FLESH)]
+    assert len(closed[1].model) > 6000
+    for positions in ((), (nodes(), np.tile(np.eye(3), (len(nodes()), 1, 1)))):
+        images = [each.render(CAMERA, *positions) for each in closed]
+        assert all(np.array_equal(a, b) for a, b in zip(*images))
+    closed[1].cut(np.zeros((0, 3, 3)))  # healed
+    assert len(closed[1].model) == 6000
+    assert np.array_equal(closed[1].render(CAMERA, *state)[0], plain.render(CAMERA, *state)[0])
+
+
+def test_the_same_cuts_and_seed_give_the_same_flesh_however_they_come():
+    state, triangles = opened(nodes()), cut()
+    first, other = renderer(triangles=triangles), renderer(InsideConfig(seed=1), triangles=triangles)
+    piecewise = renderer(triangles=cut(-0.03))
+    piecewise.cut(np.concatenate([triangles[: len(cut(-0.03))], triangles[len(cut(-0.03)) : -6]]))
+    piecewise.cut(np.zeros((0, 3, 3)))
+    for end in (40, 44, len(triangles)):
+        piecewise.cut(triangles[:end])
+    for one, two in zip(first.model.tensors().values(), piecewise.model.tensors().values()):
+        assert torch.equal(one, two)
+    for one, two in zip(first.deform(*state), piecewise.deform(*state)):
+        assert torch.equal(one, two)
+    assert torch.equal(first.model.means, other.model.means) and not torch.equal(first.model.sh, other.model.sh)
+
+
+def test_both_faces_follow_the_nodes_on_their_own_side():
+    made = renderer(triangles=cut())
+    means = made.deform(*opened(nodes()))[0]
+    inner, moved = made.model.means[6000:].numpy(), (means - made.model.means)[6000:, 0].numpy()
+    expected = np.where(inner[:, 0] > MIDDLE, OPENED, -OPENED) * (BACK - inner[:, 2]) / (BACK - SKIN)
+    assert (inner[::2, 0] > MIDDLE).all() != (inner[1::2, 0] > MIDDLE).all()
+    np.testing.assert_allclose(moved, expected, atol=2e-5)
+
+
+def test_flesh_is_as_wet_as_the_skin_beside_it():
+    model = skin(gloss=True)
+    made = renderer(model=model, triangles=cut())
+    assert {*map(tuple, made.model.gloss[6000:].tolist())} <= {*map(tuple, model.gloss.tolist())}
+    assert len(made.model) > 7000
+    assert made.render(CAMERA, *opened(nodes()))[0].any()
+
+
+@pytest.mark.parametrize("case", ["no layers", "in the air", "beside it"])
+def test_where_there_is_no_inside_there_is_no_flesh(case):
+    rest = skin().means[::12].double().numpy() if case == "no layers" else nodes()
+    triangles = {"no layers": cut(), "in the air": cut() - [0, 0, 0.05], "beside it": cut() + [0.0, 0.2, 0.0]}[case]
+    assert len(renderer(rest=rest, triangles=triangles).model) == 6000

@@ -1,0 +1,67 @@
+"""Tissue that is pulled farther than it bears tears."""
+
+import numpy as np
+import pytest
+from tissue_scene import pose_at, simulate
+
+from endo_sim_ros.physics import TissueSimulation
+from endo_sim_ros.physics.cutting.tearing import Tearing
+
+
+def pull(simulation: TissueSimulation, far: float) -> float:
+    """Grasp the skin at two places and pull them apart, m each; returns the greatest force of one, N."""
+    skin, force = simulation.nodes.rest[simulation.nodes.is_skin & ~simulation.nodes.pinned], 0.0
+    held = {side: skin[np.linalg.norm(skin - [0.015 * side, 0, 0.12], axis=1).argmin()] for side in (-1, 1)}
+    for step in range(26):
+        for side, tip in held.items():
+            simulation.set_grasp(f"jaw {side}", pose_at(tip + [side * far * step / 25, 0, 0]), True)
+        simulation.step()
+        force = max(force, float(np.linalg.norm(simulation.reaction("jaw 1")[0])))
+    return force
+
+
+@pytest.mark.slow
+def test_tissue_tears_between_what_pulls_it_apart_the_same_in_each_run_and_heals_on_reset():
+    whole, torn = simulate(), simulate(tear_strain=0.38)
+    assert pull(torn, 0.001) == pull(whole, 0.001) and torn.tears == 0 == len(torn.cuts)
+    np.testing.assert_array_equal(torn.state().positions, whole.state().positions)
+    forces, cuts = [], []
+    for _ in range(2):
+        torn.reset()
+        assert torn.tears == 0 == len(torn.cuts) and torn.last_tear == ""
+        forces.append(pull(torn, 0.012))
+        cuts.append(torn.cuts)
+    assert torn.tears > 1 and len(torn.cuts) == 2 * torn.tears and torn.faults == 0
+    assert forces[0] == forces[1] and np.array_equal(*cuts)
+    assert "its true strain was 0." in torn.last_tear and "tear_strain is 0.38" in torn.last_tear
+    first = cuts[0][:2].reshape(-1, 3)
+    assert np.abs(first.mean(0)[:2]).max() < 0.012  # between the jaws
+    whole.reset()
+    assert pull(whole, 0.012) > 1.5 * forces[0]
+    other = simulate(tear_strain=0.38, young_modulus=12e3)
+    assert other.continue_from(torn) and other.tears == torn.tears and np.array_equal(other.cuts, torn.cuts)
+
+
+def test_a_tear_goes_across_the_stretch_once_and_only_above_the_limit():
+    rest = np.stack(np.meshgrid(*[np.arange(5) * 0.01] * 3, indexing="ij"), -1).reshape(-1, 3)
+    tearing, F = Tearing(rest, 0.4, 0.015), np.tile(np.eye(3), (125, 1, 1))
+    F[62] = np.diag([1, np.exp(0.39), 1])
+    assert not len(tearing.tear(F)) and tearing.newest is None
+    F[62] = np.diag([1, np.exp(0.41), 1]) @ F[0]
+    F[63] = np.diag([1, np.exp(0.5), 1])  # a neighbour, which is strained more
+    triangles = tearing.tear(F)
+    assert triangles.shape == (2, 3, 3) and tearing.count == 1
+    np.testing.assert_allclose(triangles[..., 1], rest[63, 1], atol=1e-12)  # across y
+    np.testing.assert_allclose(np.ptp(triangles, axis=(0, 1))[[0, 2]].max(), 2.5 * 0.015, rtol=0.45)
+    assert tearing.newest is not None and tearing.newest[1] == pytest.approx(0.5)
+    assert not len(tearing.tear(F))  # the tear relieves both
+    F[0] = np.diag([np.nan, 1, 1])
+    assert not len(tearing.tear(F))
+    tearing.reset()
+    assert len(tearing.tear(F)) == 2
+
+
+def test_tissue_with_current_kinematics_never_tears():
+    simulation = simulate(tear_strain=0.1, kinematics="current")
+    simulation.step()
+    assert simulation.tears == 0 and simulation.last_tear == ""

@@ -23,7 +23,9 @@ from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
 WHITE = math.log(math.e - 1)
 """What `gloss` holds for a strength of 1: a lobe that is white where it is brightest."""
 
-_GRAZING = 0.1  # least cosine: what is seen from behind is as bright as what is seen at a grazing angle
+# Least cosine that shades. Normals in folds are known too badly for more: tissue that seems to be seen at a grazing angle would be given
+# a colour so bright that it flashes once it is pulled towards the lens.
+_GRAZING = 0.5
 
 
 def cosines(model: GaussianModel, positions: Tensor) -> Tensor:

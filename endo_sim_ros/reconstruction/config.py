@@ -13,6 +13,7 @@ from endo_sim_ros.reconstruction.stage_configs import (
     InitialModelConfig,
     InterpolationConfig,
     MatchingConfig,
+    MotionSearchConfig,
     MultiViewConfig,
     NetworkDepthConfig,
     PhotometryConfig,
@@ -127,6 +128,8 @@ class ReconstructionConfig(StageConfig):
     depth_model: str = ""
     """network: folder of a checkpoint of Depth-Anything-V2 or another depth network (transformers), or ONNX file; nothing is ever
     downloaded. Empty: the Depth-Anything-V2 that Hugging Face's cache holds."""
+    watch_motion: bool = True
+    """`endo-sim reconstruct` looks for tissue that moves periodically by itself, and says so."""
     plane_sweep: bool = True
     """Believe depth that is interpolated close to scene points alone; elsewhere match the views plane by plane."""
     multi_view_refinement: bool = True
@@ -212,6 +215,7 @@ class ReconstructionConfig(StageConfig):
     views: UsableViewsConfig = UsableViewsConfig()
     matching: MatchingConfig = MatchingConfig()
     poses: PosesConfig = PosesConfig()
+    watch: MotionSearchConfig = MotionSearchConfig()
     stereo: StereoConfig = StereoConfig()
     network: NetworkDepthConfig = NetworkDepthConfig()
     interpolation: InterpolationConfig = InterpolationConfig()
@@ -245,6 +249,7 @@ class ReconstructionConfig(StageConfig):
         "motion": ("dynamic_mask", "true"),
         "extrapolated": ("extrapolation", "more than 0"),
         "gloss": ("reflections", "true"),
+        "watch": ("watch_motion", "true"),
         **{f"training.{name}": ("iterations", "0") for name in ("iterations_per_view", "min_iterations", "max_iterations")},
         **{f"training.{name}": ("max_gaussians", "0") for name in ("pixels_per_gaussian", "min_gaussians", "max_gaussians")},
         "capacity": ("max_gaussians", "0"),

@@ -18,6 +18,7 @@ from endo_sim_ros.reconstruction.pipeline import prepare
 from endo_sim_ros.reconstruction.priors.network import find_network
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import ScenePoints
+from endo_sim_ros.reconstruction.tissue_motion import MotionWatch
 from endo_sim_ros.reconstruction.trainer import Progress, Trainer
 from endo_sim_ros.reconstruction.triangulation import POINT_VIEWS
 from endo_sim_ros.sequences.bag import read_bag
@@ -56,7 +57,8 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
     recording = Recording(lambda: read_bag(bag), 0)
     with ProgressBar() as bar:
         task = bar.add_task(f"reading {bag.name}", total=None)
-        views, sample = survey(recording, POINT_VIEWS)
+        watch = MotionWatch(config.watch)
+        views, sample = survey(watch.watch(recording) if config.watch_motion else recording, POINT_VIEWS)
         out.mkdir(parents=True, exist_ok=True)  # before the long work
 
         def on_stage(stage: str, done: int, total: int) -> None:
@@ -64,6 +66,10 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
 
         known = read_points(bag)
         given = ScenePoints.recorded(*known) if known else None
+        if config.watch_motion:
+            bar.update(task, description="looking for breath and heartbeat")
+            motions, text = watch.found()
+            log.log(logging.WARNING if motions else logging.INFO, text)
         chosen, points = choose_views(views, sample, config, StageProgress("scene points", on_stage), given)
         del sample
         log.info("%d views, training on %d", len(views), len(chosen))

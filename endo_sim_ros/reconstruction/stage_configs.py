@@ -331,3 +331,30 @@ class GlossConfig(StageConfig):
     """Strength of the narrow lobe at first: enough for training to find which Gaussians glint."""
     facing: Annotated[float, Range(0, 10)] = 0.45
     """Exponent of the cosine by which tissue that turns away grows darker: Lambert's law in encoded images, 1 / 2.2."""
+
+
+@dataclass(frozen=True)
+class MotionSearchConfig(StageConfig):
+    """Search for breath and heart in a recording."""
+
+    width: Annotated[int, Range(32, 4096, "pixels")] = 320
+    """Width of the images in which points are followed."""
+    rate: Annotated[float, Range(1.0, 100.0, "Hz")] = 12.5
+    """Images looked at in a second, at most: six for the beat of a fast heart."""
+    images: Annotated[int, Range(10, 100_000)] = 300
+    """Images looked at, at most: six breaths. Each takes some hundredths of a second."""
+    points: Annotated[int, Range(10, 10_000)] = 200
+    """Points followed at a time."""
+    shortest_beat: Annotated[float, Range(0.1, 60.0, "s")] = 0.4
+    """Least period of a heart: 150 beats a minute."""
+    shortest_breath: Annotated[float, Range(0.1, 60.0, "s")] = 1.8
+    """Least period of a breath, 33 a minute, and longest of a heart by a fifth more."""
+    longest_breath: Annotated[float, Range(0.1, 60.0, "s")] = 8.0
+    """Longest period of a breath: seven a minute."""
+    least_cycles: Annotated[float, Range(1.0, 100.0)] = 2.0
+    """Periods that must be seen; one alone may be anything that moves."""
+    least_explained: Annotated[float, Range(0.0, 1.0)] = 0.6
+    """Share of what still points leave over that a breath must explain, and a heart half of it."""
+    least_pixels: Annotated[float, Range(0.0, 100.0, "pixels")] = 1.0
+    """Root mean square that a breath must explain, in the images in which points are followed, where they drift by a third of a pixel; a
+    heart a twentieth of it, as nothing else is so fast."""

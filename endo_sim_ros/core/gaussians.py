@@ -70,8 +70,8 @@ class GaussianModel:
 
     @property
     def reflects(self) -> bool:
-        """Whether its colours depend on where it is seen from by `gloss`, whose lobes its light has."""
-        return self.gloss is not None and self.light is not None
+        """Whether its colours depend on where it is seen from by `gloss`, whose lobes its light has; never beside harmonics that do so."""
+        return self.gloss is not None and self.light is not None and not self.sh_degree
 
     @property
     def sh_degree(self) -> int:
@@ -210,6 +210,8 @@ def save_ply(model: GaussianModel, path: str | Path) -> None:
     path = Path(path)
     columns, names = to_columns(model), ply_fields(model.sh_degree)
     gloss = None if model.gloss is None else model.gloss.detach().cpu().float().numpy()
+    if gloss is not None and not np.isfinite(gloss).all():
+        raise ModelError(f"{path}: gloss is not finite in {(~np.isfinite(gloss)).any(1).sum()} Gaussians; nothing is written")
     if path.name.endswith(_COMPRESSED) and len(model):
         chunks, vertices, harmonics, gloss = compressed_ply.pack(dict(zip(names, columns.T)), gloss)
         elements = [

@@ -20,6 +20,7 @@ from endo_sim_ros.core.cameras import Camera
 _SHARPNESS = 6  # exponent of the mean that the exposure responds to: mostly to the brighter parts of a picture
 _STRIDE = 4  # pixels from one that the exposure measures to the next
 SURFACE = 0.5  # alpha above which a pixel shows a surface
+_LOBES = {"sheen_sharpness", "glint_sharpness", "facing"}  # what lights had not before there were reflections
 NEAREST = 1e-3  # least depth of lit tissue, metres, and alpha above which a pixel has a depth
 
 
@@ -61,6 +62,10 @@ class Light:
             if not number or name == "reference" and value <= 0:
                 raise ValueError(f"light: {name} is {value!r}; it must be a finite number{', above 0' * (name == 'reference')}")
 
+        for name in _LOBES:
+            if getattr(self, name) < 0:
+                raise ValueError(f"light: {name} is {getattr(self, name)!r}; it must be 0 or more")
+
     def to_json(self) -> str:
         """Return the values as one line, for a file's comment or a message."""
         return json.dumps(dataclasses.asdict(self))
@@ -74,7 +79,7 @@ class Light:
         """
         values = json.loads(text)
         known = {field.name for field in dataclasses.fields(Light)}
-        if not isinstance(values, dict) or not known - {"sheen_sharpness", "glint_sharpness", "facing"} <= set(values) <= known:
+        if not isinstance(values, dict) or set(values) not in (known, known - _LOBES):
             raise ValueError(f"light: expected the values {', '.join(sorted(known))}, got {text[:80]}")
         return Light(**values)
 

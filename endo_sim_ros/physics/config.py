@@ -7,6 +7,7 @@ import numpy as np
 
 from endo_sim_ros.core.config import ConfigError, Range, StageConfig
 
+_LEAST_DIRECTION = 1e-6  # of its largest number: less than that is none
 MOST_MOTION = 0.5  # of the travel; the rest is for tools
 
 
@@ -27,8 +28,8 @@ class MotionConfig(StageConfig):
     heartbeat_phase: Annotated[float, Range(0.0, 1.0)] = 0.0
     """Part of its period that the heart has gone at the start and after a reset; it is farthest at 0.25."""
     direction_x: Annotated[float, Range(-1.0, 1.0)] = 1.0
-    """Direction of the motion in the world, of any length but zero: x. By default tissue slides, and comes half as far nearer to a camera
-    that looks along z."""
+    """Direction of the motion in the world, of any length above a millionth: x. By default tissue slides, and comes half as far nearer to
+    a camera that looks along z."""
     direction_y: Annotated[float, Range(-1.0, 1.0)] = 0.0
     """The same: y."""
     direction_z: Annotated[float, Range(-1.0, 1.0)] = -0.5
@@ -39,8 +40,8 @@ class MotionConfig(StageConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not any(self.direction):
-            raise ConfigError("the direction of motion is 0, 0, 0; give one that points somewhere")
+        if np.abs(self.direction).max() < _LEAST_DIRECTION:
+            raise ConfigError(f"the direction of motion is {self.direction}; give one that points somewhere, as 1, 0, 0")
 
     @property
     def direction(self) -> tuple[float, float, float]:

@@ -82,13 +82,16 @@ class HeldMotion:
         if everywhere:
             self._changed, self._used = np.inf, False
         self._held[environments] = 0
-        self._shown = self._before = np.zeros(2)
-        if everywhere or self._ways.any():
+        if everywhere:
+            self._shown = self._before = np.zeros(2)
+        moving = self._ways.any() or self._ways_now().any()
+        if everywhere or moving:
             which = environments if isinstance(environments, slice) else environments.cpu().numpy()
             self._phases[which] = self.config.phases if phases is None else phases
-        if self._ways.any():
+        if moving:
             self._held[environments] = self._displacements().to(self._held)[environments]
-            self._shown = self._before = self._displacements_along()
+            if everywhere:
+                self._shown = self._before = self._displacements_along()
         self._goal[environments] = self._held[environments]
         return self._held[environments]
 

@@ -77,6 +77,8 @@ def test_a_light_that_cannot_be_is_refused(tmp_path):
         Light(reference=0)
     with pytest.raises(ValueError, match="expected the values"):
         Light.from_json('{"distance": 1.0}')
+    with pytest.raises(ValueError, match="sheen_sharpness is -1"):
+        Light(sheen_sharpness=-1.0)
     path = tmp_path / "lit.ply"
     save_ply(dataclasses.replace(wall(50), light=LAMP), path)
     path.write_bytes(path.read_bytes().replace(b'"angle": 8.0', b'"angle": NaN'))

@@ -9,7 +9,7 @@ import torch
 from lit_wall import CAMERA, wall
 from plyfile import PlyData
 
-from endo_sim_ros.core.gaussians import SH_C0, GaussianModel, load_ply, save_ply
+from endo_sim_ros.core.gaussians import SH_C0, GaussianModel, ModelError, load_ply, save_ply
 from endo_sim_ros.core.light import Light
 from endo_sim_ros.core.reflections import cosines, seen_colors, unlit
 from endo_sim_ros.core.shading import shade, to_bytes
@@ -143,6 +143,22 @@ def test_other_programs_find_the_same_vertices_and_no_light_means_no_gloss(tmp_p
     start = text.index(b"comment")
     (tmp_path / "unlit.ply").write_bytes(text[:start] + text[text.index(b"\n", start) + 1 :])
     assert not load_ply(tmp_path / "unlit.ply").reflects and load_ply(tmp_path / "glossy.ply").reflects
+
+
+def test_harmonics_beside_gloss_are_drawn_as_they_are():
+    model = glossy(500)
+    model = dataclasses.replace(model, sh=torch.cat([model.sh, 0.3 * torch.ones(500, 3, 3)], 1))
+    seen = render(model, CAMERA).colors
+    assert torch.equal(seen, render(dataclasses.replace(model, gloss=None), CAMERA).colors)
+
+
+@pytest.mark.parametrize("name", ["m.ply", "m.compressed.ply"])
+def test_gloss_that_is_not_finite_is_not_written(tmp_path, name):
+    model = glossy(50)
+    model.gloss[7, 6] = torch.nan
+    with pytest.raises(ModelError, match="gloss is not finite in 1 Gaussians"):
+        save_ply(model, tmp_path / name)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_light_of_an_older_file_reflects_nothing():

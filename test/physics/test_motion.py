@@ -181,6 +181,20 @@ def test_copies_are_the_same_as_one_alone_each_in_its_phase():
     assert not torch.equal(together[2][0], together[2][1])
 
 
+def test_a_copy_that_begins_anew_while_the_motion_fades_fades_with_the_others():
+    nodes = build_control_nodes(curved_sheet(), EYE, PhysicsConfig(node_count=300))
+    config = PhysicsConfig(device="cpu", node_count=300, motion=MotionConfig(breathing=0.02, breathing_phase=0.45))
+    batch = TissueBatch(nodes, config, 3)
+    batch.step()
+    batch.solver.motion.change(MotionConfig(breathing_phase=0.45))
+    batch.step()
+    batch.reset(torch.tensor([1]))
+    batch.step()
+    held = batch.positions()[:, torch.from_numpy(nodes.pinned)] - torch.from_numpy(nodes.rest[nodes.pinned]).float()
+    moved = held.norm(dim=-1).mean(1)
+    assert (moved / moved[0] - 1).abs().max() < 0.1 and moved[0] > 0.01
+
+
 def test_skinning_within_the_step_is_that_of_the_state():
     model = curved_sheet()
     nodes = build_control_nodes(model, EYE, PhysicsConfig(node_count=300))
@@ -200,6 +214,7 @@ def test_skinning_within_the_step_is_that_of_the_state():
         ({"breathing": float("nan")}, "must be finite"),
         ({"breathing_period": -4.0}, "must lie in"),
         ({"direction_x": 0.0, "direction_z": 0.0}, "points somewhere"),
+        ({"direction_x": 1e-200, "direction_z": 0.0}, "points somewhere"),
         ({"breathing": 0.02, "heartbeat": 0.01}, "more travel"),
     ],
 )

@@ -12,6 +12,7 @@ from endo_sim_ros.core import drawing
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.core.tissue_motion import MovingModel
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.evaluation.lpips import Lpips
 from endo_sim_ros.reconstruction import Trainer, shrink
@@ -151,13 +152,14 @@ def measure_held_out(trainer: Trainer, frames: Sequence[Frame] | Recording, out:
         out: Folder for held_out.png.
     """
     model, drift = trainer.model, trainer.drift
-    renderer = model_renderer(model, trainer.config.device)
+    moving = MovingModel(model, trainer.motion)
     rows, pictures = [], []
     shown = {int(i) for i in np.linspace(0, len(frames) - 1, min(_STRIPS, len(frames)))}
     for index, frame in enumerate(frames):
         frame = shrink(frame, trainer.config.image_width)
         if frame.mask is not None and not frame.mask.any():
             continue
+        renderer = model_renderer(moving.at(frame.stamp_ns), trainer.config.device)
         image, depth = renderer.render(frame.camera, light=drift.at(model.light, frame.stamp_ns))
         rows.append(measure(image, depth, frame))
         if index in shown:

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import logging
 from collections.abc import Iterable, Iterator, Sequence, Sized
 from pathlib import Path
 from typing import NamedTuple
@@ -11,14 +12,18 @@ from rich.progress import Progress
 from scipy.spatial import KDTree
 
 from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.core.tissue_motion import TissueMotion, stilled
 from endo_sim_ros.evaluation.cells import Cell
 from endo_sim_ros.evaluation.sources import open_named, split_source
 from endo_sim_ros.evaluation.splits import right_views, split_views
 from endo_sim_ros.reconstruction import ReconstructionConfig, ScenePoints, scene_points, shrink
+from endo_sim_ros.reconstruction.motion_watch import MotionWatch
 from endo_sim_ros.reconstruction.priors.sources import estimate_depth
 from endo_sim_ros.reconstruction.scene import TrainingView
 from endo_sim_ros.sequences.point_files import read_points
 from endo_sim_ros.sequences.recording import Recording, StoredFrame, spread, store
+
+log = logging.getLogger(__name__)
 
 _POINT_VIEWS = 48  # views that structure from motion is done with
 _HELD = 48  # frames in memory at a time while their depth is matched, which needs three times their size
@@ -35,6 +40,7 @@ class Prepared(NamedTuple):
     right: dict[int, StoredFrame]  # the right images as views, for the split of that name
     depth_source: str  # where the reference depth of the frames is from: recorded, stereo matching, or none
     points: ScenePoints  # of structure from motion with all views, like the poses
+    motion: TissueMotion | None  # how the tissue moves by itself
     judging: np.ndarray | None  # [N, 3] m, world: points that judge depth and are kept from the methods; None: no judges
 
     def carried(self) -> "Prepared":
@@ -57,7 +63,10 @@ def prepare_sequence(cells: Sequence[Cell], bar: Progress, folder: Path) -> Prep
     opened, splits = open_named(source), {cell.split for cell in cells}
     expected = len(opened) if isinstance(opened, Sized) else 0
     at_once = 0 < expected <= cells[0].most_held_out
-    for frame in _tissue(opened, bar, f"reading {cells[0].sequence}", expected):
+    configs = [ReconstructionConfig.from_mapping(cell.options) for cell in cells]
+    watch = next((MotionWatch(config.watch) for config in configs if config.watch_motion), None)
+    frames = _tissue(opened, bar, f"reading {cells[0].sequence}", expected)
+    for frame in frames if watch is None else watch.watch(frames):
         if at_once:
             stored[count] = store(frame, folder / str(count))
         count += 1
@@ -73,9 +82,17 @@ def prepare_sequence(cells: Sequence[Cell], bar: Progress, folder: Path) -> Prep
         for number, frame in enumerate(_tissue(opened, bar, f"reading {cells[0].sequence} again", expected)):
             if number in wanted:
                 stored[number] = store(frame, folder / str(number))
+    motion = None
+    if watch is not None:
+        motion, text = watch.found()
+        log.info("%s: %s", cells[0].sequence, text)
     task = bar.add_task(f"scene points of {cells[0].sequence}", total=None)
     known = opened.points() if isinstance(opened, Recording) else read_points(split_source(source)[0])  # else a bag
-    points = ScenePoints.recorded(*known) if known else scene_points([stored[number].load() for number in pointed], _POINT_VIEWS)
+    points = (
+        ScenePoints.recorded(*known)
+        if known
+        else scene_points([stilled(stored[number].load(), motion) for number in pointed], _POINT_VIEWS)
+    )
     bar.remove_task(task)
     recorded = any(frame.depth and (frame.load().depth > 0).any() for frame in stored.values())
     judging = None
@@ -101,7 +118,7 @@ def prepare_sequence(cells: Sequence[Cell], bar: Progress, folder: Path) -> Prep
         bar.advance(task, len(some))
     bar.remove_task(task)
     depth_source = "recorded" if recorded else "stereo matching" if matched else "none"
-    return Prepared(count, stored, right, depth_source, points, judging)
+    return Prepared(count, stored, right, depth_source, points, motion, judging)
 
 
 def _tissue(frames: Iterable[Frame], bar: Progress, text: str, expected: int) -> Iterator[Frame]:

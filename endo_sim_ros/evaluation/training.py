@@ -18,6 +18,7 @@ from endo_sim_ros.core import drawing
 from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.core.device import cpu_threads
 from endo_sim_ros.core.frames import Frame, SequenceError
+from endo_sim_ros.core.tissue_motion import MovingModel
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.evaluation.cells import Cell
 from endo_sim_ros.evaluation.deformed_truth import deformed_truth_psnr
@@ -29,7 +30,7 @@ from endo_sim_ros.evaluation.measurement import machine, peak_megabytes
 from endo_sim_ros.evaluation.preparation import Prepared
 from endo_sim_ros.evaluation.sources import find_patient
 from endo_sim_ros.evaluation.splits import split_views
-from endo_sim_ros.reconstruction import Progress, ReconstructionConfig, ScenePoints, Trainer, prepare, reconstruct, shrink
+from endo_sim_ros.reconstruction import Progress, ReconstructionConfig, Trainer, prepare, reconstruct, shrink
 from endo_sim_ros.reconstruction.triangulation import points_in_view
 from endo_sim_ros.sequences.recording import spread
 
@@ -92,7 +93,7 @@ def train_and_measure(argument: tuple[Cell, Path | None, Prepared | Path], devic
 
     def train() -> None:
         probes = [load(number) for number in spread(list(held_out), _CURVE_VIEWS)] if cell.curve else []
-        training.update(_train(cell, views, config, prepared.points, probes, report))
+        training.update(_train(cell, views, config, prepared, probes, report))
 
     memory = peak_megabytes(train, device)
     views.clear()  # they are large
@@ -101,11 +102,12 @@ def train_and_measure(argument: tuple[Cell, Path | None, Prepared | Path], devic
     networks = [_network(name, weights, device) for name in cell.lpips]
     trained = [prepared.frames[number] for number in split.train]
     seen_by = [dataclasses.replace(shrink(view.load(), config.image_width), right=None) for view in trained]
-    renderer = model_renderer(model, device)
+    moving = MovingModel(model, training.pop("motion"))
+    renderer_at = lambda stamp_ns: model_renderer(moving.at(stamp_ns), device)
     shown = set(spread(list(held_out), _SHOWN))
     # Without reference depth that of the model tells what was seen.
     known = all(frame.depth for frame in [*held_out.values(), *trained])
-    depth_of = lambda view: view.depth if known else renderer.render(view.camera)[1]
+    depth_of = lambda view: view.depth if known else renderer_at(view.stamp_ns).render(view.camera)[1]
     surfaces = [(view.camera, depth_of(view), view.mask) for view in seen_by]
 
     def of_view(number: int, frame: Frame, image: np.ndarray, depth: np.ndarray) -> tuple[dict[str, float], dict[str, bytes], float]:
@@ -129,7 +131,7 @@ def train_and_measure(argument: tuple[Cell, Path | None, Prepared | Path], devic
             frame = load(number)
             size = [frame.camera.width, frame.camera.height]
             masked |= frame.mask is not None and not frame.mask.all()
-            drawn = renderer.render(frame.camera, light=drift.at(model.light, frame.stamp_ns))
+            drawn = renderer_at(frame.stamp_ns).render(frame.camera, light=drift.at(model.light, frame.stamp_ns))
             waiting.append(pool.submit(of_view, number, frame, *drawn))
             while len(waiting) > 2 * cpu_threads() or waiting and index == len(held_out) - 1:
                 row, new, error = waiting.popleft().result()
@@ -162,7 +164,7 @@ def _reference_at_points(frame: Frame, judging: np.ndarray | None) -> float:
 
 
 def _train(
-    cell: Cell, views: list[Frame], config: ReconstructionConfig, points: ScenePoints, probes: list[Frame], report: Callable[[Any], None]
+    cell: Cell, views: list[Frame], config: ReconstructionConfig, prepared: Prepared, probes: list[Frame], report: Callable[[Any], None]
 ) -> dict[str, Any]:
     """Train; the seconds that it took, without those of the measurements for the curve."""
 
@@ -171,11 +173,13 @@ def _train(
             torch.cuda.synchronize(config.device)
         return time.perf_counter()
 
-    curve, start, away = [], now(), 0.0
+    curve, start, away, motion = [], now(), 0.0, None
     if cell.method in STRATEGIES:
-        trainer = GsplatTrainer(views, points, config, cell.method)
+        trainer = GsplatTrainer(views, prepared.points, config, cell.method)
     else:
-        trainer = Trainer(prepare(views, config, points, lambda stage, done, total: report((done, max(total, 1), stage))), config)
+        motion = prepared.motion if config.watch_motion else None
+        told = lambda stage, done, total: report((done, max(total, 1), stage))
+        trainer = Trainer(prepare(views, config, prepared.points, told, motion), config)
     iterations, moments = trainer.iterations, cell.curve
     # Quality changes fastest in the beginning.
     due = sorted({round(iterations * 50 ** (i / max(moments - 1, 1) - 1)) for i in range(moments)})
@@ -189,8 +193,10 @@ def _train(
             due.pop(0)
         paused = now()
         model, drift = trainer.model, trainer.drift
-        renderer = model_renderer(model, config.device)
-        drawn = lambda probe: renderer.render(probe.camera, light=drift.at(model.light, probe.stamp_ns))[0]
+        moving = MovingModel(model, motion)
+        drawn = lambda probe: model_renderer(moving.at(probe.stamp_ns), config.device).render(
+            probe.camera, light=drift.at(model.light, probe.stamp_ns)
+        )[0]
         pairs = [(drawn(probe), probe.image, probe.mask) for probe in probes]
         curve.append(
             {
@@ -204,7 +210,7 @@ def _train(
 
     model = trainer.run(on_progress, every=max(min(20, iterations // 50), 1))
     seconds = now() - start - away
-    return {"model": model, "drift": trainer.drift, "seconds": seconds, "curve": curve}
+    return {"model": model, "drift": trainer.drift, "motion": motion, "seconds": seconds, "curve": curve}
 
 
 def _pictures(view: int, image: np.ndarray, depth: np.ndarray, frame: Frame) -> dict[str, bytes]:

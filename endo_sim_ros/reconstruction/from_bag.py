@@ -5,20 +5,22 @@ import shutil
 import tempfile
 from pathlib import Path
 
+import yaml
 from rich.progress import Progress as ProgressBar
 
 from endo_sim_ros.core.cameras import Camera, save_cameras
 from endo_sim_ros.core.config import unused_options
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.gaussians import GaussianModel, save_ply
+from endo_sim_ros.core.tissue_motion import TissueMotion, stilled
 from endo_sim_ros.reconstruction.checkpoint import read_checkpoint
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
 from endo_sim_ros.reconstruction.keyframes import choose_views
+from endo_sim_ros.reconstruction.motion_watch import MotionWatch
 from endo_sim_ros.reconstruction.pipeline import prepare
 from endo_sim_ros.reconstruction.priors.network import find_network
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import ScenePoints
-from endo_sim_ros.reconstruction.tissue_motion import MotionWatch
 from endo_sim_ros.reconstruction.trainer import Progress, Trainer
 from endo_sim_ros.reconstruction.triangulation import POINT_VIEWS
 from endo_sim_ros.sequences.bag import read_bag
@@ -33,6 +35,8 @@ _REPORTS, _CHECKPOINTS = 20, 10  # iterations between looks at the progress; che
 
 def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: bool = False) -> tuple[Trainer, Recording]:
     """The trainer at its end, and up to 300 frames with tissue that were held out; writes model.ply, cameras.json and checkpoint.pt.
+
+    Where the tissue moves by itself, it also writes motion.yaml, parameters of physics_node.
 
     The bag is read twice, and once more for the frames held out, so that no more than the keyframes are held in memory.
 
@@ -57,7 +61,7 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
     recording = Recording(lambda: read_bag(bag), 0)
     with ProgressBar() as bar:
         task = bar.add_task(f"reading {bag.name}", total=None)
-        watch = MotionWatch(config.watch)
+        watch, motion = MotionWatch(config.watch), None
         views, sample = survey(watch.watch(recording) if config.watch_motion else recording, POINT_VIEWS)
         out.mkdir(parents=True, exist_ok=True)  # before the long work
 
@@ -68,12 +72,17 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
         given = ScenePoints.recorded(*known) if known else None
         if config.watch_motion:
             bar.update(task, description="looking for breath and heartbeat")
-            motions, text = watch.found()
-            log.log(logging.WARNING if motions else logging.INFO, text)
+            motion, text = watch.found()
+            log.info(text)
+            if motion is not None:
+                last = round(1e9 * motion.end)
+                views = [view for view in views if view.stamp_ns <= last]
+                log.info("the model is of tissue in its mean position, from the %d views in which it was watched", len(views))
+                sample = [stilled(frame, motion) for frame in sample if frame.stamp_ns <= last]
         chosen, points = choose_views(views, sample, config, StageProgress("scene points", on_stage), given)
         del sample
         log.info("%d views, training on %d", len(views), len(chosen))
-        trainer = Trainer(prepare(recording.take(set(chosen), len(chosen)), config, points, on_stage), config)
+        trainer = Trainer(prepare(recording.take(set(chosen), len(chosen)), config, points, on_stage, motion), config)
     if resume:
         trainer.load_checkpoint(out / "checkpoint.pt")
         log.info("going on after %d iterations", trainer.iteration)
@@ -88,7 +97,8 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
                 _save_checkpoint(trainer, out)
 
         model = trainer.run(on_progress, _REPORTS)
-    _save(model, [views[index].camera for index in chosen if views[index].stamp_ns in trainer.stamps], out)
+    cameras = [views[index].camera for index in chosen if views[index].stamp_ns in trainer.stamps]
+    _save(model, cameras, motion, out)
     _save_checkpoint(trainer, out)
     held_out = spread(sorted({index for index, view in enumerate(views) if view.tissue} - set(chosen)), _MEASURED)
     return trainer, recording.take(set(held_out), len(held_out))
@@ -102,10 +112,10 @@ def _save_checkpoint(trainer: Trainer, out: Path) -> None:
         log.warning(str(error))
 
 
-def _save(model: GaussianModel, cameras: list[Camera], out: Path) -> None:
+def _save(model: GaussianModel, cameras: list[Camera], motion: TissueMotion | None, out: Path) -> None:
     """Write model and cameras into a folder or, where that cannot be, into one that can."""
     try:
-        _write(model, cameras, out)
+        _write(model, cameras, motion, out)
         return
     except OSError as error:
         reason = error.strerror or str(error)
@@ -116,7 +126,7 @@ def _save(model: GaussianModel, cameras: list[Camera], out: Path) -> None:
         except OSError:
             continue
         try:
-            _write(model, cameras, folder)
+            _write(model, cameras, motion, folder)
         except OSError:
             shutil.rmtree(folder, ignore_errors=True)
             continue
@@ -125,6 +135,9 @@ def _save(model: GaussianModel, cameras: list[Camera], out: Path) -> None:
     raise RuntimeError(f"{out}: the model cannot be saved there ({reason}), nor in {others}; make room and start again with --resume")
 
 
-def _write(model: GaussianModel, cameras: list[Camera], folder: Path) -> None:
+def _write(model: GaussianModel, cameras: list[Camera], motion: TissueMotion | None, folder: Path) -> None:
     save_ply(model, folder / "model.ply")
     save_cameras(cameras, folder / "cameras.json")
+    if motion is not None:
+        parameters = {f"motion.{name}": round(value, 6) for name, value in motion.parameters.items()}
+        (folder / "motion.yaml").write_text(yaml.safe_dump({"physics_node": {"ros__parameters": parameters}}, sort_keys=False))

@@ -16,6 +16,7 @@ from endo_sim_ros.core.config import unused_options
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.core.tissue_motion import TissueMotion, stilled
 from endo_sim_ros.reconstruction import photometry
 from endo_sim_ros.reconstruction.capacity_trial import choose_capacity
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
@@ -41,6 +42,7 @@ def prepare(
     config: ReconstructionConfig,
     points: ScenePoints | tuple | None = None,
     on_progress: OnProgress | None = None,
+    motion: TissueMotion | None = None,
 ) -> PreparedScene:
     """Everything that a training needs, of posed frames.
 
@@ -52,12 +54,13 @@ def prepare(
             instance of structure from motion with more views than these; None triangulates these views.
         on_progress: Called as ``on_progress(stage, done, total)``, several times a second and from several threads; it cancels by
             raising `Cancelled`.
+        motion: How the tissue moves by itself (see `MotionWatch`), which is undone in the frames. None: it is at rest.
 
     Raises:
         SequenceError: If there are no views, all pixels are masked or white, or scene points that are given are not finite.
         Cancelled: If the callback raised it.
     """
-    scene = PreparedScene(tuple(frames))
+    scene = PreparedScene(tuple(stilled(frame, motion) for frame in frames), motion=motion)
     if not scene.frames:
         raise SequenceError("there are no views to reconstruct from; check the image, camera_info and pose topics")
     if points is not None:

@@ -16,7 +16,8 @@ _PLAIN = {  # points, colours and nothing else, with the densification of AbsGS:
     "initialization": "points", "densification": "gradient", "exposure": False, "light": False,
     "learning_rate": 1.0, "lambda_flat": 0.0, "lambda_opaque": 0.0,
     "lambda_opacity": 0.0, "lambda_scale": 0.0, "dropout": 0.0,
-    "plane_sweep": False, "multi_view_refinement": False, "extrapolation": 0.0, "dynamic_mask": False, "reflections": False,
+    "watch_motion": False, "plane_sweep": False, "multi_view_refinement": False, "extrapolation": 0.0, "dynamic_mask": False,
+    "reflections": False,
 }  # fmt: skip
 
 _PUBLISHED = _PLAIN | {  # what the code of 3DGS and that of FSGS, which builds upon it, have alike. Opacities learn by 0.05, as in both;

@@ -14,6 +14,7 @@ from typing_extensions import Self
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.core.tissue_motion import TissueMotion
 
 log = logging.getLogger(__name__)
 
@@ -98,6 +99,7 @@ class PreparedScene:
         views: The same as they are trained on: shrunk, with depth prior, rectified right image and mask of what is still.
         points: Scene points; none before they are found.
         given_points: Whether the caller gave them.
+        motion: How the tissue moves by itself; frames and model have it in its mean position.
         matches: Features that the frames share.
         depth_source: Where the depth prior is from: topic, stereo, network, points or none.
         model: Gaussians to start from; none before they are placed.
@@ -114,6 +116,7 @@ class PreparedScene:
     views: tuple[TrainingView, ...] = ()
     points: ScenePoints = ScenePoints.none()
     given_points: bool = False
+    motion: TissueMotion | None = None
     matches: tuple[Matches, ...] = ()
     depth_source: str = "none"
     model: GaussianModel = field(default_factory=lambda: GaussianModel.from_points(torch.empty(0, 3), torch.empty(0, 3), torch.empty(0)))

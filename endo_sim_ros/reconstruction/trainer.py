@@ -69,6 +69,8 @@ class Trainer:
         self.config = config
         self._fade(scene.fading)
         self.scene_depth = scene.depth
+        self.motion = scene.motion
+        """How the tissue moves by itself; the model has it in its mean position."""
         self.device = pick_device(config.device)
         self.stamps = [view.stamp_ns for view in scene.views]
         """When the views were taken that are trained on, nanoseconds; views that were left out are not among them."""

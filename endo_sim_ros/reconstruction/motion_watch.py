@@ -1,37 +1,23 @@
 """Whether tissue moves periodically by itself, as by breath and heart: told from tracks of points through a posed recording."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
 from endo_sim_ros.core.frames import Frame
+from endo_sim_ros.core.tissue_motion import PeriodicMotion, TissueMotion, waves
 from endo_sim_ros.reconstruction.stage_configs import MotionSearchConfig
 
 _RIDGE = 0.02  # metres: how far tissue moves; only what rays do not see of a motion is bound by it
 _ROUNDS = 20  # of telling the way and the shares of it in turns
-_PHASES = 64  # places along a period at which a motion is looked at
+_TURNS = 2  # of telling these and the rate in turns, and of breath and heart
+_HARMONICS = 3  # of a breath's way: people breathe out longer than in
+_TRACKS = 5  # times as many tracks as points are followed at a time tell the ways
 _LOOK: dict[str, Any] = dict(winSize=(15, 15), maxLevel=4)  # of optical flow
 _DISTANCE = 7  # pixels between tracked points
-
-
-@dataclass(frozen=True)
-class TissueMotion:
-    """A periodic motion of tissue.
-
-    Args:
-        period: s.
-        amplitude: How far tissue goes, there or back, where it goes farthest, m; nineteen of twenty points go less far.
-        explained: Share, 0 to 1, of what still points leave over that it explains, where it explains most.
-        cycles: Number of periods that were watched.
-    """
-
-    period: float
-    amplitude: float
-    explained: float
-    cycles: float
 
 
 @dataclass
@@ -113,56 +99,41 @@ class MotionWatch:
                 track.right += [np.full(2, np.nan)] * (len(track.left) - 1 - len(track.right)) + [place if kept else np.full(2, np.nan)]
         self._before = image
 
-    def found(self) -> tuple[list[TissueMotion], str]:
-        """The motions, breath before heart, and a sentence that says so or why nothing can be told."""
+    def found(self) -> tuple[TissueMotion | None, str]:
+        """The motion, breath before heart, and a sentence that says so or why nothing can be told."""
         options, times = self.options, np.array(self._times)
         length = float(np.ptp(times)) if len(times) else 0.0
         if length < options.least_cycles * options.shortest_beat or len(times) < 10:
-            return [], f"whether the tissue moves by itself cannot be told from {length:.1f} s"
+            return None, f"whether the tissue moves by itself cannot be told from {length:.1f} s"
         rays = _Rays.of(self._ended + self._tracks, times, self._eyes, self._baseline, options)
         if rays is None:
-            return [], "whether the tissue moves by itself cannot be told: too few points could be followed for long"
+            return None, "whether the tissue moves by itself cannot be told: too few points could be followed for long"
+        searched = rays.first(options.points)
         between, drift = options.shortest_breath, 1 + int(2 * length / options.shortest_breath)
         slowest = min(options.longest_breath, length / options.least_cycles)
         # What is slower than a heart is drift to it. A knock has many harmonics.
-        breath = self._motion(rays, between, slowest, options.least_pixels, options.least_explained)
-        fast = replace(rays, drift=drift, harmonics=4)
-        heart = self._motion(fast, options.shortest_beat, 0.8 * between, options.least_pixels / 20, options.least_explained / 2)
-        motions = [each for each in (breath, heart) if isinstance(each, TissueMotion)]
-        if motions:
-            parts = [f"{1e3 * each.amplitude:.1f} mm every {each.period:.2f} s (explains {each.explained:.0%})" for each in motions]
-            return motions, f"the tissue moves by itself: {' and '.join(parts)}, seen for {length:.0f} s; the model blurs what moves"
-        if breath:
+        breath = searched.search("breathing", 1, 1, between, slowest, options.least_pixels, options.least_explained)
+        heart = searched.search(
+            "heartbeat", drift, 4, options.shortest_beat, 0.8 * between, options.least_pixels / 20, options.least_explained / 2
+        )
+        seen = [each for each in (breath, heart) if isinstance(each, _Seen)]
+        if seen:
+            motion = rays.motion_of(seen, times[0])
+            parts = [f"{1e3 * each.amplitude:.1f} mm every {each.period:.2f} s (explains {each.explained:.0%})" for each in motion.parts]
+            return motion, f"the tissue moves by itself: {' and '.join(parts)}, seen for {length:.0f} s"
+        if isinstance(breath, float) and breath:
             text = f"in {length:.0f} s points move by {breath:.1f} pixels, by the tissue or faults of poses, without a period that is seen"
-            return [], f"{text} {options.least_cycles:g} times"
-        return [], f"no breath and no heartbeat seen in {length:.0f} s"
+            return None, f"{text} {options.least_cycles:g} times"
+        return None, f"no breath and no heartbeat seen in {length:.0f} s"
 
-    def _motion(self, rays: "_Rays", shortest: float, longest: float, least: float, share: float) -> TissueMotion | float:
-        """The motion with a period (s) in between; where there is none, by how many pixels points move anyhow, if that is enough, or 0.
 
-        Args:
-            rays: What is seen.
-            shortest, longest: Periods, s.
-            least: Pixels that it must explain.
-            share: Share that it must explain.
-        """
-        if longest <= shortest:
-            return 0.0
-        before = rays.left_over(None)
-        rates = np.linspace(1 / longest, 1 / shortest, max(int(3 * rays.times[-1] * (1 / shortest - 1 / longest)), 3))
-        power = np.array([_explained(before, rays.left_over(1 / rate)) for rate in rates])
-        peak = int(power.argmax())
-        if power[peak] < least:
-            return 0.0
-        if peak in (0, len(rates) - 1):  # what grows towards longer periods is drift
-            return float(power[peak])
-        gain = before - rays.left_over(1 / rates[peak])
-        most = gain >= np.quantile(gain, 0.8)  # a motion has its place
-        rate = _refined(lambda rate: -float(rays.left_over(1 / rate)[most].sum()), rates[peak], rates[1] - rates[0])
-        explained = 1 - float(rays.left_over(1 / rate)[most].sum() / before[most].sum())
-        if explained < share:
-            return float(power[peak])
-        return TissueMotion(float(1 / rate), rays.amplitude(1 / rate), explained, float(rays.times[-1] * rate))
+class _Seen(NamedTuple):
+    """A motion that the search found."""
+
+    name: str
+    rate: float  # Hz
+    harmonics: int
+    explained: float
 
 
 @dataclass(frozen=True)
@@ -170,23 +141,24 @@ class _Rays:
     """What is seen of N tracks: normal equations of each observation, in pixels."""
 
     times: np.ndarray  # [T] s
+    middles: np.ndarray  # [N, 3] m, world: what positions count from
     planes: np.ndarray  # [N, T, 3, 3], weighted sum of I − d dᵀ over the eyes; 0 where it is not seen
     sides: np.ndarray  # [N, T, 3], these times the lenses' positions
     squares: np.ndarray  # [N, T]
     counts: np.ndarray  # [N] observed coordinates
-    spans: np.ndarray  # [N] s that it was followed for
-    drift: int = 1  # terms of a cosine series that every point may follow
-    harmonics: int = 1  # of a motion
 
     @classmethod
     def of(cls, tracks: list[_Track], times: np.ndarray, eyes: list, baseline: float, options: MotionSearchConfig) -> "_Rays | None":
+        """Of the longest tracks, longest first; None of too few."""
         least = 2 * options.shortest_breath * options.rate
-        tracks = sorted((track for track in tracks if len(track.left) >= least), key=lambda track: -len(track.left))[: options.points]
+        tracks = sorted((track for track in tracks if len(track.left) >= least), key=lambda track: -len(track.left))[
+            : _TRACKS * options.points
+        ]
         if len(tracks) < 10:
             return None
         shape = len(tracks), len(times)
         planes, sides, squares = np.zeros((*shape, 3, 3)), np.zeros((*shape, 3)), np.zeros(shape)
-        counts, spans = np.zeros(len(tracks)), np.zeros(len(tracks))
+        counts, middles = np.zeros(len(tracks)), np.zeros((len(tracks), 3))
         for n, track in enumerate(tracks):
             numbers = range(track.first, track.first + len(track.left))
             seen = []
@@ -199,22 +171,32 @@ class _Rays:
             origins, directions, focal = (np.array(x) for x in list(zip(*seen))[1:])
             across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
             normal = across.sum(0) + 1e-6 * np.eye(3)
-            middle = np.linalg.solve(normal, np.einsum("kij,kj->i", across, origins))
-            weights = (focal / np.linalg.norm(middle - origins, axis=1).clip(1e-3)) ** 2
-            origins = origins - middle
+            middles[n] = np.linalg.solve(normal, np.einsum("kij,kj->i", across, origins))
+            weights = (focal / np.linalg.norm(middles[n] - origins, axis=1).clip(1e-3)) ** 2
+            origins = origins - middles[n]
             np.add.at(planes[n], each, weights[:, None, None] * across)
             against = np.einsum("kij,kj->ki", across, origins)
             np.add.at(sides[n], each, weights[:, None] * against)
             np.add.at(squares[n], each, weights * np.einsum("ki,ki->k", against, origins))
-            counts[n], spans[n] = 2 * len(seen), np.ptp(times[each])
-        return cls(times - times[0], planes, sides, squares, counts, spans)
+            counts[n] = 2 * len(seen)
+        return cls(times - times[0], middles, planes, sides, squares, counts)
 
-    def solved(self, period: float | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def first(self, count: int) -> "_Rays":
+        """Of the first tracks alone."""
+        return _Rays(self.times, *(x[:count] for x in (self.middles, self.planes, self.sides, self.squares, self.counts)))
+
+    def less(self, moved: np.ndarray) -> "_Rays":
+        """As if points had not moved by [N, T, 3], m."""
+        along = np.einsum("ntij,ntj->nti", self.planes, moved)
+        squares = self.squares + (moved * (along - 2 * self.sides)).sum(-1)
+        return replace(self, sides=self.sides - along, squares=squares)
+
+    def solved(self, rate: float | None, harmonics: int = 1, drift: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Coefficients of drift and motion of each point [N, 3 B], m, what the rays tell of them [N, 3 B, 3 B], 1/m², and the mean square
-        left over [N], pixels²."""
-        basis = np.cos(np.pi * np.outer(self.times / self.times[-1], np.arange(self.drift)))
-        if period is not None:
-            basis = np.concatenate([basis, _waves(self.times / period, self.harmonics)], 1)
+        left over [N], pixels². Drift is a cosine series of so many terms, which every point follows as it likes."""
+        basis = np.cos(np.pi * np.outer(self.times / self.times[-1], np.arange(drift)))
+        if rate is not None:
+            basis = np.concatenate([basis, waves(self.times * rate, harmonics)], 1)
         size = 3 * basis.shape[1]
         normal = np.einsum("ta,tb,ntij->naibj", basis, basis, self.planes, optimize=True).reshape(-1, size, size)
         side = np.einsum("ta,nti->nai", basis, self.sides).reshape(-1, size)
@@ -224,35 +206,89 @@ class _Rays:
         left = self.squares.sum(1) - 2 * (side * found).sum(1) + np.einsum("na,nab,nb->n", found, normal, found)
         return found, normal + loose, left.clip(0) / (self.counts - size).clip(1)
 
-    def left_over(self, period: float | None) -> np.ndarray:
-        """Mean square [N] that drift and a motion of this period leave over, pixels²."""
-        return self.solved(period)[2]
+    def search(self, name: str, drift: int, harmonics: int, shortest: float, longest: float, least: float, share: float) -> "_Seen | float":
+        """The motion with a period (s) in between; where there is none, by how many pixels points move anyhow, if that is enough, or 0.
 
-    def amplitude(self, period: float) -> float:
-        """How far the motion goes, m, where it goes farthest.
-
-        All points are taken to move alike, each by a share of its own: so each tells what its rays see of the way, and together they tell
-        all of it.
+        Args:
+            name: Of the motion.
+            drift: Terms of a cosine series that every point may follow besides.
+            harmonics: Of the motion.
+            shortest, longest: Periods, s.
+            least: Pixels that it must explain.
+            share: Share that it must explain.
         """
-        found, told, _ = self.solved(period)
-        n = 3 * self.drift
-        ways = found[:, n:]
-        told = told[:, n:, n:] - told[:, n:, :n] @ np.linalg.solve(told[:, :n, :n], told[:, :n, n:])
-        way, shares = np.median(ways, 0), np.ones(len(ways))
-        for _ in range(_ROUNDS):
-            seen = told @ way
-            shares = (seen * ways).sum(1) / (seen * way).sum(1).clip(1e-12)
-            weighted = shares[:, None, None] * told
-            way = np.linalg.solve((shares[:, None, None] * weighted).sum(0), np.einsum("nab,nb->a", weighted, ways))
-        certain = told @ way @ way
-        shares = np.abs(shares[certain >= np.median(certain)])
-        path = _waves(np.arange(_PHASES) / _PHASES, self.harmonics) @ way.reshape(-1, 3)
-        return float(np.quantile(shares, 0.95) * np.linalg.norm(path[:, None] - path, axis=-1).max())
+        if longest <= shortest:
+            return 0.0
+        left_over = lambda rate: self.solved(rate, harmonics, drift)[2]
+        before = left_over(None)
+        rates = np.linspace(1 / longest, 1 / shortest, max(int(3 * self.times[-1] * (1 / shortest - 1 / longest)), 3))
+        power = np.array([_explained(before, left_over(rate)) for rate in rates])
+        peak = int(power.argmax())
+        if power[peak] < least:
+            return 0.0
+        if peak in (0, len(rates) - 1):  # what grows towards longer periods is drift
+            return float(power[peak])
+        gain = before - left_over(rates[peak])
+        most = gain >= np.quantile(gain, 0.8)  # a motion has its place
+        rate = _refined(lambda rate: -float(left_over(rate)[most].sum()), rates[peak], rates[1] - rates[0])
+        explained = 1 - float(left_over(rate)[most].sum() / before[most].sum())
+        return _Seen(name, float(rate), harmonics, explained) if explained >= share else float(power[peak])
 
+    def fitted(self, rate: float, harmonics: int) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+        """A motion in which all points move alike, each by a share of its own.
 
-def _waves(phases: np.ndarray, harmonics: int) -> np.ndarray:
-    """Cosines and sines of so many harmonics at phases [T], in periods, [T, 2 H]."""
-    return np.stack([wave(2 * np.pi * k * phases) for k in range(1, harmonics + 1) for wave in (np.cos, np.sin)], 1)
+        So each tells what its rays see of the way, and together they tell all of it.
+
+        Args:
+            rate: About its rate, Hz.
+            harmonics: Of its way.
+
+        Returns:
+            Its rate, its way [2 H, 3] (m), the shares [N] and the points' means [N, 3], m from `middles`.
+        """
+        way, shares = np.zeros(0), np.ones(len(self.counts))
+        for _ in range(_TURNS):
+            found, told, left = self.solved(rate, harmonics)
+            free = told[:, 3:, 3:] - told[:, 3:, :3] @ np.linalg.solve(told[:, :3, :3], told[:, :3, 3:])
+            free = free / (left + np.median(left))[:, None, None]  # what slips tells less
+            if not len(way):
+                way = np.median(found[:, 3:], 0)
+            for _ in range(_ROUNDS):
+                seen = free @ way
+                shares = (seen * found[:, 3:]).sum(1) / (seen @ way).clip(1e-12)
+                weighted = shares[:, None, None] * free
+                way = np.linalg.solve(np.einsum("n,nab->ab", shares, weighted), np.einsum("nab,nb->a", weighted, found[:, 3:]))
+            rate = _refined(lambda rate: -self._left_together(rate, harmonics, shares, left), rate, 0.05 / self.times[-1])
+        means = (
+            found[:, :3] - np.linalg.solve(told[:, :3, :3], (told[:, :3, 3:] @ (shares[:, None] * way - found[:, 3:])[..., None]))[..., 0]
+        )
+        scale = np.quantile(np.abs(shares), 0.95) * np.sign(np.median(shares))
+        return rate, (scale * way).reshape(-1, 3), shares / scale, means
+
+    def _left_together(self, rate: float, harmonics: int, shares: np.ndarray, left: np.ndarray) -> float:
+        """Squares, less a constant, left over where points go shares [N] of the best way; each weighs less the more is `left` [N] of it."""
+        basis = waves(self.times * rate, harmonics)
+        weights = 1 / (left + np.median(left))
+        held = np.linalg.inv(self.planes.sum(1) + 1e-6 / _RIDGE**2 * np.eye(3))  # [N, 3, 3] of the means
+        cross = shares[:, None, None] * np.einsum("tk,ntij->nkij", basis, self.planes, optimize=True).reshape(len(shares), -1, 3)
+        side = shares[:, None] * np.einsum("tk,nti->nki", basis, self.sides).reshape(len(shares), -1)
+        alike = np.einsum("n,ntij->tij", weights * shares**2, self.planes)
+        normal = np.einsum("tk,tl,tij->kilj", basis, basis, alike, optimize=True).reshape(side.shape[1], -1)
+        normal = normal - np.einsum("n,nai,nij,nbj->ab", weights, cross, held, cross, optimize=True)
+        right = (weights[:, None] * (side - np.einsum("nai,nij,nj->na", cross, held, self.sides.sum(1), optimize=True))).sum(0)
+        return -float(right @ np.linalg.solve(normal, right))
+
+    def motion_of(self, seen: Sequence["_Seen"], start: float) -> TissueMotion:
+        """What was seen, with the ways of all points; phases are 0 at a time, s."""
+        moved = [np.zeros(self.sides.shape) for _ in seen]
+        for _ in range(_TURNS if len(seen) > 1 else 1):
+            parts = []
+            for index, each in enumerate(seen):
+                others = sum((m for i, m in enumerate(moved) if i != index), np.zeros(self.sides.shape))
+                rate, way, shares, means = self.less(others).fitted(each.rate, max(each.harmonics, _HARMONICS))
+                parts.append(PeriodicMotion(each.name, float(1 / rate), each.explained, float(self.times[-1] * rate), way, shares))
+                moved[index] = shares[:, None, None] * parts[-1].path(self.times)
+        return TissueMotion(start, self.middles + means, tuple(parts))
 
 
 def _ray(pixel: np.ndarray, pose: np.ndarray, K: np.ndarray) -> np.ndarray:

@@ -1,0 +1,183 @@
+"""How the tissue of a recording moves by itself, as it was found there."""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from scipy.spatial import KDTree
+
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.frames import Frame
+from endo_sim_ros.core.gaussians import GaussianModel
+
+_NEAR = 16  # points between which a place is interpolated: the noise of a share is a quarter
+_CELL = 8  # pixels, of a frame, between places whose way is interpolated: motion is smooth
+_FARTHEST = {"breathing": 0.5, "heartbeat": 0.25}  # phases, in `motion.py`
+_PHASES = 64  # places along a period at which a way is looked at
+
+
+@dataclass(frozen=True)
+class PeriodicMotion:
+    """A motion of tissue in which every place goes a share of one way.
+
+    Args:
+        name: breathing or heartbeat.
+        period: s.
+        explained: Share, 0 to 1, of what still points leave over that it explains, where it explains most.
+        cycles: Number of periods that were watched.
+        way: Coefficients [2 H, 3] of cosine and sine of each harmonic, m, world: of a place whose share is 1.
+        shares: Of the points [N].
+    """
+
+    name: str
+    period: float
+    explained: float
+    cycles: float
+    way: np.ndarray
+    shares: np.ndarray
+
+    def path(self, seconds: np.ndarray) -> np.ndarray:
+        """Where a place whose share is 1 is at times [T] (s) since the phase was 0, from its mean [T, 3], m."""
+        return waves(seconds / self.period, len(self.way) // 2) @ self.way
+
+    @property
+    def wave(self) -> tuple[np.ndarray, float]:
+        """Direction [3], world, of the way from where tissue rests longest, and the phase, 0 to 1, at which it is farthest from there."""
+        path = self.path(np.arange(_PHASES) * self.period / _PHASES)
+        direction = np.linalg.svd(path)[2][0]
+        along = path @ direction
+        if along.mean() > (along.max() + along.min()) / 2:
+            direction, along = -direction, -along
+        return direction, int(along.argmax()) / _PHASES
+
+    @property
+    def amplitude(self) -> float:
+        """How far tissue goes, there or back, m, where it goes farthest; nineteen of twenty points go less far."""
+        path = self.path(np.arange(_PHASES) * self.period / _PHASES)
+        return float(np.quantile(np.abs(self.shares), 0.95) * np.linalg.norm(path[:, None] - path, axis=-1).max())
+
+
+@dataclass(frozen=True)
+class TissueMotion:
+    """Where tissue is displaced to from its mean position, over time.
+
+    Args:
+        start: When phases are 0, s, by the stamps of the recording.
+        points: Mean positions [N, 3] of points that were followed, m, world.
+        parts: Breath, heart or both.
+    """
+
+    start: float
+    points: np.ndarray
+    parts: tuple[PeriodicMotion, ...]
+
+    @property
+    def end(self) -> float:
+        """Until when it was watched, s, by the stamps of the recording."""
+        return self.start + self.parts[0].cycles * self.parts[0].period
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """What physics calls a motion of all that is held: `motion.*` by name, as of the start of the recording."""
+        found = {}
+        for part in reversed(self.parts):  # breath says the direction
+            direction, farthest = part.wave
+            phase = (_FARTHEST[part.name] - farthest) % 1
+            found |= {part.name: part.amplitude, f"{part.name}_period": part.period, f"{part.name}_phase": phase}
+            found |= {f"direction_{axis}": float(value) for axis, value in zip("xyz", direction)}
+        return found
+
+    def shares(self, places: np.ndarray) -> np.ndarray:
+        """Of each part, those of places [M, 3] (m, world), mean positions: [M, parts]."""
+        return _interpolated(self.points, np.stack([part.shares for part in self.parts], 1), places)
+
+    def paths(self, stamp_ns: int) -> np.ndarray:
+        """Where places whose share is 1 are by each part at the time of a stamp (ns), from their mean [parts, 3], m."""
+        return np.concatenate([part.path(np.array([stamp_ns * 1e-9 - self.start])) for part in self.parts])
+
+
+class MovingModel:
+    """A model of tissue in its mean position that moves.
+
+    Args:
+        model: In the mean position.
+        motion: None moves nothing.
+    """
+
+    def __init__(self, model: GaussianModel, motion: TissueMotion | None):
+        self._model, self._motion = model, motion
+        self._shares = None if motion is None else motion.shares(model.means.cpu().numpy().astype(np.float64))
+
+    def at(self, stamp_ns: int) -> GaussianModel:
+        """The model at the time of a stamp (ns); Gaussians keep their shapes."""
+        if self._motion is None:
+            return self._model
+        means = self._model.means
+        return replace(self._model, means=means + means.new_tensor(self._shares @ self._motion.paths(stamp_ns)))
+
+
+def stilled(frame: Frame, motion: TissueMotion | None) -> Frame:
+    """The frame as if the tissue were in its mean position.
+
+    Images are warped by how points between which a pixel lies have moved. Highlights move with the tissue, and edges that hide other
+    tissue as far as the tissue there. What comes from beyond the picture is masked.
+    """
+    if motion is None:
+        return frame
+    moved = motion.points + motion.shares(motion.points) @ motion.paths(frame.stamp_ns)
+    warp = _warp(frame.camera, motion.points, moved)
+    if warp is None:
+        return frame
+    x, y, farther = warp
+    depth, mask = frame.depth, frame.mask
+    if depth is not None:
+        depth = cv2.remap(depth, x, y, cv2.INTER_NEAREST, borderValue=0)
+        depth = np.where(depth > 0, (depth - farther).clip(0), 0).astype(np.float32)
+    inside = (x > -0.5) & (x < frame.camera.width - 0.5) & (y > -0.5) & (y < frame.camera.height - 0.5)
+    if mask is not None:
+        mask = cv2.remap(mask, x, y, cv2.INTER_NEAREST, borderValue=0)
+    elif not inside.all():
+        mask = np.uint8(255) * inside
+    right = frame.right
+    if right is not None and frame.baseline is not None:
+        K = frame.camera.K if frame.right_K is None else frame.right_K
+        warp = _warp(replace(frame.camera, K=K).beside(frame.baseline), motion.points, moved)
+        right = right if warp is None else _looked_up(right, *warp[:2])
+    return replace(frame, image=_looked_up(frame.image, x, y), right=right, depth=depth, mask=mask)
+
+
+def waves(phases: np.ndarray, harmonics: int) -> np.ndarray:
+    """Cosines and sines of so many harmonics at phases [T], in periods, [T, 2 H]."""
+    return np.stack([wave(2 * np.pi * k * phases) for k in range(1, harmonics + 1) for wave in (np.cos, np.sin)], 1)
+
+
+def _looked_up(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _warp(camera: Camera, points: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Where what is at each pixel has moved to: columns and rows [H, W], pixels from the centre of the first, and how much farther, m.
+
+    None if the camera sees none of the points [N, 3], which have moved to [N, 3], m, world.
+    """
+    (uv, z), (there, far) = camera.project(points), camera.project(moved)
+    ahead = (z > 0) & (far > 0)
+    if not ahead.any():
+        return None
+    height, width = camera.height, camera.width
+    columns, rows = (np.arange(-(-size // _CELL)) * _CELL + _CELL / 2 for size in (width, height))
+    cells = np.stack(np.meshgrid(columns, rows), -1)
+    ways = np.concatenate([there - uv, (far - z)[:, None]], 1)[ahead]
+    ways = _interpolated(uv[ahead], ways, cells.reshape(-1, 2)).reshape(*cells.shape[:2], 3).astype(np.float32)
+    ways = cv2.resize(ways, (cells.shape[1] * _CELL, cells.shape[0] * _CELL), interpolation=cv2.INTER_CUBIC)[:height, :width]
+    x = np.arange(width, dtype=np.float32) + ways[..., 0]
+    y = np.arange(height, dtype=np.float32)[:, None] + ways[..., 1]
+    return x, y, ways[..., 2]
+
+
+def _interpolated(places: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Values [M, C] at others than the places [N, D] where they are known [N, C]: a mean of those near, which changes evenly."""
+    near = min(_NEAR, len(places))
+    distances, indices = (x.reshape(len(at), near) for x in KDTree(places).query(at, k=near))
+    weights = (1 - (distances / distances[:, -1:].clip(1e-12)) ** 2) ** 2 + 1e-3  # none leaves with a jump
+    return np.einsum("mk,mkc->mc", weights / weights.sum(1, keepdims=True), values[indices])

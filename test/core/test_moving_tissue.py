@@ -1,0 +1,95 @@
+"""Tissue that moves by itself is undone in frames and done to models, as far as it is known to move."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from lit_wall import CAMERA
+
+from endo_sim_ros.core.frames import Frame
+from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.core.motion import beat_share, breath_share
+from endo_sim_ros.core.tissue_motion import MovingModel, PeriodicMotion, TissueMotion, stilled, waves
+from endo_sim_ros.physics import MotionConfig
+
+FAR = np.array([0.004, -0.002, 0.006])  # metres, from the mean at phase 0
+DEPTH = 0.1
+POINTS = np.stack([*np.meshgrid(np.linspace(-0.06, 0.06, 13), np.linspace(-0.05, 0.05, 11)), np.full((11, 13), DEPTH)], -1).reshape(-1, 3)
+
+
+def breath(shares: np.ndarray) -> TissueMotion:
+    return TissueMotion(1.0, POINTS, (PeriodicMotion("breathing", 4.0, 1.0, 3.0, np.stack([FAR, 0 * FAR]), shares),))
+
+
+def wall_seen_from(camera, shift=(0.0, 0.0, 0.0)) -> tuple[np.ndarray, np.ndarray]:
+    """Smooth stripes on a wall that is displaced by so much."""
+    distance = DEPTH + shift[2] - camera.position[2]
+    x, y, _ = np.moveaxis(camera.rays() * distance + camera.position - np.array(shift), -1, 0)
+    image = 128 + 60 * np.stack([np.sin(400 * x), np.cos(350 * y), np.sin(250 * (x + y))], -1)
+    return image.round().astype(np.uint8), np.full(x.shape, distance, np.float32)
+
+
+def frame_at(seconds: float, shift: np.ndarray) -> Frame:
+    image, depth = wall_seen_from(CAMERA, shift)
+    right = wall_seen_from(CAMERA.beside(0.005), shift)[0]
+    return Frame(round(1e9 * (1.0 + seconds)), image, CAMERA, right=right, baseline=0.005, depth=depth)
+
+
+def test_frames_show_tissue_in_its_mean_position():
+    motion = breath(np.ones(len(POINTS)))
+    truth, right = wall_seen_from(CAMERA)[0], wall_seen_from(CAMERA.beside(0.005))[0]
+    inner = np.s_[20:-20, 20:-20]
+    for seconds, share in ((0.0, 1.0), (2.0, -1.0), (10.0, -1.0), (0.5, np.sqrt(0.5))):
+        frame = frame_at(seconds, share * FAR)
+        still = stilled(frame, motion)
+        assert np.abs(frame.image[inner].astype(int) - truth[inner]).max() > 60
+        assert np.abs(still.image[inner].astype(int) - truth[inner]).max() <= 4
+        assert np.abs(still.right[inner].astype(int) - right[inner]).max() <= 4
+        np.testing.assert_allclose(still.depth[inner], DEPTH, atol=1e-4)
+        shown = still.mask > 0  # the rest comes from beyond the picture
+        assert shown[inner].all() and not shown.all()
+        assert np.abs(still.image[shown].astype(int) - truth[shown]).max() <= 12
+
+
+def test_masks_follow_the_tissue_and_frames_without_points_stay():
+    motion = breath(np.ones(len(POINTS)))
+    mask = np.full((CAMERA.height, CAMERA.width), 255, np.uint8)
+    mask[:, :80] = 0
+    frame = dataclasses.replace(frame_at(0.0, FAR), mask=mask)
+    edge = int(np.argmax(stilled(frame, motion).mask[64] > 0))
+    assert abs(edge - (80 - 200 * FAR[0] / DEPTH)) <= 2
+    away = CAMERA.at(np.diag([1.0, -1.0, -1.0, 1.0]))
+    behind = dataclasses.replace(frame, camera=away)
+    assert stilled(behind, motion) is behind and stilled(frame, None) is frame
+
+
+def test_models_move_by_the_shares_of_the_points_near_them():
+    shares = np.where(POINTS[:, 0] > 0, 1.0, 0.0)
+    model = GaussianModel.from_points(
+        torch.tensor([[0.05, 0, DEPTH], [-0.05, 0, DEPTH], [0.3, 0, DEPTH]]).float(), torch.rand(3, 3), torch.full((3,), 0.001)
+    )
+    moved = MovingModel(model, breath(shares)).at(round(3e9)).means - model.means  # half a period after phase 0
+    np.testing.assert_allclose(moved, np.stack([-FAR, 0 * FAR, -FAR]), atol=1e-6)
+    assert MovingModel(model, None).at(0) is model
+
+
+@pytest.mark.parametrize("name, share, farthest", [("breathing", breath_share, 0.5), ("heartbeat", beat_share, 0.25)])
+@pytest.mark.parametrize("begun", [0.0, 0.3])
+def test_physics_takes_the_motion_as_it_was_at_the_start(name, share, farthest, begun):
+    period, direction = 1.25, FAR / np.linalg.norm(FAR)
+    phases = np.arange(400) / 400
+    along = np.array([share((phase + begun) * period, period) for phase in phases])
+    way = np.linalg.lstsq(waves(phases, 4), 0.004 * (along - along.mean())[:, None] * direction, rcond=None)[0]
+    found = TissueMotion(1.0, POINTS, (PeriodicMotion(name, period, 1.0, 3.0, way, np.ones(len(POINTS))),)).parameters
+    config = MotionConfig.from_mapping(found)
+    if name == "heartbeat":  # that of a breath is the same there and back
+        np.testing.assert_allclose(config.direction, direction, atol=1e-6)
+        assert abs((found["heartbeat_phase"] - begun + 0.5) % 1 - 0.5) < 0.02
+    else:
+        assert abs(abs(config.direction @ direction) - 1) < 1e-6
+    assert found[f"{name}_period"] == period and abs(found[name] / 0.004 - 1) < 0.1
+    played = lambda seconds: share(seconds + found[f"{name}_phase"] * period, period) * found[name] * np.array(config.direction)
+    first = played(0.0)
+    wanted = 0.004 * (along - along[0])[:, None] * direction
+    assert np.abs([played(phase * period) - first for phase in phases] - wanted).max() < 0.0006

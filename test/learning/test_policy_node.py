@@ -86,8 +86,7 @@ def user():
     "task, episodes, instrument, motion",
     [
         ("retraction", 2, True, MotionConfig()),
-        ("retraction", 1, False, MotionConfig(breathing=0.004, heartbeat=0.001)),
-        ("palpation", 1, True, MotionConfig()),
+        ("palpation", 1, False, MotionConfig(breathing=0.004, heartbeat=0.001)),
     ],
 )
 def test_over_topics_observations_images_and_actions_are_bit_for_bit_those_of_the_environment(

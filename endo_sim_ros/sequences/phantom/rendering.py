@@ -60,10 +60,12 @@ class Phantom:
         return (1 - b) * ((1 - a) * z[j, i] + a * z[j, i + 1]) + b * ((1 - a) * z[j + 1, i] + a * z[j + 1, i + 1])
 
 
-@functools.lru_cache(maxsize=4)
 def build_phantom(seed: int, sections: int = 1) -> Phantom:
     """The patient of a seed, with as many organs side by side; the last few are kept."""
-    return Phantom(seed, sections)
+    return _kept(seed, sections)
+
+
+_kept = functools.lru_cache(maxsize=4)(Phantom)
 
 
 def _slope(field: np.ndarray, axis: int) -> np.ndarray:

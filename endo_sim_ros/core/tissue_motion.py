@@ -10,7 +10,8 @@ from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.gaussians import GaussianModel
 
-_NEAR = 16  # points between which a place is interpolated: the noise of a share is a quarter
+_NEAR = 24  # points between which a place is interpolated: the noise of a share is a quarter
+_LEVEL = 0.1  # weight, of that of a point, of a slope of nothing between them, which counts where they lie in a row
 _CELL = 8  # pixels, of a frame, between places whose way is interpolated: motion is smooth
 _FARTHEST = {"breathing": 0.5, "heartbeat": 0.25}  # phases, in `motion.py`
 _PHASES = 64  # places along a period at which a way is looked at
@@ -129,10 +130,7 @@ def stilled(frame: Frame, motion: TissueMotion | None) -> Frame:
     if warp is None:
         return frame
     x, y, farther = warp
-    depth, mask = frame.depth, frame.mask
-    if depth is not None:
-        depth = cv2.remap(depth, x, y, cv2.INTER_NEAREST, borderValue=0)
-        depth = np.where(depth > 0, (depth - farther).clip(0), 0).astype(np.float32)
+    depth, mask = None if frame.depth is None else _depth_looked_up(frame.depth, x, y, farther), frame.mask
     inside = (x > -0.5) & (x < frame.camera.width - 0.5) & (y > -0.5) & (y < frame.camera.height - 0.5)
     if mask is not None:
         mask = cv2.remap(mask, x, y, cv2.INTER_NEAREST, borderValue=0)
@@ -146,6 +144,19 @@ def stilled(frame: Frame, motion: TissueMotion | None) -> Frame:
     return replace(frame, image=_looked_up(frame.image, x, y), right=right, depth=depth, mask=mask)
 
 
+def unstilled(
+    camera: Camera, depth: np.ndarray | None, mask: np.ndarray | None, stamp_ns: int, motion: TissueMotion
+) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Depth [H, W] (m, 0 = none) and mask [H, W] of tissue in its mean position as they were at the time of a stamp (ns)."""
+    moved = motion.points + motion.shares(motion.points) @ motion.paths(stamp_ns)
+    warp = _warp(camera, moved, motion.points)
+    if warp is None:
+        return depth, mask
+    x, y, _ = warp
+    mask = None if mask is None else cv2.remap(mask, x, y, cv2.INTER_NEAREST, borderValue=255)
+    return None if depth is None else _depth_looked_up(depth, *warp), mask
+
+
 def waves(phases: np.ndarray, harmonics: int) -> np.ndarray:
     """Cosines and sines of so many harmonics at phases [T], in periods, [T, 2 H]."""
     return np.stack([wave(2 * np.pi * k * phases) for k in range(1, harmonics + 1) for wave in (np.cos, np.sin)], 1)
@@ -153,6 +164,11 @@ def waves(phases: np.ndarray, harmonics: int) -> np.ndarray:
 
 def _looked_up(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _depth_looked_up(depth: np.ndarray, x: np.ndarray, y: np.ndarray, farther: np.ndarray) -> np.ndarray:
+    depth = cv2.remap(depth, x, y, cv2.INTER_NEAREST, borderValue=0)
+    return np.where(depth > 0, (depth - farther).clip(0), 0).astype(np.float32)
 
 
 def _warp(camera: Camera, points: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
@@ -176,8 +192,14 @@ def _warp(camera: Camera, points: np.ndarray, moved: np.ndarray) -> tuple[np.nda
 
 
 def _interpolated(places: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Values [M, C] at others than the places [N, D] where they are known [N, C]: a mean of those near, which changes evenly."""
-    near = min(_NEAR, len(places))
+    """Values [M, C] at others than the places [N, D] where they are known [N, C]: linear in what is near, and never beyond it."""
+    near, size = min(_NEAR, len(places)), places.shape[1] + 1
     distances, indices = (x.reshape(len(at), near) for x in KDTree(places).query(at, k=near))
-    weights = (1 - (distances / distances[:, -1:].clip(1e-12)) ** 2) ** 2 + 1e-3  # none leaves with a jump
-    return np.einsum("mk,mkc->mc", weights / weights.sum(1, keepdims=True), values[indices])
+    reach = distances[:, -1:].clip(1e-12)
+    weights = (1 - (distances / reach) ** 2) ** 2 + 1e-3  # none leaves with a jump
+    apart = np.concatenate([np.ones((len(at), near, 1)), (places[indices] - at[:, None]) / reach[..., None]], -1)
+    weighted = weights[..., None] * apart
+    normal = weighted.swapaxes(1, 2) @ apart + np.diag(np.r_[0.0, np.full(size - 1, _LEVEL)])
+    known = values[indices]
+    found = np.linalg.solve(normal, weighted.swapaxes(1, 2) @ known)[:, 0]
+    return found.clip(known.min(1), known.max(1))

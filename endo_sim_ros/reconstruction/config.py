@@ -129,7 +129,8 @@ class ReconstructionConfig(StageConfig):
     """network: folder of a checkpoint of Depth-Anything-V2 or another depth network (transformers), or ONNX file; nothing is ever
     downloaded. Empty: the Depth-Anything-V2 that Hugging Face's cache holds."""
     watch_motion: bool = True
-    """`endo-sim reconstruct` looks for tissue that moves periodically by itself, and says so."""
+    """Look for tissue that moves periodically by itself, say so, and reconstruct it in its mean position (`endo-sim reconstruct` and
+    `evaluate`)."""
     plane_sweep: bool = True
     """Believe depth that is interpolated close to scene points alone; elsewhere match the views plane by plane."""
     multi_view_refinement: bool = True

@@ -20,6 +20,7 @@ class DeviceView:
     image: Tensor  # [H, W, 3] in [0, 1]
     prior: Tensor | None  # [H, W] depth prior, m, 0 = none
     mask: Tensor | None  # [H, W] 1 = tissue; None = all of it
+    path: Tensor | None  # [parts, 3] m
     index: int  # among the training views
     index_tensor: Tensor  # [1] the same
 
@@ -27,12 +28,13 @@ class DeviceView:
     def of(cls, view: TrainingView, index: int, device: str) -> "DeviceView":
         """A view on a device."""
         tensor = lambda array: torch.tensor(array, dtype=torch.float32, device=device)
-        tissue, prior = view.tissue, view.depth_prior
+        tissue, prior, path = view.tissue, view.depth_prior, view.path
         return cls(
             view.camera,
             tensor(view.image) / 255,
             None if prior is None else tensor(prior),
             None if tissue.all() else tensor(tissue),
+            None if path is None else tensor(path),
             index,
             torch.tensor([index], device=device),
         )

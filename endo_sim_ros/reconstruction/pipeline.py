@@ -16,7 +16,7 @@ from endo_sim_ros.core.config import unused_options
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
-from endo_sim_ros.core.tissue_motion import TissueMotion, stilled
+from endo_sim_ros.core.tissue_motion import TissueMotion, stilled, unstilled
 from endo_sim_ros.reconstruction import photometry
 from endo_sim_ros.reconstruction.capacity_trial import choose_capacity
 from endo_sim_ros.reconstruction.config import ReconstructionConfig
@@ -60,7 +60,11 @@ def prepare(
         SequenceError: If there are no views, all pixels are masked or white, or scene points that are given are not finite.
         Cancelled: If the callback raised it.
     """
-    scene = PreparedScene(tuple(stilled(frame, motion) for frame in frames), motion=motion)
+    scene, recorded = PreparedScene(tuple(frames), motion=motion), {}
+    if motion is not None:
+        alone = {"right": None, "baseline": None, "right_K": None, "depth": None}
+        recorded = {frame.stamp_ns: shrink(replace(frame, **alone), config.image_width) for frame in scene.frames}
+        scene = replace(scene, frames=tuple(stilled(frame, motion) for frame in scene.frames))
     if not scene.frames:
         raise SequenceError("there are no views to reconstruct from; check the image, camera_info and pose topics")
     if points is not None:
@@ -71,7 +75,18 @@ def prepare(
         progress = StageProgress(name, on_progress)
         progress.check()
         handed_over.append(stage(handed_over.pop(), config, progress))
-    return handed_over.pop()
+    scene = handed_over.pop()
+    if motion is None:
+        return scene
+    return replace(scene, views=tuple(at_their_time(view, recorded[view.stamp_ns], motion) for view in scene.views))
+
+
+def at_their_time(view: TrainingView, recorded: Frame, motion: TissueMotion) -> TrainingView:
+    """A view of tissue in its mean position with the image that was recorded, and depth prior and mask as they were then."""
+    prior, mask = unstilled(view.camera, view.depth_prior, view.mask, view.stamp_ns, motion)
+    if mask is not None and recorded.mask is not None:
+        mask = np.minimum(mask, recorded.mask)
+    return replace(view, image=recorded.image, depth_prior=prior, mask=mask, path=motion.paths(view.stamp_ns))
 
 
 def reconstruct(

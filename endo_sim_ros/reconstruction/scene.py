@@ -75,9 +75,11 @@ class TrainingView(Frame):
 
     Args:
         depth_prior: Depth along the optical axis [H, W], float32, metres; 0 = none; None = none anywhere.
+        path: Where tissue whose share of each motion is 1 is, from its mean position [parts, 3], m; None = all is there.
     """
 
     depth_prior: np.ndarray | None = None
+    path: np.ndarray | None = None
 
     @property
     def surface(self) -> np.ndarray:
@@ -99,7 +101,7 @@ class PreparedScene:
         views: The same as they are trained on: shrunk, with depth prior, rectified right image and mask of what is still.
         points: Scene points; none before they are found.
         given_points: Whether the caller gave them.
-        motion: How the tissue moves by itself; frames and model have it in its mean position.
+        motion: How the tissue moves by itself. Frames and model have it in its mean position; views, at last, where it was.
         matches: Features that the frames share.
         depth_source: Where the depth prior is from: topic, stereo, network, points or none.
         model: Gaussians to start from; none before they are placed.

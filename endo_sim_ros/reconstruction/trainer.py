@@ -45,6 +45,7 @@ class _Inputs(NamedTuple):
     mask: Tensor | None  # [H, W]
     prior: Tensor | None  # [H, W] m
     rays: Tensor | None  # [3, H, W], for the light
+    path: Tensor | None  # [parts, 3] m, of the tissue that moves by itself
     virtual_prior: Tensor | None  # [H, W] depth prior as the virtual camera sees it
 
 
@@ -93,6 +94,9 @@ class Trainer:
         self._lobes = lobes(config.gloss)
         self._strategy = STRATEGIES[config.densification](options, scene.max_gaussians, self._unit)
         self.appearance = Appearance(scene.light, scene.exposures, scene.depth, config, self.device)
+        means = scene.model.means.numpy().astype(np.float64)
+        shares = np.zeros((len(means), 0)) if self.motion is None else self.motion.shares(means)
+        self._shares = torch.tensor(shares, dtype=torch.float32, device=self.device)  # [N, parts] of the Gaussians, in the motions
         self._set_model(scene.model.to(self.device))
 
     # ------------------------------------------------------------------ state
@@ -127,7 +131,7 @@ class Trainer:
         """Mean photometric loss of the training views at pixels [H, W] (bool) of each, such as their masks leave out."""
         total, count = 0.0, 0
         for view, chosen in zip(self._device_views, pixels, strict=True):
-            output = self.render(*matrices([view.camera], self.device), (view.camera.width, view.camera.height))[1]
+            output = self.render(*matrices([view.camera], self.device), (view.camera.width, view.camera.height), path=view.path)[1]
             rays = directions(view.camera, self.device) if self.config.light else None
             color = self._exposed(output, rays, view.index_tensor)
             where = torch.tensor(chosen, device=self.device)
@@ -148,6 +152,7 @@ class Trainer:
             "model": self._detached().tensors(),
             "optimizer": self.optimizer.state,
             "strategy": self._strategy_state,
+            "shares": self._shares,
             "seen": self._seen,  # by where Gaussians were when their number last changed
             "light": {name: value.detach() for name, value in self.appearance.tensors.items()},
             "light_optimizer": self.appearance.optimizer.state,
@@ -177,11 +182,14 @@ class Trainer:
                 raise ValueError("its light is not that of these views")
             if shapes(state["strategy"]) != shapes(self._strategy.initialize_state(len(state["model"]["means"]), "meta")):
                 raise ValueError("the state of the strategy does not fit the model")
+            if state["shares"].shape[1:] != self._shares.shape[1:]:
+                raise ValueError("its tissue moves otherwise")
             generator = torch.Generator()
             generator.set_state(state["generator"].cpu())
             noise = generator if self.device == "cpu" else torch.Generator(self.device)
             if noise is not generator:
                 noise.set_state(state["noise"].cpu())
+            self._shares = state["shares"]
             self._set_model(GaussianModel(**state["model"]))  # what is refused was so before: a training goes on as it was
             self.optimizer.state, self._strategy_state, self._seen = state["optimizer"], state["strategy"], state["seen"]
             self.appearance.set(**state["light"])
@@ -202,7 +210,8 @@ class Trainer:
     def _fitted_light(self) -> tuple[Light | None, np.ndarray]:
         """The light and what it leaves of the views' exposures [V, 3]."""
         if self._fitted is None or self._fitted[0] != self.iteration:
-            look = lambda view: self.render(*matrices([view.camera], self.device), (view.camera.width, view.camera.height))[1]
+            size = lambda camera: (camera.width, camera.height)
+            look = lambda view: self.render(*matrices([view.camera], self.device), size(view.camera), path=view.path)[1]
             self._fitted = self.iteration, *self.appearance.fitted(self._device_views, look)
         return self._fitted[1:]
 
@@ -290,7 +299,7 @@ class Trainer:
         if virtual is not None and view.prior is not None and any(term.of_virtual and term.needs_prior for term in terms):
             virtual_prior = reprojected_prior(view.prior, view.camera, viewmats[1])
         rays = directions(view.camera, self.device) if self.config.light else None
-        return _Inputs(viewmats, Ks, view.image, view.index_tensor, view.mask, view.prior, rays, virtual_prior)
+        return _Inputs(viewmats, Ks, view.image, view.index_tensor, view.mask, view.prior, rays, view.path, virtual_prior)
 
     def _descend(self, terms: tuple[losses.Term, ...], inputs: _Inputs) -> Tensor:
         """One step of the optimisers, and the loss before it; on a GPU replayed as one piece."""
@@ -313,7 +322,7 @@ class Trainer:
         masks = None
         if view.mask is not None:
             masks = torch.stack([view.mask > 0, *[torch.ones_like(view.mask, dtype=torch.bool)] * (cameras - 1)])
-        loss = self._loss(terms, view, *self.render(view.viewmats, view.Ks, (width, height), masks, absgrad, self._kept))
+        loss = self._loss(terms, view, *self.render(view.viewmats, view.Ks, (width, height), masks, absgrad, self._kept, view.path))
         gradients = dict(zip(wanted, torch.autograd.grad(loss, list(wanted.values()))))
         if absgrad is not None:
             across, down = gradients["absgrad"][0].unbind(1)
@@ -336,9 +345,12 @@ class Trainer:
         masks: Tensor | None = None,
         absgrad: Tensor | None = None,
         kept: Tensor | None = None,
+        path: Tensor | None = None,
     ) -> tuple[GaussianModel, RenderOutput]:
-        """The model, and its images of cameras, width × height pixels; ``kept`` are factors on its opacities."""
+        """The model, and its images of cameras, width × height pixels; ``kept`` are factors on its opacities; None as ``path``: at rest."""
         model = model_of(self.parameters)
+        if path is not None:
+            model = dataclasses.replace(model, means=self._moved(model.means, path))
         opacities = model.opacities if kept is None else model.opacities * kept
         sh = model.sh[:, : self._sh_count]
         if model.gloss is not None:  # in the first camera; nobody looks at the colours of a virtual one
@@ -385,13 +397,19 @@ class Trainer:
         """Which Gaussians lie where some training view shows tissue [N], 1.0 or 0.0."""
         seen = torch.zeros(len(means), dtype=torch.bool, device=means.device)
         for view in self._device_views:
-            seen |= shown(view, means)
+            seen |= shown(view, self._moved(means, view.path))
         return seen.float()
+
+    def _moved(self, means: Tensor, path: Tensor | None) -> Tensor:
+        """Where Gaussians whose mean positions are these [N, 3] are, m, when places whose shares are 1 have moved so [parts, 3], m."""
+        # Without a matrix product: libraries give other last bits with other numbers of threads.
+        return means if path is None else means + (self._shares[..., None] * path).sum(1)
 
     def refine(self) -> None:
         """Add, move and remove Gaussians, keeping the optimiser's state of those that stay."""
         model, source, fresh = self._strategy.refine(self._detached(), self._strategy_state, self._generator, self.iteration)
         states = self.optimizer.state
+        self._shares = self._shares[source]
         self._set_model(model)
         for name, state in states.items():
             moved = {key: value[source] if value.ndim else value for key, value in state.items()}

@@ -5,11 +5,16 @@ import dataclasses
 import cv2
 import numpy as np
 import pytest
+import torch
 from lit_wall import CAMERA
+from short_training import options
 
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.motion import beat_share, breath_share
-from endo_sim_ros.core.tissue_motion import TissueMotion
+from endo_sim_ros.core.tissue_motion import MovingModel, TissueMotion
+from endo_sim_ros.evaluation.held_out import model_renderer
+from endo_sim_ros.evaluation.metrics import psnr
+from endo_sim_ros.reconstruction import Trainer, prepare
 from endo_sim_ros.reconstruction.motion_watch import MotionWatch
 
 DEPTH, BASELINE, RATE = 0.1, 0.005, 12.5  # m, m, Hz
@@ -89,6 +94,33 @@ def test_breath_and_heart_have_their_periods_amplitudes_and_ways(breathing):
     assert np.quantile(off, 0.9) < 0.0006
     means = displaced(*motion.points[:, :2].T, np.mean([way(k / RATE, 0.008, 0.003) for k in range(len(breathing))], 0))
     assert np.median(np.abs(motion.points[:, 2] - DEPTH - means[:, 2])) < 0.0005
+
+
+@pytest.mark.slow
+def test_a_model_of_moving_tissue_is_sharp_at_all_times(breathing):
+    motion = watched(breathing)[0]
+    config = options(iterations=80, max_gaussians=3000, depth="stereo", extrapolation=0.0)
+    views, others = [breathing[3], breathing[28]], breathing[10:90:20]  # different phases
+
+    def quality(motion):
+        trainer = Trainer(prepare(views, config, motion=motion), config)
+        moving = MovingModel(trainer.run(), motion)
+        drawn = [model_renderer(moving.at(frame.stamp_ns), "cpu").render(frame.camera)[0] for frame in others]
+        return np.mean([psnr(image, frame.image) for image, frame in zip(drawn, others)])
+
+    assert quality(motion) > quality(None) + 3
+
+
+@pytest.mark.slow
+def test_a_training_of_moving_tissue_goes_on_as_if_never_interrupted(breathing, tmp_path):
+    motion, config = watched(breathing)[0], options(iterations=60, max_gaussians=600, refine_every=10, depth="stereo", extrapolation=0.0)
+    first, second = (Trainer(prepare(breathing[3:30:25], config, motion=motion), config) for _ in range(2))
+    for _ in range(35):
+        first.step()
+    first.save_checkpoint(tmp_path / "checkpoint.pt")
+    second.load_checkpoint(tmp_path / "checkpoint.pt")
+    pairs = zip(first.run().tensors().values(), second.run().tensors().values())
+    assert all(torch.equal(a, b) for a, b in pairs)
 
 
 @pytest.mark.slow

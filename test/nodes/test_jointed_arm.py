@@ -167,7 +167,7 @@ def test_each_of_many_changes_at_once_counts(graph):
     first = joints_of(graph)
     for _ in range(150):
         send_joints(graph, messages.tool_joint_change, [0.0005, 0, 0, 0, 0, 0])
-    graph.until(lambda: np.isclose(joints_of(graph)[0], first[0] + 0.075, atol=1e-9), "all changes", 5)
+    graph.until(lambda: np.isclose(joints_of(graph)[0], first[0] + 0.075, atol=1e-9), "all changes")
 
 
 def test_the_newest_change_during_a_pause_acts_after_it(graph):

@@ -34,7 +34,8 @@ def test_scripted_tool_waits_then_pulls_and_lets_go(bench, physics, rendering):
     jaws = np.mean([pose[:3, 3] for link, pose in arm.links().items() if link.startswith("jaw")], 0)
     ahead = arm.pose[:3, 2]  # from the hinge to the points of the jaws
     assert 0.004 < (hold - jaws) @ ahead < 0.016  # what it holds lies between the jaws, not at their hinge
-    assert 0.3 < np.linalg.norm(simulation.reaction("PSM1")[0]) < 2.0
+    # A loaded machine lags behind the tool, which pulls harder until it has caught up.
+    bench.until(lambda: 0.3 < np.linalg.norm(simulation.reaction("PSM1")[0]) < 2.0, "a reaction about as large as the force")
     bench.status("scripted_tool", "finished", OK)
     assert np.linalg.norm(tool.grasped - [0, 0, 0.1]) < 0.01
     bench.until(lambda: moved(bench) < 1e-4, "the tissue to be released")

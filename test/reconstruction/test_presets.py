@@ -124,18 +124,18 @@ def test_out_of_memory_goes_on_at_half_the_size(views, monkeypatch, caplog):
     trainer = trainer_of(views[::4], options())
     draw, widths = trainer.render, []
 
-    def short_of_memory(viewmats, Ks, size, *arguments):
+    def short_of_memory(viewmats, Ks, size, *arguments, **named):
         widths.append(size[0])
         if size[0] > 80:
             raise torch.OutOfMemoryError("CUDA out of memory")
-        return draw(viewmats, Ks, size, *arguments)
+        return draw(viewmats, Ks, size, *arguments, **named)
 
     monkeypatch.setattr(trainer, "render", short_of_memory)
     assert finite(trainer.run()) and trainer.iteration == 12
     assert widths[:2] == [160, 80] and trainer.cameras[0].width == 80
     assert "80 pixels wide" in caplog.text
     tiny = trainer_of([shrink(view, 80) for view in views[::4]], options())
-    monkeypatch.setattr(tiny, "render", lambda *_: (_ for _ in ()).throw(torch.OutOfMemoryError("CUDA out of memory")))
+    monkeypatch.setattr(tiny, "render", lambda *_, **__: (_ for _ in ()).throw(torch.OutOfMemoryError("CUDA out of memory")))
     with pytest.raises(torch.OutOfMemoryError):
         tiny.run()
 

@@ -114,9 +114,9 @@ class MotionWatch:
         slowest = min(options.longest_breath, length / options.least_cycles)
         # What is slower than a heart is drift to it. A knock has many harmonics.
         breath = searched.search("breathing", 1, 1, between, slowest, options.least_pixels, options.least_explained)
-        heart = searched.search(
-            "heartbeat", drift, 4, options.shortest_beat, 0.8 * between, options.least_pixels / 20, options.least_explained / 2
-        )
+        unclear = isinstance(breath, float) and breath > 0  # and may look like a heart
+        share = options.least_explained / (1 if unclear else 2)
+        heart = searched.search("heartbeat", drift, 4, options.shortest_beat, 0.8 * between, options.least_pixels / 20, share)
         seen = [each for each in (breath, heart) if isinstance(each, _Seen)]
         if seen:
             motion = rays.motion_of(seen, times[0])
@@ -133,6 +133,7 @@ class _Seen(NamedTuple):
 
     name: str
     rate: float  # Hz
+    drift: int
     harmonics: int
     explained: float
 
@@ -195,17 +196,25 @@ class _Rays:
     def solved(self, rate: float | None, harmonics: int = 1, drift: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Coefficients of drift and motion of each point [N, 3 B], m, what the rays tell of them [N, 3 B, 3 B], 1/m², and the mean square
         left over [N], pixels². Drift is a cosine series of so many terms, which every point follows as it likes."""
-        basis = np.cos(np.pi * np.outer(self.times / self.times[-1], np.arange(drift)))
+        basis = self._slow(drift)
         if rate is not None:
             basis = np.concatenate([basis, waves(self.times * rate, harmonics)], 1)
         size = 3 * basis.shape[1]
         normal = np.einsum("ta,tb,ntij->naibj", basis, basis, self.planes, optimize=True).reshape(-1, size, size)
         side = np.einsum("ta,nti->nai", basis, self.sides).reshape(-1, size)
-        # A motion along the only ray to a point is not seen; it is taken to be none.
-        loose = np.diag(np.r_[np.full(3, 1e-6), np.full(size - 3, 1.0)] / _RIDGE**2)
+        loose = np.diag(self._loose(drift, basis.shape[1] - drift))
         found = np.linalg.solve(normal + loose, side[..., None])[..., 0]
         left = self.squares.sum(1) - 2 * (side * found).sum(1) + np.einsum("na,nab,nb->n", found, normal, found)
         return found, normal + loose, left.clip(0) / (self.counts - size).clip(1)
+
+    def _slow(self, drift: int) -> np.ndarray:
+        """Cosine series of so many terms [T, D], the first of which is one."""
+        return np.cos(np.pi * np.outer(self.times / self.times[-1], np.arange(drift)))
+
+    def _loose(self, drift: int, others: int) -> np.ndarray:
+        """What is known of the coefficients of so many terms before anything is seen [3 · terms], 1/m²."""
+        # A motion along the only ray to a point is not seen; it is taken to be none.
+        return np.r_[np.full(3, 1e-6), np.full(3 * (drift + others - 1), 1.0)] / _RIDGE**2
 
     def search(self, name: str, drift: int, harmonics: int, shortest: float, longest: float, least: float, share: float) -> "_Seen | float":
         """The motion with a period (s) in between; where there is none, by how many pixels points move anyhow, if that is enough, or 0.
@@ -233,9 +242,9 @@ class _Rays:
         most = gain >= np.quantile(gain, 0.8)  # a motion has its place
         rate = _refined(lambda rate: -float(left_over(rate)[most].sum()), rates[peak], rates[1] - rates[0])
         explained = 1 - float(left_over(rate)[most].sum() / before[most].sum())
-        return _Seen(name, float(rate), harmonics, explained) if explained >= share else float(power[peak])
+        return _Seen(name, float(rate), drift, harmonics, explained) if explained >= share else float(power[peak])
 
-    def fitted(self, rate: float, harmonics: int) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+    def fitted(self, rate: float, harmonics: int, drift: int) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
         """A motion in which all points move alike, each by a share of its own.
 
         So each tells what its rays see of the way, and together they tell all of it.
@@ -243,40 +252,44 @@ class _Rays:
         Args:
             rate: About its rate, Hz.
             harmonics: Of its way.
+            drift: Terms of a cosine series that every point may follow besides.
 
         Returns:
             Its rate, its way [2 H, 3] (m), the shares [N] and the points' means [N, 3], m from `middles`.
         """
-        way, shares = np.zeros(0), np.ones(len(self.counts))
+        way, shares, n = np.zeros(0), np.ones(len(self.counts)), 3 * drift
         for _ in range(_TURNS):
-            found, told, left = self.solved(rate, harmonics)
-            free = told[:, 3:, 3:] - told[:, 3:, :3] @ np.linalg.solve(told[:, :3, :3], told[:, :3, 3:])
+            found, told, left = self.solved(rate, harmonics, drift)
+            free = told[:, n:, n:] - told[:, n:, :n] @ np.linalg.solve(told[:, :n, :n], told[:, :n, n:])
             free = free / (left + np.median(left))[:, None, None]  # what slips tells less
             if not len(way):
-                way = np.median(found[:, 3:], 0)
+                way = np.median(found[:, n:], 0)
             for _ in range(_ROUNDS):
                 seen = free @ way
-                shares = (seen * found[:, 3:]).sum(1) / (seen @ way).clip(1e-12)
+                shares = (seen * found[:, n:]).sum(1) / (seen @ way).clip(1e-12)
                 weighted = shares[:, None, None] * free
-                way = np.linalg.solve(np.einsum("n,nab->ab", shares, weighted), np.einsum("nab,nb->a", weighted, found[:, 3:]))
-            rate = _refined(lambda rate: -self._left_together(rate, harmonics, shares, left), rate, 0.05 / self.times[-1])
-        means = (
-            found[:, :3] - np.linalg.solve(told[:, :3, :3], (told[:, :3, 3:] @ (shares[:, None] * way - found[:, 3:])[..., None]))[..., 0]
-        )
+                way = np.linalg.solve(np.einsum("n,nab->ab", shares, weighted), np.einsum("nab,nb->a", weighted, found[:, n:]))
+            rate = _refined(lambda rate: -self._left_together(rate, harmonics, drift, shares, left), rate, 0.05 / self.times[-1])
+        others = told[:, :n, n:] @ (shares[:, None] * way - found[:, n:])[..., None]
+        means = (found[:, :n] - np.linalg.solve(told[:, :n, :n], others)[..., 0])[:, :3]
         scale = np.quantile(np.abs(shares), 0.95) * (1 if np.median(shares) >= 0 else -1)
         return rate, (scale * way).reshape(-1, 3), (shares / scale).clip(-_MOST, _MOST), means
 
-    def _left_together(self, rate: float, harmonics: int, shares: np.ndarray, left: np.ndarray) -> float:
+    def _left_together(self, rate: float, harmonics: int, drift: int, shares: np.ndarray, left: np.ndarray) -> float:
         """Squares, less a constant, left over where points go shares [N] of the best way; each weighs less the more is `left` [N] of it."""
         basis = waves(self.times * rate, harmonics)
         weights = 1 / (left + np.median(left))
-        held = np.linalg.inv(self.planes.sum(1) + 1e-6 / _RIDGE**2 * np.eye(3))  # [N, 3, 3] of the means
-        cross = shares[:, None, None] * np.einsum("tk,ntij->nkij", basis, self.planes, optimize=True).reshape(len(shares), -1, 3)
+        slow, count = self._slow(drift), len(shares)
+        free = np.einsum("ta,tb,ntij->naibj", slow, slow, self.planes, optimize=True).reshape(count, 3 * drift, 3 * drift)
+        held = np.linalg.inv(free + np.diag(self._loose(drift, 0)))  # [N, 3 D, 3 D]
+        cross = np.einsum("tk,ta,ntij->nkiaj", basis, slow, self.planes, optimize=True).reshape(count, -1, 3 * drift)
+        cross = shares[:, None, None] * cross
+        theirs = np.einsum("ta,nti->nai", slow, self.sides).reshape(count, -1)
         side = shares[:, None] * np.einsum("tk,nti->nki", basis, self.sides).reshape(len(shares), -1)
         alike = np.einsum("n,ntij->tij", weights * shares**2, self.planes)
         normal = np.einsum("tk,tl,tij->kilj", basis, basis, alike, optimize=True).reshape(side.shape[1], -1)
         normal = normal - np.einsum("n,nai,nij,nbj->ab", weights, cross, held, cross, optimize=True)
-        right = (weights[:, None] * (side - np.einsum("nai,nij,nj->na", cross, held, self.sides.sum(1), optimize=True))).sum(0)
+        right = (weights[:, None] * (side - np.einsum("nai,nij,nj->na", cross, held, theirs, optimize=True))).sum(0)
         return -float(right @ np.linalg.solve(normal, right))
 
     def motion_of(self, seen: Sequence["_Seen"], start: float) -> TissueMotion:
@@ -286,7 +299,9 @@ class _Rays:
             parts = []
             for index, each in enumerate(seen):
                 others = sum((m for i, m in enumerate(moved) if i != index), np.zeros(self.sides.shape))
-                rate, way, shares, means = self.less(others).fitted(each.rate, max(each.harmonics, _HARMONICS))
+                rate, way, shares, means = self.less(others).fitted(
+                    each.rate, max(each.harmonics, _HARMONICS), each.drift if len(seen) == 1 else 1
+                )
                 parts.append(PeriodicMotion(each.name, float(1 / rate), each.explained, float(self.times[-1] * rate), way, shares))
                 moved[index] = shares[:, None, None] * parts[-1].path(self.times)
         return TissueMotion(start, self.middles + means, tuple(parts))

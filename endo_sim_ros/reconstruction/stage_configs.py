@@ -354,7 +354,7 @@ class MotionSearchConfig(StageConfig):
     least_cycles: Annotated[float, Range(1.0, 100.0)] = 2.0
     """Periods that must be seen; one alone may be anything that moves."""
     least_explained: Annotated[float, Range(0.0, 1.0)] = 0.6
-    """Share of what still points leave over that a breath must explain, and a heart half of it."""
+    """Share of what still points leave over that a breath must explain; a heart half of it, unless points move without a period, too."""
     least_pixels: Annotated[float, Range(0.0, 100.0, "pixels")] = 1.0
     """Root mean square that a breath must explain, in the images in which points are followed, where they drift by a third of a pixel; a
     heart a twentieth of it, as nothing else is so fast."""

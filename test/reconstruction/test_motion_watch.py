@@ -132,7 +132,7 @@ def test_one_lens_sees_the_breath(breathing):
 
 @pytest.mark.slow
 def test_one_breath_alone_is_no_period(breathing):
-    for count in (45, 60, 75):  # of 44 images each
+    for count in (45, 60, 75):  # images; a breath takes 44
         motion, text = watched(breathing[:count])
         assert "mm every 3" not in text
         if motion is not None:  # the heart, although the breath is beside it

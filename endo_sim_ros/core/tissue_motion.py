@@ -180,6 +180,7 @@ def _warp(camera: Camera, points: np.ndarray, moved: np.ndarray) -> tuple[np.nda
     ahead = (z > 0) & (far > 0)
     if not ahead.any():
         return None
+    ahead &= np.minimum(z, far) > 0.1 * np.median(z[ahead])  # what is close to the lens was followed wrongly
     height, width = camera.height, camera.width
     columns, rows = (np.arange(-(-size // _CELL)) * _CELL + _CELL / 2 for size in (width, height))
     cells = np.stack(np.meshgrid(columns, rows), -1)

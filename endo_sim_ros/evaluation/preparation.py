@@ -40,6 +40,7 @@ class Prepared(NamedTuple):
     right: dict[int, StoredFrame]  # the right images as views, for the split of that name
     depth_source: str  # where the reference depth of the frames is from: recorded, stereo matching, or none
     points: ScenePoints  # of structure from motion with all views, like the poses
+    still_points: ScenePoints  # the same of tissue in its mean position, where it moves
     motion: TissueMotion | None  # how the tissue moves by itself
     judging: np.ndarray | None  # [N, 3] m, world: points that judge depth and are kept from the methods; None: no judges
 
@@ -86,18 +87,21 @@ def prepare_sequence(cells: Sequence[Cell], bar: Progress, folder: Path) -> Prep
     if watch is not None:
         motion, text = watch.found()
         log.info("%s: %s", cells[0].sequence, text)
+        last = max(frame.stamp_ns for frame in stored.values())
+        if motion is not None and last > 1e9 * (motion.end + motion.parts[0].period):
+            log.warning("%s: it is left as it is, as only the first %.0f s were watched", cells[0].sequence, motion.end - motion.start)
+            motion = None
     task = bar.add_task(f"scene points of {cells[0].sequence}", total=None)
     known = opened.points() if isinstance(opened, Recording) else read_points(split_source(source)[0])  # else a bag
-    points = (
-        ScenePoints.recorded(*known)
-        if known
-        else scene_points([stilled(stored[number].load(), motion) for number in pointed], _POINT_VIEWS)
-    )
+    posed = lambda motion: scene_points([stilled(stored[number].load(), motion) for number in pointed], _POINT_VIEWS)
+    points = ScenePoints.recorded(*known) if known else posed(None)
+    still_points = points if known or motion is None else posed(motion)
     bar.remove_task(task)
     recorded = any(frame.depth and (frame.load().depth > 0).any() for frame in stored.values())
     judging = None
-    if not recorded:
+    if not recorded and motion is None:  # points of moving tissue judge nothing
         points, judging = divide_points(points)
+        still_points = points
     width = max(cell.options["image_width"] for cell in cells)
     small = lambda frame: shrink(dataclasses.replace(frame, right=None, baseline=None, right_K=None), width)
     numbers, right, matched = sorted(stored), {}, False
@@ -118,7 +122,7 @@ def prepare_sequence(cells: Sequence[Cell], bar: Progress, folder: Path) -> Prep
         bar.advance(task, len(some))
     bar.remove_task(task)
     depth_source = "recorded" if recorded else "stereo matching" if matched else "none"
-    return Prepared(count, stored, right, depth_source, points, motion, judging)
+    return Prepared(count, stored, right, depth_source, points, still_points, motion, judging)
 
 
 def _tissue(frames: Iterable[Frame], bar: Progress, text: str, expected: int) -> Iterator[Frame]:

@@ -179,7 +179,7 @@ def _train(
     else:
         motion = prepared.motion if config.watch_motion else None
         told = lambda stage, done, total: report((done, max(total, 1), stage))
-        trainer = Trainer(prepare(views, config, prepared.points, told, motion), config)
+        trainer = Trainer(prepare(views, config, prepared.points if motion is None else prepared.still_points, told, motion), config)
     iterations, moments = trainer.iterations, cell.curve
     # Quality changes fastest in the beginning.
     due = sorted({round(iterations * 50 ** (i / max(moments - 1, 1) - 1)) for i in range(moments)})

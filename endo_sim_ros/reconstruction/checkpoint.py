@@ -76,12 +76,19 @@ def _read_state(path: str | Path, device: str) -> dict[str, Any]:
         state = torch.load(path, map_location=device, weights_only=True)
     except pickle.UnpicklingError:  # whose text advises to load it all the same
         raise ValueError("it holds other objects than tensors and numbers") from None
-    written = {"config", "stamps", "iteration", "order", "generator", "noise", "model", "optimizer", "strategy", "seen", "shares"}
+    written = {"config", "stamps", "iteration", "order", "generator", "noise", "model", "optimizer", "strategy", "seen", "shares", "paths"}
     written |= {"light", "light_optimizer", "max_gaussians", "fading"}
     if set(state) != written:
         raise ValueError("another version made it; start anew")
     moments, lights = state["optimizer"], state["light_optimizer"]  # of each parameter, by its name
-    tensors = [*state["model"].values(), *state["light"].values(), *state["strategy"].values(), state["seen"], state["shares"]]
+    tensors = [
+        *state["model"].values(),
+        *state["light"].values(),
+        *state["strategy"].values(),
+        state["seen"],
+        state["shares"],
+        state["paths"],
+    ]
     tensors += [value for values in [*moments.values(), *lights.values()] for value in values.values()]
     if sum(tensor.numel() * tensor.element_size() for tensor in tensors) > size:  # views of less
         raise ValueError("it claims more than it holds")

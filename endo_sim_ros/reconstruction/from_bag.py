@@ -75,10 +75,10 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
             motion, text = watch.found()
             log.info(text)
             if motion is not None:
-                last = round(1e9 * motion.end)
-                views = [view for view in views if view.stamp_ns <= last]
+                watched = sum(view.stamp_ns <= 1e9 * motion.end + 1000 for view in views)
+                views, sample = survey(recording.take(range(watched), watched), POINT_VIEWS)
                 log.info("the model is of tissue in its mean position, from the %d views in which it was watched", len(views))
-                sample = [stilled(frame, motion) for frame in sample if frame.stamp_ns <= last]
+                sample = [stilled(frame, motion) for frame in sample]
         chosen, points = choose_views(views, sample, config, StageProgress("scene points", on_stage), given)
         del sample
         log.info("%d views, training on %d", len(views), len(chosen))

@@ -15,6 +15,8 @@ _RIDGE = 0.02  # metres: how far tissue moves; only what rays do not see of a mo
 _ROUNDS = 20  # of telling the way and the shares of it in turns
 _TURNS = 2  # of telling these and the rate in turns, and of breath and heart
 _HARMONICS = 3  # of a breath's way: people breathe out longer than in
+_BAND = 0.45  # of the rate of images: up to half of it rates are told apart
+_LEAST = 2e-4  # metres: less is noise
 _MOST = 1.5  # share, of that which nineteen of twenty points do not reach: few rays tell a share badly
 _TRACKS = 5  # times as many tracks as points are followed at a time tell the ways
 _LOOK: dict[str, Any] = dict(winSize=(15, 15), maxLevel=4)  # of optical flow
@@ -63,7 +65,7 @@ class MotionWatch:
         if self._times and seconds - self._times[-1] < 0.999 / self.options.rate:
             return
         scale = min(self.options.width / frame.camera.width, 1.0)
-        size = round(frame.camera.width * scale), round(frame.camera.height * scale)
+        size = max(round(frame.camera.width * scale), 1), max(round(frame.camera.height * scale), 1)
         gray = [None if image is None else cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
                 for image in (frame.image, frame.right)]  # fmt: skip
         image, right = gray
@@ -74,16 +76,18 @@ class MotionWatch:
         self._times.append(seconds)
         self._eyes.append((frame.camera.pose, fit @ frame.camera.K, fit @ right_K))
         self._baseline = frame.baseline or self._baseline
+        free = np.full(image.shape, 255, np.uint8) if frame.mask is None else cv2.resize(frame.mask, size, interpolation=cv2.INTER_NEAREST)
         if self._before is not None and self._before.shape != image.shape:
             self._ended, self._tracks = self._ended + self._tracks, []
         if self._before is not None and self._tracks:
             was = np.array([track.left[-1] for track in self._tracks], np.float32)
             now, good = _followed(self._before, image, was, was)
+            columns, rows = now.round().astype(int).clip(0, np.array(size) - 1).T
+            good &= free[rows, columns] > 0  # else an instrument may take them along
             self._ended += [track for track, kept in zip(self._tracks, good) if not kept]
             self._tracks = [track for track, kept in zip(self._tracks, good) if kept]
             for track, place in zip(self._tracks, now[good]):
                 track.left.append(place)
-        free = np.full(image.shape, 255, np.uint8) if frame.mask is None else cv2.resize(frame.mask, size, interpolation=cv2.INTER_NEAREST)
         for track in self._tracks:
             cv2.circle(free, (round(float(track.left[-1][0])), round(float(track.left[-1][1]))), _DISTANCE, 0, -1)
         wanted = self.options.points - len(self._tracks)
@@ -106,6 +110,9 @@ class MotionWatch:
         length = float(np.ptp(times)) if len(times) else 0.0
         if length < options.least_cycles * options.shortest_beat or len(times) < 10:
             return None, f"whether the tissue moves by itself cannot be told from {length:.1f} s"
+        lenses = np.array([pose[:3, 3] for pose, *_ in self._eyes])
+        if not self._baseline and np.ptp(lenses, axis=0).max() < options.least_travel:
+            return None, "whether the tissue moves by itself cannot be told: one lens that stays where it is sees no depth"
         rays = _Rays.of(self._ended + self._tracks, times, self._eyes, self._baseline, options)
         if rays is None:
             return None, "whether the tissue moves by itself cannot be told: too few points could be followed for long"
@@ -116,10 +123,19 @@ class MotionWatch:
         breath = searched.search("breathing", 1, 1, between, slowest, options.least_pixels, options.least_explained)
         unclear = isinstance(breath, float) and breath > 0  # and may look like a heart
         share = options.least_explained / (1 if unclear else 2)
+        if isinstance(breath, _Seen):
+            searched = searched.less(searched.moved(breath))
         heart = searched.search("heartbeat", drift, 4, options.shortest_beat, 0.8 * between, options.least_pixels / 20, share)
         seen = [each for each in (breath, heart) if isinstance(each, _Seen)]
         if seen:
             motion = rays.motion_of(seen, times[0])
+            parts = tuple(part for part in motion.parts if part.amplitude >= _LEAST)
+            if len(parts) < len(motion.parts):
+                seen = [each for each in seen if each.name in [part.name for part in parts]]
+                motion = rays.motion_of(seen, times[0]) if seen else None
+        else:
+            motion = None
+        if motion is not None:
             parts = [f"{1e3 * each.amplitude:.1f} mm every {each.period:.2f} s (explains {each.explained:.0%})" for each in motion.parts]
             return motion, f"the tissue moves by itself: {' and '.join(parts)}, seen for {length:.0f} s"
         if isinstance(breath, float) and breath:
@@ -160,7 +176,7 @@ class _Rays:
             return None
         shape = len(tracks), len(times)
         planes, sides, squares = np.zeros((*shape, 3, 3)), np.zeros((*shape, 3)), np.zeros(shape)
-        counts, middles = np.zeros(len(tracks)), np.zeros((len(tracks), 3))
+        counts, middles, ahead = np.zeros(len(tracks)), np.zeros((len(tracks), 3)), np.zeros(len(tracks), bool)
         for n, track in enumerate(tracks):
             numbers = range(track.first, track.first + len(track.left))
             seen = []
@@ -175,13 +191,15 @@ class _Rays:
             normal = across.sum(0) + 1e-6 * np.eye(3)
             middles[n] = np.linalg.solve(normal, np.einsum("kij,kj->i", across, origins))
             weights = (focal / np.linalg.norm(middles[n] - origins, axis=1).clip(1e-3)) ** 2
+            ahead[n] = np.median(((middles[n] - origins) * directions).sum(1)) > 0
             origins = origins - middles[n]
             np.add.at(planes[n], each, weights[:, None, None] * across)
             against = np.einsum("kij,kj->ki", across, origins)
             np.add.at(sides[n], each, weights[:, None] * against)
             np.add.at(squares[n], each, weights * np.einsum("ki,ki->k", against, origins))
             counts[n] = 2 * len(seen)
-        return cls(times - times[0], middles, planes, sides, squares, counts)
+        found = cls(times - times[0], *(x[ahead] for x in (middles, planes, sides, squares, counts)))
+        return found if ahead.sum() >= 10 else None
 
     def first(self, count: int) -> "_Rays":
         """Of the first tracks alone."""
@@ -198,7 +216,7 @@ class _Rays:
         left over [N], pixels². Drift is a cosine series of so many terms, which every point follows as it likes."""
         basis = self._slow(drift)
         if rate is not None:
-            basis = np.concatenate([basis, waves(self.times * rate, harmonics)], 1)
+            basis = np.concatenate([basis, waves(self.times * rate, self._told(rate, harmonics))], 1)
         size = 3 * basis.shape[1]
         normal = np.einsum("ta,tb,ntij->naibj", basis, basis, self.planes, optimize=True).reshape(-1, size, size)
         side = np.einsum("ta,nti->nai", basis, self.sides).reshape(-1, size)
@@ -206,6 +224,10 @@ class _Rays:
         found = np.linalg.solve(normal + loose, side[..., None])[..., 0]
         left = self.squares.sum(1) - 2 * (side * found).sum(1) + np.einsum("na,nab,nb->n", found, normal, found)
         return found, normal + loose, left.clip(0) / (self.counts - size).clip(1)
+
+    def _told(self, rate: float, harmonics: int) -> int:
+        """How many harmonics of a rate (Hz), at most so many, images can tell that follow each other so slowly; at least one."""
+        return max(min(harmonics, int(_BAND / (rate * np.median(np.diff(self.times))))), 1)
 
     def _slow(self, drift: int) -> np.ndarray:
         """Cosine series of so many terms [T, D], the first of which is one."""
@@ -258,6 +280,7 @@ class _Rays:
             Its rate, its way [2 H, 3] (m), the shares [N] and the points' means [N, 3], m from `middles`.
         """
         way, shares, n = np.zeros(0), np.ones(len(self.counts)), 3 * drift
+        harmonics = self._told(1.1 * rate, harmonics)  # whatever it is refined to
         for _ in range(_TURNS):
             found, told, left = self.solved(rate, harmonics, drift)
             free = told[:, n:, n:] - told[:, n:, :n] @ np.linalg.solve(told[:, :n, :n], told[:, :n, n:])
@@ -291,6 +314,11 @@ class _Rays:
         normal = normal - np.einsum("n,nai,nij,nbj->ab", weights, cross, held, cross, optimize=True)
         right = (weights[:, None] * (side - np.einsum("nai,nij,nj->na", cross, held, theirs, optimize=True))).sum(0)
         return -float(right @ np.linalg.solve(normal, right))
+
+    def moved(self, seen: "_Seen") -> np.ndarray:
+        """How far a motion moves the points [N, T, 3], m."""
+        rate, way, shares, _ = self.fitted(seen.rate, seen.harmonics, seen.drift)
+        return shares[:, None, None] * (waves(self.times * rate, len(way) // 2) @ way)
 
     def motion_of(self, seen: Sequence["_Seen"], start: float) -> TissueMotion:
         """What was seen, with the ways of all points; phases are 0 at a time, s."""
@@ -329,8 +357,8 @@ def _explained(before: np.ndarray, after: np.ndarray) -> float:
 
 
 def _refined(power: Callable[[float], float], rate: float, step: float) -> float:
-    """The rate of the greatest power near one, to a thousandth of a step."""
-    while step > 1e-3 * rate:
+    """The rate of the greatest power near one, to a hundred-thousandth of it."""
+    while step > 1e-5 * rate:
         rate = max((rate + step * part for part in (0, -1, -0.5, 0.5, 1)), key=power)
         step /= 2
     return rate

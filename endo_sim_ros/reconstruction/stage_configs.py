@@ -345,6 +345,8 @@ class MotionSearchConfig(StageConfig):
     """Images looked at, at most: six breaths. Each takes some hundredths of a second."""
     points: Annotated[int, Range(10, 10_000)] = 200
     """Points followed at a time."""
+    least_travel: Annotated[float, Range(0.0, 1.0, "m")] = 0.002
+    """How far one lens must go for its rays to tell depth, a fiftieth of the usual one."""
     shortest_beat: Annotated[float, Range(0.1, 60.0, "s")] = 0.4
     """Least period of a heart: 150 beats a minute."""
     shortest_breath: Annotated[float, Range(0.1, 60.0, "s")] = 1.8

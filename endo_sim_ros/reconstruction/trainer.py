@@ -77,6 +77,8 @@ class Trainer:
         """When the views were taken that are trained on, nanoseconds; views that were left out are not among them."""
         self.iteration = 0
         self.iterations = scene.iterations
+        paths = [np.zeros((0, 3)) if view.path is None else view.path for view in scene.views]
+        self._paths = torch.tensor(np.array(paths), dtype=torch.float32, device=self.device)  # [V, parts, 3] m, of all views
         self._nearest = nearest_views(scene.views, 1)
         self._load(scene.views)
         eye = np.mean([view.camera.position for view in self._device_views], 0)
@@ -153,6 +155,7 @@ class Trainer:
             "optimizer": self.optimizer.state,
             "strategy": self._strategy_state,
             "shares": self._shares,
+            "paths": self._paths,
             "seen": self._seen,  # by where Gaussians were when their number last changed
             "light": {name: value.detach() for name, value in self.appearance.tensors.items()},
             "light_optimizer": self.appearance.optimizer.state,
@@ -182,7 +185,7 @@ class Trainer:
                 raise ValueError("its light is not that of these views")
             if shapes(state["strategy"]) != shapes(self._strategy.initialize_state(len(state["model"]["means"]), "meta")):
                 raise ValueError("the state of the strategy does not fit the model")
-            if state["shares"].shape[1:] != self._shares.shape[1:]:
+            if state["shares"].shape[1:] != self._shares.shape[1:] or not torch.equal(state["paths"], self._paths):
                 raise ValueError("its tissue moves otherwise")
             generator = torch.Generator()
             generator.set_state(state["generator"].cpu())

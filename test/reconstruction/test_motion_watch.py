@@ -50,15 +50,15 @@ def way(seconds: float, breath: float, heart: float) -> np.ndarray:
     return breath * breath_share(seconds, 3.5) * slides + heart * beat_share(seconds, 0.9) * knocks
 
 
-def filmed(breath: float = 0.0, heart: float = 0.0, count: int = 110) -> list[Frame]:
+def filmed(breath: float = 0.0, heart: float = 0.0, count: int = 110, rate: float = RATE) -> list[Frame]:
     """By a camera that goes to and fro."""
     frames = []
     for k in range(count):
         pose = np.eye(4)
         pose[:3, 3] = 0.008 * np.sin(0.11 * k), 0.005 * np.sin(0.17 * k), 0.003 * np.sin(0.07 * k)
-        camera, moved = CAMERA.at(pose), way(k / RATE, breath, heart)
+        camera, moved = CAMERA.at(pose), way(k / rate, breath, heart)
         right = picture(camera.beside(BASELINE), moved)
-        frames.append(Frame(round(1e9 * (5 + k / RATE)), picture(camera, moved), camera, right=right, baseline=BASELINE))
+        frames.append(Frame(round(1e9 * (5 + k / rate)), picture(camera, moved), camera, right=right, baseline=BASELINE))
     return frames
 
 
@@ -141,6 +141,15 @@ def test_one_breath_alone_is_no_period(breathing):
 
 
 @pytest.mark.slow
+def test_no_harmonic_is_taken_for_another_that_images_cannot_tell_from_it():
+    for beat in (0.003, 0.0):
+        motion = watched(filmed(0.008, beat, 80, 8.0))[0]
+        assert motion is not None and abs(motion.parts[0].period / 3.5 - 1) < 0.01
+        assert [part.name for part in motion.parts] == ["breathing", "heartbeat"][: 1 + (beat > 0)]
+        assert not beat or abs(motion.parts[1].period / 0.9 - 1) < 0.01
+
+
+@pytest.mark.slow
 def test_still_tissue_does_not_breathe():
     frames = filmed()
     for each in (frames, with_one_lens(frames)):
@@ -153,4 +162,6 @@ def test_what_cannot_be_told_is_said():
     assert watched([]) == (None, "whether the tissue moves by itself cannot be told from 0.0 s")
     at_once = [dataclasses.replace(frame, stamp_ns=5) for frame in black]
     assert watched(at_once)[1] == "whether the tissue moves by itself cannot be told from 0.0 s"
-    assert watched(black)[1].endswith("too few points could be followed for long")
+    with_two = [dataclasses.replace(frame, right=image, baseline=BASELINE) for frame in black]
+    assert watched(with_two)[1].endswith("too few points could be followed for long")
+    assert watched(black)[1].endswith("one lens that stays where it is sees no depth")

@@ -82,7 +82,7 @@ class Supervisor:
         self._ended: set[str] = set()
         self._said: dict[str, tuple[str, str]] = {}
         self._set: dict[str, dict[str, Any]] = {}  # parameters of each node, by its full name, that were set while it ran
-        self._replay = False  # the bag, as soon as the one that learns from it listens
+        self._to_play = False  # the bag, as soon as the one that learns from it listens
 
     def start(self, name: str, *ros_arguments: str, **parameters: Any) -> None:
         """Start a node, and remember its arguments for when it crashes."""
@@ -121,7 +121,7 @@ class Supervisor:
                 live = {key: _quoted(value) for key, value in self._set.get(self.full_name(name), {}).items()}
                 self._began[name] = time.monotonic()
                 self._graph.start(name, *ros_arguments, **parameters | live)
-                self._replay |= name == _LEARNER and _PLAYER in self._arguments
+                self._to_play |= name == _LEARNER and _PLAYER in self._arguments
                 continue
             if status is None or name in self._ended or name in self._due:
                 continue
@@ -154,19 +154,24 @@ class Supervisor:
         if self._ended >= self._graph.nodes.keys() - {_PLAYER}:
             raise UpError("no node is left")
 
-    def replay(self, watcher: Watcher) -> None:
-        """Play the bag again for a reconstruction_node that was started again: it knows nothing of what came before."""
-        if not self._replay or watcher.heard.get(self.full_name(_LEARNER), 0.0) < self._began[_LEARNER]:
+    def start_player(self, *ros_arguments: str, **parameters: Any) -> None:
+        """Play the bag once the reconstruction_node is there: what is played before is lost to it."""
+        self._arguments[_PLAYER], self._to_play = (ros_arguments, parameters), True
+
+    def play(self, watcher: Watcher) -> None:
+        """Play the bag, or play it again for a reconstruction_node that was started again: it knows nothing of what came before."""
+        if not self._to_play or watcher.heard.get(self.full_name(_LEARNER), 0.0) < self._began[_LEARNER]:
             return
-        self._replay = False
-        player, (ros_arguments, parameters) = self._graph.nodes[_PLAYER], self._arguments[_PLAYER]
-        if player.exit_status is None:
-            player.process.send_signal(signal.SIGINT)
-            player.wait()
-        self._ended.discard(_PLAYER)
-        self._due.pop(_PLAYER, None)
+        self._to_play = False
+        player, (ros_arguments, parameters) = self._graph.nodes.get(_PLAYER), self._arguments[_PLAYER]
+        if player is not None:
+            if player.exit_status is None:
+                player.process.send_signal(signal.SIGINT)
+                player.wait()
+            self._ended.discard(_PLAYER)
+            self._due.pop(_PLAYER, None)
+            self._console.print(f"{_PLAYER} plays the bag again for the new {_LEARNER}", highlight=False)
         self.start(_PLAYER, *ros_arguments, **parameters)
-        self._console.print(f"{_PLAYER} plays the bag again for the new {_LEARNER}", highlight=False)
 
     def rows(self, watcher: Watcher) -> list[_Row]:
         """The state of each node."""
@@ -235,7 +240,7 @@ def run_up(
         if view:
             supervisor.start("viewer_node", *common, **({"arm": arms[0], "arms": list(arms)} if arms else {}))
         if bag is not None:
-            supervisor.start("bag_player_node", *common, bag=bag.expanduser())
+            supervisor.start_player(*common, bag=bag.expanduser())
         _introduce(console, logs)
         _watch(supervisor, console, asked)
         console.print("ending all nodes")
@@ -258,7 +263,7 @@ def _watch(supervisor: Supervisor, console: Console, asked: threading.Event) -> 
             while (left := deadline - time.monotonic()) > 0 and not asked.is_set():
                 executor.spin_once(timeout_sec=left)
             supervisor.check()
-            supervisor.replay(watcher)
+            supervisor.play(watcher)
             if not warned and not supervisor.restarted and (twins := supervisor.twins(watcher)):
                 warned = True  # after a restart the one that crashed is still known to others for a while
                 text = f"{', '.join(twins)}: there more than once; does another graph run in this ROS domain?"

@@ -8,6 +8,8 @@ os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 if "ROS_DOMAIN_ID" not in os.environ or "PYTEST_XDIST_WORKER" in os.environ:  # a worker has that of who started it
     os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
 os.environ.setdefault("FASTDDS_BUILTIN_TRANSPORTS", "DEFAULT")  # finds late joiners soonest; test messages are small
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # more tests at a time than cores: threads that wait would take these from others
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402

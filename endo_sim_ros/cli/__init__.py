@@ -52,10 +52,11 @@ def parse(name: str, words: list[str]) -> Runnable:
     """The command with its options as the words give them; what is wrong with them ends the program with a sentence."""
     import tyro
 
-    from endo_sim_ros.core.config import document_ranges, refuse_renamed_flags
+    from endo_sim_ros.core.config import document_ranges, refuse_renamed_flags, refuse_repeated_flags
 
     module = importlib.import_module(f"endo_sim_ros.cli.{name}")
     command: type[Runnable] = module.Command
+    refuse_repeated_flags(words)
     refuse_renamed_flags(words, command)
     document_ranges(command)
     default: Any = module.defaults(words) if hasattr(module, "defaults") else None
@@ -63,7 +64,7 @@ def parse(name: str, words: list[str]) -> Runnable:
 
 
 def chosen(words: list[str], flag: str, names: Container[str]) -> str:
-    """Return which of these names the words give a flag last, default if none: what tyro then refuses."""
+    """Return which of these names the words give a flag, default if none: what tyro then refuses."""
     name = "default"
     for word, following in zip(words, [*words[1:], ""]):
         if word == flag or word.startswith(f"{flag}="):

@@ -158,6 +158,22 @@ def refuse_renamed_flags(words: Sequence[str], command: type) -> None:
             raise ConfigError(f"{flag} is now {new.replace('_', '-') if new.startswith('--') else new}")
 
 
+def refuse_repeated_flags(words: Sequence[str]) -> None:
+    """Raise a sentence if a command line gives an option twice: of the two, one would be lost.
+
+    Args:
+        words: The command line after the name of the command.
+
+    Raises:
+        ConfigError: If there is one.
+    """
+    seen = set[str]()
+    for flag in (word.partition("=")[0].replace("_", "-") for word in words if word.startswith("--")):
+        if flag in seen:
+            raise ConfigError(f"{flag} is given twice; give it once, with all its values")
+        seen.add(flag)
+
+
 @cache
 def document_ranges(command: type) -> None:
     """Let tyro's help of a command tell range and unit of each option of the stage configurations that it holds."""

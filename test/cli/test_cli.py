@@ -138,11 +138,20 @@ def test_options_given_beside_a_preset_count_whatever_their_value(monkeypatch):
     taken = []
     monkeypatch.setattr(from_bag, "reconstruct_bag", lambda *arguments: (taken.append(arguments[2]), []))
     monkeypatch.setattr(held_out, "measure_held_out", lambda *arguments: None)
-    for given in ("--preset paper --lambda-tv 0 --sh-degree 3", "--preset laptop --lambda-tv 0 --sh-degree 3 --preset=paper", ""):
+    for given in ("--preset paper --lambda-tv 0 --sh-degree 3", "--lambda-tv 0 --sh-degree 3 --preset=paper", ""):
         monkeypatch.setattr(sys, "argv", f"endo-sim reconstruct bag out {given}".split())
         assert cli.main() == 0
     assert taken[0] == taken[1] == preset("paper", lambda_tv=0.0, sh_degree=3)
     assert taken[2] == ReconstructionConfig()
+
+
+def test_an_option_that_is_given_twice_is_refused():
+    for words in ("my_bag out --arms PSM1 --fps 5 --arms PSM2", "my_bag out --arms=PSM1 --arms PSM2"):
+        with pytest.raises(ConfigError, match="--arms is given twice; give it once, with all its values"):
+            cli.parse("export", words.split())
+    with pytest.raises(ConfigError, match="--lambda-tv is given twice"):
+        cli.parse("reconstruct", "my_bag out --lambda-tv 1 --lambda_tv=2".split())
+    assert cli.parse("export", "my_bag out --arms PSM1 PSM2".split()).arms == ("PSM1", "PSM2")
 
 
 def test_a_tissue_has_its_options_unless_the_words_give_them():

@@ -20,7 +20,7 @@ class Command:
     """lerobot: a LeRobotDataset v3.0."""
     fps: int | None = None
     """Frames per second; default: those of the steps of a recording in lockstep, else 25."""
-    arm: tuple[str, ...] = ()
+    arms: tuple[str, ...] = ()
     """Names of the tool arms; default: all in the recording."""
     task: str = "manipulate the tissue"
     """What was done, in words."""
@@ -42,6 +42,6 @@ class Command:
             raise SequenceError("give one recording or more, then the folder of the dataset")
         *bags, out = self.paths
         episodes, frames = export_lerobot(
-            bags, out, self.task, self.fps, self.arm, self.sampling, self.images, self.world_frame, self.frames
+            bags, out, self.task, self.fps, self.arms, self.sampling, self.images, self.world_frame, self.frames
         )
         print(f"{out}: {episodes} episode{'s' * (episodes != 1)}, {frames} frames")

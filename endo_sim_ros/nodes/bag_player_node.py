@@ -5,16 +5,13 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rclpy.duration import Duration
-from rclpy.utilities import try_shutdown
-
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.messages import DIAGNOSTICS, ERROR, OK, STATE, BagPlayerState, MessageError, Topic
 from endo_sim_ros.nodes.base import EndoNode, run, sentence
 from endo_sim_ros.nodes.configs import BagPlayerConfig
+from endo_sim_ros.nodes.listeners import Listeners, delivered
 from endo_sim_ros.sequences.bag import BagReader
 
-_LAST_WORD_WITHIN = 2.0  # seconds that the last status has to arrive before its publisher is gone
 _DELIVERED_WITHIN = 10.0  # seconds that subscribers have, at the end, to ask again for what they missed
 _MESSAGES = {  # for people
     BagPlayerState.WAITING: "waiting for subscribers",
@@ -22,7 +19,6 @@ _MESSAGES = {  # for people
     BagPlayerState.DELIVERING: "waiting until everything is received",
     BagPlayerState.DONE: "finished",
 }
-_SETTLED = 3.5  # seconds without a new subscriber after which all are there: processes announce themselves every 3
 
 
 class BagPlayerNode(EndoNode):
@@ -67,10 +63,7 @@ class BagPlayerNode(EndoNode):
         if self._stopped:
             return
         self._state = BagPlayerState.DONE
-        self.publish_diagnostics()
-        self._diagnostics.wait_for_all_acked(Duration(seconds=_LAST_WORD_WITHIN))
-        self.get_logger().info(f"finished: {self._sent} messages")
-        try_shutdown(context=self.context)
+        self.finish(f"{self._sent} messages")
 
     @property
     def _stopped(self) -> bool:
@@ -101,26 +94,16 @@ class BagPlayerNode(EndoNode):
                     return
 
     def _await_subscribers(self, publishers: dict) -> None:
-        """Wait for somebody to listen, and then until nobody new has come for a while: discovery takes its time, and
-        the topics of one listener are found one after another."""
-        deadline = time.monotonic() + self._config.wait_for_subscribers
-        counts, since = None, 0.0
-        while not self._stopped and time.monotonic() < deadline:
-            found = [publisher.get_subscription_count() for publisher in publishers.values()]
-            if found != counts:
-                counts, since = found, time.monotonic()
-            elif any(found) and time.monotonic() - since > _SETTLED:
-                return
+        deadline, listeners = time.monotonic() + self._config.wait_for_subscribers, Listeners(publishers.values())
+        while not self._stopped and time.monotonic() < deadline and not listeners.settled():
             self._stop.wait(0.05)
 
     def _await_delivery(self, publishers: dict) -> None:
-        """A lost message is repeated when its subscriber asks, which it can only while the publisher exists."""
         self._state = BagPlayerState.DELIVERING
         deadline = time.monotonic() + _DELIVERED_WITHIN
         for publisher in publishers.values():
-            while not self._stopped and time.monotonic() < deadline:
-                if publisher.wait_for_all_acked(Duration(seconds=0.2)):
-                    break
+            while not self._stopped and time.monotonic() < deadline and not delivered(publisher, 0.2):
+                pass
 
     def _publish(self, bag: BagReader, publishers: dict) -> None:
         due, last = time.monotonic(), None

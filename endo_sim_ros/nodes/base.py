@@ -28,6 +28,7 @@ from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ClientState, Topic
 from endo_sim_ros.nodes.configs import NODE_CONFIGS
 from endo_sim_ros.nodes.errors import sentence
+from endo_sim_ros.nodes.listeners import delivered
 from endo_sim_ros.nodes.parameter_file import parameter_file
 from endo_sim_ros.nodes.parameters import ConfiguredNode
 from endo_sim_ros.nodes.process import end_with_parent
@@ -37,6 +38,7 @@ from endo_sim_ros.nodes.transport import prepare_transport
 _ERROR_SHOWN = 5.0  # seconds that an error stays on /diagnostics, and that its repetitions are not logged
 MOST_LOGGED = 10  # different errors logged in that time: one whose text differs at 500 Hz must not flood the log
 _LONGEST_ERROR = 1000  # characters; a sentence may quote what came, and that may be megabytes
+_LAST_WORD_WITHIN = 2.0  # seconds that the last status has to arrive before its publisher is gone
 _END_WITHIN = 3.0  # seconds that worker threads have to end before the process ends without them
 # A killed node stays known for 20 seconds. Whoever starts in its place must not take it for one that lives.
 _DISCOVERED = 5.0  # seconds after the start in which those are found that were there before
@@ -169,6 +171,13 @@ class EndoNode(ConfiguredNode):
         except Exception:
             if self.context.ok():  # otherwise a worker came to its end after the node
                 raise
+
+    def finish(self, done: str) -> None:
+        """Say what was done, on /diagnostics and in the log, and end the process: for a node whose work has an end."""
+        self.publish_diagnostics()
+        delivered(self._diagnostics, _LAST_WORD_WITHIN)
+        self.get_logger().info(f"finished: {done}")
+        try_shutdown(context=self.context)
 
     def _mixing(self) -> str:
         """Which topics of this node others publish as well, in words."""

@@ -18,12 +18,13 @@ from endo_sim_ros.learning.tasks import find_task
 from endo_sim_ros.messages import OK, STATE, WARN, PolicyState
 from endo_sim_ros.nodes.base import EndoNode, run
 from endo_sim_ros.nodes.configs import PolicyConfig, arm_names
+from endo_sim_ros.nodes.listeners import Listeners
 
 _PATIENCE = 30.0  # seconds; a request to a physics_node that was killed just now is never answered
 
 
 class PolicyNode(EndoNode):
-    """One command, one observation, and so on; begins when the tissue of its scene is there."""
+    """One command, one observation, and so on; begins when the tissue of its scene is there, and exits after the last episode."""
 
     read_at_start = frozenset(PolicyConfig.__dataclass_fields__)
 
@@ -45,9 +46,10 @@ class PolicyNode(EndoNode):
         self._step_ns = round(physics.step_duration * 1e9)
         self._pose_pub = self.publisher((messages.tool_joint_command if self._tools else messages.tool_pose_command)(arm))
         self._jaw_pub = self.publisher(messages.tool_jaw(arm))
+        self._listeners = Listeners((self._pose_pub, self._jaw_pub))
         self._resetting = self.create_client(Trigger, f"{config.physics_node}/reset")
         self._state, self._missing = PolicyState.WAITING, ""  # and what for
-        self._solved, self._done = 0, 0
+        self._begun, self._solved, self._done = False, 0, 0
         self._model_stamp = 0  # ns, which the state at rest has
         self._stamp = 0  # of the command whose answer is awaited; 0 = the state at rest
         self._heard: dict[str, Any] = {}  # parts of that answer
@@ -78,7 +80,10 @@ class PolicyNode(EndoNode):
         if not (listening and self._resetting.service_is_ready()):
             self._missing = "physics_node with arm_source commanded" + (", and an instrument with joints" if self._tools else "")
             return
-        self._missing = "the tissue of the scene"
+        if not (self._begun or self._listeners.settled()):  # a recorder, which hears the first command if it is there already
+            self._missing = "whoever else listens"
+            return
+        self._begun, self._missing = True, "the tissue of the scene"
         self._heard.pop("reset", None)
         if self._asked is not None:  # an answer that comes after all is none to this request
             self._resetting.remove_pending_request(self._asked)
@@ -169,7 +174,7 @@ class PolicyNode(EndoNode):
             columns: dict[str, Any] = {name: np.array(column) for name, column in zip(names, zip(*self._rows))}
             with written_whole(path) as partial, partial.open("wb") as file:
                 np.savez(file, **columns)
-        self.publish_diagnostics()
+        self.finish(f"{self._solved} of {self._done} episodes solved")
 
     def status(self) -> tuple[int, str, dict[str, Any]]:
         """Level, message and values: how many episodes ended and were solved, and the steps of all."""

@@ -176,8 +176,11 @@ def read_episode(
         jaw_command = streams.get(messages.tool_jaw(arm), jaw_state)
         jaw = streams.get(messages.tool_jaw_state(arm), jaw_command)
         pose = continuous(tip.at(times))
-        command = streams.get(messages.tool_pose_command(arm), tip).at(times, before=tip)
-        command = same_sign(command, pose)
+        commands = streams.get(messages.tool_pose_command(arm), Stream.never(7))
+        command = same_sign(commands.at(times, before=tip), pose)
+        if measured := int((following < commands.stamps[0]).sum()):
+            text = "%s: %d of %d actions of %s are where the tip was measured next, as nothing was commanded yet on /%s"
+            logging.getLogger(__name__).warning(text, bag, measured, len(now), arm, messages.tool_pose_command(arm).name)
         wrench = streams.get(messages.tool_wrench(arm), Stream.constant(np.zeros(6)))
         reaction = streams[messages.tool_reaction(arm)]
         state += [pose[:-1], jaw.at(now, before=Stream.constant([JAW_OPEN])), reaction.at(now)]

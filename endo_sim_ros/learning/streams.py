@@ -26,6 +26,11 @@ class Stream(NamedTuple):
         """One value [D] at all times."""
         return cls(np.array([np.iinfo(np.int64).min]), np.array([value], np.float64))
 
+    @classmethod
+    def never(cls, size: int) -> "Stream":
+        """No value at any time, where there would be so many numbers."""
+        return cls(np.array([np.iinfo(np.int64).max]), np.zeros((1, size)))
+
     def at(self, times: np.ndarray, before: "Stream | None" = None) -> np.ndarray:
         """The last values [T, D] at times [T]; ahead of the first, those of another stream."""
         indices = np.searchsorted(self.stamps, times, "right") - 1

@@ -102,6 +102,12 @@ class Recording:
             said.append((messages.tool_jaw(arm), messages.encode_jaw(0.01 * number, stamp, self.types)))
         self.write(said, leave_out)
 
+    def command(self, time_ns, number, arm="PSM1"):
+        """A command of the arm's tip, 2 cm beside where `act` has it."""
+        pose = tip(number, arm)
+        pose[1, 3] += 0.02
+        self.write([(messages.tool_pose_command(arm), messages.encode_pose(pose, BEGIN + time_ns, "world", self.types))])
+
     def write(self, said, leave_out=()):
         for topic, message in said:
             if topic not in leave_out:

@@ -64,7 +64,7 @@ def test_observations_after_a_reset_may_bear_any_time(tmp_path, reset, caplog):
         recording.observe(reset, 0)
     episode = read_episode(tmp_path / "bag")
     early = reset < 0  # then it is the first observation
-    assert episode.lockstep and len(episode) == 38 + early and not caplog.text
+    assert episode.lockstep and len(episode) == 38 + early and "missing" not in caplog.text
     np.testing.assert_array_equal(episode.left.numbers, np.arange(0 if early else 1, 39))
     np.testing.assert_allclose(column(episode, "PSM1.force_z"), -np.arange(1.0 if early else 2.0, 40))
 
@@ -84,6 +84,26 @@ def test_a_missing_step_is_left_out_and_told(tmp_path, caplog):
     episode = read_episode(lockstep(tmp_path / "bag", missing=(5,)))
     assert len(episode) == 10 and "1 of 12 steps are missing" in caplog.text
     np.testing.assert_allclose(column(episode, "PSM1.force_z"), [-1, -2, -3, -4, -6, -7, -8, -9, -10, -11])
+
+
+def test_where_no_command_was_recorded_the_next_pose_is_the_action_and_that_is_told(tmp_path, caplog):
+    """The poses of a robot move the tool without any command; a recorder that came late may have missed some."""
+    told = "actions of PSM1 are where the tip was measured next, as nothing was commanded yet on /PSM1/servo_cp"
+    episode = read_episode(lockstep(tmp_path / "none"))
+    assert f"none: 11 of 11 {told}" in caplog.text
+    np.testing.assert_allclose(episode.action[:, :7], [*episode.state[1:, :7], episode.action[-1, :7]])
+    for first, expected in ((4, f"bag4: 3 of 5 {told}"), (0, "")):
+        caplog.clear()
+        with Recording(tmp_path / f"bag{first}") as recording:
+            for number in range(6):
+                recording.act(STEP * number, number)
+                recording.observe(STEP * number, number)
+                if number >= first:
+                    recording.command(STEP * number, number)
+        episode = read_episode(tmp_path / f"bag{first}")
+        assert (expected in caplog.text) if expected else not caplog.text
+        aside = np.arange(1, 6) >= first
+        np.testing.assert_allclose(episode.action[:, 1], 0.01 + 0.02 * aside, atol=1e-7)
 
 
 def test_a_jaw_that_speaks_now_and_then_keeps_its_angle(tmp_path):

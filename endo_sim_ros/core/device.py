@@ -24,16 +24,18 @@ def pick_device(name: str = "auto") -> str:
         name: ``auto`` (the GPU when there is one), ``cpu``, ``cuda`` or ``cuda:N``.
 
     Raises:
-        ValueError: If the name is unknown or names a GPU that is not there.
+        ValueError: If the name is unknown or names a GPU that is not there or, in a forked process, was in use before.
     """
     if name == "auto":
-        return "cuda:0" if torch.cuda.is_available() else "cpu"
+        name = "cuda:0" if torch.cuda.is_available() else "cpu"
     if name == "cpu":
         return name
     if name == "cuda" or name.startswith("cuda:") and name[5:].isdigit():
         index = int(name[5:] or 0) if name != "cuda" else 0
         if index >= torch.cuda.device_count():
             raise ValueError(f"device {name!r} asked for, but {torch.cuda.device_count()} CUDA devices are visible; use cpu or auto")
+        if torch.cuda._is_in_bad_fork():
+            raise ValueError("a process that was forked from one that uses the GPU cannot use it; start it by spawn, or use cpu")
         return f"cuda:{index}"
     raise ValueError(f"unknown device {name!r}; use auto, cpu, cuda or cuda:N")
 
@@ -167,7 +169,13 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, "endo_sim")
 
 
-os.register_at_fork(after_in_child=_pool.cache_clear)  # a forked process has none of its parent's threads
+def _clean_up_after_fork() -> None:
+    """A forked process has none of its parent's threads: neither ours nor torch's, for which it would wait for ever."""
+    _pool.cache_clear()
+    torch.set_num_threads(1)
+
+
+os.register_at_fork(after_in_child=_clean_up_after_fork)
 
 
 def run_in_threads(jobs: Sequence[Callable[[], object]]) -> None:

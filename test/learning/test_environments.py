@@ -172,6 +172,30 @@ def test_contact_that_there_is_not_is_refused():
         make("retraction", contact="links", randomisation={"tool": 0.5})
 
 
+@pytest.mark.dds
+def test_environments_in_processes_of_their_own_are_the_single_ones_also_when_forked():
+    """In a process of its own, as a forked one may wait for ever for threads that only its parent has."""
+    code = f"""
+import sys
+sys.path.insert(0, {str(ROOT / "test/learning")!r})
+import gymnasium, numpy as np
+from played_tasks import IDS, make
+single = make("retraction", observations="both")  # whose threads a forked process has not
+many = gymnasium.make_vec(
+    IDS["retraction"], num_envs=2, vectorization_mode="async", device="cpu", observations="both", vector_kwargs={{"context": "fork"}}
+)
+seen, alone = many.reset(seed=3)[0], single.reset(seed=4)[0]
+for _ in range(5):
+    for name, value in alone.items():
+        np.testing.assert_array_equal(seen[name][1], value)
+    seen, alone = many.step(np.full((2, 4), 0.5, np.float32))[0], single.step(np.full(4, 0.5, np.float32))[0]
+many.close()
+print("same")
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    assert done.stdout.strip() == "same", done.stderr
+
+
 def test_many_environments_begin_anew_one_by_one_and_count_their_seeds():
     many = gymnasium.make_vec(IDS["retraction"], num_envs=2, vectorization_mode="vector_entry_point", device="cpu")
     first, _ = many.reset(seed=np.array([5, 8]))

@@ -43,10 +43,16 @@ def cosines(model: GaussianModel, positions: Tensor) -> Tensor:
     return (normalize(normals, dim=-1) * towards[..., None, :]).sum(-1)
 
 
-def seen_colors(model: GaussianModel, cosine: Tensor) -> Tensor:
-    """Return coefficients of degree 0 [..., N, 1, 3] of the colours that a lens sees under these cosines [..., N, 2]; with gradients."""
+def seen_colors(model: GaussianModel, cosine: Tensor, sh: Tensor | None = None) -> Tensor:
+    """Return coefficients of degree 0 [..., N, 1, 3] of the colours that a lens sees under these cosines [..., N, 2]; with gradients.
+
+    Args:
+        model: Gaussians that reflect.
+        cosine: Of their normals and the directions towards the lens.
+        sh: Coefficients [..., N, 1, 3] of the tissue itself in place of the model's.
+    """
     facing, reflected = _shading(model, cosine)
-    base = model.sh[:, :1] * SH_C0 + 0.5
+    base = (model.sh if sh is None else sh) * SH_C0 + 0.5
     return (base * facing + (reflected - 0.5)) / SH_C0
 
 

@@ -48,6 +48,8 @@ class SightConfig(StageConfig):
     """2: the picture of the right eye, too."""
     baseline: Annotated[float, Range(0.0005, 0.05, "m")] = 0.00414
     """Distance between the eyes; 4.14 mm is that of the endoscope of a da Vinci Xi, from the calibration of SCARED (datasets 1 to 3)."""
+    dye: bool = True
+    """Mark the target of the task with a spot of dye on the tissue."""
     segmentation: bool = False
     """What is in each pixel, too."""
 

@@ -100,6 +100,7 @@ class TaskEnvironment(gymnasium.Env):
         tool: Name or file of the tool that is shown, as `endo_sim_ros.instruments.load_arm` takes it; default: that of the task.
         eyes: 2 adds the image of the right eye, ``image_right``.
         baseline: Distance between the eyes, m; default: that of the endoscope of a da Vinci Xi.
+        dye: Whether images show a spot of dye on the tissue where the task is.
         segmentation: Add ``segmentation``, what is in each pixel: 0 nothing, 1 tissue, and from 2 on the links of the instrument,
             `endo_sim_ros.instruments.LINKS`.
         actions: ``cartesian``, ``joints`` or ``joint_positions``, see :class:`TaskBatch`.
@@ -126,6 +127,7 @@ class TaskEnvironment(gymnasium.Env):
         tool: str = "",
         eyes: Literal[1, 2] = 1,
         baseline: float = SightConfig.baseline,
+        dye: bool = True,
         segmentation: bool = False,
         actions: Actions = "cartesian",
         contact: Contact = "point",
@@ -133,7 +135,7 @@ class TaskEnvironment(gymnasium.Env):
     ):
         self.batch, self.observation_space = _make(
             task, 1, scene, observations, randomisation, device, render_mode, actions, contact, image_width=image_width,
-            instrument=instrument, tool=tool, eyes=eyes, baseline=baseline, segmentation=segmentation, motion=motion,
+            instrument=instrument, tool=tool, eyes=eyes, baseline=baseline, dye=dye, segmentation=segmentation, motion=motion,
         )  # fmt: skip
         self.action_space, self.render_mode = _action_space(self.batch), render_mode
 

@@ -71,7 +71,7 @@ def save_scene(
             **changed,
         },
         "rendering_node": {"mode": "lockstep", "image_width": sight.image_width, "baseline": sight.baseline},
-        "policy": {"task": task, "scene": str(folder.resolve()), "seed": seed, "tool": named},
+        "policy": {"task": task, "scene": str(folder.resolve()), "seed": seed, "tool": named, "dye": sight.dye},
     }
     sections = {f"/**/{node}": {"ros__parameters": values} for node, values in parameters.items()}
     (folder / "parameters.yaml").write_text(yaml.safe_dump(sections, sort_keys=False))

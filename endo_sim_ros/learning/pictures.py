@@ -9,6 +9,7 @@ from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import download, upload
+from endo_sim_ros.core.dye import DyedSpot, dyed
 from endo_sim_ros.core.light import SURFACE
 from endo_sim_ros.core.reflections import seen_colors
 from endo_sim_ros.core.shading import shade, to_bytes
@@ -62,6 +63,7 @@ class Pictures:
         self._device = device = tissue.solver.device
         self._model = scene.model.detach().to(device)
         self._tissue = tissue
+        self._sh = self._model.sh.expand(count, -1, -1, -1).clone() if sight.dye else None  # of each episode
         self._skinning = Skinning(self._model, nodes.rest, device=device)
         self._means, self._covars = tissue.append_skinning(self._skinning)
         self._pinned = torch.from_numpy(nodes.pinned).to(device)[:, None, None]
@@ -81,10 +83,12 @@ class Pictures:
         for b in range(count):
             self._show(b, self._views[b])
 
-    def reset(self, episodes: Tensor, variations: Sequence[Variation]) -> None:
-        """Show these episodes [n] at rest, each with its variation."""
-        for b, variation in zip(episodes.tolist(), variations):
+    def reset(self, episodes: Tensor, variations: Sequence[Variation], spots: Sequence[Sequence[DyedSpot]]) -> None:
+        """Show these episodes [n] at rest, each with its variation and its dyed spots."""
+        for b, variation, marked in zip(episodes.tolist(), variations, spots):
             self._show(b, self._view(variation))
+            if self._sh is not None:
+                self._sh[b] = dyed(self._model.sh, self._model.means, marked)
         self._means[episodes], self._covars[episodes] = self._skinning.means, self._skinning.covars
         if self._tissue.solver.motion.moving:
             positions = self._tissue.positions()
@@ -140,16 +144,16 @@ class Pictures:
 
     def _colors(self, rows: slice, eye: int) -> Tensor:
         """Colours of all these episodes [N, K, 3], or of each [b, N, K, 3], as `rasterize` takes them."""
-        views, sh = self._views[rows], self._model.sh
+        views, sh = self._views[rows], self._model.sh if self._sh is None else self._sh[rows]
         if self._model.reflects or self._model.sh_degree:
             F = torch.where(self._pinned, torch.eye(3, device=sh.device), self._tissue.F[rows])  # as on control_nodes
         if self._model.reflects:
             positions = [view.cameras[eye].position for view in views]
-            sh = seen_colors(self._model, self._skinning.cosines(F, self._means[rows], positions))
+            sh = seen_colors(self._model, self._skinning.cosines(F, self._means[rows], positions), sh)
         elif self._model.sh_degree:
-            sh = torch.stack(
-                [turned_colors(sh, self._skinning, *each) for each in zip(self._means[rows], F, (view.cameras[eye] for view in views))]
-            )
+            own = sh.expand(len(views), *sh.shape[-3:])
+            each = zip(own, self._means[rows], F, (view.cameras[eye] for view in views))
+            sh = torch.stack([turned_colors(own, self._skinning, means, F, camera) for own, means, F, camera in each])
         if self._by.texture:
             sh = sh * sh.new_tensor([view.contrast for view in views])[:, None, None, None]
         return sh

@@ -113,7 +113,7 @@ class TaskBatch:
         if self.tools is not None:
             self.tools.begin(chosen.cpu().numpy(), self._poses()[list(episodes)])
         if self.pictures is not None:
-            self.pictures.reset(chosen, variations)
+            self.pictures.reset(chosen, variations, [self.task.dyed_spots(b) for b in episodes])
 
     def _note(self, b: int, variation: Variation) -> None:
         """Keep what an episode has."""

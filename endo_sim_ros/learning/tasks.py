@@ -19,6 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from endo_sim_ros.core.dye import DyedSpot
 from endo_sim_ros.instruments import GRIP
 from endo_sim_ros.physics import ControlNodes, PhysicsConfig
 from endo_sim_ros.physics.regions import inside_sphere
@@ -66,6 +67,7 @@ class Task(ABC):
     tool = "LARGE_NEEDLE_DRIVER"  # what is seen of it; what it does is up to the physics
     tool_share = 1.0  # where on its jaws it works: from their hinge, 0, to their points, 1
     open_jaw, closed_jaw = 1.0, 0.0  # rad: as they are commanded
+    dyed_radius = 0.003  # m, of the spot that pictures show of where an episode is about
 
     @staticmethod
     @abstractmethod
@@ -214,6 +216,10 @@ class Task(ABC):
     def stiffness(self, b: int) -> np.ndarray:
         """Factor on the moduli of each node [M] in episode b."""
         return np.ones(len(self.nodes))
+
+    def dyed_spots(self, b: int) -> tuple[DyedSpot, ...]:
+        """What is dyed in episode b, so that pictures tell the goal: the place that it is about."""
+        return (DyedSpot(self.origin[b].copy(), self.dyed_radius),)
 
     def regions(self) -> tuple[str, ...]:
         """The stiffness of the first episode as physics_node's parameter `regions`; empty where it is 1 everywhere."""

@@ -7,6 +7,7 @@ files, which needs no ROS installation. Decoders accept messages of either. Imag
 from endo_sim_ros.messages.cameras import *
 from endo_sim_ros.messages.clouds import *
 from endo_sim_ros.messages.diagnostics import *
+from endo_sim_ros.messages.dye import *
 from endo_sim_ros.messages.headers import *
 from endo_sim_ros.messages.images import *
 from endo_sim_ros.messages.motion import *

@@ -247,6 +247,8 @@ class PolicyConfig(StageConfig):
     """Seed of the first episode; each following episode has the next seed."""
     tool: str = ""
     """Name or file of the tool that the scene was written with, which a policy that acts by joints moves; empty = that of the task."""
+    dye: bool = True
+    """Mark the target with a spot of dye on the tissue."""
     episodes: Annotated[int, Range(1, 1_000_000)] = 1
     """Number of episodes; palpation has one, as the inclusion is part of the parameters of physics_node."""
     record: str = ""

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from endo_sim_ros import messages
+from endo_sim_ros.core.dye import DyedSpot
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.messages import ControlNodeCloud
 from endo_sim_ros.nodes.background import Background
@@ -52,6 +53,7 @@ class ModelTracker:
         self._model_number = 0  # in the order of arrival; stamps may repeat
         self._cuts = {0: np.zeros((0, 3, 3), np.float32)}  # surfaces by their number, the newest last
         self._kept_cuts = kept_cuts
+        self._spots: list[DyedSpot] = []
         self._background = Background()
 
     def receive_model(self, message: Any, world_frame: str) -> None:
@@ -79,6 +81,16 @@ class ModelTracker:
         while len(self._cuts) > self._kept_cuts:
             del self._cuts[list(self._cuts)[1]]
 
+    def receive_dye(self, message: Any, world_frame: str) -> None:
+        """Decode and show a message of the topic dye.
+
+        Raises:
+            MessageError: If it cannot be used; the spots before stay.
+        """
+        self._spots = messages.decode_dye(message, world_frame, messages.DYE.name)
+        if self.bound is not None:
+            self.bound.renderer.dye(self._spots)
+
     def has_cut(self, nodes: ControlNodeCloud) -> bool:
         """Whether the cut surface of this state has arrived."""
         return nodes.cut in self._cuts
@@ -95,7 +107,9 @@ class ModelTracker:
         """
         built = self._background.take()
         if built is not None:
-            self.bound = built[1]
+            _, bound = built
+            bound.renderer.dye(self._spots)
+            self.bound = bound
         if self.model is not None:
             model, stamp = self.model, self.model_stamp
             rest = nodes.rest if nodes is not None and nodes.model_stamp_ns == stamp else None

@@ -18,8 +18,9 @@ from endo_sim_ros.learning.tasks import find_task
 from endo_sim_ros.messages import OK, STATE, WARN, PolicyState
 from endo_sim_ros.nodes.base import EndoNode, run
 from endo_sim_ros.nodes.configs import PolicyConfig, arm_names
-from endo_sim_ros.nodes.listeners import Listeners
+from endo_sim_ros.nodes.listeners import Listeners, delivered
 
+_DYED_WITHIN = 1.0  # seconds that the spot of an episode has to arrive before its first picture is rendered
 _PATIENCE = 30.0  # seconds; a request to a physics_node that was killed just now is never answered
 
 
@@ -46,6 +47,7 @@ class PolicyNode(EndoNode):
         self._step_ns = round(physics.step_duration * 1e9)
         self._pose_pub = self.publisher((messages.tool_joint_command if self._tools else messages.tool_pose_command)(arm))
         self._jaw_pub = self.publisher(messages.tool_jaw(arm))
+        self._dye_pub = self.publisher(messages.DYE)
         self._listeners = Listeners((self._pose_pub, self._jaw_pub))
         self._resetting = self.create_client(Trigger, f"{config.physics_node}/reset")
         self._state, self._missing = PolicyState.WAITING, ""  # and what for
@@ -70,6 +72,9 @@ class PolicyNode(EndoNode):
         if self._tools is not None:
             self._tools.begin(np.zeros(1, int), self._poses(self._task.tips()))
         self._stamp, self._heard, self._state = 0, {}, PolicyState.WAITING
+        spots = self._task.dyed_spots(0) if self._config.dye else ()
+        self._dye_pub.publish(messages.encode_dye(spots, self.now_ns(), self._config.world_frame))
+        delivered(self._dye_pub, _DYED_WITHIN)  # the state at rest is asked for next
         self._ask()
 
     def _ask(self) -> None:

@@ -63,6 +63,7 @@ class RenderingNode(EndoNode):
         self.subscribe(messages.TRAINING_CAMERA_INFO, self._on_training_info)
         self.subscribe(messages.CONTROL_NODES, self._on_nodes, depth)
         self.subscribe(messages.CUT_SURFACE, self._on_cut_surface, depth)
+        self.subscribe(messages.DYE, self._on_dye)
         self.subscribe(messages.CAMERA_POSE, self._on_camera, depth)
         self.subscribe(messages.LEFT_INFO, self._on_info, depth=1)
         self.subscribe(messages.RIGHT_INFO, self._on_right_info, depth=1)
@@ -127,6 +128,10 @@ class RenderingNode(EndoNode):
             self.show_states()
         else:
             self._change()
+
+    def _on_dye(self, message: Any) -> None:
+        self.tissue.receive_dye(message, self.options.world_frame)
+        self._change()
 
     def _change(self) -> None:
         """Mark what is shown as out of date."""

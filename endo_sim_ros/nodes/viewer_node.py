@@ -79,6 +79,7 @@ class ViewerNode(Watcher):
         self.subscribe(messages.TRAINING_CAMERAS, self._on_training_cameras)
         on_cut = lambda message: self._tissue.receive_cut_surface(message, self._options.world_frame)
         self.subscribe(messages.CUT_SURFACE, on_cut, depth=1)
+        self.subscribe(messages.DYE, lambda message: self._tissue.receive_dye(message, self._options.world_frame))
         self.subscribe(messages.CONTROL_NODES, self._on_nodes, depth=1)
         for topic in (messages.TRAINING_CAMERA_INFO, messages.RENDERED_INFO):
             self.subscribe(topic, partial(self._on_info, topic.name), depth=1)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import download, pick_device, upload
+from endo_sim_ros.core.dye import DyedSpot, dyed
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
 from endo_sim_ros.core.light import SURFACE, Light
 from endo_sim_ros.core.shading import shade, to_bytes
@@ -64,7 +65,7 @@ class DeformableRenderer:
             if not config.clamp_stretch:
                 options["stretch"] = None
             self.skinning = Skinning(self.model, node_rest, **options)
-        self._skin = self.model
+        self._skin, self._undyed = self.model, self.model.sh
         self._inside: Inside | None = None  # from the first cut on
 
     def cut(self, triangles: np.ndarray) -> None:
@@ -88,6 +89,12 @@ class DeformableRenderer:
             self.skinning.append(flesh)
             both = {name: torch.cat([value, getattr(flesh, name)]) for name, value in self.model.tensors().items()}
             self.model = replace(self.model, **both)
+
+    def dye(self, spots: Sequence[DyedSpot]) -> None:
+        """Show the tissue with these spots of dye, and no others."""
+        sh = dyed(self._undyed, self._skin.means, spots)
+        self._skin = replace(self._skin, sh=sh)
+        self.model = replace(self.model, sh=torch.cat([sh, self.model.sh[len(sh) :]]))
 
     def camera(self, camera: Camera) -> Camera:
         """Return the camera at the configured image width, with the height in proportion."""

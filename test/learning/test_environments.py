@@ -16,7 +16,7 @@ from played_tasks import IDS, VARIED, make, play
 
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.learning import environments
-from endo_sim_ros.learning.config import Randomisation
+from endo_sim_ros.learning.config import Randomisation, SightConfig
 from endo_sim_ros.learning.policies import scripted_policy
 from endo_sim_ros.learning.scenes import Scene, load_scene
 from endo_sim_ros.learning.task_batch import TaskBatch
@@ -170,6 +170,23 @@ def test_contact_that_there_is_not_is_refused():
         make("retraction", contact="capsule")
     with pytest.raises(ValueError, match="contact is links, which all episodes share, but randomisation gives each its tool"):
         make("retraction", contact="links", randomisation={"tool": 0.5})
+
+
+def test_a_spot_of_dye_shows_where_the_task_is():
+    """Without it, and without the tool, all episodes begin with one picture, and nobody could tell from it what to do."""
+    batch = TaskBatch("retraction", load_scene(), 8, "image", sight=SightConfig(instrument=False), device="cpu")
+    plain = TaskBatch("retraction", load_scene(), 8, "image", sight=SightConfig(instrument=False, dye=False), device="cpu")
+    for each in (batch, plain):
+        each.reset(range(8), [np.random.default_rng(seed) for seed in range(8)])
+    images, without = batch.images().astype(int), plain.images().astype(int)
+    assert (without == without[0]).all() and len(np.unique(images, axis=0)) == 8
+    camera = batch.pictures.camera
+    where = np.linalg.inv(camera.pose) @ np.append(batch.task.origin, np.ones((8, 1)), 1).T
+    places = (camera.K @ where[:3] / where[2])[:2].T
+    for image, before, place in zip(images, without, places):
+        v, u = np.nonzero(image[..., 2] - image[..., 0] > 40)
+        assert np.abs(np.array([u.mean() + 0.5, v.mean() + 0.5]) - place).max() < 2.0, "it is 7 pixels wide"
+        assert 10 < (np.abs(image - before).max(-1) > 20).sum() < 120, "the rest stays as it was"
 
 
 @pytest.mark.dds

@@ -6,6 +6,7 @@ from bad_messages import BAD_RECORDINGS, truncate
 from ros_bench import HEIGHT, WIDTH, K, S, await_image, await_nodes, newest_image, pull, send_camera, send_model, sheet
 
 from endo_sim_ros import messages
+from endo_sim_ros.core.dye import DyedSpot
 from endo_sim_ros.messages import OK, WARN
 from endo_sim_ros.nodes.configs import RenderingNodeConfig
 from endo_sim_ros.nodes.rendering_node import idle_period
@@ -58,6 +59,30 @@ def test_a_camera_that_sees_no_tissue_is_told_until_one_does(bench, rendering):
     send_camera(bench)
     await_image(bench, lambda image: image.max() > 100)
     bench.status("rendering_node", "rendering", OK, since=len(bench.statuses["rendering_node"]))
+
+
+def test_a_spot_of_dye_is_shown_until_it_is_taken_away_and_a_bad_one_changes_nothing(bench, rendering):
+    """Of a blue spot in the middle of what the camera sees, the blue stays in its place, also when a new model comes."""
+    send_model(bench)
+    send_camera(bench)
+    plain = await_image(bench, lambda image: image.max() > 100)
+    middle = sheet(8).means.numpy().mean(0)
+    blue = lambda image: image[HEIGHT // 2, WIDTH // 2, 2] > 200 > 60 > image[HEIGHT // 2, WIDTH // 2, 0]
+    assert not blue(plain)
+    bench.publish(messages.DYE, messages.encode_dye([DyedSpot(middle, 0.004, (0.0, 0.0, 1.0))], S, "world"))
+    shown = await_image(bench, blue)
+    np.testing.assert_array_equal(shown[:5, :5], plain[:5, :5])
+    for bad, sentence in (
+        (DyedSpot(middle * np.nan, 0.004), "spots are spheres (type 2) with a finite position"),
+        (DyedSpot(middle, -1.0), "a scale above 0"),
+        (DyedSpot(middle, 0.004, (0.0, 0.0, 9.0)), "colours from 0 to 1"),
+    ):
+        bench.publish(messages.DYE, messages.encode_dye([bad], S, "world"))
+        bench.refused("rendering_node", sentence, "dye: marker 0")
+    bench.publish(messages.DYE, messages.encode_dye([], S, "PSM1"))  # no spots are in no frame
+    await_image(bench, lambda image: np.array_equal(image, plain))
+    bench.publish(messages.DYE, messages.encode_dye([DyedSpot(middle, 0.004)], S, "PSM1"))
+    bench.refused("rendering_node", "unknown frame 'PSM1'")
 
 
 def test_control_nodes_that_are_damaged_or_of_another_model_leave_the_picture_alone(bench, rendering):

@@ -11,8 +11,8 @@ from endo_sim_command import endo_sim
 from made_recordings import BEGIN, HEIGHT, STEP, WIDTH, Recording, joints, labels, lockstep, picture, realtime
 
 from endo_sim_ros import messages
+from endo_sim_ros.core import drawing
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.learning import lerobot
 from endo_sim_ros.learning.episodes import action_names, environment_names, read_episode, state_names
 from endo_sim_ros.learning.lerobot import CAMERA_POSE, IMAGE, IMAGE_RIGHT, JOINTS, SEGMENTATION, export_lerobot
 
@@ -173,7 +173,7 @@ def test_a_dataset_is_not_overwritten_nor_left_in_halves(bag, dataset, tmp_path,
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(lerobot.drawing, "write_video", full)
+    monkeypatch.setattr(drawing, "write_video", full)
     with pytest.raises(OSError):
         export_lerobot([bag], tmp_path / "out", "t")
     assert not (tmp_path / "out").exists()
@@ -188,7 +188,7 @@ def test_odd_images_make_no_video(tmp_path):
             stamp = BEGIN + STEP * number
             message = messages.encode_image(picture(number)[:, 1:], stamp, "camera", recording.types)
             recording.write([(messages.RENDERED_IMAGE, message)])
-    with pytest.raises(SequenceError, match="95×80 images make no video, which needs even sides; export them as png"):
+    with pytest.raises(SequenceError, match="95×80 images make no video, which needs even sides; take another width or png"):
         export_lerobot([tmp_path / "bag"], tmp_path / "out", "t")
     assert export_lerobot([tmp_path / "bag"], tmp_path / "out", "t", images="png") == (1, 3)
 

@@ -1,0 +1,340 @@
+"""Writes a LeRobot dataset, layout v3.0: tables in parquet, images as video or PNG, metadata in json and parquet.
+
+Written here and not by the lerobot library, which wants older torch, numpy and OpenCV than this package runs with; tests
+read the result with it where it is installed. Each episode has files of its own, so that a dataset can be continued.
+"""
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import islice
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+
+from endo_sim_ros.core import drawing
+from endo_sim_ros.core.folders import written_whole
+from endo_sim_ros.core.frames import SequenceError
+
+VERSION = "v3.0"
+IMAGE = "observation.images.endoscope.left"
+IMAGE_RIGHT = "observation.images.endoscope.right"
+SEGMENTATION = "observation.segmentation"
+_DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+_VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+_EPISODES = "meta/episodes/chunk-000/file-000.parquet"
+_INFO, _HISTOGRAMS = "meta/info.json", "meta/image_histograms.npz"  # the latter to continue with
+_CHUNK_SIZE = 1000  # files in a folder
+# Every second frame is a key frame, so that any is found fast; without frames out of order times begin at zero.
+_CODEC_OPTIONS = {"g": "2", "bf": "0", "crf": "18"}
+_QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
+_GROUP = 256  # rows that are written together with their png images
+_SAMPLE = 150  # pixels along the longer side of an image that count in its statistics
+_INDICES = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+
+ImageFormat = Literal["video", "png"]
+
+
+def import_pyarrow() -> Any:
+    """The library that writes tables.
+
+    Raises:
+        RuntimeError: If it is not installed.
+    """
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError as error:
+        raise RuntimeError("a LeRobot dataset needs pyarrow, which is not installed; pip install 'endo_sim_ros[lerobot]'") from error
+    return pyarrow
+
+
+def vector_feature(names: Sequence[str]) -> dict[str, Any]:
+    """What a column of vectors with these names is."""
+    return {"dtype": "float32", "shape": [len(names)], "names": list(names)}
+
+
+def scalar_feature(dtype: str) -> dict[str, Any]:
+    """What a column of numbers is."""
+    return {"dtype": dtype, "shape": [1], "names": None}
+
+
+def picture_feature(key: str, size: tuple[int, int], fps: int, images: ImageFormat) -> dict[str, Any]:
+    """What a column of pictures of a size (height, width) is; labels are kept exactly, whatever the images are."""
+    (height, width), channels = size, 1 if key == SEGMENTATION else 3
+    kind = "image" if images == "png" or key == SEGMENTATION else "video"
+    feature: dict[str, Any] = {"dtype": kind, "shape": [height, width, channels], "names": ["height", "width", "channels"]}
+    if kind == "video":
+        feature["info"] = {
+            "video.height": height,
+            "video.width": width,
+            "video.codec": "h264",
+            "video.pix_fmt": "yuv420p",
+            "video.is_depth_map": False,
+            "video.fps": fps,
+            "video.channels": channels,
+            "has_audio": False,
+        }
+    return feature
+
+
+class DatasetWriter:
+    """Writes a dataset, episode by episode, and continues one that was begun with the same features.
+
+    Args:
+        root: Its folder.
+        task: What is done, in words.
+        fps: Rows per second.
+        features: What its columns are, beside the indices that every dataset has.
+
+    Raises:
+        SequenceError: If there is another dataset in the folder, or it is damaged, or videos have odd sides.
+        RuntimeError: If pyarrow is not installed.
+    """
+
+    def __init__(self, root: Path, task: str, fps: int, features: Mapping[str, dict[str, Any]]):
+        self.task, self._root, self._fps, self._pa = task, root, fps, import_pyarrow()
+        kinds = {name: "float32" if name == "timestamp" else "int64" for name in _INDICES}
+        self.features = {**features, **{name: scalar_feature(kind) for name, kind in kinds.items()}}
+        self._pictures = [key for key, feature in features.items() if feature["dtype"] in ("image", "video")]
+        for key in self._pictures:
+            height, width, _ = features[key]["shape"]
+            if features[key]["dtype"] == "video" and (height % 2 or width % 2):
+                raise SequenceError(f"{width}×{height} images make no video, which needs even sides; take another width or png")
+        self._rows: list[dict[str, Any]] = []
+        self._columns: list[dict[str, np.ndarray]] = []
+        self._histograms: list[dict[str, np.ndarray]] = []
+        if (root / _INFO).exists():
+            self._continue()
+
+    @property
+    def episodes(self) -> int:
+        """Number of episodes so far."""
+        return len(self._rows)
+
+    @property
+    def frames(self) -> int:
+        """Number of rows so far."""
+        return sum(row["length"] for row in self._rows)
+
+    def column(self, name: str) -> np.ndarray:
+        """A column of numbers of all episodes so far."""
+        return np.concatenate([columns[name] for columns in self._columns]) if self._columns else np.zeros(0)
+
+    def add(self, columns: dict[str, np.ndarray], pictures: Mapping[str, Iterable[np.ndarray]]) -> None:
+        """Write an episode.
+
+        Args:
+            columns: Numbers [T] and vectors [T, D].
+            pictures: T of each kind.
+        """
+        number, begin, count = self.episodes, self.frames, len(next(iter(columns.values())))
+        frames = np.arange(count)
+        own = columns | {
+            "timestamp": (frames / self._fps).astype(np.float32),
+            "frame_index": frames,
+            "episode_index": np.full_like(frames, number),
+            "index": begin + frames,
+            "task_index": np.zeros_like(frames),
+        }
+        histograms = self._write_files(number, own, pictures)
+        self._rows.append(self._row(number, begin, count) | _flat(_statistics(own, histograms, count)))
+        self._columns.append(own)
+        self._histograms.append(histograms)
+
+    def save(self) -> None:
+        """Write what describes all episodes so far; without it the newest are not part of the dataset."""
+        if not self.episodes:
+            return
+        merged = {key: self.column(key) for key in self._columns[0]}
+        histograms: dict[str, Any] = {key: np.stack([each[key] for each in self._histograms]) for key in self._histograms[0]}
+        statistics = _statistics(merged, {key: each.sum(0) for key, each in histograms.items()}, self.frames)
+        self._write_json("meta/stats.json", statistics)
+        with written_whole(self._path(_HISTOGRAMS)) as partial, partial.open("wb") as file:
+            np.savez_compressed(file, **histograms)
+        self._write_table(_EPISODES, {key: self._pa.array([row[key] for row in self._rows]) for key in self._rows[0]})
+        self._write_tasks()
+        self._write_json(_INFO, self._info())  # last: it tells how many there are
+
+    def _continue(self) -> None:
+        """Take up a dataset where it ends."""
+        try:
+            info = json.loads((self._root / _INFO).read_text("utf8"))
+            if [info["features"], info["fps"]] != json.loads(json.dumps([self.features, self._fps])):
+                raise SequenceError(f"{self._root} has other columns, images or rates; choose another name")
+            (task,) = self._pa.parquet.read_table(self._root / "meta/tasks.parquet").column("__index_level_0__").to_pylist()
+            if task != self.task:
+                raise SequenceError(f"{self._root} is of the task {task!r}, not {self.task!r}; choose another name")
+            count = info["total_episodes"]
+            self._rows = self._pa.parquet.read_table(self._root / _EPISODES).to_pylist()[:count]
+            numbers = [key for key in self.features if key not in self._pictures]
+            for number in range(count):
+                table = self._pa.parquet.read_table(self._root / _DATA.format(**_place(number)), columns=numbers)
+                self._columns.append({key: _from_column(table.column(key), self.features[key]) for key in numbers})
+            with np.load(self._root / _HISTOGRAMS) as file:
+                self._histograms = [{key: file[key][number] for key in self._pictures} for number in range(count)]
+        except (OSError, KeyError, ValueError, IndexError, self._pa.ArrowException) as error:
+            if isinstance(error, SequenceError):
+                raise
+            raise SequenceError(f"{self._root} cannot be continued: {' '.join(str(error).split())}; choose another name") from error
+
+    def _write_files(
+        self, number: int, columns: dict[str, np.ndarray], pictures: Mapping[str, Iterable[np.ndarray]]
+    ) -> dict[str, np.ndarray]:
+        """Write table and pictures of an episode and return the histograms [C, 256] of its pictures by their keys."""
+        histograms, cells, count = {}, {}, len(columns["index"])
+        table = self._pa.table({key: self._column(columns[key], self.features[key]) for key in columns})
+        for key in self._pictures:
+            histograms[key] = np.zeros((self.features[key]["shape"][2], 256), np.int64)
+            counted = _counted(pictures[key], histograms[key])
+            if self.features[key]["dtype"] == "image":
+                cells[key] = counted
+            else:
+                path = self._path(_VIDEO.format(video_key=key, **_place(number)))
+                drawing.write_video(path, counted, self._fps, _CODEC_OPTIONS)
+        kind = self._pa.struct({"bytes": self._pa.binary(), "path": self._pa.string()})
+        schema = table.schema
+        for key in cells:
+            schema = schema.append(self._pa.field(key, kind))
+        with self._pa.parquet.ParquetWriter(self._path(_DATA.format(**_place(number))), schema) as file:
+            for begin in range(0, count, _GROUP):  # the images of a long episode do not fit into memory
+                part = table.slice(begin, _GROUP)
+                for key, shown in cells.items():
+                    own = [{"bytes": _png(picture), "path": None} for picture in islice(shown, len(part))]
+                    part = part.append_column(key, self._pa.array(own, kind))
+                file.write_table(part)
+        return histograms
+
+    def _column(self, values: np.ndarray, feature: dict) -> Any:
+        """Column of scalars [T], or of vectors [T, D]."""
+        flat = self._pa.array(np.ascontiguousarray(values).reshape(-1))
+        return flat if values.ndim == 1 else self._pa.FixedSizeListArray.from_arrays(flat, feature["shape"][0])
+
+    def _row(self, number: int, begin: int, count: int) -> dict[str, Any]:
+        """What the table of episodes tells of one."""
+        place = _place(number)
+        row = {
+            "episode_index": number,
+            "tasks": [self.task],
+            "length": count,
+            **{f"data/{name}": value for name, value in place.items()},
+            "dataset_from_index": begin,
+            "dataset_to_index": begin + count,
+            "meta/episodes/chunk_index": 0,
+            "meta/episodes/file_index": 0,
+        }
+        for key in [key for key in self._pictures if self.features[key]["dtype"] == "video"]:
+            video = place | {"from_timestamp": 0.0, "to_timestamp": count / self._fps}
+            row |= {f"videos/{key}/{name}": value for name, value in video.items()}
+        return row
+
+    def _info(self) -> dict[str, Any]:
+        videos = any(self.features[key]["dtype"] == "video" for key in self._pictures)
+        return {
+            "codebase_version": VERSION,
+            "robot_type": "endo_sim",
+            "total_episodes": self.episodes,
+            "total_frames": self.frames,
+            "total_tasks": 1,
+            "chunks_size": _CHUNK_SIZE,
+            "data_files_size_in_mb": 100,
+            "video_files_size_in_mb": 200,
+            "fps": self._fps,
+            "splits": {"train": f"0:{self.episodes}"},
+            "data_path": _DATA,
+            "video_path": _VIDEO if videos else None,
+            "features": self.features,
+        }
+
+    def _write_tasks(self) -> None:
+        """One task; pandas, which reads the table, is told that its text is the index."""
+        index = "__index_level_0__"
+        column = {"metadata": None}
+        pandas = {
+            "index_columns": [index],
+            "column_indexes": [],
+            "columns": [
+                {"name": "task_index", "field_name": "task_index", "pandas_type": "int64", "numpy_type": "int64"} | column,
+                {"name": None, "field_name": index, "pandas_type": "unicode", "numpy_type": "object"} | column,
+            ],
+            "pandas_version": "2.0.0",
+        }
+        columns = {"task_index": self._pa.array([0], self._pa.int64()), index: self._pa.array([self.task])}
+        self._write_table("meta/tasks.parquet", columns, {"pandas": json.dumps(pandas)})
+
+    def _write_table(self, name: str, columns: dict[str, Any], metadata: dict[str, str] | None = None) -> None:
+        with written_whole(self._path(name)) as partial:
+            self._pa.parquet.write_table(self._pa.table(columns).replace_schema_metadata(metadata), partial)
+
+    def _write_json(self, name: str, values: dict) -> None:
+        plain = lambda value: value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
+        with written_whole(self._path(name)) as partial:
+            partial.write_text(json.dumps(values, indent=4, ensure_ascii=False, default=plain), "utf8")
+
+    def _path(self, name: str) -> Path:
+        path = self._root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path
+
+
+def _place(number: int) -> dict[str, int]:
+    """Where the files of an episode are."""
+    return dict(zip(("chunk_index", "file_index"), divmod(number, _CHUNK_SIZE)))
+
+
+def _from_column(column: Any, feature: dict[str, Any]) -> np.ndarray:
+    """Scalars [T], or vectors [T, D], of a column of a table."""
+    values = column.combine_chunks()
+    if feature["shape"] == [1] and feature["names"] is None:
+        return values.to_numpy(zero_copy_only=False)
+    return values.flatten().to_numpy(zero_copy_only=False).reshape(-1, feature["shape"][0])
+
+
+# ---------------------------------------------------------------------------------------------------------------- images
+
+
+def _png(image: np.ndarray) -> bytes:
+    return cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image)[1].tobytes()
+
+
+def _counted(images: Iterable[np.ndarray], histogram: np.ndarray) -> Iterator[np.ndarray]:
+    """Pass pictures on and add a sample of their pixels to a histogram [C, 256]."""
+    for image in images:
+        every = max(max(image.shape) // _SAMPLE, 1)
+        sample = image[::every, ::every].reshape(-1, len(histogram))
+        for channel in range(len(histogram)):
+            histogram[channel] += np.bincount(sample[:, channel], minlength=256)
+        yield image
+
+
+# ------------------------------------------------------------------------------------------------------------ statistics
+
+
+def _statistics(columns: dict[str, np.ndarray], histograms: dict[str, np.ndarray], frames: int) -> dict[str, dict[str, np.ndarray]]:
+    """Minimum, maximum, mean, standard deviation, count and quantiles of every column; of images per channel, 0 to 1."""
+    count = np.array([frames])
+    statistics = {key: _image_statistics(histogram) | {"count": count} for key, histogram in histograms.items()}
+    for key, column in columns.items():
+        values = column.reshape(len(column), -1).astype(np.float64)
+        found = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0), "std": values.std(0), "count": count}
+        statistics[key] = found | {name: np.quantile(values, q, axis=0) for name, q in _QUANTILES.items()}
+    return statistics
+
+
+def _image_statistics(histogram: np.ndarray) -> dict[str, np.ndarray]:
+    levels, share = np.arange(256) / 255, histogram / histogram.sum(1, keepdims=True)
+    below = np.cumsum(share, 1)
+    mean = share @ levels
+    found = {
+        "min": [levels[np.flatnonzero(row)[0]] for row in histogram],
+        "max": [levels[np.flatnonzero(row)[-1]] for row in histogram],
+        "mean": mean,
+        "std": np.sqrt(np.maximum(share @ levels**2 - mean**2, 0)),
+    } | {name: [levels[np.searchsorted(row, q)] for row in below] for name, q in _QUANTILES.items()}
+    return {name: np.reshape(values, (-1, 1, 1)) for name, values in found.items()}
+
+
+def _flat(statistics: dict[str, dict[str, np.ndarray]]) -> dict[str, list]:
+    """Columns of the table of episodes."""
+    return {f"stats/{key}/{name}": value.tolist() for key, found in statistics.items() for name, value in found.items()}

@@ -27,6 +27,8 @@ class Command:
     """Show the tool; without it an arm is a tip that reaches every pose."""
     tool: str = ""
     """Name or file of the tool; default: that of the task."""
+    dye: bool = SightConfig.dye
+    """Mark the target with a spot of dye on the tissue."""
     baseline: float = SightConfig.baseline
     """Distance between the eyes, m."""
     motion: MotionConfig = field(default_factory=MotionConfig)
@@ -36,6 +38,7 @@ class Command:
         from endo_sim_ros.learning.graph_files import save_scene
         from endo_sim_ros.learning.scenes import load_scene
 
-        sight = SightConfig(image_width=self.image_width, instrument=self.instrument, tool=self.tool, baseline=self.baseline)
+        names = ("image_width", "instrument", "tool", "dye", "baseline")
+        sight = SightConfig(**{name: getattr(self, name) for name in names})
         save_scene(load_scene(self.model), self.out, self.task, self.seed, sight, self.motion)
         print(f"{self.out}: model.ply, cameras.json, parameters.yaml")

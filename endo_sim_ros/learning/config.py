@@ -104,3 +104,20 @@ class PPOConfig(StageConfig):
     """Other episodes on which the mean action is tested."""
     seed: Annotated[int, Range(0, 2**31 - 1)] = 0
     """Another seed draws other weights, actions and episodes."""
+
+
+@dataclass(frozen=True)
+class DemonstrationConfig(StageConfig):
+    """Demonstrations by the scripted policy of a task."""
+
+    episodes: Annotated[int, Range(1, 1_000_000)] = 50
+    """Solved episodes of the dataset."""
+    seed: Annotated[int, Range(0, 2**31 - 1)] = 0
+    """Seed of the first episode; each following one has the next seed."""
+    environments: Annotated[int, Range(1, 10_000)] = 16
+    """Episodes at once; the dataset does not depend on it on a CPU."""
+    noise: Annotated[float, Range(0, 2)] = 0.1
+    """Standard deviation of what is added to each action before it acts, in its units of -1 to 1. What is written is the action without
+    it, so that the data show how an expert recovers (DART, Laskey et al. 2017)."""
+    images: Literal["video", "png"] = "video"
+    """video: small (H.264); png: exact."""

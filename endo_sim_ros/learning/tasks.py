@@ -51,6 +51,7 @@ class Task(ABC):
     """
 
     name: str
+    sentence: str  # what is to be done, for policies that read it
     observation_names: tuple[str, ...]
     horizon: int  # steps of an episode
     step_length = 0.002  # m in one step, per axis
@@ -158,14 +159,23 @@ class Task(ABC):
         self.fourth = fourth
         self.raised = np.where(self.fourth > 0, self.raised + 1, 0)
         self.steps = self.steps + 1
-        return self.tips(), self._closed()
+        return self.tips(), self.closes(fourth)
+
+    def forces(self) -> np.ndarray:
+        """What the tissue exerted on the tools when they were last observed [B, 3], N, world."""
+        return self._to_world(self.force)
 
     def find(self, places: np.ndarray) -> np.ndarray:
         """Places [B, 3] of the world, m, in the task frame."""
         return self._to_task(places - self.origin)
 
-    def _closed(self) -> np.ndarray:
-        return np.zeros(self.count, bool)
+    def closes(self, fourth: np.ndarray) -> np.ndarray:
+        """Whether a fourth number of actions [B] closes the jaws."""
+        return np.zeros(len(fourth), bool)
+
+    def reach(self, actions: np.ndarray) -> np.ndarray:
+        """Where actions [B, 4] in -1 … 1 put the tips [B, 3], m, world."""
+        return self.origin + self._to_world(np.clip(self.tip + self.step_length * actions[:, :3], self.low, self.high))
 
     def observe(self, positions: np.ndarray, forces: np.ndarray) -> np.ndarray:
         """Observations [B, n], float32.
@@ -240,6 +250,7 @@ class Retraction(Task):
     """
 
     name = "retraction"
+    sentence = "Grasp the tissue at the blue spot and lift it towards the endoscope."
     observation_names = (
         *(f"tip_{axis}" for axis in "xyz"), *(f"spot_from_tip_{axis}" for axis in "xyz"), "distance",
         *(f"spot_moved_{axis}" for axis in "xyz"), "jaw",
@@ -269,8 +280,9 @@ class Retraction(Task):
         self.tip[b, 2] = self.high[2]
         self._held[b] = 0
 
-    def _closed(self) -> np.ndarray:
-        return self.fourth > 0
+    def closes(self, fourth: np.ndarray) -> np.ndarray:
+        """Above zero it does."""
+        return fourth > 0
 
     def _columns(self, here: np.ndarray) -> list[np.ndarray]:
         self._moved = here[:, 0]
@@ -300,6 +312,7 @@ class Palpation(Task):
     """
 
     name = "palpation"
+    sentence = "Press on the tissue around the blue spot and report where it is stiffest."
     observation_names = (
         *(f"tip_{axis}" for axis in "xyz"), "height", "most_from_tip_x", "most_from_tip_y", "most",
         *(f"force_{axis}" for axis in "xyz"), "force", "time_left",

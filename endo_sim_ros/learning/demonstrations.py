@@ -1,0 +1,238 @@
+"""Demonstrations: scripted policies solve episodes of a task, and what they see and do is written as a LeRobot dataset.
+
+Columns beside those that every LeRobot dataset has:
+
+=============================  ==================================================================================
+observation.images.endoscope.  left, and right with two eyes: what the endoscope shows
+observation.segmentation       what is in each pixel, on request
+observation.state              of the arm alone, in the axes of the world: pose of the tip (m, xyzw), jaw (rad), and
+                               the force of the tissue on the tool (N)
+observation.joints             yaw, pitch, insertion (m), roll, wrist_pitch, wrist_yaw, where there is an instrument
+observation.environment_state  the state observation of the task, which knows the goal
+action                         what the task takes, -1 to 1: how far the tip moves in its frame, and the fourth number
+command.pose                   the same as a command: pose of the tip in the world, and jaw
+next.reward, .done, .success   what the action led to
+seed                           of the episode
+=============================  ==================================================================================
+
+With the observations of row k the policy took the action of row k.
+"""
+
+import json
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.progress import Progress
+
+from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.instruments import JOINTS
+from endo_sim_ros.learning.config import DemonstrationConfig, Randomisation, SightConfig
+from endo_sim_ros.learning.dataset import (
+    IMAGE,
+    IMAGE_RIGHT,
+    SEGMENTATION,
+    DatasetWriter,
+    ImageFormat,
+    picture_feature,
+    scalar_feature,
+    vector_feature,
+)
+from endo_sim_ros.learning.episodes import POSE_NAMES
+from endo_sim_ros.learning.held_tools import ARM
+from endo_sim_ros.learning.policies import Policy, scripted_policy
+from endo_sim_ros.learning.scenes import Scene
+from endo_sim_ros.learning.task_batch import TaskBatch
+from endo_sim_ros.learning.tasks import Task
+from endo_sim_ros.physics import MotionConfig
+
+_COLUMNS = {"image": IMAGE, "image_right": IMAGE_RIGHT, "segmentation": SEGMENTATION}
+_OPTIONS = "meta/demonstrations.json"  # what the episodes depend on
+_SAVE_EVERY = 10.0  # seconds; a process that is killed loses at most the episodes of this time
+_FEWEST = 0.02  # share of episodes that the script must solve
+_CARD = """---
+license: apache-2.0
+task_categories:
+- robotics
+tags:
+- LeRobot
+- surgical-robotics
+- simulation
+---
+
+# {task}
+
+{episodes} simulated episodes, {frames} frames at {fps} Hz, of the task *{task}* of endo_sim_ros: {sentence} A scripted policy solved them.
+
+```python
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+dataset = LeRobotDataset("local/{name}", root="{name}")
+```
+
+| column | shape | names |
+|---|---|---|
+{columns}
+"""
+
+
+@dataclass
+class _Episode:
+    """What is known of an episode so far, a row each."""
+
+    rng: np.random.Generator
+    rows: dict[str, list[Any]] = field(default_factory=dict)
+    pictures: dict[str, list[np.ndarray]] = field(default_factory=dict)
+    solved: bool | None = None  # None = it goes on
+
+
+def demonstrate(
+    task: str,
+    scene: Scene,
+    out: Path,
+    config: DemonstrationConfig = DemonstrationConfig(),
+    sight: SightConfig = SightConfig(),
+    randomisation: Randomisation = Randomisation(),
+    motion: MotionConfig = MotionConfig(),
+    device: str = "auto",
+) -> tuple[int, int]:
+    """Write solved episodes of a task, or continue where an interrupted call ended; returns their number and how many were tried now.
+
+    Args:
+        task: Its name.
+        scene: What is seen and touched.
+        out: Folder of the dataset. Finished episodes stay in it when the call is interrupted.
+        config, sight, randomisation, motion: Options.
+        device: Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N.
+
+    Raises:
+        SequenceError: If the folder has other data, or hardly an episode is solved.
+        ValueError: If there is no such task, or an option cannot be used.
+        RuntimeError: If pyarrow is not installed.
+    """
+    batch = TaskBatch(task, scene, config.environments, "both", randomisation, sight, device, motion=motion)
+    policy = scripted_policy(task, batch.count)
+    fps = round(1 / batch.task.physics().step_duration)
+    options = {"task": task, "seed": config.seed, "noise": config.noise, **asdict(sight), **asdict(randomisation), **asdict(motion)}
+    _check_options(out, options)
+    writer = DatasetWriter(out, batch.task.sentence, fps, _features(batch, fps, config.images))
+    seeds = writer.column("seed")
+    seed, tried = int(seeds[-1]) + 1 if len(seeds) else config.seed, 0
+
+    def save() -> None:
+        if writer.episodes:
+            writer.save()
+            (out / _OPTIONS).write_text(json.dumps(options, indent=4))
+            (out / "README.md").write_text(_card(out, task, fps, writer), "utf8")
+
+    saved = time.monotonic()
+    try:
+        with Progress() as bar:
+            progress = bar.add_task(task, total=config.episodes, completed=writer.episodes)
+            while writer.episodes < config.episodes:
+                episodes = _play(batch, policy, config.noise, seed)
+                for number, episode in enumerate(episodes):
+                    if writer.episodes == config.episodes:
+                        break
+                    tried += 1
+                    if episode.solved:
+                        _write(writer, episode, seed + number)
+                        bar.update(progress, completed=writer.episodes)
+                seed += len(episodes)
+                if time.monotonic() - saved > _SAVE_EVERY:
+                    save()
+                    saved = time.monotonic()
+                if tried * _FEWEST > 1 and writer.episodes < tried * _FEWEST:
+                    raise SequenceError(f"{writer.episodes} of {tried} episodes were solved; less noise or randomisation helps")
+    finally:
+        save()
+    return writer.episodes, tried
+
+
+def _check_options(out: Path, options: dict[str, Any]) -> None:
+    if not out.exists() or not any(out.iterdir()):
+        return
+    try:
+        before = json.loads((out / _OPTIONS).read_text("utf8"))
+    except (OSError, ValueError) as error:
+        raise SequenceError(f"{out} exists already and has no demonstrations; choose another name or remove it first") from error
+    other = [name for name, value in json.loads(json.dumps(options)).items() if before.get(name) != value]
+    if other:
+        had = ", ".join(f"{name} {before.get(name)!r}" for name in other)
+        raise SequenceError(f"{out} was begun with {had}; continue it with the same options, or choose another name")
+
+
+def _play(batch: TaskBatch, policy: Policy, noise: float, seed: int) -> list[_Episode]:
+    """One episode in each environment, the first with this seed, the others with those that follow."""
+    numbers, task = range(batch.count), batch.task
+    policy.reset(numbers)
+    batch.reset(numbers, [np.random.default_rng(seed + b) for b in numbers])
+    episodes = [_Episode(np.random.default_rng([seed + b, 0xDA])) for b in numbers]
+    seen = batch.observe()
+    while any(episode.solved is None for episode in episodes):
+        assert isinstance(seen, dict)  # of state and images
+        actions = np.clip(policy.act(seen["state"]), -1, 1)
+        rows = {
+            "observation.state": np.concatenate([_poses(task, task.tips(), task.fourth), task.forces()], 1),
+            "observation.environment_state": seen["state"],
+            "action": actions,
+            "command.pose": _poses(task, task.reach(actions), actions[:, 3]),
+        }
+        if batch.tools is not None:
+            rows["observation.joints"] = batch.tools.joints.copy()
+        noisy = actions + noise * np.stack([np.append(episode.rng.standard_normal(3), 0) for episode in episodes])
+        after, outcome = batch.step(np.clip(noisy, -1, 1))
+        rows |= {"next.reward": outcome.reward, "next.done": outcome.terminated | outcome.truncated, "next.success": outcome.success}
+        for b, episode in enumerate(episodes):
+            if episode.solved is None:
+                for name, values in rows.items():
+                    episode.rows.setdefault(name, []).append(values[b])
+                for name in seen.keys() & _COLUMNS.keys():
+                    episode.pictures.setdefault(_COLUMNS[name], []).append(seen[name][b].squeeze())
+                if rows["next.done"][b]:
+                    episode.solved = bool(outcome.success[b])
+        seen = after
+    return episodes
+
+
+def _write(writer: DatasetWriter, episode: _Episode, seed: int) -> None:
+    columns = {name: np.array(values) for name, values in episode.rows.items()}
+    columns = {name: values if values.dtype == bool else values.astype(np.float32) for name, values in columns.items()}
+    writer.add(columns | {"seed": np.full(len(columns["action"]), seed)}, episode.pictures)
+
+
+def _poses(task: Task, tips: np.ndarray, fourth: np.ndarray) -> np.ndarray:
+    """Poses [B, 7] of tips [B, 3] with the axes of the world, and jaws as a fourth number of actions [B] has them, [B, 8]."""
+    jaws = np.where(task.closes(fourth), task.closed_jaw, task.open_jaw)
+    return np.column_stack([tips, np.tile([0.0, 0.0, 0.0, 1.0], (len(tips), 1)), jaws])
+
+
+def _features(batch: TaskBatch, fps: int, images: ImageFormat) -> dict[str, dict[str, Any]]:
+    """What the columns are."""
+    assert batch.pictures is not None  # images are observed
+    pose = [f"{ARM}.{name}" for name in (*POSE_NAMES, "jaw")]
+    vectors = {
+        "observation.state": [*pose, *(f"{ARM}.force_{axis}" for axis in "xyz")],
+        "observation.environment_state": batch.task.observation_names,
+        "action": ["x", "y", "z", "fourth"],
+        "command.pose": pose,
+    }
+    if batch.tools is not None:
+        vectors["observation.joints"] = [f"{ARM}.{name}" for name in JOINTS]
+    kinds = {"next.reward": "float32", "next.done": "bool", "next.success": "bool", "seed": "int64"}
+    camera, sight = batch.pictures.camera, batch.sight
+    shown = [IMAGE, *([IMAGE_RIGHT] * (sight.eyes == 2)), *([SEGMENTATION] * sight.segmentation)]
+    features = {key: picture_feature(key, (camera.height, camera.width), fps, images) for key in shown}
+    features |= {key: vector_feature(names) for key, names in vectors.items()}
+    return features | {key: scalar_feature(kind) for key, kind in kinds.items()}
+
+
+def _card(out: Path, task: str, fps: int, writer: DatasetWriter) -> str:
+    """A README for those who find the dataset."""
+    cells = ((f"`{key}`", feature["shape"], ", ".join(feature["names"] or ())) for key, feature in writer.features.items())
+    columns = "\n".join("| {} | {} | {} |".format(*each) for each in cells)
+    return _CARD.format(
+        task=task, episodes=writer.episodes, frames=writer.frames, fps=fps, sentence=writer.task, name=out.name, columns=columns
+    )

@@ -1,0 +1,137 @@
+"""Demonstrations by scripted policies, as a dataset that can be continued."""
+
+import json
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from endo_sim_command import endo_sim
+from played_tasks import make
+
+from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.learning import dataset, demonstrations
+from endo_sim_ros.learning.config import DemonstrationConfig, SightConfig
+from endo_sim_ros.learning.dataset import IMAGE, IMAGE_RIGHT, SEGMENTATION, DatasetWriter, vector_feature
+from endo_sim_ros.learning.demonstrations import demonstrate
+from endo_sim_ros.learning.scenes import load_scene
+
+SIGHT = SightConfig(image_width=40, eyes=2, segmentation=True)
+
+
+def run(out, episodes, noise=0.3, environments=3, task="retraction", **options):
+    config = DemonstrationConfig(episodes=episodes, noise=noise, environments=environments, images="png", seed=7)
+    return demonstrate(task, load_scene(), out, config, options.pop("sight", SIGHT), device="cpu", **options)
+
+
+def tables(root):
+    return [pq.read_table(path) for path in sorted(root.glob("data/*/*.parquet"))]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Four episodes in one go."""
+    out = tmp_path_factory.mktemp("demonstrations") / "whole"
+    assert run(out, 4)[0] == 4
+    return out
+
+
+def test_what_was_seen_and_done_solves_the_task(whole):
+    info = json.loads((whole / "meta/info.json").read_text())
+    assert (info["total_episodes"], info["fps"], info["splits"]) == (4, 25, {"train": "0:4"})
+    assert {IMAGE, IMAGE_RIGHT, SEGMENTATION} <= set(info["features"])
+    for table in tables(whole):
+        columns = {name: np.array(table.column(name).to_pylist()) for name in table.column_names if name not in (IMAGE, IMAGE_RIGHT)}
+        assert columns["next.done"].tolist() == [False] * (len(table) - 1) + [True] == columns["next.success"].tolist()
+        assert len(np.unique(columns["seed"])) == 1
+        names = info["features"]["observation.environment_state"]["names"]
+        moved = columns["observation.environment_state"][:, names.index("spot_moved_z")]
+        assert moved[0] == 0 and moved[-1] > 0.8, "the last row is the one before the goal"
+        ways = np.linalg.norm(columns["command.pose"][:, :3] - columns["observation.state"][:, :3], axis=1)
+        inside = (np.abs(columns["action"][:, :3]) < 1).all(1)
+        np.testing.assert_allclose(ways[inside], 0.002 * np.linalg.norm(columns["action"][inside, :3], axis=1), atol=2e-6)
+
+
+@pytest.mark.slow
+def test_without_noise_the_written_actions_lead_to_the_written_states(tmp_path):
+    """As played again in a single environment, bit by bit."""
+    run(tmp_path / "out", 2, noise=0.0)
+    environment = make("retraction")
+    for table in tables(tmp_path / "out"):
+        columns = {name: np.array(table.column(name).to_pylist(), np.float32) for name in ("observation.environment_state", "action")}
+        state, _ = environment.reset(seed=table.column("seed")[0].as_py())
+        for row, action in zip(columns["observation.environment_state"], columns["action"]):
+            np.testing.assert_allclose(row, state, atol=1e-5)
+            state, *_, info = environment.step(action)
+        assert info["success"]
+
+
+@pytest.mark.slow
+def test_an_interrupted_run_goes_on_and_ends_as_one_in_one_go(whole, tmp_path, monkeypatch):
+    """Whatever the number of environments."""
+    out, add = tmp_path / "whole", DatasetWriter.add
+
+    def interrupted(writer, *arguments):
+        if writer.episodes == 2:
+            raise KeyboardInterrupt
+        add(writer, *arguments)
+
+    monkeypatch.setattr(DatasetWriter, "add", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run(out, 4, environments=2)
+    monkeypatch.undo()
+    info = json.loads((out / "meta/info.json").read_text())
+    assert info["total_episodes"] == 2 and info["total_frames"] == sum(map(len, tables(out)))
+    assert run(out, 4, environments=5)[0] == 4
+    for mine, other in zip(tables(out), tables(whole), strict=True):
+        assert mine.equals(other)
+    for name in ("meta/info.json", "meta/stats.json", "README.md"):
+        assert (out / name).read_text() == (whole / name).read_text(), name
+    assert run(out, 4) == (4, 0), "there is nothing left to do"
+
+
+def test_other_folders_and_other_options_are_refused(whole, tmp_path):
+    with pytest.raises(SequenceError, match="whole was begun with noise 0.3; continue it with the same options, or choose another name"):
+        run(whole, 5, noise=0.1)
+    with pytest.raises(SequenceError, match="was begun with image_width 40"):
+        run(whole, 5, sight=SightConfig(image_width=48, eyes=2, segmentation=True))
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos/a.txt").write_text("a")
+    with pytest.raises(SequenceError, match="photos exists already and has no demonstrations"):
+        run(tmp_path / "photos", 1)
+    with pytest.raises(SequenceError, match="41×33 images make no video"):
+        config = DemonstrationConfig(episodes=1, environments=1)
+        demonstrate("retraction", load_scene(), tmp_path / "odd", config, SightConfig(image_width=41), device="cpu")
+    assert not (tmp_path / "odd").exists()
+
+
+def test_a_script_that_hardly_solves_anything_is_told(tmp_path, monkeypatch):
+    monkeypatch.setattr(demonstrations, "_FEWEST", 1.01)
+    with pytest.raises(SequenceError, match=r"\d+ of 3 episodes were solved; less noise or randomisation helps"):
+        run(tmp_path / "out", 50)
+
+
+def test_a_dataset_that_was_cut_off_is_not_continued(tmp_path):
+    features = {"x": vector_feature(["a", "b"])}
+    writer = DatasetWriter(tmp_path, "t", 25, features)
+    writer.add({"x": np.ones((3, 2), np.float32)}, {})
+    writer.save()
+    assert DatasetWriter(tmp_path, "t", 25, features).column("x").shape == (3, 2)
+    with pytest.raises(SequenceError, match="is of the task 't', not 'u'"):
+        DatasetWriter(tmp_path, "u", 25, features)
+    with pytest.raises(SequenceError, match="has other columns, images or rates"):
+        DatasetWriter(tmp_path, "t", 30, features)
+    (path,) = tmp_path.glob("data/*/*.parquet")
+    path.write_bytes(path.read_bytes()[:-20])
+    with pytest.raises(SequenceError, match="cannot be continued: .*; choose another name"):
+        DatasetWriter(tmp_path, "t", 25, features)
+
+
+@pytest.mark.slow
+def test_demonstrating_is_a_command_whose_dataset_lerobot_reads(tmp_path):
+    out = tmp_path / "out"
+    done = endo_sim("demonstrate", "palpation", out, "--episodes", 1, "--environments", 2, "--image-width", 160, "--device", "cpu")
+    assert done.returncode == 0, done.stderr
+    assert "out: 1 solved episodes" in done.stdout
+    lerobot = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="needs lerobot")
+    frames = lerobot.LeRobotDataset("local/out", root=out)
+    assert frames.num_episodes == 1 and frames[0]["action"].shape == (4,) and dataset.VERSION == "v3.0"

@@ -33,6 +33,7 @@ def test_pictures_are_those_of_the_renderer(light, degree, instrument):
     for _ in range(16):
         seen, *_ = environment.step(script.act(batch.state())[0])
     renderer = DeformableRenderer(scene.model, batch.task.nodes.rest, RenderingConfig(device="cpu"))
+    renderer.dye(batch.task.dyed_spots(0))
     pinned = torch.from_numpy(batch.task.nodes.pinned)[:, None, None]
     F = torch.where(pinned, torch.eye(3), batch.tissue.F[0])  # as on control_nodes
     camera = batch.pictures.camera

@@ -2,7 +2,15 @@
 
 from typing import Literal
 
+import numpy as np
+from scipy.spatial.transform import Rotation
+
 from endo_sim_ros.instruments import JOINTS
+from endo_sim_ros.learning.tasks import Task
+
+POSE_NAMES = ("x", "y", "z", "qx", "qy", "qz", "qw")
+ARM_NAMES = (*POSE_NAMES, "jaw", "force_x", "force_y", "force_z")
+"""Names of the numbers of `arm_state`."""
 
 Actions = Literal["cartesian", "joints", "joint_positions"]
 """How far the tip of the tool moves, how far the joints of its arm move, or where these are; see `TaskBatch`."""
@@ -17,3 +25,22 @@ ACTION_SIZES: dict[str, int] = {"cartesian": 4, "joints": len(JOINTS) + 1, "join
 def observed_names(names: tuple[str, ...], actions: Actions) -> tuple[str, ...]:
     """Names of the numbers of the state: those of a task, and with actions of joints the joints."""
     return names if actions == "cartesian" else names + JOINTS
+
+
+def jaw_angles(task: Task, fourth: np.ndarray) -> np.ndarray:
+    """Angles between the jaws [B], rad, that a fourth number of actions [B] commands."""
+    return np.where(task.closes(fourth), task.closed_jaw, task.open_jaw)
+
+
+def arm_state(task: Task, rotations: np.ndarray) -> np.ndarray:
+    """What an arm measures of itself, which tells nothing of the goal [B, 11], float32.
+
+    It is the pose of the tip (m, xyzw) in the world, the angle between the jaws (rad), and the force of the tissue on the tool (N, in the
+    axes of the world).
+
+    Args:
+        task: Where the tips are.
+        rotations: Their axes [B, 3, 3], world.
+    """
+    turned = Rotation.from_matrix(rotations).as_quat(canonical=True)
+    return np.column_stack([task.tips(), turned, jaw_angles(task, task.fourth), task.forces()]).astype(np.float32)

@@ -107,6 +107,44 @@ class PPOConfig(StageConfig):
 
 
 @dataclass(frozen=True)
+class ImitationConfig(StageConfig):
+    """How lerobot trains a policy on demonstrations."""
+
+    policy: Literal["act", "diffusion"] = "act"
+    """act: action chunking with transformers; diffusion: a diffusion policy."""
+    steps: Annotated[int, Range(1, 10_000_000)] = 10_000
+    """Steps of the training."""
+    batch_size: Annotated[int, Range(1, 100_000)] = 64
+    """Rows of the dataset that a step learns from."""
+    learning_rate: Annotated[float, Range(1e-7, 1)] = 1e-4
+    """Of the optimiser, for the image network too."""
+    chunk: Annotated[int, Range(1, 1000)] = 16
+    """Actions that are predicted at once; of a diffusion policy a multiple of 8."""
+    executed: Annotated[int, Range(1, 1000)] = 8
+    """How many of these are executed before the policy looks again."""
+    backbone_weights: str = ""
+    """Weights that the image network starts from, such as ResNet18_Weights.IMAGENET1K_V1, which torchvision downloads; empty = random."""
+    workers: Annotated[int, Range(0, 256)] = 4
+    """Processes that read the dataset."""
+    seed: Annotated[int, Range(0, 2**31 - 1)] = 0
+    """Another seed draws other weights and another order."""
+
+
+@dataclass(frozen=True)
+class BenchmarkConfig(StageConfig):
+    """Episodes that no training sees."""
+
+    task: str = "retraction"
+    """Name of the task, such as retraction or palpation; an unknown one is answered with the list."""
+    episodes: Annotated[int, Range(1, 1_000_000)] = 100
+    """Episodes of each scene."""
+    robustness: bool = False
+    """Repeat all under other light, texture, endoscope, stiffness and breath than usual, one after the other."""
+    image_width: Annotated[int, Range(16, 4096, "pixels")] = 256
+    """Width of the video that shows the first episodes."""
+
+
+@dataclass(frozen=True)
 class DemonstrationConfig(StageConfig):
     """Demonstrations by the scripted policy of a task."""
 

@@ -11,11 +11,11 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from endo_sim_ros.learning.actions import Actions, Contact
+from endo_sim_ros.learning.actions import ARM_NAMES, Actions, Contact
 from endo_sim_ros.learning.config import Randomisation, SightConfig
 from endo_sim_ros.learning.pictures import IMAGE, IMAGE_RIGHT, SEGMENTATION
 from endo_sim_ros.learning.scenes import Scene, load_scene
-from endo_sim_ros.learning.task_batch import Observations, TaskBatch
+from endo_sim_ros.learning.task_batch import ARM_STATE, Observations, Observed, TaskBatch
 from endo_sim_ros.learning.tasks import BOUND, TASKS, Outcome
 from endo_sim_ros.physics import MotionConfig
 
@@ -27,8 +27,6 @@ except ImportError as error:
 
 FPS = 25
 """Steps and images of an episode per second."""
-Observed = np.ndarray | dict[str, np.ndarray]
-"""Observations: state or image, or what there is in a dict."""
 
 
 def _make(
@@ -45,14 +43,14 @@ def _make(
     **sight: Any,
 ) -> tuple[TaskBatch, gymnasium.Space]:
     """The simulation, and the space of the observations of one environment; the arguments are those of `TaskEnvironment`."""
-    if observations not in ("state", "image", "both"):
-        raise ValueError(f"observations must be state, image or both, got {observations!r}")
+    if observations not in get_args(Observations):
+        raise ValueError(f"observations must be {_either(Observations)}, got {observations!r}")
     if render_mode not in (None, "rgb_array"):
         raise ValueError(f"render_mode must be rgb_array or None, got {render_mode!r}")
     if actions not in get_args(Actions):
-        raise ValueError(f"actions must be {', '.join(get_args(Actions)[:-1])} or {get_args(Actions)[-1]}, got {actions!r}")
+        raise ValueError(f"actions must be {_either(Actions)}, got {actions!r}")
     if contact not in get_args(Contact):
-        raise ValueError(f"contact must be {' or '.join(get_args(Contact))}, got {contact!r}")
+        raise ValueError(f"contact must be {_either(Contact)}, got {contact!r}")
     if sight.get("image_width", 1) < 1:
         raise ValueError(f"image_width must be at least 1, got {sight['image_width']}")
     shown = SightConfig(**sight)
@@ -63,14 +61,21 @@ def _make(
     motion = MotionConfig.from_mapping(motion) if isinstance(motion, dict) else motion or MotionConfig()
     batch = TaskBatch(task, scene, count, observations, randomisation, shown, device, render_mode is not None, actions, contact, motion)
     spaces: dict[str, gymnasium.Space] = {}
-    if observations != "image":
+    if observations in ("state", "both"):
         spaces["state"] = gymnasium.spaces.Box(-BOUND, BOUND, (len(batch.observation_names),), np.float32)
+    if observations == "sensors":
+        spaces[ARM_STATE] = gymnasium.spaces.Box(-np.inf, np.inf, (len(ARM_NAMES),), np.float32)
     if batch.pictures is not None:
         camera = batch.pictures.camera
         names = ((IMAGE, 3), (IMAGE_RIGHT, 3))[: shown.eyes] if observations != "state" else ()
         for name, channels in (*names, *(((SEGMENTATION, 1),) if shown.segmentation else ())):
             spaces[name] = gymnasium.spaces.Box(0, 255, (camera.height, camera.width, channels), np.uint8)
     return batch, gymnasium.spaces.Dict(spaces) if len(spaces) > 1 else next(iter(spaces.values()))
+
+
+def _either(choice: Any) -> str:
+    *others, last = get_args(choice)
+    return f"{', '.join(others)} or {last}"
 
 
 def _action_space(batch: TaskBatch) -> gymnasium.spaces.Box:
@@ -90,7 +95,8 @@ class TaskEnvironment(gymnasium.Env):
         task: Name of the task, one of :data:`endo_sim_ros.learning.tasks.TASKS`.
         scene: A PLY model with its cameras.json, or the folder of a model.ply, or a :class:`Scene`; default: a piece of the
             synthetic patient.
-        observations: ``state``, ``image`` (the endoscope's), or ``both``. One alone is an array. More are a dict: ``state`` [n],
+        observations: ``state``, ``image`` (the endoscope's), ``both``, or ``sensors``: image and ``arm`` [11], what a robot has, see
+            `endo_sim_ros.learning.actions.arm_state`. One alone is an array. More are a dict: ``state`` [n], ``arm`` [11],
             ``image`` and ``image_right`` [H, W, 3], ``segmentation`` [H, W, 1].
         randomisation: How episodes differ from the scene, as :class:`Randomisation` or its values in a dict.
         image_width: Pixels; the height follows from the scene's camera.

@@ -32,6 +32,7 @@ from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import parse_frames
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.instruments import JOINTS
+from endo_sim_ros.learning.actions import POSE_NAMES
 from endo_sim_ros.learning.streams import Stream, continuous, read_streams, same_sign
 from endo_sim_ros.messages import ControlNodeCloud, MessageError, Topic
 from endo_sim_ros.sequences.bag import WORLD_FRAME, BagReader
@@ -41,7 +42,7 @@ JAW_OPEN = 1.0  # rad, where no jaw was ever commanded; nothing is held then
 DEFAULT_FPS = 25
 _EVEN = 10_000  # ns; within it the steps of a policy are even, and those of a clock in real time are not
 
-POSE_NAMES, _XYZ = ("x", "y", "z", "qx", "qy", "qz", "qw"), ("x", "y", "z")
+_XYZ = "x", "y", "z"
 _WRENCH = tuple(f"{kind}_{axis}" for kind in ("force", "torque") for axis in _XYZ)
 
 _FORMS = (  # of images, raw and compressed

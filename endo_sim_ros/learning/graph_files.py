@@ -14,7 +14,7 @@ from endo_sim_ros.instruments import save_tool
 from endo_sim_ros.learning.config import Randomisation, SightConfig
 from endo_sim_ros.learning.held_tools import hold_tool
 from endo_sim_ros.learning.scenes import Scene
-from endo_sim_ros.learning.tasks import find_task
+from endo_sim_ros.learning.tasks import find_task, moving
 from endo_sim_ros.learning.variation import Variation
 from endo_sim_ros.physics import MotionConfig, PhysicsConfig
 
@@ -35,19 +35,19 @@ def save_scene(
         task: Name of the task.
         seed: Of the first episode.
         sight: What the endoscope shows. Which of the pictures are rendered is up to who subscribes to them.
-        motion: Breath and heart; each episode on the graph begins in the phases of the first.
+        motion: Breath and heart; at rest, those of the task. Each episode on the graph begins in the phases of the first.
 
     Raises:
         ValueError: If there is no such task or tool, the scene is too small for it, or an arm does not reach it.
     """
     kind = find_task(task)
-    physics = kind.physics()
+    physics = moving(kind.physics(), motion)
     first = kind(scene.nodes(physics), scene.camera.position)
     rng = np.random.default_rng(seed)
     first.reset(0, rng)
-    if motion.breathing or motion.heartbeat:
+    if physics.motion.breathing or physics.motion.heartbeat:
         breath, heart = Variation.draw(Randomisation(), rng).phases.tolist()
-        physics = replace(physics, motion=replace(motion, breathing_phase=breath, heartbeat_phase=heart))
+        physics = replace(physics, motion=replace(physics.motion, breathing_phase=breath, heartbeat_phase=heart))
     usual = option_values(PhysicsConfig())
     changed = {name: value for name, value in option_values(physics).items() if value != usual[name] and name != "device"}
     changed |= {"regions": list(first.regions())} if first.regions() else {}

@@ -14,6 +14,7 @@ import numpy as np
 from rich.progress import track
 
 from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.learning.actions import POSE_NAMES
 from endo_sim_ros.learning.dataset import (
     IMAGE,
     IMAGE_RIGHT,
@@ -25,7 +26,6 @@ from endo_sim_ros.learning.dataset import (
     vector_feature,
 )
 from endo_sim_ros.learning.episodes import (
-    POSE_NAMES,
     Episode,
     Sampling,
     action_names,

@@ -1,123 +1,46 @@
 """Policies: scripted ones that solve the tasks, and a small network with its weights in a .npz file."""
 
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol, cast, get_args
 
 import numpy as np
 
+from endo_sim_ros.core.plugins import load_named
 from endo_sim_ros.learning.actions import ACTION_SIZES, Actions, observed_names
-from endo_sim_ros.learning.tasks import LENGTH, Palpation, Retraction, find_task
+from endo_sim_ros.learning.config import SightConfig
+from endo_sim_ros.learning.tasks import Script, find_task
 
 _MOST_WEIGHTS = 10_000_000  # read from a file
 
-Moves = Generator[np.ndarray, dict[str, float], None]
-"""Yields actions [4], and is sent the state observation, by its names, after each."""
-
 
 class Policy(Protocol):
-    """Acts in B episodes.
+    """Acts in B episodes."""
 
-    Attributes:
-        actions: What its actions mean, see `TaskBatch`.
-    """
+    @property
+    def actions(self) -> Actions:
+        """What its actions mean, see `TaskBatch`."""
+        ...
 
-    actions: Actions
+    @property
+    def sight(self) -> SightConfig | None:
+        """What the pictures show that it takes, with ``sensors`` as observations, see `TaskBatch`; None where it takes the state."""
+        ...
 
     def reset(self, episodes: Sequence[int]) -> None:
         """These episodes begin anew."""
 
-    def act(self, observations: np.ndarray) -> np.ndarray:
-        """Actions [B, 4 or 7] for state observations [B, n]."""
+    def act(self, observations: Any) -> np.ndarray:
+        """Actions [B, 4 or 7] for observations."""
         ...
 
 
-class RetractionScript:
-    """Goes to the spot, grasps, lifts a little farther than needed and holds."""
-
-    actions: Actions = "cartesian"
-    grasp, beyond = 0.005, 1.15  # m from the spot at which the jaw closes; how far to lift, in parts of the goal
-
-    def reset(self, episodes: Sequence[int]) -> None:
-        """Nothing to do: the script has no memory."""
+class StillPolicy(Script):
+    """Does nothing: what a task scores by itself."""
 
     def act(self, observations: np.ndarray) -> np.ndarray:
-        """Actions [B, 4] for state observations [B, n]."""
-        names = Retraction.observation_names
-        o = {name: observations[:, i].astype(np.float64) for i, name in enumerate(names)}
-        holding = (o["jaw"] > 0) & (o["distance"] < 4 * self.grasp / LENGTH)
-        close = holding | (o["distance"] < self.grasp / LENGTH)
-        towards = np.stack([o[f"spot_from_tip_{axis}"] for axis in "xyz"], 1) * LENGTH / Retraction.step_length
-        up = (self.beyond - o["spot_moved_z"]) * Retraction.lift / Retraction.step_length
-        lift = np.stack([np.zeros_like(up), np.zeros_like(up), 0.5 * up], 1)
-        moves = np.where(close[:, None], lift, towards)
-        return np.concatenate([np.clip(moves, -1, 1), np.where(close, 1.0, -1.0)[:, None]], 1)
-
-
-class PalpationScript:
-    """Presses equally deep at points of a grid, feels the stiffness at each, and reports where it is greatest."""
-
-    actions: Actions = "cartesian"
-    spacing, above = 0.01, 0.012  # m: of the grid; of the tip over the skin between presses
-    deep, further = 0.003, 0.002  # m: of the tip over the skin at last; by how much that is deeper than before
-
-    def __init__(self, count: int = 1):
-        self._runs = [self._search() for _ in range(count)]
-        self.reset(range(count))
-
-    def reset(self, episodes: Sequence[int]) -> None:
-        """Begin the search of these episodes anew."""
-        for b in episodes:
-            self._runs[b] = self._search()
-            next(self._runs[b])
-
-    def act(self, observations: np.ndarray) -> np.ndarray:
-        """Actions [B, 4] for state observations [B, n]."""
-        names = Palpation.observation_names
-        rows = [dict(zip(names, row)) for row in observations.astype(np.float64)]
-        return np.stack([run.send(row) for run, row in zip(self._runs, rows)])
-
-    def _search(self) -> Moves:
-        step, felt = Palpation.step_length, {}
-        o = yield np.zeros(4)
-
-        def to(goal: Callable[[dict[str, float]], np.ndarray], near: float = 5e-4) -> Moves:
-            """Move until the remaining way [3], m, is short."""
-            nonlocal o
-            for _ in range(40):
-                way = goal(o)
-                if np.abs(way).max() < near:
-                    return
-                o = yield np.array([*np.clip(way / step, -1, 1), -1.0])
-
-        def over(x: float, y: float, height: float) -> Callable[[dict[str, float]], np.ndarray]:
-            return lambda o: np.array([x - LENGTH * o["tip_x"], y - LENGTH * o["tip_y"], height - LENGTH * o["height"]])
-
-        def press(x: float, y: float) -> Moves:
-            yield from to(over(x, y, self.above), 1.5e-3)
-            yield from to(over(x, y, self.deep + self.further))
-            shallow = o["force"]
-            yield from to(over(x, y, self.deep))
-            felt[x, y] = o["force"] - shallow
-            yield from to(lambda o: np.array([0, 0, self.above - LENGTH * o["height"]]), 1.5e-3)
-
-        def best() -> np.ndarray:
-            """Middle of the stiffest places [2], m."""
-            places, forces = np.array(list(felt)), np.array(list(felt.values()))
-            near = ((places - places[forces.argmax()]) ** 2).sum(1) < (1.1 * self.spacing) ** 2
-            weights = near * np.maximum(forces - np.median(forces), 0) ** 2
-            return (weights[:, None] * places).sum(0) / max(weights.sum(), 1e-12)
-
-        for j in (-1, 0, 1):
-            for i in (-j or -1, 0, j or 1):  # to and fro
-                yield from press(i * self.spacing, j * self.spacing)
-        x, y = best()
-        for i, j in ((1, 0), (0, 1), (-1, 0), (0, -1)):
-            yield from press(x + i * self.spacing / 2, y + j * self.spacing / 2)
-        x, y = best()
-        yield from to(lambda o: np.array([x - LENGTH * o["tip_x"], y - LENGTH * o["tip_y"], 0]))
-        while True:
-            o = yield np.array([0, 0, 0, 1.0])
+        """Actions [B, 4] of zero for state observations [B, n]."""
+        return np.zeros((len(observations), ACTION_SIZES[self.actions]))
 
 
 class NetworkPolicy:
@@ -131,6 +54,8 @@ class NetworkPolicy:
     Raises:
         ValueError: If the layers do not fit together or do not fit the task.
     """
+
+    sight = None
 
     def __init__(self, task: str, layers: Sequence[np.ndarray], actions: Actions = "cartesian"):
         self.task, self.layers = task, [np.asarray(layer, np.float64) for layer in layers]
@@ -226,33 +151,39 @@ class NetworkPolicy:
             raise ValueError(f"{path}: not a readable policy ({error})") from error
 
 
-SCRIPTS: dict[str, Callable[[int], Policy]] = {
-    Retraction.name: lambda count: RetractionScript(),
-    Palpation.name: PalpationScript,
-}
-"""Makers of scripted policies for a number of episodes, by the names of the tasks that have one."""
-
-
 def scripted_policy(task: str, count: int = 1) -> Policy:
     """The scripted policy that solves a task, for a number of episodes.
 
     Raises:
         ValueError: If there is no such task, or no script for it.
     """
-    find_task(task)
-    if task not in SCRIPTS:
-        raise ValueError(f"there is no scripted policy for {task}; name the .npz file of a trained one")
-    return SCRIPTS[task](count)
+    return find_task(task).script(count)
 
 
-def make_policy(policy: str, task: str) -> Policy:
-    """``scripted``, or the policy in a .npz file.
+def make_policy(policy: str, task: str, count: int = 1, device: str = "auto") -> Policy:
+    """``scripted``, ``still``, the policy in a .npz file, the folder of a checkpoint of lerobot, or your own ``path/to/file.py:Class``.
+
+    Args:
+        policy: Which. A class of your own is called with the number of episodes.
+        task: Name of the task.
+        count: Number of episodes.
+        device: Of a checkpoint: auto (the GPU when there is one), cpu, cuda or cuda:N.
 
     Raises:
         ValueError: If there is no such task or script, or the file cannot be read or is for another task.
+        RuntimeError: If lerobot is needed and not installed.
     """
+    find_task(task)
     if policy == "scripted":
-        return scripted_policy(task)
+        return scripted_policy(task, count)
+    if policy == "still":
+        return StillPolicy()
+    if Path(policy).is_dir():
+        from endo_sim_ros.learning.lerobot_policy import LeRobotPolicy
+
+        return LeRobotPolicy(policy, device)
+    if ":" in policy and not Path(policy).exists():
+        return load_named(policy)(count)
     loaded = NetworkPolicy.load(policy)
     if loaded.task != task:
         raise ValueError(f"{policy} was trained for {loaded.task}, not for {task}")

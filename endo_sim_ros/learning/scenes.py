@@ -13,7 +13,10 @@ from endo_sim_ros.core.gaussians import GaussianModel, ModelError, load_ply, sav
 from endo_sim_ros.physics import ControlNodes, PhysicsConfig, build_control_nodes
 from endo_sim_ros.rendering import middle_depth, render_depth
 
-_CACHED = "phantom-1.ply"  # raise the number when the default scene changes
+PATIENT = "phantom:"
+"""How the name of a synthetic patient begins; its seed follows."""
+
+_CACHED, _VERSION = "phantom-{version}.ply", "1"  # raise the version when the scenes change
 _PIECE = 0.5  # of the synthetic patient's picture, about its middle
 
 
@@ -53,14 +56,19 @@ class Scene:
 
 
 def load_scene(path: str | Path | None = None) -> Scene:
-    """A PLY model with the cameras.json beside it, or the folder of a model.ply; without a path a piece of the synthetic patient.
+    """A PLY model with the cameras.json beside it, or the folder of a model.ply, or ``phantom:SEED``, a piece of a synthetic patient.
+
+    Without a path it is that of ``phantom:0``.
 
     Raises:
         ModelError: If the model cannot be read.
-        ValueError: If the cameras cannot.
+        ValueError: If the cameras cannot, or a seed is no number.
     """
-    if path is None:
-        return default_scene()
+    if path is None or str(path).startswith(PATIENT):
+        seed = "0" if path is None else str(path).removeprefix(PATIENT)
+        if not seed.isdecimal():
+            raise ValueError(f"{path}: the seed of a synthetic patient is a number, as in {PATIENT}1")
+        return patient_scene(int(seed))
     path = Path(path)
     path = path / "model.ply" if path.is_dir() else path
     model, cameras = load_ply(path), load_cameras(path.parent / "cameras.json")
@@ -70,20 +78,21 @@ def load_scene(path: str | Path | None = None) -> Scene:
 
 
 @functools.cache
-def default_scene() -> Scene:
-    """The middle of the synthetic patient, 6000 Gaussians. Rendered once (some seconds), then kept in ~/.cache/endo_sim_ros."""
+def patient_scene(seed: int = 0) -> Scene:
+    """The middle of a synthetic patient, 6000 Gaussians. Rendered once (some seconds), then kept in ~/.cache/endo_sim_ros."""
     from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_camera
 
     whole = phantom_camera(PhantomConfig(width=128, height=102))
     K = whole.K.copy()
     K[:2, :2] /= _PIECE
     camera = replace(whole, K=K)
-    path = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "endo_sim_ros" / _CACHED
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "endo_sim_ros"
+    path = cache / _CACHED.format(version=f"{_VERSION}-{seed}" if seed else _VERSION)
     with contextlib.suppress(ModelError):  # there is none yet, or it was damaged
         return Scene(load_ply(path), (camera,))
     from endo_sim_ros.sequences.phantom_model import phantom_model
 
-    model, _ = phantom_model(24_000, whole.width)
+    model, _ = phantom_model(24_000, whole.width, seed)
     model = model.select(np.flatnonzero(camera.sees(model.means.double().numpy())))
     with contextlib.suppress(OSError):  # of a home that cannot be written; it is rendered again next time
         save_ply(model, path)

@@ -1,24 +1,28 @@
 """B episodes of a task in the simulation: one batched solver, one renderer, no framework; what environments and training share."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
 import torch
 
-from endo_sim_ros.learning.actions import ACTION_SIZES, Actions, Contact, observed_names
+from endo_sim_ros.learning.actions import ACTION_SIZES, Actions, Contact, arm_state, observed_names
 from endo_sim_ros.learning.config import Randomisation, SightConfig
 from endo_sim_ros.learning.held_tools import HeldTool, HeldTools, hold_tool, hold_tools
 from endo_sim_ros.learning.pictures import IMAGE, SEGMENTATION, Pictures
 from endo_sim_ros.learning.scenes import Scene
-from endo_sim_ros.learning.tasks import Outcome, find_task
+from endo_sim_ros.learning.tasks import Outcome, find_task, moving
 from endo_sim_ros.learning.variation import Variation
 from endo_sim_ros.physics import MotionConfig, TissueBatch, ToolLinks
 
 RESTING_SPEED = 1e-5  # m/s; as in TissueSimulation: one tissue slower than this, that no tool moves, is left as it is
 
-Observations = Literal["state", "image", "both"]
+Observations = Literal["state", "image", "both", "sensors"]
+Observed = np.ndarray | dict[str, np.ndarray]
+"""Observations: state or image, or what there is in a dict."""
+
+ARM_STATE = "arm"
+"""Name of what the arm measures of itself."""
 
 
 class TaskBatch:
@@ -30,8 +34,9 @@ class TaskBatch:
         task: Its name.
         scene: What is touched.
         count: B.
-        observations: ``state``: float32 [B, n]; ``image``: uint8 [B, H, W, 3]; ``both``: a dict of the two by these names. Where
-            there are more pictures, a dict of all, see `Pictures.draw`.
+        observations: ``state``: float32 [B, n]; ``image``: uint8 [B, H, W, 3]; ``both``: a dict of the two by these names;
+            ``sensors``: a dict of ``image`` and ``arm``, what a robot has, see `arm_state`. Where there are more pictures, a dict
+            of all, see `Pictures.draw`.
         randomisation: How episodes differ.
         sight: What the endoscope shows.
         device: Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N.
@@ -42,7 +47,7 @@ class TaskBatch:
             the task allows it comes as near as its joints get.
         contact: What touches the tissue: ``point``, the tip that the task describes, or ``links``, the links of the instrument, whose
             jaws hold what lies between them, as in physics_node.
-        motion: Breath and heart. Each episode begins in phases of its own, not in those of the motion.
+        motion: Breath and heart; at rest, those of the task. Each episode begins in phases of its own, not in those of the motion.
 
     Raises:
         ValueError: If there is no such task or tool, the scene is too small for it, an arm does not reach it, links shall touch
@@ -64,7 +69,7 @@ class TaskBatch:
         motion: MotionConfig = MotionConfig(),
     ):
         kind = find_task(task)
-        config = replace(kind.physics(device), motion=motion)
+        config = moving(kind.physics(device), motion)
         nodes = scene.nodes(config)
         self.task, self.count = kind(nodes, scene.camera.position, count), count
         self.observations, self.randomisation = observations, randomisation
@@ -80,7 +85,7 @@ class TaskBatch:
         self._linked = torch.zeros(0)  # poses of the links, of a single tissue
         self.tissue = TissueBatch(nodes, config, count, 1, stiffness=stiffness, capsules=len(self._links or [0]))
         self._varies = largest != 1
-        self._moves = motion.breathing + motion.heartbeat > 0
+        self._moves = config.motion.breathing + config.motion.heartbeat > 0
         self._rest = torch.from_numpy(nodes.rest)
         self._resting, self._placed = True, False  # of a single tissue
         self.sight = sight
@@ -139,7 +144,7 @@ class TaskBatch:
 
     def step(
         self, actions: np.ndarray, renew: Sequence[int] = (), generators: Sequence[np.random.Generator] = ()
-    ) -> tuple[np.ndarray | dict[str, np.ndarray], Outcome]:
+    ) -> tuple[Observed, Outcome]:
         """Take one step with actions [B, 4 or 7]. The episodes in ``renew`` take none: each begins anew, by the chance of its generator.
 
         Returns:
@@ -197,10 +202,12 @@ class TaskBatch:
         holding, touching = bool(tools.gripping[0, 0]), tools.contact_radius > 0 or self._links is not None
         return self._resting and not self._moves and holding == before and not (moved and (holding or touching))
 
-    def observe(self) -> np.ndarray | dict[str, np.ndarray]:
+    def observe(self) -> Observed:
         """Observations of all episodes now."""
         state = self.state()  # which is judged, too
-        found = {"state": state} if self.observations != "image" else {}
+        found = {"state": state} if self.observations in ("state", "both") else {}
+        if self.observations == "sensors":
+            found[ARM_STATE] = self.arm_state()
         seen = self.observations != "state"
         if self.pictures is not None and (seen or self.sight.segmentation):
             drawn = self.pictures.draw(right=seen and self.sight.eyes == 2, labels=self.sight.segmentation)
@@ -215,6 +222,10 @@ class TaskBatch:
         positions = (self._rest[sites] + moved).numpy()
         state = self.task.observe(positions, self.tissue.tools.reaction_forces[:, 0].cpu().numpy())
         return state if self.actions == "cartesian" or self.tools is None else self.tools.observe(state)
+
+    def arm_state(self) -> np.ndarray:
+        """What the arm of each episode measures of itself [B, 11], see `arm_state`; the force is that of the last observation."""
+        return arm_state(self.task, self._rotations)
 
     def images(self) -> np.ndarray:
         """What the left eye of the endoscope sees of all episodes [B, H, W, 3], uint8.

@@ -3,6 +3,7 @@
 import json
 import logging
 import time
+from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -20,30 +21,43 @@ from endo_sim_ros.physics import MotionConfig
 
 log = logging.getLogger(__name__)
 
-_TESTED_FROM = 1_000_000  # seeds of episodes that are only tested on
+TESTED_FROM = 1_000_000
+"""The first seed of episodes that are only tested on."""
 
 
-def run_episodes(batch: TaskBatch, policy: Policy, seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """One episode in each copy of a batch: returns [B], success [B], and lengths [B]."""
+def play(
+    batch: TaskBatch, policy: Policy, seeds: np.ndarray, look: Callable[[np.ndarray], None] | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """One episode in each copy of a batch: returns [B], success [B], and lengths [B].
+
+    Args:
+        batch: Its observations are those that the policy takes.
+        policy: What acts.
+        seeds: Of the episodes [B].
+        look: Called after the beginning and each step, with what has ended [B].
+    """
     everyone = range(batch.count)
     batch.reset(everyone, [np.random.default_rng(int(seed)) for seed in seeds])
     policy.reset(everyone)
     returns, success, lengths = np.zeros(batch.count), np.zeros(batch.count, bool), np.zeros(batch.count, int)
     running = np.ones(batch.count, bool)
     observations = batch.observe()
+    if look is not None:
+        look(~running)
     while running.any():
-        assert isinstance(observations, np.ndarray)  # policies act on states
         observations, outcome = batch.step(policy.act(observations))
         returns += outcome.reward * running
         lengths += running
         success |= outcome.success & running
         running &= ~(outcome.terminated | outcome.truncated)
+        if look is not None:
+            look(~running)
     return returns, success, lengths
 
 
 def measure_policy(batch: TaskBatch, policy: Policy) -> dict[str, float]:
     """Mean return and success rate in episodes that no training sees, one in each copy of a batch."""
-    returns, success, _ = run_episodes(batch, policy, _TESTED_FROM + np.arange(batch.count))
+    returns, success, _ = play(batch, policy, TESTED_FROM + np.arange(batch.count))
     return {"test_return": float(returns.mean()), "test_success": float(success.mean())}
 
 
@@ -98,7 +112,7 @@ def train(
                 vectors = mean + deviation * rng.standard_normal((config.population, size))
                 policy = NetworkPolicy.from_vectors(task, hidden, vectors, actions)
                 for _ in range(config.episodes):
-                    scores += run_episodes(batch, policy, np.full(config.population, rng.integers(_TESTED_FROM)))[0] / config.episodes
+                    scores += play(batch, policy, np.full(config.population, rng.integers(TESTED_FROM)))[0] / config.episodes
                 best = np.argsort(-scores, kind="stable")[:elite_count]
                 # Noise keeps the Gaussian from collapsing before it has arrived; without it the last 30 % of the generations settle.
                 noise = 0.3 * config.spread * max(1 - generation / (0.7 * config.generations), 0.0)

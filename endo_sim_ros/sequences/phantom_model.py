@@ -13,17 +13,18 @@ from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_camera, render
 _STEEPEST = 4.0  # pixels that a Gaussian may span; beyond it lies another surface
 
 
-def phantom_model(count: int, width: int) -> tuple[GaussianModel, Camera]:
+def phantom_model(count: int, width: int, seed: int = 0) -> tuple[GaussianModel, Camera]:
     """About `count` Gaussians on what an endoscope sees of the synthetic patient, and its camera.
 
     Args:
         count: Number of Gaussians, one for each pixel of a picture of about as many.
         width: Image width of the camera, pixels; its height is 0.8 of it.
+        seed: Which patient.
     """
     camera = phantom_camera(PhantomConfig(width=width, height=round(0.8 * width)))
     columns = max(round(math.sqrt(1.25 * count)), 2)
     grid = camera.resized(columns, max(round(count / columns), 2))
-    image, depth = render_phantom(PhantomConfig(), grid)
+    image, depth = render_phantom(PhantomConfig(seed=seed), grid)
     seen = depth > 0
     points, pixel = grid.backproject(depth), depth[..., None] / grid.K[0, 0]  # [H, W, 3] m, [H, W, 1] m
     # Ellipses that reach their neighbours, also where the surface is steep.

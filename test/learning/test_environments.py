@@ -27,7 +27,7 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("observations", ["state", "image", "both"])
+@pytest.mark.parametrize("observations", ["state", "image", "both", "sensors"])
 @pytest.mark.parametrize("task", TASKS)
 def test_gymnasium_finds_nothing_to_complain_about(task, observations):
     with warnings.catch_warnings():
@@ -340,7 +340,7 @@ def test_a_report_is_ten_steps_that_say_so():
     "options, sentence",
     [
         ({"task": "suturing"}, "there is no task 'suturing'; there are retraction, palpation"),
-        ({"observations": "smell"}, "observations must be state, image or both, got 'smell'"),
+        ({"observations": "smell"}, "observations must be state, image, both or sensors, got 'smell'"),
         ({"render_mode": "human"}, "render_mode must be rgb_array or None, got 'human'"),
         ({"scene": "no/such/model.ply"}, "no/such/model.ply: no such file"),
         ({"device": "abacus"}, "unknown device 'abacus'"),

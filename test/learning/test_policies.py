@@ -17,21 +17,21 @@ from endo_sim_ros.learning.config import Randomisation, TrainingConfig
 from endo_sim_ros.learning.policies import NetworkPolicy, make_policy, scripted_policy
 from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.learning.task_batch import TaskBatch
-from endo_sim_ros.learning.train import Best, measure_policy, run_episodes, save_training, train
+from endo_sim_ros.learning.train import Best, measure_policy, play, save_training, train
 
 ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task, count", [("retraction", 48), ("palpation", 8)])
+@pytest.mark.parametrize("task, count", [("retraction", 48), ("palpation", 8), ("tracking", 32)])
 def test_scripted_policies_solve_their_tasks(task, count):
     batch = TaskBatch(task, load_scene(), count, device="cpu")
-    returns, success, lengths = run_episodes(batch, scripted_policy(task, count), np.arange(count))
+    returns, success, lengths = play(batch, scripted_policy(task, count), np.arange(count))
     assert success.mean() > 0.8 and returns.mean() > 1
     if task == "retraction":
-        assert run_episodes(batch, linear_policy(), np.arange(count))[1].mean() > 0.8
+        assert play(batch, linear_policy(), np.arange(count))[1].mean() > 0.8
     idle = NetworkPolicy.from_vectors(task, [], np.zeros(4 * (len(batch.task.observation_names) + 1)))
-    assert not run_episodes(batch, idle, np.arange(count))[1].any()
+    assert not play(batch, idle, np.arange(count))[1].any()
 
 
 def test_a_network_is_saved_and_loaded_and_nothing_else_is(tmp_path):
@@ -122,9 +122,9 @@ def test_the_code_in_the_guide_runs(tmp_path):
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_on_a_gpu_the_scripts_solve_as_on_a_cpu_and_images_are_alike():
-    for task, count in (("retraction", 256), ("palpation", 64)):
+    for task, count in (("retraction", 256), ("palpation", 64), ("tracking", 256)):
         batch = TaskBatch(task, load_scene(), count, randomisation=Randomisation(stiffness=0.1), images=True, device="cuda")
-        _, success, _ = run_episodes(batch, scripted_policy(task, count), np.arange(count))
+        _, success, _ = play(batch, scripted_policy(task, count), np.arange(count))
         assert success.mean() > 0.9, task
     gpu, cpu = (TaskBatch("retraction", load_scene(), 2, "image", device=device) for device in ("cuda", "cpu"))
     for batch in (gpu, cpu):

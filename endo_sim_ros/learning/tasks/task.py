@@ -7,22 +7,24 @@ simulation, so that the same task runs over topics.
 All lengths of a task are in its own frame: the origin on the skin, z towards the endoscope, x and y across. An action
 [4] in -1 … 1 is how far the tip moves in this step along x, y and z, in parts of `step_length`, and a fourth number that each
 task explains.
-To add a task, write a subclass of :class:`Task` and append it to :data:`TASKS`: environments, training, `endo-sim scene` and
-`endo-sim bench environments`, the policy's ROS node and every message that lists the tasks read it from there. Give
-it a scripted policy, an entry in `policies.SCRIPTS`: the tests play each task with it.
+To add a task, write a subclass of :class:`Task`, with a scripted policy, in a file of its own. Every command and the policy's ROS node
+take it as ``path/to/file.py:Name``. One that belongs to the package is a file here and has a name in `TASKS`.
 
 Sums are written out, term by term, so that their bits do not depend on B.
 """
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from endo_sim_ros.core.dye import DyedSpot
-from endo_sim_ros.instruments import GRIP
-from endo_sim_ros.physics import ControlNodes, PhysicsConfig
-from endo_sim_ros.physics.regions import inside_sphere
+from endo_sim_ros.physics import ControlNodes, MotionConfig, PhysicsConfig
+
+if TYPE_CHECKING:
+    from endo_sim_ros.learning.policies import Policy
 
 LENGTH, FORCE = 0.02, 1.0  # m and N; observations are in these units
 BOUND = 10.0  # observations are clipped to ± this
@@ -75,6 +77,15 @@ class Task(ABC):
     def physics(device: str = "auto") -> PhysicsConfig:
         """The tissue and the tools of the task."""
 
+    @staticmethod
+    def script(count: int) -> "Policy":
+        """A policy that solves the task by its state, for a number of episodes.
+
+        Raises:
+            ValueError: If nobody has written one.
+        """
+        raise ValueError("the task has no scripted policy; name the .npz file of a trained one")
+
     def __init__(self, nodes: ControlNodes, viewpoint: np.ndarray, count: int = 1):
         self.nodes, self.viewpoint, self.count = nodes, np.asarray(viewpoint, np.float64), count
         self.rest = nodes.rest.astype(np.float64)  # [M, 3] m, world
@@ -109,9 +120,9 @@ class Task(ABC):
         """Begin episode b anew; all chance comes from the generator."""
         place = int(rng.choice(self.places))
         z = self.viewpoint - self.rest[place]
-        z /= np.sqrt(_dot(z, z))
+        z /= np.sqrt(dot(z, z))
         x = np.cross(np.eye(3)[np.abs(z).argmin()], z)
-        x /= np.sqrt(_dot(x, x))
+        x /= np.sqrt(dot(x, x))
         self.origin[b], self.axes[b] = self.rest[place], np.stack([x, np.cross(z, x), z])
         self.sites[b] = place
         self.tip[b] = rng.uniform(self.low, self.high)
@@ -187,7 +198,7 @@ class Task(ABC):
         self.force = self._to_task(np.asarray(forces, np.float64))
         here = np.stack([self._to_task(positions[:, k].astype(np.float64) - self.origin) for k in range(self.site_count)], 1)
         columns = self._columns(here)
-        columns += [*(self.force / FORCE).T, _norm(self.force) / FORCE, 1 - self.steps / self.horizon]
+        columns += [*(self.force / FORCE).T, norm(self.force) / FORCE, 1 - self.steps / self.horizon]
         observation = np.clip(np.stack(columns, 1), -BOUND, BOUND).astype(np.float32) + np.float32(0)  # no negative zeros
         fresh = self.steps == 0
         self._potential[fresh] = self._value()[fresh]
@@ -214,7 +225,7 @@ class Task(ABC):
 
         Call it once a step, after `observe`, which stores the force and the positions that are judged.
         """
-        hurt = _norm(self.force) > self.force_limit
+        hurt = norm(self.force) > self.force_limit
         truncated = self.steps >= self.horizon
         success = self._judge_goal() & ~hurt
         value = self._value()
@@ -236,176 +247,32 @@ class Task(ABC):
         return ()
 
     def _to_world(self, v: np.ndarray) -> np.ndarray:
-        return _dot(self.axes.transpose(0, 2, 1), v[:, None])
+        return dot(self.axes.transpose(0, 2, 1), v[:, None])
 
     def _to_task(self, v: np.ndarray) -> np.ndarray:
-        return _dot(self.axes, v[:, None])
+        return dot(self.axes, v[:, None])
 
 
-class Retraction(Task):
-    """Grasp tissue and lift it off what it covers.
+class Script:
+    """What scripted policies have in common: they move the tip and take the state, see `endo_sim_ros.learning.policies.Policy`."""
 
-    A spot of the skin hides what the surgeon wants to see. It is uncovered when it has been raised by `lift` towards the endoscope and
-    stayed there for `hold` steps, without ever pulling harder than `force_limit`. The fourth action closes the jaw where above zero.
-    """
+    actions: Literal["cartesian"] = "cartesian"
+    sight = None
 
-    name = "retraction"
-    sentence = "Grasp the tissue at the blue spot and lift it towards the endoscope."
-    observation_names = (
-        *(f"tip_{axis}" for axis in "xyz"), *(f"spot_from_tip_{axis}" for axis in "xyz"), "distance",
-        *(f"spot_moved_{axis}" for axis in "xyz"), "jaw",
-        *(f"force_{axis}" for axis in "xyz"), "force", "time_left",
-    )  # fmt: skip
-    horizon, force_limit = 60, 3.0
-    working_fourth = 1.0
-    open_jaw = 0.6  # rad: as links, wider jaws grasp more tissue than they lift within the limit of the force
-    tool, tool_share = "PROGRASP_FORCEPS", GRIP  # what it grasps lies between its jaws, not at their points
-    low, high = (-0.02, -0.02, -0.004), (0.02, 0.02, 0.025)
-    lift, hold = 0.006, 3  # m, steps
-    grasp_radius = 0.008  # m; the jaw holds control nodes within it
-
-    @staticmethod
-    def physics(device: str = "auto") -> PhysicsConfig:
-        """Soft tissue, and a jaw that holds control nodes within `grasp_radius`."""
-        return PhysicsConfig(
-            node_count=800, layers=2, thickness=0.015, young_modulus=4e3, force_radius=Retraction.grasp_radius, device=device
-        )
-
-    def __init__(self, nodes: ControlNodes, viewpoint: np.ndarray, count: int = 1):
-        super().__init__(nodes, viewpoint, count)
-        self._spot, self._moved = np.zeros((count, 3)), np.zeros((count, 3))  # from the tip, and from rest, m, task frame
-        self._held = np.zeros(count, int)  # steps that the spot has been raised
-
-    def _reset(self, b: int, rng: np.random.Generator) -> None:
-        self.tip[b, 2] = self.high[2]
-        self._held[b] = 0
-
-    def closes(self, fourth: np.ndarray) -> np.ndarray:
-        """Above zero it does."""
-        return fourth > 0
-
-    def _columns(self, here: np.ndarray) -> list[np.ndarray]:
-        self._moved = here[:, 0]
-        self._spot = here[:, 0] - self.tip
-        jaw = np.where(self.fourth > 0, 1.0, -1.0)
-        distance = _norm(self._spot) / LENGTH
-        return [*(self.tip / LENGTH).T, *(self._spot / LENGTH).T, distance, *(self._moved / self.lift).T, jaw]
-
-    def _value(self) -> np.ndarray:
-        distance = _norm(self._spot)
-        grasped = (self.fourth > 0) & (distance <= self.grasp_radius)
-        # 2 for the lift, 0.5 for the grasp, −1 for each 2 cm from the spot: coming near, grasping and lifting each pay at once.
-        return np.minimum(self._moved[:, 2] / self.lift, 1.0) * 2 - distance / LENGTH + 0.5 * grasped
-
-    def _judge_goal(self) -> np.ndarray:
-        self._held = np.where(self._moved[:, 2] >= self.lift, self._held + 1, 0)
-        return self._held >= self.hold
+    def reset(self, episodes: Sequence[int]) -> None:
+        """These episodes begin anew; nothing to do for a script without a memory."""
 
 
-class Palpation(Task):
-    """Find a stiff inclusion by pressing.
-
-    Somewhere below a patch of skin, within `patch` of its centre, lies a ball of tissue `ratio` times as stiff. The tool is a
-    ball that pushes and feels. With the fourth action above zero for `sure` steps together, or when time is out, the episode ends and the
-    place under the tip is the report; it is right within `tolerance` across the line of sight. What was felt is part of the
-    observations: the greatest force so far, and where that was, so that a policy needs no memory of its own.
-    """
-
-    name = "palpation"
-    sentence = "Press on the tissue around the blue spot and report where it is stiffest."
-    observation_names = (
-        *(f"tip_{axis}" for axis in "xyz"), "height", "most_from_tip_x", "most_from_tip_y", "most",
-        *(f"force_{axis}" for axis in "xyz"), "force", "time_left",
-    )  # fmt: skip
-    horizon, force_limit = 200, 4.0
-    step_length = 0.003
-    low, high = (-0.025, -0.025, -0.02), (0.025, 0.025, 0.03)
-    same_tissue = False
-    open_jaw = 0.2  # rad: it feels with jaws that are as good as closed, but do not grasp
-    largest_stiffness = ratio = 8.0  # a power of two: as a factor or as a modulus, it gives the same bits
-    patch, radius, depth, tolerance = 0.016, 0.008, 0.005, 0.007  # m
-    margin, around, smooth = 0.02, 0.024, 0.5
-    sure = 10  # steps
-    touch = 0.05  # N; less is not felt
-
-    @staticmethod
-    def physics(device: str = "auto") -> PhysicsConfig:
-        """Soft tissue, and a ball that pushes."""
-        return PhysicsConfig(
-            node_count=1000, layers=3, thickness=0.02, young_modulus=4e3, contact_radius=0.008, friction=0.1, device=device
-        )
-
-    def __init__(self, nodes: ControlNodes, viewpoint: np.ndarray, count: int = 1):
-        super().__init__(nodes, viewpoint, count)
-        self.centre = np.zeros((count, 3))  # of the inclusion, m, task frame
-        self.place = np.zeros((count, 3))  # the same in the world
-        self._over = np.zeros((count, len(self.skin), 3))  # the skin at rest, m, task frame
-        self._most, self._where = np.zeros(count), np.zeros((count, 2))  # greatest force so far, N, and the tip's place then, m, task frame
-
-    def _reset(self, b: int, rng: np.random.Generator) -> None:
-        over = _dot(self.axes[b], (self.rest[self.skin] - self.origin[b])[:, None])  # [S, 3]
-        self._over[b] = over
-        near = over[(over[:, 0] ** 2 + over[:, 1] ** 2) <= self.patch**2]
-        self.centre[b] = near[rng.integers(len(near))] - [0, 0, self.depth]
-        self.place[b] = self.origin[b] + _dot(self.axes[b].T, self.centre[b])
-        self.tip[b] = 0, 0, self.high[2]
-        self._most[b], self._where[b] = 0, 0
-
-    def _columns(self, here: np.ndarray) -> list[np.ndarray]:
-        force = _norm(self.force)
-        more = force > self._most
-        self._most = np.where(more, force, self._most)
-        self._where = np.where(more[:, None], self.tip[:, :2], self._where)
-        felt = [*((self._where - self.tip[:, :2]) / LENGTH).T, self._most / FORCE]
-        across = (self._over[..., 0] - self.tip[:, None, 0]) ** 2 + (self._over[..., 1] - self.tip[:, None, 1]) ** 2
-        skin = self._over[np.arange(self.count), across.argmin(1), 2]
-        return [*(self.tip / LENGTH).T, (self.tip[:, 2] - skin) / LENGTH, *felt]
-
-    def _off(self, places: np.ndarray) -> np.ndarray:
-        """How far places [B, 2] are from the inclusion, across the line of sight [B], m."""
-        x, y = (places - self.centre[:, :2]).T
-        return np.sqrt(x**2 + y**2)
-
-    def _ended(self) -> np.ndarray:
-        return (self.raised >= self.sure) | (self.steps >= self.horizon)
-
-    def _value(self) -> np.ndarray:
-        found = np.where(self._most > self.touch, np.maximum(1 - self._off(self._where) / self.patch, -1.0), 0.0)
-        # Up to 3 for feeling the most over the inclusion, so that the search pays before the report, which is worth up to 1.
-        return 3 * found + np.where(self._ended(), 1 - self._off(self.tip[:, :2]) / self.patch, 0.0)
-
-    def _judge_goal(self) -> np.ndarray:
-        return self._ended() & (self._off(self.tip[:, :2]) <= self.tolerance)
-
-    def stiffness(self, b: int) -> np.ndarray:
-        """Factor on the moduli of each node [M] in episode b: `ratio` inside the inclusion."""
-        return np.where(inside_sphere(self.nodes.rest, self.place[b], self.radius), self.ratio, 1.0)
-
-    def regions(self) -> tuple[str, ...]:
-        """The inclusion of the first episode as physics_node's parameter `regions`."""
-        x, y, z = self.place[0].tolist()
-        return (f"sphere {x!r} {y!r} {z!r} {self.radius!r} young_modulus={self.ratio * self.physics().young_modulus!r}",)
+def moving(physics: PhysicsConfig, motion: MotionConfig) -> PhysicsConfig:
+    """The physics of a task with another motion in place of its own; without one of either kind, its own."""
+    return physics if motion == MotionConfig() else replace(physics, motion=motion)
 
 
-TASKS: dict[str, type[Task]] = {task.name: task for task in (Retraction, Palpation)}
-"""All tasks by their names."""
-
-
-def find_task(name: str) -> type[Task]:
-    """The class of a task by its name.
-
-    Raises:
-        ValueError: If there is no such task.
-    """
-    if name not in TASKS:
-        raise ValueError(f"there is no task {name!r}; there are {', '.join(TASKS)}")
-    return TASKS[name]
-
-
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Sum over the last axis, of three, in one order."""
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
 
 
-def _norm(v: np.ndarray) -> np.ndarray:
-    return np.sqrt(_dot(v, v))
+def norm(v: np.ndarray) -> np.ndarray:
+    """Lengths of vectors [..., 3]."""
+    return np.sqrt(dot(v, v))

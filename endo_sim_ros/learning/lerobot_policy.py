@@ -1,0 +1,191 @@
+"""Policies of lerobot: what trains one on a dataset, and its checkpoint as a policy of the tasks.
+
+lerobot needs Python 3.12, torchvision, and older torch and numpy than this package takes by default. It trains in an environment of
+its own, or in this one where its versions are installed.
+"""
+
+import importlib.util
+import json
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from endo_sim_ros.core.folders import written_whole
+from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.learning.actions import ACTION_SIZES, ARM_NAMES, Actions
+from endo_sim_ros.learning.config import ImitationConfig, SightConfig
+from endo_sim_ros.learning.dataset import IMAGE, IMAGE_RIGHT
+from endo_sim_ros.learning.pictures import IMAGE as SEEN, IMAGE_RIGHT as SEEN_RIGHT
+from endo_sim_ros.learning.task_batch import ARM_STATE
+
+PACKAGES = "lerobot[training,diffusion]==0.6.*"
+CONFIG = "train_config.json"
+_STATE, _ACTION = "observation.state", "action"
+_PICTURES = {IMAGE: SEEN, IMAGE_RIGHT: SEEN_RIGHT}
+_WEIGHTS = "pretrained_model"  # folder of a checkpoint
+_LAST = Path("lerobot/checkpoints/last") / _WEIGHTS  # where `write_training` has the last one
+
+_CHECKPOINTS = 5  # of a training; the last one is used
+# Of diffusion policies: the share of the image that is seen, anywhere in it while learning; a network that acts in real time without a
+# GPU, in place of one of 260 million weights for any robot; and steps in which an action is denoised, in place of 100.
+_CROP, _CHANNELS, _DENOISED = 0.9, [128, 256, 512], 10
+
+log = logging.getLogger(__name__)
+
+Kind = Literal["act", "diffusion"]
+
+
+def available() -> bool:
+    """Whether lerobot is installed here."""
+    return importlib.util.find_spec("lerobot") is not None
+
+
+def write_training(dataset: Path, out: Path, config: ImitationConfig) -> Path:
+    """Write what ``lerobot-train --config_path`` trains a policy by, and return its path.
+
+    The policy sees the images of the dataset and what the arm measures of itself, not the state of the task, which knows the goal.
+
+    Args:
+        dataset: Folder of a LeRobot dataset of demonstrations.
+        out: Folder; the checkpoints come into ``lerobot/checkpoints`` in it.
+        config: Options.
+
+    Raises:
+        SequenceError: If there is no such dataset, or its columns are not those of demonstrations, or a policy was trained there.
+    """
+    try:
+        features = json.loads((dataset / "meta/info.json").read_text("utf8"))["features"]
+        shapes = {key: features[key]["shape"] for key in (*_PICTURES, _STATE, _ACTION) if key in features}
+        missing = {IMAGE, _STATE, _ACTION} - shapes.keys()
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SequenceError(f"{dataset} is no LeRobot dataset; give the folder that `endo-sim demonstrate` wrote") from error
+    if missing or shapes[_STATE] != [len(ARM_NAMES)] or shapes[_ACTION] != [ACTION_SIZES["cartesian"]]:
+        raise SequenceError(f"{dataset} has other columns than `endo-sim demonstrate` writes; train on it with lerobot itself")
+    if (out / "lerobot").exists():
+        raise SequenceError(f"{out / 'lerobot'} exists already; choose another folder or remove it first")
+    inputs = {key: {"type": "VISUAL", "shape": [shape[2], *shape[:2]]} for key, shape in shapes.items() if key in _PICTURES}
+    inputs[_STATE] = {"type": "STATE", "shape": shapes[_STATE]}
+    policy: dict[str, Any] = {
+        "type": config.policy,
+        "push_to_hub": False,
+        "input_features": inputs,
+        "output_features": {_ACTION: {"type": "ACTION", "shape": shapes[_ACTION]}},
+        "pretrained_backbone_weights": config.backbone_weights or None,
+        "n_action_steps": config.executed,
+        "optimizer_lr": config.learning_rate,
+    }
+    if config.policy == "act":
+        policy |= {"chunk_size": config.chunk, "optimizer_lr_backbone": config.learning_rate}
+    else:
+        height, width, _ = shapes[IMAGE]
+        policy |= {
+            "horizon": config.chunk,
+            "n_obs_steps": 1,  # what moves is in the state
+            "drop_n_last_frames": 0,  # the last steps of an episode are learned from, too
+            "crop_shape": [round(_CROP * height), round(_CROP * width)],
+            "use_group_norm": not config.backbone_weights,
+            "down_dims": _CHANNELS,
+            "noise_scheduler_type": "DDIM",
+            "num_inference_steps": _DENOISED,
+        }
+    training = {
+        "dataset": {"repo_id": f"local/{dataset.resolve().name}", "root": str(dataset.resolve()), "use_imagenet_stats": False},
+        "policy": policy,
+        "output_dir": str((out / "lerobot").resolve()),
+        "job_name": out.resolve().name,
+        "seed": config.seed,
+        "batch_size": config.batch_size,
+        "steps": config.steps,
+        "save_freq": max(config.steps // _CHECKPOINTS, 1),
+        "log_freq": max(config.steps // 50, 1),
+        "num_workers": config.workers,
+        "wandb": {"enable": False},
+    }
+    out.mkdir(parents=True, exist_ok=True)
+    path = out / CONFIG
+    with written_whole(path) as partial:
+        partial.write_text(json.dumps(training, indent=4) + "\n", "utf8")
+    return path
+
+
+class LeRobotPolicy:
+    """A checkpoint of lerobot: ACT, a diffusion policy, or any other that takes the images and the state of demonstrations.
+
+    Args:
+        folder: The one that `write_training` was given, or that of the checkpoint.
+        device: auto (the GPU when there is one), cpu, cuda or cuda:N.
+
+    Raises:
+        ValueError: If there is no checkpoint, or it takes or gives other things.
+        RuntimeError: If lerobot is not installed.
+    """
+
+    actions: Actions = "cartesian"
+
+    def __init__(self, folder: str | Path, device: str = "auto"):
+        folder = Path(folder)
+        places = [place for place in (folder, folder / _WEIGHTS, folder / _LAST) if (place / "config.json").exists()]
+        if not places:
+            raise ValueError(f"{folder} has no checkpoint of lerobot; give the folder of `endo-sim imitate` after the training")
+        path = places[0]
+        inputs, self.sight = _features(path)
+        self._inputs = inputs
+        if not available():
+            raise RuntimeError(f"{folder}: to run this policy lerobot is needed; pip install '{PACKAGES}'")
+        import torch
+        from lerobot.configs.policies import PreTrainedConfig
+        from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+
+        from endo_sim_ros.core.device import pick_device
+
+        self._torch, self._device = torch, pick_device(device)
+        config: Any = PreTrainedConfig.from_pretrained(path)
+        config.device = self._device
+        self._policy: Any = get_policy_class(config.type).from_pretrained(path, config=config)
+        self._policy.to(self._device).eval()
+        overrides = {"device_processor": {"device": self._device}}
+        self._before, self._after = make_pre_post_processors(config, str(path), preprocessor_overrides=overrides)
+        self._policy.reset()
+
+    def reset(self, episodes: Sequence[int]) -> None:
+        """All episodes begin anew: what the policy remembers is of all."""
+        self._policy.reset()
+
+    def act(self, observations: dict[str, np.ndarray]) -> np.ndarray:
+        """Actions [B, 4] for observations of ``sensors``.
+
+        Raises:
+            ValueError: If images have another size than those that it was trained on.
+        """
+        tensors, torch = {}, self._torch
+        for key, shape in self._inputs.items():
+            name = _PICTURES.get(key, ARM_STATE)
+            values = torch.from_numpy(np.ascontiguousarray(observations[name])).to(self._device)
+            if key in _PICTURES:
+                values = values.permute(0, 3, 1, 2).float() / 255
+                if list(values.shape[1:]) != shape:
+                    (_, height, width), (_, h, w) = shape, values.shape[1:]
+                    raise ValueError(f"images have {w}×{h} pixels, but the policy was trained on {width}×{height}; set image_width {width}")
+            tensors[key] = values
+        with torch.inference_mode():
+            actions = self._after(self._policy.select_action(self._before(tensors)))
+        return actions.double().cpu().numpy()
+
+
+def _features(path: Path) -> tuple[dict[str, list[int]], SightConfig]:
+    """What a checkpoint takes, with the shapes, and what its pictures show."""
+    try:
+        config = json.loads((path / "config.json").read_text("utf8"))
+        inputs = {key: list(feature["shape"]) for key, feature in config["input_features"].items()}
+        given = {key: list(feature["shape"]) for key, feature in config["output_features"].items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path / 'config.json'} is no configuration of a policy of lerobot") from error
+    other = inputs.keys() - _PICTURES.keys() - {_STATE}
+    if other or IMAGE not in inputs or inputs.get(_STATE, [len(ARM_NAMES)]) != [len(ARM_NAMES)]:
+        raise ValueError(f"{path}: the policy takes {', '.join(inputs)}; those of `endo-sim imitate` take {IMAGE} and {_STATE}")
+    if given != {_ACTION: [ACTION_SIZES["cartesian"]]}:
+        raise ValueError(f"{path}: the policy gives {given}; a task takes {ACTION_SIZES['cartesian']} numbers, {_ACTION!r}")
+    return inputs, SightConfig(image_width=inputs[IMAGE][2], eyes=2 if IMAGE_RIGHT in inputs else 1)

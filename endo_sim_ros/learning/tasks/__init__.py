@@ -1,0 +1,28 @@
+"""What is to be learned: each task is a file here, with its script."""
+
+from endo_sim_ros.core.plugins import load_named
+from endo_sim_ros.learning.tasks.palpation import Palpation
+from endo_sim_ros.learning.tasks.retraction import Retraction
+from endo_sim_ros.learning.tasks.task import BOUND, LENGTH, Outcome, Script, Task, moving, norm
+from endo_sim_ros.learning.tasks.tracking import Tracking
+
+__all__ = ["BOUND", "LENGTH", "TASKS", "Outcome", "Script", "Task", "find_task", "moving", "norm"]
+
+TASKS: dict[str, type[Task]] = {task.name: task for task in (Retraction, Palpation, Tracking)}
+"""All tasks by their names."""
+
+
+def find_task(name: str) -> type[Task]:
+    """The class of a task by its name, or by where it is: ``path/to/file.py:Class`` or ``package.module:Class``.
+
+    Raises:
+        ValueError: If there is no such task.
+    """
+    if ":" in name:
+        found = load_named(name)
+        if not (isinstance(found, type) and issubclass(found, Task)):
+            raise ValueError(f"{name} is no task; a task is a subclass of endo_sim_ros.learning.tasks.Task")
+        return found
+    if name not in TASKS:
+        raise ValueError(f"there is no task {name!r}; there are {', '.join(TASKS)}, and your own as file.py:Class")
+    return TASKS[name]

@@ -19,8 +19,8 @@ class Command:
     """Name of the task, such as retraction or palpation; an unknown one is answered with the list."""
     out: Positional[Path]
     """Folder of the dataset. Finished episodes stay in it when the command is interrupted."""
-    model: Path | None = None
-    """PLY model with its cameras.json; default: a piece of the synthetic patient."""
+    scenes: tuple[str, ...] = ("phantom:0",)
+    """Synthetic patients, phantom:SEED, or PLY models with their cameras.json, which episodes take in turn."""
     device: str = "auto"
     """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""
     config: Annotated[DemonstrationConfig, tyro.conf.arg(name="")] = field(default_factory=DemonstrationConfig)
@@ -31,9 +31,6 @@ class Command:
     def run(self) -> None:
         """Write the dataset; raises SequenceError if the folder has other data."""
         from endo_sim_ros.learning.demonstrations import demonstrate
-        from endo_sim_ros.learning.scenes import load_scene
 
-        episodes, tried = demonstrate(
-            self.task, load_scene(self.model), self.out, self.config, self.sight, self.vary, self.motion, self.device
-        )
+        episodes, tried = demonstrate(self.task, self.scenes, self.out, self.config, self.sight, self.vary, self.motion, self.device)
         print(f"{self.out}: {episodes} solved episodes; {tried} were tried now")

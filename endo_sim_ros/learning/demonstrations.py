@@ -20,7 +20,10 @@ With the observations of row k the policy took the action of row k.
 
 import json
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +32,7 @@ from rich.progress import Progress
 
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.instruments import JOINTS
+from endo_sim_ros.learning.actions import ARM_NAMES, POSE_NAMES, jaw_angles
 from endo_sim_ros.learning.config import DemonstrationConfig, Randomisation, SightConfig
 from endo_sim_ros.learning.dataset import (
     IMAGE,
@@ -40,10 +44,9 @@ from endo_sim_ros.learning.dataset import (
     scalar_feature,
     vector_feature,
 )
-from endo_sim_ros.learning.episodes import POSE_NAMES
 from endo_sim_ros.learning.held_tools import ARM
 from endo_sim_ros.learning.policies import Policy, scripted_policy
-from endo_sim_ros.learning.scenes import Scene
+from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.learning.task_batch import TaskBatch
 from endo_sim_ros.learning.tasks import Task
 from endo_sim_ros.physics import MotionConfig
@@ -90,7 +93,7 @@ class _Episode:
 
 def demonstrate(
     task: str,
-    scene: Scene,
+    scenes: Sequence[str | Path],
     out: Path,
     config: DemonstrationConfig = DemonstrationConfig(),
     sight: SightConfig = SightConfig(),
@@ -102,7 +105,7 @@ def demonstrate(
 
     Args:
         task: Its name.
-        scene: What is seen and touched.
+        scenes: What is seen and touched, each as `load_scene` takes it; episodes take them in turn.
         out: Folder of the dataset. Finished episodes stay in it when the call is interrupted.
         config, sight, randomisation, motion: Options.
         device: Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N.
@@ -112,12 +115,18 @@ def demonstrate(
         ValueError: If there is no such task, or an option cannot be used.
         RuntimeError: If pyarrow is not installed.
     """
-    batch = TaskBatch(task, scene, config.environments, "both", randomisation, sight, device, motion=motion)
-    policy = scripted_policy(task, batch.count)
-    fps = round(1 / batch.task.physics().step_duration)
-    options = {"task": task, "seed": config.seed, "noise": config.noise, **asdict(sight), **asdict(randomisation), **asdict(motion)}
+    make = partial(TaskBatch, task, randomisation=randomisation, sight=sight, device=device, motion=motion)
+    batches = [make(load_scene(scene), count=config.environments, observations="both") for scene in scenes]
+    first = batches[0]
+    policy = scripted_policy(task, first.count)
+    fps = round(1 / first.task.physics().step_duration)
+    options = {"task": task, "scenes": list(map(str, scenes)), "seed": config.seed, "noise": config.noise}
+    options |= {**asdict(sight), **asdict(randomisation), **asdict(motion)}
     _check_options(out, options)
-    writer = DatasetWriter(out, batch.task.sentence, fps, _features(batch, fps, config.images))
+    features = _features(first, fps, config.images)
+    if other := [scene for scene, batch in zip(scenes, batches) if _features(batch, fps, config.images) != features]:
+        raise SequenceError(f"{other[0]} has pictures of another size than {scenes[0]}, but a dataset has one size of each kind")
+    writer = DatasetWriter(out, first.task.sentence, fps, features)
     seeds = writer.column("seed")
     seed, tried = int(seeds[-1]) + 1 if len(seeds) else config.seed, 0
 
@@ -132,13 +141,16 @@ def demonstrate(
         with Progress() as bar:
             progress = bar.add_task(task, total=config.episodes, completed=writer.episodes)
             while writer.episodes < config.episodes:
-                episodes = _play(batch, policy, config.noise, seed)
-                for number, episode in enumerate(episodes):
+                # Seed n is of scene n mod their number, however many episodes run at once.
+                own = [np.arange(first.count) * len(batches) + seed + (i - seed) % len(batches) for i in range(len(batches))]
+                played = [_play(batch, policy, config.noise, numbers) for batch, numbers in zip(batches, own)]
+                episodes = dict(zip(np.concatenate(own).tolist(), chain(*played)))
+                for number in sorted(episodes):
                     if writer.episodes == config.episodes:
                         break
                     tried += 1
-                    if episode.solved:
-                        _write(writer, episode, seed + number)
+                    if episodes[number].solved:
+                        _write(writer, episodes[number], number)
                         bar.update(progress, completed=writer.episodes)
                 seed += len(episodes)
                 if time.monotonic() - saved > _SAVE_EVERY:
@@ -164,21 +176,21 @@ def _check_options(out: Path, options: dict[str, Any]) -> None:
         raise SequenceError(f"{out} was begun with {had}; continue it with the same options, or choose another name")
 
 
-def _play(batch: TaskBatch, policy: Policy, noise: float, seed: int) -> list[_Episode]:
-    """One episode in each environment, the first with this seed, the others with those that follow."""
+def _play(batch: TaskBatch, policy: Policy, noise: float, seeds: np.ndarray) -> list[_Episode]:
+    """One episode in each environment, each with its seed [B]."""
     numbers, task = range(batch.count), batch.task
     policy.reset(numbers)
-    batch.reset(numbers, [np.random.default_rng(seed + b) for b in numbers])
-    episodes = [_Episode(np.random.default_rng([seed + b, 0xDA])) for b in numbers]
+    batch.reset(numbers, [np.random.default_rng(seed) for seed in seeds])
+    episodes = [_Episode(np.random.default_rng([seed, 0xDA])) for seed in seeds]
     seen = batch.observe()
     while any(episode.solved is None for episode in episodes):
         assert isinstance(seen, dict)  # of state and images
         actions = np.clip(policy.act(seen["state"]), -1, 1)
         rows = {
-            "observation.state": np.concatenate([_poses(task, task.tips(), task.fourth), task.forces()], 1),
+            "observation.state": batch.arm_state(),
             "observation.environment_state": seen["state"],
             "action": actions,
-            "command.pose": _poses(task, task.reach(actions), actions[:, 3]),
+            "command.pose": _commands(task, actions),
         }
         if batch.tools is not None:
             rows["observation.joints"] = batch.tools.joints.copy()
@@ -203,10 +215,9 @@ def _write(writer: DatasetWriter, episode: _Episode, seed: int) -> None:
     writer.add(columns | {"seed": np.full(len(columns["action"]), seed)}, episode.pictures)
 
 
-def _poses(task: Task, tips: np.ndarray, fourth: np.ndarray) -> np.ndarray:
-    """Poses [B, 7] of tips [B, 3] with the axes of the world, and jaws as a fourth number of actions [B] has them, [B, 8]."""
-    jaws = np.where(task.closes(fourth), task.closed_jaw, task.open_jaw)
-    return np.column_stack([tips, np.tile([0.0, 0.0, 0.0, 1.0], (len(tips), 1)), jaws])
+def _commands(task: Task, actions: np.ndarray) -> np.ndarray:
+    """Poses of the tips, with the axes of the world, and jaws that actions [B, 4] command, [B, 8]."""
+    return np.column_stack([task.reach(actions), np.tile([0.0, 0.0, 0.0, 1.0], (task.count, 1)), jaw_angles(task, actions[:, 3])])
 
 
 def _features(batch: TaskBatch, fps: int, images: ImageFormat) -> dict[str, dict[str, Any]]:
@@ -214,7 +225,7 @@ def _features(batch: TaskBatch, fps: int, images: ImageFormat) -> dict[str, dict
     assert batch.pictures is not None  # images are observed
     pose = [f"{ARM}.{name}" for name in (*POSE_NAMES, "jaw")]
     vectors = {
-        "observation.state": [*pose, *(f"{ARM}.force_{axis}" for axis in "xyz")],
+        "observation.state": [f"{ARM}.{name}" for name in ARM_NAMES],
         "observation.environment_state": batch.task.observation_names,
         "action": ["x", "y", "z", "fourth"],
         "command.pose": pose,

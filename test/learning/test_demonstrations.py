@@ -1,6 +1,7 @@
 """Demonstrations by scripted policies, as a dataset that can be continued."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -13,14 +14,13 @@ from endo_sim_ros.learning import dataset, demonstrations
 from endo_sim_ros.learning.config import DemonstrationConfig, SightConfig
 from endo_sim_ros.learning.dataset import IMAGE, IMAGE_RIGHT, SEGMENTATION, DatasetWriter, vector_feature
 from endo_sim_ros.learning.demonstrations import demonstrate
-from endo_sim_ros.learning.scenes import load_scene
 
 SIGHT = SightConfig(image_width=40, eyes=2, segmentation=True)
 
 
 def run(out, episodes, noise=0.3, environments=3, task="retraction", **options):
     config = DemonstrationConfig(episodes=episodes, noise=noise, environments=environments, images="png", seed=7)
-    return demonstrate(task, load_scene(), out, config, options.pop("sight", SIGHT), device="cpu", **options)
+    return demonstrate(task, ["phantom:0"], out, config, options.pop("sight", SIGHT), device="cpu", **options)
 
 
 def tables(root):
@@ -100,8 +100,25 @@ def test_other_folders_and_other_options_are_refused(whole, tmp_path):
         run(tmp_path / "photos", 1)
     with pytest.raises(SequenceError, match="41×33 images make no video"):
         config = DemonstrationConfig(episodes=1, environments=1)
-        demonstrate("retraction", load_scene(), tmp_path / "odd", config, SightConfig(image_width=41), device="cpu")
+        demonstrate("retraction", ["phantom:0"], tmp_path / "odd", config, SightConfig(image_width=41), device="cpu")
     assert not (tmp_path / "odd").exists()
+
+
+@pytest.mark.slow
+def test_scenes_take_turns_and_the_number_of_environments_does_not_matter(tmp_path):
+    config = DemonstrationConfig(episodes=5, images="png", seed=3)
+    roots = [tmp_path / name for name in ("two", "three")]
+    for root, environments in zip(roots, (2, 3)):
+        demonstrate("retraction", ["phantom:0", "phantom:1"], root, replace(config, environments=environments), SIGHT, device="cpu")
+    for mine, other in zip(*map(tables, roots), strict=True):
+        assert mine.equals(other)
+    for table in tables(roots[0]):
+        seed = table.column("seed")[0].as_py()
+        environment = make("retraction", scene=f"phantom:{seed % 2}")
+        state, _ = environment.reset(seed=seed)
+        np.testing.assert_array_equal(np.array(table.column("observation.environment_state")[0].as_py(), np.float32), state)
+    with pytest.raises(SequenceError, match="was begun with scenes "):
+        demonstrate("retraction", ["phantom:0"], roots[0], config, SIGHT, device="cpu")
 
 
 def test_a_script_that_hardly_solves_anything_is_told(tmp_path, monkeypatch):

@@ -1,0 +1,37 @@
+"""`endo-sim imitate`."""
+
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import Positional
+
+from endo_sim_ros.learning.config import ImitationConfig
+
+
+@dataclass(frozen=True)
+class Command:
+    """Train an image policy by lerobot on demonstrations; without lerobot write its configuration, and say what to install."""
+
+    dataset: Positional[Path]
+    """Folder that `endo-sim demonstrate` wrote."""
+    out: Positional[Path]
+    """Folder for the configuration and lerobot's checkpoints, which `endo-sim benchmark` and policy_node take as a policy."""
+    config: Annotated[ImitationConfig, tyro.conf.arg(name="")] = field(default_factory=ImitationConfig)
+
+    def run(self) -> None:
+        """Write and train; raises SequenceError if the dataset cannot be used, RuntimeError if the training fails."""
+        from endo_sim_ros.learning.lerobot_policy import PACKAGES, available, write_training
+
+        path = write_training(self.dataset, self.out, self.config)
+        if not available():
+            print(f"{path} is written, but lerobot, which trains by it, is not installed here. In an environment with Python 3.12:")
+            print(f"  pip install '{PACKAGES}'\n  lerobot-train --config_path={path}")
+            return
+        words = [sys.executable, "-m", "lerobot.scripts.lerobot_train", f"--config_path={path}"]
+        if status := subprocess.run(words, check=False).returncode:
+            raise RuntimeError(f"lerobot ended with status {status}; what it wrote is above")
+        print(f"{self.out}: trained; endo-sim benchmark OUT {self.out}")

@@ -1,0 +1,244 @@
+"""A leaderboard that repeats: policies play the same unseen episodes of a task, and a table and a page say how well.
+
+Seeds are fixed, and scenes are the same for everybody who names no others: synthetic patients that no default trains on. Results are
+added to those that the folder has, so that a page may hold several tasks, and policies from several machines.
+"""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from html import escape
+from math import sqrt
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.progress import Progress
+
+from endo_sim_ros.core import drawing
+from endo_sim_ros.core.folders import written_whole
+from endo_sim_ros.learning.config import BenchmarkConfig, Randomisation, SightConfig
+from endo_sim_ros.learning.policies import Policy, make_policy
+from endo_sim_ros.learning.scenes import load_scene
+from endo_sim_ros.learning.task_batch import TaskBatch
+from endo_sim_ros.learning.tasks import find_task
+from endo_sim_ros.learning.train import TESTED_FROM, play
+from endo_sim_ros.physics import MotionConfig
+
+SCENES = ("phantom:3", "phantom:4", "phantom:5")
+"""Synthetic patients that policies are compared on."""
+
+_RESULTS, _PAGE = "benchmark.json", "benchmark.html"
+_FILMED = 8  # episodes that the video shows
+
+CONDITIONS: dict[str, tuple[Randomisation, MotionConfig]] = {
+    "as usual": (Randomisation(), MotionConfig()),
+    "light": (Randomisation(light=0.5), MotionConfig()),
+    "texture": (Randomisation(texture=0.5), MotionConfig()),
+    "endoscope": (Randomisation(camera_position=0.002, camera_angle=2.0), MotionConfig()),
+    "instrument": (Randomisation(tool=1.0, metal=0.5, lamp=0.005), MotionConfig()),
+    "stiffness": (Randomisation(stiffness=0.5), MotionConfig()),
+    "breath": (Randomisation(), MotionConfig(breathing=0.004)),
+}
+"""What episodes are like, by its name; all but the first are of the robustness table."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """Episodes of one policy under one condition in one scene."""
+
+    task: str
+    policy: str
+    scene: str
+    condition: str
+    episodes: int
+    solved: int
+    mean_return: float
+    mean_steps: float
+
+
+def benchmark(out: Path, policies: Sequence[str], scenes: Sequence[str], config: BenchmarkConfig, device: str = "auto") -> list[Result]:
+    """Let policies play, add what came out to the table of a folder, and draw its page.
+
+    Args:
+        out: Folder of benchmark.json, benchmark.html and a video for each task and policy.
+        policies: Each as `make_policy` takes it.
+        scenes: Each as `load_scene` takes it.
+        config: Options.
+        device: Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N.
+
+    Returns:
+        The new results.
+
+    Raises:
+        ValueError: If there is no such task, policy or scene, the folder has other data, or a policy does not fit the task.
+        RuntimeError: If a policy needs a library that is not installed.
+    """
+    task = find_task(config.task).name
+    before = read_results(out)
+    loaded = {policy: make_policy(policy, config.task, config.episodes, device) for policy in policies}  # before the long work
+    conditions = CONDITIONS if config.robustness else {name: CONDITIONS[name] for name in list(CONDITIONS)[:1]}
+    found: list[Result] = []
+    out.mkdir(parents=True, exist_ok=True)
+    with Progress() as bar:
+        progress = bar.add_task(config.task, total=len(loaded) * len(scenes) * len(conditions))
+        for name, policy in loaded.items():
+            for scene in scenes:
+                for condition, (randomisation, motion) in conditions.items():
+                    bar.update(progress, description=f"{name}, {scene}, {condition}")
+                    batch = _batch(config.task, scene, config.episodes, policy, randomisation, motion, device)
+                    returns, solved, steps = play(batch, policy, TESTED_FROM + np.arange(config.episodes))
+                    counted = int(solved.sum()), float(returns.mean()), float(steps.mean())
+                    found.append(Result(task, name, scene, condition, config.episodes, *counted))
+                    del batch
+                    before = _merge(before, found)
+                    _save(out, before)
+                    bar.advance(progress)
+            _film(out, config, name, policy, scenes[0], device)
+    (out / _PAGE).write_text(_page(before, out), "utf8")
+    return found
+
+
+def read_results(folder: Path) -> list[Result]:
+    """The table of a folder; empty if there is none yet.
+
+    Raises:
+        ValueError: If there is one, but damaged.
+    """
+    path = folder / _RESULTS
+    if not path.exists():
+        return []
+    try:
+        return [Result(**row) for row in json.loads(path.read_text("utf8"))]
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{path}: not the results of `endo-sim benchmark` ({error}); choose another folder") from error
+
+
+def _merge(before: Sequence[Result], found: Sequence[Result]) -> list[Result]:
+    """Results by what they are of, newer ones in the place of older ones."""
+    key: Callable[[Result], tuple[str, ...]] = lambda result: (result.task, result.policy, result.scene, result.condition)
+    return list({key(result): result for result in (*before, *found)}.values())
+
+
+def _save(folder: Path, results: Sequence[Result]) -> None:
+    with written_whole(folder / _RESULTS) as partial:
+        partial.write_text(json.dumps([asdict(result) for result in results], indent=1) + "\n", "utf8")
+
+
+def _batch(
+    task: str, scene: str, count: int, policy: Policy, randomisation: Randomisation, motion: MotionConfig, device: str, **options: Any
+) -> TaskBatch:
+    """Episodes for a policy, with the observations that it takes."""
+    observations = "state" if policy.sight is None else "sensors"
+    sight = options.pop("sight", policy.sight or SightConfig())
+    return TaskBatch(
+        task, load_scene(scene), count, observations, randomisation, sight, device, actions=policy.actions, motion=motion, **options
+    )
+
+
+def _film(out: Path, config: BenchmarkConfig, name: str, policy: Policy, scene: str, device: str) -> None:
+    """Write a video of the first episodes, side by side, each until its end."""
+    count = min(_FILMED, config.episodes)
+    policy = make_policy(name, config.task, count, device)
+    shown = policy.sight or SightConfig(image_width=config.image_width)
+    batch = _batch(config.task, scene, count, policy, *CONDITIONS["as usual"], device, images=True, sight=shown)
+    frames: list[np.ndarray] = []
+    running = np.ones(count, bool)
+
+    def look(ended: np.ndarray) -> None:
+        images = batch.images()
+        last = frames[-1] if frames else images
+        frames.append(np.where(running[:, None, None, None], images, last))
+        running[ended] = False
+
+    play(batch, policy, TESTED_FROM + np.arange(count), look)
+    columns = (count + 1) // 2
+    blank = [np.zeros_like(frames[0][0])] * (2 * columns - count)
+    rows = ([*frame, *blank] for frame in frames)
+    tiled = (np.vstack([np.hstack(row[:columns]), np.hstack(row[columns:])]) for row in rows)
+    drawing.write_video(out / _video(batch.task.name, name), tiled, round(1 / batch.task.physics().step_duration))
+
+
+def _video(task: str, policy: str) -> str:
+    return f"{drawing.slug(task)}-{drawing.slug(policy)}.mp4"
+
+
+def interval(solved: int, episodes: int) -> tuple[float, float]:
+    """Where the true share of solved episodes lies with 95 %: Wilson's score interval."""
+    z, share = 1.96, solved / episodes
+    middle, half = share + z**2 / (2 * episodes), z * sqrt(share * (1 - share) / episodes + (z / (2 * episodes)) ** 2)
+    return (middle - half) / (1 + z**2 / episodes), (middle + half) / (1 + z**2 / episodes)
+
+
+def summarise(results: Sequence[Result], condition: str = "") -> list[Result]:
+    """Over all scenes: one result for each task, policy and condition, those that solve most first."""
+    groups: dict[tuple[str, str, str], list[Result]] = {}
+    for result in results:
+        if condition in ("", result.condition):
+            groups.setdefault((result.task, result.policy, result.condition), []).append(result)
+    merged = []
+    for each in groups.values():
+        weights = [result.episodes for result in each]
+        merged.append(
+            replace(
+                each[0],
+                scene=", ".join(result.scene for result in each),
+                episodes=sum(weights),
+                solved=sum(result.solved for result in each),
+                mean_return=float(np.average([result.mean_return for result in each], weights=weights)),
+                mean_steps=float(np.average([result.mean_steps for result in each], weights=weights)),
+            )
+        )
+    return sorted(merged, key=lambda result: (result.task, -result.solved / result.episodes, -result.mean_return))
+
+
+def table(results: Sequence[Result]) -> list[list[str]]:
+    """The leaderboard as rows of text, the first being its head."""
+    rows = [["task", "policy", "solved", "95 %", "mean return", "mean steps", "episodes", "scenes"]]
+    for result in summarise(results, next(iter(CONDITIONS))):
+        low, high = interval(result.solved, result.episodes)
+        numbers = [f"{result.solved / result.episodes:.0%}", f"{low:.0%} to {high:.0%}", f"{result.mean_return:.2f}"]
+        rows.append([result.task, result.policy, *numbers, f"{result.mean_steps:.0f}", str(result.episodes), result.scene])
+    return rows
+
+
+def robustness(results: Sequence[Result]) -> list[list[str]]:
+    """Shares of solved episodes by condition, as rows of text, the first being their head; empty where only one was played."""
+    merged = {(each.task, each.policy, each.condition): each for each in summarise(results)}
+    conditions = [name for name in CONDITIONS if any(name == condition for *_, condition in merged)]
+    if len(conditions) < 2:
+        return []
+    rows = [["task", "policy", *conditions]]
+    for task, policy in dict.fromkeys(key[:2] for key in merged):
+        found = [merged.get((task, policy, condition)) for condition in conditions]
+        rows.append([task, policy, *(f"{each.solved / each.episodes:.0%}" if each else "" for each in found)])
+    return rows
+
+
+def _page(results: Sequence[Result], out: Path) -> str:
+    """The tables and the videos as a page."""
+
+    def drawn(rows: list[list[str]]) -> str:
+        head, *body = rows
+        line = lambda cells, tag: "<tr>" + "".join(f"<{tag}>{escape(cell)}</{tag}>" for cell in cells) + "</tr>"
+        return f"<table>{line(head, 'th')}{''.join(line(row, 'td') for row in body)}</table>"
+
+    parts = ["<h2>Leaderboard</h2>", drawn(table(results))]
+    if rows := robustness(results):
+        kinds = "; ".join(f"{escape(name)}: {escape(_differs(*what))}" for name, what in list(CONDITIONS.items())[1:])
+        parts += ["<h2>Robustness</h2>", drawn(rows), f"<p>{kinds}.</p>"]
+    for result in summarise(results, next(iter(CONDITIONS))):
+        video = _video(result.task, result.policy)
+        if (out / video).exists():
+            shown = f"<video src='{escape(video)}' autoplay loop muted controls></video>"
+            parts.append(f"<h2>{escape(result.task)}: {escape(result.policy)}</h2>{shown}")
+    style = "body{font:15px/1.5 system-ui,sans-serif;max-width:1200px;margin:2rem auto;padding:0 1rem;color-scheme:light dark}"
+    style += "table{border-collapse:collapse}td,th{padding:.25rem .7rem;text-align:left;border-bottom:1px solid #8884}video{max-width:100%}"
+    head = f"<meta charset=utf-8><title>Benchmark of policies</title><style>{style}</style>"
+    return f"<!doctype html><html lang=en><head>{head}</head><body><h1>Benchmark of policies</h1>{''.join(parts)}</body></html>\n"
+
+
+def _differs(randomisation: Randomisation, motion: MotionConfig) -> str:
+    """The options that are not the default, in words."""
+    parts = [(asdict(part), asdict(type(part)())) for part in (randomisation, motion)]
+    return ", ".join(f"{name} {value:g}" for part, usual in parts for name, value in part.items() if value != usual[name])

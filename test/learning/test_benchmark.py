@@ -1,0 +1,131 @@
+"""The leaderboard, and tasks and policies that users write."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from blue_seeker import BlueSeeker
+from endo_sim_command import endo_sim
+from scipy.stats import binomtest
+
+from endo_sim_ros.learning import benchmark as module
+from endo_sim_ros.learning.benchmark import CONDITIONS, SCENES, Result, benchmark, interval, read_results, robustness, table
+from endo_sim_ros.learning.config import BenchmarkConfig
+from endo_sim_ros.learning.policies import make_policy
+from endo_sim_ros.learning.scenes import load_scene
+from endo_sim_ros.learning.task_batch import TaskBatch
+from endo_sim_ros.learning.tasks import TASKS, find_task
+from endo_sim_ros.learning.train import TESTED_FROM, play
+
+ROOT = Path(__file__).parents[2]
+SEEKER = f"{ROOT / 'test/learning/blue_seeker.py'}:BlueSeeker"
+FEW = BenchmarkConfig(episodes=3, image_width=32)
+
+
+@pytest.fixture(scope="module")
+def press(tmp_path_factory):
+    """The task of the guide, as a file."""
+    guide = (ROOT / "docs/learning.md").read_text()
+    (code,) = (block for block in re.findall(r"```python\n(.+?)```", guide, re.S) if "class Press(Task)" in block)
+    path = tmp_path_factory.mktemp("tasks") / "press.py"
+    path.write_text(code)
+    return f"{path}:Press"
+
+
+@pytest.mark.slow
+def test_a_leaderboard_is_added_to_and_says_what_the_episodes_gave(tmp_path, press):
+    out = tmp_path / "out"
+    benchmark(out, ["still"], ["phantom:0"], FEW, "cpu")
+    benchmark(out, ["scripted", "still"], ["phantom:0"], FEW, "cpu")
+    done = endo_sim(
+        *("benchmark", out, "scripted", "still", "--task", press, "--scenes", "phantom:0", "--episodes", 8, "--image-width", 32),
+        *("--device", "cpu"),
+    )
+    assert done.returncode == 0, done.stderr
+    assert "press       scripted  100%" in done.stdout and "press       still     0%" in done.stdout, done.stdout
+    results = read_results(out)
+    assert len(results) == 4 and len(json.loads((out / "benchmark.json").read_text())) == 4
+    found = {(result.task, result.policy): result for result in results}
+    returns, solved, steps = play(
+        TaskBatch("retraction", load_scene("phantom:0"), 3, device="cpu"),
+        make_policy("scripted", "retraction", 3),
+        TESTED_FROM + np.arange(3),
+    )
+    scripted = found["retraction", "scripted"]
+    assert (scripted.solved, scripted.mean_return, scripted.mean_steps) == (solved.sum(), returns.mean(), steps.mean())
+    assert found["retraction", "still"].solved == 0 and found["retraction", "still"].mean_steps == 60
+    page = (out / "benchmark.html").read_text()
+    assert page.count("<video") == 4 == len(list(out.glob("*.mp4"))) and "retraction-scripted.mp4" in page
+    import av
+
+    with av.open(str(out / "press-scripted.mp4")) as film:
+        assert sum(1 for _ in film.decode(video=0)) > found["press", "scripted"].mean_steps
+    (out / "benchmark.json").write_text("[{}]")
+    with pytest.raises(ValueError, match="not the results of `endo-sim benchmark`"):
+        benchmark(out, ["still"], ["phantom:0"], FEW, "cpu")
+
+
+@pytest.mark.slow
+def test_other_conditions_are_other_episodes(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "CONDITIONS", {name: CONDITIONS[name] for name in ("as usual", "stiffness", "breath")})
+    config = BenchmarkConfig(episodes=2, robustness=True, image_width=32)
+    results = benchmark(tmp_path, ["scripted"], ["phantom:1"], config, "cpu")
+    assert len({result.mean_return for result in results}) == 3
+    assert robustness(results) == [["task", "policy", "as usual", "stiffness", "breath"], ["retraction", "scripted", *["100%"] * 3]]
+    assert "breathing 0.004" in (tmp_path / "benchmark.html").read_text()
+
+
+def test_the_table_sums_over_scenes_and_gives_wilsons_interval():
+    results = [
+        Result("t", "a", "phantom:3", "as usual", 10, 9, 1.0, 20.0),
+        Result("t", "a", "phantom:4", "as usual", 30, 15, 2.0, 40.0),
+        Result("t", "b", "phantom:3", "as usual", 10, 10, 0.5, 20.0),
+        Result("t", "a", "phantom:3", "light", 10, 0, 1.0, 20.0),
+    ]
+    head, best, second = table(results)
+    assert best[:3] == ["t", "b", "100%"]
+    assert second == ["t", "a", "60%", "45% to 74%", "1.75", "35", "40", "phantom:3, phantom:4"]
+    for solved, episodes in ((0, 5), (24, 40), (100, 100)):
+        wilson = binomtest(solved, episodes).proportion_ci(method="wilson")
+        np.testing.assert_allclose(interval(solved, episodes), (wilson.low, wilson.high), atol=1e-4)
+
+
+def test_patients_of_the_benchmark_are_not_those_that_are_trained_on_and_differ():
+    assert "phantom:0" not in SCENES
+    first, other = (load_scene(scene).model for scene in ("phantom:0", "phantom:3"))
+    assert load_scene() is load_scene("phantom:0")
+    assert len(first.means) != len(other.means) or not np.allclose(first.means, other.means)
+    with pytest.raises(ValueError, match="phantom:x: the seed of a synthetic patient is a number, as in phantom:1"):
+        load_scene("phantom:x")
+
+
+def test_tasks_and_policies_of_files_are_found_and_what_is_wrong_is_said(press, tmp_path):
+    assert find_task(press).name == "press" and find_task(press) is find_task(press)
+    seeker = make_policy(SEEKER, "retraction", 2)
+    assert seeker.count == 2 and seeker.sight == BlueSeeker.sight
+    (tmp_path / "broken.py").write_text("import nothing_of_this_name")
+    for named, sentence in (
+        ("nowhere.py:Task", "nowhere.py cannot be loaded: FileNotFoundError"),
+        (f"{tmp_path / 'broken.py'}:Task", "cannot be loaded: ModuleNotFoundError: No module named 'nothing_of_this_name'"),
+        (SEEKER, "is no task; a task is a subclass of endo_sim_ros.learning.tasks.Task"),
+        (press + "ure", "has no 'Pressure'"),
+        ("sewing", "there is no task 'sewing'; there are retraction, palpation, tracking, and your own as file.py:Class"),
+    ):
+        with pytest.raises(ValueError, match=re.escape(sentence)):
+            find_task(named)
+
+
+def test_an_image_policy_takes_what_a_robot_has():
+    batch = TaskBatch("retraction", load_scene(), 2, "sensors", sight=BlueSeeker.sight, device="cpu")
+    batch.reset([0, 1], [np.random.default_rng(s) for s in (4, 5)])
+    seen = batch.observe()
+    assert seen.keys() == {"arm", "image", "image_right"} and seen["arm"].shape == (2, 11)
+    np.testing.assert_allclose(seen["arm"][:, :3], batch.task.tips(), rtol=1e-6)
+    still = np.float32([0, 0, 0, 1, TASKS["retraction"].open_jaw, 0, 0, 0])
+    np.testing.assert_array_equal(seen["arm"][:, 3:], [still] * 2)
+    for _ in range(25):
+        seen, _ = batch.step(np.tile([0, 0, -1, 1], (2, 1)))
+    assert (seen["arm"][:, 7] == TASKS["retraction"].closed_jaw).all()
+    np.testing.assert_allclose(seen["arm"][:, 8:], batch.task.forces(), rtol=1e-6)

@@ -1,0 +1,108 @@
+"""Policies of lerobot: what trains them, and what is said where they cannot be used."""
+
+import json
+
+import numpy as np
+import pytest
+from endo_sim_command import endo_sim
+
+from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.learning.config import DemonstrationConfig, ImitationConfig, SightConfig
+from endo_sim_ros.learning.dataset import IMAGE, IMAGE_RIGHT
+from endo_sim_ros.learning.demonstrations import demonstrate
+from endo_sim_ros.learning.lerobot_policy import LeRobotPolicy, available, write_training
+from endo_sim_ros.learning.policies import make_policy
+from endo_sim_ros.learning.scenes import load_scene
+from endo_sim_ros.learning.task_batch import TaskBatch
+from endo_sim_ros.learning.train import play
+
+
+@pytest.fixture(scope="module")
+def demonstrations(tmp_path_factory):
+    """Two patients, both eyes."""
+    out = tmp_path_factory.mktemp("demonstrations") / "two"
+    config = DemonstrationConfig(episodes=4, environments=2, images="png")
+    demonstrate("retraction", ["phantom:0", "phantom:1"], out, config, SightConfig(image_width=40, eyes=2), device="cpu")
+    return out
+
+
+def test_the_configuration_names_what_the_policy_may_see(demonstrations, tmp_path):
+    for policy in ("act", "diffusion"):
+        training = json.loads(write_training(demonstrations, tmp_path / policy, ImitationConfig(policy=policy, steps=50)).read_text())
+        told = training["policy"]
+        assert told["type"] == policy and told["n_action_steps"] == 8
+        assert told["input_features"] == {
+            IMAGE: {"type": "VISUAL", "shape": [3, 32, 40]},
+            IMAGE_RIGHT: {"type": "VISUAL", "shape": [3, 32, 40]},
+            "observation.state": {"type": "STATE", "shape": [11]},
+        }
+        assert told["output_features"] == {"action": {"type": "ACTION", "shape": [4]}}
+        assert (training["steps"], training["dataset"]["root"]) == (50, str(demonstrations))
+
+
+def test_without_lerobot_the_command_says_what_to_install(demonstrations, tmp_path):
+    if available():
+        pytest.skip("lerobot is installed, and would train")
+    done = endo_sim("imitate", demonstrations, tmp_path / "act", "--steps", 100)
+    assert done.returncode == 0, done.stderr
+    assert "pip install 'lerobot[training,diffusion]==0.6.*'" in done.stdout
+    assert f"lerobot-train --config_path={tmp_path / 'act/train_config.json'}" in done.stdout
+
+
+def test_datasets_that_cannot_be_learned_from_are_told(demonstrations, tmp_path):
+    with pytest.raises(SequenceError, match="nothing is no LeRobot dataset; give the folder that `endo-sim demonstrate` wrote"):
+        write_training(tmp_path / "nothing", tmp_path / "out", ImitationConfig())
+    info = json.loads((demonstrations / "meta/info.json").read_text())
+    info["features"]["action"]["shape"] = [7]
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta/info.json").write_text(json.dumps(info))
+    with pytest.raises(SequenceError, match="has other columns than `endo-sim demonstrate` writes; train on it with lerobot itself"):
+        write_training(tmp_path, tmp_path / "out", ImitationConfig())
+    (tmp_path / "out/lerobot").mkdir(parents=True)
+    with pytest.raises(SequenceError, match="lerobot exists already; choose another folder or remove it first"):
+        write_training(demonstrations, tmp_path / "out", ImitationConfig())
+
+
+def test_checkpoints_that_do_not_fit_are_told(tmp_path):
+    with pytest.raises(ValueError, match="has no checkpoint of lerobot; give the folder of `endo-sim imitate` after the training"):
+        make_policy(str(tmp_path), "retraction")
+    place = tmp_path / "lerobot/checkpoints/last/pretrained_model"
+    place.mkdir(parents=True)
+    config = {
+        "type": "act",
+        "input_features": {IMAGE: {"type": "VISUAL", "shape": [3, 32, 40]}, "observation.state": {"type": "STATE", "shape": [11]}},
+        "output_features": {"action": {"type": "ACTION", "shape": [4]}},
+    }
+    for key, features, sentence in (
+        ("input_features", {"observation.environment_state": {"shape": [15]}}, "the policy takes observation.environment_state; those of"),
+        ("output_features", {"action": {"shape": [14]}}, "the policy gives {'action': [14]}; a task takes 4 numbers, 'action'"),
+        ("input_features", 3, "config.json is no configuration of a policy of lerobot"),
+    ):
+        (place / "config.json").write_text(json.dumps(config | {key: features}))
+        with pytest.raises(ValueError) as told:
+            LeRobotPolicy(tmp_path)
+        assert sentence in str(told.value)
+    (place / "config.json").write_text(json.dumps(config))
+    if not available():
+        with pytest.raises(RuntimeError, match="to run this policy lerobot is needed; pip install 'lerobot"):
+            LeRobotPolicy(tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("policy", ["act", "diffusion"])
+def test_lerobot_trains_and_its_checkpoint_plays(demonstrations, tmp_path, policy, monkeypatch):
+    pytest.importorskip(
+        "lerobot.scripts.lerobot_train", reason="lerobot is not installed; it wants Python 3.12 and other versions of torch"
+    )
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    out = tmp_path / policy
+    done = endo_sim("imitate", demonstrations, out, "--policy", policy, "--steps", 5, "--batch-size", 4, "--workers", 0)
+    assert done.returncode == 0, done.stdout + done.stderr
+    loaded = make_policy(str(out), "retraction", 2)
+    assert loaded.sight == SightConfig(image_width=40, eyes=2)
+    batch = TaskBatch("retraction", load_scene(), 2, "sensors", sight=loaded.sight)
+    _, _, steps = play(batch, loaded, np.arange(2))
+    assert (steps > 0).all()
+    other = TaskBatch("retraction", load_scene(), 2, "sensors", sight=SightConfig(image_width=48, eyes=2))
+    with pytest.raises(ValueError, match="images have 48×38 pixels, but the policy was trained on 40×32; set image_width 40"):
+        play(other, loaded, np.arange(2))

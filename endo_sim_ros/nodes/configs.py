@@ -238,9 +238,10 @@ class PolicyConfig(StageConfig):
     tissue of the task: `endo-sim scene` writes these parameters to a file."""
 
     task: str = "retraction"
-    """Name of the task; an unknown one is answered with the list."""
+    """Name of the task, or your own as file.py:Class; an unknown one is answered with the list."""
     policy: str = "scripted"
-    """scripted, or the .npz file of a trained policy."""
+    """scripted; still, which does nothing; the .npz file of a trained policy; the folder of `endo-sim imitate`; or your own
+    file.py:Class."""
     scene: str = ""
     """Folder of the model.ply and cameras.json that the graph runs on; empty = a piece of the synthetic patient."""
     seed: Annotated[int, Range(0, 2**31 - 1)] = 0
@@ -249,10 +250,12 @@ class PolicyConfig(StageConfig):
     """Name or file of the tool that the scene was written with, which a policy that acts by joints moves; empty = that of the task."""
     dye: bool = True
     """Mark the target with a spot of dye on the tissue."""
+    device: str = "auto"
+    """Compute device of a policy of lerobot: auto (the GPU when there is one), cpu, cuda or cuda:N."""
     episodes: Annotated[int, Range(1, 1_000_000)] = 1
     """Number of episodes; palpation has one, as the inclusion is part of the parameters of physics_node."""
     record: str = ""
-    """File (.npz) for observations, actions, rewards and success of all steps; empty = none."""
+    """File (.npz) for states, actions, rewards and success of all steps; empty = none."""
     arm: str = "PSM1"
     """Name of the arm that acts."""
     world_frame: str = "world"

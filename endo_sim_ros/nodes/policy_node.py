@@ -1,6 +1,7 @@
 """A policy that works on a task over topics, in lockstep: the observations and actions are those of the environment in one process."""
 
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,12 @@ from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import rigid_pose
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.folders import written_whole
+from endo_sim_ros.learning.actions import arm_state
 from endo_sim_ros.learning.held_tools import HeldTools, hold_tool
+from endo_sim_ros.learning.pictures import IMAGE, IMAGE_RIGHT
 from endo_sim_ros.learning.policies import make_policy
 from endo_sim_ros.learning.scenes import load_scene
+from endo_sim_ros.learning.task_batch import ARM_STATE
 from endo_sim_ros.learning.tasks import find_task
 from endo_sim_ros.messages import OK, STATE, WARN, PolicyState
 from endo_sim_ros.nodes.base import EndoNode, run
@@ -21,6 +25,7 @@ from endo_sim_ros.nodes.configs import PolicyConfig, arm_names
 from endo_sim_ros.nodes.listeners import Listeners, delivered
 
 _DYED_WITHIN = 1.0  # seconds that the spot of an episode has to arrive before its first picture is rendered
+_STRAY = 1.0  # seconds in which pictures of a rest before the first reset may still come
 _PATIENCE = 30.0  # seconds; a request to a physics_node that was killed just now is never answered
 
 
@@ -38,7 +43,7 @@ class PolicyNode(EndoNode):
             task = find_task(config.task)
             physics = task.physics()
             self._task = task(scene.nodes(physics), scene.camera.position)
-            self._policy = policy = make_policy(config.policy, config.task)
+            self._policy = policy = make_policy(config.policy, config.task, device=config.device)
             self._tools = None if policy.actions == "cartesian" else HeldTools([hold_tool(task, scene, config.tool)], task, 1)
         except ValueError as error:
             raise ConfigError(str(error)) from error
@@ -55,11 +60,17 @@ class PolicyNode(EndoNode):
         self._model_stamp = 0  # ns, which the state at rest has
         self._stamp = 0  # of the command whose answer is awaited; 0 = the state at rest
         self._heard: dict[str, Any] = {}  # parts of that answer
+        self._placed = False  # whether the tool was put where the episode begins
         self._rows: list[tuple[np.ndarray, np.ndarray, float, bool, int]] = []
         self.subscribe(messages.CONTROL_NODES, self._on_nodes)
         self.subscribe(messages.tool_reaction(arm), self._on_reaction)
+        self._pictures = {} if policy.sight is None else {IMAGE: messages.RENDERED_IMAGE}
+        if policy.sight is not None and policy.sight.eyes == 2:
+            self._pictures[IMAGE_RIGHT] = messages.RENDERED_RIGHT_IMAGE
+        for name, topic in self._pictures.items():
+            self.subscribe(topic, partial(self._on_picture, name))
         self._asked: Any = None  # the reset that was asked for last, and when
-        self._asked_at = 0.0
+        self._asked_at = self._pictured_at = 0.0
         self._begin()
         self.every(0.5, self._ask)
 
@@ -71,7 +82,7 @@ class PolicyNode(EndoNode):
         self._policy.reset([0])
         if self._tools is not None:
             self._tools.begin(np.zeros(1, int), self._poses(self._task.tips()))
-        self._stamp, self._heard, self._state = 0, {}, PolicyState.WAITING
+        self._stamp, self._heard, self._placed, self._state = 0, {}, False, PolicyState.WAITING
         spots = self._task.dyed_spots(0) if self._config.dye else ()
         self._dye_pub.publish(messages.encode_dye(spots, self.now_ns(), self._config.world_frame))
         delivered(self._dye_pub, _DYED_WITHIN)  # the state at rest is asked for next
@@ -79,7 +90,9 @@ class PolicyNode(EndoNode):
 
     def _ask(self) -> None:
         """Reset the tissue; again and again until its state at rest is heard, as there may be no model or no connection yet."""
-        if self._stamp != 0 or self._asked is not None and not self._asked.done() and time.monotonic() - self._asked_at < _PATIENCE:
+        if self._stamp == 0:
+            self._go_on()
+        if self._stamp != 0 or self._asked is not None and time.monotonic() - self._asked_at < _PATIENCE and not self._unanswered():
             return
         listening = all(publisher.get_subscription_count() for publisher in (self._pose_pub, self._jaw_pub))
         if not (listening and self._resetting.service_is_ready()):
@@ -88,12 +101,19 @@ class PolicyNode(EndoNode):
         if not (self._begun or self._listeners.settled()):  # a recorder, which hears the first command if it is there already
             self._missing = "whoever else listens"
             return
-        self._begun, self._missing = True, "the tissue of the scene"
-        self._heard.pop("reset", None)
+        if unseen := [topic.name for topic in self._pictures.values() if not self.count_publishers(topic.name)]:
+            self._missing = f"rendering_node, which publishes {' and '.join(unseen)}"
+            return
+        self._begun, self._missing = True, "the tissue of the scene" + (" and its pictures" if self._pictures else "")
+        self._heard, self._placed = {}, False
         if self._asked is not None:  # an answer that comes after all is none to this request
             self._resetting.remove_pending_request(self._asked)
         self._asked, self._asked_at = self._resetting.call_async(Trigger.Request()), time.monotonic()
         self._asked.add_done_callback(self._on_reset)
+
+    def _unanswered(self) -> bool:
+        """Whether the reset that was asked for last was refused, or the tissue has another state since; pictures take their time."""
+        return self._asked.done() and not {"reset", "nodes"} <= self._heard.keys()
 
     def _on_reset(self, future: Any) -> None:
         with self.guard("reset"):
@@ -118,11 +138,28 @@ class PolicyNode(EndoNode):
             force = messages.decode_wrench(message, "measured_cf")[0]
             self._answer("force", force if self._tools is None else self._tools.poses()[0, :3, :3] @ force)
 
+    def _on_picture(self, name: str, message: Any) -> None:
+        if messages.stamp_to_ns(message.header.stamp) == (self._stamp or self._model_stamp):
+            self._pictured_at = time.monotonic()
+            self._answer(name, messages.decode_image(message, self._pictures[name].name))
+
     def _answer(self, part: str, value: Any) -> None:
-        """Take in a part of what answers the last command; when it is complete, act."""
+        """Take in a part of what answers the last command."""
         self._heard[part] = value
-        if not {"nodes", "force" if self._stamp else "reset"} <= self._heard.keys():
+        self._go_on()
+
+    def _go_on(self) -> None:
+        """When the answer to the last command is complete, act."""
+        if not {"nodes", "force" if self._stamp else "reset", *self._pictures} <= self._heard.keys():
             return
+        if not self._stamp and not self._placed:  # the tool begins where the task has it, and is seen there
+            if self._pictures and not self._done and time.monotonic() - self._pictured_at < _STRAY:
+                return
+            self._placed = True
+            self._command(self._task.tips(), np.zeros(1, bool), self._model_stamp)
+            if self._pictures:  # those after this show it there
+                self._heard = {name: value for name, value in self._heard.items() if name not in self._pictures}
+                return
         positions, force = self._heard["nodes"][self._task.sites], self._heard.get("force", np.zeros(3))
         observation = self._task.observe(positions, force[None])
         observation = observation if self._tools is None else self._tools.observe(observation)
@@ -134,12 +171,15 @@ class PolicyNode(EndoNode):
         if ended:
             self._end(outcome.success[0])
         else:
-            if not self._stamp:  # the tool begins where the task has it, and is seen there
-                self._command(self._task.tips(), np.zeros(1, bool), self._model_stamp)
             self._seen = observation[0]
-            self._act(observation)
+            self._act(self._sensed() if self._pictures else observation)
 
-    def _act(self, observation: np.ndarray) -> None:
+    def _sensed(self) -> dict[str, np.ndarray]:
+        """What a policy takes that sees: the pictures, and what the arm measures of itself."""
+        poses = self._poses(self._task.tips()) if self._tools is None else self._tools.poses()
+        return {ARM_STATE: arm_state(self._task, poses[:, :3, :3]), **{name: self._heard[name][None] for name in self._pictures}}
+
+    def _act(self, observation: np.ndarray | dict[str, np.ndarray]) -> None:
         actions = self._policy.act(observation)
         self._action = actions[0]
         if self._tools is None:

@@ -1,10 +1,12 @@
 """Tasks over topics are, bit for bit, those of the environment."""
 
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
 import rclpy
+from blue_seeker import BlueSeeker
 from played_tasks import joint_policy, linear_policy, make
 from ros_bench import Bench
 from waiting import wait_until
@@ -15,6 +17,7 @@ from endo_sim_ros.learning.config import SightConfig
 from endo_sim_ros.learning.graph_files import save_scene
 from endo_sim_ros.learning.policies import scripted_policy
 from endo_sim_ros.learning.scenes import load_scene
+from endo_sim_ros.learning.task_batch import TaskBatch
 from endo_sim_ros.learning.tasks import TASKS
 from endo_sim_ros.physics import MotionConfig
 
@@ -86,6 +89,7 @@ def user():
     [
         ("retraction", 2, True, MotionConfig()),
         ("palpation", 1, False, MotionConfig(breathing=0.004, heartbeat=0.001)),
+        ("tracking", 1, False, MotionConfig()),
     ],
 )
 def test_over_topics_observations_images_and_actions_are_bit_for_bit_those_of_the_environment(
@@ -139,3 +143,32 @@ def test_over_topics_observations_images_and_actions_are_bit_for_bit_those_of_th
         assert_same_as_environment(tmp_path / "joints.npz", joint_policy(), episodes, make(task, actions="joints"))
         felt = np.load(tmp_path / "joints.npz")["observations"][:, TASKS[task].observation_names.index("force")]
         assert (felt > 0.1).any(), "it holds tissue"
+
+
+@pytest.mark.slow
+def test_a_policy_that_sees_acts_over_topics_as_in_the_environment(user, tmp_path):
+    sight, record = BlueSeeker.sight, tmp_path / "episodes.npz"
+    save_scene(load_scene(), tmp_path, "retraction", seed=SEED, sight=sight)
+    with NodeGroup(tmp_path / "logs") as group:
+        parameters = ("--params-file", str(tmp_path / "parameters.yaml"))
+        logs = lambda: [(log.name, log.read_text()[-800:]) for log in (tmp_path / "logs").iterdir()]  # noqa: E731
+        named = f"{Path(__file__).parent / 'blue_seeker.py'}:BlueSeeker"
+        node = group.start("policy_node", *parameters, policy=named, record=record, episodes=2)
+        for name in ("physics_node", "rendering_node"):
+            group.start(name, *parameters)
+        group.start("reconstruction_node", *parameters, output_dir=tmp_path)
+        user.until(lambda: node.exit_status is not None, logs, 120)
+        assert node.exit_status == 0 and record.exists(), logs()
+    heard, policy, k = np.load(record), BlueSeeker(1), 0
+    batch = TaskBatch("retraction", load_scene(), 1, "sensors", sight=sight)
+    for episode in range(2):
+        batch.reset([0], [np.random.default_rng(SEED + episode)])
+        seen, ended = batch.observe(), False
+        while not ended:
+            action = policy.act(seen)
+            assert heard["actions"][k].tobytes() == action[0].tobytes(), k
+            seen, outcome = batch.step(action)
+            assert heard["rewards"][k] == outcome.reward[0], k
+            ended = bool(outcome.terminated[0] | outcome.truncated[0])
+            k += 1
+    assert k == len(heard["rewards"])

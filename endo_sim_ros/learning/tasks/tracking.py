@@ -22,7 +22,7 @@ class Tracking(Task):
     )  # fmt: skip
     horizon, force_limit = 150, 2.0
     low, high = (-0.02, -0.02, -0.01), (0.02, 0.02, 0.025)
-    open_jaw = 0.0  # rad: it points
+    open_jaw = 0.2  # rad: it feels with jaws that are as good as closed, but do not grasp
     radius, tolerance, hold = 0.006, 0.002, 50  # m, m, steps: half a breath
 
     @staticmethod

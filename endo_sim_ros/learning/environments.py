@@ -19,6 +19,8 @@ from endo_sim_ros.learning.task_batch import ARM_STATE, Observations, Observed, 
 from endo_sim_ros.learning.tasks import BOUND, TASKS, Outcome
 from endo_sim_ros.physics import MotionConfig
 
+_LARGEST = 1e3  # m, rad and N that an arm measures: far beyond any scene, and any force that ends an episode
+
 try:
     import gymnasium
     from gymnasium.vector.utils import batch_space
@@ -64,7 +66,7 @@ def _make(
     if observations in ("state", "both"):
         spaces["state"] = gymnasium.spaces.Box(-BOUND, BOUND, (len(batch.observation_names),), np.float32)
     if observations == "sensors":
-        spaces[ARM_STATE] = gymnasium.spaces.Box(-np.inf, np.inf, (len(ARM_NAMES),), np.float32)
+        spaces[ARM_STATE] = gymnasium.spaces.Box(-_LARGEST, _LARGEST, (len(ARM_NAMES),), np.float32)
     if batch.pictures is not None:
         camera = batch.pictures.camera
         names = ((IMAGE, 3), (IMAGE_RIGHT, 3))[: shown.eyes] if observations != "state" else ()

@@ -3,10 +3,16 @@
 from endo_sim_ros.core.plugins import load_named
 from endo_sim_ros.learning.tasks.palpation import Palpation
 from endo_sim_ros.learning.tasks.retraction import Retraction
-from endo_sim_ros.learning.tasks.task import BOUND, LENGTH, Outcome, Script, Task, moving, norm
+from endo_sim_ros.learning.tasks.task import (
+    BOUND as BOUND,
+    LENGTH as LENGTH,
+    Outcome as Outcome,
+    Script as Script,
+    Task as Task,
+    moving as moving,
+    norm as norm,
+)
 from endo_sim_ros.learning.tasks.tracking import Tracking
-
-__all__ = ["BOUND", "LENGTH", "TASKS", "Outcome", "Script", "Task", "find_task", "moving", "norm"]
 
 TASKS: dict[str, type[Task]] = {task.name: task for task in (Retraction, Palpation, Tracking)}
 """All tasks by their names."""

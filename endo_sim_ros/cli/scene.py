@@ -18,7 +18,7 @@ class Command:
     task: str = "retraction"
     """Name of the task, such as retraction or palpation; an unknown one is answered with the list."""
     model: Path | None = None
-    """PLY model with its cameras.json; default: a piece of the synthetic patient."""
+    """PLY model with its cameras.json, or phantom:SEED, a piece of a synthetic patient; default: phantom:0."""
     seed: int = 0
     """Of the first episode."""
     image_width: int = SightConfig.image_width

@@ -29,7 +29,7 @@ class Command:
     contact: Literal["point", "links"] = "point"
     """What touches the tissue: the tip that the task describes, or the links of the instrument."""
     model: Path | None = None
-    """PLY model with its cameras.json; default: a piece of the synthetic patient."""
+    """PLY model with its cameras.json, or phantom:SEED, a piece of a synthetic patient; default: phantom:0."""
     device: str = "auto"
     """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""
     config: Annotated[TrainingConfig, tyro.conf.arg(name="")] = field(default_factory=TrainingConfig)

@@ -139,7 +139,7 @@ class BenchmarkConfig(StageConfig):
     episodes: Annotated[int, Range(1, 1_000_000)] = 100
     """Episodes of each scene."""
     robustness: bool = False
-    """Repeat all under other light, texture, endoscope, stiffness and breath than usual, one after the other."""
+    """Repeat all under other light, texture, endoscope, instrument, stiffness and breath than usual, one after the other."""
     image_width: Annotated[int, Range(16, 4096, "pixels")] = 256
     """Width of the video that shows the first episodes."""
 

@@ -136,8 +136,8 @@ class LeRobotPolicy:
         if not available():
             raise RuntimeError(f"{folder}: to run this policy lerobot is needed; pip install '{PACKAGES}'")
         import torch
-        from lerobot.configs.policies import PreTrainedConfig  # pyright: ignore[reportMissingImports]  # on Python 3.12 and later alone
-        from lerobot.policies.factory import get_policy_class, make_pre_post_processors  # pyright: ignore[reportMissingImports]  # on Python 3.12 and later alone
+        from lerobot.configs.policies import PreTrainedConfig  # pyright: ignore[reportMissingImports]  (optional)
+        from lerobot.policies.factory import get_policy_class, make_pre_post_processors  # pyright: ignore[reportMissingImports]  (optional)
 
         from endo_sim_ros.core.device import pick_device
 

@@ -194,7 +194,7 @@ def _play(batch: TaskBatch, policy: Policy, noise: float, seeds: np.ndarray) -> 
         }
         if batch.tools is not None:
             rows["observation.joints"] = batch.tools.joints.copy()
-        noisy = actions + noise * np.stack([np.append(episode.rng.standard_normal(3), 0) for episode in episodes])
+        noisy = actions + noise * np.stack([episode.rng.standard_normal(4) for episode in episodes])
         after, outcome = batch.step(np.clip(noisy, -1, 1))
         rows |= {"next.reward": outcome.reward, "next.done": outcome.terminated | outcome.truncated, "next.success": outcome.success}
         for b, episode in enumerate(episodes):

@@ -42,7 +42,7 @@ def save_scene(
     """
     kind = find_task(task)
     physics = moving(kind.physics(), motion)
-    first = kind(scene.nodes(physics), scene.camera.position)
+    first = kind(scene.nodes(physics), scene.camera.pose)
     rng = np.random.default_rng(seed)
     first.reset(0, rng)
     if physics.motion.breathing or physics.motion.heartbeat:

@@ -29,9 +29,10 @@ _WEIGHTS = "pretrained_model"  # folder of a checkpoint
 _LAST = Path("lerobot/checkpoints/last") / _WEIGHTS  # where `write_training` has the last one
 
 _CHECKPOINTS = 5  # of a training; the last one is used
-# Of diffusion policies: the share of the image that is seen, anywhere in it while learning; a network that acts in real time without a
-# GPU, in place of one of 260 million weights for any robot; and steps in which an action is denoised, in place of 100.
-_CROP, _CHANNELS, _DENOISED = 0.9, [128, 256, 512], 10
+# Of diffusion policies: how much images are enlarged, as the last layer of the network has one place for 32 pixels; a network that acts
+# in real time without a GPU, in place of one of 260 million weights for any robot; and steps in which an action is denoised, in place of
+# 100. Images are whole: lerobot would crop each eye elsewhere, which hides how deep things are, and where they are beside the arm.
+_ENLARGED, _CHANNELS, _DENOISED = 2, [128, 256, 512], 10
 
 log = logging.getLogger(__name__)
 
@@ -85,7 +86,7 @@ def write_training(dataset: Path, out: Path, config: ImitationConfig) -> Path:
             "horizon": config.chunk,
             "n_obs_steps": 1,  # what moves is in the state
             "drop_n_last_frames": 0,  # the last steps of an episode are learned from, too
-            "crop_shape": [round(_CROP * height), round(_CROP * width)],
+            "resize_shape": [_ENLARGED * height, _ENLARGED * width],
             "use_group_norm": not config.backbone_weights,
             "down_dims": _CHANNELS,
             "noise_scheduler_type": "DDIM",

@@ -71,7 +71,7 @@ class TaskBatch:
         kind = find_task(task)
         config = moving(kind.physics(device), motion)
         nodes = scene.nodes(config)
-        self.task, self.count = kind(nodes, scene.camera.position, count), count
+        self.task, self.count = kind(nodes, scene.camera.pose, count), count
         self.observations, self.randomisation = observations, randomisation
         largest = kind.largest_stiffness * float(np.exp(randomisation.stiffness))
         stiffness = np.full(count, largest) if largest != 1 else None

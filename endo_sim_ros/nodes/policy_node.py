@@ -42,7 +42,7 @@ class PolicyNode(EndoNode):
             scene = load_scene(config.scene or None)
             task = find_task(config.task)
             physics = task.physics()
-            self._task = task(scene.nodes(physics), scene.camera.position)
+            self._task = task(scene.nodes(physics), scene.camera.pose)
             self._policy = policy = make_policy(config.policy, config.task, device=config.device)
             self._tools = None if policy.actions == "cartesian" else HeldTools([hold_tool(task, scene, config.tool)], task, 1)
         except ValueError as error:

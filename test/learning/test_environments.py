@@ -20,7 +20,7 @@ from endo_sim_ros.learning.config import Randomisation, SightConfig
 from endo_sim_ros.learning.policies import scripted_policy
 from endo_sim_ros.learning.scenes import Scene, load_scene
 from endo_sim_ros.learning.task_batch import TaskBatch
-from endo_sim_ros.learning.tasks import TASKS
+from endo_sim_ros.learning.tasks import TASKS, find_task
 from endo_sim_ros.physics import TissueSimulation
 
 ROOT = Path(__file__).parents[2]
@@ -264,7 +264,7 @@ def test_an_inclusion_is_the_region_that_physics_node_would_paint():
     regions = batch.task.regions()
     painted = TissueSimulation.from_nodes(batch.task.nodes, replace(batch.task.physics("cpu"), regions=regions))
     policy, observations = scripted_policy("palpation", 2), batch.observe()
-    for _ in range(25):
+    for _ in range(30):
         observations, _ = batch.step(policy.act(observations))
         pose = np.eye(4)
         pose[:3, 3] = batch.tissue.tools.tips[0, 0].numpy()
@@ -383,3 +383,14 @@ def test_without_gymnasium_one_sentence_says_what_to_install():
     code = "import sys; sys.modules['gymnasium'] = None; import endo_sim_ros.learning.train, endo_sim_ros.learning.environments"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
     assert done.stderr.rstrip().endswith("the environments need gymnasium, which is not installed; pip install 'endo_sim_ros[learning]'")
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_actions_mean_the_same_in_the_picture_in_all_episodes(task):
+    scene = load_scene("phantom:0")
+    played = find_task(task)(scene.nodes(find_task(task).physics("cpu")), scene.camera.pose, 32)
+    for b in range(32):
+        played.reset(b, np.random.default_rng(b))
+    x, y, z = np.moveaxis(played.axes, 1, 0) @ scene.camera.pose[:3, :3]
+    np.testing.assert_allclose(np.cross(x, y), z, atol=1e-12)
+    assert x[:, 0].min() > 0.9 and y[:, 1].max() < -0.9  # to the right, and up

@@ -50,8 +50,8 @@ class Palpation(Task):
         """The one below."""
         return PalpationScript(count)
 
-    def __init__(self, nodes: ControlNodes, viewpoint: np.ndarray, count: int = 1):
-        super().__init__(nodes, viewpoint, count)
+    def __init__(self, nodes: ControlNodes, endoscope: np.ndarray, count: int = 1):
+        super().__init__(nodes, endoscope, count)
         self.centre = np.zeros((count, 3))  # of the inclusion, m, task frame
         self.place = np.zeros((count, 3))  # the same in the world
         self._over = np.zeros((count, len(self.skin), 3))  # the skin at rest, m, task frame

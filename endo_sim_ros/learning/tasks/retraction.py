@@ -41,8 +41,8 @@ class Retraction(Task):
         """The one below."""
         return RetractionScript()
 
-    def __init__(self, nodes: ControlNodes, viewpoint: np.ndarray, count: int = 1):
-        super().__init__(nodes, viewpoint, count)
+    def __init__(self, nodes: ControlNodes, endoscope: np.ndarray, count: int = 1):
+        super().__init__(nodes, endoscope, count)
         self._spot, self._moved = np.zeros((count, 3)), np.zeros((count, 3))  # from the tip, and from rest, m, task frame
         self._held = np.zeros(count, int)  # steps that the spot has been raised
 

@@ -4,7 +4,7 @@ A task knows the nodes of the tissue at rest and where it is seen from. It turns
 measured (where some nodes of the skin are, what the tool feels) into observations, rewards and an end. It never looks into the
 simulation, so that the same task runs over topics.
 
-All lengths of a task are in its own frame: the origin on the skin, z towards the endoscope, x and y across. An action
+All lengths of a task are in its own frame: the origin on the skin, z towards the endoscope, x to the right in its picture. An action
 [4] in -1 … 1 is how far the tip moves in this step along x, y and z, in parts of `step_length`, and a fourth number that each
 task explains.
 To add a task, write a subclass of :class:`Task`, with a scripted policy, in a file of its own. Every command and the policy's ROS node
@@ -45,7 +45,7 @@ class Task(ABC):
 
     Args:
         nodes: The tissue at rest.
-        viewpoint: Where the endoscope is [3], m, world.
+        endoscope: Pose of the endoscope [4, 4], camera to world, m, optical axes (x right, y down, z forward).
         count: B.
 
     Raises:
@@ -86,8 +86,8 @@ class Task(ABC):
         """
         raise ValueError("the task has no scripted policy; name the .npz file of a trained one")
 
-    def __init__(self, nodes: ControlNodes, viewpoint: np.ndarray, count: int = 1):
-        self.nodes, self.viewpoint, self.count = nodes, np.asarray(viewpoint, np.float64), count
+    def __init__(self, nodes: ControlNodes, endoscope: np.ndarray, count: int = 1):
+        self.nodes, self.endoscope, self.count = nodes, np.asarray(endoscope, np.float64), count
         self.rest = nodes.rest.astype(np.float64)  # [M, 3] m, world
         self.skin = np.flatnonzero(nodes.is_skin & ~nodes.pinned)
         self.places = self.skin[self._clearances() >= self.margin]  # nodes that an episode may be about
@@ -119,9 +119,10 @@ class Task(ABC):
     def reset(self, b: int, rng: np.random.Generator) -> None:
         """Begin episode b anew; all chance comes from the generator."""
         place = int(rng.choice(self.places))
-        z = self.viewpoint - self.rest[place]
+        right, eye = self.endoscope[:3, 0], self.endoscope[:3, 3]
+        z = eye - self.rest[place]
         z /= np.sqrt(dot(z, z))
-        x = np.cross(np.eye(3)[np.abs(z).argmin()], z)
+        x = right - dot(right, z) * z  # as in the picture, so that a policy that sees can learn what its actions do
         x /= np.sqrt(dot(x, x))
         self.origin[b], self.axes[b] = self.rest[place], np.stack([x, np.cross(z, x), z])
         self.sites[b] = place

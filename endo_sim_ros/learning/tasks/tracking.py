@@ -38,8 +38,8 @@ class Tracking(Task):
         """The one below."""
         return TrackingScript()
 
-    def __init__(self, nodes: ControlNodes, viewpoint: np.ndarray, count: int = 1):
-        super().__init__(nodes, viewpoint, count)
+    def __init__(self, nodes: ControlNodes, endoscope: np.ndarray, count: int = 1):
+        super().__init__(nodes, endoscope, count)
         self._goal = np.zeros((count, 3))  # from the tip, m, task frame
         self._held = np.zeros(count, int)  # steps on the spot
 

@@ -4,8 +4,8 @@ A task knows the nodes of the tissue at rest and where it is seen from. It turns
 measured (where some nodes of the skin are, what the tool feels) into observations, rewards and an end. It never looks into the
 simulation, so that the same task runs over topics.
 
-All lengths of a task are in its own frame: the origin on the skin, z towards the endoscope, x to the right in its picture. An action
-[4] in -1 … 1 is how far the tip moves in this step along x, y and z, in parts of `step_length`, and a fourth number that each
+All lengths of a task are in its own frame: the origin on the skin, z towards the endoscope, x to the right and y up in its picture. An
+action [4] in -1 … 1 is how far the tip moves in this step along x, y and z, in parts of `step_length`, and a fourth number that each
 task explains.
 To add a task, write a subclass of :class:`Task`, with a scripted policy, in a file of its own. Every command and the policy's ROS node
 take it as ``path/to/file.py:Name``. One that belongs to the package is a file here and has a name in `TASKS`.

@@ -81,7 +81,7 @@ class RetractionScript(Script):
         """Actions [B, 4] for state observations [B, n]."""
         names = Retraction.observation_names
         o = {name: observations[:, i].astype(np.float64) for i, name in enumerate(names)}
-        holding = (o["jaw"] > 0) & (o["distance"] < 4 * self.grasp / LENGTH)
+        holding = (o["jaw"] > 0) & (o["distance"] < Retraction.grasp_radius / LENGTH)  # else it closed on nothing, and opens
         close = holding | (o["distance"] < self.grasp / LENGTH)
         towards = np.stack([o[f"spot_from_tip_{axis}"] for axis in "xyz"], 1) * LENGTH / Retraction.step_length
         up = (self.beyond - o["spot_moved_z"]) * Retraction.lift / Retraction.step_length

@@ -14,18 +14,26 @@ from endo_sim_ros.learning.config import ImitationConfig
 
 @dataclass(frozen=True)
 class Command:
-    """Train an image policy by lerobot on demonstrations; without lerobot write its configuration, and say what to install."""
+    """Train an image policy on demonstrations: a small one of this package, or by lerobot; without that say what to install."""
 
     dataset: Positional[Path]
     """Folder that `endo-sim demonstrate` wrote."""
     out: Positional[Path]
-    """Folder for the configuration and lerobot's checkpoints, which `endo-sim benchmark` and policy_node take as a policy."""
+    """Folder for what is trained, which `endo-sim benchmark` and policy_node take as a policy."""
     config: Annotated[ImitationConfig, tyro.conf.arg(name="")] = field(default_factory=ImitationConfig)
+    device: str = "auto"
+    """Where keypoints are trained: auto (the GPU when there is one), cpu, cuda or cuda:N."""
 
     def run(self) -> None:
         """Write and train; raises SequenceError if the dataset cannot be used, RuntimeError if the training fails."""
         from endo_sim_ros.learning.lerobot_policy import PACKAGES, available, write_training
 
+        if self.config.policy == "keypoints":
+            from endo_sim_ros.learning.keypoint_policy import train_keypoints
+
+            train_keypoints(self.dataset, self.out, self.config, self.device)
+            print(f"{self.out}: trained; endo-sim benchmark OUT {self.out}")
+            return
         path = write_training(self.dataset, self.out, self.config)
         if not available():
             print(f"{path} is written, but lerobot, which trains by it, is not installed here. In an environment with Python 3.12:")

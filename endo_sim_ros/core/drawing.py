@@ -126,3 +126,15 @@ def write_video(path: str | Path, images: Iterable[np.ndarray], fps: float, opti
             count += 1
         container.mux(stream.encode())
     return count
+
+
+def read_video(path: str | Path) -> np.ndarray:
+    """All images of a video [T, H, W, 3], uint8, RGB.
+
+    Raises:
+        OSError: If it cannot be read.
+    """
+    import av
+
+    with av.open(str(path)) as container:
+        return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])

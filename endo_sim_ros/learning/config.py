@@ -108,16 +108,17 @@ class PPOConfig(StageConfig):
 
 @dataclass(frozen=True)
 class ImitationConfig(StageConfig):
-    """How lerobot trains a policy on demonstrations."""
+    """How a policy is trained on demonstrations."""
 
-    policy: Literal["act", "diffusion"] = "act"
-    """act: action chunking with transformers; diffusion: a diffusion policy."""
-    steps: Annotated[int, Range(1, 10_000_000)] = 10_000
-    """Steps of the training."""
-    batch_size: Annotated[int, Range(1, 100_000)] = 64
+    policy: Literal["keypoints", "act", "diffusion"] = "keypoints"
+    """keypoints: a small network of this package, trained within minutes; act: action chunking with transformers, diffusion: a diffusion
+    policy, both by lerobot."""
+    steps: Annotated[int, Range(0, 10_000_000)] = 0
+    """Steps of the training; 0 = 1500 for keypoints, 10 000 for lerobot."""
+    batch_size: Annotated[int, Range(1, 100_000)] = 128
     """Rows of the dataset that a step learns from."""
-    learning_rate: Annotated[float, Range(1e-7, 1)] = 1e-4
-    """Of the optimiser, for the image network too."""
+    learning_rate: Annotated[float, Range(0, 1)] = 0.0
+    """Of the optimiser, for the image network too; 0 = 2e-3 for keypoints, 1e-4 for lerobot."""
     chunk: Annotated[int, Range(1, 1000)] = 16
     """Actions that are predicted at once; of a diffusion policy a multiple of 8."""
     executed: Annotated[int, Range(1, 1000)] = 8

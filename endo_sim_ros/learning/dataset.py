@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
+from rich.progress import track
 
 from endo_sim_ros.core import drawing
 from endo_sim_ros.core.folders import written_whole
@@ -21,6 +22,7 @@ VERSION = "v3.0"
 IMAGE = "observation.images.endoscope.left"
 IMAGE_RIGHT = "observation.images.endoscope.right"
 SEGMENTATION = "observation.segmentation"
+STATE, ENVIRONMENT_STATE, ACTION = "observation.state", "observation.environment_state", "action"
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 _EPISODES = "meta/episodes/chunk-000/file-000.parquet"
@@ -276,6 +278,38 @@ class DatasetWriter:
         path = self._root / name
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
+
+
+def read_dataset(root: Path, vectors: Sequence[str], pictures: Sequence[str]) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Columns of all episodes of a dataset that `DatasetWriter` wrote: vectors [T, D] float32, and those of the pictures that it has
+    [T, H, W, C] uint8.
+
+    Raises:
+        SequenceError: If there is no such dataset, or a vector is missing, or it is damaged.
+        RuntimeError: If pyarrow is not installed.
+    """
+    table = import_pyarrow().parquet.read_table
+    try:
+        info = json.loads((root / _INFO).read_text("utf8"))
+        features, numbers = info["features"], range(info["total_episodes"])
+        shown = [key for key in pictures if key in features]
+        read: dict[str, list[np.ndarray]] = {key: [] for key in (*vectors, *shown)}
+        for number in track(numbers, description=f"reading {root.name}", transient=True):
+            place = _place(number)
+            kept = [*vectors, *(key for key in shown if features[key]["dtype"] == "image")]
+            rows = table(root / _DATA.format(**place), columns=kept)
+            for key in vectors:
+                read[key].append(_from_column(rows.column(key), features[key]))
+            for key in shown:
+                if features[key]["dtype"] == "video":
+                    read[key].append(drawing.read_video(root / _VIDEO.format(video_key=key, **place)))
+                else:
+                    cells = (np.frombuffer(cell["bytes"], np.uint8) for cell in rows.column(key).to_pylist())
+                    read[key].append(np.stack([np.asarray(cv2.imdecode(cell, cv2.IMREAD_COLOR_RGB)) for cell in cells]))
+        joined = {key: np.concatenate(parts) for key, parts in read.items()}
+    except (OSError, KeyError, ValueError, TypeError) as error:  # those of pyarrow are among them
+        raise SequenceError(f"{root} is no LeRobot dataset that can be read; give the folder that `endo-sim demonstrate` wrote") from error
+    return {key: joined[key] for key in vectors}, {key: joined[key] for key in shown}
 
 
 def _place(number: int) -> dict[str, int]:

@@ -28,6 +28,7 @@ _PICTURES = {IMAGE: SEEN, IMAGE_RIGHT: SEEN_RIGHT}
 _WEIGHTS = "pretrained_model"  # folder of a checkpoint
 _LAST = Path("lerobot/checkpoints/last") / _WEIGHTS  # where `write_training` has the last one
 
+_STEPS, _RATE = 10_000, 1e-4
 _CHECKPOINTS = 5  # of a training; the last one is used
 # Of diffusion policies: how much images are enlarged, as the last layer of the network has one place for 32 pixels; a network that acts
 # in real time without a GPU, in place of one of 260 million weights for any robot; and steps in which an action is denoised, in place of
@@ -67,6 +68,7 @@ def write_training(dataset: Path, out: Path, config: ImitationConfig) -> Path:
         raise SequenceError(f"{dataset} has other columns than `endo-sim demonstrate` writes; train on it with lerobot itself")
     if (out / "lerobot").exists():
         raise SequenceError(f"{out / 'lerobot'} exists already; choose another folder or remove it first")
+    steps, rate = config.steps or _STEPS, config.learning_rate or _RATE
     inputs = {key: {"type": "VISUAL", "shape": [shape[2], *shape[:2]]} for key, shape in shapes.items() if key in _PICTURES}
     inputs[_STATE] = {"type": "STATE", "shape": shapes[_STATE]}
     policy: dict[str, Any] = {
@@ -76,10 +78,10 @@ def write_training(dataset: Path, out: Path, config: ImitationConfig) -> Path:
         "output_features": {_ACTION: {"type": "ACTION", "shape": shapes[_ACTION]}},
         "pretrained_backbone_weights": config.backbone_weights or None,
         "n_action_steps": config.executed,
-        "optimizer_lr": config.learning_rate,
+        "optimizer_lr": rate,
     }
     if config.policy == "act":
-        policy |= {"chunk_size": config.chunk, "optimizer_lr_backbone": config.learning_rate}
+        policy |= {"chunk_size": config.chunk, "optimizer_lr_backbone": rate}
     else:
         height, width, _ = shapes[IMAGE]
         policy |= {
@@ -99,9 +101,9 @@ def write_training(dataset: Path, out: Path, config: ImitationConfig) -> Path:
         "job_name": out.resolve().name,
         "seed": config.seed,
         "batch_size": config.batch_size,
-        "steps": config.steps,
-        "save_freq": max(config.steps // _CHECKPOINTS, 1),
-        "log_freq": max(config.steps // 50, 1),
+        "steps": steps,
+        "save_freq": max(steps // _CHECKPOINTS, 1),
+        "log_freq": max(steps // 50, 1),
         "num_workers": config.workers,
         "wandb": {"enable": False},
     }

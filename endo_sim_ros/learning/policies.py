@@ -178,6 +178,10 @@ def make_policy(policy: str, task: str, count: int = 1, device: str = "auto") ->
         return scripted_policy(task, count)
     if policy == "still":
         return StillPolicy()
+    if (Path(policy) / "keypoints.npz").exists():
+        from endo_sim_ros.learning.keypoint_policy import KeypointPolicy
+
+        return KeypointPolicy(policy, device)
     if Path(policy).is_dir():
         from endo_sim_ros.learning.lerobot_policy import LeRobotPolicy
 

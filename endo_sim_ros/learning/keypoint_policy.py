@@ -1,0 +1,209 @@
+"""A small policy that sees: a network that finds points in the images of both eyes, and acts by where they are.
+
+It learns from a LeRobot dataset of demonstrations within minutes, from random weights, with torch alone. The points are the expected
+places of a softmax over each map of a convolutional network (Finn et al. 2016, Deep Spatial Autoencoders). How far a point is between
+the eyes tells its depth. Beside the action the network is taught to tell the state of the task, which demonstrations hold and a policy
+does not see: without, it learns far slower where to look.
+"""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.progress import Progress
+from torch import Tensor, nn
+
+from endo_sim_ros.core.device import pick_device
+from endo_sim_ros.core.folders import written_whole
+from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.learning.actions import ACTION_SIZES, ARM_NAMES, Actions
+from endo_sim_ros.learning.config import ImitationConfig, SightConfig
+from endo_sim_ros.learning.dataset import ACTION, ENVIRONMENT_STATE, IMAGE, IMAGE_RIGHT, STATE, read_dataset
+from endo_sim_ros.learning.pictures import IMAGE as SEEN, IMAGE_RIGHT as SEEN_RIGHT
+from endo_sim_ros.learning.task_batch import ARM_STATE
+
+FILE = "keypoints.npz"
+_CHANNELS, _POINTS, _HIDDEN = 48, 32, 256
+_DILATIONS = 1, 2, 4, 1  # of the blocks: an output sees 100 pixels around
+_DISPARITY = 20.0  # factor, so that differences between the eyes are as large as places
+_STEPS, _RATE = 1500, 2e-3
+_AVERAGED = 0.99  # share of the averaged weights that a step keeps
+_CORNER = 0.1  # of the loss: below it an error counts by its square
+# How much training varies an image: contrast, brightness, colour, and noise of each pixel.
+_CONTRAST, _BRIGHTNESS, _HUE, _NOISE = 0.3, 0.3, 0.1, 0.02
+
+
+class _Block(nn.Module):
+    """Two convolutions beside the identity."""
+
+    def __init__(self, channels: int, dilation: int):
+        super().__init__()
+        first = nn.Conv2d(channels, channels, 3, padding=dilation, dilation=dilation)
+        layers = (nn.GroupNorm(8, channels), nn.SiLU(), first, nn.GroupNorm(8, channels), nn.SiLU())
+        self.layers = nn.Sequential(*layers, nn.Conv2d(channels, channels, 3, padding=1))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + self.layers(x)
+
+
+class KeypointNetwork(nn.Module):
+    """Points of images, and the actions and the state that follow from them.
+
+    Args:
+        eyes: Images of a sample, 1 or 2.
+        arm, state, action: How many numbers these have.
+    """
+
+    arm_mean: Tensor
+    arm_spread: Tensor
+
+    def __init__(self, eyes: int, arm: int, state: int, action: int):
+        super().__init__()
+        self.eyes, self.action = eyes, action
+        self.image = nn.Sequential(
+            *(nn.Conv2d(3, _CHANNELS // 2, 5, 2, 2), nn.GroupNorm(8, _CHANNELS // 2), nn.SiLU()),
+            nn.Conv2d(_CHANNELS // 2, _CHANNELS, 3, 2, 1),
+            *(_Block(_CHANNELS, dilation) for dilation in _DILATIONS),
+            *(nn.GroupNorm(8, _CHANNELS), nn.SiLU()),
+        )
+        self.maps, self.features = nn.Conv2d(_CHANNELS, _POINTS, 1), nn.Conv2d(_CHANNELS, _POINTS, 1)
+        sizes = [(3 * eyes + (eyes == 2)) * _POINTS + arm, _HIDDEN, _HIDDEN, _HIDDEN]
+        hidden = [layer for pair in zip(sizes, sizes[1:]) for layer in (nn.Linear(*pair), nn.SiLU())]
+        self.head = nn.Sequential(*hidden, nn.Linear(_HIDDEN, action + state))
+        self.register_buffer("arm_mean", torch.zeros(arm))
+        self.register_buffer("arm_spread", torch.ones(arm))
+
+    def forward(self, images: Tensor, arm: Tensor) -> tuple[Tensor, Tensor]:
+        """Actions [B, action], and states [B, state] as parts of their spread.
+
+        Args:
+            images: Of all eyes [B, E, 3, H, W], 0 to 1.
+            arm: What the arm measures of itself [B, arm].
+        """
+        x = self.image((images.flatten(0, 1) - 0.5) * 4)
+        where = self.maps(x).flatten(2).float().softmax(-1)  # [B E, K, h w]
+        y, x_ = (torch.linspace(-1, 1, size, device=x.device) for size in x.shape[-2:])
+        places = where @ torch.stack([part.flatten() for part in torch.meshgrid(x_, y, indexing="xy")], 1)  # [B E, K, 2]
+        found = (where * self.features(x).flatten(2).float()).sum(-1, keepdim=True)
+        parts = [torch.cat([places, found], -1).reshape(len(images), -1), (arm - self.arm_mean) / self.arm_spread]
+        if self.eyes == 2:
+            left, right = places[..., 0].reshape(-1, 2, _POINTS).unbind(1)
+            parts.append((left - right) * _DISPARITY)
+        out = self.head(torch.cat(parts, 1))
+        return out[:, : self.action], out[:, self.action :]
+
+
+def train_keypoints(dataset: Path, out: Path, config: ImitationConfig, device: str = "auto") -> None:
+    """Train a policy on a LeRobot dataset of demonstrations, and write it into a folder.
+
+    Raises:
+        SequenceError: If there is no such dataset, or its columns are not those of demonstrations, or a policy was trained there.
+        RuntimeError: If pyarrow is not installed.
+    """
+    if (out / FILE).exists():
+        raise SequenceError(f"{out / FILE} exists already; choose another folder or remove it first")
+    device = pick_device(device)
+    columns, shown = read_dataset(dataset, (STATE, ENVIRONMENT_STATE, ACTION), (IMAGE, IMAGE_RIGHT))
+    if columns[STATE].shape[1] != len(ARM_NAMES) or columns[ACTION].shape[1] != ACTION_SIZES["cartesian"]:
+        raise SequenceError(f"{dataset} has other columns than `endo-sim demonstrate` writes")
+    torch.manual_seed(config.seed)
+    arm, state, action = (torch.from_numpy(columns[name]).to(device) for name in (STATE, ENVIRONMENT_STATE, ACTION))
+    images = torch.from_numpy(np.stack(list(shown.values()), 1)).permute(0, 1, 4, 2, 3)  # [T, E, 3, H, W], in host memory
+    mean, spread = state.mean(0), state.std(0).clamp_min(1e-3)
+    network = KeypointNetwork(images.shape[1], arm.shape[1], state.shape[1], action.shape[1]).to(device)
+    network.arm_mean.copy_(arm.mean(0))
+    network.arm_spread.copy_(arm.std(0).clamp_min(1e-3))
+    steps, rate = config.steps or _STEPS, config.learning_rate or _RATE
+    optimizer = torch.optim.AdamW(network.parameters(), rate, weight_decay=1e-4)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, steps + 1, pct_start=0.1)
+    averaged = torch.optim.swa_utils.AveragedModel(network, avg_fn=_average)
+    loss_of = lambda found, true: nn.functional.smooth_l1_loss(found.float(), true, beta=_CORNER)
+    with Progress() as bar:
+        progress = bar.add_task("training", total=steps)
+        for rows in _batches(len(images), steps, config):
+            seen, own = _varied(images[rows].to(device).float() / 255), rows.to(device)
+            with torch.autocast(torch.device(device).type, torch.bfloat16):
+                acted, told = network(seen, arm[own])
+            told_loss = loss_of(told, (state[own] - mean) / spread)
+            loss = loss_of(acted, action[own]) + told_loss
+            optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+            nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+            optimizer.step()
+            schedule.step()
+            averaged.update_parameters(network)
+            bar.advance(progress)
+    weights: dict[str, Any] = {name: value.float().cpu().numpy() for name, value in averaged.module.state_dict().items()}
+    out.mkdir(parents=True, exist_ok=True)
+    with written_whole(out / FILE) as partial, partial.open("wb") as file:
+        np.savez(file, image_size=np.array(images.shape[-2:]), eyes=np.array(images.shape[1]), **weights)
+
+
+def _average(averaged: Tensor, weights: Tensor, steps: Tensor | int) -> Tensor:
+    """Averaged weights, a little nearer to those of a step; in the first steps more, so that a short training forgets its beginning."""
+    return torch.lerp(averaged, weights, 1 - min(_AVERAGED, (1 + int(steps)) / (10 + int(steps))))
+
+
+def _batches(count: int, steps: int, config: ImitationConfig) -> Iterator[Tensor]:
+    """Rows of each step [B]."""
+    generator = torch.Generator().manual_seed(config.seed)
+    for _ in range(steps):
+        yield torch.randint(count, (config.batch_size,), generator=generator)
+
+
+def _varied(images: Tensor) -> Tensor:
+    """Images [B, E, 3, H, W] in another light, the same for both eyes."""
+    factor = lambda spread, colors: 1 + spread * (2 * torch.rand(len(images), 1, colors, 1, 1, device=images.device) - 1)
+    mean = images.mean((1, 2, 3, 4), keepdim=True)
+    lit = ((images - mean) * factor(_CONTRAST, 1) + mean) * factor(_BRIGHTNESS, 1) * factor(_HUE, 3)
+    return (lit + _NOISE * torch.randn_like(lit)).clamp(0, 1)
+
+
+class KeypointPolicy:
+    """What `train_keypoints` trained.
+
+    Args:
+        folder: Where.
+        device: auto (the GPU when there is one), cpu, cuda or cuda:N.
+
+    Raises:
+        ValueError: If there is no such policy, or it is damaged; the message names the file.
+    """
+
+    actions: Actions = "cartesian"
+
+    def __init__(self, folder: str | Path, device: str = "auto"):
+        path = Path(folder) / FILE
+        self._device = pick_device(device)
+        try:
+            with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
+                values = {name: torch.from_numpy(file[name]) for name in file.files}
+            self._size, self._eyes = values.pop("image_size").tolist(), int(values.pop("eyes"))
+            outputs = len(values["head.6.bias"])
+            network = KeypointNetwork(self._eyes, len(ARM_NAMES), outputs - ACTION_SIZES["cartesian"], ACTION_SIZES["cartesian"])
+            network.load_state_dict(values)
+        except OSError as error:
+            raise ValueError(f"{path}: not a readable policy ({error})") from error
+        except Exception as error:  # zipfile, numpy and torch have a type each
+            raise ValueError(f"{path} is no policy of `endo-sim imitate --policy keypoints`, or it is damaged") from error
+        self._network = network.to(self._device).eval()
+        self.sight = SightConfig(image_width=self._size[1], eyes=2 if self._eyes == 2 else 1)
+
+    def reset(self, episodes: Sequence[int]) -> None:
+        """Nothing to do: the network has no memory."""
+
+    @torch.no_grad()
+    def act(self, observations: dict[str, np.ndarray]) -> np.ndarray:
+        """Actions [B, 4] for observations of ``sensors``.
+
+        Raises:
+            ValueError: If images have another size than those that it was trained on.
+        """
+        seen = np.stack([observations[name] for name in (SEEN, SEEN_RIGHT)[: self._eyes]], 1)
+        if list(seen.shape[2:4]) != self._size:
+            (height, width), (h, w) = self._size, seen.shape[2:4]
+            raise ValueError(f"images have {w}×{h} pixels, but the policy was trained on {width}×{height}; set image_width {width}")
+        images = torch.from_numpy(seen).to(self._device).permute(0, 1, 4, 2, 3).float() / 255
+        return self._network(images, torch.from_numpy(observations[ARM_STATE]).to(self._device))[0].double().cpu().numpy()

@@ -1,0 +1,59 @@
+"""The small policy that sees: it learns what demonstrations hold, and says what it cannot read."""
+
+import numpy as np
+import pytest
+
+from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.learning.config import DemonstrationConfig, ImitationConfig, SightConfig
+from endo_sim_ros.learning.dataset import ACTION, IMAGE, IMAGE_RIGHT, STATE, read_dataset
+from endo_sim_ros.learning.demonstrations import demonstrate
+from endo_sim_ros.learning.keypoint_policy import FILE, KeypointPolicy, train_keypoints
+from endo_sim_ros.learning.policies import make_policy
+
+pytest.importorskip("pyarrow", reason="datasets need pyarrow")
+
+
+def make_dataset(out, images, episodes=3):
+    """A few episodes with both eyes."""
+    config = DemonstrationConfig(episodes=episodes, environments=episodes, images=images)
+    demonstrate("retraction", ["phantom:0"], out, config, SightConfig(image_width=40, eyes=2), device="cpu")
+    return out
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return make_dataset(tmp_path_factory.mktemp("demonstrations") / "png", "png")
+
+
+def test_videos_are_read_as_pictures_are(dataset, tmp_path):
+    shown = [read_dataset(path, (ACTION,), (IMAGE, IMAGE_RIGHT))[1] for path in (dataset, make_dataset(tmp_path / "video", "video"))]
+    for name in (IMAGE, IMAGE_RIGHT):
+        exact, read = (each[name].astype(int) for each in shown)
+        assert exact.shape == read.shape and exact.shape[1:] == (32, 40, 3)
+        assert np.abs(exact - read).mean() < 4 < np.abs(exact[:-1] - exact[1:]).max()  # of 255, and what is shown moves
+
+
+def test_it_learns_what_was_demonstrated(dataset, tmp_path):
+    train_keypoints(dataset, tmp_path, ImitationConfig(steps=150, batch_size=32), device="cpu")
+    columns, shown = read_dataset(dataset, (STATE, ACTION), (IMAGE, IMAGE_RIGHT))
+    policy = make_policy(str(tmp_path), "retraction", device="cpu")
+    assert isinstance(policy, KeypointPolicy) and policy.sight.eyes == 2 and policy.sight.image_width == 40
+    acted = policy.act({"image": shown[IMAGE], "image_right": shown[IMAGE_RIGHT], "arm": columns[STATE]})
+    error = np.abs(acted - columns[ACTION]).mean(0)
+    plain = np.abs(np.median(columns[ACTION], 0) - columns[ACTION]).mean(0)  # the best that looks at nothing
+    assert (error < 0.5 * plain).all(), (error, plain)
+
+
+def test_what_cannot_be_used_is_told(dataset, tmp_path):
+    with pytest.raises(SequenceError, match="nothing is no LeRobot dataset that can be read; give the folder that"):
+        train_keypoints(tmp_path / "nothing", tmp_path / "out", ImitationConfig(steps=1), device="cpu")
+    (tmp_path / FILE).write_bytes(b"no policy")
+    with pytest.raises(ValueError, match="keypoints.npz is no policy of `endo-sim imitate --policy keypoints`, or it is damaged"):
+        make_policy(str(tmp_path), "retraction")
+    with pytest.raises(SequenceError, match="keypoints.npz exists already; choose another folder or remove it first"):
+        train_keypoints(dataset, tmp_path, ImitationConfig(steps=1), device="cpu")
+    train_keypoints(dataset, tmp_path / "new", ImitationConfig(steps=1, batch_size=2), device="cpu")
+    policy = KeypointPolicy(tmp_path / "new", "cpu")
+    small = np.zeros((1, 16, 20, 3), np.uint8)
+    with pytest.raises(ValueError, match="images have 20×16 pixels, but the policy was trained on 40×32; set image_width 40"):
+        policy.act({"image": small, "image_right": small, "arm": np.zeros((1, 11), np.float32)})

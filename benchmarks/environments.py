@@ -1,5 +1,6 @@
 """How fast the environments are: `endo-sim bench environments`."""
 
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,12 @@ _STEPS = 25  # of random actions in one measurement
 
 @single_threaded_torch()
 def bench_environments(
-    json_file: Path | None, task: str = "retraction", environments: tuple[int, ...] = (1, 64), device: str = "auto", repeats: int = 5
+    json_file: Path | None,
+    task: str = "retraction",
+    environments: tuple[int, ...] = (1, 64),
+    device: str = "auto",
+    repeats: int = 5,
+    gpus: int = 0,
 ) -> None:
     """Print, and if asked for write, how many steps per second the environments take together.
 
@@ -25,9 +31,11 @@ def bench_environments(
         environments: Numbers of environments stepped together.
         device: Compute device.
         repeats: Measurements, of which the median counts.
+        gpus: Workers of Ray with the greatest number of environments each, beside one such worker; 0 = none.
 
     Raises:
-        ValueError: If a number of environments is not positive, or there is none.
+        ValueError: If a number of environments is not positive, or there is none, or there are not so many GPUs, or cores where none is.
+        RuntimeError: If Ray is needed, but not installed.
     """
     if not environments or min(environments) < 1:
         raise ValueError(f"give numbers of environments of at least 1, got {' '.join(map(str, environments)) or 'none'}")
@@ -47,7 +55,32 @@ def bench_environments(
             if sight.instrument and observations == "image":
                 compared = rate / measured["image observations"][i], "without the tool"
             rows.append(Row(f"{name}, {count} environment{'s' * (count > 1)}", rate, "steps/s", *compared))
+        if gpus:
+            count, one = max(environments), f"1 worker with {max(environments)}"
+            alone, together = (_workers_rate(task, count, workers, observations, sight, repeats) for workers in (1, gpus))
+            rows += [
+                Row(f"{name}, {one}", alone, "steps/s"),
+                Row(f"{name}, {gpus} workers with {count} each", together, "steps/s", together / alone, one),
+            ]
     report(f"Environments: {task} on {machine(device)}", rows, json_file)
+
+
+def _workers_rate(task: str, count: int, workers: int, observations: Observations, sight: SightConfig, repeats: int) -> float:
+    """Steps per second of the environments of all workers together, gathered here; the tools wander above the tissue."""
+    from endo_sim_ros.learning.joined import JoinedEnvironments
+
+    environment = JoinedEnvironments(task, workers * count, workers=workers, observations=observations, **asdict(sight))
+    actions = np.random.default_rng(0).uniform(-1, 1, (_STEPS, *environment.action_space.sample().shape))
+
+    def episode() -> None:
+        environment.reset(seed=0)
+        for step in actions:
+            environment.step(step)
+
+    try:
+        return actions.shape[0] * actions.shape[1] / median_seconds(episode, repeats, warm_up=1)
+    finally:
+        environment.close()
 
 
 def _rate(task: str, scene: Scene, count: int, observations: Observations, sight: SightConfig, device: str, repeats: int) -> float:

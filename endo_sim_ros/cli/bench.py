@@ -86,6 +86,8 @@ class BenchEnvironments(Measured):
     """Name of the task, such as retraction or palpation; an unknown one is answered with the list."""
     environments: tuple[int, ...] = (1, 64)
     """Numbers of environments stepped together."""
+    gpus: int = 0
+    """Workers of Ray, each on a GPU of its own, or a core where there is none, that step the greatest of these numbers each; 0 = none."""
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from endo_sim_ros.core.device import single_threaded_torch
 from endo_sim_ros.learning.actions import Actions, Contact
 from endo_sim_ros.learning.config import PPOConfig, Randomisation
 from endo_sim_ros.learning.environments import Observed, VectorTaskEnvironment
+from endo_sim_ros.learning.joined import JoinedEnvironments
 from endo_sim_ros.learning.policies import NetworkPolicy
 from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.learning.task_batch import TaskBatch
@@ -39,7 +40,7 @@ class StableEnvironments(VecEnv):
         environment: The environments.
     """
 
-    def __init__(self, environment: VectorTaskEnvironment):
+    def __init__(self, environment: VectorTaskEnvironment | JoinedEnvironments):
         self.environment = environment
         super().__init__(environment.num_envs, environment.single_observation_space, environment.single_action_space)
 

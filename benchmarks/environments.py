@@ -55,13 +55,12 @@ def bench_environments(
             if sight.instrument and observations == "image":
                 compared = rate / measured["image observations"][i], "without the tool"
             rows.append(Row(f"{name}, {count} environment{'s' * (count > 1)}", rate, "steps/s", *compared))
-        if gpus:
-            count, one = max(environments), f"1 worker with {max(environments)}"
-            alone, together = (_workers_rate(task, count, workers, observations, sight, repeats) for workers in (1, gpus))
-            rows += [
-                Row(f"{name}, {one}", alone, "steps/s"),
-                Row(f"{name}, {gpus} workers with {count} each", together, "steps/s", together / alone, one),
-            ]
+    for name in ("state observations", "images with the tool") if gpus else ():
+        count = max(environments)
+        alone, together = (_workers_rate(task, count, workers, *kinds[name], repeats) for workers in (1, gpus))
+        one = f"1 worker with {count}"
+        rows.append(Row(f"{name}, {one}", alone, "steps/s"))
+        rows.append(Row(f"{name}, {gpus} workers with {count} each", together, "steps/s", together / alone, one))
     report(f"Environments: {task} on {machine(device)}", rows, json_file)
 
 

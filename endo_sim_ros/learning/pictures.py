@@ -61,7 +61,8 @@ class Pictures:
         camera, nodes = scene.camera, tissue.nodes
         self.camera = camera.resized(sight.image_width, max(round(camera.height * sight.image_width / camera.width), 1))
         self._device = device = tissue.solver.device
-        self._model = scene.model.detach().to(device)
+        moves = randomisation.camera_position or randomisation.camera_angle
+        self._model = (scene.whole if moves else scene.model).detach().to(device)
         self._tissue = tissue
         self._sh = self._model.sh.expand(count, -1, -1, -1).clone() if sight.dye else None  # of each episode
         self._skinning = Skinning(self._model, nodes.rest, device=device)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from endo_sim_ros.core.cameras import Camera, load_cameras
 from endo_sim_ros.core.gaussians import GaussianModel, ModelError, load_ply, save_ply
@@ -16,7 +17,7 @@ from endo_sim_ros.rendering import middle_depth, render_depth
 PATIENT = "phantom:"
 """How the name of a synthetic patient begins; its seed follows."""
 
-_CACHED, _VERSION = "phantom-{version}.ply", "1"  # raise the version when the scenes change
+_CACHED, _VERSION = "phantom-{version}-{seed}.ply", "2"  # raise the version when the scenes change
 _PIECE = 0.5  # of the synthetic patient's picture, about its middle
 
 
@@ -26,6 +27,15 @@ class Scene:
 
     model: GaussianModel
     cameras: tuple[Camera, ...]
+    beyond: GaussianModel | None = None  # what an endoscope that moves sees past the edge of the model; no tool acts there
+
+    @functools.cached_property
+    def whole(self) -> GaussianModel:
+        """The model, and behind it what lies beyond its edge."""
+        if self.beyond is None:
+            return self.model
+        more = self.beyond.tensors()
+        return replace(self.model, **{name: torch.cat([tensor, more[name]]) for name, tensor in self.model.tensors().items()})
 
     @property
     def camera(self) -> Camera:
@@ -79,21 +89,23 @@ def load_scene(path: str | Path | None = None) -> Scene:
 
 @functools.cache
 def patient_scene(seed: int = 0) -> Scene:
-    """The middle of a synthetic patient, 6000 Gaussians. Rendered once (some seconds), then kept in ~/.cache/endo_sim_ros."""
+    """The middle of a synthetic patient, 6000 Gaussians, and 18 000 beyond its edge. Rendered once (some seconds), then kept in
+    ~/.cache/endo_sim_ros."""
     from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_camera
 
-    whole = phantom_camera(PhantomConfig(width=128, height=102))
-    K = whole.K.copy()
+    picture = phantom_camera(PhantomConfig(width=128, height=102))
+    K = picture.K.copy()
     K[:2, :2] /= _PIECE
-    camera = replace(whole, K=K)
+    camera = replace(picture, K=K)
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "endo_sim_ros"
-    path = cache / _CACHED.format(version=f"{_VERSION}-{seed}" if seed else _VERSION)
-    with contextlib.suppress(ModelError):  # there is none yet, or it was damaged
-        return Scene(load_ply(path), (camera,))
-    from endo_sim_ros.sequences.phantom_model import phantom_model
+    path = cache / _CACHED.format(version=_VERSION, seed=seed)
+    try:
+        whole = load_ply(path)
+    except ModelError:  # there is none yet, or it was damaged
+        from endo_sim_ros.sequences.phantom_model import phantom_model
 
-    model, _ = phantom_model(24_000, whole.width, seed)
-    model = model.select(np.flatnonzero(camera.sees(model.means.double().numpy())))
-    with contextlib.suppress(OSError):  # of a home that cannot be written; it is rendered again next time
-        save_ply(model, path)
-    return Scene(model, (camera,))
+        whole, _ = phantom_model(24_000, picture.width, seed)
+        with contextlib.suppress(OSError):  # of a home that cannot be written; it is rendered again next time
+            save_ply(whole, path)
+    middle = camera.sees(whole.means.double().numpy())
+    return Scene(whole.select(np.flatnonzero(middle)), (camera,), whole.select(np.flatnonzero(~middle)))

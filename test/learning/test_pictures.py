@@ -122,3 +122,12 @@ def test_tools_trocars_metal_and_lamps_vary_and_are_told():
     names = {first(seed, tool=1.0)[3]["tool"] for seed in range(12)}
     assert len(names) > 3 and names <= set(SHAPES)
     assert {first(seed, tool=0.01)[3]["tool"] for seed in range(4)} == {TASKS["retraction"].tool}
+
+
+def test_an_endoscope_that_moves_sees_beyond_the_edge_of_the_scene():
+    black = {}
+    for scene in (load_scene(), replace(load_scene(), beyond=None)):
+        environment = make(observations="image", scene=scene, randomisation={"camera_position": 0.005, "camera_angle": 8.0})
+        seen = np.stack([environment.reset(seed=seed)[0] for seed in range(6)])
+        black[scene.beyond is None] = (seen.max(-1) < 8).mean((1, 2))
+    assert (black[True] > 0.1).all() and black[False].max() == 0

@@ -54,7 +54,7 @@ def save_scene(
     save_ply(scene.model, folder / "model.ply")
     save_cameras(list(scene.cameras), folder / "cameras.json")
     several = len(kind.arms) > 1
-    arms: dict[str, Any] = {"arms": list(kind.arms)} if several else {}  # else the one that there is anyway
+    arms = lambda: {"arms": list(kind.arms)} if several else {}  # lists of their own, as rcl reads no aliases
     tools: dict[str, Any] = {"instruments": ["none"]}  # tips that reach every pose and are not seen
     if sight.instrument:
         tools = {"instruments": [], "frames": []}
@@ -73,11 +73,11 @@ def save_scene(
             "arm_source": "commanded",
             "lockstep_inputs": ["pose", "jaw"],
             "link_contact": False,
-            **arms,
+            **arms(),
             **tools,
             **changed,
         },
-        "rendering_node": {"mode": "lockstep", **arms, "image_width": sight.image_width, "baseline": sight.baseline},
+        "rendering_node": {"mode": "lockstep", **arms(), "image_width": sight.image_width, "baseline": sight.baseline},
         "policy": {"task": task, "scene": str(folder.resolve()), "seed": seed, "tool": named, "dye": sight.dye},
     }
     sections = {f"/**/{node}": {"ros__parameters": values} for node, values in parameters.items()}

@@ -21,10 +21,10 @@ class Tension(Task):
     arms = ("PSM1", "PSM2")
     observation_names = (
         *(f"{arm}.{what}_{axis}" for what in ("tip", "spot_from_tip") for arm in ("PSM1", "PSM2") for axis in "xyz"),
-        *(f"{arm}.{what}" for what in ("distance", "jaw", "pull") for arm in ("PSM1", "PSM2")), "wanted", "held",
+        *(f"{arm}.{what}" for what in ("distance", "jaw", "missing") for arm in ("PSM1", "PSM2")), "wanted", "held",
         *(f"{arm}.force_{axis}" for arm in ("PSM1", "PSM2") for axis in "xyz"), "PSM1.force", "PSM2.force", "time_left",
     )  # fmt: skip
-    horizon, force_limit = 100, 2.5
+    horizon, force_limit = 100, 3.0
     working_fourth = 1.0
     open_jaw = 0.6  # rad, as for retraction
     tool, tool_share = "PROGRASP_FORCEPS", GRIP
@@ -33,8 +33,8 @@ class Tension(Task):
     apart = 0.02, 0.03  # m from one spot to the other
     slant = 0.5  # largest part of that which is not across the picture, from left to right
     wanted_force = 0.8, 1.2  # N; jaws that have just closed feel up to 0.7
-    tolerance, hold = 0.15, 15  # part of the wanted force, steps
-    grasp_radius = 0.006  # m; a jaw holds control nodes within it
+    tolerance, hold = 0.15, 10  # part of the wanted force, steps
+    grasp_radius = 0.007  # m; a jaw holds control nodes within it
 
     @staticmethod
     def physics(device: str = "auto") -> PhysicsConfig:
@@ -81,12 +81,13 @@ class Tension(Task):
         self._pull = np.stack([dot(self.force[:, 0], way), -dot(self.force[:, 1], way)], 1)
         lengths = np.concatenate([self._by_arm(v) for v in (self.tip, self._spots, norm(self._spots))], 1)
         jaws = np.where(self.fourth > 0, 1.0, -1.0)
-        return [*(lengths / LENGTH).T, *jaws.T, *(self._pull / FORCE).T, self.wanted / FORCE, self._held / self.hold]
+        missing = self.wanted[:, None] - self._pull
+        return [*(lengths / LENGTH).T, *jaws.T, *(missing / FORCE).T, self.wanted / FORCE, self._held / self.hold]
 
     def _value(self) -> np.ndarray:
         distance, off = norm(self._spots), np.abs(self._pull / self.wanted[:, None] - 1)
         grasped = (self.fourth > 0) & (distance <= self.grasp_radius)
-        # Of each arm 1 for the force, 0.5 for the grasp, −1 for each 2 cm from the spot: coming near, grasping and pulling each pay at once.
+        # Of each arm 1 for the force, 0.5 for the grasp, −1 for each 2 cm from the spot: each of the three pays at once. 1 for holding.
         each = grasped * (1.5 - np.minimum(off, 1.0)) - distance / LENGTH
         return each[:, 0] + each[:, 1] + np.minimum(self._held / self.hold, 1.0)
 
@@ -110,22 +111,19 @@ class FixedTension(Tension):
 class TensionScript(Script):
     """Goes to the spots, grasps, and when both are held pulls away from the other arm by as much as force is missing."""
 
-    grasp, gain = (
-        0.004,
-        0.0012,
-    )  # m from a spot at which its jaw closes; m a step for each N that is missing, stable with links that touch, too
+    grasp = 0.004  # m from a spot at which its jaw closes
+    gain = 0.0012  # m a step for each N that is missing; links that touch hold more tissue than a point, and more would make them swing
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Actions [B, 8] for state observations [B, n]."""
         o = observations.astype(np.float64)
         tips, ways = np.moveaxis(o[:, :12].reshape(-1, 2, 2, 3), 1, 0)  # of both arms [B, 2, 3]
-        distance, jaw, pull = np.moveaxis(o[:, 12:18].reshape(-1, 3, 2), 1, 0)  # [B, 2]
-        wanted = o[:, Tension.observation_names.index("wanted"), None]
+        distance, jaw, missing = np.moveaxis(o[:, 12:18].reshape(-1, 3, 2), 1, 0)  # [B, 2]
         holding = (jaw > 0) & (distance < Tension.grasp_radius / LENGTH)  # else it closed on nothing, and opens
         close = holding | (distance < self.grasp / LENGTH)
         outward = tips - tips[:, ::-1]
         outward /= np.maximum(norm(outward), 1e-6)[..., None]
-        more = self.gain * FORCE * np.where(holding.all(1, keepdims=True), wanted - pull, 0.0)
+        more = self.gain * FORCE * np.where(holding.all(1, keepdims=True), missing, 0.0)
         moves = np.where(close[..., None], more[..., None] * outward, ways * LENGTH) / Tension.step_length
         actions = np.concatenate([np.clip(moves, -1, 1), np.where(close, 1.0, -1.0)[..., None]], 2)
         return actions.reshape(len(o), -1)

@@ -91,8 +91,8 @@ def _rate(task: str, scene: Scene, count: int, observations: Observations, sight
         batch.reset(everyone, [np.random.default_rng(b) for b in everyone])
         batch.task.tip[:] = 0  # at the tissue
         for _ in range(_STEPS):
-            actions = rng.uniform(-1, 1, (count, 4))
-            actions[:, 3] = batch.task.working_fourth
+            actions = rng.uniform(-1, 1, (count, batch.action_size))
+            actions[:, 3::4] = batch.task.working_fourth
             batch.step(actions)
 
     return count * _STEPS / median_seconds(episode, repeats, device, warm_up=1)

@@ -11,7 +11,7 @@ from endo_sim_ros.physics.config import MotionConfig
 
 @dataclass(frozen=True)
 class Command:
-    """Write what starts the graph on a task to learn: model.ply, cameras.json, the tool's file and parameters.yaml for its nodes."""
+    """Write what starts the graph on a task to learn: model.ply, cameras.json, the tools' files and parameters.yaml for its nodes."""
 
     out: Positional[Path]
     """Folder to write; it may exist."""

@@ -1,5 +1,6 @@
 """What the numbers of actions mean, what acts by them, and what is observed beside the state of a task for them."""
 
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -19,28 +20,37 @@ Contact = Literal["point", "links"]
 """What touches the tissue: the tip as a task describes it, or the links of the instrument; see `TaskBatch`."""
 
 ACTION_SIZES: dict[str, int] = {"cartesian": 4, "joints": len(JOINTS) + 1, "joint_positions": len(JOINTS) + 1}
-"""How many numbers an action has."""
+"""How many numbers an action has for each arm."""
 
 
-def observed_names(names: tuple[str, ...], actions: Actions) -> tuple[str, ...]:
-    """Names of the numbers of the state: those of a task, and with actions of joints the joints."""
-    return names if actions == "cartesian" else names + JOINTS
+def by_arm(task: Task | type[Task], names: Sequence[str]) -> list[str]:
+    """Names of numbers that there are of each arm of a task."""
+    return [f"{arm}.{name}" for arm in task.arms for name in names]
+
+
+def observed_names(task: Task | type[Task], actions: Actions) -> tuple[str, ...]:
+    """Names of the numbers of the state: those of a task, and with actions of joints the joints, in tasks of several arms by arm."""
+    if actions == "cartesian":
+        return task.observation_names
+    return (*task.observation_names, *(JOINTS if len(task.arms) == 1 else by_arm(task, JOINTS)))
 
 
 def jaw_angles(task: Task, fourth: np.ndarray) -> np.ndarray:
-    """Angles between the jaws [B], rad, that a fourth number of actions [B] commands."""
+    """Angles between the jaws [B] or [B, A], rad, that fourth numbers of actions command."""
     return np.where(task.closes(fourth), task.closed_jaw, task.open_jaw)
 
 
 def arm_state(task: Task, rotations: np.ndarray) -> np.ndarray:
-    """What an arm measures of itself, which tells nothing of the goal [B, 11], float32.
+    """What the arms measure of themselves, which tells nothing of the goal [B, 11 A], float32.
 
-    It is the pose of the tip (m, xyzw) in the world, the angle between the jaws (rad), and the force of the tissue on the tool (N, in the
-    axes of the world).
+    Of each it is the pose of the tip (m, xyzw) in the world, the angle between the jaws (rad), and the force of the tissue on the tool (N,
+    in the axes of the world).
 
     Args:
         task: Where the tips are.
-        rotations: Their axes [B, 3, 3], world.
+        rotations: Their axes [B A, 3, 3], world, arm after arm of each episode.
     """
     turned = Rotation.from_matrix(rotations).as_quat(canonical=True)
-    return np.column_stack([task.tips(), turned, jaw_angles(task, task.fourth), task.forces()]).astype(np.float32)
+    jaws = jaw_angles(task, task.fourth).ravel()
+    measured = np.column_stack([task.tips().reshape(-1, 3), turned, jaws, task.forces().reshape(-1, 3)])
+    return measured.astype(np.float32).reshape(task.count, -1)

@@ -5,11 +5,11 @@ Columns beside those that every LeRobot dataset has:
 =============================  ==================================================================================
 observation.images.endoscope.  left, and right with two eyes: what the endoscope shows
 observation.segmentation       what is in each pixel, on request
-observation.state              of the arm alone, in the axes of the world: pose of the tip (m, xyzw), jaw (rad), and
+observation.state              of each arm alone, in the axes of the world: pose of the tip (m, xyzw), jaw (rad), and
                                the force of the tissue on the tool (N)
 observation.joints             yaw, pitch, insertion (m), roll, wrist_pitch, wrist_yaw, where there is an instrument
 observation.environment_state  the state observation of the task, which knows the goal
-action                         what the task takes, -1 to 1: how far the tip moves in its frame, and the fourth number
+action                         what the task takes, -1 to 1: how far each tip moves in its frame, and the fourth number
 command.pose                   the same as a command: pose of the tip in the world, and jaw
 next.reward, .done, .success   what the action led to
 seed                           of the episode
@@ -32,7 +32,7 @@ from rich.progress import Progress
 
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.instruments import JOINTS
-from endo_sim_ros.learning.actions import ARM_NAMES, POSE_NAMES, jaw_angles
+from endo_sim_ros.learning.actions import ARM_NAMES, POSE_NAMES, by_arm, jaw_angles
 from endo_sim_ros.learning.config import DemonstrationConfig, Randomisation, SightConfig
 from endo_sim_ros.learning.dataset import (
     IMAGE,
@@ -44,7 +44,6 @@ from endo_sim_ros.learning.dataset import (
     scalar_feature,
     vector_feature,
 )
-from endo_sim_ros.learning.held_tools import ARM
 from endo_sim_ros.learning.policies import Policy, scripted_policy
 from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.learning.task_batch import TaskBatch
@@ -193,8 +192,8 @@ def _play(batch: TaskBatch, policy: Policy, noise: float, seeds: np.ndarray) -> 
             "command.pose": _commands(task, actions),
         }
         if batch.tools is not None:
-            rows["observation.joints"] = batch.tools.joints.copy()
-        noisy = actions + noise * np.stack([episode.rng.standard_normal(4) for episode in episodes])
+            rows["observation.joints"] = batch.tools.joints.reshape(batch.count, -1).copy()
+        noisy = actions + noise * np.stack([episode.rng.standard_normal(batch.action_size) for episode in episodes])
         after, outcome = batch.step(np.clip(noisy, -1, 1))
         rows |= {"next.reward": outcome.reward, "next.done": outcome.terminated | outcome.truncated, "next.success": outcome.success}
         for b, episode in enumerate(episodes):
@@ -216,22 +215,24 @@ def _write(writer: DatasetWriter, episode: _Episode, seed: int) -> None:
 
 
 def _commands(task: Task, actions: np.ndarray) -> np.ndarray:
-    """Poses of the tips, with the axes of the world, and jaws that actions [B, 4] command, [B, 8]."""
-    return np.column_stack([task.reach(actions), np.tile([0.0, 0.0, 0.0, 1.0], (task.count, 1)), jaw_angles(task, actions[:, 3])])
+    """Poses of the tips, with the axes of the world, and jaws that actions [B, 4 A] command, [B, 8 A]."""
+    tips, fourth = task.reach(actions).reshape(-1, 3), actions.reshape(*task.fourth.shape, 4)[..., 3]
+    commands = np.column_stack([tips, np.tile([0.0, 0.0, 0.0, 1.0], (len(tips), 1)), jaw_angles(task, fourth).ravel()])
+    return commands.reshape(task.count, -1)
 
 
 def _features(batch: TaskBatch, fps: int, images: ImageFormat) -> dict[str, dict[str, Any]]:
     """What the columns are."""
     assert batch.pictures is not None  # images are observed
-    pose = [f"{ARM}.{name}" for name in (*POSE_NAMES, "jaw")]
+    task, action = batch.task, ["x", "y", "z", "fourth"]
     vectors = {
-        "observation.state": [f"{ARM}.{name}" for name in ARM_NAMES],
-        "observation.environment_state": batch.task.observation_names,
-        "action": ["x", "y", "z", "fourth"],
-        "command.pose": pose,
+        "observation.state": by_arm(task, ARM_NAMES),
+        "observation.environment_state": task.observation_names,
+        "action": action if len(task.arms) == 1 else by_arm(task, action),
+        "command.pose": by_arm(task, (*POSE_NAMES, "jaw")),
     }
     if batch.tools is not None:
-        vectors["observation.joints"] = [f"{ARM}.{name}" for name in JOINTS]
+        vectors["observation.joints"] = by_arm(task, JOINTS)
     kinds = {"next.reward": "float32", "next.done": "bool", "next.success": "bool", "seed": "int64"}
     camera, sight = batch.pictures.camera, batch.sight
     shown = [IMAGE, *([IMAGE_RIGHT] * (sight.eyes == 2)), *([SEGMENTATION] * sight.segmentation)]

@@ -66,7 +66,7 @@ def _make(
     if observations in ("state", "both"):
         spaces["state"] = gymnasium.spaces.Box(-BOUND, BOUND, (len(batch.observation_names),), np.float32)
     if observations == "sensors":
-        spaces[ARM_STATE] = gymnasium.spaces.Box(-_LARGEST, _LARGEST, (len(ARM_NAMES),), np.float32)
+        spaces[ARM_STATE] = gymnasium.spaces.Box(-_LARGEST, _LARGEST, (len(ARM_NAMES) * len(batch.task.arms),), np.float32)
     if batch.pictures is not None:
         camera = batch.pictures.camera
         names = ((IMAGE, 3), (IMAGE_RIGHT, 3))[: shown.eyes] if observations != "state" else ()
@@ -86,7 +86,7 @@ def _action_space(batch: TaskBatch) -> gymnasium.spaces.Box:
 
 def _info(batch: TaskBatch, outcome: Outcome | None = None) -> dict[str, np.ndarray]:
     success = np.zeros(batch.count, bool) if outcome is None else outcome.success
-    force, faults = np.sqrt((batch.task.force**2).sum(1)), batch.tissue.tools.faults.cpu().numpy().copy()
+    force, faults = np.sqrt((batch.task.force**2).sum(-1)), batch.tissue.tools.faults.cpu().numpy().copy()
     return {"success": success, "force": force, "faults": faults} | {name: values.copy() for name, values in batch.varied.items()}
 
 
@@ -98,7 +98,7 @@ class TaskEnvironment(gymnasium.Env):
         scene: A PLY model with its cameras.json, or the folder of a model.ply, or a :class:`Scene`; default: a piece of the
             synthetic patient.
         observations: ``state``, ``image`` (the endoscope's), ``both``, or ``sensors``: image and ``arm`` [11], what a robot has, see
-            `endo_sim_ros.learning.actions.arm_state`. One alone is an array. More are a dict: ``state`` [n], ``arm`` [11],
+            `endo_sim_ros.learning.actions.arm_state`. One alone is an array. More are a dict: ``state`` [n], ``arm`` [11 A],
             ``image`` and ``image_right`` [H, W, 3], ``segmentation`` [H, W, 1].
         randomisation: How episodes differ from the scene, as :class:`Randomisation` or its values in a dict.
         image_width: Pixels; the height follows from the scene's camera.

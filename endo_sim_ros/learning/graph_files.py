@@ -12,7 +12,7 @@ from endo_sim_ros.core.config import option_values
 from endo_sim_ros.core.gaussians import save_ply
 from endo_sim_ros.instruments import save_tool
 from endo_sim_ros.learning.config import Randomisation, SightConfig
-from endo_sim_ros.learning.held_tools import hold_tool
+from endo_sim_ros.learning.held_tools import hold_tools
 from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.learning.tasks import find_task, moving
 from endo_sim_ros.learning.variation import Variation
@@ -27,7 +27,7 @@ def save_scene(
     sight: SightConfig = SightConfig(),
     motion: MotionConfig = MotionConfig(),
 ) -> None:
-    """Write model.ply, cameras.json, the tool's file and parameters.yaml, which start the graph in lockstep on a task in this scene.
+    """Write model.ply, cameras.json, files of the tools and parameters.yaml, which start the graph in lockstep on a task in this scene.
 
     Args:
         scene: What to write.
@@ -53,12 +53,18 @@ def save_scene(
     changed |= {"regions": list(first.regions())} if first.regions() else {}
     save_ply(scene.model, folder / "model.ply")
     save_cameras(list(scene.cameras), folder / "cameras.json")
-    arm: dict[str, Any] = {"instruments": ["none"]}  # a tip that reaches every pose and is not seen
+    several = len(kind.arms) > 1
+    arms = lambda: {"arms": list(kind.arms)} if several else {}  # lists of their own, as rcl reads no aliases
+    tools: dict[str, Any] = {"instruments": ["none"]}  # tips that reach every pose and are not seen
     if sight.instrument:
-        held = hold_tool(kind, scene, sight.tool)
-        tool = folder.resolve() / f"{held.arm.tool}.json"
-        save_tool(tool, held.arm)
-        arm = {"instruments": [str(tool)], "frames": [held.frame]}
+        tools = {"instruments": [], "frames": []}
+        for held in hold_tools(kind, scene, sight.tool):
+            # The name names the shape, and the end of the tool depends on the arm.
+            tool = folder.resolve() / (held.holder if several else "") / f"{held.arm.tool}.json"
+            tool.parent.mkdir(exist_ok=True)
+            save_tool(tool, held.arm)
+            tools["instruments"].append(str(tool))
+            tools["frames"].append(held.frame)
     named = str(Path(sight.tool).resolve()) if sight.tool.endswith(".json") else sight.tool
     parameters = {
         "reconstruction_node": {"mode": "lockstep", "model_file": str(folder.resolve() / "model.ply")},
@@ -67,10 +73,11 @@ def save_scene(
             "arm_source": "commanded",
             "lockstep_inputs": ["pose", "jaw"],
             "link_contact": False,
-            **arm,
+            **arms(),
+            **tools,
             **changed,
         },
-        "rendering_node": {"mode": "lockstep", "image_width": sight.image_width, "baseline": sight.baseline},
+        "rendering_node": {"mode": "lockstep", **arms(), "image_width": sight.image_width, "baseline": sight.baseline},
         "policy": {"task": task, "scene": str(folder.resolve()), "seed": seed, "tool": named, "dye": sight.dye},
     }
     sections = {f"/**/{node}": {"ros__parameters": values} for node, values in parameters.items()}

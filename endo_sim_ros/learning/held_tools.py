@@ -1,7 +1,8 @@
 """The instruments of B episodes: where they stand, and the joints that put their tips where a task has them.
 
-A task moves a tip without a shape. Here it is a place on the jaws of an instrument, which comes into the picture as
-`endo_sim_ros.instruments.place_arm` has it, and keeps its direction in the world while the tip moves.
+A task moves tips without a shape. Here each is a place on the jaws of an instrument, which comes into the picture as
+`endo_sim_ros.instruments.place_arm` has it, and keeps its direction in the world while the tip moves. What a task of A arms has of each is
+[B A] here, arm after arm of each episode.
 """
 
 from collections.abc import Sequence
@@ -30,7 +31,6 @@ from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.learning.tasks import Task
 from endo_sim_ros.learning.variation import Variation
 
-ARM = "PSM1"
 _WORLD = "world"
 _LEVER = 0.1  # m: about how far the tip is from the remote centre, about which yaw and pitch turn it
 _WRIST_STEP = 0.05  # rad a step of 0.04 s: about half the speed that the dVRK allows
@@ -41,12 +41,14 @@ class HeldTool:
     """A tool on its arm, as a task holds it.
 
     Args:
+        holder: Name of the arm.
         arm: Its tip is where the task works with the tool; the axes of the tip are those of the world at the start.
         base: Pose [4, 4] of the base in the world, m.
         centre: The tissue in the middle of the picture [3], m, world.
         name: Name of the tool, or the path of its file.
     """
 
+    holder: str
     arm: ArmKinematics
     base: np.ndarray
     centre: np.ndarray
@@ -62,7 +64,7 @@ class HeldTool:
     @cached_property
     def frame(self) -> str:
         """The base as an option `frames` of the ROS nodes names it."""
-        return _frame(self.base)
+        return _frame(self.holder, self.base)
 
     @cached_property
     def shape(self) -> tuple[list[Part], list[Capsule]]:
@@ -74,13 +76,14 @@ class HeldTool:
         return np.clip(angles, 0.0, self.arm.jaw[1] if self.arm.jaw else 0.0)
 
 
-def hold_tool(task: type[Task], scene: Scene, tool: str = "") -> HeldTool:
-    """The tool of a task in a scene, on an arm that comes from the lower right of the picture.
+def hold_tool(task: type[Task], scene: Scene, tool: str = "", holder: str = "PSM1") -> HeldTool:
+    """The tool of a task in a scene, on an arm that comes from the lower right of the picture, PSM2 from the lower left.
 
     Args:
         task: What it is held for.
         scene: Where.
         tool: Name or file of the tool; empty = that of the task.
+        holder: Name of the arm.
 
     Raises:
         ValueError: If there is no such tool, nobody knows its shape, or the arm does not reach the tissue in the picture.
@@ -88,10 +91,10 @@ def hold_tool(task: type[Task], scene: Scene, tool: str = "") -> HeldTool:
     arm, camera = load_arm("PSM", tool or task.tool), scene.camera
     _, capsules = build_instrument(arm)
     try:
-        placed = place_arm(ARM, arm, camera, scene.depth)
+        placed = place_arm(holder, arm, camera, scene.depth)
     except ConfigError as error:
         raise ConfigError(f"{error}; or leave out the tool (instrument off)") from error
-    base = parse_frames(_WORLD, [_frame(placed.base)])[f"{ARM}_base"]  # with the bits that physics_node has
+    base = parse_frames(_WORLD, [_frame(holder, placed.base)])[f"{holder}_base"]  # with the bits that physics_node has
     # The tip moves from the hinge to where the jaws work: in the axes of the hinge, and then in those of the world.
     point = working_point(arm, capsules, task.tool_share)
     hinge = (base @ arm.tip_pose(placed.joints))[:3, :3]
@@ -99,24 +102,29 @@ def hold_tool(task: type[Task], scene: Scene, tool: str = "") -> HeldTool:
     ahead = task.physics().contact_radius * camera.pose[:3, 2]
     mount = rigid_pose(hinge, ahead - hinge @ point)
     centre = camera.position + scene.depth * camera.pose[:3, 2]
-    return HeldTool(replace(arm, tooltip_offset=arm.tooltip_offset @ invert_pose(mount)), base, centre, tool or task.tool)
+    return HeldTool(holder, replace(arm, tooltip_offset=arm.tooltip_offset @ invert_pose(mount)), base, centre, tool or task.tool)
 
 
-def hold_tools(task: type[Task], scene: Scene, tool: str = "") -> list[HeldTool]:
-    """The tool of a task, as `hold_tool` has it, and then all those in `SHAPES`; raises as that does."""
-    return [hold_tool(task, scene, tool), *(hold_tool(task, scene, name) for name in SHAPES)]
+def hold_tools(task: type[Task], scene: Scene, tool: str = "", others: bool = False) -> list[HeldTool]:
+    """The tool of each arm of a task, as `hold_tool` has it, and then those in `SHAPES`, each by all arms; raises as that does.
+
+    Args:
+        task, scene, tool: As there.
+        others: Whether those in `SHAPES` are wanted, too.
+    """
+    return [hold_tool(task, scene, name, arm) for name in (tool, *(SHAPES if others else ())) for arm in task.arms]
 
 
-def _frame(base: np.ndarray) -> str:
+def _frame(holder: str, base: np.ndarray) -> str:
     w, *xyz = matrix_to_quat(base[:3, :3])
-    return " ".join([f"{ARM}_base", *(repr(float(value)) for value in (*base[:3, 3], *xyz, w))])
+    return " ".join([f"{holder}_base", *(repr(float(value)) for value in (*base[:3, 3], *xyz, w))])
 
 
 class HeldTools:
-    """The tools of B episodes of one task.
+    """The tools of B episodes of one task of A arms.
 
     Args:
-        tools: That of the task, and then all others that an episode may have.
+        tools: That of the task, of each of its arms, and then all others that an episode may have, in the same way.
         task: The task.
         count: B.
     """
@@ -124,71 +132,82 @@ class HeldTools:
     def __init__(self, tools: Sequence[HeldTool], task: type[Task], count: int):
         self.tools = tuple(tools)
         self._task = task
-        self.which = np.zeros(count, int)  # number of each episode's tool
-        self.bases = np.tile(tools[0].base, (count, 1, 1))  # [B, 4, 4] world
-        self.joints = np.tile(tools[0].start, (count, 1))  # [B, 6] rad and m
-        self.angles = np.full(count, task.open_jaw)  # between the jaws [B], rad
+        self.which = np.tile(np.arange(len(task.arms)), count)  # number of each arm's tool [B A]
+        self.bases = np.array([tool.base for tool in tools])[self.which]  # [B A, 4, 4] world
+        self.joints = np.array([tool.start for tool in tools])[self.which]  # [B A, 6] rad and m
+        self.angles = np.full(len(self.which), task.open_jaw)  # between the jaws [B A], rad
+
+    @property
+    def kinds(self) -> list[tuple[HeldTool, ...]]:
+        """The tools by kind, one for each arm."""
+        arms = len(self._task.arms)
+        return [self.tools[i : i + arms] for i in range(0, len(self.tools), arms)]
+
+    def kind(self, episodes: np.ndarray) -> np.ndarray:
+        """Number of the kind of tools that each of these episodes [n] has [n]."""
+        return self.which[self._task.hands(episodes)[:, 0]] // len(self._task.arms)
 
     def vary(self, episode: int, variation: Variation) -> None:
-        """Give an episode its tool and the place of its arm."""
-        number = variation.tool(len(self.tools) - 1)
-        self.which[episode] = 0 if number is None else number + 1
-        tool = self.tools[self.which[episode]]
-        self.bases[episode] = variation.trocar(tool.base, tool.centre)
+        """Give the arms of an episode their tools and places."""
+        number, own = variation.tool(len(self.kinds) - 1), self._task.hands([episode])[0]
+        self.which[own] = self._task.hands([0 if number is None else number + 1])[0]
+        for arm, tool in zip(own, (self.tools[i] for i in self.which[own])):
+            self.bases[arm] = variation.trocar(tool.base, tool.centre)
 
-    def begin(self, episodes: np.ndarray, poses: np.ndarray) -> None:
-        """Begin these episodes anew with their tips at poses [n, 4, 4], world."""
-        self.joints[episodes] = np.array([tool.start for tool in self.tools])[self.which[episodes]]
-        self.move(episodes, poses, np.zeros(len(episodes), bool))
+    def begin(self, arms: np.ndarray, poses: np.ndarray) -> None:
+        """Begin anew with these arms [n], their tips at poses [n, 4, 4], world."""
+        self.joints[arms] = np.array([tool.start for tool in self.tools])[self.which[arms]]
+        self.move(arms, poses, np.zeros(len(arms), bool))
 
-    def move(self, episodes: np.ndarray, poses: np.ndarray, closed: np.ndarray) -> None:
-        """Move the tips of these episodes to poses [n, 4, 4], world, or as near as they get, and close their jaws or not [n]."""
+    def move(self, arms: np.ndarray, poses: np.ndarray, closed: np.ndarray) -> None:
+        """Move the tips of these arms [n] to poses [n, 4, 4], world, or as near as they get, and close their jaws or not [n]."""
         for number, tool in enumerate(self.tools):
-            chosen = self.which[episodes] == number
+            chosen = self.which[arms] == number
             if chosen.any():
-                own = episodes[chosen]
+                own = arms[chosen]
                 reach = solve_inverse(tool.arm, invert_poses(self.bases[own]) @ poses[chosen], self.joints[own])
                 self.joints[own] = reach.joints
-        self.angles[episodes] = self._angles(closed)
+        self.angles[arms] = self._angles(closed)
 
     def act(self, task: Task, actions: np.ndarray, relative: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Take the step of a task with actions [B, 7] of joints, as `Task.act` does with those of tips, and raises what that does.
+        """Take the step of a task with actions [B, 7 A] of joints, as `Task.act` does with those of tips, and raises what that does.
 
         Args:
             task: The task.
-            actions: Of the joints as in `reach`, and the fourth number of the task.
+            actions: Of the joints as in `reach`, and the fourth number of the task, of each arm.
             relative: As for `reach`.
 
         Returns:
-            Poses of the tips [B, 4, 4], world, and whether jaws are closed [B].
+            Poses of the tips [B A, 4, 4], world, and whether jaws are closed [B A].
         """
         actions = task.check_actions(actions, len(JOINTS) + 1)
-        self.joints = self.reach(actions[:, :-1], relative)
+        self.joints = self.reach(actions[..., :-1].reshape(self.joints.shape), relative)
         poses = self.poses()
-        asked = task.find(poses[:, :3, 3])
-        tips, closed = task.go(asked, actions[:, -1])
-        outside = np.flatnonzero((task.tip != asked).any(1))
-        if len(outside):
+        asked = task.find(poses[:, :3, 3].reshape(task.tip.shape))
+        tips, closed = (each.reshape(len(poses), *each.shape[task.fourth.ndim :]) for each in task.go(asked, actions[..., -1]))
+        clipped = (task.tip != asked).any(-1)
+        if clipped.any():
+            outside = np.flatnonzero(clipped)
             poses[outside, :3, 3] = tips[outside]
             self.move(outside, poses[outside], closed[outside])
             poses = self.poses()
-            task.tip[outside] = task.find(poses[:, :3, 3])[outside]
+            task.tip[clipped] = task.find(poses[:, :3, 3].reshape(task.tip.shape))[clipped]
         self.hold(closed)
         return poses, closed
 
     def observe(self, state: np.ndarray) -> np.ndarray:
-        """State observations [B, n + 6], float32: those of the task [B, n], and the joints as `scaled` gives them."""
-        return np.concatenate([state, self.scaled().astype(np.float32)], 1)
+        """State observations [B, n + 6 A], float32: those of the task [B, n], and the joints as `scaled` gives them."""
+        return np.concatenate([state, self.scaled().astype(np.float32).reshape(len(state), -1)], 1)
 
     def hold(self, closed: np.ndarray) -> None:
-        """Close the jaws or not [B]."""
+        """Close the jaws or not [B A]."""
         self.angles = self._angles(closed)
 
     def _angles(self, closed: np.ndarray) -> np.ndarray:
         return np.where(closed, self._task.closed_jaw, self._task.open_jaw)
 
     def reach(self, actions: np.ndarray, relative: bool) -> np.ndarray:
-        """Joint positions [B, 6] within their limits that actions [B, 6] in -1 … 1 ask for, rad and m.
+        """Joint positions [B A, 6] within their limits that actions [B A, 6] in -1 … 1 ask for, rad and m.
 
         Args:
             actions: How far each joint moves, in units of `steps`, or where it is between its limits.
@@ -206,23 +225,28 @@ class HeldTools:
         return np.array([turn, turn, self._task.step_length, _WRIST_STEP, _WRIST_STEP, _WRIST_STEP])
 
     def scaled(self) -> np.ndarray:
-        """Joint positions [B, 6] as parts of their ranges, -1 … 1."""
+        """Joint positions [B A, 6] as parts of their ranges, -1 … 1."""
         arms = [tool.arm for tool in self.tools]
         lower, upper = (np.array([getattr(arm, side) for arm in arms])[self.which] for side in ("lower", "upper"))
         return 2 * (self.joints - lower) / (upper - lower) - 1
 
     def poses(self) -> np.ndarray:
-        """Poses of the tips [B, 4, 4], world, at the joints."""
+        """Poses of the tips [B A, 4, 4], world, at the joints."""
         poses = np.empty((len(self.which), 4, 4))
         for number, tool in enumerate(self.tools):
             own = self.which == number
             poses[own] = self.bases[own] @ tool.arm.tip_pose(self.joints[own])
         return poses
 
-    def links(self, number: int, episodes: np.ndarray) -> dict[str, np.ndarray]:
-        """Poses [n, 4, 4] of the links, world, by name, of episodes that have the tool of a number."""
+    def links(self, number: int, arms: np.ndarray) -> dict[str, np.ndarray]:
+        """Poses [n, 4, 4] of the links, world, by name, of arms [n] that have the tool of a number."""
         tool = self.tools[number]
-        return link_poses(tool.arm, self.joints[episodes], tool.jaw(self.angles[episodes]), self.bases[episodes])
+        return link_poses(tool.arm, self.joints[arms], tool.jaw(self.angles[arms]), self.bases[arms])
+
+    def posed(self, kind: int, episodes: np.ndarray) -> list[dict[str, np.ndarray]]:
+        """What `links` gives of each arm [A] of episodes [n] that have a kind of tools."""
+        numbers, hands = self._task.hands([kind])[0], self._task.hands(episodes)
+        return [self.links(number, own) for number, own in zip(numbers, hands.T)]
 
 
 def invert_poses(poses: np.ndarray) -> np.ndarray:

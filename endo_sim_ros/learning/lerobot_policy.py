@@ -64,7 +64,7 @@ def write_training(dataset: Path, out: Path, config: ImitationConfig) -> Path:
         missing = {IMAGE, _STATE, _ACTION} - shapes.keys()
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SequenceError(f"{dataset} is no LeRobot dataset; give the folder that `endo-sim demonstrate` wrote") from error
-    if missing or shapes[_STATE] != [len(ARM_NAMES)] or shapes[_ACTION] != [ACTION_SIZES["cartesian"]]:
+    if missing or not _arms(shapes[_ACTION]) or shapes[_STATE] != [len(ARM_NAMES) * _arms(shapes[_ACTION])]:
         raise SequenceError(f"{dataset} has other columns than `endo-sim demonstrate` writes; train on it with lerobot itself")
     if (out / "lerobot").exists():
         raise SequenceError(f"{out / 'lerobot'} exists already; choose another folder or remove it first")
@@ -158,7 +158,7 @@ class LeRobotPolicy:
         self._policy.reset()
 
     def act(self, observations: dict[str, np.ndarray]) -> np.ndarray:
-        """Actions [B, 4] for observations of ``sensors``.
+        """Actions [B, 4 A] for observations of ``sensors``.
 
         Raises:
             ValueError: If images have another size than those that it was trained on.
@@ -178,6 +178,12 @@ class LeRobotPolicy:
         return actions.double().cpu().numpy()
 
 
+def _arms(action: list[int]) -> int:
+    """How many arms actions of a shape are for; 0 for those that no task takes."""
+    arms, more = divmod(sum(action), ACTION_SIZES["cartesian"])
+    return 0 if more or len(action) != 1 else arms
+
+
 def _features(path: Path) -> tuple[dict[str, list[int]], SightConfig]:
     """What a checkpoint takes, with the shapes, and what its pictures show."""
     try:
@@ -186,9 +192,10 @@ def _features(path: Path) -> tuple[dict[str, list[int]], SightConfig]:
         given = {key: list(feature["shape"]) for key, feature in config["output_features"].items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path / 'config.json'} is no configuration of a policy of lerobot") from error
-    other = inputs.keys() - _PICTURES.keys() - {_STATE}
-    if other or IMAGE not in inputs or inputs.get(_STATE, [len(ARM_NAMES)]) != [len(ARM_NAMES)]:
+    other, arms = inputs.keys() - _PICTURES.keys() - {_STATE}, _arms(given.get(_ACTION, []))
+    measured = [len(ARM_NAMES) * arms]
+    if other or IMAGE not in inputs or arms and inputs.get(_STATE, measured) != measured:
         raise ValueError(f"{path}: the policy takes {', '.join(inputs)}; those of `endo-sim imitate` take {IMAGE} and {_STATE}")
-    if given != {_ACTION: [ACTION_SIZES["cartesian"]]}:
+    if given.keys() != {_ACTION} or not arms:
         raise ValueError(f"{path}: the policy gives {given}; a task takes {ACTION_SIZES['cartesian']} numbers, {_ACTION!r}")
     return inputs, SightConfig(image_width=inputs[IMAGE][2], eyes=2 if IMAGE_RIGHT in inputs else 1)

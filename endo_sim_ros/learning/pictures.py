@@ -69,7 +69,9 @@ class Pictures:
         self._means, self._covars = tissue.append_skinning(self._skinning)
         self._pinned = torch.from_numpy(nodes.pinned).to(device)[:, None, None]
         self._drawings = (
-            [InstrumentDrawing([tool.shape[0]], device=device, capsules=[tool.shape[1]]) for tool in held.tools] if held else []
+            [InstrumentDrawing([t.shape[0] for t in tools], device=device, capsules=[t.shape[1] for t in tools]) for tools in held.kinds]
+            if held
+            else []
         )
         self._tables = [torch.from_numpy(_labels(drawing)).to(device) for drawing in self._drawings]
         self._at_once = _AT_ONCE if torch.device(device).type == "cpu" else max(count, 1)
@@ -106,7 +108,8 @@ class Pictures:
 
         Args:
             right: Whether the right eye's are wanted.
-            labels: Whether labels are: 0 background, 1 tissue, and then the links of the instrument in the order of `LINKS`.
+            labels: Whether labels are: 0 background, 1 tissue, and then the links of the instruments in the order of `LINKS`, those of
+                PSM2 after those of PSM1.
         """
         parts = [
             self._render(np.arange(i, min(i + self._at_once, self._count)), right, labels) for i in range(0, self._count, self._at_once)
@@ -161,7 +164,7 @@ class Pictures:
 
     def _draw_tools(self, held: HeldTools, own: np.ndarray, eyes: int, pictures: tuple[Tensor, Tensor, Tensor]) -> Tensor:
         """Draw the tools into the colours, depths and alphas of these episodes, eye after eye; returns their labels [E b, H, W]."""
-        which = held.which[own]
+        which = held.kind(own)
         viewmats, lamps = (each[:eyes, own].reshape(-1, *each.shape[2:]) for each in (self._viewmats, self._lamps))
         lens = np.tile(self._lens, (len(lamps), 1))
         surfaces = None
@@ -172,8 +175,8 @@ class Pictures:
         labels = torch.empty_like(pictures[2], dtype=torch.uint8)
         for number in np.unique(which):
             drawing, at = self._drawings[number], np.flatnonzero(which == number)
-            links = held.links(number, own[at])
-            poses = np.stack([links[link] for _, link in drawing.links], 1)
+            links = held.posed(number, own[at])
+            poses = np.stack([links[a][link] for a, link in drawing.links], 1)
             rows = np.concatenate([at + eye * len(own) for eye in range(eyes)])
             local = viewmats[rows, None] @ np.concatenate([poses] * eyes)
             if len(at) == len(own):
@@ -211,6 +214,6 @@ class Pictures:
 def _labels(drawing: InstrumentDrawing) -> np.ndarray:
     """The labels [256] that are shown for those of a drawing: as on rendered/segmentation/image, whatever parts the tool has."""
     table = np.arange(256, dtype=np.uint8)
-    for label, (_, link) in enumerate(drawing.links, FIRST_LINK):
-        table[label] = FIRST_LINK + LINKS.index(link)
+    for label, (arm, link) in enumerate(drawing.links, FIRST_LINK):
+        table[label] = FIRST_LINK + len(LINKS) * arm + LINKS.index(link)
     return table

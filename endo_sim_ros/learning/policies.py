@@ -31,16 +31,23 @@ class Policy(Protocol):
         """These episodes begin anew."""
 
     def act(self, observations: Any) -> np.ndarray:
-        """Actions [B, 4 or 7] for observations."""
+        """Actions [B, 4 or 7] for observations; those of several arms one after the other."""
         ...
 
 
 class StillPolicy(Script):
-    """Does nothing: what a task scores by itself."""
+    """Does nothing: what a task scores by itself.
+
+    Args:
+        arms: Number of arms that do nothing.
+    """
+
+    def __init__(self, arms: int = 1):
+        self._size = arms * ACTION_SIZES[self.actions]
 
     def act(self, observations: np.ndarray) -> np.ndarray:
-        """Actions [B, 4] of zero for state observations [B, n]."""
-        return np.zeros((len(observations), ACTION_SIZES[self.actions]))
+        """Actions [B, 4 A] of zero for state observations [B, n]."""
+        return np.zeros((len(observations), self._size))
 
 
 class NetworkPolicy:
@@ -81,7 +88,8 @@ class NetworkPolicy:
     @staticmethod
     def sizes(task: str, hidden: Sequence[int], actions: Actions = "cartesian") -> list[tuple[int, int]]:
         """Shapes of the layers for a task and what actions mean, with hidden layers of these sizes."""
-        widths = [len(observed_names(find_task(task).observation_names, actions)), *hidden, ACTION_SIZES[actions]]
+        kind = find_task(task)
+        widths = [len(observed_names(kind, actions)), *hidden, ACTION_SIZES[actions] * len(kind.arms)]
         return [(before + 1, after) for before, after in zip(widths, widths[1:])]
 
     @classmethod
@@ -177,7 +185,7 @@ def make_policy(policy: str, task: str, count: int = 1, device: str = "auto") ->
     if policy == "scripted":
         return scripted_policy(task, count)
     if policy == "still":
-        return StillPolicy()
+        return StillPolicy(len(find_task(task).arms))
     if (Path(policy) / "keypoints.npz").exists():
         from endo_sim_ros.learning.keypoint_policy import KeypointPolicy
 

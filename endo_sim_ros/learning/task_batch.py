@@ -5,10 +5,11 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from endo_sim_ros.learning.actions import ACTION_SIZES, Actions, Contact, arm_state, observed_names
 from endo_sim_ros.learning.config import Randomisation, SightConfig
-from endo_sim_ros.learning.held_tools import HeldTool, HeldTools, hold_tool, hold_tools
+from endo_sim_ros.learning.held_tools import HeldTool, HeldTools, hold_tools
 from endo_sim_ros.learning.pictures import IMAGE, SEGMENTATION, Pictures
 from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.learning.tasks import Outcome, find_task, moving
@@ -44,7 +45,7 @@ class TaskBatch:
         actions: ``cartesian``: four numbers, see `Task`. ``joints``: how far the six joints of the tool's arm move, in units of
             `HeldTools.steps`, and the fourth number of the task. ``joint_positions``: where they are, -1 and 1 being their limits,
             and the same. With joints the state ends with their positions as parts of their ranges. A tip that would leave where
-            the task allows it comes as near as its joints get.
+            the task allows it comes as near as its joints get. Several arms have as many such actions, one after the other.
         contact: What touches the tissue: ``point``, the tip that the task describes, or ``links``, the links of the instrument, whose
             jaws hold what lies between them, as in physics_node.
         motion: Breath and heart; at rest, those of the task. Each episode begins in phases of its own, not in those of the motion.
@@ -78,12 +79,14 @@ class TaskBatch:
         held: list[HeldTool] = []
         shown = images or observations != "state" or sight.segmentation
         if shown and sight.instrument or actions != "cartesian" or contact == "links":
-            held = hold_tools(kind, scene, sight.tool) if randomisation.tool else [hold_tool(kind, scene, sight.tool)]
+            held = hold_tools(kind, scene, sight.tool, others=randomisation.tool > 0)
         if contact == "links" and randomisation.tool:
             raise ValueError("contact is links, which all episodes share, but randomisation gives each its tool; set its tool to 0")
-        self._links = ToolLinks(held[0].shape[1]) if contact == "links" else None
-        self._linked = torch.zeros(0)  # poses of the links, of a single tissue
-        self.tissue = TissueBatch(nodes, config, count, 1, stiffness=stiffness, capsules=len(self._links or [0]))
+        arms = len(kind.arms)
+        self._links = [ToolLinks(tool.shape[1]) for tool in held] if contact == "links" else []
+        self._linked = [torch.zeros(0)] * arms  # poses of the links, of a single tissue
+        capsules = max(map(len, self._links), default=1)
+        self.tissue = TissueBatch(nodes, config, count, arms, stiffness=stiffness, capsules=capsules)
         self._varies = largest != 1
         self._moves = config.motion.breathing + config.motion.heartbeat > 0
         self._rest = torch.from_numpy(nodes.rest)
@@ -92,10 +95,10 @@ class TaskBatch:
         self.tools = HeldTools(held, kind, count) if held else None
         self.pictures: Pictures | None = None
         self.actions: Actions = actions
-        self.action_size = ACTION_SIZES[actions]
+        self.action_size = ACTION_SIZES[actions] * arms
         self.varied: dict[str, np.ndarray] = {}
         """What each episode has of each kind of randomisation that there is [B, …], by the names of the options."""
-        self._rotations = np.tile(np.eye(3), (count, 1, 1))  # of the tips, world
+        self._rotations = np.tile(np.eye(3), (count * arms, 1, 1))  # of the tips, arm after arm of each episode, world
         if shown:
             self.pictures = Pictures(scene, self.tissue, count, sight, randomisation, self.tools if sight.instrument else None)
 
@@ -114,9 +117,10 @@ class TaskBatch:
         chosen = torch.as_tensor(list(episodes), dtype=torch.long, device=self.tissue.solver.device)
         self.tissue.reset(chosen, np.array([variation.phases for variation in variations]) if self._moves else None)
         self._resting, self._placed = True, False
-        self._rotations[list(episodes)] = np.eye(3)
+        own = self.task.hands(episodes).ravel()
+        self._rotations[own] = np.eye(3)
         if self.tools is not None:
-            self.tools.begin(chosen.cpu().numpy(), self._poses()[list(episodes)])
+            self.tools.begin(own, self._poses()[own])
         if self.pictures is not None:
             self.pictures.reset(chosen, variations, [self.task.dyed_spots(b) for b in episodes])
 
@@ -124,7 +128,7 @@ class TaskBatch:
         """Keep what an episode has."""
         values: dict[str, Any] = dict(variation.values()) | ({"phases": variation.phases} if self._moves else {})
         if self.randomisation.tool and self.tools is not None:
-            values["tool"] = self.tools.tools[self.tools.which[b]].name
+            values["tool"] = self.tools.tools[self.tools.which[self.task.hands([b])[0, 0]]].name
         for name, value in values.items():
             if name not in self.varied:
                 kind = object if isinstance(value, str) else np.float64
@@ -132,20 +136,20 @@ class TaskBatch:
             self.varied[name][b] = value
 
     def _poses(self) -> np.ndarray:
-        """Poses of the tips [B, 4, 4], world."""
-        poses = np.tile(np.eye(4), (self.count, 1, 1))
-        poses[:, :3, :3], poses[:, :3, 3] = self._rotations, self.task.tips()
+        """Poses of the tips [B A, 4, 4], world."""
+        poses = np.tile(np.eye(4), (len(self._rotations), 1, 1))
+        poses[:, :3, :3], poses[:, :3, 3] = self._rotations, self.task.tips().reshape(-1, 3)
         return poses
 
     @property
     def observation_names(self) -> tuple[str, ...]:
         """Names of the numbers of the state."""
-        return observed_names(self.task.observation_names, self.actions)
+        return observed_names(self.task, self.actions)
 
     def step(
         self, actions: np.ndarray, renew: Sequence[int] = (), generators: Sequence[np.random.Generator] = ()
     ) -> tuple[Observed, Outcome]:
-        """Take one step with actions [B, 4 or 7]. The episodes in ``renew`` take none: each begins anew, by the chance of its generator.
+        """Take one step with actions [B, 4 A or 7 A]. Episodes in ``renew`` take none: each begins anew, by the chance of its generator.
 
         Returns:
             What `observe` gives at the end of the step, and its outcome.
@@ -158,49 +162,57 @@ class TaskBatch:
         tips, closed = self.task.act(actions) if self.actions == "cartesian" else self._act_by_joints(actions)
         if len(renew):
             self.reset(renew, generators)
-        tools = self.tissue.tools
-        tips = torch.from_numpy(tips)[:, None].to(tools.tips.device)
-        turned = torch.from_numpy(self._rotations)[:, None].to(tools.tips.device)
+        tools, closed = self.tissue.tools, closed.reshape(self.count, -1)
+        tips = torch.from_numpy(tips).to(tools.tips.device).view_as(tools.tips)
+        turned = torch.from_numpy(self._rotations).to(tools.tips.device).view_as(tools.rotations)
         # Of one alone: a comparison waits for a GPU.
-        moved = self.count == 1 and not (self._placed and torch.equal(tips, tools.tips) and torch.equal(turned, tools.rotations))
-        present = torch.ones((self.count, 1), dtype=torch.int32)
+        moved = self._moved(tips, turned) if self.count == 1 else []
+        present = torch.ones(closed.shape, dtype=torch.int32)
         present[list(renew)] = 0
         tools.tips.copy_(tips)
         tools.rotations.copy_(turned)
         tools.present.copy_(present)
-        tools.closed.copy_(torch.from_numpy(closed.astype(np.int32))[:, None] * present)
+        tools.closed.copy_(torch.from_numpy(closed.astype(np.int32)) * present)
         self._placed = True
-        going = np.setdiff1d(np.arange(self.count), renew)
-        if self.tools is not None and self._links is not None:
+        going = self.task.hands(np.setdiff1d(np.arange(self.count), renew)).ravel()
+        if self.tools is not None and self._links:
             if self.actions == "cartesian":
-                self.tools.move(going, self._poses()[going], closed[going])
-            posed = self.tools.links(0, np.arange(self.count))
-            linked = torch.from_numpy(np.stack([posed[link] for link in self._links.links], 1))
-            moved = moved or not torch.equal(linked, self._linked)
-            self._linked = linked
-            tools.set_links(0, self._links, linked)
+                self.tools.move(going, self._poses()[going], closed.ravel()[going])
+            for number, (links, posed) in enumerate(zip(self._links, self.tools.posed(0, np.arange(self.count)))):
+                linked = torch.from_numpy(np.stack([posed[link] for link in links.links], 1))
+                if moved:
+                    moved[number] |= not torch.equal(linked, self._linked[number])
+                self._linked[number] = linked
+                tools.set_links(number, links, linked)
         step = self.count > 1 or not self._rests(moved)
         if step:
             self.tissue.step()
-        if self.tools is not None and self._links is None and self.actions == "cartesian":  # while a GPU takes the step
-            self.tools.move(going, self._poses()[going], closed[going])
+        if self.tools is not None and not self._links and self.actions == "cartesian":  # while a GPU takes the step
+            self.tools.move(going, self._poses()[going], closed.ravel()[going])
         if step:
             self._resting = self.count == 1 and self.tissue.solver.speed < RESTING_SPEED
 
     def _act_by_joints(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What `Task.act` returns, for actions [B, 7] of joints."""
+        """What `Task.act` returns, for actions [B, 7 A] of joints."""
         assert self.tools is not None
         poses, closed = self.tools.act(self.task, actions, self.actions == "joints")
         self._rotations = poses[:, :3, :3].copy()
         return poses[:, :3, 3].copy(), closed
 
-    def _rests(self, moved: bool) -> bool:
+    def _moved(self, tips: Tensor, turned: Tensor) -> list[bool]:
+        """Of a single tissue: which of its arms [A] come to other places [1, A, 3] and axes [1, A, 3, 3] than before."""
+        tools = self.tissue.tools
+        same = lambda new, old, a: torch.equal(new[:, a], old[:, a])
+        return [not (self._placed and same(tips, tools.tips, a) and same(turned, tools.rotations, a)) for a in range(len(self.task.arms))]
+
+    def _rests(self, moved: list[bool]) -> bool:
         """Whether a single tissue is left as it is, as TissueSimulation does, so that the graph gives the same bits."""
         tools = self.tissue.tools
-        before = bool(tools.gripping[0, 0])
+        before = tools.gripping[0].tolist()
         tools.take_hold()
-        holding, touching = bool(tools.gripping[0, 0]), tools.contact_radius > 0 or self._links is not None
-        return self._resting and not self._moves and holding == before and not (moved and (holding or touching))
+        holding, touching = tools.gripping[0].tolist(), tools.contact_radius > 0 or bool(self._links)
+        disturbed = any(moves and (holds or touching) for moves, holds in zip(moved, holding))
+        return self._resting and not self._moves and holding == before and not disturbed
 
     def observe(self) -> Observed:
         """Observations of all episodes now."""
@@ -220,11 +232,12 @@ class TaskBatch:
         rows = torch.arange(self.count)[:, None]
         moved = self.tissue.displacements[rows.to(device), sites.to(device)].cpu()
         positions = (self._rest[sites] + moved).numpy()
-        state = self.task.observe(positions, self.tissue.tools.reaction_forces[:, 0].cpu().numpy())
+        forces = self.tissue.tools.reaction_forces.cpu().numpy().reshape(self.task.force.shape)
+        state = self.task.observe(positions, forces)
         return state if self.actions == "cartesian" or self.tools is None else self.tools.observe(state)
 
     def arm_state(self) -> np.ndarray:
-        """What the arm of each episode measures of itself [B, 11], see `arm_state`; the force is that of the last observation."""
+        """What the arms of each episode measure of themselves [B, 11 A], see `arm_state`; forces are those of the last observation."""
         return arm_state(self.task, self._rotations)
 
     def images(self) -> np.ndarray:

@@ -257,7 +257,7 @@ class PolicyConfig(StageConfig):
     record: str = ""
     """File (.npz) for states, actions, rewards and success of all steps; empty = none."""
     arm: str = "PSM1"
-    """Name of the arm that acts."""
+    """Name of the arm that acts, in a task of one; those of two are PSM1 and PSM2."""
     world_frame: str = "world"
     """Frame of the tool's pose."""
     physics_node: str = "physics_node"

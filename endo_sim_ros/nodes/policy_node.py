@@ -13,7 +13,7 @@ from endo_sim_ros.core.cameras import rigid_pose
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.folders import written_whole
 from endo_sim_ros.learning.actions import arm_state
-from endo_sim_ros.learning.held_tools import HeldTools, hold_tool
+from endo_sim_ros.learning.held_tools import HeldTools, hold_tools
 from endo_sim_ros.learning.pictures import IMAGE, IMAGE_RIGHT
 from endo_sim_ros.learning.policies import make_policy
 from endo_sim_ros.learning.scenes import load_scene
@@ -37,23 +37,24 @@ class PolicyNode(EndoNode):
     def __init__(self) -> None:
         super().__init__("policy")
         self._config = config = self.declare(PolicyConfig)
-        (arm,) = arm_names([config.arm])
         try:
             scene = load_scene(config.scene or None)
             task = find_task(config.task)
             physics = task.physics()
             self._task = task(scene.nodes(physics), scene.camera.pose)
             self._policy = policy = make_policy(config.policy, config.task, device=config.device)
-            self._tools = None if policy.actions == "cartesian" else HeldTools([hold_tool(task, scene, config.tool)], task, 1)
+            self._tools = None if policy.actions == "cartesian" else HeldTools(hold_tools(task, scene, config.tool), task, 1)
         except ValueError as error:
             raise ConfigError(str(error)) from error
         if not self._task.same_tissue and config.episodes > 1:
             raise ConfigError(f"episodes: {config.task} has one episode over topics, as its tissue is part of physics_node's parameters")
+        arms = arm_names([config.arm] if len(task.arms) == 1 else task.arms)
         self._step_ns = round(physics.step_duration * 1e9)
-        self._pose_pub = self.publisher((messages.tool_joint_command if self._tools else messages.tool_pose_command)(arm))
-        self._jaw_pub = self.publisher(messages.tool_jaw(arm))
+        commands = messages.tool_joint_command if self._tools else messages.tool_pose_command
+        self._pose_pubs = [self.publisher(commands(arm)) for arm in arms]
+        self._jaw_pubs = [self.publisher(messages.tool_jaw(arm)) for arm in arms]
         self._dye_pub = self.publisher(messages.DYE)
-        self._listeners = Listeners((self._pose_pub, self._jaw_pub))
+        self._listeners = Listeners((*self._pose_pubs, *self._jaw_pubs))
         self._resetting = self.create_client(Trigger, f"{config.physics_node}/reset")
         self._state, self._missing = PolicyState.WAITING, ""  # and what for
         self._begun, self._solved, self._done = False, 0, 0
@@ -63,7 +64,9 @@ class PolicyNode(EndoNode):
         self._placed = False  # whether the tool was put where the episode begins
         self._rows: list[tuple[np.ndarray, np.ndarray, float, bool, int]] = []
         self.subscribe(messages.CONTROL_NODES, self._on_nodes)
-        self.subscribe(messages.tool_reaction(arm), self._on_reaction)
+        self._forces = [f"force of {arm}" for arm in arms]
+        for number, arm in enumerate(arms):
+            self.subscribe(messages.tool_reaction(arm), partial(self._on_reaction, number))
         self._pictures = {} if policy.sight is None else {IMAGE: messages.RENDERED_IMAGE}
         if policy.sight is not None and policy.sight.eyes == 2:
             self._pictures[IMAGE_RIGHT] = messages.RENDERED_RIGHT_IMAGE
@@ -81,7 +84,7 @@ class PolicyNode(EndoNode):
         self._task.reset(0, np.random.default_rng(self._config.seed + self._done))
         self._policy.reset([0])
         if self._tools is not None:
-            self._tools.begin(np.zeros(1, int), self._poses(self._task.tips()))
+            self._tools.begin(np.arange(len(self._task.arms)), self._poses(self._task.tips()))
         self._stamp, self._heard, self._placed, self._state = 0, {}, False, PolicyState.WAITING
         spots = self._task.dyed_spots(0) if self._config.dye else ()
         self._dye_pub.publish(messages.encode_dye(spots, self.now_ns(), self._config.world_frame))
@@ -94,9 +97,10 @@ class PolicyNode(EndoNode):
             self._go_on()
         if self._stamp != 0 or self._asked is not None and time.monotonic() - self._asked_at < _PATIENCE and not self._unanswered():
             return
-        listening = all(publisher.get_subscription_count() for publisher in (self._pose_pub, self._jaw_pub))
+        listening = all(publisher.get_subscription_count() for publisher in (*self._pose_pubs, *self._jaw_pubs))
         if not (listening and self._resetting.service_is_ready()):
-            self._missing = "physics_node with arm_source commanded" + (", and an instrument with joints" if self._tools else "")
+            named = f" and the arms {' and '.join(self._task.arms)}" if len(self._task.arms) > 1 else ""
+            self._missing = f"physics_node with arm_source commanded{named}" + (", and an instrument with joints" if self._tools else "")
             return
         if not (self._begun or self._listeners.settled()):  # a recorder, which hears the first command if it is there already
             self._missing = "whoever else listens"
@@ -133,10 +137,10 @@ class PolicyNode(EndoNode):
         elif stamp == self._stamp:
             self._answer("nodes", cloud.positions)
 
-    def _on_reaction(self, message: Any) -> None:
+    def _on_reaction(self, arm: int, message: Any) -> None:
         if self._stamp and messages.stamp_to_ns(message.header.stamp) == self._stamp:
             force = messages.decode_wrench(message, "measured_cf")[0]
-            self._answer("force", force if self._tools is None else self._tools.poses()[0, :3, :3] @ force)
+            self._answer(self._forces[arm], force if self._tools is None else self._tools.poses()[arm, :3, :3] @ force)
 
     def _on_picture(self, name: str, message: Any) -> None:
         if messages.stamp_to_ns(message.header.stamp) == (self._stamp or self._model_stamp):
@@ -150,18 +154,18 @@ class PolicyNode(EndoNode):
 
     def _go_on(self) -> None:
         """When the answer to the last command is complete, act."""
-        if not {"nodes", "force" if self._stamp else "reset", *self._pictures} <= self._heard.keys():
+        if not {"nodes", *(self._forces if self._stamp else ["reset"]), *self._pictures} <= self._heard.keys():
             return
         if not self._stamp and not self._placed:  # the tool begins where the task has it, and is seen there
             if self._pictures and not self._done and time.monotonic() - self._pictured_at < _STRAY:
                 return
             self._placed = True
-            self._command(self._task.tips(), np.zeros(1, bool), self._model_stamp)
+            self._command(self._task.tips(), np.zeros(self._task.fourth.shape, bool), self._model_stamp)
             if self._pictures:  # those after this show it there
                 self._heard = {name: value for name, value in self._heard.items() if name not in self._pictures}
                 return
-        positions, force = self._heard["nodes"][self._task.sites], self._heard.get("force", np.zeros(3))
-        observation = self._task.observe(positions, force[None])
+        forces = np.array([self._heard.get(name, np.zeros(3)) for name in self._forces]).reshape(self._task.force.shape)
+        observation = self._task.observe(self._heard["nodes"][self._task.sites], forces)
         observation = observation if self._tools is None else self._tools.observe(observation)
         ended = False
         if self._stamp:
@@ -192,18 +196,19 @@ class PolicyNode(EndoNode):
         self._command(tips, closed, self._stamp)
 
     def _command(self, tips: np.ndarray, closed: np.ndarray, stamp: int) -> None:
-        """Publish where the tip shall be [1, 3], m, world, or the joints that put it there, and whether the jaw is closed [1]."""
-        if self._tools is None:
-            self._pose_pub.publish(messages.encode_pose(self._poses(tips)[0], stamp, self._config.world_frame))
-        else:
-            none = np.zeros(0)
-            self._pose_pub.publish(messages.encode_joints([], self._tools.joints[0], none, none, stamp))
-        self._jaw_pub.publish(messages.encode_jaw(self._task.closed_jaw if closed[0] else self._task.open_jaw, stamp))
+        """Publish where the tips [A] shall be, m, world, or the joints that put them there, and whether the jaws are closed [A]."""
+        none, poses = np.zeros(0), self._poses(tips)
+        for arm, (publisher, jaw) in enumerate(zip(self._pose_pubs, self._jaw_pubs)):
+            if self._tools is None:
+                publisher.publish(messages.encode_pose(poses[arm], stamp, self._config.world_frame))
+            else:
+                publisher.publish(messages.encode_joints([], self._tools.joints[arm], none, none, stamp))
+            jaw.publish(messages.encode_jaw(self._task.closed_jaw if closed.flat[arm] else self._task.open_jaw, stamp))
 
     @staticmethod
     def _poses(tips: np.ndarray) -> np.ndarray:
-        """Poses [1, 4, 4] of a tip at a place [1, 3], m, with the axes of the world."""
-        return rigid_pose(np.eye(3), tips[0])[None]
+        """Poses [A, 4, 4] of tips at places [1, 3], [A, 3] or [1, A, 3], m, with the axes of the world."""
+        return np.array([rigid_pose(np.eye(3), tip) for tip in tips.reshape(-1, 3)])
 
     def _end(self, success: bool) -> None:
         self._done += 1

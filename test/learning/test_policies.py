@@ -23,14 +23,14 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task, count", [("retraction", 48), ("palpation", 8), ("tracking", 32)])
+@pytest.mark.parametrize("task, count", [("retraction", 48), ("palpation", 8), ("tracking", 32), ("tension", 16)])
 def test_scripted_policies_solve_their_tasks(task, count):
     batch = TaskBatch(task, load_scene(), count, device="cpu")
     returns, success, lengths = play(batch, scripted_policy(task, count), np.arange(count))
     assert success.mean() > 0.8 and returns.mean() > 1
     if task == "retraction":
         assert play(batch, linear_policy(), np.arange(count))[1].mean() > 0.8
-    idle = NetworkPolicy.from_vectors(task, [], np.zeros(4 * (len(batch.task.observation_names) + 1)))
+    idle = NetworkPolicy.from_vectors(task, [], np.zeros(batch.action_size * (len(batch.task.observation_names) + 1)))
     assert not play(batch, idle, np.arange(count))[1].any()
 
 
@@ -122,7 +122,7 @@ def test_the_code_in_the_guide_runs(tmp_path):
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_on_a_gpu_the_scripts_solve_as_on_a_cpu_and_images_are_alike():
-    for task, count in (("retraction", 256), ("palpation", 64), ("tracking", 256)):
+    for task, count in (("retraction", 256), ("palpation", 64), ("tracking", 256), ("tension", 256)):
         batch = TaskBatch(task, load_scene(), count, randomisation=Randomisation(stiffness=0.1), images=True, device="cuda")
         _, success, _ = play(batch, scripted_policy(task, count), np.arange(count))
         assert success.mean() > 0.9, task

@@ -90,6 +90,7 @@ def user():
         ("retraction", 2, True, MotionConfig()),
         ("palpation", 1, False, MotionConfig(breathing=0.004, heartbeat=0.001)),
         ("tracking", 1, False, MotionConfig()),
+        ("tension", 1, True, MotionConfig()),
     ],
 )
 def test_over_topics_observations_images_and_actions_are_bit_for_bit_those_of_the_environment(

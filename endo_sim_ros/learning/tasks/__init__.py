@@ -12,9 +12,10 @@ from endo_sim_ros.learning.tasks.task import (
     moving as moving,
     norm as norm,
 )
+from endo_sim_ros.learning.tasks.tension import Tension
 from endo_sim_ros.learning.tasks.tracking import Tracking
 
-TASKS: dict[str, type[Task]] = {task.name: task for task in (Retraction, Palpation, Tracking)}
+TASKS: dict[str, type[Task]] = {task.name: task for task in (Retraction, Palpation, Tracking, Tension)}
 """All tasks by their names."""
 
 

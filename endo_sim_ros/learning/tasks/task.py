@@ -6,7 +6,7 @@ simulation, so that the same task runs over topics.
 
 All lengths of a task are in its own frame: the origin on the skin, z towards the endoscope, x to the right and y up in its picture. An
 action [4] in -1 … 1 is how far the tip moves in this step along x, y and z, in parts of `step_length`, and a fourth number that each
-task explains.
+task explains. A task of several arms has as many of such actions and tips: what is [B, 3] here is then [B, A, 3], and [B] is [B, A].
 To add a task, write a subclass of :class:`Task`, with a scripted policy, in a file of its own. Every command and the policy's ROS node
 take it as ``path/to/file.py:Name``. One that belongs to the package is a file here and has a name in `TASKS`.
 
@@ -56,6 +56,7 @@ class Task(ABC):
     sentence: str  # what is to be done, for policies that read it
     observation_names: tuple[str, ...]
     horizon: int  # steps of an episode
+    arms: tuple[str, ...] = ("PSM1",)  # that hold a tool each: PSM1 on the right of the picture, PSM2 on the left
     step_length = 0.002  # m in one step, per axis
     working_fourth = -1.0  # fourth action of a tool at work in the tissue, as benchmarks give it
     force_limit: float  # N; above it tissue is hurt, and the episode lost
@@ -86,6 +87,11 @@ class Task(ABC):
         """
         raise ValueError("the task has no scripted policy; name the .npz file of a trained one")
 
+    @classmethod
+    def hands(cls, episodes: Sequence[int] | np.ndarray) -> np.ndarray:
+        """Where the arms of episodes [n] are [n, A] in arrays [B A], which have those of each episode one after the other."""
+        return np.asarray(episodes, int)[:, None] * len(cls.arms) + np.arange(len(cls.arms))
+
     def __init__(self, nodes: ControlNodes, endoscope: np.ndarray, count: int = 1):
         self.nodes, self.endoscope, self.count = nodes, np.asarray(endoscope, np.float64), count
         self.rest = nodes.rest.astype(np.float64)  # [M, 3] m, world
@@ -97,11 +103,12 @@ class Task(ABC):
         self.places = self.places[relief <= np.quantile(relief, self.smooth)]
         self.origin, self.axes = np.zeros((count, 3)), np.tile(np.eye(3), (count, 1, 1))  # rows: x, y, z in the world
         self.sites = np.zeros((count, self.site_count), int)
-        self.tip = np.zeros((count, 3))  # m, task frame
-        self.fourth = np.zeros(count)  # of the last action
-        self.raised = np.zeros(count, int)  # steps that it has been above zero, one after the other
+        hands = (count,) if len(self.arms) == 1 else (count, len(self.arms))
+        self.tip = np.zeros((*hands, 3))  # m, task frame
+        self.fourth = np.zeros(hands)  # of the last action
+        self.raised = np.zeros(hands, int)  # steps that it has been above zero, one after the other
         self.steps = np.zeros(count, int)
-        self.force = np.zeros((count, 3))  # what the tissue exerts on the tool, N, task frame
+        self.force = np.zeros((*hands, 3))  # what the tissue exerts on the tool, N, task frame
         self._potential = np.zeros(count)
 
     def _clearances(self) -> np.ndarray:
@@ -118,47 +125,54 @@ class Task(ABC):
 
     def reset(self, b: int, rng: np.random.Generator) -> None:
         """Begin episode b anew; all chance comes from the generator."""
-        place = int(rng.choice(self.places))
+        self._choose(b, rng)
+        self.tip[b] = rng.uniform(self.low, self.high, self.tip[b].shape)
+        self.fourth[b], self.raised[b], self.steps[b], self.force[b] = -1.0, 0, 0, 0.0
+        self._reset(b, rng)
+
+    def _choose(self, b: int, rng: np.random.Generator) -> None:
+        """Choose what episode b is about: its sites and its frame."""
+        self.sites[b] = place = int(rng.choice(self.places))
+        self._look(b, self.rest[place])
+
+    def _look(self, b: int, place: np.ndarray) -> None:
+        """Put the frame of episode b at a place [3], m, world."""
         right, eye = self.endoscope[:3, 0], self.endoscope[:3, 3]
-        z = eye - self.rest[place]
+        z = eye - place
         z /= np.sqrt(dot(z, z))
         x = right - dot(right, z) * z  # as in the picture, so that a policy that sees can learn what its actions do
         x /= np.sqrt(dot(x, x))
-        self.origin[b], self.axes[b] = self.rest[place], np.stack([x, np.cross(z, x), z])
-        self.sites[b] = place
-        self.tip[b] = rng.uniform(self.low, self.high)
-        self.fourth[b], self.raised[b], self.steps[b], self.force[b] = -1.0, 0, 0, 0.0
-        self._reset(b, rng)
+        self.origin[b], self.axes[b] = place, np.stack([x, np.cross(z, x), z])
 
     def _reset(self, b: int, rng: np.random.Generator) -> None:
         """What else begins anew."""
 
     def tips(self) -> np.ndarray:
         """Where the tips are [B, 3], m, world."""
-        return self.origin + self._to_world(self.tip)
+        return _of_each(self.origin, self.tip) + self._to_world(self.tip)
 
     def act(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where the tips shall be at the end of the step [B, 3], m, world, and whether jaws are closed [B], for actions [B, 4].
+        """Where the tips shall be at the end of the step [B, 3], m, world, and whether jaws are closed [B], for actions [B, 4 A].
 
         Raises:
             ValueError: If actions have another shape, or are not finite; nothing has changed then.
         """
         actions = self.check_actions(actions, 4)
-        return self.go(self.tip + self.step_length * actions[:, :3], actions[:, 3])
+        return self.go(self.tip + self.step_length * actions[..., :3], actions[..., 3])
 
     def check_actions(self, actions: np.ndarray, size: int) -> np.ndarray:
-        """Actions [B, size], each number within -1 … 1, float64.
+        """Actions [B, size A] as those of each arm [B, size] or [B, A, size], each number within -1 … 1, float64.
 
         Raises:
             ValueError: If they have another shape, or are not finite.
         """
-        actions = np.asarray(actions, np.float64)
-        if actions.shape != (self.count, size):
-            raise ValueError(f"{self.name}: actions must be {self.count} × {size} numbers, got the shape {actions.shape}")
+        actions, whole = np.asarray(actions, np.float64), size * len(self.arms)
+        if actions.shape != (self.count, whole):
+            raise ValueError(f"{self.name}: actions must be {self.count} × {whole} numbers, got the shape {actions.shape}")
         if not np.isfinite(actions).all():
             wrong = int((~np.isfinite(actions)).any(1).argmax())
             raise ValueError(f"{self.name}: the action of episode {wrong} is not finite: {actions[wrong].tolist()}; has learning diverged?")
-        return np.clip(actions, -1.0, 1.0)
+        return np.clip(actions, -1.0, 1.0).reshape(*self.fourth.shape, size)
 
     def go(self, tips: np.ndarray, fourth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Take a step with the tips at places [B, 3], m, task frame, as far as they may be there; returns what `act` does.
@@ -178,16 +192,18 @@ class Task(ABC):
         return self._to_world(self.force)
 
     def find(self, places: np.ndarray) -> np.ndarray:
-        """Places [B, 3] of the world, m, in the task frame."""
-        return self._to_task(places - self.origin)
+        """Places [B, 3], or several of each episode [B, K, 3], of the world, m, in the task frame."""
+        return self._to_task(places - _of_each(self.origin, places))
 
     def closes(self, fourth: np.ndarray) -> np.ndarray:
         """Whether a fourth number of actions [B] closes the jaws."""
-        return np.zeros(len(fourth), bool)
+        return np.zeros(np.shape(fourth), bool)
 
     def reach(self, actions: np.ndarray) -> np.ndarray:
-        """Where actions [B, 4] in -1 … 1 put the tips [B, 3], m, world."""
-        return self.origin + self._to_world(np.clip(self.tip + self.step_length * actions[:, :3], self.low, self.high))
+        """Where actions [B, 4 A] in -1 … 1 put the tips [B, 3], m, world."""
+        actions = actions.reshape(*self.fourth.shape, 4)
+        places = np.clip(self.tip + self.step_length * actions[..., :3], self.low, self.high)
+        return _of_each(self.origin, places) + self._to_world(places)
 
     def observe(self, positions: np.ndarray, forces: np.ndarray) -> np.ndarray:
         """Observations [B, n], float32.
@@ -197,9 +213,8 @@ class Task(ABC):
             forces: What the tissue exerts on the tools [B, 3], N, world.
         """
         self.force = self._to_task(np.asarray(forces, np.float64))
-        here = np.stack([self._to_task(positions[:, k].astype(np.float64) - self.origin) for k in range(self.site_count)], 1)
-        columns = self._columns(here)
-        columns += [*(self.force / FORCE).T, norm(self.force) / FORCE, 1 - self.steps / self.horizon]
+        columns = self._columns(self.find(positions.astype(np.float64)))
+        columns += [*self._by_arm(self.force / FORCE).T, *self._by_arm(norm(self.force) / FORCE).T, 1 - self.steps / self.horizon]
         observation = np.clip(np.stack(columns, 1), -BOUND, BOUND).astype(np.float32) + np.float32(0)  # no negative zeros
         fresh = self.steps == 0
         self._potential[fresh] = self._value()[fresh]
@@ -226,7 +241,7 @@ class Task(ABC):
 
         Call it once a step, after `observe`, which stores the force and the positions that are judged.
         """
-        hurt = norm(self.force) > self.force_limit
+        hurt = (self._by_arm(norm(self.force)) > self.force_limit).any(1)
         truncated = self.steps >= self.horizon
         success = self._judge_goal() & ~hurt
         value = self._value()
@@ -247,11 +262,20 @@ class Task(ABC):
         """The stiffness of the first episode as physics_node's parameter `regions`; empty where it is 1 everywhere."""
         return ()
 
+    def _by_arm(self, values: np.ndarray) -> np.ndarray:
+        """Values of the arms [B, …] or [B, A, …], those of an episode in a row [B, n]."""
+        return values.reshape(self.count, -1)
+
     def _to_world(self, v: np.ndarray) -> np.ndarray:
-        return dot(self.axes.transpose(0, 2, 1), v[:, None])
+        return dot(_of_each(self.axes.transpose(0, 2, 1), v), v[..., None, :])
 
     def _to_task(self, v: np.ndarray) -> np.ndarray:
-        return dot(self.axes, v[:, None])
+        return dot(_of_each(self.axes, v), v[..., None, :])
+
+
+def _of_each(values: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Values of the episodes [B, …], so that they go with vectors [B, 3] or with several of each episode [B, A, 3]."""
+    return values if v.ndim == 2 else values[:, None]
 
 
 class Script:

@@ -80,7 +80,7 @@ class KeypointNetwork(nn.Module):
 
         Args:
             images: Of all eyes [B, E, 3, H, W], 0 to 1.
-            arm: What the arm measures of itself [B, arm].
+            arm: What the arms measure of themselves [B, arm].
         """
         x = self.image((images.flatten(0, 1) - 0.5) * 4)
         where = self.maps(x).flatten(2).float().softmax(-1)  # [B E, K, h w]
@@ -106,7 +106,8 @@ def train_keypoints(dataset: Path, out: Path, config: ImitationConfig, device: s
         raise SequenceError(f"{out / FILE} exists already; choose another folder or remove it first")
     device = pick_device(device)
     columns, shown = read_dataset(dataset, (STATE, ENVIRONMENT_STATE, ACTION), (IMAGE, IMAGE_RIGHT))
-    if columns[STATE].shape[1] != len(ARM_NAMES) or columns[ACTION].shape[1] != ACTION_SIZES["cartesian"]:
+    arms, measured = columns[ACTION].shape[1] / ACTION_SIZES["cartesian"], columns[STATE].shape[1] / len(ARM_NAMES)
+    if arms != measured or not measured.is_integer():
         raise SequenceError(f"{dataset} has other columns than `endo-sim demonstrate` writes")
     torch.manual_seed(config.seed)
     arm, state, action = (torch.from_numpy(columns[name]).to(device) for name in (STATE, ENVIRONMENT_STATE, ACTION))
@@ -181,8 +182,9 @@ class KeypointPolicy:
             with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
                 values = {name: torch.from_numpy(file[name]) for name in file.files}
             self._size, self._eyes = values.pop("image_size").tolist(), int(values.pop("eyes"))
-            outputs = len(values["head.6.bias"])
-            network = KeypointNetwork(self._eyes, len(ARM_NAMES), outputs - ACTION_SIZES["cartesian"], ACTION_SIZES["cartesian"])
+            arm, outputs = len(values["arm_mean"]), len(values["head.6.bias"])
+            action = arm // len(ARM_NAMES) * ACTION_SIZES["cartesian"]
+            network = KeypointNetwork(self._eyes, arm, outputs - action, action)
             network.load_state_dict(values)
         except OSError as error:
             raise ValueError(f"{path}: not a readable policy ({error})") from error
@@ -196,14 +198,17 @@ class KeypointPolicy:
 
     @torch.no_grad()
     def act(self, observations: dict[str, np.ndarray]) -> np.ndarray:
-        """Actions [B, 4] for observations of ``sensors``.
+        """Actions [B, 4 A] of A arms for observations of ``sensors``.
 
         Raises:
-            ValueError: If images have another size than those that it was trained on.
+            ValueError: If images have another size than those that it was trained on, or there are more or fewer arms.
         """
         seen = np.stack([observations[name] for name in (SEEN, SEEN_RIGHT)[: self._eyes]], 1)
         if list(seen.shape[2:4]) != self._size:
             (height, width), (h, w) = self._size, seen.shape[2:4]
             raise ValueError(f"images have {w}×{h} pixels, but the policy was trained on {width}×{height}; set image_width {width}")
+        arm, known = observations[ARM_STATE], len(self._network.arm_mean)
+        if arm.shape[1] != known:
+            raise ValueError(f"the arms measure {arm.shape[1]} numbers, but the policy was trained with {known}; it is of another task")
         images = torch.from_numpy(seen).to(self._device).permute(0, 1, 4, 2, 3).float() / 255
-        return self._network(images, torch.from_numpy(observations[ARM_STATE]).to(self._device))[0].double().cpu().numpy()
+        return self._network(images, torch.from_numpy(arm).to(self._device))[0].double().cpu().numpy()

@@ -57,3 +57,7 @@ def test_what_cannot_be_used_is_told(dataset, tmp_path):
     small = np.zeros((1, 16, 20, 3), np.uint8)
     with pytest.raises(ValueError, match="images have 20×16 pixels, but the policy was trained on 40×32; set image_width 40"):
         policy.act({"image": small, "image_right": small, "arm": np.zeros((1, 11), np.float32)})
+    with pytest.raises(ValueError, match="the arms measure 22 numbers, but the policy was trained with 11; it is of another task"):
+        policy.act(
+            {"image": np.zeros((1, 32, 40, 3), np.uint8), "image_right": np.zeros((1, 32, 40, 3), np.uint8), "arm": np.zeros((1, 22))}
+        )

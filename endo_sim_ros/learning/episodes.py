@@ -15,7 +15,8 @@ action              commanded pose of the tip (x y z qx qy qz qw), jaw, wrench (
 joints              yaw, pitch, insertion (m), roll, wrist_pitch, wrist_yaw, where all arms say them
 ==================  ==========================================================================================
 
-Beside these: the pose of the camera (x y z qx qy qz qw), the right eye and what is in each pixel, where they were recorded.
+Beside these, where they were recorded: the pose of the camera (x y z qx qy qz qw), the right eye, what is in each pixel, and of a task
+what its steps led to.
 """
 
 import functools
@@ -106,6 +107,7 @@ class Episode:
     segmentation: Shown | None = None  # what is in each pixel
     joints: np.ndarray | None = None  # [T, 6·A] float32
     camera_pose: np.ndarray | None = None  # [T, 7] float32, world
+    outcome: np.ndarray | None = None  # [T, 7] as `messages.OUTCOME` has them: what the action of each row led to
 
     def __len__(self) -> int:
         return len(self.state)
@@ -113,7 +115,7 @@ class Episode:
     @property
     def content(self) -> tuple[str, ...]:
         """What there is beside what all episodes have."""
-        return tuple(name for name in ("right", "segmentation", "joints", "camera_pose") if getattr(self, name) is not None)
+        return tuple(name for name in ("right", "segmentation", "joints", "camera_pose", "outcome") if getattr(self, name) is not None)
 
     def images(self, shown: Shown | None = None) -> Iterator[np.ndarray]:
         """The T rendered images, RGB [H, W, 3] uint8, or other pictures of the episode; labels are [H, W].
@@ -203,6 +205,8 @@ def read_episode(
         found["joints"] = np.hstack([streams[messages.tool_joints(arm)].at(now) for arm in arms]).astype(np.float32)
     if messages.RENDERED_POSE in streams:
         found["camera_pose"] = continuous(streams[messages.RENDERED_POSE].at(now)).astype(np.float32)
+    if messages.TASK_OUTCOME in streams:
+        found["outcome"] = streams[messages.TASK_OUTCOME].at(following)
     return Episode(
         bag,
         arms,

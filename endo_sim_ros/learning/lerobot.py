@@ -1,9 +1,10 @@
 """Recordings as a LeRobot dataset: each is an episode.
 
-Columns beside those that every LeRobot dataset has: `observation.images.endoscope.left`,
-and `observation.state`, `observation.environment_state` and
-`action` as described in `episodes`. What else was recorded is in `observation.images.endoscope.right`, `observation.segmentation`,
-`observation.joints` and `observation.camera_pose`. The cameras have the names of the Open-H datasets of da Vinci robots.
+Columns beside those that every LeRobot dataset has: `observation.images.endoscope.left`, and `observation.state`,
+`observation.environment_state` and `action` as described in `episodes`. What else was recorded is in
+`observation.images.endoscope.right`, `observation.segmentation`, `observation.joints` and `observation.camera_pose`. Of a task
+`next.reward`, `next.done` and `next.success` say what a step led to, `seed` and `goal` (m, world, at rest) what the episode is
+about, as in demonstrations. The cameras have the names of the Open-H datasets of da Vinci robots.
 """
 
 import shutil
@@ -23,6 +24,7 @@ from endo_sim_ros.learning.dataset import (
     ImageFormat,
     import_pyarrow,
     picture_feature,
+    scalar_feature,
     vector_feature,
 )
 from endo_sim_ros.learning.episodes import (
@@ -37,6 +39,8 @@ from endo_sim_ros.learning.episodes import (
 from endo_sim_ros.sequences.bag import WORLD_FRAME
 
 JOINTS, CAMERA_POSE = "observation.joints", "observation.camera_pose"
+GOAL = "goal"
+_OUTCOME = {"next.reward": "float32", "next.done": "bool", "next.success": "bool", "seed": "int64"}
 _PICTURES = {IMAGE: "left", IMAGE_RIGHT: "right", SEGMENTATION: "segmentation"}  # of an `Episode`
 
 
@@ -102,8 +106,11 @@ def _check_alike(first: Episode, other: Episode) -> None:
 
 
 def _columns(episode: Episode) -> dict[str, np.ndarray]:
-    """The numbers of an episode: vectors [T, D]."""
+    """The numbers of an episode: vectors [T, D], and single ones [T]."""
     more = {JOINTS: episode.joints, CAMERA_POSE: episode.camera_pose}
+    if episode.outcome is not None:
+        single, goal = np.split(episode.outcome, [len(_OUTCOME)], 1)
+        more |= {key: column.astype(kind) for (key, kind), column in zip(_OUTCOME.items(), single.T)} | {GOAL: goal.astype(np.float32)}
     return {
         "observation.state": episode.state,
         "observation.environment_state": episode.environment_state,
@@ -121,7 +128,10 @@ def _features(episode: Episode, images: ImageFormat) -> dict[str, dict]:
     }
     vectors |= {JOINTS: joint_names(episode.arms)} if episode.joints is not None else {}
     vectors |= {CAMERA_POSE: list(POSE_NAMES)} if episode.camera_pose is not None else {}
+    vectors |= {GOAL: ["x", "y", "z"]} if episode.outcome is not None else {}
+    single = _OUTCOME if episode.outcome is not None else {}
     pictures = {
         key: picture_feature(key, episode.left.size, episode.fps, images) for key, name in _PICTURES.items() if getattr(episode, name)
     }
-    return pictures | {key: vector_feature(names) for key, names in vectors.items()}
+    numbers = {key: vector_feature(names) for key, names in vectors.items()}
+    return pictures | numbers | {key: scalar_feature(kind) for key, kind in single.items()}

@@ -55,6 +55,7 @@ def read_streams(
         for make in (messages.tool_wrench, messages.tool_reaction):
             decoders[make(arm)] = lambda m, topic, arm=arm: _wrench_row(m, topic, arm, frames)
         decoders[messages.tool_joints(arm)] = _joint_row
+    decoders[messages.TASK_OUTCOME] = messages.decode_outcome
     decoders[messages.RENDERED_POSE] = lambda m, topic: _pose_row(messages.decode_pose(m, frames, topic))
     rows: dict[Topic, list] = defaultdict(list)
     numbers, sizes = dict.fromkeys((*pictures, messages.CONTROL_NODES), -1), dict[Topic, tuple[int, ...]]()

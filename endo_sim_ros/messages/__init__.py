@@ -12,6 +12,7 @@ from endo_sim_ros.messages.headers import *
 from endo_sim_ros.messages.images import *
 from endo_sim_ros.messages.motion import *
 from endo_sim_ros.messages.poses import *
+from endo_sim_ros.messages.tasks import *
 from endo_sim_ros.messages.tools import *
 from endo_sim_ros.messages.topics import *
 from endo_sim_ros.messages.types import *

@@ -32,6 +32,7 @@ CUT_SURFACE = Topic("cut_surface", "sensor_msgs/msg/PointCloud2", "latched")
 DYE = Topic("dye", "visualization_msgs/msg/MarkerArray", "latched")
 TISSUE_MOTION = Topic("tissue_motion", "sensor_msgs/msg/JointState")
 TISSUE_MOTION_COMMAND = Topic("set_tissue_motion", "sensor_msgs/msg/JointState")
+TASK_OUTCOME = Topic("task_outcome", "sensor_msgs/msg/JointState")
 RENDERED_IMAGE = Topic("rendered/image_raw", "sensor_msgs/msg/Image")
 RENDERED_INFO = Topic("rendered/camera_info", "sensor_msgs/msg/CameraInfo")
 RENDERED_POSE = Topic("rendered/camera_pose", "geometry_msgs/msg/PoseStamped")
@@ -145,7 +146,8 @@ EXTRA_RENDERED_TOPICS = (RENDERED_COMPRESSED, RENDERED_SEGMENTATION, RENDERED_RI
 def all_topics(arms: tuple[str, ...] = ("PSM1",)) -> tuple[Topic, ...]:
     """Every topic of the contract that can be recorded, for the given arms."""
     tools = tuple(make(arm) for arm in arms for make in TOOL_TOPICS)
-    scene = MODEL_TOPICS + (CONTROL_NODES, CUT_SURFACE, DYE, TISSUE_MOTION, TISSUE_MOTION_COMMAND) + RENDERED_TOPICS + EXTRA_RENDERED_TOPICS
+    tissue = (CONTROL_NODES, CUT_SURFACE, DYE, TISSUE_MOTION, TISSUE_MOTION_COMMAND)
+    scene = MODEL_TOPICS + tissue + RENDERED_TOPICS + EXTRA_RENDERED_TOPICS + (TASK_OUTCOME,)
     found = RECORDING_TOPICS + scene + tools + (TOOL_MARKERS, JOINT_STATES, ROBOT_DESCRIPTION, DIAGNOSTICS, CLOCK)
     return tuple(dict.fromkeys(found))  # the pose of an ECM among the arms is that of the camera
 

@@ -25,6 +25,7 @@ from endo_sim_ros.nodes.configs import PolicyConfig, arm_names
 from endo_sim_ros.nodes.listeners import Listeners, delivered
 
 _DYED_WITHIN = 1.0  # seconds that the spot of an episode has to arrive before its first picture is rendered
+_TOLD_WITHIN = 1.0  # seconds that the last outcome has to arrive before the node exits
 _STRAY = 1.0  # seconds in which pictures of a rest before the first reset may still come
 _PATIENCE = 30.0  # seconds; a request to a physics_node that was killed just now is never answered
 
@@ -54,6 +55,7 @@ class PolicyNode(EndoNode):
         self._pose_pubs = [self.publisher(commands(arm)) for arm in arms]
         self._jaw_pubs = [self.publisher(messages.tool_jaw(arm)) for arm in arms]
         self._dye_pub = self.publisher(messages.DYE)
+        self._outcome_pub = self.publisher(messages.TASK_OUTCOME)
         self._listeners = Listeners((*self._pose_pubs, *self._jaw_pubs))
         self._resetting = self.create_client(Trigger, f"{config.physics_node}/reset")
         self._state, self._missing = PolicyState.WAITING, ""  # and what for
@@ -171,6 +173,8 @@ class PolicyNode(EndoNode):
         if self._stamp:
             outcome = self._task.judge()
             ended = bool(outcome.terminated[0] or outcome.truncated[0])
+            told = float(outcome.reward[0]), ended, bool(outcome.success[0]), self._config.seed + self._done
+            self._outcome_pub.publish(messages.encode_outcome(*told, self._task.origin[0], self._stamp))
             self._rows.append((self._seen, self._action, float(outcome.reward[0]), bool(outcome.success[0]), self._done))
         if ended:
             self._end(outcome.success[0])
@@ -219,6 +223,7 @@ class PolicyNode(EndoNode):
             self._begin()
             return
         self._state = PolicyState.DONE
+        delivered(self._outcome_pub, _TOLD_WITHIN)
         if self._config.record:
             names, path = ("observations", "actions", "rewards", "success", "episode"), Path(self._config.record)
             columns: dict[str, Any] = {name: np.array(column) for name, column in zip(names, zip(*self._rows))}

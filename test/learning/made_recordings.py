@@ -83,6 +83,8 @@ class Recording:
         if self.compressed:
             right = (messages.RENDERED_RIGHT_COMPRESSED, messages.encode_compressed(picture(number)[:, ::-1], stamp, "camera", 95, types))
         said = [right, (messages.RENDERED_SEGMENTATION, messages.encode_image(labels(number), stamp, "camera", types))]
+        outcome = messages.encode_outcome(0.5 * number, number == 11, number == 11, 7, np.array([1.0, 2.0, 3.0]), stamp, types)
+        said.append((messages.TASK_OUTCOME, outcome))
         said.append((messages.RENDERED_POSE, messages.encode_pose(tip(number), stamp, "world", types)))
         for arm in arms:
             none = np.zeros(0)

@@ -14,7 +14,7 @@ from endo_sim_ros import messages
 from endo_sim_ros.core import drawing
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.learning.episodes import action_names, environment_names, read_episode, state_names
-from endo_sim_ros.learning.lerobot import CAMERA_POSE, IMAGE, IMAGE_RIGHT, JOINTS, SEGMENTATION, export_lerobot
+from endo_sim_ros.learning.lerobot import CAMERA_POSE, GOAL, IMAGE, IMAGE_RIGHT, JOINTS, SEGMENTATION, export_lerobot
 
 S = 1_000_000_000
 
@@ -134,6 +134,10 @@ def test_joints_both_eyes_labels_and_the_camera_are_exported(images, compressed,
         np.testing.assert_allclose(table.column(JOINTS).to_pylist(), [joints(k) for k in range(11)], atol=1e-6)
         np.testing.assert_allclose(np.array(table.column(CAMERA_POSE).to_pylist())[:, 0], 1e-3 * np.arange(11), atol=1e-7)
         np.testing.assert_allclose(np.array(table.column("observation.state").to_pylist())[1:, 7], 0.01 * np.arange(1, 11), atol=1e-7)
+        # What the action of a row led to is said with the next row.
+        assert table.column("next.reward").to_pylist() == [0.5 * k for k in range(1, 12)]
+        assert table.column("next.done").to_pylist() == [False] * 10 + [True] == table.column("next.success").to_pylist()
+        assert set(table.column("seed").to_pylist()) == {7} and table.column(GOAL).to_pylist() == [[1, 2, 3]] * 11
         for k, cell in enumerate(table.column(SEGMENTATION).to_pylist()):
             np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(cell["bytes"], np.uint8), cv2.IMREAD_UNCHANGED), labels(k))
         for key, flip in ((IMAGE, 1), (IMAGE_RIGHT, -1)):

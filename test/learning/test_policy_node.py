@@ -103,6 +103,8 @@ def test_over_topics_observations_images_and_actions_are_bit_for_bit_those_of_th
         user.user.subscribe(topic, heard[name].append, depth=1000)  # all that come while this process does not spin
     commands: list = []  # of the first run: who listens when it begins hears all
     user.user.subscribe(messages.tool_pose_command("PSM1"), commands.append, depth=1000)
+    outcomes: list = []
+    user.user.subscribe(messages.TASK_OUTCOME, outcomes.append, depth=1000)
     with NodeGroup(tmp_path / "logs") as group:
         parameters = ("--params-file", str(tmp_path / "parameters.yaml"))
         logs = lambda: [(log.name, log.read_text()[-800:]) for log in (tmp_path / "logs").iterdir()]  # noqa: E731
@@ -120,6 +122,8 @@ def test_over_topics_observations_images_and_actions_are_bit_for_bit_those_of_th
         run(tmp_path / "scripted.npz")
         given = len(np.load(tmp_path / "scripted.npz")["rewards"]) + episodes  # and where each episode begins
         user.until(lambda: len(commands) == given, lambda: f"{len(commands)} of {given} commands")
+        user.until(lambda: len(outcomes) == given - episodes, lambda: f"{len(outcomes)} of {given - episodes} outcomes")
+        told = np.array([messages.decode_outcome(outcome, "task_outcome") for outcome in outcomes])
         pictured = make(task, observations="both", eyes=2, segmentation=True, instrument=instrument, motion=motion)
         images = assert_same_as_environment(tmp_path / "scripted.npz", scripted_policy(task), episodes, pictured)
         # They may come late; an earlier episode, or some pictures of one, may be missed.
@@ -136,7 +140,12 @@ def test_over_topics_observations_images_and_actions_are_bit_for_bit_those_of_th
             other = group.start("policy_node", scene=tmp_path, task="palpation")  # for which other tissue is needed
             wait_until(lambda: "is not that of the scene and the task" in other.log.read_text(), 60, logs)
             assert other.exit_status is None
-    assert np.load(tmp_path / "scripted.npz")["success"][-1]
+    scripted = np.load(tmp_path / "scripted.npz")
+    assert scripted["success"][-1]
+    for column, name in ((0, "rewards"), (2, "success")):
+        np.testing.assert_array_equal(told[:, column], scripted[name])
+    np.testing.assert_array_equal(told[:, 1], np.append(np.diff(scripted["episode"]), 1))  # an episode ends before the next begins
+    np.testing.assert_array_equal(told[:, 3], SEED + scripted["episode"])
     assert (images[-1]["segmentation"] > 1).any() == instrument
     if episodes > 1:
         assert_same_as_environment(tmp_path / "learned.npz", linear_policy(), episodes, make(task))

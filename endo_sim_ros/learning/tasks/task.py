@@ -57,6 +57,7 @@ class Task(ABC):
     observation_names: tuple[str, ...]
     horizon: int  # steps of an episode
     step_length = 0.002  # m in one step, per axis
+    turns = False  # whether the fourth number is a speed, which rests at 0
     working_fourth = -1.0  # fourth action of a tool at work in the tissue, as benchmarks give it
     force_limit: float  # N; above it tissue is hurt, and the episode lost
     low: tuple[float, float, float]  # where the tip may be, m, task frame

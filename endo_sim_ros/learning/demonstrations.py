@@ -8,9 +8,11 @@ observation.segmentation       what is in each pixel, on request
 observation.state              of the arm alone, in the axes of the world: pose of the tip (m, xyzw), jaw (rad), and
                                the force of the tissue on the tool (N)
 observation.joints             yaw, pitch, insertion (m), roll, wrist_pitch, wrist_yaw, where there is an instrument
+observation.endoscope          yaw, pitch, insertion (m) and roll of its arm, where the actions move it
 observation.environment_state  the state observation of the task, which knows the goal
 action                         what the task takes, -1 to 1: how far the tip moves in its frame, and the fourth number
 command.pose                   the same as a command: pose of the tip in the world, and jaw
+command.endoscope              or joints of the endoscope's arm
 next.reward, .done, .success   what the action led to
 seed                           of the episode
 =============================  ==================================================================================
@@ -48,7 +50,7 @@ from endo_sim_ros.learning.held_tools import ARM
 from endo_sim_ros.learning.policies import Policy, scripted_policy
 from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.learning.task_batch import Observed, TaskBatch
-from endo_sim_ros.learning.tasks import Task
+from endo_sim_ros.learning.tasks import Camera, Task
 from endo_sim_ros.physics import MotionConfig
 
 _COLUMNS = {"image": IMAGE, "image_right": IMAGE_RIGHT, "segmentation": SEGMENTATION}
@@ -260,6 +262,8 @@ def take(
     }
     if batch.tools is not None:
         rows["observation.joints"] = batch.tools.joints.copy()
+    if isinstance(batch.task, Camera):
+        rows |= {"observation.endoscope": batch.task.joints.copy(), "command.endoscope": batch.task.aim(actions)}
     after, outcome = batch.step(np.clip(noisy, -1, 1))
     rows |= {"next.reward": outcome.reward, "next.done": outcome.terminated | outcome.truncated, "next.success": outcome.success}
     for b, episode in enumerate(episodes):
@@ -295,6 +299,8 @@ def _features(batch: TaskBatch, fps: int, images: ImageFormat) -> dict[str, dict
     }
     if batch.tools is not None:
         vectors["observation.joints"] = [f"{ARM}.{name}" for name in JOINTS]
+    if isinstance(batch.task, Camera):
+        vectors |= dict.fromkeys(("observation.endoscope", "command.endoscope"), [f"ECM.{name}" for name in JOINTS[:4]])
     kinds = {"next.reward": "float32", "next.done": "bool", "next.success": "bool", "seed": "int64"}
     camera, sight = batch.pictures.camera, batch.sight
     shown = [IMAGE, *([IMAGE_RIGHT] * (sight.eyes == 2)), *([SEGMENTATION] * sight.segmentation)]

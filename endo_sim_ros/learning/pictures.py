@@ -54,16 +54,24 @@ class Pictures:
         sight: What is shown.
         randomisation: How episodes differ.
         held: The tools, or None where pictures show the tissue alone.
+        roams: Whether the endoscopes move, and see what lies around the scene.
     """
 
     def __init__(
-        self, scene: Scene, tissue: TissueBatch, count: int, sight: SightConfig, randomisation: Randomisation, held: HeldTools | None
+        self,
+        scene: Scene,
+        tissue: TissueBatch,
+        count: int,
+        sight: SightConfig,
+        randomisation: Randomisation,
+        held: HeldTools | None,
+        roams: bool = False,
     ):
         self._sight, self._by, self._held, self._count = sight, randomisation, held, count
         nodes = tissue.nodes
         self._set_width(scene.camera, sight.image_width)
         self._device = device = tissue.solver.device
-        self._model = scene.model.detach().to(device)
+        self._model = (scene.whole if roams else scene.model).detach().to(device)
         self._tissue = tissue
         self._sh = self._model.sh.expand(count, -1, -1, -1).clone() if sight.dye else None  # of each episode
         self._skinning = Skinning(self._model, nodes.rest, device=device)

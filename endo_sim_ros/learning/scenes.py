@@ -3,10 +3,12 @@
 import contextlib
 import functools
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from endo_sim_ros.core.cameras import Camera, load_cameras
 from endo_sim_ros.core.gaussians import GaussianModel, ModelError, load_ply, save_ply
@@ -26,6 +28,7 @@ class Scene:
 
     model: GaussianModel
     cameras: tuple[Camera, ...]
+    around: Callable[[], GaussianModel] | None = None  # makes what lies beyond the model, which endoscopes that move see; it stays at rest
 
     @property
     def camera(self) -> Camera:
@@ -43,6 +46,14 @@ class Scene:
         if depth is None:
             raise ValueError("the endoscope sees no tissue in the middle of its picture; check the poses in cameras.json")
         return depth
+
+    @functools.cached_property
+    def whole(self) -> GaussianModel:
+        """The model, and what lies around it where that is known."""
+        if self.around is None:
+            return self.model
+        beyond = self.around()
+        return replace(self.model, **{name: torch.cat([tensor, getattr(beyond, name)]) for name, tensor in self.model.tensors().items()})
 
     def nodes(self, config: PhysicsConfig) -> ControlNodes:
         """The tissue's control nodes at rest, m, world: those that physics_node makes of the same files.
@@ -86,14 +97,20 @@ def patient_scene(seed: int = 0) -> Scene:
     K = whole.K.copy()
     K[:2, :2] /= _PIECE
     camera = replace(whole, K=K)
+    return Scene(_patient(seed, camera, True), (camera,), functools.partial(_patient, seed, camera, False))
+
+
+def _patient(seed: int, camera: Camera, seen: bool) -> GaussianModel:
+    """What a camera sees of a synthetic patient, or all the rest of it; kept in the cache."""
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "endo_sim_ros"
-    path = cache / _CACHED.format(version=f"{_VERSION}-{seed}" if seed else _VERSION)
+    version = (f"{_VERSION}-{seed}" if seed else _VERSION) + ("" if seen else "-around")
+    path = cache / _CACHED.format(version=version)
     with contextlib.suppress(ModelError):  # there is none yet, or it was damaged
-        return Scene(load_ply(path), (camera,))
+        return load_ply(path)
     from endo_sim_ros.sequences.phantom_model import phantom_model
 
-    model, _ = phantom_model(24_000, whole.width, seed)
-    model = model.select(np.flatnonzero(camera.sees(model.means.double().numpy())))
+    model, _ = phantom_model(24_000, camera.width, seed)
+    model = model.select(np.flatnonzero(camera.sees(model.means.double().numpy()) == seen))
     with contextlib.suppress(OSError):  # of a home that cannot be written; it is rendered again next time
         save_ply(model, path)
-    return Scene(model, (camera,))
+    return model

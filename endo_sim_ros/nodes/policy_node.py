@@ -18,7 +18,7 @@ from endo_sim_ros.learning.pictures import IMAGE, IMAGE_RIGHT
 from endo_sim_ros.learning.policies import make_policy
 from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.learning.task_batch import ARM_STATE
-from endo_sim_ros.learning.tasks import find_task
+from endo_sim_ros.learning.tasks import find_graph_task
 from endo_sim_ros.messages import OK, STATE, WARN, PolicyState
 from endo_sim_ros.nodes.base import EndoNode, run
 from endo_sim_ros.nodes.configs import PolicyConfig, arm_names
@@ -40,7 +40,7 @@ class PolicyNode(EndoNode):
         (arm,) = arm_names([config.arm])
         try:
             scene = load_scene(config.scene or None)
-            task = find_task(config.task)
+            task = find_graph_task(config.task)
             physics = task.physics()
             self._task = task(scene.nodes(physics), scene.camera.pose)
             self._policy = policy = make_policy(config.policy, config.task, device=config.device)

@@ -71,8 +71,9 @@ def test_the_tool_is_where_the_actions_put_its_tip(task):
     observation, _ = environment.reset(seed=5)
     scripts, found = scripted_policy(task), 0
     for _ in range(20):
-        at = batch.task.tips()[0] + [0, 0, batch.task.physics().contact_radius]  # the camera looks along z
-        seen = batch.pictures.camera.K @ at
+        at = batch.task.tips()[0] + [0, 0, batch.task.physics().contact_radius]  # a still camera looks along z
+        pose = batch.pictures.poses[0]
+        seen = batch.pictures.camera.K @ pose[:3, :3].T @ (at - pose[:3, 3])
         column, row = (seen[:2] / seen[2]).astype(int)
         jaws = np.argwhere(np.isin(observation["segmentation"][..., 0], JAWS))
         if len(jaws) > 50:  # not out of the picture

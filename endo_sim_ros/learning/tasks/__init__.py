@@ -1,6 +1,7 @@
 """What is to be learned: each task is a file here, with its script."""
 
 from endo_sim_ros.core.plugins import load_named
+from endo_sim_ros.learning.tasks.camera import Camera as Camera
 from endo_sim_ros.learning.tasks.palpation import Palpation
 from endo_sim_ros.learning.tasks.retraction import Retraction
 from endo_sim_ros.learning.tasks.task import (
@@ -14,8 +15,20 @@ from endo_sim_ros.learning.tasks.task import (
 )
 from endo_sim_ros.learning.tasks.tracking import Tracking
 
-TASKS: dict[str, type[Task]] = {task.name: task for task in (Retraction, Palpation, Tracking)}
+TASKS: dict[str, type[Task]] = {task.name: task for task in (Retraction, Palpation, Tracking, Camera)}
 """All tasks by their names."""
+
+
+def find_graph_task(name: str) -> type[Task]:
+    """As `find_task`, for a task over topics.
+
+    Raises:
+        ValueError: As `find_task` does, and if the task moves the endoscope.
+    """
+    task = find_task(name)
+    if task.roams:
+        raise ValueError(f"{name} moves the endoscope, which policy_node does not do; use the environments, demonstrate and benchmark")
+    return task
 
 
 def find_task(name: str) -> type[Task]:

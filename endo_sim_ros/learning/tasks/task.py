@@ -57,6 +57,7 @@ class Task(ABC):
     observation_names: tuple[str, ...]
     horizon: int  # steps of an episode
     step_length = 0.002  # m in one step, per axis
+    roams = False  # whether the actions move the endoscope
     turns = False  # whether the fourth number is a speed, which rests at 0
     working_fourth = -1.0  # fourth action of a tool at work in the tissue, as benchmarks give it
     force_limit: float  # N; above it tissue is hurt, and the episode lost
@@ -239,6 +240,10 @@ class Task(ABC):
     def stiffness(self, b: int) -> np.ndarray:
         """Factor on the moduli of each node [M] in episode b."""
         return np.ones(len(self.nodes))
+
+    def endoscopes(self) -> np.ndarray | None:
+        """Poses of the endoscopes now [B, 4, 4], camera to world, m; None where they stay where the scene has theirs."""
+        return None
 
     def dyed_spots(self, b: int) -> tuple[DyedSpot, ...]:
         """What is dyed in episode b, so that pictures tell the goal: the place that it is about."""

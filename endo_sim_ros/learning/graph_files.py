@@ -14,7 +14,7 @@ from endo_sim_ros.instruments import save_tool
 from endo_sim_ros.learning.config import Randomisation, SightConfig
 from endo_sim_ros.learning.held_tools import hold_tool
 from endo_sim_ros.learning.scenes import Scene
-from endo_sim_ros.learning.tasks import find_graph_task, moving
+from endo_sim_ros.learning.tasks import find_task, moving
 from endo_sim_ros.learning.variation import Variation
 from endo_sim_ros.physics import MotionConfig, PhysicsConfig
 
@@ -38,9 +38,9 @@ def save_scene(
         motion: Breath and heart; at rest, those of the task. Each episode on the graph begins in the phases of the first.
 
     Raises:
-        ValueError: If there is no such task or tool, the task moves the endoscope, the scene is too small, or an arm does not reach it.
+        ValueError: If there is no such task or tool, the scene is too small for it, or an arm does not reach it.
     """
-    kind = find_graph_task(task)
+    kind = find_task(task)
     physics = moving(kind.physics(), motion)
     first = kind(scene.nodes(physics), scene.camera.pose)
     rng = np.random.default_rng(seed)
@@ -70,7 +70,8 @@ def save_scene(
             **arm,
             **changed,
         },
-        "rendering_node": {"mode": "lockstep", "image_width": sight.image_width, "baseline": sight.baseline},
+        "rendering_node": {"mode": "lockstep", "image_width": sight.image_width, "baseline": sight.baseline}
+        | ({"lockstep_camera": True} if kind.roams else {}),
         "policy": {"task": task, "scene": str(folder.resolve()), "seed": seed, "tool": named, "dye": sight.dye},
     }
     sections = {f"/**/{node}": {"ros__parameters": values} for node, values in parameters.items()}

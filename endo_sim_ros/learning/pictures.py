@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from endo_sim_ros.core.cameras import Camera, invert_pose
+from endo_sim_ros.core.cameras import Camera, invert_pose, sent_poses
 from endo_sim_ros.core.device import download, upload
 from endo_sim_ros.core.dye import DyedSpot, dyed
 from endo_sim_ros.core.light import SURFACE
@@ -40,6 +40,7 @@ class _View:
     moved: np.ndarray | None = None  # how it departs from where the endoscope is, as `Variation.camera` has it
     light: tuple[float, float] = (1.0, 0.0)  # brightness, and by how much less corners have
     contrast: float = 1.0  # factor on the colours' coefficients
+    lamp: np.ndarray = field(default_factory=lambda: np.zeros(4))  # m, in the camera of the left eye, and 1
     lamps: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # [E, 3] m, in the camera of each eye
     metal: np.ndarray = field(default_factory=lambda: np.ones(2))  # factors on what surfaces give back and on their roughness
 
@@ -112,9 +113,10 @@ class Pictures:
 
     def look_from(self, poses: np.ndarray) -> None:
         """Let the endoscopes be at poses [B, 4, 4], camera to world, m; each departs from it as its episode has it."""
-        for view, pose in zip(self._views, poses):
+        for b, (view, pose) in enumerate(zip(self._views, sent_poses(poses))):
             view.poses = self._eyes(pose, view.moved)
-        self._viewmats[:] = np.array([[invert_pose(pose) for pose in view.poses] for view in self._views]).swapaxes(0, 1)
+            view.lamps = self._lamps_of(view.poses, view.lamp)
+            self._show(b, view)
 
     def reset(self, episodes: Tensor, variations: Sequence[Variation], spots: Sequence[Sequence[DyedSpot]]) -> None:
         """Show these episodes [n] at rest, each with its variation and its dyed spots."""
@@ -228,9 +230,14 @@ class Pictures:
             view.contrast, lamp = variation.texture, lamp + np.append(variation.lamp, 0.0)
             view.metal = variation.metal
         view.poses = self._eyes(pose, view.moved)
-        lamp = view.poses[0] @ lamp
-        view.lamps = np.stack([(invert_pose(each) @ lamp)[:3] for each in view.poses])
+        view.lamp, view.lamps = lamp, self._lamps_of(view.poses, lamp)
         return view
+
+    @staticmethod
+    def _lamps_of(poses: tuple[np.ndarray, ...], lamp: np.ndarray) -> np.ndarray:
+        """Where a lamp [4] of the left eye is in the camera of each [E, 3], m."""
+        shining = poses[0] @ lamp
+        return np.stack([(invert_pose(pose) @ shining)[:3] for pose in poses])
 
     def _eyes(self, pose: np.ndarray, moved: np.ndarray | None) -> tuple[np.ndarray, ...]:
         """Poses of the eyes of an endoscope at a pose [4, 4] that it departs from, as `Variation.camera` has it."""

@@ -18,13 +18,13 @@ from endo_sim_ros.learning.pictures import IMAGE, IMAGE_RIGHT
 from endo_sim_ros.learning.policies import make_policy
 from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.learning.task_batch import ARM_STATE
-from endo_sim_ros.learning.tasks import find_graph_task
+from endo_sim_ros.learning.tasks import find_task
 from endo_sim_ros.messages import OK, STATE, WARN, PolicyState
 from endo_sim_ros.nodes.base import EndoNode, run
 from endo_sim_ros.nodes.configs import PolicyConfig, arm_names
 from endo_sim_ros.nodes.listeners import Listeners, delivered
 
-_DYED_WITHIN = 1.0  # seconds that the spot of an episode has to arrive before its first picture is rendered
+_DYED_WITHIN = 1.0  # seconds that the spot of an episode, and its camera, have to arrive before its first picture is rendered
 _STRAY = 1.0  # seconds in which pictures of a rest before the first reset may still come
 _PATIENCE = 30.0  # seconds; a request to a physics_node that was killed just now is never answered
 
@@ -40,19 +40,24 @@ class PolicyNode(EndoNode):
         (arm,) = arm_names([config.arm])
         try:
             scene = load_scene(config.scene or None)
-            task = find_graph_task(config.task)
+            task = find_task(config.task)
             physics = task.physics()
             self._task = task(scene.nodes(physics), scene.camera.pose)
             self._policy = policy = make_policy(config.policy, config.task, device=config.device)
             self._tools = None if policy.actions == "cartesian" else HeldTools([hold_tool(task, scene, config.tool)], task, 1)
         except ValueError as error:
             raise ConfigError(str(error)) from error
+        if task.roams and self._tools is not None:
+            raise ConfigError(
+                f"policy: {config.task} acts by the joints of the endoscope, not by those of the tool, as {config.policy} does"
+            )
         if not self._task.same_tissue and config.episodes > 1:
             raise ConfigError(f"episodes: {config.task} has one episode over topics, as its tissue is part of physics_node's parameters")
         self._step_ns = round(physics.step_duration * 1e9)
         self._pose_pub = self.publisher((messages.tool_joint_command if self._tools else messages.tool_pose_command)(arm))
         self._jaw_pub = self.publisher(messages.tool_jaw(arm))
         self._dye_pub = self.publisher(messages.DYE)
+        self._camera_pub = self.publisher(messages.CAMERA_POSE) if task.roams else None
         self._listeners = Listeners((self._pose_pub, self._jaw_pub))
         self._resetting = self.create_client(Trigger, f"{config.physics_node}/reset")
         self._state, self._missing = PolicyState.WAITING, ""  # and what for
@@ -191,8 +196,17 @@ class PolicyNode(EndoNode):
         self._state = PolicyState.WORKING
         self._command(tips, closed, self._stamp)
 
+    def _send_camera(self, stamp: int) -> None:
+        """Publish where the endoscope is, if the task moves it; where an episode begins, wait until it has arrived."""
+        poses = self._task.endoscopes()
+        if self._camera_pub is not None and poses is not None:
+            self._camera_pub.publish(messages.encode_pose(poses[0], stamp, self._config.world_frame))
+            if stamp == self._model_stamp:
+                delivered(self._camera_pub, _DYED_WITHIN)
+
     def _command(self, tips: np.ndarray, closed: np.ndarray, stamp: int) -> None:
         """Publish where the tip shall be [1, 3], m, world, or the joints that put it there, and whether the jaw is closed [1]."""
+        self._send_camera(stamp)
         if self._tools is None:
             self._pose_pub.publish(messages.encode_pose(self._poses(tips)[0], stamp, self._config.world_frame))
         else:

@@ -10,7 +10,6 @@ from endo_sim_ros.core.light import SURFACE
 from endo_sim_ros.instruments import load_arm, place_arm
 from endo_sim_ros.learning.config import DemonstrationConfig, SightConfig
 from endo_sim_ros.learning.demonstrations import demonstrate
-from endo_sim_ros.learning.graph_files import save_scene
 from endo_sim_ros.learning.policies import scripted_policy
 from endo_sim_ros.learning.scenes import Scene, load_scene
 from endo_sim_ros.learning.task_batch import TaskBatch
@@ -100,9 +99,6 @@ def test_a_demonstration_tells_where_the_endoscope_is_and_goes(tmp_path):
     assert np.abs(joints[-1, 3]) < Camera.level and np.abs(joints[0, 3]) > Camera.level
 
 
-def test_what_the_endoscope_cannot_do_is_refused(tmp_path):
+def test_actions_of_the_joints_of_the_tool_are_refused():
     with pytest.raises(ValueError, match="camera acts by the joints of the endoscope, not by those of the tool; leave actions"):
         make("camera", actions="joints")
-    with pytest.raises(ValueError, match="camera moves the endoscope, which policy_node does not do; use the environments"):
-        save_scene(load_scene(), tmp_path, "camera")
-    assert not list(tmp_path.iterdir())

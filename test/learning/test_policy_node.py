@@ -90,6 +90,7 @@ def user():
         ("retraction", 2, True, MotionConfig()),
         ("palpation", 1, False, MotionConfig(breathing=0.004, heartbeat=0.001)),
         ("tracking", 1, False, MotionConfig()),
+        ("camera", 1, True, MotionConfig()),
     ],
 )
 def test_over_topics_observations_images_and_actions_are_bit_for_bit_those_of_the_environment(
@@ -119,7 +120,8 @@ def test_over_topics_observations_images_and_actions_are_bit_for_bit_those_of_th
         run(tmp_path / "scripted.npz")
         given = len(np.load(tmp_path / "scripted.npz")["rewards"]) + episodes  # and where each episode begins
         user.until(lambda: len(commands) == given, lambda: f"{len(commands)} of {given} commands")
-        pictured = make(task, observations="both", eyes=2, segmentation=True, instrument=instrument, motion=motion)
+        scene = tmp_path if TASKS[task].roams else None  # what lies around the synthetic patient is not in the files
+        pictured = make(task, scene=scene, observations="both", eyes=2, segmentation=True, instrument=instrument, motion=motion)
         images = assert_same_as_environment(tmp_path / "scripted.npz", scripted_policy(task), episodes, pictured)
         # They may come late; an earlier episode, or some pictures of one, may be missed.
         shown = lambda name: any(shows(part, name, images) for part in episodes_of(heard[name]))

@@ -19,18 +19,6 @@ TASKS: dict[str, type[Task]] = {task.name: task for task in (Retraction, Palpati
 """All tasks by their names."""
 
 
-def find_graph_task(name: str) -> type[Task]:
-    """As `find_task`, for a task over topics.
-
-    Raises:
-        ValueError: As `find_task` does, and if the task moves the endoscope.
-    """
-    task = find_task(name)
-    if task.roams:
-        raise ValueError(f"{name} moves the endoscope, which policy_node does not do; use the environments, demonstrate and benchmark")
-    return task
-
-
 def find_task(name: str) -> type[Task]:
     """The class of a task by its name, or by where it is: ``path/to/file.py:Class`` or ``package.module:Class``.
 

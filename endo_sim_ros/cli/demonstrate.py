@@ -7,13 +7,14 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
-from endo_sim_ros.learning.config import DemonstrationConfig, Randomisation, SightConfig
+from endo_sim_ros.core.config import ConfigError, unused_options
+from endo_sim_ros.learning.config import DemonstrationConfig, PersonConfig, Randomisation, SightConfig
 from endo_sim_ros.physics.config import MotionConfig
 
 
 @dataclass(frozen=True)
 class Command:
-    """Let a scripted policy solve a task many times, and write what it sees and does as a LeRobot dataset; called again, continue it."""
+    """Let a script, or a person in the browser, solve a task many times, and write it as a LeRobot dataset; called again, continue it."""
 
     task: Positional[str]
     """Name of the task, such as retraction or palpation; an unknown one is answered with the list."""
@@ -27,10 +28,36 @@ class Command:
     sight: Annotated[SightConfig, tyro.conf.arg(name="")] = field(default_factory=lambda: SightConfig(image_width=128))
     vary: Randomisation = field(default_factory=Randomisation)
     motion: MotionConfig = field(default_factory=MotionConfig)
+    page: PersonConfig = field(default_factory=PersonConfig)
 
     def run(self) -> None:
-        """Write the dataset; raises SequenceError if the folder has other data."""
+        """Write the dataset; raises SequenceError if the folder has other data, ValueError if options cannot be used."""
+        for text in unused_options(self.config):
+            raise ConfigError(text)
+        if self.config.by == "person":
+            self._by_person()
+            return
+        if self.page != PersonConfig():
+            raise ConfigError("page: there is none while by is script; set by to person")
         from endo_sim_ros.learning.demonstrations import demonstrate
 
         episodes, tried = demonstrate(self.task, self.scenes, self.out, self.config, self.sight, self.vary, self.motion, self.device)
         print(f"{self.out}: {episodes} solved episodes; {tried} were tried now")
+
+    def _by_person(self) -> None:
+        from endo_sim_ros.learning.by_person import demonstrate_by_person
+        from endo_sim_ros.learning.gamepad import find_gamepad
+        from endo_sim_ros.viewer.demonstration_page import DemonstrationPage
+
+        gamepad = find_gamepad(self.page)
+        page = DemonstrationPage(self.page)
+        print(f"open {page.url} in a browser; Ctrl-C ends", flush=True)
+        devices = [page] if gamepad is None else [page, gamepad]
+        try:
+            episodes = demonstrate_by_person(
+                self.task, self.scenes, self.out, page, devices, self.page, self.config,
+                self.sight, self.vary, self.motion, self.device,
+            )  # fmt: skip
+        finally:
+            page.stop()
+        print(f"{self.out}: {episodes} solved episodes")

@@ -147,24 +147,32 @@ def quat_to_matrix(quat: ArrayLike) -> np.ndarray:
 
 
 def matrix_to_quat(matrix: ArrayLike) -> np.ndarray:
-    """Quaternion wxyz [4] with w >= 0 of a rotation matrix [3, 3] (Bar-Itzhack: exact for rotations, nearest otherwise)."""
-    m = np.asarray(matrix, np.float64)
+    """Quaternions wxyz [..., 4] with w >= 0 of rotation matrices [..., 3, 3] (Bar-Itzhack: exact for rotations, nearest otherwise)."""
+    m = np.moveaxis(np.asarray(matrix, np.float64), (-2, -1), (0, 1))
+    o = np.zeros(m.shape[2:])
     K = np.array(
         [
-            [m[0, 0] - m[1, 1] - m[2, 2], 0, 0, 0],
-            [m[0, 1] + m[1, 0], m[1, 1] - m[0, 0] - m[2, 2], 0, 0],
-            [m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], m[2, 2] - m[0, 0] - m[1, 1], 0],
+            [m[0, 0] - m[1, 1] - m[2, 2], o, o, o],
+            [m[0, 1] + m[1, 0], m[1, 1] - m[0, 0] - m[2, 2], o, o],
+            [m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], m[2, 2] - m[0, 0] - m[1, 1], o],
             [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1], m.trace()],
         ]
     )
-    x, y, z, w = np.linalg.eigh(K / 3.0)[1][:, -1]  # eigh reads the lower triangle
-    quat = np.array([w, x, y, z])
-    return -quat if w < 0 else quat
+    found = np.linalg.eigh(np.moveaxis(K, (0, 1), (-2, -1)) / 3.0)[1][..., -1]  # xyzw; eigh reads the lower triangle
+    quats = np.roll(found, 1, -1)
+    return np.where(quats[..., :1] < 0, -quats, quats)
 
 
 def make_pose(position: ArrayLike, quat: ArrayLike) -> np.ndarray:
     """Rigid transform [4, 4] of a position [3], metres, and a quaternion wxyz [4], which need not be normalised."""
     return rigid_pose(quat_to_matrix(quat), position)
+
+
+def sent_poses(poses: np.ndarray) -> np.ndarray:
+    """Rigid transforms [..., 4, 4] as whoever receives them in messages has them: rotations travel as quaternions, in double precision."""
+    received = poses.copy()
+    received[..., :3, :3] = quat_to_matrix(matrix_to_quat(poses[..., :3, :3]))
+    return received
 
 
 def look_at(position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, -1.0, 0.0)) -> np.ndarray:

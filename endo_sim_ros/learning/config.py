@@ -1,7 +1,7 @@
 """Parameters of environments and of training."""
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from endo_sim_ros.core.config import Range, StageConfig
 
@@ -147,16 +147,46 @@ class BenchmarkConfig(StageConfig):
 
 @dataclass(frozen=True)
 class DemonstrationConfig(StageConfig):
-    """Demonstrations by the scripted policy of a task."""
+    """Demonstrations of a task."""
 
+    by: Literal["script", "person"] = "script"
+    """Who solves the episodes: the scripted policy of the task, or a person in a page in the browser."""
     episodes: Annotated[int, Range(1, 1_000_000)] = 50
     """Solved episodes of the dataset."""
     seed: Annotated[int, Range(0, 2**31 - 1)] = 0
     """Seed of the first episode; each following one has the next seed."""
     environments: Annotated[int, Range(1, 10_000)] = 16
-    """Episodes at once; the dataset does not depend on it on a CPU."""
+    """Episodes of a script at once; the dataset does not depend on it on a CPU."""
     noise: Annotated[float, Range(0, 2)] = 0.1
-    """Standard deviation of what is added to each action before it acts, in its units of -1 to 1. What is written is the action without
-    it, so that the data show how an expert recovers (DART, Laskey et al. 2017)."""
+    """Standard deviation of what is added to each action of a script before it acts, in its units of -1 to 1. What is written is the
+    action without it, so that the data show how an expert recovers (DART, Laskey et al. 2017)."""
     images: Literal["video", "png"] = "video"
     """video: small (H.264); png: exact."""
+
+    needs: ClassVar[dict[str, tuple[str, ...]]] = {"environments": ("by", "script"), "noise": ("by", "script")}
+
+
+@dataclass(frozen=True)
+class PersonConfig(StageConfig):
+    """What a person sees, and acts with."""
+
+    host: str = "127.0.0.1"
+    """Address that the page is served on; 0.0.0.0 lets other machines in, all of them, and none has to log in."""
+    port: Annotated[int, Range(1, 65535)] = 8080
+    """Port of the page; the next free one if it is taken."""
+    width: Annotated[int, Range(16, 4096, "pixels")] = 640
+    """Width of the picture in the page. The dataset has pictures of its own width."""
+    pace: Annotated[float, Range(0.02, 1)] = 1.0
+    """How fast time goes in an episode; 1 is real time, 0.5 gives twice as long to act. The dataset has the rate of the task."""
+    gamepad: str = ""
+    """File of a gamepad, such as /dev/input/js0; empty = the first one that there is, none = none."""
+    stick_right: Annotated[int, Range(0, 63)] = 0
+    """Axis of the gamepad that moves to the right."""
+    stick_down: Annotated[int, Range(0, 63)] = 1
+    """Axis of the gamepad that moves down in the picture."""
+    stick_near: Annotated[int, Range(0, 63)] = 4
+    """Axis of the gamepad that moves towards the endoscope when it is pulled."""
+    stick_turn: Annotated[int, Range(0, 63)] = 3
+    """Axis of the gamepad that turns, in tasks whose fourth number is a speed."""
+    dead_zone: Annotated[float, Range(0, 0.9)] = 0.15
+    """Part of the way of a stick that does nothing, as sticks do not return to their middle."""

@@ -1,4 +1,4 @@
-"""Demonstrations: scripted policies solve episodes of a task, and what they see and do is written as a LeRobot dataset.
+"""Demonstrations: a script or a person solves episodes of a task, and what is seen and done is written as a LeRobot dataset.
 
 Columns beside those that every LeRobot dataset has:
 
@@ -8,14 +8,16 @@ observation.segmentation       what is in each pixel, on request
 observation.state              of each arm alone, in the axes of the world: pose of the tip (m, xyzw), jaw (rad), and
                                the force of the tissue on the tool (N)
 observation.joints             yaw, pitch, insertion (m), roll, wrist_pitch, wrist_yaw, where there is an instrument
+observation.endoscope          yaw, pitch, insertion (m) and roll of its arm, where the actions move it
 observation.environment_state  the state observation of the task, which knows the goal
 action                         what the task takes, -1 to 1: how far each tip moves in its frame, and the fourth number
 command.pose                   the same as a command: pose of the tip in the world, and jaw
+command.endoscope              or joints of the endoscope's arm
 next.reward, .done, .success   what the action led to
 seed                           of the episode
 =============================  ==================================================================================
 
-With the observations of row k the policy took the action of row k.
+With the observations of row k the action of row k was taken.
 """
 
 import json
@@ -46,14 +48,15 @@ from endo_sim_ros.learning.dataset import (
 )
 from endo_sim_ros.learning.policies import Policy, scripted_policy
 from endo_sim_ros.learning.scenes import load_scene
-from endo_sim_ros.learning.task_batch import TaskBatch
-from endo_sim_ros.learning.tasks import Task
+from endo_sim_ros.learning.task_batch import Observed, TaskBatch
+from endo_sim_ros.learning.tasks import Camera, Task
 from endo_sim_ros.physics import MotionConfig
 
 _COLUMNS = {"image": IMAGE, "image_right": IMAGE_RIGHT, "segmentation": SEGMENTATION}
 _OPTIONS = "meta/demonstrations.json"  # what the episodes depend on
 _SAVE_EVERY = 10.0  # seconds; a process that is killed loses at most the episodes of this time
 _FEWEST = 0.02  # share of episodes that the script must solve
+_BY = {"script": "A scripted policy", "person": "A person"}
 _CARD = """---
 license: apache-2.0
 task_categories:
@@ -66,7 +69,7 @@ tags:
 
 # {task}
 
-{episodes} simulated episodes, {frames} frames at {fps} Hz, of the task *{task}* of endo_sim_ros: {sentence} A scripted policy solved them.
+{episodes} simulated episodes, {frames} frames at {fps} Hz, of the task *{task}* of endo_sim_ros: {sentence} {by} solved them.
 
 ```python
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -81,13 +84,82 @@ dataset = LeRobotDataset("local/{name}", root="{name}")
 
 
 @dataclass
-class _Episode:
+class Episode:
     """What is known of an episode so far, a row each."""
 
     rng: np.random.Generator
     rows: dict[str, list[Any]] = field(default_factory=dict)
     pictures: dict[str, list[np.ndarray]] = field(default_factory=dict)
     solved: bool | None = None  # None = it goes on
+
+
+class Demonstrations:
+    """A dataset of episodes of a task, and what they take place in: begun, or taken up where it ends.
+
+    Args:
+        task: Its name.
+        scenes: What is seen and touched, each as `load_scene` takes it; the episode of seed n is in scene n modulo their number.
+        out: Folder of the dataset.
+        count: Episodes at once.
+        config, sight, randomisation, motion: Options.
+        device: Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N.
+
+    Attributes:
+        batches: The environments of each scene.
+        seed: That of the next episode.
+
+    Raises:
+        SequenceError: If the folder has other data.
+        ValueError: If there is no such task, or an option cannot be used.
+        RuntimeError: If pyarrow is not installed.
+    """
+
+    def __init__(
+        self,
+        task: str,
+        scenes: Sequence[str | Path],
+        out: Path,
+        count: int,
+        config: DemonstrationConfig,
+        sight: SightConfig,
+        randomisation: Randomisation,
+        motion: MotionConfig,
+        device: str,
+    ):
+        make = partial(TaskBatch, task, randomisation=randomisation, sight=sight, device=device, motion=motion)
+        self.batches = [make(load_scene(scene), count=count, observations="both") for scene in scenes]
+        first = self.batches[0]
+        fps = round(1 / first.task.physics().step_duration)
+        noise = config.noise if config.by == "script" else 0.0
+        options = {"task": task, "scenes": list(map(str, scenes)), "seed": config.seed, "noise": noise, "by": config.by}
+        self._options = options | {**asdict(sight), **asdict(randomisation), **asdict(motion)}
+        _check_options(out, self._options)
+        features = _features(first, fps, config.images)
+        if other := [scene for scene, batch in zip(scenes, self.batches) if _features(batch, fps, config.images) != features]:
+            raise SequenceError(f"{other[0]} has pictures of another size than {scenes[0]}, but a dataset has one size of each kind")
+        self._writer = DatasetWriter(out, first.task.sentence, fps, features)
+        seeds = self._writer.column("seed")
+        self.seed = int(seeds[-1]) + 1 if len(seeds) else config.seed
+        self._out, self._task, self._fps = out, task, fps
+
+    @property
+    def episodes(self) -> int:
+        """Number of episodes in the dataset."""
+        return self._writer.episodes
+
+    def add(self, episode: Episode, seed: int) -> None:
+        """Write an episode."""
+        columns = {name: np.array(values) for name, values in episode.rows.items()}
+        columns = {name: values if values.dtype == bool else values.astype(np.float32) for name, values in columns.items()}
+        self._writer.add(columns | {"seed": np.full(len(columns["action"]), seed)}, episode.pictures)
+
+    def save(self) -> None:
+        """Write what describes all episodes so far; without it the newest are not part of the dataset."""
+        if self._writer.episodes:
+            self._writer.save()
+            (self._out / _OPTIONS).write_text(json.dumps(self._options, indent=4))
+            by = _BY[self._options["by"]]
+            (self._out / "README.md").write_text(_card(self._out, self._task, self._fps, self._writer, by), "utf8")
 
 
 def demonstrate(
@@ -100,66 +172,42 @@ def demonstrate(
     motion: MotionConfig = MotionConfig(),
     device: str = "auto",
 ) -> tuple[int, int]:
-    """Write solved episodes of a task, or continue where an interrupted call ended; returns their number and how many were tried now.
+    """Let the script of a task solve episodes and write them; returns the number of all in the dataset, and how many were tried now.
 
-    Args:
-        task: Its name.
-        scenes: What is seen and touched, each as `load_scene` takes it; episodes take them in turn.
-        out: Folder of the dataset. Finished episodes stay in it when the call is interrupted.
-        config, sight, randomisation, motion: Options.
-        device: Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N.
+    The arguments are those of `Demonstrations`, and so is what it raises. Finished episodes stay in the dataset when the call is
+    interrupted, and the next one continues it.
 
     Raises:
-        SequenceError: If the folder has other data, or hardly an episode is solved.
-        ValueError: If there is no such task, or an option cannot be used.
-        RuntimeError: If pyarrow is not installed.
+        SequenceError: If hardly an episode is solved, too.
     """
-    make = partial(TaskBatch, task, randomisation=randomisation, sight=sight, device=device, motion=motion)
-    batches = [make(load_scene(scene), count=config.environments, observations="both") for scene in scenes]
-    first = batches[0]
-    policy = scripted_policy(task, first.count)
-    fps = round(1 / first.task.physics().step_duration)
-    options = {"task": task, "scenes": list(map(str, scenes)), "seed": config.seed, "noise": config.noise}
-    options |= {**asdict(sight), **asdict(randomisation), **asdict(motion)}
-    _check_options(out, options)
-    features = _features(first, fps, config.images)
-    if other := [scene for scene, batch in zip(scenes, batches) if _features(batch, fps, config.images) != features]:
-        raise SequenceError(f"{other[0]} has pictures of another size than {scenes[0]}, but a dataset has one size of each kind")
-    writer = DatasetWriter(out, first.task.sentence, fps, features)
-    seeds = writer.column("seed")
-    seed, tried = int(seeds[-1]) + 1 if len(seeds) else config.seed, 0
-
-    def save() -> None:
-        if writer.episodes:
-            writer.save()
-            (out / _OPTIONS).write_text(json.dumps(options, indent=4))
-            (out / "README.md").write_text(_card(out, task, fps, writer), "utf8")
-
+    demonstrations = Demonstrations(task, scenes, out, config.environments, config, sight, randomisation, motion, device)
+    batches, count, seed, tried = demonstrations.batches, config.environments, demonstrations.seed, 0
+    policy = scripted_policy(task, count)
     saved = time.monotonic()
     try:
         with Progress() as bar:
-            progress = bar.add_task(task, total=config.episodes, completed=writer.episodes)
-            while writer.episodes < config.episodes:
+            progress = bar.add_task(task, total=config.episodes, completed=demonstrations.episodes)
+            while demonstrations.episodes < config.episodes:
                 # Seed n is of scene n mod their number, however many episodes run at once.
-                own = [np.arange(first.count) * len(batches) + seed + (i - seed) % len(batches) for i in range(len(batches))]
+                own = [np.arange(count) * len(batches) + seed + (i - seed) % len(batches) for i in range(len(batches))]
                 played = [_play(batch, policy, config.noise, numbers) for batch, numbers in zip(batches, own)]
                 episodes = dict(zip(np.concatenate(own).tolist(), chain(*played)))
                 for number in sorted(episodes):
-                    if writer.episodes == config.episodes:
+                    if demonstrations.episodes == config.episodes:
                         break
                     tried += 1
                     if episodes[number].solved:
-                        _write(writer, episodes[number], number)
-                        bar.update(progress, completed=writer.episodes)
+                        demonstrations.add(episodes[number], number)
+                        bar.update(progress, completed=demonstrations.episodes)
                 seed += len(episodes)
                 if time.monotonic() - saved > _SAVE_EVERY:
-                    save()
+                    demonstrations.save()
                     saved = time.monotonic()
-                if tried * _FEWEST > 1 and writer.episodes < tried * _FEWEST:
-                    raise SequenceError(f"{writer.episodes} of {tried} episodes were solved; less noise or randomisation helps")
+                if tried * _FEWEST > 1 and demonstrations.episodes < tried * _FEWEST:
+                    raise SequenceError(f"{demonstrations.episodes} of {tried} episodes were solved; less noise or randomisation helps")
     finally:
-        save()
-    return writer.episodes, tried
+        demonstrations.save()
+    return demonstrations.episodes, tried
 
 
 def _check_options(out: Path, options: dict[str, Any]) -> None:
@@ -169,49 +217,68 @@ def _check_options(out: Path, options: dict[str, Any]) -> None:
         before = json.loads((out / _OPTIONS).read_text("utf8"))
     except (OSError, ValueError) as error:
         raise SequenceError(f"{out} exists already and has no demonstrations; choose another name or remove it first") from error
+    before = {"by": "script", **before}  # of a dataset from when there were no others
     other = [name for name, value in json.loads(json.dumps(options)).items() if before.get(name) != value]
     if other:
         had = ", ".join(f"{name} {before.get(name)!r}" for name in other)
         raise SequenceError(f"{out} was begun with {had}; continue it with the same options, or choose another name")
 
 
-def _play(batch: TaskBatch, policy: Policy, noise: float, seeds: np.ndarray) -> list[_Episode]:
+def _play(batch: TaskBatch, policy: Policy, noise: float, seeds: np.ndarray) -> list[Episode]:
     """One episode in each environment, each with its seed [B]."""
-    numbers, task = range(batch.count), batch.task
-    policy.reset(numbers)
-    batch.reset(numbers, [np.random.default_rng(seed) for seed in seeds])
-    episodes = [_Episode(np.random.default_rng([seed, 0xDA])) for seed in seeds]
-    seen = batch.observe()
+    episodes, seen = begin(batch, seeds)
+    policy.reset(range(batch.count))
     while any(episode.solved is None for episode in episodes):
-        assert isinstance(seen, dict)  # of state and images
         actions = np.clip(policy.act(seen["state"]), -1, 1)
-        rows = {
-            "observation.state": batch.arm_state(),
-            "observation.environment_state": seen["state"],
-            "action": actions,
-            "command.pose": _commands(task, actions),
-        }
-        if batch.tools is not None:
-            rows["observation.joints"] = batch.tools.joints.reshape(batch.count, -1).copy()
-        noisy = actions + noise * np.stack([episode.rng.standard_normal(batch.action_size) for episode in episodes])
-        after, outcome = batch.step(np.clip(noisy, -1, 1))
-        rows |= {"next.reward": outcome.reward, "next.done": outcome.terminated | outcome.truncated, "next.success": outcome.success}
-        for b, episode in enumerate(episodes):
-            if episode.solved is None:
-                for name, values in rows.items():
-                    episode.rows.setdefault(name, []).append(values[b])
-                for name in seen.keys() & _COLUMNS.keys():
-                    episode.pictures.setdefault(_COLUMNS[name], []).append(seen[name][b].squeeze())
-                if rows["next.done"][b]:
-                    episode.solved = bool(outcome.success[b])
-        seen = after
+        noisy = actions + noise * np.stack([episode.rng.standard_normal(actions.shape[1]) for episode in episodes])
+        seen = take(batch, episodes, seen, actions, noisy)
     return episodes
 
 
-def _write(writer: DatasetWriter, episode: _Episode, seed: int) -> None:
-    columns = {name: np.array(values) for name, values in episode.rows.items()}
-    columns = {name: values if values.dtype == bool else values.astype(np.float32) for name, values in columns.items()}
-    writer.add(columns | {"seed": np.full(len(columns["action"]), seed)}, episode.pictures)
+def begin(batch: TaskBatch, seeds: Sequence[int] | np.ndarray) -> tuple[list[Episode], dict[str, np.ndarray]]:
+    """Begin an episode in each environment, each with its seed [B]; returns them, and what is observed first."""
+    batch.reset(range(batch.count), [np.random.default_rng(seed) for seed in seeds])
+    return [Episode(np.random.default_rng([seed, 0xDA])) for seed in seeds], _observed(batch.observe())
+
+
+def take(
+    batch: TaskBatch, episodes: Sequence[Episode], seen: dict[str, np.ndarray], actions: np.ndarray, noisy: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Take a step in all episodes, and add its row to those that go on; returns what is observed after it.
+
+    Args:
+        batch: The environments.
+        episodes: What is known of each so far [B].
+        seen: What was observed before the step.
+        actions: What is written [B, n].
+        noisy: What is done [B, n].
+    """
+    rows = {
+        "observation.state": batch.arm_state(),
+        "observation.environment_state": seen["state"],
+        "action": actions,
+        "command.pose": _commands(batch.task, actions),
+    }
+    if batch.tools is not None:
+        rows["observation.joints"] = batch.tools.joints.reshape(batch.count, -1).copy()
+    if isinstance(batch.task, Camera):
+        rows |= {"observation.endoscope": batch.task.joints.copy(), "command.endoscope": batch.task.aim(actions)}
+    after, outcome = batch.step(np.clip(noisy, -1, 1))
+    rows |= {"next.reward": outcome.reward, "next.done": outcome.terminated | outcome.truncated, "next.success": outcome.success}
+    for b, episode in enumerate(episodes):
+        if episode.solved is None:
+            for name, values in rows.items():
+                episode.rows.setdefault(name, []).append(values[b])
+            for name in seen.keys() & _COLUMNS.keys():
+                episode.pictures.setdefault(_COLUMNS[name], []).append(seen[name][b].squeeze())
+            if rows["next.done"][b]:
+                episode.solved = bool(outcome.success[b])
+    return _observed(after)
+
+
+def _observed(seen: Observed) -> dict[str, np.ndarray]:
+    assert isinstance(seen, dict)  # state and images
+    return seen
 
 
 def _commands(task: Task, actions: np.ndarray) -> np.ndarray:
@@ -233,6 +300,8 @@ def _features(batch: TaskBatch, fps: int, images: ImageFormat) -> dict[str, dict
     }
     if batch.tools is not None:
         vectors["observation.joints"] = by_arm(task, JOINTS)
+    if isinstance(batch.task, Camera):
+        vectors |= dict.fromkeys(("observation.endoscope", "command.endoscope"), [f"ECM.{name}" for name in JOINTS[:4]])
     kinds = {"next.reward": "float32", "next.done": "bool", "next.success": "bool", "seed": "int64"}
     camera, sight = batch.pictures.camera, batch.sight
     shown = [IMAGE, *([IMAGE_RIGHT] * (sight.eyes == 2)), *([SEGMENTATION] * sight.segmentation)]
@@ -241,10 +310,10 @@ def _features(batch: TaskBatch, fps: int, images: ImageFormat) -> dict[str, dict
     return features | {key: scalar_feature(kind) for key, kind in kinds.items()}
 
 
-def _card(out: Path, task: str, fps: int, writer: DatasetWriter) -> str:
+def _card(out: Path, task: str, fps: int, writer: DatasetWriter, by: str) -> str:
     """A README for those who find the dataset."""
     cells = ((f"`{key}`", feature["shape"], ", ".join(feature["names"] or ())) for key, feature in writer.features.items())
     columns = "\n".join("| {} | {} | {} |".format(*each) for each in cells)
     return _CARD.format(
-        task=task, episodes=writer.episodes, frames=writer.frames, fps=fps, sentence=writer.task, name=out.name, columns=columns
+        task=task, episodes=writer.episodes, frames=writer.frames, fps=fps, sentence=writer.task, by=by, name=out.name, columns=columns
     )

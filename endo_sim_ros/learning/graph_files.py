@@ -77,7 +77,8 @@ def save_scene(
             **tools,
             **changed,
         },
-        "rendering_node": {"mode": "lockstep", **arms(), "image_width": sight.image_width, "baseline": sight.baseline},
+        "rendering_node": {"mode": "lockstep", **arms(), "image_width": sight.image_width, "baseline": sight.baseline}
+        | ({"lockstep_camera": True} if kind.roams else {}),
         "policy": {"task": task, "scene": str(folder.resolve()), "seed": seed, "tool": named, "dye": sight.dye},
     }
     sections = {f"/**/{node}": {"ros__parameters": values} for node, values in parameters.items()}

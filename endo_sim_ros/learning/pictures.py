@@ -1,13 +1,14 @@
 """What the endoscope shows of B episodes: the tissue as it is now and the tool in it, for both eyes and as labels."""
 
+import copy
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.cameras import Camera, invert_pose, sent_poses
 from endo_sim_ros.core.device import download, upload
 from endo_sim_ros.core.dye import DyedSpot, dyed
 from endo_sim_ros.core.light import SURFACE
@@ -35,9 +36,11 @@ _AT_ONCE = 64  # images rasterised together, and on a CPU drawn into
 class _View:
     """How one episode is seen."""
 
-    cameras: tuple[Camera, ...]  # of each eye
-    light: np.ndarray | None = None  # [H, W, 1] factor, None = 1
+    poses: tuple[np.ndarray, ...]  # of each eye [4, 4], camera to world, m
+    moved: np.ndarray | None = None  # how it departs from where the endoscope is, as `Variation.camera` has it
+    light: tuple[float, float] = (1.0, 0.0)  # brightness, and by how much less corners have
     contrast: float = 1.0  # factor on the colours' coefficients
+    lamp: np.ndarray = field(default_factory=lambda: np.zeros(4))  # m, in the camera of the left eye, and 1
     lamps: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # [E, 3] m, in the camera of each eye
     metal: np.ndarray = field(default_factory=lambda: np.ones(2))  # factors on what surfaces give back and on their roughness
 
@@ -52,16 +55,24 @@ class Pictures:
         sight: What is shown.
         randomisation: How episodes differ.
         held: The tools, or None where pictures show the tissue alone.
+        roams: Whether the endoscopes move within an episode.
     """
 
     def __init__(
-        self, scene: Scene, tissue: TissueBatch, count: int, sight: SightConfig, randomisation: Randomisation, held: HeldTools | None
+        self,
+        scene: Scene,
+        tissue: TissueBatch,
+        count: int,
+        sight: SightConfig,
+        randomisation: Randomisation,
+        held: HeldTools | None,
+        roams: bool = False,
     ):
         self._sight, self._by, self._held, self._count = sight, randomisation, held, count
-        camera, nodes = scene.camera, tissue.nodes
-        self.camera = camera.resized(sight.image_width, max(round(camera.height * sight.image_width / camera.width), 1))
+        nodes = tissue.nodes
+        self._set_width(scene.camera, sight.image_width)
         self._device = device = tissue.solver.device
-        moves = randomisation.camera_position or randomisation.camera_angle
+        moves = roams or randomisation.camera_position or randomisation.camera_angle
         self._model = (scene.whole if moves else scene.model).detach().to(device)
         self._tissue = tissue
         self._sh = self._model.sh.expand(count, -1, -1, -1).clone() if sight.dye else None  # of each episode
@@ -78,13 +89,37 @@ class Pictures:
         options = DrawingConfig()
         self._lamp = np.array([options.lamp_x, options.lamp_y, 0.0, 1.0])  # m, camera
         self._surfaces = np.array([SURFACES[material] for material in Material])  # [M, 5]
-        self._lens = lenses([self.camera])
         # What each picture needs in arrays, as it changes with episodes, not with steps.
         self._viewmats = np.zeros((sight.eyes, count, 4, 4))
         self._lamps = np.zeros((sight.eyes, count, 3))  # m, in the camera of each eye
-        self._views = [self._view(None)] * count
+        self._views = [self._view(None) for _ in range(count)]
         for b in range(count):
             self._show(b, self._views[b])
+
+    def _set_width(self, camera: Camera, width: int) -> None:
+        """Draw what a camera sees, with pictures of a width."""
+        self.camera = camera.resized(width, max(round(camera.height * width / camera.width), 1))
+        self._lens = lenses([self.camera])
+        slopes = self.camera.rays()[..., :2]
+        self._outward = ((slopes / np.abs(slopes).max((0, 1))) ** 2).sum(-1, keepdims=True)  # [H, W, 1]: 2 at the corners, about
+
+    def at_width(self, width: int) -> "Pictures":
+        """Pictures of another width of the same episodes, which go on as these do."""
+        other = copy.copy(self)  # shares the arrays
+        other._set_width(self.camera, width)
+        return other
+
+    @property
+    def poses(self) -> list[np.ndarray]:
+        """Where the left eye of each episode is [4, 4], camera to world, m."""
+        return [view.poses[0] for view in self._views]
+
+    def look_from(self, poses: np.ndarray) -> None:
+        """Let the endoscopes be at poses [B, 4, 4], camera to world, m; each departs from it as its episode has it."""
+        for b, (view, pose) in enumerate(zip(self._views, sent_poses(poses))):
+            view.poses = self._eyes(pose, view.moved)
+            view.lamps = self._lamps_of(view.poses, view.lamp)
+            self._show(b, view)
 
     def reset(self, episodes: Tensor, variations: Sequence[Variation], spots: Sequence[Sequence[DyedSpot]]) -> None:
         """Show these episodes [n] at rest, each with its variation and its dyed spots."""
@@ -100,7 +135,7 @@ class Pictures:
 
     def _show(self, b: int, view: _View) -> None:
         self._views[b], self._lamps[:, b] = view, view.lamps
-        self._viewmats[:, b] = [camera.viewmat for camera in view.cameras]
+        self._viewmats[:, b] = [invert_pose(pose) for pose in view.poses]
 
     @torch.no_grad()
     def draw(self, right: bool = False, labels: bool = False) -> dict[str, np.ndarray]:
@@ -125,11 +160,10 @@ class Pictures:
         else:
             marks = (alphas > SURFACE).to(torch.uint8)
         if self._model.light is not None:
-            cameras = [view.cameras[eye] for eye in eyes for view in views]
+            cameras = [self.camera.at(view.poses[eye]) for eye in eyes for view in views]
             colors = torch.stack([shade(self._model.light, *picture) for picture in zip(colors, depths, alphas, cameras)])
         if self._by.light:
-            one = np.ones((1, 1, 1), np.float32)
-            factors = [np.broadcast_to(one if view.light is None else view.light, (*colors.shape[1:3], 1)) for view in views]
+            factors = [(view.light[0] * (1 - view.light[1] * self._outward / 2)).astype(np.float32) for view in views]
             colors = colors * upload(self._device, np.array(factors * len(eyes)))[0]
         images, *rest = download(to_bytes(colors), *([marks[: len(own), ..., None]] if labels else []))
         found: dict[str, np.ndarray] = dict(zip((IMAGE, IMAGE_RIGHT), np.split(images, len(eyes))))
@@ -152,11 +186,11 @@ class Pictures:
         if self._model.reflects or self._model.sh_degree:
             F = torch.where(self._pinned, torch.eye(3, device=sh.device), self._tissue.F[rows])  # as on control_nodes
         if self._model.reflects:
-            positions = [view.cameras[eye].position for view in views]
+            positions = [view.poses[eye][:3, 3] for view in views]
             sh = seen_colors(self._model, self._skinning.cosines(F, self._means[rows], positions), sh)
         elif self._model.sh_degree:
             own = sh.expand(len(views), *sh.shape[-3:])
-            each = zip(own, self._means[rows], F, (view.cameras[eye] for view in views))
+            each = zip(own, self._means[rows], F, (self.camera.at(view.poses[eye]) for view in views))
             sh = torch.stack([turned_colors(own, self._skinning, means, F, camera) for own, means, F, camera in each])
         if self._by.texture:
             sh = sh * sh.new_tensor([view.contrast for view in views])[:, None, None, None]
@@ -191,24 +225,33 @@ class Pictures:
 
     def _view(self, variation: Variation | None) -> _View:
         """How an episode is seen; without a variation as the scene is."""
-        camera, view = self.camera, _View((self.camera,))
-        lamp = self._lamp
+        pose, lamp = self.camera.pose, self._lamp
+        view = _View((pose,))
         if variation is not None:
-            by, varied = self._by, variation.camera
-            pose = camera.pose.copy()
-            pose[:3, 3] += varied[:3, 3]
-            pose[:3, :3] = pose[:3, :3] @ varied[:3, :3]
-            if by.light:
-                brightness, falloff = variation.light
-                centred = (camera.rays()[..., :2] / np.abs(camera.rays()[..., :2]).max((0, 1))) ** 2
-                view.light = (brightness * (1 - falloff * centred.sum(-1, keepdims=True) / 2)).astype(np.float32)
-            camera = replace(camera, pose=pose) if by.camera_position or by.camera_angle else camera
+            by = self._by
+            view.moved = variation.camera if by.camera_position or by.camera_angle else None
+            view.light = tuple(variation.light.tolist()) if by.light else view.light
             view.contrast, lamp = variation.texture, lamp + np.append(variation.lamp, 0.0)
             view.metal = variation.metal
-        view.cameras = (camera,) if self._sight.eyes == 1 else (camera, camera.beside(self._sight.baseline))
-        lamp = camera.pose @ lamp
-        view.lamps = np.stack([(each.viewmat @ lamp)[:3] for each in view.cameras])
+        view.poses = self._eyes(pose, view.moved)
+        view.lamp, view.lamps = lamp, self._lamps_of(view.poses, lamp)
         return view
+
+    @staticmethod
+    def _lamps_of(poses: tuple[np.ndarray, ...], lamp: np.ndarray) -> np.ndarray:
+        """Where a lamp [4] of the left eye is in the camera of each [E, 3], m."""
+        shining = poses[0] @ lamp
+        return np.stack([(invert_pose(pose) @ shining)[:3] for pose in poses])
+
+    def _eyes(self, pose: np.ndarray, moved: np.ndarray | None) -> tuple[np.ndarray, ...]:
+        """Poses of the eyes of an endoscope at a pose [4, 4] that it departs from, as `Variation.camera` has it."""
+        camera = self.camera.at(pose)
+        if moved is not None:
+            pose = pose.copy()
+            pose[:3, 3] += moved[:3, 3]
+            pose[:3, :3] = pose[:3, :3] @ moved[:3, :3]
+            camera = camera.at(pose)
+        return (camera.pose,) if self._sight.eyes == 1 else (camera.pose, camera.beside(self._sight.baseline).pose)
 
 
 def _labels(drawing: InstrumentDrawing) -> np.ndarray:

@@ -52,7 +52,8 @@ class TaskBatch:
 
     Raises:
         ValueError: If there is no such task or tool, the scene is too small for it, an arm does not reach it, links shall touch
-            where each episode has another tool, or tissue cannot move so far.
+            where each episode has another tool, actions are of the tool's joints where they move the endoscope, or tissue cannot move
+            so far.
     """
 
     def __init__(
@@ -70,6 +71,8 @@ class TaskBatch:
         motion: MotionConfig = MotionConfig(),
     ):
         kind = find_task(task)
+        if kind.roams and actions != "cartesian":
+            raise ValueError(f"{task} acts by the joints of the endoscope, not by those of the tool; leave actions at cartesian")
         config = moving(kind.physics(device), motion)
         nodes = scene.nodes(config)
         self.task, self.count = kind(nodes, scene.camera.pose, count), count
@@ -89,6 +92,7 @@ class TaskBatch:
         self.tissue = TissueBatch(nodes, config, count, arms, stiffness=stiffness, capsules=capsules)
         self._varies = largest != 1
         self._moves = config.motion.breathing + config.motion.heartbeat > 0
+        self._works = not kind.roams or self._moves or bool(self._links)  # else nothing touches the tissue
         self._rest = torch.from_numpy(nodes.rest)
         self._resting, self._placed = True, False  # of a single tissue
         self.sight = sight
@@ -100,7 +104,8 @@ class TaskBatch:
         """What each episode has of each kind of randomisation that there is [B, …], by the names of the options."""
         self._rotations = np.tile(np.eye(3), (count * arms, 1, 1))  # of the tips, arm after arm of each episode, world
         if shown:
-            self.pictures = Pictures(scene, self.tissue, count, sight, randomisation, self.tools if sight.instrument else None)
+            shown_tools = self.tools if sight.instrument else None
+            self.pictures = Pictures(scene, self.tissue, count, sight, randomisation, shown_tools, kind.roams)
 
     def reset(self, episodes: Sequence[int], generators: Sequence[np.random.Generator]) -> None:
         """Begin these episodes anew, each by the chance of its generator."""
@@ -123,6 +128,13 @@ class TaskBatch:
             self.tools.begin(own, self._poses()[own])
         if self.pictures is not None:
             self.pictures.reset(chosen, variations, [self.task.dyed_spots(b) for b in episodes])
+            self._look()
+
+    def _look(self) -> None:
+        """Let the endoscopes be where the task has them."""
+        poses = self.task.endoscopes()
+        if poses is not None and self.pictures is not None:
+            self.pictures.look_from(poses)
 
     def _note(self, b: int, variation: Variation) -> None:
         """Keep what an episode has."""
@@ -160,6 +172,7 @@ class TaskBatch:
 
     def _advance(self, actions: np.ndarray, renew: Sequence[int], generators: Sequence[np.random.Generator]) -> None:
         tips, closed = self.task.act(actions) if self.actions == "cartesian" else self._act_by_joints(actions)
+        self._look()
         if len(renew):
             self.reset(renew, generators)
         tools, closed = self.tissue.tools, closed.reshape(self.count, -1)
@@ -184,7 +197,7 @@ class TaskBatch:
                     moved[number] |= not torch.equal(linked, self._linked[number])
                 self._linked[number] = linked
                 tools.set_links(number, links, linked)
-        step = self.count > 1 or not self._rests(moved)
+        step = self._works and (self.count > 1 or not self._rests(moved))
         if step:
             self.tissue.step()
         if self.tools is not None and not self._links and self.actions == "cartesian":  # while a GPU takes the step

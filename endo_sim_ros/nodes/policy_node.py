@@ -24,7 +24,7 @@ from endo_sim_ros.nodes.base import EndoNode, run
 from endo_sim_ros.nodes.configs import PolicyConfig, arm_names
 from endo_sim_ros.nodes.listeners import Listeners, delivered
 
-_DYED_WITHIN = 1.0  # seconds that the spot of an episode has to arrive before its first picture is rendered
+_DYED_WITHIN = 1.0  # seconds that the spot of an episode, and its camera, have to arrive before its first picture is rendered
 _TOLD_WITHIN = 1.0  # seconds that the last outcome has to arrive before the node exits
 _STRAY = 1.0  # seconds in which pictures of a rest before the first reset may still come
 _PATIENCE = 30.0  # seconds; a request to a physics_node that was killed just now is never answered
@@ -47,6 +47,10 @@ class PolicyNode(EndoNode):
             self._tools = None if policy.actions == "cartesian" else HeldTools(hold_tools(task, scene, config.tool), task, 1)
         except ValueError as error:
             raise ConfigError(str(error)) from error
+        if task.roams and self._tools is not None:
+            raise ConfigError(
+                f"policy: {config.task} acts by the joints of the endoscope, not by those of the tool, as {config.policy} does"
+            )
         if not self._task.same_tissue and config.episodes > 1:
             raise ConfigError(f"episodes: {config.task} has one episode over topics, as its tissue is part of physics_node's parameters")
         arms = arm_names([config.arm] if len(task.arms) == 1 else task.arms)
@@ -56,6 +60,7 @@ class PolicyNode(EndoNode):
         self._jaw_pubs = [self.publisher(messages.tool_jaw(arm)) for arm in arms]
         self._dye_pub = self.publisher(messages.DYE)
         self._outcome_pub = self.publisher(messages.TASK_OUTCOME)
+        self._camera_pub = self.publisher(messages.CAMERA_POSE) if task.roams else None
         self._listeners = Listeners((*self._pose_pubs, *self._jaw_pubs))
         self._resetting = self.create_client(Trigger, f"{config.physics_node}/reset")
         self._state, self._missing = PolicyState.WAITING, ""  # and what for
@@ -199,8 +204,17 @@ class PolicyNode(EndoNode):
         self._state = PolicyState.WORKING
         self._command(tips, closed, self._stamp)
 
+    def _send_camera(self, stamp: int) -> None:
+        """Publish where the endoscope is, if the task moves it; where an episode begins, wait until it has arrived."""
+        poses = self._task.endoscopes()
+        if self._camera_pub is not None and poses is not None:
+            self._camera_pub.publish(messages.encode_pose(poses[0], stamp, self._config.world_frame))
+            if stamp == self._model_stamp:
+                delivered(self._camera_pub, _DYED_WITHIN)
+
     def _command(self, tips: np.ndarray, closed: np.ndarray, stamp: int) -> None:
         """Publish where the tips [A] shall be, m, world, or the joints that put them there, and whether the jaws are closed [A]."""
+        self._send_camera(stamp)
         none, poses = np.zeros(0), self._poses(tips)
         for arm, (publisher, jaw) in enumerate(zip(self._pose_pubs, self._jaw_pubs)):
             if self._tools is None:

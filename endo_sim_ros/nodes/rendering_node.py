@@ -43,6 +43,7 @@ class RenderingNode(EndoNode):
         self._nodes_stamp = self._last_stamp = 0  # of that state, and of the newest image in real time, ns
         self._failure = ""  # why the newest model is not shown
         self._pose: np.ndarray | None = None
+        self._rest_pose: np.ndarray | None = None  # lockstep_camera: the newest with the stamp of the state at rest
         self._training_pose: np.ndarray | None = None
         self._info: CameraInfo | None = None
         self._right_info: CameraInfo | None = None
@@ -145,7 +146,9 @@ class RenderingNode(EndoNode):
         self._pose = pose
         if self._lockstep and self.options.lockstep_camera:
             stamp = messages.stamp_to_ns(message.header.stamp)
-            if stamp != self.tissue.model_stamp:  # that of the state at rest, which comes before or after those of all steps
+            if stamp == self.tissue.model_stamp:  # that of the state at rest, which comes before or after those of all steps
+                self._rest_pose = pose
+            else:
                 self._poses.put(stamp, pose, replace=True)
             self.show_states()
         elif not same:
@@ -234,6 +237,8 @@ class RenderingNode(EndoNode):
                 self._leave_out("belongs to a model that is gone")
                 continue
             camera, at_rest = self._camera(), stamp == nodes.model_stamp_ns  # the first observation
+            if at_rest and self._rest_pose is not None:
+                camera = camera and replace(camera, pose=self._rest_pose)
             if self._posed_camera(stamp, nodes):
                 pose = self._poses.find(stamp, later)
                 if pose is None:

@@ -20,7 +20,7 @@ _NODES = ("hidden", "positions", "stress")
 _PLAIN = (90, 230, 140)  # colour of nodes
 _LARGEST = 640, 512  # pixels of rendered pictures
 _ROOM = 20.0  # size of the invisible box around the tissue in which the mouse is heard, in sizes of the tissue
-_JPEG_QUALITY = 85
+JPEG_QUALITY = 85
 
 
 Render = Callable[[Camera], np.ndarray]
@@ -125,19 +125,9 @@ class Browser:
         self._camera_shown, self._endoscope_shown = None, (None, 0.0)
 
     def _listen(self, room: Any) -> None:
-        """Hear drags in the box: Shift pulls, Ctrl lifts, and plain ones pull where they are not for turning."""
-
-        def listen(modifier: str | None, lifts: bool) -> None:
-            async def on_drag(event: Any) -> None:  # a coroutine, as only those are called in order
-                pointer = Pointer(event.client_id, event.phase, event.start_screen_pos, event.end_screen_pos, lifts)
-                self._post(lambda: self._point(pointer))
-
-            room.on_drag("left", modifier=modifier)(on_drag)
-
-        listen("shift", False)
-        listen("cmd/ctrl", True)
-        if self._mouse.value == "pulls" or self.view == ENDOSCOPE:
-            listen(None, False)
+        """Hear drags in the box; plain ones where they are not for turning."""
+        plain = self._mouse.value == "pulls" or self.view == ENDOSCOPE
+        hear_drags(room, lambda pointer: self._post(lambda: self._point(pointer)), plain)
 
     def camera(self) -> Camera:
         """The camera of the picture that the browser shows, metres."""
@@ -156,7 +146,7 @@ class Browser:
     def look_from(self, camera: Camera) -> None:
         """Put the browser's camera where another one is, with the same field of view around the optical axis."""
         mine, old = self.client.camera, self.camera()
-        _, _, height = _around_axis(camera, old.width / old.height)
+        _, _, height = around_axis(camera, old.width / old.height)
         fov = float(2 * np.arctan(height / 2 / camera.K[1, 1]))
         if abs(mine.fov - fov) > 1e-6:
             mine.fov = fov
@@ -234,7 +224,7 @@ class Browser:
         return image
 
     def _send(self, image: np.ndarray) -> None:
-        self.client.scene.set_background_image(image, "jpeg", jpeg_quality=_JPEG_QUALITY)
+        self.client.scene.set_background_image(image, "jpeg", jpeg_quality=JPEG_QUALITY)
 
     # ------------------------------------------------------------------ video
 
@@ -257,6 +247,21 @@ class Browser:
         if self._video is not None:
             with suppress(OSError):
                 self._video.close()
+
+
+def hear_drags(room: Any, tell: Callable[[Pointer], None], plain: bool) -> None:
+    """Tell of drags in a box around what is seen: those with Shift pull, those with Ctrl lift, and plain ones pull if they shall."""
+
+    def listen(modifier: str | None, lifts: bool) -> None:
+        async def on_drag(event: Any) -> None:  # a coroutine, as only those are called in order
+            tell(Pointer(event.client_id, event.phase, event.start_screen_pos, event.end_screen_pos, lifts))
+
+        room.on_drag("left", modifier=modifier)(on_drag)
+
+    listen("shift", False)
+    listen("cmd/ctrl", True)
+    if plain:
+        listen(None, False)
 
 
 class VideoRecorder:
@@ -321,7 +326,7 @@ def fitted(image: np.ndarray, width: int, height: int) -> np.ndarray:
     return cv2.copyMakeBorder(small, below // 2, below - below // 2, right // 2, right - right // 2, cv2.BORDER_CONSTANT)
 
 
-def _around_axis(camera: Camera, aspect: float) -> tuple[float, float, float]:
+def around_axis(camera: Camera, aspect: float) -> tuple[float, float, float]:
     """The smallest picture of an aspect that holds a camera's and is centred at its optical axis: the width of its pixels
     in those of the height (fy / fx), its width in such pixels, and its height."""
     fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
@@ -332,7 +337,7 @@ def _around_axis(camera: Camera, aspect: float) -> tuple[float, float, float]:
 
 def padded(image: np.ndarray, camera: Camera, aspect: float) -> np.ndarray:
     """The picture in a black frame, such that it fills a canvas of an aspect and its optical axis is in the middle."""
-    square, width, height = _around_axis(camera, aspect)
+    square, width, height = around_axis(camera, aspect)
     M = np.array([[square, 0, width / 2 - camera.K[0, 2] * square], [0, 1, height / 2 - camera.K[1, 2]]], np.float64)
     M[:, 2] += M[:, :2] @ [0.5, 0.5] - 0.5  # pixel centres are at half numbers
     return cv2.warpAffine(image, M, (round(width), round(height)), flags=cv2.INTER_LINEAR)

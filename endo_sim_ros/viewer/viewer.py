@@ -25,7 +25,7 @@ from endo_sim_ros.viewer.stress import StressColors
 from endo_sim_ros.viewer.tool_marks import ARROW, Tool, ToolMarks
 
 _TEXT_EVERY = 0.5  # s
-_PANEL_WIDTH = 270  # pixels
+PANEL_WIDTH = 270  # pixels
 _NOTICE_FOR = 8.0  # s that a notice stays
 _TRAVEL = 0.8  # share of the physics' travel that the mouse may pull; tissue slips out of a jaw at 0.9
 _FOCAL = 0.85  # focal length of a camera that nothing is known of, in image widths
@@ -329,7 +329,7 @@ class Viewer:
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         gui.set_panel_label("endo-sim")
         gui.main_panel.dock_right()  # beside the picture, which it would cover otherwise
-        gui.main_panel.set_width(_PANEL_WIDTH)
+        gui.main_panel.set_width(PANEL_WIDTH)
         scene.configure_environment_map(None)  # only arrows are lit; surroundings and shadows cost seconds where a GPU is missing
         scene.configure_default_lights(cast_shadow=False)
         scene.add_light_ambient("/light", intensity=1.0)

@@ -13,6 +13,7 @@ from endo_sim_ros.core.cameras import (
     matrix_to_quat,
     quat_to_matrix,
     save_cameras,
+    sent_poses,
     slerp,
 )
 
@@ -116,3 +117,13 @@ def test_a_camera_sees_what_lies_in_its_picture_and_before_it():
     camera = Camera(np.array([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]]), 64, 48, np.eye(4))
     points = np.array([[0, 0, 1], [0.31, 0.23, 1], [0.33, 0, 1], [0, -0.25, 1], [0, 0, -1]])
     assert camera.sees(points).tolist() == [True, True, False, False, False]
+
+
+def test_poses_that_were_sent_are_the_same_one_by_one_and_together():
+    """Bit for bit, as a task and those who see it over topics have to agree."""
+    rng = np.random.default_rng(0)
+    poses = np.stack([make_pose(rng.normal(size=3), rng.normal(size=4)) for _ in range(50)])
+    sent = sent_poses(poses)
+    for pose, received in zip(poses, sent):
+        assert received.tobytes() == make_pose(pose[:3, 3], matrix_to_quat(pose[:3, :3])).tobytes()
+    np.testing.assert_allclose(sent, poses, atol=1e-15)

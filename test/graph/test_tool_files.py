@@ -116,7 +116,7 @@ ENCLAVES = {
     "rendering_node": (RenderingNode, [[]]),
     "scripted_tool_node": (ScriptedToolNode, [[]]),
     "viewer_node": (ViewerNode, [[], ["arm_source:=commanded"]]),
-    "policy_node": (PolicyNode, [[], ["policy:={joint_policy}"]]),
+    "policy_node": (PolicyNode, [[], ["policy:={joint_policy}"], ["task:=camera"]]),
     "bag_player_node": (BagPlayerNode, [["bag:=/does/not/exist"]]),
 }
 RULES = {

@@ -72,8 +72,9 @@ def test_the_tool_is_where_the_actions_put_its_tip(task):
     scripts, found = scripted_policy(task), np.zeros(len(batch.task.arms), int)
     for _ in range(20):
         for arm, tip in enumerate(batch.task.tips().reshape(-1, 3)):
-            at = tip + [0, 0, batch.task.physics().contact_radius]  # the camera looks along z
-            seen = batch.pictures.camera.K @ at
+            at = tip + [0, 0, batch.task.physics().contact_radius]  # a still camera looks along z
+            pose = batch.pictures.poses[0]
+            seen = batch.pictures.camera.K @ pose[:3, :3].T @ (at - pose[:3, 3])
             column, row = (seen[:2] / seen[2]).astype(int)
             jaws = np.argwhere(np.isin(observation["segmentation"][..., 0], np.add(JAWS, arm * len(LINKS))))
             if len(jaws) > 50:  # not out of the picture

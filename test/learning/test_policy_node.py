@@ -91,6 +91,7 @@ def user():
         ("palpation", 1, False, MotionConfig(breathing=0.004, heartbeat=0.001)),
         ("tracking", 1, False, MotionConfig()),
         ("tension", 1, True, MotionConfig()),
+        ("camera", 1, True, MotionConfig()),
     ],
 )
 def test_over_topics_observations_images_and_actions_are_bit_for_bit_those_of_the_environment(
@@ -124,7 +125,8 @@ def test_over_topics_observations_images_and_actions_are_bit_for_bit_those_of_th
         user.until(lambda: len(commands) == given, lambda: f"{len(commands)} of {given} commands")
         user.until(lambda: len(outcomes) == given - episodes, lambda: f"{len(outcomes)} of {given - episodes} outcomes")
         told = np.array([messages.decode_outcome(outcome, "task_outcome") for outcome in outcomes])
-        pictured = make(task, observations="both", eyes=2, segmentation=True, instrument=instrument, motion=motion)
+        scene = tmp_path if TASKS[task].roams else None  # what lies around the synthetic patient is not in the files
+        pictured = make(task, scene=scene, observations="both", eyes=2, segmentation=True, instrument=instrument, motion=motion)
         images = assert_same_as_environment(tmp_path / "scripted.npz", scripted_policy(task), episodes, pictured)
         # They may come late; an earlier episode, or some pictures of one, may be missed.
         shown = lambda name: any(shows(part, name, images) for part in episodes_of(heard[name]))

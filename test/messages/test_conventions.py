@@ -86,6 +86,7 @@ def ends(tmp_path_factory, small_bag, joint_policy):
         look(viewer_node.ViewerNode, arm_source=source)
     look(ScriptedToolNode)
     look(PolicyNode)
+    look(PolicyNode, task="camera")
     look(PolicyNode, policy=str(joint_policy))
     look(RecorderNode, bag=str(made / "bag"))
     return found

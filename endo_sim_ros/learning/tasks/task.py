@@ -58,6 +58,8 @@ class Task(ABC):
     horizon: int  # steps of an episode
     arms: tuple[str, ...] = ("PSM1",)  # that hold a tool each: PSM1 on the right of the picture, PSM2 on the left
     step_length = 0.002  # m in one step, per axis
+    roams = False  # whether the actions move the endoscope
+    turns = False  # whether the fourth number is a speed, which rests at 0
     working_fourth = -1.0  # fourth action of a tool at work in the tissue, as benchmarks give it
     force_limit: float  # N; above it tissue is hurt, and the episode lost
     low: tuple[float, float, float]  # where the tip may be, m, task frame
@@ -253,6 +255,10 @@ class Task(ABC):
     def stiffness(self, b: int) -> np.ndarray:
         """Factor on the moduli of each node [M] in episode b."""
         return np.ones(len(self.nodes))
+
+    def endoscopes(self) -> np.ndarray | None:
+        """Poses of the endoscopes now [B, 4, 4], camera to world, m; None where they stay where the scene has theirs."""
+        return None
 
     def dyed_spots(self, b: int) -> tuple[DyedSpot, ...]:
         """What is dyed in episode b, so that pictures tell the goal: the place that it is about."""

@@ -1,0 +1,204 @@
+"""Demonstrations by a person, who sees the endoscope's picture in real time and acts with a mouse, keys or a gamepad.
+
+What a person does goes into the same dataset, by the same code, as what a script does. Whatever is a `Screen`, or a `Device`, can be used.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, Protocol
+
+import numpy as np
+
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.learning.config import DemonstrationConfig, PersonConfig, Randomisation, SightConfig
+from endo_sim_ros.learning.demonstrations import Demonstrations, Episode, begin, take
+from endo_sim_ros.learning.pictures import IMAGE
+from endo_sim_ros.learning.task_batch import TaskBatch
+from endo_sim_ros.learning.tasks import Task
+from endo_sim_ros.physics import MotionConfig
+
+Word = Literal["again", "drop", "next", "finish"]
+"""What a person says: this episode from its beginning; the solved one before is not kept and comes again; another one; no more."""
+
+
+@dataclass
+class Wish:
+    """What a device asks for in one step."""
+
+    way: np.ndarray = field(default_factory=lambda: np.zeros(3))  # right, up and towards the endoscope, in largest steps, -1 … 1
+    turn: float = 0.0  # -1 … 1, the fourth number of a task where it is a speed
+    jaw: bool = False  # close it if it is open, and open it if it is closed
+    arm: bool = False  # act with the next arm from now on
+    word: Word | None = None
+
+
+class Device(Protocol):
+    """What a person acts with."""
+
+    def read(self) -> Wish:
+        """What it asks for now; called once a step."""
+        ...
+
+
+@dataclass
+class View:
+    """What a person is shown."""
+
+    image: np.ndarray  # [H, W, 3], uint8: what the left eye sees
+    camera: Camera
+    pixel: float  # how many of the largest steps take the tip as far as a pixel, at its depth
+    lines: tuple[str, ...]
+
+
+class Screen(Protocol):
+    """What a person looks at."""
+
+    def show(self, view: View) -> None:
+        """Show how things are, once a step."""
+        ...
+
+    def wait(self, until: float) -> None:
+        """Return when the clock, `time.monotonic`, says that it is time for the next step."""
+        ...
+
+
+def demonstrate_by_person(
+    task: str,
+    scenes: Sequence[str | Path],
+    out: Path,
+    screen: Screen,
+    devices: Sequence[Device],
+    person: PersonConfig = PersonConfig(),
+    config: DemonstrationConfig = DemonstrationConfig(by="person"),
+    sight: SightConfig = SightConfig(),
+    randomisation: Randomisation = Randomisation(),
+    motion: MotionConfig = MotionConfig(),
+    device: str = "auto",
+) -> int:
+    """Let a person solve episodes of a task and write them; returns the number of all in the dataset.
+
+    An episode begins when the person first moves, and goes on in real time. A solved one is kept when the next one begins, or the call
+    ends, also where it is interrupted; the next call continues the dataset. One that was lost begins anew.
+
+    Args:
+        screen: What the person looks at.
+        devices: What the person acts with.
+        person: Options of what is seen, and how fast.
+        task, scenes, out, config, sight, randomisation, motion, device: As for `Demonstrations`, which tells what is raised, too.
+    """
+    demonstrations = Demonstrations(task, scenes, out, 1, config, sight, randomisation, motion, device)
+    session = _Session(demonstrations, screen, devices, person, config.episodes)
+    try:
+        session.run()
+    finally:
+        session.keep()
+    return demonstrations.episodes
+
+
+class _Session:
+    """One person and one dataset."""
+
+    def __init__(self, demonstrations: Demonstrations, screen: Screen, devices: Sequence[Device], person: PersonConfig, wanted: int):
+        self._demonstrations, self._screen, self._devices, self._wanted = demonstrations, screen, devices, wanted
+        self._pace = person.pace
+        self._shown = [batch.pictures.at_width(person.width) for batch in demonstrations.batches if batch.pictures is not None]
+        self._solved: tuple[Episode, int] | None = None  # with its seed: not kept yet
+        self._said = ""  # what became of the episode before
+
+    def run(self) -> None:
+        """Until there are as many episodes as wanted, or the person has had enough."""
+        seed = self._demonstrations.seed
+        while self._demonstrations.episodes + (self._solved is not None) < self._wanted:
+            episode, word = self._play(seed)
+            if word == "finish":
+                return
+            if word == "drop" and self._solved is not None:
+                (_, seed), self._solved, self._said = self._solved, None, "dropped; it comes again"
+            elif word == "next":
+                seed += 1
+            elif episode.solved:
+                self._solved, seed = (episode, seed), seed + 1
+
+    def keep(self) -> None:
+        """Write the solved episode that has not been kept yet."""
+        if self._solved is not None:
+            (episode, seed), self._solved = self._solved, None
+            self._demonstrations.add(episode, seed)
+            self._demonstrations.save()
+
+    def _play(self, seed: int) -> tuple[Episode, Word | None]:
+        """One episode, and the word of the person that ended it, if one did."""
+        number = seed % len(self._demonstrations.batches)
+        batch = self._demonstrations.batches[number]
+        (episode,), seen = begin(batch, [seed])
+        period = batch.task.physics().step_duration / self._pace
+        actions, arm, begun = np.tile([0.0, 0.0, 0.0, -1.0], (batch.action_size // 4, 1)), 0, False
+        rested, due = False, time.monotonic()
+        while episode.solved is None:
+            self._screen.show(self._view(number, arm, actions, begun))
+            self._screen.wait(due)
+            due = max(due, time.monotonic() - period) + period  # what cannot be kept up with is left out
+            wishes = [device.read() for device in self._devices]
+            words: list[Word] = [wish.word for wish in wishes if wish.word]
+            if words:
+                self._said = ""
+                return episode, words[0]
+            arm = (arm + sum(wish.arm for wish in wishes)) % len(actions)
+            actions[:, :3] = 0
+            actions[arm, :3] = np.clip(np.sum([wish.way for wish in wishes], 0), -1, 1)
+            if batch.task.turns:
+                actions[:, 3] = 0
+                actions[arm, 3] = np.clip(sum(wish.turn for wish in wishes), -1, 1)
+            elif sum(wish.jaw for wish in wishes) % 2:
+                actions[arm, 3] *= -1
+            moves = actions[arm, :3].any() or actions[arm, 3] not in (0, -1)
+            if not begun and not (moves and rested):  # what the hand still does of the episode before begins none
+                rested |= not moves
+                if not batch.task.turns:
+                    actions[:, 3] = -1
+                continue
+            if not begun:
+                self.keep()
+                begun, self._said = True, ""
+            action = actions.reshape(1, -1).copy()
+            seen = take(batch, [episode], seen, action, action)
+        self._said = "solved: it is kept when you begin, unless you drop it" if episode.solved else self._lost(batch)
+        return episode, None
+
+    @staticmethod
+    def _lost(batch: TaskBatch) -> str:
+        task = batch.task
+        why = "too much force" if _force(batch) > task.force_limit else "out of time" if task.steps[0] >= task.horizon else "not the goal"
+        return f"lost: {why}; here it is again"
+
+    def _view(self, number: int, arm: int, actions: np.ndarray, begun: bool) -> View:
+        """What the person sees now of a scene, with an arm at work."""
+        batch, pictures = self._demonstrations.batches[number], self._shown[number]
+        task, camera = batch.task, pictures.camera.at(pictures.poses[0])
+        _, depths = camera.project(task.tips().reshape(-1, 3)[arm : arm + 1])
+        pixel = max(float(depths[0]), 0.0) / camera.K[1, 1] / task.step_length
+        left = (task.horizon - task.steps[0]) * task.physics().step_duration
+        lines = (
+            task.sentence,
+            f"{self._demonstrations.episodes + (self._solved is not None)} of {self._wanted} episodes",
+            f"{left:.1f} s left" if begun else "move to begin",
+            f"{_force(batch):.2f} N of {task.force_limit:g} N",
+            *([f"arm {arm + 1} of {len(actions)}"] if len(actions) > 1 else []),
+            *([] if task.turns else [_state(task, actions[arm, 3])]),
+            *([self._said] if self._said else []),
+        )
+        return View(pictures.draw()[IMAGE][0], camera, pixel, lines)
+
+
+def _state(task: Task, fourth: float) -> str:
+    """What the fourth number of an action does."""
+    if task.closes(np.ones(1))[0]:
+        return "jaw closed" if task.closes(np.array([fourth]))[0] else "jaw open"
+    return f"fourth number {fourth:+.0f}"
+
+
+def _force(batch: TaskBatch) -> float:
+    """The greatest force on a tool, N."""
+    return float(np.sqrt((batch.task.force.reshape(-1, 3) ** 2).sum(1)).max())

@@ -1,0 +1,183 @@
+"""Demonstrations by a person: the same dataset as a script's, by devices that the tests make."""
+
+import json
+import os
+import struct
+import subprocess
+import sys
+import urllib.request
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from endo_sim_command import endo_sim
+
+from endo_sim_ros.learning import demonstrations
+from endo_sim_ros.learning.by_person import Wish, demonstrate_by_person
+from endo_sim_ros.learning.config import DemonstrationConfig, PersonConfig, SightConfig
+from endo_sim_ros.learning.demonstrations import demonstrate
+from endo_sim_ros.learning.gamepad import Gamepad, find_gamepad
+
+SIGHT = SightConfig(image_width=40, eyes=2, segmentation=True)
+SCENES = ["phantom:0", "phantom:1"]
+BY_PERSON = DemonstrationConfig(by="person", images="png", seed=7)
+
+
+class Screen:
+    """Nobody looks at it, and time does not pass."""
+
+    def __init__(self):
+        self.views = []
+
+    def show(self, view):
+        self.views.append(view)
+
+    def wait(self, until):
+        pass
+
+
+class Hand:
+    """Asks for what stands in a list, and then ends."""
+
+    def __init__(self, *wishes):
+        self.wishes = [Wish(), *wishes]
+
+    def read(self):
+        return self.wishes.pop(0) if self.wishes else Wish(word="finish")
+
+
+def wishes(actions):
+    """What a hand asks for, so that a single tool takes these actions [T, 4]: its jaw closes, or opens, where the last number changes."""
+    before = -1.0
+    for action in actions:
+        yield Wish(action[:3].copy(), jaw=action[3] != before)
+        before = action[3]
+
+
+def tables(root):
+    return [pq.read_table(path) for path in sorted(root.glob("data/*/*.parquet"))]
+
+
+@pytest.fixture(scope="module")
+def scripted(tmp_path_factory):
+    """Two episodes by the script, without noise, and its actions in each."""
+    out, played, kept = tmp_path_factory.mktemp("scripted") / "out", demonstrations.take, []
+
+    def take(batch, episodes, seen, actions, noisy):
+        if not episodes[0].rows:
+            kept.append([])
+        kept[-1].append(actions[0].copy())
+        return played(batch, episodes, seen, actions, noisy)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(demonstrations, "take", take)
+        config = replace(BY_PERSON, by="script", episodes=2, environments=1, noise=0.0)
+        assert demonstrate("retraction", SCENES, out, config, SIGHT, device="cpu") == (2, 2)
+    return out, sorted(kept[:2], key=len), kept[:2]
+
+
+def by_hand(out, hand, episodes=2, screen=None):
+    config = replace(BY_PERSON, episodes=episodes)
+    return demonstrate_by_person("retraction", SCENES, out, screen or Screen(), [hand], PersonConfig(width=80), config, SIGHT, device="cpu")
+
+
+def acted(scripted):
+    """The script's actions in the order of the seeds: the scene of seed 7 is the second."""
+    _, _, (of_first_scene, of_second_scene) = scripted
+    return of_second_scene, of_first_scene
+
+
+@pytest.mark.slow
+def test_the_same_actions_give_the_same_dataset_whoever_takes_them(scripted, tmp_path):
+    first, second = acted(scripted)
+    screen = Screen()
+    idle = [Wish(np.array([0, 0, 1.0])), *[Wish()] * 3]  # an episode begins when the person rests, and then moves
+    assert by_hand(tmp_path / "out", Hand(*wishes(first), *idle, *wishes(second)), screen=screen) == 2
+    for mine, other in zip(tables(tmp_path / "out"), tables(scripted[0]), strict=True):
+        assert mine.equals(other)
+    assert "A person solved them" in (tmp_path / "out/README.md").read_text()
+    view = screen.views[0]
+    assert view.image.shape[1] == 80 and view.image.std() > 5 and "move to begin" in view.lines
+    assert any("solved" in line for line in screen.views[1 + len(first)].lines)
+    K, depth = view.camera.K, 0.1
+    assert 0.5 * depth / K[1, 1] / 0.002 < view.pixel < 1.5 * depth / K[1, 1] / 0.002, "steps of 2 mm at the depth of the tip"
+
+
+@pytest.mark.slow
+def test_an_interrupted_person_goes_on_and_may_drop_what_was_solved(scripted, tmp_path):
+    first, second = acted(scripted)
+    out = tmp_path / "out"
+
+    class Tired(Hand):
+        def read(self):
+            if not self.wishes:
+                raise KeyboardInterrupt
+            return super().read()
+
+    with pytest.raises(KeyboardInterrupt):
+        by_hand(out, Tired(*wishes(first), Wish(), *list(wishes(second))[:5]))
+    assert json.loads((out / "meta/info.json").read_text())["total_episodes"] == 1, "the solved one is kept"
+    half = list(wishes(second))[:4]
+    hand = Hand(*half, Wish(word="again"), Wish(), *wishes(second), Wish(word="drop"), Wish(), *wishes(second), Wish(word="finish"))
+    assert by_hand(out, hand, episodes=3) == 2 and not hand.wishes
+    for mine, other in zip(tables(out), tables(scripted[0]), strict=True):
+        assert mine.equals(other)
+    lost = Hand(*[Wish(np.array([0, 0, 0.1]))] * 60, Wish())
+    screen = Screen()
+    assert by_hand(out, lost, episodes=3, screen=screen) == 2
+    assert "lost: out of time; here it is again" in screen.views[-1].lines
+    with pytest.raises(ValueError, match="was begun with .*by 'person'"):
+        demonstrate("retraction", SCENES, out, replace(BY_PERSON, by="script", noise=0.0), SIGHT, device="cpu")
+
+
+def test_sticks_and_buttons_of_a_gamepad_are_heard(tmp_path):
+    """As the kernel tells of them, through a pipe in the place of its file."""
+    path = tmp_path / "js0"
+    os.mkfifo(path)
+    writer = os.open(path, os.O_RDWR)
+    gamepad = Gamepad(path, PersonConfig())
+
+    def tell(*events):
+        os.write(writer, b"".join(struct.pack("=IhBB", 0, *event) for event in events))
+
+    tell((0, 0x82, 0), (0, 0x82, 1), (1, 0x81, 0), (-32767, 0x82, 2))  # how it is at first: a button held, a trigger at rest
+    wish = gamepad.read()
+    assert not wish.jaw and not wish.way.any() and wish.word is None
+    tell((32767, 2, 0), (16384, 2, 1), (-32767, 2, 4), (3000, 2, 3), (1, 1, 0), (0, 1, 0), (1, 1, 2))
+    wish = gamepad.read()
+    np.testing.assert_allclose(wish.way, [1, -(0.5 - 0.15) / 0.85, -1], atol=1e-3)
+    assert wish.jaw and wish.turn == 0 and wish.word == "drop"
+    again = gamepad.read()
+    assert not again.jaw and again.word is None and (again.way == wish.way).all(), "sticks stay, buttons are pressed once"
+    os.close(writer)
+    assert not gamepad.read().way.any(), "without it nothing moves"
+    assert find_gamepad(PersonConfig(gamepad="none")) is None
+    with pytest.raises(ValueError, match=r"gamepad: .*js7 cannot be opened \(No such file or directory\); name another, or none"):
+        find_gamepad(PersonConfig(gamepad=str(tmp_path / "js7")))
+
+
+def test_options_that_have_no_effect_are_refused(tmp_path):
+    done = endo_sim("demonstrate", "retraction", tmp_path / "out", "--by", "person", "--noise", 0.3)
+    assert done.returncode == 2 and "noise has no effect while by is person; set by to script" in done.stderr
+    done = endo_sim("demonstrate", "retraction", tmp_path / "out", "--page.port", 9000)
+    assert done.returncode == 2 and "page: there is none while by is script" in done.stderr
+
+
+@pytest.mark.dds
+def test_the_command_serves_a_page_for_a_person(tmp_path):
+    pytest.importorskip("viser")
+    port = 20000 + (os.getpid() + 31) % 20000
+    words = ["demonstrate", "retraction", tmp_path / "out", "--by", "person", "--page.port", port, "--device", "cpu"]
+    process = subprocess.Popen(
+        [sys.executable, "-u", "-m", "endo_sim_ros.cli", *map(str, words)], stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parents[2]
+    )
+    try:
+        line = next(line for line in process.stdout if line.startswith("open http"))
+        with urllib.request.urlopen(line.split()[1], timeout=20) as answer:
+            assert answer.status == 200 and b"<html" in answer.read().lower()
+    finally:
+        process.terminate()
+        assert process.wait(20) == 143
+    assert not (tmp_path / "out").exists(), "nothing was solved"

@@ -1,4 +1,4 @@
-"""Draws docs/tension.gif: the scripted policy of a task in one episode, its end held. OpenCV 4.11 or newer writes it.
+"""Draws docs/tension.gif and docs/handover.gif: a task solved by its scripted policy, the end held. OpenCV 4.11 or newer writes them.
 
 python docs/task_animation.py tension docs/tension.gif
 """

@@ -20,6 +20,7 @@ from endo_sim_ros.instruments.drawing import FIRST_LINK, SURFACES, InstrumentDra
 from endo_sim_ros.learning.config import Randomisation, SightConfig
 from endo_sim_ros.learning.held_tools import HeldTools
 from endo_sim_ros.learning.scenes import Scene
+from endo_sim_ros.learning.tasks import Task
 from endo_sim_ros.learning.variation import Variation
 from endo_sim_ros.physics import Skinning, TissueBatch
 from endo_sim_ros.rendering import turned_colors
@@ -51,39 +52,31 @@ class Pictures:
     Args:
         scene: What is seen.
         tissue: How it moves.
-        count: B.
+        task: What is done there in B episodes.
         sight: What is shown.
         randomisation: How episodes differ.
         held: The tools, or None where pictures show the tissue alone.
-        roams: Whether the endoscopes move within an episode.
     """
 
     def __init__(
-        self,
-        scene: Scene,
-        tissue: TissueBatch,
-        count: int,
-        sight: SightConfig,
-        randomisation: Randomisation,
-        held: HeldTools | None,
-        roams: bool = False,
+        self, scene: Scene, tissue: TissueBatch, task: Task, sight: SightConfig, randomisation: Randomisation, held: HeldTools | None
     ):
-        self._sight, self._by, self._held, self._count = sight, randomisation, held, count
+        self._sight, self._by, self._held, self._task, self._count = sight, randomisation, held, task, (count := task.count)
         nodes = tissue.nodes
         self._set_width(scene.camera, sight.image_width)
         self._device = device = tissue.solver.device
-        moves = roams or randomisation.camera_position or randomisation.camera_angle
+        moves = task.roams or randomisation.camera_position or randomisation.camera_angle
         self._model = (scene.whole if moves else scene.model).detach().to(device)
         self._tissue = tissue
         self._sh = self._model.sh.expand(count, -1, -1, -1).clone() if sight.dye else None  # of each episode
         self._skinning = Skinning(self._model, nodes.rest, device=device)
         self._means, self._covars = tissue.append_skinning(self._skinning)
         self._pinned = torch.from_numpy(nodes.pinned).to(device)[:, None, None]
-        self._drawings = (
-            [InstrumentDrawing([t.shape[0] for t in tools], device=device, capsules=[t.shape[1] for t in tools]) for tools in held.kinds]
-            if held
-            else []
-        )
+        self._thing = [thing] if (thing := task.thing()) else []
+        shapes = [[*(tool.shape for tool in tools), *self._thing] for tools in held.kinds] if held else []
+        self._drawings = [
+            InstrumentDrawing([parts for parts, _ in own], device=device, capsules=[capsules for _, capsules in own]) for own in shapes
+        ]
         self._tables = [torch.from_numpy(_labels(drawing)).to(device) for drawing in self._drawings]
         self._at_once = _AT_ONCE if torch.device(device).type == "cpu" else max(count, 1)
         options = DrawingConfig()
@@ -144,7 +137,7 @@ class Pictures:
         Args:
             right: Whether the right eye's are wanted.
             labels: Whether labels are: 0 background, 1 tissue, and then the links of the instruments in the order of `LINKS`, those of
-                PSM2 after those of PSM1.
+                PSM2 after those of PSM1, and the thing of the task.
         """
         parts = [
             self._render(np.arange(i, min(i + self._at_once, self._count)), right, labels) for i in range(0, self._count, self._at_once)
@@ -210,6 +203,8 @@ class Pictures:
         for number in np.unique(which):
             drawing, at = self._drawings[number], np.flatnonzero(which == number)
             links = held.posed(number, own[at])
+            if self._thing:
+                links.append({self._thing[0][0][0].link: self._task.thing_poses()[own[at]]})
             poses = np.stack([links[a][link] for a, link in drawing.links], 1)
             rows = np.concatenate([at + eye * len(own) for eye in range(eyes)])
             local = viewmats[rows, None] @ np.concatenate([poses] * eyes)
@@ -258,5 +253,5 @@ def _labels(drawing: InstrumentDrawing) -> np.ndarray:
     """The labels [256] that are shown for those of a drawing: as on rendered/segmentation/image, whatever parts the tool has."""
     table = np.arange(256, dtype=np.uint8)
     for label, (arm, link) in enumerate(drawing.links, FIRST_LINK):
-        table[label] = FIRST_LINK + len(LINKS) * arm + LINKS.index(link)
+        table[label] = FIRST_LINK + len(LINKS) * arm + (LINKS.index(link) if link in LINKS else 0)
     return table

@@ -104,8 +104,7 @@ class TaskBatch:
         """What each episode has of each kind of randomisation that there is [B, …], by the names of the options."""
         self._rotations = np.tile(np.eye(3), (count * arms, 1, 1))  # of the tips, arm after arm of each episode, world
         if shown:
-            shown_tools = self.tools if sight.instrument else None
-            self.pictures = Pictures(scene, self.tissue, count, sight, randomisation, shown_tools, kind.roams)
+            self.pictures = Pictures(scene, self.tissue, self.task, sight, randomisation, self.tools if sight.instrument else None)
 
     def reset(self, episodes: Sequence[int], generators: Sequence[np.random.Generator]) -> None:
         """Begin these episodes anew, each by the chance of its generator."""

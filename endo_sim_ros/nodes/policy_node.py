@@ -51,6 +51,8 @@ class PolicyNode(EndoNode):
             raise ConfigError(
                 f"policy: {config.task} acts by the joints of the endoscope, not by those of the tool, as {config.policy} does"
             )
+        if policy.sight is not None and task.thing() is not None:
+            raise ConfigError(f"policy: {config.policy} sees, and pictures over topics do not show what {config.task} is about")
         if not self._task.same_tissue and config.episodes > 1:
             raise ConfigError(f"episodes: {config.task} has one episode over topics, as its tissue is part of physics_node's parameters")
         arms = arm_names([config.arm] if len(task.arms) == 1 else task.arms)

@@ -111,7 +111,10 @@ def test_tasks_and_policies_of_files_are_found_and_what_is_wrong_is_said(press, 
         (f"{tmp_path / 'broken.py'}:Task", "cannot be loaded: ModuleNotFoundError: No module named 'nothing_of_this_name'"),
         (SEEKER, "is no task; a task is a subclass of endo_sim_ros.learning.tasks.Task"),
         (press + "ure", "has no 'Pressure'"),
-        ("sewing", "there is no task 'sewing'; there are retraction, palpation, tracking, tension, and your own as file.py:Class"),
+        (
+            "sewing",
+            "there is no task 'sewing'; there are retraction, palpation, tracking, tension, handover, camera, and your own as",
+        ),
     ):
         with pytest.raises(ValueError, match=re.escape(sentence)):
             find_task(named)

@@ -70,7 +70,7 @@ def test_the_tool_is_where_the_actions_put_its_tip(task):
     batch = environment.unwrapped.batch
     observation, _ = environment.reset(seed=5)
     scripts, found = scripted_policy(task), np.zeros(len(batch.task.arms), int)
-    for _ in range(20):
+    for _ in range(36):
         for arm, tip in enumerate(batch.task.tips().reshape(-1, 3)):
             at = tip + [0, 0, batch.task.physics().contact_radius]  # a still camera looks along z
             pose = batch.pictures.poses[0]

@@ -23,7 +23,9 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task, count", [("retraction", 48), ("palpation", 8), ("tracking", 32), ("tension", 16), ("camera", 32)])
+@pytest.mark.parametrize(
+    "task, count", [("retraction", 48), ("palpation", 8), ("tracking", 32), ("tension", 16), ("handover", 16), ("camera", 32)]
+)
 def test_scripted_policies_solve_their_tasks(task, count):
     batch = TaskBatch(task, load_scene(), count, device="cpu")
     returns, success, lengths = play(batch, scripted_policy(task, count), np.arange(count))
@@ -122,7 +124,7 @@ def test_the_code_in_the_guide_runs(tmp_path):
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_on_a_gpu_the_scripts_solve_as_on_a_cpu_and_images_are_alike():
-    for task, count in (("retraction", 256), ("palpation", 64), ("tracking", 256), ("tension", 256)):
+    for task, count in (("retraction", 256), ("palpation", 64), ("tracking", 256), ("tension", 256), ("handover", 256)):
         batch = TaskBatch(task, load_scene(), count, randomisation=Randomisation(stiffness=0.1), images=True, device="cuda")
         _, success, _ = play(batch, scripted_policy(task, count), np.arange(count))
         assert success.mean() > 0.9, task

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from endo_sim_ros.core.dye import DyedSpot
+from endo_sim_ros.instruments import Capsule, Part
 from endo_sim_ros.physics import ControlNodes, MotionConfig, PhysicsConfig
 
 if TYPE_CHECKING:
@@ -79,6 +80,11 @@ class Task(ABC):
     @abstractmethod
     def physics(device: str = "auto") -> PhysicsConfig:
         """The tissue and the tools of the task."""
+
+    @classmethod
+    def thing(cls) -> tuple[list[Part], list[Capsule]] | None:
+        """Parts and capsules of one link of a rigid thing that is drawn with the tools, if there is one."""
+        return None
 
     @staticmethod
     def script(count: int) -> "Policy":
@@ -263,6 +269,10 @@ class Task(ABC):
     def dyed_spots(self, b: int) -> tuple[DyedSpot, ...]:
         """What is dyed in episode b, so that pictures tell the goal: the place that it is about."""
         return (DyedSpot(self.origin[b].copy(), self.dyed_radius),)
+
+    def thing_poses(self) -> np.ndarray:
+        """Where the `thing` is [B, 4, 4], m, world."""
+        raise NotImplementedError
 
     def regions(self) -> tuple[str, ...]:
         """The stiffness of the first episode as physics_node's parameter `regions`; empty where it is 1 everywhere."""

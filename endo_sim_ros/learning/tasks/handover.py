@@ -123,7 +123,7 @@ class Handover(Task):
         self._lead[passed] = 1 - self._lead[passed]
         leading = self.tip[everyone, self._lead]
         self._offset[passed] = (self.needle - leading)[passed]
-        self.needle = np.where(self.holds.any(1)[:, None], leading + self._offset, self.needle)
+        self.needle = np.where(self.holds.any(1, keepdims=True), leading + self._offset, self.needle)
         off = norm(self._places(everyone, self._line)[:, None] - self.tip[:, :, None]).min(2)
         self.holds &= (off <= self.tolerance) | (self._lead[:, None] == [0, 1])
         free = ~self.holds.any(1)

@@ -1,0 +1,1 @@
+"""What tissue is made of, estimated from how it answers a tool."""

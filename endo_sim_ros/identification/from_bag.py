@@ -13,7 +13,7 @@ from endo_sim_ros.core.cameras import parse_frames
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
-from endo_sim_ros.identification.checks import check_clock, check_direction, check_place, distance_at_onset, overlap
+from endo_sim_ros.identification.force_checks import check_clock, check_direction, check_place, distance_at_onset, overlap
 from endo_sim_ros.identification.experiment import Experiment
 from endo_sim_ros.identification.following import follow_points, looked_at, near_way
 from endo_sim_ros.identification.recording_config import RecordingConfig, TouchConfig

@@ -1,0 +1,297 @@
+"""Estimation of what tissue is made of: Gauss-Newton on copies of the tissue, and the posterior by Laplace's method.
+
+Beside the unknowns four numbers are estimated that nobody asks for: the error of the place of the tool that all tips share [3], and the
+share by which all forces of the model are wrong. They have priors, too, so that intervals know of them.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.stats import norm
+
+from endo_sim_ros.identification.checks import IdentificationError, check_input, judge_residuals, survey
+from endo_sim_ros.identification.config import IdentificationConfig
+from endo_sim_ros.identification.experiment import Experiment
+from endo_sim_ros.identification.forward import ForwardModel, distances_to_skin, reach_of
+from endo_sim_ros.identification.maps import paint_as_regions
+from endo_sim_ros.identification.observations import Observations
+from endo_sim_ros.identification.unknowns import Reported, Told, Unknowns
+from endo_sim_ros.physics import ControlNodes, PhysicsConfig
+
+NUISANCES = 4
+OnProgress = Callable[[str, int, int], None]
+"""``on_progress(stage, done, total)``."""
+_FARTHEST = 1.5  # standard deviations that an unknown moves in one iteration
+_DAMPED, _LOOSENED, _MOST_DAMPED = 10.0, 0.1, 1e6
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One number and how well it is known.
+
+    Args:
+        name: Of it.
+        unit: Of it.
+        estimate: Median.
+        low: Lower end of its interval.
+        high: Upper end.
+        told: ``known``, ``ratio only``, or ``not told by these data``.
+        removed: Share of the variance before any data that the data took away; of the logarithm, or logit.
+    """
+
+    name: str
+    unit: str
+    estimate: float
+    low: float
+    high: float
+    told: Told
+    removed: float
+
+
+@dataclass(frozen=True)
+class Identification:
+    """What is known of the tissue.
+
+    Args:
+        unknowns: The numbers that were asked for.
+        findings: What was noticed in the data, a sentence each.
+        young_modulus: Of each control node [M], Pa; median.
+        low: Lower end of its interval [M].
+        high: Upper end [M].
+        known: Whether it is known [M], bool.
+        removed: Share of its variance that the data took away [M].
+        mean: Of the unknowns and the four others [P + 4], standard normal before any data.
+        covariance: Of these [P + 4, P + 4].
+        parameters: What the numbers mean.
+        nodes: Of the tissue.
+        level: Probability that an interval holds the truth.
+        chi_square: Of the residuals, over their number: about 1 where the model explains them.
+        steps: That were simulated, of all copies together.
+    """
+
+    unknowns: list[Estimate]
+    findings: list[str]
+    young_modulus: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    known: np.ndarray
+    removed: np.ndarray
+    mean: np.ndarray
+    covariance: np.ndarray
+    parameters: Unknowns = field(repr=False)
+    nodes: ControlNodes = field(repr=False)
+    level: float
+    chi_square: float
+    steps: int
+
+    def __getitem__(self, name: str) -> Estimate:
+        """The estimate of this name."""
+        for each in self.unknowns:
+            if each.name == name:
+                return each
+        raise KeyError(f"there is no unknown {name!r}, but {', '.join(each.name for each in self.unknowns)}")
+
+    @property
+    def tip_offset(self) -> np.ndarray:
+        """How far the tool stands from where it is said to [3], m, world."""
+        return self.mean[-NUISANCES:-1] * self.parameters.config.tip_offset
+
+    def regions(self, step: float = 0.2, most: int = 100) -> tuple[str, ...]:
+        """The map as `regions` of physics, see `paint_as_regions`."""
+        return paint_as_regions(self.nodes, self.young_modulus, step, most)
+
+    def summary(self) -> str:
+        """What is known, in lines that people read."""
+        lines = []
+        for each in self.unknowns:
+            unit = f" {each.unit}" if each.unit else ""
+            lines.append(
+                f"{each.name}: {each.estimate:.4g}{unit} ({100 * self.level:.0f} %: {each.low:.4g} to {each.high:.4g}{unit}), {each.told}"
+            )
+        if len(np.unique(self.young_modulus)) > 1:
+            lines.append(
+                f"young_modulus of {len(self.known)} control nodes: {self.young_modulus.min():.4g} to {self.young_modulus.max():.4g} Pa,"
+                f" known of {int(self.known.sum())}"
+            )
+        return "\n".join([*lines, *self.findings])
+
+
+@dataclass
+class _Point:
+    """The data as seen from one set of unknowns θ [Q]."""
+
+    theta: np.ndarray
+    residuals: list[np.ndarray]  # of each experiment [n], of the numbers that are used
+    jacobians: list[np.ndarray]  # of predictions [n, Q]
+    covariances: list
+
+
+def identify(
+    experiments: Sequence[Experiment],
+    nodes: ControlNodes,
+    physics: PhysicsConfig,
+    config: IdentificationConfig = IdentificationConfig(),
+    device: str = "auto",
+    progress: OnProgress | None = None,
+) -> Identification:
+    """Estimate what tissue is made of from how it answered a tool.
+
+    Args:
+        experiments: What was done and measured, each beginning with tissue at rest.
+        nodes: The tissue at rest.
+        physics: What it is as far as it is known; its values are the medians of the priors.
+        config: What is unknown.
+        device: Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N.
+        progress: Called as ``progress(stage, done, total)``.
+
+    Raises:
+        IdentificationError: If nothing can be estimated from the data; the sentence says what was seen.
+        ConfigError: If an unknown does not exist.
+    """
+    progress = progress or (lambda stage, done, total: None)
+    experiments = list(experiments)
+    check_input(experiments, len(nodes))
+    data = [Observations(each, config.tip_smoothing) for each in experiments]
+    unknowns = Unknowns(nodes, physics, config, touched_places(experiments, nodes, physics))
+    model = ForwardModel(nodes, physics, device)
+    progress("look at the data", 0, config.iterations)
+    first = survey(data, model, unknowns, config)
+    if not any(each.used.any() for each in data):
+        raise IdentificationError("nothing was measured: forces, displacements and tracks are all missing; give one of them")
+    theta = np.zeros(unknowns.count + NUISANCES)
+    theta[: unknowns.stiffness_count] = _scaled(unknowns, first.scale)
+    point = _minimise(theta, data, model, unknowns, config, progress)
+    return _conclude(point, data, model, unknowns, config, first.findings)
+
+
+def touched_places(experiments: Sequence[Experiment], nodes: ControlNodes, physics: PhysicsConfig) -> np.ndarray:
+    """Places of the tip while it may touch tissue [K, 3], m, world."""
+    reach, places = reach_of(physics, nodes), [np.zeros((0, 3))]
+    for each in experiments:
+        places.append(each.tips[distances_to_skin(each, nodes) <= reach])
+    return np.concatenate(places)
+
+
+def _scaled(unknowns: Unknowns, scale: float) -> np.ndarray:
+    """Numbers of stiffness [P'] with which all moduli are that many times as great, within two standard deviations."""
+    matrix = unknowns.matrix[:, : unknowns.stiffness_count]
+    whole = np.zeros(unknowns.stiffness_count)
+    if unknowns.config.stiffness == "field":
+        whole[0] = np.log(scale) / matrix[0, 0]
+    else:
+        whole[:] = np.log(scale) / unknowns.config.spread
+    return np.clip(whole, -2, 2)
+
+
+def look(theta: np.ndarray, data: list[Observations], model: ForwardModel, unknowns: Unknowns, config: IdentificationConfig) -> _Point:
+    """Residuals, Jacobian and covariance at θ, from one batch for each experiment."""
+    P = unknowns.count
+    z, offset, gain = theta[:P], theta[P : P + 3] * config.tip_offset, 1 + config.model_error * theta[P + 3]
+    copies = [unknowns.copy(z, offset)]
+    copies += [unknowns.copy(z + config.jacobian_step * np.eye(P)[p], offset) for p in range(P)]
+    copies += [unknowns.copy(z, offset + config.tip_step * np.eye(3)[axis]) for axis in range(3)]
+    residuals, jacobians, covariances = [], [], []
+    for each in data:
+        told = each.predicted(model.replay(each.experiment, copies))
+        forces = each.of_forces()
+        told[:, forces] *= gain
+        J = np.zeros((told.shape[1], P + NUISANCES))
+        J[:, :P] = (told[1 : P + 1] - told[0]).T / config.jacobian_step
+        by_tip = (told[P + 1 :] - told[0]).T / config.tip_step
+        J[:, P : P + 3] = by_tip * config.tip_offset
+        J[:, P + 3] = np.where(forces, told[0] / gain * config.model_error, 0)
+        residuals.append((each.values - told[0])[each.used])
+        jacobians.append(J[each.used])
+        covariances.append(each.covariance(by_tip))
+    return _Point(theta, residuals, jacobians, covariances)
+
+
+def _cost(residuals: list[np.ndarray], theta: np.ndarray, covariances: list) -> float:
+    return theta @ theta + sum(float(r @ R.solve(r[:, None])[:, 0]) for r, R in zip(residuals, covariances))
+
+
+def _normal(point: _Point) -> tuple[np.ndarray, np.ndarray]:
+    """JᵀR⁻¹J [Q, Q] and JᵀR⁻¹r [Q] of all experiments."""
+    H, g = np.zeros((len(point.theta),) * 2), np.zeros(len(point.theta))
+    for r, J, R in zip(point.residuals, point.jacobians, point.covariances):
+        weighted = R.solve(J)
+        H += J.T @ weighted
+        g += weighted.T @ r
+    return H, g
+
+
+def _minimise(
+    theta: np.ndarray, data: list[Observations], model: ForwardModel, unknowns: Unknowns, config: IdentificationConfig, progress: OnProgress
+) -> _Point:
+    """Levenberg and Marquardt's method. The covariance is that of the point that a step begins at: what is uncertain because the tip is
+    depends on the stiffness, but is no reason to believe in another."""
+    point = look(theta, data, model, unknowns, config)
+    damping = 1e-3
+    for iteration in range(config.iterations):
+        progress("estimate", iteration + 1, config.iterations)
+        H, g = _normal(point)
+        H = H + np.eye(len(theta))
+        g = g - point.theta
+        step = np.linalg.solve(H + damping * np.diag(np.diag(H)), g)
+        step *= min(1.0, _FARTHEST / max(float(np.abs(step).max()), 1e-12))
+        deviations = np.sqrt(np.diag(np.linalg.inv(H)))
+        if np.abs(step / deviations).max() < config.tolerance:
+            break
+        other = look(point.theta + step, data, model, unknowns, config)
+        before = _cost(point.residuals, point.theta, point.covariances)
+        if _cost(other.residuals, other.theta, point.covariances) < before:
+            point, damping = other, max(damping * _LOOSENED, 1e-6)
+        else:
+            damping *= _DAMPED if damping > 0.01 else 100 * _DAMPED
+            if damping > _MOST_DAMPED:
+                break
+    return point
+
+
+def _conclude(
+    point: _Point, data: list[Observations], model: ForwardModel, unknowns: Unknowns, config: IdentificationConfig, findings: list[str]
+) -> Identification:
+    H, _ = _normal(point)
+    chi_square = sum(float(r @ R.solve(r[:, None])[:, 0]) for r, R in zip(point.residuals, point.covariances))
+    determined = float(np.trace(np.linalg.solve(H + np.eye(len(H)), H)))
+    count = sum(len(r) for r in point.residuals)
+    factor, doubts = judge_residuals(chi_square, round(count - determined), config)
+    covariance = np.linalg.inv(H / factor + np.eye(len(H)))
+    quantile = float(norm.ppf(0.5 + config.level / 2))
+    feels = any(each.of_forces()[each.used].any() for each in data)
+    told = [_estimate(each, point.theta, covariance, quantile, feels, unknowns, config) for each in unknowns.reported()]
+    matrix = np.concatenate([unknowns.matrix, np.zeros((len(unknowns.nodes), NUISANCES))], 1)
+    middle = np.log(unknowns.base) + matrix @ point.theta
+    prior = (matrix**2).sum(1) + unknowns.residual
+    left = np.einsum("mi,ij,mj->m", matrix, covariance, matrix) + unknowns.residual
+    spread, removed = quantile * np.sqrt(left), 1 - left / prior
+    findings = [*findings, *doubts]
+    unsure = [each.name for each in told if each.told == "not told by these data"]
+    if unsure:
+        findings.append(f"these data do not tell {', '.join(unsure)}: the interval is nearly what was thought before")
+    return Identification(
+        told, findings, np.exp(middle), np.exp(middle - spread), np.exp(middle + spread), (removed >= config.known) & feels, removed,
+        point.theta, covariance, unknowns, unknowns.nodes, config.level, chi_square / max(count - determined, 1), model.steps,
+    )  # fmt: skip
+
+
+def _estimate(
+    reported: Reported, theta: np.ndarray, covariance: np.ndarray, quantile: float, feels: bool, unknowns: Unknowns,
+    config: IdentificationConfig,
+) -> Estimate:  # fmt: skip
+    row = np.concatenate([reported.row, np.zeros(NUISANCES)])
+    middle, variance, prior = row @ theta + reported.mean, row @ covariance @ row, row @ row
+    removed = 1 - variance / prior
+    told: Told = "known" if removed >= config.known else "not told by these data"
+    if reported.is_modulus and not feels:
+        # How it differs from the mean of all moduli.
+        stiffness = unknowns.matrix[:, : unknowns.stiffness_count].mean(0)
+        ratio = row.copy()
+        ratio[: unknowns.stiffness_count] -= stiffness
+        alone = ratio @ ratio
+        share = 1 - ratio @ covariance @ ratio / alone if alone > 1e-12 else 0.0
+        told = "ratio only" if share >= config.known else "not told by these data"
+    spread = quantile * np.sqrt(variance)
+    estimate, low, high = (float(reported.value(middle + side * spread)) for side in (0, -1, 1))
+    return Estimate(reported.name, reported.unit, estimate, low, high, told, float(removed))

@@ -1,6 +1,6 @@
 """From a recording to experiments: what tools did to tissue, and what was measured of it."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,20 +13,20 @@ from endo_sim_ros.core.cameras import parse_frames
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.frames import Frame, SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
-from endo_sim_ros.identification.force_checks import check_clock, check_direction, check_place, distance_at_onset, overlap
 from endo_sim_ros.identification.experiment import Experiment
 from endo_sim_ros.identification.following import follow_points, looked_at, near_way
-from endo_sim_ros.identification.recording_config import RecordingConfig, TouchConfig
+from endo_sim_ros.identification.force_checks import distance_at_onset
+from endo_sim_ros.identification.gathering import Gathered, Tool, count_touches, gather, read_tools
+from endo_sim_ros.identification.recording_config import RecordingConfig
 from endo_sim_ros.identification.surface import Surface
-from endo_sim_ros.identification.touches import Timeline, experiment, experiment_spans, tared, timeline, touches
-from endo_sim_ros.learning.streams import Stream, read_streams
+from endo_sim_ros.identification.touches import experiment
+from endo_sim_ros.learning.streams import read_streams
 from endo_sim_ros.messages import MessageError, Topic
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes
 from endo_sim_ros.sequences.bag import BagReader, feed
 from endo_sim_ros.sequences.synchronizer import Synchronizer
 
-_THINNEST, _THINNEST_CELL = 1.5, 0.3  # a capsule acts as at least this thick, as physics has it: node distances, grid cells
 _SAME_PLACE = 0.25  # spacings between a recorded control node and one of the model's that are taken for one
 _SAME_SCALE = 1.5  # times by which the recorded tissue may be larger or smaller than the model's: other options make it thicker
 _ENOUGH = 0.1  # share of the control nodes of the skin that must be in the places of recorded ones
@@ -55,13 +55,6 @@ class Recorded:
     seconds: float
     touches: int
     forces: bool
-
-
-def tool_radius(surface: Surface, nodes: ControlNodes, physics: PhysicsConfig) -> float:
-    """Radius of the capsule that a tool pushes with, m; 0 = it does not push."""
-    if not physics.contact_radius:
-        return 0.0
-    return max(physics.contact_radius, _THINNEST * surface.apart, _THINNEST_CELL * physics.grid_ratio * nodes.spacing)
 
 
 def read_experiments(
@@ -99,22 +92,11 @@ def read_experiments(
         pictures = _picture(topics)
         streams = _usable(bag, lambda: read_streams(reader, arms, frames, ()))
         motion = _motion(reader)
-    surface, findings, gathered = Surface(nodes), list[str](), []
-    radius = tool_radius(surface, nodes, physics)
-    still = round(config.settle / physics.step_duration)
-    read = lambda arm: _usable(bag, lambda: read_tool(arm, streams, surface, physics, config, radius, findings))  # noqa: E731
-    tools = {arm: read(arm) for arm in arms if messages.tool_pose(arm) in streams}
+    findings = list[str]()
+    tools = _usable(bag, lambda: read_tools(arms, streams, Surface(nodes), nodes, physics, config, findings))
     if not tools:
         raise SequenceError(f"{bag}: no pose with a time on /{messages.tool_pose(arms[0]).name}; record while the tool moves")
-    for arm, tool in tools.items():
-        spans, left_out = experiment_spans(tool.line, still)
-        if left_out:
-            findings.append(
-                f"{arm}: {left_out} of {len(touches(tool.line, still - 1))} touches are left out, as the tool was not seen away from the"
-                f" tissue for {config.settle:g} s before, so that it may not have been at rest"
-            )
-        spans = _alone(arm, spans, tools, streams, findings)
-        gathered += [(arm, span) for span in spans]
+    gathered = gather(tools, streams, physics, config, findings)
     if not gathered:
         raise SequenceError(_no_touch(bag, tools, physics, config, findings))
     if not physics.contact_radius and not any(tools[arm].line.closed[slice(*span)].any() for arm, span in gathered):
@@ -123,7 +105,7 @@ def read_experiments(
         )
     experiments = [experiment(tools[arm].line, span, physics.step_duration, tools[arm].noise, config) for arm, span in gathered]
     seconds = max(float(np.ptp(tool.line.times)) * 1e-9 for tool in tools.values())
-    count = sum(len(_within(touches(tools[arm].line), span)) for arm, span in gathered)
+    count = sum(count_touches(tools[arm].line, span, physics, config) for arm, span in gathered)
     length = sum(stop - start for _, (start, stop) in gathered) * physics.step_duration
     several = f"{count} touch{'es' * (count != 1)} in {len(experiments)} experiment{'s' * (len(experiments) != 1)} of {length:.1f} s in all"
     findings.insert(0, f"{seconds:.1f} s of {' and '.join(tools)}: {several}")
@@ -135,14 +117,14 @@ def read_experiments(
         findings.append(
             f"the tissue moves by itself, by up to {1e3 * motion:.1f} mm; that is not part of the model, give its motion as well"
         )
-    if config.motion in ("auto", "control_nodes") and messages.CONTROL_NODES in streams:
+    if config.observed in ("auto", "control_nodes") and messages.CONTROL_NODES in streams:
         on_progress("reading control nodes")
         experiments = _usable(bag, lambda: _with_nodes(bag, experiments, gathered, tools, nodes, config, findings))
-    elif config.motion in ("auto", "images") and pictures:
+    elif config.observed in ("auto", "images") and pictures:
         on_progress("following points")
         experiments = _with_tracks(bag, experiments, gathered, tools, model, frames, pictures, config, findings)
-    elif config.motion in ("images", "control_nodes"):
-        raise SequenceError(f"{bag}: motion is {config.motion}, but there are none in the recording")
+    elif config.observed in ("images", "control_nodes"):
+        raise SequenceError(f"{bag}: observed is {config.observed}, but there are none in the recording")
     elif not measured:
         raise SequenceError(
             f"{bag}: neither forces nor images with camera_info and pose, nor control nodes: nothing tells how the tissue answers"
@@ -153,79 +135,11 @@ def read_experiments(
 # ------------------------------------------------------------------------------------------------------------------ tools
 
 
-@dataclass(frozen=True)
-class Tool:
-    """A tool, with forces that are zero in the air, and the standard deviation of their components there, N."""
-
-    line: Timeline
-    noise: float
-
-
-def read_tool(
-    arm: str,
-    streams: Mapping[Topic, Stream],
-    surface: Surface,
-    physics: PhysicsConfig,
-    config: TouchConfig,
-    radius: float,
-    findings: list[str],
-) -> Tool:
-    """One tool on steps of the physics, with what is to be said of its forces.
-
-    Raises:
-        SequenceError: If the forces contradict the poses.
-    """
-    forces = streams.get(messages.tool_reaction(arm))
-    jaw = streams.get(messages.tool_jaw_state(arm), streams.get(messages.tool_jaw(arm)))
-    line = timeline(streams[messages.tool_pose(arm)], jaw, forces, surface, physics, config, radius)
-    if not len(line.times) or forces is None:
-        return Tool(line, 0.0)
-    if text := overlap(line, int(forces.stamps[0]), int(forces.stamps[-1]), config.force_delay):
-        raise SequenceError(f"{arm}/body/measured_cf: {text}")
-    inside = line.present & (line.depths > config.clearance + 1e-3)
-    if line.measured.any() and not np.nan_to_num(line.forces).any():
-        if inside.any():
-            findings.append(f"{arm}: all forces are 0, also where the tool is in the tissue: nobody measured them, and they are left out")
-        return Tool(replace(line, forces=np.full_like(line.forces, np.nan)), 0.0)
-    line, noise, offset = tared(line, round(config.settle / physics.step_duration))
-    if offset.any():
-        findings.append(f"{arm}: forces of {np.linalg.norm(offset):.2g} N while the tool touches nothing were taken off all forces")
-    floor = max(noise, config.force_noise)
-    if noise > config.force_noise:
-        findings.append(f"{arm}: a component of the force has a noise of {noise:.2g} N in the air, more than force_noise")
-    check_clock(arm, line, physics.step_duration, floor)
-    findings += [text for text in (check_direction(arm, line, surface, floor), check_place(arm, line, floor, config.clearance)) if text]
-    return Tool(line, noise)
-
-
 def _arms(topics: Mapping[str, str]) -> tuple[str, ...]:
     """Arms with the pose of a tool, but for the camera's."""
     end, pose = f"/{messages.tool_pose('').name.lstrip('/')}", f"/{messages.CAMERA_POSE.name}"
     found = {name[1 : -len(end)] for name in topics if name.endswith(end) and name != pose}
     return tuple(sorted(name for name in found if not name.endswith(("/local", "local"))))
-
-
-def _within(found: Sequence[tuple[int, int]], span: tuple[int, int]) -> list[tuple[int, int]]:
-    return [touch for touch in found if touch[0] >= span[0] and touch[1] <= span[1]]
-
-
-def _alone(
-    arm: str, spans: list[tuple[int, int]], tools: Mapping[str, Tool], streams: Mapping[Topic, Stream], findings: list[str]
-) -> list[tuple[int, int]]:
-    """The spans in which no other tool touches, and none pulls by a commanded wrench."""
-    times, kept = tools[arm].line.times, []
-    for span in spans:
-        begin, end = times[span[0]], times[span[1] - 1]
-        during = lambda stamps, does: bool((does & (stamps >= begin) & (stamps <= end)).any())  # noqa: E731
-        others = [other for other, tool in tools.items() if other != arm and during(tool.line.times, tool.line.touching)]
-        wrench = streams.get(messages.tool_wrench(arm))
-        if others:
-            findings.append(f"{arm}: an experiment is left out, as {', '.join(others)} touched the tissue, too")
-        elif wrench is not None and during(wrench.stamps, wrench.values[:, :6].any(1)):
-            findings.append(f"{arm}: an experiment is left out, as the tool pulled by a wrench; that is for simulations alone")
-        else:
-            kept.append(span)
-    return kept
 
 
 def _no_touch(bag: Path, tools: Mapping[str, Tool], physics: PhysicsConfig, config: RecordingConfig, findings: list[str]) -> str:
@@ -269,7 +183,7 @@ def _motion(reader: BagReader) -> float:
 def _with_nodes(
     bag: Path,
     experiments: list[Experiment],
-    gathered: list[tuple[str, tuple[int, int]]],
+    gathered: Gathered,
     tools: Mapping[str, Tool],
     nodes: ControlNodes,
     config: RecordingConfig,
@@ -390,7 +304,7 @@ def _fed(synchronizer: Synchronizer, topic: Topic, message: Any, name: str, fram
 def _with_tracks(
     bag: Path,
     experiments: list[Experiment],
-    gathered: list[tuple[str, tuple[int, int]]],
+    gathered: Gathered,
     tools: Mapping[str, Tool],
     model: GaussianModel,
     frames: Mapping[str, np.ndarray],

@@ -44,7 +44,7 @@ class RecordingConfig(TouchConfig):
     """Frame of the poses in the recording."""
     frames: tuple[str, ...] = ()
     """Other frames of poses and wrenches in the recording, as the nodes' parameter: 'PSM1_base x y z qx qy qz qw' each."""
-    motion: Literal["auto", "control_nodes", "images", "none"] = "auto"
+    observed: Literal["auto", "control_nodes", "images", "none"] = "auto"
     """What tells how the tissue moves: control_nodes of a simulation, points followed in images, or auto: the first of these that was
     recorded."""
     points: Annotated[int, Range(4, 10_000)] = 60

@@ -36,9 +36,9 @@ class IdentificationConfig(StageConfig):
     """Standard deviation of the share by which all forces of the model are wrong together: control nodes twice as fine change them so much."""
     iterations: Annotated[int, Range(1, 100)] = 12
     """Most iterations of Levenberg and Marquardt's method."""
-    tolerance: Annotated[float, Range(1e-4, 1.0)] = 0.05
+    tolerance: Annotated[float, Range(1e-4, 1.0)] = 0.1
     """It ends when no unknown moves by more than this many of its standard deviations."""
-    jacobian_step: Annotated[float, Range(1e-3, 1.0)] = 0.1
+    jacobian_step: Annotated[float, Range(1e-3, 1.0)] = 0.15
     """Step of the differences of the Jacobian, in standard deviations before any data. With 0.01 the rounding of float32 shows, with 0.5
     the curvature."""
     tip_step: Annotated[float, Range(1e-5, 0.01, "m")] = 0.0005

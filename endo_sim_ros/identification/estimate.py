@@ -24,6 +24,7 @@ OnProgress = Callable[[str, int, int], None]
 """``on_progress(stage, done, total)``."""
 _FARTHEST = 1.5  # standard deviations that an unknown moves in one iteration
 _DAMPED, _LOOSENED, _MOST_DAMPED = 10.0, 0.1, 1e6
+_AS_PROMISED = 0.3  # share of the promised gain with which a Jacobian is still good
 
 
 @dataclass(frozen=True)
@@ -161,8 +162,9 @@ def identify(
         raise IdentificationError("nothing was measured: forces, displacements and tracks are all missing; give one of them")
     theta = np.zeros(unknowns.count + NUISANCES)
     theta[: unknowns.stiffness_count] = _scaled(unknowns, first.scale)
-    point = _minimise(theta, data, model, unknowns, config, progress)
-    return _conclude(point, data, model, unknowns, config, first.findings)
+    parts = [_Data(each, *unknowns.directions(touched_places([each.experiment], nodes, physics))) for each in data]
+    point = _minimise(theta, parts, model, unknowns, progress)
+    return _conclude(point, data, model, unknowns, first.findings)
 
 
 def touched_places(experiments: Sequence[Experiment], nodes: ControlNodes, physics: PhysicsConfig) -> np.ndarray:
@@ -184,21 +186,31 @@ def _scaled(unknowns: Unknowns, scale: float) -> np.ndarray:
     return np.clip(whole, -2, 2)
 
 
-def look(theta: np.ndarray, data: list[Observations], model: ForwardModel, unknowns: Unknowns, config: IdentificationConfig) -> _Point:
-    """Residuals, Jacobian and covariance at θ, from one batch for each experiment."""
-    P = unknowns.count
+@dataclass
+class _Data:
+    """An experiment, and the directions of the unknowns that it tells of."""
+
+    seen: Observations
+    ways: np.ndarray  # [D, P]
+    back: np.ndarray  # [D, P]
+
+
+def look(theta: np.ndarray, data: Sequence[_Data], model: ForwardModel, unknowns: Unknowns, jacobian: bool = True) -> _Point:
+    """Residuals and covariance at θ, and the Jacobian, from one batch for each experiment; without it only its columns of the tip."""
+    config, P = unknowns.config, unknowns.count
     z, offset, gain = theta[:P], theta[P : P + 3] * config.tip_offset, 1 + config.model_error * theta[P + 3]
-    copies = [unknowns.copy(z, offset)]
-    copies += [unknowns.copy(z + config.jacobian_step * np.eye(P)[p], offset) for p in range(P)]
-    copies += [unknowns.copy(z, offset + config.tip_step * np.eye(3)[axis]) for axis in range(3)]
     residuals, jacobians, covariances = [], [], []
-    for each in data:
+    for part in data:
+        each, ways = part.seen, part.ways if jacobian else part.ways[:0]
+        copies = [unknowns.copy(z, offset)]
+        copies += [unknowns.copy(z, offset + config.tip_step * np.eye(3)[axis]) for axis in range(3)]
+        copies += [unknowns.copy(z + config.jacobian_step * way, offset) for way in ways]
         told = each.predicted(model.replay(each.experiment, copies))
         forces = each.of_forces()
         told[:, forces] *= gain
         J = np.zeros((told.shape[1], P + NUISANCES))
-        J[:, :P] = (told[1 : P + 1] - told[0]).T / config.jacobian_step
-        by_tip = (told[P + 1 :] - told[0]).T / config.tip_step
+        J[:, :P] = (told[4:] - told[0]).T / config.jacobian_step @ part.back[: len(ways)]
+        by_tip = (told[1:4] - told[0]).T / config.tip_step
         J[:, P : P + 3] = by_tip * config.tip_offset
         J[:, P + 3] = np.where(forces, told[0] / gain * config.model_error, 0)
         residuals.append((each.values - told[0])[each.used])
@@ -221,37 +233,49 @@ def _normal(point: _Point) -> tuple[np.ndarray, np.ndarray]:
     return H, g
 
 
-def _minimise(
-    theta: np.ndarray, data: list[Observations], model: ForwardModel, unknowns: Unknowns, config: IdentificationConfig, progress: OnProgress
-) -> _Point:
-    """Levenberg and Marquardt's method. The covariance is that of the point that a step begins at: what is uncertain because the tip is
-    depends on the stiffness, but is no reason to believe in another."""
-    point = look(theta, data, model, unknowns, config)
-    damping = 1e-3
+def _minimise(theta: np.ndarray, data: list[_Data], model: ForwardModel, unknowns: Unknowns, progress: OnProgress) -> _Point:
+    """Levenberg and Marquardt's method. The Jacobian is kept, with Broyden's correction, while steps do about what it promises, and is
+    fresh at the end.
+
+    The covariance is that of the point that a step begins at: how much is uncertain because the tip is depends on the stiffness, but is
+    no reason to believe in another.
+    """
+    config, P = unknowns.config, unknowns.count
+    point, damping, fresh = look(theta, data, model, unknowns), 1e-3, True
     for iteration in range(config.iterations):
         progress("estimate", iteration + 1, config.iterations)
         H, g = _normal(point)
-        H = H + np.eye(len(theta))
-        g = g - point.theta
+        H, g = H + np.eye(len(theta)), g - point.theta
         step = np.linalg.solve(H + damping * np.diag(np.diag(H)), g)
         step *= min(1.0, _FARTHEST / max(float(np.abs(step).max()), 1e-12))
-        deviations = np.sqrt(np.diag(np.linalg.inv(H)))
-        if np.abs(step / deviations).max() < config.tolerance:
-            break
-        other = look(point.theta + step, data, model, unknowns, config)
+        if np.abs(step / np.sqrt(np.diag(np.linalg.inv(H)))).max() < config.tolerance:
+            if fresh:
+                break
+            point, fresh = look(point.theta, data, model, unknowns), True
+            continue
+        other = look(point.theta + step, data, model, unknowns, jacobian=False)
         before = _cost(point.residuals, point.theta, point.covariances)
-        if _cost(other.residuals, other.theta, point.covariances) < before:
-            point, damping = other, max(damping * _LOOSENED, 1e-6)
+        gained = before - _cost(other.residuals, other.theta, point.covariances)
+        if gained > _AS_PROMISED * (2 * g @ step - step @ H @ step):
+            for old, new, was, now in zip(point.jacobians, other.jacobians, point.residuals, other.residuals):
+                wrong = was - now - old @ step
+                new[:, :P] = old[:, :P] + wrong[:, None] * step[:P] / max(float(step[:P] @ step[:P]), 1e-12)
+            point, damping, fresh = other, max(damping * _LOOSENED, 1e-6), False
+        elif not fresh:
+            point, fresh = look(other.theta if gained > 0 else point.theta, data, model, unknowns), True
+        elif gained > 0:
+            point = look(other.theta, data, model, unknowns)
         else:
             damping *= _DAMPED if damping > 0.01 else 100 * _DAMPED
             if damping > _MOST_DAMPED:
                 break
-    return point
+    return point if fresh else look(point.theta, data, model, unknowns)
 
 
 def _conclude(
-    point: _Point, data: list[Observations], model: ForwardModel, unknowns: Unknowns, config: IdentificationConfig, findings: list[str]
+    point: _Point, data: list[Observations], model: ForwardModel, unknowns: Unknowns, findings: list[str]
 ) -> Identification:
+    config = unknowns.config
     H, _ = _normal(point)
     chi_square = sum(float(r @ R.solve(r[:, None])[:, 0]) for r, R in zip(point.residuals, point.covariances))
     determined = float(np.trace(np.linalg.solve(H + np.eye(len(H)), H)))

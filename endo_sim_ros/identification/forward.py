@@ -185,7 +185,7 @@ def first_touch(experiment: Experiment, nodes: ControlNodes, physics: PhysicsCon
 
 def reach_of(physics: PhysicsConfig, nodes: ControlNodes) -> float:
     """Distance from a control node within which a tip can touch it, m; more than enough, as thin capsules act as thicker ones."""
-    return max(physics.contact_radius and max(physics.contact_radius, 2 * nodes.spacing) + physics.contact_length, physics.force_radius)
+    return max(physics.contact_radius and max(physics.contact_radius, 1.5 * nodes.spacing) + physics.contact_length, physics.force_radius)
 
 
 def distances_to_skin(experiment: Experiment, nodes: ControlNodes) -> np.ndarray:

@@ -114,6 +114,7 @@ class Unknowns:
     def __init__(self, nodes: ControlNodes, physics: PhysicsConfig, config: IdentificationConfig, touched: np.ndarray):
         self.nodes, self.physics, self.config = nodes, physics, config
         self.base = np.asarray(tissue_properties(nodes, physics).young_modulus)
+        self._factor = np.zeros((0, 0))  # of the covariance of a field at its centres
         matrix, self.labels, self.centres, self.residual = self._stiffness(touched)
         self.stiffness_count = matrix.shape[1]
         names = list(dict.fromkeys(config.unknowns))
@@ -146,7 +147,7 @@ class Unknowns:
         if config.stiffness == "regions":
             return (*self._regions(), none, np.zeros(count))
         near = self._near(touched)
-        centres, weights, residual = gaussian_process(self.nodes.rest[near], config.field_spread, config.field_length)
+        centres, weights, residual, self._factor = gaussian_process(self.nodes.rest[near], config.field_spread, config.field_length)
         field = np.zeros((count, len(centres)))
         field[near] = weights
         left = np.full(count, config.field_spread**2)
@@ -186,6 +187,26 @@ class Unknowns:
                 options.append((name, min(told, 0.49) if name == "poisson_ratio" else told))
         return Copy(factors, holds, tuple(options), np.zeros(3) if shift is None else shift)
 
+    def directions(self, touched: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Directions in which an experiment that touches these places [K, 3] tells anything of the unknowns.
+
+        Of a field that is one centre after the other, of those within `field_reach`: what is farther away is not felt.
+
+        Returns:
+            The directions [D, P], each of about one standard deviation, and the matrix [D, P] that turns derivatives along them into
+            derivatives by the unknowns.
+        """
+        if not len(self.centres):
+            return np.eye(self.count), np.eye(self.count)
+        reach = self.config.field_reach
+        near = np.arange(len(self.centres)) if not len(touched) else KDTree(touched).query(self.centres)[0] <= reach
+        spread = self.config.field_spread
+        ways, back = np.zeros((len(self.centres), self.count)), np.zeros((len(self.centres), self.count))
+        ways[:, 1 : self.stiffness_count] = spread * np.linalg.inv(self._factor).T  # of what is one at a centre and zero at others
+        back[:, 1 : self.stiffness_count] = self._factor / spread
+        others = np.delete(np.eye(self.count), np.s_[1 : self.stiffness_count], 0)
+        return np.concatenate([ways[near], others]), np.concatenate([back[near], others])
+
     def reported(self) -> list[Reported]:
         """The numbers that the result tells. Of a field: its geometric mean over the free nodes within its reach."""
         told = []
@@ -211,9 +232,10 @@ class Unknowns:
         return {name: prior.source for name, prior in self._others}
 
 
-def gaussian_process(points: np.ndarray, spread: float, length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def gaussian_process(points: np.ndarray, spread: float, length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return centres [C, 3] of a field at points [N, 3] (m), the weights [N, C] that make of C standard normal numbers what a Gaussian
-    process (squared exponential, Rasmussen and Williams 2006) with these values at the centres expects, and the variance [N] it leaves.
+    process (squared exponential, Rasmussen and Williams 2006) with these values at the centres expects, the variance [N] it leaves, and
+    the Cholesky factor [C, C] that makes of these numbers the values at the centres.
 
     Centres are as far apart as `length`: farther, and the field has places that none of them knows.
     """
@@ -234,7 +256,7 @@ def gaussian_process(points: np.ndarray, spread: float, length: float) -> tuple[
     cross = covariance(points, centres)
     left = np.maximum(spread**2 - (cross * cho_solve(factor, cross.T).T).sum(1), 0.0)
     weights = np.linalg.solve(L, cross.T).T  # cross K⁻¹ L
-    return centres, weights, left
+    return centres, weights, left, L
 
 
 def held_sets(nodes: ControlNodes) -> tuple[np.ndarray, np.ndarray]:

@@ -94,11 +94,12 @@ def check_clock(name: str, line: Timeline, step_duration: float, noise: float) -
 
 def _lag(depth: np.ndarray, size: np.ndarray, most: int) -> float | None:
     """Steps by which sizes of forces [T] are behind depths [T], if that explains them much better than none; None if nothing does."""
+    most = min(most, len(depth) // 2)
     scores = np.full(2 * most + 1, -1.0)
     for lag in range(-most, most + 1):
         ahead, behind = (depth[: len(depth) - lag], size[lag:]) if lag >= 0 else (depth[-lag:], size[:lag])
         both = np.isfinite(ahead) & np.isfinite(behind)
-        if both.sum() > 2 * most // 4 and ahead[both].std() > 0 and behind[both].std() > 0:
+        if both.sum() > most // 2 and ahead[both].std() > 0 and behind[both].std() > 0:
             scores[lag + most] = np.corrcoef(ahead[both], behind[both])[0, 1]
     best = int(scores.argmax())
     if scores[best] < _LIKE:

@@ -16,7 +16,20 @@ from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.physics import PhysicsConfig
 
 _DIGITS = 6
-_OWN = ("device", "regions", "young_modulus")  # options that are told apart
+
+
+def told(found: Identification, physics: PhysicsConfig) -> dict[str, Any]:
+    """Parameters of physics_node that were identified: the modulus of most tissue, regions, and what else was unknown.
+
+    Args:
+        found: The estimate.
+        physics: The tissue as far as it was known; its regions stay for what else they say.
+    """
+    options = option_values(physics)
+    values: dict[str, Any] = {"young_modulus": _rounded(float(np.median(found.young_modulus)))}
+    varied = found.regions() if len(np.unique(found.young_modulus)) > 1 else ()
+    values["regions"] = [text for text in (*physics.regions, *varied) if text] or [""]
+    return values | {each.name: _rounded(each.estimate) for each in found.unknowns if each.name in options and each.name not in values}
 
 
 def parameters(found: Identification, physics: PhysicsConfig) -> dict[str, Any]:
@@ -27,13 +40,8 @@ def parameters(found: Identification, physics: PhysicsConfig) -> dict[str, Any]:
         physics: The tissue as far as it was known.
     """
     usual, given = option_values(PhysicsConfig()), option_values(physics)
-    values = {name: value for name, value in given.items() if value != usual[name] and name not in _OWN}
-    values |= {each.name: _rounded(each.estimate) for each in found.unknowns if each.name in given and each.name not in _OWN}
-    regions = list(physics.regions)  # for what else they say of the tissue
-    if len(np.unique(found.young_modulus)) > 1:
-        regions += found.regions()
-    values["young_modulus"] = _rounded(float(np.median(found.young_modulus)))
-    values["regions"] = [text for text in regions if text] or [""]
+    changed = {name: value for name, value in given.items() if value != usual[name] and name != "device"}
+    values = changed | told(found, physics)
     return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
 

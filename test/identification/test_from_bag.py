@@ -178,3 +178,8 @@ def test_a_bag_without_poses_or_with_what_is_no_number_is_one_sentence(tmp_path)
     with pytest.raises(SequenceError, match="no such bag"):
         read(tmp_path / "nowhere")
     assert RADIUS == PHYSICS.contact_radius
+
+
+def test_a_recording_of_one_short_press_is_enough(tmp_path):
+    (each,) = read(press(tmp_path / "bag", seconds=1.8, presses=(0.5,))).experiments
+    assert np.linalg.norm(each.forces, axis=1).max() == pytest.approx(STIFFNESS * DEPTH, rel=0.05)

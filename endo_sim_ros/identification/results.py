@@ -11,6 +11,7 @@ from endo_sim_ros.core.config import option_values
 from endo_sim_ros.core.drawing import write_png
 from endo_sim_ros.core.folders import written_whole
 from endo_sim_ros.identification.estimate import Identification
+from endo_sim_ros.identification.maps import paint_as_regions
 from endo_sim_ros.identification.picture import draw_map
 from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.physics import PhysicsConfig
@@ -21,13 +22,16 @@ _DIGITS = 6
 def told(found: Identification, physics: PhysicsConfig) -> dict[str, Any]:
     """Parameters of physics_node that were identified: the modulus of most tissue, regions, and what else was unknown.
 
+    Where no modulus is known, as without forces, ratios alone count: most tissue has the modulus that physics has.
+
     Args:
         found: The estimate.
         physics: The tissue as far as it was known; its regions stay for what else they say.
     """
-    options = option_values(physics)
-    values: dict[str, Any] = {"young_modulus": _rounded(float(np.median(found.young_modulus)))}
-    varied = found.regions() if len(np.unique(found.young_modulus)) > 1 else ()
+    options, middle = option_values(physics), float(np.median(found.young_modulus))
+    scale = 1.0 if found.known.any() else physics.young_modulus / middle
+    values: dict[str, Any] = {"young_modulus": _rounded(scale * middle)}
+    varied = paint_as_regions(found.nodes, scale * found.young_modulus) if len(np.unique(found.young_modulus)) > 1 else ()
     values["regions"] = [text for text in (*physics.regions, *varied) if text] or [""]
     return values | {each.name: _rounded(each.estimate) for each in found.unknowns if each.name in options and each.name not in values}
 

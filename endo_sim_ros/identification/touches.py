@@ -15,7 +15,7 @@ from endo_sim_ros.physics.config import PhysicsConfig
 _SAME_PERIOD = 0.01  # of the step; forces of a simulation come with its steps, and steps are then taken where these are
 _SEVERAL = 3  # forces about the end of a step are averaged; fewer are joined by straight lines
 _NOISE_OF_MEDIAN = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
-_OFFSET = 3.0  # standard errors of the noise that a force on a tool in the air must have to be an offset
+_OFFSET = 7.0  # standard errors of a mean that a force on a tool in the air must have to be an offset: three of a median of three numbers
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,8 @@ import numpy as np
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import rigid_pose
 from endo_sim_ros.messages import ControlNodeCloud, bag_types
-from endo_sim_ros.physics import ControlNodes, PhysicsConfig
+from endo_sim_ros.physics import ControlNodes, PhysicsConfig, TissueSimulation
+from endo_sim_ros.rendering import render_depth
 from endo_sim_ros.sequences.bag import BagWriter
 
 S = 1_000_000_000
@@ -98,3 +99,35 @@ def press(path, seconds=4.0, presses=(1.0,), rate=100.0, forces=25.0, force=lamb
             vector = np.array([0, 0, -force(at)]) + options.get("offset", np.zeros(3)) + options.get("noise", 0.0) * rng.normal(size=3)
             bag.force(t + late(t), vector)
     return path
+
+
+def simulate(path, scene, physics, depth=0.005, beside=(0.0,), noise=0.0, forces=True):
+    """A recording of presses into a scene's tissue, each so far beside the middle of the picture (m), and what it answers."""
+    camera, rng = scene.camera, np.random.default_rng(0)
+    simulation = TissueSimulation(
+        scene.model, np.stack([each.position for each in scene.cameras]), physics, list(scene.cameras), render_depth
+    )
+    down = np.interp(np.arange(76), [0, 12, 22, 34, 42, 54, 64, 75], [-0.02, -0.02, -0.003, depth, depth, -0.003, -0.02, -0.02])
+    tips = []
+    skin = simulation.nodes.rest[simulation.nodes.is_skin].astype(float)
+    for x in beside:
+        pixel = camera.K[:2, 2] + [x * camera.K[0, 0] / scene.depth, 0.0]
+        (z,) = scene_depth(skin, camera, pixel)
+        place = camera.unproject(pixel[None], np.array([z]))[0]
+        tips += [place + (each - simulation.contact_radius) * camera.pose[:3, 2] for each in down]
+    with Touches(path) as bag:
+        for step, place in enumerate(tips):
+            pose = rigid_pose(np.eye(3), place)
+            simulation.set_grasp("PSM1", pose, False)
+            simulation.step()
+            pose[:3, 3] += 0.01 * noise * rng.normal(size=3)
+            bag.pose(step * physics.step_duration, pose)
+            if forces:
+                bag.force(step * physics.step_duration, simulation.reaction("PSM1")[0] + noise * rng.normal(size=3))
+    return simulation
+
+
+def scene_depth(skin, camera, pixel):
+    """Depth [1] of the control node of the skin that is nearest to a pixel, m."""
+    uv, z = camera.project(skin)
+    return z[[np.linalg.norm(uv - pixel, axis=1).argmin()]]

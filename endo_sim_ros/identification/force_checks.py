@@ -13,6 +13,7 @@ _FEW = 5  # steps; fewer tell nothing
 _LONGEST_LAG = 2.0  # s
 _CLEARER = 0.05  # by how much more a lag must explain
 _LIKE = 0.5  # correlation from which forces are those of this tool at all
+_ALIKE = 0.9  # correlation from which there is no lag to look for
 _LEAST_LAG = 2.5  # steps; tissue that relaxes, and real time, make less
 _FAR = 0.005  # m, beyond clearance, from tissue where forces begin
 
@@ -99,12 +100,14 @@ def _lag(depth: np.ndarray, size: np.ndarray, most: int) -> float | None:
     for lag in range(-most, most + 1):
         ahead, behind = (depth[: len(depth) - lag], size[lag:]) if lag >= 0 else (depth[-lag:], size[:lag])
         both = np.isfinite(ahead) & np.isfinite(behind)
-        if both.sum() > most // 2 and ahead[both].std() > 0 and behind[both].std() > 0:
+        if both.sum() > len(depth) // 2 and ahead[both].std() > 0 and behind[both].std() > 0:
             scores[lag + most] = np.corrcoef(ahead[both], behind[both])[0, 1]
     best = int(scores.argmax())
     if scores[best] < _LIKE:
         return None
-    return float(best - most) if scores[best] > scores[most] + _CLEARER else 0.0
+    if scores[most] > _ALIKE or scores[best] < scores[most] + _CLEARER:
+        return 0.0
+    return float(best - most) if 0 < best < len(scores) - 1 else None  # else another press is nearer
 
 
 def distance_at_onset(line: Timeline, noise: float) -> tuple[float, float] | None:

@@ -183,3 +183,18 @@ def test_a_bag_without_poses_or_with_what_is_no_number_is_one_sentence(tmp_path)
 def test_a_recording_of_one_short_press_is_enough(tmp_path):
     (each,) = read(press(tmp_path / "bag", seconds=1.8, presses=(0.5,))).experiments
     assert np.linalg.norm(each.forces, axis=1).max() == pytest.approx(STIFFNESS * DEPTH, rel=0.05)
+
+
+def test_presses_that_come_regularly_have_no_lag(tmp_path):
+    depths = iter([0.001, 0.004, 0.001, 0.004])  # the next press is like the one before the last
+    with Touches(tmp_path / "bag") as bag:
+        depth = 0.0
+        for step in range(225):
+            t = step * STEP
+            if step % 50 == 0:
+                depth = next(depths, 0.002)
+            at = pressed(np.array([t % 2.0]), (0.5,), depth=depth)[0]
+            bag.pose(t, tip(at))
+            if step < 180:
+                bag.force(t, [0, 0, -STIFFNESS * max(at, 0.0) ** 1.5 * 20])
+    assert len(read(tmp_path / "bag").experiments) >= 4

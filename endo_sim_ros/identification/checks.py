@@ -76,8 +76,10 @@ class Survey:
     findings: list[str]
 
 
-def survey(data: list[Observations], model: ForwardModel, unknowns: Unknowns, config: IdentificationConfig) -> Survey:
-    """Compare what was measured with what tissue as it was thought to be would do, with its surface at several depths.
+def survey(
+    data: list[Observations], model: ForwardModel, unknowns: Unknowns, config: IdentificationConfig, z: np.ndarray
+) -> Survey:
+    """Compare what was measured with what tissue of unknowns z [P], as it was thought to be, would do, its surface at several depths.
 
     Samples after which a grasp has slipped are marked as not used.
 
@@ -85,7 +87,6 @@ def survey(data: list[Observations], model: ForwardModel, unknowns: Unknowns, co
         IdentificationError: If the tool never touches, or forces are in another frame.
     """
     depths = np.linspace(-config.depth_scan, config.depth_scan, _SCANNED)
-    z = np.zeros(unknowns.count)
     predicted: list[np.ndarray] = []
     measured = [each.experiment.forces for each in data]
     axes = [_axis(each.experiment, model) for each in data]
@@ -96,12 +97,12 @@ def survey(data: list[Observations], model: ForwardModel, unknowns: Unknowns, co
     _check_touch(data, model, predicted, middle)
     if not any(np.isfinite(each).any() for each in measured):
         return Survey(1.0, ["no force was measured: of stiffness only ratios between places are known, not how stiff the tissue is"])
-    costs, scales = zip(*(_fit_scale(data, [each[d] for each in predicted], None) for d in range(_SCANNED)))
+    costs, scales = zip(*(_fit_scale(data, [each[d] for each in predicted]) for d in range(_SCANNED)))
     best = int(np.argmin(costs))
     chosen = [each[best] for each in predicted]
     _check_direction(data, chosen, config)
     findings = [*_find_slips(data, chosen, scales[best]), *_find_lag(data, chosen, config)]
-    costs, scales = zip(*(_fit_scale(data, [each[d] for each in predicted], None) for d in range(_SCANNED)))
+    costs, scales = zip(*(_fit_scale(data, [each[d] for each in predicted]) for d in range(_SCANNED)))
     depth, gain = _lowest(depths, np.array(costs), middle)
     if abs(depth) > 4 * np.hypot(config.tip_offset, np.mean([each.experiment.tip_noise for each in data]) / 2) and gain > _ENOUGH:
         where = "deeper than" if depth < 0 else "before"
@@ -159,7 +160,7 @@ def _usable(each: Observations) -> np.ndarray:
     return usable
 
 
-def _fit_scale(data: list[Observations], predicted: list[np.ndarray], _: None) -> tuple[float, float]:
+def _fit_scale(data: list[Observations], predicted: list[np.ndarray]) -> tuple[float, float]:
     """Chi-square of forces with the scale of the model that is best, and this scale."""
     pp = pm = mm = 0.0
     for each, force in zip(data, predicted):
@@ -232,8 +233,8 @@ def _find_slips(data: list[Observations], predicted: list[np.ndarray], scale: fl
                 left_out = (each.steps >= begin) & (each.steps < end)
                 each.used &= ~left_out
                 findings.append(
-                    f"the grasp slipped {begin * experiment.step_duration:.2f} s after the beginning of experiment {number}: the force fell to"
-                    f" {max(float(np.mean(along[begin + _AVERAGED // 2 : end])), 0.0):.2f} N where the model has"
+                    f"the grasp slipped {begin * experiment.step_duration:.2f} s after the beginning of experiment {number}: the force"
+                    f" fell to {max(float(np.mean(along[begin + _AVERAGED // 2 : end])), 0.0):.2f} N where the model has"
                     f" {float(np.mean(expected[begin:end])):.2f} N; the {end - begin} steps until the jaw opens are left out"
                 )
                 break
@@ -247,7 +248,7 @@ def _find_lag(data: list[Observations], predicted: list[np.ndarray], config: Ide
         return []
     lags = np.arange(-steps, steps + 1)
 
-    def best(part: slice) -> tuple[float, float]:
+    def best(begin: float, end: float) -> tuple[float, float]:
         costs = np.zeros(len(lags))
         for number, lag in enumerate(lags):
             pp = pm = mm = 0.0
@@ -259,7 +260,7 @@ def _find_lag(data: list[Observations], predicted: list[np.ndarray], config: Ide
                 moved[inside] = force[source[inside]]
                 chosen = np.zeros(len(force), bool)
                 where = np.flatnonzero(usable)
-                chosen[where[int(part.start * len(where)) : int(part.stop * len(where))]] = True
+                chosen[where[int(begin * len(where)) : int(end * len(where))]] = True
                 noise = each.experiment.force_noise
                 a, b = each.experiment.forces[chosen] / noise, moved[chosen] / noise
                 pp, pm, mm = pp + (b**2).sum(), pm + (a * b).sum(), mm + (a**2).sum()
@@ -268,8 +269,8 @@ def _find_lag(data: list[Observations], predicted: list[np.ndarray], config: Ide
         return _lowest(lags.astype(float), costs, steps)
 
     duration = data[0].experiment.step_duration
-    lag, gain = best(slice(0, 1))
-    (early, gain_early), (late, gain_late) = best(slice(0, 0.5)), best(slice(0.5, 1))
+    lag, gain = best(0, 1)
+    (early, gain_early), (late, gain_late) = best(0, 0.5), best(0.5, 1)
     # A drift moves both halves of every experiment apart; one that only one of them tells may be what tissue does.
     if abs(lag) >= 1 and gain > _ENOUGH:
         after = "after" if lag > 0 else "before"

@@ -18,7 +18,7 @@ class IdentificationConfig(StageConfig):
     spread: Annotated[float, Range(0.05, 3.0)] = 1.0
     """Standard deviation of the logarithm of a modulus before any data; published moduli of one organ differ by factors of two to four."""
     field_spread: Annotated[float, Range(0.05, 3.0)] = 0.8
-    """The same of a field, by how much one place differs from the whole: inclusions are two to ten times as stiff as what surrounds them."""
+    """The same of a field, by how much one place differs from the whole: inclusions are two to ten times as stiff as tissue around."""
     field_length: Annotated[float, Range(1e-3, 0.2, "m")] = 0.01
     """Distance at which two places of a field have nearly lost each other: about the size of what is looked for."""
     field_reach: Annotated[float, Range(1e-3, 1.0, "m")] = 0.025
@@ -33,7 +33,7 @@ class IdentificationConfig(StageConfig):
     tip_smoothing: Annotated[float, Range(0.0, 1.0, "s")] = 0.08
     """Standard deviation of the Gaussian in time that smooths tips before they are replayed: single errors would shake the tissue."""
     model_error: Annotated[float, Range(0.0, 1.0)] = 0.05
-    """Standard deviation of the share by which all forces of the model are wrong together: control nodes twice as fine change them so much."""
+    """Standard deviation of the share by which all forces of the model are wrong together; twice as many control nodes change them so."""
     iterations: Annotated[int, Range(1, 100)] = 12
     """Most iterations of Levenberg and Marquardt's method."""
     tolerance: Annotated[float, Range(1e-4, 1.0)] = 0.1

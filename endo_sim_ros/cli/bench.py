@@ -94,7 +94,7 @@ class BenchIdentification(Measured):
     it takes."""
 
     cases: int = 4
-    """Cases of one modulus with each of three truths; 0 = none."""
+    """Cases of one modulus with each of four truths; 0 = none."""
     inclusions: int = 1
     """Inclusions to be found in maps; 0 = none."""
     radius: float = 0.008

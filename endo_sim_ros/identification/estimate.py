@@ -219,9 +219,7 @@ class _Data:
     back: np.ndarray  # [D, P]
 
 
-def look(
-    theta: np.ndarray, prior: _Prior, data: Sequence[_Data], model: ForwardModel, unknowns: Unknowns, jacobian: bool = True
-) -> _Point:
+def look(theta: np.ndarray, prior: _Prior, data: Sequence[_Data], model: ForwardModel, unknowns: Unknowns, jacobian: bool = True) -> _Point:
     """Residuals and covariance at θ, and the Jacobian, from one batch for each experiment; without it only its columns of the tip."""
     config, P = unknowns.config, unknowns.count
     z, offset, gain = theta[:P], theta[P : P + 3] * config.tip_offset, 1 + config.model_error * theta[P + 3]
@@ -229,7 +227,7 @@ def look(
     for part in data:
         each, ways = part.seen, part.ways if jacobian else part.ways[:0]
         copies = [unknowns.copy(z, offset)]
-        copies += [unknowns.copy(z, offset + config.tip_step * np.eye(3)[axis]) for axis in range(3)]
+        copies += [replace(unknowns.copy(z, offset), jog=config.tip_step * np.eye(3)[axis]) for axis in range(3)]
         copies += [unknowns.copy(z + config.jacobian_step * way, offset) for way in ways]
         told = each.predicted(model.replay(each.experiment, copies))
         forces = each.of_forces()
@@ -237,11 +235,13 @@ def look(
         J = np.zeros((told.shape[1], P + NUISANCES))
         J[:, :P] = (told[4:] - told[0]).T / config.jacobian_step @ part.back[: len(ways)]
         by_tip = (told[1:4] - told[0]).T / config.tip_step
-        J[:, P : P + 3] = by_tip * config.tip_offset
+        by_place = np.where(each.closed_at[:, None] >= 0, 0, by_tip)  # a place that is held moves with the tip, wherever that is
+        J[:, P : P + 3] = by_place * config.tip_offset
         J[:, P + 3] = np.where(forces, told[0] / gain * config.model_error, 0)
+        own = np.column_stack([by_place * config.surface_error, J[:, P + 3]])  # the errors of this experiment alone
         residuals.append((each.values - told[0])[each.used])
         jacobians.append(J[each.used])
-        covariances.append(each.covariance(by_tip))
+        covariances.append(each.covariance(by_tip, own))
     return _Point(theta, prior, residuals, jacobians, covariances)
 
 
@@ -260,9 +260,7 @@ def _normal(point: _Point) -> tuple[np.ndarray, np.ndarray]:
     return H, g
 
 
-def _minimise(
-    theta: np.ndarray, prior: _Prior, data: list[_Data], model: ForwardModel, unknowns: Unknowns, progress: OnProgress
-) -> _Point:
+def _minimise(theta: np.ndarray, prior: _Prior, data: list[_Data], model: ForwardModel, unknowns: Unknowns, progress: OnProgress) -> _Point:
     """Levenberg and Marquardt's method. The Jacobian is kept, with Broyden's correction, while steps do about what it promises, and is
     fresh at the end.
 
@@ -301,9 +299,7 @@ def _minimise(
     return point if fresh else look(point.theta, prior, data, model, unknowns)
 
 
-def _conclude(
-    point: _Point, data: list[Observations], model: ForwardModel, unknowns: Unknowns, findings: list[str]
-) -> Identification:
+def _conclude(point: _Point, data: list[Observations], model: ForwardModel, unknowns: Unknowns, findings: list[str]) -> Identification:
     config = unknowns.config
     H, _ = _normal(point)
     chi_square, precision = _misfit(point.residuals, point.covariances), point.prior.precision

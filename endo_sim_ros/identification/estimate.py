@@ -201,13 +201,7 @@ def touched_places(experiments: Sequence[Experiment], nodes: ControlNodes, physi
 
 def _scaled(unknowns: Unknowns, scale: float) -> np.ndarray:
     """Numbers of stiffness [P'] with which all moduli are that many times as great, within two standard deviations."""
-    matrix = unknowns.matrix[:, : unknowns.stiffness_count]
-    whole = np.zeros(unknowns.stiffness_count)
-    if unknowns.config.stiffness == "field":
-        whole[0] = np.log(scale) / matrix[0, 0]
-    else:
-        whole[:] = np.log(scale) / unknowns.config.spread
-    return np.clip(whole, -2, 2)
+    return np.clip(np.log(scale) * unknowns.scale[: unknowns.stiffness_count], -2, 2)
 
 
 @dataclass
@@ -222,6 +216,7 @@ class _Data:
 def look(theta: np.ndarray, prior: _Prior, data: Sequence[_Data], model: ForwardModel, unknowns: Unknowns, jacobian: bool = True) -> _Point:
     """Residuals and covariance at θ, and the Jacobian, from one batch for each experiment; without it only its columns of the tip."""
     config, P = unknowns.config, unknowns.count
+    feels = any(part.seen.of_forces().any() for part in data)
     z, offset, gain = theta[:P], theta[P : P + 3] * config.tip_offset, 1 + config.model_error * theta[P + 3]
     residuals, jacobians, covariances = [], [], []
     for part in data:
@@ -234,6 +229,8 @@ def look(theta: np.ndarray, prior: _Prior, data: Sequence[_Data], model: Forward
         told[:, forces] *= gain
         J = np.zeros((told.shape[1], P + NUISANCES))
         J[:, :P] = (told[4:] - told[0]).T / config.jacobian_step @ part.back[: len(ways)]
+        if not feels:  # how stiff all is would be told by inertia and damping alone, which the model has only about right
+            J[:, :P] -= np.outer(J[:, :P] @ unknowns.scale, unknowns.scale) / (unknowns.scale @ unknowns.scale)
         by_tip = (told[1:4] - told[0]).T / config.tip_step
         by_place = np.where(each.closed_at[:, None] >= 0, 0, by_tip)  # a place that is held moves with the tip, wherever that is
         J[:, P : P + 3] = by_place * config.tip_offset
@@ -275,7 +272,8 @@ def _minimise(theta: np.ndarray, prior: _Prior, data: list[_Data], model: Forwar
         H, g = H + prior.precision, g - prior.precision @ (point.theta - prior.mean)
         step = np.linalg.solve(H + damping * np.diag(np.diag(H)), g)
         step *= min(1.0, _FARTHEST / max(float(np.abs(step).max()), 1e-12))
-        if np.abs(step / np.sqrt(np.diag(np.linalg.inv(H)))).max() < config.tolerance:
+        moved = float(np.abs(step / np.sqrt(np.diag(np.linalg.inv(H)))).max())
+        if moved < config.tolerance:
             if fresh:
                 break
             point, fresh = look(point.theta, prior, data, model, unknowns), True
@@ -285,7 +283,7 @@ def _minimise(theta: np.ndarray, prior: _Prior, data: list[_Data], model: Forwar
         gained = before - prior.cost(other.theta) - _misfit(other.residuals, point.covariances)
         if gained > _AS_PROMISED * (2 * g @ step - step @ H @ step):
             for old, new, was, now in zip(point.jacobians, other.jacobians, point.residuals, other.residuals):
-                wrong = was - now - old @ step
+                wrong = (was - now - old @ step) * (moved > 1)  # of short steps it would be rounding
                 new[:, :P] = old[:, :P] + wrong[:, None] * step[:P] / max(float(step[:P] @ step[:P]), 1e-12)
             point, damping, fresh = other, max(damping * _LOOSENED, 1e-6), False
         elif not fresh:

@@ -111,20 +111,18 @@ class Covariance:
 
 
 def smoothing_matrix(present: np.ndarray, width: float) -> np.ndarray:
-    """Return weights [T, T] that smooth by a Gaussian of a standard deviation of `width` steps, not across steps where nothing is there.
-
-    Near an end fewer steps count, as many before as after, so that a steady motion stays what it is.
+    """Return weights [T, T] that smooth by a parabola through what is near, weighted by a Gaussian (Cleveland 1979) of a standard
+    deviation of `width` steps, not across steps where nothing is there. A parabola rounds off less where a tool turns round than a mean.
     """
-    count = len(present)
-    weights = np.eye(count)
-    run = np.cumsum(np.append(True, present[1:] != present[:-1])) if count else np.zeros(0)
-    for step in range(count):
-        if not present[step] or width <= 0:
-            continue
+    weights = np.eye(len(present))
+    run = np.cumsum(np.append(True, present[1:] != present[:-1])) if len(present) else np.zeros(0)
+    for step in np.flatnonzero(present & (width > 0)):
         members = np.flatnonzero(run == run[step])
-        most = min(step - members[0], members[-1] - step, int(np.ceil(3 * width)))
-        around = np.arange(-most, most + 1)
-        kernel = np.exp(-0.5 * (around / width) ** 2)
+        around = members[np.abs(members - step) <= np.ceil(3 * width)]
+        if len(around) <= 3:
+            continue
+        basis = ((around - step) / width)[:, None] ** np.arange(3)
+        weighted = basis * np.exp(-0.5 * ((around - step) / width) ** 2)[:, None]
         weights[step] = 0
-        weights[step, step + around] = kernel / kernel.sum()
+        weights[step, around] = np.linalg.solve(weighted.T @ basis, weighted.T)[0]
     return weights

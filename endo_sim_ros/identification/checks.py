@@ -15,6 +15,7 @@ _SIGNIFICANT = 5.0  # standard deviations
 _AVERAGED = 5  # samples, before a force is said to be there
 _GONE, _STILL = 0.25, 6.0  # a grasp has slipped where less than this share of the force is left, of a force this many deviations great
 _SCANNED = 13  # depths
+_LAG = 1.5  # steps; less is within what sampling does
 _ENOUGH = 25.0  # by which chi-square must fall before another depth or lag is believed
 
 
@@ -76,8 +77,8 @@ class Survey:
     findings: list[str]
 
 
-def survey(data: list[Observations], model: ForwardModel, unknowns: Unknowns, config: IdentificationConfig) -> Survey:
-    """Compare what was measured with what tissue as it was thought to be would do, with its surface at several depths.
+def survey(data: list[Observations], model: ForwardModel, unknowns: Unknowns, config: IdentificationConfig, z: np.ndarray) -> Survey:
+    """Compare what was measured with what tissue of unknowns z [P], as it was thought to be, would do, its surface at several depths.
 
     Samples after which a grasp has slipped are marked as not used.
 
@@ -85,7 +86,6 @@ def survey(data: list[Observations], model: ForwardModel, unknowns: Unknowns, co
         IdentificationError: If the tool never touches, or forces are in another frame.
     """
     depths = np.linspace(-config.depth_scan, config.depth_scan, _SCANNED)
-    z = np.zeros(unknowns.count)
     predicted: list[np.ndarray] = []
     measured = [each.experiment.forces for each in data]
     axes = [_axis(each.experiment, model) for each in data]
@@ -96,13 +96,13 @@ def survey(data: list[Observations], model: ForwardModel, unknowns: Unknowns, co
     _check_touch(data, model, predicted, middle)
     if not any(np.isfinite(each).any() for each in measured):
         return Survey(1.0, ["no force was measured: of stiffness only ratios between places are known, not how stiff the tissue is"])
-    costs, scales = zip(*(_fit_scale(data, [each[d] for each in predicted], None) for d in range(_SCANNED)))
+    costs, scales = zip(*(_fit_scale(data, [each[d] for each in predicted]) for d in range(_SCANNED)))
     best = int(np.argmin(costs))
     chosen = [each[best] for each in predicted]
     _check_direction(data, chosen, config)
     findings = [*_find_slips(data, chosen, scales[best]), *_find_lag(data, chosen, config)]
-    costs, scales = zip(*(_fit_scale(data, [each[d] for each in predicted], None) for d in range(_SCANNED)))
-    depth, gain = _lowest(depths, np.array(costs), middle)
+    costs, scales = zip(*(_fit_scale(data, [each[d] for each in predicted]) for d in range(_SCANNED)))
+    depth, gain = _lowest(depths, np.array(costs), middle, sum(int(each.of_forces().sum()) for each in data))
     if abs(depth) > 4 * np.hypot(config.tip_offset, np.mean([each.experiment.tip_noise for each in data]) / 2) and gain > _ENOUGH:
         where = "deeper than" if depth < 0 else "before"
         findings.append(
@@ -159,7 +159,7 @@ def _usable(each: Observations) -> np.ndarray:
     return usable
 
 
-def _fit_scale(data: list[Observations], predicted: list[np.ndarray], _: None) -> tuple[float, float]:
+def _fit_scale(data: list[Observations], predicted: list[np.ndarray]) -> tuple[float, float]:
     """Chi-square of forces with the scale of the model that is best, and this scale."""
     pp = pm = mm = 0.0
     for each, force in zip(data, predicted):
@@ -170,15 +170,16 @@ def _fit_scale(data: list[Observations], predicted: list[np.ndarray], _: None) -
     return mm - 2 * scale * pm + scale**2 * pp, scale
 
 
-def _lowest(depths: np.ndarray, costs: np.ndarray, middle: int) -> tuple[float, float]:
-    """Depth of the least cost, by a parabola about it, and how much less it is there than at depth 0."""
+def _lowest(depths: np.ndarray, costs: np.ndarray, middle: int, count: int) -> tuple[float, float]:
+    """Depth of the least cost, by a parabola about it, and how much less it is there than at depth 0: of `count` residuals, as multiples of
+    the greater of 1 and their mean there, so that what no depth explains speaks for none."""
     best = int(np.argmin(costs))
     depth = float(depths[best])
     if 0 < best < len(depths) - 1:
         a, b, c = costs[best - 1 : best + 2]
         bend = a - 2 * b + c
         depth += 0.5 * (a - c) / bend * (depths[1] - depths[0]) if bend > 0 else 0.0
-    return depth, float(costs[middle] - costs[best])
+    return depth, float(costs[middle] - costs[best]) / max(1.0, costs[best] / max(count, 1))
 
 
 def _check_direction(data: list[Observations], predicted: list[np.ndarray], config: IdentificationConfig) -> None:
@@ -232,8 +233,8 @@ def _find_slips(data: list[Observations], predicted: list[np.ndarray], scale: fl
                 left_out = (each.steps >= begin) & (each.steps < end)
                 each.used &= ~left_out
                 findings.append(
-                    f"the grasp slipped {begin * experiment.step_duration:.2f} s after the beginning of experiment {number}: the force fell to"
-                    f" {max(float(np.mean(along[begin + _AVERAGED // 2 : end])), 0.0):.2f} N where the model has"
+                    f"the grasp slipped {begin * experiment.step_duration:.2f} s after the beginning of experiment {number}: the force"
+                    f" fell to {max(float(np.mean(along[begin + _AVERAGED // 2 : end])), 0.0):.2f} N where the model has"
                     f" {float(np.mean(expected[begin:end])):.2f} N; the {end - begin} steps until the jaw opens are left out"
                 )
                 break
@@ -247,8 +248,8 @@ def _find_lag(data: list[Observations], predicted: list[np.ndarray], config: Ide
         return []
     lags = np.arange(-steps, steps + 1)
 
-    def best(part: slice) -> tuple[float, float]:
-        costs = np.zeros(len(lags))
+    def best(begin: float, end: float) -> tuple[float, float]:
+        costs, count = np.zeros(len(lags)), 0
         for number, lag in enumerate(lags):
             pp = pm = mm = 0.0
             for each, force in zip(data, predicted):
@@ -259,22 +260,23 @@ def _find_lag(data: list[Observations], predicted: list[np.ndarray], config: Ide
                 moved[inside] = force[source[inside]]
                 chosen = np.zeros(len(force), bool)
                 where = np.flatnonzero(usable)
-                chosen[where[int(part.start * len(where)) : int(part.stop * len(where))]] = True
+                chosen[where[int(begin * len(where)) : int(end * len(where))]] = True
                 noise = each.experiment.force_noise
                 a, b = each.experiment.forces[chosen] / noise, moved[chosen] / noise
                 pp, pm, mm = pp + (b**2).sum(), pm + (a * b).sum(), mm + (a**2).sum()
+                count = count + a.size if lag == 0 else count
             scale = max(pm / pp, 0) if pp > 0 else 0.0
             costs[number] = mm - 2 * scale * pm + scale**2 * pp
-        return _lowest(lags.astype(float), costs, steps)
+        return _lowest(lags.astype(float), costs, steps, count)
 
     duration = data[0].experiment.step_duration
-    lag, gain = best(slice(0, 1))
-    (early, gain_early), (late, gain_late) = best(slice(0, 0.5)), best(slice(0.5, 1))
+    lag, gain = best(0, 1)
+    (early, gain_early), (late, gain_late) = best(0, 0.5), best(0.5, 1)
     # A drift moves both halves of every experiment apart; one that only one of them tells may be what tissue does.
-    if abs(lag) >= 1 and gain > _ENOUGH:
+    if abs(lag) >= _LAG and gain > _ENOUGH:
         after = "after" if lag > 0 else "before"
         drift = ""
-        if len(data) == 1 and min(gain_early, gain_late) > _ENOUGH and abs(late - early) >= 1:
+        if len(data) == 1 and min(gain_early, gain_late) > _ENOUGH and abs(late - early) >= _LAG:
             drift = f", {early * duration:.2f} s in its first half and {late * duration:.2f} s in its second: a clock drifts"
         return [f"measured forces come about {abs(lag) * duration:.2f} s {after} the poses{drift}; align the clocks and estimate again"]
     return []

@@ -5,7 +5,7 @@ share by which all forces of the model are wrong. They have priors, too, so that
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.stats import norm
@@ -15,7 +15,7 @@ from endo_sim_ros.identification.config import IdentificationConfig
 from endo_sim_ros.identification.experiment import Experiment
 from endo_sim_ros.identification.forward import ForwardModel, distances_to_skin, reach_of
 from endo_sim_ros.identification.maps import paint_as_regions
-from endo_sim_ros.identification.observations import Observations
+from endo_sim_ros.identification.observations import Covariance, Observations
 from endo_sim_ros.identification.unknowns import Reported, Told, Unknowns
 from endo_sim_ros.physics import ControlNodes, PhysicsConfig
 
@@ -98,7 +98,7 @@ class Identification:
         """How far the tool stands from where it is said to [3], m, world."""
         return self.mean[-NUISANCES:-1] * self.parameters.config.tip_offset
 
-    def regions(self, step: float = 0.2, most: int = 100) -> tuple[str, ...]:
+    def regions(self, step: float = 0.2, most: int = 300) -> tuple[str, ...]:
         """The map as `regions` of physics, see `paint_as_regions`."""
         return paint_as_regions(self.nodes, self.young_modulus, step, most)
 
@@ -118,14 +118,26 @@ class Identification:
         return "\n".join([*lines, *self.findings])
 
 
+@dataclass(frozen=True)
+class _Prior:
+    """What is known of θ before these data: normal."""
+
+    mean: np.ndarray  # [Q]
+    precision: np.ndarray  # [Q, Q]
+
+    def cost(self, theta: np.ndarray) -> float:
+        return float((theta - self.mean) @ self.precision @ (theta - self.mean))
+
+
 @dataclass
 class _Point:
     """The data as seen from one set of unknowns θ [Q]."""
 
     theta: np.ndarray
+    prior: _Prior
     residuals: list[np.ndarray]  # of each experiment [n], of the numbers that are used
     jacobians: list[np.ndarray]  # of predictions [n, Q]
-    covariances: list
+    covariances: list[Covariance]
 
 
 def identify(
@@ -135,6 +147,9 @@ def identify(
     config: IdentificationConfig = IdentificationConfig(),
     device: str = "auto",
     progress: OnProgress | None = None,
+    *,
+    around: np.ndarray | None = None,
+    start: Identification | None = None,
 ) -> Identification:
     """Estimate what tissue is made of from how it answered a tool.
 
@@ -145,6 +160,9 @@ def identify(
         config: What is unknown.
         device: Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N.
         progress: Called as ``progress(stage, done, total)``.
+        around: Places [K, 3], m, world, near which a field is unknown; default: where tools of the experiments touch.
+        start: An estimate from other experiments that this one goes on from: what they told is the prior, with the unknowns and the
+            configuration that they had. Give that one `around` where tools will touch later.
 
     Raises:
         IdentificationError: If nothing can be estimated from the data; the sentence says what was seen.
@@ -154,16 +172,22 @@ def identify(
     experiments = list(experiments)
     check_input(experiments, len(nodes))
     data = [Observations(each, config.tip_smoothing) for each in experiments]
-    unknowns = Unknowns(nodes, physics, config, touched_places(experiments, nodes, physics))
+    if start is not None:
+        unknowns, config = start.parameters, start.parameters.config
+    else:
+        unknowns = Unknowns(nodes, physics, config, touched_places(experiments, nodes, physics) if around is None else around)
     model = ForwardModel(nodes, physics, device)
     progress("look at the data", 0, config.iterations)
-    first = survey(data, model, unknowns, config)
+    size = unknowns.count + NUISANCES
+    prior = _Prior(np.zeros(size), np.eye(size)) if start is None else _Prior(start.mean, np.linalg.inv(start.covariance))
+    first = survey(data, model, unknowns, config, prior.mean[: unknowns.count])
     if not any(each.used.any() for each in data):
         raise IdentificationError("nothing was measured: forces, displacements and tracks are all missing; give one of them")
-    theta = np.zeros(unknowns.count + NUISANCES)
-    theta[: unknowns.stiffness_count] = _scaled(unknowns, first.scale)
+    theta = prior.mean.copy()
+    if start is None:
+        theta[: unknowns.stiffness_count] = _scaled(unknowns, first.scale)
     parts = [_Data(each, *unknowns.directions(touched_places([each.experiment], nodes, physics))) for each in data]
-    point = _minimise(theta, parts, model, unknowns, progress)
+    point = _minimise(theta, prior, parts, model, unknowns, progress)
     return _conclude(point, data, model, unknowns, first.findings)
 
 
@@ -177,13 +201,7 @@ def touched_places(experiments: Sequence[Experiment], nodes: ControlNodes, physi
 
 def _scaled(unknowns: Unknowns, scale: float) -> np.ndarray:
     """Numbers of stiffness [P'] with which all moduli are that many times as great, within two standard deviations."""
-    matrix = unknowns.matrix[:, : unknowns.stiffness_count]
-    whole = np.zeros(unknowns.stiffness_count)
-    if unknowns.config.stiffness == "field":
-        whole[0] = np.log(scale) / matrix[0, 0]
-    else:
-        whole[:] = np.log(scale) / unknowns.config.spread
-    return np.clip(whole, -2, 2)
+    return np.clip(np.log(scale) * unknowns.scale[: unknowns.stiffness_count], -2, 2)
 
 
 @dataclass
@@ -195,32 +213,38 @@ class _Data:
     back: np.ndarray  # [D, P]
 
 
-def look(theta: np.ndarray, data: Sequence[_Data], model: ForwardModel, unknowns: Unknowns, jacobian: bool = True) -> _Point:
+def look(theta: np.ndarray, prior: _Prior, data: Sequence[_Data], model: ForwardModel, unknowns: Unknowns, jacobian: bool = True) -> _Point:
     """Residuals and covariance at θ, and the Jacobian, from one batch for each experiment; without it only its columns of the tip."""
     config, P = unknowns.config, unknowns.count
+    feels = any(part.seen.of_forces().any() for part in data)
     z, offset, gain = theta[:P], theta[P : P + 3] * config.tip_offset, 1 + config.model_error * theta[P + 3]
     residuals, jacobians, covariances = [], [], []
     for part in data:
         each, ways = part.seen, part.ways if jacobian else part.ways[:0]
         copies = [unknowns.copy(z, offset)]
-        copies += [unknowns.copy(z, offset + config.tip_step * np.eye(3)[axis]) for axis in range(3)]
+        copies += [replace(unknowns.copy(z, offset), jog=config.tip_step * np.eye(3)[axis]) for axis in range(3)]
         copies += [unknowns.copy(z + config.jacobian_step * way, offset) for way in ways]
         told = each.predicted(model.replay(each.experiment, copies))
         forces = each.of_forces()
         told[:, forces] *= gain
         J = np.zeros((told.shape[1], P + NUISANCES))
         J[:, :P] = (told[4:] - told[0]).T / config.jacobian_step @ part.back[: len(ways)]
+        if not feels:  # how stiff all is would be told by inertia and damping alone, which the model has only about right
+            J[:, :P] -= np.outer(J[:, :P] @ unknowns.scale, unknowns.scale) / (unknowns.scale @ unknowns.scale)
         by_tip = (told[1:4] - told[0]).T / config.tip_step
-        J[:, P : P + 3] = by_tip * config.tip_offset
+        by_place = np.where(each.closed_at[:, None] >= 0, 0, by_tip)  # a place that is held moves with the tip, wherever that is
+        J[:, P : P + 3] = by_place * config.tip_offset
         J[:, P + 3] = np.where(forces, told[0] / gain * config.model_error, 0)
+        own = np.column_stack([by_place * config.surface_error, J[:, P + 3]])  # the errors of this experiment alone
         residuals.append((each.values - told[0])[each.used])
         jacobians.append(J[each.used])
-        covariances.append(each.covariance(by_tip))
-    return _Point(theta, residuals, jacobians, covariances)
+        covariances.append(each.covariance(by_tip, own))
+    return _Point(theta, prior, residuals, jacobians, covariances)
 
 
-def _cost(residuals: list[np.ndarray], theta: np.ndarray, covariances: list) -> float:
-    return theta @ theta + sum(float(r @ R.solve(r[:, None])[:, 0]) for r, R in zip(residuals, covariances))
+def _misfit(residuals: list[np.ndarray], covariances: list[Covariance]) -> float:
+    """Chi-square of residuals."""
+    return sum(float(r @ R.solve(r[:, None])[:, 0]) for r, R in zip(residuals, covariances))
 
 
 def _normal(point: _Point) -> tuple[np.ndarray, np.ndarray]:
@@ -233,7 +257,7 @@ def _normal(point: _Point) -> tuple[np.ndarray, np.ndarray]:
     return H, g
 
 
-def _minimise(theta: np.ndarray, data: list[_Data], model: ForwardModel, unknowns: Unknowns, progress: OnProgress) -> _Point:
+def _minimise(theta: np.ndarray, prior: _Prior, data: list[_Data], model: ForwardModel, unknowns: Unknowns, progress: OnProgress) -> _Point:
     """Levenberg and Marquardt's method. The Jacobian is kept, with Broyden's correction, while steps do about what it promises, and is
     fresh at the end.
 
@@ -241,47 +265,46 @@ def _minimise(theta: np.ndarray, data: list[_Data], model: ForwardModel, unknown
     no reason to believe in another.
     """
     config, P = unknowns.config, unknowns.count
-    point, damping, fresh = look(theta, data, model, unknowns), 1e-3, True
+    point, damping, fresh = look(theta, prior, data, model, unknowns), 1e-3, True
     for iteration in range(config.iterations):
         progress("estimate", iteration + 1, config.iterations)
         H, g = _normal(point)
-        H, g = H + np.eye(len(theta)), g - point.theta
+        H, g = H + prior.precision, g - prior.precision @ (point.theta - prior.mean)
         step = np.linalg.solve(H + damping * np.diag(np.diag(H)), g)
         step *= min(1.0, _FARTHEST / max(float(np.abs(step).max()), 1e-12))
-        if np.abs(step / np.sqrt(np.diag(np.linalg.inv(H)))).max() < config.tolerance:
+        moved = float(np.abs(step / np.sqrt(np.diag(np.linalg.inv(H)))).max())
+        if moved < config.tolerance:
             if fresh:
                 break
-            point, fresh = look(point.theta, data, model, unknowns), True
+            point, fresh = look(point.theta, prior, data, model, unknowns), True
             continue
-        other = look(point.theta + step, data, model, unknowns, jacobian=False)
-        before = _cost(point.residuals, point.theta, point.covariances)
-        gained = before - _cost(other.residuals, other.theta, point.covariances)
+        other = look(point.theta + step, prior, data, model, unknowns, jacobian=False)
+        before = prior.cost(point.theta) + _misfit(point.residuals, point.covariances)
+        gained = before - prior.cost(other.theta) - _misfit(other.residuals, point.covariances)
         if gained > _AS_PROMISED * (2 * g @ step - step @ H @ step):
             for old, new, was, now in zip(point.jacobians, other.jacobians, point.residuals, other.residuals):
-                wrong = was - now - old @ step
+                wrong = (was - now - old @ step) * (moved > 1)  # of short steps it would be rounding
                 new[:, :P] = old[:, :P] + wrong[:, None] * step[:P] / max(float(step[:P] @ step[:P]), 1e-12)
             point, damping, fresh = other, max(damping * _LOOSENED, 1e-6), False
         elif not fresh:
-            point, fresh = look(other.theta if gained > 0 else point.theta, data, model, unknowns), True
+            point, fresh = look(other.theta if gained > 0 else point.theta, prior, data, model, unknowns), True
         elif gained > 0:
-            point = look(other.theta, data, model, unknowns)
+            point = look(other.theta, prior, data, model, unknowns)
         else:
             damping *= _DAMPED if damping > 0.01 else 100 * _DAMPED
             if damping > _MOST_DAMPED:
                 break
-    return point if fresh else look(point.theta, data, model, unknowns)
+    return point if fresh else look(point.theta, prior, data, model, unknowns)
 
 
-def _conclude(
-    point: _Point, data: list[Observations], model: ForwardModel, unknowns: Unknowns, findings: list[str]
-) -> Identification:
+def _conclude(point: _Point, data: list[Observations], model: ForwardModel, unknowns: Unknowns, findings: list[str]) -> Identification:
     config = unknowns.config
     H, _ = _normal(point)
-    chi_square = sum(float(r @ R.solve(r[:, None])[:, 0]) for r, R in zip(point.residuals, point.covariances))
-    determined = float(np.trace(np.linalg.solve(H + np.eye(len(H)), H)))
+    chi_square, precision = _misfit(point.residuals, point.covariances), point.prior.precision
+    determined = float(np.trace(np.linalg.solve(H + precision, H)))
     count = sum(len(r) for r in point.residuals)
     factor, doubts = judge_residuals(chi_square, round(count - determined), config)
-    covariance = np.linalg.inv(H / factor + np.eye(len(H)))
+    covariance = np.linalg.inv(H / factor + precision)
     quantile = float(norm.ppf(0.5 + config.level / 2))
     feels = any(each.of_forces()[each.used].any() for each in data)
     told = [_estimate(each, point.theta, covariance, quantile, feels, unknowns, config) for each in unknowns.reported()]
@@ -319,3 +342,17 @@ def _estimate(
     spread = quantile * np.sqrt(variance)
     estimate, low, high = (float(reported.value(middle + side * spread)) for side in (0, -1, 1))
     return Estimate(reported.name, reported.unit, estimate, low, high, told, float(removed))
+
+
+def predict_as_measured(
+    found: Identification, candidates: Sequence[Experiment], model: ForwardModel
+) -> list[tuple[np.ndarray, Covariance]]:
+    """Jacobian [n, P + 4] and covariance of the forces that each experiment would measure of tissue as it was estimated."""
+    unknowns = found.parameters
+    parts = []
+    for each in candidates:
+        seen = Observations(replace(each, forces=np.zeros(each.tips.shape)), unknowns.config.tip_smoothing)
+        parts.append(_Data(seen, *unknowns.directions(touched_places([each], model.nodes, model.physics))))
+    flat = _Prior(found.mean, np.linalg.inv(found.covariance))
+    point = look(found.mean, flat, parts, model, unknowns)
+    return list(zip(point.jacobians, point.covariances))

@@ -28,13 +28,16 @@ class Copy:
         factors: On the moduli of each control node [M].
         holds: On the springs of pinned control nodes [M].
         options: Of physics that differ, by name.
-        shift: Of the tips [3], m, world.
+        shift: Of all tips [3], m, world.
+        jog: Of the tips but for those at which a jaw closes [3], m, world: as a held place moves with the tip, it does not matter where
+            all tips are together, but how far they go.
     """
 
     factors: np.ndarray
     holds: np.ndarray
     options: tuple[tuple[str, float], ...] = ()
     shift: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    jog: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,7 @@ class ForwardModel:
         groups: dict[tuple, list[int]] = {}
         for number, copy in enumerate(copies):
             groups.setdefault(copy.options, []).append(number)
-        reach = max(float(np.abs(copy.shift).max()) for copy in copies) * math.sqrt(3)
+        reach = max(float(np.abs(copy.shift + copy.jog).max()) for copy in copies) * math.sqrt(3)
         begin = first_touch(experiment, self.nodes, self.physics, reach)
         steps, count = len(experiment.tips), len(copies)
         forces, faults = np.zeros((count, steps, 3)), np.zeros(count, int)
@@ -85,7 +88,9 @@ class ForwardModel:
         substeps = self._substeps(experiment, copies)
         for options, members in groups.items():
             batch = self._batch(experiment, [copies[c] for c in members], options, substeps)
-            told = self._run(batch, experiment, np.stack([copies[c].shift for c in members]), begin, wanted, points)
+            shifts, jogs = (np.stack([getattr(copies[c], name) for c in members]) for name in ("shift", "jog"))
+            jogged = closing_steps(experiment) != np.arange(steps)
+            told = self._run(batch, experiment, shifts, jogged[:, None, None] * jogs, begin, wanted, points)
             forces[members, begin:], faults[members] = told[0], batch.tools.faults.cpu().numpy()
             if moved is not None:
                 moved[members, begin:] = told[1]
@@ -125,19 +130,20 @@ class ForwardModel:
         return batch
 
     def _run(
-        self, batch: TissueBatch, experiment: Experiment, shifts: np.ndarray, begin: int, wanted: np.ndarray | None, points: list["_Points"]
-    ) -> tuple[np.ndarray, np.ndarray | None, list[np.ndarray]]:
+        self, batch: TissueBatch, experiment: Experiment, shifts: np.ndarray, jogs: np.ndarray, begin: int, wanted: np.ndarray | None,
+        points: list["_Points"],
+    ) -> tuple[np.ndarray, np.ndarray | None, list[np.ndarray]]:  # fmt: skip
         """Forces [C, T − begin, 3], displacements and pixels of one batch."""
         tools, device = batch.tools, batch.solver.device
         tips = torch.from_numpy(np.nan_to_num(experiment.tips)).to(device, torch.float64)
         turned = torch.from_numpy(np.nan_to_num(experiment.rotations)).to(device, torch.float64)
         present, closed = (torch.from_numpy(each.astype(np.int32)).to(device) for each in (experiment.present, experiment.closed))
-        moved_by = torch.from_numpy(shifts).to(device)
+        moved_by = torch.from_numpy(shifts + jogs).to(device)  # [T, C, 3]
         nodes = None if wanted is None else torch.from_numpy(wanted).long().to(device)
         forces, moved = [], []
         pixels = [np.repeat(each.pixels_at_rest[None], len(shifts), 0) for each in points]
         for step in range(begin, len(tips)):
-            tools.tips[:, 0] = tips[step] + moved_by
+            tools.tips[:, 0] = tips[step] + moved_by[step]
             tools.rotations[:, 0] = turned[step]
             tools.present[:, 0] = present[step]
             tools.closed[:, 0] = closed[step] * present[step]
@@ -175,6 +181,13 @@ class _Points:
     def project(self, places: np.ndarray, image: int) -> np.ndarray:
         """Pixels [C, K, 2] of places [C, K, 3]."""
         return self.cameras[image].project(places.reshape(-1, 3))[0].reshape(*places.shape[:2], 2)
+
+
+def closing_steps(experiment: Experiment) -> np.ndarray:
+    """Step at which the jaw closed that is closed at each step [T], -1 where it is open."""
+    closed = np.asarray(experiment.closed, bool) & np.asarray(experiment.present, bool)
+    begins = closed & ~np.append(False, closed[:-1])
+    return np.where(closed, np.maximum.accumulate(np.where(begins, np.arange(len(closed)), -1)), -1)
 
 
 def first_touch(experiment: Experiment, nodes: ControlNodes, physics: PhysicsConfig, further: float = 0.0) -> int:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 _BEYOND = 0.5  # spacings by which the box of all tissue is larger than the control nodes
 
 
-def paint_as_regions(nodes: ControlNodes, young_modulus: np.ndarray, step: float = 0.2, most: int = 100) -> tuple[str, ...]:
+def paint_as_regions(nodes: ControlNodes, young_modulus: np.ndarray, step: float = 0.2, most: int = 300) -> tuple[str, ...]:
     """Return texts for the option `regions` of physics that paint moduli of control nodes.
 
     A box paints all tissue with the modulus of most of it; spheres paint the rest. Moduli are rounded to levels of their logarithm,
@@ -36,9 +36,9 @@ def paint_as_regions(nodes: ControlNodes, young_modulus: np.ndarray, step: float
         step *= 1.25
 
     def modulus(level: int) -> str:
-        return f"young_modulus={np.exp(logs[levels == level].mean()):.6g}"
+        return f"young_modulus={np.exp(logs[levels == level].mean() if (levels == level).any() else np.median(logs)):.6g}"
 
-    box = f"box {' '.join(f'{x:.6g}' for x in corners)} {modulus(0) if (levels == 0).any() else f'young_modulus={np.exp(np.median(logs)):.6g}'}"
+    box = f"box {' '.join(f'{x:.6g}' for x in corners)} {modulus(0)}"
     return (box, *(f"sphere {' '.join(f'{x:.6g}' for x in centre)} {radius:.6g} {modulus(level)}" for centre, radius, level in spheres))
 
 
@@ -69,7 +69,8 @@ class Inclusion:
 
     Args:
         centre: Where its middle is [3], m, world.
-        deviation: Standard deviation of its coordinates [3], m.
+        deviation: Standard deviation of its coordinates [3], m, if the stiffest place is this one.
+        sure: Probability that it is: share of draws from the posterior whose stiffest place is within two lengths of the field of it.
         ratio: Of its greatest modulus to that of the tissue around; median.
         low: Lower end of the interval of that.
         high: Upper end.
@@ -78,6 +79,7 @@ class Inclusion:
 
     centre: np.ndarray
     deviation: np.ndarray
+    sure: float
     ratio: float
     low: float
     high: float
@@ -109,9 +111,12 @@ def find_inclusion(found: "Identification", samples: int = 200, seed: int = 0) -
     logs = (np.log(unknowns.base) + np.concatenate([found.mean[fields][None], draws]) @ unknowns.matrix.T)[:, within]
     length = 2 * unknowns.config.field_length
     centres, ratios, radii = zip(*(_middle(each, rest, volumes, length) for each in logs))
+    off = np.array(centres[1:]) - centres[0]
+    here = (off**2).sum(1) <= length**2
     tail = (1 - found.level) / 2
-    low, high = np.quantile(ratios[1:], [tail, 1 - tail])
-    return Inclusion(centres[0], np.std(centres[1:], axis=0), ratios[0], float(low), float(high), radii[0])
+    low, high = np.quantile(np.array(ratios[1:])[here] if here.any() else ratios[1:], [tail, 1 - tail])
+    deviation = np.sqrt((off[here] ** 2).mean(0)) if here.any() else np.full(3, np.inf)
+    return Inclusion(centres[0], deviation, float(here.mean()), ratios[0], float(low), float(high), radii[0])
 
 
 def _middle(logs: np.ndarray, rest: np.ndarray, volumes: np.ndarray, length: float) -> tuple[np.ndarray, float, float]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from endo_sim_ros.identification.experiment import Experiment
-from endo_sim_ros.identification.forward import Replay
+from endo_sim_ros.identification.forward import Replay, closing_steps
 
 FORCE, DISPLACEMENT, PIXEL = range(3)
 _LONGEST = 250  # steps whose errors of tips are taken for correlated; more would only cost time
@@ -47,6 +47,7 @@ class Observations:
             return np.concatenate(rows)
 
         self.kinds, self.noise, self.steps = spread(0).astype(int), spread(1), spread(2).astype(int)
+        self.closed_at = closing_steps(experiment)[self.steps]  # step at which the jaw closed, -1 = open [N]
         self.used = np.ones(len(self.values), bool)
 
     def predicted(self, replay: Replay) -> np.ndarray:
@@ -59,11 +60,13 @@ class Observations:
         """Which of the numbers are forces [N]."""
         return self.kinds == FORCE
 
-    def covariance(self, tip_sensitivity: np.ndarray) -> "Covariance":
+    def covariance(self, tip_sensitivity: np.ndarray, shared: np.ndarray) -> "Covariance":
         """Of the numbers that are used: their own noise, and what independent errors of the tips make of predictions.
 
         Args:
-            tip_sensitivity: Derivative of each number by the place of the tip [N, 3], per m. Tissue is taken to follow the tip at once.
+            tip_sensitivity: Derivative of each number by the place of the tip [N, 3], per m, while a jaw is closed by how far it has gone
+                since. Tissue is taken to follow the tip at once.
+            shared: What errors that the whole experiment shares make of them, one standard deviation of each [N, K].
         """
         rows, steps, blocks = np.flatnonzero(self.used), len(self.smoother), []
         for begin in range(0, steps, _LONGEST):
@@ -71,8 +74,11 @@ class Observations:
             members = (self.steps[rows] >= begin) & (self.steps[rows] < end)
             at = rows[members]
             # A number depends on the smoothed tip of its step, and that on the errors of those around it.
-            along = self.smoother[self.steps[at], begin:end] * self.experiment.tip_noise
+            along = self.smoother[self.steps[at], begin:end]
+            along = along - np.where(self.closed_at[at, None] >= 0, self.smoother[self.closed_at[at], begin:end], 0)
+            along = along * self.experiment.tip_noise
             A = (along[:, :, None] * tip_sensitivity[at][:, None]).reshape(len(at), -1)
+            A = np.concatenate([A, shared[at]], 1)
             blocks.append(_Block(np.flatnonzero(members), self.noise[at] ** 2, A[:, np.abs(A).max(0, initial=0) > 0]))
         return Covariance(blocks)
 
@@ -105,20 +111,18 @@ class Covariance:
 
 
 def smoothing_matrix(present: np.ndarray, width: float) -> np.ndarray:
-    """Return weights [T, T] that smooth by a Gaussian of a standard deviation of `width` steps, not across steps where nothing is there.
-
-    Near an end fewer steps count, as many before as after, so that a steady motion stays what it is.
+    """Return weights [T, T] that smooth by a parabola through what is near, weighted by a Gaussian (Cleveland 1979) of a standard
+    deviation of `width` steps, not across steps where nothing is there. A parabola rounds off less where a tool turns round than a mean.
     """
-    count = len(present)
-    weights = np.eye(count)
-    run = np.cumsum(np.append(True, present[1:] != present[:-1])) if count else np.zeros(0)
-    for step in range(count):
-        if not present[step] or width <= 0:
-            continue
+    weights = np.eye(len(present))
+    run = np.cumsum(np.append(True, present[1:] != present[:-1])) if len(present) else np.zeros(0)
+    for step in np.flatnonzero(present & (width > 0)):
         members = np.flatnonzero(run == run[step])
-        most = min(step - members[0], members[-1] - step, int(np.ceil(3 * width)))
-        around = np.arange(-most, most + 1)
-        kernel = np.exp(-0.5 * (around / width) ** 2)
+        around = members[np.abs(members - step) <= np.ceil(3 * width)]
+        if len(around) <= 3:
+            continue
+        basis = ((around - step) / width)[:, None] ** np.arange(3)
+        weighted = basis * np.exp(-0.5 * ((around - step) / width) ** 2)[:, None]
         weights[step] = 0
-        weights[step, step + around] = kernel / kernel.sum()
+        weights[step, around] = np.linalg.solve(weighted.T @ basis, weighted.T)[0]
     return weights

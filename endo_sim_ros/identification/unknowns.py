@@ -120,6 +120,8 @@ class Unknowns:
         names = list(dict.fromkeys(config.unknowns))
         self._others = [(name, self._prior(name)) for name in names if name]
         self.count = self.stiffness_count + len(self._others)
+        self.scale = np.zeros(self.count)  # direction in which all moduli are multiplied by e
+        self.scale[: 1 if config.stiffness == "field" else self.stiffness_count] = 1 / config.spread
         self.matrix = np.concatenate([matrix, np.zeros((len(nodes), len(self._others)))], 1)  # log factors of nodes [M, P]
         self._back, self._rim = held_sets(nodes)
         for name, pinned in (("hold_back", self._back), ("hold_rim", self._rim)):

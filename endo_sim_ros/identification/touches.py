@@ -153,19 +153,18 @@ def experiment_spans(line: Timeline, settle: int) -> tuple[list[tuple[int, int]]
 
     Args:
         line: The tool.
-        settle: Steps without a touch after which tissue is at rest.
+        settle: Steps without a touch after which tissue is at rest. It is so, too, where the timeline begins with a tool in the air.
     """
     spans, left_out, lead = [], 0, max(settle // 2, 1)
     known, end = line.present, 0
     for start, stop in touches(line, settle - 1):
-        rested = start - settle >= 0 and known[start - settle : start].all()
-        if not rested:
+        if not start or not known[max(start - settle, 0) : start].all():
             left_out += 1
             continue
         end = stop
         while end < min(stop + lead, len(known)) and known[end]:
             end += 1
-        spans.append((start - lead, end))
+        spans.append((max(start - lead, 0), end))
     return spans, left_out
 
 

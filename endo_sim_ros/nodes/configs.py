@@ -290,9 +290,9 @@ class IdentificationNodeConfig(WorldConfig):
     arms: tuple[str, ...] = ("PSM1",)
     """Names of the tool arms whose touches count."""
     new_touches: Annotated[int, Range(1, 1000)] = 1
-    """New experiments after which it is estimated again; more may come while that goes on."""
+    """New experiments after which the estimate is refined by them; more may come while that goes on."""
     experiments: Annotated[int, Range(1, 1000)] = 12
-    """The newest experiments that count; the time of an estimate grows with them."""
+    """The newest experiments that are kept, to begin anew when options change."""
     apply: bool = False
     """Give physics_node what was estimated, where that is known: set its parameters young_modulus and regions, and those of `unknowns`."""
     physics_node: str = "physics_node"

@@ -55,6 +55,8 @@ class IdentificationNode(EndoNode):
         self._said: list[str] = []  # about touches that were left out
         self._background = Background()
         self.found: Identification | None = None
+        self._known_of: Any = None  # the tissue and the options of that
+        self._used = 0  # experiments that it is from, or that were of no use
         self._estimated, self._seconds, self._progress = 0, 0.0, ""
         self.failure = ""
         self._to_set: dict[str, Any] | None = None  # parameters that physics_node does not have yet
@@ -115,7 +117,8 @@ class IdentificationNode(EndoNode):
 
     def _begin_anew(self) -> None:
         self._log.clear()
-        self.experiments, self._gathered, self._said, self.found, self.failure = [], 0, [], None, ""
+        self.experiments, self._gathered, self._said, self.failure = [], 0, [], ""
+        self.found, self._known_of, self._used = None, None, 0
         self._until = dict.fromkeys(self._arms, 0)
 
     def _collect(self) -> None:
@@ -158,33 +161,36 @@ class IdentificationNode(EndoNode):
     # ----------------------------------------------------------------- estimate
 
     def _estimate(self) -> None:
-        """Estimate in the background, when there is news."""
+        """Estimate in the background, when there is news: from what was felt since the last estimate, which is what was known before."""
+        nodes = self.nodes
+        tissue_now = (self._model_stamp, self.config, self.physics, id(nodes))
         try:
             done = self._background.take()
             if done is not None:
-                key, (found, seconds) = done
-                if key[0] == self._model_stamp and self.experiments:
-                    self._seconds = seconds
-                    self.found, self.failure = found, ""
-                    self._estimated += 1
+                (about, count), (found, seconds) = done
+                if about == tissue_now and count <= self._gathered:
+                    self.found, self.failure, self._known_of = found, "", about
+                    self._used, self._seconds, self._estimated = count, seconds, self._estimated + 1
                     self._publish(found)
         except Exception as error:
             self.failure = sentence("identification", error)
             self.report_error(self.failure)
-        nodes, experiments = self.nodes, list(self.experiments)
-        if nodes is None or not experiments:
+            del self.experiments[-(self._gathered - self._used) :]  # nor would they tell anything later
+            self._used = self._gathered
+        start = self.found if self._known_of == tissue_now else None
+        fresh = self._gathered - self._used if start is not None else len(self.experiments)
+        if nodes is None or not fresh or (start is not None and fresh < self._options.new_touches):
             return
-        wish = self._background.wish
-        key = (self._model_stamp, self._gathered, self.config, self.physics, id(nodes))
-        if wish is not None and (wish[0], *wish[2:]) == (key[0], *key[2:]) and self._gathered - wish[1] < self._options.new_touches:
-            return
-        config, physics = self.config, self.physics
+        experiments, config, physics = self.experiments[-fresh:], self.config, self.physics
+        around = nodes.rest[nodes.is_skin & ~nodes.pinned].astype(np.float64)  # where tools may touch later
 
         def build() -> tuple[Identification, float]:
             began = time.monotonic()
-            return identify(experiments, nodes, physics, config, physics.device, self._note_progress), time.monotonic() - began
+            progress, device = self._note_progress, physics.device
+            found = identify(experiments, nodes, physics, config, device, progress, around=around, start=start)
+            return found, time.monotonic() - began
 
-        self._background.want(key, build)
+        self._background.want((tissue_now, self._gathered), build)
 
     def _note_progress(self, stage: str, done: int, total: int) -> None:
         self._progress = f"{stage}, {done} of at most {total}" if done else stage

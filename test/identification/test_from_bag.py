@@ -114,7 +114,7 @@ BAD = {
     ),
     "other_clock": (dict(late=lambda t: 50_000.0), {}, ("share no moment", r"5e\+04 s after")),
     "poses_too_rare": (dict(rate=2.0), {}, ("more than longest_gap, 0.2 s, apart",)),
-    "always_in_tissue": (dict(presses=(-1.0, 0.0, 1.0, 2.0, 3.0), depth=0.1), {}, ("no experiment can be used", "not seen away")),
+    "always_in_tissue": (dict(presses=(-0.5, 0.4, 1.3, 2.2, 3.1), depth=0.1), {}, ("no experiment can be used", "not seen away")),
     "nothing_pushes": ({}, dict(physics=PhysicsConfig(step_duration=STEP)), ("contact_radius is 0", "press nothing")),
     "no_motion_recorded": ({}, dict(observed="images"), ("observed is images",)),
     "nothing_measured": (dict(forces=0.0), {}, ("nothing tells how the tissue answers",)),

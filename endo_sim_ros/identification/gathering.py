@@ -10,13 +10,15 @@ from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.identification.force_checks import check_clock, check_direction, check_place, overlap
 from endo_sim_ros.identification.recording_config import TouchConfig
 from endo_sim_ros.identification.surface import Surface
-from endo_sim_ros.identification.touches import Timeline, experiment_spans, tared, timeline, touches
+from endo_sim_ros.identification.touches import Timeline, experiment_spans, scatter, tared, timeline, touches
 from endo_sim_ros.learning.streams import Stream
 from endo_sim_ros.messages import Topic
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes
 
 _THINNEST, _THINNEST_CELL = 1.5, 0.3  # a capsule acts as at least this thick, as physics has it: node distances, grid cells
+
+_ROUGH, _EXACT = 1.5, 0.2  # of tip_noise: beyond these tips are measured otherwise than was thought
 
 Gathered = list[tuple[str, tuple[int, int]]]
 """Experiments: the name of the arm, and the first of its steps and the one after the last."""
@@ -47,6 +49,7 @@ def read_tool(
     forces = streams.get(messages.tool_reaction(arm))
     jaw = streams.get(messages.tool_jaw_state(arm), streams.get(messages.tool_jaw(arm)))
     line = timeline(streams[messages.tool_pose(arm)], jaw, forces, surface, physics, config, radius)
+    findings += _noise_of_tips(arm, line, config)
     if not len(line.times) or forces is None:
         return Tool(line, 0.0)
     if text := overlap(line, int(forces.stamps[0]), int(forces.stamps[-1]), config.force_delay):
@@ -65,6 +68,18 @@ def read_tool(
     check_clock(arm, line, physics.step_duration, floor)
     findings += [text for text in (check_direction(arm, line, surface, floor), check_place(arm, line, floor, config.clearance)) if text]
     return Tool(line, noise)
+
+
+def _noise_of_tips(arm: str, line: Timeline, config: TouchConfig) -> list[str]:
+    """What to say where tips scatter by much more, or much less, than they are thought to."""
+    seen = scatter(line)
+    if seen > _ROUGH * config.tip_noise:
+        return [f"{arm}: tips scatter by {1e3 * seen:.2g} mm, more than tip_noise, {1e3 * config.tip_noise:.2g} mm; give that"]
+    if seen < _EXACT * config.tip_noise:
+        return [
+            f"{arm}: tips scatter by {1e3 * seen:.2g} mm only; if they are exact, as in a simulation, give tip_noise 1e-4 and tip_smoothing 0"
+        ]
+    return []
 
 
 def tool_radius(surface: Surface, nodes: ControlNodes, physics: PhysicsConfig) -> float:

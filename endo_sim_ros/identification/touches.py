@@ -15,6 +15,7 @@ from endo_sim_ros.physics.config import PhysicsConfig
 _SAME_PERIOD = 0.01  # of the step; forces of a simulation come with its steps, and steps are then taken where these are
 _SEVERAL = 3  # forces about the end of a step are averaged; fewer are joined by straight lines
 _NOISE_OF_MEDIAN = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
+_FEW = 10  # tips that tell nothing of their scatter
 _OFFSET = 7.0  # standard errors of a mean that a force on a tool in the air must have to be an offset: three of a median of three numbers
 
 
@@ -166,6 +167,13 @@ def experiment_spans(line: Timeline, settle: int) -> tuple[list[tuple[int, int]]
             end += 1
         spans.append((max(start - lead, 0), end))
     return spans, left_out
+
+
+def scatter(line: Timeline) -> float:
+    """Standard deviation of a coordinate of single tips about their steady way, m, by their second differences; NaN of too few tips."""
+    bends = np.diff(line.tips, 2, axis=0)
+    bends = bends[np.isfinite(bends).all(1)]
+    return float(_NOISE_OF_MEDIAN * np.median(np.abs(bends)) / np.sqrt(6)) if len(bends) > _FEW else float("nan")
 
 
 def tared(line: Timeline, settle: int) -> tuple[Timeline, float, np.ndarray]:

@@ -35,7 +35,8 @@ def refused(bag, *texts, **options):
 def test_presses_become_experiments_with_their_forces(tmp_path):
     found = read(press(tmp_path / "bag", seconds=7.0, presses=(1.0, 4.0)))
     assert len(found.experiments) == found.touches == 2 and found.forces
-    assert found.findings == ["7.0 s of PSM1: 2 touches in 2 experiments of 1.9 s in all"]
+    exact = "PSM1: tips scatter by 0 mm only; if they are exact, as simulated ones, give tip_noise 1e-4 and tip_smoothing 0"
+    assert found.findings == ["7.0 s of PSM1: 2 touches in 2 experiments of 1.9 s in all", exact]
     for each in found.experiments:
         assert each.step_duration == STEP and each.present.all() and not each.closed.any()
         depth = each.tips[:, 2] - tip(0.0)[2, 3]
@@ -198,3 +199,17 @@ def test_presses_that_come_regularly_have_no_lag(tmp_path):
             if step < 180:
                 bag.force(t, [0, 0, -STIFFNESS * max(at, 0.0) ** 1.5 * 20])
     assert len(read(tmp_path / "bag").experiments) >= 4
+
+
+@pytest.mark.parametrize("scatter, told", [(0.0005, None), (0.002, "mm, more than tip_noise, 0.5 mm; give that")])
+def test_the_noise_of_tips_is_measured(tmp_path, scatter, told):
+    rng = np.random.default_rng(0)
+    with Touches(tmp_path / "bag") as bag:
+        for t in np.arange(300) * STEP:
+            depth = pressed(np.array([t]), (3.0, 8.0), duration=3.0, depth=0.006)[0]
+            pose = tip(depth)
+            pose[:3, 3] += scatter * rng.normal(size=3)
+            bag.pose(t, pose)
+            bag.force(t, [0, 0, -STIFFNESS * max(depth, 0.0)])
+    said = [text for text in read(tmp_path / "bag").findings if "scatter" in text]
+    assert not said if told is None else told in said[0]

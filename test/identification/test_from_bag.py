@@ -35,7 +35,7 @@ def refused(bag, *texts, **options):
 def test_presses_become_experiments_with_their_forces(tmp_path):
     found = read(press(tmp_path / "bag", seconds=7.0, presses=(1.0, 4.0)))
     assert len(found.experiments) == found.touches == 2 and found.forces
-    exact = "PSM1: tips scatter by 0 mm only; if they are exact, as simulated ones, give tip_noise 1e-4 and tip_smoothing 0"
+    exact = "PSM1: tips scatter by 0.00 mm only; if they are exact, as simulated ones, give tip_noise 1e-4 and tip_smoothing 0"
     assert found.findings == ["7.0 s of PSM1: 2 touches in 2 experiments of 1.9 s in all", exact]
     for each in found.experiments:
         assert each.step_duration == STEP and each.present.all() and not each.closed.any()

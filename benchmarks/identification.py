@@ -129,9 +129,9 @@ def modulus_rows(scene: Scene, device: str, truth: Truth, cases: int, first: int
         modulus = float(np.exp(rng.uniform(np.log(SOFTEST), np.log(STIFFEST))))
         offset = options.tip_offset * rng.standard_normal(3)
         chosen = places[rng.permutation(len(places))[:PRESSES]]
+        softness = replace(made, young_modulus=modulus)
         experiments = [
-            measure(press(nodes, config, place, steps=40), true_nodes, replace(made, young_modulus=modulus), rng, offset=offset, device=device)
-            for place in chosen
+            measure(press(nodes, config, place, steps=40), true_nodes, softness, rng, offset=offset, device=device) for place in chosen
         ]
         begin = time.perf_counter()
         found = identify(experiments, nodes, config, options, device)
@@ -221,8 +221,8 @@ def inclusion_rows(scene: Scene, device: str, count: int, radius: float) -> list
 
 
 def search_rows(scene: Scene, device: str, count: int, radius: float) -> list[Row]:
-    """Presses until an inclusion is found within 4 mm and stays so for the next press, where each is expected to tell most, and in a
-    raster."""
+    """Presses until an inclusion is found within 4 mm across them, and is after the next, too: where each is expected to tell most, and in
+    a raster."""
     config = physics(device, SEARCH_NODES)
     nodes, needed = scene.nodes(config), {"a raster": [], "expected information": []}
     for seed in range(count):
@@ -232,7 +232,7 @@ def search_rows(scene: Scene, device: str, count: int, radius: float) -> list[Ro
     rows = []
     for policy, told in needed.items():
         compared = (np.mean(told) / np.mean(needed["a raster"]), "a raster") if policy != "a raster" else (None, None)
-        rows.append(Row(f"presses until found within 4 mm, {policy}, mean of {count}", float(np.mean(told)), "", *compared))
+        rows.append(Row(f"presses until found within 4 mm across them, {policy}, mean of {count}", float(np.mean(told)), "", *compared))
     return rows
 
 
@@ -245,9 +245,10 @@ def search(nodes: ControlNodes, config: PhysicsConfig, hidden: _Hidden, places: 
         at = 0
         if informed:
             at = best_press(found, [candidates[each] for each in left], model) if found is not None else _nearest_to_middle(places)
-        measured = measure(short_press(nodes, config, places[left.pop(at)]), nodes, config, hidden.rng, hidden.factors, hidden.offset, device=device)
+        chosen = short_press(nodes, config, places[left.pop(at)])
+        measured = measure(chosen, nodes, config, hidden.rng, hidden.factors, hidden.offset, device=device)
         found = identify([measured], nodes, config, options, device, around=places, start=found)
-        errors.append(hidden.error(found))
+        errors.append(hidden.error_across(found))
         if len(errors) > 1 and max(errors[-2:]) <= FOUND:
             return len(errors) - 1
     return MOST_PRESSES + 1

@@ -2,6 +2,7 @@
 
 from endo_sim_ros.messages import (
     BagPlayerState,
+    IdentificationState,
     NodeState,
     PhysicsState,
     PolicyState,
@@ -16,6 +17,7 @@ NODE_STATES: dict[str, type[NodeState]] = {  # by the default name of the node
     "reconstruction_node": ReconstructionState,
     "physics_node": PhysicsState,
     "rendering_node": RenderingState,
+    "identification_node": IdentificationState,
     "viewer_node": ViewerState,
     "bag_player": BagPlayerState,
     "recorder": RecorderState,

@@ -19,7 +19,7 @@ from endo_sim_ros import hear_interrupts
 # In the order of a user's way through the package.
 COMMANDS = (
     *("demo", "view", "up", "convert", "phantom", "reconstruct", "compress", "touch", "record", "export"),
-    *("train", "demonstrate", "imitate", "benchmark", "scene"),
+    *("identify", "train", "demonstrate", "imitate", "benchmark", "scene"),
     *("config", "evaluate", "report", "bench", "plot"),
 )
 

@@ -91,6 +91,23 @@ class BenchEnvironments(Measured):
 
 
 @dataclass(frozen=True)
+class BenchIdentification(Measured):
+    """Identification of tissue: how well moduli and inclusions are found that are known, whether intervals hold the truth, and how long
+    it takes."""
+
+    cases: int = 4
+    """Cases of one modulus with each of four truths; 0 = none."""
+    inclusions: int = 1
+    """Inclusions to be found in maps; 0 = none."""
+    radius: float = 0.008
+    """Radius of these, m."""
+    searches: int = 1
+    """Searches for an inclusion, press by press, where the next is expected to tell most, and in a raster; 0 = none."""
+    folder: Path | None = None
+    """Folder of presses of real tissue, as `presses` takes it; default: none."""
+
+
+@dataclass(frozen=True)
 class BenchPresses:
     """The laws of materials on presses of real tissue by a testing machine: how well each fits, and predicts other trials."""
 
@@ -134,6 +151,7 @@ class Command:
         | Annotated[BenchPhysics, tyro.conf.subcommand("physics", prefix_name=False)]
         | Annotated[BenchGraph, tyro.conf.subcommand("graph", prefix_name=False)]
         | Annotated[BenchEnvironments, tyro.conf.subcommand("environments", prefix_name=False)]
+        | Annotated[BenchIdentification, tyro.conf.subcommand("identification", prefix_name=False)]
         | Annotated[BenchPresses, tyro.conf.subcommand("presses", prefix_name=False)]
         | Annotated[BenchSoak, tyro.conf.subcommand("soak", prefix_name=False)]
     ]

@@ -1,11 +1,15 @@
 """Features that two images share, and how far they are from where known cameras expect them."""
 
+from typing import Any
+
 import cv2
 import numpy as np
 
 from endo_sim_ros.core.cameras import Camera
 
 Features = tuple[np.ndarray, np.ndarray | None]  # pixels [N, 2] and descriptors [N, 128]
+_LOOK: dict[str, Any] = dict(winSize=(15, 15), maxLevel=4)  # of optical flow
+_RETURN = 0.3  # pixels from where it began, within which the way back of a followed point ends
 
 
 def detect(image: np.ndarray, mask: np.ndarray | None, count: int) -> Features:
@@ -63,3 +67,19 @@ def epipolar_distance(
     t = ((uv_2 - near_end) * along).sum(1) / np.maximum((along * along).sum(1), 1e-12)
     distance = np.linalg.norm(uv_2 - near_end - t.clip(0, 1)[:, None] * along, axis=1)
     return np.where((z_near > 0) & (z_far > 0), distance, np.inf)
+
+
+def follow(image: np.ndarray, other: np.ndarray, places: np.ndarray, guesses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where places [N, 2] of a grey image [H, W] are in another, and whether the way back leads there [N]: pyramids of Lucas and Kanade.
+
+    Args:
+        image, other: uint8.
+        places: Pixels in the image; here (0, 0) is the centre of the first, as OpenCV has it.
+        guesses: Where to look for them in the other [N, 2].
+    """
+    flags = cv2.OPTFLOW_USE_INITIAL_FLOW
+    there, found, _ = cv2.calcOpticalFlowPyrLK(image, other, places[:, None], guesses[:, None].copy(), flags=flags, **_LOOK)
+    back, returned, _ = cv2.calcOpticalFlowPyrLK(other, image, there, places[:, None].copy(), flags=flags, **_LOOK)
+    good = (found[:, 0] > 0) & (returned[:, 0] > 0) & (np.abs(back[:, 0] - places).max(1) < _RETURN)
+    height, width = image.shape
+    return there[:, 0], good & (there[:, 0] >= 0).all(1) & (there[:, 0] < [width, height]).all(1)

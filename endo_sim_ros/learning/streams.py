@@ -47,16 +47,16 @@ def read_streams(
     """
     decoders = {}
     for arm in arms:
-        decoders[messages.tool_pose(arm)] = lambda m, topic, arm=arm: _pose_row(messages.decode_tip(m, frames, arm, topic))
+        decoders[messages.tool_pose(arm)] = lambda m, topic, arm=arm: pose_row(messages.decode_tip(m, frames, arm, topic))
         in_world = {**frames, "": np.eye(4)}  # as a commanded arm publishes its pose
-        decoders[messages.tool_pose_command(arm)] = lambda m, topic, known=in_world: _pose_row(messages.decode_pose(m, known, topic))
+        decoders[messages.tool_pose_command(arm)] = lambda m, topic, known=in_world: pose_row(messages.decode_pose(m, known, topic))
         for make in (messages.tool_jaw, messages.tool_jaw_state):
             decoders[make(arm)] = lambda m, topic: [messages.decode_jaw(m, topic)]
         for make in (messages.tool_wrench, messages.tool_reaction):
-            decoders[make(arm)] = lambda m, topic, arm=arm: _wrench_row(m, topic, arm, frames)
+            decoders[make(arm)] = lambda m, topic, arm=arm: wrench_row(m, topic, arm, frames)
         decoders[messages.tool_joints(arm)] = _joint_row
     decoders[messages.TASK_OUTCOME] = messages.decode_outcome
-    decoders[messages.RENDERED_POSE] = lambda m, topic: _pose_row(messages.decode_pose(m, frames, topic))
+    decoders[messages.RENDERED_POSE] = lambda m, topic: pose_row(messages.decode_pose(m, frames, topic))
     rows: dict[Topic, list] = defaultdict(list)
     numbers, sizes = dict.fromkeys((*pictures, messages.CONTROL_NODES), -1), dict[Topic, tuple[int, ...]]()
     for topic, _, message in reader.messages((*numbers, *decoders)):
@@ -86,7 +86,7 @@ def read_streams(
         tip = streams.get(messages.tool_pose(arm))
         for topic in (messages.tool_wrench(arm), messages.tool_reaction(arm)):
             if tip is not None and topic in streams:
-                streams[topic] = _to_world(streams[topic], tip)
+                streams[topic] = to_world(streams[topic], tip)
     return streams
 
 
@@ -106,7 +106,7 @@ def _one_run(topic: Topic, pairs: list, reactions: set[int]) -> list:
     return [pairs[index] for run in runs for index in run]
 
 
-def _pose_row(pose: np.ndarray) -> np.ndarray:
+def pose_row(pose: np.ndarray) -> np.ndarray:
     """Position and quaternion xyzw, [7]."""
     w, *xyz = matrix_to_quat(pose[:3, :3])
     return np.array([*pose[:3, 3], *xyz, w])
@@ -120,14 +120,14 @@ def _joint_row(message: Any, topic: str) -> np.ndarray:
     return joints
 
 
-def _wrench_row(message: Any, topic: str, arm: str, frames: Mapping[str, np.ndarray]) -> np.ndarray:
+def wrench_row(message: Any, topic: str, arm: str, frames: Mapping[str, np.ndarray]) -> np.ndarray:
     """Force and torque in world axes and 1 or, in those of the tip, and 0, [7]."""
     frame = messages.check_frame(message, (arm, "", *frames), topic)
     R = frames.get(frame, np.eye(4))[:3, :3]  # any other is the tool's own
     return np.array([*(vector for part in messages.decode_wrench(message, topic) for vector in R @ part), frame in frames])
 
 
-def _to_world(wrenches: Stream, tips: Stream) -> Stream:
+def to_world(wrenches: Stream, tips: Stream) -> Stream:
     """Wrenches [N, 6] in world axes of ones [N, 7] whose last column says whether they are so already, else in the tip's."""
     x, y, z, w = tips.at(wrenches.stamps)[:, 3:].T[:, :, None]
     axis = np.hstack([x, y, z])

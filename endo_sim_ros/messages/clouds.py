@@ -1,4 +1,4 @@
-"""Point clouds: Gaussian models, control nodes and cut surfaces."""
+"""Point clouds: Gaussian models, control nodes, cut surfaces and maps of stiffness."""
 
 import dataclasses
 import zlib
@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from endo_sim_ros.messages.headers import NANOSECONDS, make_header
-from endo_sim_ros.messages.topics import CONTROL_NODES, CUT_SURFACE, GAUSSIANS
+from endo_sim_ros.messages.topics import CONTROL_NODES, CUT_SURFACE, GAUSSIANS, STIFFNESS_MAP
 from endo_sim_ros.messages.types import Message, MessageError, MessageTypes, ros_types
 
 if TYPE_CHECKING:  # it takes torch, which most users of this package do not need
     from endo_sim_ros.core.gaussians import GaussianModel
 
 __all__ = [
-    "ControlNodeCloud", "cut_number", "decode_cloud", "decode_control_nodes", "decode_cut_surface", "decode_gaussians",
-    "encode_control_nodes", "encode_cut_surface", "encode_gaussians",
+    "ControlNodeCloud", "StiffnessCloud", "cut_number", "decode_cloud", "decode_control_nodes", "decode_cut_surface", "decode_gaussians",
+    "decode_stiffness", "encode_control_nodes", "encode_cut_surface", "encode_gaussians", "encode_stiffness",
 ]  # fmt: skip
 
 _POINT_FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # PointField.datatype
@@ -224,3 +224,53 @@ def decode_cut_surface(message: Message, topic: str = CUT_SURFACE.name) -> np.nd
     if not np.isfinite(triangles).all():
         raise MessageError(f"{topic}: a corner is not finite; the cut was ignored")
     return triangles
+
+
+@dataclass(frozen=True)
+class StiffnessCloud:
+    """What is known of the stiffness of the tissue, at control nodes at rest."""
+
+    positions: np.ndarray  # [M, 3] float32, m, world
+    young_modulus: np.ndarray  # [M] float32, Pa; median
+    low: np.ndarray  # [M] float32, Pa, lower end of its interval
+    high: np.ndarray  # [M] float32, Pa, upper end
+    known: np.ndarray  # [M] bool
+
+
+_STIFFNESS = (*_POSITION, "young_modulus", "low", "high")
+_STIFFNESS_DTYPE = np.dtype([*((name, "<f4") for name in _STIFFNESS), ("known", "<u4")])
+
+
+def encode_stiffness(stiffness: StiffnessCloud, model_stamp_ns: int, frame_id: str, types: MessageTypes = ros_types()) -> Message:
+    """PointCloud2 of a map of stiffness.
+
+    Args:
+        stiffness: The map.
+        model_stamp_ns: Stamp of the model, nanoseconds.
+        frame_id: The world frame.
+        types: Message classes to build; those of ROS by default.
+    """
+    points = np.empty(len(stiffness.positions), _STIFFNESS_DTYPE)
+    for number, name in enumerate(_POSITION):
+        points[name] = stiffness.positions[:, number]
+    for name in ("young_modulus", "low", "high", "known"):
+        points[name] = getattr(stiffness, name)
+    return _encode_cloud(points, model_stamp_ns, frame_id, types)
+
+
+def decode_stiffness(message: Message, topic: str = STIFFNESS_MAP.name) -> StiffnessCloud:
+    """Map of stiffness of a PointCloud2, decoded by field name.
+
+    Raises:
+        MessageError: If the cloud is damaged or empty, a field is missing, or a modulus is not a finite number above zero.
+    """
+    points = decode_cloud(message, topic)
+    missing = [name for name in (*_STIFFNESS, "known") if name not in _names(points)]
+    if missing:
+        raise MessageError(f"{topic}: missing field {', '.join(missing)}; see stiffness_map in msg_conventions.md")
+    if not len(points):
+        raise MessageError(f"{topic}: there are no points")
+    positions, moduli = _columns(points, _POSITION), _columns(points, _STIFFNESS[3:])
+    if not (np.isfinite(positions).all() and np.isfinite(moduli).all() and (moduli > 0).all()):
+        raise MessageError(f"{topic}: a position is not finite, or a modulus is not a finite number above zero; the map was ignored")
+    return StiffnessCloud(positions, moduli[:, 0], moduli[:, 1], moduli[:, 2], points["known"].astype(bool))

@@ -11,8 +11,8 @@ from endo_sim_ros.messages.headers import make_header
 from endo_sim_ros.messages.types import Message, MessageTypes, RosTypes, ros_types
 
 __all__ = [
-    "ERROR", "OK", "STATE", "WARN", "BagPlayerState", "ClientState", "NodeState", "NodeStatus", "PhysicsState", "PolicyState",
-    "ReconstructionState", "RecorderState", "RenderingState", "ScriptedToolState", "ViewerState", "decode_diagnostics",
+    "ERROR", "OK", "STATE", "WARN", "BagPlayerState", "ClientState", "IdentificationState", "NodeState", "NodeStatus", "PhysicsState",
+    "PolicyState", "ReconstructionState", "RecorderState", "RenderingState", "ScriptedToolState", "ViewerState", "decode_diagnostics",
     "encode_diagnostics",
 ]  # fmt: skip
 
@@ -56,6 +56,15 @@ class RenderingState(NodeState):
     BUILDING = "building"  # the first model is prepared
     RENDERING = "rendering"
     FAILED = "failed"  # the model cannot be rendered, and there is none before it
+
+
+class IdentificationState(NodeState):
+    """States of identification_node."""
+
+    WAITING = "waiting"  # for a model, or for the place from where its tissue is seen
+    COLLECTING = "collecting"  # touches
+    ESTIMATING = "estimating"  # what the tissue is made of; touches are collected meanwhile
+    FAILED = "failed"  # nothing could be estimated from the touches so far
 
 
 class ViewerState(NodeState):

@@ -11,6 +11,8 @@ import numpy as np
 from endo_sim_ros.core.cameras import parse_frames
 from endo_sim_ros.core.config import ConfigError, Range, StageConfig
 from endo_sim_ros.core.frames import LEFT_FRAME, RIGHT_FRAME
+from endo_sim_ros.identification.config import IdentificationConfig
+from endo_sim_ros.identification.recording_config import TouchConfig
 from endo_sim_ros.instruments.config import DrawingConfig
 from endo_sim_ros.nodes.pacing import MOST_WAITING
 from endo_sim_ros.physics.config import PhysicsConfig
@@ -278,6 +280,25 @@ class ViewerNodeConfig(WorldConfig):
     """Name of the physics node, whose parameters and services the page uses."""
 
 
+@dataclass(frozen=True)
+class IdentificationNodeConfig(WorldConfig):
+    """Options of identification_node beside those of the identification and of the physics, which must be those of physics_node."""
+
+    tissue: Tissue = "default"
+    """What the tissue is thought to be made of, with published numbers (docs/physics.md). Options that are not given have the values of
+    the tissue."""
+    arms: tuple[str, ...] = ("PSM1",)
+    """Names of the tool arms whose touches count."""
+    new_touches: Annotated[int, Range(1, 1000)] = 1
+    """New experiments after which the estimate is refined by them; more may come while that goes on."""
+    experiments: Annotated[int, Range(1, 1000)] = 12
+    """The newest experiments that are kept, to begin anew when options change."""
+    apply: bool = False
+    """Give physics_node what was estimated, where that is known: set its parameters young_modulus and regions, and those of `unknowns`."""
+    physics_node: str = "physics_node"
+    """Name of the physics node that gets it."""
+
+
 NODE_CONFIGS: dict[str, tuple[type[StageConfig], ...]] = {
     "reconstruction_node": (ReconstructionNodeConfig, ReconstructionConfig),
     "physics_node": (PhysicsNodeConfig, PhysicsConfig),
@@ -286,6 +307,7 @@ NODE_CONFIGS: dict[str, tuple[type[StageConfig], ...]] = {
     "recorder": (RecorderConfig,),
     "scripted_tool": (ScriptedToolConfig,),
     "policy": (PolicyConfig,),
+    "identification_node": (IdentificationNodeConfig, TouchConfig, IdentificationConfig, PhysicsConfig),
     "viewer_node": (ViewerNodeConfig, ViewerConfig, RenderingConfig),
 }
 """The configurations whose options are the parameters of each node, by the name of the ROS node."""

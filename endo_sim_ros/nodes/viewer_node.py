@@ -80,6 +80,7 @@ class ViewerNode(Watcher):
         on_cut = lambda message: self._tissue.receive_cut_surface(message, self._options.world_frame)
         self.subscribe(messages.CUT_SURFACE, on_cut, depth=1)
         self.subscribe(messages.DYE, lambda message: self._tissue.receive_dye(message, self._options.world_frame))
+        self.subscribe(messages.STIFFNESS_MAP, self._on_stiffness)
         self.subscribe(messages.CONTROL_NODES, self._on_nodes, depth=1)
         for topic in (messages.TRAINING_CAMERA_INFO, messages.RENDERED_INFO):
             self.subscribe(topic, partial(self._on_info, topic.name), depth=1)
@@ -113,6 +114,11 @@ class ViewerNode(Watcher):
 
     def _on_info(self, topic: str, message: Any) -> None:
         self._infos[topic] = messages.decode_camera_info(message, topic)
+
+    def _on_stiffness(self, message: Any) -> None:
+        messages.check_frame(message, (self._options.world_frame,), messages.STIFFNESS_MAP.name)
+        found = messages.decode_stiffness(message)
+        self.viewer.show_stiffness(found.positions, found.young_modulus, found.known)
 
     def _on_nodes(self, message: Any) -> None:
         messages.check_frame(message, (self._options.world_frame,), messages.CONTROL_NODES.name)

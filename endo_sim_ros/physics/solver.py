@@ -131,8 +131,13 @@ class MpmSolver:
         of(self.loads.holder)[environments] = -1
         of(self.loads.spring)[environments] = of(self.pin_springs)[environments]
 
-    def set_stiffness(self, environments: torch.Tensor | slice, stiffness: np.ndarray) -> None:
+    def set_stiffness(self, environments: torch.Tensor | slice, stiffness: np.ndarray, holds: np.ndarray | float = 1.0) -> None:
         """Other factors on the moduli [K, M] in these K environments; what pins or pushes their control nodes is as much stiffer.
+
+        Args:
+            environments: Which.
+            stiffness: The factors.
+            holds: Further factors on the springs that pin control nodes [K, M], zero or more: how firmly they are held.
 
         Raises:
             ValueError: If one is not above zero, or larger than any factor that the substeps were planned for.
@@ -145,6 +150,7 @@ class MpmSolver:
         factors = torch.from_numpy(stiffness.copy()).to(self.device)
         grasp = factors * self._grasp
         pins = self.config.pin_stiffness / self.config.grasp_stiffness * grasp * self._pinned
+        pins = pins * torch.as_tensor(holds, dtype=pins.dtype, device=pins.device)
         for array, values in ((self.scale, factors), (self.nodes.stiffness, grasp), (self.pin_springs, pins)):
             wp.to_torch(array).view(self.environments, -1)[environments] = values.float()
         springs = wp.to_torch(self.loads.spring).view(self.environments, -1)

@@ -2,11 +2,12 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
+from endo_sim_ros.core.features import follow
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.tissue_motion import PeriodicMotion, TissueMotion, waves
 from endo_sim_ros.reconstruction.stage_configs import MotionSearchConfig
@@ -19,7 +20,6 @@ _BAND = 0.45  # of the rate of images: up to half of it rates are told apart
 _LEAST = 2e-4  # metres: less is noise
 _MOST = 1.5  # share, of that which nineteen of twenty points do not reach: few rays tell a share badly
 _TRACKS = 5  # times as many tracks as points are followed at a time tell the ways
-_LOOK: dict[str, Any] = dict(winSize=(15, 15), maxLevel=4)  # of optical flow
 _DISTANCE = 7  # pixels between tracked points
 
 
@@ -81,7 +81,7 @@ class MotionWatch:
             self._ended, self._tracks = self._ended + self._tracks, []
         if self._before is not None and self._tracks:
             was = np.array([track.left[-1] for track in self._tracks], np.float32)
-            now, good = _followed(self._before, image, was, was)
+            now, good = follow(self._before, image, was, was)
             columns, rows = now.round().astype(int).clip(0, np.array(size) - 1).T
             good &= free[rows, columns] > 0  # else an instrument may take them along
             self._ended += [track for track, kept in zip(self._tracks, good) if not kept]
@@ -98,7 +98,7 @@ class MotionWatch:
             places = np.array([track.left[-1] for track in self._tracks], np.float32)
             guesses = [track.left[-1] - (track.left[-2] - track.right[-1] if track.right else 0) for track in self._tracks]
             guesses = np.where(np.isfinite(guesses), guesses, places).astype(np.float32)
-            found, good = _followed(image, right, places, guesses)
+            found, good = follow(image, right, places, guesses)
             good &= np.abs(found[:, 1] - places[:, 1]) < 1.5
             for track, place, kept in zip(self._tracks, found, good):
                 track.right += [np.full(2, np.nan)] * (len(track.left) - 1 - len(track.right)) + [place if kept else np.full(2, np.nan)]
@@ -346,16 +346,6 @@ def _ray(pixel: np.ndarray, pose: np.ndarray, K: np.ndarray) -> np.ndarray:
     """Unit direction [3], world, of a pixel whose index counts from the centre of the first."""
     direction = pose[:3, :3] @ np.array([(pixel[0] + 0.5 - K[0, 2]) / K[0, 0], (pixel[1] + 0.5 - K[1, 2]) / K[1, 1], 1.0])
     return direction / np.linalg.norm(direction)
-
-
-def _followed(image: np.ndarray, other: np.ndarray, places: np.ndarray, guesses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where places [N, 2] of an image are in another, and whether the way back leads there [N]."""
-    flags = cv2.OPTFLOW_USE_INITIAL_FLOW
-    there, found, _ = cv2.calcOpticalFlowPyrLK(image, other, places[:, None], guesses[:, None].copy(), flags=flags, **_LOOK)
-    back, returned, _ = cv2.calcOpticalFlowPyrLK(other, image, there, places[:, None].copy(), flags=flags, **_LOOK)
-    good = (found[:, 0] > 0) & (returned[:, 0] > 0) & (np.abs(back[:, 0] - places).max(1) < 0.3)
-    height, width = image.shape
-    return there[:, 0], good & (there[:, 0] >= 0).all(1) & (there[:, 0] < [width, height]).all(1)
 
 
 def _explained(before: np.ndarray, after: np.ndarray) -> float:

@@ -16,7 +16,7 @@ from endo_sim_ros.core.drawing import draw_points, write_video
 
 CENTIMETRES = 100.0  # units of the page in a metre: its covariances are half floats, which would vanish in m²
 SPLATS, RENDERED, ENDOSCOPE = VIEWS = ("orbit", "orbit, rendered here", "endoscope")
-_NODES = ("hidden", "positions", "stress")
+_NODES = ("hidden", "positions", "stress", "stiffness")
 _PLAIN = (90, 230, 140)  # colour of nodes
 _LARGEST = 640, 512  # pixels of rendered pictures
 _ROOM = 20.0  # size of the invisible box around the tissue in which the mouse is heard, in sizes of the tissue
@@ -53,7 +53,7 @@ class Browser:
                 "view", VIEWS, hint="Drawn by the browser, by this package for slow browsers, or what the endoscope sees."
             )
             self._tissue = gui.add_checkbox("tissue", True, hint="Show the Gaussians.")
-            self._nodes = gui.add_dropdown("nodes", _NODES, hint="Show the control nodes, coloured by their stress or not.")
+            self._nodes = gui.add_dropdown("nodes", _NODES, hint="Show the control nodes, in colours or not.")
             self._mouse = gui.add_dropdown("drag", ("turns", "pulls"), hint="What dragging without Shift does.")
             self._button = gui.add_button("record video")
         for element in (self._view, self._tissue, self._nodes, self._mouse):
@@ -86,6 +86,11 @@ class Browser:
     def wants_stress(self) -> bool:
         """Whether control nodes are coloured by their stress."""
         return self._nodes.value == _NODES[2]
+
+    @property
+    def wants_stiffness(self) -> bool:
+        """Whether control nodes are coloured by their stiffness."""
+        return self._nodes.value == _NODES[3]
 
     def _choose(self) -> None:
         """Follow the controls."""
@@ -175,7 +180,7 @@ class Browser:
     def show_nodes(self, positions: np.ndarray, colors: np.ndarray | None, size: float) -> None:
         """Nodes at positions [M, 3], m, in colours [M, 3] uint8, as points of a size in cm."""
         points = (CENTIMETRES * positions).astype(np.float32)
-        colors = np.tile(np.array(_PLAIN, np.uint8), (len(points), 1)) if colors is None or not self.wants_stress else colors
+        colors = np.tile(np.array(_PLAIN, np.uint8), (len(points), 1)) if colors is None else colors
         if self._points is not None and len(self._points.points) != len(points):
             self._points.remove()
             self._points = None

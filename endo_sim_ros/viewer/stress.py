@@ -41,15 +41,19 @@ class StressColors:
 
     def __call__(self, F: np.ndarray) -> np.ndarray:
         """Return colours [M, 3] uint8 of nodes with these deformation gradients [M, 3, 3]."""
-        if self._tissue is None:
-            self._tissue = self._properties(len(F))
-        known = self._parameters
+        tissue, known = self.tissue(len(F)), self._parameters
         stiffening = Stiffening(known["stiffening"], known["stiffening_limit"])
-        stress = von_mises(F, self._tissue.young_modulus, self._tissue.poisson_ratio, known["material"], stiffening)
+        stress = von_mises(F, tissue.young_modulus, tissue.poisson_ratio, known["material"], stiffening)
         largest = max(float(np.percentile(stress, _RED)), _LEAST_SCALE * known["young_modulus"])
         self.scale = max(largest, 0.98 * self.scale)
         levels = (255 * np.minimum(stress / self.scale, 1)).astype(np.uint8)
         return cv2.applyColorMap(levels[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1]
+
+    def tissue(self, count: int) -> TissueProperties:
+        """What each of so many nodes is made of, as the options say."""
+        if self._tissue is None or len(self._tissue) != count:
+            self._tissue = self._properties(count)
+        return self._tissue
 
     def _properties(self, count: int) -> TissueProperties:
         known = self._parameters  # stress does not depend on density

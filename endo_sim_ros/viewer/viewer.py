@@ -21,6 +21,7 @@ from endo_sim_ros.viewer.browser import CENTIMETRES, ENDOSCOPE, Browser, Pointer
 from endo_sim_ros.viewer.config import ViewerConfig
 from endo_sim_ros.viewer.grasp import Grasp
 from endo_sim_ros.viewer.sliders import SLIDERS, Sliders
+from endo_sim_ros.viewer.stiffness import StiffnessColors
 from endo_sim_ros.viewer.stress import StressColors
 from endo_sim_ros.viewer.tool_marks import ARROW, Tool, ToolMarks
 
@@ -101,6 +102,7 @@ class Viewer:
         self._pictures, self._texted, self._updated = 0, 0.0, time.monotonic()
         self._parameters: dict[str, Any] = {name: getattr(PhysicsConfig(), name) for name in PARAMETERS}
         self.stress_colors = StressColors(self._parameters, self.notify)
+        self.stiffness_colors = StiffnessColors(self.stress_colors)
         self.paused = False
         self._lines: tuple[str, ...] = ()
         self.notice, self._notice_until = "", 0.0
@@ -126,6 +128,7 @@ class Viewer:
         same = old is not None and torch.equal(old.model.means, renderer.model.means)
         self.renderer, self.state, self.camera = renderer, None, camera
         self.stress_colors.set_nodes(node_rest)
+        self.stiffness_colors.set_nodes(node_rest)
         self.release()
         means = renderer.model.means.cpu().numpy()
         if node_rest is not None and len(node_rest) > 1:
@@ -172,7 +175,14 @@ class Viewer:
         if (known := self._parameters | values) != self._parameters:
             self._parameters = known
             self.stress_colors.set_parameters(known)
+            self.stiffness_colors.renew()
+            self._dirty = True
         self.sliders.show(values)
+
+    def show_stiffness(self, positions: np.ndarray, young_modulus: np.ndarray, known: np.ndarray) -> None:
+        """What was identified of the stiffness: nodes at rest [K, 3], m, world, their moduli [K], Pa, and where these are known [K]."""
+        self.stiffness_colors.show(positions, young_modulus, known)
+        self._dirty = True
 
     def show_text(self, *lines: str, paused: bool | None = None) -> None:
         """What there is to say about the simulation."""
@@ -273,15 +283,16 @@ class Viewer:
     def _draw(self, now: float) -> None:
         self._drawn, dirty, self._dirty = now, self._dirty, False
         self.marks.draw(self.tools)
-        splats = colors = None
+        splats = stress = None
         for browser in self.browsers.values():
             if dirty and browser.wants_splats:
                 splats = splats or self.splats()
                 browser.show_splats(*splats)
             if dirty and browser.wants_nodes and self.state is not None:
-                if browser.wants_stress and colors is None:
-                    colors = self.stress_colors(self.state[1])
-                browser.show_nodes(self.state[0], colors, self._node_size)
+                if browser.wants_stress and stress is None:
+                    stress = self.stress_colors(self.state[1])
+                colors = self.stiffness_colors(len(self.state[0])) if browser.wants_stiffness else None
+                browser.show_nodes(self.state[0], stress if browser.wants_stress else colors, self._node_size)
             browser.show_picture(self._render, self.endoscope, self._tools_on, dirty)
         self._pictures += dirty
         if self._asked is not None and self._begun >= self._asked:
@@ -318,6 +329,8 @@ class Viewer:
         lines += [f"{name}: {np.linalg.norm(tool.force):.2f} N" for name, tool in self.tools.items()]
         if any(browser.wants_stress for browser in self.browsers.values()):
             lines.append(f"red: von Mises stress of {self.stress_colors.scale / 1e3:.2g} kPa")
+        if any(browser.wants_stiffness for browser in self.browsers.values()):
+            lines.append(self.stiffness_colors.legend)
         if now < self._notice_until:
             lines.append(f"**{self.notice}**")
         self._text.content = "  \n".join(lines)

@@ -12,6 +12,7 @@ import yaml
 from endo_sim_ros import messages
 from endo_sim_ros.nodes.bag_player_node import BagPlayerNode
 from endo_sim_ros.nodes.base import EndoNode
+from endo_sim_ros.nodes.identification_node import IdentificationNode
 from endo_sim_ros.nodes.physics_node import PhysicsNode
 from endo_sim_ros.nodes.policy_node import PolicyNode
 from endo_sim_ros.nodes.reconstruction_node import ReconstructionNode
@@ -115,6 +116,7 @@ ENCLAVES = {
     "physics_node": (PhysicsNode, [[], ["mode:=lockstep"], ["arm_source:=commanded"]]),
     "rendering_node": (RenderingNode, [[]]),
     "scripted_tool_node": (ScriptedToolNode, [[]]),
+    "identification_node": (IdentificationNode, [[]]),
     "viewer_node": (ViewerNode, [[], ["arm_source:=commanded"]]),
     "policy_node": (PolicyNode, [[], ["policy:={joint_policy}"], ["task:=camera"]]),
     "bag_player_node": (BagPlayerNode, [["bag:=/does/not/exist"]]),

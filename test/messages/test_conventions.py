@@ -11,6 +11,7 @@ from node_states import NODE_STATES
 from endo_sim_ros import messages
 from endo_sim_ros.messages import STATE
 from endo_sim_ros.nodes.bag_player_node import BagPlayerNode
+from endo_sim_ros.nodes.identification_node import IdentificationNode
 from endo_sim_ros.nodes.physics_node import PhysicsNode
 from endo_sim_ros.nodes.policy_node import PolicyNode
 from endo_sim_ros.nodes.reconstruction_node import ReconstructionNode
@@ -85,6 +86,7 @@ def ends(tmp_path_factory, small_bag, joint_policy):
     for source in ("measured", "commanded"):
         look(viewer_node.ViewerNode, arm_source=source)
     look(ScriptedToolNode)
+    look(IdentificationNode)
     look(PolicyNode)
     look(PolicyNode, task="camera")
     look(PolicyNode, policy=str(joint_policy))

@@ -376,3 +376,19 @@ def test_cuts_keep_their_triangles_and_number(wire):
         wrong = messages.encode_cut_surface(triangles[:2], 7, "world", types)
         wrong.width, wrong.row_step = 4, 48
         messages.decode_cut_surface(wrong)
+
+
+def test_maps_of_stiffness_round_trip_and_what_is_no_map_is_refused(wire):
+    types, transport = wire
+    rng = np.random.default_rng(0)
+    moduli = rng.uniform(1e3, 1e5, (3, 7)).astype(np.float32)
+    cloud = messages.StiffnessCloud(rng.normal(size=(7, 3)).astype(np.float32), *moduli, rng.random(7) > 0.5)
+    again = messages.decode_stiffness(transport(messages.encode_stiffness(cloud, 7, "world", types), "sensor_msgs/msg/PointCloud2"))
+    for name in ("positions", "young_modulus", "low", "high", "known"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(cloud, name))
+    for text, values in (("not a finite number above zero", np.zeros(7)), ("not finite", np.full(7, np.nan))):
+        bad = messages.StiffnessCloud(cloud.positions, values.astype(np.float32), *moduli[1:], cloud.known)
+        with pytest.raises(MessageError, match=f"stiffness_map: .*{text}"):
+            messages.decode_stiffness(messages.encode_stiffness(bad, 7, "world", types))
+    with pytest.raises(MessageError, match="stiffness_map: missing field young_modulus, low, high, known"):
+        messages.decode_stiffness(messages.encode_cut_surface(np.zeros((1, 3, 3)), 7, "world", types))

@@ -21,6 +21,7 @@ from endo_sim_ros.messages import (
     OK,
     STATE,
     BagPlayerState,
+    IdentificationState,
     PhysicsState,
     PolicyState,
     ReconstructionState,
@@ -30,6 +31,7 @@ from endo_sim_ros.messages import (
     ViewerState,
 )
 from endo_sim_ros.nodes.bag_player_node import BagPlayerNode
+from endo_sim_ros.nodes.identification_node import IdentificationNode
 from endo_sim_ros.nodes.physics_node import PhysicsNode
 from endo_sim_ros.nodes.policy_node import PolicyNode
 from endo_sim_ros.nodes.reconstruction_node import ReconstructionNode
@@ -134,6 +136,7 @@ def test_every_node_reports_a_state_of_its_own_and_only_values_that_are_document
         ReconstructionNode: ReconstructionState.WAITING,
         PhysicsNode: PhysicsState.WAITING,
         RenderingNode: RenderingState.WAITING,
+        IdentificationNode: IdentificationState.WAITING,
         viewer_node.ViewerNode: ViewerState.WAITING,
         BagPlayerNode: BagPlayerState.FAILED,  # no bag is given
         RecorderNode: RecorderState.RECORDING,

@@ -17,7 +17,7 @@ SOFT = PhysicsConfig(node_count=400, force_radius=0.02, device="cpu")
 class FakeBrowser:
     """Stands for a browser that looks from the origin and keeps what it is shown."""
 
-    view, wants_splats, wants_nodes, wants_stress = SPLATS, True, True, True
+    view, wants_splats, wants_nodes, wants_stress, wants_stiffness = SPLATS, True, True, True, False
 
     def __init__(self):
         self.splats, self.colors, self.models = [], [], 0

@@ -72,6 +72,30 @@ def test_stress_is_coloured_by_the_stiffness_of_each_node(page):
     assert "without regions" in viewer.notice and "/missing" in viewer.notice
 
 
+def test_stiffness_is_that_of_the_options_until_it_is_identified(page):
+    viewer, rest = page.viewer, page.simulation.nodes.rest
+    count, stiff = len(rest), rest[:, 0] >= 0
+    assert len(np.unique(viewer.stiffness_colors(count), axis=0)) == 1
+    viewer.show_parameters({"regions": ["box 0 -1 -1 1 1 1 young_modulus=80000"]})
+    colors = viewer.stiffness_colors(count)
+    assert (colors[stiff] == colors[stiff][0]).all() and colors[stiff][0, 0] > 100 > colors[~stiff][0, 0]
+    assert "red: 80 kPa, as the physics has it" in viewer.stiffness_colors.legend
+    known, order = rest[:, 1] >= 0, np.random.default_rng(0).permutation(count)  # whatever the order of the points
+    moduli = np.where(rest[:, 1] >= 0.02, 40e3, 2e3)
+    viewer.show_stiffness(rest[order], moduli[order], known[order])
+    colors = viewer.stiffness_colors(count)
+    assert "red: 40 kPa, as identified" in viewer.stiffness_colors.legend
+    assert (np.ptp(colors[~known], axis=1) == 0).all() and (np.ptp(colors[known], axis=1) > 20).all()
+    assert len(np.unique(colors[known], axis=0)) == 2
+    for browser in viewer.browsers.values():
+        browser.wants_stress, browser.wants_stiffness = False, True
+    turn_until(page, lambda: viewer.browsers[1].colors, "a picture")
+    viewer.browsers[1].colors.clear()
+    viewer.show_stiffness(rest, moduli, ~known)
+    turn_until(page, lambda: viewer.browsers[1].colors, "a picture of the new map")
+    assert (np.ptp(viewer.browsers[1].colors[-1][known], axis=1) == 0).all()
+
+
 @pytest.mark.slow
 def test_lifting_pulls_towards_the_user_with_no_more_than_the_largest_force(page):
     point(page.viewer, "start", (0.5, 0.5), lifts=True)

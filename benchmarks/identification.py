@@ -1,0 +1,258 @@
+"""How well stiffness is found where it is known: `endo-sim bench identification`.
+
+Truth is simulated, with noise of forces (0.05 N) and tips (0.5 mm, and an offset that all share), by the estimator's own model, and by
+models that it does not have: more control nodes, or more layers. Lungs that were really pressed are in `benchmarks/lung_trials.py`.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from benchmarks.lung_trials import lung_rows
+from endo_sim_ros.core.device import pick_device
+from endo_sim_ros.evaluation.measurement import Row, Stage, machine, report, run_stages
+from endo_sim_ros.identification import Experiment, Identification, IdentificationConfig, find_inclusion, identify
+from endo_sim_ros.identification.acquire import best_press
+from endo_sim_ros.identification.forward import ForwardModel
+from endo_sim_ros.identification.synthetic import measure, press, raster, skin_normal
+from endo_sim_ros.identification.unknowns import Unknowns
+from endo_sim_ros.learning.scenes import Scene, load_scene
+from endo_sim_ros.physics import ControlNodes, PhysicsConfig
+from endo_sim_ros.physics.regions import inside_sphere
+
+SOFTEST, STIFFEST = 1e3, 16e3  # Pa, of the truth: from fat to tense organs
+PRESSES = 3  # in a case of one modulus
+PATCH, DEPTH, RATIO = 0.016, 0.005, 8.0  # m, m: where inclusions lie, as in the task palpation; how much stiffer they are
+FOUND = 0.004  # m
+MOST_PRESSES, SEARCH_NODES = 12, 500  # of a search, which simulates each press that could be done
+
+
+class Truth(NamedTuple):
+    """How tissue is simulated that is to be identified, and by what model: numbers of control nodes and layers."""
+
+    name: str
+    nodes: int = 1000
+    layers: int = 3
+    by_nodes: int = 1000
+    by_layers: int = 3
+
+
+TRUTHS = (
+    Truth("of the same model"), Truth("of twice the nodes", 2000), Truth("of 5 layers instead of 3", 2000, 5),
+    Truth("of 8 layers instead of 5", 3000, 8, 2000, 5),
+)  # fmt: skip
+
+
+def physics(device: str, nodes: int = 1000, layers: int = 3) -> PhysicsConfig:
+    """Soft tissue and a ball that presses, as in the task palpation."""
+    return PhysicsConfig(
+        node_count=nodes, layers=layers, thickness=0.02, young_modulus=4e3, contact_radius=0.008, friction=0.1, device=device
+    )
+
+
+def bench_identification(
+    json_file: Path | None,
+    device: str = "auto",
+    cases: int = 4,
+    inclusions: int = 1,
+    radius: float = 0.008,
+    searches: int = 1,
+    folder: Path | None = None,
+) -> None:
+    """Print, and if asked for write, how well truth is found.
+
+    Args:
+        json_file: Where to write the rows.
+        device: Compute device.
+        cases: Of one modulus, with each truth.
+        inclusions: To be found in maps.
+        radius: Of these, m.
+        searches: For inclusions, with presses where they tell most, and in a raster.
+        folder: Of presses of lungs, as `endo-sim bench presses` takes it.
+
+    Raises:
+        ValueError: If a number is not positive, or the folder has no presses.
+    """
+    if min(cases, inclusions, searches) < 0 or not radius > 0:
+        raise ValueError("cases, inclusions and searches must be 0 or more, and the radius above 0")
+    device, scene = pick_device(device), load_scene()
+    stages: list[Stage] = [("speed", lambda: speed_rows(scene, device))]
+    if cases:
+        stages += [(f"truth {each.name}", partial(modulus_rows, scene, device, each, cases)) for each in TRUTHS]
+    if inclusions:
+        stages.append(("inclusions", lambda: inclusion_rows(scene, device, inclusions, radius)))
+    if searches:
+        stages.append(("searches", lambda: search_rows(scene, device, searches, radius)))
+    if folder is not None:
+        stages.append(("lungs", lambda: lung_rows(folder)))
+    report(f"Identification on {machine(device)}", run_stages(stages), json_file)
+
+
+def speed_rows(scene: Scene, device: str, unknowns: Sequence[int] = (1, 20, 60), steps: int = 60) -> list[Row]:
+    """Steps per second of P + 4 copies together, and what a Jacobian costs beside the best that a reverse pass could do: three forward
+    passes of one copy (itself, its recomputation from checkpoints, and the adjoint of each substep) for each of as many residuals."""
+    config = physics(device)
+    nodes = scene.nodes(config)
+    experiment, model = press(nodes, config, raster(nodes, 0.012)[0], steps=steps), ForwardModel(nodes, config, device)
+    parameters = Unknowns(nodes, config, IdentificationConfig(), np.zeros((0, 3)))
+
+    def seconds(count: int) -> float:
+        copies = [parameters.copy(np.array([0.01 * c])) for c in range(count)]
+        model.replay(experiment, copies)
+        begin = time.perf_counter()
+        model.replay(experiment, copies)
+        return time.perf_counter() - begin
+
+    alone, rows = seconds(1), []
+    for count in unknowns:
+        together = seconds(count + 4)
+        rows.append(Row(f"steps of {count + 4} copies", (count + 4) * steps / together, "steps/s"))
+        rows.append(
+            Row(f"Jacobian of {count} unknowns, one press", together, "s", together / (3 * alone), "a gradient in reverse, at best")
+        )
+    return rows
+
+
+def modulus_rows(scene: Scene, device: str, truth: Truth, cases: int, first: int = 0) -> list[Row]:
+    """Of tissue with one modulus: error, share of intervals that hold the truth, and time."""
+    config, made = physics(device, truth.by_nodes, truth.by_layers), physics(device, truth.nodes, truth.layers)
+    nodes, true_nodes = scene.nodes(config), scene.nodes(made)
+    options = IdentificationConfig()
+    places, errors, holds, seconds, widths, doubts = raster(nodes, 0.012), [], [], [], [], 0
+    for case in range(first, first + cases):
+        rng = np.random.default_rng([case, 1])
+        modulus = float(np.exp(rng.uniform(np.log(SOFTEST), np.log(STIFFEST))))
+        offset = options.tip_offset * rng.standard_normal(3)
+        chosen = places[rng.permutation(len(places))[:PRESSES]]
+        softness = replace(made, young_modulus=modulus)
+        experiments = [
+            measure(press(nodes, config, place, steps=40), true_nodes, softness, rng, offset=offset, device=device) for place in chosen
+        ]
+        begin = time.perf_counter()
+        found = identify(experiments, nodes, config, options, device)
+        seconds.append(time.perf_counter() - begin)
+        told = found["young_modulus"]
+        errors.append(abs(told.estimate / modulus - 1))
+        widths.append(np.log(told.high / told.low) / 2)
+        holds.append(told.low <= modulus <= told.high)
+        doubts += bool(found.findings)
+    name = f"one modulus, truth {truth.name}"
+    return [
+        Row(f"{name}: error, median", 100 * float(np.median(errors)), "%"),
+        Row(f"{name}: within 10 %", 100 * float(np.mean(np.array(errors) <= 0.1)), "%"),
+        Row(f"{name}: 90 % intervals that hold it", 100 * float(np.mean(holds)), "%"),
+        Row(f"{name}: half width of intervals, median", 100 * float(np.median(widths)), "%"),
+        Row(f"{name}: cases with findings", 100 * doubts / cases, "%"),
+        Row(f"{name}: time of a case, median", float(np.median(seconds)), "s"),
+    ]
+
+
+class _Hidden(NamedTuple):
+    """Tissue with an inclusion."""
+
+    centre: np.ndarray
+    normal: np.ndarray
+    factors: np.ndarray
+    offset: np.ndarray
+    rng: np.random.Generator
+
+    def error(self, found: Identification) -> float:
+        """Distance of the inclusion that is found from where it is, m."""
+        return float(np.linalg.norm(find_inclusion(found).centre - self.centre))
+
+    def error_across(self, found: Identification) -> float:
+        """The same across the press, m."""
+        off = find_inclusion(found).centre - self.centre
+        return float(np.linalg.norm(off - (off @ self.normal) * self.normal))
+
+
+def hide(nodes: ControlNodes, seed: int, radius: float) -> tuple[_Hidden, np.ndarray]:
+    """Tissue with an inclusion as in the task palpation, and a raster of places over where it may be."""
+    rng = np.random.default_rng([seed, 2])
+    places = raster(nodes, 0.01)
+    middle = places.mean(0)
+    skin = nodes.rest[nodes.is_skin & ~nodes.pinned].astype(np.float64)
+    near = skin[((skin - middle) ** 2).sum(1) <= PATCH**2]
+    at = near[rng.integers(len(near))]
+    normal = skin_normal(nodes, at)
+    centre = at - DEPTH * normal
+    inside = inside_sphere(nodes.rest, centre, radius)
+    inside[((nodes.rest - centre) ** 2).sum(1).argmin()] = True
+    offset = IdentificationConfig().tip_offset * rng.standard_normal(3)
+    over = places[((places - middle) ** 2).sum(1) <= (PATCH + 0.006) ** 2]
+    return _Hidden(centre, normal, np.where(inside, RATIO, 1.0), offset, rng), over
+
+
+def short_press(nodes: ControlNodes, config: PhysicsConfig, place: np.ndarray, steps: int = 30) -> Experiment:
+    """A press of a second or so."""
+    return press(nodes, config, place, steps=steps, hold=4)
+
+
+def inclusion_rows(scene: Scene, device: str, count: int, radius: float) -> list[Row]:
+    """Of a field, pressed in a raster over the place: how far from the truth the inclusion is found."""
+    config = physics(device)
+    nodes = scene.nodes(config)
+    errors, across, seconds, ratios = [], [], [], []
+    for seed in range(count):
+        hidden, places = hide(nodes, seed, radius)
+        experiments = [
+            measure(short_press(nodes, config, each), nodes, config, hidden.rng, hidden.factors, hidden.offset, device=device)
+            for each in places
+        ]
+        begin = time.perf_counter()
+        found = identify(experiments, nodes, config, IdentificationConfig(stiffness="field"), device)
+        seconds.append(time.perf_counter() - begin)
+        errors.append(hidden.error(found))
+        across.append(hidden.error_across(found))
+        ratios.append(find_inclusion(found).ratio)
+    name = f"inclusion of radius {1000 * radius:g} mm"
+    return [
+        Row(f"{name}: error, median", 1000 * float(np.median(errors)), "mm"),
+        Row(f"{name}: error across the press, median", 1000 * float(np.median(across)), "mm"),
+        Row(f"{name}: within 4 mm", 100 * float(np.mean(np.array(errors) <= FOUND)), "%"),
+        Row(f"{name}: ratio of moduli, which is {RATIO:g}, median", float(np.median(ratios)), ""),
+        Row(f"{name}: time of a map, median", float(np.median(seconds)), "s"),
+    ]
+
+
+def search_rows(scene: Scene, device: str, count: int, radius: float) -> list[Row]:
+    """Presses until an inclusion is found within 4 mm across them, and is after the next, too: where each is expected to tell most, and in
+    a raster."""
+    config = physics(device, SEARCH_NODES)
+    nodes, needed = scene.nodes(config), {"a raster": [], "expected information": []}
+    for seed in range(count):
+        for policy, told in needed.items():
+            hidden, places = hide(nodes, seed, radius)
+            told.append(search(nodes, config, hidden, places, policy != "a raster", device))
+    rows = []
+    for policy, told in needed.items():
+        compared = (np.mean(told) / np.mean(needed["a raster"]), "a raster") if policy != "a raster" else (None, None)
+        rows.append(Row(f"presses until found within 4 mm across them, {policy}, mean of {count}", float(np.mean(told)), "", *compared))
+    return rows
+
+
+def search(nodes: ControlNodes, config: PhysicsConfig, hidden: _Hidden, places: np.ndarray, informed: bool, device: str) -> int:
+    """Presses until the inclusion is found, `MOST_PRESSES` + 1 if it is not."""
+    model, options = ForwardModel(nodes, config, device), IdentificationConfig(stiffness="field", iterations=5)
+    candidates = [short_press(nodes, config, each, steps=14) for each in places]  # as deep, and sooner over: what is expected is rough
+    left, found, errors = list(range(len(places))), None, []
+    for _ in range(min(MOST_PRESSES, len(places))):
+        at = 0
+        if informed:
+            at = best_press(found, [candidates[each] for each in left], model) if found is not None else _nearest_to_middle(places)
+        chosen = short_press(nodes, config, places[left.pop(at)])
+        measured = measure(chosen, nodes, config, hidden.rng, hidden.factors, hidden.offset, device=device)
+        found = identify([measured], nodes, config, options, device, around=places, start=found)
+        errors.append(hidden.error_across(found))
+        if len(errors) > 1 and max(errors[-2:]) <= FOUND:
+            return len(errors) - 1
+    return MOST_PRESSES + 1
+
+
+def _nearest_to_middle(places: np.ndarray) -> int:
+    return int(((places - places.mean(0)) ** 2).sum(1).argmin())

@@ -1,0 +1,358 @@
+"""Estimation of what tissue is made of: Gauss-Newton on copies of the tissue, and the posterior by Laplace's method.
+
+Beside the unknowns four numbers are estimated that nobody asks for: the error of the place of the tool that all tips share [3], and the
+share by which all forces of the model are wrong. They have priors, too, so that intervals know of them.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.stats import norm
+
+from endo_sim_ros.identification.checks import IdentificationError, check_input, judge_residuals, survey
+from endo_sim_ros.identification.config import IdentificationConfig
+from endo_sim_ros.identification.experiment import Experiment
+from endo_sim_ros.identification.forward import ForwardModel, distances_to_skin, reach_of
+from endo_sim_ros.identification.maps import paint_as_regions
+from endo_sim_ros.identification.observations import Covariance, Observations
+from endo_sim_ros.identification.unknowns import Reported, Told, Unknowns
+from endo_sim_ros.physics import ControlNodes, PhysicsConfig
+
+NUISANCES = 4
+OnProgress = Callable[[str, int, int], None]
+"""``on_progress(stage, done, total)``."""
+_FARTHEST = 1.5  # standard deviations that an unknown moves in one iteration
+_DAMPED, _LOOSENED, _MOST_DAMPED = 10.0, 0.1, 1e6
+_AS_PROMISED = 0.3  # share of the promised gain with which a Jacobian is still good
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One number and how well it is known.
+
+    Args:
+        name: Of it.
+        unit: Of it.
+        estimate: Median.
+        low: Lower end of its interval.
+        high: Upper end.
+        told: ``known``, ``ratio only``, or ``not told by these data``.
+        removed: Share of the variance before any data that the data took away; of the logarithm, or logit.
+    """
+
+    name: str
+    unit: str
+    estimate: float
+    low: float
+    high: float
+    told: Told
+    removed: float
+
+
+@dataclass(frozen=True)
+class Identification:
+    """What is known of the tissue.
+
+    Args:
+        unknowns: The numbers that were asked for.
+        findings: What was noticed in the data, a sentence each.
+        young_modulus: Of each control node [M], Pa; median.
+        low: Lower end of its interval [M].
+        high: Upper end [M].
+        known: Whether it is known [M], bool.
+        removed: Share of its variance that the data took away [M].
+        mean: Of the unknowns and the four others [P + 4], standard normal before any data.
+        covariance: Of these [P + 4, P + 4].
+        parameters: What the numbers mean.
+        nodes: Of the tissue.
+        level: Probability that an interval holds the truth.
+        chi_square: Of the residuals, over their number: about 1 where the model explains them.
+        steps: That were simulated, of all copies together.
+    """
+
+    unknowns: list[Estimate]
+    findings: list[str]
+    young_modulus: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    known: np.ndarray
+    removed: np.ndarray
+    mean: np.ndarray
+    covariance: np.ndarray
+    parameters: Unknowns = field(repr=False)
+    nodes: ControlNodes = field(repr=False)
+    level: float
+    chi_square: float
+    steps: int
+
+    def __getitem__(self, name: str) -> Estimate:
+        """The estimate of this name."""
+        for each in self.unknowns:
+            if each.name == name:
+                return each
+        raise KeyError(f"there is no unknown {name!r}, but {', '.join(each.name for each in self.unknowns)}")
+
+    @property
+    def tip_offset(self) -> np.ndarray:
+        """How far the tool stands from where it is said to [3], m, world."""
+        return self.mean[-NUISANCES:-1] * self.parameters.config.tip_offset
+
+    def regions(self, step: float = 0.2, most: int = 300) -> tuple[str, ...]:
+        """The map as `regions` of physics, see `paint_as_regions`."""
+        return paint_as_regions(self.nodes, self.young_modulus, step, most)
+
+    def summary(self) -> str:
+        """What is known, in lines that people read."""
+        lines = []
+        for each in self.unknowns:
+            unit = f" {each.unit}" if each.unit else ""
+            lines.append(
+                f"{each.name}: {each.estimate:.4g}{unit} ({100 * self.level:.0f} %: {each.low:.4g} to {each.high:.4g}{unit}), {each.told}"
+            )
+        if len(np.unique(self.young_modulus)) > 1:
+            lines.append(
+                f"young_modulus of {len(self.known)} control nodes: {self.young_modulus.min():.4g} to {self.young_modulus.max():.4g} Pa,"
+                f" known of {int(self.known.sum())}"
+            )
+        return "\n".join([*lines, *self.findings])
+
+
+@dataclass(frozen=True)
+class _Prior:
+    """What is known of θ before these data: normal."""
+
+    mean: np.ndarray  # [Q]
+    precision: np.ndarray  # [Q, Q]
+
+    def cost(self, theta: np.ndarray) -> float:
+        return float((theta - self.mean) @ self.precision @ (theta - self.mean))
+
+
+@dataclass
+class _Point:
+    """The data as seen from one set of unknowns θ [Q]."""
+
+    theta: np.ndarray
+    prior: _Prior
+    residuals: list[np.ndarray]  # of each experiment [n], of the numbers that are used
+    jacobians: list[np.ndarray]  # of predictions [n, Q]
+    covariances: list[Covariance]
+
+
+def identify(
+    experiments: Sequence[Experiment],
+    nodes: ControlNodes,
+    physics: PhysicsConfig,
+    config: IdentificationConfig = IdentificationConfig(),
+    device: str = "auto",
+    progress: OnProgress | None = None,
+    *,
+    around: np.ndarray | None = None,
+    start: Identification | None = None,
+) -> Identification:
+    """Estimate what tissue is made of from how it answered a tool.
+
+    Args:
+        experiments: What was done and measured, each beginning with tissue at rest.
+        nodes: The tissue at rest.
+        physics: What it is as far as it is known; its values are the medians of the priors.
+        config: What is unknown.
+        device: Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N.
+        progress: Called as ``progress(stage, done, total)``.
+        around: Places [K, 3], m, world, near which a field is unknown; default: where tools of the experiments touch.
+        start: An estimate from other experiments that this one goes on from: what they told is the prior, with the unknowns and the
+            configuration that they had. Give that one `around` where tools will touch later.
+
+    Raises:
+        IdentificationError: If nothing can be estimated from the data; the sentence says what was seen.
+        ConfigError: If an unknown does not exist.
+    """
+    progress = progress or (lambda stage, done, total: None)
+    experiments = list(experiments)
+    check_input(experiments, len(nodes))
+    data = [Observations(each, config.tip_smoothing) for each in experiments]
+    if start is not None:
+        unknowns, config = start.parameters, start.parameters.config
+    else:
+        unknowns = Unknowns(nodes, physics, config, touched_places(experiments, nodes, physics) if around is None else around)
+    model = ForwardModel(nodes, physics, device)
+    progress("look at the data", 0, config.iterations)
+    size = unknowns.count + NUISANCES
+    prior = _Prior(np.zeros(size), np.eye(size)) if start is None else _Prior(start.mean, np.linalg.inv(start.covariance))
+    first = survey(data, model, unknowns, config, prior.mean[: unknowns.count])
+    if not any(each.used.any() for each in data):
+        raise IdentificationError("nothing was measured: forces, displacements and tracks are all missing; give one of them")
+    theta = prior.mean.copy()
+    if start is None:
+        theta[: unknowns.stiffness_count] = _scaled(unknowns, first.scale)
+    parts = [_Data(each, *unknowns.directions(touched_places([each.experiment], nodes, physics))) for each in data]
+    point = _minimise(theta, prior, parts, model, unknowns, progress)
+    return _conclude(point, data, model, unknowns, first.findings)
+
+
+def touched_places(experiments: Sequence[Experiment], nodes: ControlNodes, physics: PhysicsConfig) -> np.ndarray:
+    """Places of the tip while it may touch tissue [K, 3], m, world."""
+    reach, places = reach_of(physics, nodes), [np.zeros((0, 3))]
+    for each in experiments:
+        places.append(each.tips[distances_to_skin(each, nodes) <= reach])
+    return np.concatenate(places)
+
+
+def _scaled(unknowns: Unknowns, scale: float) -> np.ndarray:
+    """Numbers of stiffness [P'] with which all moduli are that many times as great, within two standard deviations."""
+    return np.clip(np.log(scale) * unknowns.scale[: unknowns.stiffness_count], -2, 2)
+
+
+@dataclass
+class _Data:
+    """An experiment, and the directions of the unknowns that it tells of."""
+
+    seen: Observations
+    ways: np.ndarray  # [D, P]
+    back: np.ndarray  # [D, P]
+
+
+def look(theta: np.ndarray, prior: _Prior, data: Sequence[_Data], model: ForwardModel, unknowns: Unknowns, jacobian: bool = True) -> _Point:
+    """Residuals and covariance at θ, and the Jacobian, from one batch for each experiment; without it only its columns of the tip."""
+    config, P = unknowns.config, unknowns.count
+    feels = any(part.seen.of_forces().any() for part in data)
+    z, offset, gain = theta[:P], theta[P : P + 3] * config.tip_offset, 1 + config.model_error * theta[P + 3]
+    residuals, jacobians, covariances = [], [], []
+    for part in data:
+        each, ways = part.seen, part.ways if jacobian else part.ways[:0]
+        copies = [unknowns.copy(z, offset)]
+        copies += [replace(unknowns.copy(z, offset), jog=config.tip_step * np.eye(3)[axis]) for axis in range(3)]
+        copies += [unknowns.copy(z + config.jacobian_step * way, offset) for way in ways]
+        told = each.predicted(model.replay(each.experiment, copies))
+        forces = each.of_forces()
+        told[:, forces] *= gain
+        J = np.zeros((told.shape[1], P + NUISANCES))
+        J[:, :P] = (told[4:] - told[0]).T / config.jacobian_step @ part.back[: len(ways)]
+        if not feels:  # how stiff all is would be told by inertia and damping alone, which the model has only about right
+            J[:, :P] -= np.outer(J[:, :P] @ unknowns.scale, unknowns.scale) / (unknowns.scale @ unknowns.scale)
+        by_tip = (told[1:4] - told[0]).T / config.tip_step
+        by_place = np.where(each.closed_at[:, None] >= 0, 0, by_tip)  # a place that is held moves with the tip, wherever that is
+        J[:, P : P + 3] = by_place * config.tip_offset
+        J[:, P + 3] = np.where(forces, told[0] / gain * config.model_error, 0)
+        own = np.column_stack([by_place * config.surface_error, J[:, P + 3]])  # the errors of this experiment alone
+        residuals.append((each.values - told[0])[each.used])
+        jacobians.append(J[each.used])
+        covariances.append(each.covariance(by_tip, own))
+    return _Point(theta, prior, residuals, jacobians, covariances)
+
+
+def _misfit(residuals: list[np.ndarray], covariances: list[Covariance]) -> float:
+    """Chi-square of residuals."""
+    return sum(float(r @ R.solve(r[:, None])[:, 0]) for r, R in zip(residuals, covariances))
+
+
+def _normal(point: _Point) -> tuple[np.ndarray, np.ndarray]:
+    """JᵀR⁻¹J [Q, Q] and JᵀR⁻¹r [Q] of all experiments."""
+    H, g = np.zeros((len(point.theta),) * 2), np.zeros(len(point.theta))
+    for r, J, R in zip(point.residuals, point.jacobians, point.covariances):
+        weighted = R.solve(J)
+        H += J.T @ weighted
+        g += weighted.T @ r
+    return H, g
+
+
+def _minimise(theta: np.ndarray, prior: _Prior, data: list[_Data], model: ForwardModel, unknowns: Unknowns, progress: OnProgress) -> _Point:
+    """Levenberg and Marquardt's method. The Jacobian is kept, with Broyden's correction, while steps do about what it promises, and is
+    fresh at the end.
+
+    The covariance is that of the point that a step begins at: how much is uncertain because the tip is depends on the stiffness, but is
+    no reason to believe in another.
+    """
+    config, P = unknowns.config, unknowns.count
+    point, damping, fresh = look(theta, prior, data, model, unknowns), 1e-3, True
+    for iteration in range(config.iterations):
+        progress("estimate", iteration + 1, config.iterations)
+        H, g = _normal(point)
+        H, g = H + prior.precision, g - prior.precision @ (point.theta - prior.mean)
+        step = np.linalg.solve(H + damping * np.diag(np.diag(H)), g)
+        step *= min(1.0, _FARTHEST / max(float(np.abs(step).max()), 1e-12))
+        moved = float(np.abs(step / np.sqrt(np.diag(np.linalg.inv(H)))).max())
+        if moved < config.tolerance:
+            if fresh:
+                break
+            point, fresh = look(point.theta, prior, data, model, unknowns), True
+            continue
+        other = look(point.theta + step, prior, data, model, unknowns, jacobian=False)
+        before = prior.cost(point.theta) + _misfit(point.residuals, point.covariances)
+        gained = before - prior.cost(other.theta) - _misfit(other.residuals, point.covariances)
+        if gained > _AS_PROMISED * (2 * g @ step - step @ H @ step):
+            for old, new, was, now in zip(point.jacobians, other.jacobians, point.residuals, other.residuals):
+                wrong = (was - now - old @ step) * (moved > 1)  # of short steps it would be rounding
+                new[:, :P] = old[:, :P] + wrong[:, None] * step[:P] / max(float(step[:P] @ step[:P]), 1e-12)
+            point, damping, fresh = other, max(damping * _LOOSENED, 1e-6), False
+        elif not fresh:
+            point, fresh = look(other.theta if gained > 0 else point.theta, prior, data, model, unknowns), True
+        elif gained > 0:
+            point = look(other.theta, prior, data, model, unknowns)
+        else:
+            damping *= _DAMPED if damping > 0.01 else 100 * _DAMPED
+            if damping > _MOST_DAMPED:
+                break
+    return point if fresh else look(point.theta, prior, data, model, unknowns)
+
+
+def _conclude(point: _Point, data: list[Observations], model: ForwardModel, unknowns: Unknowns, findings: list[str]) -> Identification:
+    config = unknowns.config
+    H, _ = _normal(point)
+    chi_square, precision = _misfit(point.residuals, point.covariances), point.prior.precision
+    determined = float(np.trace(np.linalg.solve(H + precision, H)))
+    count = sum(len(r) for r in point.residuals)
+    factor, doubts = judge_residuals(chi_square, round(count - determined), config)
+    covariance = np.linalg.inv(H / factor + precision)
+    quantile = float(norm.ppf(0.5 + config.level / 2))
+    feels = any(each.of_forces()[each.used].any() for each in data)
+    told = [_estimate(each, point.theta, covariance, quantile, feels, unknowns, config) for each in unknowns.reported()]
+    matrix = np.concatenate([unknowns.matrix, np.zeros((len(unknowns.nodes), NUISANCES))], 1)
+    middle = np.log(unknowns.base) + matrix @ point.theta
+    prior = (matrix**2).sum(1) + unknowns.residual
+    left = np.einsum("mi,ij,mj->m", matrix, covariance, matrix) + unknowns.residual
+    spread, removed = quantile * np.sqrt(left), 1 - left / prior
+    findings = [*findings, *doubts]
+    unsure = [each.name for each in told if each.told == "not told by these data"]
+    if unsure:
+        findings.append(f"these data do not tell {', '.join(unsure)}: the interval is nearly what was thought before")
+    return Identification(
+        told, findings, np.exp(middle), np.exp(middle - spread), np.exp(middle + spread), (removed >= config.known) & feels, removed,
+        point.theta, covariance, unknowns, unknowns.nodes, config.level, chi_square / max(count - determined, 1), model.steps,
+    )  # fmt: skip
+
+
+def _estimate(
+    reported: Reported, theta: np.ndarray, covariance: np.ndarray, quantile: float, feels: bool, unknowns: Unknowns,
+    config: IdentificationConfig,
+) -> Estimate:  # fmt: skip
+    row = np.concatenate([reported.row, np.zeros(NUISANCES)])
+    middle, variance, prior = row @ theta + reported.mean, row @ covariance @ row, row @ row
+    removed = 1 - variance / prior
+    told: Told = "known" if removed >= config.known else "not told by these data"
+    if reported.is_modulus and not feels:
+        # How it differs from the mean of all moduli.
+        stiffness = unknowns.matrix[:, : unknowns.stiffness_count].mean(0)
+        ratio = row.copy()
+        ratio[: unknowns.stiffness_count] -= stiffness
+        alone = ratio @ ratio
+        share = 1 - ratio @ covariance @ ratio / alone if alone > 1e-12 else 0.0
+        told = "ratio only" if share >= config.known else "not told by these data"
+    spread = quantile * np.sqrt(variance)
+    estimate, low, high = (float(reported.value(middle + side * spread)) for side in (0, -1, 1))
+    return Estimate(reported.name, reported.unit, estimate, low, high, told, float(removed))
+
+
+def predict_as_measured(
+    found: Identification, candidates: Sequence[Experiment], model: ForwardModel
+) -> list[tuple[np.ndarray, Covariance]]:
+    """Jacobian [n, P + 4] and covariance of the forces that each experiment would measure of tissue as it was estimated."""
+    unknowns = found.parameters
+    parts = []
+    for each in candidates:
+        seen = Observations(replace(each, forces=np.zeros(each.tips.shape)), unknowns.config.tip_smoothing)
+        parts.append(_Data(seen, *unknowns.directions(touched_places([each], model.nodes, model.physics))))
+    flat = _Prior(found.mean, np.linalg.inv(found.covariance))
+    point = look(found.mean, flat, parts, model, unknowns)
+    return list(zip(point.jacobians, point.covariances))

@@ -1,0 +1,214 @@
+"""The forward model: many copies of an experiment at once, each with other unknowns."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial import KDTree
+
+from endo_sim_ros.identification.experiment import Experiment, Tracks
+from endo_sim_ros.physics import ControlNodes, PhysicsConfig, TissueBatch
+from endo_sim_ros.physics.batch import tissue_properties
+from endo_sim_ros.physics.skinning import bind_weights
+from endo_sim_ros.physics.substeps import plan_substeps
+
+NEIGHBOURS = 4  # control nodes that move a point, as in `Skinning`
+_ROOM = math.sqrt(2)  # substeps are planned for moduli in steps of this, so that they hardly ever change between iterations
+_KEPT = 8  # batches that are kept, as a GPU captures each step anew
+
+
+@dataclass(frozen=True)
+class Copy:
+    """One copy of the tissue, and of the way of its tool.
+
+    Args:
+        factors: On the moduli of each control node [M].
+        holds: On the springs of pinned control nodes [M].
+        options: Of physics that differ, by name.
+        shift: Of all tips [3], m, world.
+        jog: Of the tips but for those at which a jaw closes [3], m, world: as a held place moves with the tip, it does not matter where
+            all tips are together, but how far they go.
+    """
+
+    factors: np.ndarray
+    holds: np.ndarray
+    options: tuple[tuple[str, float], ...] = ()
+    shift: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    jog: np.ndarray = field(default_factory=lambda: np.zeros(3))
+
+
+@dataclass(frozen=True)
+class Replay:
+    """What C copies of an experiment of T steps predict.
+
+    Args:
+        forces: On the tool at the end of each step [C, T, 3], N, world.
+        displacements: Of the control nodes that were measured [C, T, L, 3], m.
+        pixels: Of each set of tracks [C, F, K, 2].
+        faults: Steps that the simulation had to undo in each copy [C].
+    """
+
+    forces: np.ndarray
+    displacements: np.ndarray | None
+    pixels: list[np.ndarray]
+    faults: np.ndarray
+
+
+class ForwardModel:
+    """Replays experiments in copies of a tissue.
+
+    Args:
+        nodes: At rest.
+        physics: What the tissue is as far as it is known; factors of copies multiply its moduli.
+        device: Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N.
+    """
+
+    def __init__(self, nodes: ControlNodes, physics: PhysicsConfig, device: str = "auto"):
+        self.nodes, self.physics = nodes, replace(physics, device=device)
+        self.steps = 0
+        """Steps that were simulated, of all copies together."""
+        self._batches: dict[tuple, TissueBatch] = {}
+
+    def replay(self, experiment: Experiment, copies: Sequence[Copy]) -> Replay:
+        """Let the tool of an experiment do in each copy what it did. Until it first comes near the tissue nothing is simulated."""
+        groups: dict[tuple, list[int]] = {}
+        for number, copy in enumerate(copies):
+            groups.setdefault(copy.options, []).append(number)
+        reach = max(float(np.abs(copy.shift + copy.jog).max()) for copy in copies) * math.sqrt(3)
+        begin = first_touch(experiment, self.nodes, self.physics, reach)
+        steps, count = len(experiment.tips), len(copies)
+        forces, faults = np.zeros((count, steps, 3)), np.zeros(count, int)
+        wanted = None if experiment.displacements is None else np.asarray(experiment.nodes)
+        moved = None if wanted is None else np.zeros((count, steps, len(wanted), 3))
+        points = [_Points(tracks, self.nodes) for tracks in experiment.tracks]
+        pixels = [np.zeros((count, *tracks.pixels.shape)) for tracks in experiment.tracks]
+        substeps = self._substeps(experiment, copies)
+        for options, members in groups.items():
+            batch = self._batch(experiment, [copies[c] for c in members], options, substeps)
+            shifts, jogs = (np.stack([getattr(copies[c], name) for c in members]) for name in ("shift", "jog"))
+            jogged = closing_steps(experiment) != np.arange(steps)
+            told = self._run(batch, experiment, shifts, jogged[:, None, None] * jogs, begin, wanted, points)
+            forces[members, begin:], faults[members] = told[0], batch.tools.faults.cpu().numpy()
+            if moved is not None:
+                moved[members, begin:] = told[1]
+            for into, seen in zip(pixels, told[2]):
+                into[members] = seen
+            self.steps += len(members) * (steps - begin)
+        return Replay(forces, moved, pixels, faults)
+
+    def _config(self, experiment: Experiment, options: Sequence[tuple[str, float]]) -> PhysicsConfig:
+        given: dict[str, Any] = dict(options)
+        return replace(self.physics, step_duration=experiment.step_duration, **given)
+
+    def _substeps(self, experiment: Experiment, copies: Sequence[Copy]) -> int:
+        """As many as the most demanding copy needs; the same for all, so that they differ by their unknowns alone."""
+        if self.physics.substeps:
+            return self.physics.substeps
+        needed = 0
+        for options in {copy.options for copy in copies}:
+            config = self._config(experiment, options)
+            most = _rounded(max(float(copy.factors.max()) for copy in copies if copy.options == options))
+            cell = self.nodes.spacing * config.grid_ratio
+            needed = max(needed, plan_substeps(config, cell, tissue_properties(self.nodes, config), most).count)
+        return needed
+
+    def _batch(self, experiment: Experiment, copies: list[Copy], options: Sequence[tuple[str, float]], substeps: int) -> TissueBatch:
+        most = _rounded(max(float(copy.factors.max()) for copy in copies))
+        key = (tuple(options), len(copies), most, substeps, experiment.step_duration)
+        if key not in self._batches:
+            while len(self._batches) >= _KEPT:
+                del self._batches[next(iter(self._batches))]
+            config = replace(self._config(experiment, options), substeps=substeps)
+            self._batches[key] = TissueBatch(self.nodes, config, len(copies), stiffness=np.full(len(copies), most))
+        batch = self._batches[key]
+        batch.reset()
+        factors, holds = np.stack([copy.factors for copy in copies]), np.stack([copy.holds for copy in copies])
+        batch.solver.set_stiffness(slice(None), factors, holds)
+        return batch
+
+    def _run(
+        self, batch: TissueBatch, experiment: Experiment, shifts: np.ndarray, jogs: np.ndarray, begin: int, wanted: np.ndarray | None,
+        points: list["_Points"],
+    ) -> tuple[np.ndarray, np.ndarray | None, list[np.ndarray]]:  # fmt: skip
+        """Forces [C, T − begin, 3], displacements and pixels of one batch."""
+        tools, device = batch.tools, batch.solver.device
+        tips = torch.from_numpy(np.nan_to_num(experiment.tips)).to(device, torch.float64)
+        turned = torch.from_numpy(np.nan_to_num(experiment.rotations)).to(device, torch.float64)
+        present, closed = (torch.from_numpy(each.astype(np.int32)).to(device) for each in (experiment.present, experiment.closed))
+        moved_by = torch.from_numpy(shifts + jogs).to(device)  # [T, C, 3]
+        nodes = None if wanted is None else torch.from_numpy(wanted).long().to(device)
+        forces, moved = [], []
+        pixels = [np.repeat(each.pixels_at_rest[None], len(shifts), 0) for each in points]
+        for step in range(begin, len(tips)):
+            tools.tips[:, 0] = tips[step] + moved_by[step]
+            tools.rotations[:, 0] = turned[step]
+            tools.present[:, 0] = present[step]
+            tools.closed[:, 0] = closed[step] * present[step]
+            batch.step()
+            forces.append(tools.reaction_forces[:, 0].clone())
+            if nodes is not None:
+                moved.append(batch.displacements[:, nodes].clone())
+            for each, into in zip(points, pixels):
+                images = np.flatnonzero(each.steps == step)
+                if len(images):
+                    at = each.places(batch)
+                    for image in images:
+                        into[:, image] = each.project(at, image)
+        felt = torch.stack(forces, 1).cpu().numpy() if forces else np.zeros((len(shifts), 0, 3))
+        return felt, torch.stack(moved, 1).cpu().double().numpy() if moved else None, pixels
+
+
+class _Points:
+    """Tracked points, which follow their nearest control nodes as Gaussians do."""
+
+    def __init__(self, tracks: Tracks, nodes: ControlNodes):
+        self.steps, self.cameras = np.asarray(tracks.steps), tracks.cameras
+        rest = nodes.rest.astype(np.float64)
+        self.index, weights = bind_weights(np.asarray(tracks.rest, np.float64), rest, NEIGHBOURS, "compact")
+        self.weights = weights.astype(np.float64)
+        self.arms = np.asarray(tracks.rest, np.float64)[:, None] - rest[self.index]  # [K, N, 3]
+        self.pixels_at_rest = np.stack([camera.project(np.asarray(tracks.rest, np.float64))[0] for camera in self.cameras])
+
+    def places(self, batch: TissueBatch) -> np.ndarray:
+        """Where they are in each copy [C, K, 3], m, world."""
+        index = torch.from_numpy(self.index.astype(np.int64)).to(batch.solver.device)
+        positions, F = batch.positions()[:, index].cpu().double().numpy(), batch.F[:, index].cpu().double().numpy()
+        return ((positions + np.einsum("cknij,knj->ckni", F, self.arms)) * self.weights[..., None]).sum(2)
+
+    def project(self, places: np.ndarray, image: int) -> np.ndarray:
+        """Pixels [C, K, 2] of places [C, K, 3]."""
+        return self.cameras[image].project(places.reshape(-1, 3))[0].reshape(*places.shape[:2], 2)
+
+
+def closing_steps(experiment: Experiment) -> np.ndarray:
+    """Step at which the jaw closed that is closed at each step [T], -1 where it is open."""
+    closed = np.asarray(experiment.closed, bool) & np.asarray(experiment.present, bool)
+    begins = closed & ~np.append(False, closed[:-1])
+    return np.where(closed, np.maximum.accumulate(np.where(begins, np.arange(len(closed)), -1)), -1)
+
+
+def first_touch(experiment: Experiment, nodes: ControlNodes, physics: PhysicsConfig, further: float = 0.0) -> int:
+    """Return the first step at which the tool may touch the tissue, or T; `further` (m) is added to its reach."""
+    touching = distances_to_skin(experiment, nodes) <= reach_of(physics, nodes) + further
+    return int(touching.argmax()) if touching.any() else len(touching)
+
+
+def reach_of(physics: PhysicsConfig, nodes: ControlNodes) -> float:
+    """Distance from a control node within which a tip can touch it, m; more than enough, as thin capsules act as thicker ones."""
+    return max(physics.contact_radius and max(physics.contact_radius, 1.5 * nodes.spacing) + physics.contact_length, physics.force_radius)
+
+
+def distances_to_skin(experiment: Experiment, nodes: ControlNodes) -> np.ndarray:
+    """Distance of the tip from the nearest skin node at rest at each step [T], m; infinite where the tool is not there."""
+    skin = nodes.rest[nodes.is_skin].astype(np.float64)
+    distances = np.full(len(experiment.tips), np.inf)
+    there = np.asarray(experiment.present, bool)
+    distances[there] = KDTree(skin).query(experiment.tips[there])[0]
+    return distances
+
+
+def _rounded(factor: float) -> float:
+    return _ROOM ** math.ceil(math.log(factor * 1.0001, _ROOM))

@@ -1,0 +1,129 @@
+"""Maps of stiffness: as regions of physics, and the inclusion in them."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from endo_sim_ros.physics import ControlNodes
+
+if TYPE_CHECKING:
+    from endo_sim_ros.identification.estimate import Identification
+
+_BEYOND = 0.5  # spacings by which the box of all tissue is larger than the control nodes
+
+
+def paint_as_regions(nodes: ControlNodes, young_modulus: np.ndarray, step: float = 0.2, most: int = 300) -> tuple[str, ...]:
+    """Return texts for the option `regions` of physics that paint moduli of control nodes.
+
+    A box paints all tissue with the modulus of most of it; spheres paint the rest. Moduli are rounded to levels of their logarithm,
+    `step` apart. Each sphere is as large as it can be without other levels in it, so that their order does not matter.
+
+    Args:
+        nodes: At rest.
+        young_modulus: Of each [M], Pa.
+        step: Between the levels; where there would be more than `most` regions, it is made wider.
+        most: Regions.
+    """
+    rest, logs = nodes.rest.astype(np.float64), np.log(young_modulus)
+    corners = np.concatenate([rest.min(0) - _BEYOND * nodes.spacing, rest.max(0) + _BEYOND * nodes.spacing])
+    while True:
+        levels = np.round((logs - np.median(logs)) / step).astype(int)
+        spheres = _spheres(rest, levels, nodes.spacing, most)
+        if spheres is not None:
+            break
+        step *= 1.25
+
+    def modulus(level: int) -> str:
+        return f"young_modulus={np.exp(logs[levels == level].mean() if (levels == level).any() else np.median(logs)):.6g}"
+
+    box = f"box {' '.join(f'{x:.6g}' for x in corners)} {modulus(0)}"
+    return (box, *(f"sphere {' '.join(f'{x:.6g}' for x in centre)} {radius:.6g} {modulus(level)}" for centre, radius, level in spheres))
+
+
+def _spheres(rest: np.ndarray, levels: np.ndarray, spacing: float, most: int) -> list[tuple[np.ndarray, float, int]] | None:
+    """Spheres about control nodes that cover all whose level is not 0, none of another level; None if there are too many."""
+    left, found = levels != 0, []
+    radii = np.zeros(len(rest))
+    for level in np.unique(levels[left]):
+        members = np.flatnonzero(levels == level)
+        others = rest[levels != level]
+        nearest = KDTree(others).query(rest[members])[0] if len(others) else np.full(len(members), np.inf)
+        radii[members] = np.minimum(0.5 * nearest + 0.5 * np.minimum(nearest, spacing), 0.95 * nearest)
+        radii[members] = np.minimum(radii[members], np.linalg.norm(np.ptp(rest, axis=0)))
+    tree = KDTree(rest)
+    covered = {int(node): tree.query_ball_point(rest[node], radii[node]) for node in np.flatnonzero(left)}
+    while left.any():
+        if len(found) >= most - 1:
+            return None
+        node = max(covered, key=lambda each: int(left[covered[each]].sum()))
+        left[covered[node]] = False
+        found.append((rest[node], float(radii[node]), int(levels[node])))
+    return found
+
+
+@dataclass(frozen=True)
+class Inclusion:
+    """A place that is stiffer than what surrounds it.
+
+    Args:
+        centre: Where its middle is [3], m, world.
+        deviation: Standard deviation of its coordinates [3], m, if the stiffest place is this one.
+        sure: Probability that it is: share of draws from the posterior whose stiffest place is within two lengths of the field of it.
+        ratio: Of its greatest modulus to that of the tissue around; median.
+        low: Lower end of the interval of that.
+        high: Upper end.
+        radius: Of a ball as large as what is more than half as stiff, in logarithms, m.
+    """
+
+    centre: np.ndarray
+    deviation: np.ndarray
+    sure: float
+    ratio: float
+    low: float
+    high: float
+    radius: float
+
+
+def find_inclusion(found: "Identification", samples: int = 200, seed: int = 0) -> Inclusion:
+    """The stiffest place of an estimated field, and how well it is known: by draws of fields from the posterior.
+
+    Of each field the middle of what exceeds half of its greatest excess over the median, in logarithms, near where that is.
+
+    Args:
+        found: The estimate, of a field.
+        samples: Draws.
+        seed: Of these.
+
+    Raises:
+        ValueError: If no field was estimated.
+    """
+    unknowns = found.parameters
+    if not len(unknowns.centres):
+        raise ValueError("an inclusion is looked for in a field; estimate with stiffness = field")
+    rng = np.random.default_rng(seed)
+    fields = slice(0, unknowns.count)
+    factor = np.linalg.cholesky(found.covariance[fields, fields] + 1e-12 * np.eye(unknowns.count))
+    draws = found.mean[fields] + rng.standard_normal((samples, unknowns.count)) @ factor.T
+    within = ~unknowns.nodes.pinned & (unknowns.residual < 0.5 * unknowns.config.field_spread**2)
+    rest, volumes = unknowns.nodes.rest[within].astype(np.float64), unknowns.nodes.volumes[within].astype(np.float64)
+    logs = (np.log(unknowns.base) + np.concatenate([found.mean[fields][None], draws]) @ unknowns.matrix.T)[:, within]
+    length = 2 * unknowns.config.field_length
+    centres, ratios, radii = zip(*(_middle(each, rest, volumes, length) for each in logs))
+    off = np.array(centres[1:]) - centres[0]
+    here = (off**2).sum(1) <= length**2
+    tail = (1 - found.level) / 2
+    low, high = np.quantile(np.array(ratios[1:])[here] if here.any() else ratios[1:], [tail, 1 - tail])
+    deviation = np.sqrt((off[here] ** 2).mean(0)) if here.any() else np.full(3, np.inf)
+    return Inclusion(centres[0], deviation, float(here.mean()), ratios[0], float(low), float(high), radii[0])
+
+
+def _middle(logs: np.ndarray, rest: np.ndarray, volumes: np.ndarray, length: float) -> tuple[np.ndarray, float, float]:
+    """Middle of the stiffest place [3], its ratio, and its radius."""
+    excess = logs - np.median(logs)
+    peak = int(np.argmax(excess))
+    near = ((rest - rest[peak]) ** 2).sum(1) <= length**2
+    weight = np.where(near, np.maximum(excess - excess[peak] / 2, 0), 0) * volumes
+    volume = volumes[near & (excess > excess[peak] / 2)].sum()
+    return (weight[:, None] * rest).sum(0) / weight.sum(), float(np.exp(excess[peak])), float((0.75 * volume / np.pi) ** (1 / 3))

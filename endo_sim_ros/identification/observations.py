@@ -1,0 +1,128 @@
+"""What was measured in an experiment as one vector, with its noise."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from endo_sim_ros.identification.experiment import Experiment
+from endo_sim_ros.identification.forward import Replay, closing_steps
+
+FORCE, DISPLACEMENT, PIXEL = range(3)
+_LONGEST = 250  # steps whose errors of tips are taken for correlated; more would only cost time
+
+
+class Observations:
+    """The N numbers that were measured in an experiment.
+
+    Args:
+        experiment: What was measured; what is NaN was not.
+        smoothing: As `IdentificationConfig.tip_smoothing`.
+
+    Attributes:
+        experiment: The same with smooth tips, which are replayed.
+        values: [N].
+        noise: Standard deviation of each [N].
+        kinds: FORCE, DISPLACEMENT or PIXEL [N].
+        steps: At the end of which it was measured [N].
+        used: Which count [N]; all at first.
+    """
+
+    def __init__(self, experiment: Experiment, smoothing: float):
+        self.smoother = smoothing_matrix(np.asarray(experiment.present, bool), smoothing / experiment.step_duration)
+        tips = self.smoother @ np.nan_to_num(experiment.tips)
+        self.experiment = replace(experiment, tips=tips)
+        steps = np.arange(len(tips))
+        parts = [(np.asarray(experiment.forces, float), FORCE, experiment.force_noise, steps)]
+        if experiment.displacements is not None:
+            parts.append((np.asarray(experiment.displacements, float), DISPLACEMENT, experiment.displacement_noise, steps))
+        parts += [(np.asarray(tracks.pixels, float), PIXEL, tracks.noise, np.asarray(tracks.steps)) for tracks in experiment.tracks]
+        self._given = [np.isfinite(values).ravel() for values, *_ in parts]
+        self.values = np.concatenate([values.ravel()[given] for (values, *_), given in zip(parts, self._given)])
+
+        def spread(number: int) -> np.ndarray:
+            rows = []
+            for (values, kind, noise, at), given in zip(parts, self._given):
+                each = (kind, noise, np.repeat(at, values[0].size if len(values) else 0))[number]
+                rows.append((np.full(values.size, each) if np.isscalar(each) else each)[given])
+            return np.concatenate(rows)
+
+        self.kinds, self.noise, self.steps = spread(0).astype(int), spread(1), spread(2).astype(int)
+        self.closed_at = closing_steps(experiment)[self.steps]  # step at which the jaw closed, -1 = open [N]
+        self.used = np.ones(len(self.values), bool)
+
+    def predicted(self, replay: Replay) -> np.ndarray:
+        """The same numbers as each copy of a replay predicts them [C, N]."""
+        count = len(replay.forces)
+        parts = [replay.forces, *([] if replay.displacements is None else [replay.displacements]), *replay.pixels]
+        return np.concatenate([part.reshape(count, -1)[:, given] for part, given in zip(parts, self._given)], 1)
+
+    def of_forces(self) -> np.ndarray:
+        """Which of the numbers are forces [N]."""
+        return self.kinds == FORCE
+
+    def covariance(self, tip_sensitivity: np.ndarray, shared: np.ndarray) -> "Covariance":
+        """Of the numbers that are used: their own noise, and what independent errors of the tips make of predictions.
+
+        Args:
+            tip_sensitivity: Derivative of each number by the place of the tip [N, 3], per m, while a jaw is closed by how far it has gone
+                since. Tissue is taken to follow the tip at once.
+            shared: What errors that the whole experiment shares make of them, one standard deviation of each [N, K].
+        """
+        rows, steps, blocks = np.flatnonzero(self.used), len(self.smoother), []
+        for begin in range(0, steps, _LONGEST):
+            end = min(begin + _LONGEST, steps)
+            members = (self.steps[rows] >= begin) & (self.steps[rows] < end)
+            at = rows[members]
+            # A number depends on the smoothed tip of its step, and that on the errors of those around it.
+            along = self.smoother[self.steps[at], begin:end]
+            along = along - np.where(self.closed_at[at, None] >= 0, self.smoother[self.closed_at[at], begin:end], 0)
+            along = along * self.experiment.tip_noise
+            A = (along[:, :, None] * tip_sensitivity[at][:, None]).reshape(len(at), -1)
+            A = np.concatenate([A, shared[at]], 1)
+            blocks.append(_Block(np.flatnonzero(members), self.noise[at] ** 2, A[:, np.abs(A).max(0, initial=0) > 0]))
+        return Covariance(blocks)
+
+
+class _Block:
+    """D + A Aᵀ of some rows, by Woodbury's identity."""
+
+    def __init__(self, rows: np.ndarray, D: np.ndarray, A: np.ndarray):
+        self.rows, self.D = rows, D
+        self._scaled = A / D[:, None]
+        self._inner = np.linalg.inv(np.eye(A.shape[1]) + A.T @ self._scaled)
+
+    def solve(self, x: np.ndarray) -> np.ndarray:
+        return x / self.D[:, None] - self._scaled @ (self._inner @ (self._scaled.T @ x))
+
+
+@dataclass(frozen=True)
+class Covariance:
+    """A covariance R of numbers that are used."""
+
+    blocks: list[_Block]
+
+    def solve(self, x: np.ndarray) -> np.ndarray:
+        """R⁻¹ x for x [n, k]."""
+        out = np.zeros_like(x, dtype=float)
+        for block in self.blocks:
+            if len(block.rows):
+                out[block.rows] = block.solve(x[block.rows])
+        return out
+
+
+def smoothing_matrix(present: np.ndarray, width: float) -> np.ndarray:
+    """Return weights [T, T] that smooth by a parabola through what is near, weighted by a Gaussian (Cleveland 1979) of a standard
+    deviation of `width` steps, not across steps where nothing is there. A parabola rounds off less where a tool turns round than a mean.
+    """
+    weights = np.eye(len(present))
+    run = np.cumsum(np.append(True, present[1:] != present[:-1])) if len(present) else np.zeros(0)
+    for step in np.flatnonzero(present & (width > 0)):
+        members = np.flatnonzero(run == run[step])
+        around = members[np.abs(members - step) <= np.ceil(3 * width)]
+        if len(around) <= 3:
+            continue
+        basis = ((around - step) / width)[:, None] ** np.arange(3)
+        weighted = basis * np.exp(-0.5 * ((around - step) / width) ** 2)[:, None]
+        weights[step] = 0
+        weights[step, around] = np.linalg.solve(weighted.T @ basis, weighted.T)[0]
+    return weights

@@ -1,0 +1,39 @@
+"""The benchmark of identification runs and reports."""
+
+import json
+
+import pytest
+
+from benchmarks import identification, lung_trials
+from benchmarks.identification import Truth, bench_identification
+from endo_sim_ros.evaluation.measurement import report
+
+
+@pytest.mark.slow
+def test_bench_tells_errors_intervals_and_speed(tmp_path, monkeypatch, capsys):
+    small = {"nodes": 300, "layers": 2, "by_nodes": 300, "by_layers": 2}
+    monkeypatch.setattr(identification, "TRUTHS", (Truth("of the same model", **small),))
+    monkeypatch.setattr(identification, "PRESSES", 1)
+    bench_identification(tmp_path / "rows.json", "cpu", cases=1, inclusions=0, searches=0)
+    rows = {row["name"]: row["value"] for row in json.loads((tmp_path / "rows.json").read_text())}
+    assert rows["steps of 5 copies"] > 0
+    assert 0 <= rows["one modulus, truth of the same model: error, median"] < 50
+    assert rows["one modulus, truth of the same model: 90 % intervals that hold it"] in (0, 100)
+    with pytest.raises(ValueError, match="must be 0 or more"):
+        bench_identification(None, "cpu", cases=-1)
+
+
+@pytest.mark.slow
+def test_trials_that_are_alike_predict_each_other(tmp_path):
+    lines = ["trial,time_s,force_N,position_mm"]
+    for trial, (scale, noise) in enumerate(((1.0, 0.0), (1.02, 0.01))):
+        for step in range(60):
+            x = step / 59
+            lines.append(f"{trial},{20 * x:.3f},{50 * scale * (0.02 + 0.3 * x + 0.68 * x**3) + noise:.4f},{10 * x:.4f}")
+    (tmp_path / "even.csv").write_text("\n".join(lines))
+    rows = lung_trials.lung_rows(tmp_path)
+    report("lungs", rows)
+    assert [row.value for row in rows if "within 10 %" in row.name] == [100, 100]
+    assert all(row.value < 5 for row in rows if "greatest error" in row.name)
+    with pytest.raises(ValueError, match="no CSV files"):
+        lung_trials.lung_rows(tmp_path / "nowhere")

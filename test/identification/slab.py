@@ -1,0 +1,30 @@
+"""A slab of tissue that is pressed from above, for tests of identification."""
+
+import numpy as np
+
+from endo_sim_ros.identification import Experiment
+from endo_sim_ros.identification.synthetic import press
+from endo_sim_ros.physics import ControlNodes, PhysicsConfig
+
+SPACING = 0.006
+PHYSICS = PhysicsConfig(young_modulus=4e3, contact_radius=0.008, friction=0.1, device="cpu")
+
+
+def slab(side: int = 9, deep: int = 4) -> ControlNodes:
+    """Control nodes of a slab 10 cm in front of the world's origin, held below and at its rim; skin first, as everywhere."""
+    across = (np.arange(side) - (side - 1) / 2) * SPACING
+    down = 0.1 + np.arange(deep) * SPACING
+    z, y, x = (each.ravel() for each in np.meshgrid(down, across, across, indexing="ij"))
+    edge = across[-1] - 1e-6
+    pinned = (z > down[-1] - 1e-6) | (np.maximum(np.abs(x), np.abs(y)) > edge)
+    return ControlNodes(
+        np.stack([x, y, z], 1).astype(np.float32), pinned, np.full(len(x), SPACING**3, np.float32), z < 0.1 + 1e-6, SPACING, np.zeros(3)
+    )
+
+
+NODES = slab()
+
+
+def pressed(x: float = 0.0, y: float = 0.0, depth: float = 0.006, steps: int = 24) -> Experiment:
+    """A press at a place on the slab, m."""
+    return press(NODES, PHYSICS, np.array([x, y, 0.1]), depth, steps, hold=4)

@@ -1,0 +1,108 @@
+"""Data that the model cannot explain: each is told in a sentence."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from slab import NODES, PHYSICS, pressed
+
+from endo_sim_ros.identification import IdentificationConfig, IdentificationError, identify
+from endo_sim_ros.identification.synthetic import measure
+
+pytestmark = pytest.mark.slow
+CONFIG = IdentificationConfig(model_error=0.0, surface_error=0.0)
+
+
+@pytest.fixture(scope="module")
+def good():
+    return measure(pressed(steps=40), NODES, PHYSICS, np.random.default_rng(0))
+
+
+def findings(*experiments, config=CONFIG) -> str:
+    return "\n".join(identify(experiments, NODES, PHYSICS, config, "cpu").findings)
+
+
+def test_good_data_have_no_findings(good):
+    assert findings(good) == ""
+
+
+def test_forces_of_the_opposite_sign_are_refused(good):
+    with pytest.raises(IdentificationError, match="opposite sign"):
+        findings(replace(good, forces=-good.forces))
+
+
+def test_forces_in_another_frame_are_refused(good):
+    with pytest.raises(IdentificationError, match=r"turned by 9\d°|turned by 8\d°"):
+        findings(replace(good, forces=good.forces[:, [2, 0, 1]]))
+
+
+def test_a_tool_that_never_touches_is_refused(good):
+    away = replace(good, tips=good.tips - [0, 0, 0.05], forces=0 * good.forces)
+    with pytest.raises(IdentificationError, match="never touches the tissue: it stays 5"):
+        findings(away)
+    with pytest.raises(IdentificationError, match="forces of up to 0.* N were measured, but the tool stays"):
+        findings(replace(good, tips=good.tips - [0, 0, 0.05]))
+    with pytest.raises(IdentificationError, match="is never present"):
+        findings(replace(good, present=np.zeros(40, bool), forces=0 * good.forces))
+
+
+def test_nothing_measured_is_refused(good):
+    with pytest.raises(IdentificationError, match="nothing was measured"):
+        findings(replace(good, forces=np.full((40, 3), np.nan)))
+
+
+def test_a_lag_of_the_forces_is_told(good):
+    late = replace(good, forces=np.roll(good.forces, 4, axis=0))
+    assert "forces come about 0.1" in findings(late) and "after the poses" in findings(late)
+
+
+def test_contact_at_another_depth_is_told(good):
+    told = findings(replace(good, tips=good.tips + [0, 0, 0.003]))
+    assert "contact begins about" in told and "mm deeper than the surface" in told
+    depth = float(told.split("about ")[1].split(" mm")[0])
+    assert depth == pytest.approx(3, abs=1)
+
+
+def test_forces_that_nothing_explains_are_told_and_widen_intervals(good):
+    spoilt = good.forces + 0.3 * np.sin(np.arange(40))[:, None] * [1, 0, 0]
+    plain = identify([good], NODES, PHYSICS, CONFIG, "cpu")["young_modulus"]
+    found = identify([replace(good, forces=spoilt)], NODES, PHYSICS, CONFIG, "cpu")
+    assert any("does not explain the data" in each for each in found.findings)
+    assert np.log(found["young_modulus"].high / found["young_modulus"].low) > 1.5 * np.log(plain.high / plain.low)
+
+
+def test_a_grasp_that_slips_is_told_and_left_out():
+    steps = 40
+    way = np.concatenate([np.zeros(5), np.linspace(0, 0.012, steps - 5)])
+    tips = np.array([0, 0, 0.1]) - way[:, None] * [0, 0, 1]
+    closed = np.arange(steps) >= 3
+    pull = replace(
+        pressed(), tips=tips, rotations=np.tile(np.eye(3), (steps, 1, 1)), present=np.ones(steps, bool), closed=closed,
+        forces=np.full((steps, 3), np.nan),
+    )  # fmt: skip
+    physics = replace(PHYSICS, contact_radius=0.0, force_radius=0.009)
+    whole = measure(pull, NODES, physics, np.random.default_rng(0))
+    forces = whole.forces.copy()
+    forces[25:] = 0.05 * np.random.default_rng(1).standard_normal((15, 3))
+    found = identify([replace(whole, forces=forces)], NODES, physics, CONFIG, "cpu")
+    told = [each for each in found.findings if "the grasp slipped" in each]
+    assert len(told) == 1 and float(told[0].split("slipped ")[1].split(" s")[0]) == pytest.approx(1.0, abs=0.15)
+    modulus = found["young_modulus"]
+    assert modulus.low < 4e3 < modulus.high and modulus.estimate == pytest.approx(4e3, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"forces": np.zeros((3, 3))}, "forces has shape"),
+        ({"tips": np.full((40, 3), np.nan)}, "not finite"),
+        ({"force_noise": 0.0}, "must be above 0"),
+        ({"displacements": np.zeros((40, 1, 3))}, "need `nodes`"),
+        ({"displacements": np.zeros((3, 1, 3)), "nodes": np.array([0])}, "displacements have shape"),
+    ],
+)
+def test_arrays_that_do_not_fit_are_refused(good, change, said):
+    with pytest.raises(IdentificationError, match=said):
+        findings(replace(good, **change))
+    with pytest.raises(IdentificationError, match="no experiment"):
+        identify([], NODES, PHYSICS, CONFIG, "cpu")

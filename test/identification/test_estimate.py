@@ -1,0 +1,115 @@
+"""What is estimated of tissue that is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from slab import NODES, PHYSICS, pressed
+
+from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.identification import IdentificationConfig, identify
+from endo_sim_ros.identification.acquire import expected_information
+from endo_sim_ros.identification.forward import ForwardModel
+from endo_sim_ros.identification.synthetic import measure
+from endo_sim_ros.physics.regions import inside_sphere
+
+pytestmark = pytest.mark.slow
+EXACT = IdentificationConfig(model_error=0.0, surface_error=0.0)
+CENTRE = np.array([0.006, 0.006, 0.104])
+
+
+def measured(seed: int = 0, modulus: float = 7e3, noise: bool = True, **given):
+    rng = np.random.default_rng(seed)
+    truth = replace(PHYSICS, young_modulus=modulus)
+    return measure(replace(pressed(), **given), NODES, truth, rng, noise=noise)
+
+
+def test_a_modulus_is_found_and_its_interval_holds_it():
+    found = identify([measured()], NODES, PHYSICS, EXACT, "cpu")
+    told = found["young_modulus"]
+    assert told.told == "known" and told.low < 7e3 < told.high and abs(told.estimate / 7e3 - 1) < 0.1
+    assert not found.findings and 0.5 < found.chi_square < 1.5
+    assert np.allclose(found.young_modulus, told.estimate) and found.known.all()
+    assert "young_modulus" in found.summary() and "known" in found.summary()
+
+
+def test_without_noise_the_truth_comes_out():
+    found = identify([measured(noise=False)], NODES, PHYSICS, replace(EXACT, tip_smoothing=0.0), "cpu")
+    assert found["young_modulus"].estimate == pytest.approx(7e3, rel=0.01)
+    assert np.abs(found.tip_offset).max() < 5e-5
+
+
+def test_doubts_about_the_model_widen_intervals():
+    widths = [np.log(told.high / told.low) for each in (EXACT, IdentificationConfig())
+              for told in [identify([measured()], NODES, PHYSICS, each, "cpu")["young_modulus"]]]  # fmt: skip
+    assert widths[1] > 1.5 * widths[0]
+
+
+def test_without_force_only_ratios_are_known():
+    physics = replace(PHYSICS, regions=("box -1 -1 0 0 1 1 young_modulus=4000",))
+    factors = np.where(NODES.rest[:, 0] <= 0, 1.0, 3.0)
+    nodes = np.flatnonzero(NODES.is_skin & ~NODES.pinned)
+    rng = np.random.default_rng(0)
+    blank = replace(pressed(0.0, 0.0, 0.008), displacements=np.zeros((24, len(nodes), 3)), nodes=nodes, displacement_noise=1e-4)
+    experiment = replace(measure(blank, NODES, replace(PHYSICS, young_modulus=9e3), rng, factors), forces=np.full((24, 3), np.nan))
+    found = identify([experiment], NODES, physics, replace(EXACT, stiffness="regions", tip_offset=0.0001), "cpu")
+    assert [each.told for each in found.unknowns] == ["ratio only"] * 2
+    assert any("only ratios" in finding for finding in found.findings) and not found.known.any()
+    rest, region = (each.estimate for each in found.unknowns)
+    assert rest / region == pytest.approx(3, rel=0.3)
+    alone = identify([experiment], NODES, PHYSICS, EXACT, "cpu")["young_modulus"]
+    assert alone.told == "not told by these data" and alone.high / alone.low > 10
+
+
+def test_other_numbers_than_stiffness_are_estimated():
+    truth = replace(PHYSICS, poisson_ratio=0.42)
+    rng = np.random.default_rng(0)
+    nodes = np.flatnonzero(NODES.is_skin & ~NODES.pinned)
+    blank = replace(pressed(depth=0.008), displacements=np.zeros((24, len(nodes), 3)), nodes=nodes, displacement_noise=5e-5)
+    found = identify([measure(blank, NODES, truth, rng)], NODES, PHYSICS, replace(EXACT, unknowns=("poisson_ratio", "hold_rim")), "cpu")
+    told = found["poisson_ratio"]
+    assert told.low < 0.42 < told.high and told.estimate == pytest.approx(0.42, abs=0.03)
+    assert found["hold_rim"].told == "not told by these data" and any("hold_rim" in each for each in found.findings)
+
+
+def test_unknowns_that_do_not_exist_are_refused():
+    with pytest.raises(ConfigError, match="no 'colour', known are poisson_ratio"):
+        identify([pressed()], NODES, PHYSICS, IdentificationConfig(unknowns=("colour",)), "cpu")
+    with pytest.raises(ConfigError, match="relaxation of physics is 0"):
+        identify([pressed()], NODES, PHYSICS, IdentificationConfig(unknowns=("relaxation",)), "cpu")
+    with pytest.raises(ConfigError, match="needs regions of physics"):
+        identify([pressed()], NODES, PHYSICS, IdentificationConfig(stiffness="regions"), "cpu")
+
+
+def test_going_on_from_an_estimate_is_as_good_as_all_at_once():
+    both = [measured(seed, x) for seed, x in ((0, 7e3), (1, 7e3))]
+    first = identify(both[:1], NODES, PHYSICS, EXACT, "cpu")
+    then = identify(both[1:], NODES, PHYSICS, EXACT, "cpu", start=first)["young_modulus"]
+    once = identify(both, NODES, PHYSICS, EXACT, "cpu")["young_modulus"]
+    assert then.estimate == pytest.approx(once.estimate, rel=0.02)
+    assert np.log(then.high / then.low) == pytest.approx(np.log(once.high / once.low), rel=0.15)
+
+
+def test_a_press_elsewhere_is_expected_to_tell_more():
+    config = replace(EXACT, stiffness="field", field_length=0.012)
+    places = np.array([[-0.012, 0, 0.1], [0.012, 0, 0.1]])
+    found = identify([measure(pressed(-0.012), NODES, PHYSICS, np.random.default_rng(0))], NODES, PHYSICS, config, "cpu", around=places)
+    here, there = expected_information(found, [pressed(-0.012), pressed(0.012)], ForwardModel(NODES, PHYSICS, "cpu"))
+    assert there > 1.2 * here > 0
+
+
+def test_an_inclusion_is_found_in_a_map():
+    from endo_sim_ros.identification import find_inclusion
+    from endo_sim_ros.physics.regions import TissueProperties, paint_regions
+
+    factors = np.where(inside_sphere(NODES.rest, CENTRE, 0.007), 8.0, 1.0)
+    rng, at = np.random.default_rng(0), (-0.01, 0.0, 0.01)
+    experiments = [measure(pressed(x, y), NODES, PHYSICS, rng, factors) for x in at for y in at]
+    found = identify(experiments, NODES, PHYSICS, replace(EXACT, stiffness="field", field_length=0.012, iterations=4), "cpu")
+    inclusion = find_inclusion(found)
+    # How deep it lies presses from above hardly tell.
+    assert np.linalg.norm((inclusion.centre - CENTRE)[:2]) < 0.004 and inclusion.ratio > 2 and inclusion.sure > 0.9
+    skin = NODES.is_skin & ~NODES.pinned
+    assert found.removed[skin].mean() > found.removed[NODES.pinned & ~NODES.is_skin].mean()  # what is felt is known best
+    painted = paint_regions(TissueProperties.uniform(len(NODES), 4e3, 0.3, 1000.0), NODES.rest, found.regions(step=0.2))
+    assert np.abs(np.log(painted.young_modulus / found.young_modulus)).max() < 0.2

@@ -1,0 +1,41 @@
+"""Noise of what was measured: that of tips is in it."""
+
+from dataclasses import replace
+
+import numpy as np
+from slab import NODES, pressed
+
+from endo_sim_ros.identification.observations import Observations, smoothing_matrix
+
+
+def test_covariance_is_that_of_noise_and_tips():
+    rng = np.random.default_rng(0)
+    experiment = pressed(steps=10)
+    forces = rng.standard_normal((10, 3))
+    forces[4] = np.nan
+    seen = Observations(replace(experiment, forces=forces), 0.08)
+    assert len(seen.values) == 27
+    G, shared = rng.standard_normal((27, 3)) * 100, rng.standard_normal((27, 2))
+    # Written out: R = σ² 1 + S (σ² 1) Sᵀ + c cᵀ with S = ∂force_i/∂tip of each step.
+    S = np.zeros((27, 10, 3))
+    for row, step in enumerate(seen.steps):
+        S[row] = seen.smoother[step][:, None] * G[row]
+    S = S.reshape(27, 30)
+    R = experiment.force_noise**2 * np.eye(27) + experiment.tip_noise**2 * S @ S.T + shared @ shared.T
+    x = rng.standard_normal((27, 2))
+    assert np.allclose(seen.covariance(G, shared).solve(x), np.linalg.solve(R, x), rtol=1e-6, atol=1e-6)
+
+
+def test_smoothing_keeps_steady_motion_and_does_not_mix_what_was_apart():
+    present = np.array([1, 1, 1, 1, 0, 0, 1, 1, 1, 1, 1], bool)
+    W = smoothing_matrix(present, 1.5)
+    line = np.arange(11.0)
+    assert np.allclose(W @ line, line) and np.allclose(W.sum(1), 1)
+    assert not W[:4, 6:].any() and not W[6:, :4].any()
+
+
+def test_what_was_not_measured_is_left_out():
+    moved = np.full((24, 2, 3), np.nan)
+    moved[3:5] = 0.001
+    seen = Observations(replace(pressed(), displacements=moved, nodes=np.array([0, len(NODES) - 1])), 0.0)
+    assert len(seen.values) == 12 and set(seen.steps) == {3, 4}

@@ -1,0 +1,119 @@
+"""identification_node: touches of a tool in, a map of stiffness out, and parameters for physics_node."""
+
+import numpy as np
+import pytest
+import rclpy
+from ros_bench import SMALL, Bench, S, send_model, sheet, start_ros
+from std_srvs.srv import Trigger
+
+from endo_sim_ros import messages
+from endo_sim_ros.messages import ERROR, OK
+from endo_sim_ros.nodes.identification_node import IdentificationNode
+from endo_sim_ros.nodes.physics_node import PhysicsNode
+from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
+
+pytestmark = [pytest.mark.dds, pytest.mark.slow]
+ARM, BEGIN, TRUTH = "ROBOT", 1000 * S, 14e3  # Pa; physics_node has no such arm, so that it does not answer
+TISSUE = {"node_count": 300, "step_duration": 0.04, "contact_radius": 0.01, "force_radius": 0.02}
+STEPS, SETTLE = 30, 14
+
+
+def simulated(modulus):
+    """Tips [T, 3] of a press in the middle of the sheet, and what tissue of a modulus exerts on the tool [T, 3]."""
+    physics = PhysicsConfig(**TISSUE, young_modulus=modulus, device="cpu")
+    simulation = TissueSimulation(sheet(), np.zeros(3), physics)
+    down = np.interp(np.arange(STEPS), [0, 12, 18, STEPS - 1], [-0.02, 0.005, 0.005, -0.02])
+    depths = np.concatenate([np.full(SETTLE, -0.02), down, np.full(2 * SETTLE, -0.02)])
+    tips = np.array([0.0, 0, 0.1 - simulation.contact_radius]) + depths[:, None] * [0, 0, 1]
+    forces = []
+    for tip in tips:
+        simulation.set_grasp(ARM, pose_at(tip), False)
+        simulation.step()
+        forces.append(simulation.reaction(ARM)[0])
+    return tips, np.array(forces)
+
+
+def pose_at(tip):
+    pose = np.eye(4)
+    pose[:3, 3] = tip
+    return pose
+
+
+@pytest.fixture(scope="module")
+def press():
+    return simulated(TRUTH)
+
+
+@pytest.fixture
+def graph():
+    """A bench with identification_node, which knows control nodes, and physics_node."""
+    options = TISSUE | {"arms": f"[{ARM}]", "apply": "true", "device": "cpu"}
+    start_ros(identification_node=options, physics_node=SMALL["physics_node"] | {"contact_radius": 0.01})
+    bench = Bench()
+    try:
+        bench.hear(messages.STIFFNESS_MAP)
+        node, physics = bench.add(IdentificationNode), bench.add(PhysicsNode)
+        bench.status("identification_node", "waiting for a model")
+        send_model(bench)
+        bench.until(lambda: node.nodes is not None and physics.simulation is not None, "control nodes", 60)
+        yield bench, node, physics
+    finally:
+        bench.close()
+        rclpy.try_shutdown()
+
+
+def tell(bench, tips, forces, begin=BEGIN, noise=0.0):
+    rng = np.random.default_rng(0)
+    for step, (tip, force) in enumerate(zip(tips, forces)):
+        stamp = begin + step * S // 25
+        bench.publish(messages.tool_pose(ARM), messages.encode_pose(pose_at(tip), stamp, "world"))
+        felt = force + noise * rng.normal(size=3)
+        bench.publish(messages.tool_reaction(ARM), messages.encode_wrench(felt, np.zeros(3), stamp, ARM))
+        bench.executor.spin_once(timeout_sec=0.002)
+
+
+def test_touches_become_a_map_that_physics_takes_and_more_touches_refine_it(graph, press):
+    bench, node, physics = graph
+    assert physics.config.young_modulus == 10e3
+    _, text, values = bench.status("identification_node", "waiting for a touch of ROBOT", OK)
+    assert (values["state"], values["experiments"]) == ("collecting", "0")
+    tell(bench, *press, noise=0.05)
+    (first,) = bench.until(lambda: bench.heard["stiffness_map"], "a map", 40)
+    found = messages.decode_stiffness(first)
+    assert messages.stamp_to_ns(first.header.stamp) == 5 * S and first.header.frame_id == "world"
+    np.testing.assert_array_equal(found.positions, node.nodes.rest)
+    assert found.known.all() and np.ptp(found.young_modulus) == 0
+    assert found.low[0] < TRUTH < found.high[0] and found.young_modulus[0] == pytest.approx(TRUTH, rel=0.2)
+    bench.until(lambda: physics.config.young_modulus == pytest.approx(found.young_modulus[0], rel=1e-4), "physics_node to take it")
+    _, text, values = bench.status("identification_node", "young_modulus")
+    assert float(values["young_modulus"]) == pytest.approx(found.young_modulus[0], rel=1e-4) and float(values["known"]) == 1
+    tell(bench, *press, begin=BEGIN + 10 * S, noise=0.05)
+    bench.until(lambda: len(bench.heard["stiffness_map"]) == 2, "a second map", 40)
+    assert len(node.experiments) == 2
+    second = messages.decode_stiffness(bench.heard["stiffness_map"][-1])
+    width = lambda each: np.log(each.high[0] / each.low[0])
+    assert width(second) < 1.02 * width(found)
+    assert bench.call(Trigger, "/identification_node/reset").message == "2 experiments are forgotten"
+    assert not node.experiments and node.found is None
+
+
+def test_what_cannot_be_used_is_one_sentence_and_the_node_goes_on(graph, press):
+    bench, node, _ = graph
+    tips, forces = press
+    tell(bench, tips, -forces)
+    bench.refused("identification_node", "turn the sign round", "ROBOT/body/measured_cf")
+    bench.publish(messages.tool_pose(ARM), messages.encode_pose(np.diag([1, 1, 1, 1.0]), BEGIN + 20 * S, "nowhere"))
+    bench.refused("identification_node", "nowhere", "ROBOT/measured_cp")
+    count = len(bench.statuses["identification_node"])
+    tell(bench, tips, forces, begin=BEGIN + 30 * S)
+    bench.until(lambda: bench.heard["stiffness_map"], "a map after all", 40)
+    assert not any(level == ERROR and "unexpected" in text for level, text, _ in bench.statuses["identification_node"][count:])
+
+
+def test_time_that_begins_anew_keeps_what_was_felt(graph, press):
+    bench, node, _ = graph
+    assert bench.set("identification_node", new_touches=1000)[0]  # the first estimate, and no other
+    tell(bench, *press)
+    bench.until(lambda: len(node.experiments) == 1, "an experiment")
+    tell(bench, *press, begin=10 * S)
+    bench.until(lambda: len(node.experiments) == 2, "an experiment of the new time")

@@ -174,6 +174,7 @@ def test_the_command_serves_a_page_for_a_person(tmp_path):
         [sys.executable, "-u", "-m", "endo_sim_ros.cli", *map(str, words)], stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parents[2]
     )
     try:
+        assert process.stdout is not None
         line = next(line for line in process.stdout if line.startswith("open http"))
         with urllib.request.urlopen(line.split()[1], timeout=20) as answer:
             assert answer.status == 200 and b"<html" in answer.read().lower()

@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task, count", [("retraction", 48), ("palpation", 8), ("tracking", 32), ("camera", 32)])
+@pytest.mark.parametrize("task, count", [("retraction", 48), ("palpation", 8), ("tracking", 32), ("camera", 32), ("exposure", 24)])
 def test_scripted_policies_solve_their_tasks(task, count):
     batch = TaskBatch(task, load_scene(), count, device="cpu")
     returns, success, lengths = play(batch, scripted_policy(task, count), np.arange(count))

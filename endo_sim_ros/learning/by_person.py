@@ -134,8 +134,9 @@ class _Session:
         batch = self._demonstrations.batches[number]
         (episode,), seen = begin(batch, [seed])
         period = batch.task.physics().step_duration / self._pace
-        actions, arm, begun = np.tile([0.0, 0.0, 0.0, -1.0], (batch.action_size // 4, 1)), 0, False
-        rested, due = False, time.monotonic()
+        resting = 0.0 if batch.task.turns else -1.0  # the fourth number, of a speed or an open jaw
+        actions, arm = np.tile([0.0, 0.0, 0.0, resting], (batch.action_size // 4, 1)), 0
+        begun, rested, due = False, False, time.monotonic()
         while episode.solved is None:
             self._screen.show(self._view(number, arm, actions, begun))
             self._screen.wait(due)
@@ -153,11 +154,10 @@ class _Session:
                 actions[arm, 3] = np.clip(sum(wish.turn for wish in wishes), -1, 1)
             elif sum(wish.jaw for wish in wishes) % 2:
                 actions[arm, 3] *= -1
-            moves = actions[arm, :3].any() or actions[arm, 3] not in (0, -1)
+            moves = actions[arm, :3].any() or actions[arm, 3] != resting
             if not begun and not (moves and rested):  # what the hand still does of the episode before begins none
                 rested |= not moves
-                if not batch.task.turns:
-                    actions[:, 3] = -1
+                actions[:, 3] = resting
                 continue
             if not begun:
                 self.keep()

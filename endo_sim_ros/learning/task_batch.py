@@ -71,7 +71,7 @@ class TaskBatch:
         motion: MotionConfig = MotionConfig(),
     ):
         kind = find_task(task)
-        if kind.roams and actions != "cartesian":
+        if kind.turns and actions != "cartesian":
             raise ValueError(f"{task} acts by the joints of the endoscope, not by those of the tool; leave actions at cartesian")
         config = moving(kind.physics(device), motion)
         nodes = scene.nodes(config)
@@ -92,7 +92,7 @@ class TaskBatch:
         self.tissue = TissueBatch(nodes, config, count, arms, stiffness=stiffness, capsules=capsules)
         self._varies = largest != 1
         self._moves = config.motion.breathing + config.motion.heartbeat > 0
-        self._works = not kind.roams or self._moves or bool(self._links)  # else nothing touches the tissue
+        self._works = not kind.turns or self._moves or bool(self._links)  # else nothing touches the tissue
         self._rest = torch.from_numpy(nodes.rest)
         self._resting, self._placed = True, False  # of a single tissue
         self.sight = sight

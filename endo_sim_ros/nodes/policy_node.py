@@ -47,7 +47,7 @@ class PolicyNode(EndoNode):
             self._tools = None if policy.actions == "cartesian" else HeldTools(hold_tools(task, scene, config.tool), task, 1)
         except ValueError as error:
             raise ConfigError(str(error)) from error
-        if task.roams and self._tools is not None:
+        if task.turns and self._tools is not None:
             raise ConfigError(
                 f"policy: {config.task} acts by the joints of the endoscope, not by those of the tool, as {config.policy} does"
             )

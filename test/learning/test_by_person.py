@@ -132,6 +132,16 @@ def test_an_interrupted_person_goes_on_and_may_drop_what_was_solved(scripted, tm
         demonstrate("retraction", SCENES, out, replace(BY_PERSON, by="script", noise=0.0), SIGHT, device="cpu")
 
 
+def test_a_person_turns_the_endoscope(tmp_path):
+    """In a task whose fourth number is a speed, which is not that of a jaw."""
+    screen, hand = Screen(), Hand(Wish(), *[Wish(turn=-1.0, jaw=True)] * 5)
+    config = replace(BY_PERSON, episodes=1)
+    demonstrate_by_person("camera", SCENES[:1], tmp_path, screen, [hand], PersonConfig(width=40), config, SIGHT, device="cpu")
+    assert [line for line in screen.views[-1].lines if "left" in line] == ["5.8 s left"], "five steps of 0.04 s"
+    assert not any("fourth" in line or "jaw" in line for line in screen.views[-1].lines)
+    assert (screen.views[0].image != screen.views[-1].image).mean() > 0.1
+
+
 def test_sticks_and_buttons_of_a_gamepad_are_heard(tmp_path):
     """As the kernel tells of them, through a pipe in the place of its file."""
     path = tmp_path / "js0"
@@ -174,6 +184,7 @@ def test_the_command_serves_a_page_for_a_person(tmp_path):
         [sys.executable, "-u", "-m", "endo_sim_ros.cli", *map(str, words)], stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parents[2]
     )
     try:
+        assert process.stdout is not None
         line = next(line for line in process.stdout if line.startswith("open http"))
         with urllib.request.urlopen(line.split()[1], timeout=20) as answer:
             assert answer.status == 200 and b"<html" in answer.read().lower()

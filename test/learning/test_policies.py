@@ -24,7 +24,8 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "task, count", [("retraction", 48), ("palpation", 8), ("tracking", 32), ("tension", 16), ("handover", 16), ("camera", 32)]
+    "task, count",
+    [("retraction", 48), ("palpation", 8), ("tracking", 32), ("exposure", 24), ("tension", 16), ("handover", 16), ("camera", 32)],
 )
 def test_scripted_policies_solve_their_tasks(task, count):
     batch = TaskBatch(task, load_scene(), count, device="cpu")

@@ -59,8 +59,8 @@ class Task(ABC):
     horizon: int  # steps of an episode
     arms: tuple[str, ...] = ("PSM1",)  # that hold a tool each: PSM1 on the right of the picture, PSM2 on the left
     step_length = 0.002  # m in one step, per axis
-    roams = False  # whether the actions move the endoscope
-    turns = False  # whether the fourth number is a speed, which rests at 0
+    roams = False  # whether the endoscope is elsewhere than that of the scene, see `endoscopes`
+    turns = False  # whether actions move the endoscope, and not the tool; their fourth number is a speed then, which rests at 0
     working_fourth = -1.0  # fourth action of a tool at work in the tissue, as benchmarks give it
     force_limit: float  # N; above it tissue is hurt, and the episode lost
     low: tuple[float, float, float]  # where the tip may be, m, task frame

@@ -15,6 +15,7 @@ from endo_sim_ros.physics import ControlNodes
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 
 _LEAST_RANGE = 4.0  # from the softest to the stiffest of a scale, so that hardly different tissue looks alike
+_ENDS = 26, 236  # of the colours that are used, as both ends of them are so dark that they hide the tissue
 _UNKNOWN = (110, 110, 110)
 _WIDTH = 640  # pixels of the picture
 _STRIPES = 12  # pixels from stripe to stripe where nothing is known
@@ -33,7 +34,7 @@ def color_scale(young_modulus: np.ndarray) -> tuple[float, float]:
 def modulus_colors(young_modulus: np.ndarray, known: np.ndarray, scale: tuple[float, float]) -> np.ndarray:
     """Colours [M, 3] uint8 of moduli [M], Pa, on a logarithmic scale, as `color_scale` gives it; grey where they are not known [M]."""
     share = np.log(np.asarray(young_modulus) / scale[0]) / np.log(scale[1] / scale[0])
-    levels = (255 * share.clip(0, 1)).astype(np.uint8)
+    levels = (_ENDS[0] + (_ENDS[1] - _ENDS[0]) * share.clip(0, 1)).astype(np.uint8)
     colors = cv2.applyColorMap(levels[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1]
     return np.where(np.asarray(known)[:, None], colors, np.array(_UNKNOWN, np.uint8))
 

@@ -153,7 +153,7 @@ def _moving_mean(values: np.ndarray) -> np.ndarray:
 
 def _usable(each: Observations) -> np.ndarray:
     """Steps whose force is used [T], bool."""
-    usable = np.isfinite(each.experiment.forces).all(1)
+    usable = np.asarray(np.isfinite(each.experiment.forces).all(1))
     forces = each.of_forces()
     usable[each.steps[forces & ~each.used]] = False
     return usable

@@ -155,7 +155,7 @@ class ForwardModel:
                 images = np.flatnonzero(each.steps == step)
                 if len(images):
                     at = each.places(batch)
-                    for image in images:
+                    for image in images.tolist():
                         into[:, image] = each.project(at, image)
         felt = torch.stack(forces, 1).cpu().numpy() if forces else np.zeros((len(shifts), 0, 3))
         return felt, torch.stack(moved, 1).cpu().double().numpy() if moved else None, pixels

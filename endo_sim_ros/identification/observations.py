@@ -39,14 +39,15 @@ class Observations:
         self._given = [np.isfinite(values).ravel() for values, *_ in parts]
         self.values = np.concatenate([values.ravel()[given] for (values, *_), given in zip(parts, self._given)])
 
-        def spread(number: int) -> np.ndarray:
-            rows = []
-            for (values, kind, noise, at), given in zip(parts, self._given):
-                each = (kind, noise, np.repeat(at, values[0].size if len(values) else 0))[number]
-                rows.append((np.full(values.size, each) if np.isscalar(each) else each)[given])
-            return np.concatenate(rows)
+        def spread(of_parts: list) -> np.ndarray:
+            """Numbers of each part, one for all of it or one a row, for each that was measured."""
+            full = [
+                np.broadcast_to(np.reshape(of, (-1, *[1] * (values.ndim - 1))), values.shape) for of, (values, *_) in zip(of_parts, parts)
+            ]
+            return np.concatenate([each.ravel()[given] for each, given in zip(full, self._given)])
 
-        self.kinds, self.noise, self.steps = spread(0).astype(int), spread(1), spread(2).astype(int)
+        kinds, noises, ends = ([part[number] for part in parts] for number in (1, 2, 3))
+        self.kinds, self.noise, self.steps = spread(kinds).astype(int), spread(noises), spread(ends).astype(int)
         self.closed_at = closing_steps(experiment)[self.steps]  # step at which the jaw closed, -1 = open [N]
         self.used = np.ones(len(self.values), bool)
 

@@ -60,7 +60,9 @@ def test_the_tissue_is_taut_when_both_arms_pull_and_too_much_of_either_ends_it(m
             tips = np.array([[o[f"{arm}.tip_{axis}"][b] for axis in "xyz"] for arm in batch.task.arms])
             forces = np.array([[o[f"{arm}.force_{axis}"][b] for axis in "xyz"] for arm in batch.task.arms])
             way = (tips[1] - tips[0]) / np.linalg.norm(tips[1] - tips[0])
-            np.testing.assert_allclose(forces @ way * [1, -1], [o["wanted"][b] - o[f"{arm}.missing"][b] for arm in batch.task.arms], atol=1e-5)
+            np.testing.assert_allclose(
+                forces @ way * [1, -1], [o["wanted"][b] - o[f"{arm}.missing"][b] for arm in batch.task.arms], atol=1e-5
+            )
             np.testing.assert_allclose(forces @ way * [1, -1], o["wanted"][b], rtol=batch.task.tolerance)
         solved |= outcome.success
     assert solved.all()

@@ -125,7 +125,7 @@ class Handover(Task):
         self._offset[passed] = (self.needle - leading)[passed]
         self.needle = np.where(self.holds.any(1, keepdims=True), leading + self._offset, self.needle)
         off = norm(self._places(everyone, self._line)[:, None] - self.tip[:, :, None]).min(2)
-        self.holds &= (off <= self.tolerance) | (self._lead[:, None] == [0, 1])
+        self.holds &= (off <= self.tolerance) | np.equal(self._lead[:, None], [0, 1])
         free = ~self.holds.any(1)
         self.holds |= (self.raised == 1) & (off <= self.tolerance)
         taken = np.flatnonzero(free & self.holds.any(1))

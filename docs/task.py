@@ -1,4 +1,4 @@
-"""Draws docs/camera.webp: scripted policies play episodes of a task, side by side. OpenCV 4.11 or newer writes it.
+"""Draws the moving pictures of docs/learning.md: scripted policies play episodes of a task, side by side. OpenCV 4.11 or newer writes it.
 
 python docs/task.py camera docs/camera.webp
 """

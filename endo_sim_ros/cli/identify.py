@@ -36,6 +36,8 @@ class Command:
         from endo_sim_ros.core.folders import leaving_none_empty
         from endo_sim_ros.identification.identify_bag import identify_bag
 
+        if self.out.is_file():
+            raise ValueError(f"{self.out} is a file; name a folder for what is found")
         with leaving_none_empty(self.out):
             identify_bag(self.bag, self.model, self.out, self.config, self.recording, self.physics)
         print(f"{self.out}: stiffness.yaml, stiffness.npz, stiffness.png")

@@ -96,10 +96,13 @@ def survey(data: list[Observations], model: ForwardModel, unknowns: Unknowns, co
     _check_touch(data, model, predicted, middle)
     if not any(np.isfinite(each).any() for each in measured):
         return Survey(1.0, ["no force was measured: of stiffness only ratios between places are known, not how stiff the tissue is"])
+    _check_felt(data, [each[middle] for each in predicted])
     costs, scales = zip(*(_fit_scale(data, [each[d] for each in predicted]) for d in range(_SCANNED)))
     best = int(np.argmin(costs))
     chosen = [each[best] for each in predicted]
     _check_direction(data, chosen, config)
+    for number, (each, force) in enumerate(zip(data, chosen)):
+        _check_direction([each], [force], config, f"experiment {number}: ", by_sign=True)
     findings = [*_find_slips(data, chosen, scales[best]), *_find_lag(data, chosen, config)]
     costs, scales = zip(*(_fit_scale(data, [each[d] for each in predicted]) for d in range(_SCANNED)))
     depth, gain = _lowest(depths, np.array(costs), middle, sum(int(each.of_forces().sum()) for each in data))
@@ -139,6 +142,20 @@ def _check_touch(data: list[Observations], model: ForwardModel, predicted: list[
             f"forces of up to {most:.2g} N were measured, but the tool {away}: check frames, scale and the model's contact_radius"
         )
     raise IdentificationError(f"the tool never touches the tissue: it {away}; press deeper, or check frames and scale")
+
+
+def _check_felt(data: list[Observations], predicted: list[np.ndarray]) -> None:
+    """Refuse forces that are noise alone, though the tool is as deep in the tissue as would be felt."""
+    noise = [each.experiment.force_noise for each in data]
+    if any(_there(each.experiment.forces, own).any() for each, own in zip(data, noise)):
+        return
+    expected = [force * np.isfinite(each.experiment.forces) for each, force in zip(data, predicted)]
+    if any(_there(force, own).any() for force, own in zip(expected, noise)):
+        most = max(float(np.linalg.norm(force, axis=1).max()) for force in expected)
+        raise IdentificationError(
+            f"the tool is in the tissue, which would exert up to {most:.2g} N on it, but no force beyond the noise of {max(noise):.2g} N"
+            " was measured; set forces that were not measured to NaN, or give softer tissue"
+        )
 
 
 def _there(forces: np.ndarray, noise: float) -> np.ndarray:
@@ -182,8 +199,10 @@ def _lowest(depths: np.ndarray, costs: np.ndarray, middle: int, count: int) -> t
     return depth, float(costs[middle] - costs[best]) / max(1.0, costs[best] / max(count, 1))
 
 
-def _check_direction(data: list[Observations], predicted: list[np.ndarray], config: IdentificationConfig) -> None:
-    """Refuse forces that point elsewhere than those of the model."""
+def _check_direction(
+    data: list[Observations], predicted: list[np.ndarray], config: IdentificationConfig, where: str = "", by_sign: bool = False
+) -> None:
+    """Refuse forces that point elsewhere than those of the model, or, where one press may turn them, only those of the opposite sign."""
     H, weight = np.zeros((3, 3)), 0.0
     for each, force in zip(data, predicted):
         measured = np.where(_usable(each)[:, None], np.nan_to_num(each.experiment.forces), 0)
@@ -197,10 +216,10 @@ def _check_direction(data: list[Observations], predicted: list[np.ndarray], conf
     angle = float(np.degrees(np.arccos(np.clip(a @ b, -1, 1))))
     if angle > 180 - config.most_turned:
         raise IdentificationError(
-            "measured forces point against those that the tissue would exert on the tool: they have the opposite sign; give what the"
-            " tissue exerts on the tool, in the world's axes"
+            f"{where}measured forces point against those that the tissue would exert on the tool: they have the opposite sign; give what"
+            " the tissue exerts on the tool, in the world's axes"
         )
-    if angle > config.most_turned:
+    if angle > config.most_turned and not by_sign:
         raise IdentificationError(
             f"measured forces are turned by {angle:.0f}° from those that the tissue would exert on the tool (they point along"
             f" {np.round(a * np.sign(s[0]), 2).tolist()}, expected {np.round(b, 2).tolist()}): they are in another frame; give them in the"

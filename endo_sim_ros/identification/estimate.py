@@ -10,13 +10,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.stats import norm
 
+from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.identification.checks import IdentificationError, check_input, judge_residuals, survey
 from endo_sim_ros.identification.config import IdentificationConfig
 from endo_sim_ros.identification.experiment import Experiment
 from endo_sim_ros.identification.forward import ForwardModel, distances_to_skin, reach_of
 from endo_sim_ros.identification.maps import paint_as_regions
 from endo_sim_ros.identification.observations import Covariance, Observations
-from endo_sim_ros.identification.unknowns import Reported, Told, Unknowns
+from endo_sim_ros.identification.unknowns import MOST_LOG, Reported, Told, Unknowns
 from endo_sim_ros.physics import ControlNodes, PhysicsConfig
 
 NUISANCES = 4
@@ -24,6 +25,7 @@ OnProgress = Callable[[str, int, int], None]
 """``on_progress(stage, done, total)``."""
 _FARTHEST = 1.5  # standard deviations that an unknown moves in one iteration
 _DAMPED, _LOOSENED, _MOST_DAMPED = 10.0, 0.1, 1e6
+_FAR = 2.0  # standard deviations from what was thought, which is told
 _AS_PROMISED = 0.3  # share of the promised gain with which a Jacobian is still good
 
 
@@ -69,6 +71,7 @@ class Identification:
         level: Probability that an interval holds the truth.
         chi_square: Of the residuals, over their number: about 1 where the model explains them.
         steps: That were simulated, of all copies together.
+        felt: Whether any force was measured, here or in what it goes on from.
     """
 
     unknowns: list[Estimate]
@@ -85,6 +88,7 @@ class Identification:
     level: float
     chi_square: float
     steps: int
+    felt: bool
 
     def __getitem__(self, name: str) -> Estimate:
         """The estimate of this name."""
@@ -166,7 +170,7 @@ def identify(
 
     Raises:
         IdentificationError: If nothing can be estimated from the data; the sentence says what was seen.
-        ConfigError: If an unknown does not exist.
+        ConfigError: If an unknown does not exist, or `start` is of other tissue.
     """
     progress = progress or (lambda stage, done, total: None)
     experiments = list(experiments)
@@ -174,6 +178,8 @@ def identify(
     data = [Observations(each, config.tip_smoothing) for each in experiments]
     if start is not None:
         unknowns, config = start.parameters, start.parameters.config
+        if replace(unknowns.physics, device=physics.device) != physics or len(unknowns.nodes) != len(nodes):
+            raise ConfigError("start is an estimate of other tissue: give it the nodes and the physics that it was made with")
     else:
         unknowns = Unknowns(nodes, physics, config, touched_places(experiments, nodes, physics) if around is None else around)
     model = ForwardModel(nodes, physics, device)
@@ -187,8 +193,9 @@ def identify(
     if start is None:
         theta[: unknowns.stiffness_count] = _scaled(unknowns, first.scale)
     parts = [_Data(each, *unknowns.directions(touched_places([each.experiment], nodes, physics))) for each in data]
-    point = _minimise(theta, prior, parts, model, unknowns, progress)
-    return _conclude(point, data, model, unknowns, first.findings)
+    point, ended = _minimise(theta, prior, parts, model, unknowns, progress)
+    unended = [] if ended else [f"the estimate had not settled after {config.iterations} iterations; allow more"]
+    return _conclude(point, data, model, unknowns, [*first.findings, *unended], start is not None and start.felt)
 
 
 def touched_places(experiments: Sequence[Experiment], nodes: ControlNodes, physics: PhysicsConfig) -> np.ndarray:
@@ -257,15 +264,19 @@ def _normal(point: _Point) -> tuple[np.ndarray, np.ndarray]:
     return H, g
 
 
-def _minimise(theta: np.ndarray, prior: _Prior, data: list[_Data], model: ForwardModel, unknowns: Unknowns, progress: OnProgress) -> _Point:
-    """Levenberg and Marquardt's method. The Jacobian is kept, with Broyden's correction, while steps do about what it promises, and is
-    fresh at the end.
+def _minimise(
+    theta: np.ndarray, prior: _Prior, data: list[_Data], model: ForwardModel, unknowns: Unknowns, progress: OnProgress
+) -> tuple[_Point, bool]:
+    """Levenberg and Marquardt's method; returns where it ended, and whether it settled.
+
+    The Jacobian is kept, with Broyden's correction, while steps do about what it promises, and is fresh at the end.
 
     The covariance is that of the point that a step begins at: how much is uncertain because the tip is depends on the stiffness, but is
     no reason to believe in another.
     """
     config, P = unknowns.config, unknowns.count
     point, damping, fresh = look(theta, prior, data, model, unknowns), 1e-3, True
+    settled = False
     for iteration in range(config.iterations):
         progress("estimate", iteration + 1, config.iterations)
         H, g = _normal(point)
@@ -275,6 +286,7 @@ def _minimise(theta: np.ndarray, prior: _Prior, data: list[_Data], model: Forwar
         moved = float(np.abs(step / np.sqrt(np.diag(np.linalg.inv(H)))).max())
         if moved < config.tolerance:
             if fresh:
+                settled = True
                 break
             point, fresh = look(point.theta, prior, data, model, unknowns), True
             continue
@@ -293,11 +305,14 @@ def _minimise(theta: np.ndarray, prior: _Prior, data: list[_Data], model: Forwar
         else:
             damping *= _DAMPED if damping > 0.01 else 100 * _DAMPED
             if damping > _MOST_DAMPED:
+                settled = True  # no step gains anything
                 break
-    return point if fresh else look(point.theta, prior, data, model, unknowns)
+    return (point if fresh else look(point.theta, prior, data, model, unknowns)), settled
 
 
-def _conclude(point: _Point, data: list[Observations], model: ForwardModel, unknowns: Unknowns, findings: list[str]) -> Identification:
+def _conclude(
+    point: _Point, data: list[Observations], model: ForwardModel, unknowns: Unknowns, findings: list[str], felt: bool
+) -> Identification:
     config = unknowns.config
     H, _ = _normal(point)
     chi_square, precision = _misfit(point.residuals, point.covariances), point.prior.precision
@@ -306,21 +321,40 @@ def _conclude(point: _Point, data: list[Observations], model: ForwardModel, unkn
     factor, doubts = judge_residuals(chi_square, round(count - determined), config)
     covariance = np.linalg.inv(H / factor + precision)
     quantile = float(norm.ppf(0.5 + config.level / 2))
-    feels = any(each.of_forces()[each.used].any() for each in data)
+    feels = felt or any(each.of_forces()[each.used].any() for each in data)
     told = [_estimate(each, point.theta, covariance, quantile, feels, unknowns, config) for each in unknowns.reported()]
     matrix = np.concatenate([unknowns.matrix, np.zeros((len(unknowns.nodes), NUISANCES))], 1)
-    middle = np.log(unknowns.base) + matrix @ point.theta
+    logs = matrix @ point.theta
+    middle = np.log(unknowns.base) + np.clip(logs, -MOST_LOG, MOST_LOG)
     prior = (matrix**2).sum(1) + unknowns.residual
     left = np.einsum("mi,ij,mj->m", matrix, covariance, matrix) + unknowns.residual
     spread, removed = quantile * np.sqrt(left), 1 - left / prior
     findings = [*findings, *doubts]
     unsure = [each.name for each in told if each.told == "not told by these data"]
     if unsure:
-        findings.append(f"these data do not tell {', '.join(unsure)}: the interval is nearly what was thought before")
+        findings.append(f"these data do not tell {', '.join(unsure)}: the interval rests on what was thought before")
+    findings += _far(point.theta, unknowns)
+    if np.abs(logs).max() > MOST_LOG:
+        findings.append(
+            "moduli of more than 50 times that of physics, or less than a fiftieth, are not simulated: give physics a nearer one"
+        )
     return Identification(
         told, findings, np.exp(middle), np.exp(middle - spread), np.exp(middle + spread), (removed >= config.known) & feels, removed,
-        point.theta, covariance, unknowns, unknowns.nodes, config.level, chi_square / max(count - determined, 1), model.steps,
+        point.theta, covariance, unknowns, unknowns.nodes, config.level, chi_square / max(count - determined, 1), model.steps, feels,
     )  # fmt: skip
+
+
+def _far(theta: np.ndarray, unknowns: Unknowns) -> list[str]:
+    """Which numbers are far from what was thought of them, in a sentence each."""
+    told = []
+    for each in unknowns.reported():
+        off = float(each.row @ theta[: len(each.row)]) / max(float(np.linalg.norm(each.row)), 1e-12)
+        if abs(off) > _FAR:
+            told.append(
+                f"{each.name} lies {abs(off):.1f} standard deviations {'above' if off > 0 else 'below'} what was thought: check the"
+                " units of forces and lengths, or give physics a likelier value"
+            )
+    return told
 
 
 def _estimate(

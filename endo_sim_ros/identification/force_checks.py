@@ -88,9 +88,14 @@ def check_clock(name: str, line: Timeline, step_duration: float, noise: float) -
     told = [lag * step_duration for lag in halves if lag is not None]
     apart = len(told) == 2 and abs(told[1] - told[0]) > _LEAST_LAG * step_duration
     seconds = (found[0] if whole is None else whole) * step_duration
-    how = f"by {told[0]:.2f} s at first and {told[1]:.2f} s at last, as clocks do that run apart" if apart else f"by {seconds:.2f} s"
+    side = "behind" if seconds >= 0 else "ahead of"
+    how = (
+        f"by {told[0]:.2f} s at first and {told[1]:.2f} s at last, as clocks do that run apart"
+        if apart
+        else f"by {abs(seconds):.2f} s, or a press more or less where presses are even"
+    )
     what = "; record with one clock" if apart else f"; record with one clock, or give force_delay {seconds:.2f}"
-    raise SequenceError(f"{name}/body/measured_cf: forces are behind the motion of the tool {how}{what}")
+    raise SequenceError(f"{name}/body/measured_cf: forces are {side} the motion of the tool {how}{what}")
 
 
 def _lag(depth: np.ndarray, size: np.ndarray, most: int) -> float | None:

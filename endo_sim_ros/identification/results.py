@@ -15,6 +15,7 @@ from endo_sim_ros.identification.maps import paint_as_regions
 from endo_sim_ros.identification.picture import draw_map
 from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.physics import PhysicsConfig
+from endo_sim_ros.physics.regions import MAX_POISSON_RATIO
 
 _DIGITS = 6
 
@@ -33,7 +34,10 @@ def told(found: Identification, physics: PhysicsConfig) -> dict[str, Any]:
     values: dict[str, Any] = {"young_modulus": _rounded(scale * middle)}
     varied = paint_as_regions(found.nodes, scale * found.young_modulus) if len(np.unique(found.young_modulus)) > 1 else ()
     values["regions"] = [text for text in (*physics.regions, *varied) if text] or [""]
-    return values | {each.name: _rounded(each.estimate) for each in found.unknowns if each.name in options and each.name not in values}
+    others = {each.name: each.estimate for each in found.unknowns if each.name in options and each.name not in values}
+    if "poisson_ratio" in others:
+        others["poisson_ratio"] = min(others["poisson_ratio"], MAX_POISSON_RATIO)  # as it was simulated
+    return values | {name: _rounded(value) for name, value in others.items()}
 
 
 def parameters(found: Identification, physics: PhysicsConfig) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from endo_sim_ros.physics.regions import read_regions
 
 MODULUS = "young_modulus"
 _JITTER = 1e-6  # added to the covariance of a field, whose centres may lie close together
-_MOST_FACTOR = 50.0  # of moduli; the substeps grow with its root
+MOST_LOG = math.log(50.0)  # of factors on moduli; the substeps grow with the root of these
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ class Unknowns:
 
     def copy(self, z: np.ndarray, shift: np.ndarray | None = None) -> Copy:
         """The tissue that these unknowns [P] make."""
-        factors = np.exp(np.clip(self.matrix @ z, -math.log(_MOST_FACTOR), math.log(_MOST_FACTOR)))
+        factors = np.exp(np.clip(self.matrix @ z, -MOST_LOG, MOST_LOG))
         holds, options = np.ones(len(self.nodes)), []
         for (name, prior), value in zip(self._others, z[self.stiffness_count :]):
             if name in _HOLDS:

@@ -175,7 +175,8 @@ class IdentificationNode(EndoNode):
         except Exception as error:
             self.failure = sentence("identification", error)
             self.report_error(self.failure)
-            del self.experiments[-(self._gathered - self._used) :]  # nor would they tell anything later
+            if useless := self._gathered - self._used:
+                del self.experiments[-useless:]  # nor would they tell anything later
             self._used = self._gathered
         start = self.found if self._known_of == tissue_now else None
         fresh = self._gathered - self._used if start is not None else len(self.experiments)

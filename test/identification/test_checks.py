@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from slab import NODES, PHYSICS, pressed
 
+from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.identification import IdentificationConfig, IdentificationError, identify
 from endo_sim_ros.identification.synthetic import measure
 
@@ -49,6 +50,30 @@ def test_a_tool_that_never_touches_is_refused(good):
 def test_nothing_measured_is_refused(good):
     with pytest.raises(IdentificationError, match="nothing was measured"):
         findings(replace(good, forces=np.full((40, 3), np.nan)))
+
+
+def test_forces_that_are_noise_alone_are_refused(good):
+    for forces in (0 * good.forces, np.random.default_rng(1).normal(0, good.force_noise, good.forces.shape)):
+        with pytest.raises(IdentificationError, match="would exert up to .* N on it, but no force beyond the noise of 0.05 N was measured"):
+            findings(replace(good, forces=forces))
+
+
+def test_one_of_several_experiments_with_the_opposite_sign_is_refused(good):
+    with pytest.raises(IdentificationError, match="experiment 2: measured forces point against"):
+        findings(good, good, replace(good, forces=-good.forces))
+
+
+def test_a_modulus_far_from_what_was_thought_is_told(good):
+    told = findings(replace(good, forces=20 * good.forces))
+    assert "young_modulus lies " in told and "above what was thought: check the units of forces and lengths" in told
+
+
+def test_going_on_needs_the_same_tissue_and_keeps_that_forces_were_felt(good):
+    found = identify([good], NODES, PHYSICS, CONFIG, "cpu")
+    with pytest.raises(ConfigError, match="start is an estimate of other tissue"):
+        identify([good], NODES, replace(PHYSICS, young_modulus=2 * PHYSICS.young_modulus), CONFIG, "cpu", start=found)
+    moved = replace(good, forces=np.full((40, 3), np.nan), displacements=np.zeros((40, 1, 3)), nodes=np.array([0]))
+    assert found["young_modulus"].told == identify([moved], NODES, PHYSICS, CONFIG, "cpu", start=found)["young_modulus"].told == "known"
 
 
 def test_a_lag_of_the_forces_is_told(good):

@@ -86,6 +86,15 @@ def test_it_is_given_while_both_hold_it_and_a_pull_of_the_second_arm_loses_it(ta
     assert not dropped["given"].any() and not dropped["height"].any()
 
 
+def test_a_needle_that_psm1_has_not_lifted_is_not_given(task):
+    (first, second), up = marks(task), np.array([0, 0, 0.011])
+    put(task, [first, second], [True, True])
+    assert not put(task, [first + up, second + up], [False, True])["given"].any(), "it was tapped where it lay"
+    for _ in range(task.hold):
+        put(task, [first + up, second + up], [False, True])
+        assert not task.judge().success.any()
+
+
 def test_the_needle_is_seen_where_it_is():
     sight = SightConfig(image_width=128, segmentation=True)
     batch = TaskBatch("handover", load_scene(), 2, "both", sight=sight, device="cpu")

@@ -142,3 +142,15 @@ def test_a_scene_has_both_arms_with_tools_of_their_own(tmp_path):
     x = [float(frame.split()[1]) for frame in physics["frames"]]
     assert x[0] == pytest.approx(-x[1]) and x[0] > 0.03
     assert find_task("tension").arms == ("PSM1", "PSM2")
+
+
+@pytest.mark.slow
+def test_tissue_that_is_taut_beside_its_spots_does_not_count():
+    batch, script = begun(8), scripted_policy("tension")
+    states, solved = batch.observe(), np.zeros(8, bool)
+    for _ in range(batch.task.horizon):
+        ways = states[:, 6:12].reshape(-1, 2, 3) + [0, 0.6, 0]  # as if both spots were 12 mm higher in the picture
+        beside = np.concatenate([states[:, :6], ways.reshape(-1, 6), np.linalg.norm(ways, axis=2), states[:, 14:]], 1)
+        states, outcome = batch.step(script.act(beside))
+        solved |= outcome.success
+    assert not solved.any()

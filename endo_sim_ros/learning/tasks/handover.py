@@ -81,7 +81,7 @@ class Handover(Task):
         self._lead, self._offset = np.zeros(count, int), np.zeros((count, 3))  # the arm that it follows, and from whose tip it is so far, m
         self._height = np.zeros(count)  # above where it would lie, m
         self._ways = np.zeros((count, 2, 3))  # from the tips to the marks, m, task frame
-        self._given = np.zeros(count, bool)  # both arms have held it since it lay on the skin
+        self._given = np.zeros(count, bool)  # since it lay on the skin both arms have held it, PSM1 having lifted it
         self._held = np.zeros(count, int)  # steps that PSM2 alone has held it high enough
 
     def _reset(self, b: int, rng: np.random.Generator) -> None:
@@ -135,7 +135,8 @@ class Handover(Task):
         lies = ~self.holds.any(1)
         self.needle[:, 2] -= np.where(lies, self._height, 0.0)
         self._height = np.where(lies, 0.0, self._height)
-        self._given = ~lies & (self._given | self.holds.all(1))
+        passing = self.holds.all(1) & (self._lead == 0) & (self._height >= self.lift)
+        self._given = ~lies & (self._given | passing)
         self._ways = self._places(everyone, self._marks) - self.tip
         lengths = np.concatenate([self._by_arm(v) for v in (self.tip, self._ways, norm(self._ways))], 1)
         jaws = np.where(self.fourth > 0, 1.0, -1.0)

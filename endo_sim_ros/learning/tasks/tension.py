@@ -12,7 +12,8 @@ class Tension(Task):
     """Grasp tissue at two spots and pull them apart, until it is taut to a wanted force, and keep it so.
 
     PSM1 takes the spot on the right of the picture, PSM2 that on the left. An arm pulls by as much as the tissue draws its tool towards
-    the other. The tissue is taut while both pull within `tolerance` of the wanted force; the episode is solved after `hold` steps of
+    the other. The tissue is taut while both hold it at their spots and pull within `tolerance`
+    of the wanted force; the episode is solved after `hold` steps of
     that, one after the other. The fourth action of each arm closes its jaw where above zero.
     """
 
@@ -92,7 +93,8 @@ class Tension(Task):
         return each[:, 0] + each[:, 1] + np.minimum(self._held / self.hold, 1.0)
 
     def _judge_goal(self) -> np.ndarray:
-        taut = (np.abs(self._pull / self.wanted[:, None] - 1) <= self.tolerance).all(1)
+        grasped = (self.fourth > 0) & (norm(self._spots) <= self.grasp_radius)
+        taut = (grasped & (np.abs(self._pull / self.wanted[:, None] - 1) <= self.tolerance)).all(1)
         self._held = np.where(taut, self._held + 1, 0)
         return self._held >= self.hold
 

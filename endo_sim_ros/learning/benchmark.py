@@ -95,7 +95,7 @@ def benchmark(out: Path, policies: Sequence[str], scenes: Sequence[str], config:
                     _save(out, before)
                     bar.advance(progress)
             _film(out, config, name, policy, scenes[0], device)
-    (out / _PAGE).write_text(_page(before, out), "utf8")
+            (out / _PAGE).write_text(_page(before, out), "utf8")
     return found
 
 

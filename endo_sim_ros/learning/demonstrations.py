@@ -32,6 +32,7 @@ from typing import Any
 import numpy as np
 from rich.progress import Progress
 
+from endo_sim_ros.core.folders import written_whole
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.instruments import JOINTS
 from endo_sim_ros.learning.actions import ARM_NAMES, POSE_NAMES, by_arm, jaw_angles
@@ -132,7 +133,7 @@ class Demonstrations:
         fps = round(1 / first.task.physics().step_duration)
         noise = config.noise if config.by == "script" else 0.0
         options = {"task": task, "scenes": list(map(str, scenes)), "seed": config.seed, "noise": noise, "by": config.by}
-        self._options = options | {**asdict(sight), **asdict(randomisation), **asdict(motion)}
+        self._options = options | {**asdict(sight), "shown_tool": sight.tool, **asdict(randomisation), **asdict(motion)}
         _check_options(out, self._options)
         features = _features(first, fps, config.images)
         if other := [scene for scene, batch in zip(scenes, self.batches) if _features(batch, fps, config.images) != features]:
@@ -149,15 +150,22 @@ class Demonstrations:
 
     def add(self, episode: Episode, seed: int) -> None:
         """Write an episode."""
+        self._note_options()
         columns = {name: np.array(values) for name, values in episode.rows.items()}
         columns = {name: values if values.dtype == bool else values.astype(np.float32) for name, values in columns.items()}
         self._writer.add(columns | {"seed": np.full(len(columns["action"]), seed)}, episode.pictures)
+
+    def _note_options(self) -> None:
+        """Write what the episodes depend on, before the first: only with that are they continued."""
+        if not (self._out / _OPTIONS).exists():
+            (self._out / _OPTIONS).parent.mkdir(parents=True, exist_ok=True)
+            with written_whole(self._out / _OPTIONS) as unfinished:
+                unfinished.write_text(json.dumps(self._options, indent=4), "utf8")
 
     def save(self) -> None:
         """Write what describes all episodes so far; without it the newest are not part of the dataset."""
         if self._writer.episodes:
             self._writer.save()
-            (self._out / _OPTIONS).write_text(json.dumps(self._options, indent=4))
             by = _BY[self._options["by"]]
             (self._out / "README.md").write_text(_card(self._out, self._task, self._fps, self._writer, by), "utf8")
 
@@ -208,6 +216,14 @@ def demonstrate(
     finally:
         demonstrations.save()
     return demonstrations.episodes, tried
+
+
+def read_options(out: Path) -> dict[str, Any]:
+    """What the episodes of a dataset depend on, by the names of the options; empty if it is not known."""
+    try:
+        return json.loads((out / _OPTIONS).read_text("utf8"))
+    except (OSError, ValueError):
+        return {}
 
 
 def _check_options(out: Path, options: dict[str, Any]) -> None:

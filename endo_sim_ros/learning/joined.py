@@ -78,8 +78,12 @@ class JoinedEnvironments(gymnasium.vector.VectorEnv):
 
     def step(self, actions: np.ndarray) -> tuple[Observed, np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
         """As `VectorTaskEnvironment.step`."""
-        if len(actions) != self.num_envs:
-            raise ValueError(f"{self.num_envs} environments need as many actions, got {len(actions)}")
+        actions, shape = np.asarray(actions, np.float64), (self.num_envs, *self.single_action_space.sample().shape)
+        if actions.shape != shape:
+            raise ValueError(f"{self.num_envs} environments need as many actions, of {shape[1]} numbers, got the shape {actions.shape}")
+        if not np.isfinite(actions).all():  # before any part takes its step
+            wrong = int((~np.isfinite(actions)).any(1).argmax())
+            raise ValueError(f"the action of environment {wrong} is not finite: {actions[wrong].tolist()}; has learning diverged?")
         return _joined(self._all("step", lambda own: {"actions": actions[own]}))
 
     def renew(self, episodes: np.ndarray) -> Observed:

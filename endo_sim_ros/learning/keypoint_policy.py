@@ -6,6 +6,7 @@ the eyes tells its depth. Beside the action the network is taught to tell the st
 does not see: without, it learns far slower where to look.
 """
 
+import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,12 +22,14 @@ from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.learning.actions import ACTION_SIZES, ARM_NAMES, Actions
 from endo_sim_ros.learning.config import ImitationConfig, SightConfig
 from endo_sim_ros.learning.dataset import ACTION, ENVIRONMENT_STATE, IMAGE, IMAGE_RIGHT, STATE, read_dataset
+from endo_sim_ros.learning.demonstrations import read_options
 from endo_sim_ros.learning.pictures import IMAGE as SEEN, IMAGE_RIGHT as SEEN_RIGHT
 from endo_sim_ros.learning.task_batch import ARM_STATE
 
 FILE = "keypoints.npz"
 _CHANNELS, _POINTS, _HIDDEN = 48, 32, 256
 _DILATIONS = 1, 2, 4, 1  # of the blocks: an output sees 100 pixels around
+_SIGHT = {"shown_tool": "tool", "instrument": "instrument", "baseline": "baseline", "dye": "dye"}  # options of what it was trained on
 _DISPARITY = 20.0  # factor, so that differences between the eyes are as large as places
 _STEPS, _RATE = 1500, 2e-3
 _AVERAGED = 0.99  # share of the averaged weights that a step keeps
@@ -109,6 +112,7 @@ def train_keypoints(dataset: Path, out: Path, config: ImitationConfig, device: s
     arms, measured = columns[ACTION].shape[1] / ACTION_SIZES["cartesian"], columns[STATE].shape[1] / len(ARM_NAMES)
     if arms != measured or not measured.is_integer():
         raise SequenceError(f"{dataset} has other columns than `endo-sim demonstrate` writes")
+    options = read_options(dataset)
     torch.manual_seed(config.seed)
     arm, state, action = (torch.from_numpy(columns[name]).to(device) for name in (STATE, ENVIRONMENT_STATE, ACTION))
     images = torch.from_numpy(np.stack(list(shown.values()), 1)).permute(0, 1, 4, 2, 3)  # [T, E, 3, H, W], in host memory
@@ -139,7 +143,8 @@ def train_keypoints(dataset: Path, out: Path, config: ImitationConfig, device: s
     weights: dict[str, Any] = {name: value.float().cpu().numpy() for name, value in averaged.module.state_dict().items()}
     out.mkdir(parents=True, exist_ok=True)
     with written_whole(out / FILE) as partial, partial.open("wb") as file:
-        np.savez(file, image_size=np.array(images.shape[-2:]), eyes=np.array(images.shape[1]), **weights)
+        about = {"task": options.get("task", ""), "sight": {name: options[key] for key, name in _SIGHT.items() if key in options}}
+        np.savez(file, about=np.array(json.dumps(about)), image_size=np.array(images.shape[-2:]), eyes=np.array(images.shape[1]), **weights)
 
 
 def _average(averaged: Tensor, weights: Tensor, steps: Tensor | int) -> Tensor:
@@ -180,7 +185,8 @@ class KeypointPolicy:
         self._device = pick_device(device)
         try:
             with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-                values = {name: torch.from_numpy(file[name]) for name in file.files}
+                about = json.loads(str(file["about"]))
+                values = {name: torch.from_numpy(file[name]) for name in file.files if name != "about"}
             self._size, self._eyes = values.pop("image_size").tolist(), int(values.pop("eyes"))
             arm, outputs = len(values["arm_mean"]), len(values["head.6.bias"])
             action = arm // len(ARM_NAMES) * ACTION_SIZES["cartesian"]
@@ -191,7 +197,9 @@ class KeypointPolicy:
         except Exception as error:  # zipfile, numpy and torch have a type each
             raise ValueError(f"{path} is no policy of `endo-sim imitate --policy keypoints`, or it is damaged") from error
         self._network = network.to(self._device).eval()
-        self.sight = SightConfig(image_width=self._size[1], eyes=2 if self._eyes == 2 else 1)
+        self.sight = SightConfig(**about["sight"] | {"image_width": self._size[1], "eyes": self._eyes})
+        self.task: str = about["task"]
+        """Of the demonstrations; empty if that is not known."""
 
     def reset(self, episodes: Sequence[int]) -> None:
         """Nothing to do: the network has no memory."""

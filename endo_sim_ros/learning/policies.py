@@ -189,7 +189,10 @@ def make_policy(policy: str, task: str, count: int = 1, device: str = "auto") ->
     if (Path(policy) / "keypoints.npz").exists():
         from endo_sim_ros.learning.keypoint_policy import KeypointPolicy
 
-        return KeypointPolicy(policy, device)
+        found = KeypointPolicy(policy, device)
+        if found.task and found.task != task:
+            raise ValueError(f"{policy} was trained on demonstrations of {found.task}, not of {task}; give a policy of this task")
+        return found
     if Path(policy).is_dir():
         from endo_sim_ros.learning.lerobot_policy import LeRobotPolicy
 

@@ -51,7 +51,10 @@ def test_episodes_are_renewed_where_they_are():
     assert np.array_equal(again[[0, 2]], before[[0, 2]]) and np.array_equal(again[3], renewed[3])
     with pytest.raises(ValueError, match="4 environments need as many seeds, got 3"):
         joined.reset(seed=[1, 2, 3])
-    with pytest.raises(ValueError, match="4 environments need as many actions, got 2"):
+    with pytest.raises(ValueError, match="the action of environment 3 is not finite"):
+        joined.step(np.where(np.arange(4)[:, None] == 3, np.nan, np.zeros((4, 4))))
+    assert np.array_equal(joined.renew(np.array([], int)), again)  # nothing has moved
+    with pytest.raises(ValueError, match=r"4 environments need as many actions, of 4 numbers, got the shape \(2, 4\)"):
         joined.step(np.ones((2, 4)))
 
 
@@ -79,7 +82,7 @@ def test_workers_of_ray_give_the_same_bits():
             JoinedEnvironments("retraction", 6, workers=3, device="cpu")
         workers = JoinedEnvironments("retraction", 5, workers=2, device="cpu")
         assert all(same(a, b) for a, b in zip(play(workers, 5), play(VectorTaskEnvironment("retraction", 5, device="cpu"), 5)))
-        with pytest.raises(ValueError, match="the action of episode 1 is not finite"):
+        with pytest.raises(ValueError, match="the action of environment 1 is not finite"):
             workers.step(np.where(np.arange(5)[:, None] == 1, np.nan, np.zeros((5, 4))))
         ray.kill(workers._parts[0]._hosted)
         with pytest.raises(RuntimeError, match="a worker with environments ended .*; make them again"):

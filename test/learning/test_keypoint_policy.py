@@ -54,6 +54,9 @@ def test_what_cannot_be_used_is_told(dataset, tmp_path):
         train_keypoints(dataset, tmp_path, ImitationConfig(steps=1), device="cpu")
     train_keypoints(dataset, tmp_path / "new", ImitationConfig(steps=1, batch_size=2), device="cpu")
     policy = KeypointPolicy(tmp_path / "new", "cpu")
+    assert policy.sight == SightConfig(image_width=40, eyes=2)
+    with pytest.raises(ValueError, match="new was trained on demonstrations of retraction, not of tracking; give a policy of this task"):
+        make_policy(str(tmp_path / "new"), "tracking")
     small = np.zeros((1, 16, 20, 3), np.uint8)
     with pytest.raises(ValueError, match="images have 20×16 pixels, but the policy was trained on 40×32; set image_width 40"):
         policy.act({"image": small, "image_right": small, "arm": np.zeros((1, 11), np.float32)})

@@ -22,6 +22,7 @@ VERSION = "v3.0"
 IMAGE = "observation.images.endoscope.left"
 IMAGE_RIGHT = "observation.images.endoscope.right"
 SEGMENTATION = "observation.segmentation"
+OPTIONS = "meta/demonstrations.json"  # what the episodes of demonstrations depend on
 STATE, ENVIRONMENT_STATE, ACTION = "observation.state", "observation.environment_state", "action"
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
@@ -278,6 +279,14 @@ class DatasetWriter:
         path = self._root / name
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
+
+
+def read_options(out: Path) -> dict[str, Any]:
+    """What the episodes of demonstrations depend on, by the names of the options; empty if it is not known."""
+    try:
+        return json.loads((out / OPTIONS).read_text("utf8"))
+    except (OSError, ValueError):
+        return {}
 
 
 def read_dataset(root: Path, vectors: Sequence[str], pictures: Sequence[str]) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:

@@ -40,6 +40,7 @@ from endo_sim_ros.learning.config import DemonstrationConfig, Randomisation, Sig
 from endo_sim_ros.learning.dataset import (
     IMAGE,
     IMAGE_RIGHT,
+    OPTIONS,
     SEGMENTATION,
     DatasetWriter,
     ImageFormat,
@@ -54,7 +55,6 @@ from endo_sim_ros.learning.tasks import Camera, Task
 from endo_sim_ros.physics import MotionConfig
 
 _COLUMNS = {"image": IMAGE, "image_right": IMAGE_RIGHT, "segmentation": SEGMENTATION}
-_OPTIONS = "meta/demonstrations.json"  # what the episodes depend on
 _SAVE_EVERY = 10.0  # seconds; a process that is killed loses at most the episodes of this time
 _FEWEST = 0.02  # share of episodes that the script must solve
 _BY = {"script": "A scripted policy", "person": "A person"}
@@ -157,9 +157,9 @@ class Demonstrations:
 
     def _note_options(self) -> None:
         """Write what the episodes depend on, before the first: only with that are they continued."""
-        if not (self._out / _OPTIONS).exists():
-            (self._out / _OPTIONS).parent.mkdir(parents=True, exist_ok=True)
-            with written_whole(self._out / _OPTIONS) as unfinished:
+        if not (self._out / OPTIONS).exists():
+            (self._out / OPTIONS).parent.mkdir(parents=True, exist_ok=True)
+            with written_whole(self._out / OPTIONS) as unfinished:
                 unfinished.write_text(json.dumps(self._options, indent=4), "utf8")
 
     def save(self) -> None:
@@ -218,19 +218,11 @@ def demonstrate(
     return demonstrations.episodes, tried
 
 
-def read_options(out: Path) -> dict[str, Any]:
-    """What the episodes of a dataset depend on, by the names of the options; empty if it is not known."""
-    try:
-        return json.loads((out / _OPTIONS).read_text("utf8"))
-    except (OSError, ValueError):
-        return {}
-
-
 def _check_options(out: Path, options: dict[str, Any]) -> None:
     if not out.exists() or not any(out.iterdir()):
         return
     try:
-        before = json.loads((out / _OPTIONS).read_text("utf8"))
+        before = json.loads((out / OPTIONS).read_text("utf8"))
     except (OSError, ValueError) as error:
         raise SequenceError(f"{out} exists already and has no demonstrations; choose another name or remove it first") from error
     before = {"by": "script", **before}  # of a dataset from when there were no others

@@ -21,8 +21,7 @@ from endo_sim_ros.core.folders import written_whole
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.learning.actions import ACTION_SIZES, ARM_NAMES, Actions
 from endo_sim_ros.learning.config import ImitationConfig, SightConfig
-from endo_sim_ros.learning.dataset import ACTION, ENVIRONMENT_STATE, IMAGE, IMAGE_RIGHT, STATE, read_dataset
-from endo_sim_ros.learning.demonstrations import read_options
+from endo_sim_ros.learning.dataset import ACTION, ENVIRONMENT_STATE, IMAGE, IMAGE_RIGHT, STATE, read_dataset, read_options
 from endo_sim_ros.learning.pictures import IMAGE as SEEN, IMAGE_RIGHT as SEEN_RIGHT
 from endo_sim_ros.learning.task_batch import ARM_STATE
 

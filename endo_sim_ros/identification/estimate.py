@@ -142,6 +142,7 @@ class _Point:
     residuals: list[np.ndarray]  # of each experiment [n], of the numbers that are used
     jacobians: list[np.ndarray]  # of predictions [n, Q]
     covariances: list[Covariance]
+    undone: int  # steps of the simulation
 
 
 def identify(
@@ -225,13 +226,14 @@ def look(theta: np.ndarray, prior: _Prior, data: Sequence[_Data], model: Forward
     config, P = unknowns.config, unknowns.count
     feels = any(part.seen.of_forces().any() for part in data)
     z, offset, gain = theta[:P], theta[P : P + 3] * config.tip_offset, 1 + config.model_error * theta[P + 3]
-    residuals, jacobians, covariances = [], [], []
+    residuals, jacobians, covariances, undone = [], [], [], 0
     for part in data:
         each, ways = part.seen, part.ways if jacobian else part.ways[:0]
         copies = [unknowns.copy(z, offset)]
         copies += [replace(unknowns.copy(z, offset), jog=config.tip_step * np.eye(3)[axis]) for axis in range(3)]
         copies += [unknowns.copy(z + config.jacobian_step * way, offset) for way in ways]
-        told = each.predicted(model.replay(each.experiment, copies))
+        replay = model.replay(each.experiment, copies)
+        told, undone = each.predicted(replay), undone + int(replay.faults[0])
         forces = each.of_forces()
         told[:, forces] *= gain
         J = np.zeros((told.shape[1], P + NUISANCES))
@@ -246,7 +248,7 @@ def look(theta: np.ndarray, prior: _Prior, data: Sequence[_Data], model: Forward
         residuals.append((each.values - told[0])[each.used])
         jacobians.append(J[each.used])
         covariances.append(each.covariance(by_tip, own))
-    return _Point(theta, prior, residuals, jacobians, covariances)
+    return _Point(theta, prior, residuals, jacobians, covariances, undone)
 
 
 def _misfit(residuals: list[np.ndarray], covariances: list[Covariance]) -> float:
@@ -333,6 +335,8 @@ def _conclude(
     unsure = [each.name for each in told if each.told == "not told by these data"]
     if unsure:
         findings.append(f"these data do not tell {', '.join(unsure)}: the interval rests on what was thought before")
+    if point.undone:
+        findings.append(f"the simulation had to undo {point.undone} steps: the tool takes tissue farther than it bears")
     findings += _far(point.theta, unknowns)
     if np.abs(logs).max() > MOST_LOG:
         findings.append(

@@ -67,7 +67,6 @@ class Reported:
         row: a [P].
         mean: b.
         high: As `Prior.high`.
-        residual: Variance of its transform that no unknown has.
     """
 
     name: str
@@ -75,7 +74,6 @@ class Reported:
     row: np.ndarray
     mean: float
     high: float = 0.0
-    residual: float = 0.0
 
     @property
     def is_modulus(self) -> bool:

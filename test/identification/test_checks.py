@@ -131,3 +131,8 @@ def test_arrays_that_do_not_fit_are_refused(good, change, said):
         findings(replace(good, **change))
     with pytest.raises(IdentificationError, match="no experiment"):
         identify([], NODES, PHYSICS, CONFIG, "cpu")
+
+
+def test_steps_that_the_simulation_undid_are_told(good):
+    told = identify([good], NODES, replace(PHYSICS, travel=0.001), CONFIG, "cpu").findings  # the press goes deeper than that
+    assert any(sentence.startswith("the simulation had to undo ") for sentence in told)

@@ -271,8 +271,8 @@ class Task(ABC):
         return (DyedSpot(self.origin[b].copy(), self.dyed_radius),)
 
     def thing_poses(self) -> np.ndarray:
-        """Where the `thing` is [B, 4, 4], m, world."""
-        raise NotImplementedError
+        """Where the `thing` is [B, 4, 4], m, world; unless the task moves it, where its shape has it."""
+        return np.tile(np.eye(4), (self.count, 1, 1))
 
     def regions(self) -> tuple[str, ...]:
         """The stiffness of the first episode as physics_node's parameter `regions`; empty where it is 1 everywhere."""

@@ -51,7 +51,7 @@ from endo_sim_ros.learning.dataset import (
 from endo_sim_ros.learning.policies import Policy, scripted_policy
 from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.learning.task_batch import Observed, TaskBatch
-from endo_sim_ros.learning.tasks import Camera, Task
+from endo_sim_ros.learning.tasks import Task
 from endo_sim_ros.physics import MotionConfig
 
 _COLUMNS = {"image": IMAGE, "image_right": IMAGE_RIGHT, "segmentation": SEGMENTATION}
@@ -269,8 +269,9 @@ def take(
     }
     if batch.tools is not None:
         rows["observation.joints"] = batch.tools.joints.reshape(batch.count, -1).copy()
-    if isinstance(batch.task, Camera):
-        rows |= {"observation.endoscope": batch.task.joints.copy(), "command.endoscope": batch.task.aim(actions)}
+    joints, asked = batch.task.endoscope_joints(), batch.task.endoscope_joints(actions)
+    if joints is not None and asked is not None:
+        rows |= {"observation.endoscope": joints, "command.endoscope": asked}
     after, outcome = batch.step(np.clip(noisy, -1, 1))
     rows |= {"next.reward": outcome.reward, "next.done": outcome.terminated | outcome.truncated, "next.success": outcome.success}
     for b, episode in enumerate(episodes):
@@ -308,7 +309,7 @@ def _features(batch: TaskBatch, fps: int, images: ImageFormat) -> dict[str, dict
     }
     if batch.tools is not None:
         vectors["observation.joints"] = by_arm(task, JOINTS)
-    if isinstance(batch.task, Camera):
+    if task.endoscope_joints() is not None:
         vectors |= dict.fromkeys(("observation.endoscope", "command.endoscope"), [f"ECM.{name}" for name in JOINTS[:4]])
     kinds = {"next.reward": "float32", "next.done": "bool", "next.success": "bool", "seed": "int64"}
     camera, sight = batch.pictures.camera, batch.sight

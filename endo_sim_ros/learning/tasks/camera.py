@@ -108,6 +108,10 @@ class Camera(Task):
         moves = [-self.turn * (right * c + up * s), self.turn * (up * c - right * s), self.step_length * slide, self.roll * roll]
         return np.clip(self.joints + np.stack(moves, 1), self._lower, self._upper)
 
+    def endoscope_joints(self, actions: np.ndarray | None = None) -> np.ndarray:
+        """Joints of the endoscopes [B, 4], rad and m, now, or where actions [B, 4] take them."""
+        return self.joints.copy() if actions is None else self.aim(actions)
+
     def endoscopes(self) -> np.ndarray:
         """Poses of the endoscopes [B, 4, 4], camera to world, m."""
         return self._base @ self._arm.tip_pose(self.joints)

@@ -266,6 +266,10 @@ class Task(ABC):
         """Poses of the endoscopes now [B, 4, 4], camera to world, m; None where they stay where the scene has theirs."""
         return None
 
+    def endoscope_joints(self, actions: np.ndarray | None = None) -> np.ndarray | None:
+        """Joints of the arms of the endoscopes [B, 4], rad and m, now, or where actions [B, n] take them; None where none does."""
+        return None
+
     def dyed_spots(self, b: int) -> tuple[DyedSpot, ...]:
         """What is dyed in episode b, so that pictures tell the goal: the place that it is about."""
         return (DyedSpot(self.origin[b].copy(), self.dyed_radius),)

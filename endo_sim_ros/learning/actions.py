@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from endo_sim_ros.instruments import JOINTS
 from endo_sim_ros.learning.tasks import Task
+from endo_sim_ros.learning.tasks.task import dot
 
 POSE_NAMES = ("x", "y", "z", "qx", "qy", "qz", "qw")
 ARM_NAMES = (*POSE_NAMES, "jaw", "force_x", "force_y", "force_z")
@@ -43,14 +44,21 @@ def jaw_angles(task: Task, fourth: np.ndarray) -> np.ndarray:
 def arm_state(task: Task, rotations: np.ndarray) -> np.ndarray:
     """What the arms measure of themselves, which tells nothing of the goal [B, 11 A], float32.
 
-    Of each it is the pose of the tip (m, xyzw) in the world, the angle between the jaws (rad), and the force of the tissue on the tool (N,
-    in the axes of the world).
+    Of each it is the pose of the tip (m, xyzw) in the frame of the endoscope (x right, y down, z forward), as the arms of a da Vinci
+    measure it, the angle between the jaws (rad), and the force of the tissue on the tool (N, in the axes of the endoscope). So it agrees
+    with what the endoscope sees, wherever in the world that is.
 
     Args:
-        task: Where the tips are.
-        rotations: Their axes [B A, 3, 3], world, arm after arm of each episode.
+        task: Where the tips are, and the endoscopes.
+        rotations: Axes of the tips [B A, 3, 3], world, arm after arm of each episode.
     """
-    turned = Rotation.from_matrix(rotations).as_quat(canonical=True)
+    endoscopes = task.endoscopes()
+    poses = np.tile(task.endoscope, (task.count, 1, 1)) if endoscopes is None else endoscopes
+    poses = poses.repeat(len(task.arms), 0)  # [B A, 4, 4]
+    axes = poses[:, :3, :3].transpose(0, 2, 1)
+    local = lambda v: dot(axes, v[:, None])
+    turned = Rotation.from_matrix(axes @ rotations).as_quat(canonical=True)
     jaws = jaw_angles(task, task.fourth).ravel()
-    measured = np.column_stack([task.tips().reshape(-1, 3), turned, jaws, task.forces().reshape(-1, 3)])
+    places = local(task.tips().reshape(-1, 3) - poses[:, :3, 3])
+    measured = np.column_stack([places, turned, jaws, local(task.forces().reshape(-1, 3))])
     return measured.astype(np.float32).reshape(task.count, -1)

@@ -5,8 +5,8 @@ Columns beside those that every LeRobot dataset has:
 =============================  ==================================================================================
 observation.images.endoscope.  left, and right with two eyes: what the endoscope shows
 observation.segmentation       what is in each pixel, on request
-observation.state              of each arm alone, in the axes of the world: pose of the tip (m, xyzw), jaw (rad), and
-                               the force of the tissue on the tool (N)
+observation.state              of each arm alone, in the frame of the endoscope (x right, y down, z forward): pose of the
+                               tip (m, xyzw), jaw (rad), and the force of the tissue on the tool (N)
 observation.joints             yaw, pitch, insertion (m), roll, wrist_pitch, wrist_yaw, where there is an instrument
 observation.endoscope          yaw, pitch, insertion (m) and roll of its arm, where the actions move it
 observation.environment_state  the state observation of the task, which knows the goal

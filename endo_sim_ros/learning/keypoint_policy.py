@@ -32,6 +32,7 @@ _SIGHT = {"shown_tool": "tool", "instrument": "instrument", "baseline": "baselin
 _DISPARITY = 20.0  # factor, so that differences between the eyes are as large as places
 _STEPS, _RATE = 1500, 2e-3
 _AVERAGED = 0.99  # share of the averaged weights that a step keeps
+_NEAREST = 1e-3  # m from the eye to a tip
 _CORNER = 0.1  # of the loss: below it an error counts by its square
 # How much training varies an image: contrast, brightness, colour, and noise of each pixel.
 _CONTRAST, _BRIGHTNESS, _HUE, _NOISE = 0.3, 0.3, 0.1, 0.02
@@ -48,6 +49,13 @@ class _Block(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         return x + self.layers(x)
+
+
+def with_projections(arm: Tensor) -> Tensor:
+    """What arms measure of themselves [B, 11 A], and where the tip of each is seen: x / z, y / z and 1 / z, 1/m; together [B, 14 A]."""
+    tips = arm.unflatten(1, (-1, len(ARM_NAMES)))[..., :3]
+    nearness = 1 / tips[..., 2:].clamp_min(_NEAREST)
+    return torch.cat([arm, torch.cat([tips[..., :2] * nearness, nearness], -1).flatten(1)], 1)
 
 
 class KeypointNetwork(nn.Module):
@@ -71,11 +79,12 @@ class KeypointNetwork(nn.Module):
             *(nn.GroupNorm(8, _CHANNELS), nn.SiLU()),
         )
         self.maps, self.features = nn.Conv2d(_CHANNELS, _POINTS, 1), nn.Conv2d(_CHANNELS, _POINTS, 1)
-        sizes = [(3 * eyes + (eyes == 2)) * _POINTS + arm, _HIDDEN, _HIDDEN, _HIDDEN]
+        known = arm // len(ARM_NAMES) * (len(ARM_NAMES) + 3)
+        sizes = [(3 * eyes + (eyes == 2)) * _POINTS + known, _HIDDEN, _HIDDEN, _HIDDEN]
         hidden = [layer for pair in zip(sizes, sizes[1:]) for layer in (nn.Linear(*pair), nn.SiLU())]
         self.head = nn.Sequential(*hidden, nn.Linear(_HIDDEN, action + state))
-        self.register_buffer("arm_mean", torch.zeros(arm))
-        self.register_buffer("arm_spread", torch.ones(arm))
+        self.register_buffer("arm_mean", torch.zeros(known))
+        self.register_buffer("arm_spread", torch.ones(known))
 
     def forward(self, images: Tensor, arm: Tensor) -> tuple[Tensor, Tensor]:
         """Actions [B, action], and states [B, state] as parts of their spread.
@@ -89,7 +98,7 @@ class KeypointNetwork(nn.Module):
         y, x_ = (torch.linspace(-1, 1, size, device=x.device) for size in x.shape[-2:])
         places = where @ torch.stack([part.flatten() for part in torch.meshgrid(x_, y, indexing="xy")], 1)  # [B E, K, 2]
         found = (where * self.features(x).flatten(2).float()).sum(-1, keepdim=True)
-        parts = [torch.cat([places, found], -1).reshape(len(images), -1), (arm - self.arm_mean) / self.arm_spread]
+        parts = [torch.cat([places, found], -1).reshape(len(images), -1), (with_projections(arm) - self.arm_mean) / self.arm_spread]
         if self.eyes == 2:
             left, right = places[..., 0].reshape(-1, 2, _POINTS).unbind(1)
             parts.append((left - right) * _DISPARITY)
@@ -117,8 +126,9 @@ def train_keypoints(dataset: Path, out: Path, config: ImitationConfig, device: s
     images = torch.from_numpy(np.stack(list(shown.values()), 1)).permute(0, 1, 4, 2, 3)  # [T, E, 3, H, W], in host memory
     mean, spread = state.mean(0), state.std(0).clamp_min(1e-3)
     network = KeypointNetwork(images.shape[1], arm.shape[1], state.shape[1], action.shape[1]).to(device)
-    network.arm_mean.copy_(arm.mean(0))
-    network.arm_spread.copy_(arm.std(0).clamp_min(1e-3))
+    known = with_projections(arm)
+    network.arm_mean.copy_(known.mean(0))
+    network.arm_spread.copy_(known.std(0).clamp_min(1e-3))
     steps, rate = config.steps or _STEPS, config.learning_rate or _RATE
     optimizer = torch.optim.AdamW(network.parameters(), rate, weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, steps + 1, pct_start=0.1)
@@ -187,9 +197,9 @@ class KeypointPolicy:
                 about = json.loads(str(file["about"]))
                 values = {name: torch.from_numpy(file[name]) for name in file.files if name != "about"}
             self._size, self._eyes = values.pop("image_size").tolist(), int(values.pop("eyes"))
-            arm, outputs = len(values["arm_mean"]), len(values["head.6.bias"])
-            action = arm // len(ARM_NAMES) * ACTION_SIZES["cartesian"]
-            network = KeypointNetwork(self._eyes, arm, outputs - action, action)
+            arms, outputs = len(values["arm_mean"]) // (len(ARM_NAMES) + 3), len(values["head.6.bias"])
+            action, self._known = arms * ACTION_SIZES["cartesian"], arms * len(ARM_NAMES)
+            network = KeypointNetwork(self._eyes, self._known, outputs - action, action)
             network.load_state_dict(values)
         except OSError as error:
             raise ValueError(f"{path}: not a readable policy ({error})") from error
@@ -214,7 +224,7 @@ class KeypointPolicy:
         if list(seen.shape[2:4]) != self._size:
             (height, width), (h, w) = self._size, seen.shape[2:4]
             raise ValueError(f"images have {w}×{h} pixels, but the policy was trained on {width}×{height}; set image_width {width}")
-        arm, known = observations[ARM_STATE], len(self._network.arm_mean)
+        arm, known = observations[ARM_STATE], self._known
         if arm.shape[1] != known:
             raise ValueError(f"the arms measure {arm.shape[1]} numbers, but the policy was trained with {known}; it is of another task")
         images = torch.from_numpy(seen).to(self._device).permute(0, 1, 4, 2, 3).float() / 255

@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 from blue_seeker import BlueSeeker
 from endo_sim_command import endo_sim
+from scipy.spatial.transform import Rotation
 from scipy.stats import binomtest
 
+from endo_sim_ros.core.cameras import invert_pose
+from endo_sim_ros.instruments.drawing import FIRST_LINK
 from endo_sim_ros.learning import benchmark as module
 from endo_sim_ros.learning.benchmark import CONDITIONS, SCENES, Result, benchmark, interval, read_results, robustness, table
-from endo_sim_ros.learning.config import BenchmarkConfig
+from endo_sim_ros.learning.config import BenchmarkConfig, SightConfig
 from endo_sim_ros.learning.policies import make_policy
 from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.learning.task_batch import TaskBatch
@@ -125,10 +128,27 @@ def test_an_image_policy_takes_what_a_robot_has():
     batch.reset([0, 1], [np.random.default_rng(s) for s in (4, 5)])
     seen = batch.observe()
     assert seen.keys() == {"arm", "image", "image_right"} and seen["arm"].shape == (2, 11)
-    np.testing.assert_allclose(seen["arm"][:, :3], batch.task.tips(), rtol=1e-6)
-    still = np.float32([0, 0, 0, 1, TASKS["retraction"].open_jaw, 0, 0, 0])
-    np.testing.assert_array_equal(seen["arm"][:, 3:], [still] * 2)
+    to_eye = invert_pose(batch.task.endoscope)
+    np.testing.assert_allclose(seen["arm"][:, :3], batch.task.tips() @ to_eye[:3, :3].T + to_eye[:3, 3], rtol=1e-6)
+    np.testing.assert_allclose(Rotation.from_quat(seen["arm"][:, 3:7]).as_matrix(), [to_eye[:3, :3]] * 2, atol=1e-6)
+    np.testing.assert_array_equal(seen["arm"][:, 7:], [np.float32([TASKS["retraction"].open_jaw, 0, 0, 0])] * 2)
     for _ in range(25):
         seen, _ = batch.step(np.tile([0, 0, -1, 1], (2, 1)))
     assert (seen["arm"][:, 7] == TASKS["retraction"].closed_jaw).all()
-    np.testing.assert_allclose(seen["arm"][:, 8:], batch.task.forces(), rtol=1e-6)
+    np.testing.assert_allclose(seen["arm"][:, 8:], batch.task.forces() @ to_eye[:3, :3].T, rtol=1e-6)
+
+
+@pytest.mark.parametrize("task", ["exposure", "camera"])
+def test_arms_are_measured_where_the_endoscope_sees_them(task):
+    """Also while it moves."""
+    sight = SightConfig(image_width=128, segmentation=True)
+    batch = TaskBatch(task, load_scene(), 2, "sensors", sight=sight, device="cpu")
+    batch.reset([0, 1], [np.random.default_rng(s) for s in (4, 5)])
+    assert batch.pictures is not None
+    K = batch.pictures.camera.K
+    for _ in range(3):
+        seen, _ = batch.step(np.tile([0.5, 0.5, 0.2, 0.0], (2, 1)))
+        for x, y, z, labels in zip(*seen["arm"][:, :3].T.astype(float), seen["segmentation"][..., 0]):
+            rows, columns = np.nonzero(labels >= FIRST_LINK)
+            far = np.hypot(columns - (K[0, 0] * x / z + K[0, 2]), rows - (K[1, 1] * y / z + K[1, 2]))
+            assert far.min() < 4, (far.min(), len(rows))

@@ -8,6 +8,7 @@ import pytest
 import yaml
 from played_tasks import make, play
 
+from endo_sim_ros.core.cameras import invert_pose
 from endo_sim_ros.instruments import JOINTS, LINKS
 from endo_sim_ros.instruments.drawing import FIRST_LINK
 from endo_sim_ros.learning.actions import ARM_NAMES
@@ -38,7 +39,8 @@ def test_each_arm_has_its_part_of_actions_and_of_what_is_measured():
         wanted = before + step * 0.002 * action.reshape(2, 2, 4)[..., :3]
         np.testing.assert_allclose(batch.task.tip, np.clip(wanted, batch.task.low, batch.task.high), atol=1e-12)
     measured = seen["arm"].reshape(2, 2, len(ARM_NAMES))
-    np.testing.assert_allclose(measured[..., :3], batch.task.tips(), atol=1e-6)
+    to_eye = invert_pose(batch.task.endoscope)
+    np.testing.assert_allclose(measured[..., :3], batch.task.tips() @ to_eye[:3, :3].T + to_eye[:3, 3], atol=1e-6)
     np.testing.assert_array_equal(measured[..., 7], [[np.float32(0.6), 0]] * 2)  # the left jaw is closed
     for labels in seen["segmentation"]:
         ours = np.arange(len(LINKS)) + FIRST_LINK

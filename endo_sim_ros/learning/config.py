@@ -114,7 +114,7 @@ class ImitationConfig(StageConfig):
     """keypoints: a small network of this package, trained within minutes; act: action chunking with transformers, diffusion: a diffusion
     policy, both by lerobot."""
     steps: Annotated[int, Range(0, 10_000_000)] = 0
-    """Steps of the training; 0 = 1500 for keypoints, 10 000 for lerobot."""
+    """Steps of the training; 0 = 3000 for keypoints, 10 000 for lerobot."""
     batch_size: Annotated[int, Range(1, 100_000)] = 128
     """Rows of the dataset that a step learns from."""
     learning_rate: Annotated[float, Range(0, 1)] = 0.0

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,9 @@ SURFACES = {
     Material.STEEL: (0.02, 0.02, 0.021, 0.52, 0.58),
     Material.SHAFT: (0.002, 0.002, 0.0023, 0.55, 0.03),
     Material.INSULATION: (0.04, 0.036, 0.029, 0.6, 0.03),
+    Material.VESSEL: (0.34, 0.075, 0.06, 0.42, 0.04),
+    Material.DYE: (0.008, 0.05, 0.28, 0.42, 0.04),
+    Material.CLIP: (0.42, 0.36, 0.55, 0.5, 0.04),
 }
 """Red, green and blue of what is scattered, roughness, and share of light that is mirrored; by eye beside real instruments."""
 
@@ -93,20 +97,26 @@ class InstrumentDrawing:
         capsules: Sequence[Sequence[Capsule]] = (),
     ) -> None:
         self.config, self.device = config, pick_device(device)
-        self.links = tuple(dict.fromkeys((i, part.link) for i, parts in enumerate(instruments) for part in parts))
-        """The number of an instrument and the name of a link, in the order of the labels."""
-        corners, normals, links, materials = [], [], [], []
+        named = [[(i, part.link) for part in parts] for i, parts in enumerate(instruments)]
+        bones = [(i, bone) for i, parts in enumerate(instruments) for part in parts for bone in part.bones]
+        self.links = tuple(dict.fromkeys([*chain(*named), *bones]))
+        """The number of an instrument and the name of a link, in the order of the labels; those that are bones alone come last."""
+        numbers = {link: number for number, link in enumerate(self.links)}
+        corners, normals, links, moved, materials = [], [], [], [], []
         for i, parts in enumerate(instruments):
             for part in parts:
                 corners.append(part.vertices[part.faces])
                 normals.append(corner_normals(part))
-                links += [self.links.index((i, part.link))] * len(part.faces)
+                links += [numbers[i, part.link]] * len(part.faces)
+                own = np.array([numbers[i, bone] for bone in part.bones or [part.link] * len(part.vertices)])
+                moved.append(own[part.faces].ravel())
                 materials += [int(part.material)] * len(part.faces)
         move = lambda arrays, kind: torch.as_tensor(np.asarray(arrays), dtype=kind, device=self.device).contiguous()
         self._fixed = {
             "corners": move(np.concatenate(corners).reshape(-1, 3), torch.float32),
             "normals": move(np.concatenate(normals).reshape(-1, 3), torch.float32),
             "face_links": move(links, torch.int32),
+            "corner_links": move(np.concatenate(moved), torch.int32),
             "materials": move(materials, torch.int32),
             "owners": move([self.links[link][0] for link in links], torch.int32),
         }
@@ -116,7 +126,7 @@ class InstrumentDrawing:
             raise ValueError(f"{len(thrown)} capsules throw shadows, and at most {int(MOST)} can; draw fewer instruments")
         ends = np.array([((*capsule.start, 1.0), (*capsule.end, 1.0)) for _, capsule in thrown]).reshape(-1, 2, 4)
         self._ends = ends.swapaxes(1, 2)  # [C, 4, 2] m, in the frame of the link
-        self._capsule_links = np.array([self.links.index((i, capsule.link)) for i, capsule in thrown], int)
+        self._capsule_links = np.array([numbers[i, capsule.link] for i, capsule in thrown], int)
         self._fixed["capsule_owners"] = move([i for i, _ in thrown], torch.int32)
         self._fixed["radii"] = move([capsule.radius for _, capsule in thrown], torch.float32)
         self._look = look = resolving_kernels.Look()
@@ -251,7 +261,9 @@ def _stride(count: int) -> int:
 
 
 def corner_normals(part: Part) -> np.ndarray:
-    """Normals [F, 3, 3] at the corners of each face: the mean of the faces around that lie about as it does."""
+    """Normals [F, 3, 3] at the corners of each face: those of the part, or the mean of the faces around that lie about as it does."""
+    if part.normals is not None:
+        return part.normals[part.faces].astype(np.float64)
     corners = part.vertices[part.faces].astype(np.float64)
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])  # as long as the face is large
     unit = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-20)

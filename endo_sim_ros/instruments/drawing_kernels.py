@@ -31,9 +31,10 @@ class Frame:
     nearest: float  # m: what is nearer to the plane of the lens is not drawn
     surfaces: int  # rows of surfaces from those of one picture to the next; 0 = all have the same
     lanes: int  # threads that share a triangle on a GPU
-    corners: wp.array[wp.vec3]  # [3 F] m, in the frame of the link
+    corners: wp.array[wp.vec3]  # [3 F] m, in the frames of their links
     normals: wp.array[wp.vec3]  # [3 F]
-    face_links: wp.array[int]  # [F]
+    face_links: wp.array[int]  # [F] what faces count as
+    corner_links: wp.array[int]  # [3 F]
     materials: wp.array[int]  # [F]
     owners: wp.array[int]  # [F] numbers of the instruments
     radii: wp.array[float]  # [C] m
@@ -69,10 +70,10 @@ def project(
 ):
     i = first + wp.tid()
     picture, face = i // frame.faces, i % frame.faces
-    pose, view = poses[picture * frame.links + frame.face_links[face]], lens(views, picture)
+    view = lens(views, picture)
     frame.rows[i] = wp.vec2i(1, 0)
     for k in range(3):
-        at = wp.transform_point(pose, frame.corners[3 * face + k])
+        at = wp.transform_point(poses[picture * frame.links + frame.corner_links[3 * face + k]], frame.corners[3 * face + k])
         u, v = view[0] * at[0] / at[2] + view[2], view[1] * at[1] / at[2] + view[3]
         if not (at[2] > frame.nearest and wp.abs(u) < BEYOND and wp.abs(v) < BEYOND):  # nor if it is not a number
             return
@@ -85,6 +86,7 @@ def project(
     bottom = wp.floor(wp.clamp(wp.max(wp.max(a[1], b[1]), c[1]) + margin, -1.0, float(frame.height) - 0.5))
     frame.rows[i] = wp.vec2i(int(top), int(bottom))
     for k in range(3):
+        pose = poses[picture * frame.links + frame.corner_links[3 * face + k]]
         frame.turned[3 * i + k] = wp.transform_vector(pose, frame.normals[3 * face + k])
 
 

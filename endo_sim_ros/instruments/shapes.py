@@ -39,23 +39,34 @@ class Material(IntEnum):
     """Carbon-fibre composite: black, dull."""
     INSULATION = 2
     """Polymer sleeves and covers of instruments for electrosurgery."""
+    VESSEL = 3
+    """The wet wall of a vessel or a duct."""
+    DYE = 4
+    """The same, dyed with methylene blue."""
+    CLIP = 5
+    """The polymer of clips that lock."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """A rigid piece of an instrument.
+    """A piece of an instrument: rigid, or bent where its corners move with several links.
 
     Args:
-        link: Name of the link that it moves with.
+        link: Name of the link that it moves with, or counts as.
         material: What it is made of.
         vertices: Corners [V, 3], m, in the frame of the link.
         faces: Triangles [F, 3], whose corners go round counter-clockwise seen from outside.
+        bones: Names of the links that the corners move with instead, and in whose frames they are, V of them; empty = all with `link`.
+            Poses of these links may also scale.
+        normals: At the corners [V, 3], in the same frames; None = those of the faces around.
     """
 
     link: str
     material: Material
     vertices: np.ndarray
     faces: np.ndarray
+    bones: tuple[str, ...] = ()
+    normals: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

@@ -65,6 +65,31 @@ def test_depth_is_that_of_the_surface():
     assert (picture.labels[:, 320].numpy()[inside] == FIRST_LINK).all()
 
 
+def test_a_part_bends_with_its_bones():
+    across = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+    whole, bones = np.eye(4), {}
+    whole[:3, :3], whole[2, 3] = across, 0.06
+    for name, at in (("first", -0.02), ("second", 0.0), ("third", 0.02)):
+        bones[name] = whole.copy()
+        bones[name][:3, :3] = across * 5e-3  # whose vertices are a circle of radius 1
+        bones[name][:3, 3] += at * across[:, 2]
+    circle = cylinder(1.0, 0.0, 1.0).vertices[:256] * [1, 1, 0]
+    (_, faces), vertices = lofted(np.stack([circle + [0, 0, i] for i in range(3)])), np.concatenate([*[circle] * 3, np.zeros((2, 3))])
+    normals = np.concatenate([*[circle] * 3, [[0, 0, -1], [0, 0, 1]]])
+    part = Part("tube", Material.STEEL, vertices, faces, (*(name for name in bones for _ in range(256)), "first", "third"), normals)
+    drawing = InstrumentDrawing([[part]], device="cpu")
+    assert drawing.links == ((0, "tube"), (0, "first"), (0, "second"), (0, "third"))
+    draw = lambda: drawing.draw([{"tube": np.eye(4), **bones}], CAMERA, *tissue())
+    straight, rigid = draw(), InstrumentDrawing([[cylinder(5e-3, -0.02, 0.02)]], device="cpu").draw([{"roll": whole}], CAMERA, *tissue())
+    assert (straight.labels == rigid.labels).float().mean() > 0.999 and (straight.labels == FIRST_LINK).any()
+    np.testing.assert_allclose(straight.depths, rigid.depths, atol=1e-3)
+    assert (straight.colors - rigid.colors).abs().mean() < 1e-3, "it is lit by the normals it was given"
+    bones["third"][1, 3] += 0.01  # its end is lower in the picture
+    bent = draw()
+    rows = lambda picture, column: np.flatnonzero(picture.labels[:, column] == FIRST_LINK).mean()
+    assert abs(rows(bent, 200) - rows(straight, 200)) < 1 and rows(bent, 490) - rows(straight, 490) > 60
+
+
 @pytest.mark.parametrize("before", [True, False])
 def test_what_is_nearer_hides_what_is_farther(before):
     colors, depths, alphas = tissue(0.1 if before else 0.03)

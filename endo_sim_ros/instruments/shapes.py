@@ -129,6 +129,7 @@ SHAPES: dict[str, ToolShape] = {
     "PROGRASP_FORCEPS": ToolShape(JawShape(17.5e-3, (4.6e-3, 2.4e-3), (3.6e-3, 1.5e-3), tooth=1.0e-3, slot=0.34)),
     "MARYLAND_BIPOLAR_FORCEPS": ToolShape(JawShape(20.0e-3, (4.2e-3, 2.2e-3), (1.5e-3, 0.9e-3), curve=4.0e-3, tooth=0.9e-3), cover=True),
     "CURVED_SCISSORS": ToolShape(JawShape(15.0e-3, (1.7e-3, 2.9e-3), (0.7e-3, 0.8e-3), curve=2.6e-3, blade=True), cover=True),
+    "LARGE_CLIP_APPLIER": ToolShape(JawShape(17.0e-3, (4.4e-3, 2.2e-3), (3.8e-3, 1.6e-3), slot=0.3)),
     "PERMANENT_CAUTERY_HOOK": ToolShape(hook=(12.0e-3, 4.5e-3), cover=True),
 }
 """Dimensions of tools by the name of their kind, read off published photographs and drawings: right to about a millimetre."""

@@ -16,7 +16,7 @@ JOINT = {"name": "roll", "type": "revolute", "alpha": 0, "A": 0, "D": 0.4, "qmin
 def test_arms_and_tools_have_the_names_of_the_dvrk():
     assert arm_names() == ["ECM", "ECM_Si", "PSM", "PSM_Si"]
     kinds = "LARGE_NEEDLE_DRIVER", "PROGRASP_FORCEPS", "MARYLAND_BIPOLAR_FORCEPS", "CURVED_SCISSORS", "PERMANENT_CAUTERY_HOOK"
-    assert {name.rpartition("_")[0] for name in tool_names()} == {*kinds, "ENDOSCOPE"}
+    assert {name.rpartition("_")[0] for name in tool_names()} == {*kinds, "LARGE_CLIP_APPLIER", "ENDOSCOPE"}
 
 
 @pytest.mark.parametrize(
@@ -47,12 +47,12 @@ def test_shipped_numbers_are_those_of_the_dvrk(given):
         np.testing.assert_array_equal(ours.tooltip_offset, theirs.tooltip_offset)
         np.testing.assert_array_equal(ours.coupling, theirs.coupling)
         compared += 1
-    assert compared == 8
+    assert compared == 9
 
 
 def test_tools_of_the_dvrk_that_are_not_shipped_are_read(given):
-    arm = load_arm("PSM_Si", str(given / "kinematics" / "LARGE_CLIP_APPLIER_420230.json"))
-    assert (arm.tool, arm.jaw, arm.joints[5].a) == ("LARGE_CLIP_APPLIER_420230", (-0.349066, 0.785398), 0.0107)
+    arm = load_arm("PSM_Si", str(given / "kinematics" / "FENESTRATED_BIPOLAR_FORCEPS_420205.json"))
+    assert (arm.tool, arm.jaw, arm.joints[5].a) == ("FENESTRATED_BIPOLAR_FORCEPS_420205", (-0.698132, 1.39626), 0.0107)
 
 
 def test_files_may_have_comments_older_names_and_last_commas(tmp_path):

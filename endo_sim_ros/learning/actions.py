@@ -20,8 +20,13 @@ Actions = Literal["cartesian", "joints", "joint_positions"]
 Contact = Literal["point", "links"]
 """What touches the tissue: the tip as a task describes it, or the links of the instrument; see `TaskBatch`."""
 
-ACTION_SIZES: dict[str, int] = {"cartesian": 4, "joints": len(JOINTS) + 1, "joint_positions": len(JOINTS) + 1}
-"""How many numbers an action has for each arm."""
+CARTESIAN_SIZES = 4, 5
+"""How many numbers actions of tips may have for each arm, see `Task.twist`."""
+
+
+def action_size(task: Task | type[Task], actions: Actions) -> int:
+    """How many numbers an action has for each arm."""
+    return task.action_size() if actions == "cartesian" else len(JOINTS) + 1
 
 
 def by_arm(task: Task | type[Task], names: Sequence[str]) -> list[str]:
@@ -41,24 +46,35 @@ def jaw_angles(task: Task, fourth: np.ndarray) -> np.ndarray:
     return np.where(task.closes(fourth), task.closed_jaw, task.open_jaw)
 
 
-def arm_state(task: Task, rotations: np.ndarray) -> np.ndarray:
+def tip_poses(task: Task, tips: np.ndarray) -> np.ndarray:
+    """Poses of tips at places [B, 3] or [B A, 3], m, world, in their axes, [B A, 4, 4], arm after arm of each episode."""
+    places = tips.reshape(-1, 3)
+    poses = np.tile(np.eye(4), (len(places), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = task.rotations.reshape(-1, 3, 3), places
+    return poses
+
+
+def arm_state(task: Task) -> np.ndarray:
     """What the arms measure of themselves, which tells nothing of the goal [B, 11 A], float32.
 
     Of each it is the pose of the tip (m, xyzw) in the frame of the endoscope (x right, y down, z forward), as the arms of a da Vinci
     measure it, the angle between the jaws (rad), and the force of the tissue on the tool (N, in the axes of the endoscope). So it agrees
     with what the endoscope sees, wherever in the world that is.
-
-    Args:
-        task: Where the tips are, and the endoscopes.
-        rotations: Axes of the tips [B A, 3, 3], world, arm after arm of each episode.
     """
     endoscopes = task.endoscopes()
     poses = np.tile(task.endoscope, (task.count, 1, 1)) if endoscopes is None else endoscopes
     poses = poses.repeat(len(task.arms), 0)  # [B A, 4, 4]
     axes = poses[:, :3, :3].transpose(0, 2, 1)
     local = lambda v: dot(axes, v[:, None])
-    turned = Rotation.from_matrix(axes @ rotations).as_quat(canonical=True)
+    turned = Rotation.from_matrix(axes @ task.rotations.reshape(-1, 3, 3)).as_quat(canonical=True)
     jaws = jaw_angles(task, task.fourth).ravel()
     places = local(task.tips().reshape(-1, 3) - poses[:, :3, 3])
     measured = np.column_stack([places, turned, jaws, local(task.forces().reshape(-1, 3))])
     return measured.astype(np.float32).reshape(task.count, -1)
+
+
+def arm_commands(task: Task, actions: np.ndarray) -> np.ndarray:
+    """Poses of the tips (m, xyzw, world), and angles between the jaws (rad), that actions of the tips [B, 4 A] command, [B, 8 A]."""
+    turned = Rotation.from_matrix(task.orient(actions).reshape(-1, 3, 3)).as_quat(canonical=True)
+    jaws = jaw_angles(task, actions.reshape(*task.fourth.shape, -1)[..., 3]).ravel()
+    return np.column_stack([task.reach(actions).reshape(-1, 3), turned, jaws]).reshape(task.count, -1)

@@ -28,7 +28,7 @@ class Wish:
     """What a device asks for in one step."""
 
     way: np.ndarray = field(default_factory=lambda: np.zeros(3))  # right, up and towards the endoscope, in largest steps, -1 … 1
-    turn: float = 0.0  # -1 … 1, the fourth number of a task where it is a speed
+    turn: float = 0.0  # -1 … 1, the fourth number of a task where it is a speed, or the fifth
     jaw: bool = False  # close it if it is open, and open it if it is closed
     arm: bool = False  # act with the next arm from now on
     word: Word | None = None
@@ -135,7 +135,9 @@ class _Session:
         (episode,), seen = begin(batch, [seed])
         period = batch.task.physics().step_duration / self._pace
         resting = 0.0 if batch.task.turns else -1.0  # the fourth number, of a speed or an open jaw
-        actions, arm = np.tile([0.0, 0.0, 0.0, resting], (batch.action_size // 4, 1)), 0
+        actions, arm = np.zeros((len(batch.task.arms), batch.task.action_size())), 0
+        actions[:, 3] = resting
+        turning = 3 if batch.task.turns else 4 if batch.task.twist else None
         begun, rested, due = False, False, time.monotonic()
         while episode.solved is None:
             self._screen.show(self._view(number, arm, actions, begun))
@@ -149,12 +151,12 @@ class _Session:
             arm = (arm + sum(wish.arm for wish in wishes)) % len(actions)
             actions[:, :3] = 0
             actions[arm, :3] = np.clip(np.sum([wish.way for wish in wishes], 0), -1, 1)
-            if batch.task.turns:
-                actions[:, 3] = 0
-                actions[arm, 3] = np.clip(sum(wish.turn for wish in wishes), -1, 1)
-            elif sum(wish.jaw for wish in wishes) % 2:
+            if turning is not None:
+                actions[:, turning] = 0
+                actions[arm, turning] = np.clip(sum(wish.turn for wish in wishes), -1, 1)
+            if not batch.task.turns and sum(wish.jaw for wish in wishes) % 2:
                 actions[arm, 3] *= -1
-            moves = actions[arm, :3].any() or actions[arm, 3] != resting
+            moves = actions[arm, :3].any() or actions[arm, 3] != resting or actions[arm, 4:].any()
             if not begun and not (moves and rested):  # what the hand still does of the episode before begins none
                 rested |= not moves
                 actions[:, 3] = resting

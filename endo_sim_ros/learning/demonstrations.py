@@ -10,7 +10,8 @@ observation.state              of each arm alone, in the frame of the endoscope 
 observation.joints             yaw, pitch, insertion (m), roll, wrist_pitch, wrist_yaw, where there is an instrument
 observation.endoscope          yaw, pitch, insertion (m) and roll of its arm, where the actions move it
 observation.environment_state  the state observation of the task, which knows the goal
-action                         what the task takes, -1 to 1: how far each tip moves in its frame, and the fourth number
+action                         what the task takes, -1 to 1: how far each tip moves in its frame, the fourth number, and
+                               in some tasks the fifth, which turns it
 command.pose                   the same as a command: pose of the tip in the world, and jaw
 command.endoscope              or joints of the endoscope's arm
 next.reward, .done, .success   what the action led to
@@ -35,7 +36,7 @@ from rich.progress import Progress
 from endo_sim_ros.core.folders import written_whole
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.instruments import JOINTS
-from endo_sim_ros.learning.actions import ARM_NAMES, POSE_NAMES, by_arm, jaw_angles
+from endo_sim_ros.learning.actions import ARM_NAMES, POSE_NAMES, arm_commands, by_arm
 from endo_sim_ros.learning.config import DemonstrationConfig, Randomisation, SightConfig
 from endo_sim_ros.learning.dataset import (
     IMAGE,
@@ -51,7 +52,6 @@ from endo_sim_ros.learning.dataset import (
 from endo_sim_ros.learning.policies import Policy, scripted_policy
 from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.learning.task_batch import Observed, TaskBatch
-from endo_sim_ros.learning.tasks import Task
 from endo_sim_ros.physics import MotionConfig
 
 _COLUMNS = {"image": IMAGE, "image_right": IMAGE_RIGHT, "segmentation": SEGMENTATION}
@@ -265,7 +265,7 @@ def take(
         "observation.state": batch.arm_state(),
         "observation.environment_state": seen["state"],
         "action": actions,
-        "command.pose": _commands(batch.task, actions),
+        "command.pose": arm_commands(batch.task, actions),
     }
     if batch.tools is not None:
         rows["observation.joints"] = batch.tools.joints.reshape(batch.count, -1).copy()
@@ -290,17 +290,10 @@ def _observed(seen: Observed) -> dict[str, np.ndarray]:
     return seen
 
 
-def _commands(task: Task, actions: np.ndarray) -> np.ndarray:
-    """Poses of the tips, with the axes of the world, and jaws that actions [B, 4 A] command, [B, 8 A]."""
-    tips, fourth = task.reach(actions).reshape(-1, 3), actions.reshape(*task.fourth.shape, 4)[..., 3]
-    commands = np.column_stack([tips, np.tile([0.0, 0.0, 0.0, 1.0], (len(tips), 1)), jaw_angles(task, fourth).ravel()])
-    return commands.reshape(task.count, -1)
-
-
 def _features(batch: TaskBatch, fps: int, images: ImageFormat) -> dict[str, dict[str, Any]]:
     """What the columns are."""
     assert batch.pictures is not None  # images are observed
-    task, action = batch.task, ["x", "y", "z", "fourth"]
+    task, action = batch.task, ["x", "y", "z", "fourth", *(["twist"] if batch.task.twist else [])]
     vectors = {
         "observation.state": by_arm(task, ARM_NAMES),
         "observation.environment_state": task.observation_names,

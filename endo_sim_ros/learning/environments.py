@@ -154,7 +154,7 @@ class TaskEnvironment(gymnasium.Env):
         return _first(self.batch.observe()), _first(_info(self.batch))
 
     def step(self, action: np.ndarray) -> tuple[Observed, float, bool, bool, dict[str, Any]]:
-        """Return observation, reward, terminated, truncated and info after an action [4 or 7] in -1 … 1."""
+        """Return observation, reward, terminated, truncated and info after an action [4, 5 or 7] in -1 … 1."""
         observations, outcome = self.batch.step(np.asarray(action)[None])
         ended = bool(outcome.terminated[0]), bool(outcome.truncated[0])
         return _first(observations), float(outcome.reward[0]), *ended, _first(_info(self.batch, outcome))
@@ -211,7 +211,7 @@ class VectorTaskEnvironment(gymnasium.vector.VectorEnv):
         return self.renew(np.flatnonzero(chosen)), _info(self.batch)
 
     def step(self, actions: np.ndarray) -> tuple[Observed, np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-        """Return observations, rewards, terminated, truncated [B, …] and infos after actions [B, 4 or 7]; ended episodes begin anew."""
+        """Return observations, rewards, terminated, truncated [B, …] and infos after actions [B, 4, 5 or 7]; ended episodes begin anew."""
         renew = np.flatnonzero(self._ended)
         observations, outcome = self.batch.step(actions, renew.tolist(), [self._generators[i] for i in renew])
         self._ended = outcome.terminated | outcome.truncated

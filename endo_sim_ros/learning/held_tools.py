@@ -1,8 +1,8 @@
 """The instruments of B episodes: where they stand, and the joints that put their tips where a task has them.
 
 A task moves tips without a shape. Here each is a place on the jaws of an instrument, which comes into the picture as
-`endo_sim_ros.instruments.place_arm` has it, and keeps its direction in the world while the tip moves. What a task of A arms has of each is
-[B A] here, arm after arm of each episode.
+`endo_sim_ros.instruments.place_arm` has it, or in a direction of the task. It keeps that in the world while the tip moves, unless actions
+turn it. What a task of A arms has of each is [B A] here, arm after arm of each episode.
 """
 
 from collections.abc import Sequence
@@ -97,7 +97,9 @@ def hold_tool(task: type[Task], scene: Scene, tool: str = "", holder: str = "PSM
     base = parse_frames(_WORLD, [_frame(holder, placed.base)])[f"{holder}_base"]  # with the bits that physics_node has
     # The tip moves from the hinge to where the jaws work: in the axes of the hinge, and then in those of the world.
     point = working_point(arm, capsules, task.tool_share)
-    hinge = (base @ arm.tip_pose(placed.joints))[:3, :3]
+    hinge = task.jaw_axes(camera.pose)
+    if hinge is None:
+        hinge = (base @ arm.tip_pose(placed.joints))[:3, :3]
     # A ball that pushes has no picture: the tool touches where the ball meets what lies ahead of it.
     ahead = task.physics().contact_radius * camera.pose[:3, 2]
     mount = rigid_pose(hinge, ahead - hinge @ point)
@@ -192,6 +194,7 @@ class HeldTools:
             self.move(outside, poses[outside], closed[outside])
             poses = self.poses()
             task.tip[clipped] = task.find(poses[:, :3, 3].reshape(task.tip.shape))[clipped]
+        task.rotations = poses[:, :3, :3].reshape(task.rotations.shape)
         self.hold(closed)
         return poses, closed
 

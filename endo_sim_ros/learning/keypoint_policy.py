@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.folders import written_whole
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.learning.actions import ACTION_SIZES, ARM_NAMES, Actions
+from endo_sim_ros.learning.actions import ARM_NAMES, CARTESIAN_SIZES, Actions
 from endo_sim_ros.learning.config import ImitationConfig, SightConfig
 from endo_sim_ros.learning.dataset import ACTION, ENVIRONMENT_STATE, IMAGE, IMAGE_RIGHT, STATE, read_dataset, read_options
 from endo_sim_ros.learning.pictures import IMAGE as SEEN, IMAGE_RIGHT as SEEN_RIGHT
@@ -117,8 +117,8 @@ def train_keypoints(dataset: Path, out: Path, config: ImitationConfig, device: s
         raise SequenceError(f"{out / FILE} exists already; choose another folder or remove it first")
     device = pick_device(device)
     columns, shown = read_dataset(dataset, (STATE, ENVIRONMENT_STATE, ACTION), (IMAGE, IMAGE_RIGHT))
-    arms, measured = columns[ACTION].shape[1] / ACTION_SIZES["cartesian"], columns[STATE].shape[1] / len(ARM_NAMES)
-    if arms != measured or not measured.is_integer():
+    arms = columns[STATE].shape[1] / len(ARM_NAMES)
+    if not arms.is_integer() or columns[ACTION].shape[1] not in [arms * size for size in CARTESIAN_SIZES]:
         raise SequenceError(f"{dataset} has other columns than `endo-sim demonstrate` writes")
     options = read_options(dataset)
     torch.manual_seed(config.seed)
@@ -152,7 +152,11 @@ def train_keypoints(dataset: Path, out: Path, config: ImitationConfig, device: s
     weights: dict[str, Any] = {name: value.float().cpu().numpy() for name, value in averaged.module.state_dict().items()}
     out.mkdir(parents=True, exist_ok=True)
     with written_whole(out / FILE) as partial, partial.open("wb") as file:
-        about = {"task": options.get("task", ""), "sight": {name: options[key] for key, name in _SIGHT.items() if key in options}}
+        about: dict[str, Any] = {
+            "task": options.get("task", ""),
+            "action": action.shape[1],
+            "sight": {name: options[key] for key, name in _SIGHT.items() if key in options},
+        }
         np.savez(file, about=np.array(json.dumps(about)), image_size=np.array(images.shape[-2:]), eyes=np.array(images.shape[1]), **weights)
 
 
@@ -198,7 +202,7 @@ class KeypointPolicy:
                 values = {name: torch.from_numpy(file[name]) for name in file.files if name != "about"}
             self._size, self._eyes = values.pop("image_size").tolist(), int(values.pop("eyes"))
             arms, outputs = len(values["arm_mean"]) // (len(ARM_NAMES) + 3), len(values["head.6.bias"])
-            action, self._known = arms * ACTION_SIZES["cartesian"], arms * len(ARM_NAMES)
+            self._known, action = arms * len(ARM_NAMES), about.get("action", arms * CARTESIAN_SIZES[0])  # older files did not tell it
             network = KeypointNetwork(self._eyes, self._known, outputs - action, action)
             network.load_state_dict(values)
         except OSError as error:

@@ -15,7 +15,7 @@ import numpy as np
 
 from endo_sim_ros.core.folders import written_whole
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.learning.actions import ACTION_SIZES, ARM_NAMES, Actions
+from endo_sim_ros.learning.actions import ARM_NAMES, CARTESIAN_SIZES, Actions
 from endo_sim_ros.learning.config import ImitationConfig, SightConfig
 from endo_sim_ros.learning.dataset import IMAGE, IMAGE_RIGHT
 from endo_sim_ros.learning.pictures import IMAGE as SEEN, IMAGE_RIGHT as SEEN_RIGHT
@@ -180,8 +180,8 @@ class LeRobotPolicy:
 
 def _arms(action: list[int]) -> int:
     """How many arms actions of a shape are for; 0 for those that no task takes."""
-    arms, more = divmod(sum(action), ACTION_SIZES["cartesian"])
-    return 0 if more or len(action) != 1 else arms
+    fitting = [sum(action) // size for size in CARTESIAN_SIZES if sum(action) % size == 0]
+    return fitting[0] if fitting and len(action) == 1 else 0  # below 20 numbers, which are more than two arms take, one fits at most
 
 
 def _features(path: Path) -> tuple[dict[str, list[int]], SightConfig]:
@@ -197,5 +197,5 @@ def _features(path: Path) -> tuple[dict[str, list[int]], SightConfig]:
     if other or IMAGE not in inputs or arms and inputs.get(_STATE, measured) != measured:
         raise ValueError(f"{path}: the policy takes {', '.join(inputs)}; those of `endo-sim imitate` take {IMAGE} and {_STATE}")
     if given.keys() != {_ACTION} or not arms:
-        raise ValueError(f"{path}: the policy gives {given}; a task takes {ACTION_SIZES['cartesian']} numbers, {_ACTION!r}")
+        raise ValueError(f"{path}: the policy gives {given}; a task takes {' or '.join(map(str, CARTESIAN_SIZES))} numbers, {_ACTION!r}")
     return inputs, SightConfig(image_width=inputs[IMAGE][2], eyes=2 if IMAGE_RIGHT in inputs else 1)

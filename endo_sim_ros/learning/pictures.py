@@ -77,7 +77,8 @@ class Pictures:
         self._drawings = [
             InstrumentDrawing([parts for parts, _ in own], device=device, capsules=[capsules for _, capsules in own]) for own in shapes
         ]
-        self._tables = [torch.from_numpy(_labels(drawing)).to(device) for drawing in self._drawings]
+        named = dict.fromkeys(part.link for parts, _ in self._thing for part in parts)
+        self._tables = [torch.from_numpy(_labels(drawing, list(named))).to(device) for drawing in self._drawings]
         self._at_once = _AT_ONCE if torch.device(device).type == "cpu" else max(count, 1)
         options = DrawingConfig()
         self._lamp = np.array([options.lamp_x, options.lamp_y, 0.0, 1.0])  # m, camera
@@ -137,7 +138,7 @@ class Pictures:
         Args:
             right: Whether the right eye's are wanted.
             labels: Whether labels are: 0 background, 1 tissue, and then the links of the instruments in the order of `LINKS`, those of
-                PSM2 after those of PSM1, and the thing of the task.
+                PSM2 after those of PSM1, and the links of the thing of the task.
         """
         parts = [
             self._render(np.arange(i, min(i + self._at_once, self._count)), right, labels) for i in range(0, self._count, self._at_once)
@@ -204,7 +205,7 @@ class Pictures:
             drawing, at = self._drawings[number], np.flatnonzero(which == number)
             links = held.posed(number, own[at])
             if self._thing:
-                links.append({self._thing[0][0][0].link: self._task.thing_poses()[own[at]]})
+                links.append({link: poses[own[at]] for link, poses in self._task.thing_poses().items()})
             poses = np.stack([links[a][link] for a, link in drawing.links], 1)
             rows = np.concatenate([at + eye * len(own) for eye in range(eyes)])
             local = viewmats[rows, None] @ np.concatenate([poses] * eyes)
@@ -249,9 +250,14 @@ class Pictures:
         return (camera.pose,) if self._sight.eyes == 1 else (camera.pose, camera.beside(self._sight.baseline).pose)
 
 
-def _labels(drawing: InstrumentDrawing) -> np.ndarray:
-    """The labels [256] that are shown for those of a drawing: as on rendered/segmentation/image, whatever parts the tool has."""
+def _labels(drawing: InstrumentDrawing, things: list[str]) -> np.ndarray:
+    """The labels [256] that are shown for those of a drawing: as on rendered/segmentation/image, whatever parts the tool has.
+
+    Args:
+        drawing: What draws the tools, and the thing after these.
+        things: Names of the links that parts of the thing count as.
+    """
     table = np.arange(256, dtype=np.uint8)
     for label, (arm, link) in enumerate(drawing.links, FIRST_LINK):
-        table[label] = FIRST_LINK + len(LINKS) * arm + (LINKS.index(link) if link in LINKS else 0)
+        table[label] = FIRST_LINK + len(LINKS) * arm + next((own.index(link) for own in (LINKS, things) if link in own), 0)
     return table

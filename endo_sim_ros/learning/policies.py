@@ -7,7 +7,7 @@ from typing import Any, Protocol, cast, get_args
 import numpy as np
 
 from endo_sim_ros.core.plugins import load_named
-from endo_sim_ros.learning.actions import ACTION_SIZES, Actions, observed_names
+from endo_sim_ros.learning.actions import Actions, action_size, observed_names
 from endo_sim_ros.learning.config import SightConfig
 from endo_sim_ros.learning.tasks import Script, find_task
 
@@ -31,7 +31,7 @@ class Policy(Protocol):
         """These episodes begin anew."""
 
     def act(self, observations: Any) -> np.ndarray:
-        """Actions [B, 4 or 7] for observations; those of several arms one after the other."""
+        """Actions [B, 4, 5 or 7] for observations; those of several arms one after the other."""
         ...
 
 
@@ -39,11 +39,11 @@ class StillPolicy(Script):
     """Does nothing: what a task scores by itself.
 
     Args:
-        arms: Number of arms that do nothing.
+        size: Of its actions.
     """
 
-    def __init__(self, arms: int = 1):
-        self._size = arms * ACTION_SIZES[self.actions]
+    def __init__(self, size: int = 4):
+        self._size = size
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Actions [B, 4 A] of zero for state observations [B, n]."""
@@ -89,7 +89,7 @@ class NetworkPolicy:
     def sizes(task: str, hidden: Sequence[int], actions: Actions = "cartesian") -> list[tuple[int, int]]:
         """Shapes of the layers for a task and what actions mean, with hidden layers of these sizes."""
         kind = find_task(task)
-        widths = [len(observed_names(kind, actions)), *hidden, ACTION_SIZES[actions] * len(kind.arms)]
+        widths = [len(observed_names(kind, actions)), *hidden, action_size(kind, actions) * len(kind.arms)]
         return [(before + 1, after) for before, after in zip(widths, widths[1:])]
 
     @classmethod
@@ -146,8 +146,8 @@ class NetworkPolicy:
             raise ValueError(f"{path}: not a readable policy ({error})") from error
         except Exception as error:  # zipfile and numpy have a type each, and advise on what only programmers can do
             raise ValueError(f"{path} is no policy file; give the policy.npz that `endo-sim train` wrote") from error
-        if actions not in ACTION_SIZES:
-            known = ", ".join(ACTION_SIZES)
+        if actions not in get_args(Actions):
+            known = ", ".join(get_args(Actions))
             raise ValueError(
                 f"{path}: not a readable policy (its actions are {actions[:40]!r}, known are {known}; train one with one of these)"
             )
@@ -181,11 +181,11 @@ def make_policy(policy: str, task: str, count: int = 1, device: str = "auto") ->
         ValueError: If there is no such task or script, or the file cannot be read or is for another task.
         RuntimeError: If lerobot is needed and not installed.
     """
-    find_task(task)
+    kind = find_task(task)
     if policy == "scripted":
         return scripted_policy(task, count)
     if policy == "still":
-        return StillPolicy(len(find_task(task).arms))
+        return StillPolicy(kind.action_size() * len(kind.arms))
     if (Path(policy) / "keypoints.npz").exists():
         from endo_sim_ros.learning.keypoint_policy import KeypointPolicy
 

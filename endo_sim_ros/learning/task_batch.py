@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from endo_sim_ros.learning.actions import ACTION_SIZES, Actions, Contact, arm_state, observed_names
+from endo_sim_ros.learning.actions import Actions, Contact, action_size, arm_state, observed_names, tip_poses
 from endo_sim_ros.learning.config import Randomisation, SightConfig
 from endo_sim_ros.learning.held_tools import HeldTool, HeldTools, hold_tools
 from endo_sim_ros.learning.pictures import IMAGE, SEGMENTATION, Pictures
@@ -42,7 +42,7 @@ class TaskBatch:
         sight: What the endoscope shows.
         device: Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N.
         images: Make `images` possible also where images are not observed.
-        actions: ``cartesian``: four numbers, see `Task`. ``joints``: how far the six joints of the tool's arm move, in units of
+        actions: ``cartesian``: four numbers, or five, see `Task`. ``joints``: how far the six joints of the tool's arm move, in units of
             `HeldTools.steps`, and the fourth number of the task. ``joint_positions``: where they are, -1 and 1 being their limits,
             and the same. With joints the state ends with their positions as parts of their ranges. A tip that would leave where
             the task allows it comes as near as its joints get. Several arms have as many such actions, one after the other.
@@ -99,10 +99,9 @@ class TaskBatch:
         self.tools = HeldTools(held, kind, count) if held else None
         self.pictures: Pictures | None = None
         self.actions: Actions = actions
-        self.action_size = ACTION_SIZES[actions] * arms
+        self.action_size = action_size(kind, actions) * arms
         self.varied: dict[str, np.ndarray] = {}
         """What each episode has of each kind of randomisation that there is [B, …], by the names of the options."""
-        self._rotations = np.tile(np.eye(3), (count * arms, 1, 1))  # of the tips, arm after arm of each episode, world
         if shown:
             self.pictures = Pictures(scene, self.tissue, self.task, sight, randomisation, self.tools if sight.instrument else None)
 
@@ -122,7 +121,6 @@ class TaskBatch:
         self.tissue.reset(chosen, np.array([variation.phases for variation in variations]) if self._moves else None)
         self._resting, self._placed = True, False
         own = self.task.hands(episodes).ravel()
-        self._rotations[own] = np.eye(3)
         if self.tools is not None:
             self.tools.begin(own, self._poses()[own])
         if self.pictures is not None:
@@ -148,9 +146,7 @@ class TaskBatch:
 
     def _poses(self) -> np.ndarray:
         """Poses of the tips [B A, 4, 4], world."""
-        poses = np.tile(np.eye(4), (len(self._rotations), 1, 1))
-        poses[:, :3, :3], poses[:, :3, 3] = self._rotations, self.task.tips().reshape(-1, 3)
-        return poses
+        return tip_poses(self.task, self.task.tips())
 
     @property
     def observation_names(self) -> tuple[str, ...]:
@@ -160,7 +156,7 @@ class TaskBatch:
     def step(
         self, actions: np.ndarray, renew: Sequence[int] = (), generators: Sequence[np.random.Generator] = ()
     ) -> tuple[Observed, Outcome]:
-        """Take one step with actions [B, 4 A or 7 A]. Episodes in ``renew`` take none: each begins anew, by the chance of its generator.
+        """Take one step with actions [B, 4, 5 or 7 A]. Episodes in ``renew`` take none: each begins anew, by the chance of its generator.
 
         Returns:
             What `observe` gives at the end of the step, and its outcome.
@@ -176,7 +172,7 @@ class TaskBatch:
             self.reset(renew, generators)
         tools, closed = self.tissue.tools, closed.reshape(self.count, -1)
         tips = torch.from_numpy(tips).to(tools.tips.device).view_as(tools.tips)
-        turned = torch.from_numpy(self._rotations).to(tools.tips.device).view_as(tools.rotations)
+        turned = torch.from_numpy(self.task.rotations).to(tools.tips.device).view_as(tools.rotations)
         # Of one alone: a comparison waits for a GPU.
         moved = self._moved(tips, turned) if self.count == 1 else []
         present = torch.ones(closed.shape, dtype=torch.int32)
@@ -208,7 +204,6 @@ class TaskBatch:
         """What `Task.act` returns, for actions [B, 7 A] of joints."""
         assert self.tools is not None
         poses, closed = self.tools.act(self.task, actions, self.actions == "joints")
-        self._rotations = poses[:, :3, :3].copy()
         return poses[:, :3, 3].copy(), closed
 
     def _moved(self, tips: Tensor, turned: Tensor) -> list[bool]:
@@ -250,7 +245,7 @@ class TaskBatch:
 
     def arm_state(self) -> np.ndarray:
         """What the arms of each episode measure of themselves [B, 11 A], see `arm_state`; forces are those of the last observation."""
-        return arm_state(self.task, self._rotations)
+        return arm_state(self.task)
 
     def images(self) -> np.ndarray:
         """What the left eye of the endoscope sees of all episodes [B, H, W, 3], uint8.

@@ -9,10 +9,9 @@ import numpy as np
 from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
-from endo_sim_ros.core.cameras import rigid_pose
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.folders import written_whole
-from endo_sim_ros.learning.actions import arm_state
+from endo_sim_ros.learning.actions import arm_state, tip_poses
 from endo_sim_ros.learning.held_tools import HeldTools, hold_tools
 from endo_sim_ros.learning.pictures import IMAGE, IMAGE_RIGHT
 from endo_sim_ros.learning.policies import make_policy
@@ -93,7 +92,7 @@ class PolicyNode(EndoNode):
         self._task.reset(0, np.random.default_rng(self._config.seed + self._done))
         self._policy.reset([0])
         if self._tools is not None:
-            self._tools.begin(np.arange(len(self._task.arms)), self._poses(self._task.tips()))
+            self._tools.begin(np.arange(len(self._task.arms)), tip_poses(self._task, self._task.tips()))
         self._stamp, self._heard, self._placed, self._state = 0, {}, False, PolicyState.WAITING
         spots = self._task.dyed_spots(0) if self._config.dye else ()
         self._dye_pub.publish(messages.encode_dye(spots, self.now_ns(), self._config.world_frame))
@@ -149,7 +148,7 @@ class PolicyNode(EndoNode):
     def _on_reaction(self, arm: int, message: Any) -> None:
         if self._stamp and messages.stamp_to_ns(message.header.stamp) == self._stamp:
             force = messages.decode_wrench(message, "measured_cf")[0]
-            self._answer(self._forces[arm], force if self._tools is None else self._tools.poses()[arm, :3, :3] @ force)
+            self._answer(self._forces[arm], self._task.rotations.reshape(-1, 3, 3)[arm] @ force)
 
     def _on_picture(self, name: str, message: Any) -> None:
         if messages.stamp_to_ns(message.header.stamp) == (self._stamp or self._model_stamp):
@@ -191,8 +190,7 @@ class PolicyNode(EndoNode):
 
     def _sensed(self) -> dict[str, np.ndarray]:
         """What a policy takes that sees: the pictures, and what the arm measures of itself."""
-        poses = self._poses(self._task.tips()) if self._tools is None else self._tools.poses()
-        return {ARM_STATE: arm_state(self._task, poses[:, :3, :3]), **{name: self._heard[name][None] for name in self._pictures}}
+        return {ARM_STATE: arm_state(self._task), **{name: self._heard[name][None] for name in self._pictures}}
 
     def _act(self, observation: np.ndarray | dict[str, np.ndarray]) -> None:
         actions = self._policy.act(observation)
@@ -217,18 +215,13 @@ class PolicyNode(EndoNode):
     def _command(self, tips: np.ndarray, closed: np.ndarray, stamp: int) -> None:
         """Publish where the tips [A] shall be, m, world, or the joints that put them there, and whether the jaws are closed [A]."""
         self._send_camera(stamp)
-        none, poses = np.zeros(0), self._poses(tips)
+        none, poses = np.zeros(0), tip_poses(self._task, tips)
         for arm, (publisher, jaw) in enumerate(zip(self._pose_pubs, self._jaw_pubs)):
             if self._tools is None:
                 publisher.publish(messages.encode_pose(poses[arm], stamp, self._config.world_frame))
             else:
                 publisher.publish(messages.encode_joints([], self._tools.joints[arm], none, none, stamp))
             jaw.publish(messages.encode_jaw(self._task.closed_jaw if closed.flat[arm] else self._task.open_jaw, stamp))
-
-    @staticmethod
-    def _poses(tips: np.ndarray) -> np.ndarray:
-        """Poses [A, 4, 4] of tips at places [1, 3], [A, 3] or [1, A, 3], m, with the axes of the world."""
-        return np.array([rigid_pose(np.eye(3), tip) for tip in tips.reshape(-1, 3)])
 
     def _end(self, success: bool) -> None:
         self._done += 1

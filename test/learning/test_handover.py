@@ -103,7 +103,7 @@ def test_the_needle_is_seen_where_it_is():
     for step in range(26):
         if step in (0, 25):
             for b, labels in enumerate(seen["segmentation"][..., 0]):
-                places = batch.task.thing_poses()[b] @ np.append(batch.task._line, np.ones((len(batch.task._line), 1)), 1).T
+                places = batch.task.thing_poses()["needle"][b] @ np.append(batch.task._line, np.ones((len(batch.task._line), 1)), 1).T
                 pixels = batch.pictures.camera.K @ (batch.pictures.camera.viewmat @ places)[:3]
                 pixels = (pixels[:2] / pixels[2]).T
                 shown = np.argwhere(labels == NEEDLE)[:, ::-1] + 0.5

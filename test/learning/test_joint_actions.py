@@ -54,7 +54,7 @@ def test_deltas_move_joints_by_their_units_and_limits_hold():
     environment.step(np.array([0.5, -0.5, -0.5, 1, -1, 0.3, -1]))
     np.testing.assert_allclose(batch.tools.joints - before, batch.tools.steps * [[0.5, -0.5, -0.5, 1, -1, 0.3]], atol=1e-9)
     assert 1e-4 < np.linalg.norm(batch.task.tip - tip) < 0.01
-    np.testing.assert_allclose(batch._rotations[0], batch.tools.poses()[0, :3, :3])
+    np.testing.assert_allclose(batch.task.rotations[0], batch.tools.poses()[0, :3, :3])
     for _ in range(40):  # out of where the task allows the tip
         environment.step(np.array([0, 0, -1, 0, 0, 0, -1]))
     low, high = batch.task.low, batch.task.high

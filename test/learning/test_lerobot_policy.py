@@ -75,7 +75,7 @@ def test_checkpoints_that_do_not_fit_are_told(tmp_path):
     }
     for key, features, sentence in (
         ("input_features", {"observation.environment_state": {"shape": [15]}}, "the policy takes observation.environment_state; those of"),
-        ("output_features", {"action": {"shape": [14]}}, "the policy gives {'action': [14]}; a task takes 4 numbers, 'action'"),
+        ("output_features", {"action": {"shape": [14]}}, "the policy gives {'action': [14]}; a task takes 4 or 5 numbers, 'action'"),
         ("input_features", 3, "config.json is no configuration of a policy of lerobot"),
     ):
         (place / "config.json").write_text(json.dumps(config | {key: features}))

@@ -159,12 +159,12 @@ class Handover(Task):
         """None: the needle is seen."""
         return ()
 
-    def thing_poses(self) -> np.ndarray:
+    def thing_poses(self) -> dict[str, np.ndarray]:
         """Where the needle is [B, 4, 4], m, world."""
         poses = np.tile(np.eye(4), (self.count, 1, 1))
         poses[:, :3, :3] = self.axes.transpose(0, 2, 1) @ self.turned
         poses[:, :3, 3] = self.origin + self._to_world(self.needle)
-        return poses
+        return {NEEDLE: poses}
 
 
 class HandoverScript(Script):

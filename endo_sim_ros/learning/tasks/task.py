@@ -6,7 +6,8 @@ simulation, so that the same task runs over topics.
 
 All lengths of a task are in its own frame: the origin on the skin, z towards the endoscope, x to the right and y up in its picture. An
 action [4] in -1 … 1 is how far the tip moves in this step along x, y and z, in parts of `step_length`, and a fourth number that each
-task explains. A task of several arms has as many of such actions and tips: what is [B, 3] here is then [B, A, 3], and [B] is [B, A].
+task explains; a fifth turns the tip about z, where the task has a `twist`. A task of several arms has as many of such actions and tips:
+what is [B, 3] here is then [B, A, 3], and [B] is [B, A].
 To add a task, write a subclass of :class:`Task`, with a scripted policy, in a file of its own. Every command and the policy's ROS node
 take it as ``path/to/file.py:Name``. One that belongs to the package is a file here and has a name in `TASKS`.
 
@@ -61,6 +62,8 @@ class Task(ABC):
     step_length = 0.002  # m in one step, per axis
     roams = False  # whether the endoscope is elsewhere than that of the scene, see `endoscopes`
     turns = False  # whether actions move the endoscope, and not the tool; their fourth number is a speed then, which rests at 0
+    twist = 0.0  # rad in one step, counter-clockwise in the picture, by which a fifth number of actions turns the tip; 0 = it has none
+    most_twist = np.pi  # rad to either side
     working_fourth = -1.0  # fourth action of a tool at work in the tissue, as benchmarks give it
     force_limit: float  # N; above it tissue is hurt, and the episode lost
     low: tuple[float, float, float]  # where the tip may be, m, task frame
@@ -83,7 +86,23 @@ class Task(ABC):
 
     @classmethod
     def thing(cls) -> tuple[list[Part], list[Capsule]] | None:
-        """Parts and capsules of one link of a rigid thing that is drawn with the tools, if there is one."""
+        """Parts and capsules, each of a link, of what else is drawn with the tools, if there is something."""
+        return None
+
+    @classmethod
+    def action_size(cls) -> int:
+        """How many numbers an action of the tip has for each arm."""
+        return 5 if cls.twist else 4
+
+    @classmethod
+    def jaw_axes(cls, endoscope: np.ndarray) -> np.ndarray | None:
+        """Axes [3, 3] in the world, z along the jaws and x along their hinge, of a tool whose tip has the axes of the world.
+
+        None where they are as the arm is placed, straight from its remote centre.
+
+        Args:
+            endoscope: Pose of that of the scene [4, 4], camera to world.
+        """
         return None
 
     @staticmethod
@@ -116,6 +135,8 @@ class Task(ABC):
         self.fourth = np.zeros(hands)  # of the last action
         self.raised = np.zeros(hands, int)  # steps that it has been above zero, one after the other
         self.steps = np.zeros(count, int)
+        self.twisted = np.zeros(hands)  # by fifth numbers, rad
+        self.rotations = np.tile(np.eye(3), (*hands, 1, 1))  # axes of the tips, world; where an arm starts they are those of the world
         self.force = np.zeros((*hands, 3))  # what the tissue exerts on the tool, N, task frame
         self._potential = np.zeros(count)
 
@@ -135,8 +156,9 @@ class Task(ABC):
         """Begin episode b anew; all chance comes from the generator."""
         self._choose(b, rng)
         self.tip[b] = rng.uniform(self.low, self.high, self.tip[b].shape)
-        self.fourth[b], self.raised[b], self.steps[b], self.force[b] = -1.0, 0, 0, 0.0
+        self.fourth[b], self.raised[b], self.steps[b], self.force[b], self.twisted[b] = -1.0, 0, 0, 0.0, 0.0
         self._reset(b, rng)
+        self.rotations[b] = turned_about(self.axes[b, 2], self.twisted[b])
 
     def _choose(self, b: int, rng: np.random.Generator) -> None:
         """Choose what episode b is about: its sites and its frame."""
@@ -165,7 +187,8 @@ class Task(ABC):
         Raises:
             ValueError: If actions have another shape, or are not finite; nothing has changed then.
         """
-        actions = self.check_actions(actions, 4)
+        actions = self.check_actions(actions, self.action_size())
+        self.twisted, self.rotations = self._twist_to(actions), self.orient(actions)
         return self.go(self.tip + self.step_length * actions[..., :3], actions[..., 3])
 
     def check_actions(self, actions: np.ndarray, size: int) -> np.ndarray:
@@ -209,9 +232,20 @@ class Task(ABC):
 
     def reach(self, actions: np.ndarray) -> np.ndarray:
         """Where actions [B, 4 A] in -1 … 1 put the tips [B, 3], m, world."""
-        actions = actions.reshape(*self.fourth.shape, 4)
+        actions = actions.reshape(*self.fourth.shape, -1)
         places = np.clip(self.tip + self.step_length * actions[..., :3], self.low, self.high)
         return _of_each(self.origin, places) + self._to_world(places)
+
+    def orient(self, actions: np.ndarray) -> np.ndarray:
+        """What axes of the tips [B, 3, 3], world, actions [B, 4 A] in -1 … 1 lead to."""
+        if not self.twist:
+            return self.rotations
+        turned = self._twist_to(actions.reshape(*self.fourth.shape, -1))
+        return turned_about(_of_each(self.axes[:, 2], turned[..., None]), turned)
+
+    def _twist_to(self, actions: np.ndarray) -> np.ndarray:
+        """How far tips are turned after actions of each arm [B, n], rad."""
+        return np.clip(self.twisted + self.twist * actions[..., -1], -self.most_twist, self.most_twist)
 
     def observe(self, positions: np.ndarray, forces: np.ndarray) -> np.ndarray:
         """Observations [B, n], float32.
@@ -274,9 +308,9 @@ class Task(ABC):
         """What is dyed in episode b, so that pictures tell the goal: the place that it is about."""
         return (DyedSpot(self.origin[b].copy(), self.dyed_radius),)
 
-    def thing_poses(self) -> np.ndarray:
-        """Where the `thing` is [B, 4, 4], m, world; unless the task moves it, where its shape has it."""
-        return np.tile(np.eye(4), (self.count, 1, 1))
+    def thing_poses(self) -> dict[str, np.ndarray]:
+        """Where the links of the `thing` are [B, 4, 4], m, world, by name."""
+        return {}
 
     def regions(self) -> tuple[str, ...]:
         """The stiffness of the first episode as physics_node's parameter `regions`; empty where it is 1 everywhere."""
@@ -311,6 +345,18 @@ class Script:
 def moving(physics: PhysicsConfig, motion: MotionConfig) -> PhysicsConfig:
     """The physics of a task with another motion in place of its own; without one of either kind, its own."""
     return physics if motion == MotionConfig() else replace(physics, motion=motion)
+
+
+def turned_about(axis: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    """Rotations [..., 3, 3] by angles [...], rad, about unit axes [..., 3]."""
+    x, y, z = np.moveaxis(np.broadcast_to(axis, (*np.shape(angles), 3)), -1, 0)
+    c, s = np.cos(angles), np.sin(angles)
+    rows = [
+        [c + x * x * (1 - c), x * y * (1 - c) - z * s, x * z * (1 - c) + y * s],
+        [x * y * (1 - c) + z * s, c + y * y * (1 - c), y * z * (1 - c) - x * s],
+        [x * z * (1 - c) - y * s, y * z * (1 - c) + x * s, c + z * z * (1 - c)],
+    ]
+    return np.stack([np.stack(row, -1) for row in rows], -2)
 
 
 def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -116,7 +116,8 @@ def test_tasks_and_policies_of_files_are_found_and_what_is_wrong_is_said(press, 
         (press + "ure", "has no 'Pressure'"),
         (
             "sewing",
-            "there is no task 'sewing'; there are retraction, palpation, tracking, exposure, tension, handover, camera, and your own as",
+            "there is no task 'sewing'; there are retraction, palpation, tracking, exposure, tension, handover, camera, clip, "
+            "and your own as",
         ),
     ):
         with pytest.raises(ValueError, match=re.escape(sentence)):

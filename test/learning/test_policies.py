@@ -25,7 +25,16 @@ ROOT = Path(__file__).parents[2]
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "task, count",
-    [("retraction", 48), ("palpation", 8), ("tracking", 32), ("exposure", 24), ("tension", 16), ("handover", 16), ("camera", 32)],
+    [
+        ("retraction", 48),
+        ("palpation", 8),
+        ("tracking", 32),
+        ("exposure", 24),
+        ("tension", 16),
+        ("handover", 16),
+        ("camera", 32),
+        ("clip", 16),
+    ],
 )
 def test_scripted_policies_solve_their_tasks(task, count):
     batch = TaskBatch(task, load_scene(), count, device="cpu")
@@ -125,7 +134,7 @@ def test_the_code_in_the_guide_runs(tmp_path):
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_on_a_gpu_the_scripts_solve_as_on_a_cpu_and_images_are_alike():
-    for task, count in (("retraction", 256), ("palpation", 64), ("tracking", 256), ("tension", 256), ("handover", 256)):
+    for task, count in (("retraction", 256), ("palpation", 64), ("tracking", 256), ("tension", 256), ("handover", 256), ("clip", 256)):
         batch = TaskBatch(task, load_scene(), count, randomisation=Randomisation(stiffness=0.1), images=True, device="cuda")
         _, success, _ = play(batch, scripted_policy(task, count), np.arange(count))
         assert success.mean() > 0.9, task

@@ -2,6 +2,7 @@
 
 from endo_sim_ros.core.plugins import load_named
 from endo_sim_ros.learning.tasks.camera import Camera as Camera
+from endo_sim_ros.learning.tasks.clip import Clip
 from endo_sim_ros.learning.tasks.exposure import Exposure
 from endo_sim_ros.learning.tasks.handover import Handover
 from endo_sim_ros.learning.tasks.palpation import Palpation
@@ -18,7 +19,7 @@ from endo_sim_ros.learning.tasks.task import (
 from endo_sim_ros.learning.tasks.tension import Tension
 from endo_sim_ros.learning.tasks.tracking import Tracking
 
-TASKS: dict[str, type[Task]] = {task.name: task for task in (Retraction, Palpation, Tracking, Exposure, Tension, Handover, Camera)}
+TASKS: dict[str, type[Task]] = {task.name: task for task in (Retraction, Palpation, Tracking, Exposure, Tension, Handover, Camera, Clip)}
 """All tasks by their names."""
 
 

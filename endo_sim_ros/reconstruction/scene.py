@@ -98,7 +98,8 @@ class PreparedScene:
 
     Args:
         frames: Usable frames, as they were recorded; none when poses are checked and depth is known, since they take much memory.
-        views: The same as they are trained on: shrunk, with depth prior, rectified right image and mask of what is still.
+        views: The same as they are trained on: shrunk, with depth prior and mask of what is still; with their rectified right images until
+            depth is refined.
         points: Scene points; none before they are found.
         given_points: Whether the caller gave them.
         motion: How the tissue moves by itself. Frames and model have it in its mean position; views, at last, where it was.

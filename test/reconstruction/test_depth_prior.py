@@ -10,7 +10,7 @@ from training_views import unknown
 
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.reconstruction.priors.sources import estimate_depth, interpolate_points
-from endo_sim_ros.reconstruction.priors.stereo import align_rows, disparity_offsets, right_view, stereo_disparity
+from endo_sim_ros.reconstruction.priors.stereo import align_rows, disparity_offsets, right_view, stereo_depth, stereo_disparity
 from endo_sim_ros.reconstruction.scene import ScenePoints
 from endo_sim_ros.reconstruction.triangulation import triangulate
 
@@ -37,6 +37,19 @@ def test_a_wrong_principal_point_of_the_right_eye_is_found(large):
     K = large[0].camera.K - np.array([[0, 0, 3.0], [0, 0, 0], [0, 0, 0]])
     known = [dataclasses.replace(frame, right_K=K) for frame in wrong]
     assert disparity_offsets(known, [stereo_disparity(frame) for frame in known], points).max() == pytest.approx(0, abs=0.25)
+
+
+@pytest.mark.slow
+def test_disparities_of_many_views_are_held_in_sixteenths_of_two_bytes(small, monkeypatch):
+    monkeypatch.setenv("ENDO_SIM_THREADS", "1")  # each thread has arrays of its own
+
+    def match(count):
+        for _ in stereo_depth(unknown(count * small[:1]), NO_POINTS):
+            pass
+
+    peak_of(lambda: match(2))  # what is made once
+    pixels = small[0].camera.width * small[0].camera.height / 1e6
+    assert peak_of(lambda: match(40)) - peak_of(lambda: match(20)) < 1.5 * 20 * 2 * pixels
 
 
 @pytest.mark.slow

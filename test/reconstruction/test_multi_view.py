@@ -72,6 +72,7 @@ def test_views_come_back_as_narrow_as_asked_for(large):
     shrunk, alone = refine_depth(iter(views), NO_POINTS, "stereo", width=160), refine_depth(views, NO_POINTS, "stereo")
     for view, full in zip(shrunk, alone):
         assert view.image.shape == (128, 160, 3) and full.image.shape == (512, 640, 3)
+        assert view.right is full.right is None, "nothing needs them any more"
         np.testing.assert_array_equal(view.depth_prior, shrink(full, 160).depth_prior)
 
 

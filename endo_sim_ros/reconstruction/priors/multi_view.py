@@ -36,7 +36,7 @@ def refine_depth(
     device: str = "cpu",
     progress: StageProgress = StageProgress(),
 ) -> list[TrainingView]:
-    """The views with their depth prior corrected by scene points and by what neighbouring views show.
+    """The views, without right images, with their depth prior corrected by scene points and by what neighbouring views show.
 
     A view's image is predicted from each neighbour's with the view's depth; the optical flow between prediction and
     image, along the direction in which depth moves a pixel, is a correction of inverse depth that is the more precise the
@@ -68,8 +68,8 @@ def refine_depth(
             right = right_view(view, stereo)
             # Between the eyes reflections hardly move.
             pairs[i] = image.with_matte(view.tissue), eye_image(right, options).with_matte(right.tissue), view.baseline
-        view = dataclasses.replace(view, depth_prior=None)
-        views[i] = shrink(view, width) if width else view  # grey images are all that is needed of the full size
+        view = dataclasses.replace(view, depth_prior=None, right=None, right_K=None, baseline=None)
+        views[i] = shrink(view, width) if width else view  # grey images are all that is needed of the full size, and of the other eye
         return image
 
     images = progress.map(look, range(len(views)))

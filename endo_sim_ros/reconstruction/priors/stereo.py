@@ -2,7 +2,7 @@
 
 import dataclasses
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import cv2
 import numpy as np
@@ -38,11 +38,13 @@ def stereo_depth(
         progress: Reported to by views.
     """
     aligned = progress.map(lambda view: view if view.right is None else align_rows(view, options, matching), views)
-    disparities = progress.map(lambda view: None if view.right is None else stereo_disparity(view, options), aligned)
-    offsets = disparity_offsets(aligned, disparities, points, options, matching)
+    # Those of all views are held as they were matched, in half the memory.
+    matched = progress.map(lambda view: None if view.right is None else _matched(view, options), aligned)
+    disparity = lambda view, found: None if found is None else _in_pixels(found, view)
+    offsets = disparity_offsets(aligned, map(disparity, aligned, matched), points, options, matching)
     for view, offset in zip(aligned, offsets):
         return_freed_memory()  # of the view before
-        found = disparities.pop(0)  # which takes as much memory as the depth
+        found = disparity(view, matched.pop(0))
         yield (view, None) if found is None else (_with_right_K(view, column=offset), disparity_to_depth(view, found, offset, options))
 
 
@@ -81,10 +83,24 @@ def stereo_disparity(frame: Frame, options: StereoConfig = StereoConfig()) -> np
 
     A difference of the principal points of the two eyes is removed, so that disparity = fx·B/z; rows move by whole pixels.
     """
+    return _in_pixels(_matched(frame, options), frame)
+
+
+def _in_pixels(matched: np.ndarray, frame: Frame) -> np.ndarray:
+    """Disparity [H, W] float32 in pixels of one as it was matched, without the difference of the principal points."""
+    return np.where(matched > 0, np.maximum(matched / np.float32(16) - np.float32(_shift(frame)), 0), np.float32(0))
+
+
+def _shift(frame: Frame) -> float:
+    """Difference of the principal points of the two eyes, pixels."""
+    return frame.camera.K[0, 2] - _right_K(frame)[0, 2]
+
+
+def _matched(frame: Frame, options: StereoConfig) -> np.ndarray:
+    """Disparity [H, W] int16 as it is matched, with the difference of the principal points, in sixteenths of a pixel; 0 = none."""
     assert frame.right is not None
     fx, width = frame.camera.K[0, 0], frame.camera.width
-    shift = frame.camera.K[0, 2] - _right_K(frame)[0, 2]
-    levels = int(np.ceil((fx * frame.baseline / options.nearest + abs(shift)) / 16)) * 16  # the matcher takes multiples of 16
+    levels = int(np.ceil((fx * frame.baseline / options.nearest + abs(_shift(frame))) / 16)) * 16  # the matcher takes multiples of 16
     levels = min(levels, max(width // 2 // 16, 1) * 16)
     # Penalties as OpenCV recommends for blocks of 5 × 5 pixels.
     matcher = cv2.StereoSGBM.create(
@@ -106,12 +122,12 @@ def stereo_disparity(frame: Frame, options: StereoConfig = StereoConfig()) -> np
     # What is left of wrong matches are islands.
     sixteenths = np.where(valid, 16 * disparity, 0).astype(np.int16)
     cv2.filterSpeckles(sixteenths, 0, int(options.min_area * disparity.size), 16)
-    return np.where(sixteenths > 0, np.maximum(disparity - np.float32(shift), 0), np.float32(0))
+    return sixteenths
 
 
 def disparity_offsets(
     frames: Sequence[Frame],
-    disparities: Sequence[np.ndarray | None],
+    disparities: Iterable[np.ndarray | None],
     points: ScenePoints,
     options: StereoConfig = StereoConfig(),
     matching: MatchingConfig = MatchingConfig(),
@@ -124,10 +140,11 @@ def disparity_offsets(
     wrong. A point counts the less the farther a pixel's error moves it.
     """
     none, noise = np.zeros(len(frames)), options.disparity_error
-    residuals, weights = [np.empty(0)] * len(frames), [np.empty(0)] * len(frames)
+    residuals, weights, some = [np.empty(0)] * len(frames), [np.empty(0)] * len(frames), [np.empty(0)]
     for i, (frame, disparity) in enumerate(zip(frames, disparities)):
         if disparity is None or not len(points.positions):
             continue
+        some.append(disparity[::8, ::8].ravel())  # all of many views would take gigabytes
         index, v, u, z = pixels_of(frame.camera, points.positions)
         measured, expected = disparity[v, u], frame.camera.K[0, 0] * frame.baseline / z
         error = np.broadcast_to(points.error, len(points.positions))[index]
@@ -141,8 +158,8 @@ def disparity_offsets(
     # A quarter of a pixel is as good as none.
     if abs(offset) < max(0.25, 3 * spread * np.sqrt((weight**2).sum()) / weight.sum()):
         return none
-    some = np.concatenate([d[::8, ::8].ravel() for d in disparities if d is not None])  # all of many views would take gigabytes
-    typical = float(np.median(some[some > 0]))
+    seen = np.concatenate(some)
+    typical = float(np.median(seen[seen > 0]))
     if abs(offset) > options.max_offset * typical:
         text = "stereo disparity, %.1f pixels, and the poses are %.1f pixels apart: left so; check poses, their scale and the baseline"
         log.warning(text, typical, abs(offset))

@@ -23,6 +23,8 @@ class DeviceView:
     path: Tensor | None  # [parts, 3] m
     index: int  # among the training views
     index_tensor: Tensor  # [1] the same
+    viewmats: Tensor  # [1, 4, 4], as `matrices` gives it
+    Ks: Tensor  # [1, 3, 3]
 
     @classmethod
     def of(cls, view: TrainingView, index: int, device: str) -> "DeviceView":
@@ -37,6 +39,7 @@ class DeviceView:
             None if path is None else tensor(path),
             index,
             torch.tensor([index], device=device),
+            *matrices([view.camera], device),
         )
 
 

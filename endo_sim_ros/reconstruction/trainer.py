@@ -133,7 +133,7 @@ class Trainer:
         """Mean photometric loss of the training views at pixels [H, W] (bool) of each, such as their masks leave out."""
         total, count = 0.0, 0
         for view, chosen in zip(self._device_views, pixels, strict=True):
-            output = self.render(*matrices([view.camera], self.device), (view.camera.width, view.camera.height), path=view.path)[1]
+            output = self.render(view.viewmats, view.Ks, (view.camera.width, view.camera.height), path=view.path)[1]
             rays = directions(view.camera, self.device) if self.config.light else None
             color = self._exposed(output, rays, view.index_tensor)
             where = torch.tensor(chosen, device=self.device)
@@ -214,7 +214,7 @@ class Trainer:
         """The light and what it leaves of the views' exposures [V, 3]."""
         if self._fitted is None or self._fitted[0] != self.iteration:
             size = lambda camera: (camera.width, camera.height)
-            look = lambda view: self.render(*matrices([view.camera], self.device), size(view.camera), path=view.path)[1]
+            look = lambda view: self.render(view.viewmats, view.Ks, size(view.camera), path=view.path)[1]
             self._fitted = self.iteration, *self.appearance.fitted(self._device_views, look)
         return self._fitted[1:]
 
@@ -297,7 +297,7 @@ class Trainer:
         return first.at(interpolate_pose(first.pose, second.pose, alpha))
 
     def _inputs(self, view: DeviceView, virtual: Camera | None, terms: tuple[losses.Term, ...]) -> _Inputs:
-        viewmats, Ks = matrices([view.camera] if virtual is None else [view.camera, virtual], self.device)
+        viewmats, Ks = (view.viewmats, view.Ks) if virtual is None else matrices([view.camera, virtual], self.device)
         virtual_prior = None
         if virtual is not None and view.prior is not None and any(term.of_virtual and term.needs_prior for term in terms):
             virtual_prior = reprojected_prior(view.prior, view.camera, viewmats[1])
@@ -392,8 +392,12 @@ class Trainer:
         self._strategy_state = self._strategy.initialize_state(len(model), self.device)
         # Of each Gaussian, 0 where an iteration leaves it out, else what makes up for those; a captured step reads what it is by then.
         self._kept = torch.ones(len(model), device=self.device) if self.config.dropout else None
-        counts = self.config.lambda_opacity or self.config.lambda_scale
-        self._seen = self._seen_by_views(model.means) if counts else torch.ones(len(model), device=self.device)
+        self._seen = self._seen_by_views(model.means) if self._fades else torch.ones(len(model), device=self.device)
+
+    @property
+    def _fades(self) -> bool:
+        """Whether opacity and size of Gaussians have a weight within what the views show."""
+        return bool(self.config.lambda_opacity or self.config.lambda_scale)
 
     @torch.no_grad()
     def _seen_by_views(self, means: Tensor) -> Tensor:
@@ -408,17 +412,30 @@ class Trainer:
         # Without a matrix product: libraries give other last bits with other numbers of threads.
         return means if path is None else means + (self._shares[..., None] * path).sum(1)
 
+    @torch.no_grad()
     def refine(self) -> None:
         """Add, move and remove Gaussians, keeping the optimiser's state of those that stay."""
         model, source, fresh = self._strategy.refine(self._detached(), self._strategy_state, self._generator, self.iteration)
-        states = self.optimizer.state
-        self._shares = self._shares[source]
-        self._set_model(model)
-        for name, state in states.items():
-            moved = {key: value[source] if value.ndim else value for key, value in state.items()}
+        states = {}
+        for name, state in self.optimizer.state.items():
+            states[name] = {key: value[source] if value.ndim else value for key, value in state.items()}
             for key in ("exp_avg", "exp_avg_sq"):
-                moved[key][fresh] = 0
-            self.optimizer.state[name] = moved
+                states[name][key][fresh] = 0
+        shares = self._shares[source]
+        if len(source) != len(self.parameters["means"]):
+            self._shares = shares
+            self._set_model(model)
+            self.optimizer.state.update(states)
+            return
+        # As many as before go where captured steps find them: to capture those anew takes as long as dozens of them.
+        self._shares.copy_(shares)
+        changed = [(self.parameters, parameters_of(model)), *((self.optimizer.state[name], state) for name, state in states.items())]
+        changed.append((self._strategy_state, self._strategy.initialize_state(len(model), self.device)))
+        for old, new in changed:
+            for name, tensor in old.items():
+                tensor.copy_(new[name])
+        if self._fades:
+            self._seen.copy_(self._seen_by_views(model.means))
 
     def _load(self, views: Sequence[TrainingView]) -> None:
         """Train on these from now on."""

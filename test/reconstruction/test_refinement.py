@@ -89,3 +89,22 @@ def test_optimiser_state_follows_its_gaussians(small):
     torch.testing.assert_close(state()["exp_avg"][: len(means)][kept], moments[kept])
     assert float(state()["step"]) == 3
     trainer.step()
+
+
+@pytest.mark.slow
+def test_as_many_gaussians_as_before_stay_where_captured_steps_find_them(small):
+    trainer = trainer_of([small[0], small[8]], options(refine_every=1000, max_gaussians=1500))
+    held = lambda: [*trainer.parameters.values(), *(x for state in trainer.optimizer.state.values() for x in state.values())]
+    places = lambda: [tensor.data_ptr() for tensor in held()]
+    trainer.step()
+    while len(trainer.model) < 1500:
+        trainer.refine()
+    full, means = places(), trainer.model.means.clone()
+    with torch.no_grad():
+        trainer.parameters["logit_opacities"][:7] = -8
+    trainer.refine()
+    assert len(trainer.model) == 1500 and places() == full
+    assert (trainer.model.means[:7] != means[:7]).any(1).all(), "the dead have moved"
+    assert trainer.parameters["logit_opacities"][:7].min() > -8
+    assert not trainer.optimizer.state["means"]["exp_avg"][:7].any()
+    trainer.step()

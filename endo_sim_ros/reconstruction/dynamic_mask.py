@@ -23,6 +23,7 @@ class _Small(NamedTuple):
     camera: Camera
     image: np.ndarray  # [H, W, 3] RGB, uint8
     depth: np.ndarray  # [H, W] m, 0 = none
+    filled: np.ndarray  # [H, W] m, as deep in holes as beside them
     tissue: np.ndarray  # [H, W] float32, 1 or 0
 
 
@@ -41,7 +42,7 @@ def mask_motion(
         progress: Reported to by views.
     """
     near = nearest_views(views, 3)  # two of which must contradict
-    small = [None if view.depth_prior is None else _small(view, options) for view in views]
+    small = progress.map(lambda view: None if view.depth_prior is None else _small(view, options), views)
 
     def moved(i: int) -> np.ndarray | None:
         own, others = small[i], [other for j in near[i] if (other := small[j]) is not None]
@@ -76,17 +77,17 @@ def _small(view: TrainingView, options: DynamicMaskConfig) -> _Small:
     nearest = lambda array: cv2.resize(array, size, interpolation=cv2.INTER_NEAREST_EXACT)
     # Smoothed over a pixel and a half, what poses and depth leave off.
     image = cv2.GaussianBlur(cv2.resize(view.image, size, interpolation=cv2.INTER_AREA), (0, 0), 1.5)
-    return _Small(camera, image, nearest(view.surface), nearest(view.tissue))
+    depth = nearest(view.surface)
+    # In a hole something may hide that has no depth: let it be as deep as what is beside it.
+    return _Small(camera, image, depth, fill_holes(depth)[0] if depth.any() else depth, nearest(view.tissue))
 
 
 def _verdict(view: _Small, other: _Small, tolerance: float, options: DynamicMaskConfig) -> np.ndarray:
     """1 where another view contradicts a view [H, W], -1 where it agrees, 0 where it sees nothing of it."""
     known = view.depth > 0
-    # In a hole something may hide that has no depth: let it be as deep as what is beside it.
-    depth, _ = fill_holes(view.depth)
-    uv, z = other.camera.project(view.camera.backproject(depth).reshape(-1, 3))
-    u, v = ((uv - 0.5).T.reshape(2, *depth.shape)).astype(np.float32)  # OpenCV counts from the centre of the first pixel
-    z = z.reshape(depth.shape)
+    uv, z = other.camera.project(view.camera.backproject(view.filled).reshape(-1, 3))
+    u, v = ((uv - 0.5).T.reshape(2, *known.shape)).astype(np.float32)  # OpenCV counts from the centre of the first pixel
+    z = z.reshape(known.shape)
     look = lambda array, how: cv2.remap(array, u, v, how, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
     surface = look(other.depth, cv2.INTER_NEAREST)
     seen = (z > 0) & (surface > 0) & (view.tissue > 0) & (look(other.tissue, cv2.INTER_NEAREST) > 0)

@@ -14,7 +14,7 @@ from endo_sim_ros.core.reflections import cosines, unlit
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.stage_configs import GlossConfig
 
-_PART = 10_000  # points whose normals are told together
+_PART = 2000  # points whose normals are told together, by one core
 
 
 def lobes(options: GlossConfig) -> Light:

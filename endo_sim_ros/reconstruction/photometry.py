@@ -184,12 +184,15 @@ def _solve(
     points = max(len(np.unique(index)), 1)
     trust = min(300 / points, 1) / noise**2  # neighbouring points err alike: no more than this many are worth counting
     weights, x = np.ones(len(y)), prior
+    groups: Any = sparse.csr_matrix((np.ones(len(y)), (index, np.arange(len(y)))), (count, len(y)))  # sums over each point's own
+    entries = np.diff(A.indptr)
     for _ in range(10):
         progress.check()
         total = np.bincount(index, weights, count).clip(1e-9)
         about = lambda values: (np.bincount(index, weights * values, count) / total)[index]  # noqa: B023
-        by_point: Any = sparse.csr_matrix((weights, (index, np.arange(len(y)))), (count, len(y))) @ A
-        weighted = A.multiply(weights[:, None]).tocsr()
+        weighted = A.copy()
+        weighted.data *= np.repeat(weights, entries)
+        by_point = groups @ weighted
         normal = (A.T @ weighted - by_point.T @ by_point.multiply(1 / total[:, None]).tocsr()).toarray()
         rest = y - about(y)
         normal, right = trust * normal + np.diag(1 / spread**2), trust * (weighted.T @ rest) + prior / spread**2

@@ -71,5 +71,6 @@ class StageProgress:
             wait([future for future in futures if not future.cancelled()], timeout=0.5)
             raise
         pool.shutdown()
-        return_freed_memory()  # of threads that have ended
+        if len(items) > cpu_threads():  # of few things little is freed, and to take it anew costs more than some stages
+            return_freed_memory()  # of threads that have ended
         return [future.result() for future in futures]

@@ -73,7 +73,7 @@ def scene_points(
 
 
 def points_in_view(
-    camera: Camera, points: np.ndarray, options: MatchingConfig = MatchingConfig(), where: np.ndarray | None = None
+    camera: Camera, points: np.ndarray, options: MatchingConfig = MatchingConfig(), where: np.ndarray | None = None, threads: int = 1
 ) -> tuple[np.ndarray, np.ndarray]:
     """Pixels [M, 2] and depths [M] (m) of those of the points [N, 3] (m, world) that lie in a view, or in some of its pixels [H, W].
 
@@ -87,16 +87,18 @@ def points_in_view(
         agrees = _like_those_around(uv, z, options)
     else:
         columns, rows = np.floor(uv).astype(int).T
-        agrees = _like_those_around(uv, z, options, where[rows, columns])
+        agrees = _like_those_around(uv, z, options, where[rows, columns], threads)
     return uv[agrees], z[agrees]
 
 
-def _like_those_around(uv: np.ndarray, z: np.ndarray, options: MatchingConfig, which: np.ndarray | None = None) -> np.ndarray:
+def _like_those_around(
+    uv: np.ndarray, z: np.ndarray, options: MatchingConfig, which: np.ndarray | None = None, threads: int = 1
+) -> np.ndarray:
     """Which of the points at pixels [N, 2], or of some [N], have a depth [N] like that of the eight around them; none of too few."""
     alike = np.zeros(len(uv), bool)
     chosen = np.arange(len(uv)) if which is None else np.flatnonzero(which)
     if len(uv) > 8 and len(chosen):
-        around = z[cKDTree(uv).query(uv[chosen], k=9)[1][:, 1:]]
+        around = z[cKDTree(uv).query(uv[chosen], k=9, workers=threads)[1][:, 1:]]
         alike[chosen] = np.abs(np.median(around, axis=1) / z[chosen] - 1) < options.outlier_depth
     return alike
 

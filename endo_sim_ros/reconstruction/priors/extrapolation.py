@@ -14,6 +14,7 @@ import torch
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (it is public)
 
 from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.device import cpu_threads
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import features_at
 from endo_sim_ros.reconstruction.priors.interpolation import clip_to_range, fit_plane, inverse_distance_weighted, krige
@@ -79,31 +80,37 @@ def extrapolate(
     colors, spacings = [], []
     known = [view.depth_prior is not None and (view.depth_prior > 0).mean() >= options.min_coverage for view in views]
     usable = [index for index, view in enumerate(views) if known[index] and view.tissue.any()]
+    threads = max(cpu_threads() // max(len(usable), 1), 1)  # for each view: few leave cores idle
 
     def around(index: int) -> tuple[_Guess, _Guess]:
         view = shrink(views[index], round(_FINENESS / interpolation.cell))
         pad = int(reach * view.camera.width)
-        continued = continue_view(view, points, light, exposures[index], reference, pad, interpolation, device)
+        continued = continue_view(view, points, light, exposures[index], reference, pad, interpolation, device, threads)
         positions = continued.camera.backproject(continued.depth)
-        on_lattice = lambda times: _on_lattice(view, continued, positions, times * interpolation.cell)
-        return _unknown(on_lattice(1.0), views), _unknown(on_lattice(1.5), views)
 
+        def guess(times: float) -> _Guess:
+            unknown = _unknown(_on_lattice(view, continued, positions, times * interpolation.cell), views)
+            new = _beside(seen, unknown.positions, unknown.spacing)
+            return _Guess(*(values[new] for values in unknown))
+
+        return guess(1.0), guess(1.5)
+
+    seen = cKDTree(parts[0])
     guesses = progress.map(around, usable)
     width = 4 * interpolation.cell
-    rings = range(math.ceil(reach / width))
+    rings, tree_of = range(math.ceil(reach / width)), lambda parts: cKDTree(np.concatenate([np.empty((0, 3)), *parts]))
     # Holes, then outwards around all views at a time, since what is close to one picture and far from another is told by the former.
     for ring in (-1, *rings):
         least, most = ring * width, np.inf if ring == rings[-1] else (ring + 1) * width
-        before, of_ring = cKDTree(np.concatenate(parts)), []
+        before, of_ring = tree_of(parts[1:]), []
         for fine, coarse in guesses:
             progress.check()
             guess = fine if least < options.fine_reach else coarse
             chosen = (guess.away > least) & (guess.away <= most)
             positions, spacing = guess.positions[chosen], guess.spacing[chosen]
             new = np.ones(len(positions), bool)
-            trees = [before, cKDTree(np.concatenate(of_ring))] if of_ring else [before]
-            for tree in trees:
-                new[new] = tree.query(positions[new])[0] > 0.7 * spacing[new]
+            for tree in (before, tree_of(of_ring)):
+                new[new] = _beside(tree, positions[new], spacing[new])
             of_ring.append(positions[new])
             colors.append(guess.colors[chosen][new])
             spacings.append(spacing[new])
@@ -129,6 +136,7 @@ def continue_view(
     pad: int,
     interpolation: InterpolationConfig = InterpolationConfig(),
     device: str = "cpu",
+    threads: int = 1,
 ) -> ContinuedView:
     """The view with a margin of so many pixels, and depth and colour wherever it has none.
 
@@ -140,6 +148,7 @@ def continue_view(
         pad: Width of the margin, pixels.
         interpolation: How depth and colour are continued.
         device: Where depth is.
+        threads: How many look for neighbours.
     """
     K = view.camera.K.copy()
     K[:2, 2] += pad
@@ -152,13 +161,13 @@ def continue_view(
     plane = a * np.arange(camera.width) + b * np.arange(camera.height)[:, None] + c  # what departs from it fades
     residual = np.zeros(depth.shape, np.float32)
     residual[known] = inverse - plane[known]
-    uv, z = points_in_view(camera, points, where=~known)
+    uv, z = points_in_view(camera, points, where=~known, threads=threads)
     columns, rows = np.floor(uv).astype(int).T
     point_inverse = 1 / z
     point_residual = point_inverse - plane[rows, columns]
     if len(point_residual) > 8:  # the median of a point and those around: one wrong point would stand like a pillar before the tissue
         point_residual = np.median(point_residual[cKDTree(uv).query(uv, k=9)[1]], 1)
-    residual = krige(residual, known, uv, point_residual, view.camera.width, interpolation, device)
+    residual = krige(residual, known, uv, point_residual, view.camera.width, interpolation, device, threads)
     depth = 1 / clip_to_range(plane + residual, np.concatenate([inverse, point_inverse]), interpolation)
     shading = features_at(camera.backproject(depth).reshape(-1, 3), camera, reference) * light
     near, lit = np.exp(shading[:, 0]).reshape(depth.shape), np.exp(shading[:, 1:].sum(1)[:, None] + exposure).reshape(image.shape)
@@ -179,6 +188,11 @@ def _on_lattice(view: TrainingView, continued: ContinuedView, positions: np.ndar
     lattice[stride // 2 :: stride, stride // 2 :: stride] = True
     lattice &= np.pad(view.surface, (camera.width - width) // 2) <= 0
     return _Guess(positions[lattice], colors[lattice], stride * depth[lattice] / camera.K[0, 0], away[lattice] / width)
+
+
+def _beside(tree: cKDTree, positions: np.ndarray, spacing: np.ndarray) -> np.ndarray:
+    """Which positions [N, 3] are not where points of a tree are already [N], given the spacing [N] of Gaussians there."""
+    return tree.query(positions)[0] > 0.7 * spacing
 
 
 def _unknown(guess: _Guess, views: Sequence[TrainingView]) -> _Guess:

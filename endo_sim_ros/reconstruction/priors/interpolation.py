@@ -22,6 +22,7 @@ def krige(
     width: int,
     options: InterpolationConfig = InterpolationConfig(),
     device: str = "cpu",
+    threads: int = 1,
 ) -> np.ndarray:
     """Values [H, W] where known [H, W]; elsewhere the likeliest, by kriging with a linear variogram.
 
@@ -33,6 +34,7 @@ def krige(
         width: Of the picture, pixels; the options' lengths are in units of it.
         options: Size of the cells, errors, and number of neighbours that tell a value.
         device: Where the systems of equations are solved.
+        threads: How many look for neighbours.
     """
     side = max(round(options.cell * width), 1)
     count, means = _in_cells(values[..., None], known, side)
@@ -42,13 +44,15 @@ def krige(
     sources = np.concatenate([centres[occupied], uv / side])
     errors: Any = np.repeat([options.pixel_error, options.point_error], [occupied.sum(), len(uv)]) * width / side
     source_values = np.concatenate([means[occupied], point_values])
-    means[~occupied] = _kriged(sources, source_values, errors, centres[~occupied], options.neighbours, device)
+    means[~occupied] = _kriged(sources, source_values, errors, centres[~occupied], options.neighbours, device, threads)
     return np.where(known, values, _in_pixels(means, side, known.shape))
 
 
-def _kriged(sources: np.ndarray, values: np.ndarray, errors: np.ndarray, targets: np.ndarray, count: int, device: str) -> np.ndarray:
+def _kriged(
+    sources: np.ndarray, values: np.ndarray, errors: np.ndarray, targets: np.ndarray, count: int, device: str, threads: int
+) -> np.ndarray:
     """Values at targets [M, 2] from the nearest of sources [N, 2], whose values [N] and errors [N] are given."""
-    nearest = cKDTree(sources).query(targets, k=range(1, min(count, len(sources)) + 1))[1]
+    nearest = cKDTree(sources).query(targets, k=range(1, min(count, len(sources)) + 1), workers=threads)[1]
     sets = torch.from_numpy(np.sort(nearest, 1)).to(device)
     chosen, group = torch.unique(sets, dim=0, return_inverse=True)  # targets side by side mostly have the same
     at, given, variances, wanted = (torch.from_numpy(array).to(device, torch.float64) for array in (sources, values, errors, targets))

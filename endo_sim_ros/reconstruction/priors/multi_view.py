@@ -56,12 +56,13 @@ def refine_depth(
         progress: Reported to by views.
     """
     views = list(views)
+    free = return_freed_memory if len(views) > cpu_threads() else lambda: None  # of few there is little
     prepare_smoothing(device)
     near, priors = nearest_views(views, options.neighbours), [view.depth_prior for view in views]
     pairs: list[tuple[EyeImage, EyeImage, float] | None] = [None] * len(views)
 
     def look(i: int) -> EyeImage:
-        return_freed_memory()  # of the view before
+        free()  # what the view before took
         view, image = views[i], eye_image(views[i], options)
         if source == "stereo" and view.right is not None:
             assert view.baseline is not None
@@ -100,7 +101,7 @@ def refine_depth(
         return np.where(good, 1 / np.where(good, inverse, 1), 0).astype(np.float32)
 
     def refine(i: int) -> None:
-        return_freed_memory()
+        free()
         depth, camera = corrected(i), views[i].camera
         depth = None if depth is None else resized_depth(depth, camera.width, camera.height)
         views[i] = dataclasses.replace(views[i], depth_prior=depth)

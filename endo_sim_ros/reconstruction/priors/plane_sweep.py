@@ -169,7 +169,9 @@ def _sweep(
 
 def _speed(camera: Camera, other: Camera, inverse: float) -> float:
     """By how many pixels another view's picture moves for each 1/m of inverse depth, about the one given; median over the picture."""
-    points = lambda value: camera.backproject(np.full((camera.height, camera.width), 1 / value))[::32, ::32].reshape(-1, 3)
+    v, u = (np.arange(0, size, 32) + 0.5 for size in (camera.height, camera.width))
+    some = np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)
+    points = lambda value: camera.unproject(some, np.full(len(some), 1 / value))
     moved = other.project(points(1.01 * inverse))[0] - other.project(points(inverse))[0]
     return float(np.median(np.hypot(*moved.T))) / (0.01 * inverse)
 

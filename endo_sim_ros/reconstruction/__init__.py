@@ -7,6 +7,7 @@ from endo_sim_ros.core.lazy import lazy_names
 if TYPE_CHECKING:
     from endo_sim_ros.reconstruction.config import ReconstructionConfig as ReconstructionConfig
     from endo_sim_ros.reconstruction.keyframes import choose_views as choose_views, select_keyframes as select_keyframes
+    from endo_sim_ros.reconstruction.motion_watch import MotionWatch as MotionWatch
     from endo_sim_ros.reconstruction.pipeline import prepare as prepare, reconstruct as reconstruct
     from endo_sim_ros.reconstruction.presets import ABLATIONS as ABLATIONS, PRESETS as PRESETS, preset as preset
     from endo_sim_ros.reconstruction.progress import Cancelled as Cancelled, OnProgress as OnProgress

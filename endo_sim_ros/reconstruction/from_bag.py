@@ -71,8 +71,7 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
         known = read_points(bag)
         given = ScenePoints.recorded(*known) if known else None
         if config.watch_motion:
-            bar.update(task, description="looking for breath and heartbeat")
-            motion, text = watch.found()
+            motion, text = watch.found(StageProgress("breath and heartbeat", on_stage))
             log.info(text)
             if motion is not None:
                 watched = sum(view.stamp_ns <= 1e9 * motion.end + 1000 for view in views)

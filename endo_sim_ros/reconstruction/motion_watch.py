@@ -10,6 +10,7 @@ import numpy as np
 from endo_sim_ros.core.features import follow
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.tissue_motion import PeriodicMotion, TissueMotion, waves
+from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.stage_configs import MotionSearchConfig
 
 _RIDGE = 0.02  # metres: how far tissue moves; only what rays do not see of a motion is bound by it
@@ -104,8 +105,12 @@ class MotionWatch:
                 track.right += [np.full(2, np.nan)] * (len(track.left) - 1 - len(track.right)) + [place if kept else np.full(2, np.nan)]
         self._before = image
 
-    def found(self) -> tuple[TissueMotion | None, str]:
-        """The motion, breath before heart, and a sentence that says so or why nothing can be told."""
+    def found(self, progress: StageProgress = StageProgress()) -> tuple[TissueMotion | None, str]:
+        """The motion, breath before heart, and a sentence that says so or why nothing can be told.
+
+        Raises:
+            Cancelled: If the progress does.
+        """
         options, times = self.options, np.array(self._times)
         length = float(np.ptp(times)) if len(times) else 0.0
         if length < options.least_cycles * options.shortest_beat or len(times) < 10:
@@ -113,7 +118,7 @@ class MotionWatch:
         lenses = np.array([pose[:3, 3] for pose, *_ in self._eyes])
         if not self._baseline and np.ptp(lenses, axis=0).max() < options.least_travel:
             return None, "whether the tissue moves by itself cannot be told: one lens that stays where it is sees no depth"
-        rays = _Rays.of(self._ended + self._tracks, times, self._eyes, self._baseline, options)
+        rays = _Rays.of(self._ended + self._tracks, times, self._eyes, self._baseline, options, progress)
         if rays is None:
             return None, "whether the tissue moves by itself cannot be told: too few points could be followed for long"
         searched = rays.first(options.points)
@@ -158,6 +163,15 @@ class _Seen(NamedTuple):
     sure: bool = False
 
 
+class _Drift(NamedTuple):
+    """A cosine series that each of N points follows as it likes."""
+
+    basis: np.ndarray  # [T, D]
+    held: np.ndarray  # inverse of what the rays tell of it, and of what is known before [N, 3 D, 3 D], m²
+    loose: np.ndarray  # what is known before [3 D], 1/m²
+    side: np.ndarray  # [N, 3 D], 1/m
+
+
 @dataclass(frozen=True)
 class _Rays:
     """What is seen of N tracks: normal equations of each observation, in pixels."""
@@ -168,9 +182,12 @@ class _Rays:
     sides: np.ndarray  # [N, T, 3], these times the lenses' positions
     squares: np.ndarray  # [N, T]
     counts: np.ndarray  # [N] observed coordinates
+    progress: StageProgress  # is asked whether to go on
 
     @classmethod
-    def of(cls, tracks: list[_Track], times: np.ndarray, eyes: list, baseline: float, options: MotionSearchConfig) -> "_Rays | None":
+    def of(
+        cls, tracks: list[_Track], times: np.ndarray, eyes: list, baseline: float, options: MotionSearchConfig, progress: StageProgress
+    ) -> "_Rays | None":
         """Of the longest tracks, longest first; None of too few."""
         least = 2 * options.shortest_breath * options.rate
         tracks = sorted((track for track in tracks if len(track.left) >= least), key=lambda track: -len(track.left))[
@@ -181,16 +198,17 @@ class _Rays:
         shape = len(tracks), len(times)
         planes, sides, squares = np.zeros((*shape, 3, 3)), np.zeros((*shape, 3)), np.zeros(shape)
         counts, middles, ahead = np.zeros(len(tracks)), np.zeros((len(tracks), 3)), np.zeros(len(tracks), bool)
+        poses, lefts, rights = map(np.array, zip(*eyes))
         for n, track in enumerate(tracks):
-            numbers = range(track.first, track.first + len(track.left))
-            seen = []
-            for k, number in enumerate(numbers):
-                pose, K, right_K = eyes[number]
-                seen.append((number, pose[:3, 3], _ray(track.left[k], pose, K), K[0, 0]))
-                if k < len(track.right) and np.isfinite(track.right[k]).all():
-                    seen.append((number, pose[:3, 3] + baseline * pose[:3, 0], _ray(track.right[k], pose, right_K), right_K[0, 0]))
-            each = np.array([number for number, *_ in seen])
-            origins, directions, focal = (np.array(x) for x in list(zip(*seen))[1:])
+            progress.check()
+            numbers = track.first + np.arange(len(track.left))
+            beside = np.array(track.right, np.float64).reshape(-1, 2)
+            both = np.flatnonzero(np.isfinite(beside).all(1))
+            each = np.concatenate([numbers, numbers[both]])
+            pixels = np.concatenate([np.array(track.left, np.float64), beside[both]])
+            K = np.concatenate([lefts[numbers], rights[numbers[both]]])
+            directions, focal = _directions(pixels, poses[each], K), K[:, 0, 0]
+            origins = poses[each, :3, 3] + baseline * poses[each, :3, 0] * (np.arange(len(each)) >= len(numbers))[:, None]
             across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
             normal = across.sum(0) + 1e-6 * np.eye(3)
             middles[n] = np.linalg.solve(normal, np.einsum("kij,kj->i", across, origins))
@@ -201,13 +219,14 @@ class _Rays:
             against = np.einsum("kij,kj->ki", across, origins)
             np.add.at(sides[n], each, weights[:, None] * against)
             np.add.at(squares[n], each, weights * np.einsum("ki,ki->k", against, origins))
-            counts[n] = 2 * len(seen)
-        found = cls(times - times[0], *(x[ahead] for x in (middles, planes, sides, squares, counts)))
+            counts[n] = 2 * len(each)
+        found = cls(times - times[0], *(x[ahead] for x in (middles, planes, sides, squares, counts)), progress=progress)
         return found if ahead.sum() >= 10 else None
 
     def first(self, count: int) -> "_Rays":
         """Of the first tracks alone."""
-        return _Rays(self.times, *(x[:count] for x in (self.middles, self.planes, self.sides, self.squares, self.counts)))
+        values = (x[:count] for x in (self.middles, self.planes, self.sides, self.squares, self.counts))
+        return _Rays(self.times, *values, progress=self.progress)
 
     def less(self, moved: np.ndarray) -> "_Rays":
         """As if points had not moved by [N, T, 3], m."""
@@ -237,6 +256,37 @@ class _Rays:
         """Cosine series of so many terms [T, D], the first of which is one."""
         return np.cos(np.pi * np.outer(self.times / self.times[-1], np.arange(drift)))
 
+    def _drifting(self, drift: int) -> "_Drift":
+        """What a search of rates needs of drift by so many terms, which are many more than those of a motion."""
+        slow, count = self._slow(drift), len(self.counts)
+        free = np.einsum("ta,tb,ntij->naibj", slow, slow, self.planes, optimize=True).reshape(count, 3 * drift, 3 * drift)
+        loose = self._loose(drift, 0)
+        side = np.einsum("ta,nti->nai", slow, self.sides).reshape(count, -1)
+        return _Drift(slow, np.linalg.inv(free + np.diag(loose)), loose, side)
+
+    def _beside(self, basis: np.ndarray, slow: "_Drift") -> np.ndarray:
+        """Terms of the normal equations between a motion of this basis [T, B] and drift [N, 3 B, 3 D]."""
+        terms = np.einsum("tk,ta->tka", basis, slow.basis).reshape(len(basis), -1)
+        planes = self.planes.transpose(0, 2, 3, 1).reshape(-1, len(basis))
+        cross = (planes @ terms).reshape(len(self.counts), 3, 3, basis.shape[1], -1)
+        return cross.transpose(0, 3, 1, 4, 2).reshape(len(cross), 3 * basis.shape[1], -1)
+
+    def _left_over(self, rate: float, harmonics: int, slow: "_Drift") -> np.ndarray:
+        """What `solved` leaves over, with the drift eliminated (Schur's complement)."""
+        self.progress.check()
+        basis = waves(self.times * rate, self._told(rate, harmonics))
+        count, size = len(self.counts), 3 * basis.shape[1]
+        loose = self._loose(1, basis.shape[1])[3:]
+        normal = np.einsum("ta,tb,ntij->naibj", basis, basis, self.planes, optimize=True).reshape(count, size, size) + np.diag(loose)
+        side = np.einsum("ta,nti->nai", basis, self.sides).reshape(count, size, 1)
+        cross, theirs = self._beside(basis, slow), slow.side[..., None]
+        through = cross @ slow.held
+        found = np.linalg.solve(normal - through @ cross.swapaxes(1, 2), side - through @ theirs)
+        drift = slow.held @ (theirs - cross.swapaxes(1, 2) @ found)
+        pairs = ((found, side, loose), (drift, theirs, slow.loose))
+        explained = sum((x * (by + bound[:, None] * x)).sum((1, 2)) for x, by, bound in pairs)
+        return (self.squares.sum(1) - explained).clip(0) / (self.counts - size - len(slow.loose)).clip(1)
+
     def _loose(self, drift: int, others: int) -> np.ndarray:
         """What is known of the coefficients of so many terms before anything is seen [3 · terms], 1/m²."""
         # A motion along the only ray to a point is not seen; it is taken to be none.
@@ -258,8 +308,9 @@ class _Rays:
         """
         if longest <= shortest:
             return _Seen(name, drift, harmonics)
-        left_over = lambda rate: self.solved(rate, harmonics, drift)[2]
-        before = left_over(None)
+        slow = self._drifting(drift)
+        left_over = lambda rate: self._left_over(rate, harmonics, slow)
+        before = self.solved(None, harmonics, drift)[2]
         rates = np.linspace(1 / longest, 1 / shortest, max(int(3 * self.times[-1] * (1 / shortest - 1 / longest)), 3))
         power = np.array([_explained(before, left_over(rate)) for rate in rates])
         peak = int(power.argmax())
@@ -286,7 +337,7 @@ class _Rays:
         Returns:
             Its rate, its way [2 H, 3] (m), the shares [N] and the points' means [N, 3], m from `middles`.
         """
-        way, shares, n = np.zeros(0), np.ones(len(self.counts)), 3 * drift
+        way, shares, n, slow = np.zeros(0), np.ones(len(self.counts)), 3 * drift, self._drifting(drift)
         harmonics = self._told(1.1 * rate, harmonics)  # whatever it is refined to
         for _ in range(_TURNS):
             found, told, left = self.solved(rate, harmonics, drift)
@@ -299,27 +350,23 @@ class _Rays:
                 shares = (seen * found[:, n:]).sum(1) / (seen @ way).clip(1e-12)
                 weighted = shares[:, None, None] * free
                 way = np.linalg.solve(np.einsum("n,nab->ab", shares, weighted), np.einsum("nab,nb->a", weighted, found[:, n:]))
-            rate = _refined(lambda rate: -self._left_together(rate, harmonics, drift, shares, left), rate, 0.05 / self.times[-1])
+            rate = _refined(lambda rate: -self._left_together(rate, harmonics, slow, shares, left), rate, 0.05 / self.times[-1])
         others = told[:, :n, n:] @ (shares[:, None] * way - found[:, n:])[..., None]
         means = (found[:, :n] - np.linalg.solve(told[:, :n, :n], others)[..., 0])[:, :3]
         scale = np.quantile(np.abs(shares), 0.95) * (1 if np.median(shares) >= 0 else -1)
         return rate, (scale * way).reshape(-1, 3), (shares / scale).clip(-_MOST, _MOST), means
 
-    def _left_together(self, rate: float, harmonics: int, drift: int, shares: np.ndarray, left: np.ndarray) -> float:
+    def _left_together(self, rate: float, harmonics: int, slow: "_Drift", shares: np.ndarray, left: np.ndarray) -> float:
         """Squares, less a constant, left over where points go shares [N] of the best way; each weighs less the more is `left` [N] of it."""
-        basis = waves(self.times * rate, harmonics)
-        weights = 1 / (left + np.median(left))
-        slow, count = self._slow(drift), len(shares)
-        free = np.einsum("ta,tb,ntij->naibj", slow, slow, self.planes, optimize=True).reshape(count, 3 * drift, 3 * drift)
-        held = np.linalg.inv(free + np.diag(self._loose(drift, 0)))  # [N, 3 D, 3 D]
-        cross = np.einsum("tk,ta,ntij->nkiaj", basis, slow, self.planes, optimize=True).reshape(count, -1, 3 * drift)
-        cross = shares[:, None, None] * cross
-        theirs = np.einsum("ta,nti->nai", slow, self.sides).reshape(count, -1)
+        self.progress.check()
+        basis, weights = waves(self.times * rate, harmonics), 1 / (left + np.median(left))
+        cross = shares[:, None, None] * self._beside(basis, slow)
         side = shares[:, None] * np.einsum("tk,nti->nki", basis, self.sides).reshape(len(shares), -1)
         alike = np.einsum("n,ntij->tij", weights * shares**2, self.planes)
         normal = np.einsum("tk,tl,tij->kilj", basis, basis, alike, optimize=True).reshape(side.shape[1], -1)
-        normal = normal - np.einsum("n,nai,nij,nbj->ab", weights, cross, held, cross, optimize=True)
-        right = (weights[:, None] * (side - np.einsum("nai,nij,nj->na", cross, held, theirs, optimize=True))).sum(0)
+        through = weights[:, None, None] * cross @ slow.held
+        normal = normal - (through @ cross.swapaxes(1, 2)).sum(0)
+        right = (weights[:, None] * side - (through @ slow.side[..., None])[..., 0]).sum(0)
         return -float(right @ np.linalg.solve(normal, right))
 
     def moved(self, seen: "_Seen") -> np.ndarray:
@@ -342,10 +389,11 @@ class _Rays:
         return TissueMotion(start, self.middles + means, tuple(parts))
 
 
-def _ray(pixel: np.ndarray, pose: np.ndarray, K: np.ndarray) -> np.ndarray:
-    """Unit direction [3], world, of a pixel whose index counts from the centre of the first."""
-    direction = pose[:3, :3] @ np.array([(pixel[0] + 0.5 - K[0, 2]) / K[0, 0], (pixel[1] + 0.5 - K[1, 2]) / K[1, 1], 1.0])
-    return direction / np.linalg.norm(direction)
+def _directions(pixels: np.ndarray, poses: np.ndarray, K: np.ndarray) -> np.ndarray:
+    """Unit directions [k, 3], world, of pixels [k, 2] whose indices count from the centre of the first, in cameras [k, 4, 4], [k, 3, 3]."""
+    x, y = ((pixels[:, i] + 0.5 - K[:, i, 2]) / K[:, i, i] for i in (0, 1))
+    directions = (poses[:, :3, :3] @ np.stack([x, y, np.ones(len(x))], 1)[..., None])[..., 0]
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
 def _explained(before: np.ndarray, after: np.ndarray) -> float:

@@ -94,11 +94,12 @@ def reconstruct(
     config: ReconstructionConfig,
     points: ScenePoints | tuple | None = None,
     on_progress: OnProgress | None = None,
+    motion: TissueMotion | None = None,
 ) -> GaussianModel:
     """The trained model of posed frames; `prepare` and `Trainer` in one. Arguments and errors are those of `prepare`."""
     for text in unused_options(config):
         log.warning(text)
-    trainer = Trainer(prepare(frames, config, points, on_progress), config)
+    trainer = Trainer(prepare(frames, config, points, on_progress, motion), config)
     return trainer.run(on_progress and (lambda progress: on_progress("training", progress.iteration, progress.iterations)))
 
 

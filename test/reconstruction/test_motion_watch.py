@@ -14,8 +14,9 @@ from endo_sim_ros.core.motion import beat_share, breath_share
 from endo_sim_ros.core.tissue_motion import MovingModel, TissueMotion
 from endo_sim_ros.evaluation.held_out import model_renderer
 from endo_sim_ros.evaluation.metrics import psnr
-from endo_sim_ros.reconstruction import Trainer, prepare
+from endo_sim_ros.reconstruction import Cancelled, Trainer, prepare, reconstruct
 from endo_sim_ros.reconstruction.motion_watch import MotionWatch
+from endo_sim_ros.reconstruction.progress import StageProgress
 
 DEPTH, BASELINE, RATE = 0.1, 0.005, 12.5  # m, m, Hz
 SLIDES, KNOCKS = np.array([0.8, 0.5, -0.4]), np.array([0.2, 0.1, -1.0])  # directions
@@ -103,8 +104,7 @@ def test_a_model_of_moving_tissue_is_sharp_at_all_times(breathing):
     views, others = [breathing[3], breathing[28]], breathing[10:90:20]  # different phases
 
     def quality(motion):
-        trainer = Trainer(prepare(views, config, motion=motion), config)
-        moving = MovingModel(trainer.run(), motion)
+        moving = MovingModel(reconstruct(views, config, motion=motion), motion)
         drawn = [model_renderer(moving.at(frame.stamp_ns), "cpu").render(frame.camera)[0] for frame in others]
         return np.mean([psnr(image, frame.image) for image, frame in zip(drawn, others)])
 
@@ -154,6 +154,24 @@ def test_still_tissue_does_not_breathe():
     frames = filmed()
     for each in (frames, with_one_lens(frames)):
         assert watched(each) == (None, "no breath and no heartbeat seen in 9 s")
+
+
+@pytest.mark.slow
+def test_the_search_can_be_cancelled_at_any_time(breathing):
+    watch, calls = MotionWatch(), 0
+    assert len(list(watch.watch(breathing[:60]))) == 60
+    times = []
+
+    def on_progress(stage: str, done: int, total: int) -> None:
+        times.append(stage)
+        if len(times) > calls:
+            raise Cancelled
+
+    for calls in (0, 100, 400):  # as tracks are triangulated, and as rates are tried
+        times.clear()
+        with pytest.raises(Cancelled):
+            watch.found(StageProgress("motion", on_progress))
+    assert set(times) == {"motion"}
 
 
 def test_what_cannot_be_told_is_said():

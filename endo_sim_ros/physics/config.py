@@ -162,6 +162,9 @@ class PhysicsConfig(StageConfig):
     tear_strain: Annotated[float, Range(0.0, 5.0)] = 0.0
     """True strain, the logarithm of the stretch, beyond which the tissue tears as if it were cut there; 0 = never. Liver bears 0.38, the
     wall of the gall bladder 0.43 (Mancia et al. 2019). Each tear is 2.5 cells of the grid long."""
+    skin_strain: Annotated[float, Range(0.0, 0.5)] = 0.0
+    """Strain by which the skin is stretched at rest, in all directions along it: the edges of cuts and tears draw back from each other, and
+    curl up, as deeper tissue holds them. The outer surface of a gut has about 0.1; 0 = none."""
     dense: bool = False
     """Simulate every Gaussian as a material point (PhysGaussian's way) instead of sparse control nodes;
     layers are then ignored."""
@@ -177,6 +180,7 @@ class PhysicsConfig(StageConfig):
         "stiffening": ("material", "fung"),
         "stiffening_limit": ("material", "fung"),
         "tear_strain": ("kinematics", "rest"),
+        "skin_strain": ("kinematics", "rest"),
     }
 
     def __post_init__(self) -> None:

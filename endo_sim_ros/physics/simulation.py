@@ -19,6 +19,7 @@ from endo_sim_ros.physics.control_nodes import ControlNodes, RenderDepth, build_
 from endo_sim_ros.physics.cutting.blade import Blade, Scissors
 from endo_sim_ros.physics.cutting.stencils import CutStencils
 from endo_sim_ros.physics.cutting.tearing import Tearing
+from endo_sim_ros.physics.cutting.tension import released_forces
 from endo_sim_ros.physics.links import ToolLinks, rigid_pose
 from endo_sim_ros.physics.motion import MotionState
 from endo_sim_ros.physics.regions import TissueProperties
@@ -333,9 +334,20 @@ class TissueSimulation:
         """Part the tissue along triangles [T, 3, 3], m, world, at rest."""
         stencils = self._prepared_stencils()
         if stencils.cut(triangles):
-            with capturing:
-                self.solver.set_cut(stencils.table())
+            self._open(stencils)
             self.disturbed = True
+
+    def _open(self, stencils: CutStencils) -> None:
+        """Let the tissue be parted as the stencils are, and its edges draw back."""
+        solver = self.solver
+        with capturing:
+            solver.set_cut(stencils.table())
+            if self.config.skin_strain:
+                stress = 2 * solver.mu * (3 * solver.lam + 2 * solver.mu) / (solver.lam + 2 * solver.mu)  # of strain 1 in both directions
+                pulls = self.config.skin_strain * stress * self.nodes.volumes ** (2 / 3)
+                links = stencils.links[stencils.broken]
+                links = links[self.nodes.is_skin[links].all(1)]
+                solver.set_released(released_forces(self.nodes.rest.astype(np.float64), links, pulls))
 
     def prepare(self) -> None:
         """Make the first step ready now; a tool would otherwise wait for it (on a GPU, for seconds when kernels are compiled)."""
@@ -496,8 +508,7 @@ class TissueSimulation:
             stencils = self._prepared_stencils()
             if stencils is not other._stencils:
                 stencils.cut(other.cuts)
-            with capturing:
-                self.solver.set_cut(stencils.table())
+            self._open(stencils)
         self.disturbed = True
         return True
 

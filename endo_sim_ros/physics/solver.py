@@ -124,7 +124,8 @@ class MpmSolver:
             values = wp.to_torch(array)
             return values.view(*shape, *values.shape[1:])
 
-        for array in (self.loads.force, self.loads.target, self.loads.target_v, self.state.u, self.state.v, self.state.C, self.state.Q):
+        loads, state = self.loads, self.state
+        for array in (loads.force, loads.released, loads.target, loads.target_v, state.u, state.v, state.C, state.Q):
             of(array)[environments] = 0
         of(self.state.u)[environments] += self.motion.reset(environments, phases)[:, None]
         of(self.state.F)[environments] = torch.eye(3, device=self.device)
@@ -167,6 +168,11 @@ class MpmSolver:
         self._stencils = Stencils(self.rest_cells, self.grid_shape, cut)
         set_stencils(self.nodes, self.grid, self._stencils, self.device)
         self._change_step()
+
+    def set_released(self, forces: np.ndarray) -> None:
+        """Forces on the skin's control nodes that move, of all [M, 3], N, in all environments from now on, beside those of tools."""
+        values = torch.from_numpy(np.asarray(forces, np.float32)).to(self.device)
+        wp.to_torch(self.loads.released).view(self.environments, -1, 3)[:] = values
 
     def wrap_step(self, before: list[Launch], after: list[Launch]) -> None:
         """Make these launches of `Tools` part of every step, on a GPU of the one graph that it is; see `_build_step`."""

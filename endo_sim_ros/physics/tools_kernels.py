@@ -307,7 +307,7 @@ def load_nodes(
     touchable = constants.touchable.shape[0]
     for s in range(thread, touchable, threads):
         e = b * count + constants.touchable[s]
-        loads.force[e] = wp.vec3()
+        loads.force[e] = loads.released[e]
         loads.spring[e] = 0.0  # its last holder stays known
         loads.limit[e] = 0.0
     used = int(0)

@@ -66,6 +66,43 @@ def test_a_cut_opens_where_the_blade_was_and_not_beyond_its_end():
 
 
 @pytest.mark.slow
+def test_a_cut_through_stretched_skin_opens_and_its_edges_curl_up():
+    gaps = []
+    for strain in (0.0, 0.05, 0.1):
+        simulation = simulate(node_count=2400, layers=3, blade_length=0.03, skin_strain=strain)
+        cut_along(simulation, np.linspace(-0.03, 0.03, 21))
+        steps(simulation, 25)
+        state = simulation.state()
+        moved, rest, skin = state.positions - state.rest, state.rest, simulation.nodes.is_skin
+        near = (np.abs(rest[:, 0]) < 0.006) & (np.abs(rest[:, 1]) < 0.02)
+        apart = lambda where: moved[where & (rest[:, 0] > 0), 0].mean() - moved[where & (rest[:, 0] < 0), 0].mean()
+        gaps.append(apart(near & skin))
+        assert simulation.faults == 0
+    assert gaps[0] == 0.0 and 0.001 < gaps[1] < gaps[2] < 0.006 and gaps[2] == pytest.approx(2 * gaps[1], rel=0.2)
+    below = near & ~skin & ~simulation.nodes.pinned
+    assert gaps[2] > 2 * apart(below)  # what lies deeper holds the edges back
+    assert moved[near & skin, 2].mean() < -1e-4  # towards the camera
+    other = simulate(node_count=2400, layers=3, blade_length=0.03, skin_strain=0.1, young_modulus=12e3)
+    assert other.continue_from(simulation)
+    steps(other, 10)
+    np.testing.assert_allclose(other.state().positions, state.positions, atol=4e-4)  # stiffer skin is as much stiffer stretched
+    simulation.reset()
+    steps(simulation, 2)
+    np.testing.assert_array_equal(simulation.state().positions, state.rest)
+
+
+@pytest.mark.slow
+def test_stretched_skin_pulls_both_sides_of_a_cut_alike():
+    simulation = free_block(layers=0, blade_length=0.05, skin_strain=0.01)
+    for y in np.linspace(-0.01, 0.04, 21):
+        simulation.set_cut("knife", pose_at([0.0225, y, 0.04]), True)
+    steps(simulation, 5)
+    x, moved = simulation.nodes.rest[:, 0], simulation.solver.displacements()[:, 0]
+    assert moved[x < 0.0225].mean() < -1e-5 and moved[x > 0.0225].mean() > 1e-5
+    assert np.abs(simulation.solver.momentum()[0]).max() < 2e-6
+
+
+@pytest.mark.slow
 def test_momentum_is_kept_on_each_side_of_a_cut_through_free_tissue():
     simulation = free_block(layers=0, blade_length=0.05, kinematics="rest")
     x = simulation.nodes.rest[:, 0]

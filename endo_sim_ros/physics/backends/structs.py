@@ -62,6 +62,7 @@ class Loads:
     """What acts on control nodes during the step, all [B · M]."""
 
     force: wp.array[wp.vec3]  # N
+    released: wp.array[wp.vec3]  # the part of it that cuts have released, N
     spring: wp.array[float]  # N/m, of pinned and grasped control nodes; zero where free
     target: wp.array[wp.vec3]  # displacement u* at the start of the step that the spring pulls to, m
     target_v: wp.array[wp.vec3]  # its velocity during the step, m/s

@@ -15,7 +15,7 @@ from endo_sim_ros.physics import node_map_kernels as kernels
 from endo_sim_ros.physics.backends import backend_for
 from endo_sim_ros.physics.backends.base import Launch, Work, viewed
 from endo_sim_ros.physics.backends.structs import Skin
-from endo_sim_ros.physics.cutting.gaussians import CutNeighbours, clip_to_sides
+from endo_sim_ros.physics.cutting.gaussians import CutNeighbours, crop_to_sides
 from endo_sim_ros.physics.weights import compact_weights, nearest_nodes
 
 _UNBOUNDED = (-1e18, 1e18)  # of F; infinite bounds would make numbers that are none of zeros
@@ -83,7 +83,7 @@ class Skinning:
         if not np.isfinite(rest).all() or not np.isfinite(means).all():
             raise ValueError("skinning: node positions and Gaussian means must be finite")
         model = model.detach().to(self.device)
-        self.means = model.means.float().contiguous()  # [N, 3] m, at rest
+        self.means = model.means.float().clone(memory_format=torch.contiguous_format)  # [N, 3] m, at rest; cuts move those that they crop
         self.covars = model.covariances.float().contiguous()  # [N, 3, 3] m², at rest
         self._normals = _normals(model)
         self.node_rest = torch.from_numpy(rest).float().to(self.device).contiguous()  # [M, 3] m
@@ -92,9 +92,9 @@ class Skinning:
         index, weights = bind_weights(means, rest, neighbours, weighting)
         self.rebind(index, weights)
         self._cuts = CutNeighbours(means, rest, index, weights)
-        self._covars = self.covars.cpu().double().numpy()
-        self._clipped = self._covars.copy()  # where the cuts left them
-        self._extents = 2 * np.sqrt(np.trace(self._covars, axis1=1, axis2=2))
+        self._whole = means, self.covars.cpu().double().numpy()  # at rest, without cuts
+        self._cropped = [each.copy() for each in self._whole]  # as the cuts left them
+        self._extents = 2 * np.sqrt(np.trace(self._whole[1], axis1=1, axis2=2))
 
     def cut(self, triangles: np.ndarray) -> bool:
         """Let no Gaussian follow nodes, or reach, across a cut: all of it [T, 3, 3], m, world, in the tissue at rest.
@@ -105,18 +105,20 @@ class Skinning:
         extends = cuts.extends(triangles)
         if not extends:
             cuts.heal()
-            self._clipped, known = self._covars.copy(), 0
-            count = len(self._covars)
+            self._cropped, known = [each.copy() for each in self._whole], 0
+            count = len(self._whole[0])
             self.means, self.covars, self._extents = self.means[:count], self.covars[:count], self._extents[:count]
             self._normals = None if self._normals is None else self._normals[:count]
             self.rebind(cuts.index, cuts.weights)
-            self.covars.copy_(torch.from_numpy(self._clipped))
+            for tensor, values in zip((self.means, self.covars), self._whole):
+                tensor.copy_(torch.from_numpy(values))
         rebound = cuts.cut(triangles)
-        clipped = clip_to_sides(cuts.means, self._clipped, self._extents, cuts.triangles[known:])
+        cropped = crop_to_sides(*self._cropped, self._extents, cuts.triangles[known:])
         for tensor, values, some in (
             (self.neighbours, cuts.index, rebound),
             (self.weights, cuts.weights, rebound),
-            (self.covars, self._clipped, clipped),
+            (self.means, self._cropped[0], cropped),
+            (self.covars, self._cropped[1], cropped),
         ):
             rows = torch.from_numpy(values[some]).to(tensor.device, tensor.dtype)
             tensor[torch.from_numpy(some).to(tensor.device)] = rows
@@ -128,12 +130,13 @@ class Skinning:
         at, spread = means.cpu().double().numpy(), covars.cpu().double().numpy()
         cuts = self._cuts
         index, weights = bind_weights(at, cuts.node_rest, cuts.index.shape[1], self.weighting)
-        cuts.append(at, index, weights)
+        cuts.append(at.copy(), index, weights)
         extents = 2 * np.sqrt(np.trace(spread, axis1=1, axis2=2))
-        clip_to_sides(at, spread, extents, cuts.triangles)
-        self._clipped, self._extents = np.concatenate([self._clipped, spread]), np.concatenate([self._extents, extents])
-        covars = torch.from_numpy(spread).to(covars)
-        self.means, self.covars = torch.cat([self.means, means]), torch.cat([self.covars, covars])
+        crop_to_sides(at, spread, extents, cuts.triangles)
+        self._cropped = [np.concatenate(pair) for pair in zip(self._cropped, (at, spread))]
+        self._extents = np.concatenate([self._extents, extents])
+        self.means = torch.cat([self.means, torch.from_numpy(at).to(means)])
+        self.covars = torch.cat([self.covars, torch.from_numpy(spread).to(covars)])
         if self._normals is not None and (normals := _normals(model)) is not None:
             self._normals = torch.cat([self._normals, normals])
         self.rebind(cuts.index, cuts.weights)

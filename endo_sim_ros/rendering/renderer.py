@@ -192,7 +192,8 @@ class DeformableRenderer:
         """Colours [E, H, W, 3], depths and alphas [E, H, W] of the tissue in each camera."""
         model, count = self.model, len(self._skin)
         if len(model) > count:
-            share = open_share(model.means[count:], means[count:], self.config.inside.grain)
+            rest = means if covars is None or self.skinning is None else self.skinning.means  # which cuts that cross it have moved
+            share = open_share(rest[count:], means[count:], self.config.inside.grain)
             opacities = torch.cat([model.logit_opacities[:count], (model.opacities[count:] * share).logit()])
             model = replace(model, logit_opacities=opacities)
         draw = partial(render, background=self._background, covars=covars)

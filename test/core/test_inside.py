@@ -83,6 +83,15 @@ def test_layers_lie_below_the_skin_in_their_order():
     assert mean(red, 0.006, 0.015) < 0.8 * mean(red, 0.0015, 0.0025)
 
 
+def test_the_line_of_blood_has_no_gaps():
+    made = renderer(InsideConfig(blood=0.0004), triangles=cut())
+    flesh = made.model.select(np.arange(len(made._skin), len(made.model)))
+    depth = flesh.means[:, 2].numpy() - SKIN
+    along = flesh.means[depth < 0.0004, 1].numpy()
+    assert np.diff(np.sort(along[np.abs(along) < 0.03])).max() < 0.0004  # of the colour of blood, in all places along the cut
+    assert np.unique(depth[depth < 0.001].round(5)).size >= 3  # in rows
+
+
 def test_without_a_cut_and_with_a_closed_one_the_picture_is_the_same_bit_for_bit():
     state = opened(nodes())
     plain, made = renderer(DARK), renderer()

@@ -3,7 +3,7 @@
 import numpy as np
 from cut_block import MIDDLE, block, wall
 
-from endo_sim_ros.physics.cutting.gaussians import CutNeighbours, clip_to_sides
+from endo_sim_ros.physics.cutting.gaussians import ENDS, CutNeighbours, crop_to_sides
 from endo_sim_ros.physics.skinning import bind_weights
 
 
@@ -96,18 +96,24 @@ def test_gaussians_do_not_reach_across_a_cut_and_those_away_from_it_are_untouche
     covars = spread @ spread.transpose(0, 2, 1)
     triangles = wall()
     reach = 2 * np.sqrt(np.trace(covars, axis1=1, axis2=2))
-    clipped = covars.copy()
-    changed = clip_to_sides(means, clipped, reach, triangles)
-    np.testing.assert_array_equal(changed, np.flatnonzero((clipped != covars).any((1, 2))))
-    before, after = (np.sqrt(each[:, 0, 0]) for each in (covars, clipped))  # the wall is x = MIDDLE
-    distance = np.abs(means[:, 0] - MIDDLE)
-    over = distance < 2 * before
-    assert over.sum() > 300
-    np.testing.assert_allclose(after[over], np.maximum(distance / 2, 0.05 * before)[over], rtol=1e-6)
-    np.testing.assert_array_equal(clipped[~over], covars[~over])
-    np.testing.assert_allclose(clipped[:, 1:, 1:], covars[:, 1:, 1:], atol=1e-12)  # only across the cut
-    assert (np.linalg.eigvalsh(clipped) > -1e-12).all()
-    piecewise = covars.copy()
+    at, cropped = means.copy(), covars.copy()
+    changed = crop_to_sides(at, cropped, reach, triangles)
+    np.testing.assert_array_equal(changed, np.flatnonzero((cropped != covars).any((1, 2))))
+    before, after = (ENDS * np.sqrt(each[:, 0, 0]) for each in (covars, cropped))  # the wall is x = MIDDLE
+    distance, side = np.abs(means[:, 0] - MIDDLE), np.sign(means[:, 0] - MIDDLE)
+    inside = (means[:, 1] > 0.003) & (means[:, 1] < 0.037)  # others are at the ends, or are moved along it there
+    over, now = distance < before, side * (at[:, 0] - MIDDLE)
+    assert (over & inside).sum() > 300
+    np.testing.assert_allclose((now - after)[over], 0, atol=2e-6)  # they end at the cut, on the side where they were
+    np.testing.assert_allclose((now + after)[over], (distance + before)[over], atol=5e-6)  # and reach as far on it
+    np.testing.assert_array_equal(cropped[~over], covars[~over])
+    np.testing.assert_array_equal(at[~over], means[~over])
+    # Along the cut they are where they were, given where they are across it.
+    given = lambda each: each[:, 1:, 1:] - each[:, 1:, :1] * each[:, :1, 1:] / each[:, :1, :1]
+    np.testing.assert_allclose(given(cropped), given(covars), atol=1e-11)
+    assert (np.linalg.eigvalsh(cropped) > -1e-12).all()
+    placed, piecewise = means.copy(), covars.copy()
     for part in (triangles[:7], triangles[7:]):
-        clip_to_sides(means, piecewise, reach, part)
-    np.testing.assert_array_equal(piecewise, clipped)
+        crop_to_sides(placed, piecewise, reach, part)
+    np.testing.assert_array_equal(placed, at)
+    np.testing.assert_array_equal(piecewise, cropped)

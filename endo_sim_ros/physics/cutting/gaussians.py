@@ -5,7 +5,9 @@ import numpy as np
 from endo_sim_ros.physics.cutting.geometry import OVERLAP, separated
 from endo_sim_ros.physics.weights import compact_weights, nearest_nodes
 
-FLATTEST = 0.05  # of its extent; a Gaussian in the cut itself keeps that much across it
+ENDS = (
+    1.5  # standard deviations at which a Gaussian counts as ended: with more a closed cut is a dark gap, with fewer an open one is blurred
+)
 
 
 class CutNeighbours:
@@ -100,15 +102,15 @@ class CutNeighbours:
         return near
 
 
-def clip_to_sides(means: np.ndarray, covars: np.ndarray, reach: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Make covariances [N, 3, 3] no longer reach across a cut, so that its edges are sharp when it opens; returns the
-    numbers of those that changed.
+def crop_to_sides(means: np.ndarray, covars: np.ndarray, reach: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Make Gaussians no longer reach across a cut, so that its edges are sharp when it opens; returns the numbers of those that changed.
 
-    A Gaussian less than two standard deviations from a triangle below it is flattened along the triangle's normal until
-    it is two away, or to a twentieth. Triangles act one after the other, so it does not matter how cuts are divided into calls.
+    A Gaussian less than `ENDS` standard deviations from a triangle below it shrinks to what of it is on its own side: that still reaches as
+    far away from the cut, and as many standard deviations end at the cut. Its shape along the cut follows as if it had been cropped there.
+    Triangles act one after the other, so it does not matter how cuts are divided into calls.
 
     Args:
-        means: Gaussians at rest [N, 3], m, world.
+        means: Gaussians at rest [N, 3], m; changed in place.
         covars: Their covariances [N, 3, 3], m²; changed in place.
         reach: Bounds on two standard deviations [N], m.
         triangles: Of the cut [T, 3, 3], m, world, at rest.
@@ -133,15 +135,16 @@ def clip_to_sides(means: np.ndarray, covars: np.ndarray, reach: np.ndarray, tria
         corners = np.stack([a, b, c])
         near = np.flatnonzero(((x >= corners.min(0) - reach) & (x <= corners.max(0) + reach)).all(1))
         arm = x[near] - a
-        u, v, height = arm @ np.cross(e2, cross) / square, arm @ np.cross(cross, e1) / square, np.abs(arm @ normal)
+        u, v, height = arm @ np.cross(e2, cross) / square, arm @ np.cross(cross, e1) / square, arm @ normal
+        along = covars[some[near]] @ normal  # [n, 3]
+        spread = ENDS * np.sqrt(np.maximum(along @ normal, 0))
+        over = (u >= -OVERLAP) & (v >= -OVERLAP) & (u + v <= 1 + OVERLAP) & (np.abs(height) < spread)
+        near, along, height, spread = near[over], along[over], height[over], spread[over]
+        kept = (1 + np.abs(height) / spread) / 2  # share of its reach
+        along = along * (ENDS / spread)[:, None]  # Σ n over one standard deviation
+        x[near] += (np.where(height < 0, -1, 1) * (kept * spread - np.abs(height)) / spread * ENDS)[:, None] * along
         near = some[near]
-        along = covars[near] @ normal  # [n, 3]
-        spread = 2 * np.sqrt(np.maximum(along @ normal, 0))
-        over = (u >= -OVERLAP) & (v >= -OVERLAP) & (u + v <= 1 + OVERLAP) & (height < spread)
-        near, along = near[over], along[over]
-        lost = 1 - np.maximum(height[over] / spread[over], FLATTEST)
-        outer = lost[:, None, None] * along[:, :, None] * normal
-        kept = lost**2 * (along @ normal)
-        covars[near] += kept[:, None, None] * np.outer(normal, normal) - outer - outer.transpose(0, 2, 1)
+        covars[near] -= (1 - kept**2)[:, None, None] * along[:, :, None] * along[:, None]
         changed[near] = True
+    means[some] = x
     return np.flatnonzero(changed)

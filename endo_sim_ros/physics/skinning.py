@@ -113,7 +113,7 @@ class Skinning:
             for tensor, values in zip((self.means, self.covars), self._whole):
                 tensor.copy_(torch.from_numpy(values))
         rebound = cuts.cut(triangles)
-        cropped = crop_to_sides(*self._cropped, self._extents, cuts.triangles[known:])
+        cropped = crop_to_sides(self._cropped[0], self._cropped[1], self._extents, cuts.triangles[known:])
         for tensor, values, some in (
             (self.neighbours, cuts.index, rebound),
             (self.weights, cuts.weights, rebound),

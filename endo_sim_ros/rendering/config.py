@@ -25,6 +25,16 @@ class InsideConfig(StageConfig):
 
 
 @dataclass(frozen=True)
+class BehindConfig(StageConfig):
+    """What is behind the skin where tissue is lifted off what it hid. Nobody saw it; it is made up."""
+
+    shown: bool = True
+    """Show dim tissue there; false shows the background. Tissue at rest looks the same with both."""
+    dark: Annotated[float, Range(0, 1)] = 0.3
+    """How much darker it is than the skin nearby: organs keep the light off each other."""
+
+
+@dataclass(frozen=True)
 class RenderingConfig(StageConfig):
     """From a Gaussian model and the state of its control nodes to camera images."""
 
@@ -41,5 +51,7 @@ class RenderingConfig(StageConfig):
     """Number of nodes that move one Gaussian."""
     inside: InsideConfig = InsideConfig()
     """What open cuts show."""
+    behind: BehindConfig = BehindConfig()
+    """What is behind the skin where it is lifted."""
     device: str = "auto"
     """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""

@@ -18,7 +18,7 @@ from endo_sim_ros.rendering.config import InsideConfig
 
 _NEIGHBOURS = 16  # Gaussians of the skin that tell its place and colour
 _FEET = 32  # control nodes that tell how deep the tissue is, of a few columns
-_SOLID = 0.1  # opacity of what is skin, as for control nodes
+SOLID = 0.1  # opacity of what is skin, as for control nodes
 _OPACITY = 0.97
 # Lengths in grains:
 _OFFSET, _FLAT, _WIDE = 0.02, 0.008, 0.65  # of a face from the cut, and standard deviations of its Gaussians across and along it
@@ -43,7 +43,7 @@ class Inside:
         node_rest = np.asarray(node_rest, np.float64)
         self._low, self._high = node_rest.min(0) - config.grain, node_rest.max(0) + config.grain
         means = self._model.means.double().numpy()
-        self._solid = select_solid(means, self._model.opacities.double().numpy(), _SOLID)
+        self._solid = select_solid(means, self._model.opacities.double().numpy(), SOLID)
         self._covered: set[tuple[int, ...]] = set()
         if len(self._solid):
             self._skin, self._tree = means[self._solid], KDTree(means[self._solid])
@@ -73,7 +73,7 @@ class Inside:
         config = self._config
         skin = self._colors[self._nearest(points)].mean(1)
         bright, depth = skin.max(1, keepdims=True), depth[:, None]
-        coarse, fine = (_noise(points, size, config.seed)[:, None] for size in (0.004, 0.0009))
+        coarse, fine = (value_noise(points, size, config.seed)[:, None] for size in (0.004, 0.0009))
         color, at = skin * _BELOW_SKIN, depth * (1 + 0.4 * coarse + 0.2 * fine)
         for start, layer in ((config.fat_from, _FAT), (config.flesh_from, _FLESH)):
             share = np.clip((at / max(start, 1e-9) - 0.7) / 0.6, 0, 1)
@@ -189,7 +189,7 @@ def _query(tree: KDTree, points: np.ndarray, count: int) -> np.ndarray:
     return np.asarray(tree.query(points, k=ranks)[1])
 
 
-def _noise(points: np.ndarray, size: float, seed: int) -> np.ndarray:
+def value_noise(points: np.ndarray, size: float, seed: int) -> np.ndarray:
     """Value noise [P] from −1 to 1 at points [P, 3], m, that varies over so many metres."""
     lattice = np.floor(points / size)
     share = points / size - lattice

@@ -17,6 +17,7 @@ from endo_sim_ros.core.light import SURFACE, Light
 from endo_sim_ros.core.shading import shade, to_bytes
 from endo_sim_ros.instruments.drawing import PosedInstruments
 from endo_sim_ros.physics.skinning import Skinning
+from endo_sim_ros.rendering.behind import Behind
 from endo_sim_ros.rendering.config import RenderingConfig
 from endo_sim_ros.rendering.inside import Inside, open_share
 from endo_sim_ros.splatting import render, sh_basis
@@ -67,6 +68,9 @@ class DeformableRenderer:
             self.skinning = Skinning(self.model, node_rest, **options)
         self._skin, self._undyed = self.model, self.model.sh
         self._inside: Inside | None = None  # from the first cut on
+        self._behind: Behind | None = None
+        if self.skinning is not None and config.behind.shown:
+            self._behind = Behind(self.model, self.skinning, config.behind)
 
     def cut(self, triangles: np.ndarray) -> None:
         """Part the tissue along all cuts so far, triangles [T, 3, 3], metres, world, in the tissue at rest, and show flesh where it opens.
@@ -81,9 +85,13 @@ class DeformableRenderer:
             if self._inside is not None:
                 self._inside.heal()
         if not self.config.inside.shown or not len(triangles):
+            if self._behind is not None:
+                self._behind.cut(triangles, None)
             return
         if self._inside is None:
             self._inside = Inside(self._skin, self.skinning.node_rest.cpu().double().numpy(), self.config.inside)
+        if self._behind is not None:
+            self._behind.cut(triangles, self._inside)
         flesh = self._inside.faces(triangles[known:]).to(self.device)
         if len(flesh):
             self.skinning.append(flesh)
@@ -166,6 +174,9 @@ class DeformableRenderer:
                 raise ValueError("render: positions of control nodes go with their deformation gradients F; F is None")
             means, covars = self.deform(positions, F)
         colors, depths, alphas = self._render_tissue(cameras, means, covars, F)
+        if self._behind is not None and positions is not None:
+            at, stretched = (torch.as_tensor(each, dtype=torch.float32, device=self.device) for each in (positions, F))
+            self._behind.draw(cameras, at, stretched, (colors, depths, alphas), self._background)
         sees_tissue = (alphas[0] > SURFACE).any()
         marks = None
         if instruments is not None:

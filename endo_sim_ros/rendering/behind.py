@@ -1,0 +1,114 @@
+"""What lies behind the skin where tissue gives way: nobody saw it, so it is made up.
+
+A reconstruction is the skin that cameras saw. Where the edge of an organ is lifted off what it hid, or skin folds away, the background
+would be seen. What a reconstruction is put on, the control nodes below the skin, is drawn there as dim tissue of the colours around, beside
+a cut as flesh. It is behind all else, and counts as far as the skin above it has moved.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.physics.control_nodes import select_solid
+from endo_sim_ros.physics.skinning import Skinning
+from endo_sim_ros.physics.weights import nearest_nodes
+from endo_sim_ros.rendering.config import BehindConfig
+from endo_sim_ros.rendering.inside import SOLID, Inside, value_noise
+from endo_sim_ros.splatting import render
+
+_OPACITY = 0.97
+_WIDE, _FLAT = 0.8, 0.1  # standard deviations along the layer and across it, in distances between control nodes
+_COARSER = 4  # pixels of a picture to one of what is behind, each way: it is a blur
+_COVERED = 0.85  # opacity of tissue that shows nothing of it: skin that was trained over a black background lets a tenth through
+_MOVED = 0.1  # such distances by which the skin must have moved
+_BESIDE = 3.5  # such distances from a cut that count as beside it: what is farther away does not reach it
+_ABOVE = 4  # control nodes of the skin that tell how far it has moved
+
+
+class Behind:
+    """Tissue behind a model's skin, on the device of its skinning.
+
+    Args:
+        model: Gaussians at rest, world.
+        skinning: What moves them. Control nodes that are no Gaussians of the model are behind its skin.
+        config: How it looks.
+    """
+
+    def __init__(self, model: GaussianModel, skinning: Skinning, config: BehindConfig) -> None:
+        means, rest = (each.cpu().double().numpy() for each in (model.means, skinning.node_rest))
+        solid = select_solid(means, model.opacities.cpu().double().numpy(), SOLID)
+        self.device, self._deep = skinning.device, torch.zeros(0, dtype=torch.long)
+        if not len(solid) or len(rest) < 2:
+            return
+        distances, nearest = (each[:, 0] for each in nearest_nodes(means[solid], rest, 1))
+        apart = np.median(nearest_nodes(rest, rest, 2)[0][:, 1])
+        deep, skin = np.flatnonzero(distances > 1e-3 * apart), np.flatnonzero(distances <= 1e-3 * apart)
+        if not len(deep) or not len(skin):
+            return
+        on = lambda values, kind=torch.float32: torch.from_numpy(values).to(self.device, kind)
+        above = nearest_nodes(rest[skin], rest[deep], min(_ABOVE, len(skin)))[1]
+        self._deep, self._above = on(deep, torch.long), on(skin[above], torch.long)
+        wide = float(np.median(nearest_nodes(rest[skin], rest[skin], min(2, len(skin)))[0][:, -1]))
+        inward = rest[deep] - means[solid][nearest[deep]]
+        inward /= np.linalg.norm(inward, axis=1, keepdims=True)
+        covars = (_WIDE * wide) ** 2 * (np.eye(3) - (1 - (_FLAT / _WIDE) ** 2) * inward[:, :, None] * inward[:, None])
+        colors = model.base_colors.cpu().double().numpy()[solid][nearest[deep]] * (1 - config.dark)
+        colors = np.clip(colors * (1 + 0.12 * value_noise(rest[deep], 0.004, 0)[:, None]), 0, 1)
+        self._rest, self._covars, self._moved, self._wide = skinning.node_rest, on(covars), _MOVED * wide, wide
+        self._places, self._colors = rest[deep], colors
+        self.cut(np.zeros((0, 3, 3)), None)
+
+    def cut(self, triangles: np.ndarray, inside: Inside | None) -> None:
+        """Show flesh beside these cuts, which are all [T, 3, 3], m, world, in the tissue at rest; without an inside, nothing."""
+        if not len(self._deep):
+            return
+        colors, hides = self._colors.copy(), np.zeros(len(self._colors))
+        if len(triangles):
+            known = np.concatenate([triangles.reshape(-1, 3), triangles.mean(1)])
+            near = np.flatnonzero(nearest_nodes(known, self._places, 1)[0][:, 0] < _BESIDE * self._wide)
+            if inside is None:
+                hides[near] = np.inf
+            elif len(near):
+                colors[near] = inside.colors(self._places[near], np.full(len(near), np.inf))
+        colors, self._hides = (torch.from_numpy(each).float().to(self.device) for each in (colors, hides))
+        self._model = GaussianModel.from_points(self._rest[self._deep], colors, self._rest.new_ones(len(colors)), _OPACITY)
+
+    def draw(
+        self, cameras: Sequence[Camera], positions: Tensor, F: Tensor, images: tuple[Tensor, Tensor, Tensor], background: Tensor
+    ) -> None:
+        """Put it behind colours [E, H, W, 3], depths and alphas [E, H, W] that cameras see of tissue, which are changed in place.
+
+        Args:
+            cameras: E.
+            positions: Control nodes now [M, 3], m, world.
+            F: Their deformation gradients [M, 3, 3].
+            images: What they see, on a background.
+            background: Its colour [3].
+        """
+        if not len(self._deep):
+            return
+        moved = (positions - self._rest).norm(dim=1)[self._above].amax(1) - self._hides
+        some = (moved > self._moved).nonzero()[:, 0]
+        if not len(some):
+            return
+        numbers = self._deep[some]
+        model, F = self._model.select(some), F[numbers]
+        model.means.copy_(positions[numbers])
+        model.logit_opacities.copy_((_OPACITY * (moved[some] / self._moved - 1).clamp(0, 1)).logit())
+        colors, depths, alphas = images
+        height, width = alphas.shape[1:]
+        coarse = [camera.resized(max(width // _COARSER, 1), max(height // _COARSER, 1)) for camera in cameras]
+        behind = render(model, *coarse, covars=F @ self._covars[some] @ F.transpose(1, 2), background=background)
+        layers = torch.cat([behind.colors - background, behind.depths[..., None], behind.alphas[..., None]], 3).permute(0, 3, 1, 2)
+        for i in range(len(cameras)):
+            y, x = (alphas[i] < _COVERED).nonzero().unbind(1)
+            places = torch.stack([(2 * x + 1) / width - 1, (2 * y + 1) / height - 1], 1)[None, None]
+            found = torch.nn.functional.grid_sample(layers[i : i + 1], places, padding_mode="border", align_corners=False)[0, :, 0].T
+            found = (1 - alphas[i, y, x] / _COVERED)[:, None] * found  # all of it where there is no tissue
+            colors[i, y, x] += found[:, :3]
+            depths[i, y, x] += found[:, 3]
+            alphas[i, y, x] += found[:, 4]

@@ -1,0 +1,79 @@
+"""What is behind the skin where tissue is lifted off what it hid."""
+
+import numpy as np
+import pytest
+import torch
+from test_inside import CAMERA, DARK, OPENED, SKIN, cut, nodes, opened, skin
+
+from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
+from endo_sim_ros.rendering.config import BehindConfig, InsideConfig
+
+
+def sampled(gloss: bool = False) -> tuple[GaussianModel, np.ndarray]:
+    """A skin, and control nodes, of which those in front are some of its Gaussians."""
+    model, rest = skin(gloss), nodes()
+    model.means[:441] = torch.from_numpy(rest[:441]).float()
+    return model, np.concatenate([model.means[:441].double().numpy(), rest[441:]])
+
+
+def renderer(shown: bool, inside: InsideConfig = DARK, gloss: bool = False, background: float = 0.0) -> DeformableRenderer:
+    model, rest = sampled(gloss)
+    return DeformableRenderer(
+        model, rest, RenderingConfig(device="cpu", inside=inside, behind=BehindConfig(shown=shown), background=background)
+    )
+
+
+def torn(rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The skin of one half folded away to the side, deeper tissue where it was."""
+    moved = rest.copy()
+    moved[(rest[:, 0] < 0) & (rest[:, 2] < SKIN + 1e-3), 0] -= 0.02
+    return moved, np.tile(np.eye(3), (len(rest), 1, 1))
+
+
+@pytest.mark.parametrize("gloss", [False, True])
+def test_where_skin_has_moved_off_what_it_hid_dim_tissue_is_seen(gloss):
+    rest = sampled()[1]
+    without, with_it = (renderer(shown, gloss=gloss).views([CAMERA], *torn(rest), labels=True)[0] for shown in (False, True))
+    gap = without.labels == 0
+    assert gap.sum() > 300 and (with_it.labels[gap] == 0).mean() < 0.02
+    seen = with_it.image[gap].astype(float)
+    assert 0.4 < seen.mean() / with_it.image[:, 80:].astype(float).mean() < 1.0 or gloss
+    assert (seen[:, 0] > seen[:, 1]).mean() > 0.95  # of the colour of the skin
+    assert (with_it.depth[gap & (with_it.labels > 0)] > SKIN).all()
+    np.testing.assert_array_equal(with_it.image[:, 80:], without.image[:, 80:])  # where the skin covers it all
+
+
+def test_at_rest_and_where_nothing_moves_the_picture_is_the_same_bit_for_bit():
+    rest = sampled()[1]
+    identity = rest, np.tile(np.eye(3), (len(rest), 1, 1))
+    for state in ((), identity):
+        pair = [renderer(shown, background=0.3).views([CAMERA], *state)[0] for shown in (False, True)]
+        np.testing.assert_array_equal(pair[0].image, pair[1].image)
+        np.testing.assert_array_equal(pair[0].depth, pair[1].depth)
+
+
+def test_beside_a_cut_there_is_flesh_or_with_no_inside_nothing():
+    rest = sampled()[1]
+    state, colors = opened(rest), []
+    for shown, inside in ((False, DARK), (True, DARK), (True, InsideConfig())):
+        made = renderer(shown, inside)
+        made.cut(cut())
+        colors.append(made.views([CAMERA], *state)[0].image.astype(int))
+    middle = np.abs(np.arange(96) + 0.5 - 48) < 0.5 * 120 * OPENED / SKIN
+    np.testing.assert_array_equal(colors[0][:, middle], colors[1][:, middle])
+    red, green, _ = np.moveaxis(colors[2][:, middle], -1, 0)
+    assert np.median(red) > 40 and np.median(red) > 1.5 * np.median(green)
+    made.cut(np.zeros((0, 3, 3)))
+    healed, whole = (each.views([CAMERA], *torn(rest))[0].image for each in (made, renderer(True)))
+    np.testing.assert_array_equal(healed, whole)
+
+
+def test_a_bare_skin_has_nothing_behind_it():
+    model, rest = sampled()
+    rest = rest[:441]
+    pair = [
+        DeformableRenderer(model, rest, RenderingConfig(device="cpu", behind=BehindConfig(shown=shown))).views([CAMERA], *torn(rest))[0]
+        for shown in (False, True)
+    ]
+    np.testing.assert_array_equal(pair[0].image, pair[1].image)

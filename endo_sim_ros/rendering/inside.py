@@ -23,7 +23,7 @@ _OPACITY = 0.97
 # Lengths in grains:
 _OFFSET, _FLAT, _WIDE = 0.02, 0.008, 0.65  # of a face from the cut, and standard deviations of its Gaussians across and along it
 _THINNEST = 3  # tissue that is thinner is a bare skin
-_HIDDEN = 0.05  # by which two faces must have moved apart to be there
+_HIDDEN = 0.2  # by which two faces must have moved apart to be there; less is thinner than a pixel, and a needle at the end of a cut
 # Colours as parts of that of the skin nearby (what is just below it), or of its brightness (fat, flesh, blood).
 _BELOW_SKIN, _FAT = np.array([0.95, 0.8, 0.78]), np.array([0.96, 0.71, 0.5])
 _FLESH, _BLOOD = np.array([0.62, 0.13, 0.11]), np.array([0.42, 0.03, 0.04])

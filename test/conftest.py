@@ -41,12 +41,13 @@ def small_bag(small_frames, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def joint_policy(tmp_path_factory):
-    """File of a policy that acts by joints, and leaves them where they are."""
+    """File of a policy that acts by joints, and leaves them where they are; beside it two_arms.npz, which does so with two arms."""
     from endo_sim_ros.learning.policies import NetworkPolicy
 
     path = tmp_path_factory.mktemp("policies") / "by_joints.npz"
-    ((inputs, outputs),) = NetworkPolicy.sizes("retraction", [], "joints")
-    NetworkPolicy("retraction", [np.zeros((inputs, outputs))], "joints").save(path)
+    for task, file in (("retraction", path), ("tension", path.with_name("two_arms.npz"))):
+        (size,) = NetworkPolicy.sizes(task, [], "joints")
+        NetworkPolicy(task, [np.zeros(size)], "joints").save(file)
     return path
 
 

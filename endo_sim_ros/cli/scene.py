@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from tyro.conf import Positional
 
@@ -31,6 +32,8 @@ class Command:
     """Mark the target with a spot of dye on the tissue."""
     baseline: float = SightConfig.baseline
     """Distance between the eyes, m."""
+    mode: Literal["realtime", "lockstep"] = "lockstep"
+    """lockstep: time goes on with each action of policy_node, as in the environments. realtime: it goes on by itself."""
     motion: MotionConfig = field(default_factory=MotionConfig)
 
     def run(self) -> None:
@@ -40,5 +43,5 @@ class Command:
 
         names = ("image_width", "instrument", "tool", "dye", "baseline")
         sight = SightConfig(**{name: getattr(self, name) for name in names})
-        save_scene(load_scene(self.model), self.out, self.task, self.seed, sight, self.motion)
+        save_scene(load_scene(self.model), self.out, self.task, self.seed, sight, self.motion, self.mode)
         print(f"{self.out}: model.ply, cameras.json, parameters.yaml")

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import yaml
@@ -26,8 +26,9 @@ def save_scene(
     seed: int = 0,
     sight: SightConfig = SightConfig(),
     motion: MotionConfig = MotionConfig(),
+    mode: Literal["realtime", "lockstep"] = "lockstep",
 ) -> None:
-    """Write model.ply, cameras.json, files of the tools and parameters.yaml, which start the graph in lockstep on a task in this scene.
+    """Write model.ply, cameras.json, files of the tools and parameters.yaml, which start the graph on a task in this scene.
 
     Args:
         scene: What to write.
@@ -36,6 +37,7 @@ def save_scene(
         seed: Of the first episode.
         sight: What the endoscope shows. Which of the pictures are rendered is up to who subscribes to them.
         motion: Breath and heart; at rest, those of the task. Each episode on the graph begins in the phases of the first.
+        mode: lockstep: time goes on with each action, as in the environments. realtime: it goes on by itself.
 
     Raises:
         ValueError: If there is no such task or tool, the scene is too small for it, or an arm does not reach it.
@@ -67,9 +69,9 @@ def save_scene(
             tools["frames"].append(held.frame)
     named = str(Path(sight.tool).resolve()) if sight.tool.endswith(".json") else sight.tool
     parameters = {
-        "reconstruction_node": {"mode": "lockstep", "model_file": str(folder.resolve() / "model.ply")},
+        "reconstruction_node": {"mode": mode, "model_file": str(folder.resolve() / "model.ply")},
         "physics_node": {
-            "mode": "lockstep",
+            "mode": mode,
             "arm_source": "commanded",
             "lockstep_inputs": ["pose", "jaw"],
             "link_contact": False,
@@ -77,9 +79,10 @@ def save_scene(
             **tools,
             **changed,
         },
-        "rendering_node": {"mode": "lockstep", **arms(), "image_width": sight.image_width, "baseline": sight.baseline}
-        | ({"lockstep_camera": True} if kind.roams else {}),
-        "policy": {"task": task, "scene": str(folder.resolve()), "seed": seed, "tool": named, "dye": sight.dye},
+        "rendering_node": {"mode": mode, **arms(), "image_width": sight.image_width, "baseline": sight.baseline}
+        | ({"lockstep_camera": True} if kind.roams else {})
+        | ({"thing": task} if kind.rigid_thing() and sight.instrument else {}),
+        "policy": {"mode": mode, "task": task, "scene": str(folder.resolve()), "seed": seed, "tool": named, "dye": sight.dye},
     }
     sections = {f"/**/{node}": {"ros__parameters": values} for node, values in parameters.items()}
     (folder / "parameters.yaml").write_text(yaml.safe_dump(sections, sort_keys=False))

@@ -205,7 +205,8 @@ class Pictures:
             drawing, at = self._drawings[number], np.flatnonzero(which == number)
             links = held.posed(number, own[at])
             if self._thing:
-                links.append({link: poses[own[at]] for link, poses in self._task.thing_poses().items()})
+                received = sent_poses if self._task.rigid_thing() else lambda poses: poses
+                links.append({link: received(poses)[own[at]] for link, poses in self._task.thing_poses().items()})
             poses = np.stack([links[a][link] for a, link in drawing.links], 1)
             rows = np.concatenate([at + eye * len(own) for eye in range(eyes)])
             local = viewmats[rows, None] @ np.concatenate([poses] * eyes)

@@ -49,6 +49,9 @@ STREAM_DEPTH = 20  # messages that wait for a slow subscriber: 0.7 s of a camera
 class EndoNode(ConfiguredNode):
     """A ROS node that survives errors in its callbacks: each becomes one sentence on /diagnostics."""
 
+    failed = False
+    """Whether work that has an end could not be done: the process then ends with status 1."""
+
     def __init__(self, name: str, context: Context | None = None) -> None:
         super().__init__(name, context)
         if torch := sys.modules.get("torch"):  # not imported by the nodes that start sooner without it
@@ -261,6 +264,7 @@ def run(node_class: Callable[[], EndoNode]) -> int:
             try_shutdown()
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # ROS has put Python's handler back
         if node is not None:
+            status = status or int(node.failed)
             node.destroy_node()
     # Python waits for worker threads, and compiled code in them cannot be interrupted: give it a few seconds.
     watchdog = threading.Timer(_END_WITHIN, os._exit, [status])

@@ -171,6 +171,9 @@ class RenderingNodeConfig(WorldConfig):
     """Draw the instruments of the arms where link_poses says they are."""
     arms: tuple[str, ...] = ("PSM1",)
     """Names of the arms whose instruments are drawn; one that nobody publishes is not."""
+    thing: str = ""
+    """Name of the task, or file.py:Class, whose rigid thing is drawn with the instruments, such as the needle of handover, where
+    thing_pose says that it is; empty = none."""
     jpeg_quality: Annotated[int, Range(1, 100)] = 90
     """Quality of compressed images; at 90 the eye sees no difference."""
     drawing: DrawingConfig = DrawingConfig()
@@ -236,8 +239,12 @@ class ScriptedToolConfig(StageConfig):
 
 @dataclass(frozen=True)
 class PolicyConfig(StageConfig):
-    """Options of the policy. physics_node must have mode lockstep, arm_source commanded, lockstep_inputs [pose, jaw] and the
+    """Options of the policy. physics_node must have the same mode, arm_source commanded, lockstep_inputs [pose, jaw] and the
     tissue of the task: `endo-sim scene` writes these parameters to a file."""
+
+    mode: Literal["realtime", "lockstep"] = "lockstep"
+    """lockstep: each action takes one step, as in the environments. realtime: time goes on by itself. The policy acts on the newest
+    state, with its pictures; a step of the task is from one action to the next, and states that come while it thinks are left out."""
 
     task: str = "retraction"
     """Name of the task, or your own as file.py:Class; an unknown one is answered with the list."""

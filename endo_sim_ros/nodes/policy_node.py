@@ -1,4 +1,4 @@
-"""A policy that works on a task over topics, in lockstep: the observations and actions are those of the environment in one process."""
+"""A policy that works on a task over topics. In lockstep observations and actions are those of the environment in one process."""
 
 import time
 from functools import partial
@@ -19,13 +19,14 @@ from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.learning.task_batch import ARM_STATE
 from endo_sim_ros.learning.tasks import find_task
 from endo_sim_ros.messages import OK, STATE, WARN, PolicyState
-from endo_sim_ros.nodes.base import EndoNode, run
+from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode, run, sentence
 from endo_sim_ros.nodes.configs import PolicyConfig, arm_names
 from endo_sim_ros.nodes.listeners import Listeners, delivered
 
 _DYED_WITHIN = 1.0  # seconds that the spot of an episode, and its camera, have to arrive before its first picture is rendered
 _TOLD_WITHIN = 1.0  # seconds that the last outcome has to arrive before the node exits
 _STRAY = 1.0  # seconds in which pictures of a rest before the first reset may still come
+_SETTLED = 2  # real time: states after the tools were put where an episode begins, until they are seen there
 _PATIENCE = 30.0  # seconds; a request to a physics_node that was killed just now is never answered
 
 
@@ -50,7 +51,7 @@ class PolicyNode(EndoNode):
             raise ConfigError(
                 f"policy: {config.task} acts by the joints of the endoscope, not by those of the tool, as {config.policy} does"
             )
-        if policy.sight is not None and task.thing() is not None:
+        if policy.sight is not None and task.thing() is not None and not task.rigid_thing():
             raise ConfigError(f"policy: {config.policy} sees, and pictures over topics do not show what {config.task} is about")
         if not self._task.same_tissue and config.episodes > 1:
             raise ConfigError(f"episodes: {config.task} has one episode over topics, as its tissue is part of physics_node's parameters")
@@ -62,24 +63,29 @@ class PolicyNode(EndoNode):
         self._dye_pub = self.publisher(messages.DYE)
         self._outcome_pub = self.publisher(messages.TASK_OUTCOME)
         self._camera_pub = self.publisher(messages.CAMERA_POSE) if task.roams else None
+        self._thing_pub = self.publisher(messages.THING_POSE) if task.rigid_thing() else None
         self._listeners = Listeners((*self._pose_pubs, *self._jaw_pubs))
         self._resetting = self.create_client(Trigger, f"{config.physics_node}/reset")
         self._state, self._missing = PolicyState.WAITING, ""  # and what for
         self._begun, self._solved, self._done = False, 0, 0
         self._model_stamp = 0  # ns, which the state at rest has
-        self._stamp = 0  # of the command whose answer is awaited; 0 = the state at rest
+        self._realtime = config.mode == "realtime"
+        self._stamp = 0  # of the command whose answer is awaited; 0 = the state at rest. In real time: what answers is newer
         self._heard: dict[str, Any] = {}  # parts of that answer
-        self._placed = False  # whether the tool was put where the episode begins
+        self._stamps: dict[str, int] = {}  # and theirs, ns
+        self._observation: np.ndarray | None = None  # what the answer tells without its pictures
+        self._placed, self._rested = False, 0  # whether the tool was put where the episode begins, and states since
         self._rows: list[tuple[np.ndarray, np.ndarray, float, bool, int]] = []
-        self.subscribe(messages.CONTROL_NODES, self._on_nodes)
+        depth = 1 if self._realtime else STREAM_DEPTH  # only the newest counts, or none may be lost
+        self.subscribe(messages.CONTROL_NODES, self._on_nodes, depth)
         self._forces = [f"force of {arm}" for arm in arms]
         for number, arm in enumerate(arms):
-            self.subscribe(messages.tool_reaction(arm), partial(self._on_reaction, number))
+            self.subscribe(messages.tool_reaction(arm), partial(self._on_reaction, number), depth)
         self._pictures = {} if policy.sight is None else {IMAGE: messages.RENDERED_IMAGE}
         if policy.sight is not None and policy.sight.eyes == 2:
             self._pictures[IMAGE_RIGHT] = messages.RENDERED_RIGHT_IMAGE
         for name, topic in self._pictures.items():
-            self.subscribe(topic, partial(self._on_picture, name))
+            self.subscribe(topic, partial(self._on_picture, name), depth)
         self._asked: Any = None  # the reset that was asked for last, and when
         self._asked_at = self._pictured_at = 0.0
         self._begin()
@@ -93,7 +99,8 @@ class PolicyNode(EndoNode):
         self._policy.reset([0])
         if self._tools is not None:
             self._tools.begin(np.arange(len(self._task.arms)), tip_poses(self._task, self._task.tips()))
-        self._stamp, self._heard, self._placed, self._state = 0, {}, False, PolicyState.WAITING
+        self._stamp, self._placed, self._state = 0, False, PolicyState.WAITING
+        self._forget()
         spots = self._task.dyed_spots(0) if self._config.dye else ()
         self._dye_pub.publish(messages.encode_dye(spots, self.now_ns(), self._config.world_frame))
         delivered(self._dye_pub, _DYED_WITHIN)  # the state at rest is asked for next
@@ -117,7 +124,8 @@ class PolicyNode(EndoNode):
             self._missing = f"rendering_node, which publishes {' and '.join(unseen)}"
             return
         self._begun, self._missing = True, "the tissue of the scene" + (" and its pictures" if self._pictures else "")
-        self._heard, self._placed = {}, False
+        self._forget()
+        self._placed = False
         if self._asked is not None:  # an answer that comes after all is none to this request
             self._resetting.remove_pending_request(self._asked)
         self._asked, self._asked_at = self._resetting.call_async(Trigger.Request()), time.monotonic()
@@ -130,57 +138,78 @@ class PolicyNode(EndoNode):
     def _on_reset(self, future: Any) -> None:
         with self.guard("reset"):
             if future.result().success:
-                self._answer("reset", True)
+                self._answer("reset", True, self._model_stamp)
 
     # -------------------------------------------------------------- answers
 
     def _on_nodes(self, message: Any) -> None:
         cloud, stamp = messages.decode_control_nodes(message), messages.stamp_to_ns(message.header.stamp)
-        if self._stamp == 0 and stamp == cloud.model_stamp_ns:
+        if self._stamp == 0 and (self._realtime or stamp == cloud.model_stamp_ns):
             if not np.array_equal(cloud.rest, self._task.nodes.rest):
                 text = f"the tissue on control_nodes, {len(cloud.rest)} nodes, is not that of the scene and the task"
                 raise ValueError(f"{text}, {len(self._task.nodes)} nodes; start the graph with what `endo-sim scene` wrote")
-            self._model_stamp = stamp
-            self._answer("nodes", cloud.positions)
-        elif stamp == self._stamp:
-            self._answer("nodes", cloud.positions)
+            self._model_stamp, self._rested = stamp, self._rested + self._placed
+            self._answer("nodes", cloud.positions, stamp)
+        elif self._answers(stamp):
+            self._answer("nodes", cloud.positions, stamp)
 
     def _on_reaction(self, arm: int, message: Any) -> None:
-        if self._stamp and messages.stamp_to_ns(message.header.stamp) == self._stamp:
+        stamp = messages.stamp_to_ns(message.header.stamp)
+        if self._stamp and self._answers(stamp):
             force = messages.decode_wrench(message, "measured_cf")[0]
-            self._answer(self._forces[arm], self._task.rotations.reshape(-1, 3, 3)[arm] @ force)
+            self._answer(self._forces[arm], self._task.rotations.reshape(-1, 3, 3)[arm] @ force, stamp)
 
     def _on_picture(self, name: str, message: Any) -> None:
-        if messages.stamp_to_ns(message.header.stamp) == (self._stamp or self._model_stamp):
+        stamp = messages.stamp_to_ns(message.header.stamp)
+        if self._answers(stamp):
             self._pictured_at = time.monotonic()
-            self._answer(name, messages.decode_image(message, self._pictures[name].name))
+            self._answer(name, messages.decode_image(message, self._pictures[name].name), stamp)
 
-    def _answer(self, part: str, value: Any) -> None:
+    def _answers(self, stamp: int) -> bool:
+        """Whether what has a stamp answers the last command."""
+        if self._realtime:
+            return 0 < self._stamp < stamp
+        return stamp == (self._stamp or self._model_stamp)
+
+    def _answer(self, part: str, value: Any, stamp: int) -> None:
         """Take in a part of what answers the last command."""
-        self._heard[part] = value
+        self._heard[part], self._stamps[part] = value, stamp
         self._go_on()
+
+    def _forget(self) -> None:
+        """Await another answer."""
+        self._heard, self._stamps, self._observation = {}, {}, None
 
     def _go_on(self) -> None:
         """When the answer to the last command is complete, act."""
-        if not {"nodes", *(self._forces if self._stamp else ["reset"]), *self._pictures} <= self._heard.keys():
+        if not {"nodes", *(self._forces if self._stamp else ["reset"])} <= self._heard.keys():
+            return
+        if self._realtime and not self._stamp:
+            if not self._placed:
+                self._place()
+            elif self._rested >= _SETTLED:
+                self._stamp = self._model_stamp
+                self._forget()
+            return
+        pictured = self._pictures.keys() <= self._heard.keys() and len({self._stamps[name] for name in self._pictures}) <= 1
+        if self._observation is None and (pictured or not self._realtime):  # in lockstep pictures show what follows from it
+            self._observation = self._observe()
+        if self._observation is None or not pictured:
             return
         if not self._stamp and not self._placed:  # the tool begins where the task has it, and is seen there
             if self._pictures and not self._done and time.monotonic() - self._pictured_at < _STRAY:
                 return
-            self._placed = True
-            self._command(self._task.tips(), np.zeros(self._task.fourth.shape, bool), self._model_stamp)
+            self._place()
             if self._pictures:  # those after this show it there
                 self._heard = {name: value for name, value in self._heard.items() if name not in self._pictures}
                 return
-        forces = np.array([self._heard.get(name, np.zeros(3)) for name in self._forces]).reshape(self._task.force.shape)
-        observation = self._task.observe(self._heard["nodes"][self._task.sites], forces)
-        observation = observation if self._tools is None else self._tools.observe(observation)
+        observation, stamp = self._observation, self._stamps["nodes"]
         ended = False
-        if self._stamp:
+        if self._task.steps[0]:
             outcome = self._task.judge()
             ended = bool(outcome.terminated[0] or outcome.truncated[0])
             told = float(outcome.reward[0]), ended, bool(outcome.success[0]), self._config.seed + self._done
-            self._outcome_pub.publish(messages.encode_outcome(*told, self._task.origin[0], self._stamp))
+            self._outcome_pub.publish(messages.encode_outcome(*told, self._task.origin[0], stamp))
             self._rows.append((self._seen, self._action, float(outcome.reward[0]), bool(outcome.success[0]), self._done))
         if ended:
             self._end(outcome.success[0])
@@ -188,19 +217,40 @@ class PolicyNode(EndoNode):
             self._seen = observation[0]
             self._act(self._sensed() if self._pictures else observation)
 
+    def _place(self) -> None:
+        """Put the tools where the episode begins."""
+        self._placed, self._rested = True, 0
+        self._send_thing(self._model_stamp)
+        self._command(self._task.tips(), np.zeros(self._task.fourth.shape, bool), self._model_stamp)
+
+    def _observe(self) -> np.ndarray:
+        """The state that a policy takes [1, n]."""
+        forces = np.array([self._heard.get(name, np.zeros(3)) for name in self._forces]).reshape(self._task.force.shape)
+        observation = self._task.observe(self._heard["nodes"][self._task.sites], forces)
+        if self._stamp:
+            self._send_thing(self._stamps["nodes"])
+        return observation if self._tools is None else self._tools.observe(observation)
+
     def _sensed(self) -> dict[str, np.ndarray]:
         """What a policy takes that sees: the pictures, and what the arm measures of itself."""
         return {ARM_STATE: arm_state(self._task), **{name: self._heard[name][None] for name in self._pictures}}
 
     def _act(self, observation: np.ndarray | dict[str, np.ndarray]) -> None:
-        actions = self._policy.act(observation)
+        try:
+            actions = self._policy.act(observation)
+            if self._tools is None:
+                tips, closed = self._task.act(actions)
+            else:
+                poses, closed = self._tools.act(self._task, actions, self._policy.actions == "joints")
+                tips = poses[:, :3, 3]
+        except Exception as error:  # of whatever the policy is; it would do the same again
+            self.failed = True
+            self.report_error(sentence(f"policy {self._config.policy}", error))
+            self._finish()
+            return
         self._action = actions[0]
-        if self._tools is None:
-            tips, closed = self._task.act(actions)
-        else:
-            poses, closed = self._tools.act(self._task, actions, self._policy.actions == "joints")
-            tips = poses[:, :3, 3]
-        self._stamp, self._heard = self._stamp + self._step_ns, {}
+        self._stamp = self._stamps["nodes"] if self._realtime else self._stamp + self._step_ns
+        self._forget()
         self._state = PolicyState.WORKING
         self._command(tips, closed, self._stamp)
 
@@ -211,6 +261,14 @@ class PolicyNode(EndoNode):
             self._camera_pub.publish(messages.encode_pose(poses[0], stamp, self._config.world_frame))
             if stamp == self._model_stamp:
                 delivered(self._camera_pub, _DYED_WITHIN)
+
+    def _send_thing(self, stamp: int) -> None:
+        """Publish where the thing of the task is, if there is one; where an episode begins, wait until that has arrived."""
+        if self._thing_pub is not None:
+            (poses,) = self._task.thing_poses().values()
+            self._thing_pub.publish(messages.encode_pose(poses[0], stamp, self._config.world_frame))
+            if stamp == self._model_stamp:
+                delivered(self._thing_pub, _DYED_WITHIN)
 
     def _command(self, tips: np.ndarray, closed: np.ndarray, stamp: int) -> None:
         """Publish where the tips [A] shall be, m, world, or the joints that put them there, and whether the jaws are closed [A]."""
@@ -226,16 +284,23 @@ class PolicyNode(EndoNode):
     def _end(self, success: bool) -> None:
         self._done += 1
         self._solved += int(success)
-        self._stamp, self._heard = -1, {}  # nothing is awaited, and nothing that comes late completes an answer
+        self._stamp = -1  # nothing is awaited, and nothing that comes late completes an answer
+        self._forget()
         self.get_logger().info(f"episode {self._done}: {'solved' if success else 'not solved'} in {self._task.steps[0]} steps")
         if self._done < self._config.episodes:
             self._begin()
             return
-        self._state = PolicyState.DONE
+        self._finish()
+
+    def _finish(self) -> None:
+        """Write the episodes that are over, and end the process."""
+        self._state, self._stamp = PolicyState.DONE, -1
+        self._forget()
         delivered(self._outcome_pub, _TOLD_WITHIN)
-        if self._config.record:
+        rows = [row for row in self._rows if row[-1] < self._done]
+        if self._config.record and rows:
             names, path = ("observations", "actions", "rewards", "success", "episode"), Path(self._config.record)
-            columns: dict[str, Any] = {name: np.array(column) for name, column in zip(names, zip(*self._rows))}
+            columns: dict[str, Any] = {name: np.array(column) for name, column in zip(names, zip(*rows))}
             with written_whole(path) as partial, partial.open("wb") as file:
                 np.savez(file, **columns)
         self.finish(f"{self._solved} of {self._done} episodes solved")

@@ -11,6 +11,8 @@ import numpy as np
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.instruments import Capsule, Part
 from endo_sim_ros.instruments.drawing import PosedInstruments
 from endo_sim_ros.messages import ERROR, OK, STATE, WARN, CameraInfo, ControlNodeCloud, MessageError, RenderingState
 from endo_sim_ros.nodes.base import STREAM_DEPTH, EndoNode, run, sentence
@@ -19,7 +21,7 @@ from endo_sim_ros.nodes.episode_queue import EpisodeQueue
 from endo_sim_ros.nodes.model_tracker import BoundModel, ModelTracker
 from endo_sim_ros.nodes.pacing import MOST_WAITING, Pacer
 from endo_sim_ros.nodes.rendered_topics import RenderedTopics, Shown, beside, right_camera
-from endo_sim_ros.nodes.shown_instruments import ShownInstruments
+from endo_sim_ros.nodes.shown_instruments import THING, ShownInstruments
 from endo_sim_ros.rendering import RenderingConfig
 
 _MAX_SIDE = 8192  # pixels; a damaged camera_info must not make the node ask for all memory
@@ -30,7 +32,7 @@ _IN_TRANSIT = 0.5  # seconds after a reset in which poses of the episode before 
 class RenderingNode(EndoNode):
     """Keeps the newest model, node state and camera, and renders them at its own rate, or state by state in lockstep."""
 
-    read_at_start = frozenset({"mode", "lockstep_camera", "arms"})
+    read_at_start = frozenset({"mode", "lockstep_camera", "arms", "thing"})
 
     def __init__(self) -> None:
         super().__init__("rendering_node")
@@ -43,13 +45,15 @@ class RenderingNode(EndoNode):
         self._nodes_stamp = self._last_stamp = 0  # of that state, and of the newest image in real time, ns
         self._failure = ""  # why the newest model is not shown
         self._pose: np.ndarray | None = None
-        self._rest_pose: np.ndarray | None = None  # lockstep_camera: the newest with the stamp of the state at rest
+        self._thing_pose: np.ndarray | None = None
+        self._rest_poses: dict[str, np.ndarray] = {}  # lockstep, by topic: the newest with the stamp of the state at rest
         self._training_pose: np.ndarray | None = None
         self._info: CameraInfo | None = None
         self._right_info: CameraInfo | None = None
         self._training_info: CameraInfo | None = None
         self._states: deque[tuple[int, ControlNodeCloud]] = deque()  # lockstep: stamps and states still to be shown
-        self._poses = EpisodeQueue[np.ndarray]()  # lockstep_camera: poses that wait for their state
+        # Lockstep, by topic: poses that wait for their state.
+        self._poses = {topic.name: EpisodeQueue[np.ndarray]() for topic in (messages.CAMERA_POSE, messages.THING_POSE)}
         self._reset_heard = 0.0  # lockstep: when the newest state at rest came
         self._pacer = Pacer()
         self._dirty, self.images, self._last_image = True, 0, 0.0
@@ -57,7 +61,8 @@ class RenderingNode(EndoNode):
         self._seconds_per_image = 0.0
         self._blind: np.ndarray | None = None  # position [3], m, world, of the newest camera, if it sees no tissue
         self._topics = RenderedTopics(self)
-        self.instruments = ShownInstruments(arm_names(self.options.arms), self._lockstep)
+        thing = find_thing(self.options.thing) if self.options.thing else None
+        self.instruments = ShownInstruments(arm_names(self.options.arms), self._lockstep, thing)
         self._awaited = ""  # lockstep: what the first state waits for
         self.subscribe(messages.GAUSSIANS, self._on_model)
         self.subscribe(messages.TRAINING_CAMERAS, self._on_training_cameras)
@@ -66,6 +71,8 @@ class RenderingNode(EndoNode):
         self.subscribe(messages.CUT_SURFACE, self._on_cut_surface, depth)
         self.subscribe(messages.DYE, self._on_dye)
         self.subscribe(messages.CAMERA_POSE, self._on_camera, depth)
+        if thing is not None:
+            self.subscribe(messages.THING_POSE, self._on_thing, depth)
         self.subscribe(messages.LEFT_INFO, self._on_info, depth=1)
         self.subscribe(messages.RIGHT_INFO, self._on_right_info, depth=1)
         for arm in self.instruments.arms:
@@ -115,8 +122,7 @@ class RenderingNode(EndoNode):
             self._states.append((self._nodes_stamp, nodes))
             if len(self._states) > MOST_WAITING:
                 dropped = self._states.popleft()[0]
-                self.instruments.forget(dropped)
-                self._poses.forget(dropped)
+                self._forget(dropped)
                 raise MessageError(f"{messages.CONTROL_NODES.name}: over {MOST_WAITING} states wait to be shown; one is left out")
             self.show_states()
         elif not same:
@@ -145,14 +151,27 @@ class RenderingNode(EndoNode):
         same = self._pose is not None and np.array_equal(pose, self._pose)
         self._pose = pose
         if self._lockstep and self.options.lockstep_camera:
-            stamp = messages.stamp_to_ns(message.header.stamp)
-            if stamp == self.tissue.model_stamp:  # that of the state at rest, which comes before or after those of all steps
-                self._rest_pose = pose
-            else:
-                self._poses.put(stamp, pose, replace=True)
-            self.show_states()
+            self._follow(messages.CAMERA_POSE.name, message, pose)
         elif not same:
             self._change()
+
+    def _on_thing(self, message: Any) -> None:
+        pose = messages.decode_pose(message, self.options.frame_poses, messages.THING_POSE.name)
+        same = self._thing_pose is not None and np.array_equal(pose, self._thing_pose)
+        self._thing_pose = pose
+        if self._lockstep:
+            self._follow(messages.THING_POSE.name, message, pose)
+        elif not same:
+            self._change()
+
+    def _follow(self, topic: str, message: Any, pose: np.ndarray) -> None:
+        """Lockstep: keep a pose for the state with its stamp."""
+        stamp = messages.stamp_to_ns(message.header.stamp)
+        if stamp == self.tissue.model_stamp:  # that of the state at rest, which comes before or after those of all steps
+            self._rest_poses[topic] = pose
+        else:
+            self._poses[topic].put(stamp, pose, replace=True)
+        self.show_states()
 
     def _on_info(self, message: Any) -> None:
         info, old = _decode_info(message, messages.LEFT_INFO.name), self._info
@@ -213,7 +232,7 @@ class RenderingNode(EndoNode):
             if not self._pacer.is_due(now, 1 / self.options.rate):
                 return
             self._dirty = False
-            instruments = self._posed(self.tissue.bound, self.instruments.newest())
+            instruments = self._posed(self.tissue.bound, self.instruments.newest(), self._thing_pose)
             self._output = self._render(self.tissue.bound, self._nodes, camera, instruments or None)
             if instruments is False:  # the tissue alone meanwhile
                 self._change()
@@ -237,31 +256,34 @@ class RenderingNode(EndoNode):
                 self._leave_out("belongs to a model that is gone")
                 continue
             camera, at_rest = self._camera(), stamp == nodes.model_stamp_ns  # the first observation
-            if at_rest and self._rest_pose is not None:
-                camera = camera and replace(camera, pose=self._rest_pose)
-            if self._posed_camera(stamp, nodes):
-                pose = self._poses.find(stamp, later)
-                if pose is None:
-                    ended = nodes.model_stamp_ns in later and time.monotonic() - self._reset_heard > _IN_TRANSIT
-                    if not self._poses.passed(later) and not ended:
-                        self._awaited = f"a pose on {messages.CAMERA_POSE.name}"
-                        return
-                    self._leave_out(f"has no pose with its stamp on {messages.CAMERA_POSE.name}")
-                    continue
+            poses = self._rest_poses if at_rest else {topic: self._poses[topic].find(stamp, later) for topic in self._followed}
+            if missing := next((topic for topic, pose in poses.items() if pose is None), ""):
+                ended = nodes.model_stamp_ns in later and time.monotonic() - self._reset_heard > _IN_TRANSIT
+                if not self._poses[missing].passed(later) and not ended:
+                    self._awaited = f"a pose on {missing}"
+                    return
+                self._leave_out(f"has no pose with its stamp on {missing}")
+                continue
+            if (pose := poses.get(messages.CAMERA_POSE.name)) is not None:
                 camera = camera and replace(camera, pose=pose)
             if not self.tissue.bound.follows(nodes) or not camera or not self.tissue.has_cut(nodes):
                 return
-            instruments = self._await_instruments(stamp, self.tissue.bound)
+            instruments = self._await_instruments(stamp, self.tissue.bound, poses.get(messages.THING_POSE.name))
             if instruments is False:
                 return
             self._states.popleft()
-            self.instruments.forget(stamp)
-            self._poses.forget(stamp)
+            self._forget(stamp)
             if at_rest and self._states and self._states[0][0] == stamp:  # a reset after a reset
                 continue
             self._publish(self._render(self.tissue.bound, nodes, camera, instruments), stamp)
 
-    def _await_instruments(self, stamp: int, bound: BoundModel) -> PosedInstruments | None | Literal[False]:
+    @property
+    def _followed(self) -> list[str]:
+        """Lockstep: topics whose poses belong to one state each, but for that at rest, for which nobody may send one."""
+        wanted = {messages.CAMERA_POSE: self.options.lockstep_camera, messages.THING_POSE: bool(self.options.thing)}
+        return [topic.name for topic, follows in wanted.items() if follows]
+
+    def _await_instruments(self, stamp: int, bound: BoundModel, thing: np.ndarray | None) -> PosedInstruments | None | Literal[False]:
         """Lockstep: the instruments at the time of the first state that waits; False while links or their drawing are awaited."""
         if not self.options.instruments:
             return None
@@ -270,26 +292,29 @@ class RenderingNode(EndoNode):
         if isinstance(links, str):
             self._awaited = messages.tool_links(links).name
             return False
-        return self._posed(bound, links)
+        return self._posed(bound, links, thing)
 
-    def _posed(self, bound: BoundModel, links: dict[str, np.ndarray]) -> PosedInstruments | None | Literal[False]:
+    def _posed(self, bound: BoundModel, links: dict[str, np.ndarray], thing: np.ndarray | None) -> PosedInstruments | None | Literal[False]:
         """What draws the instruments, False while it is prepared; without it the tissue is shown alone, and an error says so."""
         if not self.options.instruments:
             return None
+        if thing is not None:
+            links = links | {THING: thing[None]}
         try:
             return self.instruments.posed(links, self.options.drawing, bound.renderer.device)
         except Exception as error:
             self.report_error(sentence("instruments", error))
             return None
 
-    def _posed_camera(self, stamp: int, nodes: ControlNodeCloud) -> bool:
-        """Lockstep: whether a state has a camera of its own; the one at rest has not, as nobody sends one for it."""
-        return self.options.lockstep_camera and stamp != nodes.model_stamp_ns
+    def _forget(self, stamp: int) -> None:
+        """Lockstep: what belongs to a state is not needed any more."""
+        self.instruments.forget(stamp)
+        for queue in self._poses.values():
+            queue.forget(stamp)
 
     def _leave_out(self, why: str) -> None:
         stamp = self._states.popleft()[0]
-        self.instruments.forget(stamp)
-        self._poses.forget(stamp)
+        self._forget(stamp)
         self.report_error(f"the state of {stamp * 1e-9:.6f} s is not shown: it {why}")
 
     def _build(self) -> None:
@@ -381,6 +406,24 @@ class RenderingNode(EndoNode):
 def idle_period(options: RenderingNodeConfig) -> float:
     """Seconds from one image to the next while nothing changes, no shorter than at `rate`; half a poll less, so as not to miss a poll."""
     return 1 / min(options.idle_rate, options.rate) - 0.5 / options.rate / _POLLS
+
+
+def find_thing(task: str) -> tuple[list[Part], list[Capsule]]:
+    """Parts and capsules of the thing of a task.
+
+    Raises:
+        ConfigError: If there is no such task, or it has none.
+    """
+    from endo_sim_ros.learning.tasks import find_task  # which other graphs do without
+
+    try:
+        kind = find_task(task)
+        thing = kind.thing() if kind.rigid_thing() else None
+    except ValueError as error:
+        raise ConfigError(f"thing: {error}") from error
+    if thing is None:
+        raise ConfigError(f"thing: {task} has no rigid thing beside the tools; leave it out")
+    return thing
 
 
 def _decode_info(message: Any, topic: str) -> CameraInfo:

@@ -17,6 +17,9 @@ from endo_sim_ros.nodes.background import Background
 from endo_sim_ros.nodes.episode_queue import EpisodeQueue
 from endo_sim_ros.nodes.pacing import MOST_WAITING
 
+THING = ""
+"""In the place of the name of an arm: a rigid thing of one link that is drawn with the instruments."""
+
 
 class ShownInstruments:
     """Keeps what arms say about their instruments.
@@ -24,15 +27,18 @@ class ShownInstruments:
     Args:
         arms: Names of the arms, in the order of the labels.
         lockstep: Whether links are wanted for each state, not only the newest.
+        thing: Parts and capsules of what is drawn with them, if there is any; its label follows those of all arms.
     """
 
-    def __init__(self, arms: Sequence[str], lockstep: bool) -> None:
-        self.arms = tuple(arms)
+    def __init__(self, arms: Sequence[str], lockstep: bool, thing: tuple[list[Part], list[Capsule]] | None = None) -> None:
+        self.arms, self._owners = tuple(arms), (*arms, THING)
         self._lockstep = lockstep
         self._types: dict[str, str] = {}
         self.undrawn: dict[str, str] = {}
         """Why arms are not drawn, in a sentence each, by their names."""
         self._tools: dict[str, tuple[list[Part], list[Capsule]]] = {}
+        if thing is not None:
+            self._tools[THING], self._types[THING] = thing, THING
         self._links = {arm: EpisodeQueue[np.ndarray](MOST_WAITING if lockstep else 1) for arm in arms}
         self._background = Background()
         self._key: Any = None  # of what is drawn with
@@ -102,14 +108,14 @@ class ShownInstruments:
             links.forget(stamp)
 
     def posed(self, links: dict[str, np.ndarray], config: DrawingConfig, device: str) -> PosedInstruments | None | Literal[False]:
-        """What draws the instruments where their links are; None if there are none, False while that is prepared.
+        """What draws the instruments, and the thing, where their links are; None if there are none, False while that is prepared.
 
         Before any links come that is prepared for all tools that are known, so that the first picture with links shows them.
 
         Raises what the preparation raised, once; after that there are none.
         """
-        names = tuple(arm for arm in self.arms if arm in links and arm in self._tools)
-        drawn = names or tuple(arm for arm in self.arms if arm in self._tools)
+        names = tuple(owner for owner in self._owners if owner in links and owner in self._tools)
+        drawn = names or tuple(owner for owner in self._owners if owner in self._tools)
         tools = [self._tools[arm] for arm in drawn]
         key = tuple((arm, self._types[arm]) for arm in drawn), config, device
         if drawn and key != self._key:
@@ -131,16 +137,20 @@ class ShownInstruments:
             self._key, self._drawing = built
         if self._drawing is None:
             return None
-        return self._drawing.at([dict(zip(LINKS, links[arm])) for arm in names])
+        return self._drawing.at([dict(zip(self._names(owner), links[owner])) for owner in names])
+
+    def _names(self, owner: str) -> Sequence[str]:
+        """Names of the links of an arm, or of that of the thing."""
+        return LINKS if owner != THING else [self._tools[THING][0][0].link]
 
     def labels(self, instruments: PosedInstruments | None, found: np.ndarray) -> np.ndarray:
         """Labels [H, W] of a picture as they are published: those of an arm and link are the same whoever else is drawn."""
         if instruments is None:
             return found
         table = np.arange(256, dtype=np.uint8)
-        names = [arm for arm, _ in self._key[0]]
+        names = [owner for owner, _ in self._key[0]]
         for label, (number, link) in enumerate(instruments.drawing.links, FIRST_LINK):
-            table[label] = FIRST_LINK + len(LINKS) * self.arms.index(names[number]) + LINKS.index(link)
+            table[label] = FIRST_LINK + len(LINKS) * self._owners.index(names[number]) + self._names(names[number]).index(link)
         return cv2.LUT(found, table)  # in a third of numpy's time
 
     def stop(self) -> None:

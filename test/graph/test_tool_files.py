@@ -114,11 +114,18 @@ def test_foxglove_layout_shows_topics_of_the_contract():
 ENCLAVES = {
     "reconstruction_node": (ReconstructionNode, [[]]),
     "physics_node": (PhysicsNode, [[], ["mode:=lockstep"], ["arm_source:=commanded"]]),
-    "rendering_node": (RenderingNode, [[]]),
+    "rendering_node": (RenderingNode, [[], ["thing:=handover"]]),
     "scripted_tool_node": (ScriptedToolNode, [[]]),
     "identification_node": (IdentificationNode, [[]]),
     "viewer_node": (ViewerNode, [[], ["arm_source:=commanded"]]),
-    "policy_node": (PolicyNode, [[], ["policy:={joint_policy}"], ["task:=camera"]]),
+    "policy_node": (
+        PolicyNode,
+        [
+            *([], ["policy:={joint_policy}"], ["task:=camera"], ["task:=handover"]),
+            ["task:=tension", "policy:={joint_policy.parent}/two_arms.npz"],
+            [f"policy:={Path(__file__).parents[1] / 'learning' / 'blue_seeker.py'}:BlueSeeker"],
+        ],
+    ),
     "bag_player_node": (BagPlayerNode, [["bag:=/does/not/exist"]]),
 }
 RULES = {

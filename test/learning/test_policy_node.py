@@ -13,9 +13,11 @@ from waiting import wait_until
 
 from endo_sim_ros import messages
 from endo_sim_ros.graph.processes import NodeGroup
-from endo_sim_ros.learning.config import SightConfig
+from endo_sim_ros.learning.config import DemonstrationConfig, ImitationConfig, SightConfig
+from endo_sim_ros.learning.demonstrations import demonstrate
 from endo_sim_ros.learning.graph_files import save_scene
-from endo_sim_ros.learning.policies import scripted_policy
+from endo_sim_ros.learning.keypoint_policy import KeypointPolicy, train_keypoints
+from endo_sim_ros.learning.policies import make_policy, scripted_policy
 from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.learning.task_batch import TaskBatch
 from endo_sim_ros.learning.tasks import TASKS
@@ -91,6 +93,7 @@ def user():
         ("palpation", 1, False, MotionConfig(breathing=0.004, heartbeat=0.001)),
         ("tracking", 1, False, MotionConfig()),
         ("tension", 1, True, MotionConfig()),
+        ("handover", 1, True, MotionConfig()),
         ("camera", 1, True, MotionConfig()),
         ("clip", 1, False, MotionConfig(breathing=0.003)),
     ],
@@ -158,30 +161,74 @@ def test_over_topics_observations_images_and_actions_are_bit_for_bit_those_of_th
         assert (felt > 0.1).any(), "it holds tissue"
 
 
-@pytest.mark.slow
-def test_a_policy_that_sees_acts_over_topics_as_in_the_environment(user, tmp_path):
-    sight, record = BlueSeeker.sight, tmp_path / "episodes.npz"
-    save_scene(load_scene(), tmp_path, "retraction", seed=SEED, sight=sight)
-    with NodeGroup(tmp_path / "logs") as group:
-        parameters = ("--params-file", str(tmp_path / "parameters.yaml"))
-        logs = lambda: [(log.name, log.read_text()[-800:]) for log in (tmp_path / "logs").iterdir()]  # noqa: E731
-        named = f"{Path(__file__).parent / 'blue_seeker.py'}:BlueSeeker"
-        node = group.start("policy_node", *parameters, policy=named, record=record, episodes=2)
+def play(user, folder, task, policy, sight, episodes, mode="lockstep", **options):
+    """Let policy_node play in the graph that `endo-sim scene` writes; returns it, what it wrote, and the outcomes that were heard."""
+    save_scene(load_scene(), folder, task, seed=SEED, sight=sight, mode=mode)
+    outcomes: list = []
+    user.user.subscribe(messages.TASK_OUTCOME, outcomes.append, depth=1000)
+    with NodeGroup(folder / "logs") as group:
+        parameters, record = ("--params-file", str(folder / "parameters.yaml")), folder / "episodes.npz"
+        logs = lambda: [(log.name, log.read_text()[-800:]) for log in (folder / "logs").iterdir()]  # noqa: E731
+        node = group.start("policy_node", *parameters, policy=policy, record=record, episodes=episodes, **options)
         for name in ("physics_node", "rendering_node"):
-            group.start(name, *parameters)
-        group.start("reconstruction_node", *parameters, output_dir=tmp_path)
+            group.start(name, *parameters, device="cpu")
+        group.start("reconstruction_node", *parameters, output_dir=folder)
         user.until(lambda: node.exit_status is not None, logs, 120)
-        assert node.exit_status == 0 and record.exists(), logs()
-    heard, policy, k = np.load(record), BlueSeeker(1), 0
-    batch = TaskBatch("retraction", load_scene(), 1, "sensors", sight=sight)
-    for episode in range(2):
+    heard = np.load(record) if record.exists() else None
+    if heard is not None:
+        user.until(lambda: len(outcomes) >= len(heard["rewards"]), lambda: f"{len(outcomes)} outcomes")
+    return node, heard, [messages.decode_outcome(outcome, "task_outcome") for outcome in outcomes]
+
+
+def imitate(task, folder):
+    """The folder of a keypoint policy that learned hardly anything: what it does depends on each picture all the same."""
+    pytest.importorskip("pyarrow", reason="datasets need pyarrow")
+    config, sight = DemonstrationConfig(episodes=2, environments=2), SightConfig(image_width=80, eyes=2)
+    demonstrate(task, ["phantom:0"], folder / "demonstrations", config, sight, device="cpu")
+    train_keypoints(folder / "demonstrations", folder / "policy", ImitationConfig(steps=3, batch_size=8), device="cpu")
+    return str(folder / "policy")
+
+
+BLUE_SEEKER = f"{Path(__file__).parent / 'blue_seeker.py'}:BlueSeeker"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task, episodes, imitated", [("retraction", 2, False), ("camera", 1, True), ("handover", 1, True)])
+def test_a_policy_that_sees_acts_over_topics_as_in_the_environment(task, episodes, imitated, user, tmp_path):
+    named = imitate(task, tmp_path) if imitated else BLUE_SEEKER
+    policy = make_policy(named, task, device="cpu")
+    assert isinstance(policy, KeypointPolicy) == imitated and policy.sight is not None
+    node, heard, _ = play(user, tmp_path, task, named, policy.sight, episodes, device="cpu")
+    assert node.exit_status == 0 and heard is not None, node.log.read_text()
+    k, scene = 0, load_scene(tmp_path if TASKS[task].roams else None)
+    batch = TaskBatch(task, scene, 1, "sensors", sight=policy.sight, device="cpu")
+    for episode in range(episodes):
         batch.reset([0], [np.random.default_rng(SEED + episode)])
         seen, ended = batch.observe(), False
         while not ended:
             action = policy.act(seen)
             assert heard["actions"][k].tobytes() == action[0].tobytes(), k
             seen, outcome = batch.step(action)
-            assert heard["rewards"][k] == outcome.reward[0], k
+            assert heard["rewards"][k] == outcome.reward[0] and heard["success"][k] == outcome.success[0], k
             ended = bool(outcome.terminated[0] | outcome.truncated[0])
             k += 1
-    assert k == len(heard["rewards"])
+    assert k == len(heard["rewards"]) and np.ptp(heard["actions"], 0).max() > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task, policy", [("handover", "scripted"), ("retraction", BLUE_SEEKER)])
+def test_in_real_time_a_policy_acts_on_the_newest_state_until_its_episodes_end(task, policy, user, tmp_path):
+    node, heard, told = play(user, tmp_path, task, policy, BlueSeeker.sight, 2, mode="realtime")
+    assert node.exit_status == 0 and heard is not None, node.log.read_text()
+    ends = np.append(np.diff(heard["episode"]), 1)
+    for column, values in ((0, heard["rewards"]), (1, ends), (2, heard["success"]), (3, SEED + heard["episode"])):
+        np.testing.assert_array_equal(np.array(told)[:, column], values)
+    assert ends.sum() == 2 and (policy != "scripted" or heard["success"].sum() == 2)
+
+
+@pytest.mark.slow
+def test_a_policy_that_fails_ends_the_node_with_a_sentence_and_the_episodes_before_are_kept(user, tmp_path):
+    node, heard, _ = play(user, tmp_path, "retraction", BLUE_SEEKER.replace("BlueSeeker", "Lost"), BlueSeeker.sight, 3)
+    text = node.log.read_text()
+    assert node.exit_status == 1 and "retraction: the action of episode 0 is not finite" in text and "Traceback" not in text, text
+    assert heard is not None and set(heard["episode"]) == {0}

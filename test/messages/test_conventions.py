@@ -70,6 +70,7 @@ def ends(tmp_path_factory, small_bag, joint_policy):
                     topic = node.resolve_topic_name(end.topic_name if kind == "subscribers" else end.topic)
                     if topic.startswith("/ECM/") and topic != f"/{messages.CAMERA_POSE.name}":  # those of any arm
                         topic = topic.replace("ECM", "PSM1")
+                    topic = topic.replace("/PSM2/", "/PSM1/")
                     package, _, name = end.msg_type.__module__.partition(".msg")[0], None, end.msg_type.__name__
                     found.append((kind, node.get_name(), lockstep, topic, f"{package}/{name}", end.qos_profile))
         finally:
@@ -81,15 +82,16 @@ def ends(tmp_path_factory, small_bag, joint_policy):
         for source in ("measured", "commanded"):
             look(PhysicsNode, mode == "lockstep", mode=mode, arm_source=source)
         look(PhysicsNode, mode == "lockstep", mode=mode, arm_source="commanded", arms="[PSM1, ECM]")
-        look(RenderingNode, mode == "lockstep", mode=mode)
+        look(RenderingNode, mode == "lockstep", mode=mode, thing="handover")
         look(ReconstructionNode, mode == "lockstep", mode=mode, output_dir=models)
     for source in ("measured", "commanded"):
         look(viewer_node.ViewerNode, arm_source=source)
     look(ScriptedToolNode)
     look(IdentificationNode)
-    look(PolicyNode)
-    look(PolicyNode, task="camera")
-    look(PolicyNode, policy=str(joint_policy))
+    seeing = f"{Path(__file__).parents[1] / 'learning' / 'blue_seeker.py'}:BlueSeeker"
+    for mode in ("realtime", "lockstep"):
+        for given in ({}, {"task": "camera"}, {"task": "handover"}, {"policy": str(joint_policy)}, {"policy": seeing}):
+            look(PolicyNode, mode == "lockstep", mode=mode, **given)
     look(RecorderNode, bag=str(made / "bag"))
     return found
 

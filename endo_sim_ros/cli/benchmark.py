@@ -2,12 +2,14 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 from tyro.conf import Positional
 
-from endo_sim_ros.learning.config import BenchmarkConfig
+from endo_sim_ros.learning.config import BenchmarkConfig, SightConfig
+
+_NODE = "node:"
 
 
 @dataclass(frozen=True)
@@ -17,18 +19,38 @@ class Command:
     out: Positional[Path]
     """Folder for benchmark.json, benchmark.html and the videos."""
     policies: Positional[tuple[str, ...]] = ("scripted", "still")
-    """scripted, still (does nothing), a policy.npz of `endo-sim train`, or the folder of `endo-sim imitate`."""
+    """scripted, still (does nothing), a policy.npz of `endo-sim train`, the folder of `endo-sim imitate`, your own file.py:Class, or
+    node:NAME, a ROS node of your own that answers NAME/observation on NAME/action."""
     scenes: tuple[str, ...] = ("phantom:3", "phantom:4", "phantom:5")
     """Synthetic patients, phantom:SEED, or PLY models with their cameras.json; demonstrate and train use phantom:0 by default."""
     device: str = "auto"
     """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""
+    sight: SightConfig = field(default_factory=SightConfig)
+    """What a ROS node sees that subscribes to NAME/image_raw; other policies say themselves what they see."""
+    patience: float = 10.0
+    """Seconds that a ROS node has for each of its answers."""
     config: Annotated[BenchmarkConfig, tyro.conf.arg(name="")] = field(default_factory=BenchmarkConfig)
 
     def run(self) -> None:
-        """Play and print the table; raises ValueError if a policy, scene or task cannot be used."""
+        """Play and print the table; raises ValueError if a policy, scene or task cannot be used, RuntimeError if a node does not answer."""
         from endo_sim_ros.learning.benchmark import benchmark, read_results, robustness, table
+        from endo_sim_ros.learning.policies import Policy, make_policy
 
-        benchmark(self.out, self.policies, self.scenes, self.config, self.device)
+        nodes: list[Any] = []
+
+        def make(policy: str, task: str, count: int, device: str) -> Policy:
+            if not policy.startswith(_NODE):
+                return make_policy(policy, task, count, device)
+            from endo_sim_ros.graph.node_policy import NodePolicy
+
+            nodes.append(NodePolicy(policy.removeprefix(_NODE), task, self.sight, self.patience))
+            return nodes[-1]
+
+        try:
+            benchmark(self.out, self.policies, self.scenes, self.config, self.device, make)
+        finally:
+            for node in nodes:
+                node.close()
         results = read_results(self.out)
         for rows in (table(results), robustness(results)):
             widths = [max(map(len, column)) for column in zip(*rows)]

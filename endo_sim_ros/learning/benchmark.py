@@ -57,7 +57,14 @@ class Result:
     mean_steps: float
 
 
-def benchmark(out: Path, policies: Sequence[str], scenes: Sequence[str], config: BenchmarkConfig, device: str = "auto") -> list[Result]:
+def benchmark(
+    out: Path,
+    policies: Sequence[str],
+    scenes: Sequence[str],
+    config: BenchmarkConfig,
+    device: str = "auto",
+    make: Callable[[str, str, int, str], Policy] = make_policy,
+) -> list[Result]:
     """Let policies play, add what came out to the table of a folder, and draw its page.
 
     Args:
@@ -66,6 +73,8 @@ def benchmark(out: Path, policies: Sequence[str], scenes: Sequence[str], config:
         scenes: Each as `load_scene` takes it.
         config: Options.
         device: Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N.
+        make: What makes a policy of its name, as `make_policy` does. One that has an attribute ``alone`` that is true plays one episode
+            after the other. What it raises ends all, and the episodes before are kept.
 
     Returns:
         The new results.
@@ -76,7 +85,7 @@ def benchmark(out: Path, policies: Sequence[str], scenes: Sequence[str], config:
     """
     task = find_task(config.task).name
     before = read_results(out)
-    loaded = {policy: make_policy(policy, config.task, config.episodes, device) for policy in policies}  # before the long work
+    loaded = {policy: make(policy, config.task, config.episodes, device) for policy in policies}  # before the long work
     conditions = CONDITIONS if config.robustness else {name: CONDITIONS[name] for name in list(CONDITIONS)[:1]}
     found: list[Result] = []
     out.mkdir(parents=True, exist_ok=True)
@@ -86,15 +95,22 @@ def benchmark(out: Path, policies: Sequence[str], scenes: Sequence[str], config:
             for scene in scenes:
                 for condition, (randomisation, motion) in conditions.items():
                     bar.update(progress, description=f"{name}, {scene}, {condition}")
-                    batch = _batch(config.task, scene, config.episodes, policy, randomisation, motion, device)
-                    returns, solved, steps = play(batch, policy, TESTED_FROM + np.arange(config.episodes))
-                    counted = int(solved.sum()), float(returns.mean()), float(steps.mean())
-                    found.append(Result(task, name, scene, condition, config.episodes, *counted))
-                    del batch
-                    before = _merge(before, found)
-                    _save(out, before)
-                    bar.advance(progress)
-            _film(out, config, name, policy, scenes[0], device)
+                    at_once = 1 if getattr(policy, "alone", False) else config.episodes
+                    batch, played = _batch(config.task, scene, at_once, policy, randomisation, motion, device), []
+                    try:
+                        for seed in range(0, config.episodes, at_once):
+                            played.append(play(batch, policy, TESTED_FROM + seed + np.arange(at_once)))
+                            bar.advance(progress, at_once / config.episodes)
+                    finally:
+                        if played:
+                            returns, solved, steps = map(np.concatenate, zip(*played))
+                            counted = int(solved.sum()), float(returns.mean()), float(steps.mean())
+                            found.append(Result(task, name, scene, condition, len(solved), *counted))
+                        del batch
+                        before = _merge(before, found)
+                        _save(out, before)
+                        (out / _PAGE).write_text(_page(before, out), "utf8")
+            _film(out, config, name, policy, scenes[0], device, make)
             (out / _PAGE).write_text(_page(before, out), "utf8")
     return found
 
@@ -136,10 +152,11 @@ def _batch(
     )
 
 
-def _film(out: Path, config: BenchmarkConfig, name: str, policy: Policy, scene: str, device: str) -> None:
-    """Write a video of the first episodes, side by side, each until its end."""
-    count = min(_FILMED, config.episodes)
-    policy = make_policy(name, config.task, count, device)
+def _film(out: Path, config: BenchmarkConfig, name: str, policy: Policy, scene: str, device: str, make: Callable[..., Policy]) -> None:
+    """Write a video of the first episodes, side by side, each until its end; of a policy that plays alone, of the first."""
+    alone = getattr(policy, "alone", False)
+    count = 1 if alone else min(_FILMED, config.episodes)
+    policy = policy if alone else make(name, config.task, count, device)
     shown = policy.sight or SightConfig(image_width=config.image_width)
     batch = _batch(config.task, scene, count, policy, *CONDITIONS["as usual"], device, images=True, sight=shown)
     frames: list[np.ndarray] = []
@@ -167,7 +184,7 @@ def interval(solved: int, episodes: int) -> tuple[float, float]:
     """Where the true share of solved episodes lies with 95 %: Wilson's score interval."""
     z, share = 1.96, solved / episodes
     middle, half = share + z**2 / (2 * episodes), z * sqrt(share * (1 - share) / episodes + (z / (2 * episodes)) ** 2)
-    return (middle - half) / (1 + z**2 / episodes), (middle + half) / (1 + z**2 / episodes)
+    return max((middle - half) / (1 + z**2 / episodes), 0.0), (middle + half) / (1 + z**2 / episodes)
 
 
 def summarise(results: Sequence[Result], condition: str = "") -> list[Result]:

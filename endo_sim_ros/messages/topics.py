@@ -125,6 +125,15 @@ tool_warning = _of_arm("warning", "StringStamped")
 tool_error = _of_arm("error", "StringStamped")
 """What an arm refused, or what ended its move."""
 
+policy_observation = _of_arm("observation", "sensor_msgs/msg/JointState")
+"""What a policy that is a node of its own takes, by the name of the node."""
+policy_image = _of_arm("image_raw", "sensor_msgs/msg/Image")
+"""What it sees with the left eye."""
+policy_right_image = _of_arm("right/image_raw", "sensor_msgs/msg/Image")
+"""What it sees with the right eye."""
+policy_action = _of_arm("action", "sensor_msgs/msg/JointState")
+"""What it answers."""
+
 JOINT_STATES = Topic("joint_states", "sensor_msgs/msg/JointState")
 ROBOT_DESCRIPTION = Topic("robot_description", "std_msgs/msg/String", "latched")
 

@@ -55,7 +55,8 @@ from endo_sim_ros.learning.task_batch import Observed, TaskBatch
 from endo_sim_ros.physics import MotionConfig
 
 _COLUMNS = {"image": IMAGE, "image_right": IMAGE_RIGHT, "segmentation": SEGMENTATION}
-_SAVE_EVERY = 10.0  # seconds; a process that is killed loses at most the episodes of this time
+_SAVE_EVERY = 10.0  # seconds; a process that is killed loses at most the episodes of this time, or of
+_SAVE_SHARE = 0.1  # so much of the time in which saving may take: it grows with the dataset
 _FEWEST = 0.02  # share of episodes that the script must solve
 _BY = {"script": "A scripted policy", "person": "A person"}
 _CARD = """---
@@ -142,6 +143,7 @@ class Demonstrations:
         seeds = self._writer.column("seed")
         self.seed = int(seeds[-1]) + 1 if len(seeds) else config.seed
         self._out, self._task, self._fps = out, task, fps
+        self._saved, self._save_after = time.monotonic(), _SAVE_EVERY
 
     @property
     def episodes(self) -> int:
@@ -164,10 +166,18 @@ class Demonstrations:
 
     def save(self) -> None:
         """Write what describes all episodes so far; without it the newest are not part of the dataset."""
+        began = time.monotonic()
         if self._writer.episodes:
             self._writer.save()
             by = _BY[self._options["by"]]
             (self._out / "README.md").write_text(_card(self._out, self._task, self._fps, self._writer, by), "utf8")
+        self._saved = time.monotonic()
+        self._save_after = max(_SAVE_EVERY, (self._saved - began) / _SAVE_SHARE)
+
+    def save_if_due(self) -> None:
+        """Save, if the last time was long ago."""
+        if time.monotonic() - self._saved > self._save_after:
+            self.save()
 
 
 def demonstrate(
@@ -191,7 +201,6 @@ def demonstrate(
     demonstrations = Demonstrations(task, scenes, out, config.environments, config, sight, randomisation, motion, device)
     batches, count, seed, tried = demonstrations.batches, config.environments, demonstrations.seed, 0
     policy = scripted_policy(task, count)
-    saved = time.monotonic()
     try:
         with Progress() as bar:
             progress = bar.add_task(task, total=config.episodes, completed=demonstrations.episodes)
@@ -208,9 +217,7 @@ def demonstrate(
                         demonstrations.add(episodes[number], number)
                         bar.update(progress, completed=demonstrations.episodes)
                 seed += len(episodes)
-                if time.monotonic() - saved > _SAVE_EVERY:
-                    demonstrations.save()
-                    saved = time.monotonic()
+                demonstrations.save_if_due()
                 if tried * _FEWEST > 1 and demonstrations.episodes < tried * _FEWEST:
                     raise SequenceError(f"{demonstrations.episodes} of {tried} episodes were solved; less noise or randomisation helps")
     finally:

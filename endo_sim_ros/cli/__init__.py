@@ -97,7 +97,15 @@ def main() -> int:
     except KeyboardInterrupt:
         return 130
     except (ImportError, RuntimeError, ValueError, OSError) as error:
-        print(f"endo-sim: {str(error) or type(error).__name__}", file=sys.stderr)
+        print(f"endo-sim: {_told(error)}", file=sys.stderr)
         return 2 if isinstance(error, _WRONGLY_GIVEN) else 1
     logging.getLogger(__name__).info("done in %.0f s", time.monotonic() - start)
     return 0
+
+
+def _told(error: Exception) -> str:
+    """What an error says; of one of the GPU the first line, as the others are for programmers."""
+    first, *others = str(error).splitlines() or [type(error).__name__]
+    if isinstance(error, RuntimeError) and "CUDA error" in first:
+        return f"the GPU failed ({first}); what was finished is kept; see what nvidia-smi says, or go on with --device cpu"
+    return "\n".join([first, *others])

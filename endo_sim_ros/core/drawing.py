@@ -111,12 +111,20 @@ def write_video(path: str | Path, images: Iterable[np.ndarray], fps: float, opti
         images: An odd last row or column is left out.
         fps: Images per second.
         options: Of libx264.
+
+    Raises:
+        RuntimeError: If there is no libx264.
     """
     import av
 
     count = 0
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000), options=options)
+        try:
+            stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000), options=options)
+        except ValueError as error:
+            raise RuntimeError(
+                f"{path}: PyAV has no libx264 here, which videos need; pip install --force-reinstall av brings it"
+            ) from error
         stream.pix_fmt = "yuv420p"
         for image in images:
             image = np.ascontiguousarray(image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2])  # H.264 wants even sizes

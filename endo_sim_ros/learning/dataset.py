@@ -119,7 +119,7 @@ class DatasetWriter:
     @property
     def frames(self) -> int:
         """Number of rows so far."""
-        return sum(row["length"] for row in self._rows)
+        return self._rows[-1]["dataset_to_index"] if self._rows else 0
 
     def column(self, name: str) -> np.ndarray:
         """A column of numbers of all episodes so far."""
@@ -297,7 +297,7 @@ def read_dataset(root: Path, vectors: Sequence[str], pictures: Sequence[str]) ->
         SequenceError: If there is no such dataset, or a vector is missing, or it is damaged.
         RuntimeError: If pyarrow is not installed.
     """
-    table = import_pyarrow().parquet.read_table
+    table, damaged = import_pyarrow().parquet.read_table, ""
     try:
         info = json.loads((root / _INFO).read_text("utf8"))
         features, numbers = info["features"], range(info["total_episodes"])
@@ -306,17 +306,21 @@ def read_dataset(root: Path, vectors: Sequence[str], pictures: Sequence[str]) ->
         for number in track(numbers, description=f"reading {root.name}", transient=True):
             place = _place(number)
             kept = [*vectors, *(key for key in shown if features[key]["dtype"] == "image")]
-            rows = table(root / _DATA.format(**place), columns=kept)
+            damaged = _DATA.format(**place)
+            rows = table(root / damaged, columns=kept)
             for key in vectors:
                 read[key].append(_from_column(rows.column(key), features[key]))
             for key in shown:
                 if features[key]["dtype"] == "video":
-                    read[key].append(drawing.read_video(root / _VIDEO.format(video_key=key, **place)))
+                    damaged = _VIDEO.format(video_key=key, **place)
+                    read[key].append(drawing.read_video(root / damaged))
                 else:
                     cells = (np.frombuffer(cell["bytes"], np.uint8) for cell in rows.column(key).to_pylist())
                     read[key].append(np.stack([np.asarray(cv2.imdecode(cell, cv2.IMREAD_COLOR_RGB)) for cell in cells]))
         joined = {key: np.concatenate(parts) for key, parts in read.items()}
     except (OSError, KeyError, ValueError, TypeError) as error:  # those of pyarrow are among them
+        if damaged and not isinstance(error, KeyError):  # which is a column that is missing
+            raise SequenceError(f"{root}: {damaged} cannot be read; copy the dataset again, if it was cut off on its way") from error
         raise SequenceError(f"{root} is no LeRobot dataset that can be read; give the folder that `endo-sim demonstrate` wrote") from error
     return {key: joined[key] for key in vectors}, {key: joined[key] for key in shown}
 

@@ -198,7 +198,13 @@ def make_policy(policy: str, task: str, count: int = 1, device: str = "auto") ->
 
         return LeRobotPolicy(policy, device)
     if ":" in policy and not Path(policy).exists():
-        return load_named(policy)(count)
+        found = load_named(policy)(count)
+        if getattr(found, "actions", None) not in ACTION_SIZES or not isinstance(getattr(found, "sight", 0), SightConfig | None):
+            known = ", ".join(ACTION_SIZES)
+            raise ValueError(
+                f"{policy} is no policy: its `actions` are one of {known}, and its `sight` is a SightConfig, or None for the state"
+            )
+        return found
     loaded = NetworkPolicy.load(policy)
     if loaded.task != task:
         raise ValueError(f"{policy} was trained for {loaded.task}, not for {task}")

@@ -222,6 +222,17 @@ def test_the_status_tells_what_was_given_wrong_from_what_failed_later(error, sta
     assert cli.main() == status
 
 
+def test_a_gpu_that_fails_is_one_sentence(monkeypatch, capsys):
+    error = RuntimeError("CUDA error: unspecified launch failure\nCUDA kernel errors might be reported elsewhere\n")
+    monkeypatch.setattr(cli, "parse", Mock(side_effect=error))
+    monkeypatch.setattr(sys, "argv", ["endo-sim", "demonstrate"])
+    assert cli.main() == 1
+    said = (
+        "endo-sim: the GPU failed (CUDA error: unspecified launch failure); what was finished is kept; see what nvidia-smi says, or go on"
+    )
+    assert capsys.readouterr().err == said + " with --device cpu\n"
+
+
 @pytest.mark.dds
 def test_reconstruct_writes_a_model_and_measures_held_out_views(bag, tmp_path):
     out = tmp_path / "result"

@@ -108,6 +108,13 @@ def test_tasks_and_policies_of_files_are_found_and_what_is_wrong_is_said(press, 
     assert find_task(press).name == "press" and find_task(press) is find_task(press)
     seeker = make_policy(SEEKER, "retraction", 2)
     assert seeker.count == 2 and seeker.sight == BlueSeeker.sight
+    (tmp_path / "blind.py").write_text(
+        "class Blind:\n    actions, sight = 'cartesian', 'all'\n\n    def __init__(self, count):\n        pass\n"
+    )
+    with pytest.raises(
+        ValueError, match="Blind is no policy: its `actions` are one of cartesian, joints, joint_positions, and its `sight` is"
+    ):
+        make_policy(f"{tmp_path / 'blind.py'}:Blind", "retraction")
     (tmp_path / "broken.py").write_text("import nothing_of_this_name")
     for named, sentence in (
         ("nowhere.py:Task", "nowhere.py cannot be loaded: FileNotFoundError"),

@@ -2,6 +2,8 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -11,9 +13,10 @@ from played_tasks import make
 
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.learning import dataset, demonstrations
-from endo_sim_ros.learning.config import DemonstrationConfig, SightConfig
+from endo_sim_ros.learning.config import DemonstrationConfig, Randomisation, SightConfig
 from endo_sim_ros.learning.dataset import IMAGE, IMAGE_RIGHT, SEGMENTATION, DatasetWriter, vector_feature
-from endo_sim_ros.learning.demonstrations import demonstrate
+from endo_sim_ros.learning.demonstrations import Demonstrations, demonstrate
+from endo_sim_ros.physics import MotionConfig
 
 SIGHT = SightConfig(image_width=40, eyes=2, segmentation=True)
 
@@ -152,3 +155,40 @@ def test_demonstrating_is_a_command_whose_dataset_lerobot_reads(tmp_path):
     lerobot = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="needs lerobot")
     frames = lerobot.LeRobotDataset("local/out", root=out)
     assert frames.num_episodes == 1 and frames[0]["action"].shape == (4,) and dataset.VERSION == "v3.0"
+
+
+def test_saving_a_dataset_that_grows_takes_a_tenth_of_the_time_at_most(tmp_path, monkeypatch):
+    clock, saves = [0.0], []
+    monkeypatch.setattr(demonstrations, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    monkeypatch.setattr(demonstrations, "_card", lambda *_: "")
+    sight, config = SightConfig(image_width=16), DemonstrationConfig(images="png")
+    growing = Demonstrations("retraction", ["phantom:0"], tmp_path, 1, config, sight, Randomisation(), MotionConfig(), "cpu")
+
+    def save():
+        clock[0] += 3.0 * (len(saves) + 1)
+        saves.append(clock[0])
+
+    growing._writer = SimpleNamespace(episodes=1, save=save)
+    while clock[0] < 1000:
+        clock[0] += 1.0
+        growing.save_if_due()
+    assert len(saves) > 3 and saves[0] < 15
+    assert sum(3.0 * (n + 1) for n in range(len(saves))) < 0.13 * clock[0]
+
+
+def test_without_the_codec_of_videos_it_is_said_what_is_missing(tmp_path, monkeypatch):
+    import av
+
+    add = av.container.OutputContainer.add_stream
+    opened = av.open
+
+    def without_codecs(*arguments, **options):
+        container = MagicMock(wraps=opened(*arguments, **options))
+        container.__enter__.return_value = container
+        container.add_stream = lambda name, **given: add(container._mock_wraps, "libnothing", **given)
+        return container
+
+    monkeypatch.setattr(av, "open", without_codecs)
+    config = DemonstrationConfig(episodes=1, environments=1)
+    with pytest.raises(RuntimeError, match="file-000.mp4: PyAV has no libx264 here, which videos need; pip install"):
+        demonstrate("retraction", ["phantom:0"], tmp_path, config, SightConfig(image_width=40), device="cpu")

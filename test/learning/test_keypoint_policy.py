@@ -1,5 +1,7 @@
 """The small policy that sees: it learns what demonstrations hold, and says what it cannot read."""
 
+import shutil
+
 import numpy as np
 import pytest
 
@@ -47,6 +49,10 @@ def test_it_learns_what_was_demonstrated(dataset, tmp_path):
 def test_what_cannot_be_used_is_told(dataset, tmp_path):
     with pytest.raises(SequenceError, match="nothing is no LeRobot dataset that can be read; give the folder that"):
         train_keypoints(tmp_path / "nothing", tmp_path / "out", ImitationConfig(steps=1), device="cpu")
+    shutil.copytree(dataset, tmp_path / "cut")
+    (last := max((tmp_path / "cut" / "data").rglob("*.parquet"))).write_bytes(last.read_bytes()[:200])
+    with pytest.raises(SequenceError, match=r"cut: data/chunk-000/file-002.parquet cannot be read; copy the dataset again"):
+        train_keypoints(tmp_path / "cut", tmp_path / "out", ImitationConfig(steps=1), device="cpu")
     (tmp_path / FILE).write_bytes(b"no policy")
     with pytest.raises(ValueError, match="keypoints.npz is no policy of `endo-sim imitate --policy keypoints`, or it is damaged"):
         make_policy(str(tmp_path), "retraction")

@@ -87,7 +87,10 @@ def _action_space(batch: TaskBatch) -> gymnasium.spaces.Box:
 def _info(batch: TaskBatch, outcome: Outcome | None = None) -> dict[str, np.ndarray]:
     success = np.zeros(batch.count, bool) if outcome is None else outcome.success
     force, faults = np.sqrt((batch.task.force**2).sum(-1)), batch.tissue.tools.faults.cpu().numpy().copy()
-    return {"success": success, "force": force, "faults": faults} | {name: values.copy() for name, values in batch.varied.items()}
+    found = {"success": success, "force": force, "faults": faults}
+    if len(batch.task.arms) == 2 and batch.tools is not None:
+        found["overlap"] = batch.tools.overlap()
+    return found | {name: values.copy() for name, values in batch.varied.items()}
 
 
 class TaskEnvironment(gymnasium.Env):

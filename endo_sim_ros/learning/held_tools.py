@@ -26,6 +26,7 @@ from endo_sim_ros.instruments import (
     working_point,
 )
 from endo_sim_ros.instruments.aiming import AHEAD
+from endo_sim_ros.instruments.overlap import overlap
 from endo_sim_ros.instruments.shapes import SHAPES
 from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.learning.tasks import Task
@@ -250,6 +251,16 @@ class HeldTools:
         """What `links` gives of each arm [A] of episodes [n] that have a kind of tools."""
         numbers, hands = self._task.hands([kind])[0], self._task.hands(episodes)
         return [self.links(number, own) for number, own in zip(numbers, hands.T)]
+
+    def overlap(self) -> np.ndarray:
+        """How deep the tools of two arms are in each other [B], m; 0 where they do not touch. Nothing stops them."""
+        episodes = np.arange(len(self.which) // len(self._task.arms))
+        deepest, kinds = np.zeros(len(episodes)), self.kind(episodes)
+        for number in np.unique(kinds):
+            own = np.flatnonzero(kinds == number)
+            first, second = zip((tool.shape[1] for tool in self.kinds[number]), self.posed(number, own))
+            deepest[own] = overlap(first, second)
+        return deepest
 
 
 def invert_poses(poses: np.ndarray) -> np.ndarray:

@@ -21,7 +21,7 @@ from endo_sim_ros.nodes.jointed_arm import JointedArm
 from endo_sim_ros.nodes.pacing import MOST_WAITING, WINDOW, CommandQueue, Pacer, SpeedMeter
 from endo_sim_ros.nodes.reactions import ReactionTopics
 from endo_sim_ros.nodes.tissue_builder import TissueBuilder
-from endo_sim_ros.nodes.tool_actions import apply_tools, slip_sentence
+from endo_sim_ros.nodes.tool_actions import apply_tools, collisions, slip_sentence
 from endo_sim_ros.physics import TISSUES, PhysicsConfig, TissueSimulation, tissue
 from endo_sim_ros.physics.regions import read_regions
 
@@ -55,6 +55,7 @@ class PhysicsNode(EndoNode):
         self._tools = {name: arm for name, arm in self.arms.items() if name != CAMERA_ARM}
         self._view: tuple[Camera, float] | None = None  # a camera of the newest model and the depth of the tissue that it sees, m
         self._unplaced = ""  # why arms have no place
+        self._collisions: list[str] = []  # of the newest step
         self._lockstep = self._options.mode == "lockstep"
         self._commands = CommandQueue(frozenset((n, kind) for n in self._tools for kind in self._options.lockstep_inputs))
         self._placing = CommandQueue(self._commands.needed)  # lockstep: what puts the arms where an episode begins
@@ -280,6 +281,7 @@ class PhysicsNode(EndoNode):
             if turning:  # else a jaw that tissue slipped out of would close again
                 arm.hold(self._options.jaw_closed, self._options.jaw_open)
         apply_tools(simulation, self._tools, self._options, None if self._lockstep else self._seconds(), self.report_error)
+        self._collisions = collisions(self._tools)
         for missing in self._misses():
             self.get_logger().warning(missing, throttle_duration_sec=_SAID_AGAIN)
         simulation.step()
@@ -408,8 +410,8 @@ class PhysicsNode(EndoNode):
         return level, text, values
 
     def _misses(self) -> list[str]:
-        """What joints miss of the poses that robots measure, in sentences."""
-        return [arm.missing for arm in self.arms.values() if isinstance(arm, JointedArm) and arm.missing]
+        """What joints miss of the poses that robots measure, and which instruments run into each other, in sentences."""
+        return [arm.missing for arm in self.arms.values() if isinstance(arm, JointedArm) and arm.missing] + self._collisions
 
     def _progress(self) -> tuple[int, str]:
         """Level and message: how the steps go."""

@@ -1,14 +1,25 @@
 """What commanded tools do to the simulated tissue, and sentences for what they fail to do."""
 
 from collections.abc import Callable, Mapping
+from itertools import combinations
 
 import numpy as np
 
+from endo_sim_ros.instruments.overlap import overlap
 from endo_sim_ros.nodes.arm import DISABLED, Arm
 from endo_sim_ros.nodes.configs import PhysicsNodeConfig
 from endo_sim_ros.nodes.errors import sentence
 from endo_sim_ros.nodes.jointed_arm import JointedArm
 from endo_sim_ros.physics import PhysicsConfig, TissueSimulation
+
+
+def collisions(arms: Mapping[str, Arm]) -> list[str]:
+    """Which instruments run into each other, in a sentence each; nothing stops them."""
+    known = {name: (arm.capsules, arm.links()) for name, arm in arms.items() if isinstance(arm, JointedArm) and arm.capsules}
+    pairs = combinations(((name, posed) for name, posed in known.items() if posed[1]), 2)
+    depths = {f"{first} and {second}": float(overlap(one, other)) for (first, one), (second, other) in pairs}
+    told = "run into each other, and nothing stops them"
+    return [f"the instruments of {both} {told}; they overlap by {1e3 * depth:.1f} mm" for both, depth in depths.items() if depth]
 
 
 def apply_tools(

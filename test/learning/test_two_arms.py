@@ -156,3 +156,16 @@ def test_tissue_that_is_taut_beside_its_spots_does_not_count():
         states, outcome = batch.step(script.act(beside))
         solved |= outcome.success
     assert not solved.any()
+
+
+def test_arms_that_run_into_each_other_are_told():
+    environment = make("tension", observations="both")
+    _, info = environment.reset(seed=2)
+    assert info["overlap"] == 0
+    task, deepest = environment.unwrapped.batch.task, []
+    for _ in range(40):
+        middle = task.tip[0].mean(0) + [0, 0, 0.002]  # above the tissue
+        moves = np.column_stack([(middle - task.tip[0]) / task.step_length, [-1, -1]])
+        *_, info = environment.step(moves.ravel().clip(-1, 1))
+        deepest.append(info["overlap"])
+    assert deepest[0] == 0 and max(deepest) > 0.001 and np.linalg.norm(task.tip[0, 0] - task.tip[0, 1]) < 0.002

@@ -9,6 +9,7 @@ from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
 from endo_sim_ros.instruments import arm_files, build_instrument, load_arm
+from endo_sim_ros.messages import OK, WARN
 from endo_sim_ros.nodes.arm_setup import make_arms
 from endo_sim_ros.nodes.configs import PhysicsNodeConfig
 
@@ -51,6 +52,20 @@ def play(bench, ways, scissors=()):
 
 PRESS = [(0.1 - JAWS - 0.008 + 0.001 * step, 0.5) for step in range(12)]
 GRASP = [*PRESS, *[(PRESS[-1][0], 0.0)] * 3, *[(PRESS[-1][0] - 0.001 * step, 0.0) for step in range(1, 8)]]
+
+
+def test_instruments_that_run_into_each_other_are_told(running):
+    assert running.call(Trigger, "/physics_node/reset").success
+    for step, apart in enumerate((0.04, 0.002)):
+        said = len(running.statuses["physics_node"])
+        for arm, x in (("PSM1", 0.0), ("PSM2", -apart)):
+            pose, stamp = np.eye(4), (100 * S + step * STEP)
+            pose[0, 3], pose[2, 3] = x, 0.06
+            running.publish(messages.tool_pose_command(arm), messages.encode_pose(pose, stamp, "world"))
+            running.publish(messages.tool_jaw(arm), messages.encode_jaw(0.5, stamp))
+        text = "the instruments of PSM1 and PSM2 run into each other, and nothing stops them; they overlap by" if step else "in lockstep"
+        level, sentence, _ = running.status("physics_node", text, WARN if step else OK, since=said)
+        assert step or "run into" not in sentence, level
 
 
 def test_jaws_press_before_the_tip_does_and_joints_feel_it(running):

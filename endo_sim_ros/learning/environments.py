@@ -88,7 +88,7 @@ def _info(batch: TaskBatch, outcome: Outcome | None = None) -> dict[str, np.ndar
     success = np.zeros(batch.count, bool) if outcome is None else outcome.success
     force, faults = np.sqrt((batch.task.force**2).sum(-1)), batch.tissue.tools.faults.cpu().numpy().copy()
     found = {"success": success, "force": force, "faults": faults}
-    if len(batch.task.arms) == 2 and batch.tools is not None:
+    if batch.count == 1 and len(batch.task.arms) == 2 and batch.tools is not None:  # of many it would take as long as a GPU's step
         found["overlap"] = batch.tools.overlap()
     return found | {name: values.copy() for name, values in batch.varied.items()}
 

@@ -11,7 +11,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.utilities import ok
 
 from endo_sim_ros import messages
-from endo_sim_ros.learning.actions import ACTION_SIZES, ARM_NAMES, Actions, by_arm
+from endo_sim_ros.learning.actions import ARM_NAMES, Actions, by_arm
 from endo_sim_ros.learning.config import SightConfig
 from endo_sim_ros.learning.pictures import IMAGE, IMAGE_RIGHT
 from endo_sim_ros.learning.task_batch import ARM_STATE
@@ -44,7 +44,7 @@ class NodePolicy:
     def __init__(self, name: str, task: str, sight: SightConfig = SightConfig(), patience: float = 10.0):
         kind = find_task(task)
         self._name, self._patience = name.strip("/"), patience
-        self._size, self._step_ns = ACTION_SIZES[self.actions] * len(kind.arms), round(kind.physics("cpu").step_duration * 1e9)
+        self._size, self._step_ns = kind.action_size() * len(kind.arms), round(kind.physics("cpu").step_duration * 1e9)
         self._stamp, self._answer = 0, None
         if not ok():
             rclpy.init()

@@ -199,8 +199,8 @@ def make_policy(policy: str, task: str, count: int = 1, device: str = "auto") ->
         return LeRobotPolicy(policy, device)
     if ":" in policy and not Path(policy).exists():
         found = load_named(policy)(count)
-        if getattr(found, "actions", None) not in ACTION_SIZES or not isinstance(getattr(found, "sight", 0), SightConfig | None):
-            known = ", ".join(ACTION_SIZES)
+        if getattr(found, "actions", None) not in get_args(Actions) or not isinstance(getattr(found, "sight", 0), SightConfig | None):
+            known = ", ".join(get_args(Actions))
             raise ValueError(
                 f"{policy} is no policy: its `actions` are one of {known}, and its `sight` is a SightConfig, or None for the state"
             )

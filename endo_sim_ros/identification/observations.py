@@ -1,6 +1,6 @@
 """What was measured in an experiment as one vector, with its noise."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -79,9 +79,8 @@ class Observations:
             along = along - np.where(self.closed_at[at, None] >= 0, self.smoother[self.closed_at[at], begin:end], 0)
             along = along * self.experiment.tip_noise
             A = (along[:, :, None] * tip_sensitivity[at][:, None]).reshape(len(at), -1)
-            A = np.concatenate([A, shared[at]], 1)
             blocks.append(_Block(np.flatnonzero(members), self.noise[at] ** 2, A[:, np.abs(A).max(0, initial=0) > 0]))
-        return Covariance(blocks)
+        return Covariance(blocks, shared[rows])
 
 
 class _Block:
@@ -96,16 +95,21 @@ class _Block:
         return x / self.D[:, None] - self._scaled @ (self._inner @ (self._scaled.T @ x))
 
 
-@dataclass(frozen=True)
 class Covariance:
-    """A covariance R of numbers that are used."""
+    """A covariance R of n numbers that are used: blocks along the diagonal, and S Sᵀ of errors that all of them share, by Woodbury."""
 
-    blocks: list[_Block]
+    def __init__(self, blocks: list[_Block], shared: np.ndarray):
+        self._blocks = blocks
+        self._scaled = self._solve_blocks(shared)
+        self._inner = np.linalg.inv(np.eye(shared.shape[1]) + shared.T @ self._scaled)
 
     def solve(self, x: np.ndarray) -> np.ndarray:
         """R⁻¹ x for x [n, k]."""
+        return self._solve_blocks(x) - self._scaled @ (self._inner @ (self._scaled.T @ x))
+
+    def _solve_blocks(self, x: np.ndarray) -> np.ndarray:
         out = np.zeros_like(x, dtype=float)
-        for block in self.blocks:
+        for block in self._blocks:
             if len(block.rows):
                 out[block.rows] = block.solve(x[block.rows])
         return out

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from slab import NODES, pressed
 
 from endo_sim_ros.identification.observations import Observations, smoothing_matrix
@@ -24,6 +25,16 @@ def test_covariance_is_that_of_noise_and_tips():
     R = experiment.force_noise**2 * np.eye(27) + experiment.tip_noise**2 * S @ S.T + shared @ shared.T
     x = rng.standard_normal((27, 2))
     assert np.allclose(seen.covariance(G, shared).solve(x), np.linalg.solve(R, x), rtol=1e-6, atol=1e-6)
+
+
+def test_what_a_long_experiment_shares_does_not_average_out():
+    steps = 600  # more than are taken for one block
+    experiment = replace(pressed(steps=steps), forces=np.ones((steps, 3)))
+    seen = Observations(experiment, 0.0)
+    level = np.ones((len(seen.values), 1))
+    R = seen.covariance(np.zeros((len(level), 3)), 0.1 * level)
+    mean_variance = 1 / (level.T @ R.solve(level)).item()
+    assert mean_variance == pytest.approx(0.1**2 + experiment.force_noise**2 / len(level), rel=1e-6)
 
 
 def test_smoothing_keeps_steady_motion_and_does_not_mix_what_was_apart():

@@ -38,6 +38,8 @@ class Command:
 
         if self.out.is_file():
             raise ValueError(f"{self.out} is a file; name a folder for what is found")
+        if (self.out / "stiffness.yaml").exists():
+            raise ValueError(f"{self.out} holds what was found before; name another folder, or remove that one first")
         with leaving_none_empty(self.out):
             identify_bag(self.bag, self.model, self.out, self.config, self.recording, self.physics)
         print(f"{self.out}: stiffness.yaml, stiffness.npz, stiffness.png")

@@ -107,7 +107,9 @@ def _lag(depth: np.ndarray, size: np.ndarray, most: int) -> float | None:
         both = np.isfinite(ahead) & np.isfinite(behind)
         if both.sum() > len(depth) // 2 and ahead[both].std() > 0 and behind[both].std() > 0:
             scores[lag + most] = np.corrcoef(ahead[both], behind[both])[0, 1]
-    best = int(scores.argmax())
+    peak = np.append(True, scores[1:] >= scores[:-1]) & np.append(scores[:-1] >= scores[1:], True)
+    likely = np.flatnonzero(peak & (scores > scores.max() - _CLEARER))  # where presses come regularly, each of them fits as well
+    best = int(likely[np.abs(likely - most).argmin()])
     if scores[best] < _LIKE:
         return None
     if scores[most] > _ALIKE or scores[best] < scores[most] + _CLEARER:

@@ -48,6 +48,7 @@ class Recorded:
         seconds: Length of the recording of poses.
         touches: In the experiments.
         forces: Whether forces were measured.
+        simulated: Whether the tissue was a simulation's, which has control nodes.
     """
 
     experiments: list[Experiment]
@@ -55,6 +56,7 @@ class Recorded:
     seconds: float
     touches: int
     forces: bool
+    simulated: bool
 
 
 def read_experiments(
@@ -90,9 +92,9 @@ def read_experiments(
             reader.require((messages.tool_pose("PSM1"),))
         reader.require(*((messages.tool_pose(arm),) for arm in arms))
         pictures = _picture(topics)
-        streams = _usable(bag, lambda: read_streams(reader, arms, frames, ()))
+        findings = list[str]()
+        streams = _usable(bag, lambda: read_streams(reader, arms, frames, (), findings))
         motion = _motion(reader)
-    findings = list[str]()
     tools = _usable(bag, lambda: read_tools(arms, streams, Surface(nodes), nodes, physics, config, findings))
     if not tools:
         raise SequenceError(f"{bag}: no pose with a time on /{messages.tool_pose(arms[0]).name}; record while the tool moves")
@@ -129,7 +131,7 @@ def read_experiments(
         raise SequenceError(
             f"{bag}: neither forces nor images with camera_info and pose, nor control nodes: nothing tells how the tissue answers"
         )
-    return Recorded(experiments, findings, seconds, count, measured)
+    return Recorded(experiments, findings, seconds, count, measured, messages.CONTROL_NODES in streams)
 
 
 # ------------------------------------------------------------------------------------------------------------------ tools

@@ -76,7 +76,7 @@ def _noise_of_tips(arm: str, line: Timeline, config: TouchConfig) -> list[str]:
     if seen > _ROUGH * config.tip_noise:
         return [f"{arm}: tips scatter by {1e3 * seen:.2g} mm, more than tip_noise, {1e3 * config.tip_noise:.2g} mm; give that"]
     if seen < _EXACT * config.tip_noise:
-        how = "if they are exact, as simulated ones, give tip_noise 1e-4 and tip_smoothing 0"
+        how = "if they are exact, as simulated ones, give tip_noise 1e-4"
         return [f"{arm}: tips scatter by {1e3 * seen:.2f} mm only; {how}"]
     return []
 

@@ -8,6 +8,9 @@ from endo_sim_ros.identification.experiment import Experiment
 from endo_sim_ros.identification.forward import Replay, closing_steps
 
 FORCE, DISPLACEMENT, PIXEL = range(3)
+_ROUNDED = 4.0  # standard deviations that smoothing takes away, beyond which it rounds off how the tool moves
+_NARROWER, _LEAST_WIDTH = 0.7, 0.5  # what is tried next; steps, below which nothing is smoothed
+_TINY = 1e-6  # m that rounding may take away
 _LONGEST = 250  # steps whose errors of tips are taken for correlated; more would only cost time
 
 
@@ -16,7 +19,7 @@ class Observations:
 
     Args:
         experiment: What was measured; what is NaN was not.
-        smoothing: As `IdentificationConfig.tip_smoothing`.
+        smoothing: As `IdentificationConfig.tip_smoothing`; less where that would round off how the tool moves.
 
     Attributes:
         experiment: The same with smooth tips, which are replayed.
@@ -28,7 +31,7 @@ class Observations:
     """
 
     def __init__(self, experiment: Experiment, smoothing: float):
-        self.smoother = smoothing_matrix(np.asarray(experiment.present, bool), smoothing / experiment.step_duration)
+        self.smoother = fitting_smoother(experiment, smoothing / experiment.step_duration)
         tips = self.smoother @ np.nan_to_num(experiment.tips)
         self.experiment = replace(experiment, tips=tips)
         steps = np.arange(len(tips))
@@ -113,6 +116,27 @@ class Covariance:
             if len(block.rows):
                 out[block.rows] = block.solve(x[block.rows])
         return out
+
+
+def fitting_smoother(experiment: Experiment, width: float) -> np.ndarray:
+    """Return weights [T, T] that smooth tips by at most so many steps (standard deviation), and by less as long as what they take away is
+    more than errors of the tips explain, by means over as many steps: that is how the tool moves."""
+    present, tips = np.asarray(experiment.present, bool), np.nan_to_num(experiment.tips)
+    noise = min(experiment.tip_noise, _scatter(experiment.tips[present]))
+    while width > _LEAST_WIDTH:
+        weights = smoothing_matrix(present, width)
+        span = np.abs(np.subtract.outer(*[np.arange(len(tips))] * 2)) <= width
+        means = (span / span.sum(1, keepdims=True)) @ (np.eye(len(tips)) - weights)
+        if (np.abs(means @ tips) <= _ROUNDED * noise * np.linalg.norm(means, axis=1, keepdims=True) + _TINY).all():
+            return weights
+        width *= _NARROWER
+    return np.eye(len(tips))
+
+
+def _scatter(tips: np.ndarray) -> float:
+    """Standard deviation of a coordinate of single tips [T, 3] about a smooth way, m, by their third differences."""
+    bends = np.abs(np.diff(tips, 3, axis=0))
+    return float(1.4826 * np.median(bends) / np.sqrt(20)) if len(bends) else 0.0
 
 
 def smoothing_matrix(present: np.ndarray, width: float) -> np.ndarray:

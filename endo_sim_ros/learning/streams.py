@@ -39,11 +39,25 @@ class Stream(NamedTuple):
 
 
 def read_streams(
-    reader: BagReader, arms: tuple[str, ...], frames: Mapping[str, np.ndarray], pictures: tuple[Topic, ...]
+    reader: BagReader,
+    arms: tuple[str, ...],
+    frames: Mapping[str, np.ndarray],
+    pictures: tuple[Topic, ...],
+    findings: list[str] | None = None,
 ) -> dict[Topic, Stream]:
     """Streams of the topics that have messages; of pictures (number, height, width), of control nodes the number.
 
     Frames are taken as physics_node does. What is large is only numbered here, in the order of the bag, and read again when it is wanted.
+
+    Args:
+        reader: Of the bag.
+        arms: Whose tools are read.
+        frames: Poses of other frames [4, 4] in the world.
+        pictures: Topics of these.
+        findings: Where given, damaged messages between good ones are left out, and that is said here; else they raise.
+
+    Raises:
+        MessageError: If a message is damaged, or all of a topic are.
     """
     decoders = {}
     for arm in arms:
@@ -58,6 +72,7 @@ def read_streams(
     decoders[messages.TASK_OUTCOME] = messages.decode_outcome
     decoders[messages.RENDERED_POSE] = lambda m, topic: pose_row(messages.decode_pose(m, frames, topic))
     rows: dict[Topic, list] = defaultdict(list)
+    damaged: dict[Topic, list[MessageError]] = defaultdict(list)
     numbers, sizes = dict.fromkeys((*pictures, messages.CONTROL_NODES), -1), dict[Topic, tuple[int, ...]]()
     for topic, _, message in reader.messages((*numbers, *decoders)):
         if topic in numbers:
@@ -67,9 +82,20 @@ def read_streams(
                 sizes[topic] = (message.height, message.width) if raw else messages.decode_image(message, topic.name).shape[:2]
             row = [numbers[topic], *sizes.get(topic, ())]
         else:
-            row = decoders[topic](message, topic.name)
+            try:
+                row = decoders[topic](message, topic.name)
+            except MessageError as error:
+                if findings is None:
+                    raise
+                damaged[topic].append(error)
+                continue
         if stamp := stamp_to_ns(message.header.stamp):  # zero marks an invalid message
             rows[topic].append((stamp, row))
+    for topic, errors in damaged.items():
+        if findings is None or not rows[topic]:
+            raise errors[0]
+        several = f"{len(errors)} messages are" if len(errors) > 1 else "a message is"
+        findings.append(f"{several} left out: {errors[0]}")
     reactions = {stamp for arm in arms for stamp, _ in rows[messages.tool_reaction(arm)]}
     streams = {}
     for topic, pairs in rows.items():

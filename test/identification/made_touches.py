@@ -83,8 +83,9 @@ def press(path, seconds=4.0, presses=(1.0,), rate=100.0, forces=25.0, force=lamb
         presses: When each begins, s.
         rate, forces: Of messages, Hz.
         force: Newtons towards the camera by the depth, m.
-        options: depth; late: seconds by which forces are late (function of the time); noise: of a force, N; offset: of all forces [3], N;
-            leave_out: (from, to) without poses, s; frame, base: name and pose of the frame of poses; x: how far beside, m.
+        options: depth; duration: of a press, s; late: seconds by which forces are late (function of the time); noise: of a force, N;
+            offset: of all forces [3], N; leave_out: (from, to) without poses, s; frame, base: name and pose of the frame of poses; x: how far beside, m;
+            broken: when a pose is no number, s.
     """
     depth, base = options.get("depth", DEPTH), options.get("base", np.eye(4))
     late, rng = options.get("late", lambda t: 0.0), np.random.default_rng(0)
@@ -92,10 +93,11 @@ def press(path, seconds=4.0, presses=(1.0,), rate=100.0, forces=25.0, force=lamb
     with Touches(path) as bag:
         for t in np.arange(int(seconds * rate)) / rate:
             if not first < t < last:
-                pose = tip(pressed(np.array([t]), presses, depth=depth)[0], options.get("x", 0.0))
+                pose = tip(pressed(np.array([t]), presses, options.get("duration", 1.0), depth)[0], options.get("x", 0.0))
+                pose[0, 3] += np.nan if abs(t - options.get("broken", np.inf)) < 0.5 / rate else 0.0
                 bag.pose(t, np.linalg.inv(base) @ pose, frame=options.get("frame", "world"))
         for t in np.arange(int(seconds * forces)) / forces if forces else ():
-            at = pressed(np.array([t]), presses, depth=depth)[0]
+            at = pressed(np.array([t]), presses, options.get("duration", 1.0), depth)[0]
             vector = np.array([0, 0, -force(at)]) + options.get("offset", np.zeros(3)) + options.get("noise", 0.0) * rng.normal(size=3)
             bag.force(t + late(t), vector)
     return path

@@ -79,6 +79,10 @@ def test_what_cannot_be_used_leaves_no_folder(tmp_path):
     with pytest.raises(SequenceError, match="never touches the tissue"):
         identify(bag, tmp_path / "out" / "deep")
     assert not (tmp_path / "out").exists()
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "stiffness.yaml").write_text("of another recording")
+    with pytest.raises(ValueError, match="old holds what was found before; name another folder"):
+        identify(bag, tmp_path / "old")
     with pytest.raises(ConfigError, match="sparse control nodes"):
         identify(bag, tmp_path / "out", "--dense")
 

@@ -14,7 +14,9 @@ def test_covariance_is_that_of_noise_and_tips():
     experiment = pressed(steps=10)
     forces = rng.standard_normal((10, 3))
     forces[4] = np.nan
-    seen = Observations(replace(experiment, forces=forces), 0.08)
+    tips = experiment.tips + experiment.tip_noise * rng.standard_normal((10, 3))
+    seen = Observations(replace(experiment, tips=tips, forces=forces), 0.08)
+    assert not np.allclose(seen.smoother, np.eye(10))
     assert len(seen.values) == 27
     G, shared = rng.standard_normal((27, 3)) * 100, rng.standard_normal((27, 2))
     # Written out: R = σ² 1 + S (σ² 1) Sᵀ + c cᵀ with S = ∂force_i/∂tip of each step.
@@ -43,6 +45,17 @@ def test_smoothing_keeps_steady_motion_and_does_not_mix_what_was_apart():
     line = np.arange(11.0)
     assert np.allclose(W @ line, line) and np.allclose(W.sum(1), 1)
     assert not W[:4, 6:].any() and not W[6:, :4].any()
+
+
+@pytest.mark.parametrize("noise, quick, kept", [(0.0005, False, True), (0.0, False, False), (0.0005, True, False)])
+def test_smoothing_does_not_round_off_how_the_tool_moves(noise, quick, kept):
+    rng, experiment = np.random.default_rng(0), pressed(steps=60)
+    way = experiment.tips + (20 * (experiment.tips - experiment.tips[0]) if quick else 0)  # twenty times as far in the same time
+    noisy = replace(experiment, tips=way + noise * rng.standard_normal((60, 3)), forces=np.zeros((60, 3)))
+    seen = Observations(noisy, 0.12)
+    assert (np.allclose(seen.smoother, smoothing_matrix(noisy.present, 3.0))) == kept
+    if not kept:
+        assert np.abs(seen.experiment.tips - way).max() < 4 * max(noise, 1e-5)
 
 
 def test_what_was_not_measured_is_left_out():

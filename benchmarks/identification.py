@@ -1,7 +1,8 @@
 """How well stiffness is found where it is known: `endo-sim bench identification`.
 
 Truth is simulated, with noise of forces (0.05 N) and tips (0.5 mm, and an offset that all share), by the estimator's own model, and by
-models that it does not have: more control nodes, or more layers. Lungs that were really pressed are in `benchmarks/lung_trials.py`.
+models that it does not have: more control nodes, or more layers, with forces corrected by finer control nodes and without. Lungs that
+were really pressed are in `benchmarks/lung_trials.py`.
 """
 
 import time
@@ -9,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple, cast
 
 import numpy as np
 
@@ -17,11 +18,15 @@ from benchmarks.lung_trials import lung_rows
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.evaluation.measurement import Row, Stage, machine, report, run_stages
 from endo_sim_ros.identification import Experiment, Identification, IdentificationConfig, find_inclusion, identify
-from endo_sim_ros.identification.acquire import best_press
+from endo_sim_ros.identification.acquire import Search
 from endo_sim_ros.identification.forward import ForwardModel
+from endo_sim_ros.identification.palpate import InformedPalpation
 from endo_sim_ros.identification.synthetic import measure, press, raster, skin_normal
 from endo_sim_ros.identification.unknowns import Unknowns
 from endo_sim_ros.learning.scenes import Scene, load_scene
+from endo_sim_ros.learning.task_batch import TaskBatch
+from endo_sim_ros.learning.tasks.palpation import Palpation
+from endo_sim_ros.learning.train import TESTED_FROM, play
 from endo_sim_ros.physics import ControlNodes, PhysicsConfig
 from endo_sim_ros.physics.regions import inside_sphere
 
@@ -29,23 +34,28 @@ SOFTEST, STIFFEST = 1e3, 16e3  # Pa, of the truth: from fat to tense organs
 PRESSES = 3  # in a case of one modulus
 PATCH, DEPTH, RATIO = 0.016, 0.005, 8.0  # m, m: where inclusions lie, as in the task palpation; how much stiffer they are
 FOUND = 0.004  # m
-MOST_PRESSES, SEARCH_NODES = 12, 500  # of a search, which simulates each press that could be done
+MOST_PRESSES, SEARCH_NODES = 12, 1000  # of a search, which simulates each press that could be done
 
 
 class Truth(NamedTuple):
-    """How tissue is simulated that is to be identified, and by what model: numbers of control nodes and layers."""
+    """How tissue is simulated that is to be identified, and by what model: numbers of control nodes and layers, also of what corrects
+    forces, 0 = nothing does."""
 
     name: str
     nodes: int = 1000
     layers: int = 3
     by_nodes: int = 1000
     by_layers: int = 3
+    finer_nodes: int = 0
+    finer_layers: int = 0
 
 
 TRUTHS = (
     Truth("of the same model"), Truth("of twice the nodes", 2000), Truth("of 5 layers instead of 3", 2000, 5),
-    Truth("of 8 layers instead of 5", 3000, 8, 2000, 5),
+    Truth("of 8 layers instead of 5", 3000, 8, 2000, 5), Truth("of twice the nodes, corrected", 2000, 3, 1000, 3, 2000, 5),
+    Truth("of 8 layers instead of 3, corrected", 3000, 8, 1000, 3, 2000, 5),
 )  # fmt: skip
+FORCE_NOISES, TIP_NOISES = (0.02, 0.05, 0.1, 0.2), (0.0002, 0.001, 0.002)  # N and m, beside the usual 0.05 N and 0.5 mm
 
 
 def physics(device: str, nodes: int = 1000, layers: int = 3) -> PhysicsConfig:
@@ -62,6 +72,8 @@ def bench_identification(
     inclusions: int = 1,
     radius: float = 0.008,
     searches: int = 1,
+    palpations: int = 1,
+    noises: int = 1,
     folder: Path | None = None,
 ) -> None:
     """Print, and if asked for write, how well truth is found.
@@ -73,13 +85,15 @@ def bench_identification(
         inclusions: To be found in maps.
         radius: Of these, m.
         searches: For inclusions, with presses where they tell most, and in a raster.
+        palpations: Episodes of the task palpation, with presses where they tell most, and by its script.
+        noises: Cases of one modulus with each noise of forces and tips.
         folder: Of presses of lungs, as `endo-sim bench presses` takes it.
 
     Raises:
         ValueError: If a number is not positive, or the folder has no presses.
     """
-    if min(cases, inclusions, searches) < 0 or not radius > 0:
-        raise ValueError("cases, inclusions and searches must be 0 or more, and the radius above 0")
+    if min(cases, inclusions, searches, palpations, noises) < 0 or not radius > 0:
+        raise ValueError("cases, inclusions, searches, palpations and noises must be 0 or more, and the radius above 0")
     device, scene = pick_device(device), load_scene()
     stages: list[Stage] = [("speed", lambda: speed_rows(scene, device))]
     if cases:
@@ -88,6 +102,10 @@ def bench_identification(
         stages.append(("inclusions", lambda: inclusion_rows(scene, device, inclusions, radius)))
     if searches:
         stages.append(("searches", lambda: search_rows(scene, device, searches, radius)))
+    if palpations:
+        stages.append(("palpations", lambda: palpation_rows(scene, device, palpations)))
+    if noises:
+        stages.append(("noises", lambda: noise_rows(scene, device, noises)))
     if folder is not None:
         stages.append(("lungs", lambda: lung_rows(folder)))
     report(f"Identification on {machine(device)}", run_stages(stages), json_file)
@@ -118,10 +136,23 @@ def speed_rows(scene: Scene, device: str, unknowns: Sequence[int] = (1, 20, 60),
     return rows
 
 
-def modulus_rows(scene: Scene, device: str, truth: Truth, cases: int, first: int = 0) -> list[Row]:
+def noise_rows(scene: Scene, device: str, cases: int) -> list[Row]:
+    """The same with each noise, which the estimator knows."""
+    noises = [(force, 0.0005) for force in FORCE_NOISES] + [(0.05, tip) for tip in TIP_NOISES]
+    rows = []
+    for force, tip in noises:
+        truth = Truth(f"of the same model, {force:g} N, {1000 * tip:g} mm")
+        rows += modulus_rows(scene, device, truth, cases, force_noise=force, tip_noise=tip)[:4]
+    return rows
+
+
+def modulus_rows(
+    scene: Scene, device: str, truth: Truth, cases: int, first: int = 0, force_noise: float = 0.05, tip_noise: float = 0.0005
+) -> list[Row]:
     """Of tissue with one modulus: error, share of intervals that hold the truth, and time."""
     config, made = physics(device, truth.by_nodes, truth.by_layers), physics(device, truth.nodes, truth.layers)
     nodes, true_nodes = scene.nodes(config), scene.nodes(made)
+    finer = scene.nodes(physics(device, truth.finer_nodes, truth.finer_layers)) if truth.finer_nodes else None
     options = IdentificationConfig()
     places, errors, holds, seconds, widths, doubts = raster(nodes, 0.012), [], [], [], [], 0
     for case in range(first, first + cases):
@@ -130,11 +161,10 @@ def modulus_rows(scene: Scene, device: str, truth: Truth, cases: int, first: int
         offset = options.tip_offset * rng.standard_normal(3)
         chosen = places[rng.permutation(len(places))[:PRESSES]]
         softness = replace(made, young_modulus=modulus)
-        experiments = [
-            measure(press(nodes, config, place, steps=40), true_nodes, softness, rng, offset=offset, device=device) for place in chosen
-        ]
+        presses = [replace(press(nodes, config, place, steps=40), force_noise=force_noise, tip_noise=tip_noise) for place in chosen]
+        experiments = [measure(each, true_nodes, softness, rng, offset=offset, device=device) for each in presses]
         begin = time.perf_counter()
-        found = identify(experiments, nodes, config, options, device)
+        found = identify(experiments, nodes, config, options, device, finer=finer)
         seconds.append(time.perf_counter() - begin)
         told = found["young_modulus"]
         errors.append(abs(told.estimate / modulus - 1))
@@ -165,9 +195,9 @@ class _Hidden(NamedTuple):
         """Distance of the inclusion that is found from where it is, m."""
         return float(np.linalg.norm(find_inclusion(found).centre - self.centre))
 
-    def error_across(self, found: Identification) -> float:
-        """The same across the press, m."""
-        off = find_inclusion(found).centre - self.centre
+    def across(self, centre: np.ndarray) -> float:
+        """Distance of a place [3], m, world, from it, across the press, m."""
+        off = centre - self.centre
         return float(np.linalg.norm(off - (off @ self.normal) * self.normal))
 
 
@@ -194,7 +224,11 @@ def short_press(nodes: ControlNodes, config: PhysicsConfig, place: np.ndarray, s
 
 
 def inclusion_rows(scene: Scene, device: str, count: int, radius: float) -> list[Row]:
-    """Of a field, pressed in a raster over the place: how far from the truth the inclusion is found."""
+    """Pressed in a raster over the place: how far from the truth the inclusion is found, as a ball, and in a field."""
+    return [row for stiffness in ("inclusion", "field") for row in _inclusion_rows(scene, device, count, radius, stiffness)]
+
+
+def _inclusion_rows(scene: Scene, device: str, count: int, radius: float, stiffness: Literal["inclusion", "field"]) -> list[Row]:
     config = physics(device)
     nodes = scene.nodes(config)
     errors, across, seconds, ratios = [], [], [], []
@@ -205,12 +239,12 @@ def inclusion_rows(scene: Scene, device: str, count: int, radius: float) -> list
             for each in places
         ]
         begin = time.perf_counter()
-        found = identify(experiments, nodes, config, IdentificationConfig(stiffness="field"), device)
+        found = identify(experiments, nodes, config, IdentificationConfig(stiffness=stiffness), device)
         seconds.append(time.perf_counter() - begin)
         errors.append(hidden.error(found))
-        across.append(hidden.error_across(found))
+        across.append(hidden.across(find_inclusion(found).centre))
         ratios.append(find_inclusion(found).ratio)
-    name = f"inclusion of radius {1000 * radius:g} mm"
+    name = f"inclusion of radius {1000 * radius:g} mm, as {stiffness}"
     return [
         Row(f"{name}: error, median", 1000 * float(np.median(errors)), "mm"),
         Row(f"{name}: error across the press, median", 1000 * float(np.median(across)), "mm"),
@@ -222,13 +256,15 @@ def inclusion_rows(scene: Scene, device: str, count: int, radius: float) -> list
 
 def search_rows(scene: Scene, device: str, count: int, radius: float) -> list[Row]:
     """Presses until an inclusion is found within 4 mm across them, and is after the next, too: where each is expected to tell most, and in
-    a raster."""
+    a raster; both are told by the same search."""
     config = physics(device, SEARCH_NODES)
     nodes, needed = scene.nodes(config), {"a raster": [], "expected information": []}
+    candidates = [short_press(nodes, config, each, steps=20) for each in hide(nodes, 0, radius)[1]]  # the places are the same for all
+    untouched = Search(candidates, ForwardModel(nodes, config, device))
     for seed in range(count):
         for policy, told in needed.items():
-            hidden, places = hide(nodes, seed, radius)
-            told.append(search(nodes, config, hidden, places, policy != "a raster", device))
+            hidden, _ = hide(nodes, seed, radius)
+            told.append(search(nodes, config, hidden, candidates, untouched.anew(), policy != "a raster", device))
     rows = []
     for policy, told in needed.items():
         compared = (np.mean(told) / np.mean(needed["a raster"]), "a raster") if policy != "a raster" else (None, None)
@@ -236,23 +272,29 @@ def search_rows(scene: Scene, device: str, count: int, radius: float) -> list[Ro
     return rows
 
 
-def search(nodes: ControlNodes, config: PhysicsConfig, hidden: _Hidden, places: np.ndarray, informed: bool, device: str) -> int:
+def search(
+    nodes: ControlNodes, config: PhysicsConfig, hidden: _Hidden, candidates: list[Experiment], known: Search, informed: bool, device: str
+) -> int:
     """Presses until the inclusion is found, `MOST_PRESSES` + 1 if it is not."""
-    model, options = ForwardModel(nodes, config, device), IdentificationConfig(stiffness="field", iterations=5)
-    candidates = [short_press(nodes, config, each, steps=14) for each in places]  # as deep, and sooner over: what is expected is rough
-    left, found, errors = list(range(len(places))), None, []
-    for _ in range(min(MOST_PRESSES, len(places))):
-        at = 0
-        if informed:
-            at = best_press(found, [candidates[each] for each in left], model) if found is not None else _nearest_to_middle(places)
-        chosen = short_press(nodes, config, places[left.pop(at)])
-        measured = measure(chosen, nodes, config, hidden.rng, hidden.factors, hidden.offset, device=device)
-        found = identify([measured], nodes, config, options, device, around=places, start=found)
-        errors.append(hidden.error_across(found))
+    left, errors = list(range(len(candidates))), []
+    for _ in range(min(MOST_PRESSES, len(candidates))):
+        chosen = left.pop(int(known.expected()[left].argmax()) if informed else 0)
+        measured = measure(candidates[chosen], nodes, config, hidden.rng, hidden.factors, hidden.offset, device=device)
+        known.feel(chosen, measured.forces)
+        errors.append(hidden.across(known.centre))
         if len(errors) > 1 and max(errors[-2:]) <= FOUND:
             return len(errors) - 1
     return MOST_PRESSES + 1
 
 
-def _nearest_to_middle(places: np.ndarray) -> int:
-    return int(((places - places.mean(0)) ** 2).sum(1).argmin())
+def palpation_rows(scene: Scene, device: str, count: int) -> list[Row]:
+    """Episodes of the task palpation: how many are solved, and how soon, by presses that are expected to tell most, and by its script."""
+    batch, rows = TaskBatch(Palpation.name, scene, count, device=device), []
+    policies = {"its script": Palpation.script(count), "expected information": InformedPalpation(cast(Palpation, batch.task), device)}
+    lengths = {}
+    for name, policy in policies.items():
+        _, success, lengths[name] = play(batch, policy, TESTED_FROM + np.arange(count))
+        compared = (lengths[name].mean() / lengths["its script"].mean(), "its script") if name != "its script" else (None, None)
+        rows.append(Row(f"palpation by {name}: solved", 100 * float(success.mean()), "%"))
+        rows.append(Row(f"palpation by {name}: steps, mean of {count}", float(lengths[name].mean()), "", *compared))
+    return rows

@@ -96,13 +96,17 @@ class BenchIdentification(Measured):
     it takes."""
 
     cases: int = 4
-    """Cases of one modulus with each of four truths; 0 = none."""
+    """Cases of one modulus with each of six truths; 0 = none."""
     inclusions: int = 1
     """Inclusions to be found in maps; 0 = none."""
     radius: float = 0.008
     """Radius of these, m."""
     searches: int = 1
     """Searches for an inclusion, press by press, where the next is expected to tell most, and in a raster; 0 = none."""
+    palpations: int = 1
+    """Episodes of the task palpation, with presses where the next is expected to tell most, and by the script of the task; 0 = none."""
+    noises: int = 1
+    """Cases of one modulus with each of seven noises of forces and tips; 0 = none."""
     folder: Path | None = None
     """Folder of presses of real tissue, as `presses` takes it; default: none."""
 

@@ -90,7 +90,7 @@ def survey(data: list[Observations], model: ForwardModel, unknowns: Unknowns, co
     measured = [each.experiment.forces for each in data]
     axes = [_axis(each.experiment, model) for each in data]
     for each, axis in zip(data, axes):
-        replay = model.replay(each.experiment, [unknowns.copy(z, depth * axis) for depth in depths])
+        replay = model.replay(each.experiment, [unknowns.copy(z, depth * axis) for depth in depths], _SCANNED)
         predicted.append(replay.forces)
     middle = _SCANNED // 2
     _check_touch(data, model, predicted, middle)

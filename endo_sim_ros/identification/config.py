@@ -10,8 +10,9 @@ from endo_sim_ros.core.config import Range, StageConfig
 class IdentificationConfig(StageConfig):
     """What is unknown of tissue, what was known before, and how it is estimated."""
 
-    stiffness: Literal["uniform", "regions", "field"] = "uniform"
-    """What is unknown of the stiffness: one modulus, one of each of the `regions` of physics and one of the rest, or a smooth field."""
+    stiffness: Literal["uniform", "regions", "field", "inclusion"] = "uniform"
+    """What is unknown of the stiffness: one modulus, one of each of the `regions` of physics and one of the rest, a smooth field, or one
+    modulus and a ball of another one: its place, depth, radius and ratio."""
     unknowns: tuple[str, ...] = ()
     """What else is unknown: poisson_ratio, damping, friction, relaxation, relaxation_time or stiffening of physics, hold_back and
     hold_rim (how firmly the deepest layer and the rim are held)."""
@@ -23,6 +24,10 @@ class IdentificationConfig(StageConfig):
     """Distance at which two places of a field have nearly lost each other: about the size of what is looked for."""
     field_reach: Annotated[float, Range(1e-3, 1.0, "m")] = 0.025
     """The field is unknown within this distance of the way of a tool, beyond it all tissue is alike: it is not felt from farther."""
+    inclusion_radius: Annotated[float, Range(5e-4, 0.1, "m")] = 0.006
+    """Radius of an inclusion before any data, its median; half of them are within a factor of 1.4."""
+    inclusion_ratio: Annotated[float, Range(0.02, 50.0)] = 4.0
+    """The same of how many times as stiff as the tissue around it is; its logarithm has the standard deviation `field_spread`."""
     level: Annotated[float, Range(0.5, 0.999)] = 0.9
     """Probability that an interval holds the truth."""
     known: Annotated[float, Range(0.1, 0.999)] = 0.75
@@ -31,14 +36,17 @@ class IdentificationConfig(StageConfig):
     """Standard deviation of a coordinate of the error that all tips share, of the registration of the tool; the errors of single tips,
     which are independent, are the `tip_noise` of the experiment."""
     tip_smoothing: Annotated[float, Range(0.0, 1.0, "s")] = 0.12
-    """Standard deviation of the Gaussian in time that weights the parabolas by which tips are smoothed before they are replayed: single
-    errors would shake the tissue, but wide ones round off where the tool turns round."""
+    """Standard deviation, at most, of the Gaussian in time that weights the parabolas by which tips are smoothed before they are replayed:
+    single errors would shake the tissue, but wide ones round off where the tool turns round."""
     model_error: Annotated[float, Range(0.0, 1.0)] = 0.05
     """Standard deviation of the share by which all forces of the model are wrong together, and of that by which those of each experiment
     are: with other control nodes forces of presses differ by 3 to 25 %."""
     surface_error: Annotated[float, Range(0.0, 0.02, "m")] = 0.0005
     """Standard deviation of a coordinate of the error of the place of the skin where an experiment touches it, of the model that was
     reconstructed and of the grid, on which contact begins a part of a cell early."""
+    grid_error: Annotated[float, Range(0.0, 2.0)] = 0.5
+    """Where finer control nodes correct forces: standard deviation of the share of this correction that is still missing, or too much.
+    Errors that fall with the distance between nodes leave as much as the correction where it is halved."""
     iterations: Annotated[int, Range(1, 100)] = 12
     """Most iterations of Levenberg and Marquardt's method."""
     tolerance: Annotated[float, Range(1e-4, 1.0)] = 0.2

@@ -1,31 +1,36 @@
 """Estimation of what tissue is made of: Gauss-Newton on copies of the tissue, and the posterior by Laplace's method.
 
-Beside the unknowns four numbers are estimated that nobody asks for: the error of the place of the tool that all tips share [3], and the
-share by which all forces of the model are wrong. They have priors, too, so that intervals know of them.
+Beside the unknowns five numbers are estimated that nobody asks for: the error of the place of the tool that all tips share [3], the share
+by which all forces of the model are wrong, and how much still finer control nodes would change them. They have priors, too, so that
+intervals know of them.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.spatial import KDTree
 from scipy.stats import norm
 
 from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.identification.ball import COUNT as BALL
 from endo_sim_ros.identification.checks import IdentificationError, check_input, judge_residuals, survey
 from endo_sim_ros.identification.config import IdentificationConfig
 from endo_sim_ros.identification.experiment import Experiment
 from endo_sim_ros.identification.forward import ForwardModel, distances_to_skin, reach_of
 from endo_sim_ros.identification.maps import paint_as_regions
 from endo_sim_ros.identification.observations import Covariance, Observations
+from endo_sim_ros.identification.scan import Places, Scan, added, weights, without_ball
 from endo_sim_ros.identification.unknowns import MOST_LOG, Reported, Told, Unknowns
 from endo_sim_ros.physics import ControlNodes, PhysicsConfig
 
-NUISANCES = 4
+NUISANCES = 5
 OnProgress = Callable[[str, int, int], None]
 """``on_progress(stage, done, total)``."""
 _FARTHEST = 1.5  # standard deviations that an unknown moves in one iteration
 _DAMPED, _LOOSENED, _MOST_DAMPED = 10.0, 0.1, 1e6
 _FAR = 2.0  # standard deviations from what was thought, which is told
+_NOTHING = 0.5  # of chi-square: what a fresh Jacobian promises no more than, and does not keep, is how rough forces are
 _AS_PROMISED = 0.3  # share of the promised gain with which a Jacobian is still good
 
 
@@ -64,14 +69,15 @@ class Identification:
         high: Upper end [M].
         known: Whether it is known [M], bool.
         removed: Share of its variance that the data took away [M].
-        mean: Of the unknowns and the four others [P + 4], standard normal before any data.
-        covariance: Of these [P + 4, P + 4].
+        mean: Of the unknowns and the five others [P + 5], standard normal before any data.
+        covariance: Of these [P + 4, P + 5].
         parameters: What the numbers mean.
         nodes: Of the tissue.
         level: Probability that an interval holds the truth.
         chi_square: Of the residuals, over their number: about 1 where the model explains them.
         steps: That were simulated, of all copies together.
         felt: Whether any force was measured, here or in what it goes on from.
+        sure: Probability that there is an inclusion, and about where it was found; None where none was looked for.
     """
 
     unknowns: list[Estimate]
@@ -89,6 +95,7 @@ class Identification:
     chi_square: float
     steps: int
     felt: bool
+    sure: float | None = None
 
     def __getitem__(self, name: str) -> Estimate:
         """The estimate of this name."""
@@ -100,7 +107,7 @@ class Identification:
     @property
     def tip_offset(self) -> np.ndarray:
         """How far the tool stands from where it is said to [3], m, world."""
-        return self.mean[-NUISANCES:-1] * self.parameters.config.tip_offset
+        return self.mean[-NUISANCES : 3 - NUISANCES] * self.parameters.config.tip_offset
 
     def regions(self, step: float = 0.2, most: int = 300) -> tuple[str, ...]:
         """The map as `regions` of physics, see `paint_as_regions`."""
@@ -155,6 +162,7 @@ def identify(
     *,
     around: np.ndarray | None = None,
     start: Identification | None = None,
+    finer: ControlNodes | None = None,
 ) -> Identification:
     """Estimate what tissue is made of from how it answered a tool.
 
@@ -168,6 +176,8 @@ def identify(
         around: Places [K, 3], m, world, near which a field is unknown; default: where tools of the experiments touch.
         start: An estimate from other experiments that this one goes on from: what they told is the prior, with the unknowns and the
             configuration that they had. Give that one `around` where tools will touch later.
+        finer: The same tissue of more control nodes, if any: forces are those of this one, how they change with the unknowns is told by
+            `nodes`, and how far both differ tells how wrong the finer one still is.
 
     Raises:
         IdentificationError: If nothing can be estimated from the data; the sentence says what was seen.
@@ -183,20 +193,34 @@ def identify(
             raise ConfigError("start is an estimate of other tissue: give it the nodes and the physics that it was made with")
     else:
         unknowns = Unknowns(nodes, physics, config, touched_places(experiments, nodes, physics) if around is None else around)
-    model = ForwardModel(nodes, physics, device)
+    model = ForwardModel(nodes, physics, device, finer)
     progress("look at the data", 0, config.iterations)
     size = unknowns.count + NUISANCES
     prior = _Prior(np.zeros(size), np.eye(size)) if start is None else _Prior(start.mean, np.linalg.inv(start.covariance))
-    first = survey(data, model, unknowns, config, prior.mean[: unknowns.count])
+    plain = prior.mean.copy()
+    if unknowns.ball is not None and start is None:
+        plain[BALL] = unknowns.ball.absent()
+    first = survey(data, model, unknowns, config, plain[: unknowns.count])
     if not any(each.used.any() for each in data):
         raise IdentificationError("nothing was measured: forces, displacements and tracks are all missing; give one of them")
     theta = prior.mean.copy()
     if start is None:
         theta[: unknowns.stiffness_count] = _scaled(unknowns, first.scale)
     parts = [_Data(each, *unknowns.directions(touched_places([each.experiment], nodes, physics))) for each in data]
+    sure = None if start is None else start.sure
+    if unknowns.ball is not None and start is None:
+        progress("look for the inclusion", 0, config.iterations)
+        theta, sure = _locate(theta, prior, parts, model, unknowns)
     point, ended = _minimise(theta, prior, parts, model, unknowns, progress)
     unended = [] if ended else [f"the estimate had not settled after {config.iterations} iterations; allow more"]
-    return _conclude(point, data, model, unknowns, [*first.findings, *unended], start is not None and start.felt)
+    found = _conclude(point, data, model, unknowns, [*first.findings, *unended], start is not None and start.felt)
+    if unknowns.ball is None:
+        return found
+    x, y, z = unknowns.ball.shape(found.mean[1 : 1 + BALL])[0]
+    there = f"the middle of the inclusion is at {x:.4f} {y:.4f} {z:.4f} m"
+    if sure is not None:
+        there += f", with a probability of {sure:.2f}" if sure >= 0.5 else ", but none explains the data as well"
+    return replace(found, sure=sure, findings=[there, *found.findings])
 
 
 def touched_places(experiments: Sequence[Experiment], nodes: ControlNodes, physics: PhysicsConfig) -> np.ndarray:
@@ -232,10 +256,11 @@ def look(theta: np.ndarray, prior: _Prior, data: Sequence[_Data], model: Forward
         copies = [unknowns.copy(z, offset)]
         copies += [replace(unknowns.copy(z, offset), jog=config.tip_step * np.eye(3)[axis]) for axis in range(3)]
         copies += [unknowns.copy(z + config.jacobian_step * way, offset) for way in ways]
-        replay = model.replay(each.experiment, copies)
+        replay = model.replay(each.experiment, copies, 4)
         told, undone = each.predicted(replay), undone + int(replay.faults[0])
-        forces = each.of_forces()
+        forces, by_grid = each.of_forces(), config.grid_error * each.changed(replay)
         told[:, forces] *= gain
+        told += theta[P + 4] * by_grid
         J = np.zeros((told.shape[1], P + NUISANCES))
         J[:, :P] = (told[4:] - told[0]).T / config.jacobian_step @ part.back[: len(ways)]
         if not feels:  # how stiff all is would be told by inertia and damping alone, which the model has only about right
@@ -243,8 +268,8 @@ def look(theta: np.ndarray, prior: _Prior, data: Sequence[_Data], model: Forward
         by_tip = (told[1:4] - told[0]).T / config.tip_step
         by_place = np.where(each.closed_at[:, None] >= 0, 0, by_tip)  # a place that is held moves with the tip, wherever that is
         J[:, P : P + 3] = by_place * config.tip_offset
-        J[:, P + 3] = np.where(forces, told[0] / gain * config.model_error, 0)
-        own = np.column_stack([by_place * config.surface_error, J[:, P + 3]])  # the errors of this experiment alone
+        J[:, P + 3], J[:, P + 4] = np.where(forces, told[0] / gain * config.model_error, 0), by_grid
+        own = np.column_stack([by_place * config.surface_error, J[:, P + 3 :]])  # the errors of this experiment alone
         residuals.append((each.values - told[0])[each.used])
         jacobians.append(J[each.used])
         covariances.append(each.covariance(by_tip, own))
@@ -264,6 +289,25 @@ def _normal(point: _Point) -> tuple[np.ndarray, np.ndarray]:
         H += J.T @ weighted
         g += weighted.T @ r
     return H, g
+
+
+def _locate(theta: np.ndarray, prior: _Prior, data: list[_Data], model: ForwardModel, unknowns: Unknowns) -> tuple[np.ndarray, float]:
+    """θ with the ball at the place that explains the data best, and the probability that there is one thereabouts."""
+    assert unknowns.ball is not None
+    theta = theta.copy()
+    theta[BALL] = unknowns.ball.absent()
+    point = look(theta, prior, data, model, unknowns)
+    touched = [touched_places([part.seen.experiment], model.nodes, model.physics) for part in data]
+    places = Places(unknowns, np.concatenate(touched))
+    scan = Scan.empty(len(theta), len(places.z))
+    for part, at, r, J, R in zip(data, touched, point.residuals, without_ball(point.jacobians), point.covariances):
+        near = KDTree(at).query(places.centres)[0] <= unknowns.config.field_reach if len(at) else np.zeros(len(places.z), bool)
+        scan.add(r, J, R, added(part.seen, model, unknowns, places, theta, near))
+    probable = weights(scan.costs(), places)
+    best = int(probable[:-1].argmax())
+    here = ((places.centres - places.centres[best]) ** 2).sum(1) <= (2 * unknowns.config.inclusion_radius) ** 2
+    theta[1 : 1 + BALL] = places.z[best, 1 : 1 + BALL]
+    return theta, float(probable[:-1][here].sum())
 
 
 def _minimise(
@@ -294,14 +338,17 @@ def _minimise(
             continue
         other = look(point.theta + step, prior, data, model, unknowns, jacobian=False)
         before = prior.cost(point.theta) + _misfit(point.residuals, point.covariances)
-        gained = before - prior.cost(other.theta) - _misfit(other.residuals, point.covariances)
-        if gained > _AS_PROMISED * (2 * g @ step - step @ H @ step):
+        gained, promised = before - prior.cost(other.theta) - _misfit(other.residuals, point.covariances), 2 * g @ step - step @ H @ step
+        if gained > _AS_PROMISED * promised:
             for old, new, was, now in zip(point.jacobians, other.jacobians, point.residuals, other.residuals):
                 wrong = (was - now - old @ step) * (moved > 1)  # of short steps it would be rounding
                 new[:, :P] = old[:, :P] + wrong[:, None] * step[:P] / max(float(step[:P] @ step[:P]), 1e-12)
             point, damping, fresh = other, max(damping * _LOOSENED, 1e-6), False
         elif not fresh:
             point, fresh = look(other.theta if gained > 0 else point.theta, prior, data, model, unknowns), True
+        elif promised < _NOTHING:
+            point, settled = look(other.theta, prior, data, model, unknowns) if gained > 0 else point, True
+            break
         elif gained > 0:
             point = look(other.theta, prior, data, model, unknowns)
         else:
@@ -325,8 +372,8 @@ def _conclude(
     quantile = float(norm.ppf(0.5 + config.level / 2))
     feels = felt or any(each.of_forces()[each.used].any() for each in data)
     told = [_estimate(each, point.theta, covariance, quantile, feels, unknowns, config) for each in unknowns.reported()]
-    matrix = np.concatenate([unknowns.matrix, np.zeros((len(unknowns.nodes), NUISANCES))], 1)
-    logs = matrix @ point.theta
+    matrix = np.concatenate([unknowns.tangent(point.theta[: unknowns.count]), np.zeros((len(unknowns.nodes), NUISANCES))], 1)
+    logs = unknowns.logs(point.theta[: unknowns.count])
     middle = np.log(unknowns.base) + np.clip(logs, -MOST_LOG, MOST_LOG)
     prior = (matrix**2).sum(1) + unknowns.residual
     left = np.einsum("mi,ij,mj->m", matrix, covariance, matrix) + unknowns.residual
@@ -371,7 +418,7 @@ def _estimate(
     told: Told = "known" if removed >= config.known else "not told by these data"
     if reported.is_modulus and not feels:
         # How it differs from the mean of all moduli.
-        stiffness = unknowns.matrix[:, : unknowns.stiffness_count].mean(0)
+        stiffness = unknowns.tangent(theta[: unknowns.count])[:, : unknowns.stiffness_count].mean(0)
         ratio = row.copy()
         ratio[: unknowns.stiffness_count] -= stiffness
         alone = ratio @ ratio
@@ -382,15 +429,18 @@ def _estimate(
     return Estimate(reported.name, reported.unit, estimate, low, high, told, float(removed))
 
 
+def predicted_at(
+    theta: np.ndarray, candidates: Sequence[Experiment], model: ForwardModel, unknowns: Unknowns
+) -> tuple[list[Observations], _Point]:
+    """Experiments as if forces of zero had been measured in them, and what these look like from θ [Q]."""
+    seen = [Observations(replace(each, forces=np.zeros(each.tips.shape)), unknowns.config.tip_smoothing) for each in candidates]
+    parts = [_Data(each, *unknowns.directions(touched_places([each.experiment], model.nodes, model.physics))) for each in seen]
+    return seen, look(theta, _Prior(np.zeros(len(theta)), np.eye(len(theta))), parts, model, unknowns)
+
+
 def predict_as_measured(
     found: Identification, candidates: Sequence[Experiment], model: ForwardModel
 ) -> list[tuple[np.ndarray, Covariance]]:
-    """Jacobian [n, P + 4] and covariance of the forces that each experiment would measure of tissue as it was estimated."""
-    unknowns = found.parameters
-    parts = []
-    for each in candidates:
-        seen = Observations(replace(each, forces=np.zeros(each.tips.shape)), unknowns.config.tip_smoothing)
-        parts.append(_Data(seen, *unknowns.directions(touched_places([each], model.nodes, model.physics))))
-    flat = _Prior(found.mean, np.linalg.inv(found.covariance))
-    point = look(found.mean, flat, parts, model, unknowns)
+    """Jacobian [n, P + 5] and covariance of the forces that each experiment would measure of tissue as it was estimated."""
+    _, point = predicted_at(found.mean, candidates, model, found.parameters)
     return list(zip(point.jacobians, point.covariances))

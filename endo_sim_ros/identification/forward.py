@@ -49,12 +49,14 @@ class Replay:
         displacements: Of the control nodes that were measured [C, T, L, 3], m.
         pixels: Of each set of tracks [C, F, K, 2].
         faults: Steps that the simulation had to undo in each copy [C].
+        change: By how much forces of the first copy are other ones on finer control nodes [T, 3], N; 0 where there are none.
     """
 
     forces: np.ndarray
     displacements: np.ndarray | None
     pixels: list[np.ndarray]
     faults: np.ndarray
+    change: np.ndarray
 
 
 class ForwardModel:
@@ -64,16 +66,46 @@ class ForwardModel:
         nodes: At rest.
         physics: What the tissue is as far as it is known; factors of copies multiply its moduli.
         device: Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N.
+        finer: The same tissue of more control nodes, which corrects forces, if any.
     """
 
-    def __init__(self, nodes: ControlNodes, physics: PhysicsConfig, device: str = "auto"):
+    def __init__(self, nodes: ControlNodes, physics: PhysicsConfig, device: str = "auto", finer: ControlNodes | None = None):
         self.nodes, self.physics = nodes, replace(physics, device=device)
-        self.steps = 0
-        """Steps that were simulated, of all copies together."""
+        self._finer = None if finer is None else ForwardModel(finer, physics, device)
+        if finer is not None:
+            self._bound = bind_weights(finer.rest.astype(np.float64), nodes.rest.astype(np.float64), NEIGHBOURS, "compact")
+        self._steps = 0
         self._batches: dict[tuple, TissueBatch] = {}
 
-    def replay(self, experiment: Experiment, copies: Sequence[Copy]) -> Replay:
-        """Let the tool of an experiment do in each copy what it did. Until it first comes near the tissue nothing is simulated."""
+    @property
+    def steps(self) -> int:
+        """Steps that were simulated, of all copies together."""
+        return self._steps + (self._finer.steps if self._finer is not None else 0)
+
+    def replay(self, experiment: Experiment, copies: Sequence[Copy], exact: int = 0) -> Replay:
+        """Let the tool of an experiment do in each copy what it did. Until it first comes near the tissue nothing is simulated.
+
+        Args:
+            experiment: What the tool did.
+            copies: C of the tissue.
+            exact: Forces of so many copies, the first ones, are those on the finer control nodes, where there are any. Those of the others
+                differ from the first as on the coarse ones, but for the scale by which forces on these are greater.
+        """
+        told = self._replay(experiment, copies)
+        if self._finer is None or not exact:
+            return told
+        finer = self._finer._replay(replace(experiment, displacements=None, tracks=[]), [self._on_finer(each) for each in copies[:exact]])
+        coarse = told.forces
+        scale = float((finer.forces[0] * coarse[0]).sum()) / max(float((coarse[0] ** 2).sum()), 1e-30)
+        forces = np.concatenate([finer.forces, finer.forces[:1] + scale * (coarse[exact:] - coarse[:1])])
+        return replace(told, forces=forces, change=finer.forces[0] - coarse[0])
+
+    def _on_finer(self, copy: Copy) -> Copy:
+        """The same on the finer control nodes."""
+        index, weights = self._bound
+        return replace(copy, factors=np.exp((np.log(copy.factors)[index] * weights).sum(1)), holds=copy.holds[index[:, 0]])
+
+    def _replay(self, experiment: Experiment, copies: Sequence[Copy]) -> Replay:
         groups: dict[tuple, list[int]] = {}
         for number, copy in enumerate(copies):
             groups.setdefault(copy.options, []).append(number)
@@ -96,8 +128,8 @@ class ForwardModel:
                 moved[members, begin:] = told[1]
             for into, seen in zip(pixels, told[2]):
                 into[members] = seen
-            self.steps += len(members) * (steps - begin)
-        return Replay(forces, moved, pixels, faults)
+            self._steps += len(members) * (steps - begin)
+        return Replay(forces, moved, pixels, faults, np.zeros((steps, 3)))
 
     def _config(self, experiment: Experiment, options: Sequence[tuple[str, float]]) -> PhysicsConfig:
         given: dict[str, Any] = dict(options)
@@ -181,6 +213,13 @@ class _Points:
     def project(self, places: np.ndarray, image: int) -> np.ndarray:
         """Pixels [C, K, 2] of places [C, K, 3]."""
         return self.cameras[image].project(places.reshape(-1, 3))[0].reshape(*places.shape[:2], 2)
+
+
+def finer_physics(physics: PhysicsConfig, times: float) -> PhysicsConfig:
+    """Physics whose control nodes are that many times closer together, across the skin and below it."""
+    layers = math.ceil(times * physics.layers)
+    skin = times**2 * physics.node_count / (physics.layers + 1)
+    return replace(physics, layers=layers, node_count=round(skin * (layers + 1)))
 
 
 def closing_steps(experiment: Experiment) -> np.ndarray:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial import KDTree
 
+from endo_sim_ros.identification.ball import COUNT as BALL
 from endo_sim_ros.physics import ControlNodes
 
 if TYPE_CHECKING:
@@ -100,12 +101,18 @@ def find_inclusion(found: "Identification", samples: int = 200, seed: int = 0) -
         ValueError: If no field was estimated.
     """
     unknowns = found.parameters
-    if not len(unknowns.centres):
-        raise ValueError("an inclusion is looked for in a field; estimate with stiffness = field")
+    if unknowns.ball is None and not len(unknowns.centres):
+        raise ValueError("an inclusion is looked for in a field, or as one; estimate with stiffness = inclusion, or field")
     rng = np.random.default_rng(seed)
     fields = slice(0, unknowns.count)
     factor = np.linalg.cholesky(found.covariance[fields, fields] + 1e-12 * np.eye(unknowns.count))
     draws = found.mean[fields] + rng.standard_normal((samples, unknowns.count)) @ factor.T
+    if unknowns.ball is not None:
+        (centre, radius, ratio), *others = (unknowns.ball.shape(each[1 : 1 + BALL]) for each in (found.mean[fields], *draws))
+        tail = (1 - found.level) / 2
+        low, high = np.exp(np.quantile([each[2] for each in others], [tail, 1 - tail]))
+        deviation = np.sqrt(((np.array([each[0] for each in others]) - centre) ** 2).mean(0))
+        return Inclusion(centre, deviation, 1.0 if found.sure is None else found.sure, np.exp(ratio), float(low), float(high), radius)
     within = ~unknowns.nodes.pinned & (unknowns.residual < 0.5 * unknowns.config.field_spread**2)
     rest, volumes = unknowns.nodes.rest[within].astype(np.float64), unknowns.nodes.volumes[within].astype(np.float64)
     logs = (np.log(unknowns.base) + np.concatenate([found.mean[fields][None], draws]) @ unknowns.matrix.T)[:, within]

@@ -60,6 +60,12 @@ class Observations:
         parts = [replay.forces, *([] if replay.displacements is None else [replay.displacements]), *replay.pixels]
         return np.concatenate([part.reshape(count, -1)[:, given] for part, given in zip(parts, self._given)], 1)
 
+    def changed(self, replay: Replay) -> np.ndarray:
+        """By how much finer control nodes change what the first copy of a replay predicts [N]."""
+        told = np.zeros(len(self.values))
+        told[self.of_forces()] = replay.change.ravel()[self._given[0]]
+        return told
+
     def of_forces(self) -> np.ndarray:
         """Which of the numbers are forces [N]."""
         return self.kinds == FORCE

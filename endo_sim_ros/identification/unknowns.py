@@ -14,6 +14,7 @@ from scipy.linalg import cho_factor, cho_solve, cholesky
 from scipy.spatial import KDTree
 
 from endo_sim_ros.core.config import ConfigError
+from endo_sim_ros.identification.ball import COUNT as BALL, PLACE, Ball
 from endo_sim_ros.identification.config import IdentificationConfig
 from endo_sim_ros.identification.forward import Copy
 from endo_sim_ros.physics import ControlNodes, PhysicsConfig, sample_farthest
@@ -113,14 +114,15 @@ class Unknowns:
         self.nodes, self.physics, self.config = nodes, physics, config
         self.base = np.asarray(tissue_properties(nodes, physics).young_modulus)
         self._factor = np.zeros((0, 0))  # of the covariance of a field at its centres
+        self.ball = Ball(nodes, config, touched) if config.stiffness == "inclusion" else None
         matrix, self.labels, self.centres, self.residual = self._stiffness(touched)
         self.stiffness_count = matrix.shape[1]
         names = list(dict.fromkeys(config.unknowns))
         self._others = [(name, self._prior(name)) for name in names if name]
         self.count = self.stiffness_count + len(self._others)
         self.scale = np.zeros(self.count)  # direction in which all moduli are multiplied by e
-        self.scale[: 1 if config.stiffness == "field" else self.stiffness_count] = 1 / config.spread
-        self.matrix = np.concatenate([matrix, np.zeros((len(nodes), len(self._others)))], 1)  # log factors of nodes [M, P]
+        self.scale[: self.stiffness_count if config.stiffness == "regions" else 1] = 1 / config.spread
+        self.matrix = np.concatenate([matrix, np.zeros((len(nodes), len(self._others)))], 1)  # the linear part of `logs` [M, P]
         self._back, self._rim = held_sets(nodes)
         for name, pinned in (("hold_back", self._back), ("hold_rim", self._rim)):
             if name in names and not pinned.any():
@@ -146,6 +148,9 @@ class Unknowns:
             return np.full((count, 1), config.spread), [MODULUS], none, np.zeros(count)
         if config.stiffness == "regions":
             return (*self._regions(), none, np.zeros(count))
+        if config.stiffness == "inclusion":
+            alone = np.full((count, 1), config.spread)
+            return np.concatenate([alone, np.zeros((count, BALL))], 1), [f"{MODULUS} of the rest"], none, np.zeros(count)
         near = self._near(touched)
         centres, weights, residual, self._factor = gaussian_process(self.nodes.rest[near], config.field_spread, config.field_length)
         field = np.zeros((count, len(centres)))
@@ -174,9 +179,24 @@ class Unknowns:
         near = np.flatnonzero(KDTree(touched).query(rest)[0] <= self.config.field_reach)
         return near if len(near) else np.arange(len(rest))
 
+    def logs(self, z: np.ndarray) -> np.ndarray:
+        """Logarithms of the factors on the moduli of all control nodes [M] that unknowns [P] make."""
+        told = self.matrix @ z
+        return told if self.ball is None else told + self.ball.logs(z[1 : 1 + BALL])
+
+    def tangent(self, z: np.ndarray) -> np.ndarray:
+        """Derivatives of `logs` [M, P]."""
+        if self.ball is None:
+            return self.matrix
+        told, step = self.matrix.copy(), self.config.jacobian_step
+        for number in range(1, 1 + BALL):
+            by = step * np.eye(self.count)[number]
+            told[:, number] = (self.logs(z + by) - self.logs(z - by)) / (2 * step)
+        return told
+
     def copy(self, z: np.ndarray, shift: np.ndarray | None = None) -> Copy:
         """The tissue that these unknowns [P] make."""
-        factors = np.exp(np.clip(self.matrix @ z, -MOST_LOG, MOST_LOG))
+        factors = np.exp(np.clip(self.logs(z), -MOST_LOG, MOST_LOG))
         holds, options = np.ones(len(self.nodes)), []
         for (name, prior), value in zip(self._others, z[self.stiffness_count :]):
             if name in _HOLDS:
@@ -216,10 +236,13 @@ class Unknowns:
             told.append(Reported(MODULUS, "Pa", self.matrix[moving].mean(0), float(np.log(self.base[moving]).mean())))
         else:
             for number, name in enumerate(self.labels):
-                members = self.matrix[:, number] > 0
+                members = self.matrix[:, number] != 0
                 row = np.zeros(self.count)
                 row[number] = self.config.spread
                 told.append(Reported(name, "Pa", row, float(np.log(self.base[members]).mean())))
+        if self.ball is not None:
+            for number, (name, unit, median, sd) in enumerate(self.ball.told(), 1 + PLACE):
+                told.append(Reported(name, unit, sd * np.eye(self.count)[number], median))
         for number, (name, prior) in enumerate(self._others, self.stiffness_count):
             row = np.zeros(self.count)
             row[number] = prior.sd

@@ -9,20 +9,28 @@ from benchmarks import identification, lung_trials
 from benchmarks.identification import Truth, bench_identification
 from benchmarks.presses import Plan, press, tabulate
 from endo_sim_ros.evaluation.measurement import report
+from endo_sim_ros.learning.scenes import load_scene
 
 
 @pytest.mark.slow
 def test_bench_tells_errors_intervals_and_speed(tmp_path, monkeypatch, capsys):
-    small = {"nodes": 300, "layers": 2, "by_nodes": 300, "by_layers": 2}
+    small = {"nodes": 300, "layers": 2, "by_nodes": 300, "by_layers": 2, "finer_nodes": 500, "finer_layers": 3}
     monkeypatch.setattr(identification, "TRUTHS", (Truth("of the same model", **small),))
     monkeypatch.setattr(identification, "PRESSES", 1)
-    bench_identification(tmp_path / "rows.json", "cpu", cases=1, inclusions=0, searches=0)
+    bench_identification(tmp_path / "rows.json", "cpu", cases=1, inclusions=0, searches=0, palpations=0, noises=0)
     rows = {row["name"]: row["value"] for row in json.loads((tmp_path / "rows.json").read_text())}
     assert rows["steps of 5 copies"] > 0
     assert 0 <= rows["one modulus, truth of the same model: error, median"] < 50
     assert rows["one modulus, truth of the same model: 90 % intervals that hold it"] in (0, 100)
     with pytest.raises(ValueError, match="must be 0 or more"):
         bench_identification(None, "cpu", cases=-1)
+
+
+@pytest.mark.slow
+def test_palpation_that_expects_to_learn_needs_fewer_steps_than_its_script():
+    rows = {row.name: row.value for row in identification.palpation_rows(load_scene(), "cpu", 1)}
+    assert rows["palpation by expected information: solved"] == rows["palpation by its script: solved"] == 100
+    assert rows["palpation by expected information: steps, mean of 1"] < rows["palpation by its script: steps, mean of 1"]
 
 
 @pytest.mark.slow

@@ -84,8 +84,8 @@ def press(path, seconds=4.0, presses=(1.0,), rate=100.0, forces=25.0, force=lamb
         rate, forces: Of messages, Hz.
         force: Newtons towards the camera by the depth, m.
         options: depth; duration: of a press, s; late: seconds by which forces are late (function of the time); noise: of a force, N;
-            offset: of all forces [3], N; leave_out: (from, to) without poses, s; frame, base: name and pose of the frame of poses; x: how far beside, m;
-            broken: when a pose is no number, s.
+            offset: of all forces [3], N; leave_out: (from, to) without poses, s; frame, base: name and pose of the frame of poses;
+            x: how far beside, m; broken: when a pose is no number, s.
     """
     depth, base = options.get("depth", DEPTH), options.get("base", np.eye(4))
     late, rng = options.get("late", lambda t: 0.0), np.random.default_rng(0)

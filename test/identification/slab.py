@@ -12,17 +12,17 @@ PHYSICS = PhysicsConfig(young_modulus=4e3, contact_radius=0.008, friction=0.1, d
 
 def slab(side: int = 9, deep: int = 4) -> ControlNodes:
     """Control nodes of a slab 10 cm in front of the world's origin, held below and at its rim; skin first, as everywhere."""
-    across = (np.arange(side) - (side - 1) / 2) * SPACING
-    down = 0.1 + np.arange(deep) * SPACING
+    across, down = np.linspace(-4 * SPACING, 4 * SPACING, side), 0.1 + np.linspace(0, 3 * SPACING, deep)
     z, y, x = (each.ravel() for each in np.meshgrid(down, across, across, indexing="ij"))
     edge = across[-1] - 1e-6
     pinned = (z > down[-1] - 1e-6) | (np.maximum(np.abs(x), np.abs(y)) > edge)
-    return ControlNodes(
-        np.stack([x, y, z], 1).astype(np.float32), pinned, np.full(len(x), SPACING**3, np.float32), z < 0.1 + 1e-6, SPACING, np.zeros(3)
-    )
+    gap, below = across[1] - across[0], down[1] - down[0]
+    volumes = np.full(len(x), gap**2 * below, np.float32)
+    return ControlNodes(np.stack([x, y, z], 1).astype(np.float32), pinned, volumes, z < 0.1 + 1e-6, max(gap, below), np.zeros(3))
 
 
 NODES = slab()
+FINER = slab(13, 6)  # the same, two thirds as far apart
 
 
 def pressed(x: float = 0.0, y: float = 0.0, depth: float = 0.006, steps: int = 24) -> Experiment:

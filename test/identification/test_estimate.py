@@ -4,18 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from slab import NODES, PHYSICS, pressed
+from slab import FINER, NODES, PHYSICS, pressed
 
 from endo_sim_ros.core.config import ConfigError
-from endo_sim_ros.identification import IdentificationConfig, identify
-from endo_sim_ros.identification.acquire import expected_information
+from endo_sim_ros.identification import IdentificationConfig, find_inclusion, identify
+from endo_sim_ros.identification.acquire import Search, expected_information
 from endo_sim_ros.identification.forward import ForwardModel
 from endo_sim_ros.identification.synthetic import measure
-from endo_sim_ros.physics.regions import inside_sphere
+from endo_sim_ros.physics.regions import TissueProperties, inside_sphere, paint_regions
 
 pytestmark = pytest.mark.slow
 EXACT = IdentificationConfig(model_error=0.0, surface_error=0.0)
-CENTRE = np.array([0.0, 0.0, 0.104])
 
 
 def measured(seed: int = 0, modulus: float = 7e3, noise: bool = True, **given):
@@ -37,6 +36,15 @@ def test_without_noise_the_truth_comes_out():
     found = identify([measured(noise=False)], NODES, PHYSICS, replace(EXACT, tip_smoothing=0.0), "cpu")
     assert found["young_modulus"].estimate == pytest.approx(7e3, rel=0.01)
     assert np.abs(found.tip_offset).max() < 5e-5
+
+
+def test_finer_nodes_correct_what_coarse_ones_make_too_stiff():
+    truth = replace(PHYSICS, young_modulus=7e3)
+    experiment = measure(pressed(), FINER, truth, np.random.default_rng(0))
+    coarse, finer = (identify([experiment], NODES, PHYSICS, EXACT, "cpu", finer=each)["young_modulus"] for each in (None, FINER))
+    assert abs(np.log(coarse.estimate / 7e3)) > 2 * abs(np.log(finer.estimate / 7e3))
+    assert not coarse.low < 7e3 < coarse.high and finer.low < 7e3 < finer.high
+    assert np.log(finer.high / finer.low) > np.log(coarse.high / coarse.low)  # as finer ones are not exact, either
 
 
 def test_doubts_about_the_model_widen_intervals():
@@ -94,22 +102,67 @@ def test_a_press_elsewhere_is_expected_to_tell_more():
     config = replace(EXACT, stiffness="field", field_length=0.012)
     places = np.array([[-0.012, 0, 0.1], [0.012, 0, 0.1]])
     found = identify([measure(pressed(-0.012), NODES, PHYSICS, np.random.default_rng(0))], NODES, PHYSICS, config, "cpu", around=places)
-    here, there = expected_information(found, [pressed(-0.012), pressed(0.012)], ForwardModel(NODES, PHYSICS, "cpu"))
+    model = ForwardModel(NODES, PHYSICS, "cpu")
+    here, there = expected_information(found, [pressed(-0.012), pressed(0.012)], model)
     assert there > 1.2 * here > 0
+    # With all unknowns known there is no news, though where the tool stands is still to be told.
+    asked = np.arange(len(found.mean)) < found.parameters.count
+    sure = np.where(asked[:, None] & asked, 1e-8 * np.eye(len(asked)), np.where(asked[:, None] ^ asked, 0, found.covariance))
+    assert expected_information(replace(found, covariance=sure), [pressed(0.012)], model)[0] < 1e-3
+
+
+AT = (-0.01, 0.0, 0.01)  # m
+
+
+def hidden(seed: int, radius: float, depth: tuple[float, float] = (0.004, 0.008)):
+    """Place of an inclusion below the nine presses of a raster, and what is felt of it."""
+    rng = np.random.default_rng(seed)
+    centre = np.array([*rng.uniform(-0.01, 0.01, 2), 0.1 + rng.uniform(*depth)])
+    inside = inside_sphere(NODES.rest, centre, radius)
+    factors, centre = np.where(inside, 8.0, 1.0), NODES.rest[inside].mean(0)  # as far as these nodes can tell
+    return centre, [measure(pressed(x, y), NODES, PHYSICS, rng, factors) for x in AT for y in AT]
 
 
 def test_an_inclusion_is_found_in_a_map():
-    from endo_sim_ros.identification import find_inclusion
-    from endo_sim_ros.physics.regions import TissueProperties, paint_regions
-
-    factors = np.where(inside_sphere(NODES.rest, CENTRE, 0.007), 8.0, 1.0)
-    rng, at = np.random.default_rng(0), (-0.01, 0.0, 0.01)
-    experiments = [measure(pressed(x, y), NODES, PHYSICS, rng, factors) for x in at for y in at]
+    centre, experiments = hidden(0, 0.007)
     found = identify(experiments, NODES, PHYSICS, IdentificationConfig(stiffness="field", field_length=0.012), "cpu")
     inclusion = find_inclusion(found)
     # How deep it lies presses from above hardly tell.
-    assert np.linalg.norm((inclusion.centre - CENTRE)[:2]) < 0.004 and inclusion.ratio > 2 and inclusion.sure > 0.9
+    assert np.linalg.norm((inclusion.centre - centre)[:2]) < 0.004 and inclusion.ratio > 2 and inclusion.sure > 0.9
     skin = NODES.is_skin & ~NODES.pinned
     assert found.removed[skin].mean() > found.removed[NODES.pinned & ~NODES.is_skin].mean()  # what is felt is known best
     painted = paint_regions(TissueProperties.uniform(len(NODES), 4e3, 0.3, 1000.0), NODES.rest, found.regions(step=0.2))
     assert np.abs(np.log(painted.young_modulus / found.young_modulus)).max() < 0.2
+
+
+def test_an_inclusion_is_found_as_a_ball():
+    centre, experiments = hidden(1, 0.007)
+    found = identify(experiments, NODES, PHYSICS, IdentificationConfig(stiffness="inclusion"), "cpu")
+    inclusion = find_inclusion(found)
+    off = inclusion.centre - centre
+    assert np.linalg.norm(off) < 0.004 and np.linalg.norm(off[:2]) < 0.003
+    assert (np.abs(off) < 3 * inclusion.deviation + 0.001).all() and inclusion.sure > 0.9
+    assert found["young_modulus of the rest"].low < 4e3 < found["young_modulus of the rest"].high
+    told = found["inclusion_ratio"]
+    assert told.low < 8 < told.high and found.young_modulus.max() == pytest.approx(4e3 * 8, rel=0.6)
+
+
+def test_without_an_inclusion_none_is_sure():
+    rng = np.random.default_rng(0)
+    experiments = [measure(pressed(x, 0.0), NODES, PHYSICS, rng) for x in AT]
+    assert find_inclusion(identify(experiments, NODES, PHYSICS, IdentificationConfig(stiffness="inclusion"), "cpu")).sure < 0.5
+
+
+def test_a_search_presses_where_it_learns_and_finds_what_it_looks_for():
+    presses = [pressed(x, y) for x in AT for y in AT]
+    search = Search(presses, ForwardModel(NODES, PHYSICS, "cpu"))
+    centre, felt = hidden(1, 0.007)
+    assert search.probable[-1] == pytest.approx(0.5) and search.deviation > 0.01
+    expected = search.expected()
+    assert (expected > 0.1).all()
+    for _ in range(4):
+        number = int(search.expected().argmax())
+        search.feel(number, felt[number].forces)
+    assert (search.expected() < expected).all()  # there is less to be learnt
+    assert search.probable[-1] < 0.1 and search.deviation < 0.006
+    assert np.linalg.norm((search.centre - centre)[:2]) < 0.006

@@ -117,6 +117,6 @@ class Search:
 
     @property
     def deviation(self) -> float:
-        """How far it may be from there, root of the mean square over all places, m."""
-        w = self.probable[:-1] / self.probable[:-1].sum()
-        return float(np.sqrt((w * ((self.places.centres - self.centre) ** 2).sum(1)).sum()))
+        """How far it may be from there, m: root of the mean square over all places, and within half the distance between them."""
+        w, half = self.probable[:-1] / self.probable[:-1].sum(), self.unknowns.config.inclusion_radius / 2
+        return float(np.sqrt((w * ((self.places.centres - self.centre) ** 2).sum(1)).sum() + half**2))

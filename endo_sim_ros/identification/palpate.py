@@ -31,7 +31,7 @@ class InformedPalpation(Script):
 
     spacing = 0.01  # m, between places that may be pressed
     deep, above = 0.003, 0.012  # m, of the tip over the skin, at last and between presses
-    known = 0.6  # of the task's tolerance: the deviation of the place with which it is reported
+    known = 0.66  # of the task's tolerance: the deviation of the place with which it is reported
     most = 13  # presses, as many as the script makes
     tip_noise = 1e-4  # m; a tip is where it is told to be
 

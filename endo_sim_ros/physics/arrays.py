@@ -1,5 +1,6 @@
 """Builds what kernels take, in the memory of a device."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -67,11 +68,14 @@ def new_nodes(
     return made
 
 
-def set_stencils(nodes: Nodes, grid: Grid, stencils: Stencils, device: str) -> None:
-    """Let control nodes transfer to the grid nodes of these stencils."""
-    nodes.first, nodes.row = copied(stencils.first, wp.vec3i, device), copied(stencils.row, int, device)
-    nodes.table = copied(stencils.table.ravel() if len(stencils.table) else np.zeros(1), int, device)
-    grid.count = stencils.grid_count
+def set_stencils(nodes: Nodes, grid: Grid, stencils: Sequence[Stencils], device: str) -> None:
+    """Let control nodes transfer to the grid nodes of these stencils, of each environment its own [B]; they differ by cuts alone."""
+    tables = [each.table for each in stencils]
+    before = np.cumsum([0, *map(len, tables)])
+    rows = [np.where(each.row < 0, -1, each.row + first) for each, first in zip(stencils, before)]
+    nodes.first, nodes.row = copied(stencils[0].first, wp.vec3i, device), copied(np.concatenate(rows), int, device)
+    nodes.table = copied(np.concatenate(tables).ravel() if before[-1] else np.zeros(1), int, device)
+    grid.count = max(each.grid_count for each in stencils)
 
 
 def new_state(count: int, device: str) -> tuple[wp.array, State]:

@@ -1,5 +1,8 @@
 """Many copies of one tissue, stepped together, in tensors."""
 
+import copy
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 import torch
 import warp as wp
@@ -9,6 +12,9 @@ from torch import Tensor
 from endo_sim_ros.physics.backends.base import capturing
 from endo_sim_ros.physics.config import PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes
+from endo_sim_ros.physics.cutting.blade import Blade
+from endo_sim_ros.physics.cutting.stencils import CutStencils
+from endo_sim_ros.physics.cutting.tension import released_forces
 from endo_sim_ros.physics.regions import TissueProperties, paint_regions
 from endo_sim_ros.physics.skinning import Skinning
 from endo_sim_ros.physics.solver import MpmSolver
@@ -26,7 +32,7 @@ class TissueBatch:
 
     Everything is a tensor on the simulation's device, and nothing waits for it: write commands into ``tools`` (see
     :class:`Tools`), call :meth:`step`, read ``displacements``, ``F`` and the reactions. Copies differ by their tools
-    and, if asked for, by their stiffness. A step that ends badly is undone in its copy and counted in ``tools.faults``.
+    and, if asked for, by their stiffness and by their cuts. A step that ends badly is undone in its copy and counted in ``tools.faults``.
 
     Args:
         nodes: The nodes at rest.
@@ -36,6 +42,7 @@ class TissueBatch:
         properties: Stiffness and density of each node; default: those of the config, with its regions.
         stiffness: Factor on the moduli of each copy [B], or of each of its nodes [B, M]; default 1. See `MpmSolver.set_stiffness`.
         capsules: Room for the capsules of each tool's links, see `Tools.set_links`.
+        own_cuts: Whether each copy may be cut, see :class:`MpmSolver`.
 
     Raises:
         ValueError: If the config or the nodes make no tissue, see :class:`MpmSolver`.
@@ -50,19 +57,23 @@ class TissueBatch:
         properties: TissueProperties | None = None,
         stiffness: ArrayLike | None = None,
         capsules: int = 1,
+        own_cuts: bool = False,
     ):
         self.nodes, self.config = nodes, config
         properties = tissue_properties(nodes, config) if properties is None else properties
         with capturing:
             self.solver = MpmSolver(
-                nodes, config, properties, environments=environments, tools=tools, capsules=capsules, stiffness=stiffness
-            )
+                nodes, config, properties, environments=environments, tools=tools, capsules=capsules, stiffness=stiffness,
+                own_cuts=own_cuts,
+            )  # fmt: skip
             self.tools = Tools(self.solver, nodes, config)
         self.step_duration = config.step_duration
         self.displacements: Tensor = wp.to_torch(self.solver.state.u).view(environments, -1, 3)  # [B, M, 3] m
         self.F: Tensor = wp.to_torch(self.solver.state.F).view(environments, -1, 3, 3)  # [B, M, 3, 3]
         self._rest = torch.from_numpy(nodes.rest).to(self.solver.device)
         self._free = torch.from_numpy(~nodes.pinned).to(self.solver.device)
+        self._cuts: dict[int, CutStencils] = {}  # of copies that have been cut
+        self._blades: dict[tuple[int, int], Blade] = {}  # of tools that cut, by copy and number
 
     def step(self) -> None:
         """Advance all copies by ``step_duration``."""
@@ -71,6 +82,87 @@ class TissueBatch:
     def positions(self) -> Tensor:
         """Positions of the nodes [B, M, 3], m, world; pinned ones where they rest, or where breath and heart have them."""
         return self._rest + torch.where(self._free[:, None], self.displacements, wp.to_torch(self.solver.held)[:, None])
+
+    def state(self, environment: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """Positions [M, 3], m, world, and deformation gradients [M, 3, 3] of the nodes of a copy now, float32; pinned ones are whole."""
+        free = ~self.nodes.pinned[:, None]
+        held = wp.to_torch(self.solver.held)[environment].cpu().numpy()
+        positions = self.nodes.rest + np.where(free, self.displacements[environment].cpu().numpy(), held)
+        return positions, np.where(free[..., None], self.F[environment].cpu().numpy(), np.eye(3, dtype=np.float32))
+
+    def cuts(self, environment: int = 0) -> np.ndarray:
+        """All that has been cut of a copy, as triangles in the tissue at rest [T, 3, 3], m, world."""
+        return self._cuts[environment].triangles if environment in self._cuts else np.zeros((0, 3, 3))
+
+    def prepare_cuts(self, environment: int = 0) -> CutStencils:
+        """Find what cuts of a copy part, which the first would otherwise wait for.
+
+        Raises:
+            ValueError: As `MpmSolver.require_cuttable` does.
+        """
+        self.solver.require_cuttable()
+        if not self._cuts:
+            self._cuts[environment] = CutStencils(self.nodes.rest, self.solver.rest_cells, self.solver.grid_shape)
+            with capturing:
+                self.solver.backend.load_for_cuts(self.config.material, self.config.kinematics)
+        if environment not in self._cuts:
+            self._cuts[environment] = copy.copy(next(iter(self._cuts.values())))
+            self._cuts[environment].reset()  # which makes arrays of its own
+        return self._cuts[environment]
+
+    def cut(self, triangles: Mapping[int, np.ndarray]) -> list[int]:
+        """Part copies along triangles [T, 3, 3], m, world, at rest, by their numbers, and return those where that changed anything."""
+        parted = [b for b, own in triangles.items() if len(own) and self.prepare_cuts(b).cut(own)]
+        self._open(parted)
+        return parted
+
+    def _open(self, environments: Sequence[int]) -> None:
+        """Let copies be parted as their stencils are, and their edges draw back."""
+        solver = self.solver
+        if not environments:
+            return
+        with capturing:
+            solver.set_cuts({b: self._cuts[b].table() for b in environments})
+            if self.config.skin_strain:
+                stress = 2 * solver.mu * (3 * solver.lam + 2 * solver.mu) / (solver.lam + 2 * solver.mu)  # of strain 1 in both directions
+                pulls = self.config.skin_strain * stress * self.nodes.volumes ** (2 / 3)
+                for b in environments:
+                    links = self._cuts[b].links[self._cuts[b].broken]
+                    links = links[self.nodes.is_skin[links].all(1)]
+                    solver.set_released(b, released_forces(self.nodes.rest.astype(np.float64), links, pulls))
+
+    def take_cuts(self, other: "TissueBatch") -> None:
+        """Take over the cuts of the first copy of other tissue with the same nodes, which is not stepped any more."""
+        if not len(other.cuts()):
+            return
+        if self.solver.grid_shape == other.solver.grid_shape and self.solver.cell_size == other.solver.cell_size:
+            self._cuts[0] = other._cuts[0]
+        stencils = self.prepare_cuts()
+        if stencils is not other._cuts[0]:
+            stencils.cut(other.cuts())
+        self._open([0])
+
+    def move_edges(self, poses: np.ndarray, cutting: np.ndarray) -> list[int]:
+        """Move the cutting edges of tools, as `TissueSimulation.set_cut` does with that of one.
+
+        Args:
+            poses: Tip-to-world transforms [B, T, 4, 4], m.
+            cutting: Which edges cut [B, T].
+
+        Returns:
+            Copies that were parted.
+        """
+        parted: list[int] = []
+        for tool in range(cutting.shape[1]):
+            swept = {}
+            for b in range(len(cutting)):
+                if not cutting[b, tool]:
+                    self._blades.pop((b, tool), None)
+                    continue
+                blade = self._blades.setdefault((b, tool), Blade(self.config.blade_length, self.nodes.spacing))
+                swept[b] = blade.move(poses[b, tool], self.nodes.rest, *self.state(b), self.cuts(b))
+            parted += self.cut(swept)
+        return parted
 
     def append_skinning(self, skinning: Skinning) -> tuple[Tensor, Tensor]:
         """Make skinning part of every step from now on, in place of another that was; on a GPU of the one graph that a step is.
@@ -91,6 +183,17 @@ class TissueBatch:
         return means, covars
 
     def reset(self, environments: Tensor | slice = slice(None), phases: np.ndarray | None = None) -> None:
-        """Back to rest, in these K copies; their tools let go. Breath and heart begin with phases [K, 2], default: those of the config."""
+        """Back to rest, in these K copies; their tools let go, their cuts heal. Breath and heart begin with phases [K, 2], default: those
+        of the config."""
         self.solver.reset(environments, phases)
         self.tools.reset(environments)
+        if self._cuts or self._blades:
+            numbers = torch.arange(self.solver.environments)
+            chosen = set(numbers[environments if isinstance(environments, slice) else environments.cpu()].tolist())
+            self._blades = {key: blade for key, blade in self._blades.items() if key[0] not in chosen}
+            healed = [b for b in chosen & self._cuts.keys() if len(self._cuts[b].triangles)]
+            for b in healed:
+                self._cuts[b].reset()
+            if healed:
+                with capturing:
+                    self.solver.set_cuts(dict.fromkeys(healed))

@@ -12,14 +12,11 @@ from torch import Tensor
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.instruments.shapes import Capsule
-from endo_sim_ros.physics.backends.base import capturing
 from endo_sim_ros.physics.batch import TissueBatch
 from endo_sim_ros.physics.config import MotionConfig, PhysicsConfig
 from endo_sim_ros.physics.control_nodes import ControlNodes, RenderDepth, build_control_nodes
 from endo_sim_ros.physics.cutting.blade import Blade, Scissors
-from endo_sim_ros.physics.cutting.stencils import CutStencils
 from endo_sim_ros.physics.cutting.tearing import Tearing
-from endo_sim_ros.physics.cutting.tension import released_forces
 from endo_sim_ros.physics.links import ToolLinks, rigid_pose
 from endo_sim_ros.physics.motion import MotionState
 from endo_sim_ros.physics.regions import TissueProperties
@@ -93,7 +90,6 @@ class TissueSimulation:
         self._slots: dict[str, int] = {}  # of tools, by name
         self._links: dict[str, ToolLinks] = {}  # of tools with an instrument
         self._placed: dict[str, Tensor] = {}  # poses of these [L, 4, 4], while known
-        self._stencils: CutStencils | None = None  # from the first cut on
         self._tearing: Tearing | None = None
         if config.tear_strain and config.kinematics == "rest":
             self._tearing = Tearing(nodes.rest, config.tear_strain, self.solver.cell_size)
@@ -193,7 +189,7 @@ class TissueSimulation:
         """
         links = ToolLinks(capsules) if capsules else None
         if links is not None and links.scissors:
-            self._require_cuttable()
+            self.solver.require_cuttable()
         if links is not None and len(links) > MAX_CAPSULES:
             raise ValueError(f"the instrument of tool {tool!r} has {len(links)} capsules; there can be {MAX_CAPSULES}")
         if tool in self._placed:
@@ -316,7 +312,7 @@ class TissueSimulation:
         if not cutting:
             self._blades.pop(tool, None)
             return
-        self._require_cuttable()
+        self.solver.require_cuttable()
         own = self._links[tool] if tool in self._placed else None
         if own is None or not own.sharp.any():
             self._cut(self._blades.setdefault(tool, Blade(self.config.blade_length, self.nodes.spacing)).move, pose)
@@ -332,22 +328,7 @@ class TissueSimulation:
 
     def _part(self, triangles: np.ndarray) -> None:
         """Part the tissue along triangles [T, 3, 3], m, world, at rest."""
-        stencils = self._prepared_stencils()
-        if stencils.cut(triangles):
-            self._open(stencils)
-            self.disturbed = True
-
-    def _open(self, stencils: CutStencils) -> None:
-        """Let the tissue be parted as the stencils are, and its edges draw back."""
-        solver = self.solver
-        with capturing:
-            solver.set_cut(stencils.table())
-            if self.config.skin_strain:
-                stress = 2 * solver.mu * (3 * solver.lam + 2 * solver.mu) / (solver.lam + 2 * solver.mu)  # of strain 1 in both directions
-                pulls = self.config.skin_strain * stress * self.nodes.volumes ** (2 / 3)
-                links = stencils.links[stencils.broken]
-                links = links[self.nodes.is_skin[links].all(1)]
-                solver.set_released(released_forces(self.nodes.rest.astype(np.float64), links, pulls))
+        self.disturbed |= bool(self._batch.cut({0: triangles}))
 
     def prepare(self) -> None:
         """Make the first step ready now; a tool would otherwise wait for it (on a GPU, for seconds when kernels are compiled)."""
@@ -360,24 +341,12 @@ class TissueSimulation:
         Raises:
             ValueError: If kinematics is not rest.
         """
-        self._prepared_stencils()
-
-    def _require_cuttable(self) -> None:
-        if self.config.kinematics != "rest":
-            raise ValueError(f"tissue with kinematics {self.config.kinematics} cannot be cut; set kinematics to rest")
-
-    def _prepared_stencils(self) -> CutStencils:
-        self._require_cuttable()
-        if self._stencils is None:
-            self._stencils = CutStencils(self.nodes.rest, self.solver.rest_cells, self.solver.grid_shape)
-            with capturing:
-                self.solver.backend.load_for_cuts(self.config.material, self.config.kinematics)
-        return self._stencils
+        self._batch.prepare_cuts()
 
     @property
     def cuts(self) -> np.ndarray:
         """All that has been cut, as triangles in the tissue at rest [T, 3, 3], m, world."""
-        return np.zeros((0, 3, 3)) if self._stencils is None else self._stencils.triangles
+        return self._batch.cuts()
 
     def reaction(self, tool: str) -> tuple[np.ndarray, np.ndarray]:
         """Force [3] N and torque [3] N·m that the tissue exerts back on a tool, world: minus what its wrench applies
@@ -459,10 +428,6 @@ class TissueSimulation:
         self._scissors.clear()
         if self._tearing is not None:
             self._tearing.reset()
-        if self._stencils is not None:
-            self._stencils.reset()
-            with capturing:
-                self.solver.set_cut(None)
         self.disturbed, self._quiet = False, 0.0
         self.resting = not any(self.config.gravity)
         self.time, self.last_fault = 0.0, ""
@@ -502,22 +467,13 @@ class TissueSimulation:
         self.last_fault = other.last_fault
         if self._tearing is not None and other._tearing is not None:
             self._tearing.copy(other._tearing)
-        if len(other.cuts):
-            if self.solver.grid_shape == other.solver.grid_shape and self.solver.cell_size == other.solver.cell_size:
-                self._stencils = other._stencils
-            stencils = self._prepared_stencils()
-            if stencils is not other._stencils:
-                stencils.cut(other.cuts)
-            self._open(stencils)
+        self._batch.take_cuts(other._batch)
         self.disturbed = True
         return True
 
     def state(self) -> TissueState:
         """Positions and deformation gradients of all nodes now."""
-        moving = ~self.nodes.pinned[:, None]
-        positions = self.nodes.rest + np.where(moving, self.solver.displacements(), wp.to_torch(self.solver.held)[0].cpu().numpy())
-        F = np.where(moving[..., None], self.solver.deformation_gradients(), np.eye(3, dtype=np.float32))
-        return TissueState(self.nodes.rest, positions, F, self.time)
+        return TissueState(self.nodes.rest, *self._batch.state(), self.time)
 
     def _describe_tools(self) -> str:
         tools, parts = self._tools, []

@@ -1,7 +1,7 @@
 """The material point solver: owns the grid and the state of the control nodes, and takes steps."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import torch
@@ -41,6 +41,8 @@ class MpmSolver:
         capsules: Most capsules of a tool.
         stiffness: Factor on the moduli of each environment [B], or of each of its control nodes [B, M]; default 1. The
             largest one is also the largest that `set_stiffness` takes later.
+        own_cuts: Whether each environment may be cut. Several that may take single launches on a GPU, a few times as long, so that
+            what is whole does not depend on who is cut.
 
     Raises:
         StabilityError: If the substeps are too long for the material.
@@ -57,6 +59,7 @@ class MpmSolver:
         tools: int = 1,
         capsules: int = 1,
         stiffness: ArrayLike | None = None,
+        own_cuts: bool = False,
     ):
         if environments < 1 or tools < 0:
             raise ValueError(f"there must be at least one environment and no fewer than zero tools, not {environments} and {tools}")
@@ -112,7 +115,10 @@ class MpmSolver:
         self._after: list[Launch] = []
         self._appended: list[Work] = []
         self._advance: Callable[[], object] | None = None
-        self.set_cut(None)
+        self._own_cuts = own_cuts and environments > 1
+        self._whole = Stencils(self.rest_cells, self.grid_shape)
+        self._stencils = [self._whole] * environments
+        self.set_cuts({})
         self.reset()
 
     def reset(self, environments: torch.Tensor | slice = slice(None), phases: np.ndarray | None = None) -> None:
@@ -157,22 +163,29 @@ class MpmSolver:
         springs = wp.to_torch(self.loads.spring).view(self.environments, -1)
         springs[environments] = torch.where(self._pinned, pins.float(), springs[environments])
 
-    def set_cut(self, cut: CutTable | None) -> None:
-        """Let control nodes beside a cut transfer to grid nodes of their own side; None makes the tissue whole again.
-
-        Raises:
-            ValueError: With current kinematics, whose control nodes change their grid nodes in every substep.
+    def set_cuts(self, cuts: Mapping[int, CutTable | None]) -> None:
+        """Let control nodes beside cuts transfer to grid nodes of their own side, in environments of these numbers; None makes the
+        tissue whole again. Raises what `require_cuttable` does.
         """
-        if cut is not None and self.config.kinematics == "current":
-            raise ValueError("tissue with current kinematics cannot be cut; set kinematics to rest")
-        self._stencils = Stencils(self.rest_cells, self.grid_shape, cut)
+        if any(cut is not None for cut in cuts.values()):
+            self.require_cuttable()
+        for environment, cut in cuts.items():
+            self._stencils[environment] = self._whole if cut is None else Stencils(self.rest_cells, self.grid_shape, cut)
         set_stencils(self.nodes, self.grid, self._stencils, self.device)
         self._change_step()
 
-    def set_released(self, forces: np.ndarray) -> None:
-        """Forces on the skin's control nodes that move, of all [M, 3], N, in all environments from now on, beside those of tools."""
+    def set_released(self, environment: int, forces: np.ndarray) -> None:
+        """Forces on the skin's control nodes that move, of all [M, 3], N, in an environment from now on, beside those of tools."""
         values = torch.from_numpy(np.asarray(forces, np.float32)).to(self.device)
-        wp.to_torch(self.loads.released).view(self.environments, -1, 3)[:] = values
+        wp.to_torch(self.loads.released).view(self.environments, -1, 3)[environment] = values
+
+    def require_cuttable(self) -> None:
+        """Raise ValueError with current kinematics, whose control nodes change their grid nodes in every substep, and if there are several
+        environments that shall have no cuts of their own."""
+        if self.config.kinematics != "rest":
+            raise ValueError(f"tissue with kinematics {self.config.kinematics} cannot be cut; set kinematics to rest")
+        if self.environments > 1 and not self._own_cuts:
+            raise ValueError(f"{self.environments} environments share what is whole; make them with own_cuts to cut one of them")
 
     def wrap_step(self, before: list[Launch], after: list[Launch]) -> None:
         """Make these launches of `Tools` part of every step, on a GPU of the one graph that it is; see `_build_step`."""
@@ -212,7 +225,7 @@ class MpmSolver:
         backend, config = self.backend, self.config
         data = StepData(
             self.environments, self.node_count, config.material, config.kinematics, self.substepping.count, self.nodes, self.state,
-            self.loads, self.rigid, self.grid, self._substep, self.scale, self._stencils,
+            self.loads, self.rigid, self.grid, self._substep, self.scale, self._stencils, self._own_cuts,
         )  # fmt: skip
         check = [backend.threads, self.node_count, config.travel, config.rollback_damping]
         check += [self._backup, self.state, self.bad_nodes, self._speed_sq, self.held, self.motion.goal]

@@ -1,5 +1,6 @@
 """Stencils: which grid nodes the control nodes transfer to, for rest kinematics."""
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,6 +53,7 @@ class Stencils:
         """Numbers of the control nodes [M], those of a cell together and neighbouring cells near each other."""
         return np.lexsort(self.first.T[::-1])
 
+    @functools.cached_property
     def by_grid_node(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """For each of n grid nodes that has any, the control nodes that give to it: E entries, those of a grid node together.
 

@@ -57,6 +57,35 @@ def test_physics_agrees_step_for_step(kinematics, material):
     np.testing.assert_allclose(cuda["felt"], cpu["felt"], atol=0.01 * np.abs(cpu["felt"]).max())
 
 
+def test_copies_are_cut_each_on_its_own_and_what_is_whole_has_the_bits_of_whole_tissue():
+    nodes = build_control_nodes(sheet(), np.zeros(3), PhysicsConfig(node_count=1000))
+
+    def play(device: str, cutters: list[float | None]) -> tuple[TissueBatch, np.ndarray]:
+        config = PhysicsConfig(device=device, node_count=1000, blade_length=0.03)
+        batch, seen = TissueBatch(nodes, config, len(cutters), 2, own_cuts=True), []
+        batch.tools.rotations[:] = torch.eye(3, device=batch.solver.device)
+        batch.tools.present[:, 0] = batch.tools.closed[:, 0] = 1
+        for step in range(10):
+            poses = np.tile(np.eye(4), (len(cutters), 2, 1, 1))
+            poses[:, 0, :3, 3] = TIP - [0.015 + 0.0005 * step, 0, 0]
+            poses[:, 1, :3, 3] = [[0.0, (at or 0.0) + 0.003 * step, 0.14] for at in cutters]
+            batch.move_edges(poses, np.array([[False, at is not None] for at in cutters]))
+            batch.tools.tips[:] = torch.from_numpy(poses[..., :3, 3]).to(batch.tools.tips)
+            batch.step()
+            seen.append(batch.displacements.cpu().numpy().copy())
+        return batch, np.array(seen)
+
+    cutters = [None, -0.015, None, 0.0]
+    (batch, cuda), (_, cpu), (_, whole) = play("cuda", cutters), play("cpu", cutters), play("cuda", [None] * 4)
+    moved = np.abs(cpu).max()
+    assert moved > 2e-3 and [len(batch.cuts(b)) > 0 for b in range(4)] == [False, True, False, True]
+    np.testing.assert_allclose(cuda, cpu, atol=5e-3 * moved)
+    np.testing.assert_array_equal(cuda[:, [0, 2]], whole[:, [0, 2]])
+    assert np.abs(cuda[:, 1] - whole[:, 1]).max() > 0.05 * moved
+    batch.reset(torch.tensor([1], device="cuda"))
+    assert not len(batch.cuts(1)) and len(batch.cuts(3)) and not batch.displacements[1].any()
+
+
 @pytest.mark.parametrize("count", [700, 2000, 4000])
 def test_blocks_that_share_the_tissue_agree_with_launches_for_each_substep(count, monkeypatch):
     one, few = touch("cuda", node_count=count, relaxation=0.5)

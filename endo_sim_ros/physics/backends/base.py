@@ -59,7 +59,8 @@ class StepData:
     grid: Grid
     substep: Substep
     scale: wp.array  # of the moduli of each control node [B · M]
-    stencils: Stencils
+    stencils: Sequence[Stencils]  # of each environment; the weights are the same in all
+    own_cuts: bool  # whether they may differ
 
 
 class Backend(Protocol):

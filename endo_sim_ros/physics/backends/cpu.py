@@ -32,7 +32,7 @@ class CpuBackend:
         slots = min(cpu_threads(), step.environments)
         padded = -(-step.node_count // LANES) * LANES
         order = np.full(padded, -1, np.int32)
-        order[: step.node_count] = step.stencils.sorted_nodes()
+        order[: step.node_count] = step.stencils[0].sorted_nodes()
         floats = functools.partial(wp.zeros, dtype=float, device="cpu")
         scratch = [wp.array(order, dtype=int, device="cpu")]
         scratch += [floats(slots * 4 * (step.grid.count + 4)) for _ in range(2)]

@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import warp as wp
 from torch import Tensor
 
@@ -85,9 +86,9 @@ class CudaBackend:
         """One launch for all substeps, on a GPU with clusters of multiprocessors; none for more control nodes than they hold."""
         # What it compiles for, which is less than the GPU where another one in the machine is older.
         arch = wp.get_device(self.device).get_cuda_compile_arch()
-        if arch is None or arch < 90 or step.kinematics == "current":
+        if arch is None or arch < 90 or step.kinematics == "current" or step.own_cuts:  # a division is of all environments
             return []
-        division = cluster.divide(step.stencils.rest_cells, step.stencils.corners())
+        division = cluster.divide(step.stencils[0].rest_cells, step.stencils[0].corners())
         if division is None:
             return []
         device, memory = wp.get_device(self.device), 16 * cluster.SHARED
@@ -118,9 +119,9 @@ class CudaBackend:
             ]
             actions: list[Action] = [grid_mv.zero_]
         else:
-            lanes, entries = 1 if self._comparing else 32, self._entries(step)
+            lanes, (most, entries) = 1 if self._comparing else 32, self._entries(step)
             inputs = [*entries, lanes, step.node_count, step.grid, decay, transfer, grid_v]
-            collecting = [self.action(Launch(collect, (step.environments, len(entries[-1]), lanes), inputs))]
+            collecting = [self.action(Launch(collect, (step.environments, most, lanes), inputs))]
             actions = []
         constants = [step.nodes, step.state, step.loads, step.tools, transfer, step.grid, step.substep, step.scale]
         count = step.substeps
@@ -132,10 +133,19 @@ class CudaBackend:
                 actions += collecting
         return actions
 
-    def _entries(self, step: StepData) -> list[wp.array]:
-        """For each grid node the control nodes that give to it, as `collect` reads them."""
-        values = step.stencils.by_grid_node()
-        return [wp.array(each, dtype=dtype, device=self.device) for each, dtype in zip(values, (int, int, wp.vec4, int))]
+    def _entries(self, step: StepData) -> tuple[int, list[wp.array]]:
+        """The most grid nodes that an environment uses, and for each the control nodes that give to it, as `collect` reads them."""
+        different = list(dict.fromkeys(step.stencils))
+        starts, members, offsets, places = zip(*(stencils.by_grid_node for stencils in different))
+        ends = np.cumsum([len(each) for each in places])
+        lists = np.stack([ends - [len(each) for each in places], ends], 1)
+        lists = lists[[different.index(stencils) for stencils in step.stencils]]
+        entries = np.cumsum([0, *(len(each) for each in members)])
+        starts = [*(each[:-1] + before for each, before in zip(starts, entries)), entries[-1:]]
+        values = [lists.astype(np.int32), *(np.concatenate(each) for each in (starts, members, offsets, places))]
+        values[1] = values[1].astype(np.int32)
+        arrays = [wp.array(each, dtype=dtype, device=self.device) for each, dtype in zip(values, (wp.vec2i, int, int, wp.vec4, int))]
+        return int(np.ptp(lists, 1).max()), arrays
 
 
 class _Replay:

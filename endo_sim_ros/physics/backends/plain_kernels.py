@@ -167,7 +167,7 @@ def make_advance_kernel(material: str, kinematics: str):
             i0, j0, k0 = first_node[0], first_node[1], first_node[2]
             f = wp.vec3(x[0] - float(i0), x[1] - float(j0), x[2] - float(k0))
             wx, wy, wz = spline(f[0]), spline(f[1]), spline(f[2])
-            row = nodes.row[p]
+            row = nodes.row[e]
             first = b * grid.count
             cx, cy, cz = wp.vec3(), wp.vec3(), wp.vec3()  # columns of Σ w v_i (i, j, k)
             for i in range(3):
@@ -228,7 +228,8 @@ def lane_sum(value: float) -> float:
 
 @wp.kernel
 def collect(
-    starts: wp.array[int],  # [n + 1] of the entries of each grid node that has any
+    lists: wp.array[wp.vec2i],  # [B] the grid nodes of each environment that have any: first and end, in the next
+    starts: wp.array[int],  # [n + 1] of the entries of each grid node
     members: wp.array[int],  # [E] nodes that give to it
     offsets: wp.array[wp.vec4],  # [E] from node to grid node, cells, and weight
     places: wp.array[int],  # [n] numbers of the grid nodes
@@ -241,6 +242,9 @@ def collect(
 ):
     """Grid velocities with decay, each grid node adding up what its nodes give. For rest kinematics, whose weights stay."""
     b, n, lane = wp.tid()
+    n += lists[b][0]
+    if n >= lists[b][1]:
+        return
     total = wp.vec4()
     for entry in range(starts[n] + lane, starts[n + 1], lanes):
         e = 4 * (b * count + members[entry])

@@ -42,7 +42,7 @@ class Nodes:
     lam: wp.array[float]
     stiffness: wp.array[float]  # N/m, of what holds or pushes the control node; of each environment its own, [B · M]
     first: wp.array[wp.vec3i]  # first grid node (i, j, k) of its stencil at rest
-    row: wp.array[int]  # in the table, of control nodes beside a cut; -1 for all others
+    row: wp.array[int]  # in the table, of control nodes beside a cut; -1 for all others; of each environment its own, [B · M]
     table: wp.array[int]  # [A · 27] numbers of the grid nodes of each of these, k fastest
 
 

@@ -221,11 +221,12 @@ template <bool CURRENT, class Nodes, class State, class Loads, class Tools, clas
     }
 
     // Control nodes beside a cut name their grid nodes one by one.
-    ENDO_SIM_INLINE bool beside_cut(int node) { return order[node] >= 0 && nodes.row.data[order[node]] >= 0; }
+    ENDO_SIM_INLINE int table_row(int node) { return nodes.row.data[b * (size_t)M + order[node]]; }
+    ENDO_SIM_INLINE bool beside_cut(int node) { return order[node] >= 0 && table_row(node) >= 0; }
     ENDO_SIM_INLINE size_t entry(int node, int i, int j, int k)
     {
         ENDO_SIM_FUSE(fast)
-        return 4 * (size_t)nodes.table.data[27 * (size_t)nodes.row.data[order[node]] + 9 * i + 3 * j + k];
+        return 4 * (size_t)nodes.table.data[27 * (size_t)table_row(node) + 9 * i + 3 * j + k];
     }
 
     // The weights along z of a node, each four times, as the grid nodes of a row lie.

@@ -13,6 +13,7 @@ environment_state   of all control nodes: mean displacement x y z, largest displ
                     `NEAREST` nodes nearest to its tip: mean offset from the tip x y z, mean displacement x y z
 action              commanded pose of the tip (x y z qx qy qz qw), jaw, wrench (force x y z, torque x y z) on the tissue
 joints              yaw, pitch, insertion (m), roll, wrist_pitch, wrist_yaw, where all arms say them
+cut                 whether the edge is commanded to cut, 0 or 1, where that of any arm was recorded
 ==================  ==========================================================================================
 
 Beside these, where they were recorded: the pose of the camera (x y z qx qy qz qw), the right eye, what is in each pixel, and of a task
@@ -71,6 +72,11 @@ def environment_names(arms: tuple[str, ...]) -> list[str]:
     return [*(f"mean_displacement_{axis}" for axis in _XYZ), "max_displacement", *near]
 
 
+def cut_names(arms: tuple[str, ...]) -> list[str]:
+    """Names of the columns of `Episode.cut`, which are part of what is done, as `action` is."""
+    return [f"{arm}.cut" for arm in arms]
+
+
 def joint_names(arms: tuple[str, ...]) -> list[str]:
     """Names of the columns of `Episode.joints`."""
     return [f"{arm}.{name}" for arm in arms for name in JOINTS]
@@ -106,6 +112,7 @@ class Episode:
     right: Shown | None = None  # those of the right eye
     segmentation: Shown | None = None  # what is in each pixel
     joints: np.ndarray | None = None  # [T, 6·A] float32
+    cut: np.ndarray | None = None  # [T, A] float32
     camera_pose: np.ndarray | None = None  # [T, 7] float32, world
     outcome: np.ndarray | None = None  # [T, 7] as `messages.OUTCOME` has them: what the action of each row led to
 
@@ -115,7 +122,9 @@ class Episode:
     @property
     def content(self) -> tuple[str, ...]:
         """What there is beside what all episodes have."""
-        return tuple(name for name in ("right", "segmentation", "joints", "camera_pose", "outcome") if getattr(self, name) is not None)
+        return tuple(
+            name for name in ("right", "segmentation", "joints", "cut", "camera_pose", "outcome") if getattr(self, name) is not None
+        )
 
     def images(self, shown: Shown | None = None) -> Iterator[np.ndarray]:
         """The T rendered images, RGB [H, W, 3] uint8, or other pictures of the episode; labels are [H, W].
@@ -203,6 +212,10 @@ def read_episode(
         found[_PICTURES[topic]] = Shown(topic, (int(rows[0, 1]), int(rows[0, 2])), rows[:, 0])
     if all(messages.tool_joints(arm) in streams for arm in arms):
         found["joints"] = np.hstack([streams[messages.tool_joints(arm)].at(now) for arm in arms]).astype(np.float32)
+    if any(messages.tool_cut(arm) in streams for arm in arms):
+        idle = Stream.constant([0.0])
+        cuts = [streams.get(messages.tool_cut(arm), idle).at(following, before=idle) for arm in arms]
+        found["cut"] = np.hstack(cuts).astype(np.float32)
     if messages.RENDERED_POSE in streams:
         found["camera_pose"] = continuous(streams[messages.RENDERED_POSE].at(now)).astype(np.float32)
     if messages.TASK_OUTCOME in streams:

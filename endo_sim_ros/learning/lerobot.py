@@ -2,7 +2,8 @@
 
 Columns beside those that every LeRobot dataset has: `observation.images.endoscope.left`, and `observation.state`,
 `observation.environment_state` and `action` as described in `episodes`. What else was recorded is in
-`observation.images.endoscope.right`, `observation.segmentation`, `observation.joints` and `observation.camera_pose`. Of a task
+`observation.images.endoscope.right`, `observation.segmentation`, `observation.joints` and `observation.camera_pose`; where edges were
+told to cut, `action` ends with that. Of a task
 `next.reward`, `next.done` and `next.success` say what a step led to, `seed` and `goal` (m, world, at rest) what the episode is
 about, as in demonstrations. The cameras have the names of the Open-H datasets of da Vinci robots.
 """
@@ -31,6 +32,7 @@ from endo_sim_ros.learning.episodes import (
     Episode,
     Sampling,
     action_names,
+    cut_names,
     environment_names,
     joint_names,
     read_episode,
@@ -115,7 +117,7 @@ def _columns(episode: Episode) -> dict[str, np.ndarray]:
         "observation.state": episode.state,
         "observation.environment_state": episode.environment_state,
         **{key: values for key, values in more.items() if values is not None},
-        "action": episode.action,
+        "action": episode.action if episode.cut is None else np.hstack([episode.action, episode.cut]),
     }
 
 
@@ -124,7 +126,7 @@ def _features(episode: Episode, images: ImageFormat) -> dict[str, dict]:
     vectors = {
         "observation.state": state_names(episode.arms),
         "observation.environment_state": environment_names(episode.arms),
-        "action": action_names(episode.arms),
+        "action": action_names(episode.arms) + (cut_names(episode.arms) if episode.cut is not None else []),
     }
     vectors |= {JOINTS: joint_names(episode.arms)} if episode.joints is not None else {}
     vectors |= {CAMERA_POSE: list(POSE_NAMES)} if episode.camera_pose is not None else {}

@@ -1,6 +1,9 @@
 """Episodes that pair what belongs together, and recordings that cannot be rows."""
 
+import json
+
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from made_recordings import BEGIN, HEIGHT, STEP, WIDTH, Recording, lockstep, realtime, tip
 
@@ -104,6 +107,23 @@ def test_where_no_command_was_recorded_the_next_pose_is_the_action_and_that_is_t
         assert (expected in caplog.text) if expected else not caplog.text
         aside = np.arange(1, 6) >= first
         np.testing.assert_allclose(episode.action[:, 1], 0.01 + 0.02 * aside, atol=1e-7)
+
+
+def test_what_edges_are_told_is_part_of_what_is_done_where_it_was_recorded(tmp_path):
+    arms, cut = ("PSM1", "PSM2"), messages.tool_cut("PSM1")
+    with Recording(tmp_path / "bag") as recording:
+        for number in range(6):
+            recording.act(STEP * number, number, arms)
+            if number in (2, 4):
+                recording.write([(cut, messages.encode_cut(number == 2, BEGIN + STEP * number, recording.types))])
+            recording.observe(STEP * number, number, arms)
+    assert read_episode(tmp_path / "bag").cut.T.tolist() == [[0, 1, 1, 0, 0], [0] * 5]
+    assert read_episode(lockstep(tmp_path / "whole")).cut is None
+    export_lerobot([tmp_path / "bag"], tmp_path / "out", "cut", images="png")
+    features = json.loads((tmp_path / "out/meta/info.json").read_text())["features"]
+    assert features["action"]["names"][-2:] == ["PSM1.cut", "PSM2.cut"] and features["action"]["shape"] == [30]
+    table = pq.read_table(next((tmp_path / "out").glob("data/*/*.parquet")))
+    assert [row[-2] for row in table.column("action").to_pylist()] == [0, 1, 1, 0, 0]
 
 
 def test_a_jaw_that_speaks_now_and_then_keeps_its_angle(tmp_path):

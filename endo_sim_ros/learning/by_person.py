@@ -188,17 +188,19 @@ class _Session:
             f"{left:.1f} s left" if begun else "move to begin",
             f"{_force(batch):.2f} N of {task.force_limit:g} N",
             *([f"arm {arm + 1} of {len(actions)}"] if len(actions) > 1 else []),
-            *([] if task.turns else [_state(task, actions[arm, 3])]),
+            *([] if task.turns else [_state(task, arm, actions[:, 3])]),
             *([self._said] if self._said else []),
         )
         return View(pictures.draw()[IMAGE][0], camera, pixel, lines)
 
 
-def _state(task: Task, fourth: float) -> str:
-    """What the fourth number of an action does."""
-    if task.closes(np.ones(1))[0]:
-        return "jaw closed" if task.closes(np.array([fourth]))[0] else "jaw open"
-    return f"fourth number {fourth:+.0f}"
+def _state(task: Task, arm: int, fourth: np.ndarray) -> str:
+    """What the fourth number of an action does, of an arm among all [A]."""
+    if task.closes(np.ones(len(fourth)))[arm]:
+        return "jaw closed" if task.closes(fourth)[arm] else "jaw open"
+    if task.cuts(np.ones(len(fourth)))[arm]:
+        return "the edge cuts" if task.cuts(fourth)[arm] else "the edge rests"
+    return f"fourth number {fourth[arm]:+.0f}"
 
 
 def _force(batch: TaskBatch) -> float:

@@ -73,7 +73,7 @@ def save_scene(
         "physics_node": {
             "mode": mode,
             "arm_source": "commanded",
-            "lockstep_inputs": ["pose", "jaw"],
+            "lockstep_inputs": ["pose", "jaw", *(["cut"] if kind.cutting else [])],
             "link_contact": False,
             **arms(),
             **tools,

@@ -89,7 +89,8 @@ def hold_tool(task: type[Task], scene: Scene, tool: str = "", holder: str = "PSM
     Raises:
         ValueError: If there is no such tool, nobody knows its shape, or the arm does not reach the tissue in the picture.
     """
-    arm, camera = load_arm("PSM", tool or task.tool), scene.camera
+    tool = tool or task.tool_of(holder)
+    arm, camera = load_arm("PSM", tool), scene.camera
     _, capsules = build_instrument(arm)
     try:
         placed = place_arm(holder, arm, camera, scene.depth)
@@ -105,7 +106,7 @@ def hold_tool(task: type[Task], scene: Scene, tool: str = "", holder: str = "PSM
     ahead = task.physics().contact_radius * camera.pose[:3, 2]
     mount = rigid_pose(hinge, ahead - hinge @ point)
     centre = camera.position + scene.depth * camera.pose[:3, 2]
-    return HeldTool(holder, replace(arm, tooltip_offset=arm.tooltip_offset @ invert_pose(mount)), base, centre, tool or task.tool)
+    return HeldTool(holder, replace(arm, tooltip_offset=arm.tooltip_offset @ invert_pose(mount)), base, centre, tool)
 
 
 def hold_tools(task: type[Task], scene: Scene, tool: str = "", others: bool = False) -> list[HeldTool]:

@@ -11,6 +11,7 @@ from torch import Tensor
 from endo_sim_ros.core.cameras import Camera, invert_pose, sent_poses
 from endo_sim_ros.core.device import download, upload
 from endo_sim_ros.core.dye import DyedSpot, dyed
+from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import SURFACE
 from endo_sim_ros.core.reflections import seen_colors
 from endo_sim_ros.core.shading import shade, to_bytes
@@ -23,7 +24,7 @@ from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.learning.tasks import Task
 from endo_sim_ros.learning.variation import Variation
 from endo_sim_ros.physics import Skinning, TissueBatch
-from endo_sim_ros.rendering import turned_colors
+from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig, turned_colors
 from endo_sim_ros.splatting import rasterize
 
 IMAGE, IMAGE_RIGHT, SEGMENTATION = "image", "image_right", "segmentation"
@@ -71,6 +72,8 @@ class Pictures:
         self._sh = self._model.sh.expand(count, -1, -1, -1).clone() if sight.dye else None  # of each episode
         self._skinning = Skinning(self._model, nodes.rest, device=device)
         self._means, self._covars = tissue.append_skinning(self._skinning)
+        self._cut: dict[int, DeformableRenderer] = {}  # of episodes whose tissue has been cut
+        self._spots: list[Sequence[DyedSpot]] = [()] * count
         self._pinned = torch.from_numpy(nodes.pinned).to(device)[:, None, None]
         self._thing = [thing] if (thing := task.thing()) else []
         shapes = [[*(tool.shape for tool in tools), *self._thing] for tools in held.kinds] if held else []
@@ -121,6 +124,9 @@ class Pictures:
             self._show(b, self._view(variation))
             if self._sh is not None:
                 self._sh[b] = dyed(self._model.sh, self._model.means, marked)
+                self._spots[b] = marked
+                if b in self._cut:
+                    self._cut[b].dye(marked)
         self._means[episodes], self._covars[episodes] = self._skinning.means, self._skinning.covars
         if self._tissue.solver.motion.moving:
             positions = self._tissue.positions()
@@ -167,25 +173,53 @@ class Pictures:
 
     def _rasterize(self, own: np.ndarray, eye: int) -> tuple[Tensor, Tensor, Tensor]:
         rows = slice(own[0], own[-1] + 1)
-        viewmats, Ks = upload(self._device, self._viewmats[eye, rows], np.array([self.camera.K] * len(own)))
-        seen = rasterize(
-            self._means[rows], None, None, self._model.opacities, self._colors(rows, eye), viewmats, Ks,
-            self.camera.width, self.camera.height, covars=self._covars[rows],
-        )  # fmt: skip
+        sh = self._model.sh if self._sh is None else self._sh[rows]
+        seen = self._draw_tissue(rows, eye, self._model, self._skinning, sh, self._means[rows], self._covars[rows])
+        for i, b in enumerate(own):
+            if len(cuts := self._tissue.cuts(b)):
+                renderer = self._parted(b, cuts)
+                state = self._tissue.state(b)
+                skinning, (means, covars) = renderer.skinning, renderer.deform(*state)
+                assert skinning is not None  # as it was made with nodes
+                model = renderer.opened(means, skinning.means)
+                parted = self._draw_tissue(slice(b, b + 1), eye, model, skinning, model.sh, means[None], covars[None])
+                renderer.draw_behind([self.camera.at(self._views[b].poses[eye])], *state, parted)
+                for whole, part in zip(seen, parted):
+                    whole[i] = part[0]
+        return seen
+
+    def _parted(self, b: int, cuts: np.ndarray) -> DeformableRenderer:
+        """What shows the skin of an episode parted along cuts [T, 3, 3], m, world, at rest, and flesh between: that of rendering_node."""
+        if b not in self._cut:
+            self._cut[b] = DeformableRenderer(self._model, self._tissue.nodes.rest, RenderingConfig(device=self._device))
+            self._cut[b].dye(self._spots[b])
+        self._cut[b].cut(cuts.astype(np.float32))
+        return self._cut[b]
+
+    def _draw_tissue(
+        self, rows: slice, eye: int, model: GaussianModel, skinning: Skinning, sh: Tensor, means: Tensor, covars: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Colours, depths and alphas [b, H, W, …] of the tissue in these episodes, whose Gaussians are at means [b, N, 3] with
+        covariances [b, N, 3, 3], and have coefficients of all [N, K, 3] or of each [b, N, K, 3]."""
+        viewmats = self._viewmats[eye, rows]
+        transforms, Ks = upload(self._device, viewmats, np.array([self.camera.K] * len(viewmats)))
+        colors = self._colors(rows, eye, model, skinning, sh, means)
+        size = self.camera.width, self.camera.height
+        seen = rasterize(means, None, None, model.opacities, colors, transforms, Ks, *size, covars=covars)
         return seen.colors, seen.depths, seen.alphas
 
-    def _colors(self, rows: slice, eye: int) -> Tensor:
+    def _colors(self, rows: slice, eye: int, model: GaussianModel, skinning: Skinning, sh: Tensor, means: Tensor) -> Tensor:
         """Colours of all these episodes [N, K, 3], or of each [b, N, K, 3], as `rasterize` takes them."""
-        views, sh = self._views[rows], self._model.sh if self._sh is None else self._sh[rows]
-        if self._model.reflects or self._model.sh_degree:
+        views = self._views[rows]
+        if model.reflects or model.sh_degree:
             F = torch.where(self._pinned, torch.eye(3, device=sh.device), self._tissue.F[rows])  # as on control_nodes
-        if self._model.reflects:
+        if model.reflects:
             positions = [view.poses[eye][:3, 3] for view in views]
-            sh = seen_colors(self._model, self._skinning.cosines(F, self._means[rows], positions), sh)
-        elif self._model.sh_degree:
+            sh = seen_colors(model, skinning.cosines(F, means, positions), sh)
+        elif model.sh_degree:
             own = sh.expand(len(views), *sh.shape[-3:])
-            each = zip(own, self._means[rows], F, (self.camera.at(view.poses[eye]) for view in views))
-            sh = torch.stack([turned_colors(own, self._skinning, means, F, camera) for own, means, F, camera in each])
+            each = zip(own, means, F, (self.camera.at(view.poses[eye]) for view in views))
+            sh = torch.stack([turned_colors(own, skinning, means, F, camera) for own, means, F, camera in each])
         if self._by.texture:
             sh = sh * sh.new_tensor([view.contrast for view in views])[:, None, None, None]
         return sh

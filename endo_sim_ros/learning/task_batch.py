@@ -52,8 +52,8 @@ class TaskBatch:
 
     Raises:
         ValueError: If there is no such task or tool, the scene is too small for it, an arm does not reach it, links shall touch
-            where each episode has another tool, actions are of the tool's joints where they move the endoscope, or tissue cannot move
-            so far.
+            where each episode has another tool or tools cut, actions are of the tool's joints where they move the endoscope, or tissue
+            cannot move so far.
     """
 
     def __init__(
@@ -85,11 +85,13 @@ class TaskBatch:
             held = hold_tools(kind, scene, sight.tool, others=randomisation.tool > 0)
         if contact == "links" and randomisation.tool:
             raise ValueError("contact is links, which all episodes share, but randomisation gives each its tool; set its tool to 0")
+        if contact == "links" and kind.cutting:
+            raise ValueError(f"{task} cuts with the edges of points, which links have none of; leave contact at point")
         arms = len(kind.arms)
         self._links = [ToolLinks(tool.shape[1]) for tool in held] if contact == "links" else []
         self._linked = [torch.zeros(0)] * arms  # poses of the links, of a single tissue
         capsules = max(map(len, self._links), default=1)
-        self.tissue = TissueBatch(nodes, config, count, arms, stiffness=stiffness, capsules=capsules)
+        self.tissue = TissueBatch(nodes, config, count, arms, stiffness=stiffness, capsules=capsules, own_cuts=kind.cutting)
         self._varies = largest != 1
         self._moves = config.motion.breathing + config.motion.heartbeat > 0
         self._works = not kind.turns or self._moves or bool(self._links)  # else nothing touches the tissue
@@ -192,7 +194,11 @@ class TaskBatch:
                     moved[number] |= not torch.equal(linked, self._linked[number])
                 self._linked[number] = linked
                 tools.set_links(number, links, linked)
-        step = self._works and (self.count > 1 or not self._rests(moved))
+        parted = False
+        if self.task.cutting:
+            cutting = self.task.cuts(self.task.fourth).reshape(closed.shape) & present.numpy().astype(bool)
+            parted = bool(self.tissue.move_edges(self._poses().reshape(*closed.shape, 4, 4), cutting))
+        step = self._works and (self.count > 1 or parted or not self._rests(moved))
         if step:
             self.tissue.step()
         if self.tools is not None and not self._links and self.actions == "cartesian":  # while a GPU takes the step
@@ -239,6 +245,8 @@ class TaskBatch:
         rows = torch.arange(self.count)[:, None]
         moved = self.tissue.displacements[rows.to(device), sites.to(device)].cpu()
         positions = (self._rest[sites] + moved).numpy()
+        for b in range(self.count if self.task.cutting else 0):
+            self.task.hear_cuts(b, self.tissue.cuts(b).astype(np.float32))
         forces = self.tissue.tools.reaction_forces.cpu().numpy().reshape(self.task.force.shape)
         state = self.task.observe(positions, forces)
         return state if self.actions == "cartesian" or self.tools is None else self.tools.observe(state)

@@ -239,8 +239,8 @@ class ScriptedToolConfig(StageConfig):
 
 @dataclass(frozen=True)
 class PolicyConfig(StageConfig):
-    """Options of the policy. physics_node must have the same mode, arm_source commanded, lockstep_inputs [pose, jaw] and the
-    tissue of the task: `endo-sim scene` writes these parameters to a file."""
+    """Options of the policy. physics_node must have the same mode, arm_source commanded, lockstep_inputs [pose, jaw], with
+    cut where the task cuts, and the tissue of the task: `endo-sim scene` writes these parameters to a file."""
 
     mode: Literal["realtime", "lockstep"] = "lockstep"
     """lockstep: each action takes one step, as in the environments. realtime: time goes on by itself. The policy acts on the newest

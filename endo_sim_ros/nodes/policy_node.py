@@ -60,11 +60,13 @@ class PolicyNode(EndoNode):
         commands = messages.tool_joint_command if self._tools else messages.tool_pose_command
         self._pose_pubs = [self.publisher(commands(arm)) for arm in arms]
         self._jaw_pubs = [self.publisher(messages.tool_jaw(arm)) for arm in arms]
+        self._cut_pubs = [self.publisher(messages.tool_cut(arm)) for arm in arms] if task.cutting else []
         self._dye_pub = self.publisher(messages.DYE)
         self._outcome_pub = self.publisher(messages.TASK_OUTCOME)
         self._camera_pub = self.publisher(messages.CAMERA_POSE) if task.roams else None
         self._thing_pub = self.publisher(messages.THING_POSE) if task.rigid_thing() else None
-        self._listeners = Listeners((*self._pose_pubs, *self._jaw_pubs))
+        self._commanded = *self._pose_pubs, *self._jaw_pubs, *self._cut_pubs
+        self._listeners = Listeners(self._commanded)
         self._resetting = self.create_client(Trigger, f"{config.physics_node}/reset")
         self._state, self._missing = PolicyState.WAITING, ""  # and what for
         self._begun, self._solved, self._done = False, 0, 0
@@ -78,6 +80,9 @@ class PolicyNode(EndoNode):
         self._rows: list[tuple[np.ndarray, np.ndarray, float, bool, int]] = []
         depth = 1 if self._realtime else STREAM_DEPTH  # only the newest counts, or none may be lost
         self.subscribe(messages.CONTROL_NODES, self._on_nodes, depth)
+        self._surfaces = {0: np.zeros((0, 3, 3), np.float32)}  # all that is cut, by its number: whole tissue, and the newest
+        if task.cutting:
+            self.subscribe(messages.CUT_SURFACE, self._on_cut_surface)
         self._forces = [f"force of {arm}" for arm in arms]
         for number, arm in enumerate(arms):
             self.subscribe(messages.tool_reaction(arm), partial(self._on_reaction, number), depth)
@@ -112,7 +117,7 @@ class PolicyNode(EndoNode):
             self._go_on()
         if self._stamp != 0 or self._asked is not None and time.monotonic() - self._asked_at < _PATIENCE and not self._unanswered():
             return
-        listening = all(publisher.get_subscription_count() for publisher in (*self._pose_pubs, *self._jaw_pubs))
+        listening = all(publisher.get_subscription_count() for publisher in self._commanded)
         if not (listening and self._resetting.service_is_ready()):
             named = f" and the arms {' and '.join(self._task.arms)}" if len(self._task.arms) > 1 else ""
             self._missing = f"physics_node with arm_source commanded{named}" + (", and an instrument with joints" if self._tools else "")
@@ -149,9 +154,15 @@ class PolicyNode(EndoNode):
                 text = f"the tissue on control_nodes, {len(cloud.rest)} nodes, is not that of the scene and the task"
                 raise ValueError(f"{text}, {len(self._task.nodes)} nodes; start the graph with what `endo-sim scene` wrote")
             self._model_stamp, self._rested = stamp, self._rested + self._placed
-            self._answer("nodes", cloud.positions, stamp)
-        elif self._answers(stamp):
-            self._answer("nodes", cloud.positions, stamp)
+        elif not self._answers(stamp):
+            return
+        self._heard["cut"] = cloud.cut
+        self._answer("nodes", cloud.positions, stamp)
+
+    def _on_cut_surface(self, message: Any) -> None:
+        triangles = messages.decode_cut_surface(message)
+        self._surfaces = {0: self._surfaces[0], messages.cut_number(triangles): triangles}
+        self._go_on()
 
     def _on_reaction(self, arm: int, message: Any) -> None:
         stamp = messages.stamp_to_ns(message.header.stamp)
@@ -183,6 +194,8 @@ class PolicyNode(EndoNode):
     def _go_on(self) -> None:
         """When the answer to the last command is complete, act."""
         if not {"nodes", *(self._forces if self._stamp else ["reset"])} <= self._heard.keys():
+            return
+        if self._task.cutting and self._heard["cut"] not in self._surfaces:
             return
         if self._realtime and not self._stamp:
             if not self._placed:
@@ -226,6 +239,8 @@ class PolicyNode(EndoNode):
     def _observe(self) -> np.ndarray:
         """The state that a policy takes [1, n]."""
         forces = np.array([self._heard.get(name, np.zeros(3)) for name in self._forces]).reshape(self._task.force.shape)
+        if self._task.cutting:
+            self._task.hear_cuts(0, self._surfaces[self._heard["cut"]])
         observation = self._task.observe(self._heard["nodes"][self._task.sites], forces)
         if self._stamp:
             self._send_thing(self._stamps["nodes"])
@@ -271,7 +286,8 @@ class PolicyNode(EndoNode):
                 delivered(self._thing_pub, _DYED_WITHIN)
 
     def _command(self, tips: np.ndarray, closed: np.ndarray, stamp: int) -> None:
-        """Publish where the tips [A] shall be, m, world, or the joints that put them there, and whether the jaws are closed [A]."""
+        """Publish where the tips [A] shall be, m, world, or the joints that put them there, whether the jaws are closed [A], and whether
+        edges cut."""
         self._send_camera(stamp)
         none, poses = np.zeros(0), tip_poses(self._task, tips)
         for arm, (publisher, jaw) in enumerate(zip(self._pose_pubs, self._jaw_pubs)):
@@ -280,6 +296,8 @@ class PolicyNode(EndoNode):
             else:
                 publisher.publish(messages.encode_joints([], self._tools.joints[arm], none, none, stamp))
             jaw.publish(messages.encode_jaw(self._task.closed_jaw if closed.flat[arm] else self._task.open_jaw, stamp))
+        for publisher, cuts in zip(self._cut_pubs, self._task.cuts(self._task.fourth).flat):
+            publisher.publish(messages.encode_cut(bool(cuts), stamp))
 
     def _end(self, success: bool) -> None:
         self._done += 1

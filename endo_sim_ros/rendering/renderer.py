@@ -174,9 +174,8 @@ class DeformableRenderer:
                 raise ValueError("render: positions of control nodes go with their deformation gradients F; F is None")
             means, covars = self.deform(positions, F)
         colors, depths, alphas = self._render_tissue(cameras, means, covars, F)
-        if self._behind is not None and positions is not None:
-            at, stretched = (torch.as_tensor(each, dtype=torch.float32, device=self.device) for each in (positions, F))
-            self._behind.draw(cameras, at, stretched, (colors, depths, alphas), self._background)
+        if positions is not None and F is not None:
+            self.draw_behind(cameras, positions, F, (colors, depths, alphas))
         sees_tissue = (alphas[0] > SURFACE).any()
         marks = None
         if instruments is not None:
@@ -197,16 +196,27 @@ class DeformableRenderer:
         distances = rest[:count] if depth else nothing
         return [View(*each) for each in zip(images, distances, rest[-count:] if labels else nothing, strict=True)]
 
+    def draw_behind(self, cameras: Sequence[Camera], positions: np.ndarray, F: np.ndarray, images: tuple[Tensor, Tensor, Tensor]) -> None:
+        """Put what is behind the skin into colours [E, H, W, 3], depths and alphas [E, H, W] of the tissue, see `Behind.draw`."""
+        if self._behind is not None:
+            at, stretched = (torch.as_tensor(each, dtype=torch.float32, device=self.device) for each in (positions, F))
+            self._behind.draw(cameras, at, stretched, images, self._background)
+
+    def opened(self, means: Tensor, rest: Tensor) -> GaussianModel:
+        """Return the model with as much of its flesh as cuts have opened, at means [N, 3], and at rest [N, 3], m, world."""
+        model, count = self.model, len(self._skin)
+        if len(model) == count:
+            return model
+        share = open_share(rest[count:], means[count:], self.config.inside.grain)
+        opacities = torch.cat([model.logit_opacities[:count], (model.opacities[count:] * share).logit()])
+        return replace(model, logit_opacities=opacities)
+
     def _render_tissue(
         self, cameras: Sequence[Camera], means: Tensor, covars: Tensor | None, F: np.ndarray | None
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Colours [E, H, W, 3], depths and alphas [E, H, W] of the tissue in each camera."""
-        model, count = self.model, len(self._skin)
-        if len(model) > count:
-            rest = means if covars is None or self.skinning is None else self.skinning.means  # which cuts that cross it have moved
-            share = open_share(rest[count:], means[count:], self.config.inside.grain)
-            opacities = torch.cat([model.logit_opacities[:count], (model.opacities[count:] * share).logit()])
-            model = replace(model, logit_opacities=opacities)
+        rest = means if covars is None or self.skinning is None else self.skinning.means  # which cuts that cross it have moved
+        model = self.opened(means, rest)
         draw = partial(render, background=self._background, covars=covars)
         if covars is None:
             return draw(model, *cameras)[:3]

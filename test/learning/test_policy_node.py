@@ -96,6 +96,7 @@ def user():
         ("handover", 1, True, MotionConfig()),
         ("camera", 1, True, MotionConfig()),
         ("clip", 1, False, MotionConfig(breathing=0.003)),
+        ("dissect", 1, True, MotionConfig()),
     ],
 )
 def test_over_topics_observations_images_and_actions_are_bit_for_bit_those_of_the_environment(

@@ -3,6 +3,7 @@
 from endo_sim_ros.core.plugins import load_named
 from endo_sim_ros.learning.tasks.camera import Camera as Camera
 from endo_sim_ros.learning.tasks.clip import Clip
+from endo_sim_ros.learning.tasks.dissect import Dissect
 from endo_sim_ros.learning.tasks.exposure import Exposure
 from endo_sim_ros.learning.tasks.handover import Handover
 from endo_sim_ros.learning.tasks.palpation import Palpation
@@ -19,7 +20,9 @@ from endo_sim_ros.learning.tasks.task import (
 from endo_sim_ros.learning.tasks.tension import Tension
 from endo_sim_ros.learning.tasks.tracking import Tracking
 
-TASKS: dict[str, type[Task]] = {task.name: task for task in (Retraction, Palpation, Tracking, Exposure, Tension, Handover, Camera, Clip)}
+TASKS: dict[str, type[Task]] = {
+    task.name: task for task in (Retraction, Palpation, Tracking, Exposure, Tension, Handover, Camera, Clip, Dissect)
+}
 """All tasks by their names."""
 
 

@@ -69,6 +69,7 @@ class Task(ABC):
     low: tuple[float, float, float]  # where the tip may be, m, task frame
     high: tuple[float, float, float]
     site_count = 1  # nodes per episode whose positions are observed
+    cutting = False  # whether tools have edges that cut the tissue, see `cuts`
     largest_stiffness = 1.0  # factor on the moduli that an episode may have
     same_tissue = True  # in all episodes, but for randomisation
     margin = 0.012  # m from tissue that is held in place to a place that is worked on
@@ -110,6 +111,11 @@ class Task(ABC):
             endoscope: Pose of that of the scene [4, 4], camera to world.
         """
         return None
+
+    @classmethod
+    def tool_of(cls, arm: str) -> str:
+        """What is seen of the tool that an arm of this name holds."""
+        return cls.tool
 
     @staticmethod
     def script(count: int) -> "Policy":
@@ -235,6 +241,13 @@ class Task(ABC):
     def closes(self, fourth: np.ndarray) -> np.ndarray:
         """Whether a fourth number of actions [B] closes the jaws."""
         return np.zeros(np.shape(fourth), bool)
+
+    def cuts(self, fourth: np.ndarray) -> np.ndarray:
+        """Whether the edge of a tool cuts with a fourth number of actions [B]; it reaches from the tip against the z of its axes."""
+        return np.zeros(np.shape(fourth), bool)
+
+    def hear_cuts(self, b: int, triangles: np.ndarray) -> None:
+        """All that has been cut in episode b, triangles [T, 3, 3] in the tissue at rest, m, world, float32; before each `observe`."""
 
     def reach(self, actions: np.ndarray) -> np.ndarray:
         """Where actions [B, 4 A] in -1 … 1 put the tips [B, 3], m, world."""

@@ -79,7 +79,8 @@ def save_scene(
             **tools,
             **changed,
         },
-        "rendering_node": {"mode": mode, **arms(), "image_width": sight.image_width, "baseline": sight.baseline}
+        # Pictures of many episodes at once show the background where skin is lifted off what it hid.
+        "rendering_node": {"mode": mode, **arms(), "image_width": sight.image_width, "baseline": sight.baseline, "behind.shown": False}
         | ({"lockstep_camera": True} if kind.roams else {})
         | ({"thing": task} if kind.rigid_thing() and sight.instrument else {}),
         "policy": {"mode": mode, "task": task, "scene": str(folder.resolve()), "seed": seed, "tool": named, "dye": sight.dye},

@@ -25,6 +25,7 @@ from endo_sim_ros.learning.tasks import Task
 from endo_sim_ros.learning.variation import Variation
 from endo_sim_ros.physics import Skinning, TissueBatch
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig, turned_colors
+from endo_sim_ros.rendering.config import BehindConfig
 from endo_sim_ros.splatting import rasterize
 
 IMAGE, IMAGE_RIGHT, SEGMENTATION = "image", "image_right", "segmentation"
@@ -178,12 +179,10 @@ class Pictures:
         for i, b in enumerate(own):
             if len(cuts := self._tissue.cuts(b)):
                 renderer = self._parted(b, cuts)
-                state = self._tissue.state(b)
-                skinning, (means, covars) = renderer.skinning, renderer.deform(*state)
+                skinning, (means, covars) = renderer.skinning, renderer.deform(*self._tissue.state(b))
                 assert skinning is not None  # as it was made with nodes
                 model = renderer.opened(means, skinning.means)
                 parted = self._draw_tissue(slice(b, b + 1), eye, model, skinning, model.sh, means[None], covars[None])
-                renderer.draw_behind([self.camera.at(self._views[b].poses[eye])], *state, parted)
                 for whole, part in zip(seen, parted):
                     whole[i] = part[0]
         return seen
@@ -191,7 +190,8 @@ class Pictures:
     def _parted(self, b: int, cuts: np.ndarray) -> DeformableRenderer:
         """What shows the skin of an episode parted along cuts [T, 3, 3], m, world, at rest, and flesh between: that of rendering_node."""
         if b not in self._cut:
-            self._cut[b] = DeformableRenderer(self._model, self._tissue.nodes.rest, RenderingConfig(device=self._device))
+            config = RenderingConfig(device=self._device, behind=BehindConfig(shown=False))
+            self._cut[b] = DeformableRenderer(self._model, self._tissue.nodes.rest, config)
             self._cut[b].dye(self._spots[b])
         self._cut[b].cut(cuts.astype(np.float32))
         return self._cut[b]

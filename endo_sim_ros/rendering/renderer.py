@@ -174,8 +174,9 @@ class DeformableRenderer:
                 raise ValueError("render: positions of control nodes go with their deformation gradients F; F is None")
             means, covars = self.deform(positions, F)
         colors, depths, alphas = self._render_tissue(cameras, means, covars, F)
-        if positions is not None and F is not None:
-            self.draw_behind(cameras, positions, F, (colors, depths, alphas))
+        if self._behind is not None and positions is not None:
+            at, stretched = (torch.as_tensor(each, dtype=torch.float32, device=self.device) for each in (positions, F))
+            self._behind.draw(cameras, at, stretched, (colors, depths, alphas), self._background)
         sees_tissue = (alphas[0] > SURFACE).any()
         marks = None
         if instruments is not None:
@@ -195,12 +196,6 @@ class DeformableRenderer:
         images, rest, nothing = arrays[:count], arrays[count:], [None] * count
         distances = rest[:count] if depth else nothing
         return [View(*each) for each in zip(images, distances, rest[-count:] if labels else nothing, strict=True)]
-
-    def draw_behind(self, cameras: Sequence[Camera], positions: np.ndarray, F: np.ndarray, images: tuple[Tensor, Tensor, Tensor]) -> None:
-        """Put what is behind the skin into colours [E, H, W, 3], depths and alphas [E, H, W] of the tissue, see `Behind.draw`."""
-        if self._behind is not None:
-            at, stretched = (torch.as_tensor(each, dtype=torch.float32, device=self.device) for each in (positions, F))
-            self._behind.draw(cameras, at, stretched, images, self._background)
 
     def opened(self, means: Tensor, rest: Tensor) -> GaussianModel:
         """Return the model with as much of its flesh as cuts have opened, at means [N, 3], and at rest [N, 3], m, world."""

@@ -89,7 +89,8 @@ class DeformableRenderer:
                 self._behind.cut(triangles, None)
             return
         if self._inside is None:
-            self._inside = Inside(self._skin, self.skinning.node_rest.cpu().double().numpy(), self.config.inside)
+            skin = replace(self._skin, sh=self._undyed)  # dye is on the skin alone, and may be elsewhere when cuts have healed
+            self._inside = Inside(skin, self.skinning.node_rest.cpu().double().numpy(), self.config.inside)
         if self._behind is not None:
             self._behind.cut(triangles, self._inside)
         flesh = self._inside.faces(triangles[known:]).to(self.device)

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.dye import DyedSpot
 from endo_sim_ros.core.gaussians import GLOSS_FIELDS, GaussianModel
 from endo_sim_ros.core.light import Light
 from endo_sim_ros.physics.cutting.geometry import sweep
@@ -119,6 +120,19 @@ def test_the_same_cuts_and_seed_give_the_same_flesh_however_they_come():
     for one, two in zip(first.deform(*state), piecewise.deform(*state)):
         assert torch.equal(one, two)
     assert torch.equal(first.model.means, other.model.means) and not torch.equal(first.model.sh, other.model.sh)
+
+
+def test_flesh_does_not_tell_where_dye_was_before_cuts_healed():
+    there, elsewhere = (DyedSpot(np.array([MIDDLE, y, SKIN]), 0.004) for y in (0.0, 0.02))
+    rest = nodes()
+    used, fresh = renderer(), renderer()
+    used.dye([elsewhere])
+    used.cut(cut(0.05))  # so that its flesh is made
+    for each in (used, fresh):
+        each.dye([there])
+        each.cut(cut())
+    pictures = [each.render(CAMERA, *opened(rest))[0] for each in (used, fresh)]
+    np.testing.assert_array_equal(*pictures)
 
 
 def test_both_faces_follow_the_nodes_on_their_own_side():

@@ -87,7 +87,7 @@ class Observations:
             along = self.smoother[self.steps[at], begin:end]
             along = along - np.where(self.closed_at[at, None] >= 0, self.smoother[self.closed_at[at], begin:end], 0)
             along = along * self.experiment.tip_noise
-            A = (along[:, :, None] * tip_sensitivity[at][:, None]).reshape(len(at), -1)
+            A = (along[:, :, None] * tip_sensitivity[at][:, None]).reshape(len(at), 3 * along.shape[1])
             blocks.append(_Block(np.flatnonzero(members), self.noise[at] ** 2, A[:, np.abs(A).max(0, initial=0) > 0]))
         return Covariance(blocks, shared[rows])
 

@@ -39,6 +39,16 @@ def test_what_a_long_experiment_shares_does_not_average_out():
     assert mean_variance == pytest.approx(0.1**2 + experiment.force_noise**2 / len(level), rel=1e-6)
 
 
+@pytest.mark.parametrize("steps, measured", [(10, slice(0, 0)), (600, slice(0, 200))])
+def test_a_stretch_in_which_nothing_was_measured_tells_nothing(steps, measured):
+    forces = np.full((steps, 3), np.nan)
+    forces[measured] = 1.0
+    seen = Observations(replace(pressed(steps=steps), forces=forces), 0.0)
+    count = len(seen.values)
+    R = seen.covariance(np.zeros((count, 3)), np.zeros((count, 1)))
+    assert np.allclose(R.solve(np.ones((count, 1))), seen.noise[:, None] ** -2)
+
+
 def test_smoothing_keeps_steady_motion_and_does_not_mix_what_was_apart():
     present = np.array([1, 1, 1, 1, 0, 0, 1, 1, 1, 1, 1], bool)
     W = smoothing_matrix(present, 1.5)

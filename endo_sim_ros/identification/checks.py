@@ -237,8 +237,9 @@ def _find_slips(data: list[Observations], predicted: list[np.ndarray], scale: fl
             continue
         expected = scale * np.linalg.norm(force, axis=1)
         unit = force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-12)
-        along = _moving_mean(np.nan_to_num((experiment.forces * unit).sum(1)))
-        strong = closed & (expected > _STILL * experiment.force_noise)
+        measured = np.isfinite(experiment.forces).all(1)
+        along = _moving_mean(np.nan_to_num((experiment.forces * unit).sum(1))) / np.maximum(_moving_mean(measured * 1.0), 1 / _AVERAGED)
+        strong = closed & measured & (expected > _STILL * experiment.force_noise)
         held = strong & (along > 0.5 * expected)
         gone = strong & (along < _GONE * expected)
         if not held.any():
@@ -248,13 +249,14 @@ def _find_slips(data: list[Observations], predicted: list[np.ndarray], scale: fl
             end = begin + int(opens[0]) if len(opens) else len(closed)
             rest = strong[begin:end]
             if held[:begin].any() and rest.sum() >= _AVERAGED and (gone[begin:end] & rest).sum() > 0.8 * rest.sum():
+                left, had = float(along[begin:end][rest].mean()), float(expected[begin:end][rest].mean())
                 begin = max(begin - _AVERAGED // 2, 0)
                 left_out = (each.steps >= begin) & (each.steps < end)
                 each.used &= ~left_out
                 findings.append(
                     f"the grasp slipped {begin * experiment.step_duration:.2f} s after the beginning of experiment {number}: the force"
-                    f" fell to {max(float(np.mean(along[begin + _AVERAGED // 2 : end])), 0.0):.2f} N where the model has"
-                    f" {float(np.mean(expected[begin:end])):.2f} N; the {end - begin} steps until the jaw opens are left out"
+                    f" fell to {max(left, 0.0):.2f} N where the model has {had:.2f} N; the {end - begin} steps until the jaw opens are"
+                    " left out"
                 )
                 break
     return findings

@@ -96,17 +96,21 @@ def test_forces_that_nothing_explains_are_told_and_widen_intervals(good):
     assert np.log(found["young_modulus"].high / found["young_modulus"].low) > 1.5 * np.log(plain.high / plain.low)
 
 
-def test_a_grasp_that_slips_is_told_and_left_out():
+@pytest.fixture(scope="module")
+def pulled():
+    """Tissue that a jaw holds and lifts, and the physics of that."""
     steps = 40
     way = np.concatenate([np.zeros(5), np.linspace(0, 0.012, steps - 5)])
-    tips = np.array([0, 0, 0.1]) - way[:, None] * [0, 0, 1]
-    closed = np.arange(steps) >= 3
     pull = replace(
-        pressed(), tips=tips, rotations=np.tile(np.eye(3), (steps, 1, 1)), present=np.ones(steps, bool), closed=closed,
-        forces=np.full((steps, 3), np.nan),
+        pressed(), tips=np.array([0, 0, 0.1]) - way[:, None] * [0, 0, 1], rotations=np.tile(np.eye(3), (steps, 1, 1)),
+        present=np.ones(steps, bool), closed=np.arange(steps) >= 3, forces=np.full((steps, 3), np.nan),
     )  # fmt: skip
     physics = replace(PHYSICS, contact_radius=0.0, force_radius=0.009)
-    whole = measure(pull, NODES, physics, np.random.default_rng(0))
+    return measure(pull, NODES, physics, np.random.default_rng(0)), physics
+
+
+def test_a_grasp_that_slips_is_told_and_left_out(pulled):
+    whole, physics = pulled
     forces = whole.forces.copy()
     forces[25:] = 0.05 * np.random.default_rng(1).standard_normal((15, 3))
     found = identify([replace(whole, forces=forces)], NODES, physics, CONFIG, "cpu")
@@ -114,6 +118,13 @@ def test_a_grasp_that_slips_is_told_and_left_out():
     assert len(told) == 1 and float(told[0].split("slipped ")[1].split(" s")[0]) == pytest.approx(1.0, abs=0.15)
     modulus = found["young_modulus"]
     assert modulus.low < 4e3 < modulus.high and modulus.estimate == pytest.approx(4e3, rel=0.1)
+
+
+def test_a_grasp_whose_force_was_not_measured_to_its_end_did_not_slip(pulled):
+    whole, physics = pulled
+    forces = whole.forces.copy()
+    forces[25:] = np.nan
+    assert not identify([replace(whole, forces=forces)], NODES, physics, CONFIG, "cpu").findings
 
 
 @pytest.mark.parametrize(

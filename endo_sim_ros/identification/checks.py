@@ -137,7 +137,7 @@ def _check_touch(data: list[Observations], model: ForwardModel, predicted: list[
         return
     away = "is never present" if not np.isfinite(nearest) else f"stays {1000 * nearest:.1f} mm or more away from the skin's control nodes"
     if any(felt):
-        most = max(float(np.nanmax(np.linalg.norm(each.experiment.forces, axis=1))) for each in data)
+        most = max(float(np.linalg.norm(np.nan_to_num(each.experiment.forces), axis=1).max()) for each in data)
         raise IdentificationError(
             f"forces of up to {most:.2g} N were measured, but the tool {away}: check frames, scale and the model's contact_radius"
         )

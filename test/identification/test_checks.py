@@ -43,6 +43,8 @@ def test_a_tool_that_never_touches_is_refused(good):
         findings(away)
     with pytest.raises(IdentificationError, match="forces of up to 0.* N were measured, but the tool stays"):
         findings(replace(good, tips=good.tips - [0, 0, 0.05]))
+    with pytest.raises(IdentificationError, match=r"forces of up to 0\.\d+ N were measured"):
+        findings(replace(away, forces=np.nan * good.forces), replace(good, tips=good.tips - [0, 0, 0.05]))
     with pytest.raises(IdentificationError, match="is never present"):
         findings(replace(good, present=np.zeros(40, bool), forces=0 * good.forces))
 

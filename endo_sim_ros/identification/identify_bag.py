@@ -17,7 +17,10 @@ from endo_sim_ros.identification.results import save_results
 from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.physics import PhysicsConfig
 
-_COARSE = "forces of real tissue are less than those of few control nodes of the same modulus: finer 1.5 corrects that"
+_COARSE = (
+    "few control nodes push back more than real tissue of the same modulus: moduli are too low, by a quarter with 1000 of them, which"
+    " intervals do not count; finer 1.5 corrects that"
+)
 _TOLD = {"known": "green", "ratio only": "yellow", "not told by these data": "red"}
 
 

@@ -14,7 +14,7 @@ from typing import Literal, NamedTuple, cast
 
 import numpy as np
 
-from benchmarks.lung_trials import lung_rows
+from benchmarks.lung_trials import lung_rows, press_files
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.evaluation.measurement import Row, Stage, machine, report, run_stages
 from endo_sim_ros.identification import Experiment, Identification, IdentificationConfig, find_inclusion, identify
@@ -94,6 +94,8 @@ def bench_identification(
     """
     if min(cases, inclusions, searches, palpations, noises) < 0 or not radius > 0:
         raise ValueError("cases, inclusions, searches, palpations and noises must be 0 or more, and the radius above 0")
+    if folder is not None:
+        press_files(folder)  # what cannot be used is refused before the long work
     device, scene = pick_device(device), load_scene()
     stages: list[Stage] = [("speed", lambda: speed_rows(scene, device))]
     if cases:

@@ -14,6 +14,18 @@ SEEN = 0.5  # share of the travel of the held-out trial that tells its scale and
 _EARLIER = 1.0  # thicknesses by which contact may have begun earlier, or later, than in the trial that was fitted
 
 
+def press_files(folder: Path) -> list[Path]:
+    """CSV files of presses in a folder.
+
+    Raises:
+        ValueError: If there are none.
+    """
+    files = sorted(folder.glob("*.csv"))
+    if not files:
+        raise ValueError(f"{folder}: there are no CSV files of presses; name the folder that has them")
+    return files
+
+
 def lung_rows(folder: Path, plan: Plan = Plan()) -> list[Row]:
     """How many held-out trials are predicted within 10 % of their greatest force, all along, by `fung` fitted to one other trial; and the
     root of the mean square, as `endo-sim bench presses` has it.
@@ -25,9 +37,7 @@ def lung_rows(folder: Path, plan: Plan = Plan()) -> list[Row]:
     Raises:
         ValueError: If there are no files, or too few trials in them.
     """
-    files = sorted(folder.glob("*.csv"))
-    if not files:
-        raise ValueError(f"{folder}: there are no CSV files of presses; name the folder that has them")
+    files = press_files(folder)
     tables, rows = tabulate("fung", plan.poisson_ratio), []
     for file in files:
         trials = read_trials(file, plan)

@@ -27,6 +27,12 @@ def test_bench_tells_errors_intervals_and_speed(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.slow
+def test_a_folder_without_presses_is_refused_before_the_long_work(tmp_path, monkeypatch):
+    monkeypatch.setattr(identification, "run_stages", lambda stages: pytest.fail("it has begun"))
+    with pytest.raises(ValueError, match="there are no CSV files of presses"):
+        bench_identification(None, "cpu", folder=tmp_path)
+
+
 def test_palpation_that_expects_to_learn_needs_fewer_steps_than_its_script():
     rows = {row.name: row.value for row in identification.palpation_rows(load_scene(), "cpu", 1)}
     assert rows["palpation by expected information: solved"] == rows["palpation by its script: solved"] == 100

@@ -123,7 +123,7 @@ def test_tasks_and_policies_of_files_are_found_and_what_is_wrong_is_said(press, 
         (press + "ure", "has no 'Pressure'"),
         (
             "sewing",
-            "there is no task 'sewing'; there are retraction, palpation, tracking, exposure, tension, handover, camera, clip, "
+            "there is no task 'sewing'; there are retraction, palpation, tracking, exposure, tension, handover, camera, clip, dissect, "
             "and your own as",
         ),
     ):

@@ -21,8 +21,9 @@ class Dissect(Task):
     PSM2 takes the spot, on the left of the line. PSM1 has half-open scissors that glide through the tissue: an edge of `blade` from its
     tip towards the endoscope, which cuts where the fourth action of PSM1 is above zero. A station on the line is parted where no tissue
     leads from one side to the other within `tolerance`, down to `depth`. The episode is solved when the line is parted over its whole
-    length, and its edges are on average `opened` farther apart than at rest. More than `most_astray` of cuts elsewhere lose it. The
-    fourth action of PSM2 closes its jaw where above zero.
+    length, and its edges are on average `opened` farther apart than at rest. More than `most_astray` of cuts elsewhere lose it, and so
+    do more than `most_loose` stations that are parted while PSM2 pulls less than `taut`. The fourth action of PSM2 closes its jaw where
+    above zero.
     """
 
     name = "dissect"
@@ -51,6 +52,7 @@ class Dissect(Task):
     depth = 0.003  # m
     opened = 0.0015  # m
     most_astray = 2e-5  # m²
+    taut, most_loose = 0.1, 2  # N, and stations: an edge pushes loose tissue away instead of parting it; half of what the script waits for
     grasp_radius = 0.006  # m; the jaw holds control nodes within it
     dot_radius = 0.0013  # m, of the spots that are the line in pictures
 
@@ -81,6 +83,7 @@ class Dissect(Task):
         self.across = np.zeros((count, 3))  # to its right
         self.parted = np.zeros((count, _STATIONS), bool)
         self.astray = np.zeros(count)  # m²
+        self.loose = np.zeros(count, int)  # stations that were parted without tension
         self._heard = np.zeros(count, int)  # triangles
         self._rest = np.zeros((count, self.site_count, 3))  # sites at rest, m, task frame
         self._weights = np.zeros((count, _STATIONS, 2 * _EACH))  # of nodes in where a station is
@@ -110,7 +113,7 @@ class Dissect(Task):
     def _reset(self, b: int, rng: np.random.Generator) -> None:
         self.tip[b, :, 0] = np.abs(self.tip[b, :, 0]) * [1, -1]  # each on its side
         self.tip[b, :, 2] = rng.uniform(0.012, self.high[2], 2)
-        self.parted[b], self.astray[b], self._heard[b] = False, 0.0, 0
+        self.parted[b], self.astray[b], self.loose[b], self._heard[b] = False, 0.0, 0, 0
 
     def closes(self, fourth: np.ndarray) -> np.ndarray:
         """The jaw of PSM2 does above zero."""
@@ -126,10 +129,11 @@ class Dissect(Task):
             return
         self._heard[b] = len(triangles)
         cut = dot(self.axes[b], (triangles.astype(np.float64) - self.origin[b])[..., None, :])  # [T, 3, 3]
-        aside, self.parted[b] = self.tolerance * self.across[b], True
+        before, aside, self.parted[b] = self.parted[b].copy(), self.tolerance * self.across[b], True
         for down in (0.3 * self.depth, self.depth):
             at = (self.line[b] - [0, 0, down] + _BRIDGE * self.along[b]).reshape(-1, 3)
             self.parted[b] &= separated(at - aside, at + aside, cut).reshape(len(_BRIDGE), -1).any(0)
+        self.loose[b] += (self._pull[b] < self.taut) * (self.parted[b] & ~before).sum()
         middle, ends = cut.mean(1), dot(self.line[b], self.along[b])
         along, below = dot(middle, self.along[b]), _heights(self.line[b], middle) - middle[:, 2]
         near = (np.abs(dot(middle, self.across[b])) <= self.tolerance) & (below <= self.deepest)
@@ -163,7 +167,7 @@ class Dissect(Task):
         return self.parted.all(1) & (self._opening >= self.opened) & ~self._ended()
 
     def _ended(self) -> np.ndarray:
-        return self.astray > self.most_astray
+        return (self.astray > self.most_astray) | (self.loose > self.most_loose)
 
     def dyed_spots(self, b: int) -> tuple[DyedSpot, ...]:
         """Where the tissue is to be held, and the line."""

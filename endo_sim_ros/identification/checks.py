@@ -237,9 +237,9 @@ def _find_slips(data: list[Observations], predicted: list[np.ndarray], scale: fl
             continue
         expected = scale * np.linalg.norm(force, axis=1)
         unit = force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-12)
-        measured = np.isfinite(experiment.forces).all(1)
-        along = _moving_mean(np.where(measured, (experiment.forces * unit).sum(1), 0.0))
-        along /= np.maximum(_moving_mean(measured * 1.0), 1 / _AVERAGED)
+        measured = np.asarray(np.isfinite(experiment.forces).all(1))
+        along = _moving_mean(np.where(measured, np.einsum("ni,ni->n", experiment.forces, unit), 0.0))
+        along /= np.maximum(_moving_mean(measured.astype(float)), 1 / _AVERAGED)
         strong = closed & measured & (expected > _STILL * experiment.force_noise)
         held = strong & (along > 0.5 * expected)
         gone = strong & (along < _GONE * expected)

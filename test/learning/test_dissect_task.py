@@ -152,7 +152,7 @@ def test_a_line_that_is_cut_without_tension_and_a_wild_edge_lose():
 
     environment = make("dissect")
     _, _, info = play(environment, Lazy(), 0)
-    task = environment.unwrapped.batch.task
+    task = environment.get_wrapper_attr("batch").task
     assert task.loose[0] > task.most_loose and not info["success"]
     _, rewards, info = play(environment, Wild(), 0)
     assert not info["success"] and len(rewards) < 60 and sum(rewards) < 2

@@ -202,13 +202,14 @@ class KeypointPolicy:
                 values = {name: torch.from_numpy(file[name]) for name in file.files if name != "about"}
             self._size, self._eyes = values.pop("image_size").tolist(), int(values.pop("eyes"))
             arms, outputs = len(values["arm_mean"]) // (len(ARM_NAMES) + 3), len(values["head.6.bias"])
-            self._known, action = arms * len(ARM_NAMES), about.get("action", arms * CARTESIAN_SIZES[0])  # older files did not tell it
+            self._known, action = arms * len(ARM_NAMES), int(about["action"])
             network = KeypointNetwork(self._eyes, self._known, outputs - action, action)
             network.load_state_dict(values)
         except OSError as error:
             raise ValueError(f"{path}: not a readable policy ({error})") from error
         except Exception as error:  # zipfile, numpy and torch have a type each
-            raise ValueError(f"{path} is no policy of `endo-sim imitate --policy keypoints`, or it is damaged") from error
+            text = f"{path} is no policy of `endo-sim imitate --policy keypoints`, or it is damaged or of an older version; train it again"
+            raise ValueError(text) from error
         self._network = network.to(self._device).eval()
         self.sight = SightConfig(**about["sight"] | {"image_width": self._size[1], "eyes": self._eyes})
         self.task: str = about["task"]

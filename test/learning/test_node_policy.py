@@ -28,7 +28,11 @@ def running(*words):
         yield process
     finally:
         process.terminate()
-        process.communicate()
+        try:
+            process.communicate(timeout=10)
+        except subprocess.TimeoutExpired:  # rclpy's own end has hung once
+            process.kill()
+            process.communicate()
 
 
 def test_the_node_of_the_guide_plays_as_the_same_policy_in_this_process_does(tmp_path):

@@ -10,10 +10,11 @@ from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
+import torch
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import cpu_threads, return_freed_memory
-from endo_sim_ros.reconstruction.priors.flow import EyeImage, FlowCorrection, eye_image, flow_correction
+from endo_sim_ros.reconstruction.priors.flow import EyeImage, FlowCorrection, eye_image, flow_correction, prepare_flow
 from endo_sim_ros.reconstruction.priors.interpolation import inverse_distance_weighted
 from endo_sim_ros.reconstruction.priors.inverse_depth import blur, correct, prepare_smoothing, scaled, smooth
 from endo_sim_ros.reconstruction.priors.stereo import right_view
@@ -58,6 +59,7 @@ def refine_depth(
     views = list(views)
     free = return_freed_memory if len(views) > cpu_threads() else lambda: None  # of few there is little
     prepare_smoothing(device)
+    prepare_flow(device)
     near, priors = nearest_views(views, options.neighbours), [view.depth_prior for view in views]
     pairs: list[tuple[EyeImage, EyeImage, float] | None] = [None] * len(views)
 
@@ -87,14 +89,16 @@ def refine_depth(
         if pair is not None:
             inverse, error = _refine_by_eyes(inverse, *pair, options, stereo, device)
         total, weight = _point_corrections(camera, inverse, error, points, options)
+        given = torch.from_numpy(inverse).to(device, torch.float32)
 
         def told_by(j: int) -> FlowCorrection | None:
             progress.check()
-            return flow_correction(inverse, images[i], images[j], options)
+            return flow_correction(given, images[i], images[j], options)
 
-        for found in several(told_by, near[i]):
-            if found is not None:
-                total, weight = total + found.precision * found.correction, weight + found.precision
+        told = [found for found in several(told_by, near[i]) if found is not None]
+        if told:
+            total = total + torch.stack([found.precision * found.correction for found in told]).sum(0).cpu().numpy()
+            weight = weight + torch.stack([found.precision for found in told]).sum(0).cpu().numpy()
         inverse = correct(inverse, total, weight, error, options.continuation, options.max_correction)
         inverse = smooth(inverse, options.smoothing, options.edge, device)
         good = known & np.isfinite(inverse) & (inverse > 0)
@@ -130,12 +134,12 @@ def _refine_by_eyes(
     pixel = left.camera.K[0, 0] * baseline  # a disparity of one pixel is 1 / pixel
     width, matched = left.camera.width, np.full(inverse.shape, stereo.disparity_error / pixel, np.float32)
     inverse = smooth(inverse, options.matched_window, options.matched_edge, device)
-    found = flow_correction(inverse, left, right, options)
+    found = flow_correction(torch.from_numpy(inverse).to(device, torch.float32), left, right, options)
     if found is None:
         return inverse, matched
-    believed = np.abs(found.correction) * pixel < scaled(options.max_step, width)
-    precision = np.where(believed, found.precision, 0)
-    correction = np.where(precision > 0, found.correction, 0)
+    correction, precision = (part.cpu().numpy() for part in found)
+    precision = np.where(np.abs(correction) * pixel < scaled(options.max_step, width), precision, 0)
+    correction = np.where(precision > 0, correction, 0)
     corrected = correct(inverse, precision * correction, precision, matched, options.continuation, options.max_correction)
     # Where flow tells nothing, far and wide, the error stays that of matching.
     share = np.minimum(2 * blur(precision > 0, options.continuation, width), 1)

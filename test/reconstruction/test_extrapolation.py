@@ -64,7 +64,7 @@ def test_noise_of_scene_points_does_not_make_the_tissue_beyond_rough(views):
     depth = flat * random.normal(1, 0.03, 400)
     local = np.column_stack([(pixels - K[:2, 2]) / K[[0, 1], [0, 1]] * depth[:, None], depth])
     points = frame.camera.position + local @ frame.camera.pose[:3, :3].T
-    continued = continue_view(frame, points, np.zeros(4), np.zeros(3), flat, 48)
+    continued = continue_view(frame, torch.from_numpy(points), np.zeros(4), np.zeros(3), flat, 48)
     around = continued.depth[48 + 10 : 48 + 118, 48 + 175 : 48 + 195]
     assert np.std(around / flat) < 0.012  # points alone: 0.017
 
@@ -78,7 +78,7 @@ def test_a_picture_goes_on_as_bright_as_it_is_however_far_the_tissue_beyond_is_g
     picture = lambda shaded: 100 * np.exp(shaded.sum(-1) - 0.9 * np.log(1.3))  # of tissue that is of one colour
     image = np.repeat(picture(shading(camera, depth))[..., None], 3, 2).round().astype(np.uint8)
     (view,) = with_prior([dataclasses.replace(bare(views[4]), mask=None, image=image, depth=depth)])
-    wide, continued, colors, _ = continue_view(view, np.empty((0, 3)), light, exposure, 0.1, 48)
+    wide, continued, colors, _ = continue_view(view, torch.empty(0, 3, dtype=torch.float64), light, exposure, 0.1, 48)
     assert continued[48:-48, -10:].max() < 0.95 * depth.min()
     shaded = shading(wide, continued)
     np.testing.assert_allclose(colors[48:-48, 48:-48, 0], colors[64, 64, 0], rtol=0.03)  # in the picture that of the tissue

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import torch
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (it is public)
+from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import cpu_threads
@@ -19,11 +20,14 @@ from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import features_at
 from endo_sim_ros.reconstruction.priors.interpolation import clip_to_range, fit_plane, inverse_distance_weighted, krige
 from endo_sim_ros.reconstruction.progress import StageProgress
-from endo_sim_ros.reconstruction.scene import TrainingView, pixels_of, shrink
+from endo_sim_ros.reconstruction.scene import TrainingView, shrink
 from endo_sim_ros.reconstruction.stage_configs import ExtrapolationConfig, InterpolationConfig
 from endo_sim_ros.reconstruction.triangulation import points_in_view
 
 _FINENESS = 4  # pixels of a cell: what goes on beyond a picture is no finer than cells
+_AROUND = 8  # pixels from where depth is unknown, within which points tell how it goes on
+_THINNED = 2  # pixels in each of which at most one point, the nearest, tells it
+_AT_ONCE = 2_000_000  # points in views that are looked up at a time
 
 
 class ContinuedView(NamedTuple):
@@ -42,6 +46,38 @@ class _Guess(NamedTuple):
     colors: np.ndarray  # [N, 3] without light
     spacing: np.ndarray  # [N] m, between neighbours
     away: np.ndarray  # [N] from the tissue in the picture, 0 in it; widths of the picture
+
+
+class _Known:
+    """What all views know, on a device: a lookup by points.
+
+    Args:
+        views: Those with a depth prior.
+        device: Where points are looked up.
+    """
+
+    def __init__(self, views: Sequence[TrainingView], device: str):
+        to = lambda values: torch.from_numpy(np.array(values)).to(device)
+        joined = lambda masks: torch.from_numpy(np.concatenate([mask.ravel() for mask in masks])).to(device)
+        cameras = [view.camera for view in views]
+        self._viewmats, self._K = to([camera.viewmat[:3] for camera in cameras]), to([camera.K for camera in cameras])
+        self._sizes = to([(camera.width, camera.height) for camera in cameras])
+        self._first = torch.cumsum(self._sizes.prod(1), 0) - self._sizes.prod(1)  # pixel of each view
+        self._depth = joined([view.depth_prior > 0 for view in views if view.depth_prior is not None])
+        self._tissue = joined([view.tissue > 0 for view in views])
+
+    def without(self, guess: _Guess) -> _Guess:
+        """The part of a guess where no view knows the depth, and, if beyond its own picture, beyond the tissue that any view sees."""
+        to = lambda array: torch.from_numpy(array).to(self._depth.device)
+        positions, beyond = to(guess.positions), to(guess.away > 0)
+        unknown = torch.ones_like(beyond)
+        # So many views at a time that their pixels take some ten megabytes.
+        for views in torch.arange(len(self._first)).split(max(_AT_ONCE // max(len(positions), 1), 1)):
+            inside, u, v, _ = _project(self._viewmats[views], self._K[views], self._sizes[views], positions)
+            pixel = torch.where(inside, self._first[views, None] + v.long() * self._sizes[views, :1] + u.long(), 0)
+            unknown &= ~(inside & (self._depth[pixel] | beyond & self._tissue[pixel])).any(0)
+        kept = unknown.cpu().numpy()
+        return _Guess(*(values[kept] for values in guess))
 
 
 def extrapolate(
@@ -81,15 +117,16 @@ def extrapolate(
     known = [view.depth_prior is not None and (view.depth_prior > 0).mean() >= options.min_coverage for view in views]
     usable = [index for index, view in enumerate(views) if known[index] and view.tissue.any()]
     threads = max(cpu_threads() // max(len(usable), 1), 1)  # for each view: few leave cores idle
+    known_views, cloud = _Known([view for view in views if view.depth_prior is not None], device), torch.from_numpy(points).to(device)
 
     def around(index: int) -> tuple[_Guess, _Guess]:
         view = shrink(views[index], round(_FINENESS / interpolation.cell))
         pad = int(reach * view.camera.width)
-        continued = continue_view(view, points, light, exposures[index], reference, pad, interpolation, device, threads)
+        continued = continue_view(view, cloud, light, exposures[index], reference, pad, interpolation, threads)
         positions = continued.camera.backproject(continued.depth)
 
         def guess(times: float) -> _Guess:
-            unknown = _unknown(_on_lattice(view, continued, positions, times * interpolation.cell), views)
+            unknown = known_views.without(_on_lattice(view, continued, positions, times * interpolation.cell))
             new = _beside(seen, unknown.positions, unknown.spacing)
             return _Guess(*(values[new] for values in unknown))
 
@@ -129,25 +166,23 @@ def extrapolate(
 
 def continue_view(
     view: TrainingView,
-    points: np.ndarray,
+    points: Tensor,
     light: np.ndarray,
     exposure: np.ndarray,
     reference: float,
     pad: int,
     interpolation: InterpolationConfig = InterpolationConfig(),
-    device: str = "cpu",
     threads: int = 1,
 ) -> ContinuedView:
     """The view with a margin of so many pixels, and depth and colour wherever it has none.
 
     Args:
         view: A training view with a depth prior.
-        points: Scene points [N, 3] (m, world).
+        points: Scene points [N, 3] (m, world, float64), on the device where depth is continued.
         light, exposure: The light [4] and the logarithm of the view's exposure [3].
         reference: Distance (m) at which colours are the tissue's own.
         pad: Width of the margin, pixels.
         interpolation: How depth and colour are continued.
-        device: Where depth is.
         threads: How many look for neighbours.
     """
     K = view.camera.K.copy()
@@ -161,13 +196,13 @@ def continue_view(
     plane = a * np.arange(camera.width) + b * np.arange(camera.height)[:, None] + c  # what departs from it fades
     residual = np.zeros(depth.shape, np.float32)
     residual[known] = inverse - plane[known]
-    uv, z = points_in_view(camera, points, where=~known, threads=threads)
+    uv, z = points_in_view(camera, _that_tell(camera, points, ~known), where=~known, threads=threads)
     columns, rows = np.floor(uv).astype(int).T
     point_inverse = 1 / z
     point_residual = point_inverse - plane[rows, columns]
     if len(point_residual) > 8:  # the median of a point and those around: one wrong point would stand like a pillar before the tissue
         point_residual = np.median(point_residual[cKDTree(uv).query(uv, k=9)[1]], 1)
-    residual = krige(residual, known, uv, point_residual, view.camera.width, interpolation, device, threads)
+    residual = krige(residual, known, uv, point_residual, view.camera.width, interpolation, str(points.device), threads)
     depth = 1 / clip_to_range(plane + residual, np.concatenate([inverse, point_inverse]), interpolation)
     shading = features_at(camera.backproject(depth).reshape(-1, 3), camera, reference) * light
     near, lit = np.exp(shading[:, 0]).reshape(depth.shape), np.exp(shading[:, 1:].sum(1)[:, None] + exposure).reshape(image.shape)
@@ -192,15 +227,30 @@ def _on_lattice(view: TrainingView, continued: ContinuedView, positions: np.ndar
 
 def _beside(tree: cKDTree, positions: np.ndarray, spacing: np.ndarray) -> np.ndarray:
     """Which positions [N, 3] are not where points of a tree are already [N], given the spacing [N] of Gaussians there."""
-    return tree.query(positions)[0] > 0.7 * spacing
+    apart = 0.7 * spacing
+    return tree.query(positions, distance_upper_bound=apart.max(initial=0.0) + 1e-9)[0] > apart  # infinite where there is none so close
 
 
-def _unknown(guess: _Guess, views: Sequence[TrainingView]) -> _Guess:
-    """The part of a guess that lies where no view knows the depth, and, if beyond its own picture, beyond the tissue that any view sees."""
-    unknown = np.ones(len(guess.away), bool)
-    for view in views:
-        if view.depth_prior is not None:
-            index, v, u, _ = pixels_of(view.camera, guess.positions)
-            known = (view.depth_prior[v, u] > 0) | (view.tissue[v, u] > 0) & (guess.away[index] > 0)
-            unknown[index[known]] = False
-    return _Guess(*(values[unknown] for values in guess))
+def _that_tell(camera: Camera, points: Tensor, unknown: np.ndarray) -> np.ndarray:
+    """Those of the points [N, 3] that tell how depth goes on where it is unknown [H, W]: close to there, and not hidden by others."""
+    close = cv2.dilate(unknown.astype(np.uint8), np.ones((2 * _AROUND + 1,) * 2, np.uint8))
+    to = lambda values: torch.from_numpy(np.array([values])).to(points.device)
+    inside, u, v, z = (part[0] for part in _project(to(camera.viewmat[:3]), to(camera.K), to((camera.width, camera.height)), points))
+    index = torch.where(inside, v.long() * camera.width + u.long(), 0)
+    told = torch.nonzero(inside & (torch.from_numpy(close).to(points.device).flatten()[index] > 0))[:, 0]
+    columns = -(-camera.width // _THINNED)
+    cell = (v[told] / _THINNED).long() * columns + (u[told] / _THINNED).long()
+    nearest = z.new_full((columns * camera.height,), torch.inf).scatter_reduce(0, cell, z[told], "amin")
+    return points[told[z[told] == nearest[cell]]].cpu().numpy()
+
+
+def _project(viewmats: Tensor, K: Tensor, sizes: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Which points [N, 3] (m, world) are in the pictures of cameras [V], and columns, rows (pixels) and depths (m) of all: each [V, N].
+
+    Of the cameras there are world to camera [V, 3, 4], K [V, 3, 3], and width and height [V, 2].
+    """
+    x, y, z = (viewmats[:, :, :3] @ points.T + viewmats[:, :, 3:]).unbind(1)
+    ahead = torch.where(z > 0, z, torch.inf)
+    u, v = (part / ahead * K[:, axis, axis, None] + K[:, axis, 2, None] for axis, part in enumerate((x, y)))
+    inside = (z > 0) & (u >= 0) & (v >= 0) & (u < sizes[:, :1]) & (v < sizes[:, 1:])
+    return inside, u, v, z

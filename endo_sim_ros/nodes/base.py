@@ -248,6 +248,7 @@ def run(node_class: Callable[[], EndoNode]) -> int:
         node = node_class()
         node.get_logger().info(f"ready; {node.status()[1]}")
         gc.freeze()  # looking through all that was imported takes 0.15 s, in which nothing else happens
+        gc.enable()
         spinning = True
         spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):

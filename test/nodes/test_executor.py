@@ -36,6 +36,15 @@ class Interrupted(EndoNode):
 raise SystemExit(run(Interrupted))
 """
 
+STARTED = """
+import gc, sys
+sys.argv[0] = "-m"
+from endo_sim_ros.nodes import base
+while_starting = gc.isenabled()
+base.spin = lambda node: print(while_starting, gc.isenabled())
+raise SystemExit(base.run(lambda: base.EndoNode("started")))
+"""
+
 
 @pytest.mark.parametrize("node", sorted(path.name for path in (Path(__file__).parents[2] / "scripts").glob("*_node")))
 def test_help_lists_the_parameters_and_unknown_arguments_are_refused(node, monkeypatch, capsys):
@@ -50,6 +59,11 @@ def test_help_lists_the_parameters_and_unknown_arguments_are_refused(node, monke
     monkeypatch.setattr(sys, "argv", [f"/somewhere/{node}.py", "--nonsense", "--ros-args", "-p", "world_frame:=map"])
     assert run(EndoNode) == 2 and not rclpy.ok()
     assert capsys.readouterr().err.startswith(f"{node}: unknown argument --nonsense; parameters are given as --ros-args -p ")
+
+
+def test_garbage_is_collected_once_a_node_spins_and_not_while_it_starts():
+    done = subprocess.run([sys.executable, "-c", STARTED], capture_output=True, text=True, timeout=60)
+    assert done.stdout == "False True\n", done.stderr
 
 
 def test_ctrl_c_during_a_callback_is_not_logged_as_its_error():

@@ -72,7 +72,8 @@ class _Worker:
 
     def start(self, index: int, argument: Any) -> None:
         if self._process is None or not self._process.is_alive():
-            context = multiprocessing.get_context("spawn")  # CUDA does not survive a fork
+            context = multiprocessing.get_context("forkserver")  # CUDA does not survive a fork of this process
+            context.set_forkserver_preload([__name__, self._arguments[0].__module__])  # so that each begins at once
             self.connection, theirs = context.Pipe()
             self._process = context.Process(target=_serve, args=(theirs, *self._arguments), daemon=True)
             self._process.start()

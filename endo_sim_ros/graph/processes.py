@@ -63,9 +63,11 @@ class NodeGroup(contextlib.AbstractContextManager):
         environment, log = self.environment | {PARENT: str(os.getpid())}, self._log_folder / f"{name}.log"
         log.parent.mkdir(parents=True, exist_ok=True)
         with log.open("wb") as output:
-            process = subprocess.Popen(arguments, env=environment, stdout=output, stderr=subprocess.STDOUT, start_new_session=True)
-        self.nodes[name] = NodeProcess(name, log, process)
+            self.nodes[name] = NodeProcess(name, log, self._launch(arguments, environment, output))
         return self.nodes[name]
+
+    def _launch(self, arguments: list[str], environment: dict[str, str], output: Any) -> Any:
+        return subprocess.Popen(arguments, env=environment, stdout=output, stderr=subprocess.STDOUT, start_new_session=True)
 
     def dead(self) -> list[NodeProcess]:
         """Nodes that ended with an error."""

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rclpy
+from forked_nodes import ForkedNodes
 from ros_bench import HEIGHT, WIDTH, Bench, K, report, send_camera, send_model, sheet, start_ros
 from std_srvs.srv import SetBool, Trigger
 from waiting import wait_until
@@ -18,7 +19,6 @@ from waiting import wait_until
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera, save_cameras
 from endo_sim_ros.core.gaussians import save_ply
-from endo_sim_ros.graph.processes import NodeGroup
 from endo_sim_ros.messages import ERROR, OK
 from endo_sim_ros.nodes.physics_node import PhysicsNode
 from endo_sim_ros.nodes.rendering_node import RenderingNode
@@ -335,7 +335,7 @@ def record(tmp_path, name, model, **physics):
     bench, bag = Bench(), tmp_path / name
     bench.hear(IMAGES)
     try:
-        with NodeGroup(tmp_path / "logs") as group:
+        with ForkedNodes(tmp_path / "logs") as group:
             group.environment |= {"ENDO_SIM_THREADS": "2" if name == "second" else "1"}
             group.start("recorder_node", bag=bag, topics=["all", *(topic.name for topic in SHOWN)])
             group.start("physics_node", **PARAMETERS["physics_node"], **physics)
@@ -391,7 +391,7 @@ def test_the_same_bag_gives_the_same_model_in_every_run(tmp_path, small_bag):
         bench = Bench()
         heard = bench.hear(messages.GAUSSIANS)
         try:
-            with NodeGroup(tmp_path / run) as group:
+            with ForkedNodes(tmp_path / run) as group:
                 options = {"iterations": 30, "max_gaussians": 1500, "image_width": 96, "keyframes": 3, "start_after": 0.5, "device": "cpu"}
                 group.start("reconstruction_node", mode="lockstep", output_dir=tmp_path / run, **options)
                 bench.status("reconstruction_node", "collecting views", OK)
@@ -418,7 +418,7 @@ def test_the_policy_in_the_guide_runs(tmp_path, last):
     bench = Bench()
     states = bench.hear(messages.CONTROL_NODES)
     try:
-        with NodeGroup(tmp_path / "logs") as group:
+        with ForkedNodes(tmp_path / "logs") as group:
             group.start("physics_node", arm_source="commanded", **PARAMETERS["physics_node"])
             group.start("reconstruction_node", mode="lockstep", model_file=tmp_path / "model.ply", output_dir=tmp_path)
             if last == "policy":

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import rclpy
 from blue_seeker import BlueSeeker
+from forked_nodes import ForkedNodes
 from played_tasks import joint_policy, linear_policy, make
 from ros_bench import Bench
 from waiting import wait_until
 
 from endo_sim_ros import messages
-from endo_sim_ros.graph.processes import NodeGroup
 from endo_sim_ros.learning.config import DemonstrationConfig, ImitationConfig, SightConfig
 from endo_sim_ros.learning.demonstrations import demonstrate
 from endo_sim_ros.learning.graph_files import save_scene
@@ -111,7 +111,7 @@ def test_over_topics_observations_images_and_actions_are_bit_for_bit_those_of_th
     user.user.subscribe(messages.tool_pose_command("PSM1"), commands.append, depth=1000)
     outcomes: list = []
     user.user.subscribe(messages.TASK_OUTCOME, outcomes.append, depth=1000)
-    with NodeGroup(tmp_path / "logs") as group:
+    with ForkedNodes(tmp_path / "logs") as group:
         parameters = ("--params-file", str(tmp_path / "parameters.yaml"))
         logs = lambda: [(log.name, log.read_text()[-800:]) for log in (tmp_path / "logs").iterdir()]  # noqa: E731
 
@@ -167,7 +167,7 @@ def play(user, folder, task, policy, sight, episodes, mode="lockstep", **options
     save_scene(load_scene(), folder, task, seed=SEED, sight=sight, mode=mode)
     outcomes: list = []
     user.user.subscribe(messages.TASK_OUTCOME, outcomes.append, depth=1000)
-    with NodeGroup(folder / "logs") as group:
+    with ForkedNodes(folder / "logs") as group:
         parameters, record = ("--params-file", str(folder / "parameters.yaml")), folder / "episodes.npz"
         logs = lambda: [(log.name, log.read_text()[-800:]) for log in (folder / "logs").iterdir()]  # noqa: E731
         node = group.start("policy_node", *parameters, policy=policy, record=record, episodes=episodes, **options)

@@ -29,7 +29,7 @@ def arm_names() -> list[str]:
 
 def tool_names() -> list[str]:
     """Names of the tools, endoscopes among them, that `load_arm` knows without a file."""
-    return sorted(path.stem for path in _SHIPPED.glob("*.json") if path.stem not in arm_names())
+    return sorted({path.stem for path in _SHIPPED.glob("*.json")} - {*arm_names()})
 
 
 def load_arm(arm: str = "PSM", tool: str = "") -> ArmKinematics:

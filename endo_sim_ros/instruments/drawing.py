@@ -33,7 +33,6 @@ SURFACES = {
 }
 """Red, green and blue of what is scattered, roughness, and share of light that is mirrored; by eye beside real instruments."""
 
-_CREASE = np.cos(np.radians(35))  # faces that meet at a smaller angle are one smooth surface
 _STRIDE = 8  # pixels from one that the hue of the tissue is taken from to the next
 _NEAREST = 2e-3  # metres from the plane of the lens
 
@@ -106,7 +105,7 @@ class InstrumentDrawing:
         for i, parts in enumerate(instruments):
             for part in parts:
                 corners.append(part.vertices[part.faces])
-                normals.append(corner_normals(part))
+                normals.append(part.corner_normals)
                 links += [numbers[i, part.link]] * len(part.faces)
                 own = np.array([numbers[i, bone] for bone in part.bones or [part.link] * len(part.vertices)])
                 moved.append(own[part.faces].ravel())
@@ -258,21 +257,3 @@ def _stride(count: int) -> int:
     while math.gcd(step, count) > 1:
         step += 1
     return step
-
-
-def corner_normals(part: Part) -> np.ndarray:
-    """Normals [F, 3, 3] at the corners of each face: those of the part, or the mean of the faces around that lie about as it does."""
-    if part.normals is not None:
-        return part.normals[part.faces].astype(np.float64)
-    corners = part.vertices[part.faces].astype(np.float64)
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])  # as long as the face is large
-    unit = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-20)
-    order = np.argsort(part.faces.ravel(), kind="stable")
-    bounds = np.searchsorted(part.faces.ravel()[order], np.arange(len(part.vertices) + 1))
-    normals = np.empty((len(part.faces), 3, 3))
-    for first, last in zip(bounds[:-1], bounds[1:]):
-        at = order[first:last]
-        around = at // 3
-        alike = unit[around] @ unit[around].T > _CREASE
-        normals[around, at % 3] = alike @ across[around]
-    return normals / np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-20)

@@ -5,6 +5,7 @@ Every part moves with one link, in whose frame its vertices are: ``roll``, ``wri
 opening angle.
 """
 
+import functools
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -29,6 +30,8 @@ _DISTAL_X = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
 """From those axes to the frame of the wrist's pitch, which turns about z and whose x points at the tip."""
 _DISTAL_Y = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """From those axes to the frame of the wrist's yaw and the jaws, which turn about z and whose y points at the tip."""
+
+_CREASE = np.cos(np.radians(35))  # faces that meet at a smaller angle are one smooth surface
 
 
 class Material(IntEnum):
@@ -67,6 +70,24 @@ class Part:
     faces: np.ndarray
     bones: tuple[str, ...] = ()
     normals: np.ndarray | None = None
+
+    @functools.cached_property
+    def corner_normals(self) -> np.ndarray:
+        """Normals [F, 3, 3] at the corners of each face: those of the part, or the mean of the faces around that lie about as it does."""
+        if self.normals is not None:
+            return self.normals[self.faces].astype(np.float64)
+        corners = self.vertices[self.faces].astype(np.float64)
+        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])  # as long as the face is large
+        unit = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-20)
+        order = np.argsort(self.faces.ravel(), kind="stable")
+        bounds = np.searchsorted(self.faces.ravel()[order], np.arange(len(self.vertices) + 1))
+        normals = np.empty((len(self.faces), 3, 3))
+        for first, last in zip(bounds[:-1], bounds[1:]):
+            at = order[first:last]
+            around = at // 3
+            alike = unit[around] @ unit[around].T > _CREASE
+            normals[around, at % 3] = alike @ across[around]
+        return normals / np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-20)
 
 
 @dataclass(frozen=True)
@@ -168,8 +189,14 @@ def build_instrument(arm: ArmKinematics, shape: ToolShape | None = None) -> tupl
     if shape is None and kind not in SHAPES:
         kind = "LARGE_NEEDLE_DRIVER" if arm.jaw else "PERMANENT_CAUTERY_HOOK"
         log.warning("%s: nobody knows the shape of %s; it looks like a %s", arm.name, arm.tool or "its tool", kind)
-    shape = shape or SHAPES[kind]
-    build, r, wrist = _Builder(), shape.radius, arm.joints[5].a
+    parts, capsules = _built(shape or SHAPES[kind], arm.joints[5].a)
+    return list(parts), list(capsules)
+
+
+@functools.lru_cache(maxsize=64)
+def _built(shape: ToolShape, wrist: float) -> tuple[list[Part], list[Capsule]]:
+    """Those of a tool whose axes of pitch and yaw are `wrist` m apart; kept, as each environment draws all tools."""
+    build, r = _Builder(), shape.radius
     _shaft(build, shape)
     # Two ears hold the pin of the pitch; between them turns the second clevis, which holds that of the yaw.
     _clevis(build, -2.2 * r, 0.92 * r, 0.62 * r)

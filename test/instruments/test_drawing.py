@@ -7,7 +7,7 @@ import torch
 
 from endo_sim_ros.core.cameras import Camera, intrinsic_matrix
 from endo_sim_ros.instruments import Material, Part, build_instrument, link_poses, load_arm, place_arm
-from endo_sim_ros.instruments.drawing import FIRST_LINK, TISSUE, InstrumentDrawing, corner_normals
+from endo_sim_ros.instruments.drawing import FIRST_LINK, TISSUE, InstrumentDrawing
 from endo_sim_ros.instruments.shapes import lofted
 
 CAMERA = Camera(intrinsic_matrix(560, 560, 320, 256), 640, 512)
@@ -125,7 +125,7 @@ def test_edges_are_as_soft_as_a_pixel():
 
 def test_smooth_where_faces_go_on_and_sharp_where_they_do_not():
     part = cylinder(4e-3, 0.0, 0.02, 40)
-    normals, corners = corner_normals(part), part.vertices[part.faces]
+    normals, corners = part.corner_normals, part.vertices[part.faces]
     side = np.abs(normals[:, 0, 2]) < 0.5
     outwards = corners[side][..., :2] / 4e-3
     np.testing.assert_allclose(normals[side][..., :2], outwards, atol=0.09)

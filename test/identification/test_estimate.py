@@ -120,7 +120,7 @@ def hidden(seed: int, radius: float, depth: tuple[float, float] = (0.004, 0.008)
     centre = np.array([*rng.uniform(-0.01, 0.01, 2), 0.1 + rng.uniform(*depth)])
     inside = inside_sphere(NODES.rest, centre, radius)
     factors, centre = np.where(inside, 8.0, 1.0), NODES.rest[inside].mean(0)  # as far as these nodes can tell
-    return centre, [measure(pressed(x, y), NODES, PHYSICS, rng, factors) for x in AT for y in AT]
+    return centre, [measure(pressed(x, y, steps=16), NODES, PHYSICS, rng, factors) for x in AT for y in AT]
 
 
 def test_an_inclusion_is_found_in_a_map():
@@ -154,7 +154,7 @@ def test_without_an_inclusion_none_is_sure():
 
 
 def test_a_search_presses_where_it_learns_and_finds_what_it_looks_for():
-    presses = [pressed(x, y) for x in AT for y in AT]
+    presses = [pressed(x, y, steps=16) for x in AT for y in AT]
     search = Search(presses, ForwardModel(NODES, PHYSICS, "cpu"))
     centre, felt = hidden(1, 0.007)
     assert search.probable[-1] == pytest.approx(0.5) and search.deviation > 0.01

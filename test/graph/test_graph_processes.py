@@ -5,6 +5,7 @@ import time
 
 import numpy as np
 import pytest
+from forked_nodes import ForkedNodes
 from ros_bench import SMALL, S, await_image, await_nodes, moved, newest_image, nodes_of, pull, sheet
 from std_srvs.srv import Trigger
 
@@ -19,6 +20,12 @@ pytestmark = pytest.mark.dds
 @pytest.fixture
 def graph(tmp_path):
     with NodeGroup(tmp_path / "logs") as group:
+        yield group
+
+
+@pytest.fixture
+def forked_graph(tmp_path):
+    with ForkedNodes(tmp_path / "logs") as group:
         yield group
 
 
@@ -86,7 +93,7 @@ def test_unreadable_bags_are_told_by_players_that_live_on_each_in_its_namespace(
 
 
 def test_two_graphs_in_two_namespaces_do_not_hear_each_other(bench, tmp_path):
-    with NodeGroup(tmp_path / "a") as a, NodeGroup(tmp_path / "b") as b:
+    with ForkedNodes(tmp_path / "a") as a, ForkedNodes(tmp_path / "b") as b:
         for group, name in ((a, "a"), (b, "b")):
             group.start("physics_node", "-r", f"__ns:=/{name}", **SMALL["physics_node"])
             bench.status(f"{name}/physics_node", "waiting for a model", WARN)
@@ -100,18 +107,18 @@ def test_two_graphs_in_two_namespaces_do_not_hear_each_other(bench, tmp_path):
         assert not heard[1]
 
 
-def test_whole_graph_starts_in_the_wrong_order_and_survives_the_loss_of_each_node(bench, graph, small_bag, tmp_path):
+def test_whole_graph_starts_in_the_wrong_order_and_survives_the_loss_of_each_node(bench, forked_graph, small_bag, tmp_path):
     options = {name: dict(values) for name, values in SMALL.items()}
     options["reconstruction_node"] |= {"start_after": 0.5, "output_dir": tmp_path / "models"}
-    start = lambda name, **more: graph.start(name, **options[name], **more)  # noqa: E731
+    start = lambda name, **more: forked_graph.start(name, **options[name], **more)  # noqa: E731
 
     def kill(name):
-        graph.nodes[name].process.send_signal(signal.SIGKILL)
-        assert graph.nodes[name].wait(5) == -signal.SIGKILL
+        forked_graph.nodes[name].process.send_signal(signal.SIGKILL)
+        assert forked_graph.nodes[name].wait(5) == -signal.SIGKILL
         bench.statuses[name].clear()
 
     def replay():
-        player = graph.start("bag_player_node", bag=small_bag)
+        player = forked_graph.start("bag_player_node", bag=small_bag)
         bench.until(lambda: player.exit_status is not None, "the bag to be played", 40)
         assert player.exit_status == 0, log_of(player)
 
@@ -177,8 +184,8 @@ def test_whole_graph_starts_in_the_wrong_order_and_survives_the_loss_of_each_nod
     bench.status("reconstruction_node", "training, iteration", OK)
 
     begun = time.monotonic()  # in the middle of it all
-    graph.stop()
+    forked_graph.stop()
     assert time.monotonic() - begun < 8
-    for name, node in graph.nodes.items():
+    for name, node in forked_graph.nodes.items():
         assert node.exit_status == 0, name
         assert "Traceback" not in log_of(node), log_of(node)

@@ -17,7 +17,7 @@ from endo_sim_ros.reconstruction.priors import flow_kernels
 from endo_sim_ros.reconstruction.priors.inverse_depth import blur, scaled
 from endo_sim_ros.reconstruction.stage_configs import MultiViewConfig
 
-_RADIUS, _STRIDE = 4, 2  # of the patches of flow on a GPU, pixels
+_RADIUS, _STRIDE = 3, 2  # of the patches of flow on a GPU, pixels
 _NOISE = 1.0  # grey levels; a patch with less in it moves as those around
 _STEPS = 5  # of each patch in each size of the images
 _COARSEST = 16  # pixels, the shorter side of the smallest image

@@ -6,15 +6,6 @@
 
 namespace endo_sim {
 
-// The first count of 16 items of a size; a copy of constant size is a single instruction.
-ENDO_SIM_INLINE void copy_items(void* to, const void* from, size_t size, size_t count)
-{
-    if (count >= 16)
-        __builtin_memcpy(to, from, 16 * size);
-    else
-        __builtin_memcpy(to, from, count * size);
-}
-
 // Light 16 pixels, or the last ones of count, from the one at 16 block on.
 ENDO_SIM_INLINE void light_pixels(int block, size_t count, const float* colors, const float* depths, const float* alphas,
     const float* fixed, float distance, float reference, float nearest, float* out)

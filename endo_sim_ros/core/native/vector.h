@@ -42,6 +42,28 @@ ENDO_SIM_INLINE float sum(vfloat x)
     return (q[0] + q[2]) + (q[1] + q[3]);
 }
 
+// The first count of 16 items of a size; a copy of constant size is a single instruction.
+ENDO_SIM_INLINE void copy_items(void* to, const void* from, size_t size, size_t count)
+{
+    if (count >= 16)
+        __builtin_memcpy(to, from, 16 * size);
+    else
+        __builtin_memcpy(to, from, count * size);
+}
+
+// Three vectors as the numbers of 16 threes, in order.
+ENDO_SIM_INLINE void interleave(vfloat a, vfloat b, vfloat c, vfloat* threes)
+{
+#define ENDO_SIM_OF(x, y, ...) __builtin_shufflevector(x, y, __VA_ARGS__)
+    const vfloat ab0 = ENDO_SIM_OF(a, b, 0, 16, -1, 1, 17, -1, 2, 18, -1, 3, 19, -1, 4, 20, -1, 5);
+    threes[0] = ENDO_SIM_OF(ab0, c, 0, 1, 16, 3, 4, 17, 6, 7, 18, 9, 10, 19, 12, 13, 20, 15);
+    const vfloat ab1 = ENDO_SIM_OF(a, b, 21, -1, 6, 22, -1, 7, 23, -1, 8, 24, -1, 9, 25, -1, 10, 26);
+    threes[1] = ENDO_SIM_OF(ab1, c, 0, 21, 2, 3, 22, 5, 6, 23, 8, 9, 24, 11, 12, 25, 14, 15);
+    const vfloat ab2 = ENDO_SIM_OF(a, b, -1, 11, 27, -1, 12, 28, -1, 13, 29, -1, 14, 30, -1, 15, 31, -1);
+    threes[2] = ENDO_SIM_OF(ab2, c, 26, 1, 2, 27, 4, 5, 28, 7, 8, 29, 10, 11, 30, 13, 14, 31);
+#undef ENDO_SIM_OF
+}
+
 ENDO_SIM_INLINE vint bits_of(vfloat x) { return (vint)x; }
 ENDO_SIM_INLINE vfloat of_bits(vint x) { return (vfloat)x; }
 

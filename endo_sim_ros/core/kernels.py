@@ -143,14 +143,8 @@ def launch_in_shares(kernel: Any, count: int, arguments: Sequence, least: int = 
     Args:
         kernel: A Warp kernel. Its first argument is the number of the first item of a share; a thread adds `wp.tid()`.
         count: Number of items.
-        arguments: The other arguments, as for `kernel_arguments`.
+        arguments: The other arguments, as for `launch`.
         least: Fewer items are left to one thread.
     """
-    if not count:
-        return
-    arguments = kernel_arguments(kernel, arguments, 1)
-
-    def share(first: int, size: int) -> None:
-        wp.launch(kernel, size, [first, *arguments], device="cpu")
-
-    run_in_threads([functools.partial(share, *own) for own in shares(count, least)])
+    if count:
+        run_in_threads([functools.partial(launch, kernel, size, [first, *arguments], "cpu") for first, size in shares(count, least)])

@@ -9,7 +9,7 @@ import warp as wp
 from torch import Tensor
 
 from endo_sim_ros.core.device import cpu_threads, run_in_threads
-from endo_sim_ros.core.kernels import kernel_arguments, launch_in_shares
+from endo_sim_ros.core.kernels import launch, launch_in_shares
 from endo_sim_ros.splatting import common_kernels as kernels, cpu_kernels
 from endo_sim_ros.splatting.constants import RECORD_SIZE, SPLAT_SIZE
 from endo_sim_ros.splatting.scene import Gradients, Scene, Settings, empty_images
@@ -87,6 +87,5 @@ def _image_arguments(state: State, scene: Scene, settings: Settings, images: Seq
 
 def _launch_tiles(kernel: Any, tile_count: int, arguments: list) -> None:
     """Launch a kernel that draws tiles from a counter, its first argument, in all threads."""
-    inputs = kernel_arguments(kernel, [torch.zeros(1, dtype=torch.int32, device="cpu"), *arguments])
-    command: Any = wp.launch(kernel, dim=tile_count, inputs=inputs, device="cpu", record_cmd=True)
-    run_in_threads([command.launch] * min(cpu_threads(), tile_count))
+    arguments = [torch.zeros(1, dtype=torch.int32, device="cpu"), *arguments]
+    run_in_threads([functools.partial(launch, kernel, tile_count, arguments, "cpu")] * min(cpu_threads(), tile_count))

@@ -2,10 +2,11 @@
 
 import warp as wp
 
+from endo_sim_ros.core.native import native
 from endo_sim_ros.instruments.drawing_kernels import EMPTY, SAMPLES, TILE, Frame, corner, lens, offset, weights
 from endo_sim_ros.instruments.shadow_kernels import light_left, near
 
-wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "extra_build_options": native("instruments/native/tiles.h")})
 
 ALL = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))
 ALIKE = wp.constant(0.99)  # cosine of the angle between normals that are lit as one
@@ -212,6 +213,54 @@ def about(
     return near(at, slack, lamp, look.lamp_size, picture * frame.capsules, frame.capsules, ends, frame.radii, frame.capsule_owners, -1)
 
 
+@wp.func_native("""
+#if !defined(__CUDA_ARCH__)
+    const endo_sim::Depths depths_seen = endo_sim::tissue_depths({left, top, right, bottom, (size_t)start, width}, depths.data, alphas.data);
+    return {depths_seen.low, depths_seen.high};
+#else
+    return {0.0f, 0.0f};
+#endif
+""")
+def tissue_depths(
+    left: int, top: int, right: int, bottom: int, start: int, width: int, depths: wp.array[float], alphas: wp.array[float]
+) -> wp.vec2:
+    """On a CPU: the nearest and the farthest tissue in a tile of the picture that begins at pixel ``start``, m."""
+    ...
+
+
+@wp.func_native("""
+#if !defined(__CUDA_ARCH__)
+    const endo_sim::Capsules capsules{(const endo_sim::Ends*)ends.data + first, radii.data, owners.data, count};
+    endo_sim::shade_tissue(
+        mask, {left, top, right, bottom, (size_t)start, width}, {view[0], view[1], view[2], view[3]}, {{lamp[0], lamp[1], lamp[2]}, size},
+        capsules, ambient, depths.data, alphas.data, (float*)colors.data);
+#endif
+""")
+def shade_tissue(
+    mask: wp.uint64,
+    left: int,
+    top: int,
+    right: int,
+    bottom: int,
+    start: int,
+    width: int,
+    view: wp.vec4,
+    lamp: wp.vec3,
+    size: float,
+    first: int,
+    count: int,
+    ends: wp.array2d[wp.vec3],
+    radii: wp.array[float],
+    owners: wp.array[int],
+    ambient: float,
+    depths: wp.array[float],
+    alphas: wp.array[float],
+    colors: wp.array[wp.vec3],
+):
+    """On a CPU: put the tissue of a tile into the shadow of capsules, as `blend` does on a GPU."""
+    ...
+
+
 @wp.kernel
 def resolve_tiles(
     first: int,
@@ -233,17 +282,10 @@ def resolve_tiles(
     right, bottom = wp.min(left + TILE, frame.width), wp.min(top + TILE, frame.height)
     start = picture * frame.height * frame.width
     marked = frame.marks[picture * each + number] != wp.uint8(0)
-    on_tissue = wp.uint64(0)
     on_links = wp.uint64(0)
     if frame.capsules > 0:
-        low = float(1.0e9)
-        high = float(0.0)
-        for row in range(top, bottom):
-            for pixel in range(start + row * frame.width + left, start + row * frame.width + right):
-                if alphas[pixel] > 0.5:
-                    z = depths[pixel] / alphas[pixel]
-                    low, high = wp.min(low, z), wp.max(high, z)
-        on_tissue = about(picture, left, top, low, high, ends, views, frame, look)
+        seen = tissue_depths(left, top, right, bottom, start, frame.width, depths, alphas)
+        on_tissue = about(picture, left, top, seen[0], seen[1], ends, views, frame, look)
         if marked and frame.several != 0:
             low = float(1.0e9)
             high = float(0.0)
@@ -255,10 +297,20 @@ def resolve_tiles(
                             z = depth_of(key)
                             low, high = wp.min(low, z), wp.max(high, z)
             on_links = about(picture, left, top, low, high, ends, views, frame, look)
-    if not marked and on_tissue == wp.uint64(0):
+        if on_tissue != wp.uint64(0):
+            shade_tissue(
+                on_tissue, left, top, right, bottom, start, frame.width, lens(views, picture),
+                wp.vec3(views[picture, 4], views[picture, 5], views[picture, 6]), look.lamp_size,
+                picture * frame.capsules, frame.capsules, ends, frame.radii, frame.capsule_owners,
+                look.ambient, depths, alphas, colors,
+            )  # fmt: skip
+    if not marked:
         return
     frame.marks[picture * each + number] = wp.uint8(0)
-    blend_square(left, top, right, bottom, picture, on_tissue, on_links, surfaces, ends, views, frame, look, colors, depths, alphas, labels)
+    blend_square(
+        left, top, right, bottom, picture, wp.uint64(0), on_links,
+        surfaces, ends, views, frame, look, colors, depths, alphas, labels,
+    )  # fmt: skip
 
 
 @wp.kernel

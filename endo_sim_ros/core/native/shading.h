@@ -31,9 +31,7 @@ ENDO_SIM_INLINE void light_pixels(int block, size_t count, const float* colors, 
 
     const vfloat y = -distance * log2;
     gain *= exp2<false>(y < -126.0f ? broadcast(-126.0f) : y > 126.0f ? broadcast(126.0f) : y);
-    rgb[0] *= __builtin_shufflevector(gain, gain, 0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 4, 4, 4, 5);
-    rgb[1] *= __builtin_shufflevector(gain, gain, 5, 5, 6, 6, 6, 7, 7, 7, 8, 8, 8, 9, 9, 9, 10, 10);
-    rgb[2] *= __builtin_shufflevector(gain, gain, 10, 11, 11, 11, 12, 12, 12, 13, 13, 13, 14, 14, 14, 15, 15, 15);
+    scale_threes(rgb, gain);
     copy_items(out + 3 * start, rgb, 3 * sizeof(float), count);
 }
 

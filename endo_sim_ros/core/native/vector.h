@@ -64,6 +64,14 @@ ENDO_SIM_INLINE void interleave(vfloat a, vfloat b, vfloat c, vfloat* threes)
 #undef ENDO_SIM_OF
 }
 
+// Multiply 16 threes in order by a number each.
+ENDO_SIM_INLINE void scale_threes(vfloat* threes, vfloat by)
+{
+    threes[0] *= __builtin_shufflevector(by, by, 0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 4, 4, 4, 5);
+    threes[1] *= __builtin_shufflevector(by, by, 5, 5, 6, 6, 6, 7, 7, 7, 8, 8, 8, 9, 9, 9, 10, 10);
+    threes[2] *= __builtin_shufflevector(by, by, 10, 11, 11, 11, 12, 12, 12, 13, 13, 13, 14, 14, 14, 15, 15, 15);
+}
+
 ENDO_SIM_INLINE vint bits_of(vfloat x) { return (vint)x; }
 ENDO_SIM_INLINE vfloat of_bits(vint x) { return (vfloat)x; }
 

@@ -5,7 +5,7 @@
 // at rest bit for bit; it returns det F. Matrices are nine numbers, row by row. The energy density ψ of each law is in
 // materials.py.
 #pragma once
-#include "physics/native/lanes.h"
+#include "core/native/lanes.h"
 #include "physics/native/svd.h"
 
 namespace endo_sim {

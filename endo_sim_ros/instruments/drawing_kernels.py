@@ -2,7 +2,9 @@
 
 import warp as wp
 
-wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
+from endo_sim_ros.core.native import native
+
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "extra_build_options": native("instruments/native/cover.h")})
 
 SAMPLES = wp.constant(4)  # of a pixel, on a rotated grid: as many levels of grey along any edge
 EMPTY = wp.constant(wp.int64(0x7FFFFFFFFFFFFFFF))
@@ -105,30 +107,52 @@ def corner(frame: Frame, i: int) -> wp.vec3:
     return frame.screen[i]
 
 
-@wp.func
+@wp.func_native("""
+    const float from[2]{a[0], a[1]}, to[2]{b[0], b[1]};
+    const endo_sim::Columns left = endo_sim::span(from, to, row, spread, {columns[0], columns[1]});
+    return {left.low, left.high};
+""")
 def span(a: wp.vec3, b: wp.vec3, row: int, spread: float, columns: wp.vec2) -> wp.vec2:
     """What of the middles of pixels from one column to another may see the inner side of the edge from a to b."""
-    slope = a[1] - b[1]  # of the weight, by columns
-    here = a[0] * b[1] - a[1] * b[0] + (b[0] - a[0]) * (float(row) + 0.5)  # at column 0
-    at_best = here - 0.5 * spread * (wp.abs(b[0] - a[0]) + wp.abs(slope))
-    if slope > 0.0:
-        return wp.vec2(columns[0], wp.min(columns[1], -at_best / slope))
-    if slope < 0.0:
-        return wp.vec2(wp.max(columns[0], -at_best / slope), columns[1])
-    return wp.where(at_best > 0.0, wp.vec2(1.0, 0.0), columns)
+    ...
+
+
+@wp.func_native("""
+#if !defined(__CUDA_ARCH__)
+    const float first[3]{a[0], a[1], a[2]}, second[3]{b[0], b[1], b[2]}, third[3]{c[0], c[1], c[2]};
+    endo_sim::cover_rows(first, second, third, face, low, high,
+        {(long long*)samples.data + 4 * (size_t)pixel, marks.data + tile, width, across, spread});
+#endif
+""")
+def cover_alone(
+    a: wp.vec3,
+    b: wp.vec3,
+    c: wp.vec3,
+    face: int,
+    low: int,
+    high: int,
+    pixel: int,
+    tile: int,
+    width: int,
+    across: int,
+    spread: float,
+    samples: wp.array[wp.int64],
+    marks: wp.array[wp.uint8],
+):
+    """On a CPU: what `cover` does with all of some rows, in a picture that begins at a pixel and a tile; no other thread writes to
+    these rows."""
+    ...
 
 
 @wp.func
 def cover(
     i: int,  # of B F triangles
-    low: int,  # row
-    high: int,
+    row: int,
     first: int,  # of the columns that the triangle may reach
     step: int,
-    alone: int,  # whether no other thread writes to these rows
     frame: Frame,
 ):
-    """Enter a triangle into the samples of every ``step``-th column of rows from ``low`` to ``high``, and mark their tiles."""
+    """Enter a triangle into the samples of every ``step``-th column of a row."""
     a, b, c = corner(frame, 3 * i), corner(frame, 3 * i + 1), corner(frame, 3 * i + 2)
     picture, face = i // frame.faces, i % frame.faces
     per_area = 1.0 / ((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
@@ -139,28 +163,22 @@ def cover(
     rightmost = wp.min(wp.max(wp.max(a[0], b[0]), c[0]) + margin, float(frame.width) - 0.5)
     if leftmost > rightmost:
         return
-    for row in range(wp.max(frame.rows[i][0], low), wp.min(frame.rows[i][1], high) + 1):
-        columns = wp.vec2(leftmost, rightmost)
-        columns = span(a, b, row, frame.spread, columns)
-        columns = span(b, c, row, frame.spread, columns)
-        columns = span(c, a, row, frame.spread, columns)
-        tile = (picture * frame.down + row // TILE) * frame.across
-        for column in range(int(wp.ceil(columns[0] - 0.5)) + first, int(wp.floor(columns[1] - 0.5)) + 1, step):
-            here = weights(a, b, c, float(column), float(row))
-            pixel = (picture * frame.height + row) * frame.width + column
-            for sample in range(SAMPLES):
-                beside = offset(sample, row, column, frame.spread)
-                w = here + beside[0] * by_u + beside[1] * by_v
-                if wp.max(wp.max(w[0], w[1]), w[2]) <= 0.0:
-                    inverse = (w[0] * a[2] + w[1] * b[2] + w[2] * c[2]) * per_area
-                    # Of positive floats the bits order as they do: what is nearest has the least key.
-                    key = (wp.int64(0x7FFFFFFF - wp.cast(inverse, wp.int32)) << wp.int64(32)) | wp.int64(face)
-                    if key < frame.samples[pixel * SAMPLES + sample]:
-                        if alone != 0:
-                            frame.samples[pixel * SAMPLES + sample] = key
-                        else:
-                            wp.atomic_min(frame.samples, pixel * SAMPLES + sample, key)
-                        frame.marks[tile + column // TILE] = wp.uint8(1)
+    columns = wp.vec2(leftmost, rightmost)
+    columns = span(a, b, row, frame.spread, columns)
+    columns = span(b, c, row, frame.spread, columns)
+    columns = span(c, a, row, frame.spread, columns)
+    for column in range(int(wp.ceil(columns[0] - 0.5)) + first, int(wp.floor(columns[1] - 0.5)) + 1, step):
+        here = weights(a, b, c, float(column), float(row))
+        pixel = (picture * frame.height + row) * frame.width + column
+        for sample in range(SAMPLES):
+            beside = offset(sample, row, column, frame.spread)
+            w = here + beside[0] * by_u + beside[1] * by_v
+            if wp.max(wp.max(w[0], w[1]), w[2]) <= 0.0:
+                inverse = (w[0] * a[2] + w[1] * b[2] + w[2] * c[2]) * per_area
+                # Of positive floats the bits order as they do: what is nearest has the least key.
+                key = (wp.int64(0x7FFFFFFF - wp.cast(inverse, wp.int32)) << wp.int64(32)) | wp.int64(face)
+                if key < frame.samples[pixel * SAMPLES + sample]:
+                    wp.atomic_min(frame.samples, pixel * SAMPLES + sample, key)
 
 
 @wp.kernel
@@ -171,10 +189,15 @@ def cover_rows(
     """On a CPU: the rows of some tiles, to which no other thread writes."""
     i = first + wp.tid()
     picture, low = i // frame.down, TILE * ((i % frame.down * frame.stride) % frame.down)
-    for face in range(picture * frame.faces, (picture + 1) * frame.faces):
-        reached = frame.rows[face]
+    for face in range(frame.faces):
+        k = picture * frame.faces + face
+        reached = frame.rows[k]
         if reached[0] < low + TILE and reached[1] >= low and reached[0] <= reached[1]:
-            cover(face, low, low + TILE - 1, 0, 1, 1, frame)
+            cover_alone(
+                corner(frame, 3 * k), corner(frame, 3 * k + 1), corner(frame, 3 * k + 2), face,
+                wp.max(reached[0], low), wp.min(reached[1], low + TILE - 1), picture * frame.height * frame.width,
+                picture * frame.down * frame.across, frame.width, frame.across, frame.spread, frame.samples, frame.marks,
+            )  # fmt: skip
 
 
 @wp.kernel
@@ -187,5 +210,4 @@ def cover_faces(
     face = i // frame.lanes
     reached = frame.rows[face]
     for part in range(i % frame.lanes, APART * (reached[1] - reached[0] + 1), frame.lanes):
-        row = reached[0] + part // APART
-        cover(face, row, row, part % APART, APART, 0, frame)
+        cover(face, reached[0] + part // APART, part % APART, APART, frame)

@@ -227,7 +227,7 @@ class InstrumentDrawing:
         new = lambda shape, kind, value=0: torch.full(shape, value, dtype=kind, device=self.device)
         triangles, pixels = count * frame.faces, count * width * height
         arrays = self._fixed | {
-            "around": new((count, 3), torch.float64),
+            "around": new((count, 3), torch.float32),
             "screen": new((3 * triangles, 3), torch.float32),
             "turned": new((3 * triangles, 3), torch.float32),
             "rows": new((triangles, 2), torch.int32),

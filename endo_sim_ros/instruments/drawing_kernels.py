@@ -41,7 +41,7 @@ class Frame:
     owners: wp.array[int]  # [F] numbers of the instruments
     radii: wp.array[float]  # [C] m
     capsule_owners: wp.array[int]  # [C]
-    around: wp.array[wp.vec3d]  # [B] in the hue of the light that comes from the tissue
+    around: wp.array[wp.vec3]  # [B] hue of the light that comes from the tissue
     screen: wp.array[wp.vec3]  # [3 B F] column and row in pixels, and one over the depth
     turned: wp.array[wp.vec3]  # [3 B F] normals, camera
     rows: wp.array[wp.vec2i]  # [B F] the first and the last row that a triangle may reach; none if it is not seen

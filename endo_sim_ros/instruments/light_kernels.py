@@ -32,5 +32,6 @@ def sum_light(
             green += wp.float64(color[1] * color[1])
             blue += wp.float64(color[2] * color[2])
     red, green, blue = block_sum(red), block_sum(green), block_sum(blue)
-    if lane == 0:
-        frame.around[picture] = wp.vec3d(red, green, blue)
+    if lane == 0:  # as bright as it gets without being more than 1 in any colour; white where there is none
+        light = wp.vec3d(red, green, blue) + wp.vec3d(wp.float64(1.0e-6))
+        frame.around[picture] = wp.vec3(light / wp.max(light))

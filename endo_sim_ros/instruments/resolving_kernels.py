@@ -40,13 +40,6 @@ def encoded(light: float) -> float:
 
 
 @wp.func
-def hue(light: wp.vec3d) -> wp.vec3:
-    """Light as bright as it gets without being more than 1 in any colour; white where there is none."""
-    lifted = light + wp.vec3d(wp.float64(1.0e-6))
-    return wp.vec3(lifted / wp.max(lifted))
-
-
-@wp.func
 def reflected(
     normal: wp.vec3, at: wp.vec3, lamp: wp.vec3, surfaces: wp.array2d[float], row: int, around: wp.vec3, left: wp.vec2, look: Look
 ) -> wp.vec3:
@@ -98,13 +91,14 @@ def blend(
     if alpha > 0.5:
         tissue = depths[pixel] / alpha
     total = float(0.0)
-    depth = float(0.0)
     color = wp.vec3(0.0, 0.0, 0.0)
     lit = wp.vec3(0.0, 0.0, 0.0)
     normal = wp.vec3(0.0, 0.0, 0.0)
     material = int(-1)
     nearest = float(1.0e9)
-    nearest_face = int(0)
+    shown = int(-1)  # the link of the nearest sample, and how deep its samples are together
+    depth = float(0.0)
+    count = float(0.0)
     second = float(0.0)  # what is seen in the second sample
     before = int(-1)
     for sample in range(SAMPLES):
@@ -133,16 +127,20 @@ def blend(
                                 on_links, at, normal, 0.5 * z / view[0], lamp, look.lamp_size,
                                 picture * frame.capsules, frame.capsules, ends, frame.radii, frame.capsule_owners, frame.owners[face],
                             )  # fmt: skip
-                        surface, around = picture * frame.surfaces + material, hue(frame.around[picture])
-                        lit = reflected(normal, at, lamp, surfaces, surface, around, left, look)
+                        surface = picture * frame.surfaces + material
+                        lit = reflected(normal, at, lamp, surfaces, surface, frame.around[picture], left, look)
                 color += seen * lit
-                depth += seen * z
                 total += seen
+                if z < nearest and frame.face_links[face] != shown:
+                    shown = frame.face_links[face]
+                    depth = 0.0
+                    count = 0.0
+                if frame.face_links[face] == shown:
+                    depth += z
+                    count += 1.0
+                nearest = wp.min(nearest, z)
                 if sample == 1:
                     second = seen
-                if z < nearest:
-                    nearest = z
-                    nearest_face = face
     kept = 1.0 - total / float(SAMPLES)
     behind = colors[pixel]
     if kept > 0.0 and alpha > 0.5 and on_tissue != wp.uint64(0):
@@ -154,10 +152,16 @@ def blend(
         behind *= encoded((1.0 - look.ambient) * left[0] + look.ambient * left[1])
     if total > 0.0:
         behind = kept * behind + color / float(SAMPLES)
-        depths[pixel] = kept * depths[pixel] + depth / float(SAMPLES)
-        alphas[pixel] = kept * alpha + total / float(SAMPLES)
+        covered = kept * alpha + total / float(SAMPLES)
+        # Colours blend at outlines. Halfway between two surfaces there is none: the depth is that of what the label tells.
         if kept < 0.5 or kept == 0.5 and second > 0.5:  # of halves every other one, so that outlines neither grow nor shrink
-            labels[pixel] = wp.uint8(2 + frame.face_links[nearest_face])
+            labels[pixel] = wp.uint8(2 + shown)
+            depths[pixel] = covered * depth / count
+        elif alpha > 0.0:
+            depths[pixel] *= covered / alpha
+        else:
+            depths[pixel] = covered * depth / count
+        alphas[pixel] = covered
     colors[pixel] = behind
 
 

@@ -65,6 +65,22 @@ def test_depth_is_that_of_the_surface():
     assert (picture.labels[:, 320].numpy()[inside] == FIRST_LINK).all()
 
 
+@pytest.mark.parametrize("opacity", [1.0, 0.7, 0.0])
+def test_depth_at_outlines_is_that_of_what_the_label_tells(opacity):
+    parts, poses = scene()
+    colors, depths, alphas = tissue(0.3)
+    depths, alphas = opacity * depths, opacity * alphas
+    picture = InstrumentDrawing([parts], device="cpu").draw([poses], CAMERA, colors, depths, alphas)
+    metres, tool = picture.depths / picture.alphas.clamp_min(1e-6), picture.labels >= FIRST_LINK
+    mixed = (picture.alphas != alphas) & (picture.alphas != 1) if opacity < 1 else ((picture.colors != colors).any(-1) & ~tool)
+    assert int(mixed.sum()) > 500, "outlines cover parts of pixels"
+    assert 0.04 < float(metres[tool].min()) and float(metres[tool].max()) < 0.15
+    if opacity > 0:
+        assert float((metres[~tool] - 0.3).abs().max()) < 1e-6
+    else:
+        assert float(metres[~tool].max()) < 0.15 and float(picture.alphas[~tool].max()) <= 0.5
+
+
 def test_a_part_bends_with_its_bones():
     across = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
     whole, bones = np.eye(4), {}

@@ -9,6 +9,7 @@ import warp as wp
 from endo_sim_ros.core import native as loader
 from endo_sim_ros.core.device import init_warp
 from endo_sim_ros.core.native import PACKAGE, native
+from endo_sim_ros.instruments import drawing_kernels, resolving_kernels
 from endo_sim_ros.reconstruction import ssim_kernels
 from endo_sim_ros.splatting import common_kernels, cuda_kernels
 
@@ -77,7 +78,11 @@ def test_a_header_that_is_not_there_is_named(folder):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("module", [common_kernels, cuda_kernels, ssim_kernels], ids=lambda module: module.__name__.rsplit(".")[-1])
+@pytest.mark.parametrize(
+    "module",
+    [common_kernels, cuda_kernels, ssim_kernels, drawing_kernels, resolving_kernels],
+    ids=lambda module: module.__name__.rsplit(".")[-1],
+)
 def test_kernels_for_gpus_compile_without_one(module, tmp_path):
     init_warp()
     wp.compile_aot_module(module, arch=75, module_dir=tmp_path, use_ptx=True)

@@ -219,8 +219,8 @@ def about(
 
 @wp.func_native("""
 #if !defined(__CUDA_ARCH__)
-    const endo_sim::Depths depths_seen = endo_sim::tissue_depths({left, top, right, bottom, (size_t)start, width}, depths.data, alphas.data);
-    return {depths_seen.low, depths_seen.high};
+    const auto seen = endo_sim::tissue_depths({left, top, right, bottom, (size_t)start, width}, depths.data, alphas.data);
+    return {seen.low, seen.high};
 #else
     return {0.0f, 0.0f};
 #endif

@@ -77,6 +77,8 @@ def _realtime(client: Client, scene: Tissue, rate: float, changes: int, shown: s
     """Latency from a wrench that changes to the first image that shows it, while commands stream; of both eyes to the right one's."""
     client.until(lambda: client.in_state("physics_node", PhysicsState.RUNNING), "the first steps")
     client.command(scene.tip, np.zeros(3), client.now_ns())  # what comes before all are connected arrives late
+    if _SHOWN[shown].get("instruments", True):  # else it would be measured how it is prepared, which compiles kernels the first time
+        client.until(lambda: client.number("rendering_node", "instruments") > 0, "an instrument in the picture")
     client.spin_until(time.perf_counter() + 1.0)
     latencies, began = [], time.perf_counter()
     skipped, first_state = client.number("physics_node", "skipped steps"), len(client.states)

@@ -58,7 +58,7 @@ class RenderingNode(EndoNode):
         self._pacer = Pacer()
         self._dirty, self.images, self._last_image = True, 0, 0.0
         self._output: Shown | None = None
-        self._seconds_per_image = 0.0
+        self._seconds_per_image, self._instruments_shown = 0.0, 0
         self._blind: np.ndarray | None = None  # position [3], m, world, of the newest camera, if it sees no tissue
         self._topics = RenderedTopics(self)
         thing = find_thing(self.options.thing) if self.options.thing else None
@@ -348,6 +348,7 @@ class RenderingNode(EndoNode):
         labels = views[0].labels
         shown = Shown(views, cameras, wanted, None if labels is None else self.instruments.labels(instruments, labels))
         self._seconds_per_image += 0.1 * (time.monotonic() - start - self._seconds_per_image)
+        self._instruments_shown = 0 if instruments is None else len(instruments.poses)
         self._blind = None if bound.renderer.sees_tissue else camera.position
         return shown
 
@@ -377,6 +378,7 @@ class RenderingNode(EndoNode):
             "gaussians": len(self.tissue.model),
             "images": self.images,
             "milliseconds per image": f"{1e3 * self._seconds_per_image:.1f}",
+            "instruments": self._instruments_shown,
             "following control nodes": self.tissue.bound is not None and self.tissue.bound.follows(self._nodes),
         }
         if self._failure:

@@ -105,6 +105,8 @@ def test_instruments_come_go_and_are_told_apart(bench):
         send_type(bench, name)
     send_links(bench, "PSM2", links("PSM2"))
     shows(bench, expected(["PSM2"])[0], "PSM2 alone")
+    told = lambda: bench.nodes[1].status()[2]["instruments"]
+    assert told() == 1
     bench.hear(messages.RENDERED_SEGMENTATION)
     of_second = {2 + 5 + LINKS.index(link) for link in ("roll", "wrist_pitch", "jaw_left", "jaw_right")}
     labels = lambda message: np.frombuffer(message.data, np.uint8)
@@ -112,6 +114,7 @@ def test_instruments_come_go_and_are_told_apart(bench):
     newest(bench, messages.RENDERED_SEGMENTATION, lambda message: of_second <= found(message) <= of_second | {0, 1})
     send_links(bench, "PSM1", links("PSM1"))
     shows(bench, expected(["PSM1", "PSM2"])[0], "both")
+    assert told() == 2
     both = newest(bench, messages.RENDERED_SEGMENTATION, lambda message: 2 in found(message))
     assert (both.encoding, both.height, both.width) == ("mono8", HEIGHT, WIDTH)
     library = expected(["PSM1", "PSM2"])[0].labels
@@ -120,6 +123,7 @@ def test_instruments_come_go_and_are_told_apart(bench):
     await_image(bench, lambda image: np.abs(image - expected(["PSM1", "PSM2"])[0].image).max() > 60, "PSM1 to move")
     assert bench.set("rendering_node", instruments=False)[0]
     shows(bench, expected([])[0], "the tissue alone")
+    assert told() == 0
 
 
 def test_the_first_picture_after_its_links_shows_an_instrument(bench):

@@ -13,9 +13,11 @@ from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.gaussians import GaussianModel
+from endo_sim_ros.core.kernels import launch, launch_in_shares, load_kernels
 from endo_sim_ros.physics.control_nodes import select_solid
 from endo_sim_ros.physics.skinning import Skinning
 from endo_sim_ros.physics.weights import nearest_nodes
+from endo_sim_ros.rendering import behind_kernels
 from endo_sim_ros.rendering.config import BehindConfig
 from endo_sim_ros.rendering.inside import SOLID, Inside, value_noise
 from endo_sim_ros.splatting import render
@@ -61,6 +63,11 @@ class Behind:
         self._rest, self._covars, self._moved, self._wide = skinning.node_rest, on(covars), _MOVED * wide, wide
         self._places, self._colors = rest[deep], colors
         self.cut(np.zeros((0, 3, 3)), None)
+        load_kernels((behind_kernels,), str(self._rest.device))
+        # What is loaded at first use would make the first picture of a pull late.
+        nowhere, none = Camera(np.array([[16.0, 0, 8], [0, 16, 8], [0, 0, 1]]), 16, 16), self._rest.new_zeros
+        moved, F = self._rest + 1.0, torch.eye(3, device=self.device).expand(len(rest), 3, 3)
+        self.draw([nowhere], moved, F, (none(1, 16, 16, 3), none(1, 16, 16), none(1, 16, 16)), none(3))
 
     def cut(self, triangles: np.ndarray, inside: Inside | None) -> None:
         """Show flesh beside these cuts, which are all [T, 3, 3], m, world, in the tissue at rest; without an inside, nothing."""
@@ -103,12 +110,8 @@ class Behind:
         height, width = alphas.shape[1:]
         coarse = [camera.resized(max(width // _COARSER, 1), max(height // _COARSER, 1)) for camera in cameras]
         behind = render(model, *coarse, covars=F @ self._covars[some] @ F.transpose(1, 2), background=background)
-        layers = torch.cat([behind.colors - background, behind.depths[..., None], behind.alphas[..., None]], 3).permute(0, 3, 1, 2)
-        for i in range(len(cameras)):
-            y, x = (alphas[i] < _COVERED).nonzero().unbind(1)
-            places = torch.stack([(2 * x + 1) / width - 1, (2 * y + 1) / height - 1], 1)[None, None]
-            found = torch.nn.functional.grid_sample(layers[i : i + 1], places, padding_mode="border", align_corners=False)[0, :, 0].T
-            found = (1 - alphas[i, y, x] / _COVERED)[:, None] * found  # all of it where there is no tissue
-            colors[i, y, x] += found[:, :3]
-            depths[i, y, x] += found[:, 3]
-            alphas[i, y, x] += found[:, 4]
+        shown = [background, behind.colors, behind.depths, behind.alphas, colors, depths, alphas]
+        if alphas.device.type == "cpu":
+            launch_in_shares(behind_kernels.put_behind, len(cameras) * height, [width, height, width, _COVERED, *shown], least=4)
+        else:
+            launch(behind_kernels.put_behind, alphas.numel(), [0, 1, height, width, _COVERED, *shown], alphas.device)

@@ -6,7 +6,8 @@ import torch
 from test_inside import CAMERA, DARK, OPENED, SKIN, cut, nodes, opened, skin
 
 from endo_sim_ros.core.gaussians import GaussianModel
-from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
+from endo_sim_ros.core.kernels import launch_in_shares, load_kernels
+from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig, behind_kernels
 from endo_sim_ros.rendering.config import BehindConfig, InsideConfig
 
 
@@ -77,3 +78,20 @@ def test_a_bare_skin_has_nothing_behind_it():
         for shown in (False, True)
     ]
     np.testing.assert_array_equal(pair[0].image, pair[1].image)
+
+
+def test_what_is_behind_comes_between_its_pixels_in_straight_lines():
+    rng = torch.Generator().manual_seed(0)
+    random = lambda *shape: torch.rand(*shape, generator=rng)
+    background, coarse = random(3), [random(2, 5, 7, 3), random(2, 5, 7), random(2, 5, 7)]
+    images = [random(2, 21, 29, 3), random(2, 21, 29), random(2, 21, 29)]
+    y, x = torch.meshgrid((2 * torch.arange(21) + 1) / 21 - 1, (2 * torch.arange(29) + 1) / 29 - 1, indexing="ij")
+    layers = torch.cat([coarse[0] - background, coarse[1][..., None], coarse[2][..., None]], 3).permute(0, 3, 1, 2)
+    places = torch.stack([x, y], 2).expand(2, 21, 29, 2)
+    found = torch.nn.functional.grid_sample(layers, places, padding_mode="border", align_corners=False).permute(0, 2, 3, 1)
+    found *= (1 - images[2] / 0.6).clamp_min(0)[..., None]
+    expected = [images[0] + found[..., :3], images[1] + found[..., 3], images[2] + found[..., 4]]
+    load_kernels((behind_kernels,), "cpu")
+    launch_in_shares(behind_kernels.put_behind, 2 * 21, [29, 21, 29, 0.6, background, *coarse, *images])
+    for mine, other in zip(images, expected):
+        torch.testing.assert_close(mine, other, atol=1e-5, rtol=0)

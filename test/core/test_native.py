@@ -11,6 +11,7 @@ from endo_sim_ros.core.device import init_warp
 from endo_sim_ros.core.native import PACKAGE, native
 from endo_sim_ros.instruments import drawing_kernels, resolving_kernels
 from endo_sim_ros.reconstruction import ssim_kernels
+from endo_sim_ros.rendering import behind_kernels
 from endo_sim_ros.splatting import common_kernels, cuda_kernels
 
 HEADERS = sorted(str(path.relative_to(PACKAGE)) for path in PACKAGE.rglob("*.h"))
@@ -80,7 +81,7 @@ def test_a_header_that_is_not_there_is_named(folder):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "module",
-    [common_kernels, cuda_kernels, ssim_kernels, drawing_kernels, resolving_kernels],
+    [common_kernels, cuda_kernels, ssim_kernels, drawing_kernels, resolving_kernels, behind_kernels],
     ids=lambda module: module.__name__.rsplit(".")[-1],
 )
 def test_kernels_for_gpus_compile_without_one(module, tmp_path):

@@ -7,7 +7,7 @@ opening angle.
 
 import functools
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.instruments.kinematics import ArmKinematics
 
-__all__ = ["LINKS", "Capsule", "JawShape", "Material", "Part", "ToolShape", "build_instrument", "link_poses"]
+__all__ = ["LINKS", "Capsule", "JawShape", "Material", "Part", "ToolShape", "build_instrument", "link_poses", "part_links"]
 
 log = logging.getLogger(__name__)
 
@@ -88,6 +88,12 @@ class Part:
             alike = unit[around] @ unit[around].T > _CREASE
             normals[around, at % 3] = alike @ across[around]
         return normals / np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-20)
+
+
+def part_links(parts: Iterable[Part]) -> tuple[str, ...]:
+    """Names of the links of parts, and then of those that only bend some, each once."""
+    parts = list(parts)
+    return tuple(dict.fromkeys([*(part.link for part in parts), *(bone for part in parts for bone in part.bones)]))
 
 
 @dataclass(frozen=True)

@@ -82,7 +82,7 @@ def save_scene(
         # Pictures of many episodes at once show the background where skin is lifted off what it hid.
         "rendering_node": {"mode": mode, **arms(), "image_width": sight.image_width, "baseline": sight.baseline, "behind.shown": False}
         | ({"lockstep_camera": True} if kind.roams else {})
-        | ({"thing": task} if kind.rigid_thing() and sight.instrument else {}),
+        | ({"thing": task} if kind.thing() and sight.instrument else {}),
         "policy": {"mode": mode, "task": task, "scene": str(folder.resolve()), "seed": seed, "tool": named, "dye": sight.dye},
     }
     sections = {f"/**/{node}": {"ros__parameters": values} for node, values in parameters.items()}

@@ -15,7 +15,7 @@ from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import SURFACE
 from endo_sim_ros.core.reflections import seen_colors
 from endo_sim_ros.core.shading import shade, to_bytes
-from endo_sim_ros.instruments import LINKS, Material
+from endo_sim_ros.instruments import LINKS, Material, part_links
 from endo_sim_ros.instruments.config import DrawingConfig
 from endo_sim_ros.instruments.drawing import FIRST_LINK, SURFACES, InstrumentDrawing, lenses
 from endo_sim_ros.learning.config import Randomisation, SightConfig
@@ -81,8 +81,8 @@ class Pictures:
         self._drawings = [
             InstrumentDrawing([parts for parts, _ in own], device=device, capsules=[capsules for _, capsules in own]) for own in shapes
         ]
-        named = dict.fromkeys(part.link for parts, _ in self._thing for part in parts)
-        self._tables = [torch.from_numpy(_labels(drawing, list(named))).to(device) for drawing in self._drawings]
+        named = part_links(part for parts, _ in self._thing for part in parts)
+        self._tables = [torch.from_numpy(_labels(drawing, named)).to(device) for drawing in self._drawings]
         self._at_once = _AT_ONCE if torch.device(device).type == "cpu" else max(count, 1)
         options = DrawingConfig()
         self._lamp = np.array([options.lamp_x, options.lamp_y, 0.0, 1.0])  # m, camera
@@ -239,8 +239,7 @@ class Pictures:
             drawing, at = self._drawings[number], np.flatnonzero(which == number)
             links = held.posed(number, own[at])
             if self._thing:
-                received = sent_poses if self._task.rigid_thing() else lambda poses: poses
-                links.append({link: received(poses)[own[at]] for link, poses in self._task.thing_poses().items()})
+                links.append({link: poses[own[at]] for link, poses in self._task.thing_poses().items()})
             poses = np.stack([links[a][link] for a, link in drawing.links], 1)
             rows = np.concatenate([at + eye * len(own) for eye in range(eyes)])
             local = viewmats[rows, None] @ np.concatenate([poses] * eyes)
@@ -285,12 +284,12 @@ class Pictures:
         return (camera.pose,) if self._sight.eyes == 1 else (camera.pose, camera.beside(self._sight.baseline).pose)
 
 
-def _labels(drawing: InstrumentDrawing, things: list[str]) -> np.ndarray:
+def _labels(drawing: InstrumentDrawing, things: tuple[str, ...]) -> np.ndarray:
     """The labels [256] that are shown for those of a drawing: as on rendered/segmentation/image, whatever parts the tool has.
 
     Args:
         drawing: What draws the tools, and the thing after these.
-        things: Names of the links that parts of the thing count as.
+        things: Names of the links of the thing.
     """
     table = np.arange(256, dtype=np.uint8)
     for label, (arm, link) in enumerate(drawing.links, FIRST_LINK):

@@ -1,4 +1,4 @@
-"""Point clouds: Gaussian models, control nodes, cut surfaces and maps of stiffness."""
+"""Point clouds: Gaussian models, control nodes, cut surfaces, maps of stiffness and where links of a thing are."""
 
 import dataclasses
 import zlib
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from endo_sim_ros.messages.headers import NANOSECONDS, make_header
-from endo_sim_ros.messages.topics import CONTROL_NODES, CUT_SURFACE, GAUSSIANS, STIFFNESS_MAP
+from endo_sim_ros.messages.topics import CONTROL_NODES, CUT_SURFACE, GAUSSIANS, STIFFNESS_MAP, THING_POSES
 from endo_sim_ros.messages.types import Message, MessageError, MessageTypes, ros_types
 
 if TYPE_CHECKING:  # it takes torch, which most users of this package do not need
@@ -16,7 +16,8 @@ if TYPE_CHECKING:  # it takes torch, which most users of this package do not nee
 
 __all__ = [
     "ControlNodeCloud", "StiffnessCloud", "cut_number", "decode_cloud", "decode_control_nodes", "decode_cut_surface", "decode_gaussians",
-    "decode_stiffness", "encode_control_nodes", "encode_cut_surface", "encode_gaussians", "encode_stiffness",
+    "decode_stiffness", "decode_thing_poses", "encode_control_nodes", "encode_cut_surface", "encode_gaussians", "encode_stiffness",
+    "encode_thing_poses",
 ]  # fmt: skip
 
 _POINT_FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # PointField.datatype
@@ -274,3 +275,29 @@ def decode_stiffness(message: Message, topic: str = STIFFNESS_MAP.name) -> Stiff
     if not (np.isfinite(positions).all() and np.isfinite(moduli).all() and (moduli > 0).all()):
         raise MessageError(f"{topic}: a position is not finite, or a modulus is not a finite number above zero; the map was ignored")
     return StiffnessCloud(positions, moduli[:, 0], moduli[:, 1], moduli[:, 2], points["known"].astype(bool))
+
+
+_THING = (*_POSITION, *_F)
+
+
+def encode_thing_poses(poses: np.ndarray, stamp_ns: int, frame_id: str, types: MessageTypes = ros_types()) -> Message:
+    """PointCloud2 of affine transforms [n, 4, 4] of links, metres, float64: where each is, and what it turns and scales by, row by row."""
+    points = np.concatenate([poses[:, :3, 3], poses[:, :3, :3].reshape(-1, 9)], 1)
+    return _encode_cloud(points.view([(name, "<f8") for name in _THING]).reshape(-1), stamp_ns, frame_id, types)
+
+
+def decode_thing_poses(message: Message, topic: str = THING_POSES.name) -> np.ndarray:
+    """Affine transforms [n, 4, 4] of the links of a thing, metres, in the frame of the header.
+
+    Raises:
+        MessageError: If the cloud is damaged, a field is missing, or a number is not finite.
+    """
+    points = decode_cloud(message, topic)
+    if missing := [name for name in _THING if name not in _names(points)]:
+        raise MessageError(f"{topic}: missing field {', '.join(missing[:4])}; see thing_poses in msg_conventions.md")
+    numbers = np.stack([points[name].astype(np.float64) for name in _THING], 1)
+    if not np.isfinite(numbers).all():
+        raise MessageError(f"{topic}: a pose is not finite; all were ignored")
+    poses = np.tile(np.eye(4), (len(numbers), 1, 1))
+    poses[:, :3, 3], poses[:, :3, :3] = numbers[:, :3], numbers[:, 3:].reshape(-1, 3, 3)
+    return poses

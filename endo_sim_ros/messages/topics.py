@@ -33,7 +33,7 @@ DYE = Topic("dye", "visualization_msgs/msg/MarkerArray", "latched")
 STIFFNESS_MAP = Topic("stiffness_map", "sensor_msgs/msg/PointCloud2", "latched")
 TISSUE_MOTION = Topic("tissue_motion", "sensor_msgs/msg/JointState")
 TISSUE_MOTION_COMMAND = Topic("set_tissue_motion", "sensor_msgs/msg/JointState")
-THING_POSE = Topic("thing_pose", "geometry_msgs/msg/PoseStamped")
+THING_POSES = Topic("thing_poses", "sensor_msgs/msg/PointCloud2")
 TASK_OUTCOME = Topic("task_outcome", "sensor_msgs/msg/JointState")
 RENDERED_IMAGE = Topic("rendered/image_raw", "sensor_msgs/msg/Image")
 RENDERED_INFO = Topic("rendered/camera_info", "sensor_msgs/msg/CameraInfo")
@@ -158,7 +158,7 @@ def all_topics(arms: tuple[str, ...] = ("PSM1",)) -> tuple[Topic, ...]:
     """Every topic of the contract that can be recorded, for the given arms."""
     tools = tuple(make(arm) for arm in arms for make in TOOL_TOPICS)
     tissue = (CONTROL_NODES, CUT_SURFACE, DYE, STIFFNESS_MAP, TISSUE_MOTION, TISSUE_MOTION_COMMAND)
-    scene = MODEL_TOPICS + tissue + RENDERED_TOPICS + EXTRA_RENDERED_TOPICS + (THING_POSE, TASK_OUTCOME)
+    scene = MODEL_TOPICS + tissue + RENDERED_TOPICS + EXTRA_RENDERED_TOPICS + (THING_POSES, TASK_OUTCOME)
     found = RECORDING_TOPICS + scene + tools + (TOOL_MARKERS, JOINT_STATES, ROBOT_DESCRIPTION, DIAGNOSTICS, CLOCK)
     return tuple(dict.fromkeys(found))  # the pose of an ECM among the arms is that of the camera
 

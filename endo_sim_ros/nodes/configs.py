@@ -172,8 +172,8 @@ class RenderingNodeConfig(WorldConfig):
     arms: tuple[str, ...] = ("PSM1",)
     """Names of the arms whose instruments are drawn; one that nobody publishes is not."""
     thing: str = ""
-    """Name of the task, or file.py:Class, whose rigid thing is drawn with the instruments, such as the needle of handover, where
-    thing_pose says that it is; empty = none."""
+    """Name of the task, or file.py:Class, whose thing is drawn with the instruments, such as the needle of handover or the vessels of
+    clip, where thing_poses says that it is; empty = none."""
     jpeg_quality: Annotated[int, Range(1, 100)] = 90
     """Quality of compressed images; at 90 the eye sees no difference."""
     drawing: DrawingConfig = DrawingConfig()

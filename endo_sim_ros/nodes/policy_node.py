@@ -11,6 +11,7 @@ from std_srvs.srv import Trigger
 from endo_sim_ros import messages
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.folders import written_whole
+from endo_sim_ros.instruments import part_links
 from endo_sim_ros.learning.actions import arm_state, tip_poses
 from endo_sim_ros.learning.held_tools import HeldTools, hold_tools
 from endo_sim_ros.learning.pictures import IMAGE, IMAGE_RIGHT
@@ -51,8 +52,6 @@ class PolicyNode(EndoNode):
             raise ConfigError(
                 f"policy: {config.task} acts by the joints of the endoscope, not by those of the tool, as {config.policy} does"
             )
-        if policy.sight is not None and task.thing() is not None and not task.rigid_thing():
-            raise ConfigError(f"policy: {config.policy} sees, and pictures over topics do not show what {config.task} is about")
         if not self._task.same_tissue and config.episodes > 1:
             raise ConfigError(f"episodes: {config.task} has one episode over topics, as its tissue is part of physics_node's parameters")
         arms = arm_names([config.arm] if len(task.arms) == 1 else task.arms)
@@ -64,7 +63,8 @@ class PolicyNode(EndoNode):
         self._dye_pub = self.publisher(messages.DYE)
         self._outcome_pub = self.publisher(messages.TASK_OUTCOME)
         self._camera_pub = self.publisher(messages.CAMERA_POSE) if task.roams else None
-        self._thing_pub = self.publisher(messages.THING_POSE) if task.rigid_thing() else None
+        self._thing = () if (thing := task.thing()) is None else part_links(thing[0])
+        self._thing_pub = self.publisher(messages.THING_POSES) if self._thing else None
         self._commanded = *self._pose_pubs, *self._jaw_pubs, *self._cut_pubs
         self._listeners = Listeners(self._commanded)
         self._resetting = self.create_client(Trigger, f"{config.physics_node}/reset")
@@ -280,8 +280,9 @@ class PolicyNode(EndoNode):
     def _send_thing(self, stamp: int) -> None:
         """Publish where the thing of the task is, if there is one; where an episode begins, wait until that has arrived."""
         if self._thing_pub is not None:
-            (poses,) = self._task.thing_poses().values()
-            self._thing_pub.publish(messages.encode_pose(poses[0], stamp, self._config.world_frame))
+            poses = self._task.thing_poses()
+            placed = np.stack([poses[link][0] for link in self._thing])
+            self._thing_pub.publish(messages.encode_thing_poses(placed, stamp, self._config.world_frame))
             if stamp == self._model_stamp:
                 delivered(self._thing_pub, _DYED_WITHIN)
 

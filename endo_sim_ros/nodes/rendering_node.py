@@ -45,7 +45,7 @@ class RenderingNode(EndoNode):
         self._nodes_stamp = self._last_stamp = 0  # of that state, and of the newest image in real time, ns
         self._failure = ""  # why the newest model is not shown
         self._pose: np.ndarray | None = None
-        self._thing_pose: np.ndarray | None = None
+        self._thing_poses: np.ndarray | None = None
         self._rest_poses: dict[str, np.ndarray] = {}  # lockstep, by topic: the newest with the stamp of the state at rest
         self._training_pose: np.ndarray | None = None
         self._info: CameraInfo | None = None
@@ -53,7 +53,7 @@ class RenderingNode(EndoNode):
         self._training_info: CameraInfo | None = None
         self._states: deque[tuple[int, ControlNodeCloud]] = deque()  # lockstep: stamps and states still to be shown
         # Lockstep, by topic: poses that wait for their state.
-        self._poses = {topic.name: EpisodeQueue[np.ndarray]() for topic in (messages.CAMERA_POSE, messages.THING_POSE)}
+        self._poses = {topic.name: EpisodeQueue[np.ndarray]() for topic in (messages.CAMERA_POSE, messages.THING_POSES)}
         self._reset_heard = 0.0  # lockstep: when the newest state at rest came
         self._pacer = Pacer()
         self._dirty, self.images, self._last_image = True, 0, 0.0
@@ -72,7 +72,7 @@ class RenderingNode(EndoNode):
         self.subscribe(messages.DYE, self._on_dye)
         self.subscribe(messages.CAMERA_POSE, self._on_camera, depth)
         if thing is not None:
-            self.subscribe(messages.THING_POSE, self._on_thing, depth)
+            self.subscribe(messages.THING_POSES, self._on_thing, depth)
         self.subscribe(messages.LEFT_INFO, self._on_info, depth=1)
         self.subscribe(messages.RIGHT_INFO, self._on_right_info, depth=1)
         for arm in self.instruments.arms:
@@ -156,11 +156,13 @@ class RenderingNode(EndoNode):
             self._change()
 
     def _on_thing(self, message: Any) -> None:
-        pose = messages.decode_pose(message, self.options.frame_poses, messages.THING_POSE.name)
-        same = self._thing_pose is not None and np.array_equal(pose, self._thing_pose)
-        self._thing_pose = pose
+        messages.check_frame(message, (self.options.world_frame,), messages.THING_POSES.name)
+        poses = messages.decode_thing_poses(message)
+        self.instruments.check_thing(poses)
+        same = self._thing_poses is not None and np.array_equal(poses, self._thing_poses)
+        self._thing_poses = poses
         if self._lockstep:
-            self._follow(messages.THING_POSE.name, message, pose)
+            self._follow(messages.THING_POSES.name, message, poses)
         elif not same:
             self._change()
 
@@ -232,7 +234,7 @@ class RenderingNode(EndoNode):
             if not self._pacer.is_due(now, 1 / self.options.rate):
                 return
             self._dirty = False
-            instruments = self._posed(self.tissue.bound, self.instruments.newest(), self._thing_pose)
+            instruments = self._posed(self.tissue.bound, self.instruments.newest(), self._thing_poses)
             self._output = self._render(self.tissue.bound, self._nodes, camera, instruments or None)
             if instruments is False:  # the tissue alone meanwhile
                 self._change()
@@ -268,7 +270,7 @@ class RenderingNode(EndoNode):
                 camera = camera and replace(camera, pose=pose)
             if not self.tissue.bound.follows(nodes) or not camera or not self.tissue.has_cut(nodes):
                 return
-            instruments = self._await_instruments(stamp, self.tissue.bound, poses.get(messages.THING_POSE.name))
+            instruments = self._await_instruments(stamp, self.tissue.bound, poses.get(messages.THING_POSES.name))
             if instruments is False:
                 return
             self._states.popleft()
@@ -280,7 +282,7 @@ class RenderingNode(EndoNode):
     @property
     def _followed(self) -> list[str]:
         """Lockstep: topics whose poses belong to one state each, but for that at rest, for which nobody may send one."""
-        wanted = {messages.CAMERA_POSE: self.options.lockstep_camera, messages.THING_POSE: bool(self.options.thing)}
+        wanted = {messages.CAMERA_POSE: self.options.lockstep_camera, messages.THING_POSES: bool(self.options.thing)}
         return [topic.name for topic, follows in wanted.items() if follows]
 
     def _await_instruments(self, stamp: int, bound: BoundModel, thing: np.ndarray | None) -> PosedInstruments | None | Literal[False]:
@@ -299,7 +301,7 @@ class RenderingNode(EndoNode):
         if not self.options.instruments:
             return None
         if thing is not None:
-            links = links | {THING: thing[None]}
+            links = links | {THING: thing}
         try:
             return self.instruments.posed(links, self.options.drawing, bound.renderer.device)
         except Exception as error:
@@ -420,11 +422,11 @@ def find_thing(task: str) -> tuple[list[Part], list[Capsule]]:
 
     try:
         kind = find_task(task)
-        thing = kind.thing() if kind.rigid_thing() else None
+        thing = kind.thing()
     except ValueError as error:
         raise ConfigError(f"thing: {error}") from error
     if thing is None:
-        raise ConfigError(f"thing: {task} has no rigid thing beside the tools; leave it out")
+        raise ConfigError(f"thing: {task} has no thing beside the tools; leave it out")
     return thing
 
 

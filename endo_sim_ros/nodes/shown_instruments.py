@@ -8,7 +8,7 @@ import numpy as np
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.config import ConfigError
-from endo_sim_ros.instruments import LINKS, Capsule, Part
+from endo_sim_ros.instruments import LINKS, Capsule, Part, part_links
 from endo_sim_ros.instruments.config import DrawingConfig
 from endo_sim_ros.instruments.drawing import FIRST_LINK, InstrumentDrawing, PosedInstruments
 from endo_sim_ros.instruments.urdf_reader import load_shape
@@ -18,7 +18,7 @@ from endo_sim_ros.nodes.episode_queue import EpisodeQueue
 from endo_sim_ros.nodes.pacing import MOST_WAITING
 
 THING = ""
-"""In the place of the name of an arm: a rigid thing of one link that is drawn with the instruments."""
+"""In the place of the name of an arm: a thing that is drawn with the instruments."""
 
 
 class ShownInstruments:
@@ -27,7 +27,7 @@ class ShownInstruments:
     Args:
         arms: Names of the arms, in the order of the labels.
         lockstep: Whether links are wanted for each state, not only the newest.
-        thing: Parts and capsules of what is drawn with them, if there is any; its label follows those of all arms.
+        thing: Parts and capsules of what is drawn with them, if there is any; its labels follow those of all arms.
     """
 
     def __init__(self, arms: Sequence[str], lockstep: bool, thing: tuple[list[Part], list[Capsule]] | None = None) -> None:
@@ -77,6 +77,11 @@ class ShownInstruments:
         moved = links.newest is None or not np.array_equal(links.newest, poses)
         links.put(messages.stamp_to_ns(message.header.stamp), poses)
         return moved
+
+    def check_thing(self, poses: np.ndarray) -> None:
+        """Raises MessageError if there are not as many poses [n, 4, 4] as the thing has links."""
+        if len(poses) != (expected := len(self._names(THING))):
+            raise MessageError(f"{messages.THING_POSES.name}: {len(poses)} poses for a thing of {expected} links; publish its own")
 
     def newest(self) -> dict[str, np.ndarray]:
         """Where the links [5, 4, 4] of each arm are that has said so."""
@@ -140,8 +145,8 @@ class ShownInstruments:
         return self._drawing.at([dict(zip(self._names(owner), links[owner])) for owner in names])
 
     def _names(self, owner: str) -> Sequence[str]:
-        """Names of the links of an arm, or of that of the thing."""
-        return LINKS if owner != THING else [self._tools[THING][0][0].link]
+        """Names of the links of an arm, or of the thing."""
+        return LINKS if owner != THING else part_links(self._tools[THING][0])
 
     def labels(self, instruments: PosedInstruments | None, found: np.ndarray) -> np.ndarray:
         """Labels [H, W] of a picture as they are published: those of an arm and link are the same whoever else is drawn."""

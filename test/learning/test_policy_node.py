@@ -95,7 +95,7 @@ def user():
         ("tension", 1, True, MotionConfig()),
         ("handover", 1, True, MotionConfig()),
         ("camera", 1, True, MotionConfig()),
-        ("clip", 1, False, MotionConfig(breathing=0.003)),
+        ("clip", 1, True, MotionConfig(breathing=0.003)),
         ("dissect", 1, True, MotionConfig()),
     ],
 )
@@ -194,7 +194,9 @@ BLUE_SEEKER = f"{Path(__file__).parent / 'blue_seeker.py'}:BlueSeeker"
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task, episodes, imitated", [("retraction", 2, False), ("camera", 1, True), ("handover", 1, True)])
+@pytest.mark.parametrize(
+    "task, episodes, imitated", [("retraction", 2, False), ("camera", 1, True), ("handover", 1, True), ("clip", 1, True)]
+)
 def test_a_policy_that_sees_acts_over_topics_as_in_the_environment(task, episodes, imitated, user, tmp_path):
     named = imitate(task, tmp_path) if imitated else BLUE_SEEKER
     policy = make_policy(named, task, device="cpu")

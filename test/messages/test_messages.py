@@ -392,3 +392,16 @@ def test_maps_of_stiffness_round_trip_and_what_is_no_map_is_refused(wire):
             messages.decode_stiffness(messages.encode_stiffness(bad, 7, "world", types))
     with pytest.raises(MessageError, match="stiffness_map: missing field young_modulus, low, high, known"):
         messages.decode_stiffness(messages.encode_cut_surface(np.zeros((1, 3, 3)), 7, "world", types))
+
+
+def test_poses_of_a_thing_keep_their_bits_and_what_is_none_is_refused(wire):
+    types, transport = wire
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, :3] = np.random.default_rng(0).normal(size=(5, 3, 4))  # they may scale and shear
+    message = transport(messages.encode_thing_poses(poses, 7, "world", types), "sensor_msgs/msg/PointCloud2")
+    np.testing.assert_array_equal(messages.decode_thing_poses(message), poses)
+    poses[3, 1, 2] = np.nan
+    with pytest.raises(MessageError, match="thing_poses: a pose is not finite"):
+        messages.decode_thing_poses(messages.encode_thing_poses(poses, 7, "world", types))
+    with pytest.raises(MessageError, match="thing_poses: missing field f_00, f_01, f_02, f_10; see thing_poses in msg_conventions.md"):
+        messages.decode_thing_poses(messages.encode_cut_surface(np.zeros((1, 3, 3)), 7, "world", types))

@@ -7,10 +7,12 @@ from ros_bench import HEIGHT, WIDTH, Bench, K, S, await_image, newest_image, sen
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.cameras import Camera, make_pose
-from endo_sim_ros.instruments import LINKS, build_instrument, link_poses, load_arm, place_arm
+from endo_sim_ros.instruments import LINKS, build_instrument, link_poses, load_arm, part_links, place_arm
 from endo_sim_ros.instruments.drawing import InstrumentDrawing
-from endo_sim_ros.messages import OK
+from endo_sim_ros.learning.tasks import Clip
+from endo_sim_ros.messages import OK, MessageError
 from endo_sim_ros.nodes.rendering_node import RenderingNode
+from endo_sim_ros.nodes.shown_instruments import ShownInstruments
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 
 pytestmark = pytest.mark.dds
@@ -253,3 +255,10 @@ def test_in_lockstep_each_state_waits_for_its_links(steps):
     send_links(steps, "PSM1", links("PSM1"), 7 * S)  # those of 6 s are lost
     steps.until(lambda: len(images) == 6, "the states after")
     assert [stamp_of(image) for image in images[-2:]] == [6 * S, 7 * S]
+
+
+def test_poses_of_another_thing_than_that_of_the_task_are_refused():
+    shown = ShownInstruments(("PSM1",), True, Clip.thing())
+    shown.check_thing(np.zeros((len(part_links(Clip.thing()[0])), 4, 4)))
+    with pytest.raises(MessageError, match=r"thing_poses: 1 poses for a thing of 78 links; publish its own"):
+        shown.check_thing(np.zeros((1, 4, 4)))

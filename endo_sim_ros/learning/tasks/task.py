@@ -91,12 +91,6 @@ class Task(ABC):
         return None
 
     @classmethod
-    def rigid_thing(cls) -> bool:
-        """Whether there is a thing of one link, which one pose tells, so that the graph has it."""
-        thing = cls.thing()
-        return thing is not None and len({part.link for part in thing[0]}) == 1
-
-    @classmethod
     def action_size(cls) -> int:
         """How many numbers an action of the tip has for each arm."""
         return 5 if cls.twist else 4

@@ -126,8 +126,12 @@ def rigid_pose(rotation: ArrayLike, position: ArrayLike) -> np.ndarray:
 
 
 def invert_pose(pose: np.ndarray) -> np.ndarray:
-    """Inverse of a rigid transform [4, 4]."""
-    return rigid_pose(pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3])
+    """Inverses of rigid transforms [..., 4, 4]."""
+    inverse = np.zeros(pose.shape)
+    inverse[..., :3, :3] = np.swapaxes(pose[..., :3, :3], -1, -2)
+    inverse[..., :3, 3] = -(inverse[..., :3, :3] @ pose[..., :3, 3:])[..., 0]
+    inverse[..., 3, 3] = 1
+    return inverse
 
 
 def rotation_numbers(w: Any, x: Any, y: Any, z: Any) -> list:

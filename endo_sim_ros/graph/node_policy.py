@@ -1,5 +1,6 @@
 """A policy that is a ROS node of somebody else: it hears observations, and answers each with an action."""
 
+import re
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -22,6 +23,7 @@ from endo_sim_ros.nodes.listeners import Listeners
 _ME = "benchmark"
 _STARTS = 30.0  # s that the node has to start, at least
 _FRAME = "endoscope_left", "endoscope_right"
+_NAME = re.compile(r"[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)  # of a node, in namespaces or not
 
 
 class NodePolicy:
@@ -34,6 +36,7 @@ class NodePolicy:
         patience: Longest wait for each of its answers, s.
 
     Raises:
+        ValueError: If no node can have this name.
         RuntimeError: If there is no such node.
     """
 
@@ -44,6 +47,8 @@ class NodePolicy:
     def __init__(self, name: str, task: str, sight: SightConfig = SightConfig(), patience: float = 10.0):
         kind = find_task(task)
         self._name, self._patience = name.strip("/"), patience
+        if not _NAME.fullmatch(self._name):
+            raise ValueError(f"node:{name} names no ROS node; give letters, digits and _ after the colon, as in node:lifter")
         self._size, self._step_ns = kind.action_size() * len(kind.arms), round(kind.physics("cpu").step_duration * 1e9)
         self._stamp, self._answer = 0, None
         if not ok():

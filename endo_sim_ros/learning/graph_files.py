@@ -75,6 +75,7 @@ def save_scene(
             "arm_source": "commanded",
             "lockstep_inputs": ["pose", "jaw", *(["cut"] if kind.cutting else [])],
             "link_contact": False,
+            **({"tell_empty_jaws": False} if kind.thing() else {}),
             **arms(),
             **tools,
             **changed,

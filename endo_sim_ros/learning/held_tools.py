@@ -169,7 +169,7 @@ class HeldTools:
             chosen = self.which[arms] == number
             if chosen.any():
                 own = arms[chosen]
-                reach = solve_inverse(tool.arm, invert_poses(self.bases[own]) @ poses[chosen], self.joints[own])
+                reach = solve_inverse(tool.arm, invert_pose(self.bases[own]) @ poses[chosen], self.joints[own])
                 self.joints[own] = reach.joints
         self.angles[arms] = self._angles(closed)
 
@@ -262,12 +262,3 @@ class HeldTools:
             first, second = zip((tool.shape[1] for tool in self.kinds[number]), self.posed(number, own))
             deepest[own] = overlap(first, second)
         return deepest
-
-
-def invert_poses(poses: np.ndarray) -> np.ndarray:
-    """The inverses of rigid transforms [B, 4, 4]."""
-    inverse = np.zeros_like(poses)
-    inverse[:, :3, :3] = np.swapaxes(poses[:, :3, :3], 1, 2)
-    inverse[:, :3, 3] = -(inverse[:, :3, :3] @ poses[:, :3, 3:])[..., 0]
-    inverse[:, 3, 3] = 1
-    return inverse

@@ -2,7 +2,6 @@
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -33,19 +32,6 @@ IMAGE, IMAGE_RIGHT, SEGMENTATION = "image", "image_right", "segmentation"
 
 _ROUGHNESS = 0.1, 1.0  # smoother metal would be a mirror, which the drawing has none of
 _AT_ONCE = 64  # images rasterised together, and on a CPU drawn into
-
-
-@dataclass
-class _View:
-    """How one episode is seen."""
-
-    poses: tuple[np.ndarray, ...]  # of each eye [4, 4], camera to world, m
-    moved: np.ndarray | None = None  # how it departs from where the endoscope is, as `Variation.camera` has it
-    light: tuple[float, float] = (1.0, 0.0)  # brightness, and by how much less corners have
-    contrast: float = 1.0  # factor on the colours' coefficients
-    lamp: np.ndarray = field(default_factory=lambda: np.zeros(4))  # m, in the camera of the left eye, and 1
-    lamps: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # [E, 3] m, in the camera of each eye
-    metal: np.ndarray = field(default_factory=lambda: np.ones(2))  # factors on what surfaces give back and on their roughness
 
 
 class Pictures:
@@ -88,11 +74,14 @@ class Pictures:
         self._lamp = np.array([options.lamp_x, options.lamp_y, 0.0, 1.0])  # m, camera
         self._surfaces = np.array([SURFACES[material] for material in Material])  # [M, 5]
         # What each picture needs in arrays, as it changes with episodes, not with steps.
-        self._viewmats = np.zeros((sight.eyes, count, 4, 4))
+        self._light = np.tile([1.0, 0.0], (count, 1))  # brightness, and by how much less corners have
+        self._contrast = np.ones(count)  # factors on the colours' coefficients
+        self._metal = np.ones((count, 2))  # factors on what surfaces give back and on their roughness
+        self._moved = np.tile(np.eye(4), (count, 1, 1))  # how each departs from where the endoscope is, as `Variation.camera` has it
+        self._shining = np.tile(self._lamp, (count, 1))  # where the lamp is in the camera of the left eye, m, and 1
+        self._poses, self._viewmats = np.zeros((2, sight.eyes, count, 4, 4))  # of the eyes, camera to world, m, and back
         self._lamps = np.zeros((sight.eyes, count, 3))  # m, in the camera of each eye
-        self._views = [self._view(None) for _ in range(count)]
-        for b in range(count):
-            self._show(b, self._views[b])
+        self._look(np.arange(count), self.camera.pose)
 
     def _set_width(self, camera: Camera, width: int) -> None:
         """Draw what a camera sees, with pictures of a width."""
@@ -108,35 +97,44 @@ class Pictures:
         return other
 
     @property
-    def poses(self) -> list[np.ndarray]:
-        """Where the left eye of each episode is [4, 4], camera to world, m."""
-        return [view.poses[0] for view in self._views]
+    def poses(self) -> np.ndarray:
+        """Where the left eye of each episode is [B, 4, 4], camera to world, m."""
+        return self._poses[0]
 
     def look_from(self, poses: np.ndarray) -> None:
         """Let the endoscopes be at poses [B, 4, 4], camera to world, m; each departs from it as its episode has it."""
-        for b, (view, pose) in enumerate(zip(self._views, sent_poses(poses))):
-            view.poses = self._eyes(pose, view.moved)
-            view.lamps = self._lamps_of(view.poses, view.lamp)
-            self._show(b, view)
+        self._look(np.arange(self._count), sent_poses(poses))
+
+    def _look(self, episodes: np.ndarray, poses: np.ndarray) -> None:
+        """Let the endoscopes of these episodes [n] be at poses [4, 4] or [n, 4, 4], from which each departs."""
+        moved = self._moved[episodes]
+        left = np.tile(np.eye(4), (len(episodes), 1, 1))
+        left[:, :3, :3] = poses[..., :3, :3] @ moved[:, :3, :3]
+        left[:, :3, 3] = poses[..., :3, 3] + moved[:, :3, 3]
+        shining = left @ self._shining[episodes, :, None]
+        for eye in range(self._sight.eyes):
+            pose = left.copy()
+            pose[:, :3, 3] += eye * self._sight.baseline * left[:, :3, 0]
+            viewmats = invert_pose(pose)
+            self._poses[eye, episodes], self._viewmats[eye, episodes] = pose, viewmats
+            self._lamps[eye, episodes] = (viewmats @ shining)[:, :3, 0]
 
     def reset(self, episodes: Tensor, variations: Sequence[Variation], spots: Sequence[Sequence[DyedSpot]]) -> None:
         """Show these episodes [n] at rest, each with its variation and its dyed spots."""
         for b, variation, marked in zip(episodes.tolist(), variations, spots):
-            self._show(b, self._view(variation))
+            self._light[b], self._contrast[b], self._metal[b] = variation.light, variation.texture, variation.metal
+            self._moved[b], self._shining[b] = variation.camera, self._lamp + np.append(variation.lamp, 0.0)
             if self._sh is not None:
                 self._sh[b] = dyed(self._model.sh, self._model.means, marked)
                 self._spots[b] = marked
                 if b in self._cut:
                     self._cut[b].dye(marked)
+        self._look(episodes.cpu().numpy(), self.camera.pose)
         self._means[episodes], self._covars[episodes] = self._skinning.means, self._skinning.covars
         if self._tissue.solver.motion.moving:
             positions = self._tissue.positions()
             for b in episodes.tolist():
                 self._means[b], self._covars[b] = self._skinning.deform(positions[b], self._tissue.F[b])
-
-    def _show(self, b: int, view: _View) -> None:
-        self._views[b], self._lamps[:, b] = view, view.lamps
-        self._viewmats[:, b] = [invert_pose(pose) for pose in view.poses]
 
     @torch.no_grad()
     def draw(self, right: bool = False, labels: bool = False) -> dict[str, np.ndarray]:
@@ -153,7 +151,7 @@ class Pictures:
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
     def _render(self, own: np.ndarray, right: bool, labels: bool) -> dict[str, np.ndarray]:
-        eyes, views = range(1 + right), [self._views[b] for b in own]
+        eyes = range(1 + right)
         seen = [self._rasterize(own[i : i + _AT_ONCE], eye) for eye in eyes for i in range(0, len(own), _AT_ONCE)]
         colors, depths, alphas = seen[0] if len(seen) == 1 else map(torch.cat, zip(*seen))
         if self._held is not None:
@@ -161,11 +159,12 @@ class Pictures:
         else:
             marks = (alphas > SURFACE).to(torch.uint8)
         if self._model.light is not None:
-            cameras = [self.camera.at(view.poses[eye]) for eye in eyes for view in views]
+            cameras = [self.camera.at(pose) for eye in eyes for pose in self._poses[eye, own]]
             colors = torch.stack([shade(self._model.light, *picture) for picture in zip(colors, depths, alphas, cameras)])
         if self._by.light:
-            factors = [(view.light[0] * (1 - view.light[1] * self._outward / 2)).astype(np.float32) for view in views]
-            colors = colors * upload(self._device, np.array(factors * len(eyes)))[0]
+            brightness, darker = self._light[own].T[..., None, None, None]
+            factors = (brightness * (1 - darker * self._outward / 2)).astype(np.float32)
+            colors = colors * upload(self._device, np.concatenate([factors] * len(eyes)))[0]
         images, *rest = download(to_bytes(colors), *([marks[: len(own), ..., None]] if labels else []))
         found: dict[str, np.ndarray] = dict(zip((IMAGE, IMAGE_RIGHT), np.split(images, len(eyes))))
         if labels:
@@ -210,18 +209,17 @@ class Pictures:
 
     def _colors(self, rows: slice, eye: int, model: GaussianModel, skinning: Skinning, sh: Tensor, means: Tensor) -> Tensor:
         """Colours of all these episodes [N, K, 3], or of each [b, N, K, 3], as `rasterize` takes them."""
-        views = self._views[rows]
+        poses = self._poses[eye, rows]
         if model.reflects or model.sh_degree:
             F = torch.where(self._pinned, torch.eye(3, device=sh.device), self._tissue.F[rows])  # as on control_nodes
         if model.reflects:
-            positions = [view.poses[eye][:3, 3] for view in views]
-            sh = seen_colors(model, skinning.cosines(F, means, positions), sh)
+            sh = seen_colors(model, skinning.cosines(F, means, list(poses[:, :3, 3])), sh)
         elif model.sh_degree:
-            own = sh.expand(len(views), *sh.shape[-3:])
-            each = zip(own, means, F, (self.camera.at(view.poses[eye]) for view in views))
+            own = sh.expand(len(poses), *sh.shape[-3:])
+            each = zip(own, means, F, map(self.camera.at, poses))
             sh = torch.stack([turned_colors(own, skinning, means, F, camera) for own, means, F, camera in each])
         if self._by.texture:
-            sh = sh * sh.new_tensor([view.contrast for view in views])[:, None, None, None]
+            sh = sh * sh.new_tensor(self._contrast[rows])[:, None, None, None]
         return sh
 
     def _draw_tools(self, held: HeldTools, own: np.ndarray, eyes: int, pictures: tuple[Tensor, Tensor, Tensor]) -> Tensor:
@@ -231,7 +229,7 @@ class Pictures:
         lens = np.tile(self._lens, (len(lamps), 1))
         surfaces = None
         if self._by.metal:
-            factors = np.stack([self._views[b].metal for b in own] * eyes)  # [E b, 2]: of all but the roughness, and of that
+            factors = np.tile(self._metal[own], (eyes, 1))  # [E b, 2]: of all but the roughness, and of that
             surfaces = self._surfaces * factors[:, None, [0, 0, 0, 1, 0]]
             surfaces[..., 3] = surfaces[..., 3].clip(*_ROUGHNESS)
         labels = torch.empty_like(pictures[2], dtype=torch.uint8)
@@ -252,36 +250,6 @@ class Pictures:
             for whole, part in zip(pictures, parts):
                 whole[chosen] = part
         return labels
-
-    def _view(self, variation: Variation | None) -> _View:
-        """How an episode is seen; without a variation as the scene is."""
-        pose, lamp = self.camera.pose, self._lamp
-        view = _View((pose,))
-        if variation is not None:
-            by = self._by
-            view.moved = variation.camera if by.camera_position or by.camera_angle else None
-            view.light = tuple(variation.light.tolist()) if by.light else view.light
-            view.contrast, lamp = variation.texture, lamp + np.append(variation.lamp, 0.0)
-            view.metal = variation.metal
-        view.poses = self._eyes(pose, view.moved)
-        view.lamp, view.lamps = lamp, self._lamps_of(view.poses, lamp)
-        return view
-
-    @staticmethod
-    def _lamps_of(poses: tuple[np.ndarray, ...], lamp: np.ndarray) -> np.ndarray:
-        """Where a lamp [4] of the left eye is in the camera of each [E, 3], m."""
-        shining = poses[0] @ lamp
-        return np.stack([(invert_pose(pose) @ shining)[:3] for pose in poses])
-
-    def _eyes(self, pose: np.ndarray, moved: np.ndarray | None) -> tuple[np.ndarray, ...]:
-        """Poses of the eyes of an endoscope at a pose [4, 4] that it departs from, as `Variation.camera` has it."""
-        camera = self.camera.at(pose)
-        if moved is not None:
-            pose = pose.copy()
-            pose[:3, 3] += moved[:3, 3]
-            pose[:3, :3] = pose[:3, :3] @ moved[:3, :3]
-            camera = camera.at(pose)
-        return (camera.pose,) if self._sight.eyes == 1 else (camera.pose, camera.beside(self._sight.baseline).pose)
 
 
 def _labels(drawing: InstrumentDrawing, things: tuple[str, ...]) -> np.ndarray:

@@ -97,6 +97,7 @@ class TaskBatch:
         self._works = not kind.turns or self._moves or bool(self._links)  # else nothing touches the tissue
         self._rest = torch.from_numpy(nodes.rest)
         self._resting, self._placed = True, False  # of a single tissue
+        self._observed = False  # since it moved last: tasks follow the tissue where they observe it
         self.sight = sight
         self.tools = HeldTools(held, kind, count) if held else None
         self.pictures: Pictures | None = None
@@ -109,7 +110,7 @@ class TaskBatch:
 
     def reset(self, episodes: Sequence[int], generators: Sequence[np.random.Generator]) -> None:
         """Begin these episodes anew, each by the chance of its generator."""
-        variations = []
+        variations, self._observed = [], False
         for b, rng in zip(episodes, generators):
             self.task.reset(b, rng)
             variation = Variation.draw(self.randomisation, rng)
@@ -248,7 +249,7 @@ class TaskBatch:
         for b in range(self.count if self.task.cutting else 0):
             self.task.hear_cuts(b, self.tissue.cuts(b).astype(np.float32))
         forces = self.tissue.tools.reaction_forces.cpu().numpy().reshape(self.task.force.shape)
-        state = self.task.observe(positions, forces)
+        state, self._observed = self.task.observe(positions, forces), True
         return state if self.actions == "cartesian" or self.tools is None else self.tools.observe(state)
 
     def arm_state(self) -> np.ndarray:
@@ -263,4 +264,6 @@ class TaskBatch:
         """
         if self.pictures is None:
             raise ValueError("this batch was made without images; make it with images=True")
+        if not self._observed:
+            self.state()
         return self.pictures.draw()[IMAGE]

@@ -110,6 +110,8 @@ class PhysicsNodeConfig(WorldConfig):
     arm_models: tuple[str, ...] = ("PSM",)
     """Kind of each arm in the order of arms, or one for all: PSM, PSM_Si, or the path of a kinematic file of the dVRK. PSM for all
     makes the ECM an ECM."""
+    tell_empty_jaws: bool = True
+    """An error says that a jaw closed on no tissue; false where jaws also take what physics knows nothing of, such as a needle."""
     link_contact: bool = True
     """Let the links of instruments touch the tissue: shaft, wrist and jaws push, and closed jaws hold what lies between them, by friction.
     Off, and for arms without an instrument or a place: the tip alone acts, with contact_radius as a rod; the tip of an instrument is

@@ -44,7 +44,8 @@ def apply_tools(
         links = arm.links() if isinstance(arm, JointedArm) and simulation.has_instrument(name) else {}
         if not simulation.set_grasp(name, arm.pose, arm.closed, links or None):
             reach = "no movable tissue lies between the jaws" if links else out_of_reach
-            report(f"{name}: the jaw closed on nothing {where}; {reach}")
+            if options.tell_empty_jaws:
+                report(f"{name}: the jaw closed on nothing {where}; {reach}")
             arm.closed = False
         try:
             simulation.set_cut(name, arm.pose, arm.cutting)

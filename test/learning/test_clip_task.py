@@ -146,6 +146,15 @@ def test_a_fifth_number_turns_the_tip_about_the_line_of_sight():
     assert task.twisted.tolist() == [task.most_twist, -task.most_twist]
 
 
+def test_the_first_picture_of_an_episode_is_the_same_before_its_first_observation():
+    batch = TaskBatch("clip", load_scene(), 2, images=True, device="cpu")
+    for seed in (0, 2):
+        batch.reset(range(2), [np.random.default_rng(seed + b) for b in range(2)])
+        first = batch.images()
+        batch.observe()
+        np.testing.assert_array_equal(first, batch.images())
+
+
 def test_episodes_do_not_depend_on_how_many_there_are():
     seen = []
     for own in ([0, 1, 2], [1]):
@@ -181,7 +190,7 @@ def test_what_is_seen_is_where_it_is_in_both_eyes():
     marks = task.origin + task._to_world(task.vessels.rings[:, 0, len(RINGS) // 2 - 1 : len(RINGS) // 2 + 1].mean(1))
     for eye, name in enumerate(("image", "image_right")):
         for b in range(3):
-            column, row = to_pixels(marks[b : b + 1], pictures._views[b].poses[eye])[0].astype(int)
+            column, row = to_pixels(marks[b : b + 1], pictures._poses[eye, b])[0].astype(int)
             around = seen[name][b, row - 1 : row + 2, column - 1 : column + 2].reshape(-1, 3).astype(int)
             blue = around[:, 2] > around[:, 0] + 40
             assert blue.any(), (name, b)
@@ -191,7 +200,7 @@ def test_what_is_seen_is_where_it_is_in_both_eyes():
         for label, vessels in ((VESSEL, [0]), (OTHERS, [1, 2])):
             rings = task.vessels.rings[b, [v for v in vessels if task.vessels.rest[b, v, 0, 2] < 0.5]]
             places = task.origin[b] + rings.reshape(-1, 3) @ task.axes[b]
-            at, shown = to_pixels(places, pictures._views[b].poses[0]), np.argwhere(labels == label)[:, ::-1] + 0.5
+            at, shown = to_pixels(places, pictures.poses[b]), np.argwhere(labels == label)[:, ::-1] + 0.5
             assert len(shown) > 50 and np.linalg.norm(shown[:, None] - at, axis=2).min(1).max() < 9
         clips += (labels == CLIP).any()
     assert task._clipped.all() and clips == 3 and Clip.dyed_spots(task, 0) == ()

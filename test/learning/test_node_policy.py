@@ -80,3 +80,9 @@ def test_a_node_that_is_not_there_is_awaited_and_named(monkeypatch):
             node_policy.NodePolicy("nobody", "retraction", patience=0.5)
     finally:
         rclpy.try_shutdown()
+
+
+@pytest.mark.parametrize("name", ["", "/", "my lifter", "3d"])
+def test_a_name_that_no_node_has_is_refused_at_once(name):
+    with pytest.raises(ValueError, match=f"node:{name} names no ROS node; give letters, digits and _ after the colon"):
+        node_policy.NodePolicy(name, "retraction")

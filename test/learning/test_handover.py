@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from endo_sim_ros.learning.config import SightConfig
 from endo_sim_ros.learning.policies import scripted_policy
@@ -84,6 +85,33 @@ def test_it_is_given_while_both_hold_it_and_a_pull_of_the_second_arm_loses_it(ta
     np.testing.assert_allclose(task.needle - place, np.tile([-0.004, 0, 0], (4, 1)), atol=1e-12)
     dropped = put(task, [first + up, second + up], [False, False])
     assert not dropped["given"].any() and not dropped["height"].any()
+
+
+def test_it_turns_with_the_jaws_that_lead_and_keeps_the_direction_in_which_it_falls(task):
+    (first, second), up = marks(task), np.array([0, 0, 0.012])
+    put(task, [first, second], [True, False])
+    put(task, [first + up, second + up], [True, False])
+    before, turn = task.turned.copy(), Rotation.from_rotvec([0.3, -0.2, 0.4]).as_matrix()
+    turn_of = lambda matrix: task.axes @ matrix @ task.axes.transpose(0, 2, 1)  # world to task frame
+    task.rotations = task.rotations.copy()
+    task.rotations[:, 1] = turn  # that of PSM2 holds nothing
+    observe(task)
+    np.testing.assert_allclose(task.turned, before, atol=1e-12)
+    task.rotations[:, 0] = turn
+    seen = observe(task)
+    np.testing.assert_allclose(task.turned, turn_of(turn) @ before, atol=1e-12)
+    np.testing.assert_allclose(marks(task)[0], first + up, atol=1e-12)  # the jaw still holds the same place
+    assert (norm(marks(task)[1] - second - up) > 0.003).all() and seen["PSM1.holds"].all()
+    first, second = marks(task)
+    put(task, [first, second], [True, True])
+    put(task, [first, second], [False, True])
+    task.rotations[:, 1] = np.eye(3)
+    observe(task)
+    np.testing.assert_allclose(task.turned, before, atol=1e-12)
+    np.testing.assert_allclose(marks(task)[1], second, atol=1e-12)
+    put(task, [first, second], [False, False])
+    np.testing.assert_allclose(task.turned, before, atol=1e-12)
+    np.testing.assert_allclose(task.thing_poses()["needle"][:, :3, :3], task.axes.transpose(0, 2, 1) @ before, atol=1e-12)
 
 
 def test_a_needle_that_psm1_has_not_lifted_is_not_given(task):

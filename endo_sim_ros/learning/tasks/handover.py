@@ -17,7 +17,7 @@ _SECTIONS, _AROUND = 32, 8  # of the tube that the needle is
 class Handover(Task):
     """Pick up a needle that lies on the skin with PSM1, and give it to PSM2.
 
-    The needle is rigid. A jaw that closes on it holds it, and it follows the tip in its direction; of two that hold it the first
+    The needle is rigid. A jaw that closes on it holds it, and it moves and turns with the tip; of two that hold it the first
     one leads, and the other loses it where it is pulled away by more than `tolerance`. Without a jaw that holds it it falls onto the skin,
     which it does not deform. The episode is solved when PSM2 alone has held it for `hold` steps, `lift` above where it would lie,
     and PSM1 has given it. The fourth action of each arm closes its jaw where above zero.
@@ -78,7 +78,8 @@ class Handover(Task):
         self._over = np.zeros((count, len(self.skin), 3))  # the skin at rest, m, task frame
         self.needle, self.turned = np.zeros((count, 3)), np.tile(np.eye(3), (count, 1, 1))  # its pose, m, task frame
         self.holds = np.zeros((count, 2), bool)
-        self._lead, self._offset = np.zeros(count, int), np.zeros((count, 3))  # the arm that it follows, and from whose tip it is so far, m
+        self._lead = np.zeros(count, int)  # the arm that it follows
+        self._grip = np.zeros((count, 3, 4))  # its axes, and where it is from the tip of that arm, m, in the axes of that tip
         self._height = np.zeros(count)  # above where it would lie, m
         self._ways = np.zeros((count, 2, 3))  # from the tips to the marks, m, task frame
         self._given = np.zeros(count, bool)  # since it lay on the skin both arms have held it, PSM1 having lifted it
@@ -118,19 +119,21 @@ class Handover(Task):
 
     def _columns(self, here: np.ndarray) -> list[np.ndarray]:
         everyone = np.arange(self.count)
+        hands = dot(self.axes[:, None, :, None], self.rotations.swapaxes(2, 3)[:, :, None])  # axes of the tips [B, 2, 3, 3], task frame
         self.holds &= self.fourth > 0
         passed = np.flatnonzero(~self.holds[everyone, self._lead] & self.holds.any(1))
         self._lead[passed] = 1 - self._lead[passed]
-        leading = self.tip[everyone, self._lead]
-        self._offset[passed] = (self.needle - leading)[passed]
-        self.needle = np.where(self.holds.any(1, keepdims=True), leading + self._offset, self.needle)
+        self._take(passed, hands)
+        held, carried = self.holds.any(1), _product(hands[everyone, self._lead], self._grip)
+        self.turned = np.where(held[:, None, None], carried[..., :3], self.turned)
+        self.needle = np.where(held[:, None], self.tip[everyone, self._lead] + carried[..., 3], self.needle)
         off = norm(self._places(everyone, self._line)[:, None] - self.tip[:, :, None]).min(2)
         self.holds &= (off <= self.tolerance) | np.equal(self._lead[:, None], [0, 1])
         free = ~self.holds.any(1)
         self.holds |= (self.raised == 1) & (off <= self.tolerance)
         taken = np.flatnonzero(free & self.holds.any(1))
         self._lead[taken] = self.holds[taken].argmax(1)
-        self._offset[taken] = self.needle[taken] - self.tip[taken, self._lead[taken]]
+        self._take(taken, hands)
         self._height = self._clearance(everyone)
         lies = ~self.holds.any(1)
         self.needle[:, 2] -= np.where(lies, self._height, 0.0)
@@ -141,6 +144,12 @@ class Handover(Task):
         lengths = np.concatenate([self._by_arm(v) for v in (self.tip, self._ways, norm(self._ways))], 1)
         jaws = np.where(self.fourth > 0, 1.0, -1.0)
         return [*(lengths / LENGTH).T, *jaws.T, *self.holds.T.astype(float), self._height / LENGTH, self._given.astype(float)]
+
+    def _take(self, own: np.ndarray, hands: np.ndarray) -> None:
+        """Let the needle follow the arm that leads in these episodes [e] from where it is; hands are the axes of the tips [B, 2, 3, 3]."""
+        lead = self._lead[own]
+        pose = np.concatenate([self.turned[own], (self.needle[own] - self.tip[own, lead])[..., None]], 2)
+        self._grip[own] = _product(hands[own, lead].swapaxes(1, 2), pose)
 
     def _value(self) -> np.ndarray:
         right, left = norm(self._ways).T
@@ -165,6 +174,11 @@ class Handover(Task):
         poses[:, :3, :3] = self.axes.transpose(0, 2, 1) @ self.turned
         poses[:, :3, 3] = self.origin + self._to_world(self.needle)
         return {NEEDLE: poses}
+
+
+def _product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Products [B, 3, n] of matrices [B, 3, 3] and [B, 3, n], each sum in one order."""
+    return dot(first[:, :, None], second.swapaxes(1, 2)[:, None])
 
 
 class HandoverScript(Script):

@@ -84,6 +84,31 @@ def test_a_clip_that_does_not_belong_where_it_is_loses(task, wrong):
     assert outcome.terminated.all() and not outcome.success.any()
 
 
+def test_closing_where_it_belongs_gains_and_elsewhere_costs_and_then_the_goal_is_away(task):
+    put(task, aside=-0.012)
+    task.judge()
+    step(task, True)
+    np.testing.assert_allclose(task.judge().reward, -0.5, atol=1e-9)
+    put(task)
+    task.judge()
+    step(task, False)
+    np.testing.assert_allclose(task.judge().reward, 0, atol=1e-9)  # to stay there, open
+    gains = []
+    for _ in range(task.latch):
+        seen = step(task, True)
+        gains.append(task.judge().reward)
+    assert (gains[0] > 1).all() and (np.array(gains) > 0.1).all() and seen["clipped"].all()
+    along, left = task._frame[:, :, 2], task.beyond * task.leave
+    np.testing.assert_allclose(task._way, -left * along, atol=1e-9)
+    np.testing.assert_allclose(seen["distance"], left / 0.02, rtol=1e-5)
+    step(task, False, 0.5 * task._way)
+    outcome = task.judge()
+    np.testing.assert_allclose(outcome.reward, 2 * 0.5 * task.beyond, atol=1e-6)
+    assert not outcome.success.any()
+    step(task, False, task._way)
+    assert task.judge().success.all()
+
+
 def test_jaws_that_close_for_less_time_leave_nothing(task):
     put(task)
     for _ in range(task.latch - 1):

@@ -36,8 +36,8 @@ class Clip(Task):
     There are two or three vessels. The one with the blue ring is to be clipped there. When the jaws have been closed for `latch` steps
     the clip has locked, and cannot be taken off: the episode is lost unless the vessel lies between its legs as a whole, within `along`
     of the mark, and square to them within `square`. It is lost as well when a jaw touches another vessel, or presses into the marked one
-    by half its radius. It is solved when the clip is on and the jaws, open again, are `leave` away. The fourth action closes the jaws
-    where above zero; the fifth turns them.
+    by half its radius. It is solved when the clip is on and the jaws, open again, are `leave` away. The goal that is observed is where the
+    jaws are to close, and then where they are to go. The fourth action closes the jaws where above zero; the fifth turns them.
     """
 
     name = "clip"
@@ -62,6 +62,8 @@ class Clip(Task):
     free = 0.004, 0.0055  # m of room between the skin and a vessel that bridges it
     along, square = 0.0025, np.radians(20.0)  # polymer clips fail more often where they are not at 90° to the vessel
     latch, leave = 5, 0.025  # steps, m
+    beyond = 1.2  # of `leave`: where the jaws are to go from the clip
+    nearly = 0.003  # m from where the jaws are to close: within about this being exact is rewarded
 
     @staticmethod
     def physics(device: str = "auto") -> PhysicsConfig:
@@ -130,7 +132,7 @@ class Clip(Task):
         self._left = float(np.sign(self._jaws(self.open_jaw)[0][0, 1, 1]))  # on which side of the middle the left jaw is
         self._sites_at = np.zeros((count, self.site_count, 3))  # at rest, m, task frame
         self._frame = np.tile(np.eye(3), (count, 1, 1))  # axes of the jaws in columns, task frame
-        self._hinge, self._way = np.zeros((count, 3)), np.zeros((count, 3))  # of the jaws; from where the mark is to be in them to it, m
+        self._hinge, self._way = np.zeros((count, 3)), np.zeros((count, 3))  # of the jaws, and from there to where it is to be, m
         self._sense = np.ones(count)  # whether the hinge of the jaws is to point along the vessel or against it
         self._misaligned, self._fits = np.zeros(count), np.zeros(count, bool)
         self._caught, self._clipped, self._lost = np.zeros(count, bool), np.zeros(count, bool), np.zeros(count, bool)
@@ -248,7 +250,9 @@ class Clip(Task):
         pierced = ~closed & ~self._clipped & (away[:, 0] < -0.5 * radius)
         others = away[:, 1:].min(1)
         self._lost |= (ends & ~on) | pierced | (others < 0)
-        self._away = norm(self._hinge - self._place_at(self._at) - self._off)
+        out = self._place_at(self._at) + self._off - self._hinge
+        self._away = norm(out)
+        self._way = np.where(self._clipped[:, None], out - self.beyond * self.leave * self._held[:, :, 2], self._way)
         lengths = np.column_stack([self.tip, self._way, norm(self._way)]) / LENGTH
         state = [self._fits.astype(float), np.where(closed, 1.0, -1.0), self._clipped.astype(float), self._clipped * self._away / LENGTH]
         return [*lengths.T, *along.T, self._misaligned, radius / LENGTH, np.minimum(others / LENGTH, 1.0), *state]
@@ -281,11 +285,13 @@ class Clip(Task):
         return start + share[:, None] * (end - start)
 
     def _value(self) -> np.ndarray:
-        # Before the clip −1 for each 2 cm from where it belongs, −½ for each radian that the jaws are to turn, ½ where they may close, and
-        # ½ for closing there; after it 2, and 1 for leaving it. −1 for losing.
-        closing = self._caught * np.minimum(self.raised / self.latch, 1.0)
-        before = 0.5 * self._fits + 0.5 * closing - norm(self._way) / LENGTH - 0.5 * np.abs(self._misaligned)
-        return np.where(self._clipped, 2 + np.minimum(self._away / self.leave, 1.0), before) - self._lost
+        # Before the clip −1 for each 2 cm from where it belongs, up to 1 for being nearly there, and −½ for each radian that the jaws are
+        # to turn. To close is worth 1 there, and 1 more until the clip locks; elsewhere it costs ½. So open jaws gain nothing where they
+        # stay. After it 4, and 2 for leaving it. −1 for losing.
+        off, closed = norm(self._way), self.fourth > 0
+        closing = np.where(self._caught, 1 + np.minimum(self.raised / self.latch, 1.0), -0.5) * closed
+        before = closing + np.exp(-off / self.nearly) - off / LENGTH - 0.5 * np.abs(self._misaligned)
+        return np.where(self._clipped, 4 + 2 * np.minimum(self._away / self.leave, 1.0), before) - self._lost
 
     def _judge_goal(self) -> np.ndarray:
         return self._clipped & ~self._lost & (self.fourth <= 0) & (self._away >= self.leave)
@@ -337,7 +343,7 @@ class ClipScript(Script):
         back = np.clip(self.held_back * (off - self.near), 0.0, self.most_back)[:, None]
         clipped = o["clipped"] > 0
         close = ~clipped & (o["fits"] > 0) & ((o["jaw"] > 0) | (norm(way) < self.exact))
-        wish = np.where(clipped[:, None], -Clip.leave * along, np.where(close[:, None], way, beside + (ahead - back) * along))
+        wish = np.where((clipped | close)[:, None], way, beside + (ahead - back) * along)
         wish = wish / np.maximum(np.abs(wish).max(1, keepdims=True), Clip.step_length)
         turn = np.where(close | clipped, 0.0, np.clip(o["misaligned"] / Clip.twist, -1, 1))
         return np.concatenate([wish, np.where(close, 1.0, -1.0)[:, None], turn[:, None]], 1)

@@ -37,8 +37,9 @@ class ShownInstruments:
         self.undrawn: dict[str, str] = {}
         """Why arms are not drawn, in a sentence each, by their names."""
         self._tools: dict[str, tuple[list[Part], list[Capsule]]] = {}
+        self._thing_links: tuple[str, ...] = ()
         if thing is not None:
-            self._tools[THING], self._types[THING] = thing, THING
+            self._tools[THING], self._types[THING], self._thing_links = thing, THING, part_links(thing[0])
         self._links = {arm: EpisodeQueue[np.ndarray](MOST_WAITING if lockstep else 1) for arm in arms}
         self._background = Background()
         self._key: Any = None  # of what is drawn with
@@ -80,8 +81,9 @@ class ShownInstruments:
 
     def check_thing(self, poses: np.ndarray) -> None:
         """Raises MessageError if there are not as many poses [n, 4, 4] as the thing has links."""
-        if len(poses) != (expected := len(self._names(THING))):
-            raise MessageError(f"{messages.THING_POSES.name}: {len(poses)} poses for a thing of {expected} links; publish its own")
+        if len(poses) != len(self._thing_links):
+            text = f"{len(poses)} poses for a thing of {len(self._thing_links)} links; publish its own"
+            raise MessageError(f"{messages.THING_POSES.name}: {text}")
 
     def newest(self) -> dict[str, np.ndarray]:
         """Where the links [5, 4, 4] of each arm are that has said so."""
@@ -146,7 +148,7 @@ class ShownInstruments:
 
     def _names(self, owner: str) -> Sequence[str]:
         """Names of the links of an arm, or of the thing."""
-        return LINKS if owner != THING else part_links(self._tools[THING][0])
+        return LINKS if owner != THING else self._thing_links
 
     def labels(self, instruments: PosedInstruments | None, found: np.ndarray) -> np.ndarray:
         """Labels [H, W] of a picture as they are published: those of an arm and link are the same whoever else is drawn."""

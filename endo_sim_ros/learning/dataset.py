@@ -104,7 +104,7 @@ class DatasetWriter:
         for key in self._pictures:
             height, width, _ = features[key]["shape"]
             if features[key]["dtype"] == "video" and (height % 2 or width % 2):
-                raise SequenceError(f"{width}×{height} images make no video, which needs even sides; take another width or png")
+                raise SequenceError(f"{width}×{height} images make no video, which needs even sides; choose --images png, or another width")
         self._rows: list[dict[str, Any]] = []
         self._columns: list[dict[str, np.ndarray]] = []
         self._histograms: list[dict[str, np.ndarray]] = []

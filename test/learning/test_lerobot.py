@@ -192,7 +192,7 @@ def test_odd_images_make_no_video(tmp_path):
             stamp = BEGIN + STEP * number
             message = messages.encode_image(picture(number)[:, 1:], stamp, "camera", recording.types)
             recording.write([(messages.RENDERED_IMAGE, message)])
-    with pytest.raises(SequenceError, match="95×80 images make no video, which needs even sides; take another width or png"):
+    with pytest.raises(SequenceError, match="95×80 images make no video, which needs even sides; choose --images png, or another width"):
         export_lerobot([tmp_path / "bag"], tmp_path / "out", "t")
     assert export_lerobot([tmp_path / "bag"], tmp_path / "out", "t", images="png") == (1, 3)
 

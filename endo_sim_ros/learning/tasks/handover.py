@@ -124,7 +124,7 @@ class Handover(Task):
         passed = np.flatnonzero(~self.holds[everyone, self._lead] & self.holds.any(1))
         self._lead[passed] = 1 - self._lead[passed]
         self._take(passed, hands)
-        held, carried = self.holds.any(1), _product(hands[everyone, self._lead], self._grip)
+        held, carried = self.holds[:, 0] | self.holds[:, 1], _product(hands[everyone, self._lead], self._grip)
         self.turned = np.where(held[:, None, None], carried[..., :3], self.turned)
         self.needle = np.where(held[:, None], self.tip[everyone, self._lead] + carried[..., 3], self.needle)
         off = norm(self._places(everyone, self._line)[:, None] - self.tip[:, :, None]).min(2)

@@ -97,6 +97,8 @@ class BenchIdentification(Measured):
 
     cases: int = 4
     """Cases of one modulus with each of six truths; 0 = none."""
+    truth: str = ""
+    """Cases are of those truths alone whose names have this in them, such as corrected; default: of all."""
     inclusions: int = 1
     """Inclusions to be found in maps; 0 = none."""
     radius: float = 0.008
@@ -107,6 +109,12 @@ class BenchIdentification(Measured):
     """Episodes of the task palpation, with presses where the next is expected to tell most, and by the script of the task; 0 = none."""
     noises: int = 1
     """Cases of one modulus with each of seven noises of forces and tips; 0 = none."""
+    fields: int = 1
+    """Maps of tissue with an inclusion, with two, and with a gradient, whose intervals are compared with the truth; 0 = none."""
+    nodes: int = 1000
+    """Control nodes of the tissue with inclusions and of these maps."""
+    layers: int = 3
+    """Layers of it below the skin."""
     folder: Path | None = None
     """Folder of presses of real tissue, as `presses` takes it; default: none."""
 

@@ -31,7 +31,8 @@ class IdentificationConfig(StageConfig):
     level: Annotated[float, Range(0.5, 0.999)] = 0.9
     """Probability that an interval holds the truth."""
     known: Annotated[float, Range(0.1, 0.999)] = 0.75
-    """Share of the variance before any data that the data must take away for an unknown to count as known: 0.75 halves the interval."""
+    """Share of the variance before any data that the data must take away for an unknown to count as known: 0.75 halves the interval. Of a
+    place in a field it is that of `field_spread`, as what is known of the whole is not known of a place."""
     tip_offset: Annotated[float, Range(0.0, 0.02, "m")] = 0.0005
     """Standard deviation of a coordinate of the error that all tips share, of the registration of the tool; the errors of single tips,
     which are independent, are the `tip_noise` of the experiment."""
@@ -47,6 +48,10 @@ class IdentificationConfig(StageConfig):
     grid_error: Annotated[float, Range(0.0, 2.0)] = 0.5
     """Where finer control nodes correct forces: standard deviation of the share of this correction that is still missing, or too much.
     Errors that fall with the distance between nodes leave as much as the correction where it is halved."""
+    smooth_error: Annotated[float, Range(0.0, 2.0)] = 0.6
+    """Standard deviation of the share by which a place of a field may differ more, or less, from the whole than was found, in logarithms:
+    edges of what is stiff contradict a smooth field, and forces hardly grow with what is much stiffer. With 0.6 intervals of 90 %
+    reach from none of that to twice as much."""
     iterations: Annotated[int, Range(1, 100)] = 12
     """Most iterations of Levenberg and Marquardt's method."""
     tolerance: Annotated[float, Range(1e-4, 1.0)] = 0.2

@@ -18,10 +18,10 @@ from endo_sim_ros.identification.checks import IdentificationError, check_input,
 from endo_sim_ros.identification.config import IdentificationConfig
 from endo_sim_ros.identification.experiment import Experiment
 from endo_sim_ros.identification.forward import ForwardModel, distances_to_skin, reach_of
-from endo_sim_ros.identification.maps import paint_as_regions
+from endo_sim_ros.identification.maps import different_places, paint_as_regions
 from endo_sim_ros.identification.observations import Covariance, Observations
 from endo_sim_ros.identification.scan import Places, Scan, added, weights, without_ball
-from endo_sim_ros.identification.unknowns import MOST_LOG, Reported, Told, Unknowns
+from endo_sim_ros.identification.unknowns import MODULUS, MOST_LOG, Reported, Told, Unknowns
 from endo_sim_ros.physics import ControlNodes, PhysicsConfig
 
 NUISANCES = 5
@@ -68,7 +68,7 @@ class Identification:
         low: Lower end of its interval [M].
         high: Upper end [M].
         known: Whether it is known [M], bool.
-        removed: Share of its variance that the data took away [M].
+        removed: Share of its variance that the data took away [M]; of a field, of the variance that places have beside the whole.
         mean: Of the unknowns and the five others [P + 5], standard normal before any data.
         covariance: Of these [P + 4, P + 5].
         parameters: What the numbers mean.
@@ -108,6 +108,11 @@ class Identification:
     def tip_offset(self) -> np.ndarray:
         """How far the tool stands from where it is said to [3], m, world."""
         return self.mean[-NUISANCES : 3 - NUISANCES] * self.parameters.config.tip_offset
+
+    @property
+    def any_known(self) -> bool:
+        """Whether any modulus is known, of a place or of the whole; else only ratios are."""
+        return bool(self.known.any()) or any(each.name.startswith(MODULUS) and each.told == "known" for each in self.unknowns)
 
     def regions(self, step: float = 0.2, most: int = 300) -> tuple[str, ...]:
         """The map as `regions` of physics, see `paint_as_regions`."""
@@ -215,7 +220,7 @@ def identify(
     unended = [] if ended else [f"the estimate had not settled after {config.iterations} iterations; allow more"]
     found = _conclude(point, data, model, unknowns, [*first.findings, *unended], start is not None and start.felt)
     if unknowns.ball is None:
-        return found
+        return replace(found, findings=[*different_places(found), *found.findings]) if len(unknowns.centres) else found
     x, y, z = unknowns.ball.shape(found.mean[1 : 1 + BALL])[0]
     there = f"the middle of the inclusion is at {x:.4f} {y:.4f} {z:.4f} m"
     if sure is not None:
@@ -377,7 +382,10 @@ def _conclude(
     middle = np.log(unknowns.base) + np.clip(logs, -MOST_LOG, MOST_LOG)
     prior = (matrix**2).sum(1) + unknowns.residual
     left = np.einsum("mi,ij,mj->m", matrix, covariance, matrix) + unknowns.residual
-    spread, removed = quantile * np.sqrt(left), 1 - left / prior
+    if len(unknowns.centres):
+        prior -= config.spread**2
+        left += (config.smooth_error * unknowns.beside(point.theta[: unknowns.count])) ** 2
+    spread, removed = quantile * np.sqrt(left), np.maximum(1 - left / prior, 0)
     findings = [*findings, *doubts]
     unsure = [each.name for each in told if each.told == "not told by these data"]
     if unsure:

@@ -12,6 +12,7 @@ from endo_sim_ros.identification.config import IdentificationConfig
 from endo_sim_ros.identification.estimate import Identification, identify
 from endo_sim_ros.identification.forward import finer_physics
 from endo_sim_ros.identification.from_bag import read_experiments
+from endo_sim_ros.identification.maps import seen_from
 from endo_sim_ros.identification.recording_config import RecordingConfig
 from endo_sim_ros.identification.results import save_results
 from endo_sim_ros.learning.scenes import load_scene
@@ -57,6 +58,7 @@ def identify_bag(
 
         finer = scene.nodes(finer_physics(physics, recording.finer)) if recording.finer > 1 else None
         found = identify(recorded.experiments, nodes, physics, config, physics.device, on_progress, finer=finer)
+        recorded.findings.extend(seen_from(found, scene.camera))
         if recorded.forces and not recorded.simulated and finer is None:
             recorded.findings.append(_COARSE)
         bar.update(task, description="drawing the map", completed=0, total=None)

@@ -6,12 +6,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial import KDTree
 
+from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.identification.ball import COUNT as BALL
 from endo_sim_ros.physics import ControlNodes
 
 if TYPE_CHECKING:
     from endo_sim_ros.identification.estimate import Identification
 
+_AGREED = 0.5  # probability from which on a place is told
+_ALIKE = np.log(1.5)  # of ratios: what differs by less is as all tissue does
 _BEYOND = 0.5  # spacings by which the box of all tissue is larger than the control nodes
 
 
@@ -66,13 +69,13 @@ def _spheres(rest: np.ndarray, levels: np.ndarray, spacing: float, most: int) ->
 
 @dataclass(frozen=True)
 class Inclusion:
-    """A place that is stiffer than what surrounds it.
+    """A place that is stiffer, or softer, than what surrounds it.
 
     Args:
         centre: Where its middle is [3], m, world.
         deviation: Standard deviation of its coordinates [3], m, if the stiffest place is this one.
         sure: Probability that it is: share of draws from the posterior whose stiffest place is within two lengths of the field of it.
-        ratio: Of its greatest modulus to that of the tissue around; median.
+        ratio: Of its greatest modulus, or least, to that of the tissue around; median.
         low: Lower end of the interval of that.
         high: Upper end.
         radius: Of a ball as large as what is more than half as stiff, in logarithms, m.
@@ -87,15 +90,17 @@ class Inclusion:
     radius: float
 
 
-def find_inclusion(found: "Identification", samples: int = 200, seed: int = 0) -> Inclusion:
+def find_inclusion(found: "Identification", samples: int = 200, seed: int = 0, softer: bool = False) -> Inclusion:
     """The stiffest place of an estimated field, and how well it is known: by draws of fields from the posterior.
 
-    Of each field the middle of what exceeds half of its greatest excess over the median, in logarithms, near where that is.
+    Of each field the middle of what exceeds half of its greatest excess over the median, in logarithms, near where that is. How great the
+    excess is is uncertain by `smooth_error` as well.
 
     Args:
         found: The estimate, of a field.
         samples: Draws.
         seed: Of these.
+        softer: The softest place of a field instead.
 
     Raises:
         ValueError: If no field was estimated.
@@ -116,21 +121,61 @@ def find_inclusion(found: "Identification", samples: int = 200, seed: int = 0) -
     within = ~unknowns.nodes.pinned & (unknowns.residual < 0.5 * unknowns.config.field_spread**2)
     rest, volumes = unknowns.nodes.rest[within].astype(np.float64), unknowns.nodes.volumes[within].astype(np.float64)
     logs = (np.log(unknowns.base) + np.concatenate([found.mean[fields][None], draws]) @ unknowns.matrix.T)[:, within]
-    length = 2 * unknowns.config.field_length
-    centres, ratios, radii = zip(*(_middle(each, rest, volumes, length) for each in logs))
+    length, sign = 2 * unknowns.config.field_length, -1 if softer else 1
+    centres, excesses, radii = zip(*(_middle(sign * each, rest, volumes, length) for each in logs))
+    share = 1 + unknowns.config.smooth_error * np.append(0, rng.standard_normal(samples))
+    ratios = np.exp(sign * np.maximum(share, 0) * excesses)
     off = np.array(centres[1:]) - centres[0]
     here = (off**2).sum(1) <= length**2
     tail = (1 - found.level) / 2
     low, high = np.quantile(np.array(ratios[1:])[here] if here.any() else ratios[1:], [tail, 1 - tail])
     deviation = np.sqrt((off[here] ** 2).mean(0)) if here.any() else np.full(3, np.inf)
-    return Inclusion(centres[0], deviation, float(here.mean()), ratios[0], float(low), float(high), radii[0])
+    return Inclusion(centres[0], deviation, float(here.mean()), float(ratios[0]), float(low), float(high), radii[0])
+
+
+def different_places(found: "Identification") -> list[str]:
+    """Where a field is stiffest and where it is softest, in a sentence each, what differs most first; places that draws from the posterior
+    do not agree on are left out."""
+    told: list[str] = []
+    skin = KDTree(found.nodes.rest[found.nodes.is_skin].astype(np.float64))
+    for name, place in _places(found):
+        (x, y, z), depth, off = place.centre, float(skin.query(place.centre)[0]), float(np.linalg.norm(place.deviation))
+        text = (
+            f"{name} is at {x:.4f} {y:.4f} {z:.4f} m, {1e3 * depth:.0f} mm below the skin, give or take {1e3 * off:.0f} mm, with a"
+            f" probability of {place.sure:.2f}; it is about {2e3 * place.radius:.0f} mm wide and {place.ratio:.3g} times as stiff as most"
+            f" tissue ({100 * found.level:.0f} %: {place.low:.3g} to {place.high:.3g})"
+        )
+        told.append(f"{text}; a smooth field draws such a place also beside one that differs more" if told else text)
+    return told
+
+
+def seen_from(found: "Identification", camera: Camera) -> list[str]:
+    """Where a camera sees these places, or the inclusion, in a sentence each."""
+    told = []
+    for name, place in _places(found):
+        x, y, z = camera.viewmat[:3] @ np.append(place.centre, 1.0)
+        across, along = f"{1e3 * abs(x):.0f} mm {'right' if x >= 0 else 'left'}", f"{1e3 * abs(y):.0f} mm {'down' if y >= 0 else 'up'}"
+        told.append(f"{name} is {across}, {along} and {1e3 * z:.0f} mm ahead of the camera of the picture")
+    return told
+
+
+def _places(found: "Identification") -> list[tuple[str, Inclusion]]:
+    """What is likely to be there and differs from most tissue, what differs most first."""
+    if found.parameters.ball is not None:
+        places = [("the middle of the inclusion", find_inclusion(found))]
+    elif len(found.parameters.centres):
+        places = [(f"the {('stiffest', 'softest')[softer]} place", find_inclusion(found, softer=softer)) for softer in (False, True)]
+    else:
+        places = []
+    likely = [each for each in places if each[1].sure >= _AGREED and abs(np.log(each[1].ratio)) >= _ALIKE]
+    return sorted(likely, key=lambda each: -abs(np.log(each[1].ratio)))
 
 
 def _middle(logs: np.ndarray, rest: np.ndarray, volumes: np.ndarray, length: float) -> tuple[np.ndarray, float, float]:
-    """Middle of the stiffest place [3], its ratio, and its radius."""
+    """Middle of the stiffest place [3], the logarithm of its ratio, and its radius."""
     excess = logs - np.median(logs)
     peak = int(np.argmax(excess))
     near = ((rest - rest[peak]) ** 2).sum(1) <= length**2
     weight = np.where(near, np.maximum(excess - excess[peak] / 2, 0), 0) * volumes
     volume = volumes[near & (excess > excess[peak] / 2)].sum()
-    return (weight[:, None] * rest).sum(0) / weight.sum(), float(np.exp(excess[peak])), float((0.75 * volume / np.pi) ** (1 / 3))
+    return (weight[:, None] * rest).sum(0) / weight.sum(), float(excess[peak]), float((0.75 * volume / np.pi) ** (1 / 3))

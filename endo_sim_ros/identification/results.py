@@ -30,7 +30,7 @@ def told(found: Identification, physics: PhysicsConfig) -> dict[str, Any]:
         physics: The tissue as far as it was known; its regions stay for what else they say.
     """
     options, middle = option_values(physics), float(np.median(found.young_modulus))
-    scale = 1.0 if found.known.any() else physics.young_modulus / middle
+    scale = 1.0 if found.any_known else physics.young_modulus / middle
     values: dict[str, Any] = {"young_modulus": _rounded(scale * middle)}
     varied = paint_as_regions(found.nodes, scale * found.young_modulus) if len(np.unique(found.young_modulus)) > 1 else ()
     values["regions"] = [text for text in (*physics.regions, *varied) if text] or [""]

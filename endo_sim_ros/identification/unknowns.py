@@ -184,6 +184,10 @@ class Unknowns:
         told = self.matrix @ z
         return told if self.ball is None else told + self.ball.logs(z[1 : 1 + BALL])
 
+    def beside(self, z: np.ndarray) -> np.ndarray:
+        """Of a field, logarithms of how many times as stiff as the whole each control node is [M]."""
+        return self.matrix[:, 1 : self.stiffness_count] @ z[1 : self.stiffness_count]
+
     def tangent(self, z: np.ndarray) -> np.ndarray:
         """Derivatives of `logs` [M, P]."""
         if self.ball is None:

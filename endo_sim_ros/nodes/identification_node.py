@@ -202,7 +202,7 @@ class IdentificationNode(EndoNode):
         for line in found.summary().splitlines():
             self.get_logger().info(line)
         if self._options.apply:
-            if found.known.any():
+            if found.any_known:
                 self._to_set = told(found, self.physics)
             else:
                 self.get_logger().warning("nothing is given to physics_node, as no modulus is known")

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from slab import FINER, NODES, PHYSICS, pressed
 
+from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.identification import IdentificationConfig, find_inclusion, identify
 from endo_sim_ros.identification.acquire import Search, expected_information
 from endo_sim_ros.identification.forward import ForwardModel
+from endo_sim_ros.identification.maps import seen_from
 from endo_sim_ros.identification.synthetic import measure
 from endo_sim_ros.physics.regions import TissueProperties, inside_sphere, paint_regions
 
@@ -115,20 +117,28 @@ AT = (-0.01, 0.0, 0.01)  # m
 
 
 def hidden(seed: int, radius: float, depth: tuple[float, float] = (0.004, 0.008)):
-    """Place of an inclusion below the nine presses of a raster, and what is felt of it."""
+    """Place of an inclusion below the nine presses of a raster, what is felt of it, and the true moduli."""
     rng = np.random.default_rng(seed)
     centre = np.array([*rng.uniform(-0.01, 0.01, 2), 0.1 + rng.uniform(*depth)])
     inside = inside_sphere(NODES.rest, centre, radius)
     factors, centre = np.where(inside, 8.0, 1.0), NODES.rest[inside].mean(0)  # as far as these nodes can tell
-    return centre, [measure(pressed(x, y, steps=16), NODES, PHYSICS, rng, factors) for x in AT for y in AT]
+    return centre, [measure(pressed(x, y, steps=16), NODES, PHYSICS, rng, factors) for x in AT for y in AT], 4e3 * factors
 
 
 def test_an_inclusion_is_found_in_a_map():
-    centre, experiments = hidden(0, 0.007)
+    centre, experiments, truth = hidden(0, 0.007)
     found = identify(experiments, NODES, PHYSICS, IdentificationConfig(stiffness="field", field_length=0.012), "cpu")
     inclusion = find_inclusion(found)
     # How deep it lies presses from above hardly tell.
     assert np.linalg.norm((inclusion.centre - centre)[:2]) < 0.004 and inclusion.ratio > 2 and inclusion.sure > 0.9
+    x, y, z = inclusion.centre
+    (said,) = [each for each in found.findings if each.startswith("the stiffest place")]
+    assert f"is at {x:.4f} {y:.4f} {z:.4f} m" in said and "times as stiff as most tissue" in said and inclusion.low < 8 < inclusion.high
+    assert seen_from(found, Camera(np.eye(3), 9, 9))[0].endswith(f"and {1e3 * z:.0f} mm ahead of the camera of the picture")
+    # What is called known holds the truth; how stiff the middle of the ball is forces hardly tell.
+    held, ball = (found.low <= truth) & (truth <= found.high), truth > 4e3
+    assert 0.05 < found.known.mean() < 0.5 and held[found.known].mean() > 0.8
+    assert held[ball].any() and not found.known[ball & ~NODES.is_skin].any()
     skin = NODES.is_skin & ~NODES.pinned
     assert found.removed[skin].mean() > found.removed[NODES.pinned & ~NODES.is_skin].mean()  # what is felt is known best
     painted = paint_regions(TissueProperties.uniform(len(NODES), 4e3, 0.3, 1000.0), NODES.rest, found.regions(step=0.2))
@@ -136,7 +146,7 @@ def test_an_inclusion_is_found_in_a_map():
 
 
 def test_an_inclusion_is_found_as_a_ball():
-    centre, experiments = hidden(1, 0.007)
+    centre, experiments, _ = hidden(1, 0.007)
     found = identify(experiments, NODES, PHYSICS, IdentificationConfig(stiffness="inclusion"), "cpu")
     inclusion = find_inclusion(found)
     off = inclusion.centre - centre
@@ -150,13 +160,15 @@ def test_an_inclusion_is_found_as_a_ball():
 def test_without_an_inclusion_none_is_sure():
     rng = np.random.default_rng(0)
     experiments = [measure(pressed(x, 0.0), NODES, PHYSICS, rng) for x in AT]
+    field = identify(experiments, NODES, PHYSICS, IdentificationConfig(stiffness="field", field_length=0.012), "cpu")
+    assert not any("place is at" in each for each in field.findings) and field.any_known
     assert find_inclusion(identify(experiments, NODES, PHYSICS, IdentificationConfig(stiffness="inclusion"), "cpu")).sure < 0.5
 
 
 def test_a_search_presses_where_it_learns_and_finds_what_it_looks_for():
     presses = [pressed(x, y, steps=16) for x in AT for y in AT]
     search = Search(presses, ForwardModel(NODES, PHYSICS, "cpu"))
-    centre, felt = hidden(1, 0.007)
+    centre, felt, _ = hidden(1, 0.007)
     assert search.probable[-1] == pytest.approx(0.5) and search.deviation > 0.01
     expected = search.expected()
     assert (expected > 0.1).all()

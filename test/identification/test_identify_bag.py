@@ -62,13 +62,13 @@ def test_regions_of_the_options_stay_and_ratios_alone_count_where_no_modulus_is_
     moduli = np.where(nodes.rest[:, 0] < -0.005, 60e3, 20e3)
     physics = PhysicsConfig(regions=("sphere 0 0 0.1 0.01 density=1100",), poisson_ratio=0.4)
     friction = SimpleNamespace(name="friction", estimate=0.123456789)
-    found = SimpleNamespace(nodes=nodes, young_modulus=moduli, known=np.ones(len(nodes), bool), unknowns=[friction])
+    found = SimpleNamespace(nodes=nodes, young_modulus=moduli, any_known=True, unknowns=[friction])
     values = results.parameters(found, physics)
     assert (values["young_modulus"], values["friction"], values["poisson_ratio"]) == (20e3, 0.123457, 0.4)
     assert values["regions"][0] == physics.regions[0]
     painted = paint_regions(TissueProperties.uniform(len(nodes), 1.0, 0.4, 1000), nodes.rest, values["regions"])
     np.testing.assert_allclose(painted.young_modulus, moduli, rtol=1e-4)
-    found.known = np.zeros(len(nodes), bool)
+    found.any_known = False
     values = results.parameters(found, physics)
     painted = paint_regions(TissueProperties.uniform(len(nodes), 1.0, 0.4, 1000), nodes.rest, values["regions"])
     assert values["young_modulus"] == 10e3

@@ -33,6 +33,8 @@ from endo_sim_ros.physics.regions import inside_sphere
 SOFTEST, STIFFEST = 1e3, 16e3  # Pa, of the truth: from fat to tense organs
 PRESSES = 3  # in a case of one modulus
 PATCH, DEPTH, RATIO = 0.016, 0.005, 8.0  # m, m: where inclusions lie, as in the task palpation; how much stiffer they are
+SOFT = 4.0  # how much softer than the rest a second one is
+FIELDS = ("an inclusion", "two inclusions", "a gradient")
 FOUND = 0.004  # m
 MOST_PRESSES, SEARCH_NODES = 12, 1000  # of a search, which simulates each press that could be done
 
@@ -74,6 +76,10 @@ def bench_identification(
     searches: int = 1,
     palpations: int = 1,
     noises: int = 1,
+    fields: int = 1,
+    truth: str = "",
+    nodes: int = 1000,
+    layers: int = 3,
     folder: Path | None = None,
 ) -> None:
     """Print, and if asked for write, how well truth is found.
@@ -87,21 +93,31 @@ def bench_identification(
         searches: For inclusions, with presses where they tell most, and in a raster.
         palpations: Episodes of the task palpation, with presses where they tell most, and by its script.
         noises: Cases of one modulus with each noise of forces and tips.
+        fields: Maps of tissue with an inclusion, with two, and that stiffens from one side to the other.
+        truth: Cases are of truths alone whose names have this in them.
+        nodes: Control nodes of inclusions and fields.
+        layers: Of these, below the skin.
         folder: Of presses of lungs, as `endo-sim bench presses` takes it.
 
     Raises:
         ValueError: If a number is not positive, or the folder has no presses.
     """
-    if min(cases, inclusions, searches, palpations, noises) < 0 or not radius > 0:
-        raise ValueError("cases, inclusions, searches, palpations and noises must be 0 or more, and the radius above 0")
+    if min(cases, inclusions, searches, palpations, noises, fields) < 0 or not radius > 0:
+        raise ValueError("cases, inclusions, searches, palpations, noises and fields must be 0 or more, and the radius above 0")
+    truths = [each for each in TRUTHS if truth in each.name]
+    if not truths:
+        raise ValueError(f"there is no truth with {truth!r} in its name, but: {'; '.join(each.name for each in TRUTHS)}")
     if folder is not None:
         press_files(folder)  # what cannot be used is refused before the long work
     device, scene = pick_device(device), load_scene()
+    config = physics(device, nodes, layers)
     stages: list[Stage] = [("speed", lambda: speed_rows(scene, device))]
     if cases:
-        stages += [(f"truth {each.name}", partial(modulus_rows, scene, device, each, cases)) for each in TRUTHS]
+        stages += [(f"truth {each.name}", partial(modulus_rows, scene, device, each, cases)) for each in truths]
     if inclusions:
-        stages.append(("inclusions", lambda: inclusion_rows(scene, device, inclusions, radius)))
+        stages.append(("inclusions", lambda: inclusion_rows(scene, config, inclusions, radius)))
+    if fields:
+        stages += [(f"field with {kind}", partial(field_rows, scene, config, kind, fields, radius)) for kind in FIELDS]
     if searches:
         stages.append(("searches", lambda: search_rows(scene, device, searches, radius)))
     if palpations:
@@ -225,14 +241,13 @@ def short_press(nodes: ControlNodes, config: PhysicsConfig, place: np.ndarray, s
     return press(nodes, config, place, steps=steps, hold=4)
 
 
-def inclusion_rows(scene: Scene, device: str, count: int, radius: float) -> list[Row]:
+def inclusion_rows(scene: Scene, config: PhysicsConfig, count: int, radius: float) -> list[Row]:
     """Pressed in a raster over the place: how far from the truth the inclusion is found, as a ball, and in a field."""
-    return [row for stiffness in ("inclusion", "field") for row in _inclusion_rows(scene, device, count, radius, stiffness)]
+    return [row for stiffness in ("inclusion", "field") for row in _inclusion_rows(scene, config, count, radius, stiffness)]
 
 
-def _inclusion_rows(scene: Scene, device: str, count: int, radius: float, stiffness: Literal["inclusion", "field"]) -> list[Row]:
-    config = physics(device)
-    nodes = scene.nodes(config)
+def _inclusion_rows(scene: Scene, config: PhysicsConfig, count: int, radius: float, stiffness: Literal["inclusion", "field"]) -> list[Row]:
+    nodes, device = scene.nodes(config), config.device
     errors, across, seconds, ratios = [], [], [], []
     for seed in range(count):
         hidden, places = hide(nodes, seed, radius)
@@ -246,7 +261,7 @@ def _inclusion_rows(scene: Scene, device: str, count: int, radius: float, stiffn
         errors.append(hidden.error(found))
         across.append(hidden.across(find_inclusion(found).centre))
         ratios.append(find_inclusion(found).ratio)
-    name = f"inclusion of radius {1000 * radius:g} mm, as {stiffness}"
+    name = f"inclusion of radius {1000 * radius:g} mm, {len(nodes)} nodes, as {stiffness}"
     return [
         Row(f"{name}: error, median", 1000 * float(np.median(errors)), "mm"),
         Row(f"{name}: error across the press, median", 1000 * float(np.median(across)), "mm"),
@@ -254,6 +269,43 @@ def _inclusion_rows(scene: Scene, device: str, count: int, radius: float, stiffn
         Row(f"{name}: ratio of moduli, which is {RATIO:g}, median", float(np.median(ratios)), ""),
         Row(f"{name}: time of a map, median", float(np.median(seconds)), "s"),
     ]
+
+
+def field_rows(scene: Scene, config: PhysicsConfig, kind: str, count: int, radius: float) -> list[Row]:
+    """Pressed in a raster over the place: how many control nodes count as known, how many of these have intervals that hold the truth, and
+    the same of what is stiffer or softer than the rest by a factor of two."""
+    nodes, told = scene.nodes(config), []
+    for seed in range(count):
+        hidden, places = hide(nodes, seed, radius)
+        factors = field_of(kind, nodes, hidden, places, radius)
+        presses = [short_press(nodes, config, each) for each in places]
+        experiments = [measure(each, nodes, config, hidden.rng, factors, hidden.offset, device=config.device) for each in presses]
+        found = identify(experiments, nodes, config, IdentificationConfig(stiffness="field"), config.device)
+        truth = config.young_modulus * factors
+        told.append(np.stack([found.known, (found.low <= truth) & (truth <= found.high), np.abs(np.log(factors)) > np.log(2)], 1))
+    known, held, different = np.concatenate(told).T
+    name = f"field, {len(nodes)} nodes, truth with {kind}"
+    rows = [Row(f"{name}: known", 100 * float(known.mean()), "%")]
+    for title, members in (("all", np.ones(len(held), bool)), ("the known", known), ("those that differ", different)):
+        if members.any():
+            rows.append(Row(f"{name}: 90 % intervals that hold it, of {title}", 100 * float(held[members].mean()), "%"))
+    return [*rows, Row(f"{name}: known of those that differ", 100 * float(known[different].mean()), "%")]
+
+
+def field_of(kind: str, nodes: ControlNodes, hidden: _Hidden, places: np.ndarray, radius: float) -> np.ndarray:
+    """Factors on the moduli [M]: of a hidden inclusion, of that one and another, soft one across the middle of the places, or e-fold
+    between the middle of the places and their rim."""
+    rest, middle = nodes.rest.astype(np.float64), places.mean(0)
+    if kind == "an inclusion":
+        return hidden.factors
+    way = hidden.centre - middle
+    if kind == "two inclusions":
+        across = way - (way @ hidden.normal) * hidden.normal
+        off = float(np.linalg.norm(across))
+        mirrored = hidden.centre - max(2 * off, 2.5 * radius) / max(off, 1e-9) * across
+        return np.where(inside_sphere(nodes.rest, mirrored, radius), 1 / SOFT, hidden.factors)
+    across = np.cross(hidden.normal, hidden.rng.standard_normal(3))
+    return np.exp((rest - middle) @ (across / np.linalg.norm(across)) / PATCH)
 
 
 def search_rows(scene: Scene, device: str, count: int, radius: float) -> list[Row]:

@@ -1,5 +1,6 @@
 """Presses of real lungs: what one trial tells of the next, as a share of the peak force."""
 
+from collections.abc import Callable
 from itertools import permutations
 from pathlib import Path
 
@@ -31,8 +32,9 @@ def lung_rows(folder: Path, plan: Plan = Plan()) -> list[Row]:
     root of the mean square, as `endo-sim bench presses` has it.
 
     With the scale of that trial, N over thickness; with one that is fitted to the held-out trial, as no trial tells how wide the next piece
-    is; and with where its contact begins fitted as well, as the first force that counts is 0.5 N wherever the press stood then. At last
-    both by the first half of the travel alone, the other half being predicted.
+    is; and with where its contact begins fitted as well, as the first force that counts is 0.5 N wherever the press stood then. Then
+    both by the first half of the travel alone, the other half being predicted. At last the forces of the other trial themselves, as far as
+    that goes, and scaled: how much two pieces differ, which no law can better. The thickness of each piece is known to all.
 
     Raises:
         ValueError: If there are no files, or too few trials in them.
@@ -48,6 +50,8 @@ def lung_rows(folder: Path, plan: Plan = Plan()) -> list[Row]:
             "scale fitted": [_errors(_scaled(curves[i], trials[j]), trials[j]) for i, j in pairs],
             "scale and contact fitted": [_errors(_placed(curves[i], trials[j]), trials[j]) for i, j in pairs],
             "scale and contact of its first half": [_rest(curves[i], trials[j]) for i, j in pairs],
+            "no law": [_without_law(trials[i], trials[j]) for i, j in pairs],
+            "no law and scale fitted": [_without_law(trials[i], trials[j], _scaled) for i, j in pairs],
         }
         for title, errors in told.items():
             worst, square = np.array([[np.abs(each).max(), np.sqrt((each**2).mean())] for each in errors]).T
@@ -85,3 +89,10 @@ def _rest(curve: Curve, trial: Trial) -> np.ndarray:
     early = trial.travel <= trial.travel[0] + SEEN * np.ptp(trial.travel)
     first, rest = (Trial(trial.travel[part], trial.force[part], trial.speed) for part in (early, ~early))
     return (_placed(curve, first)(rest.travel) - rest.force) / trial.force.max()
+
+
+def _without_law(one: Trial, other: Trial, fitted: Callable[[Curve, Trial], Curve] = lambda curve, trial: curve) -> np.ndarray:
+    """Errors of the forces of one trial in another, over the greatest force of that, at the travels that both have."""
+    both = other.travel <= one.travel[-1]
+    part = Trial(other.travel[both], other.force[both], other.speed)
+    return (fitted(lambda at: np.interp(at, one.travel, one.force), part)(part.travel) - part.force) / other.force.max()

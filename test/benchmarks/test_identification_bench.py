@@ -1,6 +1,8 @@
 """The benchmark of identification runs and reports."""
 
 import json
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,13 +19,35 @@ def test_bench_tells_errors_intervals_and_speed(tmp_path, monkeypatch, capsys):
     small = {"nodes": 300, "layers": 2, "by_nodes": 300, "by_layers": 2, "finer_nodes": 500, "finer_layers": 3}
     monkeypatch.setattr(identification, "TRUTHS", (Truth("of the same model", **small),))
     monkeypatch.setattr(identification, "PRESSES", 1)
-    bench_identification(tmp_path / "rows.json", "cpu", cases=1, inclusions=0, searches=0, palpations=0, noises=0)
+    bench_identification(tmp_path / "rows.json", "cpu", cases=1, inclusions=0, searches=0, palpations=0, noises=0, fields=0)
     rows = {row["name"]: row["value"] for row in json.loads((tmp_path / "rows.json").read_text())}
     assert rows["steps of 5 copies"] > 0
     assert 0 <= rows["one modulus, truth of the same model: error, median"] < 50
     assert rows["one modulus, truth of the same model: 90 % intervals that hold it"] in (0, 100)
     with pytest.raises(ValueError, match="must be 0 or more"):
         bench_identification(None, "cpu", cases=-1)
+    with pytest.raises(ValueError, match="no truth with 'of none' in its name, but: of the same model"):
+        bench_identification(None, "cpu", truth="of none")
+
+
+def test_fields_count_the_known_nodes_whose_intervals_hold_the_truth(monkeypatch):
+    config, scene = replace(identification.physics("cpu"), node_count=300, layers=2), load_scene()
+    nodes = scene.nodes(config)
+    monkeypatch.setattr(identification, "measure", lambda press, nodes, physics, rng, factors, *_, **__: factors)
+
+    def found(experiments, *_):
+        truth = config.young_modulus * experiments[0]
+        held = np.abs(np.log(experiments[0])) < np.log(2)  # of what is like the rest
+        return SimpleNamespace(low=truth * np.where(held, 0.9, 1.1), high=truth * 1.2, known=np.arange(len(truth)) % 2 == 0)
+
+    monkeypatch.setattr(identification, "identify", found)
+    for kind in identification.FIELDS:
+        told = {row.name.split(f"{kind}: ")[1]: row.value for row in identification.field_rows(scene, config, kind, 2, 0.008)}
+        assert told["known"] == pytest.approx(50, abs=0.5)
+        assert told["90 % intervals that hold it, of those that differ"] == 0 < told["90 % intervals that hold it, of the known"] < 100
+        hidden, places = identification.hide(nodes, 0, 0.008)
+        factors = identification.field_of(kind, nodes, hidden, places, 0.008)
+        assert (factors.min() < 0.5) == (kind != "an inclusion") and factors.max() > 2
 
 
 @pytest.mark.slow
@@ -50,6 +74,7 @@ def test_where_contact_begins_is_no_part_of_what_a_trial_tells_of_the_next(tmp_p
     (tmp_path / "late.csv").write_text("\n".join(lines))
     worst = {row.name.split(", ", 2)[2]: row.value for row in lung_trials.lung_rows(tmp_path) if "greatest error" in row.name}
     assert worst["scale and contact fitted, median"] < 0.5 * worst["scale fitted, median"]
+    assert worst["no law and scale fitted, median"] < worst["no law, median"] > 10  # the pieces differ, whatever the law
 
 
 @pytest.mark.slow
@@ -62,7 +87,7 @@ def test_trials_that_are_alike_predict_each_other(tmp_path):
     (tmp_path / "even.csv").write_text("\n".join(lines))
     rows = lung_trials.lung_rows(tmp_path)
     report("lungs", rows)
-    assert [row.value for row in rows if "within 10 %" in row.name] == [100] * 4
+    assert [row.value for row in rows if "within 10 %" in row.name] == [100] * 6
     assert all(row.value < 5 for row in rows if "greatest error" in row.name and "first half" not in row.name)
     with pytest.raises(ValueError, match="no CSV files"):
         lung_trials.lung_rows(tmp_path / "nowhere")

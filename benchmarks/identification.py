@@ -160,7 +160,7 @@ def noise_rows(scene: Scene, device: str, cases: int) -> list[Row]:
     rows = []
     for force, tip in noises:
         truth = Truth(f"of the same model, {force:g} N, {1000 * tip:g} mm")
-        rows += modulus_rows(scene, device, truth, cases, force_noise=force, tip_noise=tip)[:4]
+        rows += modulus_rows(scene, device, truth, cases, force_noise=force, tip_noise=tip)[:5]
     return rows
 
 

@@ -154,6 +154,7 @@ class _Point:
     residuals: list[np.ndarray]  # of each experiment [n], of the numbers that are used
     jacobians: list[np.ndarray]  # of predictions [n, Q]
     covariances: list[Covariance]
+    errors: list[tuple[np.ndarray, np.ndarray]]  # what these are made of, see `Observations.covariance`
     undone: int  # steps of the simulation
 
 
@@ -212,10 +213,10 @@ def identify(
     if start is None:
         theta[: unknowns.stiffness_count] = _scaled(unknowns, first.scale)
     parts = [_Data(each, *unknowns.directions(touched_places([each.experiment], nodes, physics))) for each in data]
-    sure = None if start is None else start.sure
+    sure, rests = None if start is None else start.sure, []
     if unknowns.ball is not None and start is None:
         progress("look for the inclusion", 0, config.iterations)
-        theta, sure = _locate(theta, prior, parts, model, unknowns)
+        theta, sure, rests = _locate(theta, prior, parts, model, unknowns)
     point, ended = _minimise(theta, prior, parts, model, unknowns, progress)
     unended = [] if ended else [f"the estimate had not settled after {config.iterations} iterations; allow more"]
     found = _conclude(point, data, model, unknowns, [*first.findings, *unended], start is not None and start.felt)
@@ -225,7 +226,7 @@ def identify(
     there = f"the middle of the inclusion is at {x:.4f} {y:.4f} {z:.4f} m"
     if sure is not None:
         there += f", with a probability of {sure:.2f}" if sure >= 0.5 else ", but none explains the data as well"
-    return replace(found, sure=sure, findings=[there, *found.findings])
+    return replace(found, sure=sure, findings=[there, *rests, *found.findings])
 
 
 def touched_places(experiments: Sequence[Experiment], nodes: ControlNodes, physics: PhysicsConfig) -> np.ndarray:
@@ -255,7 +256,7 @@ def look(theta: np.ndarray, prior: _Prior, data: Sequence[_Data], model: Forward
     config, P = unknowns.config, unknowns.count
     feels = any(part.seen.of_forces().any() for part in data)
     z, offset, gain = theta[:P], theta[P : P + 3] * config.tip_offset, 1 + config.model_error * theta[P + 3]
-    residuals, jacobians, covariances, undone = [], [], [], 0
+    residuals, jacobians, errors, undone = [], [], [], 0
     for part in data:
         each, ways = part.seen, part.ways if jacobian else part.ways[:0]
         copies = [unknowns.copy(z, offset)]
@@ -277,8 +278,9 @@ def look(theta: np.ndarray, prior: _Prior, data: Sequence[_Data], model: Forward
         own = np.column_stack([by_place * config.surface_error, J[:, P + 3 :]])  # the errors of this experiment alone
         residuals.append((each.values - told[0])[each.used])
         jacobians.append(J[each.used])
-        covariances.append(each.covariance(by_tip, own))
-    return _Point(theta, prior, residuals, jacobians, covariances, undone)
+        errors.append((by_tip, own))
+    covariances = [part.seen.covariance(*each) for part, each in zip(data, errors)]
+    return _Point(theta, prior, residuals, jacobians, covariances, errors, undone)
 
 
 def _misfit(residuals: list[np.ndarray], covariances: list[Covariance]) -> float:
@@ -296,23 +298,38 @@ def _normal(point: _Point) -> tuple[np.ndarray, np.ndarray]:
     return H, g
 
 
-def _locate(theta: np.ndarray, prior: _Prior, data: list[_Data], model: ForwardModel, unknowns: Unknowns) -> tuple[np.ndarray, float]:
-    """θ with the ball at the place that explains the data best, and the probability that there is one thereabouts."""
+def _locate(
+    theta: np.ndarray, prior: _Prior, data: list[_Data], model: ForwardModel, unknowns: Unknowns
+) -> tuple[np.ndarray, float, list[str]]:
+    """θ with the ball at the place that explains the data best, the probability that there is one thereabouts, and a sentence where that
+    place rests on how wrong the skin may be."""
     assert unknowns.ball is not None
     theta = theta.copy()
     theta[BALL] = unknowns.ball.absent()
     point = look(theta, prior, data, model, unknowns)
     touched = [touched_places([part.seen.experiment], model.nodes, model.physics) for part in data]
     places = Places(unknowns, np.concatenate(touched))
-    scan = Scan.empty(len(theta), len(places.z))
-    for part, at, r, J, R in zip(data, touched, point.residuals, without_ball(point.jacobians), point.covariances):
+    scan, exact = (Scan.empty(len(theta), len(places.z)) for _ in range(2))
+    jacobians = without_ball(point.jacobians)
+    for part, at, r, J, R, (by_tip, own) in zip(data, touched, point.residuals, jacobians, point.covariances, point.errors):
         near = KDTree(at).query(places.centres)[0] <= unknowns.config.field_reach if len(at) else np.zeros(len(places.z), bool)
-        scan.add(r, J, R, added(part.seen, model, unknowns, places, theta, near))
-    probable = weights(scan.costs(), places)
-    best = int(probable[:-1].argmax())
-    here = ((places.centres - places.centres[best]) ** 2).sum(1) <= (2 * unknowns.config.inclusion_radius) ** 2
+        adds = added(part.seen, model, unknowns, places, theta, near)
+        scan.add(r, J, R, adds)
+        exact.add(r, J, part.seen.covariance(by_tip, own[:, 3:]), adds)  # the first three are the place of the skin
+    probable, otherwise = (weights(each.costs(), places) for each in (scan, exact))
+    best, other = (int(each[:-1].argmax()) for each in (probable, otherwise))
+    apart = np.sqrt(((places.centres - places.centres[best]) ** 2).sum(1))
+    here = apart <= 2 * unknowns.config.inclusion_radius
     theta[1 : 1 + BALL] = places.z[best, 1 : 1 + BALL]
-    return theta, float(probable[:-1][here].sum())
+    return theta, float(probable[:-1][here].sum()), _elsewhere(places.centres[other]) if apart[other] > 0 and otherwise[-1] < 0.5 else []
+
+
+def _elsewhere(centre: np.ndarray) -> list[str]:
+    x, y, z = centre
+    return [
+        f"if the skin is where the model has it, with surface_error 0, the inclusion would rather be at {x:.4f} {y:.4f} {z:.4f} m: these"
+        " presses do not tell the two apart; press closer together than the tool is wide"
+    ]
 
 
 def _minimise(

@@ -74,7 +74,7 @@ def test_where_contact_begins_is_no_part_of_what_a_trial_tells_of_the_next(tmp_p
     (tmp_path / "late.csv").write_text("\n".join(lines))
     worst = {row.name.split(", ", 2)[2]: row.value for row in lung_trials.lung_rows(tmp_path) if "greatest error" in row.name}
     assert worst["scale and contact fitted, median"] < 0.5 * worst["scale fitted, median"]
-    assert worst["no law and scale fitted, median"] < worst["no law, median"] > 10  # the pieces differ, whatever the law
+    assert worst["no law, median"] > worst["scale and contact fitted, median"]  # the pieces differ
 
 
 @pytest.mark.slow

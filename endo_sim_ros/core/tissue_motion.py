@@ -1,9 +1,11 @@
 """How the tissue of a recording moves by itself, as it was found there."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import cv2
 import numpy as np
+import yaml
 from scipy.spatial import KDTree
 
 from endo_sim_ros.core.cameras import Camera
@@ -77,6 +79,10 @@ class TissueMotion:
         """Until when it was watched, s, by the stamps of the recording."""
         return self.start + self.parts[0].cycles * self.parts[0].period
 
+    def watched(self, stamp_ns: int) -> bool:
+        """Whether it was still watched at the time of a stamp (ns)."""
+        return stamp_ns <= 1e9 * self.end + 1000  # seconds of today hold no single nanoseconds
+
     @property
     def parameters(self) -> dict[str, float]:
         """What physics calls a motion of all that is held: `motion.*` by name, as of the start of the recording."""
@@ -87,6 +93,11 @@ class TissueMotion:
             found |= {part.name: part.amplitude, f"{part.name}_period": part.period, f"{part.name}_phase": phase}
             found |= {f"direction_{axis}": float(value) for axis, value in zip("xyz", direction)}
         return found
+
+    def save(self, path: Path) -> None:
+        """Write its `parameters` as a parameter file of physics_node."""
+        parameters = {f"motion.{name}": round(value, 6) for name, value in self.parameters.items()}
+        path.write_text(yaml.safe_dump({"physics_node": {"ros__parameters": parameters}}, sort_keys=False))
 
     def shares(self, places: np.ndarray) -> np.ndarray:
         """Of each part, those of places [M, 3] (m, world), mean positions: [M, parts]."""

@@ -78,7 +78,8 @@ class ReconstructionNodeConfig(WorldConfig):
     publish_period: Annotated[float, Range(0.1, 3600, "s")] = 5.0
     """Time between intermediate models during training."""
     output_dir: str = "~/.ros/endo_sim_ros"
-    """Where each reconstruction's model.ply, cameras.json and checkpoint.pt are saved, in a folder named by the time."""
+    """Where each reconstruction's model.ply, cameras.json and checkpoint.pt are saved, in a folder named by the time; of moving tissue also
+    motion.yaml, parameters of physics_node."""
     model_file: str = ""
     """PLY model to publish at start, before any reconstruction, or when this is set; latest = the newest in output_dir.
     Cameras saved beside it (cameras.json) are published with it."""

@@ -18,10 +18,21 @@ from endo_sim_ros.core.cameras import Camera, load_cameras, save_cameras
 from endo_sim_ros.core.config import option_values
 from endo_sim_ros.core.frames import LEFT_FRAME, Frame, SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel, load_ply, save_ply
+from endo_sim_ros.core.tissue_motion import TissueMotion, stilled
 from endo_sim_ros.messages import ERROR, OK, STATE, WARN, ReconstructionState, Topic
 from endo_sim_ros.nodes.base import EndoNode, run, sentence
 from endo_sim_ros.nodes.configs import ReconstructionNodeConfig
-from endo_sim_ros.reconstruction import PRESETS, Cancelled, Progress, ReconstructionConfig, Trainer, choose_views, prepare, preset
+from endo_sim_ros.reconstruction import (
+    PRESETS,
+    Cancelled,
+    MotionWatch,
+    Progress,
+    ReconstructionConfig,
+    Trainer,
+    choose_views,
+    prepare,
+    preset,
+)
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.triangulation import POINT_VIEWS
 from endo_sim_ros.sequences.bag import feed
@@ -64,6 +75,7 @@ class ReconstructionNode(EndoNode):
         self._file: Path | None = None  # where the newest model that was read from a file lay
         self._model_stamp = 0
         self._saved, self._failure, self._finished = "", "", False  # how the last reconstruction ended
+        self._motion = ""  # what it found of breath and heart
         self._cameras: list[Camera] = []  # of the newest published model
         self._model_pub, self._cameras_pub, self._info_pub = (self.publisher(topic, alone=True) for topic in messages.MODEL_TOPICS)
         for topic in messages.RECORDING_TOPICS:
@@ -176,7 +188,7 @@ class ReconstructionNode(EndoNode):
     def _start(self) -> None:
         self.trained = (self.frames[0].stamp_ns, self.frames[-1].stamp_ns)
         self._recording_stamp = self.trained[1]
-        self.progress, self._saved, self._failure, self._finished = None, "", "", False
+        self.progress, self._saved, self._failure, self._finished, self._motion = None, "", "", False, ""
         self.cancel.clear()
         self._thread = threading.Thread(target=self._train, args=(list(self.frames), self.config))
         self._thread.start()
@@ -184,11 +196,15 @@ class ReconstructionNode(EndoNode):
 
     def _train(self, frames: list[StoredFrame], config: ReconstructionConfig) -> None:
         try:
+            motion = self._motion_in(frames, config)
+            if motion is not None:
+                frames = [frame for frame in frames if motion.watched(frame.stamp_ns)]
             progress = StageProgress("scene points", self._on_stage)
-            chosen, points = choose_views(frames, progress.map(StoredFrame.load, spread(frames, POINT_VIEWS)), config, progress)
+            still = lambda frame: stilled(frame.load(), motion)
+            chosen, points = choose_views(frames, progress.map(still, spread(frames, POINT_VIEWS)), config, progress)
             log.info("training on %d of %d views", len(chosen), len(frames))
             views = (frames[index].load() for index in chosen)
-            trainer, lockstep = Trainer(prepare(views, config, points, self._on_stage), config), self._options.mode == "lockstep"
+            trainer, lockstep = Trainer(prepare(views, config, points, self._on_stage, motion), config), self._options.mode == "lockstep"
             if not lockstep:
                 self._offer(trainer)
             published = time.monotonic()
@@ -217,6 +233,17 @@ class ReconstructionNode(EndoNode):
             if isinstance(error, (MemoryError, torch.OutOfMemoryError)):
                 self._failure = f"out of memory: lower max_gaussians, image_width or keyframes ({error})"
             self.report_error(self._failure)
+
+    def _motion_in(self, frames: list[StoredFrame], config: ReconstructionConfig) -> TissueMotion | None:
+        """How the tissue moves by itself in these views, if it is to be looked for; says what was found."""
+        if not config.watch_motion:
+            return None
+        watch, progress = MotionWatch(config.watch), StageProgress("breath and heartbeat", self._on_stage)
+        for done, _ in enumerate(watch.watch(frame.load() for frame in frames)):
+            progress(done, len(frames))
+        motion, self._motion = watch.found(progress)
+        self.get_logger().info(self._motion)
+        return motion
 
     def _on_stage(self, stage: str, done: int, total: int) -> None:
         """Note how far the preparation is; called from several threads."""
@@ -263,6 +290,8 @@ class ReconstructionNode(EndoNode):
             save_cameras(cameras, folder / _CAMERAS)
             if trainer is not None:
                 trainer.save_checkpoint(folder / "checkpoint.pt")
+                if trainer.motion is not None:
+                    trainer.motion.save(folder / "motion.yaml")
         except OSError as error:
             reason = error.strerror or str(error)
             raise SequenceError(f"{folder}: the model cannot be saved ({reason}); set output_dir and call ~/save") from error
@@ -302,7 +331,7 @@ class ReconstructionNode(EndoNode):
         """Level, message and values: counts of views and of images that were left out, and the progress of the training."""
         dropped, state, progress = self.synchronizer.dropped, self._state, self.progress
         counts = {f"images {reason}": count for reason, count in dropped.items()}
-        values = {STATE: state, "views": len(self.frames), **counts, "saved": self._saved}
+        values = {STATE: state, "views": len(self.frames), **counts, "motion": self._motion, "saved": self._saved}
         if state is ReconstructionState.PREPARING:
             stage, done, total = self._stage
             return OK, f"preparing views: {stage}", values | {"stage": stage, "progress": f"{done / max(total, 1):.2f}"}

@@ -129,8 +129,7 @@ class ReconstructionConfig(StageConfig):
     """network: folder of a checkpoint of Depth-Anything-V2 or another depth network (transformers), or ONNX file; nothing is ever
     downloaded. Empty: the Depth-Anything-V2 that Hugging Face's cache holds."""
     watch_motion: bool = True
-    """Look for tissue that moves periodically by itself, say so, and reconstruct it in its mean position (`endo-sim reconstruct` and
-    `evaluate`)."""
+    """Look for tissue that moves periodically by itself, say so, and reconstruct it in its mean position."""
     plane_sweep: bool = True
     """Believe depth that is interpolated close to scene points alone; elsewhere match the views plane by plane."""
     multi_view_refinement: bool = True

@@ -5,7 +5,6 @@ import shutil
 import tempfile
 from pathlib import Path
 
-import yaml
 from rich.progress import Progress as ProgressBar
 
 from endo_sim_ros.core.cameras import Camera, save_cameras
@@ -74,7 +73,7 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
             motion, text = watch.found(StageProgress("breath and heartbeat", on_stage))
             log.info(text)
             if motion is not None:
-                watched = sum(view.stamp_ns <= 1e9 * motion.end + 1000 for view in views)
+                watched = sum(motion.watched(view.stamp_ns) for view in views)
                 views, sample = survey(recording.take(range(watched), watched), POINT_VIEWS)
                 log.info("the model is of tissue in its mean position, from the %d views in which it was watched", len(views))
                 sample = [stilled(frame, motion) for frame in sample]
@@ -138,5 +137,4 @@ def _write(model: GaussianModel, cameras: list[Camera], motion: TissueMotion | N
     save_ply(model, folder / "model.ply")
     save_cameras(cameras, folder / "cameras.json")
     if motion is not None:
-        parameters = {f"motion.{name}": round(value, 6) for name, value in motion.parameters.items()}
-        (folder / "motion.yaml").write_text(yaml.safe_dump({"physics_node": {"ros__parameters": parameters}}, sort_keys=False))
+        motion.save(folder / "motion.yaml")

@@ -115,6 +115,8 @@ class MotionWatch:
         length = float(np.ptp(times)) if len(times) else 0.0
         if length < options.least_cycles * options.shortest_beat or len(times) < 10:
             return None, f"whether the tissue moves by itself cannot be told from {length:.1f} s"
+        if (interval := float(np.median(np.diff(times)))) > _BAND * options.shortest_breath:
+            return None, f"whether the tissue moves by itself cannot be told from images {interval:.1f} s apart"
         lenses = np.array([pose[:3, 3] for pose, *_ in self._eyes])
         if not self._baseline and np.ptp(lenses, axis=0).max() < options.least_travel:
             return None, "whether the tissue moves by itself cannot be told: one lens that stays where it is sees no depth"
@@ -250,7 +252,12 @@ class _Rays:
 
     def _told(self, rate: float, harmonics: int) -> int:
         """How many harmonics of a rate (Hz), at most so many, images can tell that follow each other so slowly; at least one."""
-        return max(min(harmonics, int(_BAND / (rate * np.median(np.diff(self.times))))), 1)
+        return max(min(harmonics, int(_BAND / (rate * self.interval))), 1)
+
+    @property
+    def interval(self) -> float:
+        """Between images, s."""
+        return float(np.median(np.diff(self.times)))
 
     def _slow(self, drift: int) -> np.ndarray:
         """Cosine series of so many terms [T, D], the first of which is one."""
@@ -306,7 +313,7 @@ class _Rays:
             share: Share that it must explain.
             cycles: Periods that must be seen.
         """
-        if longest <= shortest:
+        if longest <= shortest or self.interval > _BAND * shortest:  # what is faster than images tell looks like something slower
             return _Seen(name, drift, harmonics)
         slow = self._drifting(drift)
         left_over = lambda rate: self._left_over(rate, harmonics, slow)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import yaml
 from bad_messages import BAD_RECORDINGS
 from ros_bench import K, S, send_frames, sheet
 from std_srvs.srv import Trigger
@@ -18,6 +19,7 @@ from endo_sim_ros import messages
 from endo_sim_ros.core.gaussians import load_ply, save_ply
 from endo_sim_ros.messages import ERROR, OK, WARN
 from endo_sim_ros.nodes.reconstruction_node import ReconstructionNode
+from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
 pytestmark = pytest.mark.dds
 
@@ -249,3 +251,16 @@ def test_views_wait_in_files_that_go_with_them(bench, reconstruction, small_fram
     np.testing.assert_array_equal(reconstruction.frames[0].load().image, small_frames[0].image)
     reconstruction.destroy_node()
     assert not folder.exists()
+
+
+@pytest.mark.slow
+def test_tissue_that_breathes_is_reconstructed_in_its_mean_position(bench, reconstruction, tmp_path):
+    """7.5 s of breaths of 3 s, through one lens."""
+    patient = PhantomConfig(frames=60, fps=8.0, width=160, height=128, breathing=0.008, breathing_period=3.0, stereo=False)
+    assert bench.set("reconstruction_node", output_dir=str(tmp_path), keyframes=3, iterations=5)[0]
+    send_frames(bench, list(phantom_sequence(patient)))
+    assert bench.call(Trigger, "/reconstruction_node/reconstruct").success
+    values = bench.status("reconstruction_node", "finished, model saved in")[2]
+    assert re.fullmatch(r"the tissue moves by itself: .* mm every (2\.9.|3\.0.) s .*, seen for 7 s", values["motion"])
+    found = yaml.safe_load(next(tmp_path.glob("*/motion.yaml")).read_text())["physics_node"]["ros__parameters"]
+    assert abs(found["motion.breathing_period"] / 3 - 1) < 0.02 and 0.006 < found["motion.breathing"] < 0.01

@@ -150,6 +150,13 @@ def test_no_harmonic_is_taken_for_another_that_images_cannot_tell_from_it():
 
 
 @pytest.mark.slow
+def test_a_beat_that_images_are_too_seldom_for_is_not_taken_for_another():
+    """At 2 Hz a beat every 0.9 s looks like one every 1.1 s, and like one every 9 s."""
+    motion = watched(filmed(0.008, 0.003, 60, 2.0))[0]
+    assert motion is None or [part.name for part in motion.parts] == ["breathing"]
+
+
+@pytest.mark.slow
 def test_still_tissue_does_not_breathe():
     frames = filmed()
     for each in (frames, with_one_lens(frames)):
@@ -180,6 +187,8 @@ def test_what_cannot_be_told_is_said():
     assert watched([]) == (None, "whether the tissue moves by itself cannot be told from 0.0 s")
     at_once = [dataclasses.replace(frame, stamp_ns=5) for frame in black]
     assert watched(at_once)[1] == "whether the tissue moves by itself cannot be told from 0.0 s"
+    seldom = [dataclasses.replace(frame, stamp_ns=20 * frame.stamp_ns) for frame in black]
+    assert watched(seldom)[1] == "whether the tissue moves by itself cannot be told from images 1.6 s apart"
     with_two = [dataclasses.replace(frame, right=image, baseline=BASELINE) for frame in black]
     assert watched(with_two)[1].endswith("too few points could be followed for long")
     assert watched(black)[1].endswith("one lens that stays where it is sees no depth")

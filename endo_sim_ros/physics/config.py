@@ -164,7 +164,7 @@ class PhysicsConfig(StageConfig):
     wall of the gall bladder 0.43 (Mancia et al. 2019). Each tear is 2.5 cells of the grid long."""
     skin_strain: Annotated[float, Range(0.0, 0.5)] = 0.0
     """Strain by which the skin is stretched at rest, in all directions along it: the edges of cuts and tears draw back from each other, and
-    curl up, as deeper tissue holds them. The outer surface of a gut has about 0.1; 0 = none."""
+    curl up, as deeper tissue holds them. The outer surface of a gut has about 0.1, skin 0.1 to 0.3 (Deroy et al. 2017); 0 = none."""
     dense: bool = False
     """Simulate every Gaussian as a material point (PhysGaussian's way) instead of sparse control nodes;
     layers are then ignored."""

@@ -92,6 +92,22 @@ def test_a_cut_through_stretched_skin_opens_and_its_edges_curl_up():
 
 
 @pytest.mark.slow
+def test_both_edges_of_an_upright_cut_through_flat_skin_draw_back_and_curl_alike():
+    flat = curved_sheet()
+    flat.means[:, 2] = 0.12
+    simulation = simulate(flat, node_count=1600, layers=3, blade_length=0.03, skin_strain=0.1)
+    cut_along(simulation, np.linspace(-0.03, 0.03, 21))
+    steps(simulation, 15)
+    state = simulation.state()
+    x, y, _ = state.rest.T
+    moved = state.positions - state.rest
+    near = simulation.nodes.is_skin & (np.abs(x) < 0.008) & (np.abs(y) < 0.02)
+    right, left = (moved[near & (side * x > 0)].mean(0) * [side, 1, 1] for side in (1, -1))
+    assert right[0] > 0.001 and right[2] < -2e-4  # outwards, and towards the camera
+    np.testing.assert_allclose(left[[0, 2]], right[[0, 2]], rtol=0.15)
+
+
+@pytest.mark.slow
 def test_stretched_skin_pulls_both_sides_of_a_cut_alike():
     simulation = free_block(layers=0, blade_length=0.05, skin_strain=0.01)
     for y in np.linspace(-0.01, 0.04, 21):

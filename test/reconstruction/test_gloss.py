@@ -14,7 +14,11 @@ from endo_sim_ros.core.gaussians import SH_C0
 from endo_sim_ros.core.light import Light
 from endo_sim_ros.core.reflections import WHITE
 from endo_sim_ros.evaluation import metrics
+from endo_sim_ros.evaluation.deformed_truth import deformed_truth_psnr
+from endo_sim_ros.reconstruction import Trainer, prepare, preset
+from endo_sim_ros.reconstruction.stage_configs import GlossConfig
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
+from endo_sim_ros.sequences.phantom import PhantomConfig, phantom_sequence
 
 
 @pytest.mark.slow
@@ -46,3 +50,17 @@ def test_training_that_knows_reflections_foresees_another_view():
         assert trained.reflects == reflections
         assert trained.gloss is None or trained.gloss[:, 6:].max() <= WHITE
     assert found[True] > found[False] + 1
+
+
+@pytest.mark.slow
+def test_a_short_training_leaves_little_that_flashes_when_tissue_is_pulled():
+    """Two views of a synthetic patient, against the strengths and rates of a long training."""
+    patient = PhantomConfig(rounds=0.5, frames=2, width=96, height=80)
+    views = list(phantom_sequence(patient))
+    cameras, found = [view.camera for view in views], []
+    for start in ({}, {f"gloss.{name}": getattr(GlossConfig(), name) for name in ("sheen", "glint")} | {"rates.gloss": 0.02}):
+        config = preset("laptop", iterations=200, max_gaussians=6000, image_width=96, device="cpu", **start)
+        model = Trainer(prepare(views, config), config).run()
+        found.append(deformed_truth_psnr(model, patient, cameras, cameras, "cpu"))
+    (pulled, at_rest), (before, before_at_rest) = found
+    assert pulled > before + 0.1 and at_rest > before_at_rest

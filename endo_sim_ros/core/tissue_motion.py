@@ -1,5 +1,6 @@
 """How the tissue of a recording moves by itself, as it was found there."""
 
+import functools
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,8 +13,9 @@ from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.gaussians import GaussianModel
 
-_NEAR = 24  # points between which a place is interpolated: the noise of a share is a quarter
-_LEVEL = 0.1  # weight, of that of a point, of a slope of nothing between them, which counts where they lie in a row
+_NEAR = 60  # points between which a place is interpolated: the noise of a share is a quarter, what motion bends is seen
+_LEVEL = 0.02  # weight, of that of a point, of no slope and no bend between them, which counts where they lie in a row
+_PART = 10_000  # places interpolated at a time: a hundred megabytes
 _CELL = 8  # pixels, of a frame, between places whose way is interpolated: motion is smooth
 _FARTHEST = {"breathing": 0.5, "heartbeat": 0.25}  # phases, in `motion.py`
 _PHASES = 64  # places along a period at which a way is looked at
@@ -54,10 +56,10 @@ class PeriodicMotion:
         return direction, int(along.argmax()) / _PHASES
 
     @property
-    def amplitude(self) -> float:
-        """How far tissue goes, there or back, m, where it goes farthest; nineteen of twenty points go less far."""
+    def reach(self) -> float:
+        """How far a place whose share is 1 goes, there or back, m."""
         path = self.path(np.arange(_PHASES) * self.period / _PHASES)
-        return float(np.quantile(np.abs(self.shares), 0.95) * np.linalg.norm(path[:, None] - path, axis=-1).max())
+        return float(np.linalg.norm(path[:, None] - path, axis=-1).max())
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,13 @@ class TissueMotion:
         """Until when it was watched, s, by the stamps of the recording."""
         return self.start + self.parts[0].cycles * self.parts[0].period
 
+    @functools.cached_property
+    def amplitudes(self) -> list[float]:
+        """How far tissue goes by each part, there or back, m, where it goes farthest; all points but a fiftieth go less far."""
+        # Of what is smooth between points: the largest share of all would be the one that is most wrong.
+        shares = np.quantile(np.abs(self.shares(self.points)), 0.98, axis=0)
+        return [float(share * part.reach) for share, part in zip(shares, self.parts)]
+
     def watched(self, stamp_ns: int) -> bool:
         """Whether it was still watched at the time of a stamp (ns)."""
         return stamp_ns <= 1e9 * self.end + 1000  # seconds of today hold no single nanoseconds
@@ -87,10 +96,10 @@ class TissueMotion:
     def parameters(self) -> dict[str, float]:
         """What physics calls a motion of all that is held: `motion.*` by name, as of the start of the recording."""
         found = {}
-        for part in reversed(self.parts):  # breath says the direction
+        for part, amplitude in reversed([*zip(self.parts, self.amplitudes)]):  # breath says the direction
             direction, farthest = part.wave
             phase = (_FARTHEST[part.name] - farthest) % 1
-            found |= {part.name: part.amplitude, f"{part.name}_period": part.period, f"{part.name}_phase": phase}
+            found |= {part.name: amplitude, f"{part.name}_period": part.period, f"{part.name}_phase": phase}
             found |= {f"direction_{axis}": float(value) for axis, value in zip("xyz", direction)}
         return found
 
@@ -204,14 +213,22 @@ def _warp(camera: Camera, points: np.ndarray, moved: np.ndarray) -> tuple[np.nda
 
 
 def _interpolated(places: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Values [M, C] at others than the places [N, D] where they are known [N, C]: linear in what is near, and never beyond it."""
-    near, size = min(_NEAR, len(places)), places.shape[1] + 1
-    distances, indices = (x.reshape(len(at), near) for x in KDTree(places).query(at, k=near))
+    """Values [M, C] at others than the places [N, D] where they are known [N, C]: quadratic in what is near, and never beyond it."""
+    tree = KDTree(places)
+    parts = [_fitted(tree, values, at[i : i + _PART]) for i in range(0, len(at), _PART)]
+    return np.concatenate([np.zeros((0, values.shape[1])), *parts])
+
+
+def _fitted(tree: KDTree, values: np.ndarray, at: np.ndarray) -> np.ndarray:
+    near, axes = min(_NEAR, tree.n), tree.m
+    distances, indices = (x.reshape(len(at), near) for x in tree.query(at, k=near))
     reach = distances[:, -1:].clip(1e-12)
     weights = (1 - (distances / reach) ** 2) ** 2 + 1e-3  # none leaves with a jump
-    apart = np.concatenate([np.ones((len(at), near, 1)), (places[indices] - at[:, None]) / reach[..., None]], -1)
+    apart = (tree.data[indices] - at[:, None]) / reach[..., None]
+    first, second = np.triu_indices(axes)
+    apart = np.concatenate([np.ones((len(at), near, 1)), apart, apart[..., first] * apart[..., second]], -1)
     weighted = weights[..., None] * apart
-    normal = weighted.swapaxes(1, 2) @ apart + np.diag(np.r_[0.0, np.full(size - 1, _LEVEL)])
+    normal = weighted.swapaxes(1, 2) @ apart + np.diag(np.r_[0.0, np.full(apart.shape[2] - 1, _LEVEL)])
     known = values[indices]
     found = np.linalg.solve(normal, weighted.swapaxes(1, 2) @ known)[:, 0]
     return found.clip(known.min(1), known.max(1))

@@ -138,14 +138,17 @@ class MotionWatch:
         seen = [each for each in (breath, heart) if each.sure]
         if seen:
             motion = rays.motion_of(seen, times[0])
-            parts = tuple(part for part in motion.parts if part.amplitude >= _LEAST)
-            if len(parts) < len(motion.parts):
-                seen = [each for each in seen if each.name in [part.name for part in parts]]
+            large = [part.name for part, amplitude in zip(motion.parts, motion.amplitudes) if amplitude >= _LEAST]
+            if len(large) < len(motion.parts):
+                seen = [each for each in seen if each.name in large]
                 motion = rays.motion_of(seen, times[0]) if seen else None
         else:
             motion = None
         if motion is not None:
-            parts = [f"{1e3 * each.amplitude:.1f} mm every {each.period:.2f} s (explains {each.explained:.0%})" for each in motion.parts]
+            parts = [
+                f"{1e3 * amplitude:.1f} mm every {each.period:.2f} s (explains {each.explained:.0%})"
+                for each, amplitude in zip(motion.parts, motion.amplitudes)
+            ]
             return motion, f"the tissue moves by itself: {' and '.join(parts)}, seen for {length:.0f} s"
         if unclear:
             text = f"in {length:.0f} s points move by {breath.pixels:.1f} pixels, by the tissue or faults of poses"

@@ -52,6 +52,18 @@ def test_frames_show_tissue_in_its_mean_position():
         assert np.abs(still.image[shown].astype(int) - truth[shown]).max() <= 12
 
 
+def test_noise_of_points_hardly_hides_how_motion_fades_around_its_place():
+    """Shares with a noise of 0.08 between 220 points: linear between the 24 nearest they are off by 0.036."""
+    rng = np.random.default_rng(0)
+    points, others = (np.c_[rng.uniform([-x, -y], [x, y], (n, 2)), np.zeros(n)] for x, y, n in ((0.06, 0.05, 220), (0.05, 0.04, 12_000)))
+    truth = lambda places: np.exp(-0.5 * (places**2).sum(1) / 0.04**2)
+    noisy = truth(points) + rng.normal(0, 0.08, len(points))
+    motion = TissueMotion(1.0, points, (PeriodicMotion("breathing", 4.0, 1.0, 3.0, np.stack([FAR, 0 * FAR]), noisy),))
+    assert np.sqrt(((motion.shares(others)[:, 0] - truth(others)) ** 2).mean()) < 0.033
+    assert motion.amplitudes[0] == pytest.approx(2 * np.linalg.norm(FAR), rel=0.05)
+    assert motion.shares(others[:0]).shape == (0, 1)
+
+
 def test_masks_follow_the_tissue_and_frames_without_points_stay():
     motion = breath(np.ones(len(POINTS)))
     mask = np.full((CAMERA.height, CAMERA.width), 255, np.uint8)

@@ -96,11 +96,12 @@ class TissueMotion:
     def parameters(self) -> dict[str, float]:
         """What physics calls a motion of all that is held: `motion.*` by name, as of the start of the recording."""
         found = {}
-        for part, amplitude in reversed([*zip(self.parts, self.amplitudes)]):  # breath says the direction
+        for part, amplitude in zip(self.parts, self.amplitudes):
             direction, farthest = part.wave
             phase = (_FARTHEST[part.name] - farthest) % 1
             found |= {part.name: amplitude, f"{part.name}_period": part.period, f"{part.name}_phase": phase}
-            found |= {f"direction_{axis}": float(value) for axis, value in zip("xyz", direction)}
+            own = "heartbeat_direction" if part.name == "heartbeat" else "direction"
+            found |= {f"{own}_{axis}": float(value) for axis, value in zip("xyz", direction)}
         return found
 
     def save(self, path: Path) -> None:

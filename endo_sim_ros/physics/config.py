@@ -34,6 +34,12 @@ class MotionConfig(StageConfig):
     """The same: y."""
     direction_z: Annotated[float, Range(-1.0, 1.0)] = -0.5
     """The same: z."""
+    heartbeat_direction_x: Annotated[float, Range(-1.0, 1.0)] = 0.0
+    """Direction of the heart's own motion in the world: x. Where none of its three is above a millionth, it is that of the breath."""
+    heartbeat_direction_y: Annotated[float, Range(-1.0, 1.0)] = 0.0
+    """The same: y."""
+    heartbeat_direction_z: Annotated[float, Range(-1.0, 1.0)] = 0.0
+    """The same: z."""
     fade: Annotated[float, Range(0.0, 60.0, "s")] = 1.0
     """Time in which a new amplitude or direction takes over from the old one, so that tissue does not jump; a new period acts at once, as
     the phase goes on from where it is."""
@@ -49,10 +55,16 @@ class MotionConfig(StageConfig):
         return self.direction_x, self.direction_y, self.direction_z
 
     @property
+    def heartbeat_direction(self) -> tuple[float, float, float]:
+        """Direction of the heart's motion, world, of any length."""
+        own = self.heartbeat_direction_x, self.heartbeat_direction_y, self.heartbeat_direction_z
+        return own if np.abs(own).max() >= _LEAST_DIRECTION else self.direction
+
+    @property
     def ways(self) -> np.ndarray:
         """How far breath and heart move held tissue [2, 3], m, world."""
-        direction = np.array(self.direction)
-        return np.array([[self.breathing], [self.heartbeat]]) * (direction / np.linalg.norm(direction))
+        directions = np.array([self.direction, self.heartbeat_direction])
+        return np.array([[self.breathing], [self.heartbeat]]) * (directions / np.linalg.norm(directions, axis=1, keepdims=True))
 
     @property
     def periods(self) -> tuple[float, float]:

@@ -57,6 +57,17 @@ def test_held_nodes_are_where_the_waveform_has_them_at_the_end_of_each_step():
     assert simulation.faults == 0 and simulation.motion.rates == pytest.approx([0.5, 1 / 0.9])
 
 
+def test_the_heart_may_go_its_own_way():
+    apart = dataclasses.replace(BOTH, heartbeat_direction_x=-0.5)
+    simulation = simulate(node_count=300, motion=apart)
+    for step in range(1, 13):
+        simulation.step()
+        breath, beat = 0.004 * breath_share(0.04 * step, 2.0), 0.002 * beat_share(0.04 * step, 0.9)
+        np.testing.assert_allclose(moved(simulation), breath * WAY + beat * np.array([-1.0, 0.0, 0.0]), rtol=3e-7, atol=1e-9)
+        np.testing.assert_allclose(simulation.motion.displacements, [breath, beat], rtol=1e-9, atol=1e-12)
+    np.testing.assert_array_equal(dataclasses.replace(BOTH, heartbeat_direction_z=1e-9).ways, BOTH.ways)
+
+
 def test_a_slab_that_is_held_below_moves_as_one():
     simulation = slab(motion=BREATH)
     mass = float(simulation.solver.nodes.mass.numpy().sum())

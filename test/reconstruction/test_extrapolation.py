@@ -70,6 +70,18 @@ def test_noise_of_scene_points_does_not_make_the_tissue_beyond_rough(views):
 
 
 @pytest.mark.slow
+def test_many_noisy_points_do_not_pull_the_tissue_beyond_towards_the_camera(views):
+    """Dozens in every pixel beyond the right edge of a flat picture, each 2 % off."""
+    camera, random = views[4].camera, np.random.default_rng(0)
+    flat = np.full((camera.height, camera.width), 0.1, np.float32)
+    (frame,) = with_prior([dataclasses.replace(bare(views[4]), mask=None, depth=flat)])
+    pixels, depth = random.uniform([165, 0], [200, 128], (100_000, 2)), 0.1 * random.normal(1, 0.02, 100_000)
+    points = torch.from_numpy(camera.unproject(pixels, depth))
+    continued = continue_view(frame, points, np.zeros(4), np.zeros(3), 0.1, 48)
+    assert abs(continued.depth[48 + 10 : 48 + 118, 48 + 170 : 48 + 195].mean() / 0.1 - 1) < 2e-3
+
+
+@pytest.mark.slow
 def test_a_picture_goes_on_as_bright_as_it_is_however_far_the_tissue_beyond_is_guessed(views):
     """Tissue that rises towards the right edge and on beyond it; the light falls off with distance."""
     camera, light, exposure = views[4].camera, np.array([0.9, 3.0, 0.1, 0.0]), np.full(3, 0.2)

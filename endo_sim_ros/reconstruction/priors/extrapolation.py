@@ -26,7 +26,7 @@ from endo_sim_ros.reconstruction.triangulation import points_in_view
 
 _FINENESS = 4  # pixels of a cell: what goes on beyond a picture is no finer than cells
 _AROUND = 8  # pixels from where depth is unknown, within which points tell how it goes on
-_THINNED = 2  # pixels in each of which at most one point, the nearest, tells it
+_THINNED = 2  # pixels in each of which at most one point tells it, that of the middle depth
 _AT_ONCE = 2_000_000  # points in views that are looked up at a time
 
 
@@ -116,6 +116,8 @@ def extrapolate(
     colors, spacings = [], []
     known = [view.depth_prior is not None and (view.depth_prior > 0).mean() >= options.min_coverage for view in views]
     usable = [index for index, view in enumerate(views) if known[index] and view.tissue.any()]
+    if not usable:
+        return model
     threads = max(cpu_threads() // max(len(usable), 1), 1)  # for each view: few leave cores idle
     known_views, cloud = _Known([view for view in views if view.depth_prior is not None], device), torch.from_numpy(points).to(device)
 
@@ -232,7 +234,7 @@ def _beside(tree: cKDTree, positions: np.ndarray, spacing: np.ndarray) -> np.nda
 
 
 def _that_tell(camera: Camera, points: Tensor, unknown: np.ndarray) -> np.ndarray:
-    """Those of the points [N, 3] that tell how depth goes on where it is unknown [H, W]: close to there, and not hidden by others."""
+    """Those of the points [N, 3] that tell how depth goes on where it is unknown [H, W]: close to there, one in a few pixels."""
     close = cv2.dilate(unknown.astype(np.uint8), np.ones((2 * _AROUND + 1,) * 2, np.uint8))
     to = lambda values: torch.from_numpy(np.array([values])).to(points.device)
     inside, u, v, z = (part[0] for part in _project(to(camera.viewmat[:3]), to(camera.K), to((camera.width, camera.height)), points))
@@ -240,8 +242,11 @@ def _that_tell(camera: Camera, points: Tensor, unknown: np.ndarray) -> np.ndarra
     told = torch.nonzero(inside & (torch.from_numpy(close).to(points.device).flatten()[index] > 0))[:, 0]
     columns = -(-camera.width // _THINNED)
     cell = (v[told] / _THINNED).long() * columns + (u[told] / _THINNED).long()
-    nearest = z.new_full((columns * camera.height,), torch.inf).scatter_reduce(0, cell, z[told], "amin")
-    return points[told[z[told] == nearest[cell]]].cpu().numpy()
+    order = torch.argsort(z[told])
+    order = order[torch.argsort(cell[order], stable=True)]  # by cells, and by depth in each
+    cells, sizes = torch.unique_consecutive(cell[order], return_counts=True)
+    middle = (sizes - cells % 2) // 2  # of an even number in every other cell the nearer of two
+    return points[told[order[torch.cumsum(sizes, 0) - sizes + middle]]].cpu().numpy()
 
 
 def _project(viewmats: Tensor, K: Tensor, sizes: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -18,7 +18,7 @@ from endo_sim_ros.reconstruction.priors.inverse_depth import blur, scaled
 from endo_sim_ros.reconstruction.stage_configs import MultiViewConfig
 
 _RADIUS, _STRIDE = 3, 2  # of the patches of flow on a GPU, pixels
-_NOISE = 1.0  # grey levels; a patch with less in it moves as those around
+_NOISE = 1.0  # grey levels; a patch with less in it stays where smaller images had it
 _STEPS = 5  # of each patch in each size of the images
 _COARSEST = 16  # pixels, the shorter side of the smallest image
 _launching = threading.Lock()
@@ -81,21 +81,29 @@ def flow_correction(inverse: Tensor, own: EyeImage, other: EyeImage, options: Mu
     The view's image is predicted from the other with its depth. Flow between prediction and image, along the direction in which depth
     moves a pixel, is a correction of inverse depth; across it, it is from poses, calibration or motion.
     """
+    seen = *own.on(str(inverse.device)), *other.on(str(inverse.device))
     # Threads that launch kernels at once wait for each other many times as long as the kernels take.
     with _launching if inverse.is_cuda else contextlib.nullcontext():
-        return _corrected(inverse, own, other, options)
+        return _corrected(inverse, own.camera, other.camera, *seen, options)
 
 
-def _corrected(inverse: Tensor, own: EyeImage, other: EyeImage, options: MultiViewConfig) -> FlowCorrection | None:
-    camera, device = own.camera, str(inverse.device)
+def _corrected(
+    inverse: Tensor,
+    camera: Camera,
+    other: Camera,
+    grey: Tensor,
+    matte: Tensor,
+    other_grey: Tensor,
+    other_matte: Tensor,
+    options: MultiViewConfig,
+) -> FlowCorrection | None:
     unit = camera.width / 640
-    (grey, matte), (other_grey, other_matte) = own.on(device), other.on(device)
-    u, v, z = _project(camera, inverse, other.camera)
+    u, v, z = _project(camera, inverse, other)
     inside = (z > 0) & (_sample(other_matte, u, v, "nearest") > 0)
     if min(inside.shape) < 16 or not inside.any():  # pixels, which optical flow needs
         return None
     step = 0.01 * inverse
-    ahead = _project(camera, inverse + step, other.camera)
+    ahead = _project(camera, inverse + step, other)
     along_u, along_v = ((there - here) / step for there, here in zip(ahead, (u, v)))
     del z, ahead  # each image of numbers takes as much memory as two of colours
     columns, rows, good = _led_to(grey, torch.where(inside, _sample(other_grey, u, v), grey), unit, options)

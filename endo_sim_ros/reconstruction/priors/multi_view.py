@@ -95,10 +95,11 @@ def refine_depth(
             progress.check()
             return flow_correction(given, images[i], images[j], options)
 
-        told = [found for found in several(told_by, near[i]) if found is not None]
-        if told:
-            total = total + torch.stack([found.precision * found.correction for found in told]).sum(0).cpu().numpy()
-            weight = weight + torch.stack([found.precision for found in told]).sum(0).cpu().numpy()
+        of_views = torch.zeros(2, *given.shape, device=device)
+        for found in several(told_by, near[i]):
+            if found is not None:
+                of_views += torch.stack([found.precision * found.correction, found.precision])
+        total, weight = np.stack([total, weight]) + of_views.cpu().numpy()
         inverse = correct(inverse, total, weight, error, options.continuation, options.max_correction)
         inverse = smooth(inverse, options.smoothing, options.edge, device)
         good = known & np.isfinite(inverse) & (inverse > 0)

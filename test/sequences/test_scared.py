@@ -327,6 +327,19 @@ def test_truncated_scene_points_are_refused_by_name(scared):
         list(read_scared(scared))
 
 
+def test_an_archive_that_is_cut_off_anywhere_is_refused(tmp_path):
+    archive, documents = tmp_path / "frame_data.tar.gz", {n: {"noise": list(np.random.default_rng(n).random(20))} for n in range(6)}
+    with tarfile.open(archive, "w:gz") as tar:
+        for number, document in documents.items():
+            add_member(tar, f"frame_data{number:06d}.json", json.dumps(document).encode())
+    assert read_frame_data(archive) == documents
+    whole = archive.read_bytes()
+    for count in range(0, len(whole), 7):  # tarfile takes a header that is cut off for the end
+        archive.write_bytes(whole[:count])
+        with pytest.raises(SequenceError, match="frame_data.tar.gz: not a readable"):
+            read_frame_data(archive)
+
+
 @pytest.mark.slow
 def test_links_in_archives_are_not_followed(scared):
     write_scared(scared, count=1)

@@ -147,12 +147,16 @@ def read_scared(
 
     def frames() -> Iterator[Frame]:
         opened = ScenePoints(points_source) if depth == "scene_points" and not points_source.is_dir() else None
+        seen = bare = 0
         with contextlib.closing(opened) if opened else contextlib.nullcontext() as archive:
             for number, left, right in images.read(numbers):
                 if not is_rectified:
                     left, right = rectification.left(left), rectification.right(right)
                 found, stamp = depth_of(number, archive), stamp_ns(number, fps or images.fps)
+                seen, bare = seen + 1, bare + (found is None)
                 yield rectification.frame(stamp, left, right, pose_of[number], rectification.valid, found)
+        if archive and bare:  # of a folder it is told before
+            logger.warning("%s: %d of %d frames have no depth", points_source, bare, seen)
 
     recording = Recording(frames, len(numbers))
     return recording if posed else with_estimated_poses(recording, root, poses, str(frame_data.relative_to(root)))

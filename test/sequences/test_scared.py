@@ -148,6 +148,7 @@ def test_scared_scene_points_in_any_order(scared, caplog):
     for frame in frames:
         assert_frame_agrees(frame, tolerance=12)
     assert "not in its place" in caplog.text
+    assert "scene_points.tar.gz: 1 of 5 frames have no depth" in caplog.text
 
 
 @pytest.mark.slow

@@ -79,7 +79,8 @@ def rigid(matrix: ArrayLike, source: str) -> np.ndarray:
     except (TypeError, ValueError):
         values = np.empty(0)
     if values.shape != (4, 4) or not np.isfinite(values).all():
-        raise SequenceError(f"{source}: expected a finite 4×4 matrix, got shape {values.shape}")
+        got = "one that is not finite" if values.shape == (4, 4) else f"shape {values.shape}"
+        raise SequenceError(f"{source}: expected a finite 4×4 matrix, got {got}")
     u, singular, vt = np.linalg.svd(values[:3, :3])
     if np.abs(singular - 1).max() > 0.02 or np.linalg.det(u @ vt) < 0:
         raise SequenceError(f"{source}: its 3×3 block is not a rotation (singular values {singular.round(3).tolist()})")

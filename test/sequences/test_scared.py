@@ -295,13 +295,13 @@ def damage_json(root: Path, data: bytes):
         (lambda r: damage_json(r, b"[]"), "camera-pose of frame 0 is missing"),
         (
             lambda r: damage_json(r, b'{"camera-pose": [[NaN,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}'),
-            "camera-pose of frame 0: expected a finite",
+            "camera-pose of frame 0: expected a finite 4×4 matrix, got one that is not finite",
         ),
         (
             lambda r: (r / "data/frame_data.tar.gz").write_bytes((r / "data/frame_data.tar.gz").read_bytes()[:400]),
             "frame_data.tar.gz: not a read",
         ),
-        (lambda r: damage_json(r, b'{"camera-pose": [[1]]}'), "camera-pose of frame 0: expected a finite 4×4"),
+        (lambda r: damage_json(r, b'{"camera-pose": [[1]]}'), r"camera-pose of frame 0: expected a finite 4×4 matrix, got shape \(1, 1\)"),
         (lambda r: damage_json(r, b" " * (2 << 20)), "far more than a camera needs"),
         (lambda r: (r / "data/scene_points.tar.gz").write_bytes(b"no archive"), "scene_points.tar.gz: not a readable"),
         (lambda r: (r / "left_depth_map.tiff").write_bytes(b"no tiff"), "left_depth_map.tiff: not a readable TIFF"),

@@ -1,6 +1,6 @@
 """By how many frames the poses of a recording are behind its images: measured from the images."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
@@ -29,6 +29,7 @@ class LagFinder:
         bridge: Missing rows that are interpolated.
         least_motion: Pixels (standard deviation over the lags) by which a pair must tell lags apart.
         overlap: Share of the image's width by which features of a pair may move.
+        least_pairs: Of frames; fewer do not outvote tissue that moves.
     """
 
     def __init__(
@@ -43,29 +44,44 @@ class LagFinder:
         bridge: int = 5,
         least_motion: float = 1.0,
         overlap: float = 0.25,
+        least_pairs: int = 6,
     ):
-        self._camera = camera
+        self._camera, self._least_pairs = camera, least_pairs
         self._lags = np.arange(-max_lag, max_lag + 1)
         self._path = _Path(poses, frames[0] - max_lag - bridge, frames[-1] + max_lag + bridge, bridge)
-        self._pairs = self._telling_pairs(np.array(frames), pairs, gaps, least_motion, overlap)
+        self._pairs, posed = self._telling_pairs(np.array(frames), pairs, gaps, least_motion, overlap)
+        self._lacking = ""  # which poses there are, where they are too few for any lag
+        if posed < least_pairs:
+            near = sum(frames[0] - max_lag <= row <= frames[-1] + max_lag for row in poses)
+            given = f"there are poses in rows {min(poses)} to {max(poses)}, {near} of them" if poses else "there is no pose"
+            self._pairs, self._lacking = [], f"{given} within {max_lag} of the frames {frames[0]} to {frames[-1]}, which are too few"
 
     @property
     def frames(self) -> list[int]:
         """Numbers of the frames whose images `find` wants, in increasing order."""
         return sorted({number for pair in self._pairs for number in pair})
 
-    def _telling_pairs(self, frames: np.ndarray, count: int, gaps: tuple[int, ...], least: float, overlap: float) -> list[tuple[int, int]]:
+    def needs(self, row: int, frames: Container[int]) -> bool:
+        """Whether the pose in a row is that of one of these frames with every lag."""
+        return all(row + lag in frames for lag in self._lags)
+
+    def _telling_pairs(
+        self, frames: np.ndarray, count: int, gaps: tuple[int, ...], least: float, overlap: float
+    ) -> tuple[list[tuple[int, int]], int]:
+        """The pairs, and how many first frames of pairs have poses with every lag."""
         width, height = self._camera.width, self._camera.height
         rays = self._camera.rays()[height // 4 :: height // 2, width // 4 :: width // 2].reshape(-1, 3)
         points, focal = 0.1 * rays, self._camera.K[0, 0]  # metres: the usual working distance
         starts = frames[:: max(1, len(frames) // 2000)]
         best = np.zeros((len(starts), 2))  # how much a pair tells, and its gap
+        posed = np.zeros(len(starts), bool)
         for gap in gaps:
             inside = np.flatnonzero(np.isin(starts + gap, frames))
             rows = starts[inside, None] - self._lags
             (here, known), (there, also_known) = self._path.at(rows), self._path.at(rows + gap)
             use = (known & also_known).all(1)
             inside, here, there = inside[use], here[use], there[use]
+            posed[inside] = True
             world = np.einsum("abij,pj->abpi", here[..., :3, :3], points) + here[..., None, :3, 3]
             moved = np.einsum("abji,abpj->abpi", there[..., :3, :3], world - there[..., None, :3, 3])
             shift = focal * (moved[..., :2] / np.maximum(moved[..., 2:], 1e-3) - rays[:, :2])  # [pairs, lags, points, 2]
@@ -78,7 +94,7 @@ class LagFinder:
             at = part[np.argmax(best[part, 0])] if len(part) else 0
             if len(part) and best[at, 0] > least:
                 pairs.append((int(starts[at]), int(starts[at] + best[at, 1])))
-        return pairs
+        return pairs, int(posed.sum())
 
     def find(
         self,
@@ -88,7 +104,6 @@ class LagFinder:
         features: int = 1500,
         ratio: float = 0.8,
         least_matches: int = 30,
-        least_pairs: int = 6,
         apart: int = 3,
         least_contrast: float = 0.1,
         least_agreement: float = 0.9,
@@ -102,12 +117,13 @@ class LagFinder:
             features: SIFT features of an image, at most.
             ratio: As `match_pair`.
             least_matches: Of a pair of frames; fewer may agree by accident.
-            least_pairs: Of frames; fewer do not outvote tissue that moves.
             apart: Distance in frames from which on another lag must be worse.
             least_contrast: By how much of its residual it must be worse.
             least_agreement: Share of random selections of the pairs that must give the lag, or one beside it.
             max_residual: Share of the image's width by which features may lie beside their lines; tissue that breathes moves by less.
         """
+        if self._lacking:
+            return None, self._lacking
         residuals = []
         for first, second in self._pairs:
             if first not in images or second not in images:
@@ -116,7 +132,7 @@ class LagFinder:
             uv_1, uv_2 = match_pair(one, other, ratio)
             if len(uv_1) >= least_matches:
                 residuals.append([self._residual(first - lag, second - lag, uv_1, uv_2) for lag in self._lags])
-        if len(residuals) < least_pairs:
+        if len(residuals) < self._least_pairs:
             return None, f"the camera moves too little, or too little is seen of it: {len(residuals)} pairs of frames tell lags apart"
         logs = np.log(np.array(residuals) + _NOISE)  # their mean: no pair outweighs the others
         curve = logs.mean(0)

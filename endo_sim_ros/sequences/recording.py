@@ -169,14 +169,20 @@ def keep_posed(numbers: list[int], poses: Mapping[int, np.ndarray], pose_file: P
     """
     posed = [n for n in numbers if n in poses]
     if not posed:
-        raise SequenceError(f"{pose_file}: holds no pose for any of the {len(numbers)} chosen frames")
-    finite = np.isfinite([poses[n] for n in posed]).reshape(len(posed), -1).all(1)
-    if not finite.all():
-        number = posed[np.argmin(finite)] - lag
-        raise SequenceError(f"{pose_file}: number {number} is not a pose; expected a finite position and a rotation; correct or remove it")
+        held = f"; it holds those of {min(poses) - lag} to {max(poses) - lag}" if poses else ""
+        chosen = f"{len(numbers)} chosen frames, {numbers[0]} to {numbers[-1]}" + (f" with a lag of {lag}" if lag else "")
+        raise SequenceError(f"{pose_file}: holds no pose for any of the {chosen}{held}")
+    refuse_unfinite({n - lag: poses[n] for n in posed}, pose_file)
     if len(posed) < len(numbers):
         logger.info("%s: %d of %d frames have no pose and are skipped", pose_file, len(numbers) - len(posed), len(numbers))
     return posed
+
+
+def refuse_unfinite(poses: Mapping[int, np.ndarray], pose_file: Path) -> None:
+    """Raise SequenceError if one of the poses, by their numbers in a file, is not finite."""
+    wrong = next((number for number, pose in poses.items() if not np.isfinite(pose).all()), None)
+    if wrong is not None:
+        raise SequenceError(f"{pose_file}: number {wrong} is not a pose; expected a finite position and a rotation; correct or remove it")
 
 
 def tell_lacking(numbers: Sequence[int], files: Container[int], folder: Path) -> None:

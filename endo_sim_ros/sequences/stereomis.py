@@ -33,7 +33,7 @@ from endo_sim_ros.sequences.mask_alignment import MaskAlignment, Reading
 from endo_sim_ros.sequences.masks import MaskFiles, read_mask
 from endo_sim_ros.sequences.pose_files import read_poses
 from endo_sim_ros.sequences.pose_lag import LagFinder
-from endo_sim_ros.sequences.recording import Recording, check_folder, keep_posed, select, spread, stamp_ns
+from endo_sim_ros.sequences.recording import Recording, check_folder, keep_posed, refuse_unfinite, select, spread, stamp_ns
 from endo_sim_ros.sequences.rectification import Rectification, StereoCalibration
 from endo_sim_ros.sequences.stereo_images import StackedVideo, StereoFiles, StereoImages, row_offsets
 from endo_sim_ros.sequences.video_files import find_video
@@ -111,7 +111,7 @@ def read_stereomis(
         if not usable:
             raise SequenceError(f"{root}: the {split} split holds none of the frames {images.numbers[0]} to {images.numbers[-1]}")
     numbers = select(usable, root, start, stop, step)
-    rows = None if estimated else read_poses(root / POSES_FILE)
+    rows, posed = None if estimated else read_poses(root / POSES_FILE), dict[int, np.ndarray]()
 
     mask_files = numbered_files(root / "masks", ending="l") or numbered_files(root / "masks")
     masks = MaskFiles(mask_files, root / "masks", mask_polarity)
@@ -124,7 +124,13 @@ def read_stereomis(
     small = Camera(rectification.K, *images.size).resized(*(round(scale * side) for side in images.size))
     finder = None
     if rows is not None and pose_lag is None:
-        finder = LagFinder({row: rectification.pose(pose) for row, pose in rows.items() if np.isfinite(pose).all()}, small, surveyed)
+        finite = {row: pose for row, pose in rows.items() if np.isfinite(pose).all()}
+        finder, chosen = LagFinder({row: rectification.pose(pose) for row, pose in finite.items()}, small, surveyed), set(numbers)
+        refuse_unfinite({row: pose for row, pose in rows.items() if row not in finite and finder.needs(row, chosen)}, root / POSES_FILE)
+        if not finder.frames:  # no image tells it
+            pose_lag, finder = _told_lag(root, *finder.find({}, lambda number: None)), None
+    if rows is not None and pose_lag is not None:  # what is wrong with them is told before the images are looked at
+        numbers, posed = _posed(root, numbers, rows, pose_lag)
     views = _look(images, is_rectified, rectification, alignment, finder, (small.width, small.height))
 
     masks_rectified, first_mask = _chosen_reading(root, alignment, readings) if mask_files else readings[0]
@@ -138,14 +144,12 @@ def read_stereomis(
         mask = None if nearest is None else masks.of(nearest + first_mask, images.size)
         return rectification.mask(mask) if mask is None or not masks_rectified else cv2.bitwise_and(mask, rectification.valid)
 
-    if finder is not None:
+    if rows is not None and finder is not None:
         pose_lag = _told_lag(
             root, *finder.find(views, lambda n: cv2.resize(tissue(n), (small.width, small.height), interpolation=cv2.INTER_NEAREST))
         )
+        numbers, posed = _posed(root, numbers, rows, pose_lag)
     del views
-    posed = {row + (pose_lag or 0): pose for row, pose in (rows or {}).items()}
-    if rows is not None:
-        numbers = keep_posed(numbers, posed, root / POSES_FILE, pose_lag or 0)
     bare = sum(_nearest(masked, n, max_mask_gap) is None for n in numbers)
     if bare:
         logger.warning("%s: %d of %d frames have no mask; tools stay visible in them", root, bare, len(numbers))
@@ -305,6 +309,12 @@ def _told_lag(root: Path, lag: int | None, basis: str) -> int:
         return USUAL_LAG
     logger.info("%s: poses lag the images by %d frames: %s", root, lag, basis)
     return lag
+
+
+def _posed(root: Path, numbers: list[int], rows: Mapping[int, np.ndarray], lag: int) -> tuple[list[int], dict[int, np.ndarray]]:
+    """Those of the frames that have a pose with a lag, and the poses by frame."""
+    posed = {row + lag: pose for row, pose in rows.items()}
+    return keep_posed(numbers, posed, root / POSES_FILE, lag), posed
 
 
 def _read_split(root: Path, split: str) -> list[tuple[int, int]]:

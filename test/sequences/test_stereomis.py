@@ -84,7 +84,26 @@ def test_lag_that_is_stated_shifts_the_rows(plane_source):
 
 def test_lag_of_too_short_a_sequence_is_assumed(plane_source, caplog):
     assert numbers_of(read_stereomis(plane_source)) == [4, 5, 6]
+    assert "(there are poses in rows 0 to 7, 7 of them within 10 of the frames 0 to 7, which are too few)" in caplog.text
     assert "the lag of the poses cannot be told from the images" in caplog.text and "4 frames are assumed" in caplog.text
+
+
+@pytest.mark.parametrize("lag", [None, -3])
+def test_poses_of_other_frames_are_told_before_the_images_are_looked_at(plane, lag, monkeypatch):
+    monkeypatch.setattr(stereomis, "_look", None)
+    write_poses(plane / "groundtruth.txt", {row: stereomis_copy.pose_of_frame(row % 8) for row in range(500, 508)})
+    with pytest.raises(SequenceError, match=f"8 chosen frames, 0 to 7 with a lag of {lag or 4}; it holds those of 500 to 507"):
+        read_stereomis(plane, pose_lag=lag)
+
+
+@pytest.mark.slow
+def test_a_pose_that_is_needed_with_any_lag_is_refused_before_the_images_are_looked_at(tmp_path, monkeypatch):
+    root = write_stereomis(tmp_path / "P2_1")
+    lines = (root / "groundtruth.txt").read_text().splitlines()
+    (root / "groundtruth.txt").write_text("\n".join("20 0 0 nan 0 0 0 1" if line.startswith("20 ") else line for line in lines))
+    monkeypatch.setattr(stereomis, "_look", None)
+    with pytest.raises(SequenceError, match="groundtruth.txt: number 20 is not a pose"):
+        read_stereomis(root)
 
 
 def test_frames_without_pose_are_counted_in_the_log(plane_source, caplog):

@@ -136,5 +136,6 @@ def _save(model: GaussianModel, cameras: list[Camera], motion: TissueMotion | No
 def _write(model: GaussianModel, cameras: list[Camera], motion: TissueMotion | None, folder: Path) -> None:
     save_ply(model, folder / "model.ply")
     save_cameras(cameras, folder / "cameras.json")
+    (folder / "motion.yaml").unlink(missing_ok=True)  # of a model that was there before
     if motion is not None:
         motion.save(folder / "motion.yaml")

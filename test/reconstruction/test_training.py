@@ -179,6 +179,13 @@ def test_reconstruction_of_a_bag_is_measured(tmp_path, small):
         assert (tmp_path / "out" / name).stat().st_size > 0
 
 
+def test_motion_of_an_earlier_model_goes_with_it(tmp_path, small):
+    model = trainer_of([small[0]], options()).model
+    (tmp_path / "motion.yaml").write_text("physics_node: {}")
+    from_bag._save(model, [small[0].camera], None, tmp_path)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["cameras.json", "model.ply"]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("room", ["nowhere", "elsewhere"])
 def test_a_full_disk_loses_no_trained_model(tmp_path, small, room, monkeypatch, caplog):

@@ -10,6 +10,7 @@ from rich.progress import Progress as ProgressBar
 from endo_sim_ros.core.cameras import Camera, save_cameras
 from endo_sim_ros.core.config import unused_options
 from endo_sim_ros.core.device import pick_device
+from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel, save_ply
 from endo_sim_ros.core.tissue_motion import TissueMotion, stilled
 from endo_sim_ros.reconstruction.checkpoint import read_checkpoint
@@ -46,7 +47,7 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
         resume: Go on from the checkpoint in the folder, to the same model; one is written every tenth of the way.
 
     Raises:
-        SequenceError: If the bag or the checkpoint cannot be used, or `prepare` finds nothing to start from.
+        SequenceError: If the bag, the folder or the checkpoint cannot be used, or `prepare` finds nothing to start from.
         ValueError: If there is no such device.
         RuntimeError: If the folder takes no files, as on a full disk; the model is then in another, which is named.
     """
@@ -57,12 +58,15 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
         log.warning(text)
     if resume:
         read_checkpoint(out / "checkpoint.pt", config, "cpu")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SequenceError(f"{out}: the folder for the model cannot be made ({error.strerror}); choose another place") from None
     recording = Recording(lambda: read_bag(bag), 0)
     with ProgressBar() as bar:
         task = bar.add_task(f"reading {bag.name}", total=None)
         watch, motion = MotionWatch(config.watch), None
         views, sample = survey(watch.watch(recording) if config.watch_motion else recording, POINT_VIEWS)
-        out.mkdir(parents=True, exist_ok=True)  # before the long work
 
         def on_stage(stage: str, done: int, total: int) -> None:
             bar.update(task, description=stage, completed=done, total=total or None)

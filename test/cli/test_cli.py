@@ -256,6 +256,11 @@ def test_reconstruct_writes_a_model_and_measures_held_out_views(bag, tmp_path):
         (("convert", "no/such/thing", "no_bag"), "no/such/thing: no such file or folder"),
         (("convert", "launch", "no_bag"), "no known layout recognised"),
         (("reconstruct", "no_bag", "out"), "no_bag: no such bag"),
+        (
+            ("reconstruct", "no_bag", "README.md"),
+            r"README.md: the folder for the model cannot be made \(File exists\); choose",
+        ),
+        (("reconstruct", "no_bag", "README.md/out"), r"README.md/out: the folder for the model cannot be made \(Not a directory\)"),
         (("reconstruct", "no_bag", "no_out", "--device", "cuda:99"), "device 'cuda:99' asked for, but"),
         (("reconstruct", "no_bag", "no_out", "--resume"), "no_out/checkpoint.pt: not a readable checkpoint"),
         (("phantom", "README.md"), "README.md exists already"),

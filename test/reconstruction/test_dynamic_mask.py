@@ -1,6 +1,7 @@
 """What moved between the views."""
 
 import dataclasses
+import logging
 
 import cv2
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from short_training import options
 from training_views import with_prior
 
-from endo_sim_ros.reconstruction import prepare
+from endo_sim_ros.reconstruction import dynamic_mask, prepare
 from endo_sim_ros.reconstruction.dynamic_mask import mask_motion
 from endo_sim_ros.reconstruction.stage_configs import DynamicMaskConfig
 
@@ -37,6 +38,15 @@ def test_an_instrument_in_one_of_several_views_is_left_out(views, tool, caplog):
     hidden = (found[4].mask == 0) & (held.mask > 0)
     assert hidden[shown].mean() > 0.8 and hidden[~shown].mean() < 0.05
     assert (found[4].depth_prior[hidden] == 0).all()
+
+
+def test_a_share_of_no_percent_is_no_warning(views, caplog):
+    (view,), moved = with_prior([views[4]]), np.zeros((128, 160), bool)
+    caplog.set_level(logging.INFO)
+    for side, level, share in ((5, logging.INFO, "less than 1 %"), (20, logging.WARNING, "2 %")):
+        moved[:side, :side] = True
+        dynamic_mask._masked(view, moved, DynamicMaskConfig())
+        assert caplog.records[-1].levelno == level and f": {share} of it contradicts" in caplog.messages[-1]
 
 
 @pytest.mark.slow

@@ -401,9 +401,11 @@ def _plane_depth(scene: PreparedScene, config: ReconstructionConfig) -> tuple[Pr
     if np.isfinite(depth):
         return scene.decided(f"no view sees enough scene points for a depth prior: training starts from a plane {depth:.3g} m away"), depth
     depth = guessed_depth([view.camera for view in scene.views], config.initial.guessed_shift)
+    lone = len(scene.views) == 1
+    more = "or more views, from different positions" if lone else "views that overlap from different positions, or check the poses"
     sentence = (
         f"NO DEPTH IS KNOWN, neither measured nor of points that views share: training starts from a plane {depth:.3g} m away, which is a "
-        "guess; give depth or a right image, views that overlap from different positions, or check the poses"
+        f"guess; give depth or a right image, {more}"
     )
     return scene.decided(sentence), depth
 

@@ -4,6 +4,8 @@ Only the file of the command that runs is imported, and nothing heavy before its
 """
 
 import ast
+import atexit
+import gc
 import importlib
 import logging
 import signal
@@ -90,7 +92,11 @@ def main() -> int:
     if name not in COMMANDS:
         print(f"endo-sim: there is no command {name}; the commands are {', '.join(COMMANDS)}", file=sys.stderr)
         return 2
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    shown = logging.StreamHandler()
+    # What others tell is for programmers, as what torch says when it is interrupted.
+    shown.addFilter(lambda record: record.levelno > logging.INFO or record.name.startswith("endo_sim_ros"))
+    logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[shown])
+    atexit.register(gc.freeze)  # looking for garbage in all that was imported, torch above all, takes a second before the command ends
     start = time.monotonic()
     try:
         parse(name, words).run()

@@ -88,17 +88,26 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
     if resume:
         trainer.load_checkpoint(out / "checkpoint.pt")
         log.info("going on after %d iterations", trainer.iteration)
-    iterations = trainer.iterations
-    with ProgressBar() as bar:
-        task = bar.add_task("reconstructing", total=iterations)
+    iterations, kept = trainer.iterations, trainer.iteration if resume else 0
+    bar = ProgressBar()
+    task = bar.add_task("reconstructing", total=iterations)
 
-        def on_progress(progress: Progress) -> None:
-            text = f"reconstructing, {progress.gaussians} Gaussians, loss {progress.loss:.4f}"
-            bar.update(task, completed=progress.iteration, description=text)
-            if progress.iteration % max(iterations // (_CHECKPOINTS * _REPORTS) * _REPORTS, _REPORTS) == 0:
-                _save_checkpoint(trainer, out)
+    def on_progress(progress: Progress) -> None:
+        nonlocal kept
+        text = f"reconstructing, {progress.gaussians} Gaussians, loss {progress.loss:.4f}"
+        bar.update(task, completed=progress.iteration, description=text)
+        if progress.iteration % max(iterations // (_CHECKPOINTS * _REPORTS) * _REPORTS, _REPORTS) == 0 and _save_checkpoint(trainer, out):
+            kept = progress.iteration
 
-        model = trainer.run(on_progress, _REPORTS)
+    try:
+        with bar:
+            model = trainer.run(on_progress, _REPORTS)
+    except (KeyboardInterrupt, SystemExit):
+        if kept:
+            log.info(
+                "%s: holds what was reached after %d of %d iterations; --resume goes on from there", out / "checkpoint.pt", kept, iterations
+            )
+        raise
     cameras = [views[index].camera for index in chosen if views[index].stamp_ns in trainer.stamps]
     _save(model, cameras, motion, out)
     _save_checkpoint(trainer, out)
@@ -106,12 +115,14 @@ def reconstruct_bag(bag: Path, out: Path, config: ReconstructionConfig, resume: 
     return trainer, recording.take(set(held_out), len(held_out))
 
 
-def _save_checkpoint(trainer: Trainer, out: Path) -> None:
-    """Write the checkpoint; without room for it the training, and its model, still count."""
+def _save_checkpoint(trainer: Trainer, out: Path) -> bool:
+    """Write the checkpoint, and return whether it was; without room for it the training, and its model, still count."""
     try:
         trainer.save_checkpoint(out / "checkpoint.pt")
     except OSError as error:
         log.warning(str(error))
+        return False
+    return True
 
 
 def _save(model: GaussianModel, cameras: list[Camera], motion: TissueMotion | None, out: Path) -> None:

@@ -29,6 +29,7 @@ from endo_sim_ros.physics import PhysicsConfig, tissue
 from endo_sim_ros.reconstruction import ReconstructionConfig, from_bag
 from endo_sim_ros.reconstruction.from_bag import reconstruct_bag
 from endo_sim_ros.reconstruction.presets import preset
+from endo_sim_ros.reconstruction.trainer import Progress
 from endo_sim_ros.sequences.bag import read_bag, write_bag
 from endo_sim_ros.sequences.readers import READERS
 
@@ -131,6 +132,40 @@ def test_a_killed_reconstruction_goes_on_to_the_same_model(bag, tmp_path, caplog
     assert re.search(r"going on after [1-9]\d* iterations", caplog.text)
     reconstruct_bag(bag, tmp_path / "whole", config)
     assert (tmp_path / "killed" / "model.ply").read_bytes() == (tmp_path / "whole" / "model.ply").read_bytes()
+
+
+@pytest.mark.slow
+def test_an_interrupted_reconstruction_says_how_to_go_on(small_frames, tmp_path, monkeypatch, caplog):
+    write_bag(tmp_path / "bag", small_frames)
+
+    def interrupted(self, on_progress, every):
+        on_progress(Progress(100, 200, 0.1, 5))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(from_bag.Trainer, "run", interrupted)
+    caplog.set_level(logging.INFO)
+    config = ReconstructionConfig(iterations=200, max_gaussians=2000, keyframes=3, image_width=96, device="cpu")
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct_bag(tmp_path / "bag", tmp_path / "out", config)
+    last = caplog.messages[-1]
+    assert last.endswith("checkpoint.pt: holds what was reached after 100 of 200 iterations; --resume goes on from there")
+    assert (tmp_path / "out/checkpoint.pt").is_file()
+
+
+def test_what_other_packages_tell_programmers_is_not_shown():
+    code = """if True:
+    import logging, sys
+    from unittest.mock import Mock
+    from endo_sim_ros import cli
+    def run():
+        for name in ("torch", "endo_sim_ros.core"):
+            logging.getLogger(name).info("%s informs", name)
+            logging.getLogger(name).warning("%s warns", name)
+    cli.parse, sys.argv = (lambda *words: Mock(run=run)), ["endo-sim", "demo"]
+    cli.main()
+    """
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.stderr.splitlines()[:-1] == ["torch warns", "endo_sim_ros.core informs", "endo_sim_ros.core warns"], done.stderr
 
 
 @pytest.mark.slow

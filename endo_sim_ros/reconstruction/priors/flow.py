@@ -97,6 +97,7 @@ def _corrected(
     other_matte: Tensor,
     options: MultiViewConfig,
 ) -> FlowCorrection | None:
+    """As `flow_correction`, with grey levels and mattes [H, W] of both images on a device."""
     unit = camera.width / 640
     u, v, z = _project(camera, inverse, other)
     inside = (z > 0) & (_sample(other_matte, u, v, "nearest") > 0)

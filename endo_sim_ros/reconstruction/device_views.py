@@ -50,17 +50,26 @@ def matrices(cameras: Sequence[Camera], device: str) -> tuple[Tensor, Tensor]:
     return tensor([camera.viewmat for camera in cameras]), tensor([camera.K for camera in cameras])
 
 
+def project(viewmats: Tensor, K: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Columns, rows (pixels) and depths (m) [..., N] of points [N, 3] (m, world) in cameras: world to camera [..., 4, 4], K [..., 3, 3].
+
+    What is not ahead of a camera is anywhere.
+    """
+    # Without a matrix product: libraries give other last bits with other numbers of threads.
+    x, y, z = (sum(viewmats[..., r, i, None] * points[:, i] for i in range(3)) + viewmats[..., r, 3, None] for r in range(3))
+    ahead = z.clamp_min(1e-6)
+    u, v = (part / ahead * K[..., axis, axis, None] + K[..., axis, 2, None] for axis, part in enumerate((x, y)))
+    return u, v, z
+
+
 def shown(view: DeviceView, points: Tensor) -> Tensor:
     """Which points [N, 3] (m, world) lie in the picture of a view, on its tissue, hidden or not [N]."""
     camera = view.camera
-    rows, K = camera.viewmat.tolist(), camera.K
-    x, y, z = (sum(row[i] * points[:, i] for i in range(3)) + row[3] for row in rows[:3])
-    ahead = z.clamp_min(1e-6)
-    u, v = (x / ahead * K[0, 0] + K[0, 2]).floor(), (y / ahead * K[1, 1] + K[1, 2]).floor()
+    u, v, z = project(view.viewmats[0], view.Ks[0], points)
     inside = (z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
     if view.mask is None:
         return inside
-    pixels = torch.where(inside, v * camera.width + u, 0).long()
+    pixels = torch.where(inside, v.long() * camera.width + u.long(), 0)
     return inside & (view.mask.reshape(-1)[pixels] > 0)
 
 
@@ -71,11 +80,8 @@ def reprojected_prior(prior: Tensor, camera: Camera, viewmat: Tensor) -> Tensor:
     K, pose = (torch.tensor(matrix).to(viewmat) for matrix in (camera.K, camera.pose))
     z = prior[v, u]
     points = torch.stack([(u + 0.5 - K[0, 2]) / K[0, 0] * z, (v + 0.5 - K[1, 2]) / K[1, 1] * z, z], 1)
-    # Without a matrix product: libraries give other last bits with other numbers of threads.
-    x, y, z = (sum(row[i] * points[:, i] for i in range(3)) + row[3] for row in (viewmat @ pose)[:3])
-    ahead = z.clamp_min(1e-6)
-    u, v = (x / ahead * K[0, 0] + K[0, 2]).floor(), (y / ahead * K[1, 1] + K[1, 2]).floor()
+    u, v, z = project(viewmat @ pose, K, points)
     inside = (z > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    pixels = (v * width + u).long()[inside]
+    pixels = v[inside].long() * width + u[inside].long()
     nearest = torch.full((height * width,), math.inf, device=z.device).scatter_reduce(0, pixels, z[inside], "amin")
     return torch.where(nearest.isfinite(), nearest, 0).view(height, width)

@@ -8,6 +8,7 @@
 namespace endo_sim {
 
 ENDO_SIM_INLINE float negative(float x) { return -fabsf(x); }
+ENDO_SIM_INLINE float absolute(float x) { return fabsf(x); }
 
 #if !defined(__CUDA_ARCH__)
 

@@ -18,6 +18,7 @@ from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import cpu_threads
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import features_at
+from endo_sim_ros.reconstruction.device_views import project
 from endo_sim_ros.reconstruction.priors.interpolation import clip_to_range, fit_plane, inverse_distance_weighted, krige
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import TrainingView, shrink
@@ -60,7 +61,7 @@ class _Known:
         to = lambda values: torch.from_numpy(np.array(values)).to(device)
         joined = lambda masks: torch.from_numpy(np.concatenate([mask.ravel() for mask in masks])).to(device)
         cameras = [view.camera for view in views]
-        self._viewmats, self._K = to([camera.viewmat[:3] for camera in cameras]), to([camera.K for camera in cameras])
+        self._viewmats, self._K = to([camera.viewmat for camera in cameras]), to([camera.K for camera in cameras])
         self._sizes = to([(camera.width, camera.height) for camera in cameras])
         self._first = torch.cumsum(self._sizes.prod(1), 0) - self._sizes.prod(1)  # pixel of each view
         self._depth = joined([view.depth_prior > 0 for view in views if view.depth_prior is not None])
@@ -73,7 +74,8 @@ class _Known:
         unknown = torch.ones_like(beyond)
         # So many views at a time that their pixels take some ten megabytes.
         for views in torch.arange(len(self._first)).split(max(_AT_ONCE // max(len(positions), 1), 1)):
-            inside, u, v, _ = _project(self._viewmats[views], self._K[views], self._sizes[views], positions)
+            u, v, z = project(self._viewmats[views], self._K[views], positions)
+            inside = (z > 0) & (u >= 0) & (v >= 0) & (u < self._sizes[views, :1]) & (v < self._sizes[views, 1:])
             pixel = torch.where(inside, self._first[views, None] + v.long() * self._sizes[views, :1] + u.long(), 0)
             unknown &= ~(inside & (self._depth[pixel] | beyond & self._tissue[pixel])).any(0)
         kept = unknown.cpu().numpy()
@@ -198,7 +200,7 @@ def continue_view(
     plane = a * np.arange(camera.width) + b * np.arange(camera.height)[:, None] + c  # what departs from it fades
     residual = np.zeros(depth.shape, np.float32)
     residual[known] = inverse - plane[known]
-    uv, z = points_in_view(camera, _that_tell(camera, points, ~known), where=~known, threads=threads)
+    uv, z = points_in_view(camera, _points_about(camera, points, ~known), where=~known, threads=threads)
     columns, rows = np.floor(uv).astype(int).T
     point_inverse = 1 / z
     point_residual = point_inverse - plane[rows, columns]
@@ -233,11 +235,11 @@ def _beside(tree: cKDTree, positions: np.ndarray, spacing: np.ndarray) -> np.nda
     return tree.query(positions, distance_upper_bound=apart.max(initial=0.0) + 1e-9)[0] > apart  # infinite where there is none so close
 
 
-def _that_tell(camera: Camera, points: Tensor, unknown: np.ndarray) -> np.ndarray:
-    """Those of the points [N, 3] that tell how depth goes on where it is unknown [H, W]: close to there, one in a few pixels."""
+def _points_about(camera: Camera, points: Tensor, unknown: np.ndarray) -> np.ndarray:
+    """Of the points [N, 3] those close to where depth is unknown [H, W], one for every few pixels: they tell how it goes on."""
     close = cv2.dilate(unknown.astype(np.uint8), np.ones((2 * _AROUND + 1,) * 2, np.uint8))
-    to = lambda values: torch.from_numpy(np.array([values])).to(points.device)
-    inside, u, v, z = (part[0] for part in _project(to(camera.viewmat[:3]), to(camera.K), to((camera.width, camera.height)), points))
+    u, v, z = project(points.new_tensor(camera.viewmat), points.new_tensor(camera.K), points)
+    inside = (z > 0) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
     index = torch.where(inside, v.long() * camera.width + u.long(), 0)
     told = torch.nonzero(inside & (torch.from_numpy(close).to(points.device).flatten()[index] > 0))[:, 0]
     columns = -(-camera.width // _THINNED)
@@ -247,15 +249,3 @@ def _that_tell(camera: Camera, points: Tensor, unknown: np.ndarray) -> np.ndarra
     cells, sizes = torch.unique_consecutive(cell[order], return_counts=True)
     middle = (sizes - cells % 2) // 2  # of an even number in every other cell the nearer of two
     return points[told[order[torch.cumsum(sizes, 0) - sizes + middle]]].cpu().numpy()
-
-
-def _project(viewmats: Tensor, K: Tensor, sizes: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Which points [N, 3] (m, world) are in the pictures of cameras [V], and columns, rows (pixels) and depths (m) of all: each [V, N].
-
-    Of the cameras there are world to camera [V, 3, 4], K [V, 3, 3], and width and height [V, 2].
-    """
-    x, y, z = (viewmats[:, :, :3] @ points.T + viewmats[:, :, 3:]).unbind(1)
-    ahead = torch.where(z > 0, z, torch.inf)
-    u, v = (part / ahead * K[:, axis, axis, None] + K[:, axis, 2, None] for axis, part in enumerate((x, y)))
-    inside = (z > 0) & (u >= 0) & (v >= 0) & (u < sizes[:, :1]) & (v < sizes[:, 1:])
-    return inside, u, v, z

@@ -108,17 +108,29 @@ template <class F> ENDO_SIM_INLINE auto crosses_median(const Layer<F>& layer)
     return (layer.before > MEDIAN) & (layer.after <= MEDIAN);
 }
 
+// What pixels show in the end, over a background.
+template <class F> struct Shown {
+    F red, green, blue, depth, alpha;
+};
+
+template <class F> ENDO_SIM_INLINE Shown<F> shown(const Pixel<F>& pixel, const float* background, float reference)
+{
+    ENDO_SIM_FUSE(on)
+    const F seen_through = absolute(pixel.transmittance), alpha = 1.0f - seen_through;
+    return {pixel.red + seen_through * background[0], pixel.green + seen_through * background[1],
+        pixel.blue + seen_through * background[2], pixel.depth + reference * alpha, alpha};
+}
+
 // Write one pixel's images.
 ENDO_SIM_INLINE void finish(
     const Pixel<float>& pixel, size_t index, const float* background, float reference, const Images& images)
 {
-    ENDO_SIM_FUSE(on)
-    const float seen_through = fabsf(pixel.transmittance);
-    images.colors[3 * index] = pixel.red + seen_through * background[0];
-    images.colors[3 * index + 1] = pixel.green + seen_through * background[1];
-    images.colors[3 * index + 2] = pixel.blue + seen_through * background[2];
-    images.depths[index] = pixel.depth + reference * (1.0f - seen_through);
-    images.alphas[index] = 1.0f - seen_through;
+    const Shown<float> seen = shown(pixel, background, reference);
+    images.colors[3 * index] = seen.red;
+    images.colors[3 * index + 1] = seen.green;
+    images.colors[3 * index + 2] = seen.blue;
+    images.depths[index] = seen.depth;
+    images.alphas[index] = seen.alpha;
     images.distortions[index] = pixel.distortion;
 }
 

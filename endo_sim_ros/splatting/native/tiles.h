@@ -107,16 +107,12 @@ ENDO_SIM_INLINE void composite_tile(
     for (int row = 0; row < rows; ++row) {
         const Pixel<vfloat>& p = pixels[row];
         const size_t index = place.pixel0 + (size_t)row * width;
-        const vfloat seen_through = absolute(p.transmittance), alpha = 1.0f - seen_through;
-        const vfloat depth = p.depth + reference * alpha;
-        const vfloat red = p.red + seen_through * background[0];
-        const vfloat green = p.green + seen_through * background[1];
-        const vfloat blue = p.blue + seen_through * background[2];
+        const Shown<vfloat> seen = shown(p, background, reference);
         vfloat rgb[3];
-        interleave(red, green, blue, rgb);
+        interleave(seen.red, seen.green, seen.blue, rgb);
         copy_items(images.colors + 3 * index, rgb, 3 * sizeof(float), columns);
-        copy_items(images.depths + index, &depth, sizeof(float), columns);
-        copy_items(images.alphas + index, &alpha, sizeof(float), columns);
+        copy_items(images.depths + index, &seen.depth, sizeof(float), columns);
+        copy_items(images.alphas + index, &seen.alpha, sizeof(float), columns);
         copy_items(images.distortions + index, &p.distortion, sizeof(float), columns);
         if (owners_of_median)
             copy_items(owners_of_median + index, &owner[row], sizeof(int), columns);

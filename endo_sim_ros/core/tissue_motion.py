@@ -221,6 +221,7 @@ def _interpolated(places: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.
 
 
 def _fitted(tree: KDTree, values: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """As `_interpolated`, of all places at once; the tree has those that are known."""
     near, axes = min(_NEAR, tree.n), tree.m
     distances, indices = (x.reshape(len(at), near) for x in tree.query(at, k=near))
     reach = distances[:, -1:].clip(1e-12)

@@ -67,6 +67,7 @@ class NodeGroup(contextlib.AbstractContextManager):
         return self.nodes[name]
 
     def _launch(self, arguments: list[str], environment: dict[str, str], output: Any) -> Any:
+        """Start a process that writes to a file; what it returns has `pid`, `poll`, `wait`, `send_signal` and `kill` of one."""
         return subprocess.Popen(arguments, env=environment, stdout=output, stderr=subprocess.STDOUT, start_new_session=True)
 
     def dead(self) -> list[NodeProcess]:

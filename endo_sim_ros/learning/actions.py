@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from endo_sim_ros.instruments import JOINTS
 from endo_sim_ros.learning.tasks import Task
 from endo_sim_ros.learning.tasks.task import dot
+from endo_sim_ros.learning.variation import departed
 
 POSE_NAMES = ("x", "y", "z", "qx", "qy", "qz", "qw")
 ARM_NAMES = (*POSE_NAMES, "jaw", "force_x", "force_y", "force_z")
@@ -54,15 +55,21 @@ def tip_poses(task: Task, tips: np.ndarray) -> np.ndarray:
     return poses
 
 
-def arm_state(task: Task) -> np.ndarray:
+def arm_state(task: Task, moved: np.ndarray | None = None) -> np.ndarray:
     """What the arms measure of themselves, which tells nothing of the goal [B, 11 A], float32.
 
     Of each it is the pose of the tip (m, xyzw) in the frame of the endoscope (x right, y down, z forward), as the arms of a da Vinci
     measure it, the angle between the jaws (rad), and the force of the tissue on the tool (N, in the axes of the endoscope). So it agrees
     with what the endoscope sees, wherever in the world that is.
+
+    Args:
+        task: The task.
+        moved: How the endoscope of each episode departs from where the task has it [B, 4, 4], see `departed`; None = none does.
     """
     endoscopes = task.endoscopes()
     poses = np.tile(task.endoscope, (task.count, 1, 1)) if endoscopes is None else endoscopes
+    if moved is not None:
+        poses = departed(poses, moved)
     poses = poses.repeat(len(task.arms), 0)  # [B A, 4, 4]
     axes = poses[:, :3, :3].transpose(0, 2, 1)
     local = lambda v: dot(axes, v[:, None])

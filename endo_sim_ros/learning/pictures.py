@@ -21,7 +21,7 @@ from endo_sim_ros.learning.config import Randomisation, SightConfig
 from endo_sim_ros.learning.held_tools import HeldTools
 from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.learning.tasks import Task
-from endo_sim_ros.learning.variation import Variation
+from endo_sim_ros.learning.variation import Variation, departed
 from endo_sim_ros.physics import Skinning, TissueBatch
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig, turned_colors
 from endo_sim_ros.rendering.config import BehindConfig
@@ -44,6 +44,9 @@ class Pictures:
         sight: What is shown.
         randomisation: How episodes differ.
         held: The tools, or None where pictures show the tissue alone.
+
+    Attributes:
+        moved: How the endoscope of each episode departs from where it is [B, 4, 4], see `departed`.
     """
 
     def __init__(
@@ -77,7 +80,7 @@ class Pictures:
         self._light = np.tile([1.0, 0.0], (count, 1))  # brightness, and by how much less corners have
         self._contrast = np.ones(count)  # factors on the colours' coefficients
         self._metal = np.ones((count, 2))  # factors on what surfaces give back and on their roughness
-        self._moved = np.tile(np.eye(4), (count, 1, 1))  # how each departs from where the endoscope is, as `Variation.camera` has it
+        self.moved = np.tile(np.eye(4), (count, 1, 1))
         self._shining = np.tile(self._lamp, (count, 1))  # where the lamp is in the camera of the left eye, m, and 1
         self._poses, self._viewmats = np.zeros((2, sight.eyes, count, 4, 4))  # of the eyes, camera to world, m, and back
         self._lamps = np.zeros((sight.eyes, count, 3))  # m, in the camera of each eye
@@ -107,10 +110,7 @@ class Pictures:
 
     def _look(self, episodes: np.ndarray, poses: np.ndarray) -> None:
         """Let the endoscopes of these episodes [n] be at poses [4, 4] or [n, 4, 4], from which each departs."""
-        moved = self._moved[episodes]
-        left = np.tile(np.eye(4), (len(episodes), 1, 1))
-        left[:, :3, :3] = poses[..., :3, :3] @ moved[:, :3, :3]
-        left[:, :3, 3] = poses[..., :3, 3] + moved[:, :3, 3]
+        left = departed(poses, self.moved[episodes])
         shining = left @ self._shining[episodes, :, None]
         for eye in range(self._sight.eyes):
             pose = left.copy()
@@ -123,7 +123,7 @@ class Pictures:
         """Show these episodes [n] at rest, each with its variation and its dyed spots."""
         for b, variation, marked in zip(episodes.tolist(), variations, spots):
             self._light[b], self._contrast[b], self._metal[b] = variation.light, variation.texture, variation.metal
-            self._moved[b], self._shining[b] = variation.camera, self._lamp + np.append(variation.lamp, 0.0)
+            self.moved[b], self._shining[b] = variation.camera, self._lamp + np.append(variation.lamp, 0.0)
             if self._sh is not None:
                 self._sh[b] = dyed(self._model.sh, self._model.means, marked)
                 self._spots[b] = marked

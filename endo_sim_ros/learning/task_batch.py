@@ -254,7 +254,7 @@ class TaskBatch:
 
     def arm_state(self) -> np.ndarray:
         """What the arms of each episode measure of themselves [B, 11 A], see `arm_state`; forces are those of the last observation."""
-        return arm_state(self.task)
+        return arm_state(self.task, None if self.pictures is None else self.pictures.moved)
 
     def images(self) -> np.ndarray:
         """What the left eye of the endoscope sees of all episodes [B, H, W, 3], uint8.

@@ -12,6 +12,14 @@ _FIRST, _MORE = 10, 12  # numbers that are drawn
 _BELOW = 1e-9  # share taken off random stiffness: rounded, it must not exceed what the substeps were planned for
 
 
+def departed(poses: np.ndarray, moved: np.ndarray) -> np.ndarray:
+    """Poses of endoscopes [4, 4] or [B, 4, 4], camera to world, that each depart from as `Variation.camera` [B, 4, 4] has it."""
+    left = moved.copy()
+    left[:, :3, :3] = poses[..., :3, :3] @ moved[:, :3, :3]
+    left[:, :3, 3] += poses[..., :3, 3]
+    return left
+
+
 @dataclass(frozen=True)
 class Variation:
     """What an episode has of each kind of randomisation.

@@ -133,3 +133,17 @@ def test_an_endoscope_that_moves_sees_beyond_the_edge_of_the_scene():
         seen = np.stack([environment.reset(seed=seed)[0] for seed in range(6)])
         black[scene.beyond is None] = (seen.max(-1) < 8).mean((1, 2))
     assert (black[True] > 0.1).all() and black[False].max() == 0
+
+
+def test_arms_are_measured_where_the_endoscope_of_the_episode_is():
+    for task in ("retraction", "camera"):
+        varied = {"camera_position": 0.005, "camera_angle": 4.0}
+        environment, off = make(task, observations="sensors", segmentation=True, randomisation=varied), []
+        for seed in range(4):
+            seen, _ = environment.reset(seed=seed)
+            x, y, z = seen["arm"][:3].astype(np.float64)
+            column, row, _ = environment.unwrapped.batch.pictures.camera.K @ [x, y, z] / z
+            shown = np.argwhere(np.isin(seen["segmentation"][..., 0], JAWS))
+            if len(shown) > 10:  # else it begins beside the picture
+                off.append(np.linalg.norm(shown - [row, column], axis=1).min())
+        assert len(off) > 1 and max(off) < 4  # pixels

@@ -9,11 +9,13 @@ import cv2
 import numpy as np
 import torch
 from scipy import sparse
+from torch import Tensor
 
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
-from endo_sim_ros.core.light import Light, features_at
+from endo_sim_ros.core.light import Light, directions, falloff, features, features_at
+from endo_sim_ros.reconstruction.device_views import project
 from endo_sim_ros.reconstruction.progress import StageProgress
-from endo_sim_ros.reconstruction.scene import PointPixels, TrainingView, pixels_of
+from endo_sim_ros.reconstruction.scene import TrainingView
 from endo_sim_ros.reconstruction.stage_configs import PhotometryConfig
 
 
@@ -101,28 +103,25 @@ def remove_light(
     reference: float,
     tolerance: float,
     progress: StageProgress = StageProgress(),
+    device: str = "cpu",
 ) -> GaussianModel:
     """The model with the colours that, in the light [4] and exposures [V, 3], look like those of the views that see it.
 
-    The other arguments are those of `fit_light`.
+    The other arguments are those of `fit_light`, and the device where colours are looked up.
     """
-    points = model.means.numpy().astype(np.float64)
-    total, count = np.zeros((len(points), 3)), np.zeros((len(points), 1))
-
-    def seen_colors(own: tuple[TrainingView, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        view, exposure = own
-        seen = _visible(view, points, tolerance)
-        colors = view.image[seen.rows, seen.columns].astype(np.float64).clip(1) / 255
-        quantities = features_at(points[seen.index], view.camera, reference)
-        return seen.index, colors / np.exp((quantities @ light)[:, None] + exposure)
-
-    for index, colors in progress.map(seen_colors, zip(views, exposures)):
-        total[index] += colors
+    points = model.means.to(device)
+    total, count, theta = torch.zeros_like(points), points.new_zeros(len(points), 1), torch.from_numpy(light).to(points)
+    for done, (view, exposure) in enumerate(zip(views, torch.from_numpy(exposures).to(points))):
+        progress(done, len(views))
+        index, pixels, depth = _visible(view, points, tolerance)
+        colors = torch.tensor(view.image, device=device).view(-1, 3)[pixels].clamp_min(1) / 255
+        quantities = features(depth, torch.ones_like(depth), directions(view.camera, device).flatten(1)[:, pixels], reference)
+        total[index] += colors / (falloff(quantities, theta)[:, None] * exposure.exp())
         count[index] += 1
     # What is dark in the corner of a picture may be this many times as bright as white in full light.
-    colors = torch.from_numpy((total / count.clip(1)).clip(0, 4).astype(np.float32))
+    colors = (total / count.clamp_min(1)).clamp(0, 4).to(model.sh.device)
     sh = model.sh.clone()
-    sh[:, 0] = torch.where(torch.from_numpy(count) > 0, (colors - 0.5) / SH_C0, sh[:, 0])
+    sh[:, 0] = torch.where(count.to(sh.device) > 0, (colors - 0.5) / SH_C0, sh[:, 0])
     return dataclasses.replace(model, sh=sh)
 
 
@@ -148,21 +147,24 @@ def fit_exposure(
     return response, exposures.mean(0) + response * brightness.mean(), residuals
 
 
-def _visible(view: TrainingView, points: np.ndarray, tolerance: float) -> PointPixels:
-    """Which of the points [N, 3] a view sees: those on its tissue that its depth prior does not hide."""
-    found = pixels_of(view.camera, points)
-    seen = view.tissue[found.rows, found.columns] > 0
-    surface = view.surface[found.rows, found.columns]
-    seen &= (surface <= 0) | (np.abs(found.depth - surface) < tolerance * surface)
-    return PointPixels(*(values[seen] for values in found))
+def _visible(view: TrainingView, points: Tensor, tolerance: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Of the points [N, 3] that a view sees, those on its tissue that its depth prior does not hide: indices, pixels, depths (m) [M]."""
+    camera, on_device = view.camera, lambda array: torch.tensor(array, device=points.device).flatten()
+    u, v, z = project(points.new_tensor(camera.viewmat), points.new_tensor(camera.K), points)
+    index = torch.nonzero((z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height))[:, 0]
+    pixels, z = v[index].long() * camera.width + u[index].long(), z[index]
+    surface = on_device(view.surface)[pixels]
+    seen = (on_device(view.tissue)[pixels] > 0) & ((surface <= 0) | ((z - surface).abs() < tolerance * surface))
+    return index[seen], pixels[seen], z[seen]
 
 
 def _well_seen(
     view: TrainingView, points: np.ndarray, reference: float, tolerance: float, options: PhotometryConfig
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of the points that a view sees well: their indices [M], colours [M, 3] in [0, 1] and light's quantities [M, 4]."""
-    index, rows, columns, _ = _visible(view, points, tolerance)
-    colors = cv2.GaussianBlur(view.image, (0, 0), 1.5)[rows, columns].astype(np.float64)  # over a pixel and a half, what depth is off
+    index, pixels, _ = (found.numpy() for found in _visible(view, torch.from_numpy(points), tolerance))
+    blurred = cv2.GaussianBlur(view.image, (0, 0), 1.5)  # over a pixel and a half, what depth is off
+    colors = blurred.reshape(-1, 3)[pixels].astype(np.float64)
     good = (colors.max(1) < options.brightest) & (colors.max(1) > options.darkest)
     return index[good], colors[good].clip(1) / 255, features_at(points[index[good]], view.camera, reference)
 

@@ -305,7 +305,8 @@ def fit_light(scene: PreparedScene, config: ReconstructionConfig, progress: Stag
         exposure=config.exposure,
         progress=progress,
     )
-    model = photometry.remove_light(scene.model, scene.views, light, exposures, scene.depth, config.depth_tolerance, progress)
+    seen_in = scene.views, light, exposures, scene.depth, config.depth_tolerance
+    model = photometry.remove_light(scene.model, *seen_in, progress, pick_device(config.device))
     return replace(scene, model=model, light=light, exposures=exposures)
 
 

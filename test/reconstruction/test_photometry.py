@@ -116,13 +116,16 @@ def test_what_the_views_leave_open_is_taken_from_the_options():
     assert fit_exposure(*one, PhotometryConfig(response=0.3))[0] == pytest.approx(0.3)
 
 
-def test_hidden_and_masked_points_keep_their_colour():
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=pytest.mark.gpu)])
+def test_hidden_and_masked_points_keep_their_colour(device):
+    if device != "cpu" and not torch.cuda.is_available():
+        pytest.skip("needs CUDA")
     (view,) = lit_views(LAMP, [0.0], [np.eye(4)])
     mask = np.full(view.image.shape[:2], 255, np.uint8)
     mask[:, :80] = 0
     model = dataclasses.replace(wall(), sh=torch.full_like(wall().sh, 7.0))
     behind = dataclasses.replace(model, means=model.means + torch.tensor([0.0, 0.0, 0.03]))
-    unlit = lambda model, view: remove_light(model, [view], np.zeros(4), np.zeros((1, 3)), 0.1, 0.05)
+    unlit = lambda model, view: remove_light(model, [view], np.zeros(4), np.zeros((1, 3)), 0.1, 0.05, device=device)
     assert torch.equal(unlit(behind, view).sh, behind.sh)
     uv = view.camera.project(model.means.numpy().astype(np.float64))[0]
     changed = (unlit(model, dataclasses.replace(view, mask=mask)).sh != model.sh).flatten(1).any(1).numpy()

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,9 +20,10 @@ def test_bench_tells_errors_intervals_and_speed(tmp_path, monkeypatch, capsys):
     small = {"nodes": 300, "layers": 2, "by_nodes": 300, "by_layers": 2, "finer_nodes": 500, "finer_layers": 3}
     monkeypatch.setattr(identification, "TRUTHS", (Truth("of the same model", **small),))
     monkeypatch.setattr(identification, "PRESSES", 1)
+    monkeypatch.setattr(identification, "speed_rows", partial(identification.speed_rows, unknowns=(1, 2), steps=12))
     bench_identification(tmp_path / "rows.json", "cpu", cases=1, inclusions=0, searches=0, palpations=0, noises=0, fields=0)
     rows = {row["name"]: row["value"] for row in json.loads((tmp_path / "rows.json").read_text())}
-    assert rows["steps of 5 copies"] > 0
+    assert rows["steps of 5 copies"] > 0 and rows["Jacobian of 2 unknowns, one press"] > 0
     assert 0 <= rows["one modulus, truth of the same model: error, median"] < 50
     assert rows["one modulus, truth of the same model: 90 % intervals that hold it"] in (0, 100)
     with pytest.raises(ValueError, match="must be 0 or more"):

@@ -18,7 +18,7 @@ TORCH ?= torch==2.13.0
 TORCH_INDEX ?= $(shell command -v nvidia-smi >/dev/null 2>&1 || echo --extra-index-url https://download.pytorch.org/whl/cpu)
 PIP_INSTALL = python -m pip install --quiet $(if $(CONSTRAINTS),-c $(CONSTRAINTS))
 
-.PHONY: demo lint types fast check test test-minimum api setup links clean
+.PHONY: demo lint types fast check all-tests test test-minimum api setup links clean
 
 demo: setup
 	$(VENV)/bin/endo-sim demo --out $(OUT) $(if $(BAG),--bag $(BAG))
@@ -36,8 +36,12 @@ fast: setup
 check: lint
 	@$(MAKE) --no-print-directory -j2 --output-sync types fast
 
+# The type checker has one thread: it works beside the tests.
+test: lint
+	@$(MAKE) --no-print-directory -j2 types all-tests
+
 # Three workers on two cores: while a test waits for the processes of a graph, another one works.
-test: lint types
+all-tests: setup
 	$(VENV)/bin/python -m pytest -n 3 --dist worksteal
 
 test-minimum:

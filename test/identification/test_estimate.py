@@ -181,7 +181,7 @@ def test_a_place_that_rests_on_where_the_skin_is_is_told():
 
 def test_without_an_inclusion_none_is_sure():
     rng = np.random.default_rng(0)
-    experiments = [measure(pressed(x, 0.0), NODES, PHYSICS, rng) for x in AT]
+    experiments = [measure(pressed(x, 0.0, steps=16), NODES, PHYSICS, rng) for x in AT]
     field = identify(experiments, NODES, PHYSICS, IdentificationConfig(stiffness="field", field_length=0.012), "cpu")
     assert not any("place is at" in each for each in field.findings) and field.any_known
     assert find_inclusion(identify(experiments, NODES, PHYSICS, IdentificationConfig(stiffness="inclusion"), "cpu")).sure < 0.5

@@ -114,7 +114,9 @@ def test_training_learns_and_leaves_its_curve(tmp_path):
     assert found["test_return"] == max((point["test_success"], point["test_return"]) for point in curve)[1]
     save_training(tmp_path, policy, curve, config)
     assert json.loads((tmp_path / "curve.json").read_text())["curve"] == curve
-    by_joints, _ = train("retraction", load_scene(), replace(config, generations=1), device="cpu", actions="joints")
+    by_joints, _ = train(
+        "retraction", load_scene(), replace(config, generations=1, population=4, test_episodes=1), device="cpu", actions="joints"
+    )
     assert by_joints.actions == "joints" and by_joints.layers[0].shape == (23, 7)
     assert (tmp_path / "curve.png").stat().st_size > 1000 and NetworkPolicy.load(tmp_path / "policy.npz").task == "retraction"
 

@@ -1,9 +1,10 @@
-"""A small policy that sees: a network that finds points in the images of both eyes, and acts by where they are.
+"""A small policy that sees: a network that finds points in the image of the left eye, and acts by where they are.
 
 It learns from a LeRobot dataset of demonstrations within minutes, from random weights, with torch alone. The points are the expected
-places of a softmax over each map of a convolutional network (Finn et al. 2016, Deep Spatial Autoencoders). How far a point is between
-the eyes tells its depth. Beside the action the network is taught to tell the state of the task, which demonstrations hold and a policy
-does not see: without, it learns far slower where to look.
+places of a softmax over each map of a convolutional network (Finn et al. 2016, Deep Spatial Autoencoders). How far each lies between the
+eyes tells its depth: that is matched, not learned, as a network that shall learn it from demonstrations learns how deep tissue usually
+is instead. Beside the action the network is taught to tell the state of the task, which demonstrations hold and a policy does not see:
+without, it learns far slower where to look.
 """
 
 import json
@@ -13,8 +14,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from rich.progress import Progress
+from rich.progress import Progress, track
 from torch import Tensor, nn
+from torch.nn import functional
 
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.core.folders import written_whole
@@ -27,9 +29,15 @@ from endo_sim_ros.learning.task_batch import ARM_STATE
 
 FILE = "keypoints.npz"
 _CHANNELS, _POINTS, _HIDDEN = 48, 32, 256
+_STRIDE = 4  # pixels between neighbours in a map
 _DILATIONS = 1, 2, 4, 1  # of the blocks: an output sees 100 pixels around
 _SIGHT = {"shown_tool": "tool", "instrument": "instrument", "baseline": "baseline", "dye": "dye"}  # options of what it was trained on
-_DISPARITY = 20.0  # factor, so that differences between the eyes are as large as places
+_WIDEST = 3 / 16  # of the width of an image: the greatest disparity that is looked for
+_WINDOW = 7  # pixels: side of the patches that are matched
+_SHARP = 50.0  # factor on correlations, before the softmax that weighs disparities
+_USUAL, _DIFFERS = (1 / 16, 0.5), (1 / 64, 1.0)  # of disparities and correlations: what inputs of the network are measured from, and in
+_TOGETHER = 64  # images that are matched at once
+_FLAT = 1e-4  # variance of a patch below which it is hardly matched; colours are 0 to 1
 _STEPS, _RATE = 3000, 2e-3
 _AVERAGED = 0.99  # share of the averaged weights that a step keeps
 _NEAREST = 1e-3  # m from the eye to a tip
@@ -58,6 +66,45 @@ def with_projections(arm: Tensor) -> Tensor:
     return torch.cat([arm, torch.cat([tips[..., :2] * nearness, nearness], -1).flatten(1)], 1)
 
 
+@torch.no_grad()
+def disparities(left: Tensor, right: Tensor) -> Tensor:
+    """How far what each pixel of left images shows lies to the left in the right ones, as a share of their width, and how alike they are.
+
+    Patches of all disparities are compared by their normalised correlation, and the disparities weighed by a softmax over it.
+
+    Args:
+        left, right: Of both eyes [B, 3, H, W], 0 to 1.
+
+    Returns:
+        Disparity, and the greatest correlation, -1 to 1 [B, 2, H, W].
+    """
+    width = left.shape[-1]
+    count = round(width * _WIDEST) + 1
+    right = functional.pad(right, (count - 1, 0, 0, 0), mode="replicate")
+    means = _smoothed(left), _smoothed(right)
+    spreads = [(_covariance(eye, eye, mean, mean) + _FLAT).sqrt() for eye, mean in zip((left, right), means)]
+    alike = []
+    for disparity in range(count):
+        own = slice(count - 1 - disparity, count - 1 - disparity + width)
+        covariance = _covariance(left, right[..., own], means[0], means[1][..., own])
+        alike.append(covariance / (spreads[0] * spreads[1][..., own]))
+    scores = torch.cat(alike, 1)
+    weights, each = (_SHARP * scores).softmax(1), torch.arange(count, device=left.device) / width
+    return torch.cat([torch.einsum("bdhw,d->bhw", weights, each)[:, None], scores.amax(1, keepdim=True)], 1)
+
+
+def _covariance(a: Tensor, b: Tensor, mean_a: Tensor, mean_b: Tensor) -> Tensor:
+    """Of patches around each pixel [B, 1, H, W], over all colours; each colour has its own mean."""
+    return _smoothed((a * b).mean(1, keepdim=True)) - (mean_a * mean_b).mean(1, keepdim=True)
+
+
+def _smoothed(images: Tensor) -> Tensor:
+    """Means of patches around each pixel."""
+    for size, margin in (((_WINDOW, 1), (_WINDOW // 2, 0)), ((1, _WINDOW), (0, _WINDOW // 2))):
+        images = functional.avg_pool2d(images, size, 1, margin, count_include_pad=False)
+    return images
+
+
 class KeypointNetwork(nn.Module):
     """Points of images, and the actions and the state that follow from them.
 
@@ -80,30 +127,45 @@ class KeypointNetwork(nn.Module):
         )
         self.maps, self.features = nn.Conv2d(_CHANNELS, _POINTS, 1), nn.Conv2d(_CHANNELS, _POINTS, 1)
         known = arm // len(ARM_NAMES) * (len(ARM_NAMES) + 3)
-        sizes = [(3 * eyes + (eyes == 2)) * _POINTS + known, _HIDDEN, _HIDDEN, _HIDDEN]
+        sizes = [(1 + 2 * eyes) * _POINTS + known, _HIDDEN, _HIDDEN, _HIDDEN]
         hidden = [layer for pair in zip(sizes, sizes[1:]) for layer in (nn.Linear(*pair), nn.SiLU())]
         self.head = nn.Sequential(*hidden, nn.Linear(_HIDDEN, action + state))
         self.register_buffer("arm_mean", torch.zeros(known))
         self.register_buffer("arm_spread", torch.ones(known))
 
-    def forward(self, images: Tensor, arm: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, images: Tensor, near: Tensor, arm: Tensor) -> tuple[Tensor, Tensor]:
         """Actions [B, action], and states [B, state] as parts of their spread.
 
         Args:
-            images: Of all eyes [B, E, 3, H, W], 0 to 1.
+            images: Of the left eye [B, 3, H, W], 0 to 1.
+            near: What `matched` returns for both eyes.
             arm: What the arms measure of themselves [B, arm].
         """
-        x = self.image((images.flatten(0, 1) - 0.5) * 4)
-        where = self.maps(x).flatten(2).float().softmax(-1)  # [B E, K, h w]
+        # What follows the convolutions would lose a quarter of a pixel to fewer bits.
+        with torch.autocast(images.device.type, torch.bfloat16, enabled=self.training):
+            x = self.image((images - 0.5) * 4)
+            maps, features = self.maps(x).flatten(2), self.features(x).flatten(2)
+        where = maps.float().softmax(-1)  # [B, K, h w]
         y, x_ = (torch.linspace(-1, 1, size, device=x.device) for size in x.shape[-2:])
-        places = where @ torch.stack([part.flatten() for part in torch.meshgrid(x_, y, indexing="xy")], 1)  # [B E, K, 2]
-        found = (where * self.features(x).flatten(2).float()).sum(-1, keepdim=True)
-        parts = [torch.cat([places, found], -1).reshape(len(images), -1), (with_projections(arm) - self.arm_mean) / self.arm_spread]
-        if self.eyes == 2:
-            left, right = places[..., 0].reshape(-1, 2, _POINTS).unbind(1)
-            parts.append((left - right) * _DISPARITY)
-        out = self.head(torch.cat(parts, 1))
+        grid = torch.stack([part.flatten() for part in torch.meshgrid(x_, y, indexing="xy")], 1)
+        parts = [where @ grid, (where * features.float()).sum(-1, keepdim=True), where @ near.flatten(2).mT]
+        seen = torch.cat(parts, -1).flatten(1)
+        out = self.head(torch.cat([seen, (with_projections(arm) - self.arm_mean) / self.arm_spread], 1))
         return out[:, : self.action], out[:, self.action :]
+
+
+def matched(images: Tensor) -> Tensor:
+    """Disparities and how sure they are, as the network takes them, at the size of its maps [B, 2, h, w]; of one eye [B, 0, h, w].
+
+    Args:
+        images: Of all eyes [B, E, 3, H, W], uint8.
+    """
+    size = [-(-side // _STRIDE) for side in images.shape[-2:]]
+    if images.shape[1] == 1:
+        return torch.zeros(len(images), 0, *size, device=images.device)
+    found = functional.interpolate(disparities(*(images.float() / 255).unbind(1)), size, mode="area")
+    usual, differs = (found.new_tensor(values)[:, None, None] for values in (_USUAL, _DIFFERS))
+    return (found - usual) / differs
 
 
 def train_keypoints(dataset: Path, out: Path, config: ImitationConfig, device: str = "auto") -> None:
@@ -130,16 +192,16 @@ def train_keypoints(dataset: Path, out: Path, config: ImitationConfig, device: s
     network.arm_mean.copy_(known.mean(0))
     network.arm_spread.copy_(known.std(0).clamp_min(1e-3))
     steps, rate = config.steps or _STEPS, config.learning_rate or _RATE
+    near = torch.cat([matched(part.to(device)) for part in track(images.split(_TOGETHER), "matching both eyes", transient=True)])
     optimizer = torch.optim.AdamW(network.parameters(), rate, weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, steps + 1, pct_start=0.1)
     averaged = torch.optim.swa_utils.AveragedModel(network, avg_fn=_average)
-    loss_of = lambda found, true: nn.functional.smooth_l1_loss(found.float(), true, beta=_CORNER)
+    loss_of = lambda found, true: functional.smooth_l1_loss(found, true, beta=_CORNER)
     with Progress() as bar:
         progress = bar.add_task("training", total=steps)
         for rows in _batches(len(images), steps, config):
-            seen, own = _varied(images[rows].to(device).float() / 255), rows.to(device)
-            with torch.autocast(torch.device(device).type, torch.bfloat16):
-                acted, told = network(seen, arm[own])
+            seen, own = _varied(images[rows, 0].to(device).float() / 255), rows.to(device)
+            acted, told = network(seen, near[own], arm[own])
             told_loss = loss_of(told, (state[own] - mean) / spread)
             loss = loss_of(acted, action[own]) + told_loss
             optimizer.zero_grad(set_to_none=True)
@@ -173,9 +235,9 @@ def _batches(count: int, steps: int, config: ImitationConfig) -> Iterator[Tensor
 
 
 def _varied(images: Tensor) -> Tensor:
-    """Images [B, E, 3, H, W] in another light, the same for both eyes."""
-    factor = lambda spread, colors: 1 + spread * (2 * torch.rand(len(images), 1, colors, 1, 1, device=images.device) - 1)
-    mean = images.mean((1, 2, 3, 4), keepdim=True)
+    """Images [B, 3, H, W] in another light."""
+    factor = lambda spread, colors: 1 + spread * (2 * torch.rand(len(images), colors, 1, 1, device=images.device) - 1)
+    mean = images.mean((1, 2, 3), keepdim=True)
     lit = ((images - mean) * factor(_CONTRAST, 1) + mean) * factor(_BRIGHTNESS, 1) * factor(_HUE, 3)
     return (lit + _NOISE * torch.randn_like(lit)).clamp(0, 1)
 
@@ -232,5 +294,6 @@ class KeypointPolicy:
         arm, known = observations[ARM_STATE], self._known
         if arm.shape[1] != known:
             raise ValueError(f"the arms measure {arm.shape[1]} numbers, but the policy was trained with {known}; it is of another task")
-        images = torch.from_numpy(seen).to(self._device).permute(0, 1, 4, 2, 3).float() / 255
-        return self._network(images, torch.from_numpy(arm).to(self._device))[0].double().cpu().numpy()
+        images = torch.from_numpy(seen).to(self._device).permute(0, 1, 4, 2, 3)
+        near = torch.cat([matched(part) for part in images.split(_TOGETHER)])
+        return self._network(images[:, 0].float() / 255, near, torch.from_numpy(arm).to(self._device))[0].double().cpu().numpy()

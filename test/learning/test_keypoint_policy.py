@@ -4,12 +4,15 @@ import shutil
 
 import numpy as np
 import pytest
+import torch
+from torch.nn import functional
 
 from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.learning import keypoint_policy
 from endo_sim_ros.learning.config import DemonstrationConfig, ImitationConfig, SightConfig
-from endo_sim_ros.learning.dataset import ACTION, IMAGE, IMAGE_RIGHT, STATE, read_dataset
+from endo_sim_ros.learning.dataset import ACTION, ENVIRONMENT_STATE, IMAGE, IMAGE_RIGHT, STATE, read_dataset
 from endo_sim_ros.learning.demonstrations import demonstrate
-from endo_sim_ros.learning.keypoint_policy import FILE, KeypointPolicy, train_keypoints
+from endo_sim_ros.learning.keypoint_policy import FILE, KeypointPolicy, disparities, train_keypoints
 from endo_sim_ros.learning.policies import make_policy
 
 pytest.importorskip("pyarrow", reason="datasets need pyarrow")
@@ -33,6 +36,31 @@ def test_videos_are_read_as_pictures_are(dataset, tmp_path):
         exact, read = (each[name].astype(int) for each in shown)
         assert exact.shape == read.shape and exact.shape[1:] == (32, 40, 3)
         assert np.abs(exact - read).mean() < 4 < np.abs(exact[:-1] - exact[1:]).max()  # of 255, and what is shown moves
+
+
+def test_disparities_are_those_of_what_both_eyes_see():
+    noise = torch.rand(1, 3, 102, 512, generator=torch.Generator().manual_seed(0))
+    scene = functional.avg_pool2d(noise, 9, 1, 4)  # wider than a pixel of the images, as texture of tissue is
+    scene = (scene - scene.mean()) / scene.std() * 0.1 + 0.5
+    left = functional.avg_pool2d(scene[..., 100:356], (1, 2))
+    for shift in (5, 9, 14, 35):  # halves of pixels
+        right = functional.avg_pool2d(scene[..., 100 + shift : 356 + shift], (1, 2))
+        for seen in (right, right * 0.8 * torch.tensor([1.0, 0.9, 0.7])[:, None, None]):  # in another light, too
+            found, sure = disparities(left, seen)[0, :, 10:-10, 30:-10]
+            error = (found * 128 - shift / 2).abs()
+            assert error.median() < 0.25 and error.quantile(0.95) < 0.6 and sure.median() > 0.8  # pixels
+    _, sure = disparities(left, torch.rand(1, 3, 102, 128, generator=torch.Generator().manual_seed(1)))[0]
+    assert sure.median() < 0.6
+    assert disparities(torch.full_like(left, 0.5), torch.full_like(left, 0.5)).isfinite().all()
+
+
+def test_one_eye_is_enough_to_train(dataset, tmp_path, monkeypatch):
+    both = read_dataset(dataset, (STATE, ENVIRONMENT_STATE, ACTION), (IMAGE, IMAGE_RIGHT))
+    monkeypatch.setattr(keypoint_policy, "read_dataset", lambda *_: (both[0], {IMAGE: both[1][IMAGE]}))
+    train_keypoints(dataset, tmp_path, ImitationConfig(steps=2, batch_size=4), device="cpu")
+    policy = KeypointPolicy(tmp_path, "cpu")
+    assert policy.sight.eyes == 1
+    assert policy.act({"image": both[1][IMAGE][:3], "arm": both[0][STATE][:3]}).shape == (3, 4)
 
 
 def test_it_learns_what_was_demonstrated(dataset, tmp_path):

@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.lung_trials import lung_rows, press_files
 from endo_sim_ros.core.device import pick_device
 from endo_sim_ros.evaluation.measurement import Row, Stage, machine, report, run_stages
-from endo_sim_ros.identification import Experiment, Identification, IdentificationConfig, find_inclusion, identify
+from endo_sim_ros.identification import Experiment, Identification, IdentificationConfig, IdentificationError, find_inclusion, identify
 from endo_sim_ros.identification.acquire import Search
 from endo_sim_ros.identification.forward import ForwardModel
 from endo_sim_ros.identification.palpate import InformedPalpation
@@ -160,7 +160,7 @@ def noise_rows(scene: Scene, device: str, cases: int) -> list[Row]:
     rows = []
     for force, tip in noises:
         truth = Truth(f"of the same model, {force:g} N, {1000 * tip:g} mm")
-        rows += modulus_rows(scene, device, truth, cases, force_noise=force, tip_noise=tip)[:5]
+        rows += modulus_rows(scene, device, truth, cases, force_noise=force, tip_noise=tip)
     return rows
 
 
@@ -172,7 +172,7 @@ def modulus_rows(
     nodes, true_nodes = scene.nodes(config), scene.nodes(made)
     finer = scene.nodes(physics(device, truth.finer_nodes, truth.finer_layers)) if truth.finer_nodes else None
     options = IdentificationConfig()
-    places, errors, holds, seconds, widths, doubts = raster(nodes, 0.012), [], [], [], [], 0
+    places, errors, holds, seconds, widths, doubts, refused = raster(nodes, 0.012), [], [], [], [], 0, 0
     for case in range(first, first + cases):
         rng = np.random.default_rng([case, 1])
         modulus = float(np.exp(rng.uniform(np.log(SOFTEST), np.log(STIFFEST))))
@@ -182,7 +182,11 @@ def modulus_rows(
         presses = [replace(press(nodes, config, place, steps=40), force_noise=force_noise, tip_noise=tip_noise) for place in chosen]
         experiments = [measure(each, true_nodes, softness, rng, offset=offset, device=device) for each in presses]
         begin = time.perf_counter()
-        found = identify(experiments, nodes, config, options, device, finer=finer)
+        try:
+            found = identify(experiments, nodes, config, options, device, finer=finer)
+        except IdentificationError:  # nothing beyond the noise was measured
+            refused += 1
+            continue
         seconds.append(time.perf_counter() - begin)
         told = found["young_modulus"]
         errors.append(abs(told.estimate / modulus - 1))
@@ -190,13 +194,17 @@ def modulus_rows(
         holds.append(told.low <= modulus <= told.high)
         doubts += bool(found.findings)
     name = f"one modulus, truth {truth.name}"
+    rows = [Row(f"{name}: cases refused", 100 * refused / cases, "%")] if refused else []
+    if refused == cases:
+        return rows
     return [
         Row(f"{name}: error, median", 100 * float(np.median(errors)), "%"),
         Row(f"{name}: within 10 %", 100 * float(np.mean(np.array(errors) <= 0.1)), "%"),
         Row(f"{name}: 90 % intervals that hold it", 100 * float(np.mean(holds)), "%"),
         Row(f"{name}: half width of intervals, median", 100 * float(np.median(widths)), "%"),
-        Row(f"{name}: cases with findings", 100 * doubts / cases, "%"),
+        Row(f"{name}: cases with findings", 100 * doubts / len(errors), "%"),
         Row(f"{name}: time of a case, median", float(np.median(seconds)), "s"),
+        *rows,
     ]
 
 

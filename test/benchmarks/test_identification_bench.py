@@ -12,6 +12,7 @@ from benchmarks import identification, lung_trials
 from benchmarks.identification import Truth, bench_identification
 from benchmarks.presses import Plan, press, tabulate
 from endo_sim_ros.evaluation.measurement import report
+from endo_sim_ros.identification import IdentificationError
 from endo_sim_ros.learning.scenes import load_scene
 
 
@@ -30,6 +31,24 @@ def test_bench_tells_errors_intervals_and_speed(tmp_path, monkeypatch, capsys):
         bench_identification(None, "cpu", cases=-1)
     with pytest.raises(ValueError, match="no truth with 'of none' in its name, but: of the same model"):
         bench_identification(None, "cpu", truth="of none")
+
+
+def test_cases_that_are_refused_are_counted(monkeypatch):
+    answers = iter([IdentificationError("no force"), {"young_modulus": SimpleNamespace(low=1e2, estimate=4e3, high=1e6)}])
+
+    class Found(dict):
+        findings = ()
+
+    def answer(*_, **__):
+        if isinstance(each := next(answers), Exception):
+            raise each
+        return Found(each)
+
+    monkeypatch.setattr(identification, "measure", lambda *_, **__: None)
+    monkeypatch.setattr(identification, "identify", answer)
+    truth = Truth("of the same model", nodes=300, layers=2, by_nodes=300, by_layers=2)
+    told = {row.name.split(": ")[1]: row.value for row in identification.modulus_rows(load_scene(), "cpu", truth, 2)}
+    assert told["cases refused"] == 50 and told["90 % intervals that hold it"] == 100 and told["cases with findings"] == 0
 
 
 def test_fields_count_the_known_nodes_whose_intervals_hold_the_truth(monkeypatch):

@@ -62,15 +62,20 @@ def project(viewmats: Tensor, K: Tensor, points: Tensor) -> tuple[Tensor, Tensor
     return u, v, z
 
 
+def inside(u: Tensor, v: Tensor, z: Tensor, width: int | Tensor, height: int | Tensor) -> Tensor:
+    """Which of what `project` returns is in pictures of a size, pixels, and ahead of the camera."""
+    return (z > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+
+
 def shown(view: DeviceView, points: Tensor) -> Tensor:
     """Which points [N, 3] (m, world) lie in the picture of a view, on its tissue, hidden or not [N]."""
     camera = view.camera
     u, v, z = project(view.viewmats[0], view.Ks[0], points)
-    inside = (z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    within = inside(u, v, z, camera.width, camera.height)
     if view.mask is None:
-        return inside
-    pixels = torch.where(inside, v.long() * camera.width + u.long(), 0)
-    return inside & (view.mask.reshape(-1)[pixels] > 0)
+        return within
+    pixels = torch.where(within, v.long() * camera.width + u.long(), 0)
+    return within & (view.mask.reshape(-1)[pixels] > 0)
 
 
 def reprojected_prior(prior: Tensor, camera: Camera, viewmat: Tensor) -> Tensor:
@@ -81,7 +86,7 @@ def reprojected_prior(prior: Tensor, camera: Camera, viewmat: Tensor) -> Tensor:
     z = prior[v, u]
     points = torch.stack([(u + 0.5 - K[0, 2]) / K[0, 0] * z, (v + 0.5 - K[1, 2]) / K[1, 1] * z, z], 1)
     u, v, z = project(viewmat @ pose, K, points)
-    inside = (z > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    pixels = v[inside].long() * width + u[inside].long()
-    nearest = torch.full((height * width,), math.inf, device=z.device).scatter_reduce(0, pixels, z[inside], "amin")
+    within = inside(u, v, z, width, height)
+    pixels = v[within].long() * width + u[within].long()
+    nearest = torch.full((height * width,), math.inf, device=z.device).scatter_reduce(0, pixels, z[within], "amin")
     return torch.where(nearest.isfinite(), nearest, 0).view(height, width)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
 from endo_sim_ros.core.light import Light, directions, falloff, features, features_at
-from endo_sim_ros.reconstruction.device_views import project
+from endo_sim_ros.reconstruction.device_views import inside, project
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import TrainingView
 from endo_sim_ros.reconstruction.stage_configs import PhotometryConfig
@@ -151,7 +151,7 @@ def _visible(view: TrainingView, points: Tensor, tolerance: float) -> tuple[Tens
     """Of the points [N, 3] that a view sees, those on its tissue that its depth prior does not hide: indices, pixels, depths (m) [M]."""
     camera, on_device = view.camera, lambda array: torch.tensor(array, device=points.device).flatten()
     u, v, z = project(points.new_tensor(camera.viewmat), points.new_tensor(camera.K), points)
-    index = torch.nonzero((z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height))[:, 0]
+    index = torch.nonzero(inside(u, v, z, camera.width, camera.height))[:, 0]
     pixels, z = v[index].long() * camera.width + u[index].long(), z[index]
     surface = on_device(view.surface)[pixels]
     seen = (on_device(view.tissue)[pixels] > 0) & ((surface <= 0) | ((z - surface).abs() < tolerance * surface))

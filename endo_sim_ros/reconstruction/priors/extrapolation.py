@@ -18,7 +18,7 @@ from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import cpu_threads
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import features_at
-from endo_sim_ros.reconstruction.device_views import project
+from endo_sim_ros.reconstruction.device_views import inside, project
 from endo_sim_ros.reconstruction.priors.interpolation import clip_to_range, fit_plane, inverse_distance_weighted, krige
 from endo_sim_ros.reconstruction.progress import StageProgress
 from endo_sim_ros.reconstruction.scene import TrainingView, shrink
@@ -75,9 +75,9 @@ class _Known:
         # So many views at a time that their pixels take some ten megabytes.
         for views in torch.arange(len(self._first)).split(max(_AT_ONCE // max(len(positions), 1), 1)):
             u, v, z = project(self._viewmats[views], self._K[views], positions)
-            inside = (z > 0) & (u >= 0) & (v >= 0) & (u < self._sizes[views, :1]) & (v < self._sizes[views, 1:])
-            pixel = torch.where(inside, self._first[views, None] + v.long() * self._sizes[views, :1] + u.long(), 0)
-            unknown &= ~(inside & (self._depth[pixel] | beyond & self._tissue[pixel])).any(0)
+            within = inside(u, v, z, self._sizes[views, :1], self._sizes[views, 1:])
+            pixel = torch.where(within, self._first[views, None] + v.long() * self._sizes[views, :1] + u.long(), 0)
+            unknown &= ~(within & (self._depth[pixel] | beyond & self._tissue[pixel])).any(0)
         kept = unknown.cpu().numpy()
         return _Guess(*(values[kept] for values in guess))
 
@@ -239,9 +239,9 @@ def _points_about(camera: Camera, points: Tensor, unknown: np.ndarray) -> np.nda
     """Of the points [N, 3] those close to where depth is unknown [H, W], one for every few pixels: they tell how it goes on."""
     close = cv2.dilate(unknown.astype(np.uint8), np.ones((2 * _AROUND + 1,) * 2, np.uint8))
     u, v, z = project(points.new_tensor(camera.viewmat), points.new_tensor(camera.K), points)
-    inside = (z > 0) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
-    index = torch.where(inside, v.long() * camera.width + u.long(), 0)
-    told = torch.nonzero(inside & (torch.from_numpy(close).to(points.device).flatten()[index] > 0))[:, 0]
+    within = inside(u, v, z, camera.width, camera.height)
+    index = torch.where(within, v.long() * camera.width + u.long(), 0)
+    told = torch.nonzero(within & (torch.from_numpy(close).to(points.device).flatten()[index] > 0))[:, 0]
     columns = -(-camera.width // _THINNED)
     cell = (v[told] / _THINNED).long() * columns + (u[told] / _THINNED).long()
     order = torch.argsort(z[told])

@@ -125,7 +125,7 @@ class _Session:
         """Write the solved episode that has not been kept yet."""
         if self._solved is not None:
             (episode, seed), self._solved = self._solved, None
-            self._demonstrations.add(episode, seed)
+            self._demonstrations.add({seed: episode})
             self._demonstrations.save()
 
     def _play(self, seed: int) -> tuple[Episode, Word | None]:

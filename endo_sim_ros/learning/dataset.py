@@ -6,6 +6,7 @@ read the result with it where it is installed. Each episode has files of its own
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
@@ -15,6 +16,7 @@ import numpy as np
 from rich.progress import track
 
 from endo_sim_ros.core import drawing
+from endo_sim_ros.core.device import cpu_threads
 from endo_sim_ros.core.folders import written_whole
 from endo_sim_ros.core.frames import SequenceError
 
@@ -30,7 +32,8 @@ _EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 _INFO, _HISTOGRAMS = "meta/info.json", "meta/image_histograms.npz"  # the latter to continue with
 _CHUNK_SIZE = 1000  # files in a folder
 # Every second frame is a key frame, so that any is found fast; without frames out of order times begin at zero.
-_CODEC_OPTIONS = {"g": "2", "bf": "0", "crf": "18"}
+# Episodes are written beside each other, so that one needs no threads of its own.
+_CODEC_OPTIONS = {"g": "2", "bf": "0", "crf": "18", "threads": "1"}
 _QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 _GROUP = 256  # rows that are written together with their png images
 _SAMPLE = 150  # pixels along the longer side of an image that count in its statistics
@@ -125,26 +128,30 @@ class DatasetWriter:
         """A column of numbers of all episodes so far."""
         return np.concatenate([columns[name] for columns in self._columns]) if self._columns else np.zeros(0)
 
-    def add(self, columns: dict[str, np.ndarray], pictures: Mapping[str, Iterable[np.ndarray]]) -> None:
-        """Write an episode.
+    def add(self, *episodes: tuple[dict[str, np.ndarray], Mapping[str, Iterable[np.ndarray]]]) -> None:
+        """Write episodes, one on each core at a time.
 
         Args:
-            columns: Numbers [T] and vectors [T, D].
-            pictures: T of each kind.
+            episodes: Of each its columns, numbers [T] and vectors [T, D], and T pictures of each kind.
         """
-        number, begin, count = self.episodes, self.frames, len(next(iter(columns.values())))
-        frames = np.arange(count)
-        own = columns | {
-            "timestamp": (frames / self._fps).astype(np.float32),
-            "frame_index": frames,
-            "episode_index": np.full_like(frames, number),
-            "index": begin + frames,
-            "task_index": np.zeros_like(frames),
-        }
-        histograms = self._write_files(number, own, pictures)
-        self._rows.append(self._row(number, begin, count) | _flat(_statistics(own, histograms, count)))
-        self._columns.append(own)
-        self._histograms.append(histograms)
+        placed, first, begin = [], self.episodes, self.frames
+        for number, (columns, pictures) in enumerate(episodes, first):
+            frames = np.arange(len(next(iter(columns.values()))))
+            own = columns | {
+                "timestamp": (frames / self._fps).astype(np.float32),
+                "frame_index": frames,
+                "episode_index": np.full_like(frames, number),
+                "index": begin + frames,
+                "task_index": np.zeros_like(frames),
+            }
+            placed.append((number, own, pictures))
+            begin += len(frames)
+        with ThreadPoolExecutor(cpu_threads()) as pool:  # encoding does not hold the interpreter
+            for (number, own, _), histograms in zip(placed, pool.map(lambda each: self._write_files(*each), placed)):
+                begin, count = self.frames, len(own["index"])
+                self._rows.append(self._row(number, begin, count) | _flat(_statistics(own, histograms, count)))
+                self._columns.append(own)
+                self._histograms.append(histograms)
 
     def save(self) -> None:
         """Write what describes all episodes so far; without it the newest are not part of the dataset."""
@@ -365,7 +372,7 @@ def _statistics(columns: dict[str, np.ndarray], histograms: dict[str, np.ndarray
     for key, column in columns.items():
         values = column.reshape(len(column), -1).astype(np.float64)
         found = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0), "std": values.std(0), "count": count}
-        statistics[key] = found | {name: np.quantile(values, q, axis=0) for name, q in _QUANTILES.items()}
+        statistics[key] = found | dict(zip(_QUANTILES, np.quantile(values, list(_QUANTILES.values()), axis=0)))
     return statistics
 
 

@@ -22,8 +22,9 @@ With the observations of row k the action of row k was taken.
 """
 
 import json
+import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from itertools import chain
@@ -50,9 +51,11 @@ from endo_sim_ros.learning.dataset import (
     vector_feature,
 )
 from endo_sim_ros.learning.policies import Policy, scripted_policy
-from endo_sim_ros.learning.scenes import load_scene
+from endo_sim_ros.learning.scenes import Scene, load_scene
 from endo_sim_ros.learning.task_batch import Observed, TaskBatch
 from endo_sim_ros.physics import MotionConfig
+
+_logger = logging.getLogger(__name__)
 
 _COLUMNS = {"image": IMAGE, "image_right": IMAGE_RIGHT, "segmentation": SEGMENTATION}
 _SAVE_EVERY = 10.0  # seconds; a process that is killed loses at most the episodes of this time, or of
@@ -100,7 +103,8 @@ class Demonstrations:
 
     Args:
         task: Its name.
-        scenes: What is seen and touched, each as `load_scene` takes it; the episode of seed n is in scene n modulo their number.
+        scenes: What is seen and touched, each as `load_scene` takes it. One in which the task cannot take place is left out, and it is
+            said why. Of the others the episode of seed n is in scene n modulo their number.
         out: Folder of the dataset.
         count: Episodes at once.
         config, sight, randomisation, motion: Options.
@@ -112,7 +116,7 @@ class Demonstrations:
 
     Raises:
         SequenceError: If the folder has other data.
-        ValueError: If there is no such task, or an option cannot be used.
+        ValueError: If there is no such task, or an option cannot be used, or the task can take place in no scene.
         RuntimeError: If pyarrow is not installed.
     """
 
@@ -129,7 +133,7 @@ class Demonstrations:
         device: str,
     ):
         make = partial(TaskBatch, task, randomisation=randomisation, sight=sight, device=device, motion=motion)
-        self.batches = [make(load_scene(scene), count=count, observations="both") for scene in scenes]
+        scenes, self.batches = _usable(scenes, partial(make, count=count, observations="both"))
         first = self.batches[0]
         fps = round(1 / first.task.physics().step_duration)
         noise = config.noise if config.by == "script" else 0.0
@@ -150,12 +154,15 @@ class Demonstrations:
         """Number of episodes in the dataset."""
         return self._writer.episodes
 
-    def add(self, episode: Episode, seed: int) -> None:
-        """Write an episode."""
+    def add(self, episodes: dict[int, Episode]) -> None:
+        """Write episodes by their seeds."""
         self._note_options()
-        columns = {name: np.array(values) for name, values in episode.rows.items()}
-        columns = {name: values if values.dtype == bool else values.astype(np.float32) for name, values in columns.items()}
-        self._writer.add(columns | {"seed": np.full(len(columns["action"]), seed)}, episode.pictures)
+        rows = []
+        for seed, episode in episodes.items():
+            columns = {name: np.array(values) for name, values in episode.rows.items()}
+            columns = {name: values if values.dtype == bool else values.astype(np.float32) for name, values in columns.items()}
+            rows.append((columns | {"seed": np.full(len(columns["action"]), seed)}, episode.pictures))
+        self._writer.add(*rows)
 
     def _note_options(self) -> None:
         """Write what the episodes depend on, before the first: only with that are they continued."""
@@ -209,13 +216,11 @@ def demonstrate(
                 own = [np.arange(count) * len(batches) + seed + (i - seed) % len(batches) for i in range(len(batches))]
                 played = [_play(batch, policy, config.noise, numbers) for batch, numbers in zip(batches, own)]
                 episodes = dict(zip(np.concatenate(own).tolist(), chain(*played)))
-                for number in sorted(episodes):
-                    if demonstrations.episodes == config.episodes:
-                        break
-                    tried += 1
-                    if episodes[number].solved:
-                        demonstrations.add(episodes[number], number)
-                        bar.update(progress, completed=demonstrations.episodes)
+                solved = [number for number in sorted(episodes) if episodes[number].solved]
+                kept = solved[: config.episodes - demonstrations.episodes]
+                tried += len(episodes) if kept == solved else sorted(episodes).index(kept[-1]) + 1
+                demonstrations.add({number: episodes[number] for number in kept})
+                bar.update(progress, completed=demonstrations.episodes)
                 seed += len(episodes)
                 demonstrations.save_if_due()
                 if tried * _FEWEST > 1 and demonstrations.episodes < tried * _FEWEST:
@@ -223,6 +228,22 @@ def demonstrate(
     finally:
         demonstrations.save()
     return demonstrations.episodes, tried
+
+
+def _usable(scenes: Sequence[str | Path], make: Callable[[Scene], TaskBatch]) -> tuple[list[str | Path], list[TaskBatch]]:
+    """Those scenes that the task can take place in, and the batch of each; of the others it is said why not."""
+    usable, batches, refused = [], [], []
+    for scene, loaded in [(scene, load_scene(scene)) for scene in scenes]:
+        try:
+            batches.append(make(loaded))
+            usable.append(scene)
+        except ValueError as error:
+            refused.append((scene, error))
+    if not usable:
+        raise refused[0][1]
+    for scene, error in refused:
+        _logger.warning("%s is left out: %s", scene, error)
+    return usable, batches
 
 
 def _check_options(out: Path, options: dict[str, Any]) -> None:

@@ -86,7 +86,7 @@ def export_lerobot(
         for episode in episodes:
             shown = {key: episode.images(getattr(episode, name)) for key, name in _PICTURES.items() if getattr(episode, name)}
             shown[IMAGE] = track(shown[IMAGE], description=f"writing {episode.bag.name}", total=len(episode))
-            writer.add(_columns(episode), shown)
+            writer.add((_columns(episode), shown))
         writer.save()
     except BaseException:  # half a dataset would only be in the way of the next try
         shutil.rmtree(out, ignore_errors=True)

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import MagicMock
 
@@ -11,11 +12,14 @@ import pytest
 from endo_sim_command import endo_sim
 from played_tasks import make
 
+from endo_sim_ros.core.cameras import save_cameras
 from endo_sim_ros.core.frames import SequenceError
+from endo_sim_ros.core.gaussians import ModelError, save_ply
 from endo_sim_ros.learning import dataset, demonstrations
 from endo_sim_ros.learning.config import DemonstrationConfig, Randomisation, SightConfig
 from endo_sim_ros.learning.dataset import IMAGE, IMAGE_RIGHT, SEGMENTATION, DatasetWriter, vector_feature
 from endo_sim_ros.learning.demonstrations import Demonstrations, demonstrate
+from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.physics import MotionConfig
 
 SIGHT = SightConfig(image_width=40, eyes=2, segmentation=True)
@@ -124,6 +128,21 @@ def test_scenes_take_turns_and_the_number_of_environments_does_not_matter(tmp_pa
         demonstrate("retraction", ["phantom:0"], roots[0], config, SIGHT, device="cpu")
 
 
+def test_a_scene_that_the_task_refuses_is_left_out_with_a_reason(tmp_path, caplog):
+    whole, small = load_scene("phantom:0"), str(tmp_path / "small/model.ply")
+    save_ply(whole.model.select(np.flatnonzero(np.linalg.norm(whole.model.means[:, :2], axis=1) < 0.012)), Path(small))
+    save_cameras(whole.cameras, tmp_path / "small/cameras.json")
+    config = DemonstrationConfig(episodes=1, environments=1)
+    demonstrate("retraction", [small, "phantom:0"], tmp_path / "out", config, SIGHT, device="cpu")
+    assert f"{small} is left out: retraction: " in caplog.text
+    assert json.loads((tmp_path / "out/meta/demonstrations.json").read_text())["scenes"] == ["phantom:0"]
+    with pytest.raises(ValueError, match="retraction: "):
+        demonstrate("retraction", [small], tmp_path / "none", config, SIGHT, device="cpu")
+    with pytest.raises(ModelError, match="nowhere.ply"):
+        demonstrate("retraction", ["phantom:0", "nowhere.ply"], tmp_path / "none", config, SIGHT, device="cpu")
+    assert not (tmp_path / "none").exists()
+
+
 def test_a_script_that_hardly_solves_anything_is_told(tmp_path, monkeypatch):
     monkeypatch.setattr(demonstrations, "_FEWEST", 1.01)
     with pytest.raises(SequenceError, match=r"\d+ of 3 episodes were solved; less noise or randomisation helps"):
@@ -133,7 +152,7 @@ def test_a_script_that_hardly_solves_anything_is_told(tmp_path, monkeypatch):
 def test_a_dataset_that_was_cut_off_is_not_continued(tmp_path):
     features = {"x": vector_feature(["a", "b"])}
     writer = DatasetWriter(tmp_path, "t", 25, features)
-    writer.add({"x": np.ones((3, 2), np.float32)}, {})
+    writer.add(({"x": np.ones((3, 2), np.float32)}, {}))
     writer.save()
     assert DatasetWriter(tmp_path, "t", 25, features).column("x").shape == (3, 2)
     with pytest.raises(SequenceError, match="is of the task 't', not 'u'"):

@@ -87,6 +87,17 @@ def test_it_is_given_while_both_hold_it_and_a_pull_of_the_second_arm_loses_it(ta
     assert not dropped["given"].any() and not dropped["height"].any()
 
 
+def test_the_arm_that_receives_is_paid_while_it_holds(task):
+    """Else its jaw could open again, and the first arm would lose all by letting go."""
+    (first, second), up = marks(task), np.array([0, 0, 0.011])
+    step = lambda lifted, closed: [put(task, [first + lifted, second + lifted], closed), task.judge().reward][1]
+    step(0 * up, [True, False])
+    step(up, [True, False])
+    assert (step(up, [True, True]) > 0.9).all() and (step(up, [True, False]) < -0.9).all()
+    step(up, [True, True])
+    assert (step(up, [False, True]) > 0.9).all()
+
+
 def test_it_turns_with_the_jaws_that_lead_and_keeps_the_direction_in_which_it_falls(task):
     (first, second), up = marks(task), np.array([0, 0, 0.012])
     put(task, [first, second], [True, False])

@@ -46,6 +46,21 @@ def test_scripted_policies_solve_their_tasks(task, count):
     assert not play(batch, idle, np.arange(count))[1].any()
 
 
+@pytest.mark.parametrize("task", ["retraction", "exposure", "tension", "handover", "clip", "dissect"])
+def test_scripts_tell_by_and_by_that_a_jaw_is_about_to_close(task):
+    """For policies that copy them: one row of a demonstration would not tell when."""
+    batch, policy, numbers = TaskBatch(task, load_scene(), 1, device="cpu"), scripted_policy(task, 1), []
+    batch.reset([0], [np.random.default_rng(1)])
+    for _ in range(60):
+        actions = policy.act(batch.state())
+        numbers.append(actions.reshape(len(batch.task.arms), -1)[:, 3])
+        batch.step(actions)
+    for own in np.array(numbers).T:
+        assert (own > 0).any()
+        coming = own[: np.argmax(own > 0)]
+        assert (np.diff(coming)[-2:] > 0).all() and coming[-1] > -0.5, coming
+
+
 def test_a_network_is_saved_and_loaded_and_nothing_else_is(tmp_path):
     rng = np.random.default_rng(0)
     size = sum(a * b for a, b in NetworkPolicy.sizes("retraction", [5]))

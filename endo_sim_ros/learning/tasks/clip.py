@@ -342,11 +342,13 @@ class ClipScript(Script):
         off = norm(beside) + self.lever * np.abs(o["misaligned"])
         back = np.clip(self.held_back * (off - self.near), 0.0, self.most_back)[:, None]
         clipped = o["clipped"] > 0
-        close = ~clipped & (o["fits"] > 0) & ((o["jaw"] > 0) | (norm(way) < self.exact))
+        fits, closed, coming = o["fits"] > 0, o["jaw"] > 0, self.closing(norm(way), self.exact)
+        jaw = np.where(clipped | closed & ~fits, -1.0, np.where(closed, 1.0, np.where(fits, coming, np.minimum(coming, 0.0))))
+        close = jaw > 0
         wish = np.where((clipped | close)[:, None], way, beside + (ahead - back) * along)
         wish = wish / np.maximum(np.abs(wish).max(1, keepdims=True), Clip.step_length)
         turn = np.where(close | clipped, 0.0, np.clip(o["misaligned"] / Clip.twist, -1, 1))
-        return np.concatenate([wish, np.where(close, 1.0, -1.0)[:, None], turn[:, None]], 1)
+        return np.concatenate([wish, jaw[:, None], turn[:, None]], 1)
 
 
 def _angle(first: np.ndarray, second: np.ndarray) -> np.ndarray:

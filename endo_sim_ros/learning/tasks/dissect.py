@@ -198,22 +198,22 @@ class DissectScript(Script):
         across = np.stack([o["line_y"], -o["line_x"], np.zeros(len(observations))], 1)
 
         holding = (o["PSM2.jaw"] > 0) & (o["PSM2.distance"] < Dissect.grasp_radius / LENGTH)
-        close = holding | (o["PSM2.distance"] < self.grasp / LENGTH)
+        jaw = np.where(holding, 1.0, self.closing(LENGTH * o["PSM2.distance"], self.grasp))
         more = self.gain * np.where(holding, np.where(o["parted"] < 1, self.wanted, self.wide) - FORCE * o["pull"], 0.0)
-        pull = np.where(close[:, None], -more[:, None] * across, vector("PSM2.spot_from_tip"))
+        pull = np.where(jaw[:, None] > 0, -more[:, None] * across, vector("PSM2.spot_from_tip"))
 
         way = vector("PSM1.next_from_tip")
         entry, aim, depth = way - self.behind * along, way + self.ahead * along, way[:, 2]
         whole, over = o["parted"] < 1, np.hypot(*entry[:, :2].T) < self.near
         goes_on = whole & (o["PSM1.cuts"] > 0) & (np.abs(dot(way, across)) < 0.5 * Dissect.tolerance) & (dot(way, along) > -self.past)
         enters = whole & over & holding & (FORCE * o["pull"] > self.taut)
-        cuts = goes_on | enters & (depth > self.down - self.near)
-        level = np.where(cuts | enters, depth - self.down, depth + self.over)
+        cuts = np.where(goes_on, 1.0, np.where(enters, self.closing(self.down - depth, self.near), -1.0))
+        level = np.where(goes_on | enters, depth - self.down, depth + self.over)
         glide = np.where(goes_on[:, None], aim * (self.pace / norm(aim))[:, None], entry)
         glide = np.where((goes_on | over | (depth < self.near - self.over))[:, None] & whole[:, None], glide, 0.0)  # else it leaves first
         move = np.concatenate([glide[:, :2], level[:, None]], 1)
         moves = np.clip(np.stack([move, pull], 1) / Dissect.step_length, -1, 1)
-        fourth = np.where(np.stack([cuts, close], 1), 1.0, -1.0)
+        fourth = np.stack([cuts, jaw], 1)
         return np.concatenate([moves, fourth[..., None]], 2).reshape(len(o["parted"]), -1)
 
 

@@ -179,16 +179,17 @@ class Exposure(Task):
 class ExposureScript(Script):
     """Goes to the grip, closes there, and pulls the fold towards the endoscope and down while the place is hidden."""
 
+    grasp = 0.003  # m from the grip at which the jaw closes
     pull = np.array([0.0, -0.4, 0.92])  # pulled down alone the fold takes the place with it
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Actions [B, 4] for state observations [B, n]."""
         o = dict(zip(Exposure.observation_names, observations.astype(np.float64).T))
         holding = (o["jaw"] > 0) & (o["distance"] < Exposure.grasp_radius / LENGTH)
-        close = holding | (o["distance"] < 0.003 / LENGTH)
+        jaw = np.where(holding, 1.0, self.closing(o["distance"] * LENGTH, self.grasp))
         way = np.stack([o[f"grip_from_tip_{axis}"] for axis in "xyz"], 1) * LENGTH / Exposure.step_length
         pull = np.where(o["hidden"] > 0, 0.5, 0.0)[:, None] * self.pull
-        return np.concatenate([np.clip(np.where(close[:, None], pull, way), -1, 1), np.where(close, 1.0, -1.0)[:, None]], 1)
+        return np.concatenate([np.clip(np.where(jaw[:, None] > 0, pull, way), -1, 1), jaw[:, None]], 1)
 
 
 def hidden_by(eyes: np.ndarray, here: np.ndarray, corners: np.ndarray) -> np.ndarray:

@@ -154,10 +154,11 @@ class Handover(Task):
     def _value(self) -> np.ndarray:
         right, left = norm(self._ways).T
         taken = self._given | self.holds[:, 0]
-        alone = self._given & self.holds[:, 1] & ~self.holds[:, 0]
-        # −1 for each 2 cm of an arm from its mark; ½, 1, 1 and 1 for taking, lifting, giving and leaving it.
+        received = self._given & self.holds[:, 1]
+        # −1 for each 2 cm of an arm from its mark; ½, 1, 1 and 1 for taking, lifting, receiving and leaving it. PSM2 is paid while it
+        # holds, not for having held: else its jaw need not stay closed, and PSM1 cannot learn to let go.
         lifted = np.minimum(self._height / self.lift, 1.0)
-        return 0.5 * taken + lifted + self._given + alone - (np.where(taken, 0.0, right) + left) / LENGTH
+        return 0.5 * taken + lifted + received + (received & ~self.holds[:, 0]) - (np.where(taken, 0.0, right) + left) / LENGTH
 
     def _judge_goal(self) -> np.ndarray:
         done = self._given & self.holds[:, 1] & ~self.holds[:, 0] & (self._height >= self.lift)
@@ -204,5 +205,7 @@ class HandoverScript(Script):
         ready = (distance * LENGTH < self.close) & (jaw < 0)  # a jaw that closed on nothing opens before it closes again
         takes = np.stack([~left & (right | ready[:, 0]), left | right & high & ready[:, 1]], 1)
         moves = np.where((takes & (holds == 0))[..., None], 0.0, moves)
-        actions = np.concatenate([np.clip(moves / Handover.step_length, -1, 1), np.where(takes, 1.0, -1.0)[..., None]], 2)
+        coming = (jaw < 0) & np.stack([~left & ~right, right & high & ~left], 1)
+        jaws = np.where(coming, self.closing(distance * LENGTH, self.close), np.where(takes, 1.0, -1.0))
+        actions = np.concatenate([np.clip(moves / Handover.step_length, -1, 1), jaws[..., None]], 2)
         return actions.reshape(len(o), -1)

@@ -82,9 +82,9 @@ class RetractionScript(Script):
         names = Retraction.observation_names
         o = {name: observations[:, i].astype(np.float64) for i, name in enumerate(names)}
         holding = (o["jaw"] > 0) & (o["distance"] < Retraction.grasp_radius / LENGTH)  # else it closed on nothing, and opens
-        close = holding | (o["distance"] < self.grasp / LENGTH)
+        jaw = np.where(holding, 1.0, self.closing(o["distance"] * LENGTH, self.grasp))
         towards = np.stack([o[f"spot_from_tip_{axis}"] for axis in "xyz"], 1) * LENGTH / Retraction.step_length
         up = (self.beyond - o["spot_moved_z"]) * Retraction.lift / Retraction.step_length
         lift = np.stack([np.zeros_like(up), np.zeros_like(up), 0.5 * up], 1)
-        moves = np.where(close[:, None], lift, towards)
-        return np.concatenate([np.clip(moves, -1, 1), np.where(close, 1.0, -1.0)[:, None]], 1)
+        moves = np.where(jaw[:, None] > 0, lift, towards)
+        return np.concatenate([np.clip(moves, -1, 1), jaw[:, None]], 1)

@@ -350,6 +350,14 @@ class Script:
 
     actions: Literal["cartesian"] = "cartesian"
     sight = None
+    fade = 0.008  # m: how far from where a jaw closes the fourth number is as low as it gets
+
+    def closing(self, distance: np.ndarray, grasp: float) -> np.ndarray:
+        """Fourth numbers of jaws at distances [...], m, that close nearer than `grasp`, m, and say by and by that they are coming near.
+
+        They are for policies that copy them: of a number that jumps, hardly a row of a demonstration would tell when to close.
+        """
+        return np.clip((grasp - distance) / self.fade, -1, 1)
 
     def reset(self, episodes: Sequence[int]) -> None:
         """These episodes begin anew; nothing to do for a script without a memory."""

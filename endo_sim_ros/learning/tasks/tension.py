@@ -122,10 +122,10 @@ class TensionScript(Script):
         tips, ways = np.moveaxis(o[:, :12].reshape(-1, 2, 2, 3), 1, 0)  # of both arms [B, 2, 3]
         distance, jaw, missing = np.moveaxis(o[:, 12:18].reshape(-1, 3, 2), 1, 0)  # [B, 2]
         holding = (jaw > 0) & (distance < Tension.grasp_radius / LENGTH)  # else it closed on nothing, and opens
-        close = holding | (distance < self.grasp / LENGTH)
+        jaws = np.where(holding, 1.0, self.closing(distance * LENGTH, self.grasp))
         outward = tips - tips[:, ::-1]
         outward /= np.maximum(norm(outward), 1e-6)[..., None]
         more = self.gain * FORCE * np.where(holding.all(1, keepdims=True), missing, 0.0)
-        moves = np.where(close[..., None], more[..., None] * outward, ways * LENGTH) / Tension.step_length
-        actions = np.concatenate([np.clip(moves, -1, 1), np.where(close, 1.0, -1.0)[..., None]], 2)
+        moves = np.where(jaws[..., None] > 0, more[..., None] * outward, ways * LENGTH) / Tension.step_length
+        actions = np.concatenate([np.clip(moves, -1, 1), jaws[..., None]], 2)
         return actions.reshape(len(o), -1)

@@ -102,17 +102,16 @@ def _warp_stream(index: int, handle: int) -> "wp.Stream":
     return wp.Stream(wp.get_device(f"cuda:{index}"), cuda_stream=handle)
 
 
-def upload(device: torch.device | str, *arrays: np.ndarray, into: Tensor | None = None) -> list[Tensor]:
+def upload(device: torch.device | str, *arrays: np.ndarray) -> list[Tensor]:
     """Return numbers as float32 tensors on a device, copied all at once. The host does not wait for what a GPU does at the moment.
 
-    The copy starts from pinned memory, which torch does not use again before the copy is done. It goes into new memory of a GPU, or into
-    the beginning of a tensor [N].
+    The copy starts from pinned memory, which torch does not use again before the copy is done.
     """
     sizes, on_host = [array.size for array in arrays], torch.device(device).type == "cpu"
     flat = torch.empty(sum(sizes), dtype=torch.float32, pin_memory=not on_host)
     np.concatenate(arrays, None, flat.numpy(), casting="same_kind")
     if not on_host:
-        flat = flat.to(device, non_blocking=True) if into is None else into[: len(flat)].copy_(flat, non_blocking=True)
+        flat = flat.to(device, non_blocking=True)
     return [part.view(array.shape) for part, array in zip(flat.split_with_sizes(sizes), arrays)]
 
 

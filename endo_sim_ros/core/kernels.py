@@ -8,11 +8,10 @@ version 1.19.
 import contextlib
 import contextvars
 import functools
-import gc
 import threading
 import types
 import weakref
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from endo_sim_ros.core.device import current_warp_stream, gpu_index, init_warp, run_in_threads, shares, warp_stream
+from endo_sim_ros.core.device import current_warp_stream, gpu_index, init_warp, run_in_threads, shares
 
 _plain = contextvars.ContextVar("plain", default=False)
 
@@ -136,70 +135,6 @@ def _record(kernel: Any, count: int | tuple[int, ...], arguments: Sequence, devi
     for place in places:
         place._ref = None
     return command, places, gpu_index(device)
-
-
-@contextlib.contextmanager
-def no_garbage_collection() -> Iterator[None]:
-    """Within it, no garbage is collected: freeing tensors or graphs on the GPU would end a capture."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
-
-
-class Replays:
-    """Launches on a GPU that come again and again, replayed as one graph: it takes the host as long as one launch.
-
-    A graph knows memory by its address. Pictures get the same memory again and again, as long as it is free in between. Launches on memory
-    that was not seen before are made one by one; when they come again on the same memory they are captured.
-
-    Args:
-        device: The GPU, e.g. ``cuda:0``.
-    """
-
-    def __init__(self, device: str) -> None:
-        self._device, self._index, self._graphs = device, gpu_index(device) or 0, dict[Hashable, Any]()
-        self._stream: torch.cuda.Stream | None = None
-
-    def run(self, key: Hashable, launches: Sequence[tuple[Any, int, Sequence]]) -> None:
-        """Launch kernels one after another.
-
-        Args:
-            key: Equal where all else is: kernels, counts, numbers, and the addresses of all memory.
-            launches: Kernels, counts and arguments as for `launch`.
-        """
-        if torch.cuda.is_current_stream_capturing():  # the work becomes part of another graph
-            return self._launch(launches)
-        graph = self._graphs.pop(key, None)
-        if graph is None:
-            graph = _SEEN
-            self._launch(launches)
-        else:
-            if graph is _SEEN:
-                graph = self._capture(launches)
-            wp.capture_launch(graph, current_warp_stream(self._index))
-        self._graphs[key] = graph  # the newest last
-        if len(self._graphs) > _GRAPHS:
-            del self._graphs[next(iter(self._graphs))]
-
-    def _launch(self, launches: Sequence[tuple[Any, int, Sequence]]) -> None:
-        for kernel, count, arguments in launches:
-            launch(kernel, count, arguments, self._device)
-
-    def _capture(self, launches: Sequence[tuple[Any, int, Sequence]]) -> Any:
-        """A graph of the launches, which are not made. It is captured on a stream of its own, as torch's default stream cannot be."""
-        stream = self._stream = self._stream or torch.cuda.Stream(self._device)
-        capture = wp.ScopedCapture(stream=warp_stream(stream), force_module_load=False)
-        with no_garbage_collection(), torch.cuda.stream(stream), capture:
-            self._launch(launches)
-        return capture.graph
-
-
-_SEEN = object()  # in the place of the graph of launches that came once
-_GRAPHS = 16  # that are kept: pictures of a loop take turns in a few pieces of memory
 
 
 def launch_in_shares(kernel: Any, count: int, arguments: Sequence, least: int = 1024) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.device import pick_device, upload
-from endo_sim_ros.core.kernels import Replays, launch_in_shares, load_kernels, vectorised
+from endo_sim_ros.core.kernels import launch, launch_in_shares, load_kernels, vectorised
 from endo_sim_ros.core.light import SURFACE
 from endo_sim_ros.instruments import drawing_kernels, light_kernels, resolving_kernels
 from endo_sim_ros.instruments.config import DrawingConfig as DrawingConfig
@@ -132,8 +132,6 @@ class InstrumentDrawing:
         look.ambient, look.softness = config.ambient, config.softness
         look.lamp_size, look.mirror, look.white = config.lamp_size, config.mirror, config.white
         self._newest: tuple[int, tuple[int, int, bool], Any] = 0, (0, 0, False), None
-        self._parameters: Tensor | None = None  # of the newest frame, on a GPU
-        self._replays = Replays(self.device)  # on its memory
         load_kernels((drawing_kernels, light_kernels, resolving_kernels), self.device)
 
     def at(self, poses: Sequence[Mapping[str, np.ndarray]]) -> PosedInstruments:
@@ -200,7 +198,7 @@ class InstrumentDrawing:
         surfaces = self._surfaces if surfaces is None else surfaces
         ends = (local[:, self._capsule_links] @ self._ends)[:, :, :3].swapaxes(2, 3)  # [B, C, 2, 3]
         numbers = local, ends, np.concatenate([lenses, lamps], 1), surfaces
-        placed, ends, views, materials = upload(self.device, *numbers, into=self._parameters)
+        placed, ends, views, materials = upload(self.device, *numbers)
         on_host, in_vectors = torch.device(self.device).type == "cpu", vectorised(self.device)
         labels = (alphas > SURFACE).view(torch.uint8) if in_vectors else torch.empty_like(alphas, dtype=torch.uint8)
         lanes = 1 if on_host else light_kernels.LANES
@@ -215,12 +213,11 @@ class InstrumentDrawing:
         else:
             work.append((drawing_kernels.cover_faces, count * frame.faces * frame.lanes, [frame]))
             work.append((resolving_kernels.resolve_pixels, count * width * height, scene))
-        if on_host:
-            for kernel, items, arguments in work:
+        for kernel, items, arguments in work:
+            if on_host:
                 launch_in_shares(kernel, items, arguments, least=4)
-        else:
-            key = count, *(image.data_ptr() for image in (colors, depths, alphas, labels))
-            self._replays.run(key, [(kernel, items, [0, *arguments]) for kernel, items, arguments in work])
+            else:
+                launch(kernel, items, [0, *arguments], self.device)
         return labels
 
     def _frame(self, count: int, width: int, height: int, own_surfaces: bool) -> Any:
@@ -249,9 +246,6 @@ class InstrumentDrawing:
         for name, array in arrays.items():
             setattr(frame, name, wp.from_torch(array, dtype=drawing_kernels.Frame.vars[name].type.dtype))
         self._newest = count, key, frame
-        if torch.device(self.device).type != "cpu":
-            numbers = 16 * frame.links + 6 * frame.capsules + 7 + (self._surfaces.size if own_surfaces else 0)
-            self._parameters, self._replays = new((count * numbers + self._surfaces.size,), torch.float32), Replays(self.device)
         return frame
 
 

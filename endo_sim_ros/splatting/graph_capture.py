@@ -1,14 +1,15 @@
 """CUDA graphs of work that draws pictures, captured once and replayed: hundreds of launches then take the host the time of one."""
 
+import contextlib
 import functools
-from collections.abc import Callable
+import gc
+from collections.abc import Callable, Iterator
 
 import torch
 import warp as wp
 from torch import Tensor
 
 from endo_sim_ros.core.device import warp_stream
-from endo_sim_ros.core.kernels import no_garbage_collection
 from endo_sim_ros.splatting import cuda
 
 
@@ -67,7 +68,7 @@ class GraphCapture:
         # Other threads may go on using the GPU. Warp has to know of the capture, for the memory that it takes.
         capture = torch.cuda.graph(graph, self._pool, stream, capture_error_mode="thread_local")
         with (
-            no_garbage_collection(),
+            _no_garbage_collection(),
             cuda.noted_capacities() as capacities,
             capture,
             wp.ScopedCapture(stream=warp_stream(stream), external=True),
@@ -78,6 +79,18 @@ class GraphCapture:
 
 def _device_of(inputs: list[Tensor | None]) -> torch.device:
     return next(x.device for x in inputs if x is not None)
+
+
+@contextlib.contextmanager
+def _no_garbage_collection() -> Iterator[None]:
+    """Within it, no garbage is collected: freeing tensors or graphs on the GPU would end a capture."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 @functools.cache

@@ -179,7 +179,7 @@ class Exposure(Task):
 class ExposureScript(Script):
     """Goes to the grip, closes there, and pulls the fold towards the endoscope and down while the place is hidden."""
 
-    grasp = 0.003  # m from the grip at which the jaw closes
+    grasp = 0.005  # m from the grip at which the jaw closes
     pull = np.array([0.0, -0.4, 0.92])  # pulled down alone the fold takes the place with it
 
     def act(self, observations: np.ndarray) -> np.ndarray:
@@ -188,7 +188,7 @@ class ExposureScript(Script):
         holding = (o["jaw"] > 0) & (o["distance"] < Exposure.grasp_radius / LENGTH)
         jaw = np.where(holding, 1.0, self.closing(o["distance"] * LENGTH, self.grasp))
         way = np.stack([o[f"grip_from_tip_{axis}"] for axis in "xyz"], 1) * LENGTH / Exposure.step_length
-        pull = np.where(o["hidden"] > 0, 0.5, 0.0)[:, None] * self.pull
+        pull = np.where(o["hidden"] > 0, 0.5, 0.2)[:, None] * self.pull
         return np.concatenate([np.clip(np.where(jaw[:, None] > 0, pull, way), -1, 1), jaw[:, None]], 1)
 
 

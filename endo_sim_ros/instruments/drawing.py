@@ -197,8 +197,7 @@ class InstrumentDrawing:
         lamps = np.tile((config.lamp_x, config.lamp_y, 0.0), (count, 1)) if lamps is None else lamps
         surfaces = self._surfaces if surfaces is None else surfaces
         ends = (local[:, self._capsule_links] @ self._ends)[:, :, :3].swapaxes(2, 3)  # [B, C, 2, 3]
-        numbers = local, ends, np.concatenate([lenses, lamps], 1), surfaces
-        placed, ends, views, materials = upload(self.device, *numbers)
+        placed, ends, views, materials = upload(self.device, local, ends, np.concatenate([lenses, lamps], 1), surfaces)
         on_host, in_vectors = torch.device(self.device).type == "cpu", vectorised(self.device)
         labels = (alphas > SURFACE).view(torch.uint8) if in_vectors else torch.empty_like(alphas, dtype=torch.uint8)
         lanes = 1 if on_host else light_kernels.LANES

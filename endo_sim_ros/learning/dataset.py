@@ -356,9 +356,9 @@ def _counted(images: Iterable[np.ndarray], histogram: np.ndarray) -> Iterator[np
     """Pass pictures on and add a sample of their pixels to a histogram [C, 256]."""
     for image in images:
         every = max(max(image.shape) // _SAMPLE, 1)
-        sample = image[::every, ::every].reshape(-1, len(histogram))
+        sample = np.ascontiguousarray(image[::every, ::every])
         for channel in range(len(histogram)):
-            histogram[channel] += np.bincount(sample[:, channel], minlength=256)
+            histogram[channel] += cv2.calcHist([sample], [channel], None, [256], [0, 256]).ravel().astype(np.int64)
         yield image
 
 

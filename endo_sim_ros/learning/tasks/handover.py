@@ -155,10 +155,11 @@ class Handover(Task):
         right, left = norm(self._ways).T
         taken = self._given | self.holds[:, 0]
         received = self._given & self.holds[:, 1]
-        # −1 for each 2 cm of an arm from its mark; ½, 1, 1 and 1 for taking, lifting, receiving and leaving it. PSM2 is paid while it
-        # holds, not for having held: else its jaw need not stay closed, and PSM1 cannot learn to let go.
-        lifted = np.minimum(self._height / self.lift, 1.0)
-        return 0.5 * taken + lifted + received + (received & ~self.holds[:, 0]) - (np.where(taken, 0.0, right) + left) / LENGTH
+        # −1 for each 2 cm of an arm from its mark; ½, 1, 1 and 1 for taking, lifting, receiving and leaving it, and up to 1 for the fourth
+        # number of PSM1 on its way to letting go, which is far from where it held. PSM2 is paid while it holds, not for having held: else
+        # its jaw need not stay closed, and PSM1 would lose all by letting go.
+        lifted, lets = np.minimum(self._height / self.lift, 1.0), 0.5 * (1 - self.fourth[:, 0]) + ~self.holds[:, 0]
+        return 0.5 * taken + lifted + received * (1 + lets) - (np.where(taken, 0.0, right) + left) / LENGTH
 
     def _judge_goal(self) -> np.ndarray:
         done = self._given & self.holds[:, 1] & ~self.holds[:, 0] & (self._height >= self.lift)

@@ -19,7 +19,7 @@ class Command:
     task: Positional[str]
     """Name of the task, such as retraction or palpation; an unknown one is answered with the list."""
     out: Positional[Path]
-    """Folder of the dataset. Finished episodes stay in it when the command is interrupted."""
+    """Folder of the dataset. Finished rounds of episodes stay in it when the command is interrupted."""
     scenes: tuple[str, ...] = ("phantom:0",)
     """Synthetic patients, phantom:SEED, or PLY models with their cameras.json, which episodes take in turn."""
     device: str = "auto"

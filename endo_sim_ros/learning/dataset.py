@@ -7,6 +7,7 @@ read the result with it where it is installed. Each episode has files of its own
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
@@ -32,8 +33,7 @@ _EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 _INFO, _HISTOGRAMS = "meta/info.json", "meta/image_histograms.npz"  # the latter to continue with
 _CHUNK_SIZE = 1000  # files in a folder
 # Every second frame is a key frame, so that any is found fast; without frames out of order times begin at zero.
-# Episodes are written beside each other, so that one needs no threads of its own.
-_CODEC_OPTIONS = {"g": "2", "bf": "0", "crf": "18", "threads": "1"}
+_CODEC_OPTIONS = {"g": "2", "bf": "0", "crf": "18"}
 _QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 _GROUP = 256  # rows that are written together with their png images
 _SAMPLE = 150  # pixels along the longer side of an image that count in its statistics
@@ -146,12 +146,11 @@ class DatasetWriter:
             }
             placed.append((number, own, pictures))
             begin += len(frames)
-        with ThreadPoolExecutor(cpu_threads()) as pool:  # encoding does not hold the interpreter
-            for (number, own, _), histograms in zip(placed, pool.map(lambda each: self._write_files(*each), placed)):
-                begin, count = self.frames, len(own["index"])
-                self._rows.append(self._row(number, begin, count) | _flat(_statistics(own, histograms, count)))
-                self._columns.append(own)
-                self._histograms.append(histograms)
+        for (number, own, _), histograms in zip(placed, self._write_all(placed)):
+            count = len(own["index"])
+            self._rows.append(self._row(number, self.frames, count) | _flat(_statistics(own, histograms, count)))
+            self._columns.append(own)
+            self._histograms.append(histograms)
 
     def save(self) -> None:
         """Write what describes all episodes so far; without it the newest are not part of the dataset."""
@@ -189,8 +188,20 @@ class DatasetWriter:
                 raise
             raise SequenceError(f"{self._root} cannot be continued: {' '.join(str(error).split())}; choose another name") from error
 
+    def _write_all(self, episodes: Sequence[tuple[int, dict, Mapping]]) -> Iterator[dict[str, np.ndarray]]:
+        """What `_write_files` returns for each; encoding several at a time does not hold the interpreter."""
+        if len(episodes) == 1:  # it has all cores, and is interrupted at once
+            yield self._write_files(*episodes[0])
+            return
+        with ThreadPoolExecutor(cpu_threads()) as pool:
+            yield from pool.map(partial(self._write_files, codec_options=_CODEC_OPTIONS | {"threads": "1"}), *zip(*episodes))
+
     def _write_files(
-        self, number: int, columns: dict[str, np.ndarray], pictures: Mapping[str, Iterable[np.ndarray]]
+        self,
+        number: int,
+        columns: dict[str, np.ndarray],
+        pictures: Mapping[str, Iterable[np.ndarray]],
+        codec_options: dict[str, str] = _CODEC_OPTIONS,
     ) -> dict[str, np.ndarray]:
         """Write table and pictures of an episode and return the histograms [C, 256] of its pictures by their keys."""
         histograms, cells, count = {}, {}, len(columns["index"])
@@ -202,7 +213,7 @@ class DatasetWriter:
                 cells[key] = counted
             else:
                 path = self._path(_VIDEO.format(video_key=key, **_place(number)))
-                drawing.write_video(path, counted, self._fps, _CODEC_OPTIONS)
+                drawing.write_video(path, counted, self._fps, codec_options)
         kind = self._pa.struct({"bytes": self._pa.binary(), "path": self._pa.string()})
         schema = table.schema
         for key in cells:

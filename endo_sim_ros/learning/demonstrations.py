@@ -199,14 +199,15 @@ def demonstrate(
 ) -> tuple[int, int]:
     """Let the script of a task solve episodes and write them; returns the number of all in the dataset, and how many were tried now.
 
-    The arguments are those of `Demonstrations`, and so is what it raises. Finished episodes stay in the dataset when the call is
-    interrupted, and the next one continues it.
+    The arguments are those of `Demonstrations`, and so is what it raises. Episodes are played in rounds: some in each scene, at most as
+    many as are wanted. Those of finished rounds stay in the dataset when the call is interrupted, and the next one continues it.
 
     Raises:
         SequenceError: If hardly an episode is solved, too.
     """
-    demonstrations = Demonstrations(task, scenes, out, config.environments, config, sight, randomisation, motion, device)
-    batches, count, seed, tried = demonstrations.batches, config.environments, demonstrations.seed, 0
+    count = min(config.environments, -(-config.episodes // max(len(scenes), 1)))
+    demonstrations = Demonstrations(task, scenes, out, count, config, sight, randomisation, motion, device)
+    batches, seed, tried = demonstrations.batches, demonstrations.seed, 0
     policy = scripted_policy(task, count)
     try:
         with Progress() as bar:
@@ -214,12 +215,16 @@ def demonstrate(
             while demonstrations.episodes < config.episodes:
                 # Seed n is of scene n mod their number, however many episodes run at once.
                 own = [np.arange(count) * len(batches) + seed + (i - seed) % len(batches) for i in range(len(batches))]
-                played = [_play(batch, policy, config.noise, numbers) for batch, numbers in zip(batches, own)]
+                played = []
+                for number, (batch, seeds) in enumerate(zip(batches, own), 1):
+                    bar.update(progress, description=f"{task}, scene {number} of {len(batches)}")
+                    played.append(_play(batch, policy, config.noise, seeds))
                 episodes = dict(zip(np.concatenate(own).tolist(), chain(*played)))
                 solved = [number for number in sorted(episodes) if episodes[number].solved]
                 kept = solved[: config.episodes - demonstrations.episodes]
                 tried += len(episodes) if kept == solved else sorted(episodes).index(kept[-1]) + 1
-                demonstrations.add({number: episodes[number] for number in kept})
+                if kept:
+                    demonstrations.add({number: episodes[number] for number in kept})
                 bar.update(progress, completed=demonstrations.episodes)
                 seed += len(episodes)
                 demonstrations.save_if_due()
@@ -232,17 +237,19 @@ def demonstrate(
 
 def _usable(scenes: Sequence[str | Path], make: Callable[[Scene], TaskBatch]) -> tuple[list[str | Path], list[TaskBatch]]:
     """Those scenes that the task can take place in, and the batch of each; of the others it is said why not."""
-    usable, batches, refused = [], [], []
+    if not scenes:
+        raise ValueError("there is no scene; give one or more, such as phantom:0")
+    usable, batches, refused = [], [], {}
     for scene, loaded in [(scene, load_scene(scene)) for scene in scenes]:
         try:
             batches.append(make(loaded))
             usable.append(scene)
         except ValueError as error:
-            refused.append((scene, error))
-    if not usable:
-        raise refused[0][1]
-    for scene, error in refused:
-        _logger.warning("%s is left out: %s", scene, error)
+            refused[scene] = str(error)
+    if not usable:  # each reason once
+        raise ValueError("; ".join(f"{scene}: {text}" for text, scene in {text: scene for scene, text in refused.items()}.items()))
+    for scene, text in refused.items():
+        _logger.warning("%s is left out: %s", scene, text)
     return usable, batches
 
 

@@ -143,6 +143,17 @@ def test_a_scene_that_the_task_refuses_is_left_out_with_a_reason(tmp_path, caplo
     assert not (tmp_path / "none").exists()
 
 
+def test_a_round_without_a_solved_episode_leaves_nothing_behind(tmp_path, monkeypatch):
+    monkeypatch.setattr(demonstrations, "_FEWEST", 0.5)
+    with pytest.raises(SequenceError, match="0 of 3 episodes were solved"):
+        run(tmp_path / "out", 3, noise=2.0, task="tracking")
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(ValueError, match="there is no scene; give one or more, such as phantom:0"):
+        demonstrate("retraction", [], tmp_path / "out", device="cpu")
+    with pytest.raises(ValueError, match="^phantom:1: .*nowhere.urdf"):
+        demonstrate("retraction", ["phantom:0", "phantom:1"], tmp_path / "out", sight=SightConfig(tool="nowhere.urdf"), device="cpu")
+
+
 def test_a_script_that_hardly_solves_anything_is_told(tmp_path, monkeypatch):
     monkeypatch.setattr(demonstrations, "_FEWEST", 1.01)
     with pytest.raises(SequenceError, match=r"\d+ of 3 episodes were solved; less noise or randomisation helps"):

@@ -156,7 +156,7 @@ class DemonstrationConfig(StageConfig):
     seed: Annotated[int, Range(0, 2**31 - 1)] = 0
     """Seed of the first episode; each following one has the next seed."""
     environments: Annotated[int, Range(1, 10_000)] = 16
-    """Episodes of a script at once; the dataset does not depend on it on a CPU."""
+    """Episodes of a script at once in each scene, at most as many as are wanted; the dataset does not depend on it on a CPU."""
     noise: Annotated[float, Range(0, 2)] = 0.1
     """Standard deviation of what is added to each action of a script before it acts, in its units of -1 to 1. What is written is the
     action without it, so that the data show how an expert recovers (DART, Laskey et al. 2017)."""

@@ -246,8 +246,9 @@ def _usable(scenes: Sequence[str | Path], make: Callable[[Scene], TaskBatch]) ->
             usable.append(scene)
         except ValueError as error:
             refused[scene] = str(error)
-    if not usable:  # each reason once
-        raise ValueError("; ".join(f"{scene}: {text}" for text, scene in {text: scene for scene, text in refused.items()}.items()))
+    if not usable:
+        reasons = {text: scene for scene, text in refused.items()}  # each once
+        raise ValueError("; ".join(f"{scene}: {text}" for text, scene in reasons.items()))
     for scene, text in refused.items():
         _logger.warning("%s is left out: %s", scene, text)
     return usable, batches

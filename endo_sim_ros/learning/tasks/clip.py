@@ -343,7 +343,7 @@ class ClipScript(Script):
         back = np.clip(self.held_back * (off - self.near), 0.0, self.most_back)[:, None]
         clipped = o["clipped"] > 0
         fits, closed, coming = o["fits"] > 0, o["jaw"] > 0, self.closing(norm(way), self.exact)
-        jaw = np.where(clipped | closed & ~fits, -1.0, np.where(closed, 1.0, np.where(fits, coming, np.minimum(coming, 0.0))))
+        jaw = np.select([clipped | closed & ~fits, closed, fits], [-1.0, 1.0, coming], np.minimum(coming, 0.0))
         close = jaw > 0
         wish = np.where((clipped | close)[:, None], way, beside + (ahead - back) * along)
         wish = wish / np.maximum(np.abs(wish).max(1, keepdims=True), Clip.step_length)

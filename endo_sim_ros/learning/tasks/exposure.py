@@ -177,9 +177,10 @@ class Exposure(Task):
 
 
 class ExposureScript(Script):
-    """Goes to the grip, closes there, and pulls the fold towards the endoscope and down while the place is hidden."""
+    """Goes to the grip, closes there, and pulls the fold towards the endoscope and down, slower once the place is seen."""
 
     grasp = 0.005  # m from the grip at which the jaw closes
+    pace = 0.5, 0.2  # parts of a step while the place is hidden and once it is seen; a policy that copies a stop fades out before it
     pull = np.array([0.0, -0.4, 0.92])  # pulled down alone the fold takes the place with it
 
     def act(self, observations: np.ndarray) -> np.ndarray:
@@ -188,7 +189,7 @@ class ExposureScript(Script):
         holding = (o["jaw"] > 0) & (o["distance"] < Exposure.grasp_radius / LENGTH)
         jaw = np.where(holding, 1.0, self.closing(o["distance"] * LENGTH, self.grasp))
         way = np.stack([o[f"grip_from_tip_{axis}"] for axis in "xyz"], 1) * LENGTH / Exposure.step_length
-        pull = np.where(o["hidden"] > 0, 0.5, 0.2)[:, None] * self.pull
+        pull = np.where(o["hidden"] > 0, *self.pace)[:, None] * self.pull
         return np.concatenate([np.clip(np.where(jaw[:, None] > 0, pull, way), -1, 1), jaw[:, None]], 1)
 
 

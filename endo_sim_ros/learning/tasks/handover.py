@@ -156,10 +156,9 @@ class Handover(Task):
         taken = self._given | self.holds[:, 0]
         received = self._given & self.holds[:, 1]
         # −1 for each 2 cm of an arm from its mark; ½, 1, 1 and 1 for taking, lifting, receiving and leaving it. PSM2 is paid while it
-        # holds, not for having held: else its jaw need not stay closed, and the needle falls when PSM1 lets go. Once PSM2 holds, up to 1
-        # more as the fourth number of PSM1 sinks, which leads learners from a firm grasp to letting go.
-        lifted, lets = np.minimum(self._height / self.lift, 1.0), 0.5 * (1 - self.fourth[:, 0]) + ~self.holds[:, 0]
-        return 0.5 * taken + lifted + received * (1 + lets) - (np.where(taken, 0.0, right) + left) / LENGTH
+        # holds, not for having held: else its jaw need not stay closed, and the needle falls when PSM1 lets go.
+        lifted, leaves = np.minimum(self._height / self.lift, 1.0), 1.0 - self.holds[:, 0]
+        return 0.5 * taken + lifted + received * (1 + leaves) - (np.where(taken, 0.0, right) + left) / LENGTH
 
     def _judge_goal(self) -> np.ndarray:
         done = self._given & self.holds[:, 1] & ~self.holds[:, 0] & (self._height >= self.lift)

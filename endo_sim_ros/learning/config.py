@@ -98,6 +98,9 @@ class PPOConfig(StageConfig):
     """Of the generalised advantage estimate."""
     spread: Annotated[float, Range(1e-3, 10)] = 0.6
     """Standard deviation of the actions at the beginning."""
+    demonstrations: Annotated[int, Range(0, 1_000_000)] = 0
+    """Episodes of the task's script, with this spread, from which the policy learns before it learns by reward; 0 = none. Chance hardly
+    finds what takes two arms in turn."""
     tests: Annotated[int, Range(1, 10_000)] = 10
     """Points of the learning curve after its first."""
     test_episodes: Annotated[int, Range(1, 100_000)] = 64

@@ -7,14 +7,14 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
-from rich.progress import Progress
+from rich.progress import Progress, track
 
 from endo_sim_ros.core.device import single_threaded_torch
 from endo_sim_ros.learning.actions import Actions, Contact
 from endo_sim_ros.learning.config import PPOConfig, Randomisation
 from endo_sim_ros.learning.environments import Observed, VectorTaskEnvironment
 from endo_sim_ros.learning.joined import JoinedEnvironments
-from endo_sim_ros.learning.policies import NetworkPolicy
+from endo_sim_ros.learning.policies import NetworkPolicy, scripted_policy
 from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.learning.task_batch import TaskBatch
 from endo_sim_ros.learning.train import Best, measure_policy
@@ -31,6 +31,10 @@ try:
     )
 except ImportError as error:
     raise ImportError("PPO needs stable-baselines3, which is not installed; pip install 'endo_sim_ros[rl]'") from error
+
+
+_FITTED, _ROWS, _RATE = 6000, 512, 2e-3  # steps, rows of each, and greatest rate with which a policy is fitted to a script
+_VALUED = 0.05  # how much the square error of values, which are up to about 10, counts beside that of actions
 
 
 class StableEnvironments(VecEnv):
@@ -119,6 +123,56 @@ def network(task: str, model: PPO, actions: Actions = "cartesian") -> NetworkPol
     return NetworkPolicy(task, [layer.detach().cpu().numpy() for layer in layers], actions)
 
 
+def learn_script(model: PPO, batch: TaskBatch, config: PPOConfig) -> None:
+    """Let a model act as the script of a task does, and value states by what follows there, so that PPO begins with both.
+
+    The script acts with the noise with which the model is to explore, so that it shows the way back (as DAgger does for a learner's own
+    errors; that demonstrations begin and reward goes on is Rajeswaran et al. 2018, https://arxiv.org/abs/1709.10087).
+
+    Args:
+        model: Of PPO, with the observations and actions of the batch.
+        batch: Where the script acts, in as many rounds as it takes.
+        config: How many episodes, and the noise.
+
+    Raises:
+        ValueError: If the actions are those of joints: scripts move tips.
+    """
+    if batch.actions != "cartesian":
+        raise ValueError(f"scripts move tips, but actions are {batch.actions}; leave out --ppo.demonstrations, or take cartesian actions")
+    rng, rounds = np.random.default_rng([config.seed, 0xDE]), -(-config.demonstrations // batch.count)
+    parts = [_shown(batch, config, rng) for _ in track(range(rounds), "demonstrations", transient=True)]
+    seen, done, worth = (torch.from_numpy(np.concatenate(part).astype(np.float32)) for part in zip(*parts))
+    optimizer = torch.optim.Adam(model.policy.parameters(), _RATE)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, _RATE, _FITTED)
+    generator = torch.Generator().manual_seed(config.seed)
+    for _ in track(range(_FITTED), "learning from them", transient=True):
+        rows = torch.randint(len(seen), (_ROWS,), generator=generator)
+        acted, valued = model.policy.get_distribution(seen[rows]).distribution.mean, model.policy.predict_values(seen[rows])[:, 0]
+        loss = (acted - done[rows]).square().mean() + _VALUED * (valued - worth[rows]).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+
+
+def _shown(batch: TaskBatch, config: PPOConfig, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What a script observes [T, n] in an episode of each environment, does without its noise [T, m], and gets from then on [T]."""
+    everyone, policy = range(batch.count), scripted_policy(batch.task.name, batch.count)
+    batch.reset(everyone, rng.spawn(batch.count))
+    policy.reset(everyone)
+    seen, running, rows = batch.observe(), np.ones(batch.count, bool), []
+    while running.any():
+        assert isinstance(seen, np.ndarray)  # states
+        actions = np.clip(policy.act(seen), -1, 1)
+        after, outcome = batch.step(np.clip(actions + config.spread * rng.standard_normal(actions.shape), -1, 1))
+        rows.append((seen, actions, outcome.reward * running, running.copy()))
+        seen, running = after, running & ~(outcome.terminated | outcome.truncated)
+    observations, done, rewards, running = (np.array(values) for values in zip(*rows))
+    for step in reversed(range(len(rewards) - 1)):
+        rewards[step] += config.gamma * rewards[step + 1]
+    return observations[running], done[running], rewards[running]
+
+
 class _Curve(BaseCallback):
     """Tests the policy now and then while it learns."""
 
@@ -163,33 +217,38 @@ def train_ppo(
 
     Returns:
         The best policy, see `Best`, and the learning curve: number of training episodes and steps so far, test return and success
-        rate, and seconds; first of the untrained policy.
+        rate, and seconds; first of the policy before it learns by reward.
+
+    Raises:
+        ValueError: If demonstrations are wanted and actions are those of joints.
     """
+    options: dict[str, Any] = {
+        "scene": scene,
+        "randomisation": randomisation,
+        "device": device,
+        "actions": actions,
+        "contact": contact,
+        "motion": motion,
+    }
+    environments = VectorTaskEnvironment(task, config.environments, **options)
+    testing = TaskBatch(task, count=config.test_episodes, **options)
+    rollout = config.environments * config.rollout
+    model = PPO(
+        "MlpPolicy",
+        StableEnvironments(environments),
+        seed=config.seed,
+        n_steps=config.rollout,
+        batch_size=max(rollout // config.minibatches, 2),
+        learning_rate=config.learning_rate,
+        gamma=config.gamma,
+        gae_lambda=config.gae_lambda,
+        policy_kwargs={"net_arch": [config.hidden] * 2, "log_std_init": np.log(config.spread)},
+        device="cpu",  # so small a network is faster there
+    )
+    if config.demonstrations:
+        learn_script(model, environments.batch, config)
     with Progress() as bar:
-        options: dict[str, Any] = {
-            "scene": scene,
-            "randomisation": randomisation,
-            "device": device,
-            "actions": actions,
-            "contact": contact,
-            "motion": motion,
-        }
-        environments = StableEnvironments(VectorTaskEnvironment(task, config.environments, **options))
-        testing = TaskBatch(task, count=config.test_episodes, **options)
-        rollout = config.environments * config.rollout
-        model = PPO(
-            "MlpPolicy",
-            environments,
-            seed=config.seed,
-            n_steps=config.rollout,
-            batch_size=max(rollout // config.minibatches, 2),
-            learning_rate=config.learning_rate,
-            gamma=config.gamma,
-            gae_lambda=config.gae_lambda,
-            policy_kwargs={"net_arch": [config.hidden] * 2, "log_std_init": np.log(config.spread)},
-            device="cpu",  # so small a network is faster there
-        )
         callback = _Curve(task, testing, config, bar)
         model.learn(config.steps, callback=callback)
         callback.test()
-        return callback.best.policy, callback.curve
+    return callback.best.policy, callback.curve

@@ -7,13 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from played_tasks import make, play
 
 from endo_sim_ros.learning import environments
 from endo_sim_ros.learning.config import PPOConfig
 from endo_sim_ros.learning.policies import make_policy, scripted_policy
 from endo_sim_ros.learning.scenes import load_scene
-from endo_sim_ros.learning.train import save_training
+from endo_sim_ros.learning.train import measure_policy, save_training
 
 ROOT = Path(__file__).parents[2]
 
@@ -71,6 +72,32 @@ def test_ppo_trains_a_policy_that_needs_no_torch(tmp_path):
     observations = stable.reset()
     actions = np.clip(ppo.network("retraction", model).act(observations), -1, 1)
     np.testing.assert_allclose(actions, model.predict(observations, deterministic=True)[0], atol=1e-6)
+
+
+def test_a_policy_that_begins_from_its_script_solves_what_chance_does_not(monkeypatch):
+    ppo = pytest.importorskip("endo_sim_ros.learning.ppo", exc_type=ImportError)
+    monkeypatch.setattr(ppo, "_FITTED", 800)
+    config = PPOConfig(environments=8, spread=0.2, demonstrations=10)
+    many = environments.VectorTaskEnvironment("retraction", 8, device="cpu")
+    models = [ppo.PPO("MlpPolicy", ppo.StableEnvironments(many), n_steps=2, batch_size=2, seed=0, device="cpu") for _ in range(2)]
+    before = measure_policy(many.batch, ppo.network("retraction", models[0]))
+    for model in models:
+        ppo.learn_script(model, many.batch, config)
+    after = measure_policy(many.batch, ppo.network("retraction", models[0]))
+    assert before["test_success"] == 0 and after["test_success"] >= 0.75
+    for first, second in zip(*(model.policy.parameters() for model in models)):
+        np.testing.assert_array_equal(first.detach(), second.detach())
+    many.reset(seed=0)
+    worth = models[0].policy.predict_values(torch.from_numpy(many.batch.observe())).mean()
+    scripted = measure_policy(many.batch, scripted_policy("retraction", 8))["test_return"]
+    assert 0.5 * scripted < float(worth) < scripted  # by the discount
+
+
+def test_scripts_do_not_show_how_joints_move():
+    ppo = pytest.importorskip("endo_sim_ros.learning.ppo", exc_type=ImportError)
+    config = PPOConfig(steps=4, environments=2, rollout=2, test_episodes=1, demonstrations=1)
+    with pytest.raises(ValueError, match="scripts move tips, but actions are joints; leave out --ppo.demonstrations"):
+        ppo.train_ppo("retraction", load_scene(), config, device="cpu", actions="joints")
 
 
 @pytest.mark.dds

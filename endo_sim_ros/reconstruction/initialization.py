@@ -71,9 +71,9 @@ def initial_model(
         for view, pixels, seen in zip(surfaces, taken, compared.mean_colors(taken, tolerance, progress)):
             depth, centres = view.surface[pixels].astype(np.float64), np.argwhere(pixels)[:, ::-1] + 0.5
             parts.append(_Points(view.camera.unproject(centres, depth), seen, stride * depth / view.camera.K[0, 0]))
-    useful = ~_afloat(surfaces, points, tolerance, options, progress)
-    if any(pixels.any() for pixels in chosen):  # lone points beyond the views would reach into them; see `extrapolate`
-        useful &= np.any([view.camera.sees(points) for view in views], 0)
+    useful = np.ones(len(points), bool)
+    if any(pixels.any() for pixels in chosen):
+        useful = _believable(views, points, tolerance, options, progress)
     parts.append(_in_holes(parts, points[useful], colors[useful]))
     positions, *others = (np.concatenate(arrays) for arrays in zip(*parts))
     shown = sum(int(pixels.sum()) for pixels in chosen)
@@ -124,25 +124,29 @@ def _lattice(shape: tuple[int, int], stride: float) -> np.ndarray:
     return rows[:, None] & columns
 
 
-def _afloat(
-    views: list[TrainingView], points: np.ndarray, tolerance: float, options: InitialModelConfig, progress: StageProgress
+def _believable(
+    views: Sequence[TrainingView], points: np.ndarray, tolerance: float, options: InitialModelConfig, progress: StageProgress
 ) -> np.ndarray:
-    """Which triangulated points [N] float in front of the surface that some view sees there or, in a hole of it, beside it.
+    """Which triangulated points [N] may be tissue of unknown depth: in a hole of some view's surface, and beyond what is beside it in no
+    view, nor, in that one, behind it. Points outside of all views would reach into them; see `extrapolate`.
 
-    Highlights are where depth has holes, and where points are matched that are no tissue: they move with the light.
+    Highlights are where depth has holes, and where points are matched that are no tissue: images of the light in it. Training would
+    make the tissue before them transparent, since they explain how the highlights move.
     """
 
-    def before(view: TrainingView) -> np.ndarray:
-        depth, distance = fill_holes(view.surface)
-        beside = (depth * (1 - tolerance - options.max_slope * distance / view.camera.K[0, 0])).astype(np.float32)
+    def compare(view: TrainingView) -> tuple[np.ndarray, np.ndarray]:
         found = pixels_of(view.camera, points)
-        surface = np.maximum(beside, 0)[found.rows, found.columns]
-        return found.index[(surface > 0) & (found.depth < surface)]
+        if not (view.surface > 0).any():
+            return found.index[:0], found.index
+        depth, distance = (values[found.rows, found.columns] for values in fill_holes(view.surface))
+        rise = tolerance + options.max_slope * distance / view.camera.K[0, 0]
+        floats, sinks = found.depth < depth * (1 - rise), found.depth > depth * (1 + rise)
+        return found.index[floats], found.index[(distance > 0) & ~sinks]
 
-    floats = np.zeros(len(points), bool)
-    for index in progress.map(before, views):
-        floats[index] = True
-    return floats
+    floating, fitting = np.zeros((2, len(points)), bool)
+    for floats, fits in progress.map(compare, views):
+        floating[floats] = fitting[fits] = True
+    return fitting & ~floating
 
 
 def _in_holes(parts: list[_Points], points: np.ndarray, colors: np.ndarray) -> _Points:

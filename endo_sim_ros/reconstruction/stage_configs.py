@@ -235,8 +235,8 @@ class InitialModelConfig(StageConfig):
     """By how much the picture moves between two views, in the median, where nothing tells depth: training then starts from a plane at
     the depth that follows. Of four recordings and patients it is 0.06 to 0.4."""
     max_slope: Annotated[float, Range(0, 100)] = 2.0
-    """Slope of a surface across the line of sight in holes of the depth prior; a point that it would have to rise more for floats before
-    the surface."""
+    """Slope of a surface across the line of sight in holes of the depth prior; a point that it would have to rise or fall more for is no
+    tissue."""
 
 
 @dataclass(frozen=True)

@@ -55,20 +55,42 @@ def test_masked_pixels_give_no_gaussians(small):
     assert uv[:, 0].max() < 80
 
 
-def test_points_that_float_before_the_surface_or_before_a_hole_of_it_do_not_become_gaussians(small):
-    frame, camera = small[0], small[0].camera
-    depth = frame.depth.copy()
-    row, column = camera.height // 2, camera.width // 2
-    true = float(depth[row, column])
-    depth[row - 10 : row + 11, column - 10 : column + 11] = 0  # a highlight: no depth there
-    ray = camera.backproject(np.ones_like(depth))[row, column] - camera.position
-    points = camera.position + ray * np.array([[0.5 * true], [true], [0.98 * true]])
-    points = np.concatenate([points, points + 1e-4])
-    model = placed([dataclasses.replace(frame, depth=depth)], 50_000, points)
-    z = camera.project(model.means.double().numpy())[1]
-    assert z.min() > 0.9 * frame.depth[frame.depth > 0].min()
-    near = np.linalg.norm(model.means.double().numpy()[:, None] - points, axis=2).min(0)
-    assert (near[[1, 2, 4, 5]] < 1e-6).all() and (near[[0, 3]] > 0.01).all()
+def highlight(frame):
+    """The frame with a hole of the depth in the middle, as highlights make, and a function from distance (of the tissue's) to two points
+    there and two at its side, where depth is known."""
+    depth, (height, width) = frame.depth.copy(), frame.depth.shape
+    row, column = height // 2, width // 2
+    pixels = [(row, column), (row, column - 30)]
+    depth[row - 10 : row + 11, column - 10 : column + 11] = 0
+    camera, rays = frame.camera, frame.camera.backproject(np.ones_like(depth)) - frame.camera.position
+
+    def at(distance):
+        points = np.array([camera.position + rays[pixel] * distance * float(frame.depth[pixel]) for pixel in pixels])
+        return np.concatenate([points, points + 1e-4])
+
+    return dataclasses.replace(frame, depth=depth), at
+
+
+def among(model, points):
+    """Which of the points are Gaussians."""
+    return np.linalg.norm(model.means.double().numpy()[:, None] - points, axis=2).min(0) < 1e-6
+
+
+def test_points_become_gaussians_where_they_neither_float_before_the_surface_nor_sink_behind_it(small):
+    frame, at = highlight(small[0])
+    for distance, in_hole in ((0.5, False), (0.98, True), (1.02, True), (1.1, True), (2.0, False)):
+        points = at(distance)
+        assert among(placed([frame], 50_000, points), points).tolist() == [in_hole, False] * 2, distance
+
+
+def test_a_point_behind_what_one_view_sees_may_be_what_another_one_sees_in_a_hole(small):
+    frame, at = highlight(small[0])
+    points = at(1.0)[[0, 2]]
+    hiding = dataclasses.replace(small[0], depth=0.7 * small[0].depth)  # of another surface, before it
+    assert not among(placed([hiding], 50_000, points), points).any()
+    assert among(placed([frame, hiding], 50_000, points), points).all()
+    blind = dataclasses.replace(small[0], depth=np.zeros_like(frame.depth))  # knows no depth, and says nothing against them
+    assert among(placed([blind, hiding], 50_000, points), points).all()
 
 
 def test_the_colours_are_the_mean_of_the_views_that_see_the_surface(small):

@@ -19,8 +19,8 @@ from endo_sim_ros.core import drawing
 from endo_sim_ros.core.folders import written_whole
 from endo_sim_ros.learning.config import BenchmarkConfig, Randomisation, SightConfig
 from endo_sim_ros.learning.policies import Policy, make_policy
-from endo_sim_ros.learning.scenes import load_scene
-from endo_sim_ros.learning.task_batch import TaskBatch
+from endo_sim_ros.learning.scenes import Scene
+from endo_sim_ros.learning.task_batch import TaskBatch, usable
 from endo_sim_ros.learning.tasks import find_task
 from endo_sim_ros.learning.train import TESTED_FROM, play
 from endo_sim_ros.physics import MotionConfig
@@ -70,7 +70,7 @@ def benchmark(
     Args:
         out: Folder of benchmark.json, benchmark.html and a video for each task and policy.
         policies: Each as `make_policy` takes it.
-        scenes: Each as `load_scene` takes it.
+        scenes: Each once, as `load_scene` takes it. One in which the task cannot take place is left out, and it is said why.
         config: Options.
         device: Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N.
         make: What makes a policy of its name, as `make_policy` does. One that has an attribute ``alone`` that is true plays one episode
@@ -80,25 +80,32 @@ def benchmark(
         The new results.
 
     Raises:
-        ValueError: If there is no such task, policy or scene, the folder has other data, or a policy does not fit the task.
+        ValueError: If there is no such task, policy or scene, a scene is given twice, none is left, the folder has other data, or a
+            policy does not fit the task.
         RuntimeError: If a policy needs a library that is not installed.
     """
     task = find_task(config.task).name
-    if not scenes:
-        raise ValueError("there is no scene; give one or more, such as phantom:3")
     before = read_results(out)
     loaded = {policy: make(policy, config.task, config.episodes, device) for policy in policies}  # before the long work
     conditions = CONDITIONS if config.robustness else {name: CONDITIONS[name] for name in list(CONDITIONS)[:1]}
+
+    def playable(scene: Scene) -> Scene:
+        for policy in loaded.values():
+            for randomisation, motion in conditions.values():
+                _batch(config.task, scene, 1, policy, randomisation, motion, device, images=True)
+        return scene
+
+    names, places = usable(scenes, playable)
     found: list[Result] = []
     out.mkdir(parents=True, exist_ok=True)
     with Progress() as bar:
-        progress = bar.add_task(config.task, total=len(loaded) * len(scenes) * len(conditions))
+        progress = bar.add_task(config.task, total=len(loaded) * len(names) * len(conditions))
         for name, policy in loaded.items():
-            for scene in scenes:
+            for scene, place in zip(names, places):
                 for condition, (randomisation, motion) in conditions.items():
                     bar.update(progress, description=f"{name}, {scene}, {condition}")
                     at_once = 1 if getattr(policy, "alone", False) else config.episodes
-                    batch, played = _batch(config.task, scene, at_once, policy, randomisation, motion, device), []
+                    batch, played = _batch(config.task, place, at_once, policy, randomisation, motion, device), []
                     try:
                         for seed in range(0, config.episodes, at_once):
                             played.append(play(batch, policy, TESTED_FROM + seed + np.arange(at_once)))
@@ -107,12 +114,12 @@ def benchmark(
                         if played:
                             returns, solved, steps = map(np.concatenate, zip(*played))
                             counted = int(solved.sum()), float(returns.mean()), float(steps.mean())
-                            found.append(Result(task, name, scene, condition, len(solved), *counted))
+                            found.append(Result(task, name, str(scene), condition, len(solved), *counted))
                         del batch
                         before = _merge(before, found)
                         _save(out, before)
                         (out / _PAGE).write_text(_page(before, out), "utf8")
-            _film(out, config, name, policy, scenes[0], device, make)
+            _film(out, config, name, policy, places[0], device, make)
             (out / _PAGE).write_text(_page(before, out), "utf8")
     return found
 
@@ -144,17 +151,15 @@ def _save(folder: Path, results: Sequence[Result]) -> None:
 
 
 def _batch(
-    task: str, scene: str, count: int, policy: Policy, randomisation: Randomisation, motion: MotionConfig, device: str, **options: Any
+    task: str, scene: Scene, count: int, policy: Policy, randomisation: Randomisation, motion: MotionConfig, device: str, **options: Any
 ) -> TaskBatch:
     """Episodes for a policy, with the observations that it takes."""
     observations = "state" if policy.sight is None else "sensors"
     sight = options.pop("sight", policy.sight or SightConfig())
-    return TaskBatch(
-        task, load_scene(scene), count, observations, randomisation, sight, device, actions=policy.actions, motion=motion, **options
-    )
+    return TaskBatch(task, scene, count, observations, randomisation, sight, device, actions=policy.actions, motion=motion, **options)
 
 
-def _film(out: Path, config: BenchmarkConfig, name: str, policy: Policy, scene: str, device: str, make: Callable[..., Policy]) -> None:
+def _film(out: Path, config: BenchmarkConfig, name: str, policy: Policy, scene: Scene, device: str, make: Callable[..., Policy]) -> None:
     """Write a video of the first episodes, side by side, each until its end; of a policy that plays alone, of the first."""
     alone = getattr(policy, "alone", False)
     count = 1 if alone else min(_FILMED, config.episodes)

@@ -24,7 +24,7 @@ With the observations of row k the action of row k was taken.
 import json
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from itertools import chain
@@ -51,8 +51,7 @@ from endo_sim_ros.learning.dataset import (
     vector_feature,
 )
 from endo_sim_ros.learning.policies import Policy, scripted_policy
-from endo_sim_ros.learning.scenes import Scene, load_scene
-from endo_sim_ros.learning.task_batch import Observed, TaskBatch
+from endo_sim_ros.learning.task_batch import Observed, TaskBatch, usable
 from endo_sim_ros.physics import MotionConfig
 
 _logger = logging.getLogger(__name__)
@@ -103,8 +102,8 @@ class Demonstrations:
 
     Args:
         task: Its name.
-        scenes: What is seen and touched, each as `load_scene` takes it. One in which the task cannot take place is left out, and it is
-            said why. Of the others the episode of seed n is in scene n modulo their number.
+        scenes: What is seen and touched, each once, as `load_scene` takes it. One in which the task cannot take place is left out,
+            and it is said why. Of the others the episode of seed n is in scene n modulo their number.
         out: Folder of the dataset.
         count: Episodes at once.
         config, sight, randomisation, motion: Options.
@@ -133,7 +132,7 @@ class Demonstrations:
         device: str,
     ):
         make = partial(TaskBatch, task, randomisation=randomisation, sight=sight, device=device, motion=motion)
-        scenes, self.batches = _usable(scenes, partial(make, count=count, observations="both"))
+        scenes, self.batches = usable(scenes, partial(make, count=count, observations="both"))
         first = self.batches[0]
         fps = round(1 / first.task.physics().step_duration)
         noise = config.noise if config.by == "script" else 0.0
@@ -233,25 +232,6 @@ def demonstrate(
     finally:
         demonstrations.save()
     return demonstrations.episodes, tried
-
-
-def _usable(scenes: Sequence[str | Path], make: Callable[[Scene], TaskBatch]) -> tuple[list[str | Path], list[TaskBatch]]:
-    """Those scenes that the task can take place in, and the batch of each; of the others it is said why not."""
-    if not scenes:
-        raise ValueError("there is no scene; give one or more, such as phantom:0")
-    usable, batches, refused = [], [], {}
-    for scene, loaded in [(scene, load_scene(scene)) for scene in scenes]:
-        try:
-            batches.append(make(loaded))
-            usable.append(scene)
-        except ValueError as error:
-            refused[scene] = str(error)
-    if not usable:
-        reasons = {text: scene for scene, text in refused.items()}  # each once
-        raise ValueError("; ".join(f"{scene}: {text}" for text, scene in reasons.items()))
-    for scene, text in refused.items():
-        _logger.warning("%s is left out: %s", scene, text)
-    return usable, batches
 
 
 def _check_options(out: Path, options: dict[str, Any]) -> None:

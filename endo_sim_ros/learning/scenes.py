@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -74,17 +75,42 @@ def load_scene(path: str | Path | None = None) -> Scene:
         ModelError: If the model cannot be read.
         ValueError: If the cameras cannot, or a seed is no number.
     """
+    place = _found(path)
+    if isinstance(place, int):
+        return patient_scene(place)
+    model, cameras = load_ply(place), load_cameras(place.parent / "cameras.json")
+    if not cameras:
+        raise ValueError(f"{place.parent / 'cameras.json'} has no camera; a task needs to know from where the tissue is seen")
+    return Scene(model, tuple(cameras))
+
+
+def load_scenes(paths: Sequence[str | Path]) -> list[Scene]:
+    """Several scenes, each as `load_scene` takes it.
+
+    Raises:
+        ModelError, ValueError: As `load_scene` does, and if there is none, or one is given twice.
+    """
+    if not paths:
+        raise ValueError("there is no scene; give one or more, such as phantom:0")
+    found: dict[int | Path, str | Path] = {}
+    for path in paths:
+        place = _found(path)
+        place = place if isinstance(place, int) else place.resolve()
+        if place in found:
+            raise ValueError(f"{path}: the same scene as {found[place]}; give each once")
+        found[place] = path
+    return [load_scene(path) for path in paths]
+
+
+def _found(path: str | Path | None) -> int | Path:
+    """The seed of a synthetic patient, or the file of a model."""
     if path is None or str(path).startswith(PATIENT):
         seed = "0" if path is None else str(path).removeprefix(PATIENT)
         if not seed.isdecimal():
             raise ValueError(f"{path}: the seed of a synthetic patient is a number, as in {PATIENT}1")
-        return patient_scene(int(seed))
+        return int(seed)
     path = Path(path)
-    path = path / "model.ply" if path.is_dir() else path
-    model, cameras = load_ply(path), load_cameras(path.parent / "cameras.json")
-    if not cameras:
-        raise ValueError(f"{path.parent / 'cameras.json'} has no camera; a task needs to know from where the tissue is seen")
-    return Scene(model, tuple(cameras))
+    return path / "model.ply" if path.is_dir() else path
 
 
 @functools.cache

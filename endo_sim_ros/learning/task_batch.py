@@ -1,7 +1,9 @@
 """B episodes of a task in the simulation: one batched solver, one renderer, no framework; what environments and training share."""
 
-from collections.abc import Sequence
-from typing import Any, Literal
+import logging
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -11,7 +13,7 @@ from endo_sim_ros.learning.actions import Actions, Contact, action_size, arm_sta
 from endo_sim_ros.learning.config import Randomisation, SightConfig
 from endo_sim_ros.learning.held_tools import HeldTool, HeldTools, hold_tools
 from endo_sim_ros.learning.pictures import IMAGE, SEGMENTATION, Pictures
-from endo_sim_ros.learning.scenes import Scene
+from endo_sim_ros.learning.scenes import Scene, load_scenes
 from endo_sim_ros.learning.tasks import Outcome, find_task, moving
 from endo_sim_ros.learning.variation import Variation
 from endo_sim_ros.physics import MotionConfig, TissueBatch, ToolLinks
@@ -24,6 +26,36 @@ Observed = np.ndarray | dict[str, np.ndarray]
 
 ARM_STATE = "arm"
 """Name of what the arm measures of itself."""
+
+
+_logger = logging.getLogger(__name__)
+_Made = TypeVar("_Made")
+
+
+def usable(scenes: Sequence[str | Path], make: Callable[[Scene], _Made]) -> tuple[list[str | Path], list[_Made]]:
+    """Those scenes that a task can take place in, and what is made of each; of the others it is said why not.
+
+    Args:
+        scenes: Each once, as `load_scene` takes it.
+        make: Makes a `TaskBatch` in a scene, or several; where that raises ValueError, the scene is left out.
+
+    Raises:
+        ModelError: If a model cannot be read.
+        ValueError: If there is no scene, one is given twice, or none is left.
+    """
+    names, made, refused = [], [], {}
+    for scene, loaded in zip(scenes, load_scenes(scenes)):
+        try:
+            made.append(make(loaded))
+            names.append(scene)
+        except ValueError as error:
+            refused[scene] = str(error)
+    if not names:
+        reasons = {text: scene for scene, text in refused.items()}  # each once
+        raise ValueError("; ".join(f"{scene}: {text}" for text, scene in reasons.items()))
+    for scene, text in refused.items():
+        _logger.warning("%s is left out: %s", scene, text)
+    return names, made
 
 
 class TaskBatch:

@@ -80,6 +80,22 @@ def test_other_conditions_are_other_episodes(tmp_path, monkeypatch):
     assert "breathing 0.004" in (tmp_path / "benchmark.html").read_text()
 
 
+@pytest.mark.slow
+def test_a_scene_that_the_task_refuses_is_left_out_and_none_is_played_twice(tmp_path, caplog, small):
+    config = BenchmarkConfig(episodes=1, image_width=32)
+    results = benchmark(tmp_path / "out", ["still"], [small, "phantom:0"], config, "cpu")
+    assert [result.scene for result in results] == ["phantom:0"]
+    assert f"{small} is left out: retraction: no skin node is" in caplog.text
+    for given, sentence in (
+        ([small], f"^{small}: retraction: no skin node is"),
+        (["phantom:3", "phantom:3"], "^phantom:3: the same scene as phantom:3; give each once$"),
+        ([], "there is no scene; give one or more"),
+    ):
+        with pytest.raises(ValueError, match=sentence):
+            benchmark(tmp_path / "none", ["still"], given, config, "cpu")
+    assert not (tmp_path / "none").exists()
+
+
 def test_the_table_sums_over_scenes_and_gives_wilsons_interval():
     results = [
         Result("t", "a", "phantom:3", "as usual", 10, 9, 1.0, 20.0),

@@ -12,14 +12,12 @@ import pytest
 from endo_sim_command import endo_sim
 from played_tasks import make
 
-from endo_sim_ros.core.cameras import save_cameras
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.core.gaussians import ModelError, save_ply
+from endo_sim_ros.core.gaussians import ModelError
 from endo_sim_ros.learning import dataset, demonstrations
 from endo_sim_ros.learning.config import DemonstrationConfig, Randomisation, SightConfig
 from endo_sim_ros.learning.dataset import IMAGE, IMAGE_RIGHT, SEGMENTATION, DatasetWriter, vector_feature
 from endo_sim_ros.learning.demonstrations import Demonstrations, demonstrate
-from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.physics import MotionConfig
 
 SIGHT = SightConfig(image_width=40, eyes=2, segmentation=True)
@@ -128,10 +126,7 @@ def test_scenes_take_turns_and_the_number_of_environments_does_not_matter(tmp_pa
         demonstrate("retraction", ["phantom:0"], roots[0], config, SIGHT, device="cpu")
 
 
-def test_a_scene_that_the_task_refuses_is_left_out_with_a_reason(tmp_path, caplog):
-    whole, small = load_scene("phantom:0"), str(tmp_path / "small/model.ply")
-    save_ply(whole.model.select(np.flatnonzero(np.linalg.norm(whole.model.means[:, :2], axis=1) < 0.012)), Path(small))
-    save_cameras(whole.cameras, tmp_path / "small/cameras.json")
+def test_a_scene_that_the_task_refuses_is_left_out_with_a_reason(tmp_path, caplog, small):
     config = DemonstrationConfig(episodes=1, environments=1)
     demonstrate("retraction", [small, "phantom:0"], tmp_path / "out", config, SIGHT, device="cpu")
     assert f"{small} is left out: retraction: " in caplog.text
@@ -140,6 +135,13 @@ def test_a_scene_that_the_task_refuses_is_left_out_with_a_reason(tmp_path, caplo
         demonstrate("retraction", [small], tmp_path / "none", config, SIGHT, device="cpu")
     with pytest.raises(ModelError, match="nowhere.ply"):
         demonstrate("retraction", ["phantom:0", "nowhere.ply"], tmp_path / "none", config, SIGHT, device="cpu")
+    for given, sentence in (
+        (["phantom:0", "phantom:1", "phantom:0"], "phantom:0: the same scene as phantom:0; give each once"),
+        (["phantom:0", "phantom:00"], "phantom:00: the same scene as phantom:0; give each once"),
+        ([small, Path(small).parent], f"{Path(small).parent}: the same scene as {small}; give each once"),
+    ):
+        with pytest.raises(ValueError, match=f"^{sentence}$"):
+            demonstrate("retraction", given, tmp_path / "none", config, SIGHT, device="cpu")
     assert not (tmp_path / "none").exists()
 
 

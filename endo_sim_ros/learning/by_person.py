@@ -90,10 +90,11 @@ def demonstrate_by_person(
     """
     demonstrations = Demonstrations(task, scenes, out, 1, config, sight, randomisation, motion, device)
     session = _Session(demonstrations, screen, devices, person, config.episodes)
-    try:
-        session.run()
-    finally:
-        session.keep()
+    with demonstrations:
+        try:
+            session.run()
+        finally:
+            session.keep()
     return demonstrations.episodes
 
 

@@ -8,7 +8,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from itertools import islice
+from itertools import islice, product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -108,6 +108,7 @@ class DatasetWriter:
             height, width, _ = features[key]["shape"]
             if features[key]["dtype"] == "video" and (height % 2 or width % 2):
                 raise SequenceError(f"{width}×{height} images make no video, which needs even sides; choose --images png, or another width")
+        self.saved = 0  # episodes that the dataset tells of
         self._rows: list[dict[str, Any]] = []
         self._columns: list[dict[str, np.ndarray]] = []
         self._histograms: list[dict[str, np.ndarray]] = []
@@ -146,11 +147,15 @@ class DatasetWriter:
             }
             placed.append((number, own, pictures))
             begin += len(frames)
-        for (number, own, _), histograms in zip(placed, self._write_all(placed)):
-            count = len(own["index"])
-            self._rows.append(self._row(number, self.frames, count) | _flat(_statistics(own, histograms, count)))
-            self._columns.append(own)
-            self._histograms.append(histograms)
+        try:
+            for (number, own, _), histograms in zip(placed, self._write_all(placed)):
+                count = len(own["index"])
+                self._rows.append(self._row(number, self.frames, count) | _flat(_statistics(own, histograms, count)))
+                self._columns.append(own)
+                self._histograms.append(histograms)
+        except BaseException:
+            self._drop(len(self._histograms), first + len(placed))
+            raise
 
     def save(self) -> None:
         """Write what describes all episodes so far; without it the newest are not part of the dataset."""
@@ -159,12 +164,24 @@ class DatasetWriter:
         merged = {key: self.column(key) for key in self._columns[0]}
         histograms: dict[str, Any] = {key: np.stack([each[key] for each in self._histograms]) for key in self._histograms[0]}
         statistics = _statistics(merged, {key: each.sum(0) for key, each in histograms.items()}, self.frames)
-        self._write_json("meta/stats.json", statistics)
-        with written_whole(self._path(_HISTOGRAMS)) as partial, partial.open("wb") as file:
-            np.savez_compressed(file, **histograms)
-        self._write_table(_EPISODES, {key: self._pa.array([row[key] for row in self._rows]) for key in self._rows[0]})
-        self._write_tasks()
-        self._write_json(_INFO, self._info())  # last: it tells how many there are
+        try:
+            with written_whole(self._path(_HISTOGRAMS)) as partial, partial.open("wb") as file:
+                np.savez_compressed(file, **histograms)
+            self._write_table(_EPISODES, {key: self._pa.array([row[key] for row in self._rows]) for key in self._rows[0]})
+            self._write_tasks()
+            self._write_json("meta/stats.json", statistics)
+            self._write_json(_INFO, self._info())  # last: it tells how many there are
+        except OSError:  # no room; what was saved before still is
+            self._drop(self.saved, self.episodes)
+            raise
+        self.saved = self.episodes
+
+    def _drop(self, first: int, end: int) -> None:
+        """Leave nothing of these episodes, as readers look into all files, and others may need the room."""
+        for known in (self._rows, self._columns, self._histograms):
+            del known[first:]
+        for number, key, name in product(range(first, end), self.features, (_DATA, _VIDEO)):
+            (self._root / name.format(video_key=key, **_place(number))).unlink(missing_ok=True)
 
     def _continue(self) -> None:
         """Take up a dataset where it ends."""
@@ -183,6 +200,7 @@ class DatasetWriter:
                 self._columns.append({key: _from_column(table.column(key), self.features[key]) for key in numbers})
             with np.load(self._root / _HISTOGRAMS) as file:
                 self._histograms = [{key: file[key][number] for key in self._pictures} for number in range(count)]
+            self.saved = count
         except (OSError, KeyError, ValueError, IndexError, self._pa.ArrowException) as error:
             if isinstance(error, SequenceError):
                 raise

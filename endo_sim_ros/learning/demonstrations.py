@@ -34,7 +34,7 @@ from typing import Any
 import numpy as np
 from rich.progress import Progress
 
-from endo_sim_ros.core.folders import written_whole
+from endo_sim_ros.core.folders import leaving_none_empty, written_whole
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.instruments import JOINTS
 from endo_sim_ros.learning.actions import ARM_NAMES, POSE_NAMES, arm_commands, by_arm
@@ -100,6 +100,8 @@ class Episode:
 class Demonstrations:
     """A dataset of episodes of a task, and what they take place in: begun, or taken up where it ends.
 
+    As a context it saves at its end. Where that is an interrupt or a failing drive, it is told how many episodes are kept.
+
     Args:
         task: Its name.
         scenes: What is seen and touched, each once, as `load_scene` takes it. One in which the task cannot take place is left out,
@@ -145,8 +147,22 @@ class Demonstrations:
         self._writer = DatasetWriter(out, first.task.sentence, fps, features)
         seeds = self._writer.column("seed")
         self.seed = int(seeds[-1]) + 1 if len(seeds) else config.seed
-        self._out, self._task, self._fps = out, task, fps
+        self._out, self._task, self._fps, self._wanted = out, task, fps, config.episodes
         self._saved, self._save_after = time.monotonic(), _SAVE_EVERY
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        try:
+            self.save()
+        except OSError as failed:
+            error = failed
+        kept = f"{self._writer.saved} of {self._wanted} episodes are kept, and the same command goes on from there"
+        if isinstance(error, OSError):  # a full drive, above all
+            raise OSError(f"{self._out}: {error.strerror or error}; {kept}") from error
+        if isinstance(error, (KeyboardInterrupt, SystemExit)):
+            _logger.warning("%s: %s", self._out, kept)
 
     @property
     def episodes(self) -> int:
@@ -166,9 +182,11 @@ class Demonstrations:
     def _note_options(self) -> None:
         """Write what the episodes depend on, before the first: only with that are they continued."""
         if not (self._out / OPTIONS).exists():
-            (self._out / OPTIONS).parent.mkdir(parents=True, exist_ok=True)
-            with written_whole(self._out / OPTIONS) as unfinished:
-                unfinished.write_text(json.dumps(self._options, indent=4), "utf8")
+            folder = (self._out / OPTIONS).parent
+            with leaving_none_empty(folder):
+                folder.mkdir(parents=True, exist_ok=True)
+                with written_whole(self._out / OPTIONS) as unfinished:
+                    unfinished.write_text(json.dumps(self._options, indent=4), "utf8")
 
     def save(self) -> None:
         """Write what describes all episodes so far; without it the newest are not part of the dataset."""
@@ -203,34 +221,32 @@ def demonstrate(
 
     Raises:
         SequenceError: If hardly an episode is solved, too.
+        OSError: If episodes cannot be written, as on a full drive.
     """
     count = min(config.environments, -(-config.episodes // max(len(scenes), 1)))
     demonstrations = Demonstrations(task, scenes, out, count, config, sight, randomisation, motion, device)
     batches, seed, tried = demonstrations.batches, demonstrations.seed, 0
     policy = scripted_policy(task, count)
-    try:
-        with Progress() as bar:
-            progress = bar.add_task(task, total=config.episodes, completed=demonstrations.episodes)
-            while demonstrations.episodes < config.episodes:
-                # Seed n is of scene n mod their number, however many episodes run at once.
-                own = [np.arange(count) * len(batches) + seed + (i - seed) % len(batches) for i in range(len(batches))]
-                played = []
-                for number, (batch, seeds) in enumerate(zip(batches, own), 1):
-                    bar.update(progress, description=f"{task}, scene {number} of {len(batches)}")
-                    played.append(_play(batch, policy, config.noise, seeds))
-                episodes = dict(zip(np.concatenate(own).tolist(), chain(*played)))
-                solved = [number for number in sorted(episodes) if episodes[number].solved]
-                kept = solved[: config.episodes - demonstrations.episodes]
-                tried += len(episodes) if kept == solved else sorted(episodes).index(kept[-1]) + 1
-                if kept:
-                    demonstrations.add({number: episodes[number] for number in kept})
-                bar.update(progress, completed=demonstrations.episodes)
-                seed += len(episodes)
-                demonstrations.save_if_due()
-                if tried * _FEWEST > 1 and demonstrations.episodes < tried * _FEWEST:
-                    raise SequenceError(f"{demonstrations.episodes} of {tried} episodes were solved; less noise or randomisation helps")
-    finally:
-        demonstrations.save()
+    with demonstrations, Progress() as bar:
+        progress = bar.add_task(task, total=config.episodes, completed=demonstrations.episodes)
+        while demonstrations.episodes < config.episodes:
+            # Seed n is of scene n mod their number, however many episodes run at once.
+            own = [np.arange(count) * len(batches) + seed + (i - seed) % len(batches) for i in range(len(batches))]
+            played = []
+            for number, (batch, seeds) in enumerate(zip(batches, own), 1):
+                bar.update(progress, description=f"{task}, scene {number} of {len(batches)}")
+                played.append(_play(batch, policy, config.noise, seeds))
+            episodes = dict(zip(np.concatenate(own).tolist(), chain(*played)))
+            solved = [number for number in sorted(episodes) if episodes[number].solved]
+            kept = solved[: config.episodes - demonstrations.episodes]
+            tried += len(episodes) if kept == solved else sorted(episodes).index(kept[-1]) + 1
+            if kept:
+                demonstrations.add({number: episodes[number] for number in kept})
+            bar.update(progress, completed=demonstrations.episodes)
+            seed += len(episodes)
+            demonstrations.save_if_due()
+            if tried * _FEWEST > 1 and demonstrations.episodes < tried * _FEWEST:
+                raise SequenceError(f"{demonstrations.episodes} of {tried} episodes were solved; less noise or randomisation helps")
     return demonstrations.episodes, tried
 
 

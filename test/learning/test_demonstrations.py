@@ -1,5 +1,6 @@
 """Demonstrations by scripted policies, as a dataset that can be continued."""
 
+import errno
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from endo_sim_ros.learning.demonstrations import Demonstrations, demonstrate
 from endo_sim_ros.physics import MotionConfig
 
 SIGHT = SightConfig(image_width=40, eyes=2, segmentation=True)
+NO_ROOM = OSError(errno.ENOSPC, "No space left on device")
 
 
 def run(out, episodes, noise=0.3, environments=3, task="retraction", **options):
@@ -71,21 +73,31 @@ def test_without_noise_the_written_actions_lead_to_the_written_states(tmp_path):
 
 
 @pytest.mark.slow
-def test_an_interrupted_run_goes_on_and_ends_as_one_in_one_go(whole, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("method", "error", "kept"),
+    [("_write_files", KeyboardInterrupt(), 3), ("_write_files", NO_ROOM, 3), ("_write_table", NO_ROOM, 2)],
+    ids=["interrupted", "full while writing", "full while saving"],
+)
+def test_what_a_run_has_finished_is_kept_and_goes_on_as_one_in_one_go(whole, tmp_path, monkeypatch, caplog, method, error, kept):
     """Whatever the number of environments."""
-    out, add = tmp_path / "whole", DatasetWriter.add
+    out, works = tmp_path / "whole", getattr(DatasetWriter, method)
 
-    def interrupted(writer, *arguments):
-        if writer.episodes == 2:
-            raise KeyboardInterrupt
-        add(writer, *arguments)
+    def fails(writer, first, *rest, **options):
+        if first == 2 or writer.episodes < 4 and first != 3:
+            return works(writer, first, *rest, **options)
+        (out / "data/chunk-000/file-003.parquet").write_bytes(b"PAR1")
+        raise error
 
-    monkeypatch.setattr(DatasetWriter, "add", interrupted)
-    with pytest.raises(KeyboardInterrupt):
+    run(out, 2, environments=2)
+    monkeypatch.setattr(DatasetWriter, method, fails)
+    with pytest.raises(type(error)) as raised:
         run(out, 4, environments=2)
     monkeypatch.undo()
+    told = caplog.text if error is not NO_ROOM else str(raised.value)
+    reason = "" if error is not NO_ROOM else ": No space left on device;"
+    assert f"{out}{reason or ':'} {kept} of 4 episodes are kept, and the same command goes on from there" in told
     info = json.loads((out / "meta/info.json").read_text())
-    assert info["total_episodes"] == 2 and info["total_frames"] == sum(map(len, tables(out)))
+    assert info["total_episodes"] == kept and info["total_frames"] == sum(map(len, tables(out)))
     assert run(out, 4, environments=5)[0] == 4
     for mine, other in zip(tables(out), tables(whole), strict=True):
         assert mine.equals(other)

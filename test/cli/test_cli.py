@@ -89,9 +89,9 @@ def test_convert_offers_every_option_of_every_reader():
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("bags") / "patient"
-    done = endo_sim("phantom", path, "--frames", 10, "--width", 128, "--height", 96)
+    done = endo_sim("phantom", path, "--frames", 6, "--width", 128, "--height", 96)
     assert done.returncode == 0, done.stderr
-    assert "10 frames" in done.stdout
+    assert "6 frames" in done.stdout
     return path
 
 
@@ -115,7 +115,7 @@ def test_bag_is_read_by_the_authors_of_the_format(bag):
 
 @pytest.mark.dds
 def test_a_killed_reconstruction_goes_on_to_the_same_model(bag, tmp_path, caplog):
-    values = {"iterations": 120, "max_gaussians": 2000, "keyframes": 3, "image_width": 96, "device": "cpu"}
+    values = {"iterations": 120, "max_gaussians": 2000, "keyframes": 2, "image_width": 64, "device": "cpu"}
     options = [word for name, value in values.items() for word in (f"--{name.replace('_', '-')}", str(value))]
     command = [sys.executable, "-m", "endo_sim_ros.cli", "reconstruct", bag, tmp_path / "killed", *options]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
@@ -144,7 +144,7 @@ def test_an_interrupted_reconstruction_says_how_to_go_on(small_frames, tmp_path,
 
     monkeypatch.setattr(from_bag.Trainer, "run", interrupted)
     caplog.set_level(logging.INFO)
-    config = ReconstructionConfig(iterations=200, max_gaussians=2000, keyframes=3, image_width=96, device="cpu")
+    config = ReconstructionConfig(iterations=200, max_gaussians=2000, keyframes=2, image_width=48, device="cpu")
     with pytest.raises(KeyboardInterrupt):
         reconstruct_bag(tmp_path / "bag", tmp_path / "out", config)
     last = caplog.messages[-1]

@@ -82,7 +82,7 @@ def test_unreadable_bags_are_told_by_players_that_live_on_each_in_its_namespace(
     (tmp_path / "truncated.mcap").write_bytes(next(small_bag.glob("*.mcap")).read_bytes()[:5000])
     (tmp_path / "foreign.mcap").write_text("not a bag")
     sentences = {"missing": "no such bag", "truncated": "the bag cannot be read", "foreign": "the bag cannot be read"}
-    with NodeGroup(tmp_path / "a") as a, NodeGroup(tmp_path / "b") as b, NodeGroup(tmp_path / "c") as c:
+    with ForkedNodes(tmp_path / "a") as a, ForkedNodes(tmp_path / "b") as b, ForkedNodes(tmp_path / "c") as c:
         players = {
             name: group.start("bag_player_node", "-r", f"__ns:=/{name}", bag=tmp_path / f"{name}.mcap")
             for group, name in zip((a, b, c), sentences)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from endo_sim_command import endo_sim
+from endo_sim_command import endo_sim_here
 
 from endo_sim_ros.learning import demonstrations
 from endo_sim_ros.learning.by_person import Wish, demonstrate_by_person
@@ -170,9 +170,9 @@ def test_sticks_and_buttons_of_a_gamepad_are_heard(tmp_path):
 
 
 def test_options_that_have_no_effect_are_refused(tmp_path):
-    done = endo_sim("demonstrate", "retraction", tmp_path / "out", "--by", "person", "--noise", 0.3)
+    done = endo_sim_here("demonstrate", "retraction", tmp_path / "out", "--by", "person", "--noise", 0.3)
     assert done.returncode == 2 and "noise has no effect while by is person; set by to script" in done.stderr
-    done = endo_sim("demonstrate", "retraction", tmp_path / "out", "--page.port", 9000)
+    done = endo_sim_here("demonstrate", "retraction", tmp_path / "out", "--page.port", 9000)
     assert done.returncode == 2 and "page: there is none while by is script" in done.stderr
 
 

@@ -160,7 +160,7 @@ def test_a_scene_that_the_task_refuses_is_left_out_with_a_reason(tmp_path, caplo
 def test_a_round_without_a_solved_episode_leaves_nothing_behind(tmp_path, monkeypatch):
     monkeypatch.setattr(demonstrations, "_FEWEST", 0.5)
     with pytest.raises(SequenceError, match="0 of 3 episodes were solved"):
-        run(tmp_path / "out", 3, noise=2.0, task="tracking")
+        run(tmp_path / "out", 3, noise=2.0)
     assert not (tmp_path / "out").exists()
     with pytest.raises(ValueError, match="there is no scene; give one or more, such as phantom:0"):
         demonstrate("retraction", [], tmp_path / "out", device="cpu")
@@ -193,7 +193,7 @@ def test_a_dataset_that_was_cut_off_is_not_continued(tmp_path):
 @pytest.mark.slow
 def test_demonstrating_is_a_command_whose_dataset_lerobot_reads(tmp_path):
     out = tmp_path / "out"
-    done = endo_sim("demonstrate", "palpation", out, "--episodes", 1, "--environments", 2, "--image-width", 160, "--device", "cpu")
+    done = endo_sim("demonstrate", "retraction", out, "--episodes", 1, "--environments", 2, "--image-width", 80, "--device", "cpu")
     assert done.returncode == 0, done.stderr
     assert "out: 1 solved episodes" in done.stdout
     lerobot = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="needs lerobot")

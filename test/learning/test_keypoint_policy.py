@@ -64,7 +64,7 @@ def test_one_eye_is_enough_to_train(dataset, tmp_path, monkeypatch):
 
 
 def test_it_learns_what_was_demonstrated(dataset, tmp_path):
-    train_keypoints(dataset, tmp_path, ImitationConfig(steps=150, batch_size=32), device="cpu")
+    train_keypoints(dataset, tmp_path, ImitationConfig(steps=100, batch_size=32), device="cpu")
     columns, shown = read_dataset(dataset, (STATE, ACTION), (IMAGE, IMAGE_RIGHT))
     policy = make_policy(str(tmp_path), "retraction", device="cpu")
     assert isinstance(policy, KeypointPolicy) and policy.sight.eyes == 2 and policy.sight.image_width == 40

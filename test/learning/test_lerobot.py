@@ -7,7 +7,7 @@ import av
 import cv2
 import numpy as np
 import pytest
-from endo_sim_command import endo_sim
+from endo_sim_command import endo_sim, endo_sim_here
 from made_recordings import BEGIN, HEIGHT, STEP, WIDTH, Recording, joints, labels, lockstep, picture, realtime
 
 from endo_sim_ros import messages
@@ -267,7 +267,8 @@ def test_export_is_a_command(bag, tmp_path):
     ],
 )
 def test_mistakes_are_one_sentence(arguments, sentence, tmp_path):
-    done = endo_sim(*(tmp_path / "out" if word == "OUT" else word for word in arguments))
+    run = endo_sim_here if arguments[0] == "export" else endo_sim  # that records has the signals of its process
+    done = run(*(tmp_path / "out" if word == "OUT" else word for word in arguments))
     assert done.returncode == 2 and "Traceback" not in done.stderr
     assert sentence in done.stderr and len(done.stderr.strip().splitlines()) == 1, done.stderr
     assert not (tmp_path / "out").exists()

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from endo_sim_command import endo_sim
+from endo_sim_command import endo_sim, endo_sim_here
 
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.learning.config import DemonstrationConfig, ImitationConfig, SightConfig
@@ -43,7 +43,7 @@ def test_the_configuration_names_what_the_policy_may_see(demonstrations, tmp_pat
 def test_without_lerobot_the_command_says_what_to_install(demonstrations, tmp_path):
     if available():
         pytest.skip("lerobot is installed, and would train")
-    done = endo_sim("imitate", demonstrations, tmp_path / "act", "--policy", "act", "--steps", 100)
+    done = endo_sim_here("imitate", demonstrations, tmp_path / "act", "--policy", "act", "--steps", 100)
     assert done.returncode == 0, done.stderr
     assert "pip install 'lerobot[training,diffusion]==0.6.*'" in done.stdout
     assert f"lerobot-train --config_path={tmp_path / 'act/train_config.json'}" in done.stdout

@@ -42,8 +42,9 @@ def test_scripted_policies_solve_their_tasks(task, count):
     assert success.mean() > 0.8 and returns.mean() > 1
     if task == "retraction":
         assert play(batch, linear_policy(), np.arange(count))[1].mean() > 0.8
-    idle = NetworkPolicy.from_vectors(task, [], np.zeros(batch.action_size * (len(batch.task.observation_names) + 1)))
-    assert not play(batch, idle, np.arange(count))[1].any()
+    few = TaskBatch(task, load_scene(), count // 4, device="cpu")  # as they all last to the end
+    idle = NetworkPolicy.from_vectors(task, [], np.zeros(few.action_size * (len(few.task.observation_names) + 1)))
+    assert not play(few, idle, np.arange(few.count))[1].any()
 
 
 @pytest.mark.parametrize("task", ["retraction", "exposure", "tension", "handover", "clip", "dissect"])
@@ -119,13 +120,13 @@ def test_learning_that_gets_worse_keeps_what_was_best():
 
 @pytest.mark.slow
 def test_training_learns_and_leaves_its_curve(tmp_path):
-    config = TrainingConfig(generations=2, population=24, episodes=1, test_episodes=8)
+    config = TrainingConfig(generations=2, population=16, episodes=1, test_episodes=6)
     policy, curve = train("retraction", load_scene(), config, device="cpu")
     again, _ = train("retraction", load_scene(), config, device="cpu")
     np.testing.assert_array_equal(policy.layers[0], again.layers[0])
-    assert [point["episodes"] for point in curve] == [0, 24, 48]
+    assert [point["episodes"] for point in curve] == [0, 16, 32]
     assert curve[-1]["test_return"] > curve[0]["test_return"]
-    found = measure_policy(TaskBatch("retraction", load_scene(), 8, device="cpu"), policy)
+    found = measure_policy(TaskBatch("retraction", load_scene(), 6, device="cpu"), policy)
     assert found["test_return"] == max((point["test_success"], point["test_return"]) for point in curve)[1]
     save_training(tmp_path, policy, curve, config)
     assert json.loads((tmp_path / "curve.json").read_text())["curve"] == curve

@@ -12,7 +12,7 @@ from trained import trainer_of
 from endo_sim_ros.core.config import ConfigError, option_values
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.evaluation import metrics
-from endo_sim_ros.reconstruction import ABLATIONS, PRESETS, ReconstructionConfig, losses, preset
+from endo_sim_ros.reconstruction import ABLATIONS, PRESETS, ReconstructionConfig, Trainer, losses, prepare, preset
 from endo_sim_ros.reconstruction.scene import shrink
 from endo_sim_ros.reconstruction.triangulation import triangulate
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
@@ -27,10 +27,15 @@ def quality(model, frames) -> tuple[float, float]:
     return float(np.mean([metrics.psnr(*pair) for pair in pairs])), float(np.mean(fitted))
 
 
+@pytest.fixture(scope="module")
+def points(views):
+    """Scene points of the views."""
+    return triangulate(views)[:2]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PRESETS)
-def test_every_preset_trains(views, name):
-    points = triangulate(views)[:2]
+def test_every_preset_trains(views, points, name):
     model = trainer_of(views[::4], preset(name, **SHORT), points).run()
     assert finite(model) and len(model) <= 2000
     assert (model.light is None) == (name not in ("default", "laptop"))
@@ -45,9 +50,9 @@ def test_the_originals_have_no_frequency_regularisation(name):
 
 
 @pytest.mark.slow
-def test_spherical_harmonics_rise_and_opacities_fall_as_planned(views):
+def test_spherical_harmonics_rise_and_opacities_fall_as_planned(views, points):
     plan = {"sh_every": 4, "gradient.reset_every": 6, "refine_from": 5, "refine_every": 3, "schedule": 14, "gradient.threshold": 0.0}
-    trainer = trainer_of(views[::4], preset("3dgs", **SHORT | {"max_gaussians": 4000} | plan), triangulate(views)[:2])
+    trainer = trainer_of(views[::4], preset("3dgs", **SHORT | {"max_gaussians": 4000} | plan), points)
     learnt, counts, opacities = [], [], []
     while trainer.iteration < 12:
         trainer.step()
@@ -62,21 +67,21 @@ def test_spherical_harmonics_rise_and_opacities_fall_as_planned(views):
 
 
 @pytest.mark.slow
-def test_learning_rates_follow_the_schedule_and_the_unit(views):
-    trainer = trainer_of(views[::4], preset("3dgs", unit="cameras", **SHORT), triangulate(views)[:2])
+def test_learning_rates_follow_the_schedule_and_the_unit(views, points):
+    trainer = trainer_of(views[::4], preset("3dgs", unit="cameras", **SHORT), points)
     positions = np.array([camera.position for camera in trainer.cameras])
     extent = 1.1 * np.linalg.norm(positions - positions.mean(0), axis=1).max()
     trainer.run()
     trainer.step()
     assert trainer.optimizer.rates["means"] == pytest.approx(1.6e-4 * extent * 0.01 ** (12 / 30_000), rel=1e-6)
     for frames, unit in ((views[::4], "depth"), (views[:1], "cameras")):  # one camera has no extent
-        other = trainer_of(frames, preset("3dgs", unit=unit, **SHORT), triangulate(views)[:2])
+        other = trainer_of(frames, preset("3dgs", unit=unit, **SHORT), points)
         other.step()
         assert other.optimizer.rates["means"] == pytest.approx(1.6e-4 * other.scene_depth, rel=1e-6)
 
 
 @pytest.mark.slow
-def test_virtual_cameras_begin_and_weigh_as_told(views, monkeypatch):
+def test_virtual_cameras_begin_and_weigh_as_told(views, points, monkeypatch):
     weights, trained = [], losses.regularized
 
     def note(loss, terms, rendering, config, virtual=False):
@@ -87,7 +92,7 @@ def test_virtual_cameras_begin_and_weigh_as_told(views, monkeypatch):
         return after
 
     monkeypatch.setattr(losses, "regularized", note)
-    trainer = trainer_of(views[:3], preset("fsgs", **SHORT, virtual_from=10), triangulate(views)[:2])
+    trainer = trainer_of(views[:3], preset("fsgs", **SHORT, virtual_from=10), points)
     trainer.run()
     np.testing.assert_allclose(weights, [10.0, 10.0], rtol=1e-3)
 
@@ -99,10 +104,9 @@ def test_every_ablation_changes_its_preset():
 
 
 @pytest.mark.slow
-def test_the_default_beats_the_paper_on_two_views(views):
+def test_the_default_beats_the_paper_on_two_views(views, points):
     ends, rest = [views[0], views[-1]], views[1:-1]
     short = {"iterations": 60, "max_gaussians": 6000, "refine_every": 20, "device": "cpu"}
-    points = triangulate(views)[:2]
     paper = quality(trainer_of(ends, preset("paper", **short), points).run(), rest)
     ours = quality(trainer_of(ends, preset("default", **short)).run(), rest)
     assert ours[0] > paper[0] + 1.5 and ours[1] > paper[1] + 1.5
@@ -142,14 +146,17 @@ def test_out_of_memory_goes_on_at_half_the_size(views, monkeypatch, caplog):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["default", "3dgs", "fsgs"])
-def test_a_checkpoint_of_any_preset_goes_on_as_if_never_interrupted(views, tmp_path, name):
-    make = lambda: trainer_of(views[::4], preset(name, **SHORT), triangulate(views)[:2])
+def test_a_checkpoint_of_any_preset_goes_on_as_if_never_interrupted(views, points, tmp_path, name):
+    config = preset(name, **SHORT)
+    scene = prepare(views[::4], config, points)
+    make = lambda: Trainer(scene, config)
     whole, first = make().run(), make()
     for _ in range(7):
         first.step()
-    first.save_checkpoint(tmp_path / "checkpoint.pt")
+    first.save_checkpoint(tmp_path / "new" / "checkpoint.pt")
     second = make()
-    second.load_checkpoint(tmp_path / "checkpoint.pt")
+    second.load_checkpoint(tmp_path / "new" / "checkpoint.pt")
+    assert second.iteration == 7
     resumed = second.run()
     assert all(torch.equal(a, b) for a, b in zip(resumed.tensors().values(), whole.tensors().values()))
     assert resumed.light == whole.light
@@ -166,9 +173,8 @@ def test_options_beside_a_preset_count_even_if_they_are_the_defaults():
 
 
 @pytest.mark.slow
-def test_a_checkpoint_knows_the_options_and_not_the_preset_that_they_came_from(views, tmp_path):
+def test_a_checkpoint_knows_the_options_and_not_the_preset_that_they_came_from(views, points, tmp_path):
     config = preset("paper", lambda_dist=0.0, **SHORT)
-    points = triangulate(views)[:2]
     trainer = trainer_of(views[::4], config, points)
     trainer.step()
     trainer.save_checkpoint(tmp_path / "checkpoint.pt")

@@ -128,20 +128,6 @@ def test_same_seed_gives_the_same_bits_whatever_the_threads(small, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_checkpoint_goes_on_as_if_never_interrupted(small, tmp_path):
-    views = list(small[::4])
-    whole = trainer_of(views, options()).run()
-    first = trainer_of(views, options())
-    for _ in range(7):
-        first.step()
-    first.save_checkpoint(tmp_path / "a" / "checkpoint.pt")
-    second = trainer_of(views, options())
-    second.load_checkpoint(tmp_path / "a" / "checkpoint.pt")
-    assert second.iteration == 7
-    assert equal(second.run(), whole)
-
-
-@pytest.mark.slow
 def test_checkpoints_that_do_not_fit_are_refused(small, tmp_path):
     path = tmp_path / "checkpoint.pt"
     trainer = trainer_of([small[0]], options())

@@ -392,7 +392,7 @@ def test_the_same_bag_gives_the_same_model_in_every_run(tmp_path, small_bag):
         heard = bench.hear(messages.GAUSSIANS)
         try:
             with ForkedNodes(tmp_path / run) as group:
-                options = {"iterations": 30, "max_gaussians": 1500, "image_width": 96, "keyframes": 3, "start_after": 0.5, "device": "cpu"}
+                options = {"iterations": 30, "max_gaussians": 1500, "image_width": 48, "keyframes": 2, "start_after": 0.5, "device": "cpu"}
                 group.start("reconstruction_node", mode="lockstep", output_dir=tmp_path / run, **options)
                 bench.status("reconstruction_node", "collecting views", OK)
                 group.start("bag_player_node", bag=small_bag)

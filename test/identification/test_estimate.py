@@ -149,7 +149,8 @@ def test_an_inclusion_is_found_in_a_map():
 
 
 def test_an_inclusion_is_found_as_a_ball():
-    centre, experiments, _ = hidden(1, 0.007)
+    centre, felt, _ = hidden(1, 0.007)
+    experiments = felt[::3] + felt[2::3]  # two rows of the raster are enough
     found = identify(experiments, NODES, PHYSICS, IdentificationConfig(stiffness="inclusion", iterations=ENOUGH), "cpu")
     inclusion = find_inclusion(found)
     off = inclusion.centre - centre

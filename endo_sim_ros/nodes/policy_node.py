@@ -29,6 +29,7 @@ _TOLD_WITHIN = 1.0  # seconds that the last outcome has to arrive before the nod
 _STRAY = 1.0  # seconds in which pictures of a rest before the first reset may still come
 _SETTLED = 2  # real time: states after the tools were put where an episode begins, until they are seen there
 _PATIENCE = 30.0  # seconds; a request to a physics_node that was killed just now is never answered
+_SILENT = 5.0  # seconds without an answer after which the node says so
 
 
 class PolicyNode(EndoNode):
@@ -74,6 +75,7 @@ class PolicyNode(EndoNode):
         self._realtime = config.mode == "realtime"
         self._stamp = 0  # of the command whose answer is awaited; 0 = the state at rest. In real time: what answers is newer
         self._heard: dict[str, Any] = {}  # parts of that answer
+        self._awaited_from = 0.0  # when the command was sent, or the last part of its answer came
         self._stamps: dict[str, int] = {}  # and theirs, ns
         self._observation: np.ndarray | None = None  # what the answer tells without its pictures
         self._placed, self._rested = False, 0  # whether the tool was put where the episode begins, and states since
@@ -112,7 +114,15 @@ class PolicyNode(EndoNode):
         self._ask()
 
     def _ask(self) -> None:
-        """Reset the tissue; again and again until its state at rest is heard, as there may be no model or no connection yet."""
+        """Reset the tissue; again and again until its state at rest is heard, as there may be no model or no connection yet.
+
+        An episode whose physics_node is gone begins anew.
+        """
+        if self._silence() > _SILENT and not self._resetting.service_is_ready():
+            self.report_error(f"physics_node is gone; episode {self._done + 1} begins anew when there is one again")
+            self._rows = [row for row in self._rows if row[-1] < self._done]
+            self._begin()
+            return
         if self._stamp == 0:
             self._go_on()
         if self._stamp != 0 or self._asked is not None and time.monotonic() - self._asked_at < _PATIENCE and not self._unanswered():
@@ -184,12 +194,17 @@ class PolicyNode(EndoNode):
 
     def _answer(self, part: str, value: Any, stamp: int) -> None:
         """Take in a part of what answers the last command."""
-        self._heard[part], self._stamps[part] = value, stamp
+        self._heard[part], self._stamps[part], self._awaited_from = value, stamp, time.monotonic()
         self._go_on()
 
     def _forget(self) -> None:
         """Await another answer."""
         self._heard, self._stamps, self._observation = {}, {}, None
+        self._awaited_from = time.monotonic()
+
+    def _silence(self) -> float:
+        """Seconds for which nothing has come of an answer that is awaited; 0 where none is."""
+        return time.monotonic() - self._awaited_from if self._stamp > 0 else 0.0
 
     def _go_on(self) -> None:
         """When the answer to the last command is complete, act."""
@@ -306,22 +321,25 @@ class PolicyNode(EndoNode):
         self._stamp = -1  # nothing is awaited, and nothing that comes late completes an answer
         self._forget()
         self.get_logger().info(f"episode {self._done}: {'solved' if success else 'not solved'} in {self._task.steps[0]} steps")
+        if self._config.record:
+            self._record(Path(self._config.record))
         if self._done < self._config.episodes:
             self._begin()
             return
         self._finish()
 
+    def _record(self, path: Path) -> None:
+        """Write the episodes that are over; after each, so that whatever ends the process leaves them."""
+        names = ("observations", "actions", "rewards", "success", "episode")
+        columns: dict[str, Any] = {name: np.array(column) for name, column in zip(names, zip(*self._rows))}
+        with written_whole(path) as partial, partial.open("wb") as file:
+            np.savez(file, **columns)
+
     def _finish(self) -> None:
-        """Write the episodes that are over, and end the process."""
+        """End the process."""
         self._state, self._stamp = PolicyState.DONE, -1
         self._forget()
         delivered(self._outcome_pub, _TOLD_WITHIN)
-        rows = [row for row in self._rows if row[-1] < self._done]
-        if self._config.record and rows:
-            names, path = ("observations", "actions", "rewards", "success", "episode"), Path(self._config.record)
-            columns: dict[str, Any] = {name: np.array(column) for name, column in zip(names, zip(*rows))}
-            with written_whole(path) as partial, partial.open("wb") as file:
-                np.savez(file, **columns)
         self.finish(f"{self._solved} of {self._done} episodes solved")
 
     def status(self) -> tuple[int, str, dict[str, Any]]:
@@ -333,7 +351,9 @@ class PolicyNode(EndoNode):
             PolicyState.DONE: "finished",
         }[self._state]
         solved = f", {self._solved} of {self._done} solved" if self._done else ""
-        return (WARN if self._state is PolicyState.WAITING else OK), text + solved, values
+        silent = self._silence() > _SILENT
+        silence = f"; nothing has come from physics_node{' or rendering_node' if self._pictures else ''} for {self._silence():.0f} s"
+        return (WARN if silent or self._state is PolicyState.WAITING else OK), text + silence * silent + solved, values
 
 
 if __name__ == "__main__":

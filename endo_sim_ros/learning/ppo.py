@@ -14,7 +14,7 @@ from endo_sim_ros.learning.actions import Actions, Contact
 from endo_sim_ros.learning.config import PPOConfig, Randomisation
 from endo_sim_ros.learning.environments import Observed, VectorTaskEnvironment
 from endo_sim_ros.learning.joined import JoinedEnvironments
-from endo_sim_ros.learning.policies import NetworkPolicy, scripted_policy
+from endo_sim_ros.learning.policies import NetworkPolicy
 from endo_sim_ros.learning.scenes import Scene
 from endo_sim_ros.learning.task_batch import TaskBatch
 from endo_sim_ros.learning.train import Best, measure_policy
@@ -157,7 +157,7 @@ def learn_script(model: PPO, batch: TaskBatch, config: PPOConfig) -> None:
 
 def _shown(batch: TaskBatch, config: PPOConfig, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What a script observes [T, n] in an episode of each environment, does without its noise [T, m], and gets from then on [T]."""
-    everyone, policy = range(batch.count), scripted_policy(batch.task.name, batch.count)
+    everyone, policy = range(batch.count), batch.task.script(batch.count)
     batch.reset(everyone, rng.spawn(batch.count))
     policy.reset(everyone)
     seen, running, rows = batch.observe(), np.ones(batch.count, bool), []

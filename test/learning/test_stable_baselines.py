@@ -93,6 +93,15 @@ def test_a_policy_that_begins_from_its_script_solves_what_chance_does_not(monkey
     assert 0.5 * scripted < float(worth) < scripted  # by the discount
 
 
+def test_a_task_of_ones_own_shows_its_script(monkeypatch, tmp_path):
+    ppo = pytest.importorskip("endo_sim_ros.learning.ppo", exc_type=ImportError)
+    monkeypatch.setattr(ppo, "_FITTED", 10)
+    lines = "from endo_sim_ros.learning.tasks.tracking import Tracking", "class Own(Tracking):", "    name = 'own'"
+    (tmp_path / "own.py").write_text("\n".join(lines))
+    config = PPOConfig(steps=4, environments=2, rollout=2, tests=1, test_episodes=1, demonstrations=1)
+    assert ppo.train_ppo(f"{tmp_path / 'own.py'}:Own", load_scene(), config, device="cpu")[1]
+
+
 def test_scripts_do_not_show_how_joints_move():
     ppo = pytest.importorskip("endo_sim_ros.learning.ppo", exc_type=ImportError)
     config = PPOConfig(steps=4, environments=2, rollout=2, test_episodes=1, demonstrations=1)

@@ -27,8 +27,6 @@ class Command:
     """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""
     sight: SightConfig = field(default_factory=SightConfig)
     """What a ROS node sees that subscribes to NAME/image_raw; other policies say themselves what they see."""
-    patience: float = 10.0
-    """Seconds that a ROS node has for each of its answers."""
     config: Annotated[BenchmarkConfig, tyro.conf.arg(name="")] = field(default_factory=BenchmarkConfig)
 
     def run(self) -> None:
@@ -43,7 +41,7 @@ class Command:
                 return make_policy(policy, task, count, device)
             from endo_sim_ros.graph.node_policy import NodePolicy
 
-            nodes.append(NodePolicy(policy.removeprefix(_NODE), task, self.sight, self.patience))
+            nodes.append(NodePolicy(policy.removeprefix(_NODE), task, self.sight, self.config.patience))
             return nodes[-1]
 
         try:

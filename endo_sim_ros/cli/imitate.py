@@ -9,6 +9,8 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
+from endo_sim_ros.core.config import ConfigError, unused_options
+from endo_sim_ros.core.folders import leaving_none_empty
 from endo_sim_ros.learning.config import ImitationConfig
 
 
@@ -25,13 +27,18 @@ class Command:
     """Where keypoints are trained: auto (the GPU when there is one), cpu, cuda or cuda:N."""
 
     def run(self) -> None:
-        """Write and train; raises SequenceError if the dataset cannot be used, RuntimeError if the training fails."""
+        """Write and train; raises SequenceError if the dataset cannot be used, ConfigError if options cannot, RuntimeError if the training
+        fails."""
+        for text in unused_options(self.config):
+            raise ConfigError(text)
         from endo_sim_ros.learning.lerobot_policy import PACKAGES, available, write_training
 
         if self.config.policy == "keypoints":
             from endo_sim_ros.learning.keypoint_policy import train_keypoints
 
-            train_keypoints(self.dataset, self.out, self.config, self.device)
+            with leaving_none_empty(self.out):
+                self.out.mkdir(parents=True, exist_ok=True)  # before the long work
+                train_keypoints(self.dataset, self.out, self.config, self.device)
             print(f"{self.out}: trained; endo-sim benchmark OUT {self.out}")
             return
         path = write_training(self.dataset, self.out, self.config)

@@ -133,6 +133,10 @@ class ImitationConfig(StageConfig):
     seed: Annotated[int, Range(0, 2**31 - 1)] = 0
     """Another seed draws other weights and another order."""
 
+    needs: ClassVar[dict[str, tuple[str, ...]]] = dict.fromkeys(
+        ("chunk", "executed", "backbone_weights", "workers"), ("policy", "act", "diffusion")
+    )
+
 
 @dataclass(frozen=True)
 class BenchmarkConfig(StageConfig):
@@ -146,6 +150,8 @@ class BenchmarkConfig(StageConfig):
     """Repeat all under other light, texture, endoscope, instrument, stiffness and breath than usual, one after the other."""
     image_width: Annotated[int, Range(16, 4096, "pixels")] = 256
     """Width of the video that shows the first episodes."""
+    patience: Annotated[float, Range(0.01, 86_400, "s")] = 10.0
+    """How long a ROS node has for each of its answers, s."""
 
 
 @dataclass(frozen=True)

@@ -13,17 +13,17 @@ from typing import Any, Literal
 
 import numpy as np
 
+from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.folders import written_whole
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.learning.actions import ARM_NAMES, CARTESIAN_SIZES, Actions
 from endo_sim_ros.learning.config import ImitationConfig, SightConfig
-from endo_sim_ros.learning.dataset import IMAGE, IMAGE_RIGHT
+from endo_sim_ros.learning.dataset import ACTION, IMAGE, IMAGE_RIGHT, STATE
 from endo_sim_ros.learning.pictures import IMAGE as SEEN, IMAGE_RIGHT as SEEN_RIGHT
 from endo_sim_ros.learning.task_batch import ARM_STATE
 
 PACKAGES = "lerobot[training,diffusion]==0.6.*"
 CONFIG = "train_config.json"
-_STATE, _ACTION = "observation.state", "action"
 _PICTURES = {IMAGE: SEEN, IMAGE_RIGHT: SEEN_RIGHT}
 _WEIGHTS = "pretrained_model"  # folder of a checkpoint
 _LAST = Path("lerobot/checkpoints/last") / _WEIGHTS  # where `write_training` has the last one
@@ -34,6 +34,7 @@ _CHECKPOINTS = 5  # of a training; the last one is used
 # in real time without a GPU, in place of one of 260 million weights for any robot; and steps in which an action is denoised, in place of
 # 100. Images are whole: lerobot would crop each eye elsewhere, which hides how deep things are, and where they are beside the arm.
 _ENLARGED, _CHANNELS, _DENOISED = 2, [128, 256, 512], 10
+_HALVED = 2 ** len(_CHANNELS)  # its network halves a chunk as often as it has sizes
 
 log = logging.getLogger(__name__)
 
@@ -57,25 +58,30 @@ def write_training(dataset: Path, out: Path, config: ImitationConfig) -> Path:
 
     Raises:
         SequenceError: If there is no such dataset, or its columns are not those of demonstrations, or a policy was trained there.
+        ConfigError: If no policy has such chunks.
     """
+    if config.executed > config.chunk:
+        raise ConfigError(f"executed is {config.executed}, but only {config.chunk} actions are predicted at once; give at most chunk")
+    if config.policy == "diffusion" and config.chunk % _HALVED:
+        raise ConfigError(f"chunk is {config.chunk}; of a diffusion policy it is a multiple of {_HALVED}")
     try:
         features = json.loads((dataset / "meta/info.json").read_text("utf8"))["features"]
-        shapes = {key: features[key]["shape"] for key in (*_PICTURES, _STATE, _ACTION) if key in features}
-        missing = {IMAGE, _STATE, _ACTION} - shapes.keys()
+        shapes = {key: features[key]["shape"] for key in (*_PICTURES, STATE, ACTION) if key in features}
+        missing = {IMAGE, STATE, ACTION} - shapes.keys()
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SequenceError(f"{dataset} is no LeRobot dataset; give the folder that `endo-sim demonstrate` wrote") from error
-    if missing or not _arms(shapes[_ACTION]) or shapes[_STATE] != [len(ARM_NAMES) * _arms(shapes[_ACTION])]:
+    if missing or not _arms(shapes[ACTION]) or shapes[STATE] != [len(ARM_NAMES) * _arms(shapes[ACTION])]:
         raise SequenceError(f"{dataset} has other columns than `endo-sim demonstrate` writes; train on it with lerobot itself")
     if (out / "lerobot").exists():
         raise SequenceError(f"{out / 'lerobot'} exists already; choose another folder or remove it first")
     steps, rate = config.steps or _STEPS, config.learning_rate or _RATE
     inputs = {key: {"type": "VISUAL", "shape": [shape[2], *shape[:2]]} for key, shape in shapes.items() if key in _PICTURES}
-    inputs[_STATE] = {"type": "STATE", "shape": shapes[_STATE]}
+    inputs[STATE] = {"type": "STATE", "shape": shapes[STATE]}
     policy: dict[str, Any] = {
         "type": config.policy,
         "push_to_hub": False,
         "input_features": inputs,
-        "output_features": {_ACTION: {"type": "ACTION", "shape": shapes[_ACTION]}},
+        "output_features": {ACTION: {"type": "ACTION", "shape": shapes[ACTION]}},
         "pretrained_backbone_weights": config.backbone_weights or None,
         "n_action_steps": config.executed,
         "optimizer_lr": rate,
@@ -132,7 +138,8 @@ class LeRobotPolicy:
         folder = Path(folder)
         places = [place for place in (folder, folder / _WEIGHTS, folder / _LAST) if (place / "config.json").exists()]
         if not places:
-            raise ValueError(f"{folder} has no checkpoint of lerobot; give the folder of `endo-sim imitate` after the training")
+            trained = f"{folder / 'policy.npz'}, as `endo-sim train` wrote it, or " if (folder / "policy.npz").exists() else ""
+            raise ValueError(f"{folder} has no checkpoint of lerobot; give {trained}the folder of `endo-sim imitate` after the training")
         path = places[0]
         inputs, self.sight = _features(path)
         self._inputs = inputs
@@ -192,10 +199,10 @@ def _features(path: Path) -> tuple[dict[str, list[int]], SightConfig]:
         given = {key: list(feature["shape"]) for key, feature in config["output_features"].items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path / 'config.json'} is no configuration of a policy of lerobot") from error
-    other, arms = inputs.keys() - _PICTURES.keys() - {_STATE}, _arms(given.get(_ACTION, []))
+    other, arms = inputs.keys() - _PICTURES.keys() - {STATE}, _arms(given.get(ACTION, []))
     measured = [len(ARM_NAMES) * arms]
-    if other or IMAGE not in inputs or arms and inputs.get(_STATE, measured) != measured:
-        raise ValueError(f"{path}: the policy takes {', '.join(inputs)}; those of `endo-sim imitate` take {IMAGE} and {_STATE}")
-    if given.keys() != {_ACTION} or not arms:
-        raise ValueError(f"{path}: the policy gives {given}; a task takes {' or '.join(map(str, CARTESIAN_SIZES))} numbers, {_ACTION!r}")
+    if other or IMAGE not in inputs or arms and inputs.get(STATE, measured) != measured:
+        raise ValueError(f"{path}: the policy takes {', '.join(inputs)}; those of `endo-sim imitate` take {IMAGE} and {STATE}")
+    if given.keys() != {ACTION} or not arms:
+        raise ValueError(f"{path}: the policy gives {given}; a task takes {' or '.join(map(str, CARTESIAN_SIZES))} numbers, {ACTION!r}")
     return inputs, SightConfig(image_width=inputs[IMAGE][2], eyes=2 if IMAGE_RIGHT in inputs else 1)

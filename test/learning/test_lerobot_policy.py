@@ -63,6 +63,16 @@ def test_datasets_that_cannot_be_learned_from_are_told(demonstrations, tmp_path)
         write_training(demonstrations, tmp_path / "out", ImitationConfig())
 
 
+def test_options_that_no_policy_has_are_refused(demonstrations, tmp_path):
+    for words, sentence in (
+        (("--policy", "diffusion", "--chunk", 10), "chunk is 10; of a diffusion policy it is a multiple of 8"),
+        (("--policy", "act", "--executed", 32), "executed is 32, but only 16 actions are predicted at once; give at most chunk"),
+        (("--chunk", 32), "chunk has no effect while policy is keypoints; set policy to act or diffusion"),
+    ):
+        done = endo_sim_here("imitate", demonstrations, tmp_path / "out", *words)
+        assert done.returncode != 0 and sentence in done.stderr and not (tmp_path / "out").exists()
+
+
 def test_checkpoints_that_do_not_fit_are_told(tmp_path):
     with pytest.raises(ValueError, match="has no checkpoint of lerobot; give the folder of `endo-sim imitate` after the training"):
         make_policy(str(tmp_path), "retraction")

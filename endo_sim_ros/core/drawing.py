@@ -103,6 +103,21 @@ def jpeg(image: np.ndarray, quality: int) -> bytes:
     return cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
+def check_video() -> None:
+    """Find out whether `write_video` can write, before long work.
+
+    Raises:
+        RuntimeError: If there is no PyAV, or no libx264 in it.
+    """
+    try:
+        from av.codec import Codec
+
+        Codec("libx264", "w")
+    except (ImportError, ValueError) as error:
+        missing = "there is no PyAV" if isinstance(error, ImportError) else "PyAV has no libx264"
+        raise RuntimeError(f"{missing} here, which videos need; pip install --force-reinstall av brings it") from error
+
+
 def write_video(path: str | Path, images: Iterable[np.ndarray], fps: float, options: dict[str, str] = {"crf": "18"}) -> int:
     """Write RGB images [H, W, 3] uint8 of one size as H.264 that browsers play, and return their number.
 
@@ -113,18 +128,14 @@ def write_video(path: str | Path, images: Iterable[np.ndarray], fps: float, opti
         options: Of libx264.
 
     Raises:
-        RuntimeError: If there is no libx264.
+        RuntimeError: As `check_video` does.
     """
+    check_video()
     import av
 
     count = 0
     with av.open(str(path), "w") as container:
-        try:
-            stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000), options=options)
-        except ValueError as error:
-            raise RuntimeError(
-                f"{path}: PyAV has no libx264 here, which videos need; pip install --force-reinstall av brings it"
-            ) from error
+        stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000), options=options)
         stream.pix_fmt = "yuv420p"
         for image in images:
             image = np.ascontiguousarray(image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2])  # H.264 wants even sizes

@@ -85,6 +85,7 @@ def benchmark(
         RuntimeError: If a policy needs a library that is not installed.
     """
     task = find_task(config.task).name
+    drawing.check_video()
     before = read_results(out)
     loaded = {policy: make(policy, config.task, config.episodes, device) for policy in policies}  # before the long work
     conditions = CONDITIONS if config.robustness else {name: CONDITIONS[name] for name in list(CONDITIONS)[:1]}

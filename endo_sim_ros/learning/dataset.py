@@ -8,7 +8,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from itertools import islice, product
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, Literal
 
@@ -104,6 +104,8 @@ class DatasetWriter:
         kinds = {name: "float32" if name == "timestamp" else "int64" for name in _INDICES}
         self.features = {**features, **{name: scalar_feature(kind) for name, kind in kinds.items()}}
         self._pictures = [key for key, feature in features.items() if feature["dtype"] in ("image", "video")]
+        if any(features[key]["dtype"] == "video" for key in self._pictures):
+            drawing.check_video()
         for key in self._pictures:
             height, width, _ = features[key]["shape"]
             if features[key]["dtype"] == "video" and (height % 2 or width % 2):
@@ -114,6 +116,10 @@ class DatasetWriter:
         self._histograms: list[dict[str, np.ndarray]] = []
         if (root / _INFO).exists():
             self._continue()
+        # What a process that was killed had not told of yet: readers look into all files.
+        told = {self._root / name for number in range(self.saved) for name in self._files(number)}
+        for path in {*root.glob("data/*/*"), *root.glob("videos/*/*/*")} - told:
+            path.unlink()
 
     @property
     def episodes(self) -> int:
@@ -180,8 +186,13 @@ class DatasetWriter:
         """Leave nothing of these episodes, as readers look into all files, and others may need the room."""
         for known in (self._rows, self._columns, self._histograms):
             del known[first:]
-        for number, key, name in product(range(first, end), self.features, (_DATA, _VIDEO)):
-            (self._root / name.format(video_key=key, **_place(number))).unlink(missing_ok=True)
+        for name in chain.from_iterable(map(self._files, range(first, end))):
+            (self._root / name).unlink(missing_ok=True)
+
+    def _files(self, number: int) -> list[str]:
+        """Names of the files that an episode may have."""
+        place = _place(number)
+        return [_DATA.format(**place), *(_VIDEO.format(video_key=key, **place) for key in self._pictures)]
 
     def _continue(self) -> None:
         """Take up a dataset where it ends."""

@@ -2,10 +2,10 @@
 
 import errno
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from unittest.mock import MagicMock
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -103,7 +103,10 @@ def test_what_a_run_has_finished_is_kept_and_goes_on_as_one_in_one_go(whole, tmp
         assert mine.equals(other)
     for name in ("meta/info.json", "meta/stats.json", "README.md"):
         assert (out / name).read_text() == (whole / name).read_text(), name
+    untold = out / "data/chunk-000/file-007.parquet"
+    untold.write_bytes(b"PAR1")  # of a process that was killed
     assert run(out, 4) == (4, 0), "there is nothing left to do"
+    assert not untold.exists() and len(tables(out)) == 4
 
 
 def test_other_folders_and_other_options_are_refused(whole, tmp_path):
@@ -223,16 +226,14 @@ def test_saving_a_dataset_that_grows_takes_a_tenth_of_the_time_at_most(tmp_path,
 def test_without_the_codec_of_videos_it_is_said_what_is_missing(tmp_path, monkeypatch):
     import av
 
-    add = av.container.OutputContainer.add_stream
-    opened = av.open
+    def without(name, *rest):
+        raise av.codec.codec.UnknownCodecError(name)
 
-    def without_codecs(*arguments, **options):
-        container = MagicMock(wraps=opened(*arguments, **options))
-        container.__enter__.return_value = container
-        container.add_stream = lambda name, **given: add(container._mock_wraps, "libnothing", **given)
-        return container
-
-    monkeypatch.setattr(av, "open", without_codecs)
+    monkeypatch.setattr(av.codec, "Codec", without)
     config = DemonstrationConfig(episodes=1, environments=1)
-    with pytest.raises(RuntimeError, match="file-000.mp4: PyAV has no libx264 here, which videos need; pip install"):
+    with pytest.raises(RuntimeError, match="^PyAV has no libx264 here, which videos need; pip install"):
+        demonstrate("retraction", ["phantom:0"], tmp_path, config, SightConfig(image_width=40), device="cpu")
+    assert not any(tmp_path.iterdir()), "it was said before anything was played"
+    monkeypatch.setitem(sys.modules, "av.codec", None)
+    with pytest.raises(RuntimeError, match="^there is no PyAV here, which videos need; pip install"):
         demonstrate("retraction", ["phantom:0"], tmp_path, config, SightConfig(image_width=40), device="cpu")

@@ -52,6 +52,8 @@ class Command:
             raise ConfigError(f"options that begin with --ppo. are for ppo, the others for cem; --algorithm is {self.algorithm}")
         with leaving_none_empty(self.out):
             self.out.mkdir(parents=True, exist_ok=True)  # before the long work
+            if (self.out / "policy.npz").exists():
+                raise ConfigError(f"{self.out / 'policy.npz'} exists already; choose another folder or remove it first")
             options = {
                 "randomisation": self.vary,
                 "device": self.device,

@@ -52,6 +52,7 @@ from endo_sim_ros.learning.dataset import (
 )
 from endo_sim_ros.learning.policies import Policy, scripted_policy
 from endo_sim_ros.learning.task_batch import Observed, TaskBatch, usable
+from endo_sim_ros.learning.tasks import find_task
 from endo_sim_ros.physics import MotionConfig
 
 _logger = logging.getLogger(__name__)
@@ -133,6 +134,7 @@ class Demonstrations:
         motion: MotionConfig,
         device: str,
     ):
+        find_task(task)  # else no scene would be usable
         make = partial(TaskBatch, task, randomisation=randomisation, sight=sight, device=device, motion=motion)
         scenes, self.batches = usable(scenes, partial(make, count=count, observations="both"))
         first = self.batches[0]

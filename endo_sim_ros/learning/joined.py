@@ -42,6 +42,8 @@ class JoinedEnvironments(gymnasium.vector.VectorEnv):
     def __init__(
         self, task: str, num_envs: int = 1, scenes: Sequence[Scene | Path | str | None] = (None,), workers: int = 0, **options: Any
     ):
+        if workers < 0:
+            raise ValueError(f"workers is {workers}; give a number of processes, or 0 for this one")
         if num_envs < max(workers, 1) * len(scenes) or not scenes:
             raise ValueError(f"{num_envs} environments cannot be divided among {max(workers, 1)} workers with {len(scenes)} scenes each")
         shares = _shares(num_envs, workers) if workers else _shares(num_envs, len(scenes))

@@ -198,7 +198,10 @@ def make_policy(policy: str, task: str, count: int = 1, device: str = "auto") ->
 
         return LeRobotPolicy(policy, device)
     if ":" in policy and not Path(policy).exists():
-        found = load_named(policy)(count)
+        try:
+            found = load_named(policy)(count)
+        except TypeError as error:
+            raise ValueError(f"{policy} is called with the number of episodes alone: {error}") from error
         if getattr(found, "actions", None) not in get_args(Actions) or not isinstance(getattr(found, "sight", 0), SightConfig | None):
             known = ", ".join(get_args(Actions))
             raise ValueError(

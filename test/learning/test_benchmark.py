@@ -131,6 +131,13 @@ def test_tasks_and_policies_of_files_are_found_and_what_is_wrong_is_said(press, 
         ValueError, match="Blind is no policy: its `actions` are one of cartesian, joints, joint_positions, and its `sight` is"
     ):
         make_policy(f"{tmp_path / 'blind.py'}:Blind", "retraction")
+    (tmp_path / "alone.py").write_text("class Alone:\n    actions, sight = 'cartesian', None\n")
+    with pytest.raises(ValueError, match="Alone is called with the number of episodes alone: .*takes no arguments"):
+        make_policy(f"{tmp_path / 'alone.py'}:Alone", "retraction")
+    (tmp_path / "trained").mkdir()
+    (tmp_path / "trained/policy.npz").touch()
+    with pytest.raises(ValueError, match="has no checkpoint of lerobot; give .*trained/policy.npz, as `endo-sim train` wrote it, or"):
+        make_policy(str(tmp_path / "trained"), "retraction")
     (tmp_path / "broken.py").write_text("import nothing_of_this_name")
     for named, sentence in (
         ("nowhere.py:Task", "nowhere.py cannot be loaded: FileNotFoundError"),

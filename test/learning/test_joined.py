@@ -61,6 +61,8 @@ def test_episodes_are_renewed_where_they_are():
 def test_what_cannot_be_divided_is_refused():
     with pytest.raises(ValueError, match="1 environments cannot be divided among 1 workers with 2 scenes each"):
         JoinedEnvironments("retraction", 1, SCENES)
+    with pytest.raises(ValueError, match="workers is -1; give a number of processes, or 0 for this one"):
+        JoinedEnvironments("retraction", 2, workers=-1)
 
 
 def test_workers_without_ray_say_what_to_install():

@@ -26,7 +26,7 @@ SMALL = Plan(
     curve_sizes=((16, 16),),
     overlaps=(2.0,),
     reference=(40, 24, 16),
-    training=(300, 96, 80),
+    training=(300, 48, 40),
     seconds=0.0,
 )
 SMALL_PHYSICS = physics.Plan(
@@ -98,7 +98,7 @@ def test_the_rasteriser_bench_reports_every_row(tmp_path, capsys):
     expected = {"50 32x24 forward": "ms", "50 32x24 forward + backward": "ms", "40 24x16 forward": "ms"}
     expected |= {"over Gaussians: 20 32x24": "ms", "over Gaussians: 1k 32x24": "ms", "over pixels: 50 16x16": "ms"}
     expected |= {"1 instrument 32x24": "ms", "2 instruments with shadows 32x24": "ms"}
-    expected |= {"over overlap: 50 32x24 overlap x2": "ms", "training 300 96x80": "iterations/s"}
+    expected |= {"over overlap: 50 32x24 overlap x2": "ms", "training 300 48x40": "iterations/s"}
     for name, unit in expected.items():
         assert rows[name]["unit"] == unit and 0 < rows[name]["value"] < math.inf
     for name, peer in {"50 32x24 forward": "plain scalar kernel, one thread", "40 24x16 forward + backward": "torch reference"}.items():

@@ -75,8 +75,9 @@ class _Worker:
             context = multiprocessing.get_context("forkserver")  # CUDA does not survive a fork of this process
             context.set_forkserver_preload([__name__, self._arguments[0].__module__])  # so that each begins at once
             self.connection, theirs = context.Pipe()
-            self._process = context.Process(target=_serve, args=(theirs, *self._arguments), daemon=True)
-            self._process.start()
+            process = context.Process(target=_serve, args=(theirs, *self._arguments), daemon=True)
+            process.start()
+            self._process = process  # not before: one that Ctrl-C keeps from beginning cannot be killed
             theirs.close()
         self.index = index
         self.connection.send(argument)

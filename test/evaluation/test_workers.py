@@ -1,5 +1,6 @@
 """Jobs in processes that crash lose only themselves."""
 
+import multiprocessing
 import os
 import re
 import signal
@@ -37,3 +38,12 @@ def test_a_job_that_crashes_loses_only_itself():
     assert ends[4].error == "its process was ended by SIGKILL, as when memory runs out"
     assert ends[5].error == "not this one"
     assert News(0, "begun on cpu") in events
+
+
+def test_ctrl_c_while_a_process_begins_is_that_and_no_other_error(monkeypatch):
+    def interrupted(process):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(multiprocessing.get_context("forkserver").Process, "start", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        list(run_in_processes(_temperamental, ["a"], ["cpu"]))

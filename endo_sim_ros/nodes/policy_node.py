@@ -76,6 +76,7 @@ class PolicyNode(EndoNode):
         self._stamp = 0  # of the command whose answer is awaited; 0 = the state at rest. In real time: what answers is newer
         self._heard: dict[str, Any] = {}  # parts of that answer
         self._awaited_from = 0.0  # when the command was sent, or the last part of its answer came
+        self._lost = False  # whether the tissue was at rest again meanwhile
         self._stamps: dict[str, int] = {}  # and theirs, ns
         self._observation: np.ndarray | None = None  # what the answer tells without its pictures
         self._placed, self._rested = False, 0  # whether the tool was put where the episode begins, and states since
@@ -116,10 +117,10 @@ class PolicyNode(EndoNode):
     def _ask(self) -> None:
         """Reset the tissue; again and again until its state at rest is heard, as there may be no model or no connection yet.
 
-        An episode whose physics_node is gone begins anew.
+        An episode whose physics_node is gone, or began anew itself, begins anew.
         """
-        if self._silence() > _SILENT and not self._resetting.service_is_ready():
-            self.report_error(f"physics_node is gone; episode {self._done + 1} begins anew when there is one again")
+        if self._silence() > _SILENT and (self._lost or not self._resetting.service_is_ready()):
+            self.report_error(f"physics_node was ended or reset; episode {self._done + 1} begins anew")
             self._rows = [row for row in self._rows if row[-1] < self._done]
             self._begin()
             return
@@ -165,6 +166,7 @@ class PolicyNode(EndoNode):
                 raise ValueError(f"{text}, {len(self._task.nodes)} nodes; start the graph with what `endo-sim scene` wrote")
             self._model_stamp, self._rested = stamp, self._rested + self._placed
         elif not self._answers(stamp):
+            self._lost |= stamp == cloud.model_stamp_ns
             return
         self._heard["cut"] = cloud.cut
         self._answer("nodes", cloud.positions, stamp)
@@ -199,7 +201,7 @@ class PolicyNode(EndoNode):
 
     def _forget(self) -> None:
         """Await another answer."""
-        self._heard, self._stamps, self._observation = {}, {}, None
+        self._heard, self._stamps, self._observation, self._lost = {}, {}, None, False
         self._awaited_from = time.monotonic()
 
     def _silence(self) -> float:

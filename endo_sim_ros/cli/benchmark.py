@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import tyro
 from tyro.conf import Positional
 
-from endo_sim_ros.learning.config import BenchmarkConfig, SightConfig
+from endo_sim_ros.learning.config import COMPARED_IN, BenchmarkConfig, SightConfig
 
 _NODE = "node:"
 
@@ -21,7 +21,7 @@ class Command:
     policies: Positional[tuple[str, ...]] = ("scripted", "still")
     """scripted, still (does nothing), a policy.npz of `endo-sim train`, the folder of `endo-sim imitate`, your own file.py:Class, or
     node:NAME, a ROS node of your own that answers NAME/observation on NAME/action."""
-    scenes: tuple[str, ...] = ("phantom:3", "phantom:4", "phantom:5")
+    scenes: tuple[str, ...] = COMPARED_IN
     """Synthetic patients, phantom:SEED, or PLY models with their cameras.json; demonstrate and train use phantom:0 by default."""
     device: str = "auto"
     """Compute device: auto (the GPU when there is one), cpu, cuda or cuda:N."""

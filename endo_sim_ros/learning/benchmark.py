@@ -25,9 +25,6 @@ from endo_sim_ros.learning.tasks import find_task
 from endo_sim_ros.learning.train import TESTED_FROM, play
 from endo_sim_ros.physics import MotionConfig
 
-SCENES = ("phantom:3", "phantom:4", "phantom:5")
-"""Synthetic patients that policies are compared on."""
-
 _RESULTS, _PAGE = "benchmark.json", "benchmark.html"
 _FILMED = 8  # episodes that the video shows
 
@@ -113,15 +110,12 @@ def benchmark(
                             bar.advance(progress, at_once / config.episodes)
                     finally:
                         if played:
-                            returns, solved, steps = map(np.concatenate, zip(*played))
-                            counted = int(solved.sum()), float(returns.mean()), float(steps.mean())
-                            found.append(Result(task, name, str(scene), condition, len(solved), *counted))
+                            found.append(_result(task, name, scene, condition, played))
                         del batch
                         before = _merge(before, found)
                         _save(out, before)
-                        (out / _PAGE).write_text(_page(before, out), "utf8")
             _film(out, config, name, policy, places[0], device, make)
-            (out / _PAGE).write_text(_page(before, out), "utf8")
+            _save(out, before)  # with the film
     return found
 
 
@@ -146,9 +140,19 @@ def _merge(before: Sequence[Result], found: Sequence[Result]) -> list[Result]:
     return list({key(result): result for result in (*before, *found)}.values())
 
 
+def _result(
+    task: str, policy: str, scene: str | Path, condition: str, played: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]
+) -> Result:
+    """Of what `play` returned, once or more."""
+    returns, solved, steps = map(np.concatenate, zip(*played))
+    return Result(task, policy, str(scene), condition, len(solved), int(solved.sum()), float(returns.mean()), float(steps.mean()))
+
+
 def _save(folder: Path, results: Sequence[Result]) -> None:
+    """Write the table, and the page with the films that there are."""
     with written_whole(folder / _RESULTS) as partial:
         partial.write_text(json.dumps([asdict(result) for result in results], indent=1) + "\n", "utf8")
+    (folder / _PAGE).write_text(_page(results, folder), "utf8")
 
 
 def _batch(

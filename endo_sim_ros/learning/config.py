@@ -138,6 +138,10 @@ class ImitationConfig(StageConfig):
     )
 
 
+COMPARED_IN = ("phantom:3", "phantom:4", "phantom:5")
+"""Synthetic patients that policies are compared in; demonstrate and train use phantom:0 by default."""
+
+
 @dataclass(frozen=True)
 class BenchmarkConfig(StageConfig):
     """Episodes that no training sees."""

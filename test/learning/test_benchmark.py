@@ -14,8 +14,8 @@ from scipy.stats import binomtest
 from endo_sim_ros.core.cameras import invert_pose
 from endo_sim_ros.instruments.drawing import FIRST_LINK
 from endo_sim_ros.learning import benchmark as module
-from endo_sim_ros.learning.benchmark import CONDITIONS, SCENES, Result, benchmark, interval, read_results, robustness, table
-from endo_sim_ros.learning.config import BenchmarkConfig, SightConfig
+from endo_sim_ros.learning.benchmark import CONDITIONS, Result, benchmark, interval, read_results, robustness, table
+from endo_sim_ros.learning.config import COMPARED_IN, BenchmarkConfig, SightConfig
 from endo_sim_ros.learning.policies import make_policy
 from endo_sim_ros.learning.scenes import load_scene
 from endo_sim_ros.learning.task_batch import TaskBatch
@@ -112,7 +112,7 @@ def test_the_table_sums_over_scenes_and_gives_wilsons_interval():
 
 
 def test_patients_of_the_benchmark_are_not_those_that_are_trained_on_and_differ():
-    assert "phantom:0" not in SCENES
+    assert "phantom:0" not in COMPARED_IN
     first, other = (load_scene(scene).model for scene in ("phantom:0", "phantom:3"))
     assert load_scene() is load_scene("phantom:0")
     assert len(first.means) != len(other.means) or not np.allclose(first.means, other.means)

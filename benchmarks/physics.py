@@ -10,7 +10,7 @@ import statistics
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -44,6 +44,10 @@ DENSE = "dense"
 PULL = np.array([0.6, 0.0, -0.8])  # where a tool drags the tissue: aside and to the camera, in camera axes
 
 
+Driven = Literal["path", "force"]
+"""What a tool prescribes: where it goes, or how hard it pulls, as the paper's does."""
+
+
 class Plan(NamedTuple):
     """What to measure; smaller in tests."""
 
@@ -51,6 +55,7 @@ class Plan(NamedTuple):
     width: int = 640
     printed_nodes: int = 2000
     travel: float = 0.01  # of the tool, m
+    force: float = 0.02  # of the tool, N: a bare skin of one layer goes a centimetre by it
     node_counts: tuple[int, ...] = (500, 1000, 2000, 4000, 8000)
     substeps: tuple[int, ...] = (10, 20, 40, 80, 160)
     skin_counts: tuple[int, ...] = (30_000, 100_000, 300_000)
@@ -71,32 +76,38 @@ class Scene(NamedTuple):
 
 @single_threaded_torch()
 def bench_physics(
-    device: str, json_file: Path | None = None, model: Path | None = None, environments: tuple[int, ...] = (), plan: Plan = Plan()
+    device: str,
+    json_file: Path | None = None,
+    models: tuple[Path, ...] = (),
+    environments: tuple[int, ...] = (),
+    driven: Driven = "path",
+    plan: Plan = Plan(),
 ) -> None:
     """Print the results on a device (see `pick_device`) and, if asked for, write them to a file.
 
     Args:
         device: Where to compute.
         json_file: File for the rows.
-        model: PLY of the tissue, metres, seen by the first camera of the cameras.json beside it, else from the world's
-            origin; default: a piece of the synthetic patient.
+        models: PLY of each tissue, metres, seen by the first camera of the cameras.json beside it, else from the world's
+            origin; default: a piece of the synthetic patient. The paper's comparison is the median over all, the rest is of the first.
         environments: Numbers of copies stepped together; default: 1 to 64 on a CPU, to 1024 on a GPU.
+        driven: What the tool of the paper's comparison prescribes.
         plan: Sizes.
     """
     device = pick_device(device)
     environments = environments or ((1, 4, 16, 64) if device == "cpu" else (1, 4, 16, 64, 256, 1024))
-    scene = load_scene(model, plan.width) if model else phantom_scene(plan.gaussians, plan.width)
+    scenes = [load_scene(model, plan.width) for model in models] or [phantom_scene(plan.gaussians, plan.width)]
     notes: list[str] = []
-    report(f"Simulation on {machine(device)}", run_stages(stages(scene, device, environments, plan, notes)), json_file)
+    report(f"Simulation on {machine(device)}", run_stages(stages(scenes, device, environments, driven, plan, notes)), json_file)
     for note in notes:
         print(note)
 
 
-def stages(scene: Scene, device: str, environments: tuple[int, ...], plan: Plan, notes: list[str]) -> list[Stage]:
+def stages(scenes: list[Scene], device: str, environments: tuple[int, ...], driven: Driven, plan: Plan, notes: list[str]) -> list[Stage]:
     """What is measured, in order."""
-    nodes, seconds = plan.printed_nodes, plan.seconds
+    scene, nodes, seconds = scenes[0], plan.printed_nodes, plan.seconds
     return [
-        ("dense and sparse", partial(_paper, scene, device, plan)),
+        ("dense and sparse", partial(_over_scenes, scenes, device, driven, plan)),
         *((f"{short(n)} nodes", partial(_over_nodes, scene, n, device, seconds)) for n in plan.node_counts),
         *((f"{n} substeps", partial(_over_substeps, scene, n, nodes, device, seconds)) for n in plan.substeps),
         ("contact", partial(_contact, scene, nodes, device, seconds)),
@@ -145,30 +156,35 @@ class _Dragged:
     Args:
         scene: Tissue and camera.
         config: How it is simulated.
+        pull: By how much the tool pulls at most, in camera axes [3]: m that it goes, or N.
+        driven: Which of the two.
         renderings: How it is rendered; only the first is timed.
     """
 
-    def __init__(self, scene: Scene, config: PhysicsConfig, *renderings: RenderingConfig):
-        self.scene = scene
+    def __init__(self, scene: Scene, config: PhysicsConfig, pull: np.ndarray, driven: Driven, *renderings: RenderingConfig):
+        self.scene, self._pull, self._driven = scene, scene.camera.pose[:3, :3] @ pull, driven
         self.simulation = TissueSimulation(scene.model, scene.camera.position, config)
         self.renderers = [DeformableRenderer(scene.model, self.simulation.nodes.rest, each) for each in renderings]
         self.images: list[list[np.ndarray]] = [[] for _ in renderings]  # [H, W, 3] uint8, after each step
         self.steps, self.wholes = [], []  # s: the step; the step, skinning and rendering
         self.farthest = 0.0  # m, of any node
         self._state = self.simulation.state()
-        if not self._grasp(np.zeros(3)):
+        if not self._act(1.0 if driven == "force" else 0.0):
             where = scene.tip.round(3).tolist()
             raise ValueError(f"no moving tissue within {config.force_radius:g} m of {where}, where the tool should hold it")
         self.renderers[0].render(scene.camera)  # compiled and warm
 
-    def _grasp(self, offset: np.ndarray) -> bool:
+    def _act(self, share: float) -> bool:
+        """Let the tool pull by a share of the most; returns whether it has tissue."""
+        if self._driven == "force":
+            return self.simulation.set_wrench("tool", self.scene.tip, share * self._pull)
         pose = np.eye(4)
-        pose[:3, 3] = self.scene.tip + self.scene.camera.pose[:3, :3] @ offset
+        pose[:3, 3] = self.scene.tip + share * self._pull
         return self.simulation.set_grasp("tool", pose, True)
 
-    def drag(self, offset: np.ndarray) -> None:
-        """A step to where the jaw is an offset [3] in camera axes, metres, from where it closed."""
-        self._grasp(offset)
+    def drag(self, share: float) -> None:
+        """A step in which the tool pulls by a share of the most."""
+        self._act(share)
         timed = partial(median_seconds, repeats=1, device=self.simulation.solver.device, warm_up=0)
         self.steps.append(timed(self.simulation.step))
         self.wholes.append(self.steps[-1] + timed(self._show))
@@ -183,12 +199,25 @@ class _Dragged:
         self.images[0].append(self.renderers[0].render(self.scene.camera, self._state.positions, self._state.F)[0])
 
 
-def _paper(scene: Scene, device: str, plan: Plan) -> list[Row]:
-    """Every Gaussian a node, the printed method and the default, dragged by the same tool along the same path.
+def _over_scenes(scenes: list[Scene], device: str, driven: Driven, plan: Plan) -> list[Row]:
+    """`_paper` of each scene; of several, medians."""
+    each = [_paper(scene, device, driven, plan) for scene in scenes]
+    if len(each) == 1:
+        return each[0]
+    middle = lambda values: None if None in values else statistics.median(values)
+    return [
+        dataclasses.replace(rows[0], name=f"{rows[0].name}, median of {len(each)} scenes", value=middle([row.value for row in rows]),
+                            ratio=middle([row.ratio for row in rows]))
+        for rows in zip(*each)
+    ]  # fmt: skip
 
-    The tool holds the tissue at one point and swings by a centimetre, towards the camera and aside and then in, in one
-    second: what is prescribed is a displacement, so that neither mass nor stiffness, which these methods give the tissue
-    differently, decides how far it moves. The default's tissue is 2 cm thick and pinned behind, that of the others a bare
+
+def _paper(scene: Scene, device: str, driven: Driven, plan: Plan) -> list[Row]:
+    """Every Gaussian a node, the printed method and the default, pulled by the same tool.
+
+    The tool holds the tissue at one point and swings, towards the camera and aside and then in, in one second. What is prescribed is by
+    default a displacement of a centimetre, so that neither mass nor stiffness, which these methods give the tissue differently, decides
+    how far it moves; or the force. The default's tissue is 2 cm thick and pinned behind, that of the others a bare
     skin held at its rim: their images differ because the tissue does.
     """
     common = {"substeps": PAPER_SUBSTEPS, "device": device}
@@ -196,16 +225,17 @@ def _paper(scene: Scene, device: str, plan: Plan) -> list[Row]:
     softmax = RenderingConfig(skinning="softmax", device=device)
     compact = RenderingConfig(device=device)
     own = RenderingConfig(neighbours=1, device=device)  # every Gaussian is its own node
-    dense = _Dragged(scene, PhysicsConfig.baseline(**common), own)
+    pull = (plan.force if driven == "force" else plan.travel) * PULL
+    dense = _Dragged(scene, PhysicsConfig.baseline(**common), pull, driven, own)
     methods = {
-        "printed": _Dragged(scene, printed, softmax, compact),
-        "default": _Dragged(scene, PhysicsConfig(device=device), compact),
+        "printed": _Dragged(scene, printed, pull, driven, softmax, compact),
+        "default": _Dragged(scene, PhysicsConfig(device=device), pull, driven, compact),
     }
     everyone = {DENSE: dense, **methods}
     count = round(1 / printed.step_duration)
     for number in range(1, count + 1):  # in turns: a busy machine slows all alike
         for tissue in everyone.values():
-            tissue.drag(plan.travel * math.sin(2 * math.pi * number / count) * PULL)
+            tissue.drag(math.sin(2 * math.pi * number / count))
     step = {name: statistics.median(tissue.steps) for name, tissue in everyone.items()}
     whole = {name: statistics.median(tissue.wholes) for name, tissue in everyone.items()}
     size = f"{scene.camera.width}x{scene.camera.height}"

@@ -4,7 +4,7 @@ import importlib
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -51,11 +51,14 @@ class BenchRaster(Measured):
 class BenchPhysics(Measured):
     """The simulation: the paper's comparison of every Gaussian with sparse nodes, the cost of a step, and many copies of a tissue."""
 
-    model: Path | None = None
-    """PLY model of the tissue, in metres, seen by the first camera of the cameras.json beside it, else from the world's
-    origin; default: a piece of the synthetic patient."""
+    models: tuple[Path, ...] = ()
+    """PLY model of each tissue, in metres, seen by the first camera of the cameras.json beside it, else from the world's
+    origin; default: a piece of the synthetic patient. The paper's comparison is the median over all, the rest is of the first."""
     environments: tuple[int, ...] = ()
     """Numbers of copies stepped together; default: 1 4 16 64, on a GPU also 256 1024."""
+    driven: Literal["path", "force"] = "path"
+    """What the tool of the paper's comparison prescribes: where it goes, by a centimetre, or how hard it pulls, by 0.02 N, as the paper's
+    does."""
 
 
 @dataclass(frozen=True)

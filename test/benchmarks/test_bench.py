@@ -144,6 +144,23 @@ def test_the_physics_bench_reports_every_row(tmp_path, capsys, monkeypatch):
     assert not any("PhysGaussian's solver" in name for name, _ in rows)
 
 
+@pytest.mark.slow
+def test_the_papers_comparison_is_the_median_over_scenes_and_may_be_driven_by_a_force():
+    scenes, plan = [phantom_scene(count, SMALL_PHYSICS.width) for count in (6000, 5000)], SMALL_PHYSICS._replace(force=0.01)
+    compared = physics._over_scenes(scenes, "cpu", "force", plan)
+    assert all(row.name.endswith(", median of 2 scenes") for row in compared)
+    rows = {row.name.removesuffix(", median of 2 scenes"): row for row in compared}
+    assert rows["paper: its sparse nodes, RTX 3090"].ratio == 57 / 4 and rows["default: simulation alone"].ratio > 0
+    one, twice = (
+        [{row.name: row.value for row in physics._paper(scene, "cpu", "force", each)} for scene in scenes]
+        for each in (plan, plan._replace(force=0.02))
+    )
+    far = "default: farthest any node went"
+    np.testing.assert_allclose(rows[far].value, np.mean([each[far] for each in one]), rtol=1e-5)
+    np.testing.assert_allclose([each[far] for each in twice], [2 * each[far] for each in one], rtol=0.1)  # a small force: linear
+    assert all(1.2 * first["dense: farthest any node went"] < second["dense: farthest any node went"] for first, second in zip(one, twice))
+
+
 PEER = """
 import numpy as np
 
@@ -171,7 +188,7 @@ def test_the_peer_is_measured_where_it_works_and_otherwise_noted(working, tmp_pa
     (tmp_path / "mpm_solver_warp.py").write_text(PEER if working else "import warp.no_such_module")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "mpm_solver_warp", raising=False)
-    only_the_peer = lambda scene, device, environments, *rest: [("", partial(physics.beside_peer, scene, device, *rest))]
+    only_the_peer = lambda scenes, device, environments, driven, *rest: [("", partial(physics.beside_peer, scenes[0], device, *rest))]
     monkeypatch.setattr(physics, "stages", only_the_peer)
     rows = rows_of_physics(tmp_path)
     monkeypatch.delitem(sys.modules, "mpm_solver_warp", raising=False)

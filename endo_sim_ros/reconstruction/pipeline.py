@@ -35,6 +35,7 @@ from endo_sim_ros.reconstruction.triangulation import match_features, triangulat
 
 log = logging.getLogger(__name__)
 _DEPTHS = 10_000_000  # of Gaussians in views, whose median is that of the scene
+_FARTHEST = 1.0  # m; no endoscope sees so far
 
 
 def prepare(
@@ -152,9 +153,14 @@ def check_poses(scene: PreparedScene, config: ReconstructionConfig, progress: St
 
 def find_points(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:
     """Triangulate scene points, unless they are given."""
-    if scene.given_points:
-        return scene
-    return replace(scene, points=triangulate(scene.frames, scene.matches, config.matching, progress))
+    if not scene.given_points:
+        scene = replace(scene, points=triangulate(scene.frames, scene.matches, config.matching, progress))
+    depth = rough_depth(scene.views, scene.points.positions)
+    if depth > _FARTHEST:
+        scene = scene.decided(
+            f"SCENE POINTS ARE {depth:.3g} m AWAY: poses are in metres, and these may be in millimetres; endoscopes see a tenth of one"
+        )
+    return scene
 
 
 def find_depth(scene: PreparedScene, config: ReconstructionConfig, progress: StageProgress) -> PreparedScene:

@@ -8,12 +8,24 @@ import numpy as np
 
 from endo_sim_ros.core.frames import SequenceError
 
+_FEWEST_BITS = 12  # of images of 16: with fewer all would be black
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
 
 def read_image(path: Path) -> np.ndarray:
-    """An RGB image [H, W, 3], uint8."""
-    return cv2.cvtColor(_decode(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+    """An RGB image [H, W, 3], uint8; of 16 bits the upper eight.
+
+    Raises:
+        SequenceError: If it is missing, damaged, or has fewer bits than its file.
+    """
+    image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    if image.dtype == np.uint16:
+        if (most := int(image.max())) < 2**_FEWEST_BITS:
+            raise SequenceError(
+                f"{path}: has 16 bits, but no value above {most}, as of a camera of 10 or 12 bits; scale images to all 16, or to 8"
+            )
+        image = (image >> 8).astype(np.uint8)
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 def read_gray(path: Path) -> np.ndarray:

@@ -133,7 +133,8 @@ class LagFinder:
             if len(uv_1) >= least_matches:
                 residuals.append([self._residual(first - lag, second - lag, uv_1, uv_2) for lag in self._lags])
         if len(residuals) < self._least_pairs:
-            return None, f"the camera moves too little, or too little is seen of it: {len(residuals)} pairs of frames tell lags apart"
+            moves = "the camera moves too little, or too far, as with poses that are not in metres, or too little is seen of it"
+            return None, f"{moves}: {len(residuals)} pairs of frames tell lags apart"
         logs = np.log(np.array(residuals) + _NOISE)  # their mean: no pair outweighs the others
         curve = logs.mean(0)
         best = int(np.argmin(curve))

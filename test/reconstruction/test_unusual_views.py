@@ -12,7 +12,10 @@ from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.evaluation import metrics
 from endo_sim_ros.reconstruction import Trainer, prepare
 from endo_sim_ros.reconstruction.keyframes import USUAL_DEPTH
+from endo_sim_ros.reconstruction.pipeline import find_points
 from endo_sim_ros.reconstruction.priors.stereo import right_view
+from endo_sim_ros.reconstruction.progress import StageProgress
+from endo_sim_ros.reconstruction.scene import PreparedScene, ScenePoints, TrainingView
 from endo_sim_ros.rendering import DeformableRenderer, RenderingConfig
 
 
@@ -69,6 +72,20 @@ def test_a_handful_of_points_starts_from_a_plane(small):
     assert "from a plane" in "".join(scene.decisions)
     depths = np.concatenate([small[i].camera.project(scene.model.means.numpy().astype(float))[1] for i in (0, 8)])
     assert np.median(depths) == pytest.approx(np.median(frame.camera.project(points)[1]), rel=0.1)
+
+
+def test_poses_in_millimetres_are_told(small):
+    frame = small[4]
+    v, u = np.mgrid[20:110:30, 20:140:40].reshape(2, -1)
+    points = frame.camera.backproject(frame.depth)[v, u]
+    camera = small[0].camera
+    for scale, told in ((1.0, False), (1000.0, True)):
+        pose = camera.pose.copy()
+        pose[:3, 3] *= scale
+        view = TrainingView.of(dataclasses.replace(bare(small[0]), camera=camera.at(pose)))
+        given = ScenePoints(scale * points, np.full_like(points, 0.5), np.full(len(points), 0.01))
+        found = find_points(PreparedScene((), (view,), given, given_points=True), options(), StageProgress())
+        assert any("SCENE POINTS ARE" in text and "may be in millimetres" in text for text in found.decisions) == told
 
 
 def from_guess(frames, **changes):

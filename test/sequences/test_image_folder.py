@@ -4,6 +4,7 @@ import shutil
 import struct
 import zlib
 
+import cv2
 import numpy as np
 import pytest
 from plane_scene import (
@@ -145,6 +146,17 @@ def test_a_huge_image_is_one_sentence(tmp_path):
         read_image(tmp_path / "1.png")
     with pytest.raises(ConfigError, match=r"1.png has over 64 megapixels"):
         regions._read_mask(str(tmp_path / "1.png"))
+
+
+def test_an_image_of_ten_bits_in_sixteen_is_not_black_but_told(tmp_path):
+    shades = np.random.default_rng(0).integers(0, 1024, (8, 8, 3), np.uint16)
+    cv2.imwrite(str(tmp_path / "10.png"), shades)
+    cv2.imwrite(str(tmp_path / "16.png"), 64 * shades)
+    np.testing.assert_array_equal(read_image(tmp_path / "16.png"), (shades >> 2)[..., ::-1])
+    with pytest.raises(
+        SequenceError, match=r"10.png: has 16 bits, but no value above 10\d\d, as of a camera of 10 or 12 bits; scale images"
+    ):
+        read_image(tmp_path / "10.png")
 
 
 def test_a_baseline_in_millimetres_is_told(folder, caplog):

@@ -32,6 +32,7 @@ _DAMPED, _LOOSENED, _MOST_DAMPED = 10.0, 0.1, 1e6
 _FAR = 2.0  # standard deviations from what was thought, which is told
 _NOTHING = 0.5  # of chi-square: what a fresh Jacobian promises no more than, and does not keep, is how rough forces are
 _AS_PROMISED = 0.3  # share of the promised gain with which a Jacobian is still good
+_TREMBLES, _ABOUT = 4, 5  # copies whose tips err as measured ones do; steps over which what they tell is averaged
 
 
 @dataclass(frozen=True)
@@ -213,6 +214,8 @@ def identify(
     if start is None:
         theta[: unknowns.stiffness_count] = _scaled(unknowns, first.scale)
     parts = [_Data(each, *unknowns.directions(touched_places([each.experiment], nodes, physics))) for each in data]
+    for part in parts:
+        part.seen.uneven = _unevenness(part.seen, model, unknowns, theta)
     sure, rests = None if start is None else start.sure, []
     if unknowns.ball is not None and start is None:
         progress("look for the inclusion", 0, config.iterations)
@@ -281,6 +284,29 @@ def look(theta: np.ndarray, prior: _Prior, data: Sequence[_Data], model: Forward
         errors.append((by_tip, own))
     covariances = [part.seen.covariance(*each) for part, each in zip(data, errors)]
     return _Point(theta, prior, residuals, jacobians, covariances, errors, undone)
+
+
+def _unevenness(seen: Observations, model: ForwardModel, unknowns: Unknowns, theta: np.ndarray) -> np.ndarray:
+    """Variance of each number [N], if it is a force, by errors of single tips, beyond what derivatives by the place of all tips tell.
+
+    Skin sticks to a tool: one that trembles across it drags at it, while one that is elsewhere all along does not. Copies with smoothed
+    errors that are drawn tell how much that is. What they tell of the three axes is averaged, and over some steps.
+    """
+    config, forces = unknowns.config, seen.of_forces()
+    if not forces.any() or not seen.experiment.tip_noise:
+        return np.zeros(len(seen.values))
+    draws = np.random.default_rng(0).standard_normal((_TREMBLES, *seen.experiment.tips.shape))
+    errors = seen.smoother @ (seen.experiment.tip_noise * draws)
+    plain = unknowns.copy(theta[: unknowns.count], theta[unknowns.count : unknowns.count + 3] * config.tip_offset)
+    told = seen.predicted(
+        model.replay(seen.experiment, [replace(plain, jog=jog) for jog in (np.zeros(3), *config.tip_step * np.eye(3), *errors)])
+    )
+    by_tip = (told[1:4] - told[0]) / config.tip_step  # [3, N]
+    beyond = ((told[4:] - told[0] - np.einsum("kna,an->kn", errors[:, seen.steps], by_tip)) ** 2).mean(0)
+    steps, count = seen.steps[forces], len(seen.experiment.tips)
+    around = np.abs(np.subtract.outer(np.arange(count), np.arange(count))) <= _ABOUT // 2
+    sums, numbers = (around @ np.bincount(steps, each, count) for each in (beyond[forces], np.ones(len(steps))))
+    return np.where(forces, (sums / np.maximum(numbers, 1))[seen.steps], 0.0)
 
 
 def _misfit(residuals: list[np.ndarray], covariances: list[Covariance]) -> float:

@@ -29,8 +29,8 @@ class Copy:
         holds: On the springs of pinned control nodes [M].
         options: Of physics that differ, by name.
         shift: Of all tips [3], m, world.
-        jog: Of the tips but for those at which a jaw closes [3], m, world: as a held place moves with the tip, it does not matter where
-            all tips are together, but how far they go.
+        jog: Of the tips but for those at which a jaw closes [3], or of each step [T, 3], m, world: as a held place moves with the tip, it
+            does not matter where all tips are together, but how far they go.
     """
 
     factors: np.ndarray
@@ -120,7 +120,8 @@ class ForwardModel:
         substeps = self._substeps(experiment, copies)
         for options, members in groups.items():
             batch = self._batch(experiment, [copies[c] for c in members], options, substeps)
-            shifts, jogs = (np.stack([getattr(copies[c], name) for c in members]) for name in ("shift", "jog"))
+            shifts = np.stack([copies[c].shift for c in members])
+            jogs = np.stack([np.broadcast_to(copies[c].jog, (steps, 3)) for c in members], 1)
             jogged = closing_steps(experiment) != np.arange(steps)
             told = self._run(batch, experiment, shifts, jogged[:, None, None] * jogs, begin, wanted, points)
             forces[members, begin:], faults[members] = told[0], batch.tools.faults.cpu().numpy()

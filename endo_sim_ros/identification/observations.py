@@ -28,6 +28,7 @@ class Observations:
         kinds: FORCE, DISPLACEMENT or PIXEL [N].
         steps: At the end of which it was measured [N].
         used: Which count [N]; all at first.
+        uneven: Variance of each [N] that errors of single tips make beyond what derivatives tell; 0 at first.
     """
 
     def __init__(self, experiment: Experiment, smoothing: float):
@@ -52,7 +53,7 @@ class Observations:
         kinds, noises, ends = ([part[number] for part in parts] for number in (1, 2, 3))
         self.kinds, self.noise, self.steps = spread(kinds).astype(int), spread(noises), spread(ends).astype(int)
         self.closed_at = closing_steps(experiment)[self.steps]  # step at which the jaw closed, -1 = open [N]
-        self.used = np.ones(len(self.values), bool)
+        self.used, self.uneven = np.ones(len(self.values), bool), np.zeros(len(self.values))
 
     def predicted(self, replay: Replay) -> np.ndarray:
         """The same numbers as each copy of a replay predicts them [C, N]."""
@@ -88,7 +89,7 @@ class Observations:
             along = along - np.where(self.closed_at[at, None] >= 0, self.smoother[self.closed_at[at], begin:end], 0)
             along = along * self.experiment.tip_noise
             A = (along[:, :, None] * tip_sensitivity[at][:, None]).reshape(len(at), 3 * along.shape[1])
-            blocks.append(_Block(np.flatnonzero(members), self.noise[at] ** 2, A[:, np.abs(A).max(0, initial=0) > 0]))
+            blocks.append(_Block(np.flatnonzero(members), (self.noise**2 + self.uneven)[at], A[:, np.abs(A).max(0, initial=0) > 0]))
         return Covariance(blocks, shared[rows])
 
 

@@ -7,7 +7,7 @@ from scipy.stats import chi2
 
 from endo_sim_ros.identification.config import IdentificationConfig
 from endo_sim_ros.identification.experiment import Experiment
-from endo_sim_ros.identification.forward import ForwardModel, distances_to_skin
+from endo_sim_ros.identification.forward import ForwardModel, closing_steps, distances_to_skin
 from endo_sim_ros.identification.observations import Observations
 from endo_sim_ros.identification.unknowns import Unknowns
 
@@ -16,7 +16,7 @@ _AVERAGED = 5  # samples, before a force is said to be there
 _GONE, _STILL = 0.25, 6.0  # a grasp has slipped where less than this share of the force is left, of a force this many deviations great
 _SCANNED = 13  # depths
 _ROUGHLY = 1.2  # times as great as by theory chi-square may be: that of 40 presses of tissue as the model has it was 1.08 ± 0.1
-_LAG = 1.5  # steps; less is within what sampling does
+_LAG, _UNLIKE = 1.5, 0.3  # steps; less is within what sampling does. Share of what noise does not explain that a lag may leave
 _ENOUGH = 25.0  # by which chi-square must fall before another depth or lag is believed
 
 
@@ -98,16 +98,18 @@ def survey(data: list[Observations], model: ForwardModel, unknowns: Unknowns, co
     if not any(np.isfinite(each).any() for each in measured):
         return Survey(1.0, ["no force was measured: of stiffness only ratios between places are known, not how stiff the tissue is"])
     _check_felt(data, [each[middle] for each in predicted])
+    findings = _find_slips(data, [each[middle] for each in predicted])
     costs, scales = zip(*(_fit_scale(data, [each[d] for each in predicted]) for d in range(_SCANNED)))
-    best = int(np.argmin(costs))
-    chosen = [each[best] for each in predicted]
+    chosen = [each[int(np.argmin(costs))] for each in predicted]
     _check_direction(data, chosen, config)
     for number, (each, force) in enumerate(zip(data, chosen)):
         _check_direction([each], [force], config, f"experiment {number}: ", by_sign=True)
-    findings = [*_find_slips(data, chosen, scales[best]), *_find_lag(data, chosen, config)]
-    costs, scales = zip(*(_fit_scale(data, [each[d] for each in predicted]) for d in range(_SCANNED)))
-    depth, gain = _lowest(depths, np.array(costs), middle, sum(int(each.of_forces().sum()) for each in data))
-    if abs(depth) > 4 * np.hypot(config.tip_offset, np.mean([each.experiment.tip_noise for each in data]) / 2) and gain > _ENOUGH:
+    far = 4 * np.hypot(config.tip_offset, np.mean([each.experiment.tip_noise for each in data]) / 2)
+    lag = _find_lag(data, [each[np.abs(depths) <= max(far, depths[1] - depths[0])] for each in predicted], config)
+    findings += lag
+    opened = np.array([_fit_scale(data, [each[d] for each in predicted], opened=True)[0] for d in range(_SCANNED)])
+    depth, gain = _lowest(depths, opened, middle, sum(int(each.of_forces().sum()) for each in data))
+    if not lag and abs(depth) > far and gain > _ENOUGH:
         where = "deeper than" if depth < 0 else "before"
         findings.append(
             f"contact begins about {1000 * abs(depth):.1f} mm {where} the surface of the model: check its scale, and where the tool stands"
@@ -155,7 +157,7 @@ def _check_felt(data: list[Observations], predicted: list[np.ndarray]) -> None:
         most = max(float(np.linalg.norm(force, axis=1).max()) for force in expected)
         raise IdentificationError(
             f"the tool is in the tissue, which would exert up to {most:.2g} N on it, but no force beyond the noise of {max(noise):.2g} N"
-            " was measured; set forces that were not measured to NaN, or give softer tissue"
+            " was measured; set forces that were not measured to NaN, check whether their clock is that of the poses, or give softer tissue"
         )
 
 
@@ -177,11 +179,14 @@ def _usable(each: Observations) -> np.ndarray:
     return usable
 
 
-def _fit_scale(data: list[Observations], predicted: list[np.ndarray]) -> tuple[float, float]:
-    """Chi-square of forces with the scale of the model that is best, and this scale."""
+def _fit_scale(data: list[Observations], predicted: list[np.ndarray], opened: bool = False) -> tuple[float, float]:
+    """Chi-square of forces with the scale of the model that is best, and this scale; of those with an open jaw only, if so wanted, as a
+    closed one feels how far it goes, not where it is."""
     pp = pm = mm = 0.0
     for each, force in zip(data, predicted):
         usable, noise = _usable(each), each.experiment.force_noise
+        if opened:
+            usable &= closing_steps(each.experiment) < 0
         measured, force = each.experiment.forces[usable] / noise, force[usable] / noise
         pp, pm, mm = pp + (force**2).sum(), pm + (force * measured).sum(), mm + (measured**2).sum()
     scale = max(pm / pp, 1e-6) if pp > 0 else 1.0
@@ -228,81 +233,77 @@ def _check_direction(
         )
 
 
-def _find_slips(data: list[Observations], predicted: list[np.ndarray], scale: float) -> list[str]:
-    """Mark samples after which a closed jaw has lost its tissue as not used, and tell them."""
+def _find_slips(data: list[Observations], predicted: list[np.ndarray]) -> list[str]:
+    """Mark samples after which a closed jaw has lost its tissue as not used, and tell them.
+
+    Each grasp is compared with forces of the model [T, 3] that are scaled to it up to some sample, and are gone after that.
+    """
     findings = []
     for number, (each, force) in enumerate(zip(data, predicted)):
-        experiment = each.experiment
-        closed = np.asarray(experiment.closed, bool) & np.asarray(experiment.present, bool)
-        if not closed.any() or not np.isfinite(experiment.forces).any():
-            continue
-        expected = scale * np.linalg.norm(force, axis=1)
-        unit = force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-12)
-        measured = np.asarray(np.isfinite(experiment.forces).all(1))
-        along = _moving_mean(np.where(measured, np.einsum("ni,ni->n", experiment.forces, unit), 0.0))
-        along /= np.maximum(_moving_mean(measured.astype(float)), 1 / _AVERAGED)
-        strong = closed & measured & (expected > _STILL * experiment.force_noise)
-        held = strong & (along > 0.5 * expected)
-        gone = strong & (along < _GONE * expected)
-        if not held.any():
-            continue
-        for begin in np.flatnonzero(gone):
-            opens = np.flatnonzero(~closed[begin:])
-            end = begin + int(opens[0]) if len(opens) else len(closed)
-            rest = strong[begin:end]
-            if held[:begin].any() and rest.sum() >= _AVERAGED and (gone[begin:end] & rest).sum() > 0.8 * rest.sum():
-                left, had = float(along[begin:end][rest].mean()), float(expected[begin:end][rest].mean())
-                begin = max(begin - _AVERAGED // 2, 0)
-                left_out = (each.steps >= begin) & (each.steps < end)
-                each.used &= ~left_out
-                findings.append(
-                    f"the grasp slipped {begin * experiment.step_duration:.2f} s after the beginning of experiment {number}: the force"
-                    f" fell to {max(left, 0.0):.2f} N where the model has {had:.2f} N; the {end - begin} steps until the jaw opens are"
-                    " left out"
-                )
-                break
+        experiment, measured = each.experiment, _usable(each)
+        began = closing_steps(experiment)
+        for start in np.unique(began[began >= 0]):
+            at = np.flatnonzero((began == start) & measured)
+            a, b = experiment.forces[at] / experiment.force_noise, force[at] / experiment.force_noise
+            pm, pp = np.cumsum((a * b).sum(1)), np.cumsum((b**2).sum(1))
+            explained = pm.clip(0) ** 2 / np.maximum(pp, 1e-12)
+            last = int(explained.argmax()) if len(at) else 0
+            rest = slice(last + 1, None)
+            if len(b[rest]) < _AVERAGED:
+                continue
+            had = pm[last] / max(pp[last], 1e-12) * np.linalg.norm(b[rest], axis=1)
+            left = (a[rest] * b[rest]).sum(1) / np.maximum(np.linalg.norm(b[rest], axis=1), 1e-12)
+            unexplained = max(1.0, float((a**2).sum() - explained[last]) / a.size)
+            if explained[last] - explained[-1] < _ENOUGH * unexplained or had.mean() < _STILL or left.mean() > _GONE * had.mean():
+                continue
+            begin, end = int(at[last]), int(np.flatnonzero(began == start)[-1]) + 1
+            each.used &= (each.steps < begin) | (each.steps >= end)
+            findings.append(
+                f"the grasp slipped {begin * experiment.step_duration:.2f} s after the beginning of experiment {number}: the force"
+                f" fell to {max(left.mean(), 0.0) * experiment.force_noise:.2f} N where the model has"
+                f" {had.mean() * experiment.force_noise:.2f} N; the {end - begin} steps until the jaw opens are left out"
+            )
     return findings
 
 
 def _find_lag(data: list[Observations], predicted: list[np.ndarray], config: IdentificationConfig) -> list[str]:
-    """Tell by how long forces come after poses, where a shift explains them much better; and whether that grows."""
-    steps = int(config.most_lag / min(each.experiment.step_duration for each in data))
-    if steps < 1:
+    """Tell by how long forces come after poses, and whether that grows, where that explains most of what nothing else does: not how stiff
+    each experiment is, nor a likely depth at which contact begins.
+
+    Args:
+        data: Without what slipped.
+        predicted: Forces of the model at D likely depths, of each experiment [D, T, 3].
+        config: How long a lag may be.
+    """
+    duration = min(each.experiment.step_duration for each in data)
+    steps = int(config.most_lag / duration)
+    lags, parts, count = np.arange(-steps, steps + 1), [], 0
+    for each, force in zip(data, predicted):
+        where, noise, T = np.flatnonzero(_usable(each)), each.experiment.force_noise, force.shape[1]
+        padded = np.pad(force, ((0, 0), (steps, steps), (0, 0))) / noise  # before and after the tool is away, and feels nothing
+        a, moved = each.experiment.forces[where] / noise, [padded[:, steps - lag : steps - lag + T][:, where] for lag in lags]
+        pm, pp = np.array([[(a * y).sum((1, 2)), (y**2).sum((1, 2))] for y in moved]).transpose(1, 0, 2)
+        parts.append((a**2).sum() - pm.clip(0) ** 2 / np.maximum(pp, 1e-12))  # [L, D]
+        count += a.size
+    costs = np.sum(parts, axis=0)
+    depth = int(costs.min(0).argmin())
+    lag, gain = _lowest(lags.astype(float), costs.min(1), steps, count)
+    own = [_lowest(lags.astype(float), part[:, depth], steps, count)[0] for part in parts]
+    apart = float(costs[:, depth].min() - sum(part[:, depth].min() for part in parts))
+    drifts = abs(own[-1] - own[0]) >= _LAG and apart > _ENOUGH
+    left = costs.min() - drifts * apart - count
+    if left > _UNLIKE * (costs[steps].min() - count) or not (drifts or (abs(lag) >= _LAG and gain > _ENOUGH)):
         return []
-    lags = np.arange(-steps, steps + 1)
+    if drifts:
+        return [
+            f"measured forces come {_when(own[0] * duration)} the poses at first and {_when(own[-1] * duration)} them at last: their clocks"
+            " run apart; record with one clock"
+        ]
+    return [f"measured forces come {_when(lag * duration)} the poses: record with one clock, or give force_delay {lag * duration:.2f}"]
 
-    def best(begin: float, end: float) -> tuple[float, float]:
-        costs, count = np.zeros(len(lags)), 0
-        for number, lag in enumerate(lags):
-            pp = pm = mm = 0.0
-            for each, force in zip(data, predicted):
-                usable = _usable(each)
-                moved = np.zeros_like(force)  # before and after the tool is away, and feels nothing
-                source = np.arange(len(force)) - lag
-                inside = (source >= 0) & (source < len(force))
-                moved[inside] = force[source[inside]]
-                chosen = np.zeros(len(force), bool)
-                where = np.flatnonzero(usable)
-                chosen[where[int(begin * len(where)) : int(end * len(where))]] = True
-                noise = each.experiment.force_noise
-                a, b = each.experiment.forces[chosen] / noise, moved[chosen] / noise
-                pp, pm, mm = pp + (b**2).sum(), pm + (a * b).sum(), mm + (a**2).sum()
-                count = count + a.size if lag == 0 else count
-            scale = max(pm / pp, 0) if pp > 0 else 0.0
-            costs[number] = mm - 2 * scale * pm + scale**2 * pp
-        return _lowest(lags.astype(float), costs, steps, count)
 
-    duration = data[0].experiment.step_duration
-    lag, gain = best(0, 1)
-    (early, gain_early), (late, gain_late) = best(0, 0.5), best(0.5, 1)
-    # A drift moves both halves of every experiment apart; one that only one of them tells may be what tissue does.
-    if abs(lag) >= _LAG and gain > _ENOUGH:
-        after = "after" if lag > 0 else "before"
-        drift = ""
-        if len(data) == 1 and min(gain_early, gain_late) > _ENOUGH and abs(late - early) >= _LAG:
-            drift = f", {early * duration:.2f} s in its first half and {late * duration:.2f} s in its second: a clock drifts"
-        return [f"measured forces come about {abs(lag) * duration:.2f} s {after} the poses{drift}; align the clocks and estimate again"]
-    return []
+def _when(seconds: float) -> str:
+    return f"{abs(seconds):.2f} s {'after' if seconds >= 0 else 'before'}"
 
 
 def judge_residuals(chi_square: float, count: int, config: IdentificationConfig) -> tuple[float, list[str]]:

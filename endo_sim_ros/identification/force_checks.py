@@ -10,11 +10,6 @@ _CLEAR = 5.0  # standard deviations of its noise that a force must have to tell 
 _DEEP = 0.001  # m that a tool must have gone into tissue, or pulled it, to know where the force points
 _AGAINST, _ASKEW = 120.0, 60.0  # degrees between a force and where it should point: friction and slopes make less than 45
 _FEW = 5  # steps; fewer tell nothing
-_LONGEST_LAG = 2.0  # s
-_CLEARER = 0.05  # by how much more a lag must explain
-_LIKE = 0.5  # correlation from which forces are those of this tool at all
-_ALIKE = 0.9  # correlation from which there is no lag to look for
-_LEAST_LAG = 2.5  # steps; tissue that relaxes, and real time, make less
 _FAR = 0.005  # m, beyond clearance, from tissue where forces begin
 
 
@@ -45,7 +40,7 @@ def check_direction(name: str, line: Timeline, surface: Surface, noise: float) -
     """
     size = np.linalg.norm(line.forces, axis=1)
     pressed = ~line.closed & (line.gaps < -_DEEP)
-    drawn = line.closed & (np.linalg.norm(line.pulled, axis=1) > _DEEP)
+    drawn = line.closed & (np.linalg.norm(line.pulled, axis=1) > _DEEP) & (line.gaps > 0)  # else the tool presses, too
     tells = line.present & line.measured & (size > _CLEAR * noise) & (pressed | drawn)
     if tells.sum() < _FEW:
         return ""
@@ -63,58 +58,6 @@ def check_direction(name: str, line: Timeline, surface: Surface, noise: float) -
     if angle > _ASKEW:
         return f"{what} are {angle:.0f} degrees from where tissue should push the tool; are they in another frame than the header says?"
     return ""
-
-
-def check_clock(name: str, line: Timeline, step_duration: float, noise: float) -> None:
-    """Compare when forces rise and fall with when the tool goes into the tissue.
-
-    Args:
-        name: Of the arm.
-        line: The tool.
-        step_duration: s.
-        noise: Standard deviation of a component of the force, N.
-
-    Raises:
-        SequenceError: If forces come later or earlier, with how much in both halves of the recording.
-    """
-    depth, size = line.depths, np.linalg.norm(line.forces, axis=1)
-    if np.nanmax(size, initial=0.0) < _CLEAR * noise or np.nanmax(depth, initial=0.0) < _DEEP:
-        return
-    most, middle = round(_LONGEST_LAG / step_duration), len(depth) // 2
-    whole, *halves = (_lag(depth[part], size[part], most) for part in (slice(None), slice(None, middle), slice(middle, None)))
-    found = [lag for lag in (whole, *halves) if lag is not None and abs(lag) > _LEAST_LAG]
-    if not found:
-        return
-    told = [lag * step_duration for lag in halves if lag is not None]
-    apart = len(told) == 2 and abs(told[1] - told[0]) > _LEAST_LAG * step_duration
-    seconds = (found[0] if whole is None else whole) * step_duration
-    side = "behind" if seconds >= 0 else "ahead of"
-    how = (
-        f"by {told[0]:.2f} s at first and {told[1]:.2f} s at last, as clocks do that run apart"
-        if apart
-        else f"by {abs(seconds):.2f} s, or a press more or less where presses are even"
-    )
-    what = "; record with one clock" if apart else f"; record with one clock, or give force_delay {seconds:.2f}"
-    raise SequenceError(f"{name}/body/measured_cf: forces are {side} the motion of the tool {how}{what}")
-
-
-def _lag(depth: np.ndarray, size: np.ndarray, most: int) -> float | None:
-    """Steps by which sizes of forces [T] are behind depths [T], if that explains them much better than none; None if nothing does."""
-    most = min(most, len(depth) // 2)
-    scores = np.full(2 * most + 1, -1.0)
-    for lag in range(-most, most + 1):
-        ahead, behind = (depth[: len(depth) - lag], size[lag:]) if lag >= 0 else (depth[-lag:], size[:lag])
-        both = np.isfinite(ahead) & np.isfinite(behind)
-        if both.sum() > len(depth) // 2 and ahead[both].std() > 0 and behind[both].std() > 0:
-            scores[lag + most] = np.corrcoef(ahead[both], behind[both])[0, 1]
-    peak = np.append(True, scores[1:] >= scores[:-1]) & np.append(scores[:-1] >= scores[1:], True)
-    likely = np.flatnonzero(peak & (scores > scores.max() - _CLEARER))  # where presses come regularly, each of them fits as well
-    best = int(likely[np.abs(likely - most).argmin()])
-    if scores[best] < _LIKE:
-        return None
-    if scores[most] > _ALIKE or scores[best] < scores[most] + _CLEARER:
-        return 0.0
-    return float(best - most) if 0 < best < len(scores) - 1 else None  # else another press is nearer
 
 
 def distance_at_onset(line: Timeline, noise: float) -> tuple[float, float] | None:

@@ -7,7 +7,7 @@ import numpy as np
 
 from endo_sim_ros import messages
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.identification.force_checks import check_clock, check_direction, check_place, overlap
+from endo_sim_ros.identification.force_checks import check_direction, check_place, overlap
 from endo_sim_ros.identification.recording_config import TouchConfig
 from endo_sim_ros.identification.surface import Surface
 from endo_sim_ros.identification.touches import Timeline, experiment_spans, scatter, tared, timeline, touches
@@ -65,7 +65,6 @@ def read_tool(
     floor = max(noise, config.force_noise)
     if noise > config.force_noise:
         findings.append(f"{arm}: a component of the force has a noise of {noise:.2g} N in the air, more than force_noise")
-    check_clock(arm, line, physics.step_duration, floor)
     findings += [text for text in (check_direction(arm, line, surface, floor), check_place(arm, line, floor, config.clearance)) if text]
     return Tool(line, noise)
 

@@ -78,9 +78,40 @@ def test_going_on_needs_the_same_tissue_and_keeps_that_forces_were_felt(good):
     assert found["young_modulus"].told == identify([moved], NODES, PHYSICS, CONFIG, "cpu", start=found)["young_modulus"].told == "known"
 
 
-def test_a_lag_of_the_forces_is_told(good):
-    late = replace(good, forces=np.roll(good.forces, 4, axis=0))
-    assert "forces come about 0.1" in findings(late) and "after the poses" in findings(late)
+@pytest.fixture(scope="module")
+def three():
+    """Presses in three places."""
+    return [measure(pressed(x, steps=40), NODES, PHYSICS, np.random.default_rng(0)) for x in (-0.006, 0.0, 0.006)]
+
+
+def moved(experiment, steps):
+    """Its forces that many steps late."""
+    return replace(experiment, forces=np.roll(experiment.forces, steps, axis=0))
+
+
+def of_clocks(text):
+    return [line for line in text.split("\n") if "measured forces come" in line]
+
+
+@pytest.mark.parametrize("steps", [-4, 4])
+def test_a_lag_of_the_forces_is_told_with_the_option_that_takes_it_away(three, steps):
+    for presses in (three, three[:1]):
+        (told,) = of_clocks(findings(*[moved(each, steps) for each in presses]))
+        side, delay = told.split(" the poses: record with one clock, or give force_delay ")
+        assert side.endswith("after" if steps > 0 else "before") and float(delay) == pytest.approx(0.04 * steps, abs=0.02)
+
+
+def test_a_lag_that_grows_is_told_as_clocks_that_run_apart(three):
+    (told,) = of_clocks(findings(*[moved(each, 2 * number) for number, each in enumerate(three)]))
+    assert "at first" in told and "run apart" in told and "force_delay" not in told
+    last = told.split("at first and ")[1]
+    assert last.split(" s ")[1].startswith("after") and float(last.split(" s ")[0]) == pytest.approx(0.16, abs=0.03)
+
+
+def test_what_no_lag_explains_is_no_lag(three):
+    broken = [replace(three[0], forces=three[0].forces * (np.arange(40) < 18)[:, None]), *three[1:]]  # a sensor dies
+    clipped = [replace(each, forces=each.forces.clip(-0.2, 0.2)) for each in three]
+    assert not of_clocks(findings(*broken)) and not of_clocks(findings(*clipped))
 
 
 def test_contact_at_another_depth_is_told(good):
@@ -120,6 +151,14 @@ def test_a_grasp_that_slips_is_told_and_left_out(pulled):
     assert len(told) == 1 and float(told[0].split("slipped ")[1].split(" s")[0]) == pytest.approx(1.0, abs=0.15)
     modulus = found["young_modulus"]
     assert modulus.low < 4e3 < modulus.high and modulus.estimate == pytest.approx(4e3, rel=0.1)
+
+
+def test_grasps_that_all_slip_early_are_left_out_from_there_on_and_are_no_lag(pulled):
+    whole, physics = pulled
+    slips = [replace(whole, forces=np.where(np.arange(40)[:, None] < until, whole.forces, 0.0)) for until in (20, 22)]
+    found = identify(slips, NODES, physics, CONFIG, "cpu")
+    assert [each.startswith("the grasp slipped") for each in found.findings] == [True, True]
+    assert found["young_modulus"].estimate == pytest.approx(4e3, rel=0.15)
 
 
 def test_a_grasp_whose_force_was_not_measured_to_its_end_did_not_slip(pulled):

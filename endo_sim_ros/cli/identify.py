@@ -1,5 +1,6 @@
 """`endo-sim identify`."""
 
+import logging
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -40,8 +41,12 @@ class Command:
             raise ValueError(f"{self.out} is a file; name a folder for what is found")
         if (self.out / "stiffness.yaml").exists():
             raise ValueError(f"{self.out} holds what was found before; name another folder, or remove that one first")
-        with leaving_none_empty(self.out):
-            identify_bag(self.bag, self.model, self.out, self.config, self.recording, self.physics)
+        try:
+            with leaving_none_empty(self.out):
+                identify_bag(self.bag, self.model, self.out, self.config, self.recording, self.physics)
+        except KeyboardInterrupt:
+            logging.getLogger(__name__).info("interrupted; nothing was written to %s", self.out)
+            raise
         print(f"{self.out}: stiffness.yaml, stiffness.npz, stiffness.png")
 
 

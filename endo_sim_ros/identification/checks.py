@@ -18,6 +18,7 @@ _SCANNED = 13  # depths
 _ROUGHLY = 1.2  # times as great as by theory chi-square may be: that of 40 presses of tissue as the model has it was 1.08 ± 0.1
 _LAG, _UNLIKE = 1.5, 0.3  # steps; less is within what sampling does. Share of what noise does not explain that a lag may leave
 _ENOUGH = 25.0  # by which chi-square must fall before another depth or lag is believed
+_FAR = 2.0  # standard deviations of where the tool stands, beyond which that is told
 
 
 class IdentificationError(ValueError):
@@ -72,31 +73,37 @@ class Survey:
     Args:
         scale: By which forces of the model are to be multiplied.
         findings: Sentences.
+        offset: Of all tips [3], m, world, where contact begins elsewhere than `tip_offset` explains; else 0.
+        doubtful: Whether one of these says that the data are not what they are taken for.
     """
 
     scale: float
     findings: list[str]
+    offset: np.ndarray
+    doubtful: bool = False
 
 
-def survey(data: list[Observations], model: ForwardModel, unknowns: Unknowns, config: IdentificationConfig, z: np.ndarray) -> Survey:
-    """Compare what was measured with what tissue of unknowns z [P], as it was thought to be, would do, its surface at several depths.
+def survey(data: list[Observations], model: ForwardModel, unknowns: Unknowns, theta: np.ndarray) -> Survey:
+    """Compare what was measured with what tissue of numbers θ [P + 5], as it was thought to be, would do, its surface at several depths.
 
     Samples after which a grasp has slipped are marked as not used.
 
     Raises:
         IdentificationError: If the tool never touches, or forces are in another frame.
     """
+    config, z, offset = unknowns.config, theta[: unknowns.count], theta[unknowns.count :][:3] * unknowns.config.tip_offset
     depths = np.linspace(-config.depth_scan, config.depth_scan, _SCANNED)
     predicted: list[np.ndarray] = []
     measured = [each.experiment.forces for each in data]
     axes = [_axis(each.experiment, model) for each in data]
     for each, axis in zip(data, axes):
-        replay = model.replay(each.experiment, [unknowns.copy(z, depth * axis) for depth in depths], _SCANNED)
+        replay = model.replay(each.experiment, [unknowns.copy(z, offset + depth * axis) for depth in depths], _SCANNED)
         predicted.append(replay.forces)
     middle = _SCANNED // 2
     _check_touch(data, model, predicted, middle)
     if not any(np.isfinite(each).any() for each in measured):
-        return Survey(1.0, ["no force was measured: of stiffness only ratios between places are known, not how stiff the tissue is"])
+        told = "no force was measured: of stiffness only ratios between places are known, not how stiff the tissue is"
+        return Survey(1.0, [told], np.zeros(3))
     _check_felt(data, [each[middle] for each in predicted])
     findings = _find_slips(data, [each[middle] for each in predicted])
     costs, scales = zip(*(_fit_scale(data, [each[d] for each in predicted]) for d in range(_SCANNED)))
@@ -104,18 +111,20 @@ def survey(data: list[Observations], model: ForwardModel, unknowns: Unknowns, co
     _check_direction(data, chosen, config)
     for number, (each, force) in enumerate(zip(data, chosen)):
         _check_direction([each], [force], config, f"experiment {number}: ", by_sign=True)
-    far = 4 * np.hypot(config.tip_offset, np.mean([each.experiment.tip_noise for each in data]) / 2)
-    lag = _find_lag(data, [each[np.abs(depths) <= max(far, depths[1] - depths[0])] for each in predicted], config)
+    far, near = _FAR * config.tip_offset, np.abs(depths) <= max(2 * _FAR * config.tip_offset, depths[-1] - depths[-2])
+    lag = _find_lag(data, [each[near] for each in predicted], config)
     findings += lag
     opened = np.array([_fit_scale(data, [each[d] for each in predicted], opened=True)[0] for d in range(_SCANNED)])
     depth, gain = _lowest(depths, opened, middle, sum(int(each.of_forces().sum()) for each in data))
+    offset, beyond = np.zeros(3), bool(abs(depth) >= config.depth_scan and gain > _ENOUGH)
     if not lag and abs(depth) > far and gain > _ENOUGH:
         where = "deeper than" if depth < 0 else "before"
         findings.append(
-            f"contact begins about {1000 * abs(depth):.1f} mm {where} the surface of the model: check its scale, and where the tool stands"
-            " to it"
+            f"contact begins about {1000 * abs(depth):.1f} mm {'or more ' * beyond}{where} the surface of the model: check its scale, and"
+            " where the tool stands to it" + "; intervals count with a tip_offset as great" * (not beyond)
         )
-    return Survey(float(np.clip(scales[int(np.argmin(costs))], 0.05, 20.0)), findings)
+        offset = depth * (1 - beyond) * np.mean(axes, axis=0)
+    return Survey(float(np.clip(scales[int(np.argmin(costs))], 0.05, 20.0)), findings, offset, bool(lag) or beyond)
 
 
 def _axis(experiment: Experiment, model: ForwardModel) -> np.ndarray:
@@ -319,5 +328,5 @@ def judge_residuals(chi_square: float, count: int, config: IdentificationConfig)
     factor = chi_square / count
     return factor, [
         f"the model does not explain the data: residuals are {np.sqrt(factor):.1f} times as great as their noise (chi-square"
-        f" {chi_square:.0f} for {count:.0f}); intervals are as much wider, and may still not hold the truth"
+        f" {chi_square:.0f} for {count:.0f}); intervals are as much wider, but nothing counts as known"
     ]

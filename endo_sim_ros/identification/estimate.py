@@ -18,7 +18,7 @@ from endo_sim_ros.identification.checks import IdentificationError, check_input,
 from endo_sim_ros.identification.config import IdentificationConfig
 from endo_sim_ros.identification.experiment import Experiment
 from endo_sim_ros.identification.forward import ForwardModel, distances_to_skin, reach_of
-from endo_sim_ros.identification.maps import different_places, paint_as_regions
+from endo_sim_ros.identification.maps import AGREED, different_places, paint_as_regions
 from endo_sim_ros.identification.observations import Covariance, Observations
 from endo_sim_ros.identification.scan import Places, Scan, added, weights, without_ball
 from endo_sim_ros.identification.unknowns import MODULUS, MOST_LOG, Reported, Told, Unknowns
@@ -32,6 +32,8 @@ _DAMPED, _LOOSENED, _MOST_DAMPED = 10.0, 0.1, 1e6
 _FAR = 2.0  # standard deviations from what was thought, which is told
 _NOTHING = 0.5  # of chi-square: what a fresh Jacobian promises no more than, and does not keep, is how rough forces are
 _AS_PROMISED = 0.3  # share of the promised gain with which a Jacobian is still good
+_FALLS = 0.05  # share of chi-square that the last two iterations took away, from which on the next ones would, too
+_DRAWS = 200  # from the posterior, for places at the edge of an inclusion
 _TREMBLES, _ABOUT = 4, 5  # copies whose tips err as measured ones do; steps over which what they tell is averaged
 
 
@@ -109,6 +111,11 @@ class Identification:
     def tip_offset(self) -> np.ndarray:
         """How far the tool stands from where it is said to [3], m, world."""
         return self.mean[-NUISANCES : 3 - NUISANCES] * self.parameters.config.tip_offset
+
+    @property
+    def tells_inclusion(self) -> bool:
+        """Whether an inclusion is likely, and its radius or its ratio is known; else the map has none."""
+        return _tells_inclusion(self.unknowns, self.sure)
 
     @property
     def any_known(self) -> bool:
@@ -207,12 +214,15 @@ def identify(
     plain = prior.mean.copy()
     if unknowns.ball is not None and start is None:
         plain[BALL] = unknowns.ball.absent()
-    first = survey(data, model, unknowns, config, plain[: unknowns.count])
+    first = survey(data, model, unknowns, plain)
+    if start is None:
+        config = unknowns.config = replace(config, tip_offset=max(config.tip_offset, float(np.linalg.norm(first.offset))))
     if not any(each.used.any() for each in data):
         raise IdentificationError("nothing was measured: forces, displacements and tracks are all missing; give one of them")
     theta = prior.mean.copy()
     if start is None:
         theta[: unknowns.stiffness_count] = _scaled(unknowns, first.scale)
+        theta[unknowns.count :][:3] = first.offset / max(config.tip_offset, 1e-12)
     parts = [_Data(each, *unknowns.directions(touched_places([each.experiment], nodes, physics))) for each in data]
     for part in parts:
         part.seen.uneven = _unevenness(part.seen, model, unknowns, theta)
@@ -220,16 +230,25 @@ def identify(
     if unknowns.ball is not None and start is None:
         progress("look for the inclusion", 0, config.iterations)
         theta, sure, rests = _locate(theta, prior, parts, model, unknowns)
-    point, ended = _minimise(theta, prior, parts, model, unknowns, progress)
-    unended = [] if ended else [f"the estimate had not settled after {config.iterations} iterations; allow more"]
-    found = _conclude(point, data, model, unknowns, [*first.findings, *unended], start is not None and start.felt)
+    point, ended, falls = _minimise(theta, prior, parts, model, unknowns, progress)
+    unknown = ", so that nothing counts as known" * falls
+    more = [] if ended else [f"the estimate had not settled after {config.iterations} iterations{unknown}; allow more"]
+    findings, doubtful = [*first.findings, *more], first.doubtful or falls
+    found = _conclude(point, data, model, unknowns, findings, start is not None and start.felt, sure, doubtful)
     if unknowns.ball is None:
         return replace(found, findings=[*different_places(found), *found.findings]) if len(unknowns.centres) else found
+    if not found.tells_inclusion:
+        why = f"the likeliest one has a probability of {sure or 0.0:.2f}, and its radius and ratio are {found['inclusion_ratio'].told}"
+        found = replace(found, findings=[f"no inclusion is told, so that the map is that of tissue without one: {why}", *found.findings])
+        if start is not None:
+            return found
+        whole = identify(experiments, nodes, physics, replace(config, stiffness="uniform"), device, progress, finer=finer)
+        rest = replace(whole.unknowns[0], name=found.unknowns[0].name)
+        moduli = {name: getattr(whole, name) for name in ("young_modulus", "low", "high", "known", "removed")}
+        return replace(found, unknowns=[rest, *found.unknowns[1:]], **moduli)
     x, y, z = unknowns.ball.shape(found.mean[1 : 1 + BALL])[0]
-    there = f"the middle of the inclusion is at {x:.4f} {y:.4f} {z:.4f} m"
-    if sure is not None:
-        there += f", with a probability of {sure:.2f}" if sure >= 0.5 else ", but none explains the data as well"
-    return replace(found, sure=sure, findings=[there, *rests, *found.findings])
+    there = f"the middle of the inclusion is at {x:.4f} {y:.4f} {z:.4f} m, with a probability of {sure:.2f}"
+    return replace(found, findings=[there, *rests, *found.findings])
 
 
 def touched_places(experiments: Sequence[Experiment], nodes: ControlNodes, physics: PhysicsConfig) -> np.ndarray:
@@ -360,8 +379,8 @@ def _elsewhere(centre: np.ndarray) -> list[str]:
 
 def _minimise(
     theta: np.ndarray, prior: _Prior, data: list[_Data], model: ForwardModel, unknowns: Unknowns, progress: OnProgress
-) -> tuple[_Point, bool]:
-    """Levenberg and Marquardt's method; returns where it ended, and whether it settled.
+) -> tuple[_Point, bool, bool]:
+    """Levenberg and Marquardt's method; returns where it ended, whether it settled, and whether it was still getting better.
 
     The Jacobian is kept, with Broyden's correction, while steps do about what it promises, and is fresh at the end.
 
@@ -370,9 +389,10 @@ def _minimise(
     """
     config, P = unknowns.config, unknowns.count
     point, damping, fresh = look(theta, prior, data, model, unknowns), 1e-3, True
-    settled = False
+    settled, costs = False, []
     for iteration in range(config.iterations):
         progress("estimate", iteration + 1, config.iterations)
+        costs.append(prior.cost(point.theta) + _misfit(point.residuals, point.covariances))
         H, g = _normal(point)
         H, g = H + prior.precision, g - prior.precision @ (point.theta - prior.mean)
         step = np.linalg.solve(H + damping * np.diag(np.diag(H)), g)
@@ -385,8 +405,7 @@ def _minimise(
             point, fresh = look(point.theta, prior, data, model, unknowns), True
             continue
         other = look(point.theta + step, prior, data, model, unknowns, jacobian=False)
-        before = prior.cost(point.theta) + _misfit(point.residuals, point.covariances)
-        gained, promised = before - prior.cost(other.theta) - _misfit(other.residuals, point.covariances), 2 * g @ step - step @ H @ step
+        gained, promised = costs[-1] - prior.cost(other.theta) - _misfit(other.residuals, point.covariances), 2 * g @ step - step @ H @ step
         if gained > _AS_PROMISED * promised:
             for old, new, was, now in zip(point.jacobians, other.jacobians, point.residuals, other.residuals):
                 wrong = (was - now - old @ step) * (moved > 1)  # of short steps it would be rounding
@@ -404,12 +423,15 @@ def _minimise(
             if damping > _MOST_DAMPED:
                 settled = True  # no step gains anything
                 break
-    return (point if fresh else look(point.theta, prior, data, model, unknowns)), settled
+    point = point if fresh else look(point.theta, prior, data, model, unknowns)
+    last = prior.cost(point.theta) + _misfit(point.residuals, point.covariances)
+    return point, settled, not settled and last < (1 - _FALLS) * costs[-2:][0]
 
 
 def _conclude(
-    point: _Point, data: list[Observations], model: ForwardModel, unknowns: Unknowns, findings: list[str], felt: bool
-) -> Identification:
+    point: _Point, data: list[Observations], model: ForwardModel, unknowns: Unknowns, findings: list[str], felt: bool, sure: float | None,
+    doubtful: bool,
+) -> Identification:  # fmt: skip
     config = unknowns.config
     H, _ = _normal(point)
     chi_square, precision = _misfit(point.residuals, point.covariances), point.prior.precision
@@ -420,17 +442,29 @@ def _conclude(
     quantile = float(norm.ppf(0.5 + config.level / 2))
     feels = felt or any(each.of_forces()[each.used].any() for each in data)
     told = [_estimate(each, point.theta, covariance, quantile, feels, unknowns, config) for each in unknowns.reported()]
+    unsure = [each.name for each in told if each.told == "not told by these data"]
+    if doubtful or doubts:
+        told = [replace(each, told="not told by these data") for each in told]
     matrix = np.concatenate([unknowns.tangent(point.theta[: unknowns.count]), np.zeros((len(unknowns.nodes), NUISANCES))], 1)
-    logs = unknowns.logs(point.theta[: unknowns.count])
+    logs, tells = unknowns.logs(point.theta[: unknowns.count]), _tells_inclusion(told, sure)
+    if unknowns.ball is not None and not tells:
+        matrix[:, 1 : 1 + BALL] = 0
+        logs = matrix @ point.theta
     middle = np.log(unknowns.base) + np.clip(logs, -MOST_LOG, MOST_LOG)
     prior = (matrix**2).sum(1) + unknowns.residual
     left = np.einsum("mi,ij,mj->m", matrix, covariance, matrix) + unknowns.residual
     if len(unknowns.centres):
         prior -= config.spread**2
         left += (config.smooth_error * unknowns.beside(point.theta[: unknowns.count])) ** 2
+    elif tells:
+        prior[:] = config.field_spread**2  # by which a place may differ from the rest
+        draws = np.random.default_rng(0).multivariate_normal(point.theta, covariance, _DRAWS)[:, : unknowns.count]
+        left = np.mean([(unknowns.logs(each) - logs) ** 2 for each in draws], axis=0)  # its edge is too sharp for derivatives
+        assert unknowns.ball is not None
+        ball = point.theta[1 : 1 + BALL]
+        left += unknowns.ball.logs(ball) * (unknowns.ball.shape(ball)[2] - unknowns.ball.logs(ball))  # there a node is in it or not
     spread, removed = quantile * np.sqrt(left), np.maximum(1 - left / prior, 0)
     findings = [*findings, *doubts]
-    unsure = [each.name for each in told if each.told == "not told by these data"]
     if unsure:
         findings.append(f"these data do not tell {', '.join(unsure)}: the interval rests on what was thought before")
     if point.undone:
@@ -440,10 +474,17 @@ def _conclude(
         findings.append(
             "moduli of more than 50 times that of physics, or less than a fiftieth, are not simulated: give physics a nearer one"
         )
+    known = (removed >= config.known) & (feels and not doubtful and not doubts)
     return Identification(
-        told, findings, np.exp(middle), np.exp(middle - spread), np.exp(middle + spread), (removed >= config.known) & feels, removed,
-        point.theta, covariance, unknowns, unknowns.nodes, config.level, chi_square / max(count - determined, 1), model.steps, feels,
+        told, findings, np.exp(middle), np.exp(middle - spread), np.exp(middle + spread), known, removed, point.theta, covariance, unknowns,
+        unknowns.nodes, config.level, chi_square / max(count - determined, 1), model.steps, feels, sure,
     )  # fmt: skip
+
+
+def _tells_inclusion(told: Sequence[Estimate], sure: float | None) -> bool:
+    """Whether an inclusion is likelier than none, and its radius or its ratio is known."""
+    sizes = [each for each in told if each.name in ("inclusion_radius", "inclusion_ratio")]
+    return sure is not None and sure >= AGREED and any(each.told == "known" for each in sizes)
 
 
 def _far(theta: np.ndarray, unknowns: Unknowns) -> list[str]:

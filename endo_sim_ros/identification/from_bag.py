@@ -93,18 +93,16 @@ def read_experiments(
         reader.require(*((messages.tool_pose(arm),) for arm in arms))
         pictures = _picture(topics)
         findings = list[str]()
-        streams = _usable(bag, lambda: read_streams(reader, arms, frames, (), findings))
+        streams = _usable(bag, lambda: read_streams(reader, arms, frames, (), findings), "no message of a topic can be used: ")
         motion = _motion(reader)
     tools = _usable(bag, lambda: read_tools(arms, streams, Surface(nodes), nodes, physics, config, findings))
     if not tools:
         raise SequenceError(f"{bag}: no pose with a time on /{messages.tool_pose(arms[0]).name}; record while the tool moves")
-    gathered = gather(tools, streams, physics, config, findings)
+    if not physics.contact_radius and not any(tool.line.closed.any() for tool in tools.values()):
+        raise ConfigError(f"{bag}: contact_radius is 0, so that tools press nothing, and no jaw holds tissue; give the radius of the tip")
+    of_tools, gathered = list(findings), gather(tools, streams, physics, config, findings)
     if not gathered:
         raise SequenceError(_no_touch(bag, tools, physics, config, findings))
-    if not physics.contact_radius and not any(tools[arm].line.closed[slice(*span)].any() for arm, span in gathered):
-        raise ConfigError(
-            f"{bag}: tools touch the tissue with open jaws, but contact_radius is 0, so that they press nothing; give the radius of the tip"
-        )
     experiments = [experiment(tools[arm].line, span, physics.step_duration, tools[arm].noise, config) for arm, span in gathered]
     seconds = max(float(np.ptp(tool.line.times)) * 1e-9 for tool in tools.values())
     count = sum(count_touches(tools[arm].line, span, physics, config) for arm, span in gathered)
@@ -130,6 +128,7 @@ def read_experiments(
     elif not measured:
         raise SequenceError(
             f"{bag}: neither forces nor images with camera_info and pose, nor control nodes: nothing tells how the tissue answers"
+            + "".join(f"; {text}" for text in of_tools)
         )
     return Recorded(experiments, findings, seconds, count, measured, messages.CONTROL_NODES in streams)
 
@@ -334,12 +333,12 @@ def _with_tracks(
     return [replace(each, tracks=[found[number]]) if number in found else each for number, each in enumerate(experiments)]
 
 
-def _usable(bag: Path, do: Callable[[], Any]) -> Any:
+def _usable(bag: Path, do: Callable[[], Any], said: str = "") -> Any:
     """What a function returns; what is wrong with a message is told with the name of its bag."""
     try:
         return do()
     except MessageError as error:
-        raise SequenceError(f"{bag}: {error}") from error
+        raise SequenceError(f"{bag}: {said}{error}") from error
     except SequenceError as error:
         text = str(error)
         raise SequenceError(text if text.startswith(str(bag)) else f"{bag}: {text}") from error

@@ -18,6 +18,7 @@ from endo_sim_ros.physics.control_nodes import ControlNodes
 
 _THINNEST, _THINNEST_CELL = 1.5, 0.3  # a capsule acts as at least this thick, as physics has it: node distances, grid cells
 
+_THICKER = 1.1  # times as thick as was said, which is told
 _ROUGH, _EXACT = 1.5, 0.2  # of tip_noise: beyond these tips are measured otherwise than was thought
 
 Gathered = list[tuple[str, tuple[int, int]]]
@@ -102,6 +103,12 @@ def read_tools(
         SequenceError: If the forces contradict the poses.
     """
     radius = tool_radius(surface, nodes, physics)
+    if radius > _THICKER * physics.contact_radius:
+        findings.append(
+            f"tools act as balls of {1e3 * radius:.1f} mm radius, not of {1e3 * physics.contact_radius:.1f} mm as contact_radius says,"
+            f" because control nodes of the skin are {1e3 * surface.apart:.1f} mm apart: give more of them (node_count), unless a"
+            " simulation of the same ones was recorded"
+        )
     there = [arm for arm in arms if messages.tool_pose(arm) in streams]
     return {arm: read_tool(arm, streams, surface, physics, config, radius, findings) for arm in there}
 

@@ -20,8 +20,9 @@ from endo_sim_ros.physics import PhysicsConfig
 
 _COARSE = (
     "few control nodes push back more than real tissue of the same modulus: moduli are too low, by a quarter with 1000 of them, which"
-    " intervals do not count; finer 1.5 corrects that"
+    " intervals do not count; finer {:.2g} corrects that"
 )
+_FINE = 2800  # control nodes whose forces correct those of 1000 so that moduli are 7 % off, see docs/identification.md
 _TOLD = {"known": "green", "ratio only": "yellow", "not told by these data": "red"}
 
 
@@ -51,7 +52,10 @@ def identify_bag(
         task = bar.add_task("building control nodes", total=None)
         nodes = scene.nodes(physics)
         recorded = read_experiments(bag, scene.model, nodes, physics, recording, lambda text: bar.update(task, description=text))
-        out.mkdir(parents=True, exist_ok=True)  # before the long work
+        try:
+            out.mkdir(parents=True, exist_ok=True)  # before the long work
+        except OSError as error:
+            raise ValueError(f"{out}: the folder cannot be made ({error.strerror}); choose another place") from None
 
         def on_progress(stage: str, done: int, total: int) -> None:
             bar.update(task, description=stage, completed=done, total=total or None)
@@ -60,7 +64,8 @@ def identify_bag(
         found = identify(recorded.experiments, nodes, physics, config, physics.device, on_progress, finer=finer)
         recorded.findings.extend(seen_from(found, scene.camera))
         if recorded.forces and not recorded.simulated and finer is None:
-            recorded.findings.append(_COARSE)
+            finer = min(max(1.5, (_FINE / len(nodes)) ** (1 / 3)), 4.0)
+            recorded.findings.append(_COARSE.format(finer))
         bar.update(task, description="drawing the map", completed=0, total=None)
         save_results(found, scene, physics, out, [f"Written by endo-sim identify, from {bag}.", *recorded.findings])
     _tell(found, recorded.findings)

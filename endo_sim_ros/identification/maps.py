@@ -13,7 +13,7 @@ from endo_sim_ros.physics import ControlNodes
 if TYPE_CHECKING:
     from endo_sim_ros.identification.estimate import Identification
 
-_AGREED = 0.5  # probability from which on a place is told
+AGREED = 0.5  # probability from which on a place is told
 _ALIKE = np.log(1.5)  # of ratios: what differs by less is as all tissue does
 _BEYOND = 0.5  # spacings by which the box of all tissue is larger than the control nodes
 
@@ -162,12 +162,12 @@ def seen_from(found: "Identification", camera: Camera) -> list[str]:
 def _places(found: "Identification") -> list[tuple[str, Inclusion]]:
     """What is likely to be there and differs from most tissue, what differs most first."""
     if found.parameters.ball is not None:
-        places = [("the middle of the inclusion", find_inclusion(found))]
+        places = [("the middle of the inclusion", find_inclusion(found))] * found.tells_inclusion
     elif len(found.parameters.centres):
         places = [(f"the {('stiffest', 'softest')[softer]} place", find_inclusion(found, softer=softer)) for softer in (False, True)]
     else:
         places = []
-    likely = [each for each in places if each[1].sure >= _AGREED and abs(np.log(each[1].ratio)) >= _ALIKE]
+    likely = [each for each in places if each[1].sure >= AGREED and abs(np.log(each[1].ratio)) >= _ALIKE]
     return sorted(likely, key=lambda each: -abs(np.log(each[1].ratio)))
 
 

@@ -81,7 +81,7 @@ def test_going_on_needs_the_same_tissue_and_keeps_that_forces_were_felt(good):
 @pytest.fixture(scope="module")
 def three():
     """Presses in three places."""
-    return [measure(pressed(x, steps=40), NODES, PHYSICS, np.random.default_rng(0)) for x in (-0.006, 0.0, 0.006)]
+    return [measure(pressed(x, steps=40), NODES, PHYSICS, np.random.default_rng(n)) for n, x in enumerate((-0.006, 0.0, 0.006))]
 
 
 def moved(experiment, steps):
@@ -119,6 +119,42 @@ def test_contact_at_another_depth_is_told(good):
     assert "contact begins about" in told and "mm deeper than the surface" in told
     depth = float(told.split("about ")[1].split(" mm")[0])
     assert depth == pytest.approx(3, abs=1)
+
+
+@pytest.mark.parametrize("away", [-0.002, 0.002, 0.003])
+def test_a_tool_that_stands_elsewhere_is_found_there(three, away):
+    found = identify([replace(each, tips=each.tips + [0, 0, away]) for each in three], NODES, PHYSICS, CONFIG, "cpu")
+    modulus = found["young_modulus"]
+    assert any(text.startswith("contact begins about") for text in found.findings)
+    assert modulus.told == "known" and modulus.low < 4e3 < modulus.high
+    assert found.tip_offset[2] == pytest.approx(-away, abs=0.0005)
+
+
+def broken(experiment, how):
+    """The experiment with forces that are not what they are taken for."""
+    rising = np.arange(len(experiment.forces))[:, None] < 16
+    forces = {
+        "clipped": (4 * experiment.forces).clip(-0.3, 0.3),  # of stiffer tissue
+        "dead": experiment.forces * rising,
+        "shaken": experiment.forces + 0.3 * np.sin(np.arange(40))[:, None] * [1, 0, 0],
+        "late": np.roll(experiment.forces, 5, axis=0),
+    }
+    return replace(experiment, forces=forces[how])
+
+
+@pytest.mark.parametrize("how", ["clipped", "dead", "shaken", "late"])
+def test_nothing_is_known_by_data_that_a_finding_says_are_wrong(three, how):
+    found = identify([broken(each, how) for each in three], NODES, PHYSICS, CONFIG, "cpu")
+    assert found["young_modulus"].told == "not told by these data" and not found.known.any() and not found.any_known and found.findings
+    assert not any("rests on what was thought before" in text for text in found.findings)
+
+
+def test_nothing_is_known_by_an_estimate_that_did_not_settle_or_contact_beyond_the_scan(three):
+    found = identify([replace(three[0], forces=8 * three[0].forces)], NODES, PHYSICS, replace(CONFIG, iterations=1), "cpu")
+    assert any("had not settled after 1 iterations" in text for text in found.findings) and not found.any_known
+    far = [replace(each, tips=each.tips + [0, 0, 0.004]) for each in three]
+    found = identify(far, NODES, PHYSICS, replace(CONFIG, depth_scan=0.002), "cpu")
+    assert any("2.0 mm or more deeper than" in text for text in found.findings) and not found.any_known
 
 
 def test_forces_that_nothing_explains_are_told_and_widen_intervals(good):

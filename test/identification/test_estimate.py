@@ -67,7 +67,7 @@ def test_a_tool_that_trembles_on_skin_that_sticks_is_expected_to():
 
 def test_finer_nodes_correct_what_coarse_ones_make_too_stiff():
     truth = replace(PHYSICS, young_modulus=7e3)
-    experiment = measure(pressed(), FINER, truth, np.random.default_rng(0))
+    experiment = measure(pressed(), FINER, truth, np.random.default_rng(1))
     coarse, finer = (identify([experiment], NODES, PHYSICS, EXACT, "cpu", finer=each)["young_modulus"] for each in (None, FINER))
     assert abs(np.log(coarse.estimate / 7e3)) > 2 * abs(np.log(finer.estimate / 7e3))
     assert not coarse.low < 7e3 < coarse.high and finer.low < 7e3 < finer.high
@@ -155,7 +155,7 @@ def hidden(seed: int, radius: float, depth: tuple[float, float] = (0.004, 0.008)
 
 
 def test_an_inclusion_is_found_in_a_map():
-    centre, experiments, truth = hidden(0, 0.007, steps=12)
+    centre, experiments, truth = hidden(0, 0.007)
     found = identify(experiments, NODES, PHYSICS, IdentificationConfig(stiffness="field", field_length=0.012, iterations=ENOUGH), "cpu")
     inclusion = find_inclusion(found)
     # How deep it lies presses from above hardly tell.
@@ -175,14 +175,17 @@ def test_an_inclusion_is_found_in_a_map():
 
 
 def test_an_inclusion_is_found_as_a_ball():
-    centre, felt, _ = hidden(1, 0.007)
-    experiments = felt[::3] + felt[2::3]  # two rows of the raster are enough
+    centre, experiments, truth = hidden(1, 0.007)
     found = identify(experiments, NODES, PHYSICS, IdentificationConfig(stiffness="inclusion", iterations=ENOUGH), "cpu")
     inclusion = find_inclusion(found)
     off = inclusion.centre - centre
     assert np.linalg.norm(off) < 0.004 and np.linalg.norm(off[:2]) < 0.003
     assert (np.abs(off) < 3 * inclusion.deviation + 0.001).all() and inclusion.sure > 0.9
     assert found["young_modulus of the rest"].low < 4e3 < found["young_modulus of the rest"].high
+    assert found.tells_inclusion and "the middle of the inclusion is at" in found.findings[0]
+    held = (found.low <= truth) & (truth <= found.high)
+    about = np.linalg.norm(NODES.rest - centre, axis=1)
+    assert held[about < 0.01].mean() > 0.8 and held[found.known].mean() > 0.9 and found.known[about > 0.02].all()
     told = found["inclusion_ratio"]
     assert told.low < 8 < told.high and found.young_modulus.max() == pytest.approx(4e3 * 8, rel=0.6)
 
@@ -211,8 +214,10 @@ def test_without_an_inclusion_none_is_sure():
     experiments = [measure(pressed(x, 0.0, steps=16), NODES, PHYSICS, rng) for x in AT]
     field = identify(experiments, NODES, PHYSICS, IdentificationConfig(stiffness="field", field_length=0.012, iterations=ENOUGH), "cpu")
     assert not any("place is at" in each for each in field.findings) and field.any_known
-    ball = identify(experiments, NODES, PHYSICS, IdentificationConfig(stiffness="inclusion", iterations=ENOUGH), "cpu")
-    assert find_inclusion(ball).sure < 0.5
+    found = identify(experiments, NODES, PHYSICS, IdentificationConfig(stiffness="inclusion", iterations=ENOUGH), "cpu")
+    assert find_inclusion(found).sure < 0.5 and not found.tells_inclusion and found.findings[0].startswith("no inclusion is told")
+    assert np.ptp(found.young_modulus) == 0 and not seen_from(found, Camera(np.eye(3), 9, 9))
+    assert found.young_modulus[0] == pytest.approx(found["young_modulus of the rest"].estimate)
 
 
 def test_a_search_presses_where_it_learns_and_finds_what_it_looks_for():

@@ -112,6 +112,7 @@ BAD = {
     "other_clock": (dict(late=lambda t: 50_000.0), {}, ("share no moment", r"5e\+04 s after")),
     "poses_too_rare": (dict(rate=2.0), {}, ("more than longest_gap, 0.2 s, apart",)),
     "always_in_tissue": (dict(presses=(-0.5, 0.4, 1.3, 2.2, 3.1), depth=0.1), {}, ("no experiment can be used", "not seen away")),
+    "nothing_pushes_and_is_near": (dict(depth=-0.003), dict(physics=PhysicsConfig(step_duration=STEP)), ("contact_radius is 0, so that",)),
     "nothing_pushes": ({}, dict(physics=PhysicsConfig(step_duration=STEP)), ("contact_radius is 0", "press nothing")),
     "no_motion_recorded": ({}, dict(observed="images"), ("observed is images",)),
     "nothing_measured": (dict(forces=0.0), {}, ("nothing tells how the tissue answers",)),
@@ -140,7 +141,15 @@ def test_forces_that_are_askew_or_far_or_zero_are_told(tmp_path):
     assert any("90 degrees from where tissue should push" in text for text in read(tmp_path / "askew").findings)
     far = press(tmp_path / "far", force=lambda depth: 300 * max(depth + 0.0098, 0))
     assert any(re.search("begin where the tool is [78] mm in front of", text) for text in read(far).findings)
-    refused(press(tmp_path / "zero", depth=0.006, force=lambda depth: 0.0), "nothing tells how the tissue answers")
+    zero = press(tmp_path / "zero", depth=0.006, force=lambda depth: 0.0)
+    refused(zero, "nothing tells how the tissue answers; .*all forces are 0, also where the tool is in the tissue")
+
+
+def test_a_tool_that_acts_as_thicker_than_it_is_said_to_be_is_told(tmp_path):
+    bag = press(tmp_path / "bag")
+    assert not any("act as balls" in text for text in read(bag).findings)
+    told = read(bag, nodes=flat_tissue(0.004, 11)).findings
+    assert any("tools act as balls of 6.0 mm radius, not of 4.0 mm" in text and "node_count" in text for text in told)
 
 
 def test_other_arms_and_wrenches_are_no_part_of_an_experiment(tmp_path):
@@ -170,7 +179,7 @@ def test_a_bag_without_poses_or_with_what_is_no_number_is_one_sentence(tmp_path)
         pose = tip(0.0)
         pose[0, 3] = np.nan
         bag.pose(0.1, pose)
-    refused(tmp_path / "nan", "PSM1/measured_cp: the pose is not finite")
+    refused(tmp_path / "nan", "no message of a topic can be used: PSM1/measured_cp: the pose is not finite")
     with pytest.raises(SequenceError, match="no such bag"):
         read(tmp_path / "nowhere")
     assert RADIUS == PHYSICS.contact_radius

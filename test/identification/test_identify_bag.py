@@ -1,5 +1,6 @@
 """`endo-sim identify`: from a recording to parameters of physics_node, a map and its picture."""
 
+import signal
 from types import SimpleNamespace
 
 import cv2
@@ -11,7 +12,7 @@ from made_touches import flat_tissue, press, simulate
 from endo_sim_ros import cli
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.core.frames import SequenceError
-from endo_sim_ros.identification import results
+from endo_sim_ros.identification import identify_bag, results
 from endo_sim_ros.identification.picture import color_scale, draw_map, modulus_colors, most_different
 from endo_sim_ros.learning.scenes import patient_scene
 from endo_sim_ros.physics import PhysicsConfig
@@ -73,6 +74,16 @@ def test_regions_of_the_options_stay_and_ratios_alone_count_where_no_modulus_is_
     painted = paint_regions(TissueProperties.uniform(len(nodes), 1.0, 0.4, 1000), nodes.rest, values["regions"])
     assert values["young_modulus"] == 10e3
     np.testing.assert_allclose(painted.young_modulus, moduli / 2, rtol=1e-4)
+
+
+def test_a_folder_that_cannot_be_made_and_an_interrupt_are_told(recording, tmp_path, monkeypatch, caplog):
+    (tmp_path / "file").touch()
+    with pytest.raises(ValueError, match="out: the folder cannot be made .*; choose another place"):
+        identify(recording, tmp_path / "file" / "out")
+    monkeypatch.setattr(identify_bag, "identify", lambda *args, **options: signal.raise_signal(signal.SIGINT))
+    with caplog.at_level("INFO"), pytest.raises(KeyboardInterrupt):
+        identify(recording, tmp_path / "out")
+    assert "interrupted; nothing was written" in caplog.text and not (tmp_path / "out").exists()
 
 
 def test_what_cannot_be_used_leaves_no_folder(tmp_path):

@@ -31,6 +31,8 @@ class Command:
         fails."""
         for text in unused_options(self.config):
             raise ConfigError(text)
+        if self.out.resolve() == self.dataset.resolve():
+            raise ConfigError(f"{self.out} is the dataset; give the policy a folder of its own")
         from endo_sim_ros.learning.lerobot_policy import PACKAGES, available, write_training
 
         if self.config.policy == "keypoints":

@@ -152,7 +152,9 @@ def read_video(path: str | Path) -> np.ndarray:
 
     Raises:
         OSError: If it cannot be read.
+        RuntimeError: As `check_video` does.
     """
+    check_video()
     import av
 
     with av.open(str(path)) as container:

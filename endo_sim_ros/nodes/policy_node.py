@@ -30,6 +30,7 @@ _STRAY = 1.0  # seconds in which pictures of a rest before the first reset may s
 _SETTLED = 2  # real time: states after the tools were put where an episode begins, until they are seen there
 _PATIENCE = 30.0  # seconds; a request to a physics_node that was killed just now is never answered
 _SILENT = 5.0  # seconds without an answer after which the node says so
+_GIVEN_UP = 60.0  # seconds without an answer; one may be lost unseen where another physics_node begins at once
 
 
 class PolicyNode(EndoNode):
@@ -117,10 +118,11 @@ class PolicyNode(EndoNode):
     def _ask(self) -> None:
         """Reset the tissue; again and again until its state at rest is heard, as there may be no model or no connection yet.
 
-        An episode whose physics_node is gone, or began anew itself, begins anew.
+        An episode whose physics_node began anew itself, or is out of reach, so that its answer is lost, begins anew.
         """
-        if self._silence() > _SILENT and (self._lost or not self._resetting.service_is_ready()):
-            self.report_error(f"physics_node was ended or reset; episode {self._done + 1} begins anew")
+        silence, reached = self._silence(), self._resetting.service_is_ready()
+        if silence > _GIVEN_UP or silence > _SILENT and (self._lost or not reached):
+            self.report_error(f"physics_node was reset, ended or out of reach; episode {self._done + 1} begins anew")
             self._rows = [row for row in self._rows if row[-1] < self._done]
             self._begin()
             return
@@ -148,8 +150,11 @@ class PolicyNode(EndoNode):
         self._asked.add_done_callback(self._on_reset)
 
     def _unanswered(self) -> bool:
-        """Whether the reset that was asked for last was refused, or the tissue has another state since; pictures take their time."""
-        return self._asked.done() and not {"reset", "nodes"} <= self._heard.keys()
+        """Whether the reset that was asked for last was refused, or the tissue has another state since; pictures take their time. So it is
+        where the tissue came to rest and nobody says that this was a reset: another physics_node has begun meanwhile."""
+        if not self._asked.done():
+            return "nodes" in self._heard and time.monotonic() - self._awaited_from > _SILENT
+        return not {"reset", "nodes"} <= self._heard.keys()
 
     def _on_reset(self, future: Any) -> None:
         with self.guard("reset"):

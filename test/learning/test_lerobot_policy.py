@@ -71,6 +71,8 @@ def test_options_that_no_policy_has_are_refused(demonstrations, tmp_path):
     ):
         done = endo_sim_here("imitate", demonstrations, tmp_path / "out", *words)
         assert done.returncode != 0 and sentence in done.stderr and not (tmp_path / "out").exists()
+    done = endo_sim_here("imitate", demonstrations, demonstrations)
+    assert done.returncode != 0 and "is the dataset; give the policy a folder of its own" in done.stderr
 
 
 def test_checkpoints_that_do_not_fit_are_told(tmp_path):

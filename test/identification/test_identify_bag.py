@@ -1,7 +1,7 @@
 """`endo-sim identify`: from a recording to parameters of physics_node, a map and its picture."""
 
-import signal
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -80,7 +80,7 @@ def test_a_folder_that_cannot_be_made_and_an_interrupt_are_told(recording, tmp_p
     (tmp_path / "file").touch()
     with pytest.raises(ValueError, match="out: the folder cannot be made .*; choose another place"):
         identify(recording, tmp_path / "file" / "out")
-    monkeypatch.setattr(identify_bag, "identify", lambda *args, **options: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr(identify_bag, "identify", Mock(side_effect=KeyboardInterrupt))
     with caplog.at_level("INFO"), pytest.raises(KeyboardInterrupt):
         identify(recording, tmp_path / "out")
     assert "interrupted; nothing was written" in caplog.text and not (tmp_path / "out").exists()

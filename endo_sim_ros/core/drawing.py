@@ -5,6 +5,7 @@ import re
 from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -110,12 +111,19 @@ def check_video() -> None:
         RuntimeError: If there is no PyAV, or no libx264 in it.
     """
     try:
-        from av.codec import Codec
+        _import_av().codec.Codec("libx264", "w")
+    except ValueError as error:
+        raise RuntimeError("PyAV has no libx264 here, which videos need; pip install --force-reinstall av brings it") from error
 
-        Codec("libx264", "w")
-    except (ImportError, ValueError) as error:
-        missing = "there is no PyAV" if isinstance(error, ImportError) else "PyAV has no libx264"
-        raise RuntimeError(f"{missing} here, which videos need; pip install --force-reinstall av brings it") from error
+
+def _import_av() -> Any:
+    """PyAV; raises RuntimeError if there is none."""
+    try:
+        import av
+        import av.codec
+    except ImportError as error:
+        raise RuntimeError("there is no PyAV here, which videos need; pip install --force-reinstall av brings it") from error
+    return av
 
 
 def write_video(path: str | Path, images: Iterable[np.ndarray], fps: float, options: dict[str, str] = {"crf": "18"}) -> int:
@@ -131,8 +139,7 @@ def write_video(path: str | Path, images: Iterable[np.ndarray], fps: float, opti
         RuntimeError: As `check_video` does.
     """
     check_video()
-    import av
-
+    av = _import_av()
     count = 0
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000), options=options)
@@ -152,10 +159,7 @@ def read_video(path: str | Path) -> np.ndarray:
 
     Raises:
         OSError: If it cannot be read.
-        RuntimeError: As `check_video` does.
+        RuntimeError: If there is no PyAV.
     """
-    check_video()
-    import av
-
-    with av.open(str(path)) as container:
+    with _import_av().open(str(path)) as container:
         return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])

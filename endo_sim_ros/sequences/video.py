@@ -82,14 +82,15 @@ def read_video(
         SequenceError: If a file is missing or wrong, or poses are given without intrinsics.
     """
     path = Path(path)
+    folder = path if path.is_dir() else path.parent
     if path.is_dir():
-        folder, found = path, find_video(path)
+        found = find_video(path)
         if found is None:
             raise SequenceError(f"{folder}: holds no video; pass a video file or a folder with one")
         path = found
-        poses = poses or _existing(folder / "poses.txt")
-        calibration = calibration or (_existing(folder / "calibration.yaml") if fx is None else None)
-        mask = mask or _existing(folder / "mask.png") or _existing(folder / "masks")
+    poses = poses or _existing(folder / "poses.txt")
+    calibration = calibration or (_existing(folder / "calibration.yaml") if fx is None else None)
+    mask = mask or _existing(folder / "mask.png") or _existing(folder / "masks")
     check_positive(path, fps=fps, scale=scale)
     if threads < 1 and threads != -1:
         raise SequenceError(f"{path}: threads must be -1 for all cores, or 1 or more, got {threads}")

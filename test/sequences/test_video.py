@@ -22,8 +22,9 @@ def video(tmp_path):
 INTRINSICS = {"fx": 150.0, "fy": 152.0, "cx": 78.5, "cy": 65.5, "distortion": BARREL.tolist()}
 
 
-def test_video_with_poses_beside_it(video):
-    frames = list(open_sequence(video, **INTRINSICS))
+@pytest.mark.parametrize("named", ["", "endo.mp4"])
+def test_video_with_poses_beside_it(video, named):
+    frames = list(open_sequence(video / named, **INTRINSICS))
     assert [f.stamp_ns for f in frames] == [1_000_000_000, 1_060_000_000, 1_120_000_000]
     for frame in frames:
         assert frame.right is None and frame.depth is None

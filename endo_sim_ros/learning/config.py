@@ -155,7 +155,7 @@ class BenchmarkConfig(StageConfig):
     image_width: Annotated[int, Range(16, 4096, "pixels")] = 256
     """Width of the video that shows the first episodes."""
     patience: Annotated[float, Range(0.01, 86_400, "s")] = 10.0
-    """How long a ROS node has for each of its answers, s."""
+    """How long a ROS node has for each of its answers, s; to appear it has half a minute, or as long if that is more."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,11 @@ from endo_sim_ros.physics.config import MotionConfig
 
 @dataclass(frozen=True)
 class Command:
-    """Let a script, or a person in the browser, solve a task many times, and write it as a LeRobot dataset; called again, continue it."""
+    """Let a script, or a person, solve a task many times, and write it as a LeRobot dataset; called again, continue it.
+
+    A person sees the endoscope's picture in a page in the browser, and acts by mouse and keys, a gamepad or a 3D mouse, as the options
+    under page say.
+    """
 
     task: Positional[str]
     """Name of the task, such as retraction or palpation; an unknown one is answered with the list."""
@@ -46,18 +50,20 @@ class Command:
 
     def _by_person(self) -> None:
         from endo_sim_ros.learning.by_person import demonstrate_by_person
-        from endo_sim_ros.learning.gamepad import find_gamepad
+        from endo_sim_ros.learning.devices import find_devices
         from endo_sim_ros.viewer.demonstration_page import DemonstrationPage
 
-        gamepad = find_gamepad(self.page)
+        found = find_devices(self.page)
         page = DemonstrationPage(self.page)
-        print(f"open {page.url} in a browser; Ctrl-C ends", flush=True)
-        devices = [page] if gamepad is None else [page, gamepad]
+        heard = f" heard as well: {', '.join(map(str, found))};" if found else ""
+        print(f"open {page.url} in a browser;{heard} Ctrl-C ends", flush=True)
         try:
             episodes = demonstrate_by_person(
-                self.task, self.scenes, self.out, page, devices, self.page, self.config,
+                self.task, self.scenes, self.out, page, [page, *found], self.page, self.config,
                 self.sight, self.vary, self.motion, self.device,
             )  # fmt: skip
         finally:
             page.stop()
+            for device in found:
+                device.close()
         print(f"{self.out}: {episodes} solved episodes")

@@ -1,4 +1,4 @@
-"""Demonstrations by a person, who sees the endoscope's picture in real time and acts with a mouse, keys or a gamepad.
+"""Demonstrations by a person, who sees the endoscope's picture in real time and acts with a mouse, keys or other devices.
 
 What a person does goes into the same dataset, by the same code, as what a script does. Whatever is a `Screen`, or a `Device`, can be used.
 """

@@ -163,7 +163,8 @@ class DemonstrationConfig(StageConfig):
     """Demonstrations of a task."""
 
     by: Literal["script", "person"] = "script"
-    """Who solves the episodes: the scripted policy of the task, or a person in a page in the browser."""
+    """Who solves the episodes: the scripted policy of the task, or a person who sees a page in the browser and acts by mouse, keys, a
+    gamepad or a 3D mouse."""
     episodes: Annotated[int, Range(1, 1_000_000)] = 50
     """Solved episodes of the dataset."""
     seed: Annotated[int, Range(0, 2**31 - 1)] = 0
@@ -179,9 +180,13 @@ class DemonstrationConfig(StageConfig):
     needs: ClassVar[dict[str, tuple[str, ...]]] = {"environments": ("by", "script"), "noise": ("by", "script")}
 
 
+AXES = ("right", "up", "near", "turn")
+"""Where sticks and 3D mice move and turn: in the picture, towards the endoscope, and counter-clockwise."""
+
+
 @dataclass(frozen=True)
 class PersonConfig(StageConfig):
-    """What a person sees, and acts with."""
+    """What a person sees, and acts with beside the mouse and the keys of the page: a gamepad, a 3D mouse."""
 
     host: str = "127.0.0.1"
     """Address that the page is served on; 0.0.0.0 lets other machines in, all of them, and none has to log in."""
@@ -200,6 +205,12 @@ class PersonConfig(StageConfig):
     stick_near: Annotated[int, Range(0, 63)] = 4
     """Axis of the gamepad that moves towards the endoscope when it is pulled."""
     stick_turn: Annotated[int, Range(0, 63)] = 3
-    """Axis of the gamepad that turns, in tasks whose fourth number is a speed."""
+    """Axis of the gamepad that turns clockwise, in tasks that turn something."""
+    mouse_3d: str = ""
+    """File of a 3D mouse, such as /dev/hidraw0; empty = the first one that there is, none = none."""
     dead_zone: Annotated[float, Range(0, 0.9)] = 0.15
-    """Part of the way of a stick that does nothing, as sticks do not return to their middle."""
+    """Part of the way of a stick or a 3D mouse that does nothing, as they do not return to their middle."""
+    speed: Annotated[float, Range(0.01, 1)] = 1.0
+    """How fast the tip goes when a stick or a 3D mouse is pushed to its end, in parts of the fastest."""
+    reverse: tuple[Literal["right", "up", "near", "turn"], ...] = ()
+    """Axes on which a gamepad or a 3D mouse goes the other way."""

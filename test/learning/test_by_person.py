@@ -2,7 +2,6 @@
 
 import json
 import os
-import struct
 import subprocess
 import sys
 import urllib.request
@@ -18,7 +17,6 @@ from endo_sim_ros.learning import demonstrations
 from endo_sim_ros.learning.by_person import Wish, demonstrate_by_person
 from endo_sim_ros.learning.config import DemonstrationConfig, PersonConfig, SightConfig
 from endo_sim_ros.learning.demonstrations import demonstrate
-from endo_sim_ros.learning.gamepad import Gamepad, find_gamepad
 
 SIGHT = SightConfig(image_width=40, eyes=2, segmentation=True)
 SCENES = ["phantom:0", "phantom:1"]
@@ -141,32 +139,6 @@ def test_a_person_turns_the_endoscope(tmp_path):
     assert [line for line in screen.views[-1].lines if "left" in line] == ["5.8 s left"], "five steps of 0.04 s"
     assert not any("fourth" in line or "jaw" in line for line in screen.views[-1].lines)
     assert (screen.views[0].image != screen.views[-1].image).mean() > 0.1
-
-
-def test_sticks_and_buttons_of_a_gamepad_are_heard(tmp_path):
-    """As the kernel tells of them, through a pipe in the place of its file."""
-    path = tmp_path / "js0"
-    os.mkfifo(path)
-    writer = os.open(path, os.O_RDWR)
-    gamepad = Gamepad(path, PersonConfig())
-
-    def tell(*events):
-        os.write(writer, b"".join(struct.pack("=IhBB", 0, *event) for event in events))
-
-    tell((0, 0x82, 0), (0, 0x82, 1), (1, 0x81, 0), (-32767, 0x82, 2))  # how it is at first: a button held, a trigger at rest
-    wish = gamepad.read()
-    assert not wish.jaw and not wish.way.any() and wish.word is None
-    tell((32767, 2, 0), (16384, 2, 1), (-32767, 2, 4), (3000, 2, 3), (1, 1, 0), (0, 1, 0), (1, 1, 2))
-    wish = gamepad.read()
-    np.testing.assert_allclose(wish.way, [1, -(0.5 - 0.15) / 0.85, -1], atol=1e-3)
-    assert wish.jaw and wish.turn == 0 and wish.word == "drop"
-    again = gamepad.read()
-    assert not again.jaw and again.word is None and (again.way == wish.way).all(), "sticks stay, buttons are pressed once"
-    os.close(writer)
-    assert not gamepad.read().way.any(), "without it nothing moves"
-    assert find_gamepad(PersonConfig(gamepad="none")) is None
-    with pytest.raises(ValueError, match=r"gamepad: .*js7 cannot be opened \(No such file or directory\); name another, or none"):
-        find_gamepad(PersonConfig(gamepad=str(tmp_path / "js7")))
 
 
 def test_options_that_have_no_effect_are_refused(tmp_path):

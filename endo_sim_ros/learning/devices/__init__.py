@@ -1,0 +1,26 @@
+"""What a person can act with in demonstrations, beside the page: each is a `Device` of :mod:`endo_sim_ros.learning.by_person`."""
+
+from typing import Protocol
+
+from endo_sim_ros.learning.by_person import Device
+from endo_sim_ros.learning.config import PersonConfig
+from endo_sim_ros.learning.devices.gamepad import find_gamepad
+from endo_sim_ros.learning.devices.mouse_3d import find_mouse_3d
+
+
+class FoundDevice(Device, Protocol):
+    """One whose name is its text, and that can be closed."""
+
+    def close(self) -> None:
+        """Hear it no more."""
+        ...
+
+
+def find_devices(config: PersonConfig) -> list[FoundDevice]:
+    """The gamepad and the 3D mouse that are there and wanted.
+
+    Raises:
+        ValueError: If one that is asked for cannot be used.
+    """
+    found = (find_gamepad(config), find_mouse_3d(config))
+    return [device for device in found if device is not None]

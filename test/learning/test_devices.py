@@ -1,0 +1,117 @@
+"""What a person acts with beside the page: bytes of gamepads and 3D mice."""
+
+import fcntl
+import os
+import struct
+
+import numpy as np
+import pytest
+
+from endo_sim_ros.learning.config import PersonConfig
+from endo_sim_ros.learning.devices.device_file import first_device, is_multi_axis_controller
+from endo_sim_ros.learning.devices.gamepad import Gamepad, find_gamepad
+from endo_sim_ros.learning.devices.mouse_3d import Mouse3D, find_mouse_3d
+
+# How the report descriptors of a SpaceMouse Wireless and of a gamepad begin.
+MOUSE_3D = "05 01 09 08 A1 01 A1 00 85 01 16 A2 FE 26 5E 01 36 88 FA 46 78 05 55 0C 65 11 09 30 09 31 09 32 09 33 09 34 09 35 75 10"
+GAMEPAD = "05 01 09 05 A1 01 85 01 09 30 09 31 09 32 09 35 15 00 26 FF 00 75 08 95 04 81 02"
+
+
+@pytest.fixture
+def pipe(tmp_path):
+    """In the place of a device's file; what is written to it at once comes as one report, as from the kernel."""
+    path = tmp_path / "device"
+    os.mkfifo(path)
+    writer = os.open(path, os.O_RDWR)
+    fcntl.fcntl(writer, fcntl.F_SETFL, os.O_DIRECT)
+    yield path, lambda data: os.write(writer, data), lambda: os.close(writer)
+
+
+def test_sticks_and_buttons_of_a_gamepad_are_heard(pipe, tmp_path):
+    path, write, end = pipe
+    gamepad = Gamepad(path, PersonConfig())
+
+    def tell(*events):
+        write(b"".join(struct.pack("=IhBB", 0, *event) for event in events))
+
+    tell((0, 0x82, 0), (0, 0x82, 1), (1, 0x81, 0), (-32767, 0x82, 2))  # how it is at first: a button held, a trigger at rest
+    wish = gamepad.read()
+    assert not wish.jaw and not wish.way.any() and wish.word is None
+    tell((32767, 2, 0), (16384, 2, 1), (-32767, 2, 4), (3000, 2, 3), (1, 1, 0), (0, 1, 0), (1, 1, 2))
+    wish = gamepad.read()
+    np.testing.assert_allclose(wish.way, [1, -(0.5 - 0.15) / 0.85, -1], atol=1e-3)
+    assert wish.jaw and wish.turn == 0 and wish.word == "drop"
+    tell((32767, 2, 3))
+    again = gamepad.read()
+    assert again.turn == -1, "to the right is clockwise"
+    assert not again.jaw and again.word is None and (again.way == wish.way).all(), "sticks stay, buttons are pressed once"
+    end()
+    assert not gamepad.read().way.any(), "without it nothing moves"
+    assert find_gamepad(PersonConfig(gamepad="none")) is None
+    with pytest.raises(ValueError, match=r"gamepad: .*js7 cannot be opened \(No such file or directory\); allow it, name another, or none"):
+        find_gamepad(PersonConfig(gamepad=str(tmp_path / "js7")))
+
+
+def test_the_tip_goes_as_the_cap_of_a_3d_mouse(pipe, caplog):
+    path, write, end = pipe
+    mouse = find_mouse_3d(PersonConfig(mouse_3d=str(path), dead_zone=0.2))
+    assert mouse is not None and not mouse.read().way.any()
+    write(struct.pack("<B3h", 1, 100, 0, 0))
+    write(struct.pack("<B3h", 1, 350, -210, -350))  # right, away from the user, up: the newest counts
+    write(bytes.fromhex("02 00 00 e2 ff a2 fe"))  # twisted counter-clockwise, as seen from above
+    wish = mouse.read()
+    np.testing.assert_allclose([*wish.way, wish.turn], [1, 1, -0.5, 1], atol=1e-6)
+    write(struct.pack("<B6h", 1, 0, 10, 280, 0, 0, 350))  # newer ones have one report; this turns clockwise
+    wish = mouse.read()
+    np.testing.assert_allclose([*wish.way, wish.turn], [0, -0.75, 0, -1], atol=1e-6)
+    assert mouse.read().way[1] == pytest.approx(-0.75), "it stays until the next report"
+    write(bytes.fromhex("17 64 01"))  # the battery
+    end()
+    assert not mouse.read().way.any() and f"mouse_3d: {path} is gone; the mouse and the keys go on" in caplog.text
+
+
+def test_buttons_of_a_3d_mouse_are_jaw_arm_and_again(pipe):
+    path, write, end = pipe
+    mouse = Mouse3D(path, PersonConfig())
+
+    def pressed(*held):
+        for buttons in held:
+            write(bytes([3, *buttons]))
+        wish = mouse.read()
+        return wish.jaw, wish.arm, wish.word
+
+    assert pressed((1, 0)) == (True, False, None)
+    assert pressed((1, 0)) == (False, False, None), "it is held"
+    assert pressed((0, 0), (2, 0)) == (False, True, None)
+    assert pressed((3, 0)) == (False, False, "again"), "one while the other is held"
+    assert pressed((0, 0), (1, 0), (0, 0), (1, 0)) == (False, False, None), "closed, and opened again"
+    assert pressed((0, 0x10, 0, 0)) == (False, False, None), "larger ones have more"
+    end()
+
+
+def test_axes_are_reversed_and_slowed_down(pipe):
+    path, write, end = pipe
+    config = PersonConfig(reverse=("near", "turn"), speed=0.5, dead_zone=0)
+    mouse, pad = Mouse3D(path, config), Gamepad(path, config)
+    write(struct.pack("<B6h", 1, 350, 350, -350, 0, 0, -350))
+    wish = mouse.read()
+    np.testing.assert_allclose([*wish.way, wish.turn], [0.5, 0.5, -0.5, -0.5])
+    write(struct.pack("=IhBB", 0, 32767, 2, 4))
+    np.testing.assert_allclose(pad.read().way, [0, 0, -0.5])
+    end()
+
+
+def test_3d_mice_are_known_by_what_they_say_of_themselves(tmp_path):
+    for descriptor, known in ((MOUSE_3D, True), (GAMEPAD, False)):
+        (tmp_path / "report_descriptor").write_bytes(bytes.fromhex(descriptor))
+        assert is_multi_axis_controller(tmp_path) == known
+    assert not is_multi_axis_controller(tmp_path / "nothing")
+
+
+def test_the_first_device_that_can_be_opened_is_taken(pipe, tmp_path, caplog):
+    path, _, end = pipe
+    make = lambda file: Mouse3D(file, PersonConfig())
+    found = first_device("", [tmp_path / "none", path], make)
+    assert str(found) == f"3D mouse {path}" and "none cannot be opened" in caplog.text
+    assert first_device("none", [path], make) is None and first_device("", [], make) is None
+    end()

@@ -44,6 +44,7 @@ setup(
         "depth": ["onnxruntime", "transformers"],  # reconstruction with depth:=network
         "learning": ["gymnasium>=1.1"],  # endo_sim_ros.learning.environments
         "lerobot": ["pyarrow>=15"],  # `endo-sim export`
+        "openxr": ["pyopenxr>=1.1.6501"],  # controllers in the hands of a person, `endo-sim demonstrate --by person`
         "ray": ["gymnasium>=1.1", "ray>=2.9"],  # environments on several GPUs or machines, `learning.joined`
         "rl": ["gymnasium>=1.1", "stable-baselines3>=2.4"],  # `endo-sim train --algorithm ppo`
         "urdf": ["trimesh>=4"],  # instruments of your own, `instruments.urdf_reader`

@@ -16,8 +16,8 @@ from endo_sim_ros.physics.config import MotionConfig
 class Command:
     """Let a script, or a person, solve a task many times, and write it as a LeRobot dataset; called again, continue it.
 
-    A person sees the endoscope's picture in a page in the browser, and acts by mouse and keys, a gamepad or a 3D mouse, as the options
-    under page say.
+    A person sees the endoscope's picture in a page in the browser, and acts by mouse and keys, a gamepad, a 3D mouse or the controllers
+    of OpenXR, as the options under page say.
     """
 
     task: Positional[str]
@@ -53,6 +53,8 @@ class Command:
         from endo_sim_ros.learning.devices import find_devices
         from endo_sim_ros.viewer.demonstration_page import DemonstrationPage
 
+        for text in unused_options(self.page):
+            raise ConfigError(f"page: {text}")
         found = find_devices(self.page)
         page = DemonstrationPage(self.page)
         heard = f" heard as well: {', '.join(map(str, found))};" if found else ""

@@ -30,6 +30,8 @@ class Wish:
     way: np.ndarray = field(default_factory=lambda: np.zeros(3))  # right, up and towards the endoscope, in largest steps, -1 … 1
     turn: float = 0.0  # -1 … 1, the fourth number of a task where it is a speed, or the fifth
     jaw: bool = False  # close it if it is open, and open it if it is closed
+    closed: bool | None = None  # close it, or open it; None = as `jaw` says
+    hand: int | None = None  # arm of the task that this is for, or its last; None = the one at work
     arm: bool = False  # act with the next arm from now on
     word: Word | None = None
 
@@ -138,7 +140,7 @@ class _Session:
         resting = 0.0 if batch.task.turns else -1.0  # the fourth number, of a speed or an open jaw
         actions, arm = np.zeros((len(batch.task.arms), batch.task.action_size())), 0
         actions[:, 3] = resting
-        turning = 3 if batch.task.turns else 4 if batch.task.twist else None
+        moving = [0, 1, 2, *([3] if batch.task.turns else [4] if batch.task.twist else [])]
         begun, rested, due = False, False, time.monotonic()
         while episode.solved is None:
             self._screen.show(self._view(number, arm, actions, begun))
@@ -150,14 +152,14 @@ class _Session:
                 self._said = ""
                 return episode, words[0]
             arm = (arm + sum(wish.arm for wish in wishes)) % len(actions)
-            actions[:, :3] = 0
-            actions[arm, :3] = np.clip(np.sum([wish.way for wish in wishes], 0), -1, 1)
-            if turning is not None:
-                actions[:, turning] = 0
-                actions[arm, turning] = np.clip(sum(wish.turn for wish in wishes), -1, 1)
-            if not batch.task.turns and sum(wish.jaw for wish in wishes) % 2:
-                actions[arm, 3] *= -1
-            moves = actions[arm, :3].any() or actions[arm, 3] != resting or actions[arm, 4:].any()
+            actions[:, moving] = 0
+            for wish in wishes:
+                of = actions[arm if wish.hand is None else min(wish.hand, len(actions) - 1)]
+                of[moving] += [*wish.way, wish.turn][: len(moving)]
+                if not batch.task.turns and (wish.jaw or wish.closed is not None):
+                    of[3] = -of[3] if wish.closed is None else 1.0 if wish.closed else -1.0
+            actions = np.clip(actions, -1, 1)
+            moves = actions[:, moving].any() or (actions[:, 3] != resting).any()
             if not begun and not (moves and rested):  # what the hand still does of the episode before begins none
                 rested |= not moves
                 actions[:, 3] = resting
@@ -188,20 +190,24 @@ class _Session:
             f"{self._demonstrations.episodes + (self._solved is not None)} of {self._wanted} episodes",
             f"{left:.1f} s left" if begun else "move to begin",
             f"{_force(batch):.2f} N of {task.force_limit:g} N",
-            *([f"arm {arm + 1} of {len(actions)}"] if len(actions) > 1 else []),
-            *([] if task.turns else [_state(task, arm, actions[:, 3])]),
+            *([f"{task.arms[arm]} at work"] if len(actions) > 1 else []),
+            *([] if task.turns else _states(task, actions[:, 3])),
             *([self._said] if self._said else []),
         )
         return View(pictures.draw()[IMAGE][0], camera, pixel, lines)
 
 
-def _state(task: Task, arm: int, fourth: np.ndarray) -> str:
-    """What the fourth number of an action does, of an arm among all [A]."""
-    if task.closes(np.ones(len(fourth)))[arm]:
-        return "jaw closed" if task.closes(fourth)[arm] else "jaw open"
-    if task.cuts(np.ones(len(fourth)))[arm]:
-        return "the edge cuts" if task.cuts(fourth)[arm] else "the edge rests"
-    return f"fourth number {fourth[arm]:+.0f}"
+def _states(task: Task, fourth: np.ndarray) -> list[str]:
+    """What the fourth numbers of an action [A] do."""
+    ones, states = np.ones(len(fourth)), []
+    for arm, value in enumerate(fourth):
+        if task.closes(ones)[arm]:
+            states.append("jaw closed" if task.closes(fourth)[arm] else "jaw open")
+        elif task.cuts(ones)[arm]:
+            states.append("the edge cuts" if task.cuts(fourth)[arm] else "the edge rests")
+        else:
+            states.append(f"fourth number {value:+.0f}")
+    return [f"{arm}: {state}" for arm, state in zip(task.arms, states)] if len(states) > 1 else states
 
 
 def _force(batch: TaskBatch) -> float:

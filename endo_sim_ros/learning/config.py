@@ -164,7 +164,7 @@ class DemonstrationConfig(StageConfig):
 
     by: Literal["script", "person"] = "script"
     """Who solves the episodes: the scripted policy of the task, or a person who sees a page in the browser and acts by mouse, keys, a
-    gamepad or a 3D mouse."""
+    gamepad, a 3D mouse or the controllers of OpenXR."""
     episodes: Annotated[int, Range(1, 1_000_000)] = 50
     """Solved episodes of the dataset."""
     seed: Annotated[int, Range(0, 2**31 - 1)] = 0
@@ -181,12 +181,12 @@ class DemonstrationConfig(StageConfig):
 
 
 AXES = ("right", "up", "near", "turn")
-"""Where sticks and 3D mice move and turn: in the picture, towards the endoscope, and counter-clockwise."""
+"""Where sticks, 3D mice and hands move and turn: in the picture, towards the endoscope, and counter-clockwise."""
 
 
 @dataclass(frozen=True)
 class PersonConfig(StageConfig):
-    """What a person sees, and acts with beside the mouse and the keys of the page: a gamepad, a 3D mouse."""
+    """What a person sees, and acts with beside the mouse and the keys of the page: a gamepad, a 3D mouse, the controllers of OpenXR."""
 
     host: str = "127.0.0.1"
     """Address that the page is served on; 0.0.0.0 lets other machines in, all of them, and none has to log in."""
@@ -214,3 +214,14 @@ class PersonConfig(StageConfig):
     """How fast the tip goes when a stick or a 3D mouse is pushed to its end, in parts of the fastest."""
     reverse: tuple[Literal["right", "up", "near", "turn"], ...] = ()
     """Axes on which a gamepad or a 3D mouse goes the other way."""
+    openxr: Literal["auto", "on", "off"] = "auto"
+    """Hear controllers of OpenXR: auto = where pyopenxr is installed and its runtime can be used; on = or end with a sentence that says
+    why not."""
+    hand_step: Annotated[float, Range(0.0005, 0.1, "m")] = 0.006
+    """How far a hand with a controller of OpenXR goes for a largest step, which is 2 mm of the tip in most tasks, m."""
+    hand_turn: Annotated[float, Range(0.1, 45, "deg")] = 5.0
+    """How far it turns for a largest turn, degrees."""
+    hand_heading: Annotated[float, Range(-180, 180, "deg")] = 0.0
+    """How far to the left of the headset's direction, as it was at the beginning, the person looks at the page, degrees."""
+
+    needs: ClassVar[dict[str, tuple[str, ...]]] = dict.fromkeys(("hand_step", "hand_turn", "hand_heading"), ("openxr", "auto", "on"))

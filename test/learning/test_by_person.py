@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 from endo_sim_command import endo_sim_here
 
-from endo_sim_ros.learning import demonstrations
+from endo_sim_ros.learning import by_person, demonstrations
 from endo_sim_ros.learning.by_person import Wish, demonstrate_by_person
 from endo_sim_ros.learning.config import DemonstrationConfig, PersonConfig, SightConfig
 from endo_sim_ros.learning.demonstrations import demonstrate
@@ -141,9 +141,27 @@ def test_a_person_turns_the_endoscope(tmp_path):
     assert (screen.views[0].image != screen.views[-1].image).mean() > 0.1
 
 
+def test_each_hand_acts_with_the_arm_on_its_side(tmp_path, monkeypatch):
+    taken = []
+    monkeypatch.setattr(by_person, "take", lambda *given: taken.append(given[-1].reshape(-1, 4)) or demonstrations.take(*given))
+    right = [Wish(), *[Wish(np.array([0.5, 0, 0]), closed=True, hand=0), Wish(hand=0), Wish(closed=False, hand=0)]]
+    left = [Wish(), *[Wish(np.array([0, 0, 0.5]), hand=1), Wish(closed=True, hand=1), Wish(np.array([0, 1.0, 0]), hand=1)]]
+    config = replace(BY_PERSON, episodes=1)
+    hands, screen = [Hand(*right), Hand(*left)], Screen()
+    demonstrate_by_person("handover", SCENES[:1], tmp_path, screen, hands, PersonConfig(width=40), config, SIGHT, device="cpu")
+    assert (np.array(taken) == [
+        [[0.5, 0, 0, 1], [0, 0, 0.5, -1]],
+        [[0, 0, 0, 1], [0, 0, 0, 1]],
+        [[0, 0, 0, -1], [0, 1, 0, 1]],
+    ]).all()  # fmt: skip
+    assert {"PSM1 at work", "PSM1: jaw open", "PSM2: jaw closed"} <= set(screen.views[-1].lines)
+
+
 def test_options_that_have_no_effect_are_refused(tmp_path):
     done = endo_sim_here("demonstrate", "retraction", tmp_path / "out", "--by", "person", "--noise", 0.3)
     assert done.returncode == 2 and "noise has no effect while by is person; set by to script" in done.stderr
+    done = endo_sim_here("demonstrate", "retraction", tmp_path / "out", "--by", "person", "--page.openxr", "off", "--page.hand-step", 0.01)
+    assert done.returncode == 2 and "page: hand_step has no effect while openxr is off; set openxr to auto or on" in done.stderr
     done = endo_sim_here("demonstrate", "retraction", tmp_path / "out", "--page.port", 9000)
     assert done.returncode == 2 and "page: there is none while by is script" in done.stderr
 

@@ -1,16 +1,23 @@
-"""What a person acts with beside the page: bytes of gamepads and 3D mice."""
+"""What a person acts with beside the page: bytes of gamepads and 3D mice, and hands in OpenXR."""
 
 import fcntl
+import importlib.util
+import logging
 import os
+import shutil
 import struct
+import time
 
 import numpy as np
 import pytest
+from remote_hands import Monado, RemoteHand
+from scipy.spatial.transform import Rotation
 
 from endo_sim_ros.learning.config import PersonConfig
 from endo_sim_ros.learning.devices.device_file import first_device, is_multi_axis_controller
 from endo_sim_ros.learning.devices.gamepad import Gamepad, find_gamepad
 from endo_sim_ros.learning.devices.mouse_3d import Mouse3D, find_mouse_3d
+from endo_sim_ros.learning.devices.openxr import Grip, Hand, find_hands
 
 # How the report descriptors of a SpaceMouse Wireless and of a gamepad begin.
 MOUSE_3D = "05 01 09 08 A1 01 A1 00 85 01 16 A2 FE 26 5E 01 36 88 FA 46 78 05 55 0C 65 11 09 30 09 31 09 32 09 33 09 34 09 35 75 10"
@@ -115,3 +122,86 @@ def test_the_first_device_that_can_be_opened_is_taken(pipe, tmp_path, caplog):
     assert str(found) == f"3D mouse {path}" and "none cannot be opened" in caplog.text
     assert first_device("none", [path], make) is None and first_device("", [], make) is None
     end()
+
+
+class Told:
+    """A runtime that tells what stands in a list."""
+
+    def __init__(self, *grips):
+        self.grips = list(grips)
+
+    def grip(self, hand):
+        return self.grips.pop(0)
+
+
+def grip(place=(0, 0, 0), degrees=0.0, held=True, closed=False, pressed=()):
+    return Grip(np.array(place), Rotation.from_euler("z", degrees, degrees=True), held, closed, frozenset(pressed))
+
+
+def test_the_tip_follows_a_hand_that_holds_on():
+    grips = [
+        grip((0.5, 0, 0), held=False),
+        grip((0.6, 0, 0)),
+        grip((0.609, -0.003, 0.006), 10),
+        grip((0.609, -0.003, 0.006), 10, closed=True),
+    ]
+    grips += [grip((0, 0, 0), 90, held=False, closed=True), None, grip((9, 9, 9)), grip((9, 9, 9.003), pressed=["next"]), None, None]
+    hand = Hand(Told(*grips), 1, PersonConfig())
+    wishes = [hand.read() for _ in grips]
+    moves = [[*wish.way, wish.turn] for wish in wishes]
+    expected = [[0] * 4, [0] * 4, [1, -0.5, 1, 1], [0.5, 0, 0, 1], *[[0] * 4] * 3, [0, 0, 0.5, 0], *[[0] * 4] * 2]
+    np.testing.assert_allclose(moves, expected, atol=1e-9, err_msg="of a long way a step at a time, and nothing of where it went free")
+    assert [wish.closed for wish in wishes] == [None, False, False, True, None, None, None, False, None, None]
+    assert [wish.word for wish in wishes] == [*[None] * 7, "next", None, None] and all(wish.hand == 1 for wish in wishes)
+
+
+def test_a_hand_moves_as_the_person_sees_it():
+    """Whose headset looked to the right of the page."""
+    hand = Hand(Told(grip(), grip((0, 0, -0.006))), 0, PersonConfig(hand_heading=90))
+    hand.read()
+    np.testing.assert_allclose(hand.read().way, [1, 0, 0], atol=1e-9)
+
+
+def test_hands_without_a_runtime_are_told_where_they_are_asked_for(monkeypatch, tmp_path):
+    monkeypatch.setenv("XR_RUNTIME_JSON", str(tmp_path / "none.json"))
+    assert find_hands(PersonConfig()) == () == find_hands(PersonConfig(openxr="off"))
+    wrong = "pyopenxr cannot be used .*pip install" if importlib.util.find_spec("xr") is None else "no runtime can be used .*start one"
+    with pytest.raises(ValueError, match=f"openxr: {wrong}"):
+        find_hands(PersonConfig(openxr="on"))
+
+
+@pytest.mark.dds
+def test_hands_are_heard_through_a_runtime_until_it_is_gone(monkeypatch, tmp_path, caplog):
+    pytest.importorskip("xr", reason="needs pyopenxr")
+    if not shutil.which("monado-service"):
+        pytest.skip("needs monado-service, a runtime of OpenXR")
+    monado = Monado(tmp_path, 20000 + (os.getpid() + 57) % 20000)
+    try:
+        monkeypatch.setenv("XDG_RUNTIME_DIR", str(monado.runtime))
+        hands = find_hands(PersonConfig(openxr="on"))
+        assert [str(hand).split(" of Monado")[0] for hand in hands] == ["right hand", "left hand"]
+
+        def wish(right, left):
+            monado.tell(right, left)
+            time.sleep(0.1)
+            return [hand.read() for hand in hands]
+
+        place, there = (0.2, 1.2, -0.3), (0.206, 1.203, -0.303)
+        left, turned = RemoteHand((-0.2, 1.2, -0.3)), (0, 0, *np.sin(np.deg2rad([2.5, 87.5])))
+        for _ in range(2):
+            assert not any(each.way.any() for each in wish(RemoteHand(place), left))
+        wish(RemoteHand(place, squeeze=True), left)
+        one, other = wish(RemoteHand(there, turned, squeeze=True, trigger=True), left)
+        np.testing.assert_allclose([*one.way, one.turn], [1, 0.5, -0.5, 1], atol=1e-3)
+        assert one.closed and one.hand == 0 and other.closed is None and other.hand == 1 and not other.way.any()
+        one, other = wish(RemoteHand(place, a=True), RemoteHand(left.place, b=True))
+        assert one.word == "again" and other.word == "finish" and one.closed is None and not one.way.any()
+        one, _ = wish(RemoteHand(there, squeeze=True, seen=False), left)
+        assert one.closed is None, "out of sight"
+    finally:
+        monado.stop()
+    with caplog.at_level(logging.WARNING):
+        assert not any(hand.read().way.any() for hand in (*hands, *hands))
+    assert len(caplog.records) == 1 and "openxr: the runtime is gone (InstanceLostError); the mouse and the keys go on" in caplog.text
+    for hand in hands:
+        hand.close()

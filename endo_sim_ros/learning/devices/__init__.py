@@ -6,6 +6,7 @@ from endo_sim_ros.learning.by_person import Device
 from endo_sim_ros.learning.config import PersonConfig
 from endo_sim_ros.learning.devices.gamepad import find_gamepad
 from endo_sim_ros.learning.devices.mouse_3d import find_mouse_3d
+from endo_sim_ros.learning.devices.openxr import find_hands
 
 
 class FoundDevice(Device, Protocol):
@@ -17,10 +18,10 @@ class FoundDevice(Device, Protocol):
 
 
 def find_devices(config: PersonConfig) -> list[FoundDevice]:
-    """The gamepad and the 3D mouse that are there and wanted.
+    """The gamepad, the 3D mouse and the hands that are there and wanted.
 
     Raises:
         ValueError: If one that is asked for cannot be used.
     """
-    found = (find_gamepad(config), find_mouse_3d(config))
+    found = (find_gamepad(config), find_mouse_3d(config), *find_hands(config))
     return [device for device in found if device is not None]

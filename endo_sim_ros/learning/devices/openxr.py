@@ -1,0 +1,226 @@
+"""Controllers in the hands of a person, through a runtime of OpenXR (the specification 1.0, by pyopenxr).
+
+The session is headless (XR_MND_headless): the person looks at the page, and the headset, if there is one, may lie on the desk.
+"""
+
+import ctypes
+import importlib.util
+import logging
+import os
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from endo_sim_ros.learning.by_person import Wish, Word
+from endo_sim_ros.learning.config import PersonConfig
+
+_EXTENSIONS = {"XR_MND_headless": "to hear controllers without drawing", "XR_KHR_convert_timespec_time": "to know the time"}
+_HANDS = ("/user/hand/right", "/user/hand/left")  # in the order of the arms: PSM1 is on the right
+# Of each interaction profile: what is held to act, what closes the jaw, and two buttons of the right and two of the left hand.
+_INPUTS = {
+    "khr/simple_controller": ("select/click", "menu/click", (), ()),
+    "oculus/touch_controller": ("squeeze/value", "trigger/value", ("a/click", "b/click"), ("x/click", "y/click")),
+    "valve/index_controller": ("squeeze/value", "trigger/value", ("a/click", "b/click"), ("a/click", "b/click")),
+    "htc/vive_controller": ("squeeze/click", "trigger/value", ("menu/click", "trackpad/click"), ("menu/click", "trackpad/click")),
+    "microsoft/motion_controller": ("squeeze/click", "trigger/value", ("menu/click", "trackpad/click"), ("menu/click", "trackpad/click")),
+}
+_WORDS: tuple[tuple[Word, Word], ...] = (("again", "next"), ("drop", "finish"))  # by the buttons of the right and the left hand
+
+_logger = logging.getLogger(__name__)
+
+
+@dataclass
+class Grip:
+    """A hand with its controller, in the frame of the room: x right, y up, z towards the person."""
+
+    place: np.ndarray  # [3], m
+    rotation: Rotation
+    held: bool  # what is held to act
+    closed: bool
+    pressed: frozenset[Word]
+
+
+class Runtime:
+    """A session of a runtime, and what it tells of the hands.
+
+    Raises:
+        ValueError: If pyopenxr is not installed, or there is no runtime that can be used.
+    """
+
+    def __init__(self):
+        os.environ.setdefault("XR_LOADER_DEBUG", "none")  # what it would print is said in the sentence
+        try:
+            import xr  # pyright: ignore[reportMissingImports]  (optional)
+        except (ImportError, OSError, AttributeError) as error:  # the last two where it finds no OpenGL
+            raise ValueError(f"openxr: pyopenxr cannot be used ({error}); pip install 'endo_sim_ros[openxr]'") from error
+        self._xr, self._instance, self._running = xr, None, False
+        try:
+            self._begin()
+        except xr.exception.XrException as error:
+            self.close()
+            raise ValueError(f"openxr: no runtime can be used ({type(error).__name__}); start one, such as monado-service") from error
+
+    def _begin(self) -> None:
+        xr = self._xr
+        known = {each.extension_name.decode() for each in xr.enumerate_instance_extension_properties()}
+        for extension, purpose in _EXTENSIONS.items():
+            if extension not in known:
+                raise ValueError(f"openxr: the runtime has no {extension}, {purpose}; take another one, such as Monado")
+        application = xr.ApplicationInfo("endo_sim_ros", 1, "endo_sim_ros", 1, xr.Version(1, 0, 0))
+        self._instance = xr.create_instance(xr.InstanceCreateInfo(application_info=application, enabled_extension_names=[*_EXTENSIONS]))
+        self.name = xr.get_instance_properties(self._instance).runtime_name.decode()
+        system = xr.get_system(self._instance, xr.SystemGetInfo(xr.FormFactor.HEAD_MOUNTED_DISPLAY))
+        self._session = xr.create_session(self._instance, xr.SessionCreateInfo(system_id=system))
+        self._set = xr.create_action_set(self._instance, xr.ActionSetCreateInfo("hands", "Hands"))
+        self._hands = [self._path(hand) for hand in _HANDS]
+        kind = xr.ActionType.BOOLEAN_INPUT  # of a trigger, too: runtimes know from where on it counts as pressed
+        words = [word for words in _WORDS for word in words]
+        self._switches = {name: self._action(name, kind) for name in ("held", "closed", *words)}
+        grip = self._action("grip", xr.ActionType.POSE_INPUT)
+        for profile, (held, closed, *buttons) in _INPUTS.items():
+            bound = []
+            for hand, names, words in zip(_HANDS, buttons, _WORDS):
+                inputs = {"held": held, "closed": closed, **dict(zip(words, names))}
+                bound += [(self._switches[name], f"{hand}/input/{where}") for name, where in inputs.items()]
+                bound.append((grip, f"{hand}/input/grip/pose"))
+            bindings = [xr.ActionSuggestedBinding(action, self._path(where)) for action, where in bound]
+            suggestion = xr.InteractionProfileSuggestedBinding(self._path(f"/interaction_profiles/{profile}"), suggested_bindings=bindings)
+            xr.suggest_interaction_profile_bindings(self._instance, suggestion)
+        xr.attach_session_action_sets(self._session, xr.SessionActionSetsAttachInfo(action_sets=[self._set]))
+        spaces = [xr.ActionSpaceCreateInfo(action=grip, subaction_path=hand) for hand in self._hands]
+        self._spaces = [xr.create_action_space(self._session, space) for space in spaces]
+        self._room = xr.create_reference_space(self._session, xr.ReferenceSpaceCreateInfo(xr.ReferenceSpaceType.LOCAL))
+
+    def _path(self, text: str) -> Any:
+        return self._xr.string_to_path(self._instance, text)
+
+    def _action(self, name: str, kind: Any) -> Any:
+        xr = self._xr
+        info = xr.ActionCreateInfo(action_name=name, action_type=kind, subaction_paths=self._hands, localized_action_name=name.capitalize())
+        return xr.create_action(self._set, info)
+
+    def grip(self, hand: int) -> Grip | None:
+        """How a hand is now, 0 = the right one, 1 = the left one; None where its controller is not seen, or the runtime is gone."""
+        if self._instance is None:
+            return None
+        try:
+            return self._grip(hand)
+        except self._xr.exception.QualifiedSuccessResult:  # other programs have the controllers
+            return None
+        except self._xr.exception.XrException as error:
+            self.close()
+            _logger.warning("openxr: the runtime is gone (%s); the mouse and the keys go on", type(error).__name__)
+            return None
+
+    def _grip(self, hand: int) -> Grip | None:
+        xr = self._xr
+        self._hear()
+        if not self._running:
+            return None
+        xr.sync_actions(self._session, xr.ActionsSyncInfo(active_action_sets=[xr.ActiveActionSet(self._set, xr.NULL_PATH)]))
+        seconds, nanoseconds = divmod(time.monotonic_ns(), 10**9)  # the clock of Linux that the extension takes
+        now = xr.convert_timespec_time_to_time_khr(self._instance, xr.timespec(seconds, nanoseconds))
+        found = xr.locate_space(self._spaces[hand], self._room, now)
+        seen = xr.SPACE_LOCATION_POSITION_TRACKED_BIT | xr.SPACE_LOCATION_ORIENTATION_TRACKED_BIT
+        if found.location_flags & seen != seen:
+            return None
+        place, turned = found.pose.position, found.pose.orientation
+        infos = {name: xr.ActionStateGetInfo(action, self._hands[hand]) for name, action in self._switches.items()}
+        on = {name: bool(xr.get_action_state_boolean(self._session, info).current_state) for name, info in infos.items()}
+        rotation = Rotation.from_quat([turned.x, turned.y, turned.z, turned.w])
+        words: list[Word] = [word for word in _WORDS[hand] if on[word]]
+        return Grip(np.array([place.x, place.y, place.z]), rotation, on["held"], on["closed"], frozenset(words))
+
+    def _hear(self) -> None:
+        """What the runtime says of the session."""
+        xr = self._xr
+        while True:
+            try:
+                event = xr.poll_event(self._instance)
+            except xr.exception.EventUnavailable:
+                return
+            if event.type == xr.StructureType.EVENT_DATA_INSTANCE_LOSS_PENDING.value:
+                raise xr.exception.InstanceLostError
+            if event.type != xr.StructureType.EVENT_DATA_SESSION_STATE_CHANGED.value:
+                continue
+            state = xr.SessionState(ctypes.cast(ctypes.byref(event), ctypes.POINTER(xr.EventDataSessionStateChanged)).contents.state)
+            if state == xr.SessionState.READY:
+                xr.begin_session(self._session, xr.SessionBeginInfo())
+                self._running = True
+            elif state == xr.SessionState.STOPPING:
+                xr.end_session(self._session)
+                self._running = False
+            elif state in (xr.SessionState.EXITING, xr.SessionState.LOSS_PENDING):
+                raise xr.exception.SessionLostError
+
+    def close(self) -> None:
+        """End the session."""
+        instance, self._instance = self._instance, None
+        if instance is not None:
+            try:
+                self._xr.destroy_instance(instance)
+            except self._xr.exception.XrException:
+                pass  # a runtime that is gone
+
+
+class Hand:
+    """A hand that acts while it holds its controller firmly, with the arm on its side: the tip moves as it does, and goes after it.
+
+    Args:
+        runtime: What tells of it.
+        number: 0 = the right one, 1 = the left one.
+        config: How far it goes for a step.
+    """
+
+    def __init__(self, runtime: Runtime, number: int, config: PersonConfig):
+        self._runtime, self._number = runtime, number
+        self._steps = np.array([1 / config.hand_step] * 3 + [1 / np.deg2rad(config.hand_turn)])
+        self._heading = Rotation.from_euler("y", -config.hand_heading, degrees=True)
+        self._before: Grip | None = None
+        self._left = np.zeros(4)  # of what it moved and turned and the tip has not yet, in largest steps
+
+    def __str__(self) -> str:
+        return f"{('right', 'left')[self._number]} hand of {self._runtime.name}"
+
+    def read(self) -> Wish:
+        """What it did since the last call: of a long way the first step."""
+        grip, before = self._runtime.grip(self._number), self._before
+        self._before, wish = grip, Wish(hand=self._number)
+        if grip is None or not grip.held:
+            self._left[:] = 0
+        elif before is not None:
+            if before.held:
+                way = self._heading.apply(grip.place - before.place)
+                turn = self._heading.apply((grip.rotation * before.rotation.inv()).as_rotvec())
+                self._left += self._steps * [*way, turn[2]]
+            step = np.clip(self._left, -1, 1)
+            self._left -= step
+            wish.way, wish.turn, wish.closed = step[:3], float(step[3]), grip.closed
+        if grip is not None and before is not None:
+            wish.word = next(iter(grip.pressed - before.pressed), None)
+        return wish
+
+    def close(self) -> None:
+        """No more of it."""
+        self._runtime.close()
+
+
+def find_hands(config: PersonConfig) -> tuple[Hand, ...]:
+    """Both hands; none where they are not wanted, or there is no runtime and none is asked for.
+
+    Raises:
+        ValueError: If they are asked for, and pyopenxr or its runtime cannot be used.
+    """
+    if config.openxr == "off" or config.openxr == "auto" and importlib.util.find_spec("xr") is None:
+        return ()
+    try:
+        runtime = Runtime()
+    except ValueError as error:
+        if config.openxr == "on":
+            raise
+        _logger.info("%s", error)
+        return ()
+    return Hand(runtime, 0, config), Hand(runtime, 1, config)

@@ -7,6 +7,7 @@ intervals know of them.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -14,7 +15,7 @@ from scipy.stats import norm
 
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.identification.ball import COUNT as BALL
-from endo_sim_ros.identification.checks import IdentificationError, check_input, judge_residuals, survey
+from endo_sim_ros.identification.checks import IdentificationError, Survey, check_input, judge_residuals, survey
 from endo_sim_ros.identification.config import IdentificationConfig
 from endo_sim_ros.identification.experiment import Experiment
 from endo_sim_ros.identification.forward import ForwardModel, distances_to_skin, reach_of
@@ -231,10 +232,12 @@ def identify(
         progress("look for the inclusion", 0, config.iterations)
         theta, sure, rests = _locate(theta, prior, parts, model, unknowns)
     point, ended, falls = _minimise(theta, prior, parts, model, unknowns, progress)
-    unknown = ", so that nothing counts as known" * falls
-    more = [] if ended else [f"the estimate had not settled after {config.iterations} iterations{unknown}; allow more"]
-    findings, doubtful = [*first.findings, *more], first.doubtful or falls
-    found = _conclude(point, data, model, unknowns, findings, start is not None and start.felt, sure, doubtful)
+    if not ended:
+        unknown = ", so that nothing counts as known" * falls
+        more = f"the estimate had not settled after {config.iterations} iterations{unknown}; allow more"
+        first = replace(first, findings=[*first.findings, more], doubtful=first.doubtful or falls)
+    felt = (start is not None and start.felt) or any(each.of_forces()[each.used].any() for each in data)
+    found = _conclude(point, unknowns, first, felt, sure, model.steps)
     if unknowns.ball is None:
         return replace(found, findings=[*different_places(found), *found.findings]) if len(unknowns.centres) else found
     if not found.tells_inclusion:
@@ -428,10 +431,8 @@ def _minimise(
     return point, settled, not settled and last < (1 - _FALLS) * costs[-2:][0]
 
 
-def _conclude(
-    point: _Point, data: list[Observations], model: ForwardModel, unknowns: Unknowns, findings: list[str], felt: bool, sure: float | None,
-    doubtful: bool,
-) -> Identification:  # fmt: skip
+def _conclude(point: _Point, unknowns: Unknowns, first: Survey, felt: bool, sure: float | None, steps: int) -> Identification:
+    """What is known at the end: numbers, the map, and findings beside those of the first look."""
     config = unknowns.config
     H, _ = _normal(point)
     chi_square, precision = _misfit(point.residuals, point.covariances), point.prior.precision
@@ -440,45 +441,58 @@ def _conclude(
     factor, doubts = judge_residuals(chi_square, round(count - determined), config)
     covariance = np.linalg.inv(H / factor + precision)
     quantile = float(norm.ppf(0.5 + config.level / 2))
-    feels = felt or any(each.of_forces()[each.used].any() for each in data)
-    told = [_estimate(each, point.theta, covariance, quantile, feels, unknowns, config) for each in unknowns.reported()]
+    told = [_estimate(each, point.theta, covariance, quantile, felt, unknowns, config) for each in unknowns.reported()]
     unsure = [each.name for each in told if each.told == "not told by these data"]
-    if doubtful or doubts:
+    doubtful = first.doubtful or bool(doubts)
+    if doubtful:
         told = [replace(each, told="not told by these data") for each in told]
-    matrix = np.concatenate([unknowns.tangent(point.theta[: unknowns.count]), np.zeros((len(unknowns.nodes), NUISANCES))], 1)
-    logs, tells = unknowns.logs(point.theta[: unknowns.count]), _tells_inclusion(told, sure)
-    if unknowns.ball is not None and not tells:
-        matrix[:, 1 : 1 + BALL] = 0
-        logs = matrix @ point.theta
-    middle = np.log(unknowns.base) + np.clip(logs, -MOST_LOG, MOST_LOG)
-    prior = (matrix**2).sum(1) + unknowns.residual
-    left = np.einsum("mi,ij,mj->m", matrix, covariance, matrix) + unknowns.residual
-    if len(unknowns.centres):
-        prior -= config.spread**2
-        left += (config.smooth_error * unknowns.beside(point.theta[: unknowns.count])) ** 2
-    elif tells:
-        prior[:] = config.field_spread**2  # by which a place may differ from the rest
-        draws = np.random.default_rng(0).multivariate_normal(point.theta, covariance, _DRAWS)[:, : unknowns.count]
-        left = np.mean([(unknowns.logs(each) - logs) ** 2 for each in draws], axis=0)  # its edge is too sharp for derivatives
-        assert unknowns.ball is not None
-        ball = point.theta[1 : 1 + BALL]
-        left += unknowns.ball.logs(ball) * (unknowns.ball.shape(ball)[2] - unknowns.ball.logs(ball))  # there a node is in it or not
-    spread, removed = quantile * np.sqrt(left), np.maximum(1 - left / prior, 0)
-    findings = [*findings, *doubts]
+    painted = _paint(point.theta, covariance, unknowns, _tells_inclusion(told, sure))
+    middle, spread = np.log(unknowns.base) + np.clip(painted.logs, -MOST_LOG, MOST_LOG), quantile * np.sqrt(painted.variance)
+    findings = [*first.findings, *doubts]
     if unsure:
         findings.append(f"these data do not tell {', '.join(unsure)}: the interval rests on what was thought before")
     if point.undone:
         findings.append(f"the simulation had to undo {point.undone} steps: the tool takes tissue farther than it bears")
     findings += _far(point.theta, unknowns)
-    if np.abs(logs).max() > MOST_LOG:
+    if np.abs(painted.logs).max() > MOST_LOG:
         findings.append(
             "moduli of more than 50 times that of physics, or less than a fiftieth, are not simulated: give physics a nearer one"
         )
-    known = (removed >= config.known) & (feels and not doubtful and not doubts)
+    known = (painted.removed >= config.known) & (felt and not doubtful)
     return Identification(
-        told, findings, np.exp(middle), np.exp(middle - spread), np.exp(middle + spread), known, removed, point.theta, covariance, unknowns,
-        unknowns.nodes, config.level, chi_square / max(count - determined, 1), model.steps, feels, sure,
+        told, findings, np.exp(middle), np.exp(middle - spread), np.exp(middle + spread), known, painted.removed, point.theta, covariance,
+        unknowns, unknowns.nodes, config.level, chi_square / max(count - determined, 1), steps, felt, sure,
     )  # fmt: skip
+
+
+class _Painted(NamedTuple):
+    """The factor on the modulus of each control node, all [M]."""
+
+    logs: np.ndarray  # its logarithm
+    variance: np.ndarray  # of that
+    removed: np.ndarray  # as in `Identification`
+
+
+def _paint(theta: np.ndarray, covariance: np.ndarray, unknowns: Unknowns, inclusion: bool) -> _Painted:
+    """The map that θ [Q] and its covariance make, with the ball, if any, only where an inclusion is told."""
+    config, z = unknowns.config, theta[: unknowns.count]
+    matrix = np.concatenate([unknowns.tangent(z), np.zeros((len(unknowns.nodes), NUISANCES))], 1)
+    logs = unknowns.logs(z)
+    if unknowns.ball is not None and not inclusion:
+        matrix[:, 1 : 1 + BALL] = 0
+        logs = matrix @ theta
+    prior = (matrix**2).sum(1) + unknowns.residual
+    left = np.einsum("mi,ij,mj->m", matrix, covariance, matrix) + unknowns.residual
+    if len(unknowns.centres):
+        prior -= config.spread**2
+        left += (config.smooth_error * unknowns.beside(z)) ** 2
+    elif unknowns.ball is not None and inclusion:
+        prior[:] = config.field_spread**2  # by which a place may differ from the rest
+        draws = np.random.default_rng(0).multivariate_normal(theta, covariance, _DRAWS)[:, : unknowns.count]
+        left = np.mean([(unknowns.logs(each) - logs) ** 2 for each in draws], axis=0)  # its edge is too sharp for derivatives
+        ball = theta[1 : 1 + BALL]
+        left += unknowns.ball.logs(ball) * (unknowns.ball.shape(ball)[2] - unknowns.ball.logs(ball))  # there a node is in it or not
+    return _Painted(logs, left, np.maximum(1 - left / prior, 0))
 
 
 def _tells_inclusion(told: Sequence[Estimate], sure: float | None) -> bool:

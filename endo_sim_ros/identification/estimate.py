@@ -248,7 +248,7 @@ def identify(
         whole = identify(experiments, nodes, physics, replace(config, stiffness="uniform"), device, progress, finer=finer)
         rest = replace(whole.unknowns[0], name=found.unknowns[0].name)
         moduli = {name: getattr(whole, name) for name in ("young_modulus", "low", "high", "known", "removed")}
-        return replace(found, unknowns=[rest, *found.unknowns[1:]], **moduli)
+        return replace(found, unknowns=[rest, *found.unknowns[1:]], steps=found.steps + whole.steps, **moduli)
     x, y, z = unknowns.ball.shape(found.mean[1 : 1 + BALL])[0]
     there = f"the middle of the inclusion is at {x:.4f} {y:.4f} {z:.4f} m, with a probability of {sure:.2f}"
     return replace(found, findings=[there, *rests, *found.findings])

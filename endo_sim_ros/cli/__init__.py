@@ -85,6 +85,8 @@ def main() -> int:
         if signal.getsignal(number) is signal.SIG_DFL:
             signal.signal(number, lambda number, frame: sys.exit(128 + number))
     words = sys.argv[1:]
+    if not {"-h", "--help"}.isdisjoint(words):
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # help that `head` or `less` has read enough of ends without an error
     if not words or words[0] in ("-h", "--help"):
         print(overview())
         return 0 if words else 2

@@ -2,6 +2,7 @@
 
 import inspect
 import logging
+import os
 import re
 import signal
 import subprocess
@@ -69,6 +70,17 @@ def test_help_names_every_command_and_imports_none():
     for name in cli.COMMANDS:
         assert re.search(rf"^  {name} +[A-Z]", done.stdout, re.M), name
     assert not {"torch", "warp", "rclpy", "numpy", "cv2", "tyro", "rich"} & set(done.stderr.split())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("words", [["--help"], ["config", "--help"]])
+def test_help_that_nobody_reads_on_ends_without_an_error(words):
+    read, write = os.pipe()
+    os.close(read)
+    command = [sys.executable, "-m", "endo_sim_ros.cli", *words]
+    with open(write, "wb") as output:
+        done = subprocess.run(command, cwd=ROOT, stdout=output, stderr=subprocess.PIPE)
+    assert done.returncode == -signal.SIGPIPE and not done.stderr
 
 
 @pytest.mark.slow

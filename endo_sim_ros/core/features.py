@@ -8,6 +8,7 @@ import numpy as np
 from endo_sim_ros.core.cameras import Camera
 
 Features = tuple[np.ndarray, np.ndarray | None]  # pixels [N, 2] and descriptors [N, 128]
+_AT_ONCE = 1000  # features that are compared with all of another image at a time: 16 MB of 4000
 _LOOK: dict[str, Any] = dict(winSize=(15, 15), maxLevel=4)  # of optical flow
 _RETURN = 0.3  # pixels from where it began, within which the way back of a followed point ends
 
@@ -36,9 +37,17 @@ def match_pair(first: Features, second: Features, ratio: float) -> tuple[np.ndar
     (uv_1, descriptors_1), (uv_2, descriptors_2) = first, second
     if descriptors_1 is None or descriptors_2 is None or len(descriptors_2) < 2:
         return np.empty((0, 2)), np.empty((0, 2))
-    matches = cv2.BFMatcher(cv2.NORM_L2).knnMatch(descriptors_1, descriptors_2, k=2)
-    good = [best for best, second_best in matches if best.distance < ratio * second_best.distance]
-    return uv_1[[match.queryIdx for match in good]], uv_2[[match.trainIdx for match in good]]
+    nearest, good = np.empty(len(uv_1), int), np.empty(len(uv_1), bool)
+    for rows in np.array_split(np.arange(len(uv_1)), -(-len(uv_1) // _AT_ONCE)):
+        # Squared distances. Descriptors of SIFT are whole numbers, so small that these sums are exact. OpenCV takes five times as long.
+        squared = descriptors_1[rows] @ (-2 * descriptors_2.T)
+        squared += (descriptors_1[rows] ** 2).sum(1, keepdims=True)
+        squared += (descriptors_2**2).sum(1)
+        best = squared.argmin(1)[:, None]
+        least = np.take_along_axis(squared, best, 1)
+        np.put_along_axis(squared, best, np.inf, 1)
+        nearest[rows], good[rows] = best[:, 0], least[:, 0] < ratio**2 * squared.min(1)
+    return uv_1[good], uv_2[nearest[good]]
 
 
 def slopes(camera: Camera, uv: np.ndarray) -> np.ndarray:

@@ -3,12 +3,10 @@
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 import torch
-from scipy import sparse
 from torch import Tensor
 
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
@@ -77,19 +75,18 @@ def fit_light(
     count, prior = len(views), np.array([options.distance, options.angle, 0.0, 0.0]) * light
     if not len(view):
         return prior, np.zeros((count, 3))
-    gains: Any = sparse.csr_matrix((np.ones(len(view)), (np.arange(len(view)), view)), (len(view), count))
-    A: Any = sparse.hstack([quantities, gains], format="csr")  # all views' gains would fill the memory
     # Standard deviations of the prior; what is not to be fitted has next to none. Views of one recording differ by a factor of two.
     off = 1e-6
     spread = np.concatenate([[0.3, 6.0, 0.3, 0.3] if light else np.full(4, off), np.full(count, 0.7 if exposure else off)])
     prior = np.concatenate([prior, np.zeros(count)])
     y = np.log(colors).mean(1)
-    solution, weights = _solve(A, y, index, len(points), prior, spread, options.noise, progress)
+    solution, weights = _solve(quantities, y, view, index, prior, spread, options.noise, progress)
     # The exposure of each channel by itself, with the light of all.
     shaded = quantities @ solution[:4]
     channels = [np.log(channel) - shaded for channel in colors.T]
-    by_channel = [_solve(gains, c, index, len(points), solution[4:], spread[4:], options.noise, progress)[0] for c in channels]
-    exposures = np.stack(by_channel, 1)
+    none = quantities[:, :0]
+    by_channel = lambda c: _solve(none, c, view, index, solution[4:], spread[4:], options.noise, progress)[0]
+    exposures = np.stack(progress.map(by_channel, channels), 1)
     if exposure:
         exposures = exposures - np.average(shaded[:, None] + exposures[view], axis=0, weights=weights)
     return solution[:4], exposures
@@ -170,36 +167,40 @@ def _well_seen(
 
 
 def _solve(
-    A: Any,
+    quantities: np.ndarray,
     y: np.ndarray,
+    view: np.ndarray,
     index: np.ndarray,
-    count: int,
     prior: np.ndarray,
     spread: np.ndarray,
     noise: float,
     progress: StageProgress,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """x [P] that minimises Σ w (y − A x − own_index)² / noise² + Σ (x − prior)² / spread², and the weights w [M]; A [M, P] is sparse.
+    """x [Q + V] that minimises Σ w (y − A x − own_index)² / noise² + Σ (x − prior)² / spread², and the weights w [M].
 
-    Each point's own value is eliminated; w falls for observations that do not fit (Cauchy).
+    A x is quantities [M, Q] times the first numbers of x, plus that of the view [M] among the last. Each point's own value is
+    eliminated; w falls for observations that do not fit (Cauchy).
     """
-    points = max(len(np.unique(index)), 1)
-    trust = min(300 / points, 1) / noise**2  # neighbouring points err alike: no more than this many are worth counting
-    weights, x = np.ones(len(y)), prior
-    groups: Any = sparse.csr_matrix((np.ones(len(y)), (index, np.arange(len(y)))), (count, len(y)))  # sums over each point's own
-    entries = np.diff(A.indptr)
+    points, index = np.unique(index, return_inverse=True)
+    trust = min(300 / len(points), 1) / noise**2  # neighbouring points err alike: no more than this many are worth counting
+    known, count, size = np.ascontiguousarray(quantities.T), len(points), len(prior)
+    Q, column, weights, x = len(known), len(known) + view, np.ones(len(y)), prior
+    product = lambda a, b: np.einsum("im,jm->ij", a, b)  # `@` has other last bits with other numbers of threads
     for _ in range(10):
         progress.check()
-        total = np.bincount(index, weights, count).clip(1e-9)
-        about = lambda values: (np.bincount(index, weights * values, count) / total)[index]  # noqa: B023
-        weighted = A.copy()
-        weighted.data *= np.repeat(weights, entries)
-        by_point = groups @ weighted
-        normal = (A.T @ weighted - by_point.T @ by_point.multiply(1 / total[:, None]).tocsr()).toarray()
+        total = np.bincount(index, weights)
+        about = lambda values: (np.bincount(index, weights * values) / total)[index]  # noqa: B023
         rest = y - about(y)
-        normal, right = trust * normal + np.diag(1 / spread**2), trust * (weighted.T @ rest) + prior / spread**2
-        x = np.linalg.solve(normal, right)
-        fitted = A @ x
+        normal, right = np.diag(np.bincount(column, weights, size)), np.bincount(column, weights * rest, size)
+        by_point = np.bincount(column * count + index, weights, size * count).reshape(size, count)
+        weighted = weights * known
+        normal[:Q, :Q], right[:Q] = product(weighted, known), (weighted * rest).sum(1)
+        for i, values in enumerate(weighted):
+            normal[i, Q:] = normal[Q:, i] = np.bincount(view, values, size - Q)
+            by_point[i] = np.bincount(index, values)
+        normal = trust * (normal - product(by_point, by_point / total)) + np.diag(1 / spread**2)
+        x = np.linalg.solve(normal, trust * right + prior / spread**2)
+        fitted = quantities @ x[:Q] + x[column]
         residual = rest - fitted + about(fitted)
         scale = max(1.4826 * np.median(np.abs(residual)), 1e-3)
         weights = 1 / (1 + (residual / (2 * scale)) ** 2)

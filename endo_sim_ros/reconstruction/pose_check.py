@@ -108,7 +108,8 @@ class _PoseCheck:
         for camera, uv in zip(cameras, pixels):
             x, y = slopes(camera, uv).T[..., None]
             rows += [x * camera.viewmat[2] - camera.viewmat[0], y * camera.viewmat[2] - camera.viewmat[1]]
-        homogeneous = np.linalg.svd(np.stack(rows, 1))[2][:, -1]
+        equations = np.stack(rows, 1)
+        homogeneous = np.linalg.eigh(equations.swapaxes(1, 2) @ equations)[1][..., 0]  # a singular value decomposition takes twice as long
         points = homogeneous[:, :3] / np.where(np.abs(homogeneous[:, 3:]) < 1e-9, 1e-9, homogeneous[:, 3:])
         errors = np.zeros(len(points))
         for camera, uv in zip(cameras, pixels):

@@ -22,8 +22,9 @@ class _Small(NamedTuple):
 
     camera: Camera
     image: np.ndarray  # [H, W, 3] RGB, uint8
+    chroma: np.ndarray  # [2, H, W], see `_chroma`
     depth: np.ndarray  # [H, W] m, 0 = none
-    filled: np.ndarray  # [H, W] m, as deep in holes as beside them
+    points: np.ndarray  # [H * W, 3] m, world, as deep in holes as beside them
     tissue: np.ndarray  # [H, W] float32, 1 or 0
 
 
@@ -80,13 +81,14 @@ def _small(view: TrainingView, options: DynamicMaskConfig) -> _Small:
     image = cv2.GaussianBlur(cv2.resize(view.image, size, interpolation=cv2.INTER_AREA), (0, 0), 1.5)
     depth = nearest(view.surface)
     # In a hole something may hide that has no depth: let it be as deep as what is beside it.
-    return _Small(camera, image, depth, fill_holes(depth)[0] if depth.any() else depth, nearest(view.tissue))
+    points = camera.backproject(fill_holes(depth)[0] if depth.any() else depth).reshape(-1, 3)
+    return _Small(camera, image, _chroma(image), depth, points, nearest(view.tissue))
 
 
 def _verdict(view: _Small, other: _Small, tolerance: float, options: DynamicMaskConfig) -> np.ndarray:
     """1 where another view contradicts a view [H, W], -1 where it agrees, 0 where it sees nothing of it."""
     known = view.depth > 0
-    uv, z = other.camera.project(view.camera.backproject(view.filled).reshape(-1, 3))
+    uv, z = other.camera.project(view.points)
     u, v = ((uv - 0.5).T.reshape(2, *known.shape)).astype(np.float32)  # OpenCV counts from the centre of the first pixel
     z = z.reshape(known.shape)
     look = lambda array, how: cv2.remap(array, u, v, how, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
@@ -94,14 +96,14 @@ def _verdict(view: _Small, other: _Small, tolerance: float, options: DynamicMask
     seen = (z > 0) & (surface > 0) & (view.tissue > 0) & (look(other.tissue, cv2.INTER_NEAREST) > 0)
     floats = seen & known & (z < surface * (1 - tolerance))
     same = seen & (np.abs(z - surface) < tolerance * surface)
-    differs = np.abs(_chroma(view.image) - _chroma(look(other.image, cv2.INTER_LINEAR))).max(-1) > options.chroma
+    differs = np.abs(view.chroma - _chroma(look(other.image, cv2.INTER_LINEAR))).max(0) > options.chroma
     return np.where(floats | same & differs, 1, np.where(same, -1, 0))
 
 
 def _chroma(image: np.ndarray) -> np.ndarray:
-    """Logarithms of red and blue over green [H, W, 2], those of dark pixels, which are noise, next to 0."""
-    colors = np.log(image.astype(np.float32) + 8)
-    return colors[..., ::2] - colors[..., 1:2]
+    """Logarithms of red and blue over green [2, H, W], those of dark pixels, which are noise, next to 0."""
+    red, green, blue = cv2.split(np.log(image.astype(np.float32) + 8))
+    return np.stack([red - green, blue - green])
 
 
 def _wide_pieces(pixels: np.ndarray, options: DynamicMaskConfig) -> np.ndarray:

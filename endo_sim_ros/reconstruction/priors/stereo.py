@@ -2,13 +2,12 @@
 
 import dataclasses
 import logging
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 
 import cv2
 import numpy as np
 
 from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.core.device import return_freed_memory
 from endo_sim_ros.core.features import detect, match_pair
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.reconstruction.progress import StageProgress
@@ -25,8 +24,8 @@ def stereo_depth(
     options: StereoConfig = StereoConfig(),
     matching: MatchingConfig = MatchingConfig(),
     progress: StageProgress = StageProgress(),
-) -> Iterator[tuple[AnyFrame, np.ndarray | None]]:
-    """Each view, now with the right eye's principal point as its matches tell it, and its depth [H, W], in turn.
+) -> list[tuple[AnyFrame, np.ndarray | None]]:
+    """Each view, now with the right eye's principal point as its matches tell it, and its depth [H, W] float32.
 
     Depth is in metres, 0 = none; None without a right image.
 
@@ -42,10 +41,15 @@ def stereo_depth(
     matched = progress.map(lambda view: None if view.right is None else _matched(view, options), aligned)
     disparity = lambda view, found: None if found is None else _in_pixels(found, view)
     offsets = disparity_offsets(aligned, map(disparity, aligned, matched), points, options, matching)
-    for view, offset in zip(aligned, offsets):
-        return_freed_memory()  # of the view before
-        found = disparity(view, matched.pop(0))
-        yield (view, None) if found is None else (_with_right_K(view, column=offset), disparity_to_depth(view, found, offset, options))
+
+    def with_depth(i: int) -> tuple[AnyFrame, np.ndarray | None]:
+        view, offset, found = aligned[i], offsets[i], disparity(aligned[i], matched[i])
+        matched[i] = None
+        if found is None:
+            return view, None
+        return _with_right_K(view, column=offset), disparity_to_depth(view, found, offset, options).astype(np.float32)
+
+    return progress.map(with_depth, range(len(views)))
 
 
 def right_camera(frame: Frame) -> Camera:

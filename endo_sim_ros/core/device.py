@@ -5,6 +5,7 @@ import ctypes
 import functools
 import os
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
@@ -100,6 +101,17 @@ def _warp_stream(index: int, handle: int) -> "wp.Stream":
     import warp as wp
 
     return wp.Stream(wp.get_device(f"cuda:{index}"), cuda_stream=handle)
+
+
+_launching = threading.Lock()
+
+
+def one_at_a_time(device: torch.device | str) -> contextlib.AbstractContextManager:
+    """Return a context in which no other thread works on a GPU, whichever it is; on a CPU, one that does nothing.
+
+    Threads that launch kernels at once wait for each other many times as long as the kernels take.
+    """
+    return contextlib.nullcontext() if torch.device(device).type == "cpu" else _launching
 
 
 def upload(device: torch.device | str, *arrays: np.ndarray) -> list[Tensor]:

@@ -15,9 +15,9 @@ from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.core.device import cpu_threads
+from endo_sim_ros.core.device import cpu_threads, one_at_a_time
 from endo_sim_ros.core.gaussians import GaussianModel
-from endo_sim_ros.core.light import features_at
+from endo_sim_ros.core.light import directions, falloff, features
 from endo_sim_ros.reconstruction.device_views import inside, project
 from endo_sim_ros.reconstruction.priors.interpolation import clip_to_range, fit_plane, inverse_distance_weighted, krige
 from endo_sim_ros.reconstruction.progress import StageProgress
@@ -127,10 +127,10 @@ def extrapolate(
         view = shrink(views[index], round(_FINENESS / interpolation.cell))
         pad = int(reach * view.camera.width)
         continued = continue_view(view, cloud, light, exposures[index], reference, pad, interpolation, threads)
-        positions = continued.camera.backproject(continued.depth)
 
         def guess(times: float) -> _Guess:
-            unknown = known_views.without(_on_lattice(view, continued, positions, times * interpolation.cell))
+            with one_at_a_time(device):
+                unknown = known_views.without(_on_lattice(view, continued, times * interpolation.cell))
             new = _beside(seen, unknown.positions, unknown.spacing)
             return _Guess(*(values[new] for values in unknown))
 
@@ -139,7 +139,8 @@ def extrapolate(
     seen = cKDTree(parts[0])
     guesses = progress.map(around, usable)
     width = 4 * interpolation.cell
-    rings, tree_of = range(math.ceil(reach / width)), lambda parts: cKDTree(np.concatenate([np.empty((0, 3)), *parts]))
+    rings = range(math.ceil(reach / width))
+    tree_of = lambda parts: cKDTree(np.concatenate([np.empty((0, 3)), *parts]), compact_nodes=False, balanced_tree=False)  # built sooner
     # Holes, then outwards around all views at a time, since what is close to one picture and far from another is told by the former.
     for ring in (-1, *rings):
         least, most = ring * width, np.inf if ring == rings[-1] else (ring + 1) * width
@@ -200,7 +201,9 @@ def continue_view(
     plane = a * np.arange(camera.width) + b * np.arange(camera.height)[:, None] + c  # what departs from it fades
     residual = np.zeros(depth.shape, np.float32)
     residual[known] = inverse - plane[known]
-    uv, z = points_in_view(camera, _points_about(camera, points, ~known), where=~known, threads=threads)
+    with one_at_a_time(points.device):
+        telling = _points_about(camera, points, ~known)
+    uv, z = points_in_view(camera, telling, where=~known, threads=threads)
     columns, rows = np.floor(uv).astype(int).T
     point_inverse = 1 / z
     point_residual = point_inverse - plane[rows, columns]
@@ -208,25 +211,26 @@ def continue_view(
         point_residual = np.median(point_residual[cKDTree(uv).query(uv, k=9)[1]], 1)
     residual = krige(residual, known, uv, point_residual, view.camera.width, interpolation, str(points.device), threads)
     depth = 1 / clip_to_range(plane + residual, np.concatenate([inverse, point_inverse]), interpolation)
-    shading = features_at(camera.backproject(depth).reshape(-1, 3), camera, reference) * light
-    near, lit = np.exp(shading[:, 0]).reshape(depth.shape), np.exp(shading[:, 1:].sum(1)[:, None] + exposure).reshape(image.shape)
+    quantities = features(torch.from_numpy(depth).float(), torch.ones(1), directions(camera, "cpu"), reference)
+    near, lit = (falloff(quantities[part], quantities.new_tensor(light[part])).numpy()[..., None] for part in (slice(1), slice(1, 4)))
+    lit = lit * np.exp(exposure, dtype=np.float32)
     clipped = lambda colors: np.clip(colors, 0, 2).astype(np.float32)  # in full light; a guess must not glare
     tissue = np.pad(view.tissue > 0, pad)
     away = cv2.distanceTransform((~tissue).astype(np.uint8), cv2.DIST_C, cv2.DIST_MASK_3)
     # The picture goes on as bright as it is at its edges, however near or far the guess is: wrong, it would glare in other views.
     continued = inverse_distance_weighted(clipped(image / lit), tissue, view.camera.width, interpolation)
-    return ContinuedView(camera, depth, clipped(continued / near[..., None]), away)
+    return ContinuedView(camera, depth, clipped(continued / near), away)
 
 
-def _on_lattice(view: TrainingView, continued: ContinuedView, positions: np.ndarray, spacing: float) -> _Guess:
-    """Where the view knows no depth, what may be there, every so many widths of the picture; positions [H, W, 3] are those of pixels."""
-    camera, depth, colors, away = continued
-    width = view.camera.width
+def _on_lattice(view: TrainingView, continued: ContinuedView, spacing: float) -> _Guess:
+    """Where the view knows no depth, what may be there, every so many widths of the picture."""
+    camera, width = continued.camera, view.camera.width
     stride = max(round(spacing * width), 1)
-    lattice = np.zeros(away.shape, bool)
-    lattice[stride // 2 :: stride, stride // 2 :: stride] = True
-    lattice &= np.pad(view.surface, (camera.width - width) // 2) <= 0
-    return _Guess(positions[lattice], colors[lattice], stride * depth[lattice] / camera.K[0, 0], away[lattice] / width)
+    lattice = (slice(stride // 2, None, stride),) * 2
+    unknown = np.pad(view.surface, (camera.width - width) // 2)[lattice] <= 0
+    depth, colors, away = (values[lattice][unknown] for values in continued[1:])
+    centres = np.argwhere(unknown)[:, ::-1] * stride + stride // 2 + 0.5
+    return _Guess(camera.unproject(centres, depth), colors, stride * depth / camera.K[0, 0], away / width)
 
 
 def _beside(tree: cKDTree, positions: np.ndarray, spacing: np.ndarray) -> np.ndarray:

@@ -1,7 +1,5 @@
 """What the optical flow between an image and its prediction from another one tells of depth."""
 
-import contextlib
-import threading
 from typing import Any, NamedTuple
 
 import cv2
@@ -11,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, interpolate, pad
 
 from endo_sim_ros.core.cameras import Camera
+from endo_sim_ros.core.device import one_at_a_time
 from endo_sim_ros.core.frames import Frame
 from endo_sim_ros.core.kernels import launch, load_kernels
 from endo_sim_ros.reconstruction.priors import flow_kernels
@@ -21,7 +20,6 @@ _RADIUS, _STRIDE = 3, 2  # of the patches of flow on a GPU, pixels
 _NOISE = 1.0  # grey levels; a patch with less in it stays where smaller images had it
 _STEPS = 5  # of each patch in each size of the images
 _COARSEST = 16  # pixels, the shorter side of the smallest image
-_launching = threading.Lock()
 
 
 class EyeImage(NamedTuple):
@@ -82,8 +80,7 @@ def flow_correction(inverse: Tensor, own: EyeImage, other: EyeImage, options: Mu
     moves a pixel, is a correction of inverse depth; across it, it is from poses, calibration or motion.
     """
     seen = *own.on(str(inverse.device)), *other.on(str(inverse.device))
-    # Threads that launch kernels at once wait for each other many times as long as the kernels take.
-    with _launching if inverse.is_cuda else contextlib.nullcontext():
+    with one_at_a_time(inverse.device):
         return _corrected(inverse, own.camera, other.camera, *seen, options)
 
 

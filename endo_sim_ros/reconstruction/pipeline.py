@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import numpy as np
 
 from endo_sim_ros.core.config import unused_options
@@ -112,12 +113,12 @@ def select_usable(scene: PreparedScene, config: ReconstructionConfig, progress: 
     options = config.views
 
     def fault(frame: Frame) -> str:
-        pixels = frame.image.reshape(-1, 3) if frame.mask is None else frame.image[frame.mask > 0]
-        if not len(pixels):
+        where, channels = frame.tissue > 0, cv2.split(frame.image)
+        if not where.any():
             return "masked"
-        if (pixels.min(-1) >= options.white).mean() > options.overexposed_share:
+        if (np.minimum.reduce(channels)[where] >= options.white).mean() > options.overexposed_share:
             return "overexposed"
-        return "black" if (pixels.max(-1) <= options.black).mean() > options.black_share else ""
+        return "black" if (np.maximum.reduce(channels)[where] <= options.black).mean() > options.black_share else ""
 
     kept, out = [], {}
     for frame, reason in zip(scene.frames, progress.map(fault, scene.frames)):

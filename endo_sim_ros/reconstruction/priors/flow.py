@@ -61,7 +61,7 @@ def eye_image(frame: Frame, options: MultiViewConfig) -> EyeImage:
 def _reflections(image: np.ndarray, tissue: np.ndarray, options: MultiViewConfig) -> np.ndarray:
     """Where an image [H, W, 3] shows reflections of the light [H, W], which lie deeper than the tissue [H, W] and move with the camera."""
     width = image.shape[1]
-    least = image.min(2).astype(np.float32)
+    least = np.minimum.reduce(cv2.split(image)).astype(np.float32)
     around = blur(least * tissue, 15, width) / np.maximum(blur(tissue, 15, width), 1e-3)
     bright = ((least > 250) | (least > around + options.reflection)) & (tissue > 0)  # white is a few levels short of 255
     return cv2.dilate(bright.astype(np.uint8), np.ones((2 * round(scaled(3, width)) + 1,) * 2, np.uint8)) > 0  # with the glow around

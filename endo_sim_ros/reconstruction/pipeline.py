@@ -35,7 +35,7 @@ from endo_sim_ros.reconstruction.trainer import Trainer
 from endo_sim_ros.reconstruction.triangulation import match_features, triangulate
 
 log = logging.getLogger(__name__)
-_DEPTHS = 10_000_000  # of Gaussians in views, whose median is that of the scene
+_DEPTHS = 1_000_000  # of Gaussians in views, whose median is that of the scene
 _FARTHEST = 1.0  # m; no endoscope sees so far
 
 

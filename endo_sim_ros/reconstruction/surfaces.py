@@ -27,7 +27,7 @@ class Surfaces:
             tensor([[K[0, 0], K[1, 1], K[0, 2], K[1, 2]] for K in (view.camera.K for view in views)], torch.float32),
             tensor([[view.camera.width, view.camera.height] for view in views], torch.int32),
             tensor(self._starts[:-1], torch.int32),
-            tensor(np.concatenate([view.surface.reshape(-1) for view in views]), torch.float32),
+            torch.from_numpy(np.concatenate([view.surface.reshape(-1) for view in views])).to(device),
         ]
         load_kernels((surface_kernels,), device)
 
@@ -47,7 +47,7 @@ class Surfaces:
         The view that sees a piece from nearest provides it. A pixel whose point floats in front of the surface that another
         view sees, by more than the relative tolerance, is contradicted and left out.
         """
-        fineness = [np.median(view.surface[view.surface > 0]) / view.camera.K[0, 0] for view in self.views]
+        fineness = progress.map(lambda view: np.median(view.surface[view.surface > 0]) / view.camera.K[0, 0], self.views)
         factors = torch.full((len(self.views),), 1 - tolerance, device=self.device)
         chosen: list[np.ndarray] = [np.empty(0)] * len(self.views)
         for done, i in enumerate(np.argsort(fineness, kind="stable")):

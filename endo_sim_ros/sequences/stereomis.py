@@ -104,13 +104,7 @@ def read_stereomis(
     rectification = Rectification.stereo(calibration.resized(*images.size))
     fps = fps or images.fps
 
-    usable: Sequence[int] = images.numbers
-    if split:
-        ranges = _read_split(root, split)
-        usable = [n for n in usable if any(first <= n < end for first, end in ranges)]
-        if not usable:
-            raise SequenceError(f"{root}: the {split} split holds none of the frames {images.numbers[0]} to {images.numbers[-1]}")
-    numbers = select(usable, root, start, stop, step)
+    numbers = select(_of_split(root, images.numbers, split) if split else images.numbers, root, start, stop, step)
     rows, posed = None if estimated else read_poses(root / POSES_FILE), dict[int, np.ndarray]()
 
     mask_files = numbered_files(root / "masks", ending="l") or numbered_files(root / "masks")
@@ -124,33 +118,26 @@ def read_stereomis(
     small = Camera(rectification.K, *images.size).resized(*(round(scale * side) for side in images.size))
     finder = None
     if rows is not None and pose_lag is None:
-        finite = {row: pose for row, pose in rows.items() if np.isfinite(pose).all()}
-        finder, chosen = LagFinder({row: rectification.pose(pose) for row, pose in finite.items()}, small, surveyed), set(numbers)
-        refuse_unfinite({row: pose for row, pose in rows.items() if row not in finite and finder.needs(row, chosen)}, root / POSES_FILE)
+        finder = _lag_finder(root, rows, rectification, small, surveyed, numbers)
         if not finder.frames:  # no image tells it
             pose_lag, finder = _told_lag(root, *finder.find({}, lambda number: None)), None
     if rows is not None and pose_lag is not None:  # what is wrong with them is told before the images are looked at
         numbers, posed = _posed(root, numbers, rows, pose_lag)
     views = _look(images, is_rectified, rectification, alignment, finder, (small.width, small.height))
 
-    masks_rectified, first_mask = _chosen_reading(root, alignment, readings) if mask_files else readings[0]
-    masked = np.array(sorted(mask_files), np.int64) - first_mask  # frames, increasing
-    beyond = np.count_nonzero(~np.isin(masked, images.numbers))
+    reading = _chosen_reading(root, alignment, readings) if mask_files else readings[0]
+    tissue = _Tissue(masks, sorted(mask_files), reading, max_mask_gap, images.size, rectification)
+    beyond = np.count_nonzero(~np.isin(tissue.masked, images.numbers))
     if beyond:
-        logger.warning("%s: %d of %d masks have numbers of no frame", root / "masks", beyond, len(masked))
-
-    def tissue(number: int) -> np.ndarray:
-        nearest = _nearest(masked, number, max_mask_gap)
-        mask = None if nearest is None else masks.of(nearest + first_mask, images.size)
-        return rectification.mask(mask) if mask is None or not masks_rectified else cv2.bitwise_and(mask, rectification.valid)
+        logger.warning("%s: %d of %d masks have numbers of no frame", root / "masks", beyond, len(mask_files))
 
     if rows is not None and finder is not None:
         pose_lag = _told_lag(
-            root, *finder.find(views, lambda n: cv2.resize(tissue(n), (small.width, small.height), interpolation=cv2.INTER_NEAREST))
+            root, *finder.find(views, lambda n: cv2.resize(tissue.of(n), (small.width, small.height), interpolation=cv2.INTER_NEAREST))
         )
         numbers, posed = _posed(root, numbers, rows, pose_lag)
     del views
-    bare = sum(_nearest(masked, n, max_mask_gap) is None for n in numbers)
+    bare = sum(tissue.nearest(n) is None for n in numbers)
     if bare:
         logger.warning("%s: %d of %d frames have no mask; tools stay visible in them", root, bare, len(numbers))
 
@@ -159,7 +146,7 @@ def read_stereomis(
             if not is_rectified:
                 left, right = rectification.left(left), rectification.right(right)
             pose = np.eye(4) if rows is None else posed[number]
-            yield rectification.frame(stamp_ns(number, fps), left, right, pose, tissue(number))
+            yield rectification.frame(stamp_ns(number, fps), left, right, pose, tissue.of(number))
 
     recording = Recording(frames, len(numbers))
     return recording if rows is not None else with_estimated_poses(recording, root, poses, POSES_FILE)
@@ -232,6 +219,40 @@ def _open_images(root: Path, calibration: StereoCalibration, rectified: bool | N
     return images, rectified
 
 
+class _Tissue:
+    """Where the rectified frames show tissue.
+
+    Args:
+        masks: The masks, and their numbers in `files`, increasing.
+        reading: Whether they are of rectified images, and the number of the first frame.
+        max_gap: How many frames away a mask may be.
+        size: Width and height of the images, pixels.
+        rectification: That of the images.
+    """
+
+    def __init__(
+        self, masks: MaskFiles, files: Sequence[int], reading: Reading, max_gap: int, size: tuple[int, int], rectification: Rectification
+    ) -> None:
+        self._masks, self._max_gap, self._size, self._rectification = masks, max_gap, size, rectification
+        self._rectified, self._first = reading
+        self.masked = np.array(files, np.int64) - self._first
+        """The frames that have a mask, increasing."""
+
+    def nearest(self, number: int) -> int | None:
+        """The frame whose mask counts for a frame, if any does."""
+        at = np.searchsorted(self.masked, number)
+        near = min(self.masked[max(at - 1, 0) : at + 1].tolist(), key=lambda other: abs(other - number), default=None)
+        return near if near is not None and abs(near - number) <= self._max_gap else None
+
+    def of(self, number: int) -> np.ndarray:
+        """The mask [H, W] of a frame, 255 where there is tissue."""
+        nearest = self.nearest(number)
+        mask = None if nearest is None else self._masks.of(nearest + self._first, self._size)
+        if mask is None or not self._rectified:
+            return self._rectification.mask(mask)
+        return cv2.bitwise_and(mask, self._rectification.valid)
+
+
 def _surveyed(numbers: Sequence[int], chosen: Sequence[int]) -> Sequence[int]:
     """The frame numbers from the first to the last chosen one, and some around them where these are few."""
     first, stop = bisect.bisect_left(numbers, chosen[0]), bisect.bisect_right(numbers, chosen[-1])
@@ -299,6 +320,25 @@ def _chosen_reading(root: Path, alignment: MaskAlignment, readings: Sequence[Rea
     return rectified, first
 
 
+def _lag_finder(
+    root: Path,
+    rows: Mapping[int, np.ndarray],
+    rectification: Rectification,
+    camera: Camera,
+    surveyed: Sequence[int],
+    numbers: Sequence[int],
+) -> LagFinder:
+    """What finds the lag of the poses from images of a camera; it knows those that are finite.
+
+    Raises:
+        SequenceError: If one that the chosen frames need is not.
+    """
+    finite = {row: pose for row, pose in rows.items() if np.isfinite(pose).all()}
+    finder, chosen = LagFinder({row: rectification.pose(pose) for row, pose in finite.items()}, camera, surveyed), set(numbers)
+    refuse_unfinite({row: pose for row, pose in rows.items() if row not in finite and finder.needs(row, chosen)}, root / POSES_FILE)
+    return finder
+
+
 def _told_lag(root: Path, lag: int | None, basis: str) -> int:
     """The lag that was found, or the usual one; which of them is logged."""
     if lag is None:
@@ -315,6 +355,15 @@ def _posed(root: Path, numbers: list[int], rows: Mapping[int, np.ndarray], lag: 
     """Those of the frames that have a pose with a lag, and the poses by frame."""
     posed = {row + lag: pose for row, pose in rows.items()}
     return keep_posed(numbers, posed, root / POSES_FILE, lag), posed
+
+
+def _of_split(root: Path, numbers: Sequence[int], split: str) -> list[int]:
+    """Those of the frames that are in a split."""
+    ranges = _read_split(root, split)
+    usable = [n for n in numbers if any(first <= n < end for first, end in ranges)]
+    if not usable:
+        raise SequenceError(f"{root}: the {split} split holds none of the frames {numbers[0]} to {numbers[-1]}")
+    return usable
 
 
 def _read_split(root: Path, split: str) -> list[tuple[int, int]]:
@@ -336,10 +385,3 @@ def _read_split(root: Path, split: str) -> list[tuple[int, int]]:
     if not ranges:
         raise SequenceError(f"{path}: holds no ranges; expected lines `start,end`")
     return ranges
-
-
-def _nearest(numbers: np.ndarray, number: int, max_gap: int) -> int | None:
-    """The nearest to a number among increasing numbers [N], if it is at most max_gap away."""
-    at = np.searchsorted(numbers, number)
-    near = min(numbers[max(at - 1, 0) : at + 1].tolist(), key=lambda other: abs(other - number), default=None)
-    return near if near is not None and abs(near - number) <= max_gap else None

@@ -1,10 +1,11 @@
 """Progress of long work, and how it is cancelled."""
 
+import contextlib
 import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 
-from endo_sim_ros.core.device import cpu_threads, return_freed_memory
+from endo_sim_ros.core.device import cpu_threads, return_freed_memory, single_threaded_torch
 
 OnProgress = Callable[[str, int, int], None]
 """``on_progress(stage, done, total)``; total is 0 where it is unknown. It may be called from several threads, and cancels the work by
@@ -54,6 +55,10 @@ class StageProgress:
         as a single call of OpenCV can take seconds, is left to end by itself.
         """
         items = list(items)
+        with single_threaded_torch() if len(items) >= cpu_threads() else contextlib.nullcontext():  # else its threads multiply ours
+            return self._map(function, items)
+
+    def _map(self, function: Callable, items: list) -> list:
         self._stopped = stopped = threading.Event()
         pool, futures = ThreadPoolExecutor(cpu_threads(), "endo_sim"), []
         try:

@@ -74,6 +74,14 @@ class Ball:
         depth = max(float(self._basis(place[None])[0] @ self._bend - flat[2]), 1e-4)
         return np.array([*place, (np.log(depth) - self._medians[0]) / self._sds[0]])
 
+    def aside(self, centre: np.ndarray, touched: np.ndarray) -> float:
+        """How far a centre [3] is along the surface from the nearest place that was touched [K, 3], m, world, if all of them lie on one
+        side of it; else 0."""
+        ways = (touched - centre) @ self.axes[:2].T
+        angles = np.sort(np.arctan2(ways[:, 1], ways[:, 0]))
+        surrounded = np.diff(angles, append=angles[0] + 2 * np.pi).max() <= np.pi
+        return 0.0 if surrounded else float(np.sqrt((ways**2).sum(1)).min())
+
     def absent(self) -> float:
         """The number of a ratio of one."""
         return float(-self._medians[2] / self._sds[2])

@@ -10,6 +10,7 @@ from endo_sim_ros.core.cameras import Camera
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.identification import IdentificationConfig, estimate, find_inclusion, identify
 from endo_sim_ros.identification.acquire import Search, expected_information
+from endo_sim_ros.identification.ball import Ball
 from endo_sim_ros.identification.forward import ForwardModel
 from endo_sim_ros.identification.maps import seen_from
 from endo_sim_ros.identification.observations import Observations
@@ -189,6 +190,14 @@ def test_an_inclusion_is_found_as_a_ball():
     assert held[about < 0.01].mean() > 0.8 and held[found.known].mean() > 0.9 and found.known[about > 0.02].all()
     told = found["inclusion_ratio"]
     assert told.low < 8 < told.high and found.young_modulus.max() == pytest.approx(4e3 * 8, rel=0.6)
+
+
+def test_presses_to_one_side_of_an_inclusion_are_told_apart_from_those_around_it():
+    touched = np.array([[x, y, 0.099] for x in AT for y in AT])
+    ball = Ball(NODES, IdentificationConfig(), touched)
+    assert ball.aside(np.array([0.007, -0.002, 0.106]), touched) == 0
+    assert ball.aside(np.array([0.022, 0.001, 0.106]), touched) == pytest.approx(np.hypot(0.012, 0.001), abs=1e-4)
+    assert ball.aside(np.array([0.003, 0.0, 0.106]), touched[:1]) == pytest.approx(np.hypot(0.013, 0.01), abs=1e-4)
 
 
 def test_a_place_that_rests_on_where_the_skin_is_is_told():

@@ -252,7 +252,7 @@ def identify(
     x, y, z = centre = unknowns.ball.shape(found.mean[1 : 1 + BALL])[0]
     there = f"the middle of the inclusion is at {x:.4f} {y:.4f} {z:.4f} m, with a probability of {sure:.2f}"
     aside = 0.0 if start is not None else unknowns.ball.aside(centre, touched_places(experiments, nodes, physics))
-    if aside > max(physics.contact_radius, physics.force_radius):
+    if aside > (physics.contact_radius or physics.force_radius):
         rests = [f"all presses are to one side of it, the nearest {1e3 * aside:.0f} mm away: it is less sure; press around it", *rests]
     return replace(found, findings=[there, *rests, *found.findings])
 

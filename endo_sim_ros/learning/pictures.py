@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera, invert_pose, sent_poses
-from endo_sim_ros.core.device import download, upload
+from endo_sim_ros.core.device import download, single_threaded_torch, upload
 from endo_sim_ros.core.dye import DyedSpot, dyed
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import SURFACE
@@ -137,6 +137,7 @@ class Pictures:
                 self._means[b], self._covars[b] = self._skinning.deform(positions[b], self._tissue.F[b])
 
     @torch.no_grad()
+    @single_threaded_torch()
     def draw(self, right: bool = False, labels: bool = False) -> dict[str, np.ndarray]:
         """What the endoscope sees of all episodes: ``image`` and ``image_right`` [B, H, W, 3], ``segmentation`` [B, H, W, 1], uint8.
 

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from endo_sim_ros.core.device import single_threaded_torch
 from endo_sim_ros.learning.actions import Actions, Contact, action_size, arm_state, observed_names, tip_poses
 from endo_sim_ros.learning.config import Randomisation, SightConfig
 from endo_sim_ros.learning.held_tools import HeldTool, HeldTools, hold_tools
@@ -140,6 +141,7 @@ class TaskBatch:
         if shown:
             self.pictures = Pictures(scene, self.tissue, self.task, sight, randomisation, self.tools if sight.instrument else None)
 
+    @single_threaded_torch()
     def reset(self, episodes: Sequence[int], generators: Sequence[np.random.Generator]) -> None:
         """Begin these episodes anew, each by the chance of its generator."""
         variations, self._observed = [], False
@@ -188,6 +190,7 @@ class TaskBatch:
         """Names of the numbers of the state."""
         return observed_names(self.task, self.actions)
 
+    @single_threaded_torch()
     def step(
         self, actions: np.ndarray, renew: Sequence[int] = (), generators: Sequence[np.random.Generator] = ()
     ) -> tuple[Observed, Outcome]:

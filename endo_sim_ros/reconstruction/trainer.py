@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera, interpolate_pose
-from endo_sim_ros.core.device import pick_device
+from endo_sim_ros.core.device import pick_device, single_threaded_torch
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.core.light import Light, directions
@@ -246,6 +246,7 @@ class Trainer:
         torch.cuda.empty_cache()
         self._load([shrink(view, width) for view in self._views])
 
+    @single_threaded_torch()
     def step(self) -> None:
         """One iteration: a training view, a virtual view, one step of the optimiser."""
         config = self.config

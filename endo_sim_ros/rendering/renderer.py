@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.core.device import download, pick_device, upload
+from endo_sim_ros.core.device import download, pick_device, single_threaded_torch, upload
 from endo_sim_ros.core.dye import DyedSpot, dyed
 from endo_sim_ros.core.gaussians import SH_C0, GaussianModel
 from endo_sim_ros.core.light import SURFACE, Light
@@ -143,6 +143,7 @@ class DeformableRenderer:
         assert view.depth is not None  # asked for
         return view.image, view.depth
 
+    @single_threaded_torch()
     @torch.no_grad()
     def views(
         self,

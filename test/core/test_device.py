@@ -1,0 +1,36 @@
+"""Threads of torch."""
+
+import threading
+
+import torch
+
+from endo_sim_ros.core.device import single_threaded_torch
+
+
+def test_torch_gets_its_threads_back_when_the_last_one_is_done():
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    entered, leave, seen = threading.Event(), threading.Event(), []
+
+    def other():
+        with single_threaded_torch():
+            entered.set()
+            leave.wait(10)
+            seen.append(torch.get_num_threads())
+
+    thread = threading.Thread(target=other)
+    try:
+        with single_threaded_torch():
+            with single_threaded_torch():
+                thread.start()
+                entered.wait(10)
+            seen.append(torch.get_num_threads())
+        seen.append(torch.get_num_threads())  # the other one still works
+        leave.set()
+        thread.join()
+        assert seen == [1, 3, 1] and torch.get_num_threads() == 3
+        with single_threaded_torch():
+            assert torch.get_num_threads() == 1
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)

@@ -1,11 +1,14 @@
 """How fast the environments are: `endo-sim bench environments`."""
 
+import gc
+import os
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
+import torch
 
-from endo_sim_ros.core.device import pick_device, single_threaded_torch
+from endo_sim_ros.core.device import pick_device, return_freed_memory, single_threaded_torch
 from endo_sim_ros.evaluation.measurement import Row, machine, median_seconds, report
 from endo_sim_ros.learning.config import SightConfig
 from endo_sim_ros.learning.scenes import Scene, load_scene
@@ -55,6 +58,11 @@ def bench_environments(
             if sight.instrument and observations == "image":
                 compared = rate / measured["image observations"][i], "without the tool"
             rows.append(Row(f"{name}, {count} environment{'s' * (count > 1)}", rate, "steps/s", *compared))
+    for count in environments:
+        named = f"{count} environment{'s' * (count > 1)}"
+        milliseconds, megabytes = _reset_and_memory(task, scene, count, device, repeats)
+        rows.append(Row(f"reset of each of {named}", milliseconds, "ms"))
+        rows.append(Row(f"memory of each of {named}, images with the tool", megabytes, "MB"))
     for name in ("state observations", "images with the tool") if gpus else ():
         count = max(environments)
         alone, together = (_workers_rate(task, count, workers, *kinds[name], repeats) for workers in (1, gpus))
@@ -96,3 +104,26 @@ def _rate(task: str, scene: Scene, count: int, observations: Observations, sight
             batch.step(actions)
 
     return count * _STEPS / median_seconds(episode, repeats, device, warm_up=1)
+
+
+def _reset_and_memory(task: str, scene: Scene, count: int, device: str, repeats: int) -> tuple[float, float]:
+    """Milliseconds that an environment's part of a reset of all takes, and its megabytes on the device, with pictures of the tool."""
+    before = _used(device)
+    batch = TaskBatch(task, scene, count, "image", device=device)
+    everyone, rngs = range(count), [np.random.default_rng(b) for b in range(count)]
+    batch.reset(everyone, rngs)
+    batch.step(np.zeros((count, batch.action_size)))
+    batch.images()
+    megabytes = (_used(device) - before) / count / 1e6
+    return 1e3 * median_seconds(lambda: batch.reset(everyone, rngs), repeats, device) / count, megabytes
+
+
+def _used(device: str) -> int:
+    """Bytes that this process takes on a device; on a GPU those that all take."""
+    gc.collect()
+    if device.startswith("cuda"):
+        torch.cuda.empty_cache()
+        free, total = torch.cuda.mem_get_info(device)
+        return total - free
+    return_freed_memory()
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import tyro
 from tyro.conf import Positional
 
+from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.learning.config import COMPARED_IN, BenchmarkConfig, SightConfig
 
 _NODE = "node:"
@@ -30,10 +31,13 @@ class Command:
     config: Annotated[BenchmarkConfig, tyro.conf.arg(name="")] = field(default_factory=BenchmarkConfig)
 
     def run(self) -> None:
-        """Play and print the table; raises ValueError if a policy, scene or task cannot be used, RuntimeError if a node does not answer."""
+        """Play and print the table; raises ValueError if what is given cannot be used, RuntimeError if a node does not answer."""
         from endo_sim_ros.learning.benchmark import benchmark, read_results, robustness, table
         from endo_sim_ros.learning.policies import Policy, make_policy
 
+        own = (self.sight, self.config.patience) != (SightConfig(), BenchmarkConfig().patience)
+        if own and not any(policy.startswith(_NODE) for policy in self.policies):
+            raise ConfigError("sight and patience are options of a ROS node; give one as node:NAME, or leave them out")
         nodes: list[Any] = []
 
         def make(policy: str, task: str, count: int, device: str) -> Policy:

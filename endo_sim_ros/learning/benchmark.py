@@ -52,6 +52,8 @@ class Result:
     solved: int
     mean_return: float
     mean_steps: float
+    first_seed: int = TESTED_FROM  # of the episodes, whose seeds follow one another
+    complete: bool = True  # else something ended them before all that were wanted
 
 
 def benchmark(
@@ -110,7 +112,7 @@ def benchmark(
                             bar.advance(progress, at_once / config.episodes)
                     finally:
                         if played:
-                            found.append(_result(task, name, scene, condition, played))
+                            found.append(_result(task, name, scene, condition, played, config.episodes))
                         del batch
                         before = _merge(before, found)
                         _save(out, before)
@@ -135,17 +137,23 @@ def read_results(folder: Path) -> list[Result]:
 
 
 def _merge(before: Sequence[Result], found: Sequence[Result]) -> list[Result]:
-    """Results by what they are of, newer ones in the place of older ones."""
-    key: Callable[[Result], tuple[str, ...]] = lambda result: (result.task, result.policy, result.scene, result.condition)
-    return list({key(result): result for result in (*before, *found)}.values())
+    """Results by what they are of, newer ones in the place of older ones, but of complete ones no incomplete one."""
+    merged: dict[tuple[str, ...], Result] = {}
+    for result in (*before, *found):
+        key = (result.task, result.policy, result.scene, result.condition)
+        old = merged.get(key)
+        if old is None or result.complete or (not old.complete and result.episodes >= old.episodes):
+            merged[key] = result
+    return list(merged.values())
 
 
 def _result(
-    task: str, policy: str, scene: str | Path, condition: str, played: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]
+    task: str, policy: str, scene: str | Path, condition: str, played: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], wanted: int
 ) -> Result:
     """Of what `play` returned, once or more."""
     returns, solved, steps = map(np.concatenate, zip(*played))
-    return Result(task, policy, str(scene), condition, len(solved), int(solved.sum()), float(returns.mean()), float(steps.mean()))
+    means, complete = (float(returns.mean()), float(steps.mean())), len(solved) == wanted
+    return Result(task, policy, str(scene), condition, len(solved), int(solved.sum()), *means, complete=complete)
 
 
 def _save(folder: Path, results: Sequence[Result]) -> None:
@@ -212,6 +220,7 @@ def summarise(results: Sequence[Result], condition: str = "") -> list[Result]:
             replace(
                 each[0],
                 scene=", ".join(result.scene for result in each),
+                complete=all(result.complete for result in each),
                 episodes=sum(weights),
                 solved=sum(result.solved for result in each),
                 mean_return=float(np.average([result.mean_return for result in each], weights=weights)),
@@ -227,7 +236,8 @@ def table(results: Sequence[Result]) -> list[list[str]]:
     for result in summarise(results, next(iter(CONDITIONS))):
         low, high = interval(result.solved, result.episodes)
         numbers = [f"{result.solved / result.episodes:.0%}", f"{low:.0%} to {high:.0%}", f"{result.mean_return:.2f}"]
-        rows.append([result.task, result.policy, *numbers, f"{result.mean_steps:.0f}", str(result.episodes), result.scene])
+        episodes = f"{result.episodes}{'' if result.complete else ', interrupted'}"
+        rows.append([result.task, result.policy, *numbers, f"{result.mean_steps:.0f}", episodes, result.scene])
     return rows
 
 
@@ -252,7 +262,8 @@ def _page(results: Sequence[Result], out: Path) -> str:
         line = lambda cells, tag: "<tr>" + "".join(f"<{tag}>{escape(cell)}</{tag}>" for cell in cells) + "</tr>"
         return f"<table>{line(head, 'th')}{''.join(line(row, 'td') for row in body)}</table>"
 
-    parts = ["<h2>Leaderboard</h2>", drawn(table(results))]
+    seeds = "; ".join(sorted({f"from {result.first_seed} on" for result in results}))
+    parts = ["<h2>Leaderboard</h2>", drawn(table(results)), f"<p>Seeds of the episodes in each scene: {seeds}.</p>"]
     if rows := robustness(results):
         kinds = "; ".join(f"{escape(name)}: {escape(_differs(*what))}" for name, what in list(CONDITIONS.items())[1:])
         parts += ["<h2>Robustness</h2>", drawn(rows), f"<p>{kinds}.</p>"]

@@ -23,6 +23,7 @@ log = logging.getLogger(__name__)
 
 TESTED_FROM = 1_000_000
 """The first seed of episodes that are only tested on."""
+_CHOSEN_FROM = 2_000_000  # the first seed of those by which a training chooses its best policy
 
 
 def play(
@@ -57,7 +58,7 @@ def play(
 
 def measure_policy(batch: TaskBatch, policy: Policy) -> dict[str, float]:
     """Mean return and success rate in episodes that no training sees, one in each copy of a batch."""
-    returns, success, _ = play(batch, policy, TESTED_FROM + np.arange(batch.count))
+    returns, success, _ = play(batch, policy, _CHOSEN_FROM + np.arange(batch.count))
     return {"test_return": float(returns.mean()), "test_success": float(success.mean())}
 
 

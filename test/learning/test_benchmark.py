@@ -111,6 +111,15 @@ def test_the_table_sums_over_scenes_and_gives_wilsons_interval():
         np.testing.assert_allclose(interval(solved, episodes), (wilson.low, wilson.high), atol=1e-4)
 
 
+def test_an_interrupted_run_takes_no_complete_ones_place():
+    whole, part, more = (
+        Result("t", "a", "phantom:3", "as usual", episodes, episodes, 1.0, 20.0, complete=episodes == 10) for episodes in (10, 2, 4)
+    )
+    assert module._merge([whole], [part]) == [whole] and module._merge([part], [whole]) == [whole]
+    assert module._merge([part], [more]) == [more] == module._merge([more], [part])
+    assert table([more])[1][6] == "4, interrupted"
+
+
 def test_patients_of_the_benchmark_are_not_those_that_are_trained_on_and_differ():
     assert "phantom:0" not in COMPARED_IN
     first, other = (load_scene(scene).model for scene in ("phantom:0", "phantom:3"))

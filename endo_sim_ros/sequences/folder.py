@@ -81,6 +81,7 @@ def read_folder(
     if pose_file and poses is None:
         recorded = read_poses(pose_file)
         numbers = keep_posed(numbers, recorded, pose_file)
+    stamp_ns(numbers[-1], rate)  # one that cannot be said is refused before the long work
     missing = [n for n in numbers if right and n not in right]
     if missing:
         raise SequenceError(f"{root / 'right'}: the right image of {left[missing[0]].name} is missing")
@@ -90,6 +91,11 @@ def read_folder(
     rectification = Rectification.mono(K, calibration["distortion"], size)
     depths, mask_files = numbered_files(root / "depth"), numbered_files(root / "masks")
     for name, files in (("depth", depths), ("masks", mask_files)):
+        if files and not files.keys() & left.keys():
+            raise SequenceError(
+                f"{root / name}: holds numbers from {min(files)} to {max(files)}, but no image in left/, from {min(left)} to {max(left)},"
+                " has one of them; number them alike, or take the folder away"
+            )
         tell_lacking(numbers, files, root / name)
     masks = MaskFiles(mask_files, root / "masks", mask_polarity)
 

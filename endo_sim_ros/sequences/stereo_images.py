@@ -63,17 +63,17 @@ class StereoFiles(StereoImages):
     fps = DEFAULT_FPS
 
     def __init__(self, source: Path, left: Mapping[int, Path], right: Mapping[int, Path], first: int = 0):
-        missing = sorted(set(left) - set(right))
-        if missing:
-            raise SequenceError(f"{source}: the right image of {left[missing[0]].name} is missing")
         self.source = source
-        self._files = {number - first: (left[number], right[number]) for number in sorted(left)}
-        self.numbers: Sequence[int] = list(self._files)
-        self.size = image_size(read_image(self._files[self.numbers[0]][0]))
+        self._left, self._right = ({number - first: file for number, file in eye.items()} for eye in (left, right))
+        self.numbers: Sequence[int] = sorted(self._left)
+        self.size = image_size(read_image(self._left[self.numbers[0]]))
 
     def read(self, numbers: Sequence[int]) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:  # noqa: D102
+        alone = next((number for number in numbers if number not in self._right), None)
+        if alone is not None:
+            raise SequenceError(f"{self.source}: the right image of {self._left[alone].name} is missing")
         for number in numbers:
-            left, right = (check_size(read_image(file), self.size, file) for file in self._files[number])
+            left, right = (check_size(read_image(file), self.size, file) for file in (self._left[number], self._right[number]))
             yield number, left, right
 
 

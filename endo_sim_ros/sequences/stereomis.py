@@ -128,6 +128,11 @@ def read_stereomis(
     reading = _chosen_reading(root, alignment, readings) if mask_files else readings[0]
     tissue = _Tissue(masks, sorted(mask_files), reading, max_mask_gap, images.size, rectification)
     beyond = np.count_nonzero(~np.isin(tissue.masked, images.numbers))
+    if beyond and beyond == len(mask_files):
+        raise SequenceError(
+            f"{root / 'masks'}: holds numbers from {min(mask_files)} to {max(mask_files)}, but frames go from {images.numbers[0]} to"
+            f" {images.numbers[-1]}: masks of another sequence? Number them as the frames, or take the folder away"
+        )
     if beyond:
         logger.warning("%s: %d of %d masks have numbers of no frame", root / "masks", beyond, len(mask_files))
 

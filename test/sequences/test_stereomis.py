@@ -359,6 +359,12 @@ def test_masks_of_another_sequence_are_told(plane, caplog):
     assert "2 of 3 masks have numbers of no frame" in caplog.text
 
 
+def test_masks_of_no_frame_are_refused(plane):
+    write_rgb(plane / "masks/000300l.png", np.zeros((64, 80), np.uint8))
+    with pytest.raises(SequenceError, match="masks: holds numbers from 300 to 300, but frames go from 0 to 7"):
+        read_stereomis(plane, pose_lag=0)
+
+
 def test_right_images_must_be_there(plane):
     next(plane.glob("*.mp4")).unlink()
     write_rgb(plane / "video_frames/000001l.png", np.zeros((64, 80, 3), np.uint8))

@@ -96,6 +96,7 @@ class Pictures:
     def at_width(self, width: int) -> "Pictures":
         """Pictures of another width of the same episodes, which go on as these do."""
         other = copy.copy(self)  # shares the arrays
+        other._drawings = list(map(copy.copy, self._drawings))  # each keeps what it draws with, which is of one size
         other._set_width(self.camera, width)
         return other
 
@@ -156,7 +157,7 @@ class Pictures:
         seen = [self._rasterize(own[i : i + _AT_ONCE], eye) for eye in eyes for i in range(0, len(own), _AT_ONCE)]
         colors, depths, alphas = seen[0] if len(seen) == 1 else map(torch.cat, zip(*seen))
         if self._held is not None:
-            marks = self._draw_tools(self._held, own, len(eyes), (colors, depths, alphas))
+            marks = self._draw_tools(self._held, own, len(eyes), (colors, depths, alphas), labels)
         else:
             marks = (alphas > SURFACE).to(torch.uint8)
         if self._model.light is not None:
@@ -223,8 +224,12 @@ class Pictures:
             sh = sh * sh.new_tensor(self._contrast[rows])[:, None, None, None]
         return sh
 
-    def _draw_tools(self, held: HeldTools, own: np.ndarray, eyes: int, pictures: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-        """Draw the tools into the colours, depths and alphas of these episodes, eye after eye; returns their labels [E b, H, W]."""
+    def _draw_tools(self, held: HeldTools, own: np.ndarray, eyes: int, pictures: tuple[Tensor, Tensor, Tensor], labelled: bool) -> Tensor:
+        """Draw the tools into the colours, depths and alphas of these episodes, eye after eye.
+
+        Returns:
+            Their labels [E b, H, W], uint8; without `labelled` those of the drawing, which cost nothing.
+        """
         which = held.kind(own)
         viewmats, lamps = (each[:eyes, own].reshape(-1, *each.shape[2:]) for each in (self._viewmats, self._lamps))
         lens = np.tile(self._lens, (len(lamps), 1))
@@ -243,11 +248,13 @@ class Pictures:
             rows = np.concatenate([at + eye * len(own) for eye in range(eyes)])
             local = viewmats[rows, None] @ np.concatenate([poses] * eyes)
             if len(at) == len(own):
-                return self._tables[number][drawing.draw_links(local, lens, *pictures, lamps, surfaces).int()]
+                marks = drawing.draw_links(local, lens, *pictures, lamps, surfaces)
+                return self._tables[number][marks.int()] if labelled else marks
             chosen = torch.from_numpy(rows).to(self._device)
             parts = [picture[chosen] for picture in pictures]
             own_surfaces = None if surfaces is None else surfaces[rows]
-            labels[chosen] = self._tables[number][drawing.draw_links(local, lens[rows], *parts, lamps[rows], own_surfaces).int()]
+            marks = drawing.draw_links(local, lens[rows], *parts, lamps[rows], own_surfaces)
+            labels[chosen] = self._tables[number][marks.int()] if labelled else marks
             for whole, part in zip(pictures, parts):
                 whole[chosen] = part
         return labels

@@ -1,7 +1,9 @@
 """The page: what browsers show, and what users do there. It knows no ROS; what drives it is behind `Actions`."""
 
+import errno
 import logging
 import queue
+import socket
 import time
 import warnings
 from collections.abc import Callable
@@ -396,7 +398,7 @@ class Viewer:
 
 
 def serve(config: ViewerConfig) -> Any:
-    """A server of the page; raises ConfigError if viser is not installed or the port is taken."""
+    """A server of the page; raises ConfigError if viser is not installed or it cannot be served at that address."""
     try:
         import viser
     except ImportError:
@@ -404,9 +406,22 @@ def serve(config: ViewerConfig) -> Any:
     logging.getLogger("websockets").setLevel(logging.WARNING)  # else it tells of every browser that comes and goes
     warnings.filterwarnings("ignore", "Queued a .* on a closed connection")  # browsers leave while they are drawn for
     try:
+        _try_address(config.host, config.port)
         return viser.ViserServer(host=config.host, port=config.port, verbose=False)
     except (OSError, RuntimeError) as error:
-        raise ConfigError(f"the page cannot be served at {config.host}:{config.port}: {error}") from error
+        reason = getattr(error, "strerror", None) or error
+        raise ConfigError(f"the page cannot be served at {config.host}:{config.port} ({reason}); give another host or port") from error
+
+
+def _try_address(host: str, port: int) -> None:
+    """Raise OSError where nothing can be served, for which viser would wait for ever; a port that is taken is left to it."""
+    (family, kind, protocol, _, address), *_ = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+    with socket.socket(family, kind, protocol) as tried:
+        try:
+            tried.bind(address)
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise
 
 
 def plain_camera(pose: np.ndarray) -> Camera:

@@ -9,9 +9,11 @@ import pytest
 from fake_browser import CAMERA, PORT
 from waiting import wait_until
 
+from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.learning.by_person import View
 from endo_sim_ros.learning.config import PersonConfig
 from endo_sim_ros.viewer.browser import Pointer
+from endo_sim_ros.viewer.config import ViewerConfig
 
 IMAGE = np.tile(np.linspace(40, 255, CAMERA.width, dtype=np.uint8)[None, :, None], (CAMERA.height, 1, 3))
 VIEW = View(IMAGE, CAMERA, 0.05, ("Do it.", "move to begin"))
@@ -42,6 +44,17 @@ def test_the_tip_goes_as_far_as_the_mouse_a_step_at_a_time(page):
     np.testing.assert_allclose(ways[[0, 3]], [[1, 1, 0], [0, 0, 0]], atol=1e-9)
     page.point(Pointer(1, "start", (0.5, 0.5), (0.5, 0.45), True))
     np.testing.assert_allclose(page.read().way, [0, 0, 0.05 * 160 * 0.05], atol=1e-9)
+
+
+@pytest.mark.dds
+def test_an_address_that_nothing_can_be_served_at_is_refused(page):
+    from endo_sim_ros.viewer.viewer import serve
+
+    with pytest.raises(ConfigError, match=r"cannot be served at 203\.0\.113\.9:\d+ \(.*\); give another host or port"):
+        serve(ViewerConfig(host="203.0.113.9", port=PORT + 12))  # nobody has this address (RFC 5737)
+    other = serve(ViewerConfig(port=PORT + 11))
+    assert other.get_port() > PORT + 11, "the next free port"
+    other.stop()
 
 
 @pytest.mark.dds

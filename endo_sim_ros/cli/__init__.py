@@ -47,7 +47,7 @@ def overview() -> str:
     """What `endo-sim --help` prints."""
     lines = ["usage: endo-sim COMMAND [OPTIONS]", "", "Endoscope recordings become tissue that a robot can touch.", "", "commands:"]
     for name in COMMANDS:
-        lines += textwrap.wrap(summary(name), 100, initial_indent=f"  {name:13}", subsequent_indent=" " * 15)
+        lines += textwrap.wrap(summary(name).partition("\n\n")[0], 100, initial_indent=f"  {name:13}", subsequent_indent=" " * 15)
     return "\n".join([*lines, "", "`endo-sim COMMAND --help` tells the options of a command."])
 
 

@@ -69,6 +69,7 @@ def test_help_names_every_command_and_imports_none():
     assert done.returncode == 0, done.stderr
     for name in cli.COMMANDS:
         assert re.search(rf"^  {name} +[A-Z]", done.stdout, re.M), name
+    assert re.search(r"continue it\.\n  imitate", done.stdout), "of each the first paragraph"
     assert not {"torch", "warp", "rclpy", "numpy", "cv2", "tyro", "rich"} & set(done.stderr.split())
 
 

@@ -85,6 +85,7 @@ def test_each_of_many_environments_is_the_single_one_with_its_seed(task):
     assert len(recorded) > 10
     single = make(task, observations="both", randomisation=VARIED)
     seen, rewards, _ = play(single, scripted_policy(task), seed + 1, len(recorded))
+    assert all(re.search(r"\d|report|holds", line) and "nan" not in line for line in single.unwrapped.batch.task.goal_lines())
     for k, reward in enumerate(rewards):
         for kind in ("state", "image"):
             np.testing.assert_array_equal(recorded[k][0][kind][1], seen[k + 1][kind])

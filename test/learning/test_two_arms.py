@@ -66,6 +66,10 @@ def test_the_tissue_is_taut_when_both_arms_pull_and_too_much_of_either_ends_it(m
                 forces @ way * [1, -1], [o["wanted"][b] - o[f"{arm}.missing"][b] for arm in batch.task.arms], atol=1e-5
             )
             np.testing.assert_allclose(forces @ way * [1, -1], o["wanted"][b], rtol=batch.task.tolerance)
+            if b == 0:
+                right, left = forces @ way * [1, -1]
+                pulls = f"pull with {o['wanted'][0]:.2f} N each, ± 15%: PSM1 {right:.2f} N, PSM2 {left:.2f} N"
+                assert batch.task.goal_lines() == (pulls, "taut for 10 of 10 steps")
         solved |= outcome.success
     assert solved.all()
     monkeypatch.setattr(TASKS["tension"], "force_limit", 0.1)

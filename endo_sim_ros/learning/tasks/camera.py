@@ -134,6 +134,17 @@ class Camera(Task):
         """None: the tip is the target."""
         return ()
 
+    def goal_lines(self) -> tuple[str, ...]:
+        """How far the view is from a good one, and how long it has been good."""
+        right, up, far = self._seen[0]
+        off, rolled = np.hypot(right, up), np.rad2deg(self.joints[0, 3])
+        return (
+            f"tip {abs(far) * 1e3:.0f} mm too {'far' if far > 0 else 'near'}, good within {self.near * 1e3:.0f} mm",
+            f"{off:.2f} beside the middle (slope), good within {self.middle:g}",
+            f"rolled by {rolled:+.0f}°, good within {np.rad2deg(self.level):.0f}°",
+            f"good for {self._good[0]} of {self.wanted} steps",
+        )
+
     def _columns(self, here: np.ndarray) -> list[np.ndarray]:
         right, up, far = self._seen.T
         moves = (self._seen - self._before).T

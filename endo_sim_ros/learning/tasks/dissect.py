@@ -150,12 +150,19 @@ class Dissect(Task):
         self._next = (self.line + moved)[episodes, waiting] - self.tip[:, 0]
         self._spot = here[:, -1] - self.tip[:, 1]
         wider = dot(sides[:, 1] - sides[:, 0], self.across[:, None, None]).reshape(self.count, -1)
-        self._opening = sum(wider.T) / wider.shape[1]
+        self._opening = np.asarray(sum(wider.T) / wider.shape[1])
         self._pull = dot(self.force[:, 1], self.across)
         lengths = np.concatenate([self._by_arm(self.tip), self._next, self._spot, norm(self._next)[:, None], norm(self._spot)[:, None]], 1)
         states = np.where(self.fourth > 0, 1.0, -1.0)
         told = [*self.along[:, :2].T, self.parted.mean(1), self._opening / self.opened, self.astray / self.most_astray, self._pull / FORCE]
         return [*(lengths / LENGTH).T, *states.T, *told]
+
+    def goal_lines(self) -> tuple[str, ...]:
+        """Whether it is pulled hard enough to be cut, and how far that is."""
+        return (
+            f"PSM2 pulls aside with {self._pull[0]:.2f} N, taut from {self.taut:g} N",
+            f"parted by {self.parted[0].mean():.0%}, open by {self._opening[0] * 1e3:.1f} mm of {self.opened * 1e3:.1f} mm",
+        )
 
     def _value(self) -> np.ndarray:
         far = norm(self._next) + norm(self._spot)

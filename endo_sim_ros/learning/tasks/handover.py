@@ -165,6 +165,11 @@ class Handover(Task):
         self._held = np.where(done, self._held + 1, 0)
         return self._held >= self.hold
 
+    def goal_lines(self) -> tuple[str, ...]:
+        """Who holds the needle, and how high."""
+        holding = " and ".join(arm for arm, holds in zip(self.arms, self.holds[0]) if holds) or "nobody"
+        return (f"{holding} holds the needle, {self._height[0] * 1e3:.0f} mm above the tissue of {self.lift * 1e3:.0f} mm",)
+
     def dyed_spots(self, b: int) -> tuple[DyedSpot, ...]:
         """None: the needle is seen."""
         return ()

@@ -66,6 +66,11 @@ class Palpation(Task):
         self.tip[b] = 0, 0, self.high[2]
         self._most[b], self._where[b] = 0, 0
 
+    def goal_lines(self) -> tuple[str, ...]:
+        """Whether the place under the tip is being reported."""
+        raised = int(self.raised[0])
+        return (f"reporting: {raised} of {self.sure} steps" if raised else "not reporting",)
+
     def _columns(self, here: np.ndarray) -> list[np.ndarray]:
         force = norm(self.force)
         more = force > self._most

@@ -61,6 +61,10 @@ class Retraction(Task):
         distance = norm(self._spot) / LENGTH
         return [*(self.tip / LENGTH).T, *(self._spot / LENGTH).T, distance, *(self._moved / self.lift).T, jaw]
 
+    def goal_lines(self) -> tuple[str, ...]:
+        """How far the spot has been lifted."""
+        return (f"lifted by {self._moved[0, 2] * 1e3:.1f} mm of {self.lift * 1e3:.0f} mm",)
+
     def _value(self) -> np.ndarray:
         distance = norm(self._spot)
         grasped = (self.fourth > 0) & (distance <= self.grasp_radius)

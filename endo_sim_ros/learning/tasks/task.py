@@ -321,6 +321,10 @@ class Task(ABC):
         """What is dyed in episode b, so that pictures tell the goal: the place that it is about."""
         return (DyedSpot(self.origin[b].copy(), self.dyed_radius),)
 
+    def goal_lines(self) -> tuple[str, ...]:
+        """What pictures do not show a person about the goal of the first episode now, a line each."""
+        return ()
+
     def thing_poses(self) -> dict[str, np.ndarray]:
         """Where the links of the `thing` are [B, 4, 4], m, world, by name."""
         return {}

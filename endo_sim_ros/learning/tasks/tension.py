@@ -98,6 +98,11 @@ class Tension(Task):
         self._held = np.where(taut, self._held + 1, 0)
         return self._held >= self.hold
 
+    def goal_lines(self) -> tuple[str, ...]:
+        """The wanted force, what each arm pulls with, and for how long it has been taut."""
+        pulls = ", ".join(f"{arm} {pull:.2f} N" for arm, pull in zip(self.arms, self._pull[0]))
+        return f"pull with {self.wanted[0]:.2f} N each, ± {self.tolerance:.0%}: {pulls}", f"taut for {self._held[0]} of {self.hold} steps"
+
     def dyed_spots(self, b: int) -> tuple[DyedSpot, ...]:
         """The two places that are to be grasped."""
         return tuple(DyedSpot(self.rest[site].copy(), self.dyed_radius) for site in self.sites[b])

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from endo_sim_ros.learning.tasks.task import LENGTH, Script, Task, norm
+from endo_sim_ros.learning.tasks.task import LENGTH, Script, Task, dot, norm
 from endo_sim_ros.physics import ControlNodes, MotionConfig, PhysicsConfig
 
 
@@ -46,6 +46,14 @@ class Tracking(Task):
     def _reset(self, b: int, rng: np.random.Generator) -> None:
         self.tip[b, 2] = self.high[2]
         self._held[b] = 0
+
+    def goal_lines(self) -> tuple[str, ...]:
+        """How far the tip is from the spot, and how long it has been on it."""
+        off = np.sqrt(dot(self._goal[0], self._goal[0]))
+        return (
+            f"{off * 1e3:.0f} mm from the spot, on it within {self.tolerance * 1e3:.0f} mm",
+            f"on it for {self._held[0]} of {self.hold} steps",
+        )
 
     def _columns(self, here: np.ndarray) -> list[np.ndarray]:
         moved = here[:, 0]

@@ -50,22 +50,23 @@ class Command:
 
     def _by_person(self) -> None:
         from endo_sim_ros.learning.by_person import demonstrate_by_person
+        from endo_sim_ros.learning.demonstrations import Demonstrations
         from endo_sim_ros.learning.devices import find_devices
         from endo_sim_ros.viewer.demonstration_page import DemonstrationPage
 
         for text in unused_options(self.page):
             raise ConfigError(f"page: {text}")
+        demonstrations = Demonstrations(self.task, self.scenes, self.out, 1, self.config, self.sight, self.vary, self.motion, self.device)
         found = find_devices(self.page)
-        page = DemonstrationPage(self.page)
-        heard = f" heard as well: {', '.join(map(str, found))};" if found else ""
-        print(f"open {page.url} in a browser;{heard} Ctrl-C ends", flush=True)
         try:
-            episodes = demonstrate_by_person(
-                self.task, self.scenes, self.out, page, [page, *found], self.page, self.config,
-                self.sight, self.vary, self.motion, self.device,
-            )  # fmt: skip
+            page = DemonstrationPage(self.page)
+            heard = f" heard as well: {', '.join(map(str, found))};" if found else ""
+            print(f"open {page.url} in a browser;{heard} Ctrl-C ends", flush=True)
+            try:
+                episodes = demonstrate_by_person(demonstrations, page, [page, *found], self.page)
+            finally:
+                page.stop()
         finally:
-            page.stop()
             for device in found:
                 device.close()
         print(f"{self.out}: {episodes} solved episodes")

@@ -6,21 +6,24 @@ What a person does goes into the same dataset, by the same code, as what a scrip
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Literal, Protocol
 
 import numpy as np
 
 from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.learning.config import DemonstrationConfig, PersonConfig, Randomisation, SightConfig
+from endo_sim_ros.core.device import single_threaded_torch
+from endo_sim_ros.learning.config import PersonConfig
 from endo_sim_ros.learning.demonstrations import Demonstrations, Episode, begin, take
 from endo_sim_ros.learning.pictures import IMAGE
 from endo_sim_ros.learning.task_batch import TaskBatch
 from endo_sim_ros.learning.tasks import Task
-from endo_sim_ros.physics import MotionConfig
 
 Word = Literal["again", "drop", "next", "finish"]
 """What a person says: this episode from its beginning; the solved one before is not kept and comes again; another one; no more."""
+
+_WINDOW = 1.0  # s over which it is measured how fast time goes
+_SLOW = 0.95  # less of the wanted pace is told
+_NARROWEST = 160  # pixels; a page of half of it would show nothing of use
 
 
 @dataclass
@@ -34,6 +37,7 @@ class Wish:
     hand: int | None = None  # arm of the task that this is for, or its last; None = the one at work
     arm: bool = False  # act with the next arm from now on
     word: Word | None = None
+    gone: bool = False  # there is nothing more to hear of the device
 
 
 class Device(Protocol):
@@ -66,32 +70,26 @@ class Screen(Protocol):
         ...
 
 
+@single_threaded_torch()  # its threads would wait for each other longer than they work
 def demonstrate_by_person(
-    task: str,
-    scenes: Sequence[str | Path],
-    out: Path,
-    screen: Screen,
-    devices: Sequence[Device],
-    person: PersonConfig = PersonConfig(),
-    config: DemonstrationConfig = DemonstrationConfig(by="person"),
-    sight: SightConfig = SightConfig(),
-    randomisation: Randomisation = Randomisation(),
-    motion: MotionConfig = MotionConfig(),
-    device: str = "auto",
+    demonstrations: Demonstrations, screen: Screen, devices: Sequence[Device], person: PersonConfig = PersonConfig()
 ) -> int:
     """Let a person solve episodes of a task and write them; returns the number of all in the dataset.
 
-    An episode begins when the person first moves, and goes on in real time. A solved one is kept when the next one begins, or the call
-    ends, also where it is interrupted; the next call continues the dataset. One that was lost begins anew.
+    An episode begins when the person first moves, and goes on in real time. A solved one is kept when the person moves again, or the
+    call ends, also where it is interrupted; the next call continues the dataset. One that was lost begins anew.
 
     Args:
+        demonstrations: The dataset, and what its episodes take place in, one at once.
         screen: What the person looks at.
         devices: What the person acts with.
         person: Options of what is seen, and how fast.
-        task, scenes, out, config, sight, randomisation, motion, device: As for `Demonstrations`, which tells what is raised, too.
+
+    Raises:
+        ValueError: If a device asks for what is not a number.
+        OSError: If episodes cannot be written, as on a full drive.
     """
-    demonstrations = Demonstrations(task, scenes, out, 1, config, sight, randomisation, motion, device)
-    session = _Session(demonstrations, screen, devices, person, config.episodes)
+    session = _Session(demonstrations, screen, devices, person)
     with demonstrations:
         try:
             session.run()
@@ -103,17 +101,19 @@ def demonstrate_by_person(
 class _Session:
     """One person and one dataset."""
 
-    def __init__(self, demonstrations: Demonstrations, screen: Screen, devices: Sequence[Device], person: PersonConfig, wanted: int):
-        self._demonstrations, self._screen, self._devices, self._wanted = demonstrations, screen, devices, wanted
-        self._pace = person.pace
+    def __init__(self, demonstrations: Demonstrations, screen: Screen, devices: Sequence[Device], person: PersonConfig):
+        self._demonstrations, self._screen, self._devices, self._wanted = demonstrations, screen, devices, demonstrations.wanted
+        self._person = person
+        self._gone: list[str] = []  # devices
+        self._slow = ""  # how slowly time goes, where it does
         self._shown = [batch.pictures.at_width(person.width) for batch in demonstrations.batches if batch.pictures is not None]
         self._solved: tuple[Episode, int] | None = None  # with its seed: not kept yet
         self._said = ""  # what became of the episode before
 
     def run(self) -> None:
-        """Until there are as many episodes as wanted, or the person has had enough."""
+        """Until as many episodes as wanted are kept, or the person has had enough."""
         seed = self._demonstrations.seed
-        while self._demonstrations.episodes + (self._solved is not None) < self._wanted:
+        while self._demonstrations.episodes < self._wanted:
             episode, word = self._play(seed)
             if word == "finish":
                 return
@@ -132,21 +132,25 @@ class _Session:
             self._demonstrations.save()
 
     def _play(self, seed: int) -> tuple[Episode, Word | None]:
-        """One episode, and the word of the person that ended it, if one did."""
+        """One episode, and the word of the person that ended it, if one did; finish, too, where none is missing any more."""
         number = seed % len(self._demonstrations.batches)
         batch = self._demonstrations.batches[number]
         (episode,), seen = begin(batch, [seed])
-        period = batch.task.physics().step_duration / self._pace
+        period = batch.task.physics().step_duration / self._person.pace
         resting = 0.0 if batch.task.turns else -1.0  # the fourth number, of a speed or an open jaw
         actions, arm = np.zeros((len(batch.task.arms), batch.task.action_size())), 0
         actions[:, 3] = resting
         moving = [0, 1, 2, *([3] if batch.task.turns else [4] if batch.task.twist else [])]
         begun, rested, due = False, False, time.monotonic()
+        image, steps, since = self._draw(number), 0, due
         while episode.solved is None:
-            self._screen.show(self._view(number, arm, actions, begun))
+            self._screen.show(self._view(number, image, arm, actions, begun))
             self._screen.wait(due)
-            due = max(due, time.monotonic() - period) + period  # what cannot be kept up with is left out
-            wishes = [device.read() for device in self._devices]
+            now = time.monotonic()
+            due = max(due, now - period) + period  # what cannot be kept up with is left out
+            if begun and now - since > _WINDOW:
+                self._slow, steps, since = self._told_pace(steps * period / (now - since)), 0, now
+            wishes = self._read()
             words: list[Word] = [wish.word for wish in wishes if wish.word]
             if words:
                 self._said = ""
@@ -166,11 +170,32 @@ class _Session:
                 continue
             if not begun:
                 self.keep()
-                begun, self._said = True, ""
+                if self._demonstrations.episodes >= self._wanted:
+                    return episode, "finish"
+                begun, self._said, steps, since = True, "", 0, time.monotonic()
             action = actions.reshape(1, -1).copy()
-            seen = take(batch, [episode], seen, action, action)
-        self._said = "solved: it is kept when you begin, unless you drop it" if episode.solved else self._lost(batch)
+            seen, image, steps = take(batch, [episode], seen, action, action), self._draw(number), steps + 1
+        self._said = "solved: it is kept when you move, unless you drop it" if episode.solved else self._lost(batch)
         return episode, None
+
+    def _read(self) -> list[Wish]:
+        """What all devices ask for.
+
+        Raises:
+            ValueError: If it is not a number.
+        """
+        wishes = [device.read() for device in self._devices]
+        for device, wish in zip(self._devices, wishes):
+            if not np.isfinite([*wish.way, wish.turn]).all():
+                raise ValueError(f"{device} asks for the way {list(wish.way)} and the turn {wish.turn}, which must be finite; mend it")
+        self._gone = [f"{device} is gone; the mouse and the keys go on" for device, wish in zip(self._devices, wishes) if wish.gone]
+        return wishes
+
+    def _told_pace(self, share: float) -> str:
+        """What there is to say where time goes at a share of the pace that is wanted."""
+        width = self._person.width
+        less = f": --page.width {width // 2} draws less" if width >= 2 * _NARROWEST else ""
+        return f"time goes at {share * self._person.pace:.2g} of real time{less}" if share < _SLOW else ""
 
     @staticmethod
     def _lost(batch: TaskBatch) -> str:
@@ -178,36 +203,42 @@ class _Session:
         why = "too much force" if _force(batch) > task.force_limit else "out of time" if task.steps[0] >= task.horizon else "not the goal"
         return f"lost: {why}; here it is again"
 
-    def _view(self, number: int, arm: int, actions: np.ndarray, begun: bool) -> View:
-        """What the person sees now of a scene, with an arm at work."""
+    def _draw(self, number: int) -> np.ndarray:
+        """What the left eye sees of a scene [H, W, 3], uint8."""
+        return self._shown[number].draw()[IMAGE][0]
+
+    def _view(self, number: int, image: np.ndarray, arm: int, actions: np.ndarray, begun: bool) -> View:
+        """What the person is shown of a scene, with an arm at work."""
         batch, pictures = self._demonstrations.batches[number], self._shown[number]
         task, camera = batch.task, pictures.camera.at(pictures.poses[0])
         _, depths = camera.project(task.tips().reshape(-1, 3)[arm : arm + 1])
         pixel = max(float(depths[0]), 0.0) / camera.K[1, 1] / task.step_length
         left = (task.horizon - task.steps[0]) * task.physics().step_duration
+        episodes = self._demonstrations.episodes + (self._solved is not None)
         lines = (
             task.sentence,
-            f"{self._demonstrations.episodes + (self._solved is not None)} of {self._wanted} episodes",
-            f"{left:.1f} s left" if begun else "move to begin",
+            f"{episodes} of {self._wanted} episodes",
+            f"{left:.1f} s left" if begun else "move to begin" if episodes < self._wanted else "move to end",
             f"{_force(batch):.2f} N of {task.force_limit:g} N",
             *([f"{task.arms[arm]} at work"] if len(actions) > 1 else []),
             *([] if task.turns else _states(task, actions[:, 3])),
-            *([self._said] if self._said else []),
+            *task.goal_lines(),
+            *self._gone,
+            *filter(None, (self._slow, self._said)),
         )
-        return View(pictures.draw()[IMAGE][0], camera, pixel, lines)
+        return View(image, camera, pixel, lines)
 
 
 def _states(task: Task, fourth: np.ndarray) -> list[str]:
-    """What the fourth numbers of an action [A] do."""
+    """What the fourth numbers of an action [A] do to jaws and edges; what else they do `Task.goal_lines` says."""
     ones, states = np.ones(len(fourth)), []
-    for arm, value in enumerate(fourth):
+    for arm, name in enumerate(task.arms):
+        of = f"{name}: " if len(fourth) > 1 else ""
         if task.closes(ones)[arm]:
-            states.append("jaw closed" if task.closes(fourth)[arm] else "jaw open")
+            states.append(f"{of}jaw {'closed' if task.closes(fourth)[arm] else 'open'}")
         elif task.cuts(ones)[arm]:
-            states.append("the edge cuts" if task.cuts(fourth)[arm] else "the edge rests")
-        else:
-            states.append(f"fourth number {value:+.0f}")
-    return [f"{arm}: {state}" for arm, state in zip(task.arms, states)] if len(states) > 1 else states
+            states.append(f"{of}the edge {'cuts' if task.cuts(fourth)[arm] else 'rests'}")
+    return states
 
 
 def _force(batch: TaskBatch) -> float:

@@ -115,6 +115,7 @@ class Demonstrations:
     Attributes:
         batches: The environments of each scene.
         seed: That of the next episode.
+        wanted: Number of episodes that the dataset shall have.
 
     Raises:
         SequenceError: If the folder has other data.
@@ -149,7 +150,7 @@ class Demonstrations:
         self._writer = DatasetWriter(out, first.task.sentence, fps, features)
         seeds = self._writer.column("seed")
         self.seed = int(seeds[-1]) + 1 if len(seeds) else config.seed
-        self._out, self._task, self._fps, self._wanted = out, task, fps, config.episodes
+        self._out, self._task, self._fps, self.wanted = out, task, fps, config.episodes
         self._saved, self._save_after = time.monotonic(), _SAVE_EVERY
 
     def __enter__(self) -> None:
@@ -160,7 +161,7 @@ class Demonstrations:
             self.save()
         except OSError as failed:
             error = failed
-        kept = f"{self._writer.saved} of {self._wanted} episodes are kept, and the same command goes on from there"
+        kept = f"{self._writer.saved} of {self.wanted} episodes are kept, and the same command goes on from there"
         if isinstance(error, OSError):  # a full drive, above all
             raise OSError(f"{self._out}: {error.strerror or error}; {kept}") from error
         if isinstance(error, (KeyboardInterrupt, SystemExit)):

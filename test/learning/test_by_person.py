@@ -7,6 +7,7 @@ import sys
 import urllib.request
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -15,8 +16,9 @@ from endo_sim_command import endo_sim_here
 
 from endo_sim_ros.learning import by_person, demonstrations
 from endo_sim_ros.learning.by_person import Wish, demonstrate_by_person
-from endo_sim_ros.learning.config import DemonstrationConfig, PersonConfig, SightConfig
-from endo_sim_ros.learning.demonstrations import demonstrate
+from endo_sim_ros.learning.config import DemonstrationConfig, PersonConfig, Randomisation, SightConfig
+from endo_sim_ros.learning.demonstrations import Demonstrations, demonstrate
+from endo_sim_ros.physics import MotionConfig
 
 SIGHT = SightConfig(image_width=40, eyes=2, segmentation=True)
 SCENES = ["phantom:0", "phantom:1"]
@@ -78,8 +80,13 @@ def scripted(tmp_path_factory):
 
 
 def by_hand(out, hand, episodes=2, screen=None):
+    return play("retraction", out, [hand], screen or Screen(), SCENES, PersonConfig(width=80), episodes)
+
+
+def play(task, out, hands, screen, scenes=SCENES[:1], person=PersonConfig(width=40), episodes=1):
     config = replace(BY_PERSON, episodes=episodes)
-    return demonstrate_by_person("retraction", SCENES, out, screen or Screen(), [hand], PersonConfig(width=80), config, SIGHT, device="cpu")
+    data = Demonstrations(task, scenes, out, 1, config, SIGHT, Randomisation(), MotionConfig(), "cpu")
+    return demonstrate_by_person(data, screen, hands, person)
 
 
 def acted(scripted):
@@ -99,7 +106,9 @@ def test_the_same_actions_give_the_same_dataset_whoever_takes_them(scripted, tmp
     assert "A person solved them" in (tmp_path / "out/README.md").read_text()
     view = screen.views[0]
     assert view.image.shape[1] == 80 and view.image.std() > 5 and "move to begin" in view.lines
-    assert any("solved" in line for line in screen.views[1 + len(first)].lines)
+    solved = screen.views[1 + len(first)].lines
+    assert any("solved" in line for line in solved) and any(" lifted by 0.0 mm" in f" {line}" for line in solved), "the next one"
+    assert max(line for view in screen.views[: len(first)] for line in view.lines if "lifted" in line) > "lifted by 5.0 mm of 6 mm"
     K, depth = view.camera.K, 0.1
     assert 0.5 * depth / K[1, 1] / 0.002 < view.pixel < 1.5 * depth / K[1, 1] / 0.002, "steps of 2 mm at the depth of the tip"
 
@@ -134,10 +143,12 @@ def test_an_interrupted_person_goes_on_and_may_drop_what_was_solved(scripted, tm
 def test_a_person_turns_the_endoscope(tmp_path):
     """In a task whose fourth number is a speed, which is not that of a jaw."""
     screen, hand = Screen(), Hand(Wish(), *[Wish(turn=-1.0, jaw=True)] * 5)
-    config = replace(BY_PERSON, episodes=1)
-    demonstrate_by_person("camera", SCENES[:1], tmp_path, screen, [hand], PersonConfig(width=40), config, SIGHT, device="cpu")
+    play("camera", tmp_path, [hand], screen)
     assert [line for line in screen.views[-1].lines if "left" in line] == ["5.8 s left"], "five steps of 0.04 s"
-    assert not any("fourth" in line or "jaw" in line for line in screen.views[-1].lines)
+    assert not any("jaw" in line for line in screen.views[-1].lines)
+    rolled = [next(line for line in view.lines if "rolled" in line) for view in (screen.views[0], screen.views[-1])]
+    degrees = [float(line.removeprefix("rolled by ").partition("°")[0]) for line in rolled]
+    assert degrees[1] - degrees[0] == pytest.approx(-5 * np.rad2deg(0.02), abs=1.01)
     assert (screen.views[0].image != screen.views[-1].image).mean() > 0.1
 
 
@@ -146,15 +157,58 @@ def test_each_hand_acts_with_the_arm_on_its_side(tmp_path, monkeypatch):
     monkeypatch.setattr(by_person, "take", lambda *given: taken.append(given[-1].reshape(-1, 4)) or demonstrations.take(*given))
     right = [Wish(), *[Wish(np.array([0.5, 0, 0]), closed=True, hand=0), Wish(hand=0), Wish(closed=False, hand=0)]]
     left = [Wish(), *[Wish(np.array([0, 0, 0.5]), hand=1), Wish(closed=True, hand=1), Wish(np.array([0, 1.0, 0]), hand=1)]]
-    config = replace(BY_PERSON, episodes=1)
     hands, screen = [Hand(*right), Hand(*left)], Screen()
-    demonstrate_by_person("handover", SCENES[:1], tmp_path, screen, hands, PersonConfig(width=40), config, SIGHT, device="cpu")
+    play("handover", tmp_path, hands, screen)
     assert (np.array(taken) == [
         [[0.5, 0, 0, 1], [0, 0, 0.5, -1]],
         [[0, 0, 0, 1], [0, 0, 0, 1]],
         [[0, 0, 0, -1], [0, 1, 0, 1]],
     ]).all()  # fmt: skip
     assert {"PSM1 at work", "PSM1: jaw open", "PSM2: jaw closed"} <= set(screen.views[-1].lines)
+
+
+@pytest.mark.slow
+def test_the_last_episode_can_be_dropped_as_well(scripted, tmp_path):
+    first, _ = acted(scripted)
+    screen, more = Screen(), Wish(np.array([0, 0, 0.5]))
+    hand = Hand(*wishes(first), Wish(), Wish(word="drop"), Wish(), *wishes(first), Wish(), more, more)
+    assert by_hand(tmp_path / "out", hand, episodes=1, screen=screen) == 1 and hand.wishes == [more], "the first move ends"
+    assert {"1 of 1 episodes", "move to end"} <= set(screen.views[-1].lines)
+    assert tables(tmp_path / "out")[0].equals(tables(scripted[0])[0])
+
+
+def test_a_person_is_told_how_slowly_time_goes_and_what_is_gone(tmp_path, monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr(by_person, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+
+    class Slow(Screen):
+        late = 0.1  # s that a step takes
+
+        def wait(self, until):
+            clock[0] = max(clock[0] + self.late, until)
+
+    for screen in (Slow(), quick := Slow()):
+        quick.late = 0.0
+        hand = Hand(Wish(), *[Wish(np.array([0, 0, 0.1]), gone=True)] * 30)
+        play("retraction", tmp_path, [hand], screen, person=PersonConfig(width=320))
+        assert f"{hand} is gone; the mouse and the keys go on" in screen.views[-1].lines
+        slow = [line for line in screen.views[-1].lines if "real time" in line]
+        assert slow == ([] if screen is quick else ["time goes at 0.4 of real time: --page.width 160 draws less"])
+
+
+def test_what_no_device_may_ask_for_is_said_of_it(tmp_path):
+    class Broken(Hand):
+        def __str__(self):
+            return "my wheel"
+
+    with pytest.raises(ValueError, match=r"my wheel asks for the way .*nan.*, which must be finite"):
+        play("palpation", tmp_path, [Broken(Wish(np.array([0, np.nan, 0])))], Screen())
+
+
+def test_mistakes_are_told_before_the_page_opens(tmp_path):
+    pytest.importorskip("viser")
+    done = endo_sim_here("demonstrate", "retraction", tmp_path / "out", "--by", "person", "--image-width", 37)
+    assert done.returncode == 2 and "37×29 images make no video" in done.stderr and "http" not in done.stdout
 
 
 def test_options_that_have_no_effect_are_refused(tmp_path):

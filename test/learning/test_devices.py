@@ -52,8 +52,10 @@ def test_sticks_and_buttons_of_a_gamepad_are_heard(pipe, tmp_path):
     again = gamepad.read()
     assert again.turn == -1, "to the right is clockwise"
     assert not again.jaw and again.word is None and (again.way == wish.way).all(), "sticks stay, buttons are pressed once"
+    assert not again.gone
     end()
-    assert not gamepad.read().way.any(), "without it nothing moves"
+    wish = gamepad.read()
+    assert wish.gone and not wish.way.any(), "without it nothing moves"
     assert find_gamepad(PersonConfig(gamepad="none")) is None
     with pytest.raises(ValueError, match=r"gamepad: .*js7 cannot be opened \(No such file or directory\); allow it, name another, or none"):
         find_gamepad(PersonConfig(gamepad=str(tmp_path / "js7")))
@@ -126,6 +128,8 @@ def test_the_first_device_that_can_be_opened_is_taken(pipe, tmp_path, caplog):
 
 class Told:
     """A runtime that tells what stands in a list."""
+
+    gone = False
 
     def __init__(self, *grips):
         self.grips = list(grips)

@@ -52,6 +52,21 @@ def test_pictures_are_those_of_the_renderer(light, degree, instrument):
     np.testing.assert_array_equal(seen["segmentation"][..., 0] > 1, views[0].labels > 1)
 
 
+def test_pictures_of_two_sizes_take_nothing_from_each_other():
+    """As where a person sees larger ones than the dataset has: what they are drawn with is not made anew each time."""
+    environment = make(observations="image")
+    environment.reset(seed=0)
+    small = environment.unwrapped.batch.pictures
+    large = small.at_width(100)
+    drawn, frames = [], []
+    for _ in range(2):
+        drawn.append((small.draw()["image"], large.draw()["image"]))
+        frames.append([pictures._drawings[0]._newest[2] for pictures in (small, large)])
+    assert drawn[0][1].shape[2] == 100 and frames[0][0] is frames[1][0] and frames[0][1] is frames[1][1]
+    for before, after in zip(*drawn, strict=True):
+        np.testing.assert_array_equal(before, after)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS)
 def test_the_tool_is_seen_and_changes_nothing_else(task):

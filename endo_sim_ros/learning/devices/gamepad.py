@@ -37,7 +37,7 @@ class Gamepad:
 
     def read(self) -> Wish:
         """Where the sticks are, and what was pressed since the last call."""
-        wish = Wish()
+        wish, config = Wish(), self._config
         for data in self._file.chunks(_AT_ONCE * _EVENT.size):
             for _, value, kind, number in _EVENT.iter_unpack(data[: len(data) // _EVENT.size * _EVENT.size]):
                 if kind & _AXIS:
@@ -48,8 +48,7 @@ class Gamepad:
                     if number in _WORDS:
                         wish.word = _WORDS[number]
         if self._file.gone:
-            self._axes = {}
-        config = self._config
+            self._axes, wish.gone = {}, True
         across, down, near, turn = (
             self._axes.get(axis, 0.0) for axis in (config.stick_right, config.stick_down, config.stick_near, config.stick_turn)
         )

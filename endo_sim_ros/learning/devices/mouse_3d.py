@@ -53,7 +53,7 @@ class Mouse3D:
                     wish.jaw ^= bool(pressed & 1)
                     wish.arm |= bool(pressed & 2)
         if self._file.gone:
-            self._axes[:] = 0
+            self._axes[:], wish.gone = 0, True
         right, near, down, _, _, clockwise = self._axes
         wish.way, wish.turn = pushed(np.array([right, -down, near, -clockwise]), self._config)
         return wish

@@ -102,9 +102,14 @@ class Runtime:
         info = xr.ActionCreateInfo(action_name=name, action_type=kind, subaction_paths=self._hands, localized_action_name=name.capitalize())
         return xr.create_action(self._set, info)
 
+    @property
+    def gone(self) -> bool:
+        """Whether it is heard no more."""
+        return self._instance is None
+
     def grip(self, hand: int) -> Grip | None:
         """How a hand is now, 0 = the right one, 1 = the left one; None where its controller is not seen, or the runtime is gone."""
-        if self._instance is None:
+        if self.gone:
             return None
         try:
             return self._grip(hand)
@@ -188,7 +193,7 @@ class Hand:
     def read(self) -> Wish:
         """What it did since the last call: of a long way the first step."""
         grip, before = self._runtime.grip(self._number), self._before
-        self._before, wish = grip, Wish(hand=self._number)
+        self._before, wish = grip, Wish(hand=self._number, gone=self._runtime.gone)
         if grip is None or not grip.held:
             self._left[:] = 0
         elif before is not None:

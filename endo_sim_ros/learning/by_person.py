@@ -157,7 +157,7 @@ class _Session:
                 return episode, words[0]
             arm = (arm + sum(wish.arm for wish in wishes)) % len(actions)
             actions[:, moving] = 0
-            for wish in wishes:
+            for wish in sorted(wishes, key=lambda wish: wish.closed is True):  # of two hands with one arm the one that closes counts
                 of = actions[arm if wish.hand is None else min(wish.hand, len(actions) - 1)]
                 of[moving] += [*wish.way, wish.turn][: len(moving)]
                 if not batch.task.turns and (wish.jaw or wish.closed is not None):

@@ -167,6 +167,16 @@ def test_each_hand_acts_with_the_arm_on_its_side(tmp_path, monkeypatch):
     assert {"PSM1 at work", "PSM1: jaw open", "PSM2: jaw closed"} <= set(screen.views[-1].lines)
 
 
+def test_of_two_hands_with_one_arm_the_one_that_closes_counts(tmp_path, monkeypatch):
+    taken = []
+    monkeypatch.setattr(by_person, "take", lambda *given: taken.append(given[-1][0, 3]) or demonstrations.take(*given))
+    right = [Wish(), Wish(closed=True, hand=0), Wish(closed=True, hand=0), Wish(closed=False, hand=0), Wish(hand=0)]
+    left = [Wish(), Wish(closed=False, hand=1), Wish(hand=1), Wish(closed=True, hand=1), Wish(closed=False, hand=1)]
+    play("palpation", tmp_path, [Hand(*right), Hand(*left)], screen := Screen())
+    assert taken == [1, 1, 1, -1]
+    assert "reporting: 3 of 10 steps" in screen.views[-2].lines and "not reporting" in screen.views[-1].lines
+
+
 @pytest.mark.slow
 def test_the_last_episode_can_be_dropped_as_well(scripted, tmp_path):
     first, _ = acted(scripted)

@@ -155,8 +155,20 @@ def test_the_tip_follows_a_hand_that_holds_on():
     moves = [[*wish.way, wish.turn] for wish in wishes]
     expected = [[0] * 4, [0] * 4, [1, -0.5, 1, 1], [0.5, 0, 0, 1], *[[0] * 4] * 3, [0, 0, 0.5, 0], *[[0] * 4] * 2]
     np.testing.assert_allclose(moves, expected, atol=1e-9, err_msg="of a long way a step at a time, and nothing of where it went free")
-    assert [wish.closed for wish in wishes] == [None, False, False, True, None, None, None, False, None, None]
+    assert [wish.closed for wish in wishes] == [None, None, None, True, *[None] * 6]
     assert [wish.word for wish in wishes] == [*[None] * 7, "next", None, None] and all(wish.hand == 1 for wish in wishes)
+
+
+def test_a_jaw_stays_as_it_was_where_the_grip_is_squeezed_again():
+    """(held, closed) by time, and what the hand asks of the jaw."""
+    told = [
+        ((False, False), None), ((True, False), None), ((True, True), True), ((True, True), True),
+        ((False, True), None), ((False, False), None), ((True, False), None), ((True, False), None),  # let go, and squeezed again
+        ((True, True), True), ((True, False), False), ((True, False), None),
+        ((False, True), None), ((True, True), None), ((True, True), None), ((True, False), False),  # pulled before it was squeezed
+    ]  # fmt: skip
+    hand = Hand(Told(*(grip(held=held, closed=closed) for (held, closed), _ in told)), 0, PersonConfig())
+    assert [hand.read().closed for _ in told] == [asked for _, asked in told]
 
 
 def test_a_hand_moves_as_the_person_sees_it():

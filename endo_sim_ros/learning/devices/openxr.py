@@ -185,6 +185,7 @@ class Hand:
         self._steps = np.array([1 / config.hand_step] * 3 + [1 / np.deg2rad(config.hand_turn)])
         self._heading = Rotation.from_euler("y", -config.hand_heading, degrees=True)
         self._before: Grip | None = None
+        self._closes = False  # the trigger was pulled since the grip is held, and has not been let go
         self._left = np.zeros(4)  # of what it moved and turned and the tip has not yet, in largest steps
 
     def __str__(self) -> str:
@@ -195,15 +196,18 @@ class Hand:
         grip, before = self._runtime.grip(self._number), self._before
         self._before, wish = grip, Wish(hand=self._number, gone=self._runtime.gone)
         if grip is None or not grip.held:
-            self._left[:] = 0
+            self._left[:], self._closes = 0, False
         elif before is not None:
             if before.held:
                 way = self._heading.apply(grip.place - before.place)
                 turn = self._heading.apply((grip.rotation * before.rotation.inv()).as_rotvec())
                 self._left += self._steps * [*way, turn[2]]
+                self._closes = grip.closed and (self._closes or not before.closed)
+                # A jaw is as it was until the trigger moves; of two hands with one arm, only one that lets go opens it.
+                wish.closed = True if self._closes else False if before.closed and not grip.closed else None
             step = np.clip(self._left, -1, 1)
             self._left -= step
-            wish.way, wish.turn, wish.closed = step[:3], float(step[3]), grip.closed
+            wish.way, wish.turn = step[:3], float(step[3])
         if grip is not None and before is not None:
             wish.word = next(iter(grip.pressed - before.pressed), None)
         return wish

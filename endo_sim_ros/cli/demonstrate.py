@@ -54,7 +54,7 @@ class Command:
         from endo_sim_ros.learning.devices import find_devices
         from endo_sim_ros.viewer.demonstration_page import DemonstrationPage
 
-        for text in unused_options(self.page):
+        for text in self.page.without_effect():
             raise ConfigError(f"page: {text}")
         demonstrations = Demonstrations(self.task, self.scenes, self.out, 1, self.config, self.sight, self.vary, self.motion, self.device)
         found = find_devices(self.page)

@@ -1,9 +1,9 @@
 """Parameters of environments and of training."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Annotated, ClassVar, Literal
 
-from endo_sim_ros.core.config import Range, StageConfig
+from endo_sim_ros.core.config import ConfigError, Range, StageConfig, unused_options
 
 
 @dataclass(frozen=True)
@@ -206,6 +206,18 @@ class PersonConfig(StageConfig):
     """Axis of the gamepad that moves towards the endoscope when it is pulled."""
     stick_turn: Annotated[int, Range(0, 63)] = 3
     """Axis of the gamepad that turns clockwise, in tasks that turn something."""
+    button_jaw: Annotated[int, Range(0, 255)] = 0
+    """Button of the gamepad that closes and opens the jaw. The numbers by default are those of Linux for Xbox: A."""
+    button_arm: Annotated[int, Range(0, 255)] = 4
+    """Button of the gamepad for the next arm: the left one of the shoulder."""
+    button_again: Annotated[int, Range(0, 255)] = 1
+    """Button of the gamepad for again: B."""
+    button_drop: Annotated[int, Range(0, 255)] = 2
+    """Button of the gamepad for drop: X."""
+    button_next: Annotated[int, Range(0, 255)] = 3
+    """Button of the gamepad for next: Y."""
+    button_finish: Annotated[int, Range(0, 255)] = 7
+    """Button of the gamepad for finish: start. It is 9, options, on those of a PlayStation, where 7 is a trigger."""
     mouse_3d: str = ""
     """File of a 3D mouse, such as /dev/hidraw0; empty = the first one that there is, none = none."""
     dead_zone: Annotated[float, Range(0, 0.9)] = 0.15
@@ -225,3 +237,21 @@ class PersonConfig(StageConfig):
     """How far to the left of the headset's direction, as it was at the beginning, the person looks at the page, degrees."""
 
     needs: ClassVar[dict[str, tuple[str, ...]]] = dict.fromkeys(("hand_step", "hand_turn", "hand_heading"), ("openxr", "auto", "on"))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for kind, text in (("stick", "axis"), ("button", "button")):
+            taken: dict[int, str] = {}
+            for name in (field.name for field in fields(self) if field.name.startswith(f"{kind}_")):
+                if (other := taken.setdefault(number := getattr(self, name), name)) != name:
+                    raise ConfigError(f"PersonConfig.{other} and {name} are both {text} {number} of the gamepad; give each its own")
+
+    def without_effect(self) -> list[str]:
+        """A sentence for each option that is not at its default, yet has no effect beside the others."""
+        found = unused_options(self)
+        for field in fields(self):
+            of_both = field.name in ("dead_zone", "speed", "reverse")
+            devices = ["gamepad", *(["mouse_3d"] * of_both)] if of_both or field.name.startswith(("stick_", "button_")) else []
+            if devices and getattr(self, field.name) != field.default and all(getattr(self, device) == "none" for device in devices):
+                found.append(f"{field.name} has no effect while {' and '.join(devices)} is none; name one")
+        return found

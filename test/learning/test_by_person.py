@@ -222,6 +222,12 @@ def test_mistakes_are_told_before_the_page_opens(tmp_path):
 
 
 def test_options_that_have_no_effect_are_refused(tmp_path):
+    assert PersonConfig(gamepad="none", mouse_3d="none", speed=0.5).without_effect() == [
+        "speed has no effect while gamepad and mouse_3d is none; name one"
+    ]
+    assert PersonConfig(gamepad="none", stick_near=5, speed=0.5).without_effect() == [
+        "stick_near has no effect while gamepad is none; name one"
+    ]
     done = endo_sim_here("demonstrate", "retraction", tmp_path / "out", "--by", "person", "--noise", 0.3)
     assert done.returncode == 2 and "noise has no effect while by is person; set by to script" in done.stderr
     done = endo_sim_here("demonstrate", "retraction", tmp_path / "out", "--by", "person", "--page.openxr", "off", "--page.hand-step", 0.01)

@@ -13,6 +13,7 @@ import pytest
 from remote_hands import Monado, RemoteHand
 from scipy.spatial.transform import Rotation
 
+from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.learning.config import PersonConfig
 from endo_sim_ros.learning.devices.device_file import first_device, is_multi_axis_controller
 from endo_sim_ros.learning.devices.gamepad import Gamepad, find_gamepad
@@ -59,6 +60,25 @@ def test_sticks_and_buttons_of_a_gamepad_are_heard(pipe, tmp_path):
     assert find_gamepad(PersonConfig(gamepad="none")) is None
     with pytest.raises(ValueError, match=r"gamepad: .*js7 cannot be opened \(No such file or directory\); allow it, name another, or none"):
         find_gamepad(PersonConfig(gamepad=str(tmp_path / "js7")))
+
+
+def test_buttons_of_a_gamepad_are_options(pipe):
+    path, write, end = pipe
+    gamepad = Gamepad(path, PersonConfig(button_finish=9, button_jaw=3, button_next=0))
+
+    def pressed(*buttons):
+        write(b"".join(struct.pack("=IhBB", 0, 1, 1, button) for button in buttons))
+        wish = gamepad.read()
+        return wish.jaw, wish.arm, wish.word
+
+    assert pressed(9) == (False, False, "finish")
+    assert pressed(7) == (False, False, None)
+    assert pressed(3, 4) == (True, True, None) and pressed(0) == (False, False, "next")
+    end()
+    with pytest.raises(ConfigError, match="button_jaw and button_finish are both button 0 of the gamepad; give each its own"):
+        PersonConfig(button_finish=0)
+    with pytest.raises(ConfigError, match="stick_right and stick_near are both axis 0"):
+        PersonConfig(stick_near=0)
 
 
 def test_the_tip_goes_as_the_cap_of_a_3d_mouse(pipe, caplog):

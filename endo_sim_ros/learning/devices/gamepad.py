@@ -13,8 +13,6 @@ _EVENT = struct.Struct("=IhBB")  # time, value, kind, number
 _BUTTON, _AXIS = 0x01, 0x02  # kinds; 0x80 is added to those that tell how things are when the file is opened
 _LARGEST = 32767  # of an axis
 _AT_ONCE = 64  # events
-_JAW, _ARM = 0, 4  # buttons: of most gamepads A, and the left one of the shoulder
-_WORDS: dict[int, Word] = {1: "again", 2: "drop", 3: "next", 7: "finish"}  # B, X, Y, start
 
 
 class Gamepad:
@@ -22,7 +20,7 @@ class Gamepad:
 
     Args:
         path: Its file.
-        config: Which axes are what.
+        config: Which axes and buttons are what.
 
     Raises:
         ValueError: If it cannot be opened.
@@ -31,6 +29,9 @@ class Gamepad:
     def __init__(self, path: Path, config: PersonConfig):
         self._file, self._config = DeviceFile("gamepad", path), config
         self._axes: dict[int, float] = {}  # -1 … 1
+        self._words: dict[int, Word] = {
+            config.button_again: "again", config.button_drop: "drop", config.button_next: "next", config.button_finish: "finish"
+        }  # fmt: skip
 
     def __str__(self) -> str:
         return f"gamepad {self._file.path}"
@@ -43,10 +44,10 @@ class Gamepad:
                 if kind & _AXIS:
                     self._axes[number] = value / _LARGEST
                 elif kind == _BUTTON and value:
-                    wish.jaw ^= number == _JAW
-                    wish.arm |= number == _ARM
-                    if number in _WORDS:
-                        wish.word = _WORDS[number]
+                    wish.jaw ^= number == config.button_jaw
+                    wish.arm |= number == config.button_arm
+                    if number in self._words:
+                        wish.word = self._words[number]
         if self._file.gone:
             self._axes, wish.gone = {}, True
         across, down, near, turn = (

@@ -11,7 +11,6 @@ from typing import Literal, Protocol
 import numpy as np
 
 from endo_sim_ros.core.cameras import Camera
-from endo_sim_ros.core.device import single_threaded_torch
 from endo_sim_ros.learning.config import PersonConfig
 from endo_sim_ros.learning.demonstrations import Demonstrations, Episode, begin, take
 from endo_sim_ros.learning.pictures import IMAGE
@@ -70,7 +69,6 @@ class Screen(Protocol):
         ...
 
 
-@single_threaded_torch()  # its threads would wait for each other longer than they work
 def demonstrate_by_person(
     demonstrations: Demonstrations, screen: Screen, devices: Sequence[Device], person: PersonConfig = PersonConfig()
 ) -> int:

@@ -16,7 +16,7 @@ from endo_sim_ros.core.gaussians import GaussianModel
 from endo_sim_ros.identification.experiment import Experiment
 from endo_sim_ros.identification.following import follow_points, looked_at, near_way
 from endo_sim_ros.identification.force_checks import distance_at_onset
-from endo_sim_ros.identification.gathering import Gathered, Tool, count_touches, gather, read_tools
+from endo_sim_ros.identification.gathering import Gathered, Tool, count_touches, gather, read_tools, told_thickness
 from endo_sim_ros.identification.recording_config import RecordingConfig
 from endo_sim_ros.identification.surface import Surface
 from endo_sim_ros.identification.touches import experiment
@@ -95,7 +95,8 @@ def read_experiments(
         findings = list[str]()
         streams = _usable(bag, lambda: read_streams(reader, arms, frames, (), findings), "no message of a topic can be used: ")
         motion = _motion(reader)
-    tools = _usable(bag, lambda: read_tools(arms, streams, Surface(nodes), nodes, physics, config, findings))
+    surface = Surface(nodes)
+    tools = _usable(bag, lambda: read_tools(arms, streams, surface, nodes, physics, config, findings))
     if not tools:
         raise SequenceError(f"{bag}: no pose with a time on /{messages.tool_pose(arms[0]).name}; record while the tool moves")
     if not physics.contact_radius and not any(tool.line.closed.any() for tool in tools.values()):
@@ -110,8 +111,7 @@ def read_experiments(
     several = f"{count} touch{'es' * (count != 1)} in {len(experiments)} experiment{'s' * (len(experiments) != 1)} of {length:.1f} s in all"
     findings.insert(0, f"{seconds:.1f} s of {' and '.join(tools)}: {several}")
     measured = any(np.isfinite(each.forces[each.present]).any() for each in experiments)
-    if not measured:
-        findings.append("no forces: what is stiffer than what can be told, but not how stiff anything is")
+    findings += told_thickness(surface, nodes, physics)
     findings += _links(topics, tools, physics)
     if motion > _BREATH:
         findings.append(

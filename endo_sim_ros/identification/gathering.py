@@ -88,6 +88,18 @@ def tool_radius(surface: Surface, nodes: ControlNodes, physics: PhysicsConfig) -
     return max(physics.contact_radius, _THINNEST * surface.apart, _THINNEST_CELL * physics.grid_ratio * nodes.spacing)
 
 
+def told_thickness(surface: Surface, nodes: ControlNodes, physics: PhysicsConfig) -> list[str]:
+    """What to say where tools act as thicker ones than was said."""
+    radius = tool_radius(surface, nodes, physics)
+    if radius <= _THICKER * physics.contact_radius:
+        return []
+    return [
+        f"tools act as balls of {1e3 * radius:.1f} mm radius, not of {1e3 * physics.contact_radius:.1f} mm as contact_radius says,"
+        f" because control nodes of the skin are {1e3 * surface.apart:.1f} mm apart: give more of them (node_count), unless a"
+        " simulation of the same ones was recorded"
+    ]
+
+
 def read_tools(
     arms: Sequence[str],
     streams: Mapping[Topic, Stream],
@@ -103,12 +115,6 @@ def read_tools(
         SequenceError: If the forces contradict the poses.
     """
     radius = tool_radius(surface, nodes, physics)
-    if radius > _THICKER * physics.contact_radius:
-        findings.append(
-            f"tools act as balls of {1e3 * radius:.1f} mm radius, not of {1e3 * physics.contact_radius:.1f} mm as contact_radius says,"
-            f" because control nodes of the skin are {1e3 * surface.apart:.1f} mm apart: give more of them (node_count), unless a"
-            " simulation of the same ones was recorded"
-        )
     there = [arm for arm in arms if messages.tool_pose(arm) in streams]
     return {arm: read_tool(arm, streams, surface, physics, config, radius, findings) for arm in there}
 

@@ -15,7 +15,7 @@ from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.identification.config import IdentificationConfig
 from endo_sim_ros.identification.estimate import Identification, identify
 from endo_sim_ros.identification.experiment import Experiment
-from endo_sim_ros.identification.gathering import Tool, gather, read_tools, settling_steps
+from endo_sim_ros.identification.gathering import Tool, gather, read_tools, settling_steps, told_thickness
 from endo_sim_ros.identification.recording_config import TouchConfig
 from endo_sim_ros.identification.results import told
 from endo_sim_ros.identification.surface import Surface
@@ -144,7 +144,7 @@ class IdentificationNode(EndoNode):
             self.experiments.append(experiment(line, (start, stop), self.physics.step_duration, tools[arm].noise, self._touch))
             self._until[arm] = int(line.times[stop - 1])
             self._gathered += 1
-            self._said = said
+            self._said = [*said, *told_thickness(self._surface, self.nodes, self.physics)]
         del self.experiments[: -self._options.experiments]
         self._forget(tools, settle)
 

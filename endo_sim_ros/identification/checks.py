@@ -72,15 +72,15 @@ class Survey:
 
     Args:
         scale: By which forces of the model are to be multiplied.
-        findings: Sentences.
+        doubts: Sentences that say that the data are not what they are taken for.
+        findings: Other ones.
         offset: Of all tips [3], m, world, where contact begins elsewhere than `tip_offset` explains; else 0.
-        doubtful: Whether one of these says that the data are not what they are taken for.
     """
 
     scale: float
+    doubts: list[str]
     findings: list[str]
     offset: np.ndarray
-    doubtful: bool = False
 
 
 def survey(data: list[Observations], model: ForwardModel, unknowns: Unknowns, theta: np.ndarray) -> Survey:
@@ -103,7 +103,7 @@ def survey(data: list[Observations], model: ForwardModel, unknowns: Unknowns, th
     _check_touch(data, model, predicted, middle)
     if not any(np.isfinite(each).any() for each in measured):
         told = "no force was measured: of stiffness only ratios between places are known, not how stiff the tissue is"
-        return Survey(1.0, [told], np.zeros(3))
+        return Survey(1.0, [], [told], np.zeros(3))
     _check_felt(data, [each[middle] for each in predicted])
     findings = _find_slips(data, [each[middle] for each in predicted])
     costs, scales = zip(*(_fit_scale(data, [each[d] for each in predicted]) for d in range(_SCANNED)))
@@ -112,19 +112,19 @@ def survey(data: list[Observations], model: ForwardModel, unknowns: Unknowns, th
     for number, (each, force) in enumerate(zip(data, chosen)):
         _check_direction([each], [force], config, f"experiment {number}: ", by_sign=True)
     far, near = _FAR * config.tip_offset, np.abs(depths) <= max(2 * _FAR * config.tip_offset, depths[-1] - depths[-2])
-    lag = _find_lag(data, [each[near] for each in predicted], config)
-    findings += lag
+    doubts = lag = _find_lag(data, [each[near] for each in predicted], config)
     opened = np.array([_fit_scale(data, [each[d] for each in predicted], opened=True)[0] for d in range(_SCANNED)])
     depth, gain = _lowest(depths, opened, middle, sum(int(each.of_forces().sum()) for each in data))
     offset, beyond = np.zeros(3), bool(abs(depth) >= config.depth_scan and gain > _ENOUGH)
     if not lag and abs(depth) > far and gain > _ENOUGH:
         where = "deeper than" if depth < 0 else "before"
-        findings.append(
+        told = (
             f"contact begins about {1000 * abs(depth):.1f} mm {'or more ' * beyond}{where} the surface of the model: check its scale, and"
-            " where the tool stands to it" + "; intervals count with a tip_offset as great" * (not beyond)
+            " where the tool stands to it"
         )
+        (doubts if beyond else findings).append(told)
         offset = depth * (1 - beyond) * np.mean(axes, axis=0)
-    return Survey(float(np.clip(scales[int(np.argmin(costs))], 0.05, 20.0)), findings, offset, bool(lag) or beyond)
+    return Survey(float(np.clip(scales[int(np.argmin(costs))], 0.05, 20.0)), doubts, findings, offset)
 
 
 def _axis(experiment: Experiment, model: ForwardModel) -> np.ndarray:

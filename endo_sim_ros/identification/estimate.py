@@ -34,6 +34,9 @@ _FAR = 2.0  # standard deviations from what was thought, which is told
 _NOTHING = 0.5  # of chi-square: what a fresh Jacobian promises no more than, and does not keep, is how rough forces are
 _AS_PROMISED = 0.3  # share of the promised gain with which a Jacobian is still good
 _FALLS = 0.05  # share of chi-square that the last two iterations took away, from which on the next ones would, too
+_DOUBTFUL_START = (
+    "it goes on from an estimate whose data are not what they were taken for, so that nothing counts as known; begin anew without that one"
+)
 _DRAWS = 200  # from the posterior, for places at the edge of an inclusion
 _TREMBLES, _ABOUT = 4, 5  # copies whose tips err as measured ones do; steps over which what they tell is averaged
 
@@ -82,6 +85,7 @@ class Identification:
         steps: That were simulated, of all copies together.
         felt: Whether any force was measured, here or in what it goes on from.
         sure: Probability that there is an inclusion, and about where it was found; None where none was looked for.
+        doubts: Those of the findings that say that the data are not what they are taken for; where there are any, nothing is known.
     """
 
     unknowns: list[Estimate]
@@ -100,6 +104,7 @@ class Identification:
     steps: int
     felt: bool
     sure: float | None = None
+    doubts: list[str] = field(default_factory=list)
 
     def __getitem__(self, name: str) -> Estimate:
         """The estimate of this name."""
@@ -190,13 +195,14 @@ def identify(
         progress: Called as ``progress(stage, done, total)``.
         around: Places [K, 3], m, world, near which a field is unknown; default: where tools of the experiments touch.
         start: An estimate from other experiments that this one goes on from: what they told is the prior, with the unknowns and the
-            configuration that they had. Give that one `around` where tools will touch later.
+            configuration that they had. Give that one `around` where tools will touch later. Nothing is known by an estimate that goes on
+            from one with `doubts`.
         finer: The same tissue of more control nodes, if any: forces are those of this one, how they change with the unknowns is told by
             `nodes`, and how far both differ tells how wrong the finer one still is.
 
     Raises:
         IdentificationError: If nothing can be estimated from the data; the sentence says what was seen.
-        ConfigError: If an unknown does not exist, or `start` is of other tissue.
+        ConfigError: If an unknown does not exist, `start` is of other tissue, or an inclusion is to be found with `start`.
     """
     progress = progress or (lambda stage, done, total: None)
     experiments = list(experiments)
@@ -206,6 +212,8 @@ def identify(
         unknowns, config = start.parameters, start.parameters.config
         if replace(unknowns.physics, device=physics.device) != physics or len(unknowns.nodes) != len(nodes):
             raise ConfigError("start is an estimate of other tissue: give it the nodes and the physics that it was made with")
+        if unknowns.ball is not None:
+            raise ConfigError("stiffness: inclusion needs all experiments together: give them at once, without start")
     else:
         unknowns = Unknowns(nodes, physics, config, touched_places(experiments, nodes, physics) if around is None else around)
     model = ForwardModel(nodes, physics, device, finer)
@@ -213,11 +221,22 @@ def identify(
     size = unknowns.count + NUISANCES
     prior = _Prior(np.zeros(size), np.eye(size)) if start is None else _Prior(start.mean, np.linalg.inv(start.covariance))
     plain = prior.mean.copy()
-    if unknowns.ball is not None and start is None:
+    if unknowns.ball is not None:
         plain[BALL] = unknowns.ball.absent()
     first = survey(data, model, unknowns, plain)
-    if start is None:
+    if start is not None:
+        if start.doubts:
+            first.doubts.append(_DOUBTFUL_START)
+        if first.offset.any():
+            off = 1e3 * float(np.linalg.norm(first.offset))
+            first.doubts.append(
+                f"contact begins {off:.1f} mm from where it did in what the estimate goes on from, which has a tip_offset of only"
+                f" {1e3 * config.tip_offset:.1f} mm"
+            )
+    else:
         config = unknowns.config = replace(config, tip_offset=max(config.tip_offset, float(np.linalg.norm(first.offset))))
+        if first.offset.any():
+            first.findings.append(f"intervals count with a tip_offset of {1e3 * config.tip_offset:.1f} mm")
     if not any(each.used.any() for each in data):
         raise IdentificationError("nothing was measured: forces, displacements and tracks are all missing; give one of them")
     theta = prior.mean.copy()
@@ -227,15 +246,15 @@ def identify(
     parts = [_Data(each, *unknowns.directions(touched_places([each.experiment], nodes, physics))) for each in data]
     for part in parts:
         part.seen.uneven = _unevenness(part.seen, model, unknowns, theta)
-    sure, rests = None if start is None else start.sure, []
-    if unknowns.ball is not None and start is None:
+    sure, rests = None, []
+    if unknowns.ball is not None:
         progress("look for the inclusion", 0, config.iterations)
         theta, sure, rests = _locate(theta, prior, parts, model, unknowns)
     point, ended, falls = _minimise(theta, prior, parts, model, unknowns, progress)
     if not ended:
         unknown = ", so that nothing counts as known" * falls
         more = f"the estimate had not settled after {config.iterations} iterations{unknown}; allow more"
-        first = replace(first, findings=[*first.findings, more], doubtful=first.doubtful or falls)
+        (first.doubts if falls else first.findings).append(more)
     felt = (start is not None and start.felt) or any(each.of_forces()[each.used].any() for each in data)
     found = _conclude(point, unknowns, first, felt, sure, model.steps)
     if unknowns.ball is None:
@@ -243,15 +262,13 @@ def identify(
     if not found.tells_inclusion:
         why = f"the likeliest one has a probability of {sure or 0.0:.2f}, and its radius and ratio are {found['inclusion_ratio'].told}"
         found = replace(found, findings=[f"no inclusion is told, so that the map is that of tissue without one: {why}", *found.findings])
-        if start is not None:
-            return found
         whole = identify(experiments, nodes, physics, replace(config, stiffness="uniform"), device, progress, finer=finer)
         rest = replace(whole.unknowns[0], name=found.unknowns[0].name)
         moduli = {name: getattr(whole, name) for name in ("young_modulus", "low", "high", "known", "removed")}
         return replace(found, unknowns=[rest, *found.unknowns[1:]], steps=found.steps + whole.steps, **moduli)
     x, y, z = centre = unknowns.ball.shape(found.mean[1 : 1 + BALL])[0]
     there = f"the middle of the inclusion is at {x:.4f} {y:.4f} {z:.4f} m, with a probability of {sure:.2f}"
-    aside = 0.0 if start is not None else unknowns.ball.aside(centre, touched_places(experiments, nodes, physics))
+    aside = unknowns.ball.aside(centre, touched_places(experiments, nodes, physics))
     if aside > (physics.contact_radius or physics.force_radius):
         rests = [f"all presses are to one side of it, the nearest {1e3 * aside:.0f} mm away: it is less sure; press around it", *rests]
     return replace(found, findings=[there, *rests, *found.findings])
@@ -441,17 +458,17 @@ def _conclude(point: _Point, unknowns: Unknowns, first: Survey, felt: bool, sure
     chi_square, precision = _misfit(point.residuals, point.covariances), point.prior.precision
     determined = float(np.trace(np.linalg.solve(H + precision, H)))
     count = sum(len(r) for r in point.residuals)
-    factor, doubts = judge_residuals(chi_square, round(count - determined), config)
+    factor, unexplained = judge_residuals(chi_square, round(count - determined), config)
     covariance = np.linalg.inv(H / factor + precision)
     quantile = float(norm.ppf(0.5 + config.level / 2))
     told = [_estimate(each, point.theta, covariance, quantile, felt, unknowns, config) for each in unknowns.reported()]
     unsure = [each.name for each in told if each.told == "not told by these data"]
-    doubtful = first.doubtful or bool(doubts)
-    if doubtful:
+    doubts = [*first.doubts, *unexplained]
+    if doubts:
         told = [replace(each, told="not told by these data") for each in told]
     painted = _paint(point.theta, covariance, unknowns, _tells_inclusion(told, sure))
     middle, spread = np.log(unknowns.base) + np.clip(painted.logs, -MOST_LOG, MOST_LOG), quantile * np.sqrt(painted.variance)
-    findings = [*first.findings, *doubts]
+    findings = [*doubts, *first.findings]
     if unsure:
         findings.append(f"these data do not tell {', '.join(unsure)}: the interval rests on what was thought before")
     if point.undone:
@@ -461,10 +478,10 @@ def _conclude(point: _Point, unknowns: Unknowns, first: Survey, felt: bool, sure
         findings.append(
             "moduli of more than 50 times that of physics, or less than a fiftieth, are not simulated: give physics a nearer one"
         )
-    known = (painted.removed >= config.known) & (felt and not doubtful)
+    known = (painted.removed >= config.known) & (felt and not doubts)
     return Identification(
         told, findings, np.exp(middle), np.exp(middle - spread), np.exp(middle + spread), known, painted.removed, point.theta, covariance,
-        unknowns, unknowns.nodes, config.level, chi_square / max(count - determined, 1), steps, felt, sure,
+        unknowns, unknowns.nodes, config.level, chi_square / max(count - determined, 1), steps, felt, sure, doubts,
     )  # fmt: skip
 
 

@@ -10,7 +10,7 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from endo_sim_ros import messages
-from endo_sim_ros.core.config import option_values
+from endo_sim_ros.core.config import ConfigError, option_values
 from endo_sim_ros.core.frames import SequenceError
 from endo_sim_ros.identification.config import IdentificationConfig
 from endo_sim_ros.identification.estimate import Identification, identify
@@ -42,7 +42,7 @@ class IdentificationNode(EndoNode):
         super().__init__("identification_node")
         self._options = self.declare(IdentificationNodeConfig)
         self._touch = self.declare(TouchConfig)
-        self.config = self.declare(IdentificationConfig)
+        self.config = _refinable(self.declare(IdentificationConfig))
         self.physics = self.declare(PhysicsConfig, option_values(tissue(self._options.tissue)))
         self._arms = arm_names(self._options.arms)
         self._builder = TissueBuilder()
@@ -52,7 +52,9 @@ class IdentificationNode(EndoNode):
         self.experiments: list[Experiment] = []  # the newest
         self._gathered = 0  # all so far
         self._until = dict.fromkeys(self._arms, 0)  # ns: end of the last experiment of each arm
-        self._said: list[str] = []  # about touches that were left out
+        self._said: list[str] = []  # of what touches were collected from, and those that were left out
+        self._left_out = ""  # about the newest experiment that an estimate left out
+        self._logged: set[str] = set()  # what was noticed already
         self._background = Background()
         self.found: Identification | None = None
         self._known_of: Any = None  # the tissue and the options of that
@@ -74,11 +76,15 @@ class IdentificationNode(EndoNode):
         self.every(_PERIOD, self._on_timer)
 
     def config_changed(self, config: Any) -> None:
-        """New options count from the next estimate on, which begins at once."""
+        """New options count from the next estimate on, which begins at once.
+
+        Raises:
+            ConfigError: If an inclusion is to be found.
+        """
         if isinstance(config, PhysicsConfig):
             self.physics = config
         elif isinstance(config, IdentificationConfig):
-            self.config = config
+            self.config = _refinable(config)
         elif isinstance(config, TouchConfig):
             self._touch = config
         else:
@@ -117,7 +123,8 @@ class IdentificationNode(EndoNode):
 
     def _begin_anew(self) -> None:
         self._log.clear()
-        self.experiments, self._gathered, self._said, self.failure = [], 0, [], ""
+        self.experiments, self._gathered, self._said, self._left_out, self.failure = [], 0, [], "", ""
+        self._logged.clear()
         self.found, self._known_of, self._used = None, None, 0
         self._until = dict.fromkeys(self._arms, 0)
 
@@ -161,7 +168,8 @@ class IdentificationNode(EndoNode):
     # ----------------------------------------------------------------- estimate
 
     def _estimate(self) -> None:
-        """Estimate in the background, when there is news: from what was felt since the last estimate, which is what was known before."""
+        """Estimate in the background, when there is news: from what was felt since the last estimate that can be relied on, which is what
+        was known before."""
         nodes = self.nodes
         tissue_now = (self._model_stamp, self.config, self.physics, id(nodes))
         try:
@@ -169,9 +177,14 @@ class IdentificationNode(EndoNode):
             if done is not None:
                 (about, count), (found, seconds) = done
                 if about == tissue_now and count <= self._gathered:
-                    self.found, self.failure, self._known_of = found, "", about
-                    self._used, self._seconds, self._estimated = count, seconds, self._estimated + 1
-                    self._publish(found)
+                    self.failure, self._seconds, self._estimated = "", seconds, self._estimated + 1
+                    if found.doubts:
+                        self._leave_out(count - self._used, found.doubts)
+                    if not (found.doubts and self._known_of == about):
+                        self.found, self._known_of = found, None if found.doubts else about
+                        self._publish(found)
+                    self._used = count
+                    self._log_new()
         except Exception as error:
             self.failure = sentence("identification", error)
             self.report_error(self.failure)
@@ -193,13 +206,21 @@ class IdentificationNode(EndoNode):
 
         self._background.want((tissue_now, self._gathered), build)
 
+    def _leave_out(self, count: int, doubts: list[str]) -> None:
+        """Forget the experiments that an estimate was made of that cannot be relied on, and say why; not those that others were made of."""
+        later = self._gathered - self._used - count
+        if count:
+            del self.experiments[-(count + later) : -later or None]
+            what = "an experiment is" if count == 1 else f"{count} experiments are"
+            self._left_out = f"{what} left out of the estimate: {'; '.join(doubts)}"
+
     def _note_progress(self, stage: str, done: int, total: int) -> None:
         self._progress = f"{stage}, {done} of at most {total}" if done else stage
 
     def _publish(self, found: Identification) -> None:
         cloud = StiffnessCloud(found.nodes.rest, found.young_modulus, found.low, found.high, found.known)
         self._map_pub.publish(messages.encode_stiffness(cloud, self._model_stamp, self._options.world_frame))
-        for line in found.summary().splitlines():
+        for line in found.summary().splitlines()[: -len(found.findings) or None]:  # these are logged when they are new
             self.get_logger().info(line)
         if self._options.apply:
             if found.any_known:
@@ -256,14 +277,41 @@ class IdentificationNode(EndoNode):
         if found is None:
             return OK, text, values
         text = f"{text}; {found.summary().splitlines()[0]}"
-        noticed = [*self._said, *found.findings]
-        return (WARN, f"{text}; {noticed[0]}", values) if noticed else (OK, text, values)
+        noticed = self._noticed()
+        return (WARN, f"{text}; {'; '.join(noticed)}", values) if noticed else (OK, text, values)
+
+    def _noticed(self) -> list[str]:
+        """What was noticed, what matters most first."""
+        findings, doubts = (self.found.findings, self.found.doubts) if self.found is not None else ([], [])
+        others = [text for text in dict.fromkeys([*doubts, *findings, *self._said]) if text not in self._left_out]
+        return [self._left_out, *others] if self._left_out else others
+
+    def _log_new(self) -> None:
+        """Log what was not noticed before."""
+        new = [text for text in self._noticed() if text not in self._logged]
+        for text in new:
+            self.get_logger().warning(text)
+        self._logged.update(new)
 
     def destroy_node(self) -> None:
         """Estimate nothing more."""
         self._builder.stop()
         self._background.stop()
         super().destroy_node()
+
+
+def _refinable(config: IdentificationConfig) -> IdentificationConfig:
+    """The configuration, if estimates with it can be refined.
+
+    Raises:
+        ConfigError: If they cannot.
+    """
+    if config.stiffness == "inclusion":
+        raise ConfigError(
+            "stiffness: inclusion needs all presses together, and this node takes one after the other; choose field, or record the presses"
+            " and give them to endo-sim identify"
+        )
+    return config
 
 
 if __name__ == "__main__":

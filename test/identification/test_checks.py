@@ -9,6 +9,7 @@ from slab import NODES, PHYSICS, pressed
 from endo_sim_ros.core.config import ConfigError
 from endo_sim_ros.identification import IdentificationConfig, IdentificationError, identify
 from endo_sim_ros.identification.synthetic import measure
+from endo_sim_ros.identification.unknowns import Unknowns
 
 pytestmark = pytest.mark.slow
 CONFIG = IdentificationConfig(model_error=0.0, surface_error=0.0)
@@ -76,6 +77,29 @@ def test_going_on_needs_the_same_tissue_and_keeps_that_forces_were_felt(good):
         identify([good], NODES, replace(PHYSICS, young_modulus=2 * PHYSICS.young_modulus), CONFIG, "cpu", start=found)
     moved = replace(good, forces=np.full((40, 3), np.nan), displacements=np.zeros((40, 1, 3)), nodes=np.array([0]))
     assert found["young_modulus"].told == identify([moved], NODES, PHYSICS, CONFIG, "cpu", start=found)["young_modulus"].told == "known"
+
+
+def test_going_on_from_an_estimate_that_is_doubtful_is_doubtful(good):
+    late = identify([replace(good, forces=np.roll(good.forces, 5, axis=0))], NODES, PHYSICS, CONFIG, "cpu")
+    assert late.doubts and late.doubts == late.findings[: len(late.doubts)]
+    then = identify([good], NODES, PHYSICS, CONFIG, "cpu", start=late)
+    assert then.doubts and "goes on from an estimate whose data" in then.findings[0] and not then.any_known
+
+
+def test_contact_that_begins_elsewhere_than_before_is_not_taken_in(good):
+    found = identify([good], NODES, PHYSICS, CONFIG, "cpu")
+    deep = replace(good, tips=good.tips + [0, 0, 0.003])
+    assert any("intervals count with a tip_offset of " in text for text in identify([deep], NODES, PHYSICS, CONFIG, "cpu").findings)
+    then = identify([deep], NODES, PHYSICS, CONFIG, "cpu", start=found)
+    assert not any("intervals count" in text for text in then.findings) and not then.any_known
+    assert any("which has a tip_offset of only 0.5 mm" in text for text in then.doubts)
+
+
+def test_an_inclusion_needs_all_experiments_at_once(good):
+    config = replace(CONFIG, stiffness="inclusion", iterations=1)
+    found = identify([good], NODES, PHYSICS, CONFIG, "cpu")
+    with pytest.raises(ConfigError, match="needs all experiments together"):
+        identify([good], NODES, PHYSICS, config, "cpu", start=replace(found, parameters=Unknowns(NODES, PHYSICS, config, good.tips)))
 
 
 @pytest.fixture(scope="module")

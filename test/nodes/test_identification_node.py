@@ -118,3 +118,25 @@ def test_time_that_begins_anew_keeps_what_was_felt(graph, press):
     bench.until(lambda: len(node.experiments) == 1, "an experiment")
     tell(bench, *press, begin=10 * S)
     bench.until(lambda: len(node.experiments) == 2, "an experiment of the new time")
+
+
+def test_touches_that_cannot_be_relied_on_are_left_out_and_told(graph, press):
+    bench, node, _ = graph
+    tips, forces = press
+    late = np.roll(forces, 6, axis=0)
+    tell(bench, tips, late, noise=0.05)
+    bench.status("identification_node", "an experiment is left out of the estimate: measured forces come 0.2")
+    assert not node.experiments and not node.found.any_known
+    tell(bench, *press, begin=BEGIN + 10 * S, noise=0.05)
+    bench.until(lambda: node.found.any_known, "an estimate of the good one alone", 40)
+    first = node.found
+    assert first["young_modulus"].low < TRUTH < first["young_modulus"].high and len(node.experiments) == 1
+    tell(bench, tips, late, begin=BEGIN + 20 * S, noise=0.05)
+    bench.until(lambda: node._used == 3, "an estimate of another late one", 40)
+    assert node.found is first and len(node.experiments) == 1 and len(bench.heard["stiffness_map"]) == 2
+    _, text, _ = bench.status("identification_node", "3 experiments")
+    assert text.index("left out of the estimate") < text.index("tools act as balls") and text.endswith(
+        "simulation of the same ones was recorded"
+    )
+    done, why = bench.set("identification_node", stiffness="inclusion")
+    assert not done and "needs all presses together" in why and node.config.stiffness == "uniform"

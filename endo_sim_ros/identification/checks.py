@@ -7,6 +7,7 @@ from scipy.stats import chi2
 
 from endo_sim_ros.identification.config import IdentificationConfig
 from endo_sim_ros.identification.experiment import Experiment
+from endo_sim_ros.identification.force_checks import check_clipped
 from endo_sim_ros.identification.forward import ForwardModel, closing_steps, distances_to_skin
 from endo_sim_ros.identification.observations import Observations
 from endo_sim_ros.identification.unknowns import Unknowns
@@ -113,6 +114,12 @@ def survey(data: list[Observations], model: ForwardModel, unknowns: Unknowns, th
         _check_direction([each], [force], config, f"experiment {number}: ", by_sign=True)
     far, near = _FAR * config.tip_offset, np.abs(depths) <= max(2 * _FAR * config.tip_offset, depths[-1] - depths[-2])
     doubts = lag = _find_lag(data, [each[near] for each in predicted], config)
+    if not lag:
+        doubts = check_clipped(
+            [np.where(_usable(each)[:, None], each.experiment.forces, np.nan) for each in data],
+            [each[middle] for each in predicted],
+            [each.experiment.force_noise for each in data],
+        )
     opened = np.array([_fit_scale(data, [each[d] for each in predicted], opened=True)[0] for d in range(_SCANNED)])
     depth, gain = _lowest(depths, opened, middle, sum(int(each.of_forces().sum()) for each in data))
     offset, beyond = np.zeros(3), bool(abs(depth) >= config.depth_scan and gain > _ENOUGH)

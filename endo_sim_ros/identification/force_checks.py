@@ -1,5 +1,7 @@
 """What is wrong with the forces of a recording: told by comparing them with how far the tool goes into the tissue."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from endo_sim_ros.core.frames import SequenceError
@@ -10,6 +12,10 @@ _CLEAR = 5.0  # standard deviations of its noise that a force must have to tell 
 _DEEP = 0.001  # m that a tool must have gone into tissue, or pulled it, to know where the force points
 _AGAINST, _ASKEW = 120.0, 60.0  # degrees between a force and where it should point: friction and slopes make less than 45
 _FEW = 5  # steps; fewer tell nothing
+_LOADED = 0.95  # share of the greatest force of the model at which a tool has gone in: what it does then, as a hold, tells no plateau
+_RISING, _LEVEL = 4, 4  # samples that must be on a line, and on a plateau
+_KINKED, _ENOUGH = 9.0, 25.0  # by which chi-square is less with a plateau: of an experiment, to count, and of all, to be believed
+_FLAT, _STEEP = 0.3, 0.5  # slopes of a plateau, as shares of that before it: beyond the first forces grow, and the other must be ruled out
 _FAR = 0.005  # m, beyond clearance, from tissue where forces begin
 
 
@@ -80,3 +86,73 @@ def check_place(name: str, line: Timeline, noise: float, clearance: float) -> st
         f"{name}: forces of up to {force:.2g} N begin where the tool is {where} the surface of the model: are model and recording of one"
         " scale and in one frame, and is contact_radius that of the tool?"
     )
+
+
+def check_clipped(forces: list[np.ndarray], predicted: list[np.ndarray], noises: list[float]) -> list[str]:
+    """A sentence if forces stop growing while the tool goes on into the tissue, else none.
+
+    While the tool goes in, measured forces along those of the model are compared with these: on a line, and on a line that becomes a
+    plateau. Lines have an intercept, as contact may begin elsewhere.
+
+    Args:
+        forces: Of each experiment [T, 3], N; NaN where they do not count.
+        predicted: Those of the model [T, 3], of any modulus.
+        noises: Standard deviation of a component of each.
+    """
+    found = []
+    for force, model, noise in zip(forces, predicted, noises):
+        measured, expected = _going_in(force, model)
+        kink = _kink(measured / noise, expected)
+        if kink is not None and kink.gain > _KINKED:
+            found.append((kink, noise))
+    if not found:
+        return []
+    xy, xx = (sum(getattr(kink, name) for kink, _ in found) for name in ("xy", "xx"))
+    if sum(kink.gain for kink, _ in found) < _ENOUGH or xy > _FLAT * xx or xy + 2 * np.sqrt(xx) > _STEEP * xx:
+        return []
+    low, high = (find(kink.level * noise for kink, noise in found) for find in (min, max))
+    level = f"{low:.2g}" if f"{low:.2g}" == f"{high:.2g}" else f"{low:.2g} to {high:.2g}"
+    return [f"forces stop at {level} N while the tool goes deeper, where those of the model go on growing: is the sensor clipped?"]
+
+
+def _going_in(force: np.ndarray, model: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Measured forces and those of the model [n], along the greatest of these, N, from the last contact before it until nearly there."""
+    size = np.linalg.norm(model, axis=1)
+    top = int(size.argmax())
+    end = int(np.argmax(size >= _LOADED * size[top])) + 1
+    begin = int(np.flatnonzero(size[:end] == 0)[-1]) + 1 if (size[:end] == 0).any() else 0
+    steps = begin + np.flatnonzero(np.isfinite(force[begin:end]).all(1))
+    along = model[top] / max(size[top], 1e-12)
+    return force[steps] @ along, model[steps] @ along
+
+
+@dataclass(frozen=True)
+class _Kink:
+    """Forces on a line that becomes a plateau; all in standard deviations of noise, which are those of the model on that line, too."""
+
+    gain: float  # by which chi-square is less than that of a line, over what neither explains
+    level: float  # of the plateau
+    xy: float  # sums over the plateau of products of forces of the model and measured ones, less their means
+    xx: float
+
+
+def _kink(measured: np.ndarray, model: np.ndarray) -> _Kink | None:
+    """The likeliest plateau, if any."""
+
+    def line(until: int) -> tuple[float, float]:
+        basis = np.column_stack([model[:until], np.ones(until)])
+        best = np.linalg.lstsq(basis, measured[:until], rcond=None)[0]
+        return float(best[0]), float(((measured[:until] - basis @ best) ** 2).sum())
+
+    count, plateaus = len(measured), list[tuple[float, int, float]]()
+    for until in range(_RISING, count - _LEVEL + 1):
+        slope, cost = line(until)
+        if slope > 0:
+            plateaus.append((cost + float(((measured[until:] - measured[until:].mean()) ** 2).sum()), until, slope))
+    if not plateaus:
+        return None
+    cost, until, slope = min(plateaus)
+    level = float(measured[until:].mean())
+    x = slope * (model[until:] - model[until:].mean())
+    gain = (line(count)[1] - cost) / max(1.0, cost / count)
+    return _Kink(gain, level, float(x @ (measured[until:] - level)), float(x @ x))

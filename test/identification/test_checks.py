@@ -173,6 +173,17 @@ def test_nothing_is_known_by_data_that_a_finding_says_are_wrong(three, how):
     assert not any("rests on what was thought before" in text for text in found.findings)
 
 
+def test_nothing_is_known_by_a_sensor_that_is_clipped_where_a_softer_tissue_would_explain_it(three):
+    stiff = [measure(replace(each, forces=0 * each.forces), NODES, replace(PHYSICS, young_modulus=8e3), np.random.default_rng(n))
+             for n, each in enumerate(three)]  # fmt: skip
+    sizes = [np.linalg.norm(each.forces, axis=1, keepdims=True) for each in stiff]
+    limit = 0.6 * max(size.max() for size in sizes)
+    found = identify([replace(each, forces=each.forces * np.minimum(1, limit / np.maximum(size, 1e-9)))
+                      for each, size in zip(stiff, sizes)], NODES, PHYSICS, CONFIG, "cpu")  # fmt: skip
+    (told,) = [text for text in found.doubts if text.startswith("forces stop at ")]
+    assert float(told.split(" N ")[0].split()[-1]) == pytest.approx(limit, rel=0.1) and not found.any_known
+
+
 def test_nothing_is_known_by_an_estimate_that_did_not_settle_or_contact_beyond_the_scan(three):
     found = identify([replace(three[0], forces=8 * three[0].forces)], NODES, PHYSICS, replace(CONFIG, iterations=1), "cpu")
     assert any("had not settled after 1 iterations" in text for text in found.findings) and not found.any_known

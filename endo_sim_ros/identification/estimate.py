@@ -22,7 +22,7 @@ from endo_sim_ros.identification.forward import ForwardModel, distances_to_skin,
 from endo_sim_ros.identification.maps import AGREED, different_places, paint_as_regions
 from endo_sim_ros.identification.observations import Covariance, Observations
 from endo_sim_ros.identification.scan import Places, Scan, added, weights, without_ball
-from endo_sim_ros.identification.unknowns import MODULUS, MOST_LOG, Reported, Told, Unknowns
+from endo_sim_ros.identification.unknowns import MODULUS, MOST_LOG, NOT_TOLD, Reported, Told, Unknowns
 from endo_sim_ros.physics import ControlNodes, PhysicsConfig
 
 NUISANCES = 5
@@ -260,12 +260,18 @@ def identify(
     if unknowns.ball is None:
         return replace(found, findings=[*different_places(found), *found.findings]) if len(unknowns.centres) else found
     if not found.tells_inclusion:
-        why = f"the likeliest one has a probability of {sure or 0.0:.2f}, and its radius and ratio are {found['inclusion_ratio'].told}"
-        found = replace(found, findings=[f"no inclusion is told, so that the map is that of tissue without one: {why}", *found.findings])
+        sizes = ", ".join(f"its {name} is {found[f'inclusion_{name}'].told}" for name in ("radius", "ratio"))
+        why = f"the likeliest one has a probability of {sure or 0.0:.2f}, {sizes}"
         whole = identify(experiments, nodes, physics, replace(config, stiffness="uniform"), device, progress, finer=finer)
         rest = replace(whole.unknowns[0], name=found.unknowns[0].name)
-        moduli = {name: getattr(whole, name) for name in ("young_modulus", "low", "high", "known", "removed")}
-        return replace(found, unknowns=[rest, *found.unknowns[1:]], steps=found.steps + whole.steps, **moduli)
+        shown = ("young_modulus", "low", "high", "known", "removed", "chi_square", "doubts")
+        return replace(
+            found,
+            unknowns=[rest, *(replace(each, told=NOT_TOLD) if whole.doubts else each for each in found.unknowns[1:])],
+            findings=[f"no inclusion is told, so that the map is that of tissue without one: {why}", *whole.findings],
+            steps=found.steps + whole.steps,
+            **{name: getattr(whole, name) for name in shown},
+        )
     x, y, z = centre = unknowns.ball.shape(found.mean[1 : 1 + BALL])[0]
     there = f"the middle of the inclusion is at {x:.4f} {y:.4f} {z:.4f} m, with a probability of {sure:.2f}"
     aside = unknowns.ball.aside(centre, touched_places(experiments, nodes, physics))
@@ -462,10 +468,10 @@ def _conclude(point: _Point, unknowns: Unknowns, first: Survey, felt: bool, sure
     covariance = np.linalg.inv(H / factor + precision)
     quantile = float(norm.ppf(0.5 + config.level / 2))
     told = [_estimate(each, point.theta, covariance, quantile, felt, unknowns, config) for each in unknowns.reported()]
-    unsure = [each.name for each in told if each.told == "not told by these data"]
+    unsure = [each.name for each in told if each.told == NOT_TOLD]
     doubts = [*first.doubts, *unexplained]
     if doubts:
-        told = [replace(each, told="not told by these data") for each in told]
+        told = [replace(each, told=NOT_TOLD) for each in told]
     painted = _paint(point.theta, covariance, unknowns, _tells_inclusion(told, sure))
     middle, spread = np.log(unknowns.base) + np.clip(painted.logs, -MOST_LOG, MOST_LOG), quantile * np.sqrt(painted.variance)
     findings = [*doubts, *first.findings]
@@ -512,6 +518,7 @@ def _paint(theta: np.ndarray, covariance: np.ndarray, unknowns: Unknowns, inclus
         left = np.mean([(unknowns.logs(each) - logs) ** 2 for each in draws], axis=0)  # its edge is too sharp for derivatives
         ball = theta[1 : 1 + BALL]
         left += unknowns.ball.logs(ball) * (unknowns.ball.shape(ball)[2] - unknowns.ball.logs(ball))  # there a node is in it or not
+        left += unknowns.residual  # no tool felt that
     return _Painted(logs, left, np.maximum(1 - left / prior, 0))
 
 
@@ -541,7 +548,7 @@ def _estimate(
     row = np.concatenate([reported.row, np.zeros(NUISANCES)])
     middle, variance, prior = row @ theta + reported.mean, row @ covariance @ row, row @ row
     removed = 1 - variance / prior
-    told: Told = "known" if removed >= config.known else "not told by these data"
+    told: Told = "known" if removed >= config.known else NOT_TOLD
     if reported.is_modulus and not feels:
         # How it differs from the mean of all moduli.
         stiffness = unknowns.tangent(theta[: unknowns.count])[:, : unknowns.stiffness_count].mean(0)
@@ -549,7 +556,7 @@ def _estimate(
         ratio[: unknowns.stiffness_count] -= stiffness
         alone = ratio @ ratio
         share = 1 - ratio @ covariance @ ratio / alone if alone > 1e-12 else 0.0
-        told = "ratio only" if share >= config.known else "not told by these data"
+        told = "ratio only" if share >= config.known else NOT_TOLD
     spread = quantile * np.sqrt(variance)
     estimate, low, high = (float(reported.value(middle + side * spread)) for side in (0, -1, 1))
     return Estimate(reported.name, reported.unit, estimate, low, high, told, float(removed))

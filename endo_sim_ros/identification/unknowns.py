@@ -149,8 +149,9 @@ class Unknowns:
         if config.stiffness == "regions":
             return (*self._regions(), none, np.zeros(count))
         if config.stiffness == "inclusion":
-            alone = np.full((count, 1), config.spread)
-            return np.concatenate([alone, np.zeros((count, BALL))], 1), [f"{MODULUS} of the rest"], none, np.zeros(count)
+            alone, left = np.full((count, 1), config.spread), np.full(count, config.field_spread**2)
+            left[self._near(touched)] = 0
+            return np.concatenate([alone, np.zeros((count, BALL))], 1), [f"{MODULUS} of the rest"], none, left
         near = self._near(touched)
         centres, weights, residual, self._factor = gaussian_process(self.nodes.rest[near], config.field_spread, config.field_length)
         field = np.zeros((count, len(centres)))
@@ -297,4 +298,5 @@ def held_sets(nodes: ControlNodes) -> tuple[np.ndarray, np.ndarray]:
     return nodes.pinned & ~rim, rim
 
 
+NOT_TOLD = "not told by these data"
 Told = Literal["known", "ratio only", "not told by these data"]

@@ -187,9 +187,22 @@ def test_an_inclusion_is_found_as_a_ball():
     assert found.tells_inclusion and "the middle of the inclusion is at" in found.findings[0]
     held = (found.low <= truth) & (truth <= found.high)
     about = np.linalg.norm(NODES.rest - centre, axis=1)
-    assert held[about < 0.01].mean() > 0.8 and held[found.known].mean() > 0.9 and found.known[about > 0.02].all()
+    felt = found.parameters.residual == 0
+    assert held[about < 0.01].mean() > 0.8 and held[found.known].mean() > 0.9
+    assert found.known[(about > 0.02) & felt].all() and not found.known[~felt].any() and 0.5 < felt.mean() < 1
     told = found["inclusion_ratio"]
     assert told.low < 8 < told.high and found.young_modulus.max() == pytest.approx(4e3 * 8, rel=0.6)
+
+
+def test_places_that_no_tool_felt_are_not_known_with_an_inclusion():
+    config = IdentificationConfig(stiffness="inclusion")
+    near, far = (NODES.rest[:, 0] < 0 if side else NODES.rest[:, 0] > 0.02 for side in (True, False))
+    unknowns = Unknowns(NODES, PHYSICS, config, np.array([[-0.012, 0.0, 0.1]]))
+    theta = np.zeros(unknowns.count + estimate.NUISANCES)
+    theta[1:3] = unknowns.ball.numbers(np.array([-0.012, 0.0, 0.106]))[:2]
+    painted = estimate._paint(theta, 1e-6 * np.eye(len(theta)), unknowns, True)
+    assert np.median(painted.removed[near]) > config.known and not painted.removed[far].any()
+    assert (painted.variance[far] >= config.field_spread**2).all()
 
 
 def test_presses_to_one_side_of_an_inclusion_are_told_apart_from_those_around_it():
@@ -226,6 +239,9 @@ def test_without_an_inclusion_none_is_sure():
     assert not any("place is at" in each for each in field.findings) and field.any_known
     found = identify(experiments, NODES, PHYSICS, IdentificationConfig(stiffness="inclusion", iterations=ENOUGH), "cpu")
     assert find_inclusion(found).sure < 0.5 and not found.tells_inclusion and found.findings[0].startswith("no inclusion is told")
+    assert all(f"its {name} is {found[f'inclusion_{name}'].told}" in found.findings[0] for name in ("radius", "ratio"))
+    whole = identify(experiments, NODES, PHYSICS, IdentificationConfig(iterations=ENOUGH), "cpu")
+    assert found.findings[1:] == whole.findings and found.chi_square == pytest.approx(whole.chi_square)
     assert np.ptp(found.young_modulus) == 0 and not seen_from(found, Camera(np.eye(3), 9, 9))
     assert found.young_modulus[0] == pytest.approx(found["young_modulus of the rest"].estimate)
 

@@ -193,7 +193,7 @@ class PersonConfig(StageConfig):
     port: Annotated[int, Range(1, 65535)] = 8080
     """Port of the page; the next free one if it is taken."""
     width: Annotated[int, Range(16, 4096, "pixels")] = 480
-    """Width of the picture in the page; two cores draw this one in real time. The dataset has pictures of its own width."""
+    """Width of the picture in the page; two cores about keep up with this one. The dataset has pictures of its own width."""
     pace: Annotated[float, Range(0.02, 1)] = 1.0
     """How fast time goes in an episode; 1 is real time, 0.5 gives twice as long to act. The dataset has the rate of the task."""
     gamepad: str = ""

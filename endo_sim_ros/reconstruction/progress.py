@@ -52,7 +52,8 @@ class StageProgress:
         """Results of a function, which mostly waits for OpenCV or numpy, for each item, several at a time; reports the share done.
 
         After an error, a cancellation or Ctrl-C no further item begins, and `check` raises in those that run. One that does not check,
-        as a single call of OpenCV can take seconds, is left to end by itself.
+        as a single call of OpenCV can take seconds, is left to end by itself. Meanwhile torch has one thread in each of ours where these
+        fill the cores.
         """
         items = list(items)
         with single_threaded_torch() if len(items) >= cpu_threads() else contextlib.nullcontext():  # else its threads multiply ours

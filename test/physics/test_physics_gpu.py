@@ -176,7 +176,8 @@ def test_many_environments_agree_with_one_and_faults_stay_in_theirs():
     single.tools.forces[:, 0, 2] = 0.3
     for _ in range(5):
         single.step()
-    assert torch.equal(single.displacements[0], batch.displacements[-1])
+    # One is shared by more blocks than each of many, which add up in another order.
+    torch.testing.assert_close(single.displacements[0], batch.displacements[-1], atol=1e-7, rtol=0)
     pinned = torch.from_numpy(nodes.pinned).cuda()[:, None, None]
     expected = skinning.deform(batch.positions()[-1], torch.where(pinned, torch.eye(3, device="cuda"), batch.F[-1]))
     torch.testing.assert_close(means[-1], expected[0], atol=1e-7, rtol=0)

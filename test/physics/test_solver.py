@@ -35,24 +35,24 @@ def test_rest_state_stays_bit_identical_without_force(kinematics, material):
 @pytest.mark.parametrize("material", MATERIALS)
 def test_kernels_for_gpus_compile_without_one(material, tmp_path):
     init_warp()
-    for kernel, arch in ((make_advance_kernel(material, "rest"), 75), (make_step_kernel(material, 4), 90)):  # clusters are of sm_90
+    for kernel, arch in ((make_advance_kernel(material, "rest"), 75), (make_step_kernel(material, 4, 16), 90)):  # clusters are of sm_90
         wp.compile_aot_module(kernel.module, arch=arch, module_dir=tmp_path / str(arch), use_ptx=True)
         assert list((tmp_path / str(arch)).glob("*.ptx"))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [20, 700, 2000, 4000])
-def test_blocks_of_a_cluster_add_up_what_all_nodes_give_to_a_grid_node(count):
+@pytest.mark.parametrize("count, blocks", [(20, 1), (20, 16), (700, 4), (2000, 8), (2000, 16), (4000, 16)])
+def test_blocks_of_a_cluster_add_up_what_all_nodes_give_to_a_grid_node(count, blocks):
     solver = simulate(node_count=count).solver
     corners = Stencils(solver.rest_cells, solver.grid_shape).corners()
-    division = cluster.divide(solver.rest_cells, corners)
+    division = cluster.divide(solver.rest_cells, corners, blocks)
     given = np.random.default_rng(0).normal(size=corners.shape)
     expected = np.zeros(corners.max() + 1)
     np.add.at(expected, corners, given)
     assert sorted(division.nodes[division.nodes >= 0]) == list(range(len(corners)))
     patch = division.addends.shape[2]
-    inboxes = np.zeros((cluster.CLUSTER, division.inbox))
-    for nodes, slots, sums, inbox in zip(division.nodes, division.slot_of, division.sums.reshape(cluster.CLUSTER, -1, 4), inboxes):
+    inboxes = np.zeros((blocks, division.inbox))
+    for nodes, slots, sums, inbox in zip(division.nodes, division.slot_of, division.sums.reshape(blocks, -1, 4), inboxes):
         memory = np.zeros(division.slots)
         memory[slots[nodes >= 0]] = given[nodes[nodes >= 0]]
         assert not memory[-1] and len(np.unique(slots[nodes >= 0])) == 27 * (nodes >= 0).sum()
@@ -61,7 +61,7 @@ def test_blocks_of_a_cluster_add_up_what_all_nodes_give_to_a_grid_node(count):
                 threads = sums[thread : thread + cluster.BANKS * sharing : cluster.BANKS]
                 inbox[g] = sum(memory[begin : end : cluster.WARP].sum() for begin, end, _, _ in threads)
     totals = inboxes[:, :patch].copy()
-    for block, outgoing in enumerate(division.outgoing.reshape(cluster.CLUSTER, -1, 3)):
+    for block, outgoing in enumerate(division.outgoing.reshape(blocks, -1, 3)):
         for g, other, place in outgoing[outgoing[:, 0] >= 0]:
             assert other != block and not inboxes[other, place]
             inboxes[other, place] = totals[block, g]
@@ -73,7 +73,14 @@ def test_blocks_of_a_cluster_add_up_what_all_nodes_give_to_a_grid_node(count):
 
 def test_more_nodes_than_a_cluster_holds_are_not_divided():
     solver = simulate(curved_sheet(20_000), node_count=8000).solver
-    assert cluster.divide(solver.rest_cells, Stencils(solver.rest_cells, solver.grid_shape).corners()) is None
+    corners = Stencils(solver.rest_cells, solver.grid_shape).corners()
+    assert all(cluster.divide(solver.rest_cells, corners, blocks) is None for blocks in cluster.CLUSTERS)
+
+
+def test_few_environments_are_shared_by_many_blocks_and_many_by_few():
+    assert [cluster.by_preference(environments, 132)[0] for environments in (1, 4, 8, 16, 64)] == [16, 16, 8, 4, 1]
+    for environments in (1, 8, 1024):
+        assert sorted(cluster.by_preference(environments, 132)) == sorted(cluster.CLUSTERS)
 
 
 @pytest.mark.parametrize("kinematics", ["rest", "current"])

@@ -5,8 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 BLOCK = 256  # threads of a block; with more there are too few registers
-CLUSTER = 16  # blocks
-THREADS = CLUSTER * BLOCK
+CLUSTERS = (16, 8, 4, 2, 1)  # blocks
 WARP = 32
 ROUNDS = 4  # of a block's threads over its patch, or over what it sends
 AT_ONCE = 4  # loads of a thread that adds up
@@ -16,7 +15,7 @@ OTHERS = 4096  # bytes of it that Warp and the GPU's own take at most
 
 
 class Division(NamedTuple):
-    """How the nodes and the grid are divided among the blocks of a cluster.
+    """How the nodes and the grid are divided among the C blocks of a cluster.
 
     All are tables int32. Places in shared memory are numbers of fours; those in the inbox count from its beginning.
     """
@@ -24,18 +23,28 @@ class Division(NamedTuple):
     lanes: int  # that share a node
     slots: int  # fours that hold what nodes give; the last is for lanes that have nothing to give
     inbox: int  # fours; the first are the totals of the patch, the last is zero
-    nodes: np.ndarray  # [CLUSTER, P] nodes of each piece, -1 = none
-    corners: np.ndarray  # [CLUSTER, P, 27] number in its patch of each node's grid nodes
-    slot_of: np.ndarray  # [CLUSTER, P, 27] slot of what it gives to each of these
-    sums: np.ndarray  # [CLUSTER, ROUNDS, BLOCK, 4] of each thread: first slot, end, threads that share a sum, its grid node or -1
-    outgoing: np.ndarray  # [CLUSTER, ROUNDS, BLOCK, 3] of each thread: grid node to send or -1, block that gets it, place in its inbox
-    addends: np.ndarray  # [CLUSTER, K, G] places in the inbox of the K totals that add up to each grid node
-    received: np.ndarray  # [CLUSTER] fours that other blocks send
+    nodes: np.ndarray  # [C, P] nodes of each piece, -1 = none
+    corners: np.ndarray  # [C, P, 27] number in its patch of each node's grid nodes
+    slot_of: np.ndarray  # [C, P, 27] slot of what it gives to each of these
+    sums: np.ndarray  # [C, ROUNDS, BLOCK, 4] of each thread: first slot, end, threads that share a sum, its grid node or -1
+    outgoing: np.ndarray  # [C, ROUNDS, BLOCK, 3] of each thread: grid node to send or -1, block that gets it, place in its inbox
+    addends: np.ndarray  # [C, K, G] places in the inbox of the K totals that add up to each grid node
+    received: np.ndarray  # [C] fours that other blocks send
 
 
-def divide(rest_cells: np.ndarray, corners: np.ndarray) -> Division | None:
-    """Divide nodes at [M, 3] (cells), each with the numbers of its grid nodes [M, 27]; None if they are too many."""
-    pieces = _bisect(rest_cells, np.arange(len(rest_cells)), CLUSTER)
+def by_preference(environments: int, multiprocessors: int) -> list[int]:
+    """Numbers of blocks that an environment may have, the best first.
+
+    A step of one ends soonest with many blocks. Many environments take the most steps with few: less is sent, and with one lane for each
+    node nothing is computed twice. A cluster lies within a group of multiprocessors, so that clusters at a time fill half of a GPU or more.
+    """
+    at_once = [blocks for blocks in CLUSTERS if 2 * environments * blocks <= multiprocessors]
+    return at_once + sorted(set(CLUSTERS) - set(at_once))
+
+
+def divide(rest_cells: np.ndarray, corners: np.ndarray, blocks: int) -> Division | None:
+    """Divide nodes at [M, 3] (cells), each with the numbers of its grid nodes [M, 27], among so many blocks; None if they are too many."""
+    pieces = _bisect(rest_cells, np.arange(len(rest_cells)), blocks)
     largest = max(len(piece) for piece in pieces)
     lanes = next((lanes for lanes in (4, 2, 1) if lanes * largest <= BLOCK), 0)
     if not lanes:
@@ -49,9 +58,9 @@ def divide(rest_cells: np.ndarray, corners: np.ndarray) -> Division | None:
     size = max(len(patch) for patch in patches)
     if size > ROUNDS * BLOCK:
         return None
-    nodes = np.full((CLUSTER, largest), -1, np.int32)
-    local, slot_of = np.zeros((2, CLUSTER, largest, 27), np.int32)
-    sums = np.zeros((CLUSTER, ROUNDS, BLOCK, 4), np.int32)
+    nodes = np.full((blocks, largest), -1, np.int32)
+    local, slot_of = np.zeros((2, blocks, largest, 27), np.int32)
+    sums = np.zeros((blocks, ROUNDS, BLOCK, 4), np.int32)
     slots = 0
     for i, (piece, patch) in enumerate(zip(pieces, patches)):
         nodes[i, : len(piece)] = piece
@@ -67,7 +76,7 @@ def divide(rest_cells: np.ndarray, corners: np.ndarray) -> Division | None:
     #   numbers 7 9 9, owner 0 0 1, index 0 1 0;  pairs: mine 0 1 1 2 2, theirs 0 1 2 1 2, rank 0 0 1 0 1;
     #   place 0 1 2 2 0: the own totals lie at 0 and 1 (block 0) and at 0 (block 1), what the other block sends at size = 2;
     #   addends of grid node 9: places 1, 2 in block 0 and 2, 0 in block 1, both block 0's total first.
-    owner, index = np.repeat(np.arange(CLUSTER), [len(patch) for patch in patches]), np.concatenate([np.arange(len(p)) for p in patches])
+    owner, index = np.repeat(np.arange(blocks), [len(patch) for patch in patches]), np.concatenate([np.arange(len(p)) for p in patches])
     numbers = np.concatenate(patches)
     order = np.flatnonzero(numbers >= 0)
     order = order[np.argsort(numbers[order], kind="stable")]
@@ -80,20 +89,20 @@ def divide(rest_cells: np.ndarray, corners: np.ndarray) -> Division | None:
     place = index[theirs]  # of the own totals
     foreign = np.flatnonzero(owner[mine] != owner[theirs])
     foreign = foreign[np.lexsort((numbers[mine[foreign]], owner[theirs[foreign]], owner[mine[foreign]]))]
-    received = np.bincount(owner[mine[foreign]], minlength=CLUSTER)
+    received = np.bincount(owner[mine[foreign]], minlength=blocks)
     place[foreign] = size + np.arange(len(foreign)) - np.repeat(np.cumsum(received) - received, received)
     inbox = size + int(received.max()) + 1
-    sent = np.bincount(owner[theirs[foreign]], minlength=CLUSTER)
+    sent = np.bincount(owner[theirs[foreign]], minlength=blocks)
     if sent.max() > ROUNDS * BLOCK or slots + 2 * inbox + size + 1 > SHARED:
         return None
-    addends = np.full((CLUSTER, max(AT_ONCE, rank.max() + 1), size), inbox - 1, np.int32)
+    addends = np.full((blocks, max(AT_ONCE, rank.max() + 1), size), inbox - 1, np.int32)
     addends[owner[mine], rank, index[mine]] = place
     source, target = owner[theirs[foreign]], owner[mine[foreign]]
-    foreign = foreign[np.lexsort((place[foreign], (target - source) % CLUSTER, source))]  # not all to the same block at first
-    outgoing = np.full((CLUSTER, ROUNDS * BLOCK, 3), -1, np.int32)
+    foreign = foreign[np.lexsort((place[foreign], (target - source) % blocks, source))]  # not all to the same block at first
+    outgoing = np.full((blocks, ROUNDS * BLOCK, 3), -1, np.int32)
     number = np.arange(len(foreign)) - np.repeat(np.cumsum(sent) - sent, sent)
     outgoing[owner[theirs[foreign]], number] = np.stack([index[theirs[foreign]], owner[mine[foreign]], place[foreign]], 1)
-    return Division(lanes, slots, inbox, nodes, local, slot_of, sums, outgoing.reshape(CLUSTER, ROUNDS, BLOCK, 3), addends, received)
+    return Division(lanes, slots, inbox, nodes, local, slot_of, sums, outgoing.reshape(blocks, ROUNDS, BLOCK, 3), addends, received)
 
 
 def _sliced(rows: np.ndarray, size: int, rounds: int) -> tuple[np.ndarray, np.ndarray, int]:

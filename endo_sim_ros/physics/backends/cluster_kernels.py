@@ -5,7 +5,8 @@ time goes into launches and into waiting for memory. Here a cluster of blocks ha
 first loads works in registers and shared memory alone. Each block owns a compact piece of the tissue, whose nodes stay in
 the registers of a few lanes each for the whole step, and a *patch* of the grid, all grid nodes that its piece reaches. In a
 substep it adds up what its nodes give to its patch, and sends that to the blocks whose patches touch its own, which wait for
-no others. Every sum has a fixed order: same bits in every run.
+no others. Every sum has a fixed order: same bits in every run. How many blocks a cluster has is up to the number of
+environments (`by_preference`); clusters of other sizes differ by rounding.
 
 Shared memory, in fours of float32: a slot for what each node gives to each of its grid nodes, where threads next to each
 other add up what lies next to each other (sliced ELLPACK, as for sparse matrices); the inbox, of even and odd substeps, with
@@ -17,7 +18,7 @@ import functools
 import warp as wp
 
 from endo_sim_ros.core.native import native
-from endo_sim_ros.physics.backends.cluster_division import AT_ONCE, BANKS, BLOCK, CLUSTER, ROUNDS, SHARED, THREADS, WARP
+from endo_sim_ros.physics.backends.cluster_division import AT_ONCE, BANKS, BLOCK, ROUNDS, SHARED, WARP
 from endo_sim_ros.physics.backends.plain_kernels import node_move, node_update, spline, three
 from endo_sim_ros.physics.backends.structs import Grid, Loads, Nodes, RigidTools, State, Substep
 from endo_sim_ros.physics.materials import MATERIALS
@@ -82,8 +83,8 @@ def spline_at(distance: float) -> float:
 
 
 @functools.cache
-def make_step_kernel(material: str, lanes: int):
-    """The kernel of a whole step for a division with so many lanes; launched over environments × THREADS.
+def make_step_kernel(material: str, lanes: int, blocks: int):
+    """The kernel of a whole step for a division with so many lanes and blocks; launched over environments × blocks × BLOCK.
 
     Each lane has up to three of the nine lines along i of its node's stencil.
     """
@@ -95,7 +96,7 @@ def make_step_kernel(material: str, lanes: int):
     four_each = wp.types.vector(length=4 * ROUNDS, dtype=wp.int32)
     three_each = wp.types.vector(length=3 * ROUNDS, dtype=wp.int32)
 
-    @wp.kernel(enable_backward=False, module="unique", cluster_dim=CLUSTER, launch_bounds=BLOCK, module_options=options)
+    @wp.kernel(enable_backward=False, module="unique", cluster_dim=blocks, launch_bounds=BLOCK, module_options=options)
     def take_step(
         nodes: Nodes,
         state: State,
@@ -116,8 +117,8 @@ def make_step_kernel(material: str, lanes: int):
         received: wp.array[int],
     ):
         thread = wp.tid()
-        b = thread // THREADS
-        block = thread // BLOCK % CLUSTER
+        b = thread // wp.static(blocks * BLOCK)
+        block = thread // BLOCK % wp.static(blocks)
         thread = thread % BLOCK
         count = nodes.X.shape[0]
         patch = addends.shape[2]

@@ -88,19 +88,22 @@ class CudaBackend:
         arch = wp.get_device(self.device).get_cuda_compile_arch()
         if arch is None or arch < 90 or step.kinematics == "current" or step.own_cuts:  # a division is of all environments
             return []
-        division = cluster.divide(step.stencils[0].rest_cells, step.stencils[0].corners())
-        if division is None:
-            return []
         device, memory = wp.get_device(self.device), 16 * cluster.SHARED
         if device.max_shared_memory_per_block < memory + cluster.OTHERS:
             return []
-        kernel = make_step_kernel(step.material, division.lanes)
-        if wp.get_cuda_max_cluster_dim(kernel, device, block_dim=cluster.BLOCK, dynamic_smem_bytes=memory) < cluster.CLUSTER:
-            return []
-        tables = [wp.array(values, dtype=int, device=device) for values in division[3:]]
-        inputs = [step.nodes, step.state, step.loads, step.tools, step.grid, step.substep, step.substeps, step.scale]
-        inputs += [division.slots, division.inbox, *tables]
-        return [self.action(Launch(kernel, step.environments * cluster.THREADS, inputs, cluster.BLOCK))]
+        rest_cells, corners = step.stencils[0].rest_cells, step.stencils[0].corners()
+        for blocks in cluster.by_preference(step.environments, device.sm_count):
+            division = cluster.divide(rest_cells, corners, blocks)
+            if division is None:
+                continue
+            kernel = make_step_kernel(step.material, division.lanes, blocks)
+            if wp.get_cuda_max_cluster_dim(kernel, device, block_dim=cluster.BLOCK, dynamic_smem_bytes=memory) < blocks:
+                continue
+            tables = [wp.array(values, dtype=int, device=device) for values in division[3:]]
+            inputs = [step.nodes, step.state, step.loads, step.tools, step.grid, step.substep, step.substeps, step.scale]
+            inputs += [division.slots, division.inbox, *tables]
+            return [self.action(Launch(kernel, step.environments * blocks * cluster.BLOCK, inputs, cluster.BLOCK))]
+        return []
 
     def _launched(self, step: StepData) -> list[Action]:
         """Two launches for each substep with rest kinematics, three with current kinematics."""

@@ -1,5 +1,6 @@
 """How one episode differs from the scene, by its chance."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -94,15 +95,15 @@ class Variation:
     def values(self) -> dict[str, np.ndarray | float]:
         """What was drawn of each kind that there is, but the tool, by the names of the options; angles in degrees."""
         by = self.by
-        found = {
-            "stiffness": self.stiffness,
-            "light": self.light,
-            "texture": self.texture,
-            "camera_position": by.camera_position * self.chance[1:4],
-            "camera_angle": by.camera_angle * self.chance[4:7],
-            "trocar_angle": by.trocar_angle * self.more[1:4],
-            "trocar_position": by.trocar_position * self.more[4:7],
-            "metal": self.metal,
-            "lamp": self.lamp,
+        kinds: dict[str, Callable[[], np.ndarray | float]] = {
+            "stiffness": lambda: self.stiffness,
+            "light": lambda: self.light,
+            "texture": lambda: self.texture,
+            "camera_position": lambda: by.camera_position * self.chance[1:4],
+            "camera_angle": lambda: by.camera_angle * self.chance[4:7],
+            "trocar_angle": lambda: by.trocar_angle * self.more[1:4],
+            "trocar_position": lambda: by.trocar_position * self.more[4:7],
+            "metal": lambda: self.metal,
+            "lamp": lambda: self.lamp,
         }
-        return {name: value for name, value in found.items() if getattr(by, name)}
+        return {name: value() for name, value in kinds.items() if getattr(by, name)}

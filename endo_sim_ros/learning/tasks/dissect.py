@@ -101,7 +101,7 @@ class Dissect(Task):
         self.line[b, :, 2] = _heights(skin, self.line[b])
         aside = dot(skin, self.across[b])
         off = ((skin - self.line[b][:, None])[..., :2] ** 2).sum(-1)  # [_STATIONS, S]
-        sides = [np.argsort(np.where(side * aside > 0, off, np.inf), 1, kind="stable")[:, :_EACH] for side in (-1, 1)]
+        sides = [_nearest(np.where(side * aside > 0, off, np.inf), _EACH) for side in (-1, 1)]
         spot = ((skin + self.spot_away * self.across[b])[:, :2] ** 2).sum(1).argmin()
         chosen = np.append(np.concatenate(sides), spot)
         self.sites[b], self._rest[b] = self.skin[chosen], skin[chosen]
@@ -227,6 +227,12 @@ class DissectScript(Script):
 def _heights(points: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Heights z [P] of a surface through points [S, 3] at places [P, 2 or more], those of near points counting more."""
     squared = ((places[:, None, :2] - points[:, :2]) ** 2).sum(2)
-    nearest = np.argsort(squared, axis=1, kind="stable")[:, :_NEAR]
+    nearest = _nearest(squared, _NEAR)
     weights = 1 / (np.take_along_axis(squared, nearest, 1) + 1e-8)
     return (weights * points[nearest, 2]).sum(1) / weights.sum(1)
+
+
+def _nearest(squares: np.ndarray, count: int) -> np.ndarray:
+    """Numbers [P, count] of the smallest of squared distances [P, S], in their order."""
+    some = np.argpartition(squares, count, axis=1)[:, :count]
+    return np.take_along_axis(some, np.take_along_axis(squares, some, 1).argsort(1, kind="stable"), 1)
